@@ -105,42 +105,58 @@ class Mean(NamedTuple):
     high: float
 
 
-def variance_of_mean(values: np.ndarray) -> float:
-    """The variance of the mean of values (B, n): B redraws of what runs share (segments, plants), n runs on
-    each, drawn from the redraw alone.
+def shared_variance(figures: Sequence[np.ndarray]) -> float:
+    """The share of a run's variance that all runs on one redraw have in common (intraclass correlation), pooled
+    over figures (B, n) that are alike: B redraws of what runs share (segments, plants), n runs on each.
 
-    The redraws' means differ by what is shared and by their own runs: max(var_b(mean_b) - s^2 / n, 0) is
-    the first alone (variance components, Searle 1971), to which the mean of all adds s^2 / (B n), where s^2 is
-    the variance within a redraw. Raises ValueError for fewer than two redraws.
+    sum (var_b(mean_b) - s^2 / n) / sum (var_b(mean_b) + (1 - 1 / n) s^2), not below 0, with s^2 the variance
+    within a redraw (components of variance: Searle 1971). One figure alone tells it badly: what n runs differ
+    by exceeds what they share. Raises ValueError for fewer than two redraws.
     """
+    between = total = 0.0
+    for figure in figures:
+        values = np.asarray(figure, float)
+        if values.ndim != 2 or values.shape[0] < 2:
+            raise ValueError(
+                f"shared_variance: expected values (B, n) of at least 2 redraws, found shape {values.shape}; "
+                "redraw more often"
+            )
+        n = values.shape[1]
+        within = float(values.var(axis=1, ddof=1).mean()) if n > 1 else 0.0
+        common = float(values.mean(axis=1).var(ddof=1)) - within / n
+        between, total = between + common, total + common + within
+    return min(max(between / total, 0.0), 1.0) if total > 0 else 0.0
+
+
+def effective_runs(redraws: int, runs: int, shared: float) -> float:
+    """As how many runs that share nothing do `runs`, on so many redraws of segments, tell a mean?
+
+    1 / (shared + (1 - shared) / runs): further runs say nothing more of the segments (Kish 1965), times
+    (z / t)^2 for Student's t of redraws - 1 (Korn and Graubard 1998).
+    """
+    student = float(scipy.special.ndtri(0.975) / scipy.special.stdtrit(redraws - 1, 0.975))
+    return student**2 / (shared + (1.0 - shared) / runs)
+
+
+def redrawn_mean(values: np.ndarray, shared: float) -> Mean:
+    """The mean of values (B, n) of n runs on each of B redraws with its 95 % interval, for the `shared`
+    variance of `shared_variance`."""
     values = np.asarray(values, float)
-    if values.ndim != 2 or values.shape[0] < 2 or values.shape[1] < 1:
-        raise ValueError(
-            f"variance_of_mean: expected values (B, n) of at least 2 redraws, found shape {values.shape}; "
-            "redraw more often"
-        )
-    n = values.shape[1]
-    within = float(values.var(axis=1, ddof=1).mean()) if n > 1 else 0.0
-    between = max(float(values.mean(axis=1).var(ddof=1)) - within / n, 0.0)
-    return between + within / values.size
-
-
-def redrawn_mean(values: np.ndarray) -> Mean:
-    """The mean of values (B, n) of B redraws with its 95 % interval, Student's t of B - 1."""
-    mean, B = float(np.mean(values)), len(values)
-    half = float(scipy.special.stdtrit(B - 1, 0.975) * np.sqrt(variance_of_mean(values)))
+    mean, n = float(values.mean()), effective_runs(len(values), values.size, shared)
+    half = float(scipy.special.ndtri(0.975) * values.std() / np.sqrt(n))
     return Mean(mean, mean - half, mean + half)
 
 
-def redrawn_share(happened: np.ndarray) -> Share:
-    """The share of True in happened (B, n) of B redraws, in percent, with its 95 % interval: Wilson's, of as
-    many runs as would tell as much if they shared nothing.
+def redrawn_share(happened: np.ndarray, shared: float) -> Share:
+    """The share of True in happened (B, n) in percent with the 95 % interval of what the same work gives on
+    other segments: Wilson's, of an effective number of runs.
 
-    n_eff = p (1 - p) / V (z / t)^2, at most B n, with V of `variance_of_mean` and t of B - 1 (Korn and
-    Graubard 1998); where all or none happened, nothing tells V, and n_eff is B n.
+    The mean of B redraws and a repetition on one set of segments differ by shared (1 + 1 / B) of a run's
+    variance for the segments and by (1 - shared) / (B n) for the runs of either; z / t as in
+    `effective_runs`. `shared` is of all figures alike; where this one shows more, its own counts.
     """
     happened = np.asarray(happened, bool)
-    p, V, B = float(happened.mean()), variance_of_mean(happened), len(happened)
-    n = min(p * (1.0 - p) / V, happened.size) if V > 0 and 0 < p < 1 else float(happened.size)
+    B, own = len(happened), max(shared, shared_variance([happened]))
     student = float(scipy.special.ndtri(0.975) / scipy.special.stdtrit(B - 1, 0.975))
-    return wilson_interval(p, n * student**2)
+    variance = own * (1.0 + 1.0 / B) + 2.0 * (1.0 - own) / happened.size
+    return wilson_interval(float(happened.mean()), student**2 / variance)

@@ -29,7 +29,7 @@ from pipeline.setpoint.simulator import (
     paper_windows,
     rollout,
 )
-from pipeline.statistics import Mean, Share, redrawn_mean, redrawn_share
+from pipeline.statistics import Mean, Share, effective_runs, redrawn_mean, shared_variance, wilson_interval
 
 START_FLOWS, START_TEMPERATURES = (
     (30.0, 60.0, 80.0, 120.0, 150.0, 200.0, 300.0),
@@ -39,7 +39,10 @@ STARTS = len(START_FLOWS) * len(START_TEMPERATURES)
 GOOD_STARTS = np.linspace(92.5, 107.5, STARTS)  # percent: prints that nothing is wrong with
 SOUND, STUCK, BLIND = range(3)
 FAULT_STEPS = (20, 50)  # decisions from and until which a camera is stuck or blind
-OTHER_CAMERA = (1.12, 0.8)  # scale and exponent: it shows 12 % more at 100 %, and ratios smaller than they are
+OTHER_CAMERA = (
+    1.12,
+    0.8,
+)  # scale and exponent: it shows 12 % more at 100 %, and ratios smaller than they are
 MOVED_BORDERS = (0.92, 1.08)  # of those learned
 DOES_NOTHING = "do nothing"
 
@@ -107,9 +110,7 @@ def all_cases(runs: int, *, segment_mean_decisions: float) -> dict[str, Case]:
     sticky = fresh._replace(**lasting)
     weak = {"gain": 0.6 * one}
     clog, half_clog = ({"clog": left * one, "clog_step": CLOG_STEP * one} for left in (0.6, 0.75))
-    paper = {
-        accuracy: starts(runs, accuracy=accuracy)._replace(**none) for accuracy in (1.0, 0.9, 0.8, 0.7)
-    }
+    paper = {accuracy: starts(runs, accuracy=accuracy)._replace(**none) for accuracy in (1.0, 0.9, 0.8, 0.7)}
     asked = {f"accuracy {accuracy:g}": conditions for accuracy, conditions in paper.items()} | {
         "accuracy 0.7, gain 0.6": paper[0.7]._replace(**weak),
         "accuracy 0.7, clog": paper[0.7]._replace(**clog),
@@ -130,6 +131,14 @@ def all_cases(runs: int, *, segment_mean_decisions: float) -> dict[str, Case]:
         for camera, of in cameras().items()
     }
     return {name: Case(conditions) for name, conditions in asked.items()} | harm
+
+
+def alike(case: str) -> str:
+    """What the windows of a case have in common with those of others: "" the paper's, which share no segment;
+    fresh ones; sticky ones. Cases alike tell together how much runs on one redraw share."""
+    if case.startswith("accuracy"):
+        return ""
+    return "fresh" if case.startswith("recorded, fresh") else "sticky"
 
 
 def counts(case: str) -> bool:
@@ -181,9 +190,7 @@ def _shown(table: Shown, conditions: Conditions, flow, segment, u) -> tuple[jax.
     seen = BEST_FLOW * table.scale * (flow / BEST_FLOW) ** table.exponent
     paper = paper_windows().draw((), conditions, flow, segment, u)
     recorded = table.recorded.draw(table.recorded.table, conditions, seen, segment, u)
-    return tuple(
-        jnp.where(conditions.persistence > 0, *pair) for pair in zip(recorded, paper, strict=True)
-    )
+    return tuple(jnp.where(conditions.persistence > 0, *pair) for pair in zip(recorded, paper, strict=True))
 
 
 class Fault(NamedTuple):
@@ -229,8 +236,8 @@ def redrawn(table: WindowTable, redraws: int, rng: np.random.Generator) -> Windo
     """`redraws` tables of as many segments as the table has, drawn from them with replacement: a source whose
     arrays have a leading axis (redraws,).
 
-    A redraw that leaves a bin of the flow without a window is drawn again. Raises ValueError where 100 in a
-    row do: the table has too few segments.
+    A bin of the flow that a redraw leaves without a window keeps its own segments: of prints that stand at
+    one flow each there may be no other.
     """
     sources = [recorded_windows(_redraw(table, rng)) for _ in range(redraws)]
 
@@ -243,27 +250,22 @@ def redrawn(table: WindowTable, redraws: int, rng: np.random.Generator) -> Windo
 
 
 def _redraw(table: WindowTable, rng: np.random.Generator) -> WindowTable:
+    flow_bin = np.asarray(table.flow_bin)
     names, segment = np.unique(table.segment, return_inverse=True)
-    bins = len(table.flow_edges) - 1
-    order = np.argsort(segment.ravel(), kind="stable")
-    counts = np.bincount(segment.ravel())
+    segment = segment.ravel()
+    order, counts = np.argsort(segment, kind="stable"), np.bincount(segment)
     first = np.cumsum(counts) - counts
-    for _ in range(100):
-        drawn = rng.integers(0, len(names), len(names))
-        rows = np.concatenate([order[first[s] : first[s] + counts[s]] for s in drawn])
-        if len(np.unique(table.flow_bin[rows])) == bins:
-            break
-    else:
-        raise ValueError(
-            f"redrawn segments: expected windows of every flow bin in a redraw of {len(names)} segments, found "
-            "100 redraws in a row without; record more segments (train_classifier.recorded)"
-        )
-    picked = {
+    drawn = rng.integers(0, len(names), len(names))
+    rows = np.concatenate([order[first[s] : first[s] + counts[s]] for s in drawn])
+    kept = np.flatnonzero(~np.isin(flow_bin, flow_bin[rows]))
+    which = np.concatenate([np.repeat(np.arange(len(drawn)), counts[drawn]), len(drawn) + segment[kept]])
+    rows = np.concatenate([rows, kept])
+    columns = {
         name: np.asarray(column)[rows]
         for name, column in table._asdict().items()
-        if name != "flow_edges" and np.shape(column)[:1] == np.shape(table.segment)
+        if name not in ("flow_edges", "segment") and np.shape(column)[:1] == flow_bin.shape
     }
-    return table._replace(**picked | {"segment": np.repeat(np.arange(len(drawn)), counts[drawn])})
+    return table._replace(**columns, segment=which)
 
 
 def evaluate(
@@ -308,7 +310,7 @@ class Judged(NamedTuple):
 
 
 def harmless(of: Judged, bars: Mapping[str, float]) -> str:
-    """"" where the contestant leaves +-25 % in at most bars[case] percent of the runs of each case, else where
+    """ "" where the contestant leaves +-25 % in at most bars[case] percent of the runs of each case, else where
     it leaves it most beyond its bar."""
     over = {case: 100.0 * float(of.harmed[case].mean()) - bar for case, bar in bars.items()}
     case = max(over, key=lambda name: over[name], default="")
@@ -327,10 +329,15 @@ def worst_case(of: Judged) -> tuple[float, str]:
 def lead(of: Judged, other: Judged) -> Mean:
     """By how many points the worst case of `of` exceeds the worst of the other, with its 95 % interval, from
     the redraws that both have: same segments, same chance."""
-    ours, theirs = of.kept[worst_case(of)[1]], other.kept[worst_case(other)[1]]
-    both = min(len(ours), len(theirs))
-    value, low, high = redrawn_mean(100.0 * (ours[:both].astype(float) - theirs[:both]))
-    return Mean(value, low, high)
+    first, second = worst_case(of)[1], worst_case(other)[1]
+    both = min(len(of.kept[first]), len(other.kept[second]))
+
+    def beyond(case: str, against: str) -> np.ndarray:
+        return 100.0 * (of.kept[case][:both].astype(float) - other.kept[against][:both])
+
+    groups = {alike(first), alike(second)} - {""}
+    shared = shared_variance([beyond(case, case) for case in of.kept if alike(case) in groups])
+    return redrawn_mean(beyond(first, second), shared)
 
 
 def still_in(judged: Mapping[str, Judged], bars: Mapping[str, float]) -> list[str]:
@@ -343,15 +350,27 @@ def still_in(judged: Mapping[str, Judged], bars: Mapping[str, float]) -> list[st
         name
         for name, of in judged.items()
         if _worst_share(of).high >= least
-        and all(redrawn_share(of.harmed[case]).low <= bar for case, bar in bars.items())
+        and all(_interval(of, of.harmed, case).low <= bar for case, bar in bars.items())
     ]
 
 
 def _worst_share(of: Judged) -> Share:
-    return redrawn_share(of.kept[worst_case(of)[1]])
+    return _interval(of, of.kept, worst_case(of)[1])
 
 
-def choose(judged: Mapping[str, Judged], *, simplest_first: Sequence[str], bars: Mapping[str, float]) -> Choice:
+def _interval(of: Judged, figures: Mapping[str, np.ndarray], case: str) -> Share:
+    """Of a case, with what its runs share told by all cases alike."""
+    group = [
+        blocks for side in (of.kept, of.harmed) for name, blocks in side.items() if alike(name) == alike(case)
+    ]
+    blocks = figures[case]
+    shared = shared_variance(group) if alike(case) else 0.0
+    return wilson_interval(float(blocks.mean()), effective_runs(len(blocks), blocks.size, shared))
+
+
+def choose(
+    judged: Mapping[str, Judged], *, simplest_first: Sequence[str], bars: Mapping[str, float]
+) -> Choice:
     """The default: of the contestants that do no harm the simplest whose worst case is not worse than the
     best one's beyond its 95 % interval.
 
@@ -378,7 +397,9 @@ def choose(judged: Mapping[str, Judged], *, simplest_first: Sequence[str], bars:
         rival = max(rest, key=lambda other: worst_case(judged[other])[0])
         margin = lead(judged[name], judged[rival])
         why = _reason(name, rival, judged[rival], margin)
-    opening = f"{name} is the default: in its worst case ({case}) {100 * worst:.1f} % of the runs settle and stay"
+    opening = (
+        f"{name} is the default: in its worst case ({case}) {100 * worst:.1f} % of the runs settle and stay"
+    )
     beside = "".join(f" Not asked: {other} {why}." for other, why in refused.items())
     return Choice(name, 100 * worst, case, *margin, refused, f"{opening}; {why}.{beside}")
 

@@ -105,12 +105,13 @@ def outcomes(flow: np.ndarray, temperature: np.ndarray) -> Outcomes:
     )
 
 
-def summary(of: Outcomes, *, redraws: int = 1) -> Score:
+def summary(of: Outcomes, *, redraws: int = 1, shared: float = 0.0) -> Score:
     """The score of runs that are `redraws` equal blocks, one after the other, each on a redraw of the segments
-    of its own. With one redraw the runs share nothing, and the intervals are Wilson's."""
+    of its own, where a block's runs have the share `shared` of their variance in common
+    (`statistics.shared_variance`). With one redraw the runs share nothing, and the intervals are Wilson's."""
 
     def share(happened: np.ndarray) -> Share:
-        return wilson(happened) if redraws == 1 else redrawn_share(happened.reshape(redraws, -1))
+        return wilson(happened) if redraws == 1 else redrawn_share(happened.reshape(redraws, -1), shared)
 
     median, p90 = np.percentile(of.entered[of.settled], [50, 90]) if of.settled.any() else (np.nan, np.nan)
     return Score(
