@@ -128,6 +128,9 @@ class RobustFilter(Section):
     hazard: float = Field(ge=0, lt=1)
     move_cost: float = Field(ge=0, le=10)
     outside_cost: float = Field(ge=0, le=1000)
+    move_fixed_cost: float = Field(ge=0, le=100)
+    known_start_share: float = Field(ge=0, lt=1)
+    known_start_std: float = Field(gt=0, le=1)
 
     def hypotheses(self) -> int:
         return len(self.gains) * (len(self.accuracies) + self.width_bias_levels)
@@ -189,6 +192,9 @@ class ClassFilter(Section):
     hazard: float = Field(ge=0, lt=1)
     move_cost: float = Field(ge=0, le=10)
     outside_cost: float = Field(ge=0, le=1000)
+    move_fixed_cost: float = Field(ge=0, le=100)
+    known_start_share: float = Field(ge=0, lt=1)
+    known_start_std: float = Field(gt=0, le=1)
 
 
 class Baselines(Section):
@@ -222,11 +228,23 @@ class Pixels(Section):
     softening_per_degC: float = Field(ge=0, le=1)
 
 
+class MostHarmed(Section):
+    """Of runs from good starts those that may leave +-25 %, or a controller is no candidate: from 100 %, and
+    from 92.5 to 107.5 % with a camera that is right, stuck or blind for a while."""
+
+    perfect_percent: float = Field(ge=0, le=100)
+    in_band_percent: float = Field(ge=0, le=100)
+
+
 class EvaluateSetpoint(Section):
-    """Section `evaluate_setpoint`."""
+    """Section `evaluate_setpoint`. Segments are redrawn `redraws` times a round, in each of which whoever may
+    still become the default runs `runs` times from each of 21 starts, in every case."""
 
     seed: int = Field(ge=0, le=2**31)
     runs: int = Field(ge=1, le=10_000)
+    redraws: int = Field(ge=2, le=1000)
+    rounds: int = Field(ge=1, le=100)
+    most_harmed: MostHarmed
     segment_mean_decisions: float = Field(ge=1, le=10_000)
     baselines: Baselines
     pixels: Pixels
