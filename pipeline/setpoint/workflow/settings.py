@@ -11,7 +11,7 @@ REACH_PX = 30
 
 
 class Counts(Section):
-    """A number for each of the four parts."""
+    """A number for each of the four parts of the classifier's frames."""
 
     learned: int = Field(ge=1, le=10_000)
     held_out: int = Field(ge=1, le=10_000)
@@ -19,15 +19,32 @@ class Counts(Section):
     judged: int = Field(ge=1, le=10_000)
 
 
-class Recorded(Section):
-    """Segments whose windows over the whole range of flows are recorded for the simulator, and windows of
-    each in a bin of the flow: those that controllers are trained and tuned on (many segments, as what a
-    segment adds stays with its windows), and those that they are judged on."""
+class Sweeps(Section):
+    """Segments whose windows over the whole range of flows stand for the camera in the simulator: those that
+    controllers are trained and tuned on, that the default is chosen on, and that are judged on. Many
+    segments, as what a segment adds stays with its windows."""
 
-    learn: int = Field(ge=1, le=1000)
-    judge: int = Field(ge=1, le=1000)
-    learn_windows: float = Field(gt=0, le=100)
-    judge_windows: float = Field(gt=0, le=100)
+    learn: int = Field(ge=1, le=10_000)
+    choose: int = Field(ge=1, le=10_000)
+    judge: int = Field(ge=1, le=10_000)
+
+
+class SweepWindows(Section):
+    """Windows of each of these segments in a bin of the flow, on average."""
+
+    learn: float = Field(gt=0, le=100)
+    choose: float = Field(gt=0, le=100)
+    judge: float = Field(gt=0, le=100)
+
+
+class RenderFrames(Section):
+    """Section `render_frames`: segments are counted in fifteens, three at each of the five temperatures."""
+
+    seed: int = Field(ge=0, le=2**31)
+    segments: Counts
+    frames: Counts
+    sweeps: Sweeps
+    sweep_windows: SweepWindows
 
 
 class Recipe(Section):
@@ -59,9 +76,7 @@ class TrainClassifier(Section):
     seed: int = Field(ge=0, le=2**31)
     size: Literal["small", "paper"]
     augmentation: Literal["along_bead", "adr"]
-    segments: Counts
     prints: Counts
-    frames: Counts
     window: int = Field(ge=1, le=1000)
     least_score: float = Field(ge=0, le=255)
     tip_px: tuple[Annotated[float, Field(ge=0, le=100_000)], Annotated[float, Field(ge=0, le=100_000)]] | None
@@ -72,7 +87,6 @@ class TrainClassifier(Section):
     coverage: float = Field(gt=0.5, lt=1)
     confidence: float = Field(gt=0.5, lt=1)
     false_alarms: float = Field(gt=0, lt=0.5)
-    recorded: Recorded
 
 
 class Learning(Section):

@@ -43,7 +43,9 @@ RELIABILITY = Schema(
     1,
     (
         Column("of", TEXT, NONE, "image, or window of frames of one segment"),
-        Column("method", TEXT, NONE, "raw or calibrated (image); hard_counts, mean or log_sum (window)"),
+        Column(
+            "method", TEXT, NONE, "raw or calibrated (image); hard_counts, mean, log_sum or flow (window)"
+        ),
         Column("low", FLOAT, NONE, "confidence from", 0, 1),
         Column("high", FLOAT, NONE, "confidence to", 0, 1),
         Column("count", COUNT, NONE, "images or windows in this bin", low=0),
@@ -63,6 +65,10 @@ CLASSIFIER_CURVE = Schema(
         Column("held_out_accuracy", FLOAT, NONE, "share that is right there", 0, 1, nullable=True),
     ),
 )
+
+# what controllers are trained and tuned on, what the default is chosen on, and what is judged once: no
+# segment in two of them
+WINDOW_PARTS = ("learn", "choose", "judge")
 
 WINDOWS = Schema(
     "windows",

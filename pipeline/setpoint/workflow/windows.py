@@ -6,11 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.setpoint.recorded import WindowTable
-from pipeline.setpoint.workflow.tables import FLOW_EDGES
-
-# what controllers are trained and tuned on, what the default is chosen on, and what is judged once: no
-# segment in two of them
-WINDOW_PARTS = ("learn", "choose", "judge")
+from pipeline.setpoint.workflow.tables import FLOW_EDGES, WINDOW_PARTS
 
 
 def edges(flows: Sequence[np.ndarray]) -> np.ndarray:
