@@ -1,5 +1,5 @@
-"""Controllers of setpoints on one yardstick: what they are asked (21 wrong starts, good starts that shall stay
-good, cameras that err), on redrawn segments, and the rule by which one of them runs by default.
+"""Controllers of setpoints on one yardstick: what they are asked (21 wrong starts, good starts that shall
+stay good, cameras that err), on redrawn segments, and the rule by which one of them runs by default.
 
 Figures are of the segments that a classifier happened to record. Redrawn with replacement, as often as runs
 have blocks, these segments say how far the figures would move had others been recorded (cluster bootstrap:
@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -310,8 +309,8 @@ class Judged(NamedTuple):
 
 
 def harmless(of: Judged, bars: Mapping[str, float]) -> str:
-    """ "" where the contestant leaves +-25 % in at most bars[case] percent of the runs of each case, else where
-    it leaves it most beyond its bar."""
+    """ "" where the contestant leaves +-25 % in at most bars[case] percent of the runs of each case; else
+    where it leaves it most beyond its bar."""
     over = {case: 100.0 * float(of.harmed[case].mean()) - bar for case, bar in bars.items()}
     case = max(over, key=lambda name: over[name], default="")
     if not case or over[case] <= 0:

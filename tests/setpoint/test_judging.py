@@ -385,10 +385,10 @@ def test_the_default_is_the_best_in_its_worst_case_and_the_margin_is_said():
 
 
 def test_within_noise_the_simpler_runs_whatever_the_order_of_the_table():
+    # the agent loses 18 of 480 runs, the filter 24 others
     close = {
-        "agent": contestant(0.97, 0.97, seed=1),
-        "filter": contestant(0.95, 0.95, seed=2),
-        DOES_NOTHING: IDLE,
+        name: Judged({"clog": kept}, IDLE.harmed)
+        for name, kept in (("agent", ~spread(18 / 480)), ("filter", ~spread(24 / 480)[::-1, ::-1]))
     }
     assert judging.worst_case(close["agent"])[0] > judging.worst_case(close["filter"])[0]
     choice = choose(close, simplest_first=ORDER, bars=BARS)
