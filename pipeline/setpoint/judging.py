@@ -187,7 +187,7 @@ def redrawn(table: WindowTable, redraws: int, rng: np.random.Generator) -> Windo
     A bin of the flow that a redraw leaves without a window keeps its own segments: of prints that stand at
     one flow each there may be no other.
     """
-    sources = [recorded_windows(_redraw(table, rng)) for _ in range(redraws)]
+    sources = [recorded_windows(redraw(table, rng)) for _ in range(redraws)]
 
     def stacked(*leaves: jax.Array) -> jax.Array:
         longest = max(map(len, leaves))
@@ -197,7 +197,8 @@ def redrawn(table: WindowTable, redraws: int, rng: np.random.Generator) -> Windo
     return sources[0]._replace(table=jax.tree.map(stacked, *(source.table for source in sources)))
 
 
-def _redraw(table: WindowTable, rng: np.random.Generator) -> WindowTable:
+def redraw(table: WindowTable, rng: np.random.Generator) -> WindowTable:
+    """The table of as many segments, drawn from its own with replacement; each is one of its own there."""
     flow_bin = np.asarray(table.flow_bin)
     names, segment = np.unique(table.segment, return_inverse=True)
     segment = segment.ravel()

@@ -106,7 +106,7 @@ class Conditions(NamedTuple):
     gain_drift: relative change of the gain at each step, within GAIN_LIMITS; clog_rate: probability a step
     that a clog comes, and goes again with CLOG_GOES; seen: factor on the flow that the camera reads, against
     its record; the camera repeats its window for stuck_for decisions from stuck_from on, and shows nothing
-    for blind_for from blind_from on.
+    for blind_for from blind_from on. flow_actions: lambda, of flow to one of temperature.
     """
 
     flow: jax.Array
@@ -128,6 +128,7 @@ class Conditions(NamedTuple):
     stuck_for: jax.Array
     blind_from: jax.Array
     blind_for: jax.Array
+    flow_actions: jax.Array
 
 
 class State(NamedTuple):
@@ -198,6 +199,7 @@ def nominal(flow, temperature, *, accuracy: float) -> Conditions:
             "temperature": jnp.asarray(temperature, float) * one,
             "accuracy": accuracy * one,
             "wait_s": 6.0 * one,
+            "flow_actions": LAMBDA * one,
         }
     )
 
@@ -297,7 +299,7 @@ def _sent(conditions: Conditions, state: State, action: Action) -> tuple[Setpoin
     """What is sent of an action, the wait after it in s, and the flow's executed move in percent as
     commanded. The flow is limited where it arrives: a move of a reaches gain a."""
     acts = state.reason == ACTS
-    heeded = acts & (state.acted % LAMBDA == 0)
+    heeded = acts & (state.acted % conditions.flow_actions == 0)
     asked = jnp.stack(
         [
             jnp.where(acts, jnp.asarray(FLOW_MOVES)[action.flow], 0.0),
@@ -348,9 +350,9 @@ def _observation(state: State) -> Observation:
     return Observation(*state.shown, state.flow_move, state.temperature, state.sent.value[1], state.acted)
 
 
-def first_history() -> jax.Array:
-    """(8) at the start: 30 classes as if all had been good, 1 / n_c each; oldest first."""
-    return jnp.full(HISTORY, 1.0 / CLASSES)
+def first_history(length: int = HISTORY) -> jax.Array:
+    """(8) at the start: eta classes as if all had been good, 1 / n_c each; oldest first."""
+    return jnp.full(length, 1.0 / CLASSES)
 
 
 def remembered(history: jax.Array, named: jax.Array) -> jax.Array:

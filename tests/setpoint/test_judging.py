@@ -258,14 +258,14 @@ def test_redraws_are_whole_segments_and_what_fills_them_up_is_never_drawn():
     again = np.random.default_rng(1)
     used = []
     for b in range(5):
-        one = recorded_windows(judging._redraw(table, again))
+        one = recorded_windows(judging.redraw(table, again))
         of = stacked._replace(table=jax.tree.map(lambda leaf, b=b: leaf[b], stacked.table))
         for u in (0.0, 0.4, 0.999):
             flows = np.linspace(25, 300, 40)
             for x, y in zip(windows_at(of, flows, 1.0, u), windows_at(one, flows, 1.0, u), strict=True):
                 np.testing.assert_array_equal(x, y)
             assert {*map(tuple, np.asarray(windows_at(of, flows, 1.0, u)[0]))} <= {*map(tuple, shares)}
-        drawn = judging._redraw(table, np.random.default_rng(b))
+        drawn = judging.redraw(table, np.random.default_rng(b))
         by_shares = {tuple(row): segment for row, segment in zip(shares, table.segment, strict=True)}
         for segment in np.unique(drawn.segment):
             rows = drawn.segment == segment
@@ -279,7 +279,7 @@ def test_redraws_are_whole_segments_and_what_fills_them_up_is_never_drawn():
 def test_a_bin_of_one_segment_keeps_it():
     table = TABLE._replace(segment=TABLE.flow_bin)
     for seed in range(5):
-        assert set(judging._redraw(table, np.random.default_rng(seed)).flow_bin) == set(TABLE.flow_bin)
+        assert set(judging.redraw(table, np.random.default_rng(seed)).flow_bin) == set(TABLE.flow_bin)
 
 
 def test_asking_runs_each_case_on_each_redraw_from_one_key():

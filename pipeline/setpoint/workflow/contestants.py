@@ -49,15 +49,20 @@ class ControllerSpec(NamedTuple):
 
 
 @cache  # one controller for all phases, so that what was compiled for it is found again
-def _published() -> Controller:
-    return agent.greedy(agent.paper_encoder())
+def _published(history: int) -> Controller:
+    return agent.greedy(agent.paper_encoder(history))
 
 
 def _after_phase(number: int) -> Callable[[Problem], tuple[Controller, Any] | None]:
     """The agent of Li and Pattinson (2025) after so many of its phases."""
-    return lambda problem: (
-        (_published(), problem.agents.li_2025[number - 1]) if number <= len(problem.agents.li_2025) else None
-    )
+
+    def made(problem: Problem) -> tuple[Controller, Any] | None:
+        if number > len(problem.agents.li_2025):
+            return None
+        network = problem.agents.li_2025[number - 1]
+        return _published(agent.history_of(network)), network
+
+    return made
 
 
 CONTESTANTS = (
