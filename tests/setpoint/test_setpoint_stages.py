@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 import yaml
 
+from pipeline.setpoint import nozzle_scene
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, classify
-from pipeline.setpoint.calibration import KNOTS_PERCENT, Calibration, Familiar, FlowCalibration
+from pipeline.setpoint.calibration import Calibration, Familiar
 from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.vision_transformer import SMALL as SMALL_SIZE
 from pipeline.setpoint.vision_transformer import named_arrays, vision_transformer
-from pipeline.setpoint.workflow import parts, train_agent, train_classifier
+from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
+from pipeline.setpoint.workflow import parts, render_frames, train_agent, train_classifier
 from pipeline.setpoint.workflow.agent_files import AGENTS_SCHEMA, Agents, restore_agents, store_agents
 from pipeline.setpoint.workflow.classifier_files import (
     CLASSIFIER_SCHEMA,
@@ -57,6 +59,7 @@ SMALL = {
     "train_classifier.window": SHOTS,
     "train_classifier.coverage": 0.6,
     "train_classifier.confidence": 0.55,
+    "train_classifier.coverage_by_flow": 0.6,
     "train_classifier.false_alarms": 0.1,
     **{f"train_classifier.{network}.{key}": value for network in ("small", "cnn") for key,
     value in RECIPE.items()},
@@ -182,6 +185,12 @@ def check_classifier(source: str) -> dict:
     for name in ("image_accuracy", "window_accuracy", "svc_image_accuracy", "ece_image", "ece_window"):
         assert 0 <= figures[name] <= 1
     assert figures["source"] == source
+    bins = [(row["flow_low"], row["flow_high"]) for row in figures["by_flow"]]
+    assert bins == [(low, low + 5) for low in range(70, 150, 5)]
+    assert [(row["flow_low"], row["flow_high"]) for row in figures["coverage_by_flow"]] == bins
+    assert figures["right_70_150"].keys() == {"percent", "low", "high"}
+    for low, high in figures["intervals_percent"].values():
+        assert 0 <= low <= high <= 100
     assert figures["epochs"] == {"vision transformer": 2, "convolutional network": 2}
     return figures
 
@@ -228,6 +237,61 @@ def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(
         assert arrays.keys() == whole.keys()
         for name, values in whole.items():
             np.testing.assert_array_equal(arrays[name], values, err_msg=name)
+
+
+# ---- rendered frames
+
+
+def test_rendered_parts_share_no_segment_and_every_bin_has_a_window_in_every_part(simulated, monkeypatch):
+    monkeypatch.chdir(simulated)
+    found = render_frames.restore_frames(Path("datasets/render_frames"))
+    assert tuple(found) == (*render_frames.PARTS, *WINDOW_PARTS)
+    segments = [set(frames.segment.tolist()) for frames in found.values()]
+    assert sum(map(len, segments)) == len(set.union(*segments)) == 15 * (3 + 1 + 2 + 2) + 3
+    for part, frames in found.items():
+        assert len(frames.valid) == len(frames.images) == len(frames.score), part
+        np.testing.assert_array_equal(frames.label, nozzle_scene.label(frames.flow))
+    tables = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
+    bins = len(tables["judge"].flow_edges) - 1
+    for part, recorded in tables.items():
+        assert set(recorded.flow_bin.tolist()) == set(range(bins)), part
+        assert set(recorded.segment.tolist()) <= set(found[part].segment.tolist())
+        low, high = (recorded.flow_edges[recorded.flow_bin + end] for end in (0, 1))
+        assert ((recorded.flow >= low) & (recorded.flow <= high)).all()
+
+
+def test_rendering_again_gives_the_same_bytes_whatever_the_workers(simulated, project):
+    declare({"execution.jobs": 2})
+    stage("render_frames")
+    assert artifacts.sha256("datasets/render_frames") == artifacts.sha256(
+        simulated / "datasets/render_frames"
+    )
+
+
+def test_how_far_a_line_must_stand_out_is_decided_after_rendering(simulated):
+    frames = render_frames.restore_frames(simulated / "datasets/render_frames")["judged"]
+    assert (frames.score[frames.valid] < 10).any()
+    strict = render_frames.standing_out(frames, 10.0)
+    np.testing.assert_array_equal(strict.valid, frames.valid & (frames.score >= 10))
+    assert not strict.images[~strict.valid].any()
+    assert all(reason.startswith("no fresh line: ") for reason in strict.reasons[~strict.valid])
+    assert not any(strict.reasons[strict.valid])
+
+
+def test_frames_that_are_damaged_or_were_never_rendered_are_refused_by_name(simulated, project, capsys):
+    said = refusal("train_classifier", capsys)
+    assert "datasets/render_frames/learned.safetensors is missing" in said
+    assert "make it again with ./run dvc repro render_frames" in said
+    shutil.copytree(simulated / "datasets/render_frames", "datasets/render_frames")
+    path = Path("datasets/render_frames/choose.safetensors")
+    path.write_bytes(path.read_bytes()[:1000])
+    assert f"{path} holds no whole weights" in refusal("train_classifier", capsys)
+
+
+def test_recordings_need_no_rendering(project):
+    declare({"train_classifier.source": "recordings"})
+    stage("render_frames")
+    assert not list(Path("datasets/render_frames").iterdir())
 
 
 # ---- there and back

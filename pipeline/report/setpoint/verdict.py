@@ -304,7 +304,7 @@ def _accurate(sources: Sources, question: Question, others: Sequence[str], of: s
         limit=f"≥ {question.limit:g}{THIN}%",
         place="vision",
         reason=reason,
-        remedy="More segments to train on (train_classifier.segments), or another view of the nozzle.",
+        remedy="More segments to train on (render_frames.segments), or another view of the nozzle.",
     )
     return rule, rule._replace(figure=best, text=share_text(best) + (f" {BRIEF[who]}" if who else ""))
 
@@ -333,7 +333,7 @@ def _calibrated(sources: Sources, name: str, limit: float, keys: tuple[str, str]
         else (
             f"Stated and true shares of right answers differ by {texts[0]} on average; {limit:g} is allowed."
         ),
-        remedy="Calibrate on more segments (train_classifier.segments.calibration).",
+        remedy="Calibrate on more segments (render_frames.segments.calibration).",
     )
     return rule, rule._replace(figure=_plain(raw), text=texts[1])
 

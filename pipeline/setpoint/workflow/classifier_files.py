@@ -14,6 +14,7 @@ from pipeline.setpoint.vision_transformer import (
     named_arrays,
     vision_transformer,
 )
+from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.setpoint.workflow.settings import TrainClassifier
 from pipeline.store import artifacts
 from pipeline.store.artifacts import read_weights, write_weights
@@ -69,7 +70,7 @@ def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedCl
         network = from_named_arrays(
             vision_transformer(SIZES[about["size"]], np.random.default_rng(0)), arrays
         )
-    knots = (len(calibration.KNOTS_PERCENT),)
+    knots = (len(KNOTS_PERCENT),)
     fitted = artifacts.read_arrays(
         calibration_path, *CALIBRATION, shapes={"flow_shown": knots, "flow_scale": knots}
     )
@@ -80,8 +81,6 @@ def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedCl
             *numbers,
             calibration.Familiar(fitted["means"], fitted["whitening"]),
             float(fitted["foreign_above"]),
-            calibration.FlowCalibration(
-                fitted["flow_shown"], fitted["flow_scale"], float(fitted["flow_correlation"])
-            ),
+            FlowCalibration(fitted["flow_shown"], fitted["flow_scale"], float(fitted["flow_correlation"])),
         ),
     )

@@ -86,6 +86,7 @@ class TrainClassifier(Section):
     cnn: Recipe
     coverage: float = Field(gt=0.5, lt=1)
     confidence: float = Field(gt=0.5, lt=1)
+    coverage_by_flow: float = Field(gt=0.5, lt=1)
     false_alarms: float = Field(gt=0, lt=0.5)
 
 

@@ -191,7 +191,7 @@ def judged(settings: TrainClassifier, by_part: Mapping[str, LabelledFrames], net
         outputs["learned"],
         outputs["calibration"],
         length=settings.window,
-        promise=Promise(settings.coverage, settings.confidence),
+        promise=Promise(settings.coverage, settings.confidence, settings.coverage_by_flow),
         false_alarms=settings.false_alarms,
     )
     windows = calibrated_classifier.window_predictions(fitted, outputs["judged"], length=settings.window)
