@@ -36,12 +36,6 @@ ASKED = (
     "in band",
     "in band, stuck 30",
 )
-    "recorded, sticky",
-    "recorded, sticky, clog",
-    "recorded, sticky, half clog",
-    "in band",
-    "in band, stuck 30",
-)
 
 
 def redraw(table: WindowTable, seed: int) -> WindowTable:

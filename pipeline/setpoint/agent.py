@@ -77,7 +77,7 @@ class QNetwork(eqx.Module):
 
 def history_of(network: QNetwork) -> int:
     """How many former classes it sees."""
-    return network.vision.in_features - CLASSES
+    return network.vision.weight.shape[1] - CLASSES
 
 
 class ObservationEncoder(NamedTuple):

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -63,7 +63,7 @@ def restore_agents(path: str) -> Agents:
         return Agents(li_2025, Belief(model, *(belief[name] for name in Belief._fields[1:])), network)
 
 
-def store_published(path: Path, networks: Sequence[QNetwork], rewards: Sequence[np.ndarray]) -> None:
+def store_published(path: Path, networks: Sequence[QNetwork], rewards: Sequence[jax.Array]) -> None:
     """The networks of Li and Pattinson (2025) after each phase, and the rewards of its steps, for a memo."""
     arrays = {
         f"phase{i + 1}.{name}": a for i, n in enumerate(networks) for name, a in agent.weights(n).items()
@@ -84,7 +84,8 @@ def restore_published(path: Path) -> agent.Published:
 def _network(part: dict[str, np.ndarray]) -> QNetwork:
     """The network of these arrays, whose history is as long as they say."""
     numbers = np.shape(part.get("vision.weight", np.zeros((256, HISTORY + CLASSES))))
-    return agent.with_weights(QNetwork(jax.random.key(0), max(numbers[-1] - CLASSES, 1)), part)
+    network = QNetwork(jax.random.key(0), max(numbers[-1] - CLASSES, 1))
+    return cast(QNetwork, agent.with_weights(network, part))
 
 
 def _part(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
