@@ -94,7 +94,9 @@ def wilson_interval(p: float, n: float) -> Share:
     z = float(scipy.special.ndtri(0.975))
     centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
-    return Share(100.0 * p, float(100.0 * max(centre - half, 0.0)), float(100.0 * min(centre + half, 1.0)))
+    # of none or all one end is the share itself, which rounding would miss
+    low, high = min(float(max(centre - half, 0.0)), p), max(float(min(centre + half, 1.0)), p)
+    return Share(100.0 * p, 100.0 * low, 100.0 * high)
 
 
 class Mean(NamedTuple):
