@@ -493,7 +493,7 @@ def _rows(table: WindowTable, mask: np.ndarray) -> WindowTable:
 
 def _quiet_prints(table: WindowTable, rng: np.random.Generator) -> tuple[jax.Array, jax.Array]:
     """Flows seen at 100 % (prints, decisions), and class shares: stretches of one segment's mean error, and
-    the errors of windows about their segments. These are of any segment, as a camera's windows do not come back
+    the errors of windows about their segments. These are of any segment: a camera's windows do not come back
     as the few of a segment would."""
     near = (table.flow >= QUIET_FLOWS[0]) & (table.flow <= QUIET_FLOWS[1])
     error = np.log(table.flow_seen / table.flow)[near]
