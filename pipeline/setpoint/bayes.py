@@ -154,7 +154,7 @@ def _filtered(
 
 # of the test whether the camera is the table's: windows after the start that do not count, the most that one
 # window counts, what is let pass each window, and how far past its limit a sum may grow
-UNSETTLED, MOST_SURPRISE, ALLOWANCE, CEILING = 2, 2.0, 0.25, 1.3
+UNSETTLED, MOST_SURPRISE, ALLOWANCE, CEILING = 2, 2.0, 0.5, 1.3
 
 
 def _surprise(parameters: Filter, predicted: jax.Array, probability: jax.Array) -> jax.Array:
@@ -492,8 +492,8 @@ def _rows(table: WindowTable, mask: np.ndarray) -> WindowTable:
 
 
 def _quiet_prints(table: WindowTable, rng: np.random.Generator) -> tuple[jax.Array, jax.Array]:
-    """Flows seen at 100 % (prints, decisions), and class shares: stretches of one segment's mean error, with the
-    errors of windows about their segments. These are of any segment, as a camera's windows do not come back
+    """Flows seen at 100 % (prints, decisions), and class shares: stretches of one segment's mean error, and
+    the errors of windows about their segments. These are of any segment: a camera's windows do not come back
     as the few of a segment would."""
     near = (table.flow >= QUIET_FLOWS[0]) & (table.flow <= QUIET_FLOWS[1])
     error = np.log(table.flow_seen / table.flow)[near]
