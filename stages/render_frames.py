@@ -1,6 +1,6 @@
 """Nozzle frames with their labels: renders them, cuts their key areas and writes
-datasets/render_frames/<part>.safetensors; nothing where the frames are recordings. A classifier that is
-trained anew renders nothing anew."""
+datasets/render_frames/<part>.safetensors, and frames.json with how many; no part where the frames are
+recordings. A classifier that is trained anew renders nothing anew."""
 
 from pipeline.setpoint.workflow import render_frames
 from pipeline.setpoint.workflow.settings import RenderFrames
@@ -14,6 +14,7 @@ def main() -> None:
         source = params.value("train_classifier.source", one_of=("simulated", "recordings"))
         by_part = render_frames.rendered(settings, execution) if source == "simulated" else {}
         render_frames.store_frames(out, by_part)
+        artifacts.write_json(out / "frames.json", render_frames.counts(by_part))
 
 
 if __name__ == "__main__":

@@ -147,6 +147,14 @@ def store_frames(folder: Path, by_part: dict[str, LabelledFrames]) -> None:
         write_weights(folder / f"{part}.safetensors", FRAMES_SCHEMA, arrays, {"part": part})
 
 
+def counts(by_part: dict[str, LabelledFrames]) -> dict[str, dict[str, int]]:
+    """Frames and segments of each part."""
+    return {
+        part: {"frames": len(frames.valid), "segments": len(np.unique(frames.segment))}
+        for part, frames in by_part.items()
+    }
+
+
 def restore_frames(folder: Path) -> dict[str, LabelledFrames]:
     """What `store_frames` wrote."""
     found = {}

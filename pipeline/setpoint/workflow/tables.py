@@ -81,15 +81,15 @@ WINDOWS = Schema(
             "learn: controllers are trained and tuned on these; choose: the default is chosen on these; "
             "judge: read once, for the figures told",
         ),
-        Column("flow_percent", FLOAT, "percent", "true flow, of nominal", low=0),
+        Column("flow_percent", FLOAT, "percent", "true flow, of nominal", low=0, nullable=True),
         Column("flow_bin", INDEX, NONE, "bin of the true flow", low=0),
         Column("flow_low_percent", FLOAT, "percent", "its lower edge", low=0),
         Column("flow_high_percent", FLOAT, "percent", "its upper edge", low=0),
         Column("segment", INDEX, NONE, "segment that the window is of", low=0),
         *_SHARES,
         Column("named", INDEX, NONE, f"class of the window: {_CLASS}", 0, 2),
-        Column("flow_seen_percent", FLOAT, "percent", "flow that the window shows, of nominal", low=0),
-        Column("spread", FLOAT, NONE, "its relative standard deviation, that of its logarithm", low=0),
+        Column("flow_seen_percent", FLOAT, "percent", "flow that the window shows", low=0, nullable=True),
+        Column("spread", FLOAT, NONE, "its relative standard deviation", low=0, nullable=True),
     ),
 )
 

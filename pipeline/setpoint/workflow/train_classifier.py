@@ -36,6 +36,8 @@ from pipeline.store.artifacts import read_weights, write_weights
 AUGMENTATIONS = {"along_bead": classifier.along_bead, "adr": classifier.adr}
 # of the yardstick that is fitted beside the networks, yardsticks.fit_profile_machine
 FOLDS = 3
+# yardsticks, the small CNN among them, learn from one frame in so many: they take ten times as long a frame
+EVERY = 3
 MEMO = Path("datasets/memo/train_classifier")
 
 
@@ -53,7 +55,7 @@ class Trained(NamedTuple):
 def trained(
     settings: TrainClassifier, by_part: Mapping[str, LabelledFrames], checkpoints: Path = MEMO
 ) -> Trained:
-    """The vision transformer of settings.size and the small CNN, trained alike; a
+    """The vision transformer of settings.size, and the small CNN on one frame in EVERY; a
     training that was killed goes on from its last epoch.
 
     Raises ValueError, nothing trained, where the other parts do not
@@ -70,12 +72,13 @@ def trained(
         "convolutional network": (convolutional(np.random.default_rng([settings.seed, 11])), settings.cnn),
     }
     curves = {}
+    to_learn = {"vision transformer": learned, "convolutional network": fewer(learned)}
     for i, (name, (network, recipe)) in enumerate(untrained.items()):
         inputs = settings.size, settings.augmentation, settings.seed, recipe.model_dump()
-        what = (name, *inputs, [a.tobytes() for data in (learned, held_out) for a in data], _code())
+        what = (name, *inputs, [a.tobytes() for data in (to_learn[name], held_out) for a in data], _code())
         train = functools.partial(
             classifier.train,
-            learned=learned,
+            learned=to_learn[name],
             held_out=held_out,
             settings=TrainingSettings(**recipe.model_dump(exclude={"epochs"})),
             key=jax.random.fold_in(key, i),
@@ -84,6 +87,12 @@ def trained(
         state = classifier.untrained(network, epochs=recipe.epochs)
         curves[name] = _resumed(train, state, name, checkpoints / f"{joblib.hash(what)}.safetensors")
     return Trained(curves["vision transformer"].best, curves["convolutional network"].best, curves)
+
+
+def fewer(learned: Labelled) -> Labelled:
+    """Of each class one frame in EVERY: what the yardsticks learn from."""
+    of_class = (np.flatnonzero(learned.label == c)[::EVERY] for c in range(3))
+    return learned.take(np.sort(np.concatenate([*of_class])))
 
 
 def _resumed(train: Callable, state: TrainState, name: str, checkpoint: Path) -> TrainState:
@@ -180,7 +189,7 @@ def _all(settings: TrainClassifier, frames: LabelledFrames) -> Labelled:
 
 def judged(settings: TrainClassifier, by_part: Mapping[str, LabelledFrames], networks: Trained) -> Judged:
     """The networks calibrated on one part and judged on another, beside their yardsticks."""
-    learned, data = Labelled(*by_part["learned"].labelled()), _all(settings, by_part["judged"])
+    learned, data = fewer(Labelled(*by_part["learned"].labelled())), _all(settings, by_part["judged"])
     outputs = {
         part: calibrated_classifier.outputs(
             networks.network, _all(settings, by_part[part]), by_part[part].valid

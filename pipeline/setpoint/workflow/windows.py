@@ -22,18 +22,19 @@ def edges(flows: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def window_rows(tables: dict[str, WindowTable]) -> dict[str, np.ndarray]:
-    """The tables of WINDOW_PARTS as columns of schema WINDOWS."""
+    """The tables of WINDOW_PARTS as columns of schema WINDOWS; flows are missing of a classifier that names
+    classes only."""
     columns = collections.defaultdict(list)
     for part, table in tables.items():
         columns["part"] += [part] * len(table.named)
-        columns["flow_percent"].append(table.flow)
+        columns["flow_percent"].append(np.broadcast_to(table.flow, len(table.named)))
         columns["flow_bin"].append(table.flow_bin)
         columns["flow_low_percent"].append(table.flow_edges[table.flow_bin])
         columns["flow_high_percent"].append(table.flow_edges[table.flow_bin + 1])
         columns["segment"].append(table.segment)
         columns["named"].append(table.named)
-        columns["flow_seen_percent"].append(table.flow_seen)
-        columns["spread"].append(table.spread)
+        columns["flow_seen_percent"].append(np.broadcast_to(table.flow_seen, len(table.named)))
+        columns["spread"].append(np.broadcast_to(table.spread, len(table.named)))
         for c, name in enumerate(("under", "good", "over")):
             columns[f"p_{name}"].append(table.shares[:, c])
     return {name: values if name == "part" else np.concatenate(values) for name, values in columns.items()}
