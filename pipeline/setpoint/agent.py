@@ -8,6 +8,7 @@ still looks ahead.
 """
 
 from collections.abc import Callable
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,6 +21,7 @@ from jax.tree_util import Partial
 from pipeline.setpoint.published import BEST_TEMPERATURE, LAMBDA, PHASES
 from pipeline.setpoint.simulator import (
     CHANCES,
+    CLASSES,
     FLOW_LIMITS,
     HISTORY,
     STAND,
@@ -40,7 +42,6 @@ from pipeline.setpoint.simulator import (
     stepped,
 )
 
-VISION = HISTORY + 3  # numbers of the state that come from the camera; the rest are temperatures
 ACTIONS = 5  # of each head
 # rows that one product sums: the linear algebra under XLA cuts longer sums by the size of the CPU's first
 # cache (288 numbers in 32 kB)
@@ -50,28 +51,33 @@ TEMPERATURE_SCALE = 30.0  # °C, half the range of the targets: degrees as they 
 
 class QNetwork(eqx.Module):
     """The paper's network, 47,082 parameters: camera 33 -> 256 and temperatures 2 -> 32,
-    together 288 -> 128 -> 5 + 5, rectified linear."""
+    together 288 -> 128 -> 5 + 5, rectified linear. The camera's numbers are a history of classes and (4)."""
 
     vision: eqx.nn.Linear
     temperature: eqx.nn.Linear
     joint: eqx.nn.Linear
     heads: eqx.nn.Linear
 
-    def __init__(self, key: jax.Array):
+    def __init__(self, key: jax.Array, history: int = HISTORY):
         keys = jax.random.split(key, 4)
-        self.vision = eqx.nn.Linear(VISION, 256, key=keys[0])
+        self.vision = eqx.nn.Linear(history + CLASSES, 256, key=keys[0])
         self.temperature = eqx.nn.Linear(2, 32, key=keys[1])
         self.joint = eqx.nn.Linear(288, 128, key=keys[2])
         self.heads = eqx.nn.Linear(128, 2 * ACTIONS, key=keys[3])
 
     def __call__(self, state: jax.Array) -> jax.Array:
         """Q (2, 5) of the flow's and the temperature's actions at a
-        state (35,) of (9), temperatures already scaled."""
+        state (history + 5,) of (9), temperatures already scaled."""
         # both first layers as one product, zeros where one does not see the other's numbers: for a batch that
         # is dearer in sums and cheaper in moving them
         both = jax.scipy.linalg.block_diag(self.vision.weight, self.temperature.weight)
         hidden = jax.nn.relu(both @ state + jnp.concatenate([self.vision.bias, self.temperature.bias]))
         return self.heads(jax.nn.relu(self.joint(hidden))).reshape(2, ACTIONS)
+
+
+def history_of(network: QNetwork) -> int:
+    """How many former classes it sees."""
+    return network.vision.weight.shape[1] - CLASSES
 
 
 class ObservationEncoder(NamedTuple):
@@ -82,16 +88,17 @@ class ObservationEncoder(NamedTuple):
     encode: Callable[[Any, Any, Observation], tuple[Any, jax.Array]]
 
 
-def paper_encoder() -> ObservationEncoder:
-    """The state (9): 30 former classes, the scaled distribution, and both temperatures as (u - 210) / 30."""
+@cache
+def paper_encoder(history: int = HISTORY) -> ObservationEncoder:
+    """The state (9): so many former classes, the scaled distribution, and both temperatures as
+    (u - 210) / 30."""
 
-    def encode(network, history, observation):
-        state = paper_state(history, observation)
-        return remembered(history, observation.named), state.at[VISION:].add(-BEST_TEMPERATURE).at[
-            VISION:
-        ].divide(TEMPERATURE_SCALE)
+    def encode(network, classes, observation):
+        state, camera = paper_state(classes, observation), history + CLASSES
+        temperatures = state.at[camera:].add(-BEST_TEMPERATURE).at[camera:].divide(TEMPERATURE_SCALE)
+        return remembered(classes, observation.named), temperatures
 
-    return ObservationEncoder(first_history, encode)
+    return ObservationEncoder(partial(first_history, history), encode)
 
 
 def greedy(encoder: ObservationEncoder) -> Controller:
@@ -207,14 +214,14 @@ def _stepped(problem: DqnProblem, network, episodes, epsilon, u: jax.Array, key)
     explores, at_random, befalls = u[:, :2] < epsilon, (ACTIONS * u[:, 2:4]).astype(jnp.int32), u[:, 4:]
     action = jnp.where(explores, at_random, jax.vmap(network)(x).argmax(axis=2))
     action = action.at[:, 1].set(
-        jnp.where(state.step % LAMBDA == 0, action[:, 1], STAND)
+        jnp.where(state.step % conditions.flow_actions == 0, action[:, 1], STAND)
     )  # what is not heeded is standing
     state, observation = jax.vmap(Partial(stepped, env.windows))(
         conditions, state, Action(action[:, 0], action[:, 1]), befalls
     )
     memory, after = jax.vmap(Partial(problem.encoder.encode, network))(memory, observation)
     rewards = jax.vmap(env.rewards)(state)
-    over, masked = state.step >= problem.settings.episode, state.step % LAMBDA != 0
+    over, masked = state.step >= problem.settings.episode, state.step % conditions.flow_actions != 0
 
     def renewed(going):
         again = _fresh(problem, network, jax.random.split(key, len(x)))
@@ -284,7 +291,8 @@ def _phase(train_state: TrainState, key, problem: DqnProblem, updates, epsilon, 
     k_start, k_clock, key = jax.random.split(key, 3)
     n, capacity = settings.environments, settings.capacity
     conditions, state, memory, x = _fresh(problem, train_state.network, jax.random.split(k_start, n))
-    state = state._replace(step=LAMBDA * jax.random.randint(k_clock, (n,), 0, settings.episode // LAMBDA))
+    actions = conditions.flow_actions.astype(jnp.int32)
+    state = state._replace(step=actions * jax.random.randint(k_clock, (n,), 0, settings.episode // actions))
     # a step draws some thousand numbers: by XLA's own generator
     # (Philox), which costs a tenth of jax's default there
     fast = jax.random.wrap_key_data(jnp.tile(jax.random.key_data(key), 2), impl="rbg")
@@ -323,18 +331,21 @@ def ellipse(a, b, state: State) -> jax.Array:
     return jnp.tile(reward(state.flow, state.temperature, a=a, b=b), 2)
 
 
-def anywhere(accuracy, key: jax.Array) -> Conditions:
-    """A machine that does as it is told, from a flow and temperature uniform within the limits."""
+def anywhere(accuracy, key: jax.Array, *, flow_actions=LAMBDA) -> Conditions:
+    """A machine that does as it is told, from a flow and temperature uniform within the limits; flow_actions
+    to one temperature action."""
     u = jax.random.uniform(key, (2,))
     low, high = jnp.array([FLOW_LIMITS, TEMPERATURE_LIMITS]).T
     flow, temperature = low + (high - low) * u
-    return nominal(flow, temperature, accuracy=accuracy)
+    conditions = nominal(flow, temperature, accuracy=accuracy)
+    return conditions._replace(flow_actions=flow_actions * jnp.ones_like(flow))
 
 
 class PublishedTraining(NamedTuple):
     """`updates` of each phase, as many phases as there are numbers; accuracy of the windows in the last one.
 
-    Epsilon falls to `least`: from `explore` in phase 1, from `explore_again` in the later ones.
+    Epsilon falls to `least`: from `explore` in phase 1, from `explore_again` in the later ones. history is
+    eta of (8), flow_actions is lambda, table 2.
     """
 
     dqn: DqnSettings
@@ -344,6 +355,8 @@ class PublishedTraining(NamedTuple):
     explore: float
     explore_again: float
     least: float
+    history: int = HISTORY
+    flow_actions: int = LAMBDA
 
 
 def train_published(key: jax.Array, settings: PublishedTraining, *, on_step=None) -> Published:
@@ -353,16 +366,16 @@ def train_published(key: jax.Array, settings: PublishedTraining, *, on_step=None
     on_step(phase, network, rewards) is called after each phase.
     """
     k_network, key = jax.random.split(key)
-    network, optimiser = QNetwork(k_network), optax.adam(settings.learning_rate)
-    encoder, windows = paper_encoder(), paper_windows()
+    network, optimiser = QNetwork(k_network, settings.history), optax.adam(settings.learning_rate)
+    encoder, windows = paper_encoder(settings.history), paper_windows()
+    clock = jnp.float32(settings.flow_actions)
     train_state = TrainState(network, network, optimiser.init(eqx.filter(network, eqx.is_array)))
     networks, all_rewards = [], []
     for i, count in enumerate(settings.updates):
         a, b = PHASES[min(i, len(PHASES) - 1)]
         right = 1.0 if i < len(PHASES) else settings.accuracy
-        env = EnvSpec(
-            windows, Partial(anywhere, jnp.asarray(right)), Partial(ellipse, jnp.asarray(a), jnp.asarray(b))
-        )
+        start = Partial(anywhere, jnp.asarray(right), flow_actions=clock)
+        env = EnvSpec(windows, start, Partial(ellipse, jnp.asarray(a), jnp.asarray(b)))
         train_state, rewards = phase(
             train_state,
             jax.random.fold_in(key, i),

@@ -4,6 +4,7 @@ conformal sets by segment, distance from what was learned.
 All of it is fitted on segments that the classifier never saw, and judged on yet others.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ import sklearn.covariance
 
 from pipeline.setpoint.classifier import Labelled, Prediction
 from pipeline.setpoint.recorded import WindowTable
+from pipeline.setpoint.window_flow import FlowCalibration, WindowFlow, fit_flow, window_flow
+from pipeline.statistics import Share
 
 CLASSES = 3
 
@@ -99,16 +102,10 @@ def hard_shares(log_p: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def recorded(
-    log_p: np.ndarray,
-    valid: np.ndarray,
-    flow: np.ndarray,
-    segment: np.ndarray,
-    *,
-    correlation: float,
-    flow_edges: np.ndarray,
+    seen: WindowFlow, flow: np.ndarray, segment: np.ndarray, *, flow_edges: np.ndarray
 ) -> WindowTable:
-    """Windows (w, length, 3) of segments printed at flow (w,) percent as the simulator draws them again;
-    windows without a valid frame are left out.
+    """What was seen in w windows of segments (w,) printed at flow (w,) percent, as the simulator draws it
+    again; windows without a valid frame are left out.
 
     flow_edges (bins + 1,) in percent; raises ValueError where a flow lies outside them.
     """
@@ -119,10 +116,12 @@ def recorded(
             f"flows are expected within {flow_edges[0]:g} .. {flow_edges[-1]:g} % but {outside.sum()} are "
             f"not, the first {flow[outside][0]:g}; widen the bins"
         )
-    mask = valid.any(axis=1)
-    prob = window_probabilities(log_p[mask], valid[mask], correlation)
-    flow_bin = np.clip(np.searchsorted(flow_edges, flow[mask], side="right") - 1, 0, len(flow_edges) - 2)
-    return WindowTable(prob, prob.argmax(axis=1), flow_bin, np.asarray(segment)[mask], flow_edges)
+    some = np.isfinite(seen.flow_seen)
+    seen, flow = WindowFlow(*(values[some] for values in seen)), flow[some]
+    flow_bin = np.clip(np.searchsorted(flow_edges, flow, side="right") - 1, 0, len(flow_edges) - 2)
+    named = seen.prob.argmax(axis=1)
+    bins = flow_bin, np.asarray(segment)[some], flow_edges
+    return WindowTable(seen.prob, named, *bins, seen.flow_seen, seen.spread, flow)
 
 
 # ---- how true the probabilities are
@@ -163,6 +162,79 @@ def reliability(p: np.ndarray, label: np.ndarray, *, bins: int) -> Reliability:
     return Reliability(*means, count, edges[:-1], float(error), float(floor))
 
 
+def share_by_segment(happened: np.ndarray, segment: np.ndarray) -> Share:
+    """The share of True among n images or windows, in percent, with its 95 % interval: what is of one segment
+    (n,) errs together, so the segments are what was drawn.
+
+    Wilson's interval of n_eff = p (1 - p) / V images, with V the variance of a ratio of sums over segments
+    and a factor for Student's t of few of them (Korn and Graubard 1998); n_eff is at most n, and the number
+    of segments where all or none happened. No image: NaN.
+    """
+    happened, n = np.asarray(happened, float), len(happened)
+    if n == 0:
+        return Share(np.nan, np.nan, np.nan)
+    _, place = np.unique(segment, return_inverse=True)
+    clusters = int(place.max()) + 1
+    p, z = float(happened.mean()), float(scipy.special.ndtri(0.975))
+    residual = np.bincount(place, happened - p)
+    variance = (residual**2).sum() / n**2 * clusters / max(clusters - 1, 1)
+    effective = float(clusters)
+    if variance > 0 and clusters > 1:
+        student = float(scipy.special.stdtrit(clusters - 1, 0.975))
+        effective = min(p * (1 - p) / variance, n) * (z / student) ** 2
+    centre = (p + z**2 / (2 * effective)) / (1 + z**2 / effective)
+    half = z * np.sqrt(p * (1 - p) / effective + z**2 / (4 * effective**2)) / (1 + z**2 / effective)
+    return Share(100 * p, float(100 * max(centre - half, 0.0)), float(100 * min(centre + half, 1.0)))
+
+
+# ---- by flow
+
+
+class WindowTruth(NamedTuple):
+    """Of w windows: true class (w,), flow in percent (w,), temperature in °C (w,) and segment (w,)."""
+
+    label: np.ndarray
+    flow_percent: np.ndarray
+    temperature_degC: np.ndarray
+    segment: np.ndarray
+
+
+# bins of the true flow in percent by which a classifier is judged
+JUDGED_PERCENT = tuple(np.arange(70.0, 151.0, 5.0))
+
+
+class ByFlow(NamedTuple):
+    """Of windows with a true flow from `flow_low` to `flow_high` percent: how many, and the share for which
+    something holds, in percent, with its 95 % interval by segment; NaN where there is none."""
+
+    flow_low: float
+    flow_high: float
+    windows: int
+    percent: float
+    low: float
+    high: float
+
+
+def by_flow(happened: np.ndarray, truth: WindowTruth) -> list[ByFlow]:
+    """The share of True (w,) in each bin of JUDGED_PERCENT."""
+    rows = []
+    for low, high in itertools.pairwise(JUDGED_PERCENT):
+        here = (truth.flow_percent >= low) & (truth.flow_percent < high)
+        share = share_by_segment(happened[here], truth.segment[here])
+        rows.append(ByFlow(low, high, int(here.sum()), *share))
+    return rows
+
+
+def uniform_share(happened: np.ndarray, truth: WindowTruth) -> Share:
+    """The share of True (w,) as if the flows were uniform over JUDGED_PERCENT, in percent: the mean over its
+    bins, each with the variance of its share by segment. NaN where a bin has no window."""
+    rows = by_flow(happened, truth)
+    z = scipy.special.ndtri(0.975)
+    mean = float(np.mean([row.percent for row in rows]))
+    half = z * np.sqrt(np.sum([((row.high - row.low) / (2 * z)) ** 2 for row in rows])) / len(rows)
+    return Share(mean, float(max(mean - half, 0.0)), float(min(mean + half, 100.0)))
+
+
 # ---- sets that hold the true class
 
 
@@ -192,6 +264,54 @@ def conformal_level(
     order = np.argsort(true, kind="stable")
     below = np.cumsum(1 / windows_of[place[order]])  # segments at or below each window
     return float(true[order][np.searchsorted(below, k - 1e-9)])
+
+
+class Promise(NamedTuple):
+    """What the conformal sets promise: `coverage` of all windows with this confidence, and `by_flow` of those
+    at any one flow."""
+
+    coverage: float
+    confidence: float
+    by_flow: float
+
+
+# bins of flow in percent, where controllers work, in each of which sets must cover
+COVERED_PERCENT = (70.0, 80.0, 90.0, 100.0, 110.0, 120.0, 150.0)
+
+
+def conditional_level(p: np.ndarray, truth: WindowTruth, promise: Promise) -> float:
+    """One level whose sets cover at every flow and temperature: the lowest of 1 - by_flow, the conformal
+    level of all windows (w,), and those of the windows in each bin of COVERED_PERCENT and at each
+    temperature.
+
+    Sets that cover on average do so where nothing is in doubt, and miss beside the borders. Under the normal
+    law a flow at the border of its class has p < a with probability a, so that 1 - by_flow is enough where
+    that law holds. The groups hold it against what was measured (label-conditional prediction, Vovk 2012),
+    each at even odds; one with too few segments for that is left to the others.
+    """
+    every = conformal_level(
+        p, truth.label, truth.segment, coverage=promise.coverage, confidence=promise.confidence
+    )
+    levels = [every, 1 - promise.by_flow]
+    near = (truth.flow_percent >= COVERED_PERCENT[0]) & (truth.flow_percent < COVERED_PERCENT[-1])
+    flow_bin = np.searchsorted(COVERED_PERCENT, truth.flow_percent, side="right")
+    groups = [near & (flow_bin == k) for k in range(1, len(COVERED_PERCENT))]
+    groups += [near & (truth.temperature_degC == degrees) for degrees in np.unique(truth.temperature_degC)]
+    needed = np.log(0.5) / np.log(promise.by_flow)
+    for group in groups:
+        segment = truth.segment[group]
+        if len(np.unique(segment)) >= needed:
+            levels.append(
+                conformal_level(
+                    p[group], truth.label[group], segment, coverage=promise.by_flow, confidence=0.5
+                )
+            )
+    return min(levels)
+
+
+def holds_true_class(p: np.ndarray, label: np.ndarray, level: float) -> np.ndarray:
+    """(w,) whether the set {c: p_c >= level} holds the true class (w,)."""
+    return p[np.arange(len(label)), label] >= level
 
 
 class Sets(NamedTuple):
@@ -281,12 +401,17 @@ def auroc(familiar: np.ndarray, foreign: np.ndarray) -> float:
 
 
 class ClassifierOutputs(NamedTuple):
-    """A network's outputs on n frames: logits (n, 3), features with appearance (n, f); and the frames' label,
-    segment and valid (n,)."""
+    """A network's outputs on n frames: logits (n, 3), features with appearance (n, f), log(flow / 100 %) (n,)
+    with its deviation (n,); and the frames' label, flow in percent, temperature in °C, segment and valid
+    (n,)."""
 
     logits: np.ndarray
     features: np.ndarray
+    log_flow: np.ndarray
+    deviation: np.ndarray
     label: np.ndarray
+    flow_percent: np.ndarray
+    temperature_degC: np.ndarray
     segment: np.ndarray
     valid: np.ndarray
 
@@ -297,21 +422,27 @@ def classifier_outputs(prediction: Prediction, data: Labelled, valid: np.ndarray
     return ClassifierOutputs(
         prediction.logits,
         np.hstack([prediction.features, appearance(data.key_area)]),
+        np.asarray(prediction.log_flow, float),
+        np.asarray(prediction.deviation, float),
         data.label,
+        np.asarray(data.flow_percent, float),
+        np.asarray(data.temperature_degC, float),
         data.segment,
         np.asarray(valid, bool),
     )
 
 
 class Calibration(NamedTuple):
-    """What turns logits into decisions: temperature of images, correlation of a window's frames, level of its
-    conformal set, and the distance that is foreign."""
+    """What turns outputs into decisions: temperature of images, correlation of the classes of a window's
+    frames (for summed logarithms), level of a window's conformal set, the distance that is foreign, and what
+    turns the flows of frames into that of a window."""
 
     temperature: float
     correlation: float
     level: float
     familiar: Familiar
     foreign_above: float
+    flow: FlowCalibration
 
 
 def calibrate(
@@ -319,8 +450,7 @@ def calibrate(
     unseen: ClassifierOutputs,
     *,
     length: int,
-    coverage: float,
-    confidence: float,
+    promise: Promise,
     false_alarms: float,
 ) -> Calibration:
     """Everything fitted on segments `unseen` in training, but for the familiar features, which are those
@@ -328,21 +458,18 @@ def calibrate(
     v = unseen.valid
     T = fit_temperature(unseen.logits[v], unseen.label[v])
     rows = _rows(unseen, length)
-    log_p, label, segment = (
-        log_probabilities(unseen.logits, T)[rows],
-        unseen.label[rows[:, 0]],
-        unseen.segment[rows[:, 0]],
+    first = rows[:, 0]
+    correlation = fit_correlation(log_probabilities(unseen.logits, T)[rows], v[rows], unseen.label[first])
+    of_frames = unseen.log_flow[rows], unseen.deviation[rows], v[rows]
+    flow = fit_flow(*of_frames, unseen.flow_percent[first])
+    truth = WindowTruth(
+        unseen.label[first], unseen.flow_percent[first], unseen.temperature_degC[first], unseen.segment[first]
     )
-    correlation = fit_correlation(log_p, v[rows], label)
-    p = window_probabilities(log_p, v[rows], correlation)
-    level = conformal_level(p, label, segment, coverage=coverage, confidence=confidence)
+    level = conditional_level(window_flow(*of_frames, flow).prob, truth, promise)
     familiar = fit_familiar(learned.features[learned.valid], learned.label[learned.valid])
+    distance = mahalanobis(familiar, unseen.features[v])
     return Calibration(
-        T,
-        correlation,
-        level,
-        familiar,
-        foreign_above(mahalanobis(familiar, unseen.features[v]), false_alarms=false_alarms),
+        T, correlation, level, familiar, foreign_above(distance, false_alarms=false_alarms), flow
     )
 
 

@@ -1,21 +1,60 @@
-"""From the frames of a window to a setpoint that may be sent: hold with a reason, limits, and the wait."""
+"""From the frames of a window to a setpoint that may be sent: what the frames say together, and why it acted.
+When to hold, limits and waits are `actuation`'s, and have their names here too."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.setpoint.actuation import (
+    ACTS,
+    AMBIGUOUS,
+    FEW,
+    FOREIGN,
+    NO_NUMBER,
+    REASONS,
+    STILL,
+    TABLE,
+    TIP,
+    Limits,
+    Setpoints,
+    Waits,
+    at_rest,
+    decide,
+    is_evidence,
+    moved,
+    setpoints,
+    still,
+    wait_after,
+)
 from pipeline.setpoint.calibration import hard_shares, window_probabilities
 
+__all__ = [
+    "ACTS",
+    "AMBIGUOUS",
+    "CLASSES",
+    "FEW",
+    "FOREIGN",
+    "NO_NUMBER",
+    "REASONS",
+    "STILL",
+    "TABLE",
+    "TIP",
+    "Limits",
+    "Setpoints",
+    "Waits",
+    "Window",
+    "at_rest",
+    "decide",
+    "is_evidence",
+    "judge_window",
+    "moved",
+    "setpoints",
+    "still",
+    "wait_after",
+    "why",
+]
 CLASSES = ("under", "good", "over")
-REASONS = (
-    "acts",
-    "too few valid frames",
-    "out of distribution",
-    "tip moved",
-    "the classes cannot be told apart",
-    "the action is not a number",
-)
-ACTS, FEW, FOREIGN, TIP, AMBIGUOUS, NO_NUMBER = range(6)
 
 
 class Window(NamedTuple):
@@ -24,7 +63,8 @@ class Window(NamedTuple):
     p (E, 3) soft shares, counts of which the paper makes its shares: shares (E, 3) and scaled (E, 3) of (4),
     label (E,) the class of p, members (E, 3) the conformal set, score (E,) the median out-of-distribution
     score, valid (E,) and used (E,) the frames that were valid and the frames that count, reason (E,). Where
-    no frame counts, p and shares are 1/3 each and the score is NaN.
+    no frame counts, p and shares are 1/3 each and the score is NaN. flow_seen (E,) in percent of nominal and
+    spread (E,), the deviation of its logarithm, NaN where the classifier names classes only.
     """
 
     p: np.ndarray
@@ -36,6 +76,8 @@ class Window(NamedTuple):
     valid: np.ndarray
     used: np.ndarray
     reason: np.ndarray
+    flow_seen: np.ndarray
+    spread: np.ndarray
 
 
 def judge_window(
@@ -44,6 +86,7 @@ def judge_window(
     scores: np.ndarray,
     tip_moved: np.ndarray,
     *,
+    flows: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]] | None = None,
     least_frames: int,
     correlation: float,
     foreign_above: float,
@@ -58,6 +101,10 @@ def judge_window(
     / max p Li and Pattinson 2025, eq. 1-4 members = {c: p_c >= conformal_level} split conformal set (Sadinle,
     Lei, Wasserman 2019) Held: fewer than `least_frames` count (by what cost the most of them), the tip has
     moved, or the set is no single class.
+
+    flows(frames that count (E, W)) -> flow_seen (E,), spread (E,), class probabilities (E, 3) is of a
+    classifier that shows flows (`calibration.window_flow`). Its windows have those probabilities, and are not
+    held for two classes: how sure the flow is, is for the controller to weigh.
     """
     P, valid, scores = np.asarray(probabilities, float), np.asarray(valid, bool), np.asarray(scores, float)
     if (
@@ -82,9 +129,12 @@ def judge_window(
     m = familiar.sum(axis=1)
     logs = np.log(np.clip(P, 1e-6, 1.0))
     p, shares = window_probabilities(logs, familiar, correlation), hard_shares(logs, familiar)
+    flow_seen, spread = np.full((2, len(P)), np.nan)
+    if flows is not None:
+        flow_seen, spread, p = flows(familiar)
     members = p >= conformal_level
     few = np.where(sound.sum(axis=1) >= least_frames, FOREIGN, FEW)
-    reason = np.where(members.sum(axis=1) != 1, AMBIGUOUS, ACTS)
+    reason = np.where((members.sum(axis=1) != 1) & np.isnan(flow_seen), AMBIGUOUS, ACTS)
     reason = np.where(tip_moved, TIP, np.where(m < least_frames, few, reason))
     return Window(
         p,
@@ -96,6 +146,8 @@ def judge_window(
         valid.sum(axis=1),
         m,
         reason,
+        flow_seen,
+        spread,
     )
 
 
@@ -106,85 +158,6 @@ def _median(scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
     n = mask.sum(axis=1)
     ordered = np.concatenate([ordered, np.full((len(n), 1), np.nan)], axis=1)
     return ordered[np.arange(len(n)), np.where(n > 0, n // 2, -1)]
-
-
-class Limits(NamedTuple):
-    """Of (flow in percent, target temperature in °C), each (2,): the box, the largest change of one action
-    and the travel allowed in any 60 s."""
-
-    low: np.ndarray
-    high: np.ndarray
-    per_action: np.ndarray
-    per_minute: np.ndarray
-
-
-class Setpoints(NamedTuple):
-    """Setpoints as sent, value (E, 2); the moves of the last minute, times (E, H) in s and moves (E,
-    H, 2); `clipped` (E, 4) counts how often the size of one action, the travel of a minute or the
-    box cut a change, and how often it was no number."""
-
-    value: np.ndarray
-    times: np.ndarray
-    moves: np.ndarray
-    clipped: np.ndarray
-
-
-def setpoints(start: np.ndarray, limits: Limits) -> Setpoints:
-    """Setpoints at rest at start (E, 2). Raises ValueError where a start lies outside the box."""
-    start = np.asarray(start, float)
-    outside = ~((start >= limits.low) & (start <= limits.high)).all(axis=1)
-    if outside.any():
-        raise ValueError(
-            f"setpoints: expected a start within {np.asarray(limits.low)} to {np.asarray(limits.high)} (flow "
-            "in percent, target in °C), "
-            f"found {start[outside][0]}; bring the machine there by hand first"
-        )
-    n = len(start)
-    return Setpoints(start, np.zeros((n, 0)), np.zeros((n, 0, 2)), np.zeros((n, 4), int))
-
-
-def moved(state: Setpoints, change: np.ndarray, time_s: np.ndarray, limits: Limits) -> Setpoints:
-    """The setpoints after the wanted change (E, 2) at time_s (E,), cut to the size of one action, to what is
-    left of the last 60 s' travel, and to the box.
-
-    A change that is no number moves nothing. Every cut is counted.
-    """
-    number = np.isfinite(change).all(axis=1)
-    wanted = np.where(number[:, None], change, 0.0)
-    recent = np.asarray(time_s)[:, None] - state.times < 60.0
-    left = np.maximum(limits.per_minute - (np.abs(state.moves) * recent[:, :, None]).sum(axis=1), 0.0)
-    small = np.clip(wanted, -limits.per_action, limits.per_action)
-    allowed = np.clip(small, -left, left)
-    value = np.clip(state.value + allowed, limits.low, limits.high)
-    cuts = np.stack(
-        [
-            (small != wanted).any(axis=1),
-            (allowed != small).any(axis=1),
-            (value != state.value + allowed).any(axis=1),
-            ~number,
-        ],
-        axis=1,
-    )
-    keep = recent.any(axis=0)
-    times = np.concatenate([state.times[:, keep], np.asarray(time_s, float)[:, None]], axis=1)
-    moves = np.concatenate([state.moves[:, keep], (value - state.value)[:, None]], axis=1)
-    return Setpoints(value, times, moves, state.clipped + cuts)
-
-
-class Waits(NamedTuple):
-    """Seconds to the next window after an action that moved the flow,
-    that moved the temperature, that moved nothing."""
-
-    flow_s: float
-    temperature_s: float
-    idle_s: float
-
-
-def wait_after(change: np.ndarray, waits: Waits) -> np.ndarray:
-    """Seconds (E,) to wait after the changes (E, 2) that were really
-    sent: the longest that any of them asks for."""
-    asked = np.where(change != 0, [waits.flow_s, waits.temperature_s], 0.0)
-    return np.maximum(asked.max(axis=1), waits.idle_s)
 
 
 def why(time_s: float, window: Window, i: int, change: np.ndarray) -> str:
@@ -200,6 +173,7 @@ def why(time_s: float, window: Window, i: int, change: np.ndarray) -> str:
             )
             or "no change"
         )
-        return f"{frames}, {CLASSES[window.label[i]]} {window.p[i, window.label[i]]:.2f}; {moves}"
+        seen = "" if np.isnan(window.flow_seen[i]) else f", flow {window.flow_seen[i]:.0f} %"
+        return f"{frames}{seen}, {CLASSES[window.label[i]]} {window.p[i, window.label[i]]:.2f}; {moves}"
     shares = " ".join(f"{name} {p:.2f}" for name, p in zip(CLASSES, window.p[i], strict=True))
     return f"{frames}, {shares}, score {window.score[i]:.3g}; held: {REASONS[window.reason[i]]}"

@@ -2,6 +2,7 @@
 -> window -> hold or controller -> setpoints."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pipeline.setpoint import deployment, key_area, nozzle_scene
-from pipeline.setpoint.deployment import ACTS, AMBIGUOUS, Limits, Waits, Window
+from pipeline.setpoint.deployment import ACTS, Limits, Waits, Window
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.simulator import Controller, Observation
 
@@ -145,14 +146,19 @@ class Episodes(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """What is closed into a loop, and how it is deployed: the machine; the classifier classify(images
-    (n, 16, 48), temperature (n,)) -> class probabilities (n, 3), out-of-distribution scores (n,); frames a
-    window at frame_rate_hz, waits, limits, the rule of the window judge(P, valid, scores, tip_moved) ->
-    Window, the least ridge score of a key area, how far the nozzle may be from where its tip was calibrated,
-    and how long a segment's conditions last on average."""
+    """What is closed into a loop, and how it is deployed.
+
+    The machine; the classifier classify(images (n, 16, 48), temperature (n,)) -> class probabilities (n, 3),
+    out-of-distribution scores (n,) and, where it shows flows, log(flow / 100 %) (n,) and its deviation (n,);
+    frames a window at frame_rate_hz, waits, limits, and the rule of the window, judge(P, valid, scores,
+    tip_moved, flows=) -> Window; the least ridge score of a key area, how far the nozzle may be from where
+    its tip was calibrated, and how long a segment's conditions last on average. window_flow(log_flow,
+    deviation, valid), each (E, W), -> flow_seen, spread and class probabilities of windows; None of a
+    classifier that names classes only.
+    """
 
     machine: Machine
-    classify: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    classify: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
     frames: int
     frame_rate_hz: float
     waits: Waits
@@ -161,12 +167,7 @@ class Loop(NamedTuple):
     least_score: float
     tip_tolerance_px: float
     segment_mean_s: float
-
-
-def _is_evidence(reason: np.ndarray) -> np.ndarray:
-    """Whether the controller is shown a window: those acted on, and
-    those that cannot tell the classes apart."""
-    return (reason == ACTS) | (reason == AMBIGUOUS)
+    window_flow: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]] | None = None
 
 
 def _answer(
@@ -176,11 +177,13 @@ def _answer(
     shown: Observation,
     keys: jax.Array,
     reason: np.ndarray,
-) -> tuple[Any, np.ndarray]:
-    """Memory and the change (E, 2) wanted of flow and target; the target's only where lambda's clock allows
-    it, none where the window is held."""
+) -> tuple[Any, np.ndarray, np.ndarray]:
+    """Memory, the change (E, 2) wanted of flow and target, and the reason (E,); the target's only where
+    lambda's clock allows it, none where the window is held."""
     shown = Observation(*(jnp.asarray(a, jnp.int32 if a.dtype.kind == "i" else jnp.float32) for a in shown))
-    memory, q, u = _decided(controller, parameters, memory, shown, keys, jnp.asarray(_is_evidence(reason)))
+    memory, (q, u), reason_now = _decided(
+        controller, parameters, memory, shown, jnp.asarray(reason, jnp.int32), keys
+    )
     wanted = np.stack(
         [
             np.asarray(FLOW_MOVES)[q],
@@ -188,23 +191,11 @@ def _answer(
         ],
         axis=1,
     )
-    return memory, np.where((reason == ACTS)[:, None], wanted, 0.0)
+    reason = np.asarray(reason_now)
+    return memory, np.where((reason == ACTS)[:, None], wanted, 0.0), reason
 
 
-@eqx.filter_jit
-def _decided(
-    controller: Controller,
-    parameters: Any,
-    memory: Any,
-    shown: Observation,
-    keys: jax.Array,
-    evidence: jax.Array,
-):
-    """Memory, which stays where the window is no evidence, and action indices of every episode."""
-    after, action = jax.vmap(controller.act, (None, 0, 0, 0))(parameters, memory, shown, keys)
-    return jax.tree.map(
-        lambda new, old: jnp.where(evidence.reshape(-1, *[1] * (new.ndim - 1)), new, old), after, memory
-    ), *action
+_decided = eqx.filter_jit(jax.vmap(deployment.decide, (None, None, 0, 0, 0, 0)))
 
 
 class _Cameras(NamedTuple):
@@ -262,7 +253,7 @@ def run(
     running = at_rest(loop.machine, *setpoints.value.T, tick_s=tick_s)
     memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (E, *jnp.shape(leaf))), controller.start())
     time_s, change = np.zeros(E), np.zeros((E, 2))
-    acted, since = np.zeros(E, int), np.zeros(E)
+    acted, since, seen = np.zeros(E, int), np.zeros(E), np.full(E, np.nan)
     steps: list[_Step] = []
     pictures: dict[tuple[int, int], np.ndarray] = {}
     for decision in range(decisions + 1):
@@ -274,22 +265,40 @@ def run(
             break
         _renew_segments(cameras, time_s, loop.segment_mean_s)
         areas = _window_areas(cameras, flow, temperature, loop, disturbances, decision, draw)
-        P, scores = loop.classify(areas.images.reshape(-1, *key_area.SHAPE), temperature.ravel())
-        window = loop.judge(P.reshape(E, -1, 3), areas.valid, scores.reshape(E, -1), areas.tip_moved)
+        window = _judged(loop, areas, temperature)
+        reason = np.where(window.reason == ACTS, deployment.still(window.flow_seen, seen), window.reason)
+        seen = window.flow_seen
         pictures |= areas.pictures
         step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, decision)
         shown = Observation(
-            window.p, window.label, since, temperature.mean(axis=1), setpoints.value[:, 1], acted
+            window.p,
+            window.label,
+            window.flow_seen,
+            since,
+            temperature.mean(axis=1),
+            setpoints.value[:, 1],
+            acted,
         )
-        memory, wanted = _answer(controller, parameters, memory, shown, step_keys, window.reason)
+        memory, wanted, reason = _answer(controller, parameters, memory, shown, step_keys, reason)
+        window = window._replace(reason=reason)
         before, setpoints = setpoints, deployment.moved(setpoints, wanted, time_s, loop.limits)
         change = setpoints.value - before.value
         means = flow.mean(axis=1), temperature.mean(axis=1)
         steps.append(_Step(*means, time_s, before.value, change, window, cameras.numbers.copy()))
-        since = np.where(_is_evidence(window.reason), 0.0, since) + change[:, 0]
-        acted = acted + (window.reason == ACTS)
+        since = np.where(deployment.is_evidence(reason), 0.0, since) + change[:, 0]
+        acted = acted + (reason == ACTS)
     last = flow.mean(axis=1), temperature.mean(axis=1)
     return _episodes(steps, *last, setpoints.clipped, pictures)
+
+
+def _judged(loop: Loop, areas: "_WindowAreas", temperature: np.ndarray) -> Window:
+    """What the windows of E episodes say, at the temperatures (E, W) of their frames."""
+    E = len(temperature)
+    P, scores, *flows = loop.classify(areas.images.reshape(-1, *key_area.SHAPE), temperature.ravel())
+    shown = P.reshape(E, -1, 3), areas.valid, scores.reshape(E, -1), areas.tip_moved
+    if loop.window_flow is None:
+        return loop.judge(*shown)
+    return loop.judge(*shown, flows=partial(loop.window_flow, *(a.reshape(E, -1) for a in flows)))
 
 
 def _episodes(

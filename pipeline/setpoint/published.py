@@ -16,5 +16,6 @@ FLOW_MOVES, TEMPERATURE_MOVES = (
     (-20.0, -10.0, 0.0, 10.0, 20.0),
 )  # (5), percent and °C
 LAMBDA = 10  # flow actions to one temperature action (table 2)
-DELTA = 5.0  # of (6), in steps; the paper prints no value
-ALPHA, SIGMA = 1.5, 0.15  # of (7); the paper prints no values
+# our guesses: the paper prints no values
+DELTA = 5.0  # of (6), in steps
+ALPHA, SIGMA = 1.5, 0.15  # of (7)

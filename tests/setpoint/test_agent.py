@@ -32,7 +32,7 @@ from pipeline.setpoint.agent import (
     with_weights,
 )
 from pipeline.setpoint.judging import evaluate, starts
-from pipeline.setpoint.simulator import STAND, Observation, State, paper_windows
+from pipeline.setpoint.simulator import STAND, Observation, begin, nominal, paper_windows
 from tests.setpoint.synthetic import synthetic_table
 
 SMALL = DqnSettings(gamma=0.99, tau=0.005, batch=64, capacity=512, environments=8, episode=100)
@@ -62,7 +62,7 @@ def observation(named=1, flow_move=0.0, temperature=210.0, target=210.0, step=0)
     as_float = (
         jnp.asarray(shares, jnp.float32),
         jnp.asarray(named),
-        *(jnp.asarray(x, jnp.float32) for x in (flow_move, temperature, target)),
+        *(jnp.asarray(x, jnp.float32) for x in (np.nan, flow_move, temperature, target)),
     )
     return Observation(*as_float, jnp.asarray(step))
 
@@ -145,8 +145,8 @@ def test_double_learning_values_the_networks_choice_by_the_target_network():
 
 
 def test_both_heads_are_paid_by_the_ellipse():
-    zero = jnp.zeros(())
-    state = State(zero, zero, jnp.asarray(110.0), zero, jnp.asarray(205.0), zero, zero, zero)
+    at = nominal(110.0, 205.0, accuracy=1.0)
+    state, _ = begin(paper_windows(), at, jax.random.key(0))
     np.testing.assert_allclose(
         ellipse(40.0, 20.0, state), [0.394, 0.394], atol=5e-4
     )  # the check value has three digits
@@ -208,7 +208,7 @@ def test_learning_raises_the_reward_from_its_first_to_its_last_steps():
 def test_before_training_the_agent_is_the_greedy_filter(prior_belief):
     network = belief_agent.BeliefNetwork(prior_belief.filter.evidence.shape[0], jax.random.key(0))
     encoder = belief_agent.belief_encoder(prior_belief)
-    (belief, _), x = encoder.encode(network, encoder.start(), observation(named=0))
+    (belief, *_), x = encoder.encode(network, encoder.start(), observation(named=0))
     np.testing.assert_allclose(network(x)[0], prior_belief.values @ belief.sum(axis=0), rtol=1e-5)  # float32
 
 

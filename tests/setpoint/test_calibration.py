@@ -12,9 +12,13 @@ from benchmarks.classifier import judge
 from pipeline.setpoint.calibration import (
     ClassifierOutputs,
     Familiar,
+    Promise,
+    WindowTruth,
     appearance,
     auroc,
+    by_flow,
     calibrate,
+    conditional_level,
     conformal_level,
     energy,
     fit_correlation,
@@ -22,14 +26,19 @@ from pipeline.setpoint.calibration import (
     fit_temperature,
     foreign_above,
     hard_shares,
+    holds_true_class,
     log_probabilities,
     mahalanobis,
     recorded,
     reliability,
     sets,
+    share_by_segment,
+    uniform_share,
     window_probabilities,
     windows,
 )
+from pipeline.setpoint.window_flow import KNOTS_PERCENT, WindowFlow, class_probabilities
+from pipeline.statistics import wilson
 
 
 def draw(n: int, *, seed: int, sure: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
@@ -111,27 +120,22 @@ def test_hard_shares_by_hand():
 
 
 def test_recorded_windows_fall_into_the_bins_of_their_flow():
-    log_p = np.log(np.tile([0.7, 0.2, 0.1], (4, 2, 1)))
-    valid = np.array([[True, True], [True, True], [False, False], [True, False]])
-    table = recorded(
-        log_p,
-        valid,
-        [20.0, 89.9, 95.0, 310.0],
-        [5, 6, 7, 8],
-        correlation=1.0,
-        flow_edges=np.array([20.0, 90, 110, 310]),
+    seen = WindowFlow(
+        np.array([20.0, 88, np.nan, 300]),
+        np.array([0.1, 0.1, np.nan, 0.1]),
+        np.array([[1.0, 0, 0], [0.6, 0.4, 0], [1 / 3, 1 / 3, 1 / 3], [0, 0, 1]]),
     )
+    flow, segment, edges = [20.0, 89.9, 95.0, 310.0], [5, 6, 7, 8], np.array([20.0, 90, 110, 310])
+    table = recorded(seen, flow, segment, flow_edges=edges)
     np.testing.assert_array_equal(table.flow_bin, [0, 0, 2])
     np.testing.assert_array_equal(table.segment, [5, 6, 8])
-    np.testing.assert_allclose(table.shares, np.tile([0.7, 0.2, 0.1], (3, 1)))
-    np.testing.assert_array_equal(table.named, [0, 0, 0])
-    with pytest.raises(
-        ValueError,
-        match=re.escape("flows are expected within 20 .. 310 % but 1 are not, the first 400; widen the bins"),
-    ):
-        recorded(
-            log_p[:1], valid[:1], [400.0], [5], correlation=1.0, flow_edges=np.array([20.0, 90, 110, 310])
-        )
+    np.testing.assert_array_equal(table.named, [0, 0, 2])
+    np.testing.assert_array_equal(table.flow_seen, [20, 88, 300])
+    np.testing.assert_array_equal(table.flow, [20, 89.9, 310])
+    np.testing.assert_allclose(table.spread, 0.1)
+    expected = "flows are expected within 20 .. 310 % but 1 are not, the first 400; widen the bins"
+    with pytest.raises(ValueError, match=re.escape(expected)):
+        recorded(seen, [20.0, 89.9, 95.0, 400.0], segment, flow_edges=edges)
 
 
 # ---- reliability
@@ -228,6 +232,69 @@ def test_too_few_segments_promise_nothing():
     )
 
 
+def test_sets_that_cover_at_every_flow_do_so_beside_the_borders_too_and_others_do_not():
+    def drawn(n, seed):
+        """Windows that show log flow with 10 %, and say so: flows log-uniform over 40-250 %."""
+        rng = np.random.default_rng(seed)
+        flow = np.exp(rng.uniform(np.log(40), np.log(250), n))
+        p = class_probabilities(np.log(flow / 100) + 0.1 * rng.normal(size=n), np.full(n, 0.1))
+        label = (flow >= 90).astype(int) + (flow > 110)
+        return p, WindowTruth(label, flow, rng.choice([190.0, 230.0], n), np.arange(n))
+
+    p, truth = drawn(900, 0)
+    promise = Promise(0.95, 0.8, 0.9)
+    level = conditional_level(p, truth, promise)
+    everywhere = conformal_level(p, truth.label, truth.segment, coverage=0.95, confidence=0.8)
+    p, truth = drawn(40_000, 1)
+    worst = [
+        min(row.percent for row in by_flow(holds_true_class(p, truth.label, one), truth))
+        for one in (level, everywhere)
+    ]
+    assert worst[0] > 90  # 1,000 windows a bin know it to 1 %, and the draw of 900 is on its safe side
+    assert worst[1] < 85
+
+
+# ---- by segment, by flow
+
+
+def test_an_interval_by_segment_is_wilson_s_of_single_images_and_that_of_segments_where_images_repeat():
+    rng = np.random.default_rng(0)
+    right = rng.random(400) < 0.8
+    alone, plain = share_by_segment(right, np.arange(400)), wilson(right)
+    np.testing.assert_allclose(alone, plain, atol=0.1)  # Student's t of 399 segments
+    copies = share_by_segment(np.repeat(right, 20), np.repeat(np.arange(400), 20))
+    np.testing.assert_allclose(copies, alone, atol=1e-9)
+    assert wilson(np.repeat(right, 20)).high - plain.percent < 0.4 * (alone.high - alone.percent)
+
+
+def test_intervals_by_segment_hold_the_truth_as_often_as_they_say():
+    rng = np.random.default_rng(1)
+    held = []
+    for _ in range(400):
+        rate = rng.beta(8, 2, 60)  # of each segment, 80 % on average
+        right = (rng.random((60, 20)) < rate[:, None]).ravel()
+        share = share_by_segment(right, np.repeat(np.arange(60), 20))
+        held.append(share.low <= 80 <= share.high)
+    assert 0.915 < np.mean(held) < 0.985  # 95 %, three deviations of 400 draws
+
+
+def test_where_all_or_none_happened_the_segments_are_counted_and_nothing_gives_no_figure():
+    share = share_by_segment(np.ones(200, bool), np.repeat(np.arange(10), 20))
+    np.testing.assert_allclose(share, wilson(np.ones(10, bool)))
+    assert np.isnan(share_by_segment(np.zeros(0, bool), np.zeros(0, int))).all()
+
+
+def test_figures_by_flow_by_hand():
+    flow = np.repeat(np.arange(72.5, 150, 5), 2)
+    truth = WindowTruth(np.zeros(32, int), flow, np.full(32, 210.0), np.arange(32))
+    happened = np.tile([True, False], 16)
+    happened[:2] = True
+    rows = by_flow(happened, truth)
+    assert [(row.flow_low, row.flow_high, row.windows) for row in rows[:2]] == [(70, 75, 2), (75, 80, 2)]
+    assert [row.percent for row in rows] == [100, *[50] * 15]
+    assert uniform_share(happened, truth).percent == pytest.approx((100 + 15 * 50) / 16)
+
+
 # ---- the foreign
 
 
@@ -286,50 +353,56 @@ def test_blur_and_a_turned_key_area_look_unlike_beads_and_light_does_not_matter(
 
 
 def frames(segments: int, *, seed: int) -> ClassifierOutputs:
-    """Segments of 20 frames: a frame shows its flow with an error of its own and one of its segment, as if
-    both were its own, and 1.7 times as sure as that allows."""
+    """Segments of 20 frames: a frame shows its log flow with an error of its own and one of its segment, as
+    if both were its own, and 1.7 times as sure as that allows."""
     rng = np.random.default_rng(seed)
-    label = rng.integers(0, 3, segments)
-    shown = (label + 0.4 * rng.normal(size=segments))[:, None] + 0.5 * rng.normal(size=(segments, 20))
-    logits = -1.7 * (shown[:, :, None] - np.arange(3)) ** 2 / (2 * (0.4**2 + 0.5**2))
+    flow = np.exp(rng.uniform(np.log(50), np.log(200), segments))
+    label = (flow >= 90).astype(int) + (flow > 110)
+    errors = SEGMENT * rng.normal(size=segments)[:, None] + FRAME * rng.normal(size=(segments, 20))
+    shown = np.log(flow / 100)[:, None] + errors
+    one = np.hypot(SEGMENT, FRAME)
+    p = class_probabilities(shown.ravel(), np.full(shown.size, one))
+    logits = 1.7 * np.log(np.maximum(p, 1e-12))
     features = shown[:, :, None] + 0.1 * rng.normal(size=(segments, 20, 4))
     valid = rng.random((segments, 20)) > 0.06
     return ClassifierOutputs(
         logits.reshape(-1, 3),
         features.reshape(-1, 4),
-        np.repeat(label, 20),
-        np.repeat(np.arange(segments), 20),
+        shown.ravel(),
+        np.full(20 * segments, one / 1.7),
+        *(np.repeat(a, 20) for a in (label, flow, np.full(segments, 210.0), np.arange(segments))),
         valid.ravel(),
     )
 
 
+SEGMENT, FRAME = 0.12, 0.15
+PROMISE = Promise(coverage=0.95, confidence=0.8, by_flow=0.9)
+
+
 def test_frames_that_share_an_error_are_calibrated_alone_and_in_windows_on_segments_never_seen():
-    fitted = calibrate(
-        frames(200, seed=0), frames(600, seed=1), length=20, coverage=0.95, confidence=0.8, false_alarms=0.05
-    )
+    learned, unseen = frames(200, seed=0), frames(600, seed=1)
+    fitted = calibrate(learned, unseen, length=20, promise=PROMISE, false_alarms=0.05)
     assert fitted.temperature == pytest.approx(1.7, rel=0.1)  # 600 segments
-    # with the segment's error of variance 0.16 and the frame's of 0.25, 20 frames know the class to 0.16 +
-    # 0.25 / 20; one to 0.41, so that they carry the evidence of 2.4
-    assert 20 / (1 + 19 * fitted.correlation) == pytest.approx(0.41 / 0.1725, rel=0.2)
+    # frames repeat their segment's error: 0.0144 of 0.0369, with the deviation of 600 segments
+    assert fitted.flow.correlation == pytest.approx(SEGMENT**2 / (SEGMENT**2 + FRAME**2), abs=0.05)
+    near = (np.array(KNOTS_PERCENT) >= 65) & (np.array(KNOTS_PERCENT) <= 140)
+    np.testing.assert_allclose(fitted.flow.scale[near], 1.7, rtol=0.2)
     found = judge(fitted, frames(2_000, seed=2), length=20, bins=10)
     assert found.image.error < 0.02  # 40,000 images of 2,000 segments
     assert found.window.error < 0.03  # floor 0.01
     assert found.hard_window.error > 2 * found.window.error
     assert found.window_accuracy > found.image_accuracy + 0.05
     assert (
-        0.93 < found.sets.coverage < 0.98
-    )  # 0.95, with the deviation of 600 calibration segments, 0.009, on its safe side
+        0.93 < found.sets.coverage
+    )  # 0.95, with the deviation of 600 calibration segments, on its safe side
     assert found.false_alarms == pytest.approx(0.05, abs=0.01)
 
 
 def test_segments_shorter_than_a_window_are_refused():
-    with pytest.raises(
-        ValueError,
-        match=(
-            "expected a segment with 21 frames in a row of one class but found none among 200 frames; "
-            "film longer ones"
-        ),
-    ):
-        calibrate(
-            frames(10, seed=0), frames(10, seed=1), length=21, coverage=0.9, confidence=0.5, false_alarms=0.05
-        )
+    expected = (
+        "expected a segment with 21 frames in a row of one class but found none among 200 frames; "
+        "film longer ones"
+    )
+    few = frames(10, seed=0)
+    with pytest.raises(ValueError, match=expected):
+        calibrate(few, few, length=21, promise=Promise(0.9, 0.5, 0.9), false_alarms=0.05)

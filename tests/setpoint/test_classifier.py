@@ -53,7 +53,8 @@ def stripes(segments: int, frames: int, *, seed: int) -> Labelled:
     across = np.abs(np.arange(16)[None, :] - 7.5 - rng.normal(0, 0.5, (len(label), 1)))
     bead = 60 + 120 * (across < (2 + 1.5 * label)[:, None])
     area = np.clip(bead[:, :, None] + rng.normal(0, 15, (len(label), 16, 48)), 0, 255).astype(np.uint8)
-    return Labelled(area, rng.choice([190.0, 210.0, 230.0], len(label)), label, segment)
+    flow = np.array([60.0, 100.0, 160.0])[label]
+    return Labelled(area, rng.choice([190.0, 210.0, 230.0], len(label)), label, flow, segment)
 
 
 SETTINGS = TrainingSettings(
@@ -93,6 +94,7 @@ def same(a, b) -> bool:
 def test_the_papers_network_has_the_papers_parameters():
     network = drawn(PAPER)
     assert (parameters(network.body), parameters(network.head)) == (3_962_880, 33_363)
+    assert parameters(network.flow_head) == 2 * (128 + 16) + 2  # ours, beside them
 
 
 def test_the_small_transformer_has_some_76_thousand_parameters_and_the_cnn_some_50():
@@ -261,6 +263,9 @@ def test_data_that_no_classifier_can_learn_from_is_refused_in_a_sentence():
         "key areas are expected as uint8 (24, 16, 48) but found float64 (24, 16, 48)": data._replace(
             key_area=data.key_area / 255
         ),
+        "flows are expected above 0 % but 1 of 24 are not, the first nan": data._replace(
+            flow_percent=np.where(np.arange(24) == 5, np.nan, 100.0)
+        ),
         "1 of 24 temperatures are no numbers": data._replace(
             temperature_degC=np.where(np.arange(24) == 5, np.nan, 210.0)
         ),
@@ -332,6 +337,19 @@ def test_the_loss_by_hand():
     assert cross_entropy(logits, jnp.array([0, 1]), 0.3) == pytest.approx(-np.mean(smooth), rel=1e-6)
 
 
+def test_the_loss_of_the_flow_by_hand_and_what_makes_it_least():
+    flow = jnp.array([100.0, 200.0])
+    found = classifier.flow_loss(jnp.zeros(2), jnp.log(jnp.array([1.0, 0.5])), flow)
+    assert found == pytest.approx((0 + np.log(0.5) + 0.5 * (np.log(2) / 0.5) ** 2) / 2, rel=1e-6)
+    # of flows with a deviation of 10 % it is least where the network says their mean, and 10 %
+    many = 100 * jnp.exp(0.1 * jax.random.normal(KEY, (20_000,)))
+    losses = [
+        classifier.flow_loss(jnp.full(20_000, mean), jnp.full(20_000, np.log(s)), many)
+        for mean, s in ((0.0, 0.1), (0.03, 0.1), (-0.03, 0.1), (0.0, 0.12), (0.0, 0.08))
+    ]
+    assert int(np.argmin(losses)) == 0
+
+
 def test_a_tiny_network_learns_widths_that_anyone_can_see():
     settings = SETTINGS._replace(learning_rate=1e-2, cycle_epochs=30, patience=30)
     state = train(untrained(drawn(TINY), epochs=30), *parts(), settings, **DRAW)
@@ -340,6 +358,10 @@ def test_a_tiny_network_learns_widths_that_anyone_can_see():
         np.mean(predict(state.best, test.key_area, test.temperature_degC).logits.argmax(axis=1) == test.label)
         > 0.95
     )  # chance is a third
+    seen = predict(state.best, test.key_area, test.temperature_degC)
+    error = np.log(test.flow_percent / 100) - seen.log_flow
+    assert np.abs(error).mean() < 0.1  # the flows are 0.5 apart in their logarithm
+    assert 0.5 < (error / seen.deviation).std() < 2
     history = np.asarray(state.history)
     assert history[int(state.best_epoch) - 1, 1] == np.nanmin(history[:, 1])
 
@@ -364,7 +386,7 @@ def test_an_epoch_as_one_program_is_an_epoch_step_by_step():
     network, data = drawn(TINY), parts()[0]
     start, rows, rates = (
         (network, network, classifier.ADAM.init(network)),
-        [jnp.asarray(a) for a in data[:3]],
+        [jnp.asarray(a) for a in data[:4]],
         Rates(1e-3, 1, 10, 0.01, 0.1, 0.9),
     )
     batches = jax.random.split(KEY, 5), jnp.arange(80).reshape(5, 16)
@@ -379,8 +401,9 @@ def test_an_epoch_as_one_program_is_an_epoch_step_by_step():
 
 def test_training_ends_when_the_held_out_loss_has_not_improved_for_patience_epochs_and_keeps_the_best():
     learned, held_out = parts()
+    order = np.random.default_rng(0).permutation(len(held_out.label))
     shuffled = held_out._replace(
-        label=np.random.default_rng(0).permutation(held_out.label)
+        label=held_out.label[order], flow_percent=held_out.flow_percent[order]
     )  # whatever is learned makes these worse
     states = []
     state = train(

@@ -1,6 +1,8 @@
 """From frames to a setpoint: what holds and why, limits that no action passes,
 and the wait and window that measurements ask for."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,17 +15,22 @@ from pipeline.setpoint.deployment import (
     AMBIGUOUS,
     FEW,
     FOREIGN,
-    NO_NUMBER,
     REASONS,
+    STILL,
+    TABLE,
     TIP,
     Limits,
     Waits,
+    at_rest,
+    decide,
     judge_window,
     moved,
     setpoints,
+    still,
     wait_after,
     why,
 )
+from pipeline.setpoint.simulator import Action, Controller
 
 RULES = {"least_frames": 8, "correlation": 0.45, "foreign_above": 5.0, "conformal_level": 0.2}
 LIMITS = Limits(
@@ -199,7 +206,7 @@ def test_limits_by_hand():
         state, np.array([[0.0, 0.0], [-10.0, 0.0]]), np.array([67.0, 67.0]), LIMITS
     )  # the move at 7 s is a minute old
     np.testing.assert_array_equal(state.value[1], [30.0, 210.0])
-    assert len(REASONS) == NO_NUMBER + 1
+    assert len(REASONS) == STILL + 1
 
 
 def test_a_start_outside_the_box_is_refused():
@@ -315,3 +322,69 @@ def test_the_strip_says_what_was_seen_and_why_it_was_held():
     )
     assert why(0.0, one(), 0, np.zeros(2)).endswith("no change")
     assert why(3.0, one(valid=3), 0, np.zeros(2)).endswith("score 1; held: too few valid frames")
+
+
+# ---- windows that show flows, and cameras that do not look
+
+
+def test_a_window_that_shows_a_flow_is_not_held_for_two_classes():
+    def flows(counts):
+        assert counts.shape == (1, 20)
+        return np.array([91.0]), np.array([0.07]), np.array([[0.44, 0.55, 0.01]])
+
+    got = one(p=np.array([0.5, 0.49, 0.01]), flows=flows)
+    assert (got.reason[0], got.label[0]) == (ACTS, 1)
+    assert (got.flow_seen[0], got.spread[0]) == (91.0, 0.07)
+    assert one(p=np.array([0.5, 0.49, 0.01])).reason[0] == AMBIGUOUS
+    assert np.isnan(one().flow_seen[0])
+    assert one(valid=3, flows=lambda counts: flows(counts)).reason[0] == FEW
+    assert "flow 91 %" in why(0.0, got, 0, np.zeros(2))
+
+
+def test_a_camera_that_repeats_its_reading_to_the_last_bit_stands_still():
+    seen = np.array([91.0, 91.0, np.nan, 91.0])
+    np.testing.assert_array_equal(
+        still(seen, np.array([91.0, 91.0001, np.nan, np.nan])), [STILL, ACTS, ACTS, ACTS]
+    )
+    assert REASONS[STILL] == "the picture stands still"
+    assert REASONS[TABLE] == "the camera is not the one of the table: record levels"
+
+
+@pytest.mark.parametrize(
+    ("reason", "remembers"), [(ACTS, True), (AMBIGUOUS, True), (FEW, False), (STILL, False)]
+)
+def test_a_controller_remembers_what_is_evidence_and_is_asked_whether_the_camera_is_strange(
+    reason, remembers
+):
+    asked = Controller(
+        lambda: jnp.int32(0),
+        lambda parameters, memory, observation, key: (memory + 1, Action(jnp.int32(0), jnp.int32(0))),
+        lambda parameters, memory: memory >= parameters,
+    )
+    key, nothing = jax.random.key(0), None
+    memory, _, after = decide(asked, 5, jnp.int32(3), nothing, jnp.int32(reason), key)
+    assert (int(memory), int(after)) == (4 if remembers else 3, reason)
+    _, _, after = decide(asked, 4, jnp.int32(3), nothing, jnp.int32(reason), key)
+    assert int(after) == (TABLE if reason == ACTS else reason)
+
+
+def test_jax_and_numpy_take_the_same_limits():
+    rng = np.random.default_rng(0)
+    lead = setpoints(np.tile([100.0, 210.0], (3, 1)), LIMITS)
+    other = at_rest(jnp.asarray(lead.value, jnp.float32), remembered=64)
+    for t in range(12):
+        change = rng.choice([-10.0, -5.0, 0.0, 5.0, 10.0, np.nan], (3, 2))
+        lead = moved(lead, change, np.full(3, 7.0 * t), LIMITS)
+        other = moved(other, jnp.asarray(change, jnp.float32), jnp.full(3, 7.0 * t), LIMITS)
+        np.testing.assert_allclose(other.value, lead.value, rtol=1e-6)
+    np.testing.assert_array_equal(other.clipped, lead.clipped)
+
+
+def test_no_move_is_sent_while_more_lie_within_the_minute_than_are_remembered():
+    state = at_rest(np.array([100.0, 210.0]), remembered=3)
+    wide = LIMITS._replace(per_minute=np.array([1e6, 1e6]))
+    for t in range(5):
+        state = moved(state, np.array([5.0, 0.0]), np.array(float(t)), wide)
+    assert state.value[0] == 115.0
+    assert state.clipped[1] == 2
+    assert moved(state, np.array([5.0, 0.0]), np.array(70.0), wide).value[0] == 120.0

@@ -123,6 +123,48 @@ def test_heat_changes_the_look_a_little():
     assert 0.5 < bright[1] - bright[0] < 15  # gray levels of gloss
 
 
+def test_flows_to_learn_have_one_density_across_the_borders_and_reach_everywhere():
+    flow = nozzle_scene.draw_flow(np.random.default_rng(0), 200_000)
+    assert flow.min() >= nozzle_scene.FLOWS[0]
+    assert flow.max() <= nozzle_scene.FLOWS[1]
+    density = np.histogram(flow, bins=np.arange(20.0, 311, 1.0))[0] / len(flow)
+    for border in nozzle_scene.BORDERS:
+        k = int(border - 20)
+        # two counts of about 2,600 differ by 3 % of chance; the paper's shares leap by a factor of 3 and 10
+        assert density[k - 1] == pytest.approx(density[k], rel=0.08)
+    # half of them log-uniform: a hundredth of all lies in 2.7 % of flow, anywhere
+    assert (np.histogram(np.log(flow), bins=50)[0] / len(flow)).min() > 0.009
+    assert np.mean((flow > 70) & (flow < 150)) == pytest.approx(0.14 + 0.43, abs=0.02)
+
+
+def test_flows_to_judge_are_uniform_where_controllers_work_in_equal_numbers_a_bin():
+    flow = nozzle_scene.draw_judged_flow(np.random.default_rng(0), 640)
+    counts = np.histogram(flow, bins=np.arange(70.0, 151, 5))[0]
+    wide = np.histogram(np.exp(np.linspace(np.log(20), np.log(310), 321)[:-1]), bins=np.arange(70.0, 151, 5))[
+        0
+    ]
+    assert np.abs(counts - 20 - wide).max() <= 3
+    assert (flow < 70).sum() > 100
+    assert (flow > 150).sum() > 70
+
+
+@pytest.mark.parametrize("n", [1, 2, 15])
+def test_few_flows_are_as_many_as_asked_for_and_fifteen_hold_every_class(n):
+    for seed in range(20):
+        flow = nozzle_scene.draw_flow(np.random.default_rng(seed), n)
+        assert flow.shape == nozzle_scene.draw_judged_flow(np.random.default_rng(seed), n).shape == (n,)
+        assert n < 15 or set(nozzle_scene.label(flow).tolist()) == {0, 1, 2}
+
+
+def test_filmed_segments_keep_their_flow_and_temperature():
+    flow, temperature = np.array([60.0, 140.0]), np.array([190.0, 230.0])
+    made = nozzle_scene.filmed(np.random.default_rng(14), flow, temperature, frames=3, least_score=LEAST)
+    np.testing.assert_array_equal(made.flow, np.repeat(flow, 3))
+    np.testing.assert_array_equal(made.temperature, np.repeat(temperature, 3))
+    np.testing.assert_array_equal(made.segment, np.repeat([0, 1], 3))
+    assert (made.score[made.valid] >= LEAST).all()
+
+
 def test_a_data_set_holds_the_fifteen_combinations_in_equal_parts():
     made = nozzle_scene.data_set(np.random.default_rng(13), segments=2, frames=3, least_score=LEAST)
     assert made.images.shape == (90, 16, 48)

@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 import yaml
 
+from pipeline.setpoint import nozzle_scene
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, classify
 from pipeline.setpoint.calibration import Calibration, Familiar
 from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.vision_transformer import SMALL as SMALL_SIZE
 from pipeline.setpoint.vision_transformer import named_arrays, vision_transformer
-from pipeline.setpoint.workflow import parts, train_agent, train_classifier
+from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
+from pipeline.setpoint.workflow import parts, render_frames, train_agent, train_classifier
 from pipeline.setpoint.workflow.agent_files import AGENTS_SCHEMA, Agents, restore_agents, store_agents
 from pipeline.setpoint.workflow.classifier_files import (
     CLASSIFIER_SCHEMA,
@@ -35,7 +37,7 @@ from pipeline.setpoint.workflow.tables import (
     SCOREBOARD,
     WINDOWS,
 )
-from pipeline.setpoint.workflow.windows import edges, window_rows, window_tables
+from pipeline.setpoint.workflow.windows import WINDOW_PARTS, edges, window_rows, window_tables
 from pipeline.store import artifacts, params
 from pipeline.store.artifacts import read_weights, write_weights
 from pipeline.store.params import Execution
@@ -50,13 +52,15 @@ RECIPE = {"epochs": 2, "cycle_epochs": 2, "warmup_epochs": 0, "batch": 16}
 # a few frames of everything, and as much promised as so few allow
 SMALL = {
     "execution.jobs": 1,
-    "train_classifier.segments": {"learned": 3, "held_out": 1, "calibration": 2, "judged": 2},
-    "train_classifier.frames": {"learned": 1, "held_out": 2, "calibration": SHOTS, "judged": SHOTS},
+    "render_frames.segments": {"learned": 3, "held_out": 1, "calibration": 2, "judged": 2},
+    "render_frames.frames": {"learned": 1, "held_out": 2, "calibration": SHOTS, "judged": SHOTS},
+    "render_frames.sweeps": {"learn": 1, "choose": 1, "judge": 1},
+    "render_frames.sweep_windows": {"learn": 1.0, "choose": 1.0, "judge": 1.0},
     "train_classifier.window": SHOTS,
     "train_classifier.coverage": 0.6,
     "train_classifier.confidence": 0.55,
+    "train_classifier.coverage_by_flow": 0.6,
     "train_classifier.false_alarms": 0.1,
-    "train_classifier.recorded": {"learn": 1, "judge": 1, "learn_windows": 1.0, "judge_windows": 1.0},
     **{f"train_classifier.{network}.{key}": value for network in ("small", "cnn") for key,
     value in RECIPE.items()},
     "train_agent.runs": 1,
@@ -102,6 +106,7 @@ def simulated(tmp_path_factory) -> Path:
     """A project in which the classifier was trained on rendered frames."""
     place = begun(tmp_path_factory.mktemp("simulated"))
     with contextlib.chdir(place):
+        stage("render_frames")
         stage("train_classifier")
     return place
 
@@ -115,16 +120,16 @@ def project(tmp_path, monkeypatch) -> Path:
 @pytest.fixture
 def stored(project) -> Path:
     """A project with a classifier that has learned nothing, and made-up windows; to be spoiled."""
-    known = Calibration(1.0, 0.1, 0.2, Familiar(np.zeros((3, 4)), np.eye(4)), 9.0)
+    knots = np.log(np.array(KNOTS_PERCENT) / 100)
+    flow = FlowCalibration(knots, np.ones(len(knots)), 0.5)
+    known = Calibration(1.0, 0.1, 0.2, Familiar(np.zeros((3, 4)), np.eye(4)), 9.0, flow)
     out = project / "datasets/train_classifier"
     store_classifier(
         out,
         params.load(TrainClassifier, "train_classifier"),
         CalibratedClassifier(vision_transformer(SMALL_SIZE, np.random.default_rng(0)), known),
     )
-    tables = {
-        part: synthetic_table(np.random.default_rng(1), segments=1, windows=2) for part in ("learn", "judge")
-    }
+    tables = {part: synthetic_table(np.random.default_rng(1), segments=1, windows=2) for part in WINDOW_PARTS}
     artifacts.write_table(out / "windows.parquet", WINDOWS, window_rows(tables))
     return project
 
@@ -180,6 +185,12 @@ def check_classifier(source: str) -> dict:
     for name in ("image_accuracy", "window_accuracy", "svc_image_accuracy", "ece_image", "ece_window"):
         assert 0 <= figures[name] <= 1
     assert figures["source"] == source
+    bins = [(row["flow_low"], row["flow_high"]) for row in figures["by_flow"]]
+    assert bins == [(low, low + 5) for low in range(70, 150, 5)]
+    assert [(row["flow_low"], row["flow_high"]) for row in figures["coverage_by_flow"]] == bins
+    assert figures["right_70_150"].keys() == {"percent", "low", "high"}
+    for low, high in figures["intervals_percent"].values():
+        assert 0 <= low <= high <= 100
     assert figures["epochs"] == {"vision transformer": 2, "convolutional network": 2}
     return figures
 
@@ -193,11 +204,17 @@ def test_on_rendered_frames_every_artifact_is_written_with_its_schema(simulated,
     assert course["epoch"].tolist() == [1, 2] * 2
 
 
+def _parts(settings: TrainClassifier) -> parts.Parts:
+    execution = params.load(Execution, "execution")
+    return parts.parts(settings, "datasets/render_frames", "datasets/raw/setpoint", execution)
+
+
 def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(
     simulated, project, monkeypatch
 ):
     p, write, epochs = params.load(TrainClassifier, "train_classifier"), write_weights, []
-    found, _ = parts.parts(p, "datasets/raw/setpoint", params.load(Execution, "execution"))
+    shutil.copytree(simulated / "datasets/render_frames", "datasets/render_frames")
+    found = _parts(p).frames
 
     def killing(path, name, arrays, about):
         write(path, name, arrays, about)
@@ -220,6 +237,61 @@ def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(
         assert arrays.keys() == whole.keys()
         for name, values in whole.items():
             np.testing.assert_array_equal(arrays[name], values, err_msg=name)
+
+
+# ---- rendered frames
+
+
+def test_rendered_parts_share_no_segment_and_every_bin_has_a_window_in_every_part(simulated, monkeypatch):
+    monkeypatch.chdir(simulated)
+    found = render_frames.restore_frames(Path("datasets/render_frames"))
+    assert tuple(found) == (*render_frames.PARTS, *WINDOW_PARTS)
+    segments = [set(frames.segment.tolist()) for frames in found.values()]
+    assert sum(map(len, segments)) == len(set.union(*segments)) == 15 * (3 + 1 + 2 + 2) + 3
+    for part, frames in found.items():
+        assert len(frames.valid) == len(frames.images) == len(frames.score), part
+        np.testing.assert_array_equal(frames.label, nozzle_scene.label(frames.flow))
+    tables = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
+    bins = len(tables["judge"].flow_edges) - 1
+    for part, recorded in tables.items():
+        assert set(recorded.flow_bin.tolist()) == set(range(bins)), part
+        assert set(recorded.segment.tolist()) <= set(found[part].segment.tolist())
+        low, high = (recorded.flow_edges[recorded.flow_bin + end] for end in (0, 1))
+        assert ((recorded.flow >= low) & (recorded.flow <= high)).all()
+
+
+def test_rendering_again_gives_the_same_bytes_whatever_the_workers(simulated, project):
+    declare({"execution.jobs": 2})
+    stage("render_frames")
+    assert artifacts.sha256("datasets/render_frames") == artifacts.sha256(
+        simulated / "datasets/render_frames"
+    )
+
+
+def test_how_far_a_line_must_stand_out_is_decided_after_rendering(simulated):
+    frames = render_frames.restore_frames(simulated / "datasets/render_frames")["judged"]
+    assert (frames.score[frames.valid] < 10).any()
+    strict = render_frames.standing_out(frames, 10.0)
+    np.testing.assert_array_equal(strict.valid, frames.valid & (frames.score >= 10))
+    assert not strict.images[~strict.valid].any()
+    assert all(reason.startswith("no fresh line: ") for reason in strict.reasons[~strict.valid])
+    assert not any(strict.reasons[strict.valid])
+
+
+def test_frames_that_are_damaged_or_were_never_rendered_are_refused_by_name(simulated, project, capsys):
+    said = refusal("train_classifier", capsys)
+    assert "datasets/render_frames/learned.safetensors is missing" in said
+    assert "make it again with ./run dvc repro render_frames" in said
+    shutil.copytree(simulated / "datasets/render_frames", "datasets/render_frames")
+    path = Path("datasets/render_frames/choose.safetensors")
+    path.write_bytes(path.read_bytes()[:1000])
+    assert f"{path} holds no whole weights" in refusal("train_classifier", capsys)
+
+
+def test_recordings_need_no_rendering(project):
+    declare({"train_classifier.source": "recordings"})
+    stage("render_frames")
+    assert [path.name for path in Path("datasets/render_frames").iterdir()] == ["frames.json"]
 
 
 # ---- there and back
@@ -247,7 +319,7 @@ def test_the_calibrated_classifier_survives_being_stored(simulated, project):
 def test_window_tables_survive_being_written(simulated, tmp_path):
     made = {
         part: synthetic_table(np.random.default_rng(k), segments=3, windows=2)
-        for k, part in enumerate(("learn", "judge"))
+        for k, part in enumerate(WINDOW_PARTS)
     }
     artifacts.write_table(tmp_path / "windows.parquet", WINDOWS, window_rows(made))
     found = window_tables(artifacts.read_table(tmp_path / "windows.parquet", WINDOWS))
@@ -313,7 +385,7 @@ def test_damaged_or_foreign_weights_are_refused_by_name(stored, capsys):
         "evaluate_setpoint", capsys
     )
     write_weights(path, "agents 1", arrays, {"size": "small"})
-    assert f"{path} should hold weights of classifier 1 but has schema agents 1" in refusal(
+    assert f"{path} should hold weights of classifier 2 but has schema agents 1" in refusal(
         "evaluate_setpoint", capsys
     )
     path.unlink()
@@ -365,7 +437,7 @@ def test_on_a_user_s_folder_every_artifact_is_written_and_no_print_is_in_two_par
     assert figures["data"]["valid"] + sum(figures["data"]["rejected"].values()) == figures["data"]["frames"]
     first = artifacts.sha256("datasets/train_classifier"), artifacts.sha256("reports")
     p = params.load(TrainClassifier, "train_classifier")
-    found, _ = parts.parts(p, "datasets/raw/setpoint", params.load(Execution, "execution"))
+    found = _parts(p).frames
     prints = [set(part.print_number.tolist()) for part in found.values()]
     assert sum(map(len, prints)) == len(set.union(*prints)) == PRINTS
     for path in Path("datasets/memo").rglob("*.safetensors"):
@@ -451,7 +523,7 @@ def test_the_whole_loop_runs_and_repeats_to_the_byte(source, frames, tmp_path, m
     shutil.copytree(frames, "datasets/raw/setpoint")
     found = []
     for _ in range(2):
-        for name in ("train_classifier", "train_agent", "evaluate_setpoint"):
+        for name in ("render_frames", "train_classifier", "train_agent", "evaluate_setpoint"):
             stage(name)
         check_classifier(source)
         check_agents()

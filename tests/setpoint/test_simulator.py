@@ -5,14 +5,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
+from pipeline.setpoint.actuation import ACTS, FEW, STILL
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
 from pipeline.setpoint.simulator import (
+    CHANCES,
     FLOW_MOVES,
     TEMPERATURE_MOVES,
     Action,
     Controller,
     Observation,
+    begin,
     first_history,
     flow_class,
     nominal,
@@ -21,8 +25,9 @@ from pipeline.setpoint.simulator import (
     remembered,
     reward,
     rollout,
+    stepped,
 )
-from tests.setpoint.synthetic import synthetic_table
+from tests.setpoint.synthetic import synthetic_flow_table, synthetic_table
 
 STEPS, N = 30, 2000  # one shape, so that everything runs in one compiled program
 
@@ -154,6 +159,7 @@ def test_the_paper_s_state_is_thirty_classes_three_shares_and_two_temperatures()
     seen = Observation(
         jnp.array([0.5, 0.3, 0.2]),
         jnp.array(0),
+        jnp.array(jnp.nan),
         jnp.array(0.0),
         jnp.array(205.0),
         jnp.array(210.0),
@@ -207,6 +213,37 @@ def test_a_drawn_window_is_one_of_its_flow_bin_and_all_of_them_come():
     assert drawn == {tuple(row) for row in np.asarray(table.shares[here], np.float32)}
 
 
+def test_a_window_that_shows_a_flow_keeps_its_error_when_it_is_drawn_at_another_flow():
+    table = synthetic_flow_table(np.random.default_rng(0), segments=200, windows=2)
+    windows = recorded_windows(table)
+    here = table.flow_bin == np.searchsorted(table.flow_edges, 101.0, side="right") - 1
+    errors = np.log(table.flow_seen / table.flow)[here]
+    u = jax.random.uniform(jax.random.key(1), (400, 4))
+    conditions = nominal(101.0, 210.0, accuracy=1.0)
+    shares, named, seen = jax.vmap(
+        lambda one: windows.draw(windows.table, conditions, jnp.float32(101.0), one[3], one[:3])
+    )(u)
+    found = np.log(np.asarray(seen) / 101.0)
+    nearest = np.abs(found[:, None] - errors)
+    assert nearest.min(axis=1).max() <= 1e-3 + 1e-5  # the dither, and float32
+    assert set(nearest.argmin(axis=1)) == set(range(len(errors)))
+    assert len(np.unique(found)) > 390  # a window drawn twice is no picture that stands still
+    # the shares are those of N(log flow_seen, spread^2) between 90 and 110 %
+    spread = float(table.spread[0])
+    under = scipy.stats.norm.cdf((np.log(90) - np.log(np.asarray(seen))) / spread)
+    over = scipy.stats.norm.sf((np.log(110) - np.log(np.asarray(seen))) / spread)
+    np.testing.assert_allclose(np.asarray(shares)[:, [0, 2]], np.stack([under, over], axis=1), atol=1e-5)
+    np.testing.assert_array_equal(named, np.asarray(shares).argmax(axis=1))
+
+
+def test_a_table_with_some_flows_only_is_refused():
+    table = synthetic_flow_table(np.random.default_rng(0), segments=200, windows=1)
+    seen = table.flow_seen.copy()
+    seen[3] = np.nan
+    with pytest.raises(ValueError, match="expected flow_seen, spread and flow of all 200 windows.*found 199"):
+        recorded_windows(table._replace(flow_seen=seen))
+
+
 def test_a_sticky_segment_keeps_its_look_when_the_flow_moves_to_another_bin():
     # in both bins segment 7 always looks thin and segment 3 always thick
     table = WindowTable(
@@ -215,6 +252,9 @@ def test_a_sticky_segment_keeps_its_look_when_the_flow_moves_to_another_bin():
         np.array([0, 0, 1, 1]),
         np.array([7, 3, 7, 3]),
         np.array([20.0, 100.0, 310.0]),
+        np.array([50.0, 150.0] * 2),
+        np.full(4, 0.07),
+        np.array([60.0, 60.0, 140.0, 140.0]),
     )
     moves = standing()
     moves[:, 0] = 4
@@ -278,3 +318,107 @@ def spoilt(**fields):
 def test_a_table_that_cannot_be_drawn_from_is_refused(table, message):
     with pytest.raises(ValueError, match=message):
         recorded_windows(table)
+
+
+# ---- as deployed
+
+
+def up_by(index, at):
+    moves = standing()
+    moves[at, 0] = index
+    return moves
+
+
+def test_a_melt_lets_the_flow_follow_by_what_has_left_it():
+    """A move of 10 at the first decision, a wait of 3 s, half a window of 1 s: exp(-3.5 / melt_s) is left."""
+    run = played(up_by(4, 0), machine(100.0, 210.0, wait_s=3.0, melt_s=5.0))
+    np.testing.assert_allclose(run.flow[0, 1:5], 110 - 10 * np.exp(-3.5 / 5.0) ** np.arange(1, 5), rtol=1e-5)
+
+
+def test_a_gain_that_drifts_moves_by_what_it_is_then_and_keeps_to_its_limits():
+    moves = standing()
+    moves[:, 0] = 3
+    run = played(moves, machine(100.0, 210.0, gain=0.6, gain_drift=0.1))
+    gain = np.minimum(0.6 * 1.1 ** np.arange(STEPS), 1.2)
+    np.testing.assert_allclose(np.diff(run.flow[0]), 5 * gain, rtol=1e-4)
+
+
+def test_the_travel_of_a_minute_is_limited_as_in_the_loop_through_pixels():
+    """Moves of 10 at every decision of 4 s: ten are sent, then none until the first is a minute old."""
+    moves = standing()
+    moves[:, 0] = 4
+    run = played(moves, machine(20.0, 210.0, wait_s=3.0))
+    sent = np.diff(run.flow[0])
+    np.testing.assert_allclose(sent[:15], [10.0] * 10 + [0.0] * 5, atol=1e-4)
+    np.testing.assert_allclose(sent[15:25], 10.0, atol=1e-4)
+
+
+def test_clogs_come_at_their_rate_and_go_again():
+    run = played(standing(), machine(100.0, 210.0, clog=0.7, clog_rate=0.02))
+    clogged = run.flow < 99.0
+    np.testing.assert_allclose(run.flow[clogged], 70.0, rtol=1e-4)
+    np.testing.assert_allclose(run.flow[~clogged], 100.0, rtol=1e-4)
+    came = (~clogged[:, :-1] & clogged[:, 1:]).sum() / (~clogged[:, :-1]).sum()
+    went = (clogged[:, :-1] & ~clogged[:, 1:]).sum() / clogged[:, :-1].sum()
+    # four deviations of 50,000 and 10,000 decisions
+    assert came == pytest.approx(0.02, abs=0.003)
+    assert went == pytest.approx(1 / 30, abs=0.008)
+
+
+def test_nothing_is_sent_and_no_clock_runs_while_the_camera_is_blind():
+    """It moves at decision 4 and would at each blind window: nothing is sent, and no clock runs."""
+
+    def act(moves, memory, observation, key):
+        return memory, Action(
+            jnp.where((observation.step == 4) | (observation.step == 5), 4, 2), jnp.int32(2)
+        )
+
+    watcher = Controller(lambda: (), act)
+    conditions = machine(100.0, 210.0, blind_from=5, blind_for=4)
+    run = jax.tree.map(
+        np.asarray, rollout(watcher, (), paper_windows(), conditions, jax.random.key(0), steps=STEPS)
+    )
+    np.testing.assert_array_equal(run.reason[0], [ACTS] * 5 + [FEW] * 4 + [ACTS] * (STEPS - 9))
+    np.testing.assert_allclose(run.flow[0], [100.0] * 5 + [110.0] * 5 + [120.0] * (STEPS - 9), rtol=1e-6)
+
+
+def test_a_move_before_blind_windows_is_told_with_the_next_that_is_seen():
+    state, observation = begin(paper_windows(), _one(blind_from=1.0, blind_for=2.0), jax.random.key(0))
+    told = []
+    for index in (4, 2, 2, 2):
+        state, observation = stepped(
+            paper_windows(),
+            _one(blind_from=1.0, blind_for=2.0),
+            state,
+            Action(jnp.int32(index), jnp.int32(2)),
+            jnp.full(CHANCES, 0.5),
+        )
+        told.append(float(observation.flow_move))
+    assert told == [10.0, 10.0, 10.0, 0.0]  # 1 and 2 are blind: 3 is the first that the controller is shown
+
+
+def _one(**changes):
+    values = {name: jnp.float32(value) for name, value in changes.items()}
+    return nominal(100.0, 210.0, accuracy=1.0)._replace(**values)
+
+
+def test_a_stuck_camera_that_shows_flows_stands_still_and_nothing_is_sent():
+    table = synthetic_flow_table(np.random.default_rng(0), segments=200, windows=4)
+    moves = standing()
+    moves[:, 0] = 4
+    run = played(moves, machine(100.0, 210.0, stuck_from=3, stuck_for=6), recorded_windows(table))
+    np.testing.assert_array_equal(run.reason[:, 3:9], STILL)
+    assert (run.reason[:, :3] == ACTS).all()
+    assert (run.reason[:, 9:] == ACTS).mean() > 0.999
+    np.testing.assert_array_equal(run.flow[:, 4:10], run.flow[:, 3:4] * np.ones(6))
+
+
+def test_what_the_camera_reads_can_be_scaled_against_its_record():
+    table = synthetic_flow_table(np.random.default_rng(0), segments=400, windows=4)
+    told = [
+        played(standing(), machine(100.0, 210.0, seen=factor), recorded_windows(table)).shares
+        for factor in (1.0, 1.3)
+    ]
+    # over is N(log 1.0, 0.07^2) beyond log 1.1 with as much spread: 17 %; some 12 segments are of this bin
+    assert told[0][..., 2].mean() < 0.35
+    assert told[1][..., 2].mean() > 0.9

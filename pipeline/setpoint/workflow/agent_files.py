@@ -1,8 +1,8 @@
 """What train_agent leaves: the agents and the belief that the belief DQN reads, to one file and back."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +11,11 @@ import numpy as np
 from pipeline.setpoint import agent, bayes
 from pipeline.setpoint.agent import QNetwork
 from pipeline.setpoint.belief_agent import Belief, BeliefNetwork
+from pipeline.setpoint.simulator import CLASSES, HISTORY
 from pipeline.store import artifacts
 from pipeline.store.artifacts import read_weights, write_weights
 
-AGENTS_SCHEMA = "agents 2"
+AGENTS_SCHEMA, PUBLISHED_SCHEMA = "agents 2", "published agent 1"
 # names of arrays in the file, which stay as they were first written: the belief network, and a field of the
 # filter
 OURS, FILE_NAMES = "ours", {"filter.window_repeat_probability": "filter.repeats"}
@@ -58,8 +59,33 @@ def restore_agents(path: str) -> Agents:
         )
         hypotheses = model.evidence.shape[0]
         network = agent.with_weights(BeliefNetwork(hypotheses, jax.random.key(0)), parts.pop(OURS))
-        li_2025 = tuple(agent.with_weights(QNetwork(jax.random.key(0)), part) for part in parts.values())
+        li_2025 = tuple(_network(part) for part in parts.values())
         return Agents(li_2025, Belief(model, *(belief[name] for name in Belief._fields[1:])), network)
+
+
+def store_published(path: Path, networks: Sequence[QNetwork], rewards: Sequence[jax.Array]) -> None:
+    """The networks of Li and Pattinson (2025) after each phase, and the rewards of its steps, for a memo."""
+    arrays = {
+        f"phase{i + 1}.{name}": a for i, n in enumerate(networks) for name, a in agent.weights(n).items()
+    }
+    arrays |= {f"phase{i + 1}.rewards": np.asarray(r) for i, r in enumerate(rewards)}
+    write_weights(path, PUBLISHED_SCHEMA, arrays, {"phases": str(len(networks))})
+
+
+def restore_published(path: Path) -> agent.Published:
+    """What `store_published` wrote. Raises ValueError where the file is none."""
+    arrays, about = read_weights(path, PUBLISHED_SCHEMA)
+    with artifacts.about(path):
+        parts = [_part(arrays, f"phase{i + 1}") for i in range(int(about["phases"]))]
+        rewards = tuple(jnp.asarray(part.pop("rewards")) for part in parts)
+        return agent.Published(tuple(_network(part) for part in parts), rewards)
+
+
+def _network(part: dict[str, np.ndarray]) -> QNetwork:
+    """The network of these arrays, whose history is as long as they say."""
+    numbers = np.shape(part.get("vision.weight", np.zeros((256, HISTORY + CLASSES))))
+    network = QNetwork(jax.random.key(0), max(numbers[-1] - CLASSES, 1))
+    return cast(QNetwork, agent.with_weights(network, part))
 
 
 def _part(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:

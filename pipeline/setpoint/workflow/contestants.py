@@ -1,4 +1,5 @@
-"""The table of contestants: every controller of the setpoint comparison, in the order of the scoreboard.
+"""The table of contestants: every controller of the setpoint comparison, in the order of simplicity: of two
+that are alike within noise the first runs by default.
 
 A new controller is its own file in pipeline/setpoint/, its line in CONTESTANTS, and its settings. The stage
 builds from this table; the pages take name and kind from the scoreboard, and rank by it.
@@ -11,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pipeline.setpoint import agent, baselines, bayes, belief_agent
+from pipeline.setpoint import agent, baselines, bayes, belief_agent, judging
 from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.simulator import Controller
 from pipeline.setpoint.workflow.agent_files import Agents
@@ -48,18 +49,24 @@ class ControllerSpec(NamedTuple):
 
 
 @cache  # one controller for all phases, so that what was compiled for it is found again
-def _published() -> Controller:
-    return agent.greedy(agent.paper_encoder())
+def _published(history: int) -> Controller:
+    return agent.greedy(agent.paper_encoder(history))
 
 
 def _after_phase(number: int) -> Callable[[Problem], tuple[Controller, Any] | None]:
     """The agent of Li and Pattinson (2025) after so many of its phases."""
-    return lambda problem: (
-        (_published(), problem.agents.li_2025[number - 1]) if number <= len(problem.agents.li_2025) else None
-    )
+
+    def made(problem: Problem) -> tuple[Controller, Any] | None:
+        if number > len(problem.agents.li_2025):
+            return None
+        network = problem.agents.li_2025[number - 1]
+        return _published(agent.history_of(network)), network
+
+    return made
 
 
 CONTESTANTS = (
+    Contestant(judging.DOES_NOTHING, "baseline", lambda problem: (baselines.nothing(), ())),
     Contestant(
         "proportional",
         "baseline",
@@ -99,7 +106,7 @@ CONTESTANTS = (
         "baseline",
         lambda problem: (
             bayes.bayes(problem.settings.bayes_robust.hypotheses()),
-            bayes.robust_filter(
+            bayes.watching_filter(
                 problem.windows, bayes.CameraErrorModel(**problem.settings.bayes_robust.model_dump())
             ),
         ),

@@ -1,0 +1,90 @@
+"""The contest of the setpoint loop: chosen on some segments, told on others, with harm beside settling."""
+
+import collections
+
+import numpy as np
+import pytest
+
+from pipeline.setpoint import baselines, judging
+from pipeline.setpoint.judging import Choice
+from pipeline.setpoint.score import Outcomes
+from pipeline.setpoint.workflow import evaluate_setpoint
+from pipeline.setpoint.workflow.contestants import CONTESTANTS, ControllerSpec, Problem, controllers
+from pipeline.setpoint.workflow.settings import EvaluateSetpoint
+from pipeline.setpoint.workflow.tables import SCOREBOARD
+from pipeline.store import artifacts, params
+from tests.setpoint.synthetic import synthetic_table
+
+NO_PIXELS = evaluate_setpoint.PixelRollouts({}, None, ())
+SIMPLE = ("do nothing", "filtered proportional", "sequential test")
+
+
+@pytest.fixture(scope="module")
+def settings(root) -> EvaluateSetpoint:
+    declared = params.load(EvaluateSetpoint, "evaluate_setpoint", root / params.FILE)
+    return declared.model_copy(update={"runs": 1, "redraws": 3, "rounds": 2})
+
+
+def test_harm_is_barred_from_good_starts_with_the_camera_right_stuck_or_blind(settings):
+    limits = evaluate_setpoint.bars(settings)
+    assert limits == {"perfect": 1.0, "in band": 2.0, "in band, stuck 30": 2.0, "in band, blind 30": 2.0}
+
+
+def test_what_is_told_is_of_other_segments_and_the_default_s_harm_stands_by_case(settings, tmp_path):
+    problem = Problem(settings.baselines, agents=None, windows=None)
+    specs = controllers(problem, [line for line in CONTESTANTS if line.name in SIMPLE])
+    choose, judge = (synthetic_table(np.random.default_rng(k), segments=6, windows=2) for k in (1, 2))
+    choice = evaluate_setpoint.chosen(specs, choose, settings)
+    contest = evaluate_setpoint.contest(specs, judge, settings, choice.name)
+    assert contest.redraws == {name: 6 if name == choice.name else 3 for name in SIMPLE}
+    told = evaluate_setpoint.told(choice, contest)
+    board = evaluate_setpoint.scoreboard(specs, contest, NO_PIXELS)
+    artifacts.write_table(tmp_path / "scoreboard.parquet", SCOREBOARD, board)
+    figures = evaluate_setpoint.metrics(specs, contest, told, NO_PIXELS)
+    assert figures["default"] == choice.name
+    assert set(figures["cases"]) == {case for case in contest.scores[choice.name] if judging.counts(case)}
+    for case, shares in figures["cases"].items():
+        assert 0 <= shares["low"] <= shares["stay"] <= shares["high"] <= 100, case
+    assert figures["worst"] == min(shares["stay"] for shares in figures["cases"].values())
+    assert {"recovered", "recovery_steps", "back_within_15"} <= set(
+        figures["cases"]["recorded, sticky, half clog"]
+    )
+    assert len(figures["harm"]) == 12
+    for case, shares in figures["harm"].items():
+        assert shares["beyond_10"] >= shares["beyond_15"] >= shares["beyond_25"] >= 0, case
+        assert shares["beyond_25_low"] <= shares["beyond_25"] <= shares["beyond_25_high"]
+    idle = figures["do nothing"]["harm"]
+    assert {share for case in idle.values() for share in case.values()} == {0.0}
+    # another camera misleads whoever follows it, and nobody else
+    followed = figures["filtered proportional"]["harm"]["in band, another camera"]
+    assert followed["beyond_10"] > 20
+
+
+def test_who_cannot_win_any_more_runs_in_one_round_only(settings, monkeypatch):
+    """Runs are made up: of 21 from wrong starts, so many are kept."""
+    kept = {"do nothing": 0, "slow": 5, "good": 20, "better": 21}
+    specs = {name: ControllerSpec("baseline", baselines.nothing(), name) for name in kept}
+    asked = collections.Counter()
+
+    def ask(controller, name, case, part, keys):
+        asked[name] += 1
+        n = 21 * len(keys)
+        stay = np.tile(np.arange(21) < kept[name], len(keys))
+        empty = dict.fromkeys(Outcomes._fields, np.zeros(n))
+        return Outcomes(**empty | {"stay": stay, "beyond": np.zeros((n, 3), bool)})
+
+    monkeypatch.setattr(judging, "ask", ask)
+    table = synthetic_table(np.random.default_rng(1), segments=2, windows=1)
+    longer = settings.model_copy(update={"redraws": 8, "rounds": 3})
+    choice = evaluate_setpoint.chosen(specs, table, longer)
+    cases = 13 + len(evaluate_setpoint.bars(longer))
+    # 20 of 21 are told from 21 of 21 by 336 runs, and not by 168
+    assert asked == {"do nothing": cases, "slow": cases, "good": 2 * cases, "better": 3 * cases}
+    assert isinstance(choice, Choice)
+    assert choice.name == "better"
+
+
+def test_the_table_is_in_the_order_of_simplicity():
+    names = [line.name for line in CONTESTANTS]
+    order = ("do nothing", "filtered proportional", "sequential test", "Bayes, robust", "our agent")
+    assert [name for name in names if name in order] == list(order)
