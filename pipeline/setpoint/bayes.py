@@ -29,7 +29,7 @@ import scipy.special
 
 from pipeline.setpoint.baselines import temperature_move
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, FLOW_MOVES
-from pipeline.setpoint.recorded import WindowTable, class_shares, with_flows
+from pipeline.setpoint.recorded import WindowTable, class_shares, segment_errors, with_flows
 from pipeline.setpoint.simulator import (
     CLASSES,
     FLOW_LIMITS,
@@ -312,50 +312,6 @@ def _class_frequencies(table: WindowTable, biased: np.ndarray, smoothing: float)
     weight = np.exp(-0.5 * ((biased[..., None] - centre) / np.maximum(smoothing, width / 2)) ** 2)
     frequency = weight @ counts
     return frequency / frequency.sum(axis=2, keepdims=True)
-
-
-class SegmentErrors(NamedTuple):
-    """Errors log flow_seen / flow of a table's windows, in two parts: within (n,), of each window about its
-    segment and the table's mean, and bias_std, the deviation of the segments' own."""
-
-    within: np.ndarray
-    bias_std: float
-
-
-# segments that the declared deviation counts for, beside the table's own
-DECLARED_SEGMENTS = 5
-
-
-def segment_errors(table: WindowTable, *, width_bias_std: float) -> SegmentErrors:
-    """The errors of a table that shows flows, by a one-way analysis of variance: s_b^2 = var(segment means) -
-    s_w^2 mean(1 / n_s), pooled with the declared width_bias_std^2. A segment that stands at one flow only
-    cannot tell its bias from what the camera does at that flow: errors are taken about the smoothed mean."""
-    log_flow = np.log(table.flow)
-    error = np.log(table.flow_seen) - log_flow
-    mean = _smooth_mean(log_flow, error)
-    _, place, counts = np.unique(table.segment, return_inverse=True, return_counts=True)
-    about = error - mean
-    segment_mean = np.bincount(place, about) / counts
-    within = about - segment_mean[place]
-    free = len(error) - len(counts)
-    if free <= 0:  # one window a segment: nothing parts the two
-        return SegmentErrors(error, width_bias_std)
-    variance = (within**2).sum() / free
-    between = max(0.0, float((segment_mean**2).mean() - variance * (1 / counts).mean()))
-    n = len(counts)
-    bias_std = np.sqrt((n * between + DECLARED_SEGMENTS * width_bias_std**2) / (n + DECLARED_SEGMENTS))
-    inflate = np.sqrt(variance / max(float((within**2).mean()), 1e-12))
-    return SegmentErrors(mean + within * inflate, float(bias_std))
-
-
-MEAN_BANDWIDTH = 0.08  # of log flow, one deviation: over which a camera's mean error is smooth
-
-
-def _smooth_mean(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The kernel mean (n,) of y over x, read at every x."""
-    at = np.linspace(x.min(), x.max(), 200)
-    weight = np.exp(-0.5 * ((at[:, None] - x) / MEAN_BANDWIDTH) ** 2)
-    return np.interp(x, at, (weight @ y) / np.maximum(weight.sum(axis=1), 1e-12))
 
 
 def _flow_frequencies(

@@ -1,11 +1,11 @@
 """Windows recorded from a trained classifier as a source for the simulator: whole windows are drawn again, so
 errors sit, stick and mislead as the classifier's do.
 
-Given a true flow q, a segment of its flow bin is taken, and of that segment any window. Of a table with flows
-the window keeps its error: it shows flow_seen q / flow, and the class shares that belong to it. Conditions
-persist: within a bin the segments are ranked by how much they look over-extruded (mean log flow_seen / flow,
-or mean p_2 - p_0 where only classes are seen), and an episode keeps its rank for a while, also when the flow
-moves to another bin, so that what looks thin here looks thin there.
+Of a table of classes only: given a true flow, a segment of its flow bin is taken, and of that segment any
+window. Conditions persist: within a bin the segments are ranked by how much they look over-extruded (mean
+p_2 - p_0), and an episode keeps its rank for a while, also when the flow moves to another bin, so that what
+looks thin here looks thin there. Of a table with flows an error is drawn: that of a segment, which persists
+in the same way, and about it that of any of the NEAREST windows recorded at flows like this one.
 """
 
 from typing import NamedTuple
@@ -46,19 +46,72 @@ def with_flows(table: WindowTable) -> bool:
     return bool(np.isfinite(table.flow_seen).all())
 
 
+NEAREST = 40  # windows that an error is drawn from, or all where there are fewer
+
+
 class _Ranked(NamedTuple):
     """Windows sorted by bin, then by the rank of their segment: segments of bin b are first_segment[b] + 0 ..
-    segments[b] - 1, their windows likewise. log_error (n,) is log flow_seen / flow."""
+    segments[b] - 1, their windows likewise. Of those that show flows, sorted by log_flow (n,): their errors
+    about their segments (n,) and spread (n,); and bias (segments,) of the segments, rising."""
 
     shares: jax.Array
     named: jax.Array
-    log_error: jax.Array
+    log_flow: jax.Array
+    error: jax.Array
     spread: jax.Array
+    bias: jax.Array
     first_segment: jax.Array
     segments: jax.Array
     first_window: jax.Array
     windows: jax.Array
     flow_edges: jax.Array
+
+
+class SegmentErrors(NamedTuple):
+    """Errors log flow_seen / flow of a table's windows, in two parts: within (n,), of each window about its
+    segment, with the camera's mean error at its flow; bias (segments,) of the segments, their number of
+    windows shrunk away, and its deviation bias_std."""
+
+    within: np.ndarray
+    bias: np.ndarray
+    bias_std: float
+
+
+# segments that the declared deviation counts for, beside the table's own
+DECLARED_SEGMENTS = 5
+
+
+def segment_errors(table: WindowTable, *, width_bias_std: float) -> SegmentErrors:
+    """The errors of a table that shows flows, by a one-way analysis of variance: s_b^2 = var(segment means) -
+    s_w^2 mean(1 / n_s), pooled with the declared width_bias_std^2. A segment that stands at one flow only
+    cannot tell its bias from what the camera does at that flow: errors are taken about the smoothed mean."""
+    log_flow = np.log(table.flow)
+    error = np.log(table.flow_seen) - log_flow
+    mean = _smooth_mean(log_flow, error)
+    _, place, counts = np.unique(table.segment, return_inverse=True, return_counts=True)
+    about = error - mean
+    segment_mean = np.bincount(place, about) / counts
+    within = about - segment_mean[place]
+    free = len(error) - len(counts)
+    if free <= 0:  # one window a segment: nothing parts the two
+        return SegmentErrors(error, np.zeros(1), width_bias_std)
+    variance = (within**2).sum() / free
+    between = max(0.0, float((segment_mean**2).mean() - variance * (1 / counts).mean()))
+    n = len(counts)
+    bias_std = np.sqrt((n * between + DECLARED_SEGMENTS * width_bias_std**2) / (n + DECLARED_SEGMENTS))
+    inflate = np.sqrt(variance / max(float((within**2).mean()), 1e-12))
+    own = segment_mean * np.sqrt(between / max(between + variance * (1 / counts).mean(), 1e-12))
+    return SegmentErrors(mean + within * inflate, own, float(bias_std))
+
+
+MEAN_BANDWIDTH = 0.08  # of log flow, one deviation: over which a camera's mean error is smooth
+
+
+def _smooth_mean(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The kernel mean (n,) of y over x, read at every x."""
+    at = np.linspace(x.min(), x.max(), 200)
+    weight = np.exp(-0.5 * ((at[:, None] - x) / MEAN_BANDWIDTH) ** 2)
+    return np.interp(x, at, (weight @ y) / np.maximum(weight.sum(axis=1), 1e-12))
 
 
 def recorded_windows(table: WindowTable) -> Windows:
@@ -68,19 +121,20 @@ def recorded_windows(table: WindowTable) -> Windows:
     pairs, place = np.unique(np.stack([table.flow_bin, table.segment], axis=1), axis=0, return_inverse=True)
     place = place.ravel()
     counts = np.bincount(place)
-    log_error = np.broadcast_to(np.log(table.flow_seen / table.flow), counts.sum())
-    wide = log_error if with_flows(table) else shares[:, 2] - shares[:, 0]
-    thickness = np.bincount(place, weights=wide) / counts
+    thickness = np.bincount(place, weights=shares[:, 2] - shares[:, 0]) / counts
     order = np.lexsort([thickness, pairs[:, 0]])  # by bin, then by thickness
     position = np.empty_like(order)
     position[order] = np.arange(len(order))
     rows = np.argsort(position[place], kind="stable")
     windows, segments = counts[order], np.bincount(pairs[:, 0], minlength=bins)
+    log_flow, error, spread, bias = _errors(table)
     ranked = _Ranked(
         shares=jnp.asarray(shares[rows]),
         named=jnp.asarray(np.asarray(table.named, np.int32)[rows]),
-        log_error=jnp.asarray(log_error[rows], jnp.float32),
-        spread=jnp.asarray(np.broadcast_to(table.spread, len(rows))[rows], jnp.float32),
+        log_flow=jnp.asarray(log_flow, jnp.float32),
+        error=jnp.asarray(error, jnp.float32),
+        spread=jnp.asarray(spread, jnp.float32),
+        bias=jnp.asarray(bias, jnp.float32),
         first_segment=jnp.asarray(np.cumsum(segments) - segments),
         segments=jnp.asarray(segments),
         first_window=jnp.asarray(np.cumsum(windows) - windows),
@@ -90,16 +144,30 @@ def recorded_windows(table: WindowTable) -> Windows:
     return Windows(_recorded_draw, ranked)
 
 
+def _errors(table: WindowTable) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """log_flow, error, spread and bias as _Ranked has them; NaN of a table of classes only."""
+    if not with_flows(table):
+        none = np.full(1, np.nan)
+        return none, none, none, none
+    errors = segment_errors(table, width_bias_std=0.0)
+    order = np.argsort(table.flow, kind="stable")
+    return np.log(table.flow)[order], errors.within[order], table.spread[order], np.sort(errors.bias)
+
+
 def _recorded_draw(
     ranked: _Ranked, conditions: Conditions, flow, segment, u
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     flow_bin = (flow >= ranked.flow_edges[1:-1]).sum()
     s = ranked.first_segment[flow_bin] + jnp.floor(segment * ranked.segments[flow_bin]).astype(jnp.int32)
     w = ranked.first_window[s] + jnp.floor(u[0] * ranked.windows[s]).astype(jnp.int32)
-    seen = jnp.clip(flow, ranked.flow_edges[0], ranked.flow_edges[-1]) * jnp.exp(
-        ranked.log_error[w] + DITHER * u[1]
-    )
-    by_flow = class_shares(seen, ranked.spread[w])
+    q = jnp.clip(flow, ranked.flow_edges[0], ranked.flow_edges[-1])
+    n = len(ranked.log_flow)
+    some = min(NEAREST, n)
+    first = jnp.clip(jnp.searchsorted(ranked.log_flow, jnp.log(q)) - some // 2, 0, n - some)
+    near = first + jnp.floor(u[0] * some).astype(jnp.int32)
+    bias = ranked.bias[jnp.floor(segment * len(ranked.bias)).astype(jnp.int32)]
+    seen = q * jnp.exp(bias + ranked.error[near] + DITHER * u[1])
+    by_flow = class_shares(seen, ranked.spread[near])
     known = jnp.isfinite(seen)
     shares = jnp.where(known, by_flow, ranked.shares[w])
     return shares, jnp.where(known, by_flow.argmax().astype(jnp.int32), ranked.named[w]), seen
