@@ -201,7 +201,8 @@ def fit_camera(windows: np.ndarray, segment: np.ndarray, *, false_alarms: float)
     if len(names) < needed:
         raise ValueError(
             f"a camera is known from at least {needed} segments with a fresh line where {false_alarms:.0%} "
-            f"of its windows may be called foreign, found {len(names)}; record more, or allow more false alarms"
+            f"of its windows may be called foreign, found {len(names)}; record more, "
+            "or allow more false alarms"
         )
     learned = windows[np.isin(segment, names[::2])]
     mean, deviation = learned.mean(axis=0), learned.std(axis=0) + 1e-6

@@ -45,6 +45,7 @@ LOOKED_AT = 2000
 # endings of what is written about recordings, and the longest path that is shown
 TEXTS, LONGEST = {".md", ".txt", ".html", ".yaml", ".yml", ".dvc", ""}, 200
 REPEATED, COPY = "an earlier line lists the image", "the frame is a copy of another"
+SEVERAL = "several lines"
 NO_FLOW, NO_TEMPERATURE, NO_PRINT, NO_NAME = (
     "no flow is known",
     "no temperature is known",
@@ -64,6 +65,8 @@ REMEDIES = {
     NO_NAME: "fill in img_path, or remove those lines",
     REPEATED: "remove the lines that repeat others",
     COPY: "record again with a camera that runs, or remove the copies",
+    SEVERAL: "write travel_direction_deg, the way the line leaves the tip in the picture, beside the frames, or "
+    "take frames at 10 a second and more, in which the motion can be seen",
 }
 LOOK = "look at a few with ./run beadline calibrate-tip IMAGE --tip X,Y"
 

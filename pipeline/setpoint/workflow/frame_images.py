@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.reading.image_messages import check_size
-from pipeline.setpoint import key_area
+from pipeline.setpoint import key_area, travel
 from pipeline.store import artifacts
 from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema
 
@@ -24,6 +24,7 @@ HERE = Path(__file__).parents[2]
 # the code that decides what an entry of the memo holds
 CODE = (
     "setpoint/workflow/frame_images.py", "setpoint/workflow/frame_mcap.py", "setpoint/key_area.py",
+    "setpoint/travel.py",
     "store/mcap_frames.py",
     "reading/image_messages.py", "reading/image_topics.py",
 )  # fmt: skip
@@ -129,32 +130,61 @@ def crop_key_areas(
 def find_key_areas(
     frames: Iterable[np.ndarray | str], tips: np.ndarray, directions_deg: np.ndarray, *, least_score: float
 ) -> FrameKeyAreas:
-    """What the front end makes of n frames, or of a text that says why
-    there is none; digests are left empty."""
-    areas = []
-    for frame, tip, direction in zip(frames, tips, directions_deg, strict=True):
-        reason = (
-            frame if isinstance(frame, str) else _shallow(frame) or ("" if np.isfinite(tip).all() else NO_TIP)
-        )
-        area = key_area.KeyArea(np.zeros(key_area.SHAPE, np.uint8), np.nan, np.nan, np.nan, np.nan, reason)
-        if not reason:
-            try:
-                direction_deg = float(direction) if np.isfinite(direction) else None
-                area = key_area.find(
-                    frame,
-                    (float(tip[0]), float(tip[1])),
-                    least_score=least_score,
-                    direction_deg=direction_deg,
-                )
-            except ValueError as error:
-                area = area._replace(reason=f"{UNUSABLE}: {error}")
-        areas.append(area)
+    """What the front end makes of n frames of one film, or of a text that says why there is none; digests are
+    left empty. A direction that is not known (NaN) is sought in the motion of the ground, where frames follow
+    one another; a batch is in memory as crops of 350 x 350 px."""
+    areas, unknown = [], {}
+    for i, (frame, tip, direction) in enumerate(zip(frames, tips, directions_deg, strict=True)):
+        cropped = _cropped(frame, tip)
+        if isinstance(cropped, str):
+            empty = np.zeros(key_area.SHAPE, np.uint8)
+            areas.append(key_area.KeyArea(empty, np.nan, np.nan, np.nan, np.nan, cropped))
+        elif np.isfinite(direction):
+            areas.append(key_area.find_in(cropped, least_score=least_score, direction_deg=float(direction)))
+        else:
+            unknown[i] = cropped
+            areas.append(None)
+    for i, area in _by_motion(unknown, least_score):
+        areas[i] = area
     images = np.array([area.image for area in areas], np.uint8).reshape(-1, *key_area.SHAPE)
     figures = (
         np.array([getattr(area, name) for area in areas], float)
         for name in ("angle_deg", "score", "padded_share")
     )
     return FrameKeyAreas(images, *figures, [area.reason for area in areas], [""] * len(areas))
+
+
+def _cropped(frame: np.ndarray | str, tip: np.ndarray) -> key_area.Crop | str:
+    """The crop round the tip (x, y), or the reason why there is none."""
+    reason = frame if isinstance(frame, str) else _shallow(frame)
+    if reason or not np.isfinite(tip).all():
+        return reason or NO_TIP
+    try:
+        return key_area.crop(frame, (float(tip[0]), float(tip[1])))
+    except ValueError as error:
+        return f"{UNUSABLE}: {error}"
+
+
+def _by_motion(
+    unknown: dict[int, key_area.Crop], least_score: float
+) -> Iterator[tuple[int, key_area.KeyArea]]:
+    """Key areas of frames {place: crop} whose direction nobody told: along the motion of the ground where it
+    can be seen, else the only line there is."""
+    places = np.array(sorted(unknown), int)
+    for run in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1):
+        motion = travel.travel([unknown[i].gray for i in run])
+        for i, direction, why in zip(run.tolist(), motion.direction_deg, motion.reasons, strict=True):
+            if np.isfinite(direction):
+                area = key_area.find_in(
+                    unknown[i],
+                    least_score=least_score,
+                    direction_deg=float(direction),
+                    leeway_deg=travel.LEEWAY_DEG,
+                )
+            else:
+                area = key_area.find_in(unknown[i], least_score=least_score)
+            several = area.reason.startswith("several lines")
+            yield i, area._replace(reason=f"{area.reason} ({why})") if several else area
 
 
 def _shallow(frame: np.ndarray) -> str:
