@@ -18,12 +18,14 @@ from pipeline.setpoint.key_area import SIDE
 # ground below the tip, reduced by STEP; rows nearer than BELOW px show the nozzle's rim
 STEP, BELOW = 2, 8
 SHAPE = ((SIDE // 2 - BELOW) // STEP, SIDE // STEP)
-# a run is a frame with so many on either side; fewer pairs than LEAST say nothing
-RUN, LEAST = 3, 3
+# a run is a frame with so many on either side, at an end of the film its first or last of as many; fewer pairs
+# than LEAST say nothing
+RUN, LEAST = 3, 5
 # a shift stands out by so many deviations of the correlation, by such a factor over any other, and is so long
 DEVIATIONS, FACTOR, SHORTEST_PX = 8.0, 1.3, 3.0
-# and it is that of so many of the run's pairs, in each by so many deviations
-AGREE, EACH = 2 / 3, 4.0
+# and it is, within STEP px, the likeliest of this share of the run's pairs: frames of no film, or of a stage that
+# goes to and fro, have a shift each
+AGREE = 0.8
 # streaks of at least this coherence give the motion's axis; it turns by at most TURN_DEG in a run, and the
 # shift lies within ALONG_DEG of it
 COHERENT, TURN_DEG, ALONG_DEG = 0.15, 8.0, 20.0
@@ -97,20 +99,19 @@ def _of_run(
     k: int, axis: np.ndarray, coherence: np.ndarray, surfaces: np.ndarray
 ) -> tuple[float, float, str]:
     """(direction, shift in px, reason) of the run round frame k."""
-    run, pairs = slice(max(0, k - RUN), k + RUN + 1), surfaces[max(0, k - RUN) : k + RUN]
+    start = min(max(0, k - RUN), max(0, len(axis) - 2 * RUN - 1))
+    run, pairs = slice(start, start + 2 * RUN + 1), surfaces[start : start + 2 * RUN]
     turned = np.abs((axis[run] - axis[k] + 90) % 180 - 90).max()
     streaky = coherence[run].min() >= COHERENT
     if streaky and turned > TURN_DEG:
         return np.nan, np.nan, f"motion: the picture turns by {turned:.0f} degrees within a few frames"
-    if len(pairs) < LEAST:
-        return np.nan, np.nan, "motion: too few frames in a row to see the ground move"
     surface = pairs.sum(axis=0)
     row, column = (int(v) for v in np.unravel_index(int(surface.argmax()), surface.shape))
     peak, spread = float(surface[row, column]), max(float(surface.std()), 1e-12)
-    around = np.s_[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-    each = pairs[(slice(None), *around)].max(axis=(1, 2)) >= EACH * pairs.std(axis=(1, 2))
+    own = np.unravel_index(pairs.reshape(len(pairs), -1).argmax(axis=1), SHAPE)
+    alike = (np.abs(own[0] - row) <= 1) & (np.abs(own[1] - column) <= 1)
     surface[max(row - 4, 0) : row + 5, max(column - 4, 0) : column + 5] = 0
-    if peak < DEVIATIONS * spread or peak < FACTOR * surface.max() or each.mean() < AGREE:
+    if peak < DEVIATIONS * spread or peak < FACTOR * surface.max() or alike.mean() < AGREE:
         return np.nan, np.nan, "motion: no shift of the ground stands out"
     y, x = row - SHAPE[0] // 2, column - SHAPE[1] // 2
     shift, direction = STEP * float(np.hypot(x, y)), float(np.rad2deg(np.arctan2(y, x))) % 360

@@ -29,6 +29,8 @@ CODE = (
     "reading/image_messages.py", "reading/image_topics.py",
 )  # fmt: skip
 DIGEST_BYTES = 16
+# frames among which the ground's motion is sought at a time
+IN_A_ROW = 20
 # cameras of 10 and 12 bits may leave the upper ones of 16 empty; a picture as dark as that
 # has fewer than 16 of 256 gray levels in any case
 FILLED_BITS = 12
@@ -132,7 +134,7 @@ def find_key_areas(
 ) -> FrameKeyAreas:
     """What the front end makes of n frames of one film, or of a text that says why there is none; digests are
     left empty. A direction that is not known (NaN) is sought in the motion of the ground, where frames follow
-    one another; a batch is in memory as crops of 350 x 350 px."""
+    one another, IN_A_ROW of them in memory at a time."""
     areas, unknown = [], {}
     for i, (frame, tip, direction) in enumerate(zip(frames, tips, directions_deg, strict=True)):
         cropped = _cropped(frame, tip)
@@ -144,8 +146,10 @@ def find_key_areas(
         else:
             unknown[i] = cropped
             areas.append(None)
-    for i, area in _by_motion(unknown, least_score):
-        areas[i] = area
+        if len(unknown) == IN_A_ROW:
+            _look_along_motion(areas, unknown, least_score)
+            unknown = {}
+    _look_along_motion(areas, unknown, least_score)
     images = np.array([area.image for area in areas], np.uint8).reshape(-1, *key_area.SHAPE)
     figures = (
         np.array([getattr(area, name) for area in areas], float)
@@ -165,26 +169,26 @@ def _cropped(frame: np.ndarray | str, tip: np.ndarray) -> key_area.Crop | str:
         return f"{UNUSABLE}: {error}"
 
 
-def _by_motion(
-    unknown: dict[int, key_area.Crop], least_score: float
-) -> Iterator[tuple[int, key_area.KeyArea]]:
-    """Key areas of frames {place: crop} whose direction nobody told: along the motion of the ground where it
-    can be seen, else the only line there is."""
+def _look_along_motion(
+    areas: list[key_area.KeyArea | None], unknown: dict[int, key_area.Crop], least_score: float
+) -> None:
+    """Fills in the key areas of frames {place: crop} whose direction nobody told: along the motion of the
+    ground where it can be seen, else the only line there is."""
     places = np.array(sorted(unknown), int)
     for run in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1):
         motion = travel.travel([unknown[i].gray for i in run])
         for i, direction, why in zip(run.tolist(), motion.direction_deg, motion.reasons, strict=True):
             if np.isfinite(direction):
-                area = key_area.find_in(
+                areas[i] = key_area.find_in(
                     unknown[i],
                     least_score=least_score,
                     direction_deg=float(direction),
                     leeway_deg=travel.LEEWAY_DEG,
                 )
-            else:
-                area = key_area.find_in(unknown[i], least_score=least_score)
+                continue
+            area = key_area.find_in(unknown[i], least_score=least_score)
             several = area.reason.startswith("several lines")
-            yield i, area._replace(reason=f"{area.reason} ({why})") if several else area
+            areas[i] = area._replace(reason=f"{area.reason} ({why})") if several else area
 
 
 def _shallow(frame: np.ndarray) -> str:
