@@ -149,7 +149,7 @@ def _lines() -> np.ndarray:
 
 
 def of_window(
-    frames: Sequence[np.ndarray], tips: np.ndarray, areas: KeyAreas, *, count: int = FRAMES
+    frames: Sequence[np.ndarray] | np.ndarray, tips: np.ndarray, areas: KeyAreas, *, count: int = FRAMES
 ) -> np.ndarray:
     """(measures,) medians over `count` valid frames spread over a window, with the tips (n, 2), or one for
     all (2,); NaN where none is valid: there is no line beside which to look."""

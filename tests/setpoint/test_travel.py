@@ -1,5 +1,5 @@
-"""The way the ground moves: on grounds that are shifted by hand, on scenes of a straight line, and on a real film in
-which the picture turns."""
+"""The way the ground moves: on grounds that are shifted by hand, on frames of no film, and on a real film
+in which the picture turns."""
 
 import cv2
 import numpy as np
@@ -12,8 +12,8 @@ N = 12
 
 
 def moved(direction_deg, shift_px, *, seed=0, streak=0, noise=3.0, lines=()):
-    """(N, 350, 350) crops of a textured ground that moves by shift_px a frame, streaks of so many px along it;
-    a nozzle above and lines (direction, level, miss) stand still."""
+    """(N, 350, 350) crops of a textured ground that moves by shift_px a frame, streaks of so many px along
+    it; a nozzle above and lines (direction, level, miss) stand still."""
     rng, a = np.random.default_rng(seed), np.deg2rad(direction_deg)
     texture = cv2.GaussianBlur(rng.standard_normal((1200, 1200), dtype=np.float32), (0, 0), 2.0)
     if streak:
