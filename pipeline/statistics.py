@@ -74,7 +74,7 @@ def blocks_needed(level: float) -> int:
 
 
 class Share(NamedTuple):
-    """A share of runs in percent with its 95 % Wilson interval."""
+    """A share of runs in percent with its 95 % interval."""
 
     percent: float
     low: float
@@ -82,11 +82,65 @@ class Share(NamedTuple):
 
 
 def wilson(happened: np.ndarray) -> Share:
-    """The share of True (n,) in percent with its 95 % interval (Wilson 1927).
+    """The share of True (n,) in percent with its 95 % interval, for n that share nothing (Wilson 1927)."""
+    return wilson_interval(float(np.mean(happened)), len(happened))
+
+
+def wilson_interval(p: float, n: float) -> Share:
+    """The interval of a share p of n, n > 0, which need not be whole (an effective number).
 
     (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)
     """
-    n, p, z = len(happened), float(np.mean(happened)), float(scipy.special.ndtri(0.975))
+    z = float(scipy.special.ndtri(0.975))
     centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
     return Share(100.0 * p, float(100.0 * max(centre - half, 0.0)), float(100.0 * min(centre + half, 1.0)))
+
+
+class Mean(NamedTuple):
+    """A mean with the ends of its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def variance_of_mean(values: np.ndarray) -> float:
+    """The variance of the mean of values (B, n): B redraws of what runs share (segments, plants), n runs on
+    each, drawn from the redraw alone.
+
+    The redraws' means differ by what is shared and by their own runs: max(var_b(mean_b) - s^2 / n, 0) is
+    the first alone (variance components, Searle 1971), to which the mean of all adds s^2 / (B n), where s^2 is
+    the variance within a redraw. Raises ValueError for fewer than two redraws.
+    """
+    values = np.asarray(values, float)
+    if values.ndim != 2 or values.shape[0] < 2 or values.shape[1] < 1:
+        raise ValueError(
+            f"variance_of_mean: expected values (B, n) of at least 2 redraws, found shape {values.shape}; "
+            "redraw more often"
+        )
+    n = values.shape[1]
+    within = float(values.var(axis=1, ddof=1).mean()) if n > 1 else 0.0
+    between = max(float(values.mean(axis=1).var(ddof=1)) - within / n, 0.0)
+    return between + within / values.size
+
+
+def redrawn_mean(values: np.ndarray) -> Mean:
+    """The mean of values (B, n) of B redraws with its 95 % interval, Student's t of B - 1."""
+    mean, B = float(np.mean(values)), len(values)
+    half = float(scipy.special.stdtrit(B - 1, 0.975) * np.sqrt(variance_of_mean(values)))
+    return Mean(mean, mean - half, mean + half)
+
+
+def redrawn_share(happened: np.ndarray) -> Share:
+    """The share of True in happened (B, n) of B redraws, in percent, with its 95 % interval: Wilson's, of as
+    many runs as would tell as much if they shared nothing.
+
+    n_eff = p (1 - p) / V (z / t)^2, at most B n, with V of `variance_of_mean` and t of B - 1 (Korn and
+    Graubard 1998); where all or none happened, nothing tells V, and n_eff is B n.
+    """
+    happened = np.asarray(happened, bool)
+    p, V, B = float(happened.mean()), variance_of_mean(happened), len(happened)
+    n = min(p * (1.0 - p) / V, happened.size) if V > 0 and 0 < p < 1 else float(happened.size)
+    student = float(scipy.special.ndtri(0.975) / scipy.special.stdtrit(B - 1, 0.975))
+    return wilson_interval(p, n * student**2)
