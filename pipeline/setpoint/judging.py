@@ -39,7 +39,10 @@ STARTS = len(START_FLOWS) * len(START_TEMPERATURES)
 GOOD_STARTS = np.linspace(92.5, 107.5, STARTS)  # percent: prints that nothing is wrong with
 SOUND, STUCK, BLIND = range(3)
 FAULT_STEPS = (20, 50)  # decisions from and until which a camera is stuck or blind
-OTHER_CAMERA = (1.12, 0.8)  # scale and exponent: it shows 12 % more at 100 %, and ratios smaller than they are
+OTHER_CAMERA = (
+    1.12,
+    0.8,
+)  # scale and exponent: it shows 12 % more at 100 %, and ratios smaller than they are
 MOVED_BORDERS = (0.92, 1.08)  # of those learned
 DOES_NOTHING = "do nothing"
 
@@ -107,9 +110,7 @@ def all_cases(runs: int, *, segment_mean_decisions: float) -> dict[str, Case]:
     sticky = fresh._replace(**lasting)
     weak = {"gain": 0.6 * one}
     clog, half_clog = ({"clog": left * one, "clog_step": CLOG_STEP * one} for left in (0.6, 0.75))
-    paper = {
-        accuracy: starts(runs, accuracy=accuracy)._replace(**none) for accuracy in (1.0, 0.9, 0.8, 0.7)
-    }
+    paper = {accuracy: starts(runs, accuracy=accuracy)._replace(**none) for accuracy in (1.0, 0.9, 0.8, 0.7)}
     asked = {f"accuracy {accuracy:g}": conditions for accuracy, conditions in paper.items()} | {
         "accuracy 0.7, gain 0.6": paper[0.7]._replace(**weak),
         "accuracy 0.7, clog": paper[0.7]._replace(**clog),
@@ -181,9 +182,7 @@ def _shown(table: Shown, conditions: Conditions, flow, segment, u) -> tuple[jax.
     seen = BEST_FLOW * table.scale * (flow / BEST_FLOW) ** table.exponent
     paper = paper_windows().draw((), conditions, flow, segment, u)
     recorded = table.recorded.draw(table.recorded.table, conditions, seen, segment, u)
-    return tuple(
-        jnp.where(conditions.persistence > 0, *pair) for pair in zip(recorded, paper, strict=True)
-    )
+    return tuple(jnp.where(conditions.persistence > 0, *pair) for pair in zip(recorded, paper, strict=True))
 
 
 class Fault(NamedTuple):
@@ -308,7 +307,7 @@ class Judged(NamedTuple):
 
 
 def harmless(of: Judged, bars: Mapping[str, float]) -> str:
-    """"" where the contestant leaves +-25 % in at most bars[case] percent of the runs of each case, else where
+    """ "" where the contestant leaves +-25 % in at most bars[case] percent of the runs of each case, else where
     it leaves it most beyond its bar."""
     over = {case: 100.0 * float(of.harmed[case].mean()) - bar for case, bar in bars.items()}
     case = max(over, key=lambda name: over[name], default="")
@@ -351,7 +350,9 @@ def _worst_share(of: Judged) -> Share:
     return redrawn_share(of.kept[worst_case(of)[1]])
 
 
-def choose(judged: Mapping[str, Judged], *, simplest_first: Sequence[str], bars: Mapping[str, float]) -> Choice:
+def choose(
+    judged: Mapping[str, Judged], *, simplest_first: Sequence[str], bars: Mapping[str, float]
+) -> Choice:
     """The default: of the contestants that do no harm the simplest whose worst case is not worse than the
     best one's beyond its 95 % interval.
 
@@ -378,7 +379,9 @@ def choose(judged: Mapping[str, Judged], *, simplest_first: Sequence[str], bars:
         rival = max(rest, key=lambda other: worst_case(judged[other])[0])
         margin = lead(judged[name], judged[rival])
         why = _reason(name, rival, judged[rival], margin)
-    opening = f"{name} is the default: in its worst case ({case}) {100 * worst:.1f} % of the runs settle and stay"
+    opening = (
+        f"{name} is the default: in its worst case ({case}) {100 * worst:.1f} % of the runs settle and stay"
+    )
     beside = "".join(f" Not asked: {other} {why}." for other, why in refused.items())
     return Choice(name, 100 * worst, case, *margin, refused, f"{opening}; {why}.{beside}")
 

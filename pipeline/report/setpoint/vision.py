@@ -505,15 +505,18 @@ GROUPS = {
     "foreign": "Foreign to the classifier",
 }
 RENDERED = "These frames are rendered."
-RECORDED = "These frames are real, of prints that nothing was learned from; shares are of all frames of those prints."
+RECORDED = (
+    "These frames are real, of prints that nothing was learned from; shares are of all of their frames."
+)
 
 
 def frames(sources: Sources) -> Frames:
     """Frames with key area and direction drawn in, of a rejected one the reason; where the classifier learned
     from recordings real ones: accepted, wrong, rejected and foreign, each with its share."""
-    table = sources.tables["nozzle_frames"]
-    if isinstance(table, Missing):
-        return Frames(table)
+    index = sources.tables["nozzle_frames"]
+    if isinstance(index, Missing):
+        return Frames(index)
+    table: list[Any] = list(index)
     recorded = [row for row in table if row.get("group") in GROUPS]
     origin = page.origin(sources.source("nozzle_frames"))
     if not recorded:

@@ -51,17 +51,11 @@ def bars(settings: EvaluateSetpoint) -> dict[str, float]:
     }
 
 
-def chosen(
-    specs: Mapping[str, ControllerSpec], windows: WindowTable, settings: EvaluateSetpoint
-) -> Choice:
+def chosen(specs: Mapping[str, ControllerSpec], windows: WindowTable, settings: EvaluateSetpoint) -> Choice:
     """The default, by the segments to choose on. In each of settings.rounds every contestant that may still
     win runs on settings.redraws further redraws of them; the others run no more."""
     limits, rounds = bars(settings), settings.rounds
-    asked = {
-        name: case
-        for name, case in _cases(settings).items()
-        if not case.good or name in limits
-    }
+    asked = {name: case for name, case in _cases(settings).items() if not case.good or name in limits}
     recorded = judging.redrawn(windows, rounds * settings.redraws, np.random.default_rng([settings.seed, 0]))
     outcomes: dict[str, dict[str, Outcomes]] = {name: {} for name in specs}
     left = list(specs)
@@ -70,7 +64,9 @@ def chosen(
         key = jax.random.fold_in(jax.random.key(settings.seed), number)
         part = _of_round(recorded, number, settings.redraws)
         for name in left:
-            now = _asked(specs[name], asked, part, settings.redraws, key, f"choose, round {number + 1}: {name}")
+            now = _asked(
+                specs[name], asked, part, settings.redraws, key, f"choose, round {number + 1}: {name}"
+            )
             outcomes[name] = _with(outcomes[name], now)
             judged[name] = _judged(outcomes[name], asked, (number + 1) * settings.redraws)
         if number + 1 < rounds:
@@ -134,9 +130,7 @@ def _with(before: Mapping[str, Outcomes], now: Mapping[str, Outcomes]) -> dict[s
     """Runs of a further round behind those of earlier ones."""
     if not before:
         return dict(now)
-    return {
-        case: jax.tree.map(lambda *a: np.concatenate(a), before[case], of) for case, of in now.items()
-    }
+    return {case: jax.tree.map(lambda *a: np.concatenate(a), before[case], of) for case, of in now.items()}
 
 
 def _judged(outcomes: Mapping[str, Outcomes], cases: Mapping[str, Case], redraws: int) -> Judged:
@@ -153,9 +147,7 @@ def told(choice: Choice, contest: Contest) -> Choice:
     """The choice with its figures on the segments that are read once. Its sentence says what it was chosen
     by, and then these."""
     worst = {
-        name: min(
-            (score.stay.percent, case) for case, score in by_case.items() if judging.counts(case)
-        )
+        name: min((score.stay.percent, case) for case, score in by_case.items() if judging.counts(case))
         for name, by_case in contest.scores.items()
     }
     share, case = worst[choice.name]

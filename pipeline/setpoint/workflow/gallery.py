@@ -12,7 +12,9 @@ import numpy as np
 from pipeline.setpoint import calibrated_classifier, key_area
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
 from pipeline.setpoint.workflow import frame_images, frame_mcap
-from pipeline.setpoint.workflow.frame_folder import NozzleFrames, ReadOptions
+from pipeline.setpoint.workflow.frame_folder import NozzleFrames, ReadOptions, read_options
+from pipeline.setpoint.workflow.settings import TrainClassifier
+from pipeline.setpoint.workflow.train_classifier import shown as rendered_frames
 from pipeline.store import artifacts
 
 ACCEPTED, WRONG, REJECTED, FOREIGN = "accepted", "wrong", "rejected", "foreign"
@@ -76,6 +78,20 @@ def _in_turn(lists: Sequence[list[int]]) -> list[int]:
     """The first of each list, then the second of each, MOST in all."""
     turns = itertools.chain.from_iterable(itertools.zip_longest(*lists))
     return [row for row in turns if row is not None][:MOST]
+
+
+def write_frames(
+    settings: TrainClassifier,
+    model: CalibratedClassifier,
+    frames: NozzleFrames | None,
+    prints: np.ndarray,
+    folder: Path,
+) -> list[dict[str, Any]]:
+    """A row for each frame of the page, with its JPEG in `folder`: real ones of the prints of these numbers,
+    rendered ones where there are no recorded `frames`."""
+    if frames is None:
+        return rendered_frames(settings, model, folder)
+    return write_gallery(model, frames, np.unique(prints), read_options(settings), folder)
 
 
 def write_gallery(

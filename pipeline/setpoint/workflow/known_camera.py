@@ -10,52 +10,49 @@ from tqdm import tqdm
 
 from pipeline.setpoint import familiar, nozzle_scene
 from pipeline.setpoint.familiar import Camera
-from pipeline.setpoint.workflow import frame_folder
 from pipeline.setpoint.workflow.frame_folder import NozzleFrames
-from pipeline.setpoint.workflow.settings import TrainClassifier
+from pipeline.setpoint.workflow.settings import RenderFrames
 from pipeline.store import artifacts
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
 
-KNOWN_CAMERA = ("known_camera", 1)
+FILE, KNOWN_CAMERA = "known_camera.parquet", ("known_camera", 1)
 # of windows of the known camera, the share that may be called foreign; pictures of other machines lie so far
 # off that it may be small
 FALSE_ALARMS = 0.01
-# rendered segments, each seen in one window at one flow
-SEGMENTS = 400
-# its place among the seeds of the stage
-STREAM = 20
-MEMO = Path("datasets/memo/train_classifier")
+# of rendered segments, the place among the seeds of the stage, and the score below which a frame is not
+# measured
+STREAM, LEAST_SCORE = 20, 10.0
 
 
-def known(settings: TrainClassifier, folder: str, execution: Execution) -> Camera | None:
-    """The camera of the frames that the classifier learns from; None where a folder has too few windows to
-    know it by: then every frame is foreign."""
-    if settings.source == "simulated":
-        return rendered(settings, execution)
-    options = frame_folder.read_options(settings)
-    frames = frame_folder.read_folder(Path(folder), options, execution, memo=MEMO)
+def known(rendered: Path, frames: NozzleFrames | None, *, length: int) -> Camera | None:
+    """The camera of the frames that the classifier learns from: what render_frames left in the folder
+    `rendered`, or that of recorded `frames`; None where they have too few windows of `length` to know it by:
+    then nothing tells whether a frame is of that camera."""
+    if frames is None:
+        return restore_camera(rendered / FILE)
     try:
-        return recorded(frames, length=settings.window)
+        return recorded(frames, length=length)
     except ValueError:
         return None
 
 
-def rendered(settings: TrainClassifier, execution: Execution) -> Camera:
-    """Of SEGMENTS rendered segments at flows over the whole range."""
-    calls = [delayed(_window)((settings.seed, STREAM, i), settings.least_score) for i in range(SEGMENTS)]
+def drawn(settings: RenderFrames, execution: Execution) -> Camera:
+    """The camera of rendered segments, each seen in one window at one flow, over the whole range."""
+    count = settings.camera_segments
+    calls = [delayed(_window)((settings.seed, STREAM, i)) for i in range(count)]
     running = run_all(calls, execution)
-    rows = np.array(list(tqdm(running, total=SEGMENTS, desc="train_classifier: known camera", mininterval=2)))
-    return familiar.fit_camera(rows, np.arange(SEGMENTS), false_alarms=FALSE_ALARMS)
+    rows = np.array(list(tqdm(running, total=count, desc="render_frames: known camera", mininterval=2)))
+    return familiar.fit_camera(rows, np.arange(count), false_alarms=FALSE_ALARMS)
 
 
-def _window(seed: Sequence[int], least_score: float) -> np.ndarray:
+def _window(seed: Sequence[int]) -> np.ndarray:
     """(measures,) of a few frames of one new segment."""
     rng = np.random.default_rng(seed)
     flow = np.full(familiar.FRAMES + 1, np.exp(rng.uniform(*np.log(nozzle_scene.FLOWS))))
     segment, degrees = nozzle_scene.draw_segment(rng), rng.choice(nozzle_scene.TEMPERATURES)
     scene = nozzle_scene.render(segment, flow, degrees, rng)
-    areas = nozzle_scene.key_areas(scene, least_score=least_score)
+    areas = nozzle_scene.key_areas(scene, least_score=LEAST_SCORE)
     return familiar.of_window(scene.frames, np.array(scene.tip), areas)
 
 
@@ -82,7 +79,10 @@ def window_medians(frames: NozzleFrames, *, length: int) -> tuple[np.ndarray, np
     return windows[sound], np.array(stretch, int)[sound]
 
 
-def store_camera(path: Path, camera: Camera) -> None:
+def store_camera(path: Path, camera: Camera | None) -> None:
+    """Writes the camera; nothing where there is none."""
+    if camera is None:
+        return
     units = "1", "as the measures of familiar.NAMES"
     artifacts.write_arrays(
         path,

@@ -18,12 +18,13 @@ from pipeline.store.params import Execution
 
 
 class Parts(NamedTuple):
-    """Frames by part of PARTS; frames whose windows stand for the camera, by part of WINDOW_PARTS; and what
-    was read for the first, counted."""
+    """Frames by part of PARTS; frames whose windows stand for the camera, by part of WINDOW_PARTS; what was
+    read for the first, counted; and all that was read of a folder."""
 
     frames: dict[str, LabelledFrames]
     windows: dict[str, LabelledFrames]
     read: dict[str, Any]
+    recorded: NozzleFrames | None = None
 
 
 def parts(settings: TrainClassifier, rendered: str, folder: str, execution: Execution) -> Parts:
@@ -47,7 +48,7 @@ def parts(settings: TrainClassifier, rendered: str, folder: str, execution: Exec
         windows = dict(
             zip(WINDOW_PARTS, (by_part[k] for k in ("calibration", "held_out", "judged")), strict=True)
         )
-        return Parts(by_part, windows, frame_folder.figures(frames))
+        return Parts(by_part, windows, frame_folder.figures(frames), frames)
     found = restore_frames(Path(rendered))
     found = {part: standing_out(frames, settings.least_score) for part, frames in found.items()}
     by_part = {part: found[part] for part in PARTS}

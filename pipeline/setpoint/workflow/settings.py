@@ -78,6 +78,7 @@ class RenderFrames(Section):
     frames: Counts
     sweeps: Sweeps
     sweep_windows: SweepWindows
+    camera_segments: int = Field(ge=240, le=10_000)
 
 
 class Recipe(Section):

@@ -104,6 +104,7 @@ AGENT_CURVE = Schema(
     ),
 )
 
+
 def _share(name: str, meaning: str) -> tuple[Column, ...]:
     """A share of runs with its interval: three columns."""
     return (
@@ -125,7 +126,9 @@ _WHO = (
         "paper: eqs. 6-9; recorded: windows of the trained classifier; harm: the same from good starts; "
         "pixels: rendered frames through the whole chain",
     ),
-    Column("case", TEXT, NONE, "what the machine and the camera do: accuracy, clog, gain, persistence, fault"),
+    Column(
+        "case", TEXT, NONE, "what the machine and the camera do: accuracy, clog, gain, persistence, fault"
+    ),
     Column("counts", BOOL, NONE, "controllers are ranked by this case"),
     Column("runs", COUNT, NONE, "runs, 21 starts together", low=1),
 )
@@ -188,7 +191,9 @@ SCOREBOARD = Schema(
             low=1,
         ),
         *_SETTLED,
-        *_share("back", "within +-15 % from some step up to 90 until step 120; missing where nothing happens"),
+        *_share(
+            "back", "within +-15 % from some step up to 90 until step 120; missing where nothing happens"
+        ),
         *(
             column
             for points in BEYOND
