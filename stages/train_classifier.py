@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipeline.setpoint.workflow import gallery, known_camera, parts, train_classifier
 from pipeline.setpoint.workflow.classifier_files import store_classifier
-from pipeline.setpoint.workflow.settings import TrainClassifier
+from pipeline.setpoint.workflow.settings import SetpointMaterial, TrainClassifier
 from pipeline.setpoint.workflow.tables import CLASSIFIED, CLASSIFIER_CURVE, RELIABILITY, WINDOWS
 from pipeline.setpoint.workflow.windows import window_rows
 from pipeline.store import artifacts, params
@@ -19,7 +19,8 @@ def main() -> None:
             params.load(TrainClassifier, "train_classifier"),
             params.load(params.Execution, "execution"),
         )
-        found = parts.parts(settings, "datasets/render_frames", "datasets/raw/setpoint", execution)
+        material = params.load(SetpointMaterial, "setpoint_material").material()
+        found = parts.parts(settings, "datasets/render_frames", "datasets/raw/setpoint", execution, material)
         by_part = found.frames
         networks = train_classifier.trained(settings, by_part)
         judged = train_classifier.judged(settings, by_part, networks)
@@ -46,7 +47,7 @@ def main() -> None:
         prints = by_part["judged"].print_number
         artifacts.write_json(
             out / "frames/frames.json",
-            gallery.write_frames(settings, judged.model, found.recorded, prints, out / "frames"),
+            gallery.write_frames(settings, material, judged.model, found.recorded, prints, out / "frames"),
         )
         camera = known_camera.known(Path("datasets/render_frames"), found.recorded, length=settings.window)
         known_camera.store_camera(out / known_camera.FILE, camera)

@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.setpoint import calibrated_classifier, key_area
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
+from pipeline.setpoint.material import Material
 from pipeline.setpoint.workflow import frame_images, frame_mcap
 from pipeline.setpoint.workflow.frame_folder import NozzleFrames, ReadOptions, read_options
 from pipeline.setpoint.workflow.settings import TrainClassifier
@@ -82,6 +83,7 @@ def _in_turn(lists: Sequence[list[int]]) -> list[int]:
 
 def write_frames(
     settings: TrainClassifier,
+    material: Material,
     model: CalibratedClassifier,
     frames: NozzleFrames | None,
     prints: np.ndarray,
@@ -91,7 +93,7 @@ def write_frames(
     rendered ones where there are no recorded `frames`."""
     if frames is None:
         return rendered_frames(settings, model, folder)
-    return write_gallery(model, frames, np.unique(prints), read_options(settings), folder)
+    return write_gallery(model, frames, np.unique(prints), read_options(settings, material), folder)
 
 
 def write_gallery(
@@ -107,16 +109,20 @@ def write_gallery(
     for i, picture in zip(picked, pictures([frames.picture[i] for i in picked], options), strict=True):
         name, share = f"frame_{len(rows):02d}.jpg", float((shown.group[mine] == shown.group[i]).mean())
         artifacts.write_jpeg(folder / name, _drawn(picture, frames, i))
-        rows.append({"file": name, "share": share} | _row(model, shown, frames, i))
+        rows.append({"file": name, "share": share} | _row(model, shown, frames, i, options.material))
     return rows
 
 
-def _row(model: CalibratedClassifier, shown: Shown, frames: NozzleFrames, i: int) -> dict[str, Any]:
+def _row(
+    model: CalibratedClassifier, shown: Shown, frames: NozzleFrames, i: int, material: Material
+) -> dict[str, Any]:
     group, valid = str(shown.group[i]), bool(frames.valid[i])
     foreign = "foreign: further from what was learned than allowed" if group == FOREIGN else ""
     numbers = {
-        "score": frames.score[i], "direction_deg": frames.angle_deg[i], "flow_percent": frames.flow[i],
-        "temperature_degC": frames.temperature[i], "distance": shown.distance[i],
+        "score": frames.score[i], "direction_deg": frames.angle_deg[i],
+        "flow_percent": material.own_flow(frames.flow[i]),
+        "temperature_degC": material.own_temperature(frames.temperature[i]),
+        "distance": shown.distance[i],
     }  # fmt: skip
     return {
         "place": group,

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.setpoint.classifier import Labelled, split_by_segment
+from pipeline.setpoint.material import PLA, Material
 from pipeline.setpoint.workflow import frame_folder
 from pipeline.setpoint.workflow.frame_folder import NozzleFrames
 from pipeline.setpoint.workflow.render_frames import PARTS, LabelledFrames, restore_frames, standing_out
@@ -27,7 +28,9 @@ class Parts(NamedTuple):
     recorded: NozzleFrames | None = None
 
 
-def parts(settings: TrainClassifier, rendered: str, folder: str, execution: Execution) -> Parts:
+def parts(
+    settings: TrainClassifier, rendered: str, folder: str, execution: Execution, material: Material = PLA
+) -> Parts:
     """The frames of `rendered`, what render_frames wrote; or those of `folder` where the source is
     recordings.
 
@@ -38,7 +41,7 @@ def parts(settings: TrainClassifier, rendered: str, folder: str, execution: Exec
     if settings.source == "recordings":
         frames = frame_folder.read_folder(
             Path(folder),
-            frame_folder.read_options(settings),
+            frame_folder.read_options(settings, material),
             execution,
             memo=Path("datasets/memo/train_classifier"),
         )
