@@ -29,7 +29,7 @@ CODE = (
     "reading/image_messages.py", "reading/image_topics.py",
 )  # fmt: skip
 DIGEST_BYTES = 16
-# of so many frames one is measured as the known camera's are: four of a window
+# of so many frames the first accepted one is measured as the known camera's are: four of a window
 MEASURED = 5
 # frames among which the ground's motion is sought at a time
 IN_A_ROW = 20
@@ -72,7 +72,7 @@ KEY_AREAS = Schema(
 class FrameKeyAreas(NamedTuple):
     """What the front end made of n frames: images (n, 16, 48) uint8, zeros where rejected; angle_deg,
     miss_px, score, padded_share (n,), NaN where nothing was looked at; tip (n, 2) in px; surroundings (n,
-    measures) float32 of every MEASURED-th frame, NaN of the others and of rejected ones; n reasons, empty
+    measures) float32 of the first accepted of every MEASURED frames, NaN of the others; n reasons, empty
     where there is a key area; n digests of what the frame held."""
 
     images: np.ndarray
@@ -156,14 +156,15 @@ def find_key_areas(
     one another, IN_A_ROW of them in memory at a time."""
     areas: list[key_area.KeyArea] = []
     surroundings = np.full((len(tips), len(familiar.NAMES)), np.nan, np.float32)
-    walking = zip(frames, tips, directions_deg, strict=True)
+    walking, measured = zip(frames, tips, directions_deg, strict=True), -1
     while some := list(itertools.islice(((_cropped(f, tip), d) for f, tip, d in walking), IN_A_ROW)):
         first = len(areas)
         areas += _found([one for one, _ in some], [float(d) for _, d in some], least_score)
         for i in range(first, len(areas)):
             cropped, area = some[i - first][0], areas[i]
-            if i % MEASURED == 0 and not area.reason and not isinstance(cropped, str):
+            if i // MEASURED > measured and not area.reason and not isinstance(cropped, str):
                 surroundings[i] = familiar.surroundings(cropped.gray, area.angle_deg, area.miss_px)
+                measured = i // MEASURED
     images = np.array([area.image for area in areas], np.uint8).reshape(-1, *key_area.SHAPE)
     figures = (
         np.array([getattr(area, name) for area in areas], float)
