@@ -61,6 +61,13 @@ def test_the_p_value_is_rarely_small_where_nothing_is_foreign():
     assert np.mean(shares) == pytest.approx(0.0498, abs=0.012)
 
 
+def test_the_score_by_hand():
+    plain = familiar.Camera(np.array([1.0, 0.0]), np.array([2.0, 1.0]), np.eye(2), np.zeros(3))
+    # z = (2, -1): 4 + 1, and (16 + 1) / 2
+    assert familiar.score(plain, np.array([[5.0, -1.0]])).tolist() == [13.5]
+    assert familiar.p_value(plain, np.array([[5.0, -1.0]])).tolist() == [0.25]
+
+
 def test_windows_of_a_segment_count_once():
     rng = np.random.default_rng(1)
     rows = rng.standard_normal((150, 4))
