@@ -1,11 +1,13 @@
 """Nozzle frames -> classifier of the flow: reads datasets/render_frames, or datasets/raw/setpoint; writes
 datasets/train_classifier: weights.safetensors and calibration.parquet of the vision transformer,
 classified.parquet and reliability.parquet of the frames it is judged on, course.parquet, windows.parquet for
-the simulator, and frames for the page."""
+the simulator, frames for the page, and known_camera.parquet, by which frames of other cameras are foreign."""
 
-from pipeline.setpoint.workflow import parts, train_classifier
+from pathlib import Path
+
+from pipeline.setpoint.workflow import gallery, known_camera, parts, train_classifier
 from pipeline.setpoint.workflow.classifier_files import store_classifier
-from pipeline.setpoint.workflow.settings import TrainClassifier
+from pipeline.setpoint.workflow.settings import SetpointMaterial, TrainClassifier
 from pipeline.setpoint.workflow.tables import CLASSIFIED, CLASSIFIER_CURVE, RELIABILITY, WINDOWS
 from pipeline.setpoint.workflow.windows import window_rows
 from pipeline.store import artifacts, params
@@ -17,7 +19,8 @@ def main() -> None:
             params.load(TrainClassifier, "train_classifier"),
             params.load(params.Execution, "execution"),
         )
-        found = parts.parts(settings, "datasets/render_frames", "datasets/raw/setpoint", execution)
+        material = params.load(SetpointMaterial, "setpoint_material").material()
+        found = parts.parts(settings, "datasets/render_frames", "datasets/raw/setpoint", execution, material)
         by_part = found.frames
         networks = train_classifier.trained(settings, by_part)
         judged = train_classifier.judged(settings, by_part, networks)
@@ -41,9 +44,13 @@ def main() -> None:
             figures=("training_loss", "held_out_loss", "held_out_accuracy"),
         )
         artifacts.write_table(out / "windows.parquet", WINDOWS, window_rows(windows))
+        prints = by_part["judged"].print_number
         artifacts.write_json(
-            out / "frames/frames.json", train_classifier.shown(settings, judged.model, out / "frames")
+            out / "frames/frames.json",
+            gallery.write_frames(settings, material, judged.model, found.recorded, prints, out / "frames"),
         )
+        camera = known_camera.known(Path("datasets/render_frames"), found.recorded, length=settings.window)
+        known_camera.store_camera(out / known_camera.FILE, camera)
         artifacts.write_metrics(
             "train_classifier", train_classifier.metrics(settings, judged, networks, found.read)
         )

@@ -112,14 +112,15 @@ def of_prints(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
 
 def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[PrintFigures]:
     from pipeline.setpoint.workflow import frame_folder
-    from pipeline.setpoint.workflow.settings import TrainClassifier
+    from pipeline.setpoint.workflow.settings import SetpointMaterial, TrainClassifier
 
     settings = params.load(TrainClassifier, "train_classifier")
     if settings.source != "recordings":
         return []
+    material = params.load(SetpointMaterial, "setpoint_material").material()
     frames = frame_folder.read_folder(
         folder,
-        frame_folder.read_options(settings),
+        frame_folder.read_options(settings, material),
         params.load(params.Execution, "execution"),
         memo=Path("datasets/memo/train_classifier"),
     )

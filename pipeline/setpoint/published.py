@@ -3,7 +3,9 @@ Plain numbers, so that a page can name them without a simulator."""
 
 import math
 
-BEST_FLOW, BEST_TEMPERATURE = 100.0, 210.0  # q* in percent of nominal, u* in °C: PLA, as printed
+from pipeline.setpoint.material import PLA
+
+BEST_FLOW, BEST_TEMPERATURE = 100.0, PLA.best_temperature_degC  # q* in percent of nominal, u* in °C
 ROTATION = math.pi * 70 / 180  # theta of table 2
 PHASES = (
     (40.0, 20.0),

@@ -43,6 +43,7 @@ SECTIONS = (
     "report",
     "reproduce_study",
     "segment_library",
+    "setpoint_material",
     "tracking",
     "train_agent",
     "render_frames",

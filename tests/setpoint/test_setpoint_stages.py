@@ -19,7 +19,7 @@ from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.vision_transformer import SMALL as SMALL_SIZE
 from pipeline.setpoint.vision_transformer import named_arrays, vision_transformer
 from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
-from pipeline.setpoint.workflow import parts, render_frames, train_agent, train_classifier
+from pipeline.setpoint.workflow import known_camera, parts, render_frames, train_agent, train_classifier
 from pipeline.setpoint.workflow.agent_files import AGENTS_SCHEMA, Agents, restore_agents, store_agents
 from pipeline.setpoint.workflow.classifier_files import (
     CLASSIFIER_SCHEMA,
@@ -56,6 +56,7 @@ SMALL = {
     "render_frames.frames": {"learned": 1, "held_out": 2, "calibration": SHOTS, "judged": SHOTS},
     "render_frames.sweeps": {"learn": 1, "choose": 1, "judge": 1},
     "render_frames.sweep_windows": {"learn": 1.0, "choose": 1.0, "judge": 1.0},
+    "render_frames.camera_segments": 240,
     "train_classifier.window": SHOTS,
     "train_classifier.coverage": 0.6,
     "train_classifier.confidence": 0.55,
@@ -174,6 +175,9 @@ def check_classifier(source: str) -> dict:
         "frames/frames.json",
     }
     expected |= {f"frames/{row['file']}" for row in frames}
+    # real frames stand by what became of them; these folders are too small to know a camera by
+    assert all(("group" in row) == (source == "recordings") for row in frames)
+    expected |= {known_camera.FILE} if source == "simulated" else set()
     courses = {f"{figure}.tsv" for figure in ("training_loss", "held_out_loss", "held_out_accuracy")}
     expected |= {
         f"live/plots/metrics/{learner}/{name}"

@@ -55,7 +55,7 @@ WORDS = (
     "reward",
     "accepted",
 )
-SECTIONS = ("train_classifier", "train_agent", "evaluate_setpoint")
+SECTIONS = ("setpoint_material", "train_classifier", "train_agent", "evaluate_setpoint")
 MOST = 12
 LANES = {"data_driven": "dd", "kernel": "dd", "model_based": "mb", "exact_model": "mb", "baseline": "acc"}
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.setpoint.classifier import Labelled, split_by_segment
+from pipeline.setpoint.material import PLA, Material
 from pipeline.setpoint.workflow import frame_folder
 from pipeline.setpoint.workflow.frame_folder import NozzleFrames
 from pipeline.setpoint.workflow.render_frames import PARTS, LabelledFrames, restore_frames, standing_out
@@ -18,15 +19,18 @@ from pipeline.store.params import Execution
 
 
 class Parts(NamedTuple):
-    """Frames by part of PARTS; frames whose windows stand for the camera, by part of WINDOW_PARTS; and what
-    was read for the first, counted."""
+    """Frames by part of PARTS; frames whose windows stand for the camera, by part of WINDOW_PARTS; what was
+    read for the first, counted; and all that was read of a folder."""
 
     frames: dict[str, LabelledFrames]
     windows: dict[str, LabelledFrames]
     read: dict[str, Any]
+    recorded: NozzleFrames | None = None
 
 
-def parts(settings: TrainClassifier, rendered: str, folder: str, execution: Execution) -> Parts:
+def parts(
+    settings: TrainClassifier, rendered: str, folder: str, execution: Execution, material: Material = PLA
+) -> Parts:
     """The frames of `rendered`, what render_frames wrote; or those of `folder` where the source is
     recordings.
 
@@ -37,7 +41,7 @@ def parts(settings: TrainClassifier, rendered: str, folder: str, execution: Exec
     if settings.source == "recordings":
         frames = frame_folder.read_folder(
             Path(folder),
-            frame_folder.read_options(settings),
+            frame_folder.read_options(settings, material),
             execution,
             memo=Path("datasets/memo/train_classifier"),
         )
@@ -47,7 +51,7 @@ def parts(settings: TrainClassifier, rendered: str, folder: str, execution: Exec
         windows = dict(
             zip(WINDOW_PARTS, (by_part[k] for k in ("calibration", "held_out", "judged")), strict=True)
         )
-        return Parts(by_part, windows, frame_folder.figures(frames))
+        return Parts(by_part, windows, frame_folder.figures(frames), frames)
     found = restore_frames(Path(rendered))
     found = {part: standing_out(frames, settings.least_score) for part, frames in found.items()}
     by_part = {part: found[part] for part in PARTS}
