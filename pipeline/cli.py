@@ -206,12 +206,48 @@ def calibrate_camera(arguments: argparse.Namespace) -> None:
     print(camera.calibrate(asked, out, write=arguments.write))
 
 
+def shadow(arguments: argparse.Namespace) -> None:
+    """Watch a printer's camera: what the controller would do in each window and why,
+    as MCAP and a local page. Nothing is sent."""
+    from pipeline.setpoint.workflow import shadow as watching
+    from pipeline.setpoint.workflow.shadow import deploy
+    from pipeline.setpoint.workflow.watch_sources import shown_place, source
+
+    ready = deploy.ready()
+    asked = deploy.asked(
+        arguments.flow, arguments.temperature, arguments.tip, once=arguments.once, settings=ready
+    )
+    frames = source(arguments.source, ready.topics, rate_hz=deploy.bounded("--rate", arguments.rate))
+    place = shown_place(arguments.source)
+    with watching.until_told() as stopped:
+        watched = watching.watch(frames, ready.deployed, asked, arguments.out, place=place, stopped=stopped)
+    print(watching.summary_lines(watched, place))
+
+
 def version() -> str:
     """The version that pyproject.toml beside the code states; without one, that of the installed package."""
     project = Path(__file__).resolve().parents[1] / "pyproject.toml"
     if project.exists():
         return tomllib.loads(project.read_text(encoding="utf-8"))["project"]["version"]
     return importlib.metadata.version("beadline")
+
+
+def _add_shadow(commands: argparse._SubParsersAction) -> None:
+    command = commands.add_parser("shadow", help=shadow.__doc__)
+    command.add_argument(
+        "source", help="a folder that fills with pictures, an MCAP file that grows, or the address of a snapshot"
+    )
+    command.add_argument("--out", type=Path, default=Path("shadow"), metavar="DIR", help="(shadow)")
+    command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels")
+    command.add_argument(
+        "--flow", type=float, default=100.0, help="flow setpoint in %% where the source has none (100)"
+    )
+    command.add_argument(
+        "--temperature", type=float, default=210.0, help="of the nozzle in °C where the source has none (210)"
+    )
+    command.add_argument("--rate", type=float, default=5.0, metavar="HZ", help="snapshots a second (5)")
+    command.add_argument("--once", action="store_true", help="end where the source ends")
+    command.set_defaults(run=shadow)
 
 
 def main() -> None:
@@ -302,6 +338,7 @@ def main() -> None:
         "--out", type=Path, metavar="FILE", help="the page; default PICTURE.camera.html here"
     )
     command.set_defaults(run=calibrate_camera)
+    _add_shadow(commands)
     nights.add(commands)
     arguments = parser.parse_args()
     try:

@@ -1,0 +1,78 @@
+"""The default controller and the trained classifier, as the stages left them, ready to decide."""
+
+from typing import NamedTuple
+
+from pipeline.setpoint.workflow import contestants
+from pipeline.setpoint.workflow.agent_files import restore_agents
+from pipeline.setpoint.workflow.classifier_files import restore_classifier
+from pipeline.setpoint.workflow.frame_folder import read_options
+from pipeline.setpoint.workflow.frame_mcap import Topics
+from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
+from pipeline.setpoint.workflow.shadow.decide import Asked, Deployed, deployed
+from pipeline.setpoint.workflow.tables import WINDOWS
+from pipeline.setpoint.workflow.windows import window_tables
+from pipeline.store import artifacts, params
+
+# what a printer can be told: percent of flow, degC, and pictures a second
+BOUNDS = {"--flow": (1.0, 1000.0), "--temperature": (0.0, 600.0), "--rate": (0.05, 100.0)}
+
+
+class Ready(NamedTuple):
+    """What decides; where recordings have what we need; the tip of the settings."""
+
+    deployed: Deployed
+    topics: Topics
+    tip: tuple[float, float] | None
+
+
+def ready() -> Ready:
+    """The default of evaluate_setpoint with the classifier of train_classifier. Raises ValueError, one
+    sentence, where a stage has not run."""
+    settings = params.load(EvaluateSetpoint, "evaluate_setpoint")
+    view = params.load(TrainClassifier, "train_classifier")
+    name = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
+    model = restore_classifier(
+        "datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet"
+    )
+    windows = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
+    agents = restore_agents("datasets/train_agent/weights.safetensors")
+    entries = [entry for entry in contestants.CONTESTANTS if entry.name == name]
+    specs = contestants.controllers(
+        contestants.Problem(settings.baselines, agents, windows["learn"]), entries
+    )
+    if name not in specs:
+        raise ValueError(
+            f"datasets/evaluate_setpoint/choice.json: the default {name!r} is no controller of this version; "
+            "make it again with ./run dvc repro evaluate_setpoint"
+        )
+    options = read_options(view)
+    spec = (name, specs[name].controller, specs[name].parameters)
+    return Ready(deployed(model, spec, settings, view), options.topics, options.tip_px)
+
+
+def asked(flow: float, temperature: float, tip: str, *, once: bool, settings: Ready) -> Asked:
+    """What the command line says, checked; the tip of the settings where it says none."""
+    bounded("--flow", flow)
+    bounded("--temperature", temperature)
+    return Asked(flow, temperature, pixel(tip) if tip else settings.tip, once)
+
+
+def bounded(flag: str, value: float) -> float:
+    """The value of a flag. Raises ValueError where it lies outside BOUNDS."""
+    low, high = BOUNDS[flag]
+    if not low <= value <= high:
+        raise ValueError(f"{flag}: expected {low:g} to {high:g}, found {value:g}; write a number in that range")
+    return value
+
+
+def pixel(text: str) -> tuple[float, float]:
+    """(571, 511) of "571,511"."""
+    try:
+        x, y = map(float, text.split(","))
+    except ValueError:
+        x, y = -1.0, -1.0
+    if not (0 <= x <= 1e5 and 0 <= y <= 1e5):
+        raise ValueError(
+            f"--tip: expected two numbers of pixels such as 571,511, found {text!r}; write X,Y without a blank"
+        )
+    return x, y
