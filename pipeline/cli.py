@@ -224,6 +224,30 @@ def shadow(arguments: argparse.Namespace) -> None:
     print(watching.summary_lines(watched, place))
 
 
+def training_print(arguments: argparse.Namespace) -> None:
+    """The G-code of a print from which the classifier learns: flows and temperatures in steps,
+    with a layer at 100 % between; and a table of which setting holds from which line on."""
+    from pipeline.setpoint.workflow import training_print as printing
+    from pipeline.setpoint.workflow.shadow.deploy import pixel
+
+    def one(flag: str) -> float:
+        return printing.numbers(str(getattr(arguments, flag[2:].replace("-", "_"))), flag, 1)[0]
+
+    def pair(flag: str) -> tuple[float, float]:
+        x, y = printing.numbers(getattr(arguments, flag[2:]), flag, 2)
+        return x, y
+
+    asked = printing.Print(
+        flows=printing.numbers(arguments.flows, "--flows"),
+        temperatures=printing.numbers(arguments.temperatures, "--temperatures"),
+        bed=pair("--bed"), height=one("--height"), size=pair("--size"), nozzle=one("--nozzle"),
+        layer=one("--layer"), filament=one("--filament"), speed=one("--speed"), travel=one("--travel"),
+        bed_temperature=one("--bed-temperature"), best_temperature=one("--best-temperature"),
+        melt=one("--melt"),
+    )  # fmt: skip
+    print(printing.write(asked, arguments.out, pixel(arguments.tip) if arguments.tip else None))
+
+
 def version() -> str:
     """The version that pyproject.toml beside the code states; without one, that of the installed package."""
     project = Path(__file__).resolve().parents[1] / "pyproject.toml"
@@ -248,6 +272,25 @@ def _add_shadow(commands: argparse._SubParsersAction) -> None:
     command.add_argument("--rate", type=float, default=5.0, metavar="HZ", help="snapshots a second (5)")
     command.add_argument("--once", action="store_true", help="end where the source ends")
     command.set_defaults(run=shadow)
+
+
+def _add_training_print(commands: argparse._SubParsersAction) -> None:
+    command = commands.add_parser("training-print", help=training_print.__doc__.replace("%", "%%"))
+    command.add_argument("out", type=Path, metavar="OUT.gcode")
+    for flag, default, metavar, words in (
+        ("--flows", "40,60,75,85,92,100,108,115,125,150,200", "PERCENT,...", "steps of the flow"),
+        ("--temperatures", "190,200,210,220,230", "DEGC,...", "steps of the nozzle's temperature"),
+        ("--bed", "220,220", "MM,MM", "the bed along x and y"), ("--height", "250", "MM", "room above the bed"),
+        ("--size", "50,20", "MM,MM", "the cuboid along x and y"), ("--nozzle", "0.4", "MM", "its diameter"),
+        ("--layer", "0.2", "MM", "height of a layer"), ("--filament", "1.75", "MM", "its diameter"),
+        ("--speed", "20", "MM/S", "of lines"), ("--travel", "100", "MM/S", "between them"),
+        ("--bed-temperature", "60", "DEGC", "of the bed"),
+        ("--best-temperature", "210", "DEGC", "of the layers between"),
+        ("--melt", "12", "MM^3/S", "the most that the hot end melts"),
+    ):  # fmt: skip
+        command.add_argument(flag, default=default, metavar=metavar, help=f"{words} ({default})")
+    command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels, for the table")
+    command.set_defaults(run=training_print)
 
 
 def main() -> None:
@@ -339,6 +382,7 @@ def main() -> None:
     )
     command.set_defaults(run=calibrate_camera)
     _add_shadow(commands)
+    _add_training_print(commands)
     nights.add(commands)
     arguments = parser.parse_args()
     try:
