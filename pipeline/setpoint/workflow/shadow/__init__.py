@@ -12,14 +12,16 @@ from typing import Any, NamedTuple
 from pipeline.setpoint.deployment import ACTS
 from pipeline.setpoint.workflow.decision_log import DecisionLog
 from pipeline.setpoint.workflow.shadow.decide import Asked, Decision, Deployed, Mind
-from pipeline.setpoint.workflow.shadow.page import render
+from pipeline.setpoint.workflow.shadow.page import ENDED, render
 from pipeline.setpoint.workflow.shadow.windows import GAP_S, Windows
-from pipeline.setpoint.workflow.watch_sources import Recording, Source
+from pipeline.setpoint.workflow.watch_sources import Recording, Snapshots, Source
 from pipeline.store import artifacts
 from pipeline.store.printable import printable
 
 # with --once, a recording without footer has ended where nothing came for so long
 SILENT_S = 5.0
+# with --once, a source that is not there is waited for so long
+IN_VAIN_S = 30.0
 # the page is written at least so often; decisions it lists
 PAGE_S, LISTED = 2.0, 30
 
@@ -55,7 +57,7 @@ def watch(
     def show(state: str, notes: list[str]) -> float:
         return _write_page(page, render(place, deployed.name, decisions, state, notes, log.trouble))
 
-    artifacts.write_text(page, render(place, deployed.name, [], "it begins", [], ""))
+    artifacts.write_text(page, render(place, deployed.name, [], "The watch begins.", [], ""))
     shown_at = came_at = time.monotonic()
     remarks = 0
     while not stopped():
@@ -74,15 +76,16 @@ def watch(
             if stopped():
                 break
         silent = time.monotonic() - came_at
-        if asked.once and not came and (source.ended or silent > SILENT_S):
+        if asked.once and _has_ended(source, came, silent, len(decisions)):
             break
         if time.monotonic() - shown_at > PAGE_S:
             log.save()
-            waits = f"no frame came for {silent:.0f} s" if silent > GAP_S else ""
-            shown_at = show(source.waits_for or waits, windows.notes)
+            waits = f"No frame came for {silent:.0f} s." if silent > GAP_S else ""
+            waits = f"Waiting: {source.waits_for}." if source.waits_for else waits
+            shown_at = show(waits, windows.notes)
         _rest(source.rest_s, stopped)
     log.save()
-    show("it has ended", windows.notes)
+    show(ENDED, windows.notes)
     if log.trouble:
         raise OSError(log.trouble)
     return Watched(frames, mind.number, acts, page, first)
@@ -105,6 +108,18 @@ def _rest(seconds: float, stopped: Callable[[], bool]) -> None:
     until = time.monotonic() + seconds
     while (left := until - time.monotonic()) > 0 and not stopped():
         time.sleep(min(left, 0.2))
+
+
+def _has_ended(source: Source, came: bool, silent_s: float, decisions: int) -> bool:
+    """Whether a source that is looked at once has no more; a camera that never ends has shown a window.
+
+    Raises OSError where it was waited for in vain.
+    """
+    if isinstance(source, Snapshots) and decisions:
+        return True
+    if source.waits_for and silent_s > IN_VAIN_S:
+        raise OSError(f"{source.waits_for}; start it first, or watch without --once")
+    return not came and not source.waits_for and (source.ended or silent_s > SILENT_S)
 
 
 def _damage(source: Source) -> list[str]:

@@ -44,11 +44,12 @@ class Asked(NamedTuple):
 
 
 class Deployed(NamedTuple):
-    """What decides: the classifier, the default controller with its parameters and its name, frames of a
-    window, the front end's least score, how a window is judged, the limits, how long after a move of the
-    setpoint frames are of no use, how far the nozzle may be from where its tip was."""
+    """What decides: classify(images (n, 16, 48), temperature (n,)) -> class probabilities (n, 3) and
+    out-of-distribution scores (n,); the default controller with its name and parameters, frames of a window,
+    the front end's least score, how a window is judged, the limits, how long after a move of the setpoint
+    frames are of no use, how far the nozzle may be from where its tip was."""
 
-    model: CalibratedClassifier
+    classify: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
     name: str
     controller: Controller
     parameters: Any
@@ -97,7 +98,7 @@ def deployed(
         np.array(q.per_minute),
     )
     return Deployed(
-        model, *spec, view.window, view.least_score, judge, limits, q.wait_s, q.tip_tolerance_px
+        partial(classify, model), *spec, view.window, view.least_score, judge, limits, q.wait_s, q.tip_tolerance_px
     )
 
 
@@ -125,7 +126,7 @@ class Mind:
             least_score=self.deployed.least_score,
         )
         valid = np.array([not reason for reason in areas.reasons])
-        prob, scores = classify(self.deployed.model, areas.images, temperature)
+        prob, scores = self.deployed.classify(areas.images, temperature)
         judged = self.deployed.judge(
             prob[None], valid[None], scores[None], np.array([self._tip_moved(window, tips, notes)])
         )

@@ -16,22 +16,23 @@ from pipeline.setpoint.workflow.shadow.decide import Decision, Drawn
 from pipeline.store.printable import printable, printable_page
 
 COLOURS = ("#3b76c4", "#2f9e5a", "#d0662a")
+ENDED = "The watch has ended."
 # of the drawing of the belief
-WIDTH, HEIGHT, TICKS = 640, 130, (20, 50, 90, 110, 150, 200, 310)
+WIDTH, HEIGHT, TICKS = 640, 90, (20, 50, 90, 110, 150, 200, 310)
 REASONS_LISTED, NOTES_LISTED = 5, 10
 
 
 def render(
     place: str, controller: str, decisions: Sequence[Decision], state: str, notes: Sequence[str], trouble: str
 ) -> str:
-    """The page after these decisions, the last one at the end. `state` says why nothing comes, "" where frames
-    do; `trouble` why the decisions cannot be written."""
+    """The page after these decisions, the last one at the end. `state` is a sentence on why nothing comes, ""
+    where frames do; `trouble` why the decisions cannot be written. After ENDED it refreshes itself no more."""
     last = decisions[-1] if decisions else None
-    warnings = [text for text in (state and f"Waiting: {state}.", trouble) if text]
+    warnings = [text for text in (state, trouble) if text]
     values = {
         "place": _text(place),
         "controller": _text(controller),
-        "refresh": "" if state == "it has ended" else '<meta http-equiv="refresh" content="2">',
+        "refresh": "" if state == ENDED else '<meta http-equiv="refresh" content="2">',
         "warnings": "".join(f"<p class=warning>{_text(text)}</p>" for text in warnings),
         "would": "<p class=big>No window yet.</p>" if last is None else _would(last),
         "shares": "" if last is None else _shares(last),
@@ -53,8 +54,7 @@ def _would(last: Decision) -> str:
     acts = last.judged.reason[0] == ACTS
     words = f"It would {_text(last.row['would'])}." if last.row["would"].startswith("change") else ""
     words = words or (f"It would send: {_text(last.row['would'])}." if acts else "It would hold.")
-    why = deployment.REASONS[last.judged.reason[0]]
-    because = f"{_text(last.row['why'])}" if acts else f"Why: {_text(why)}. {_text(last.row['why'])}"
+    because = _text(last.row["why"])
     setpoint = f"The print is set to {last.setpoint[0]:g} % of flow and {last.setpoint[1]:g} °C."
     return (
         f"<p class=big>{words}</p><p>{because}</p>"
