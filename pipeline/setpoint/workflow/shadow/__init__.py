@@ -58,7 +58,7 @@ def watch(
         return _write_page(page, render(place, deployed.name, decisions, state, notes, log.trouble))
 
     artifacts.write_text(page, render(place, deployed.name, [], "The watch begins.", [], ""))
-    shown_at = came_at = time.monotonic()
+    shown_at = came_at = there_at = time.monotonic()
     remarks = 0
     while not stopped():
         came = False
@@ -76,7 +76,9 @@ def watch(
             if stopped():
                 break
         silent = time.monotonic() - came_at
-        if asked.once and _has_ended(source, came, silent, len(decisions)):
+        there_at = time.monotonic() if source.waits_for else there_at
+        quiet = silent if source.waits_for else time.monotonic() - max(came_at, there_at)
+        if asked.once and _has_ended(source, came, quiet, len(decisions)):
             break
         if time.monotonic() - shown_at > PAGE_S:
             log.save()
@@ -110,16 +112,17 @@ def _rest(seconds: float, stopped: Callable[[], bool]) -> None:
         time.sleep(min(left, 0.2))
 
 
-def _has_ended(source: Source, came: bool, silent_s: float, decisions: int) -> bool:
-    """Whether a source that is looked at once has no more; a camera that never ends has shown a window.
+def _has_ended(source: Source, came: bool, quiet_s: float, decisions: int) -> bool:
+    """Whether a source that is looked at once has no more: nothing came for quiet_s since its last frame or
+    since it is there. A camera that never ends has shown a window.
 
     Raises OSError where it was waited for in vain.
     """
     if isinstance(source, Snapshots) and decisions:
         return True
-    if source.waits_for and silent_s > IN_VAIN_S:
+    if source.waits_for and quiet_s > IN_VAIN_S:
         raise OSError(f"{source.waits_for}; start it first, or watch without --once")
-    return not came and not source.waits_for and (source.ended or silent_s > SILENT_S)
+    return not came and not source.waits_for and (source.ended or quiet_s > SILENT_S)
 
 
 def _damage(source: Source) -> list[str]:
