@@ -20,6 +20,7 @@ import numpy as np
 from pipeline.setpoint import judging
 from pipeline.setpoint.baselines import Proportional, SequentialTest, proportional, sequential_test
 from pipeline.setpoint.bayes import (
+    PRIOR,
     CameraErrorModel,
     Filter,
     bayes,
@@ -74,6 +75,8 @@ CONTROLLERS = {
             hazard=7.7e-4,
             move_cost=0.4,
             outside_cost=6.4,
+            move_fixed_cost=0.0,
+            prior=PRIOR,
         ),
     ),
     "Bayes, robust": (bayes(2 * (2 + ROBUST.width_bias_levels)), robust_filter(LEARNED, ROBUST)),

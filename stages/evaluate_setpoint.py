@@ -26,13 +26,14 @@ def main() -> None:
         controllers = contestants.controllers(
             contestants.Problem(settings.baselines, agents, windows["learn"])
         )
-        scores = evaluate_setpoint.scores(controllers, windows["judge"], settings)
-        choice = evaluate_setpoint.chosen(scores)
+        choice = evaluate_setpoint.chosen(controllers, windows["choose"], settings)
+        contest = evaluate_setpoint.contest(controllers, windows["judge"], settings, choice.name)
+        choice = evaluate_setpoint.told(choice, contest)
         rollouts = evaluate_setpoint.pixel_rollouts(controllers, choice, model, settings, view)
         artifacts.write_table(
             out / "scoreboard.parquet",
             SCOREBOARD,
-            evaluate_setpoint.scoreboard(controllers, scores, rollouts),
+            evaluate_setpoint.scoreboard(controllers, contest, rollouts),
         )
         artifacts.write_table(
             out / "paths.parquet",
@@ -44,7 +45,7 @@ def main() -> None:
         )
         artifacts.write_json(out / "choice.json", choice)
         artifacts.write_metrics(
-            "evaluate_setpoint", evaluate_setpoint.metrics(controllers, scores, choice, rollouts)
+            "evaluate_setpoint", evaluate_setpoint.metrics(controllers, contest, choice, rollouts)
         )
 
 

@@ -1,4 +1,4 @@
-"""Nozzle frames -> classifier of the flow: renders them, or reads datasets/raw/setpoint; writes
+"""Nozzle frames -> classifier of the flow: reads datasets/render_frames, or datasets/raw/setpoint; writes
 datasets/train_classifier: weights.safetensors and calibration.parquet of the vision transformer,
 classified.parquet and reliability.parquet of the frames it is judged on, course.parquet, windows.parquet for
 the simulator, and frames for the page."""
@@ -17,12 +17,11 @@ def main() -> None:
             params.load(TrainClassifier, "train_classifier"),
             params.load(params.Execution, "execution"),
         )
-        by_part, read = parts.parts(settings, "datasets/raw/setpoint", execution)
+        found = parts.parts(settings, "datasets/render_frames", "datasets/raw/setpoint", execution)
+        by_part = found.frames
         networks = train_classifier.trained(settings, by_part)
         judged = train_classifier.judged(settings, by_part, networks)
-        windows = train_classifier.recorded(
-            settings, judged.model, parts.to_record(settings, by_part, execution)
-        )
+        windows = train_classifier.recorded(settings, judged.model, found.windows)
         store_classifier(out, settings, judged.model)
         artifacts.write_table(
             out / "classified.parquet",
@@ -46,7 +45,7 @@ def main() -> None:
             out / "frames/frames.json", train_classifier.shown(settings, judged.model, out / "frames")
         )
         artifacts.write_metrics(
-            "train_classifier", train_classifier.metrics(settings, judged, networks, read)
+            "train_classifier", train_classifier.metrics(settings, judged, networks, found.read)
         )
 
 

@@ -95,10 +95,8 @@ def _deposition(folder: Path) -> Evidence:
 def _setpoint(folder: Path) -> Evidence:
     """Of each case of each simulator that counts: the share of runs that the chosen controller does not
     settle, plus one point. Guards: the worst case, and the slowest."""
-    table, chosen = (
-        artifacts.read_table(folder / "evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD),
-        artifacts.read_json(folder / "evaluate_setpoint/choice.json"),
-    )
+    table = _scoreboard(folder / "evaluate_setpoint/scoreboard.parquet")
+    chosen = artifacts.read_json(folder / "evaluate_setpoint/choice.json")
     rows = [k for k, name in enumerate(table["controller"]) if name == chosen["name"] and table["counts"][k]]
     lost = {
         f"{table['simulator'][k]}: {table['case'][k]}": 101.0 - float(table["settled_percent"][k])
@@ -110,6 +108,12 @@ def _setpoint(folder: Path) -> Evidence:
         {name: (name, cost) for name, cost in lost.items()},
         {"worst_unsettled_percent": max(lost.values(), default=np.nan), "slowest_p90_steps": float(slow)},
     )
+
+
+def _scoreboard(path: Path) -> Mapping[str, np.ndarray]:
+    """The scoreboard; of a champion of an earlier version as it was written."""
+    schema = tables.SCOREBOARD_1 if artifacts.version(path) == 1 else tables.SCOREBOARD
+    return artifacts.read_table(path, schema)
 
 
 # ---- the temperature loop

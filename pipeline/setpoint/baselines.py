@@ -1,5 +1,5 @@
-"""Controllers without learning, behind the interface of the agent: proportional, filtered proportional, and a
-sequential test (CUSUM) of the window's class.
+"""Controllers without learning, behind the interface of the agent: nothing, proportional, filtered
+proportional, and a sequential test (CUSUM) of the window's class.
 
 The class depends on the flow alone, so nothing that the camera sees bears on the temperature: every
 controller here moves the target to 210 °C in the largest steps that lambda's clock allows, which the lag (6)
@@ -26,6 +26,17 @@ def temperature_move(observation: Observation) -> jax.Array:
     """Straight to 210 °C: the move nearest to u* - u_bar. It says so
     at every step; lambda's clock takes every tenth."""
     return nearest(TEMPERATURE_MOVES, BEST_TEMPERATURE - observation.target)
+
+
+@cache
+def nothing() -> Controller:
+    """Never moves the flow, whatever it sees: what any other controller must be better than. Its parameters
+    are ()."""
+
+    def act(parameters, memory: tuple, observation: Observation, key: jax.Array) -> tuple[tuple, Action]:
+        return memory, Action(jnp.int32(STAND), temperature_move(observation))
+
+    return Controller(lambda: (), act)
 
 
 class Proportional(NamedTuple):

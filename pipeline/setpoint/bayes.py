@@ -7,7 +7,8 @@ flow is q, the camera errs in the manner of h, and the extruder follows its comm
 b(h, q) <- sum_h' T(h', h) [(1 - hazard) b(h', q - g_h' move) + hazard b'(h') prior(q)] the move; a
 clog or the like, with a small probability; another segment b(h, q) <- b(h, q) P(window | h, q,
 window before) / sum the window a = argmin_a sum b(h, q) loss(q + g_h a) + move_cost |a| loss(q) =
-|q - 100| + outside_cost where that is more than 10
+|q - 100| + outside_cost where that is more than 10; a move costs move_fixed_cost more, so that a print that
+may well be good is left alone
 
 Manners of erring (`evidence`): anywhere with one probability, as in the paper's simulator; or as a
 trained classifier does by its recorded windows, seen through a segment that makes every bead look
@@ -28,11 +29,12 @@ import scipy.special
 
 from pipeline.setpoint.baselines import temperature_move
 from pipeline.setpoint.published import BEST_FLOW, FLOW_MOVES
-from pipeline.setpoint.recorded import WindowTable
+from pipeline.setpoint.recorded import WindowTable, with_flows
 from pipeline.setpoint.simulator import (
     CLASSES,
     FLOW_LIMITS,
     GOOD,
+    GOOD_BORDERS,
     UNDER,
     Action,
     Controller,
@@ -47,15 +49,22 @@ GRID = np.arange(FLOW_LIMITS[0], FLOW_LIMITS[1] + SPACING / 2, SPACING)  # (N,)
 PRIOR = 1 / GRID / np.sum(1 / GRID)  # errors of extrusion are ratios: 50 % is as likely as 200 %
 LEVELS = 6  # of the shares within each class
 FAINTEST = 0.03  # shares below this are told apart no more
-CODES = CLASSES * LEVELS
+CLASS_CODES = CLASSES * LEVELS
+# of a flow seen: bins of its logarithm, so many between the borders of good, which they are aligned to
+BINS_OF_GOOD = 8
+FLOW_CODE_WIDTH = np.log(GOOD_BORDERS[1] / GOOD_BORDERS[0]) / BINS_OF_GOOD
+FIRST_GOOD = int(np.ceil(np.log(GOOD_BORDERS[0] / FLOW_LIMITS[0]) / FLOW_CODE_WIDTH))
+FLOW_CODES = FIRST_GOOD + int(np.ceil(np.log(FLOW_LIMITS[1] / GOOD_BORDERS[0]) / FLOW_CODE_WIDTH))
+CODES = CLASS_CODES + FLOW_CODES
 
 
 class Filter(NamedTuple):
     """evidence (H, CODES, N) is P(code | h, q). transition and after_jump (H, H) lead from row to column at
     each decision and at each jump of the flow. gains (H,): true by commanded move. window_repeat_probability
     (H,): that a window shows what the one before did where the flow setpoint stood. hazard: probability a
-    decision that the flow jumps. move_cost in percent of flow error by percent of move, outside_cost in
-    percent of flow error."""
+    decision that the flow jumps. Costs in percent of flow error: move_cost by percent of move, outside_cost
+    of a miss beyond 10 %, move_fixed_cost of any move. prior (N,) is the belief about the flow at the
+    start."""
 
     evidence: jax.Array
     transition: jax.Array
@@ -65,20 +74,31 @@ class Filter(NamedTuple):
     hazard: float
     move_cost: float
     outside_cost: float
+    move_fixed_cost: float
+    prior: jax.Array
 
 
 class FilterState(NamedTuple):
-    """What the filter remembers: belief (H, N), sum 1, and the code of
-    the last window, -1 before the first."""
+    """What the filter remembers: belief (H, N), sum 1; the code of the last window, -1 before the first; and
+    how many windows it has seen."""
 
     belief: jax.Array
     last_code: jax.Array
+    windows: jax.Array
 
 
 def initial_state(hypotheses: int) -> FilterState:
-    """Before the first window."""
+    """Before the first window, when the belief becomes the filter's prior."""
     belief = jnp.tile(jnp.asarray(PRIOR, jnp.float32) / hypotheses, (hypotheses, 1))
-    return FilterState(belief, jnp.int32(-1))
+    return FilterState(belief, jnp.int32(-1), jnp.int32(0))
+
+
+def start_prior(*, known_start_share: float, known_start_std: float) -> np.ndarray:
+    """(N,) the belief about the flow before the first window: with known_start_share the machine prints as
+    commanded, log flow ~ N(log 100 %, known_start_std^2); else anything, with density 1 / q."""
+    log_flow = np.log(GRID / BEST_FLOW) / max(known_start_std, SPACING / BEST_FLOW / 2)
+    as_commanded = np.exp(-0.5 * log_flow**2) / GRID
+    return known_start_share * as_commanded / as_commanded.sum() + (1.0 - known_start_share) * PRIOR
 
 
 @cache  # one pair of functions, so that what was compiled for it is found again
@@ -99,16 +119,18 @@ def bayes(hypotheses: int) -> Controller:
 
 def filter_update(parameters: Filter, state: FilterState, observation: Observation) -> FilterState:
     """The state after the move that led to this window, and the window."""
-    moved = jax.vmap(predict_shift)(state.belief, parameters.gains * observation.flow_move)
-    jumped = (parameters.after_jump.T @ state.belief.sum(axis=1))[:, None] * jnp.asarray(PRIOR, jnp.float32)
+    H = len(parameters.gains)
+    belief = jnp.where(state.windows == 0, jnp.tile(parameters.prior / H, (H, 1)), state.belief)
+    moved = jax.vmap(predict_shift)(belief, parameters.gains * observation.flow_move)
+    jumped = (parameters.after_jump.T @ belief.sum(axis=1))[:, None] * jnp.asarray(PRIOR, jnp.float32)
     predicted = parameters.transition.T @ ((1.0 - parameters.hazard) * moved + parameters.hazard * jumped)
-    shown = code(observation.shares, observation.named)
+    shown = code(observation.shares, observation.named, observation.flow_seen)
     may_repeat = (state.last_code >= 0) & (observation.flow_move == 0)
     repeats = (parameters.window_repeat_probability * may_repeat)[:, None]
     posterior = predicted * (
         repeats * (shown == state.last_code) + (1.0 - repeats) * parameters.evidence[:, shown]
     )
-    return FilterState(posterior / posterior.sum(), shown)
+    return FilterState(posterior / posterior.sum(), shown, state.windows + 1)
 
 
 def expected_loss(parameters: Filter, belief: jax.Array) -> jax.Array:
@@ -116,9 +138,8 @@ def expected_loss(parameters: Filter, belief: jax.Array) -> jax.Array:
     moves = jnp.asarray(FLOW_MOVES)
     miss = jnp.abs(GRID + parameters.gains[:, None] * moves[:, None, None] - BEST_FLOW)  # (5, H, N)
     # of a miss on the border itself, as little as rounding is not outside
-    return jnp.sum(
-        (miss + parameters.outside_cost * (miss > 10.0 + 1e-3)) * belief, axis=(1, 2)
-    ) + parameters.move_cost * jnp.abs(moves)
+    expected = jnp.sum((miss + parameters.outside_cost * (miss > 10.0 + 1e-3)) * belief, axis=(1, 2))
+    return expected + parameters.move_cost * jnp.abs(moves) + parameters.move_fixed_cost * (moves != 0)
 
 
 def predict_shift(belief: jax.Array, move: jax.Array) -> jax.Array:
@@ -138,59 +159,166 @@ def predict_shift(belief: jax.Array, move: jax.Array) -> jax.Array:
     return moved + last * (belief.sum(axis=-1, keepdims=True) - moved.sum(axis=-1, keepdims=True))
 
 
-def code(shares: jax.Array, named: jax.Array) -> jax.Array:
-    """The window as one of CODES numbers: its class, and within it one of LEVELS of s = log (p_2 + f) / (p_0
-    + f), which says where in the class the flow is."""
+def code(shares: jax.Array, named: jax.Array, flow_seen: jax.Array) -> jax.Array:
+    """The window as one of CODES numbers. Where it shows a flow, CLASS_CODES and the bin of its logarithm;
+    else its class, and within it one of LEVELS of s = log (p_2 + f) / (p_0 + f), which says where in the
+    class the flow is."""
+    seen = jnp.log(jnp.nan_to_num(flow_seen, nan=BEST_FLOW) / GOOD_BORDERS[0]) / FLOW_CODE_WIDTH
+    by_flow = CLASS_CODES + jnp.clip(FIRST_GOOD + jnp.floor(seen), 0, FLOW_CODES - 1).astype(jnp.int32)
     s = jnp.log((shares[..., 2] + FAINTEST) / (shares[..., 0] + FAINTEST)) / np.log((1 + FAINTEST) / FAINTEST)
     within = jnp.where(named == UNDER, s + 1.0, jnp.where(named == GOOD, (s + 0.8) / 1.6, s))
-    return (named * LEVELS + jnp.clip(jnp.floor(within * LEVELS), 0, LEVELS - 1)).astype(jnp.int32)
+    by_class = (named * LEVELS + jnp.clip(jnp.floor(within * LEVELS), 0, LEVELS - 1)).astype(jnp.int32)
+    return jnp.where(jnp.isfinite(flow_seen), by_flow, by_class)
+
+
+CODE_CLASS = np.r_[  # (CODES,) the class that a code names
+    np.arange(CLASS_CODES) // LEVELS,
+    np.digitize(np.arange(FLOW_CODES), [FIRST_GOOD, FIRST_GOOD + BINS_OF_GOOD]),
+]
 
 
 def class_evidence(accuracy: float) -> np.ndarray:
     """(1, CODES, N): the class is right with this probability and one of the others otherwise, wherever the
-    flow is; the shares are those of (7) for the class named, which say nothing more of the flow."""
-    right = np.arange(CODES)[:, None] // LEVELS == np.asarray(flow_class(GRID))
-    return (np.where(right, accuracy, (1.0 - accuracy) / (CLASSES - 1)) * _paper_levels()[:, None])[None]
+    flow is; the shares are those of (7) for the class named, and a flow seen is any of that class, which say
+    nothing more of the flow. Both kinds of code have sum 1 for every flow."""
+    right = CODE_CLASS[:, None] == np.asarray(flow_class(GRID))
+    flow_codes = CODE_CLASS[CLASS_CODES:]
+    within = np.r_[_paper_levels(), (1 / np.bincount(flow_codes))[flow_codes]]
+    return (np.where(right, accuracy, (1.0 - accuracy) / (CLASSES - 1)) * within[:, None])[None]
 
 
 @cache
 def _paper_levels() -> np.ndarray:
-    """(CODES,) P(code | class named) under (7), by the midpoints of its two
+    """(CLASS_CODES,) P(code | class named) under (7), by the midpoints of its two
     uniform numbers, with a floor of 1 % for every level."""
     u = jnp.stack(jnp.meshgrid(*2 * [(jnp.arange(100) + 0.5) / 100], indexing="ij"), axis=-1).reshape(-1, 2)
-    frequency = np.zeros(CODES)
+    frequency = np.zeros(CLASS_CODES)
     for flow in (50.0, 100.0, 150.0):
         drawn = jax.vmap(
             lambda pair, flow=flow: paper_windows().draw(
                 (), nominal(flow, 210.0, accuracy=1.0), flow, 0.0, jnp.concatenate([jnp.zeros(1), pair])
             )
         )(u)
-        frequency += np.bincount(np.asarray(code(*drawn)), minlength=CODES) / len(u)
+        frequency += np.bincount(np.asarray(code(*drawn)), minlength=CLASS_CODES) / len(u)
     return 0.99 * frequency + 0.01 / LEVELS
 
 
 def recorded_evidence(
     table: WindowTable, *, width_bias_std: float, width_bias_levels: int, floor: float, smoothing: float
 ) -> np.ndarray:
-    """(width_bias_levels, CODES, N): frequencies of the codes by flow, under hypothesis j as if the flow were
-    q exp(width_bias_std z_j), z_j the middles of width_bias_levels equal parts of N(0, 1).
+    """(width_bias_levels, CODES, N): how likely each code is by flow, under hypothesis j as if the flow were
+    q exp(width_bias_std z_j), z_j the middles of width_bias_levels equal parts of N(0, 1). Codes of classes
+    and codes of flows have sum 1 each.
 
-    width_bias_std: relative width that a segment adds to its beads, one deviation; floor: share of windows
-    that may show anything; smoothing over flow in percent, one deviation, at least half a bin.
+    width_bias_std: relative width that a segment adds to its beads, one deviation, which a table that shows
+    flows corrects by its own segments; floor: share of windows that may show anything; smoothing over flow in
+    percent, one deviation, at least half a bin.
     """
+    z = scipy.special.ndtri((np.arange(width_bias_levels) + 0.5) / width_bias_levels)
+    by_class = _class_frequencies(table, GRID * np.exp(width_bias_std * z)[:, None], smoothing)
+    by_flow = np.full((width_bias_levels, len(GRID), FLOW_CODES), 1 / FLOW_CODES)
+    if with_flows(table):
+        errors = segment_errors(table, width_bias_std=width_bias_std)
+        for j in range(width_bias_levels):
+            by_flow[j] = _flow_frequencies(
+                table, errors.within, np.log(GRID) + errors.bias_std * z[j], smoothing / BEST_FLOW
+            )
+    blocks = [(1.0 - floor) * block + floor / block.shape[2] for block in (by_class, by_flow)]
+    return np.swapaxes(np.concatenate(blocks, axis=2), 1, 2)
+
+
+def _class_frequencies(table: WindowTable, biased: np.ndarray, smoothing: float) -> np.ndarray:
+    """(levels, N, CLASS_CODES): frequencies of the codes of classes at flows biased (levels, N)."""
     edges = np.asarray(table.flow_edges, float)
     centre, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
-    counts = np.zeros((len(centre), CODES))
-    np.add.at(
-        counts, (table.flow_bin, np.asarray(code(jnp.asarray(table.shares), jnp.asarray(table.named)))), 1.0
-    )
+    counts = np.zeros((len(centre), CLASS_CODES))
+    shown = code(jnp.asarray(table.shares), jnp.asarray(table.named), jnp.full(len(table.named), jnp.nan))
+    np.add.at(counts, (table.flow_bin, np.asarray(shown)), 1.0)
     counts *= (width / counts.sum(axis=1))[:, None]  # as if every percent of flow had been recorded alike
-    z = scipy.special.ndtri((np.arange(width_bias_levels) + 0.5) / width_bias_levels)
-    biased = GRID * np.exp(width_bias_std * z)[:, None]
     weight = np.exp(-0.5 * ((biased[..., None] - centre) / np.maximum(smoothing, width / 2)) ** 2)
     frequency = weight @ counts
-    frequency = (1.0 - floor) * frequency / frequency.sum(axis=2, keepdims=True) + floor / CODES
-    return np.swapaxes(frequency, 1, 2)
+    return frequency / frequency.sum(axis=2, keepdims=True)
+
+
+class SegmentErrors(NamedTuple):
+    """Errors log flow_seen / flow of a table's windows, in two parts: within (n,), of each window about its
+    segment and the table's mean, and bias_std, the deviation of the segments' own."""
+
+    within: np.ndarray
+    bias_std: float
+
+
+# segments that the declared deviation counts for, beside the table's own
+DECLARED_SEGMENTS = 5
+
+
+def segment_errors(table: WindowTable, *, width_bias_std: float) -> SegmentErrors:
+    """The errors of a table that shows flows, by a one-way analysis of variance: s_b^2 = var(segment means) -
+    s_w^2 mean(1 / n_s), pooled with the declared width_bias_std^2. A segment that stands at one flow only
+    cannot tell its bias from what the camera does at that flow: errors are taken about the smoothed mean."""
+    log_flow = np.log(table.flow)
+    error = np.log(table.flow_seen) - log_flow
+    mean = _smooth_mean(log_flow, error)
+    _, place, counts = np.unique(table.segment, return_inverse=True, return_counts=True)
+    about = error - mean
+    segment_mean = np.bincount(place, about) / counts
+    within = about - segment_mean[place]
+    free = len(error) - len(counts)
+    if free <= 0:  # one window a segment: nothing parts the two
+        return SegmentErrors(error, width_bias_std)
+    variance = (within**2).sum() / free
+    between = max(0.0, float((segment_mean**2).mean() - variance * (1 / counts).mean()))
+    n = len(counts)
+    bias_std = np.sqrt((n * between + DECLARED_SEGMENTS * width_bias_std**2) / (n + DECLARED_SEGMENTS))
+    inflate = np.sqrt(variance / max(float((within**2).mean()), 1e-12))
+    return SegmentErrors(mean + within * inflate, float(bias_std))
+
+
+MEAN_BANDWIDTH = 0.08  # of log flow, one deviation: over which a camera's mean error is smooth
+
+
+def _smooth_mean(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The kernel mean (n,) of y over x, read at every x."""
+    at = np.linspace(x.min(), x.max(), 200)
+    weight = np.exp(-0.5 * ((at[:, None] - x) / MEAN_BANDWIDTH) ** 2)
+    return np.interp(x, at, (weight @ y) / np.maximum(weight.sum(axis=1), 1e-12))
+
+
+def _flow_frequencies(
+    table: WindowTable, error: np.ndarray, log_shown: np.ndarray, smoothing: float
+) -> np.ndarray:
+    """(N, FLOW_CODES): frequencies of the codes of flows at log flows log_shown (N,): a window of the table
+    shows its error (n,) there, and counts by how near its own flow is, in units of `smoothing` of log flow
+    or as far as the nearest windows are; of windows recorded densely, each counts less."""
+    log_flow = np.sort(np.log(table.flow))
+    order = np.argsort(np.log(table.flow), kind="stable")
+    at = np.clip(log_shown, log_flow[0], log_flow[-1])
+    near = np.maximum(smoothing, _reach(log_flow, at))
+    kernel = np.exp(-0.5 * ((at[:, None] - log_flow) / near[:, None]) ** 2) * _spacing(log_flow)
+    shown = log_shown[:, None] + error[order]
+    bins = FIRST_GOOD + np.floor((shown - np.log(GOOD_BORDERS[0])) / FLOW_CODE_WIDTH).astype(int)
+    flat = np.clip(bins, 0, FLOW_CODES - 1) + FLOW_CODES * np.arange(len(at))[:, None]
+    counts = np.bincount(flat.ravel(), kernel.ravel(), FLOW_CODES * len(at)).reshape(len(at), FLOW_CODES)
+    step = np.arange(FLOW_CODES)
+    blur = np.exp(-0.5 * (step[:, None] - step) ** 2)  # of one bin: a table has few windows a bin
+    counts = counts @ (blur / blur.sum(axis=1, keepdims=True))
+    return counts / counts.sum(axis=1, keepdims=True)
+
+
+NEAREST = 40  # windows that a flow's frequencies rest on at least
+
+
+def _reach(log_flow: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """(N,) half the distance from `at` to the NEAREST-th of the sorted log flows (n,)."""
+    distance = np.sort(np.abs(at[:, None] - log_flow), axis=1)
+    return distance[:, min(NEAREST, len(log_flow)) - 1] / 2
+
+
+def _spacing(log_flow: np.ndarray) -> np.ndarray:
+    """(n,) how much of the axis each of the sorted log flows stands for, with a floor where they coincide."""
+    wide = np.gradient(log_flow) if len(log_flow) > 1 else np.ones(1)
+    smooth = np.convolve(np.pad(wide, 10, mode="edge"), np.full(21, 1 / 21), "valid")
+    return smooth + 1e-3 * smooth.max()
 
 
 class CameraErrorModel(NamedTuple):
@@ -201,7 +329,7 @@ class CameraErrorModel(NamedTuple):
     segment_mean_decisions. mode_switch_probability: a decision, of going over from one way of erring (any of
     `accuracies`, or as recorded) to another. window_repeat_probability: that a window shows what the one
     before did, of the manners as recorded. gains: true by commanded move. floor and smoothing as
-    `recorded_evidence` says; hazard and costs as `Filter` says.
+    `recorded_evidence` says; hazard and costs as `Filter` says; known_start as `start_prior` says.
     """
 
     accuracies: Sequence[float]
@@ -216,6 +344,9 @@ class CameraErrorModel(NamedTuple):
     hazard: float
     move_cost: float
     outside_cost: float
+    move_fixed_cost: float = 0.0
+    known_start_share: float = 0.0
+    known_start_std: float = 0.05
 
 
 def robust_filter(table: WindowTable, model: CameraErrorModel) -> Filter:
@@ -242,7 +373,13 @@ def robust_filter(table: WindowTable, model: CameraErrorModel) -> Filter:
         model.hazard,
         model.move_cost,
         model.outside_cost,
+        model.move_fixed_cost,
+        jnp.asarray(_prior(model.known_start_share, model.known_start_std)),
     )
+
+
+def _prior(share: float, std: float) -> np.ndarray:
+    return start_prior(known_start_share=share, known_start_std=std).astype(np.float32)
 
 
 def _mode_transition(model: CameraErrorModel) -> np.ndarray:
@@ -260,7 +397,27 @@ def _mode_transition(model: CameraErrorModel) -> np.ndarray:
     return transition
 
 
-def class_filter(*, accuracy: float, hazard: float, move_cost: float, outside_cost: float) -> Filter:
+def class_filter(
+    *,
+    accuracy: float,
+    hazard: float,
+    move_cost: float,
+    outside_cost: float,
+    move_fixed_cost: float = 0.0,
+    known_start_share: float = 0.0,
+    known_start_std: float = 0.05,
+) -> Filter:
     """The filter of the paper's simulator: exact with hazard 0, and with a leak otherwise."""
     evidence, one = jnp.asarray(class_evidence(accuracy), jnp.float32), jnp.ones((1, 1))
-    return Filter(evidence, one, one, jnp.ones(1), jnp.zeros(1), hazard, move_cost, outside_cost)
+    return Filter(
+        evidence,
+        one,
+        one,
+        jnp.ones(1),
+        jnp.zeros(1),
+        hazard,
+        move_cost,
+        outside_cost,
+        move_fixed_cost,
+        jnp.asarray(_prior(known_start_share, known_start_std)),
+    )

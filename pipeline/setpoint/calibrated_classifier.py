@@ -8,7 +8,7 @@ import numpy as np
 import scipy.special
 
 from pipeline.setpoint import calibration, yardsticks
-from pipeline.setpoint.calibration import Calibration, ClassifierOutputs, Reliability
+from pipeline.setpoint.calibration import Calibration, ClassifierOutputs, Reliability, WindowFlow, WindowTruth
 from pipeline.setpoint.classifier import Labelled, predict
 from pipeline.setpoint.vision_transformer import Classifier
 
@@ -20,17 +20,38 @@ class CalibratedClassifier(NamedTuple):
     calibration: Calibration
 
 
-def classify(
+class FrameReadings(NamedTuple):
+    """Of n key areas: class probabilities (n, 3), how foreign each is (n,), log(flow / 100 %) (n,) and its
+    deviation (n,) as the network gives them; calibration.window_flow makes a window's flow of them."""
+
+    prob: np.ndarray
+    distance: np.ndarray
+    log_flow: np.ndarray
+    deviation: np.ndarray
+
+
+def read_frames(
     model: CalibratedClassifier, images: np.ndarray, temperature_degC: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Class probabilities (n, 3) of key areas (n, 16, 48) at temperatures (n,), and how foreign each is (n,):
-    squared Mahalanobis distance of features and appearance."""
+) -> FrameReadings:
+    """What key areas (n, 16, 48) at temperatures (n,) show; the distance is the squared Mahalanobis distance
+    of features and appearance from those learned."""
     prediction = predict(model.network, images, temperature_degC)
     prob = np.exp(calibration.log_probabilities(prediction.logits, model.calibration.temperature))
     features = np.hstack([prediction.features, calibration.appearance(images)])
-    return prob / prob.sum(axis=1, keepdims=True), calibration.mahalanobis(
-        model.calibration.familiar, features
+    return FrameReadings(
+        prob / prob.sum(axis=1, keepdims=True),
+        calibration.mahalanobis(model.calibration.familiar, features),
+        prediction.log_flow.astype(float),
+        prediction.deviation.astype(float),
     )
+
+
+def classify(
+    model: CalibratedClassifier, images: np.ndarray, temperature_degC: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Class probabilities (n, 3) of key areas (n, 16, 48) at temperatures (n,), and how foreign each is
+    (n,), as `read_frames` says."""
+    return read_frames(model, images, temperature_degC)[:2]
 
 
 def outputs(network: Classifier, data: Labelled, valid: np.ndarray) -> ClassifierOutputs:
@@ -40,13 +61,15 @@ def outputs(network: Classifier, data: Labelled, valid: np.ndarray) -> Classifie
 
 
 class WindowPredictions(NamedTuple):
-    """Of w windows: probabilities (w, 3) by summed logarithms, by hard counts and by the mean; true class
-    (w,), rows (w, length) of the frames, whether any is valid (w,)."""
+    """Of w windows: the flow seen and the probabilities of the classes that follow from it; those by summed
+    logarithms (w, 3), by hard counts and by the mean; the truth, rows (w, length) of the frames, whether any
+    is valid (w,)."""
 
-    prob: np.ndarray
+    seen: WindowFlow
+    log_sum: np.ndarray
     hard: np.ndarray
     mean: np.ndarray
-    label: np.ndarray
+    truth: WindowTruth
     rows: np.ndarray
     any_valid: np.ndarray
 
@@ -58,11 +81,14 @@ def window_predictions(fitted: Calibration, frames: ClassifierOutputs, *, length
     log_p, valid = calibration.log_probabilities(frames.logits, fitted.temperature)[rows], frames.valid[rows]
     total = np.where(valid[:, :, None], np.exp(log_p), 0).sum(axis=1)
     m = valid.sum(axis=1)[:, None]
+    first = rows[:, 0]
+    truth = frames.label, frames.flow_percent, frames.temperature_degC, frames.segment
     return WindowPredictions(
-        prob=calibration.window_probabilities(log_p, valid, fitted.correlation),
+        seen=calibration.window_flow(frames.log_flow[rows], frames.deviation[rows], valid, fitted.flow),
+        log_sum=calibration.window_probabilities(log_p, valid, fitted.correlation),
         hard=calibration.hard_shares(log_p, valid),
         mean=np.where(m > 0, total / np.maximum(m, 1), 1 / 3),
-        label=frames.label[rows[:, 0]],
+        truth=WindowTruth(*(column[first] for column in truth)),
         rows=rows,
         any_valid=valid.any(axis=1),
     )
@@ -71,19 +97,21 @@ def window_predictions(fitted: Calibration, frames: ClassifierOutputs, *, length
 def reliabilities(
     fitted: Calibration, frames: ClassifierOutputs, *, length: int
 ) -> dict[tuple[str, str], Reliability]:
-    """By (image or window, method): before and after calibration, and the paper's hard counts."""
+    """By (image or window, method): before and after calibration; of windows the paper's hard counts, the
+    mean, summed logarithms, and what follows from the flow seen."""
     v, windows = frames.valid, window_predictions(fitted, frames, length=length)
     images = {
         "raw": scipy.special.softmax(frames.logits[v], axis=1),
         "calibrated": np.exp(calibration.log_probabilities(frames.logits[v], fitted.temperature)),
     }
-    methods = {"hard_counts": windows.hard, "mean": windows.mean, "log_sum": windows.prob}
+    methods = {"hard_counts": windows.hard, "mean": windows.mean, "log_sum": windows.log_sum}
+    methods["flow"] = windows.seen.prob
     some = windows.any_valid
     return {
         ("image", name): calibration.reliability(prob, frames.label[v], bins=BINS)
         for name, prob in images.items()
     } | {
-        ("window", name): calibration.reliability(prob[some], windows.label[some], bins=BINS)
+        ("window", name): calibration.reliability(prob[some], windows.truth.label[some], bins=BINS)
         for name, prob in methods.items()
     }
 
@@ -153,5 +181,5 @@ def yardstick_classes(
     return YardstickClasses(
         prob.argmax(axis=1),
         yardsticks.width_class(rule, data.key_area),
-        float(np.mean((counts == windows.label)[windows.any_valid])),
+        float(np.mean((counts == windows.truth.label)[windows.any_valid])),
     )

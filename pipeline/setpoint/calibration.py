@@ -4,6 +4,7 @@ conformal sets by segment, distance from what was learned.
 All of it is fitted on segments that the classifier never saw, and judged on yet others.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,9 @@ import scipy.stats
 import sklearn.covariance
 
 from pipeline.setpoint.classifier import Labelled, Prediction
+from pipeline.setpoint.nozzle_scene import BORDERS
 from pipeline.setpoint.recorded import WindowTable
+from pipeline.statistics import Share
 
 CLASSES = 3
 
@@ -98,17 +101,159 @@ def hard_shares(log_p: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(m > 0, counts / np.maximum(m, 1), 1 / CLASSES)
 
 
+# where the map from what frames show to the flow has its knots, in percent; between them it is linear
+KNOTS_PERCENT = (
+    10.0,
+    20.0,
+    35.0,
+    50.0,
+    65.0,
+    80.0,
+    90.0,
+    100.0,
+    110.0,
+    120.0,
+    140.0,
+    170.0,
+    220.0,
+    310.0,
+    620.0,
+)
+# windows that weigh as much as the wish for a straight map, and the flattest slope that is believed
+STRAIGHT, LEAST_SLOPE = 3.0, 0.1
+
+
+class FlowCalibration(NamedTuple):
+    """What turns the log flows of frames into that of a window: `shown` (k,) is what frames show on average
+    at the flows KNOTS_PERCENT, rising; `scale` (k,) multiplies their deviation there; `correlation` is that
+    of the errors of one segment's frames.
+
+    A network that is sure of little says a flow nearer to those that it learned than the true one: the map
+    undoes that, so that a window at any flow shows that flow on average.
+    """
+
+    shown: np.ndarray
+    scale: np.ndarray
+    correlation: float
+
+
+class WindowFlow(NamedTuple):
+    """Of w windows: flow_seen (w,) in percent of nominal, its relative standard deviation spread (w,), and
+    the probabilities prob (w, 3) of under, good, over. Without a valid frame: NaN, NaN and 1/3 each."""
+
+    flow_seen: np.ndarray
+    spread: np.ndarray
+    prob: np.ndarray
+
+
+def window_flow(
+    log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, fitted: FlowCalibration
+) -> WindowFlow:
+    """The flow of w windows from log(flow / 100 %) of their frames with its deviation, and valid (w, length).
+
+    What is shown is the mean of the m valid frames weighted by v_i = deviation_i^-2, and flow_seen the flow
+    at which frames show that on average. Frames of one segment repeat each other: spread^2 =
+    scale^2 (1 + (m - 1) correlation) / sum_i v_i (design effect; Kish 1965).
+    """
+    shown, unscaled = _shown(log_flow, deviation, valid, fitted.correlation)
+    seen = np.interp(shown, fitted.shown, _knots())
+    some = np.isfinite(seen)
+    spread = unscaled * np.interp(seen, _knots(), fitted.scale)
+    prob = np.full((len(seen), CLASSES), 1 / CLASSES)
+    prob[some] = class_probabilities(seen[some], spread[some])
+    return WindowFlow(100 * np.exp(seen), spread, prob)
+
+
+def _shown(
+    log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, correlation: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted mean of each window's frames, and its deviation before any scale (w,); NaN without a valid
+    frame."""
+    m = valid.sum(axis=1)
+    weight = np.where(valid, deviation, np.inf) ** -2.0
+    total = np.where(m > 0, weight.sum(axis=1), np.nan)
+    mean = (weight * np.where(valid, log_flow, 0.0)).sum(axis=1) / total
+    return mean, np.sqrt((1 + np.maximum(m - 1, 0) * correlation) / total)
+
+
+def _knots() -> np.ndarray:
+    return np.log(np.array(KNOTS_PERCENT) / 100)
+
+
+def _hats(log_flow: np.ndarray) -> np.ndarray:
+    """(n, k) weights of the knots in linear interpolation at log_flow (n,)."""
+    return np.stack([np.interp(log_flow, _knots(), one) for one in np.eye(len(KNOTS_PERCENT))], axis=1)
+
+
+def _straight() -> np.ndarray:
+    """(k - 2, k): changes of slope at the inner knots, per unit of log flow."""
+    slopes = np.diff(np.eye(len(KNOTS_PERCENT)), axis=0) / np.diff(_knots())[:, None]
+    return np.diff(slopes, axis=0)
+
+
+def fit_flow(
+    log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, flow: np.ndarray
+) -> FlowCalibration:
+    """Map, scale and correlation from windows (w, length) at flows (w,) in percent, all of segments that were
+    not learned from.
+
+    The map is least squares with its changes of slope weighed as STRAIGHT windows; the correlation that of
+    the standardised residuals of two frames of a window (analysis of variance); the scale what makes the
+    windows' squared errors as large as they are, smoothed in the same way.
+    """
+    some = valid.any(axis=1)
+    log_flow, deviation, valid, truth = (a[some] for a in (log_flow, deviation, valid, np.log(flow / 100)))
+    hats, straight = _hats(truth), STRAIGHT * _straight().T @ _straight()
+    slopes = np.eye(len(KNOTS_PERCENT))[[0, -1]] * 1e-6  # keeps ends that nobody saw finite
+    shown, _ = _shown(log_flow, deviation, valid, 0.0)
+    knots = _knots()
+    fitted = np.linalg.solve(
+        hats.T @ hats + straight + slopes.T @ slopes, hats.T @ shown + slopes.T @ slopes @ knots
+    )
+    steps = np.maximum(np.diff(fitted), LEAST_SLOPE * np.diff(knots))
+    middle = KNOTS_PERCENT.index(100.0)
+    rising = np.concatenate([[0.0], np.cumsum(steps)])
+    fitted = rising + fitted[middle] - rising[middle]
+    correlation = _correlation((log_flow - (hats @ fitted)[:, None]) / deviation, valid)
+    shown, unscaled = _shown(log_flow, deviation, valid, correlation)
+    seen = np.interp(shown, fitted, knots)
+    squared = ((seen - truth) / unscaled) ** 2
+    hats = _hats(seen)
+    level = squared.mean()
+    scale2 = np.linalg.solve(hats.T @ hats + straight + 1e-6 * np.eye(len(knots)), hats.T @ squared)
+    return FlowCalibration(fitted, np.sqrt(np.clip(scale2, 0.25 * level, 16 * level)), correlation)
+
+
+def _correlation(residual: np.ndarray, valid: np.ndarray) -> float:
+    """Mean product of two valid frames of a window over the mean square of one, within 0 .. 1."""
+    r = np.where(valid, residual, 0.0)
+    m = valid.sum(axis=1)
+    pairs = (m * (m - 1)).sum()
+    if pairs == 0:
+        return 1.0  # windows of one frame: nothing says that more would tell more
+    products = (r.sum(axis=1) ** 2 - (r**2).sum(axis=1)).sum() / pairs
+    return float(np.clip(products / ((r**2).sum() / m.sum()), 0.0, 1.0))
+
+
+def class_probabilities(log_flow: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """(n, 3) P(flow below 90 %, 90 to 110 %, above) under Normal(log_flow, spread) of log(flow / 100 %)."""
+    low, high = (np.log(border / 100) for border in BORDERS)
+    under = scipy.special.ndtr((low - log_flow) / spread)
+    over = scipy.special.ndtr((log_flow - high) / spread)
+    # as the difference of the nearer tails: 1 - under - over loses its digits far from 100 %
+    good = np.where(
+        log_flow > 0,
+        scipy.special.ndtr((high - log_flow) / spread) - under,
+        scipy.special.ndtr((log_flow - low) / spread) - over,
+    )
+    return np.stack([under, np.maximum(good, 0.0), over], axis=1)
+
+
 def recorded(
-    log_p: np.ndarray,
-    valid: np.ndarray,
-    flow: np.ndarray,
-    segment: np.ndarray,
-    *,
-    correlation: float,
-    flow_edges: np.ndarray,
+    seen: WindowFlow, flow: np.ndarray, segment: np.ndarray, *, flow_edges: np.ndarray
 ) -> WindowTable:
-    """Windows (w, length, 3) of segments printed at flow (w,) percent as the simulator draws them again;
-    windows without a valid frame are left out.
+    """What was seen in w windows of segments (w,) printed at flow (w,) percent, as the simulator draws it
+    again; windows without a valid frame are left out.
 
     flow_edges (bins + 1,) in percent; raises ValueError where a flow lies outside them.
     """
@@ -119,10 +264,12 @@ def recorded(
             f"flows are expected within {flow_edges[0]:g} .. {flow_edges[-1]:g} % but {outside.sum()} are "
             f"not, the first {flow[outside][0]:g}; widen the bins"
         )
-    mask = valid.any(axis=1)
-    prob = window_probabilities(log_p[mask], valid[mask], correlation)
-    flow_bin = np.clip(np.searchsorted(flow_edges, flow[mask], side="right") - 1, 0, len(flow_edges) - 2)
-    return WindowTable(prob, prob.argmax(axis=1), flow_bin, np.asarray(segment)[mask], flow_edges)
+    some = np.isfinite(seen.flow_seen)
+    seen, flow = WindowFlow(*(values[some] for values in seen)), flow[some]
+    flow_bin = np.clip(np.searchsorted(flow_edges, flow, side="right") - 1, 0, len(flow_edges) - 2)
+    named = seen.prob.argmax(axis=1)
+    bins = flow_bin, np.asarray(segment)[some], flow_edges
+    return WindowTable(seen.prob, named, *bins, seen.flow_seen, seen.spread, flow)
 
 
 # ---- how true the probabilities are
@@ -163,6 +310,79 @@ def reliability(p: np.ndarray, label: np.ndarray, *, bins: int) -> Reliability:
     return Reliability(*means, count, edges[:-1], float(error), float(floor))
 
 
+def share_by_segment(happened: np.ndarray, segment: np.ndarray) -> Share:
+    """The share of True among n images or windows, in percent, with its 95 % interval: what is of one segment
+    (n,) errs together, so the segments are what was drawn.
+
+    Wilson's interval of n_eff = p (1 - p) / V images, with V the variance of a ratio of sums over segments
+    and a factor for Student's t of few of them (Korn and Graubard 1998); n_eff is at most n, and the number
+    of segments where all or none happened. No image: NaN.
+    """
+    happened, n = np.asarray(happened, float), len(happened)
+    if n == 0:
+        return Share(np.nan, np.nan, np.nan)
+    _, place = np.unique(segment, return_inverse=True)
+    clusters = int(place.max()) + 1
+    p, z = float(happened.mean()), float(scipy.special.ndtri(0.975))
+    residual = np.bincount(place, happened - p)
+    variance = (residual**2).sum() / n**2 * clusters / max(clusters - 1, 1)
+    effective = float(clusters)
+    if variance > 0 and clusters > 1:
+        student = float(scipy.special.stdtrit(clusters - 1, 0.975))
+        effective = min(p * (1 - p) / variance, n) * (z / student) ** 2
+    centre = (p + z**2 / (2 * effective)) / (1 + z**2 / effective)
+    half = z * np.sqrt(p * (1 - p) / effective + z**2 / (4 * effective**2)) / (1 + z**2 / effective)
+    return Share(100 * p, float(100 * max(centre - half, 0.0)), float(100 * min(centre + half, 1.0)))
+
+
+# ---- by flow
+
+
+class WindowTruth(NamedTuple):
+    """Of w windows: true class (w,), flow in percent (w,), temperature in °C (w,) and segment (w,)."""
+
+    label: np.ndarray
+    flow_percent: np.ndarray
+    temperature_degC: np.ndarray
+    segment: np.ndarray
+
+
+# bins of the true flow in percent by which a classifier is judged
+JUDGED_PERCENT = tuple(np.arange(70.0, 151.0, 5.0))
+
+
+class ByFlow(NamedTuple):
+    """Of windows with a true flow from `flow_low` to `flow_high` percent: how many, and the share for which
+    something holds, in percent, with its 95 % interval by segment; NaN where there is none."""
+
+    flow_low: float
+    flow_high: float
+    windows: int
+    percent: float
+    low: float
+    high: float
+
+
+def by_flow(happened: np.ndarray, truth: WindowTruth) -> list[ByFlow]:
+    """The share of True (w,) in each bin of JUDGED_PERCENT."""
+    rows = []
+    for low, high in itertools.pairwise(JUDGED_PERCENT):
+        here = (truth.flow_percent >= low) & (truth.flow_percent < high)
+        share = share_by_segment(happened[here], truth.segment[here])
+        rows.append(ByFlow(low, high, int(here.sum()), *share))
+    return rows
+
+
+def uniform_share(happened: np.ndarray, truth: WindowTruth) -> Share:
+    """The share of True (w,) as if the flows were uniform over JUDGED_PERCENT, in percent: the mean over its
+    bins, each with the variance of its share by segment. NaN where a bin has no window."""
+    rows = by_flow(happened, truth)
+    z = scipy.special.ndtri(0.975)
+    mean = float(np.mean([row.percent for row in rows]))
+    half = z * np.sqrt(np.sum([((row.high - row.low) / (2 * z)) ** 2 for row in rows])) / len(rows)
+    return Share(mean, float(max(mean - half, 0.0)), float(min(mean + half, 100.0)))
+
+
 # ---- sets that hold the true class
 
 
@@ -192,6 +412,45 @@ def conformal_level(
     order = np.argsort(true, kind="stable")
     below = np.cumsum(1 / windows_of[place[order]])  # segments at or below each window
     return float(true[order][np.searchsorted(below, k - 1e-9)])
+
+
+class Promise(NamedTuple):
+    """What the conformal sets promise: coverage, with this confidence."""
+
+    coverage: float
+    confidence: float
+
+
+# bins of flow in percent, where controllers work, in each of which sets must cover
+COVERED_PERCENT = (70.0, 80.0, 90.0, 100.0, 110.0, 120.0, 150.0)
+
+
+def conditional_level(p: np.ndarray, truth: WindowTruth, promise: Promise) -> float:
+    """The lowest of the conformal levels of all windows (w,), of those of each bin of COVERED_PERCENT, and of
+    those within these bins at each temperature: one level, whose sets cover in each of these groups.
+
+    Sets that cover on average only do so where nothing is in doubt, and miss beside the borders (Vovk 2012,
+    label-conditional prediction). A group promises its coverage with even odds, all windows together with
+    promise.confidence; a group with too few segments for that is left to the others.
+    """
+    level = conformal_level(p, truth.label, truth.segment, **promise._asdict())
+    near = (truth.flow_percent >= COVERED_PERCENT[0]) & (truth.flow_percent < COVERED_PERCENT[-1])
+    flow_bin = np.searchsorted(COVERED_PERCENT, truth.flow_percent, side="right")
+    groups = [near & (flow_bin == k) for k in range(1, len(COVERED_PERCENT))]
+    groups += [near & (truth.temperature_degC == degrees) for degrees in np.unique(truth.temperature_degC)]
+    needed = np.log(0.5) / np.log(promise.coverage)
+    for group in groups:
+        if len(np.unique(truth.segment[group])) >= needed:
+            own = conformal_level(
+                p[group], truth.label[group], truth.segment[group], coverage=promise.coverage, confidence=0.5
+            )
+            level = min(level, own)
+    return level
+
+
+def holds_true_class(p: np.ndarray, label: np.ndarray, level: float) -> np.ndarray:
+    """(w,) whether the set {c: p_c >= level} holds the true class (w,)."""
+    return p[np.arange(len(label)), label] >= level
 
 
 class Sets(NamedTuple):
@@ -281,12 +540,17 @@ def auroc(familiar: np.ndarray, foreign: np.ndarray) -> float:
 
 
 class ClassifierOutputs(NamedTuple):
-    """A network's outputs on n frames: logits (n, 3), features with appearance (n, f); and the frames' label,
-    segment and valid (n,)."""
+    """A network's outputs on n frames: logits (n, 3), features with appearance (n, f), log(flow / 100 %) (n,)
+    with its deviation (n,); and the frames' label, flow in percent, temperature in °C, segment and valid
+    (n,)."""
 
     logits: np.ndarray
     features: np.ndarray
+    log_flow: np.ndarray
+    deviation: np.ndarray
     label: np.ndarray
+    flow_percent: np.ndarray
+    temperature_degC: np.ndarray
     segment: np.ndarray
     valid: np.ndarray
 
@@ -297,21 +561,27 @@ def classifier_outputs(prediction: Prediction, data: Labelled, valid: np.ndarray
     return ClassifierOutputs(
         prediction.logits,
         np.hstack([prediction.features, appearance(data.key_area)]),
+        np.asarray(prediction.log_flow, float),
+        np.asarray(prediction.deviation, float),
         data.label,
+        np.asarray(data.flow_percent, float),
+        np.asarray(data.temperature_degC, float),
         data.segment,
         np.asarray(valid, bool),
     )
 
 
 class Calibration(NamedTuple):
-    """What turns logits into decisions: temperature of images, correlation of a window's frames, level of its
-    conformal set, and the distance that is foreign."""
+    """What turns outputs into decisions: temperature of images, correlation of the classes of a window's
+    frames (for summed logarithms), level of a window's conformal set, the distance that is foreign, and what
+    turns the flows of frames into that of a window."""
 
     temperature: float
     correlation: float
     level: float
     familiar: Familiar
     foreign_above: float
+    flow: FlowCalibration
 
 
 def calibrate(
@@ -319,8 +589,7 @@ def calibrate(
     unseen: ClassifierOutputs,
     *,
     length: int,
-    coverage: float,
-    confidence: float,
+    promise: Promise,
     false_alarms: float,
 ) -> Calibration:
     """Everything fitted on segments `unseen` in training, but for the familiar features, which are those
@@ -328,21 +597,18 @@ def calibrate(
     v = unseen.valid
     T = fit_temperature(unseen.logits[v], unseen.label[v])
     rows = _rows(unseen, length)
-    log_p, label, segment = (
-        log_probabilities(unseen.logits, T)[rows],
-        unseen.label[rows[:, 0]],
-        unseen.segment[rows[:, 0]],
+    first = rows[:, 0]
+    correlation = fit_correlation(log_probabilities(unseen.logits, T)[rows], v[rows], unseen.label[first])
+    of_frames = unseen.log_flow[rows], unseen.deviation[rows], v[rows]
+    flow = fit_flow(*of_frames, unseen.flow_percent[first])
+    truth = WindowTruth(
+        unseen.label[first], unseen.flow_percent[first], unseen.temperature_degC[first], unseen.segment[first]
     )
-    correlation = fit_correlation(log_p, v[rows], label)
-    p = window_probabilities(log_p, v[rows], correlation)
-    level = conformal_level(p, label, segment, coverage=coverage, confidence=confidence)
+    level = conditional_level(window_flow(*of_frames, flow).prob, truth, promise)
     familiar = fit_familiar(learned.features[learned.valid], learned.label[learned.valid])
+    distance = mahalanobis(familiar, unseen.features[v])
     return Calibration(
-        T,
-        correlation,
-        level,
-        familiar,
-        foreign_above(mahalanobis(familiar, unseen.features[v]), false_alarms=false_alarms),
+        T, correlation, level, familiar, foreign_above(distance, false_alarms=false_alarms), flow
     )
 
 

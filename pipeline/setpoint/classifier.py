@@ -17,12 +17,13 @@ CLASS_NAMES = ("under (flow < 90 %)", "good (90 to 110 %)", "over (flow > 110 %)
 
 
 class Labelled(NamedTuple):
-    """Key areas (n, 16, 48) uint8 with nozzle temperature in °C (n,), class 0, 1, 2 (n,) and the segment or
-    print that each was filmed in (n,)."""
+    """Key areas (n, 16, 48) uint8 with nozzle temperature in °C (n,), class 0, 1, 2 (n,), flow in percent of
+    nominal (n,), and the segment or print that each was filmed in (n,)."""
 
     key_area: np.ndarray
     temperature_degC: np.ndarray
     label: np.ndarray
+    flow_percent: np.ndarray
     segment: np.ndarray
 
     def take(self, rows: np.ndarray) -> "Labelled":
@@ -30,7 +31,7 @@ class Labelled(NamedTuple):
 
 
 def checked(data: Labelled) -> Labelled:
-    """`data` as arrays; raises ValueError where shapes, depth, labels or temperatures are none that a
+    """`data` as arrays; raises ValueError where shapes, depth, labels, flows or temperatures are none that a
     classifier can learn from, or a class is empty."""
     data = Labelled(*(np.asarray(a) for a in data))
     n = len(data.label)
@@ -39,7 +40,7 @@ def checked(data: Labelled) -> Labelled:
             f"key areas are expected as uint8 ({n}, {ROWS}, {COLUMNS}) but found {data.key_area.dtype} "
             f"{data.key_area.shape}; cut them with key_area"
         )
-    for name in ("temperature_degC", "segment"):
+    for name in ("temperature_degC", "flow_percent", "segment"):
         if getattr(data, name).shape != (n,):
             raise ValueError(
                 f"{name} is expected once a key area, ({n},), but found {getattr(data, name).shape}"
@@ -48,6 +49,12 @@ def checked(data: Labelled) -> Labelled:
         raise ValueError(
             f"{np.sum(~np.isfinite(data.temperature_degC))} of {n} temperatures are no numbers; "
             "drop those frames or fill in the measured temperature"
+        )
+    no_flow = ~(np.isfinite(data.flow_percent) & (data.flow_percent > 0))
+    if no_flow.any():
+        raise ValueError(
+            f"flows are expected above 0 % but {no_flow.sum()} of {n} are not, the first "
+            f"{data.flow_percent[no_flow][0]:g}; write flow_rate in percent of nominal, or drop those frames"
         )
     outside = ~np.isin(data.label, range(CLASSES))
     if outside.any():
@@ -229,6 +236,21 @@ def cross_entropy(logits: Float[Array, "n 3"], label: Array, smoothing: float) -
     return -jnp.mean(jnp.sum(target * jax.nn.log_softmax(logits), axis=1))
 
 
+def flow_loss(log_flow: Array, log_deviation: Array, flow_percent: Array) -> Array:
+    """Mean of log s + ((y - mu) / s)^2 / 2 with y = log(flow / 100 %): the negative log likelihood of
+    Normal(mu, s), but for its constant (Nix and Weigend 1994)."""
+    error = jnp.log(flow_percent / 100) - log_flow
+    return jnp.mean(log_deviation + 0.5 * (error * jnp.exp(-log_deviation)) ** 2)
+
+
+def total_loss(
+    outputs: tuple[Array, Array, Array], label: Array, flow_percent: Array, smoothing: float
+) -> Array:
+    """Cross entropy of the classes and flow_loss, added: the logarithm of what is said of both."""
+    logits, *flow = outputs
+    return cross_entropy(logits, label, smoothing) + flow_loss(*flow, flow_percent)
+
+
 def train(
     state: TrainState,
     learned: Labelled,
@@ -257,7 +279,7 @@ def train(
         settings.smoothing,
         settings.averaging,
     )
-    rows, judged = [[jnp.asarray(a) for a in data[:3]] for data in (learned, held_out)]
+    rows, judged = [[_on_device(a) for a in data[:4]] for data in (learned, held_out)]
     run = _steps_on_cpu if jax.default_backend() == "cpu" else _steps
     while int(state.epoch) < epochs and int(state.epoch) - int(state.best_epoch) <= settings.patience:
         order, drawn = jax.random.split(jax.random.fold_in(key, state.epoch))
@@ -270,11 +292,12 @@ def train(
             rates,
         )
         state = state._replace(network=network, average=average, opt_state=opt_state)
-        logits = [
-            _logits(average, *(a[i : i + AT_ONCE] for a in judged[:2]))
+        outputs = [
+            _outputs(average, *(a[i : i + AT_ONCE] for a in judged[:2]))
             for i in range(0, len(judged[2]), AT_ONCE)
         ]
-        state = _judged(state, loss, jnp.concatenate(logits), judged[2])
+        whole = tuple(jnp.concatenate(one) for one in zip(*outputs, strict=True))
+        state = _judged(state, loss, whole, judged[2:])
         on_step(state)
     if int(state.best_epoch) == 0:
         raise ValueError(
@@ -282,6 +305,10 @@ def train(
             f"lower the learning rate of {settings.learning_rate:g}"
         )
     return state
+
+
+def _on_device(values: np.ndarray) -> Array:
+    return jnp.asarray(values, jnp.float32 if values.dtype.kind == "f" else None)
 
 
 def _check_apart(learned: Labelled, held_out: Labelled) -> None:
@@ -299,10 +326,10 @@ def _step(augment, carry, drawn: tuple[Array, Array], rows: list[Array], rates: 
     """One batch, drawn as (key, rows): AdamW (Loshchilov and Hutter 2019), theta <- theta - rate (Adam's
     direction + decay theta), and the running average of theta."""
     (network, average, opt_state), (key, chosen) = carry, drawn
-    key_area, temperature, label = [a[chosen] for a in rows]
+    key_area, temperature, label, flow = [a[chosen] for a in rows]
     augmented = augment(key, key_area.astype(jnp.float32))
     loss, gradient = jax.value_and_grad(
-        lambda net: cross_entropy(net(augmented, temperature), label, rates.smoothing)
+        lambda net: total_loss(net.outputs(augmented, temperature), label, flow, rates.smoothing)
     )(network)
     t = opt_state.count
     direction, opt_state = ADAM.update(gradient, opt_state)
@@ -328,17 +355,16 @@ def _steps_on_cpu(augment, carry, drawn, rows, rates):
 
 
 @jax.jit
-def _logits(network: Classifier, key_area: Array, temperature_degC: Array) -> Array:
-    return network(key_area, temperature_degC)
+def _outputs(network: Classifier, key_area: Array, temperature_degC: Array) -> tuple[Array, Array, Array]:
+    return network.outputs(key_area, temperature_degC)
 
 
 @jax.jit
-def _judged(state: TrainState, loss: Array, logits: Array, label: Array) -> TrainState:
-    """The state with its average judged by its logits for the held-out
-    segments, and kept where its loss is the lowest yet."""
-    row = jnp.stack(
-        [loss.mean(), cross_entropy(logits, label, 0.0), jnp.mean(jnp.argmax(logits, axis=1) == label)]
-    )
+def _judged(state: TrainState, loss: Array, outputs: tuple, truth: list[Array]) -> TrainState:
+    """The state with its average judged by its outputs for the held-out segments, of which `truth` holds
+    class and flow, and kept where its loss is the lowest yet."""
+    right = jnp.argmax(outputs[0], axis=1) == truth[0]
+    row = jnp.stack([loss.mean(), total_loss(outputs, *truth, 0.0), jnp.mean(right)])
     better = row[1] < jnp.min(
         jnp.nan_to_num(state.history[:, 1], nan=jnp.inf)
     )  # never where the loss is no number
@@ -356,24 +382,28 @@ def _judged(state: TrainState, loss: Array, logits: Array, label: Array) -> Trai
 
 
 class Prediction(NamedTuple):
-    """Logits (n, 3) and the features that the last layer saw (n, f), both float32."""
+    """Logits (n, 3), the features that the last layers saw (n, f), log(flow / 100 %) (n,) and its deviation
+    (n,), all float32."""
 
     logits: np.ndarray
     features: np.ndarray
+    log_flow: np.ndarray
+    deviation: np.ndarray
 
 
 @jax.jit
-def _predict(network: Classifier, key_area: Array, temperature_degC: Array) -> tuple[Array, Array]:
+def _predict(network: Classifier, key_area: Array, temperature_degC: Array) -> tuple[Array, ...]:
     mirrored = (key_area, key_area[:, ::-1], key_area[:, :, ::-1], key_area[:, ::-1, ::-1])
     features = sum(network.features(x, temperature_degC) for x in mirrored) / len(mirrored)
-    return network.head.classes(features), features
+    log_flow, log_deviation = network.flow_head(features)
+    return network.head.classes(features), features, log_flow, jnp.exp(log_deviation)
 
 
 def predict(
     network: Classifier, key_area: np.ndarray, temperature_degC: np.ndarray, *, batch: int = AT_ONCE
 ) -> Prediction:
-    """Logits and features of key areas (n, 16, 48) at temperatures (n,), the mean over each area's four
-    mirror images: a bead has no left, right, head or tail.
+    """Logits, features and flow of key areas (n, 16, 48) at temperatures (n,), from the mean features of each
+    area's four mirror images: a bead has no left, right, head or tail.
 
     It takes batches, the last one padded, so that one program serves any n.
     """
@@ -388,7 +418,6 @@ def predict(
         x[:k], u[:k] = key_area[i : i + k], temperature_degC[i : i + k]
         parts.append([np.asarray(a)[:k] for a in _predict(network, x, u)])
     if not parts:
-        return Prediction(
-            np.zeros((0, CLASSES), np.float32), np.zeros((0, network.head.classes.W.shape[0]), np.float32)
-        )
+        shapes = (0, CLASSES), (0, network.head.classes.W.shape[0]), (0,), (0,)
+        return Prediction(*(np.zeros(shape, np.float32) for shape in shapes))
     return Prediction(*(np.concatenate(p) for p in zip(*parts, strict=True)))

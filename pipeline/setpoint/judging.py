@@ -1,29 +1,89 @@
-"""Controllers of setpoints on one yardstick: 21 starts x runs judged by the true flow,
-and the choice of the default by its worst case."""
+"""Controllers of setpoints on one yardstick: what they are asked (21 wrong starts, good starts that shall stay
+good, cameras that err), on redrawn segments, and the rule by which one of them runs by default.
 
-from typing import NamedTuple
+Figures are of the segments that a classifier happened to record. Redrawn with replacement, as often as runs
+have blocks, these segments say how far the figures would move had others been recorded (cluster bootstrap:
+Davison and Hinkley 1997, section 3.8): each block of runs sees a redraw of its own.
+"""
 
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint.score import CLOG_STEP, STEPS, Score, judge
-from pipeline.setpoint.simulator import Conditions, Controller, Windows, nominal, paper_windows, rollout
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
+from pipeline.setpoint.recorded import WindowTable, recorded_windows
+from pipeline.setpoint.score import CLOG_STEP, STEPS, Outcomes, Score, judge, outcomes
+from pipeline.setpoint.simulator import (
+    STAND,
+    Action,
+    Conditions,
+    Controller,
+    Observation,
+    Windows,
+    nominal,
+    paper_windows,
+    rollout,
+)
+from pipeline.statistics import Mean, Share, effective_runs, redrawn_mean, shared_variance, wilson_interval
 
 START_FLOWS, START_TEMPERATURES = (
     (30.0, 60.0, 80.0, 120.0, 150.0, 200.0, 300.0),
     (190.0, 210.0, 230.0),
 )  # section 3.4
+STARTS = len(START_FLOWS) * len(START_TEMPERATURES)
+GOOD_STARTS = np.linspace(92.5, 107.5, STARTS)  # percent: prints that nothing is wrong with
+SOUND, STUCK, BLIND = range(3)
+FAULT_STEPS = (20, 50)  # decisions from and until which a camera is stuck or blind
+OTHER_CAMERA = (
+    1.12,
+    0.8,
+)  # scale and exponent: it shows 12 % more at 100 %, and ratios smaller than they are
+MOVED_BORDERS = (0.92, 1.08)  # of those learned
+DOES_NOTHING = "do nothing"
+
+
+class Camera(NamedTuple):
+    """What it shows instead of the flow q, 100 scale (q / 100)^exponent percent, and its fault: kind SOUND,
+    STUCK (every window as the last one before) or BLIND (no window, so the controller is held), in decisions
+    from .. until - 1."""
+
+    scale: float = 1.0
+    exponent: float = 1.0
+    kind: int = SOUND
+    start: int = FAULT_STEPS[0]
+    until: int = FAULT_STEPS[1]
+
+
+class Case(NamedTuple):
+    """Conditions (n,), persistence 0 of the paper's windows; the camera. good: from good starts, where harm
+    is what counts."""
+
+    conditions: Conditions
+    camera: Camera = Camera()
+    good: bool = False
 
 
 class Choice(NamedTuple):
-    """The default: worst is the share of runs (percent) that settle and stay in its worst case, margin the
-    points by which that exceeds the next controller's worst."""
+    """The default. worst is the share of its runs (percent) that settle and stay in its worst case; margin
+    the points by which that exceeds the worst of the strongest other, with its 95 % interval (NaN where
+    nothing else was judged). refused: who may not run, and why."""
 
     name: str
     worst: float
     case: str
     margin: float
+    margin_low: float
+    margin_high: float
+    refused: dict[str, str]
     sentence: str
+
+
+# ---- what is asked
 
 
 def starts(runs: int, *, accuracy: float) -> Conditions:
@@ -34,76 +94,336 @@ def starts(runs: int, *, accuracy: float) -> Conditions:
     return nominal(flow, temperature, accuracy=accuracy)
 
 
+def good_starts(flows: Sequence[float] | np.ndarray, runs: int) -> Conditions:
+    """From each of the flows (percent) at 210 °C, `runs` times."""
+    return nominal(np.repeat(flows, runs), BEST_TEMPERATURE, accuracy=1.0)
+
+
+def all_cases(runs: int, *, segment_mean_decisions: float) -> dict[str, Case]:
+    """Every case by name, 21 runs each: on the paper's simulator and on recorded windows the 21 starts, with
+    the actuator at 0.6 of its gain, and clogged to 0.6 or 0.75 at step 60; then good starts on recorded
+    windows whose conditions last segment_mean_decisions, with cameras that are right or wrong.
+    """
+    fresh = starts(runs, accuracy=1.0)
+    one = jnp.ones_like(fresh.flow)
+    lasting, none = {"persistence": segment_mean_decisions * one}, {"persistence": 0.0 * one}
+    sticky = fresh._replace(**lasting)
+    weak = {"gain": 0.6 * one}
+    clog, half_clog = ({"clog": left * one, "clog_step": CLOG_STEP * one} for left in (0.6, 0.75))
+    paper = {accuracy: starts(runs, accuracy=accuracy)._replace(**none) for accuracy in (1.0, 0.9, 0.8, 0.7)}
+    asked = {f"accuracy {accuracy:g}": conditions for accuracy, conditions in paper.items()} | {
+        "accuracy 0.7, gain 0.6": paper[0.7]._replace(**weak),
+        "accuracy 0.7, clog": paper[0.7]._replace(**clog),
+        "recorded, fresh": fresh,
+        "recorded, sticky": sticky,
+        "recorded, fresh, gain 0.6": fresh._replace(**weak),
+        "recorded, sticky, gain 0.6": sticky._replace(**weak),
+        "recorded, fresh, clog": fresh._replace(**clog),
+        "recorded, sticky, clog": sticky._replace(**clog),
+        "recorded, sticky, half clog": sticky._replace(**half_clog),
+    }
+    perfect, in_band = (
+        good_starts(flows, runs)._replace(**lasting) for flows in (np.full(STARTS, BEST_FLOW), GOOD_STARTS)
+    )
+    harm = {
+        f"{name}{camera}": Case(conditions, of, good=True)
+        for name, conditions in (("perfect", perfect), ("in band", in_band))
+        for camera, of in cameras().items()
+    }
+    return {name: Case(conditions) for name, conditions in asked.items()} | harm
+
+
+def alike(case: str) -> str:
+    """What the windows of a case have in common with those of others: "" the paper's, which share no segment;
+    fresh ones; sticky ones. Cases alike tell together how much runs on one redraw share."""
+    if case.startswith("accuracy"):
+        return ""
+    return "fresh" if case.startswith("recorded, fresh") else "sticky"
+
+
+def counts(case: str) -> bool:
+    """Whether a case is of the wrong starts, by which controllers are ranked; the good ones tell harm."""
+    return not case.startswith(("perfect", "in band"))
+
+
+def cameras() -> dict[str, Camera]:
+    """The camera right, of another make, at fault, and with borders moved, by what a case's name ends in."""
+    scale, exponent = OTHER_CAMERA
+    low, high = MOVED_BORDERS
+    length = FAULT_STEPS[1] - FAULT_STEPS[0]
+    return {
+        "": Camera(),
+        ", another camera": Camera(scale, exponent),
+        f", stuck {length}": Camera(kind=STUCK),
+        f", blind {length}": Camera(kind=BLIND),
+        f", borders {100 * low:g} %": Camera(1 / low),
+        f", borders {100 * high:g} %": Camera(1 / high),
+    }
+
+
 def cases(
     recorded: Windows, *, runs: int, segment_mean_decisions: float
 ) -> dict[str, tuple[Windows, Conditions]]:
-    """What every controller is judged on, by name: both simulators, with the actuator at 0.6 of its gain, and
-    with a clog (flow x 0.6 from step 60).
-
-    recorded: from `recorded_windows`; its conditions last segment_mean_decisions in the sticky cases.
-    """
-    paper, rough, fresh = paper_windows(), starts(runs, accuracy=0.7), starts(runs, accuracy=1.0)
-    one = jax.numpy.ones_like(fresh.flow)
-    sticky = fresh._replace(persistence=segment_mean_decisions * one)
-    weak, clog = {"gain": 0.6 * one}, {"clog": 0.6 * one, "clog_step": CLOG_STEP * one}
+    """The cases from wrong starts as sources of windows and conditions. recorded: of `recorded_windows`."""
     return {
-        **{
-            f"accuracy {accuracy:g}": (paper, starts(runs, accuracy=accuracy))
-            for accuracy in (1.0, 0.9, 0.8, 0.7)
-        },
-        "accuracy 0.7, gain 0.6": (paper, rough._replace(**weak)),
-        "accuracy 0.7, clog": (paper, rough._replace(**clog)),
-        "recorded, fresh": (recorded, fresh),
-        "recorded, sticky": (recorded, sticky),
-        "recorded, fresh, gain 0.6": (recorded, fresh._replace(**weak)),
-        "recorded, sticky, gain 0.6": (recorded, sticky._replace(**weak)),
-        "recorded, fresh, clog": (recorded, fresh._replace(**clog)),
-        "recorded, sticky, clog": (recorded, sticky._replace(**clog)),
+        name: (shown_by(recorded, case.camera), case.conditions)
+        for name, case in all_cases(runs, segment_mean_decisions=segment_mean_decisions).items()
+        if not case.good
     }
+
+
+class Shown(NamedTuple):
+    """recorded windows and how the camera maps the flow that they show."""
+
+    recorded: Windows
+    scale: jax.Array
+    exponent: jax.Array
+
+
+def shown_by(recorded: Windows, camera: Camera) -> Windows:
+    """The windows of this camera: those of the paper where conditions.persistence is 0, else recorded ones at
+    the flow that the camera makes of the true one. One program for all of them."""
+    return Windows(_shown, Shown(recorded, jnp.float32(camera.scale), jnp.float32(camera.exponent)))
+
+
+def _shown(table: Shown, conditions: Conditions, flow, segment, u) -> tuple[jax.Array, ...]:
+    seen = BEST_FLOW * table.scale * (flow / BEST_FLOW) ** table.exponent
+    paper = paper_windows().draw((), conditions, flow, segment, u)
+    recorded = table.recorded.draw(table.recorded.table, conditions, seen, segment, u)
+    return tuple(jnp.where(conditions.persistence > 0, *pair) for pair in zip(recorded, paper, strict=True))
+
+
+class Fault(NamedTuple):
+    kind: jax.Array
+    start: jax.Array
+    until: jax.Array
+
+
+_TOLD = ("flow_move", "temperature", "target", "step")  # of an observation, what no camera says
+
+
+@cache  # one pair of functions, so that what was compiled for it is found again
+def behind_camera(controller: Controller) -> Controller:
+    """The controller behind a camera that may stick or go blind: parameters (Fault, the controller's own).
+
+    Stuck: it is shown the last window again. Blind: it is not asked, and stands; the moves that it missed
+    reach it with its next window.
+    """
+
+    def act(parameters, memory, observation: Observation, key):
+        fault, own = parameters
+        before, shown, missed = memory
+        now = (observation.step >= fault.start) & (observation.step < fault.until)
+        stuck, blind = now & (fault.kind == STUCK), now & (fault.kind == BLIND)
+        window = {name: getattr(observation, name) for name in observation._fields if name not in _TOLD}
+        window = jax.tree.map(lambda last, new: jnp.where(stuck, last, new), shown, window)
+        missed = missed + observation.flow_move
+        after, action = controller.act(own, before, observation._replace(flow_move=missed, **window), key)
+        memory = jax.tree.map(lambda old, new: jnp.where(blind, old, new), (before, missed), (after, 0.0))
+        action = jax.tree.map(lambda move: jnp.where(blind, STAND, move).astype(jnp.int32), action)
+        return (memory[0], window, memory[1]), Action(*action)
+
+    empty = {"shares": jnp.zeros(3), "named": jnp.int32(0)} | (
+        {"flow_seen": jnp.zeros(())} if "flow_seen" in Observation._fields else {}
+    )
+    return Controller(lambda: (controller.start(), empty, jnp.zeros(())), act)
+
+
+# ---- runs on redrawn segments
+
+
+def redrawn(table: WindowTable, redraws: int, rng: np.random.Generator) -> Windows:
+    """`redraws` tables of as many segments as the table has, drawn from them with replacement: a source whose
+    arrays have a leading axis (redraws,).
+
+    A bin of the flow that a redraw leaves without a window keeps its own segments: of prints that stand at
+    one flow each there may be no other.
+    """
+    sources = [recorded_windows(_redraw(table, rng)) for _ in range(redraws)]
+
+    def stacked(*leaves: jax.Array) -> jax.Array:
+        longest = max(map(len, leaves))
+        # what is filled up is never drawn: counts say where a segment ends
+        return jnp.stack([jnp.pad(a, [(0, longest - len(a))] + [(0, 0)] * (a.ndim - 1)) for a in leaves])
+
+    return sources[0]._replace(table=jax.tree.map(stacked, *(source.table for source in sources)))
+
+
+def _redraw(table: WindowTable, rng: np.random.Generator) -> WindowTable:
+    flow_bin = np.asarray(table.flow_bin)
+    names, segment = np.unique(table.segment, return_inverse=True)
+    segment = segment.ravel()
+    order, counts = np.argsort(segment, kind="stable"), np.bincount(segment)
+    first = np.cumsum(counts) - counts
+    drawn = rng.integers(0, len(names), len(names))
+    rows = np.concatenate([order[first[s] : first[s] + counts[s]] for s in drawn])
+    kept = np.flatnonzero(~np.isin(flow_bin, flow_bin[rows]))
+    which = np.concatenate([np.repeat(np.arange(len(drawn)), counts[drawn]), len(drawn) + segment[kept]])
+    rows = np.concatenate([rows, kept])
+    columns = {
+        name: np.asarray(column)[rows]
+        for name, column in table._asdict().items()
+        if name not in ("flow_edges", "segment") and np.shape(column)[:1] == flow_bin.shape
+    }
+    return table._replace(**columns, segment=which)
 
 
 def evaluate(
     controller: Controller, parameters, windows: Windows, conditions: Conditions, key: jax.Array
 ) -> Score:
-    """Roll out and judge."""
+    """Roll out and judge runs that share nothing."""
     trajectory = rollout(controller, parameters, windows, conditions, key, steps=STEPS)
     return judge(trajectory.flow, trajectory.temperature)
 
 
-def choose(scores: dict[str, dict[str, Score]]) -> Choice:
-    """The controller with the best worst case: scores[controller][case], read by the share that settles and
-    stays, of two alike the one with the better mean.
+def ask(controller: Controller, parameters: Any, case: Case, recorded: Windows, keys: jax.Array) -> Outcomes:
+    """What becomes of the case's runs (n,) on each redraw of `recorded` (of `redrawn`), one key each (B,):
+    B n runs, block by block. The same key, the same chance for every controller."""
+    camera = case.camera
+    fault = Fault(*map(jnp.int32, (camera.kind, camera.start, camera.until)))
+    flow, temperature = _asked(
+        behind_camera(controller), (fault, parameters), shown_by(recorded, camera), case.conditions, keys
+    )
+    return outcomes(*(np.asarray(a).reshape(-1, STEPS + 1) for a in (flow, temperature)))
 
-    Raises ValueError where controllers were not judged on the same cases.
+
+def _asked(controller: Controller, parameters, windows: Windows, conditions: Conditions, keys):
+    shown: Shown = windows.table
+
+    def one(table, key):
+        of = windows._replace(table=shown._replace(recorded=shown.recorded._replace(table=table)))
+        trajectory = rollout(controller, parameters, of, conditions, key, steps=STEPS)
+        return trajectory.flow, trajectory.temperature
+
+    return jax.vmap(one)(shown.recorded.table, keys)
+
+
+# ---- the choice
+
+
+class Judged(NamedTuple):
+    """A contestant's runs by case, each (B, n) on B redraws: kept, settled and stayed (from wrong starts);
+    harmed, farther than +-25 % from 100 % (from good starts)."""
+
+    kept: Mapping[str, np.ndarray]
+    harmed: Mapping[str, np.ndarray]
+
+
+def harmless(of: Judged, bars: Mapping[str, float]) -> str:
+    """ "" where the contestant leaves +-25 % in at most bars[case] percent of the runs of each case, else where
+    it leaves it most beyond its bar."""
+    over = {case: 100.0 * float(of.harmed[case].mean()) - bar for case, bar in bars.items()}
+    case = max(over, key=lambda name: over[name], default="")
+    if not case or over[case] <= 0:
+        return ""
+    share = 100.0 * float(of.harmed[case].mean())
+    return f"leaves +-25 % in {share:.1f} % of the runs ({case}), of at most {bars[case]:g} %"
+
+
+def worst_case(of: Judged) -> tuple[float, str]:
+    """The least share (0 to 1) of runs that settle and stay, and where; of two alike the first case."""
+    case = min(of.kept, key=lambda name: float(of.kept[name].mean()))
+    return float(of.kept[case].mean()), case
+
+
+def lead(of: Judged, other: Judged) -> Mean:
+    """By how many points the worst case of `of` exceeds the worst of the other, with its 95 % interval, from
+    the redraws that both have: same segments, same chance."""
+    first, second = worst_case(of)[1], worst_case(other)[1]
+    both = min(len(of.kept[first]), len(other.kept[second]))
+
+    def beyond(case: str, against: str) -> np.ndarray:
+        return 100.0 * (of.kept[case][:both].astype(float) - other.kept[against][:both])
+
+    groups = {alike(first), alike(second)} - {""}
+    shared = shared_variance([beyond(case, case) for case in of.kept if alike(case) in groups])
+    return redrawn_mean(beyond(first, second), shared)
+
+
+def still_in(judged: Mapping[str, Judged], bars: Mapping[str, float]) -> list[str]:
+    """Who may still become the default: whose worst case does not lie below that of the best harmless one,
+    interval by interval, and whose harm is not beyond its bar by the whole of its interval."""
+    sound = [name for name, of in judged.items() if not harmless(of, bars)] or list(judged)
+    best = max(sound, key=lambda name: worst_case(judged[name])[0])
+    least = _worst_share(judged[best]).low
+    return [
+        name
+        for name, of in judged.items()
+        if _worst_share(of).high >= least
+        and all(_interval(of, of.harmed, case).low <= bar for case, bar in bars.items())
+    ]
+
+
+def _worst_share(of: Judged) -> Share:
+    return _interval(of, of.kept, worst_case(of)[1])
+
+
+def _interval(of: Judged, figures: Mapping[str, np.ndarray], case: str) -> Share:
+    """Of a case, with what its runs share told by all cases alike."""
+    group = [
+        blocks for side in (of.kept, of.harmed) for name, blocks in side.items() if alike(name) == alike(case)
+    ]
+    blocks = figures[case]
+    shared = shared_variance(group) if alike(case) else 0.0
+    return wilson_interval(float(blocks.mean()), effective_runs(len(blocks), blocks.size, shared))
+
+
+def choose(
+    judged: Mapping[str, Judged], *, simplest_first: Sequence[str], bars: Mapping[str, float]
+) -> Choice:
+    """The default: of the contestants that do no harm the simplest whose worst case is not worse than the
+    best one's beyond its 95 % interval.
+
+    simplest_first: names in the order of simplicity. bars: percent of runs that may leave +-25 % from good
+    starts, by case. Raises ValueError where contestants were not judged on the same cases, where a name has
+    no place in the order, and where all do harm.
     """
-    cases = {frozenset(by_case) for by_case in scores.values()}
-    if len(cases) != 1:
+    _check(judged, simplest_first, bars)
+    refused = {name: why for name, of in judged.items() if (why := harmless(of, bars))}
+    candidates = [name for name in simplest_first if name in judged and name not in refused]
+    if not candidates:
         raise ValueError(
-            "choose: expected every controller judged on the same cases, "
-            f"found {sorted(sorted(c) for c in cases)}; judge all on all"
+            f"choose: expected a contestant that does no harm, found none of {', '.join(judged)}; "
+            f'add "{DOES_NOTHING}"'
         )
-    figures = {
-        name: sorted((score.stay.percent, case) for case, score in by_case.items())
-        for name, by_case in scores.items()
-    }
-    ranked = sorted(
-        figures,
-        key=lambda name: (figures[name][0][0], np.mean([stay for stay, _ in figures[name]])),
-        reverse=True,
+    best = max(candidates, key=lambda name: worst_case(judged[name])[0])
+    ties = [name for name in candidates if name == best or lead(judged[best], judged[name]).low <= 0]
+    name = ties[0]
+    worst, case = worst_case(judged[name])
+    rest = [other for other in candidates if other != name]
+    if not rest:
+        margin, why = Mean(*3 * (float("nan"),)), "nothing else may run"
+    else:
+        rival = max(rest, key=lambda other: worst_case(judged[other])[0])
+        margin = lead(judged[name], judged[rival])
+        why = _reason(name, rival, judged[rival], margin)
+    opening = (
+        f"{name} is the default: in its worst case ({case}) {100 * worst:.1f} % of the runs settle and stay"
     )
-    (worst, case), *others = (figures[name][0] for name in ranked)
-    sentence = (
-        f"{ranked[0]} is the default: in its worst case ({case}) {worst:.1f} % of the runs settle and stay"
-    )
-    if not others:
-        return Choice(ranked[0], worst, case, float("nan"), f"{sentence}; nothing else was judged.")
-    next_worst, next_case = others[0]
-    margin = worst - next_worst
-    return Choice(
-        ranked[0],
-        worst,
-        case,
-        margin,
-        f"{sentence}, {margin:.1f} points more than of {ranked[1]} in its worst ({next_case}, "
-        f"{next_worst:.1f} %).",
-    )
+    beside = "".join(f" Not asked: {other} {why}." for other, why in refused.items())
+    return Choice(name, 100 * worst, case, *margin, refused, f"{opening}; {why}.{beside}")
+
+
+def _reason(name: str, rival: str, of: Judged, margin: Mean) -> str:
+    worst, case = worst_case(of)
+    other = f"{rival} {100 * worst:.1f} % in its own ({case})"
+    ends = f"95 % interval {margin.low:+.1f} to {margin.high:+.1f} points"
+    if margin.low > 0:
+        return f"that is {margin.value:.1f} points more than of {other}, {ends}"
+    if name == DOES_NOTHING:
+        return f"no controller does better beyond noise, the best is {other}, {ends}"
+    return f"{other} is within noise ({ends}), and of two alike the simpler runs"
+
+
+def _check(judged: Mapping[str, Judged], simplest_first: Sequence[str], bars: Mapping[str, float]) -> None:
+    asked = {frozenset(of.kept) for of in judged.values()}
+    if len(asked) != 1 or any(bars.keys() - of.harmed.keys() for of in judged.values()):
+        raise ValueError(
+            "choose: expected every controller judged on the same cases, found "
+            f"{sorted(sorted({*of.kept, *of.harmed}) for of in judged.values())}; judge all on all"
+        )
+    if lost := [name for name in judged if name not in simplest_first]:
+        raise ValueError(
+            f"choose: expected every contestant in the order of simplicity, found {', '.join(lost)} without "
+            "a place; add it"
+        )

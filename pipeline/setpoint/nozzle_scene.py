@@ -13,12 +13,15 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import scipy.special
 
 from pipeline.setpoint.key_area import SIDE, KeyAreas, find_all
 
 # classes 0 below 90, 1 from 90 to 110, 2 above 110 percent of the nominal flow (paper,
 # section 2.2); the flows that a printer is set to
 BORDERS, FLOWS = (90.0, 110.0), (20.0, 310.0)
+# where flows to judge are uniform, in percent; deviation of log flow of the bump in those to learn from
+JUDGED, BUMP = (70.0, 150.0), 0.25
 TEMPERATURES = (190.0, 200.0, 210.0, 220.0, 230.0)
 # a bead of nominal flow in px; a stadium of height h has the section (w - h) h + pi h^2 / 4, so that w =
 # w_100 (q + FLAT (1 - q)) with FLAT = (1 - pi/4) h / w_100
@@ -85,7 +88,7 @@ class Frames(NamedTuple):
 class DataSet(NamedTuple):
     """Key areas of many segments: images (n, 16, 48) uint8, label (n,) 0 1 2,
     flow (n,) in percent, temperature (n,) in degC, segment (n,) 0 1 2 ..., valid
-    (n,) bool (images are zeros elsewhere), n reasons."""
+    (n,) bool (images are zeros elsewhere), score (n,) of the line's ridge in gray levels, n reasons."""
 
     images: np.ndarray
     label: np.ndarray
@@ -93,6 +96,7 @@ class DataSet(NamedTuple):
     temperature: np.ndarray
     segment: np.ndarray
     valid: np.ndarray
+    score: np.ndarray
     reasons: tuple[str, ...]
 
 
@@ -173,32 +177,69 @@ def key_areas(frames: Frames, *, least_score: float) -> KeyAreas:
     return find_all(frames.frames, frames.tip, least_score=least_score, directions_deg=frames.direction_deg)
 
 
-def draw_flow(rng: np.random.Generator, kind: int, n: int) -> np.ndarray:
-    """n flows of a class in percent, uniform between its borders within FLOWS."""
+def draw_flow(rng: np.random.Generator, n: int) -> np.ndarray:
+    """(n,) flows in percent to learn and to calibrate with, in random order: of every two one log-uniform
+    over FLOWS, and one from a log-normal bump of deviation BUMP round 100 %, where the classes' borders are.
+
+    The density is continuous everywhere, also across the borders: a flow of 111 % is as frequent as one of
+    109 %. Both halves are drawn in equal strata, so that few flows already hold all classes.
+    """
+    wide, near = _strata(rng, n - n // 2), _strata(rng, n // 2)
+    low, high = np.log(FLOWS)
+    ends = scipy.special.ndtr((np.log(FLOWS) - np.log(100.0)) / BUMP)
+    bump = 100 * np.exp(BUMP * scipy.special.ndtri(ends[0] + (ends[1] - ends[0]) * near))
+    return rng.permutation(np.concatenate([np.exp(low + (high - low) * wide), bump]))
+
+
+def draw_judged_flow(rng: np.random.Generator, n: int) -> np.ndarray:
+    """(n,) flows in percent to judge on, in random order: of every two one uniform over JUDGED, where a
+    controller works, and one log-uniform over FLOWS, both in equal strata."""
+    low, high = np.log(FLOWS)
+    near = JUDGED[0] + (JUDGED[1] - JUDGED[0]) * _strata(rng, n - n // 2)
+    return rng.permutation(np.concatenate([near, np.exp(low + (high - low) * _strata(rng, n // 2))]))
+
+
+def _strata(rng: np.random.Generator, n: int) -> np.ndarray:
+    """(n,) numbers, one uniform in each of n equal parts of 0..1."""
+    return (np.arange(n) + rng.random(n)) / max(n, 1)
+
+
+def draw_class_flow(rng: np.random.Generator, kind: int, n: int) -> np.ndarray:
+    """n flows of a class in percent, uniform between its borders within FLOWS: as the paper's data are
+    dealt out, with a leap at each border."""
     ends = (FLOWS[0], *BORDERS, FLOWS[1])
     return rng.uniform(ends[kind], ends[kind + 1], n)
 
 
-def data_set(rng: np.random.Generator, *, segments: int, frames: int, least_score: float) -> DataSet:
-    """Key areas of `segments` segments for each of the 15 combinations of class and temperature, `frames`
-    images each; flow and temperature stay within a segment.
+def filmed(
+    rng: np.random.Generator, flow: np.ndarray, temperature: np.ndarray, *, frames: int, least_score: float
+) -> DataSet:
+    """Key areas of n segments, each at its flow (n,) in percent and temperature (n,) in degC with `frames`
+    images.
 
     Images of one segment share its conditions: a classifier learns
     more from many short segments than from few long ones.
     """
     rows: list[tuple] = []
-    for combination in range(15 * segments):
-        kind, temperature = combination % 3, TEMPERATURES[combination // 3 % 5]
-        flow = np.full(frames, draw_flow(rng, kind, 1)[0])
-        made = render(draw_segment(rng), flow, np.full(frames, temperature), rng)
+    for q, degrees in zip(flow, temperature, strict=True):
+        made = render(draw_segment(rng), np.full(frames, q), np.full(frames, degrees), rng)
         rows.append((made, key_areas(made, least_score=least_score)))
-    flow = np.concatenate([m.flow for m, _ in rows])
+    flow = np.repeat(np.asarray(flow, float), frames)
+    areas = [k for _, k in rows]
     return DataSet(
-        np.concatenate([k.images for _, k in rows]), label(flow), flow,
-        np.concatenate([m.temperature for m, _ in rows]),
-        np.repeat(np.arange(len(rows)), frames), np.concatenate([k.valid for _, k in rows]),
-        sum((k.reasons for _, k in rows), ()),
+        np.concatenate([k.images for k in areas]), label(flow), flow, np.repeat(temperature, frames),
+        np.repeat(np.arange(len(rows)), frames), np.concatenate([k.valid for k in areas]),
+        np.concatenate([k.score for k in areas]), sum((k.reasons for k in areas), ()),
     )  # fmt: skip
+
+
+def data_set(rng: np.random.Generator, *, segments: int, frames: int, least_score: float) -> DataSet:
+    """Key areas of `segments` segments for each of the paper's 15 combinations of class and temperature,
+    `frames` images each; flow and temperature stay within a segment."""
+    combination = np.arange(15 * segments)
+    flow = np.array([draw_class_flow(rng, kind, 1)[0] for kind in combination % 3])
+    temperature = np.array(TEMPERATURES)[combination // 3 % 5]
+    return filmed(rng, flow, temperature, frames=frames, least_score=least_score)
 
 
 def _slope(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -279,7 +279,13 @@ def run(
         pictures |= areas.pictures
         step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, decision)
         shown = Observation(
-            window.p, window.label, since, temperature.mean(axis=1), setpoints.value[:, 1], acted
+            window.p,
+            window.label,
+            np.full(E, np.nan),
+            since,
+            temperature.mean(axis=1),
+            setpoints.value[:, 1],
+            acted,
         )
         memory, wanted = _answer(controller, parameters, memory, shown, step_keys, window.reason)
         before, setpoints = setpoints, deployment.moved(setpoints, wanted, time_s, loop.limits)

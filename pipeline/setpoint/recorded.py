@@ -1,10 +1,11 @@
 """Windows recorded from a trained classifier as a source for the simulator: whole windows are drawn again, so
 errors sit, stick and mislead as the classifier's do.
 
-Given a true flow, a segment of its flow bin is taken, and of that segment any window.
-Conditions persist: within a bin the segments are ranked by how much they look over-extruded
-(mean p_2 - p_0), and an episode keeps its rank for a while, also when the flow moves to another
-bin, so that what looks thin here looks thin there.
+Given a true flow q, a segment of its flow bin is taken, and of that segment any window. Of a table with flows
+the window keeps its error: it shows flow_seen q / flow, and the class shares that belong to it. Conditions
+persist: within a bin the segments are ranked by how much they look over-extruded (mean log flow_seen / flow,
+or mean p_2 - p_0 where only classes are seen), and an episode keeps its rank for a while, also when the flow
+moves to another bin, so that what looks thin here looks thin there.
 """
 
 from typing import NamedTuple
@@ -13,7 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint.simulator import Conditions, Windows
+from pipeline.setpoint.simulator import GOOD_BORDERS, Conditions, Windows
+
+UNSEEN = np.array(np.nan)  # of a table of classes only
 
 
 class WindowTable(NamedTuple):
@@ -22,7 +25,9 @@ class WindowTable(NamedTuple):
 
     flow_edges (bins + 1,) in percent, rising; flows outside take the outermost bin. Every bin needs a window;
     a segment may occur in one bin or in many. Bins of 2.5 % from 70 to 130 % and wider ones beyond let a
-    controller find 100 % within the good class.
+    controller find 100 % within the good class. flow_seen (n,) is the flow that a window shows, spread (n,)
+    the deviation of its logarithm, flow (n,) the true one, both in percent of nominal: all three NaN where
+    the classifier names classes only.
     """
 
     shares: np.ndarray
@@ -30,14 +35,24 @@ class WindowTable(NamedTuple):
     flow_bin: np.ndarray
     segment: np.ndarray
     flow_edges: np.ndarray
+    flow_seen: np.ndarray = UNSEEN
+    spread: np.ndarray = UNSEEN
+    flow: np.ndarray = UNSEEN
+
+
+def with_flows(table: WindowTable) -> bool:
+    """Whether the windows show flows, not classes only."""
+    return bool(np.isfinite(table.flow_seen).all())
 
 
 class _Ranked(NamedTuple):
     """Windows sorted by bin, then by the rank of their segment: segments of bin b are first_segment[b] + 0 ..
-    segments[b] - 1, their windows likewise."""
+    segments[b] - 1, their windows likewise. log_error (n,) is log flow_seen / flow."""
 
     shares: jax.Array
     named: jax.Array
+    log_error: jax.Array
+    spread: jax.Array
     first_segment: jax.Array
     segments: jax.Array
     first_window: jax.Array
@@ -52,7 +67,9 @@ def recorded_windows(table: WindowTable) -> Windows:
     pairs, place = np.unique(np.stack([table.flow_bin, table.segment], axis=1), axis=0, return_inverse=True)
     place = place.ravel()
     counts = np.bincount(place)
-    thickness = np.bincount(place, weights=shares[:, 2] - shares[:, 0]) / counts
+    log_error = np.broadcast_to(np.log(table.flow_seen / table.flow), counts.sum())
+    wide = log_error if with_flows(table) else shares[:, 2] - shares[:, 0]
+    thickness = np.bincount(place, weights=wide) / counts
     order = np.lexsort([thickness, pairs[:, 0]])  # by bin, then by thickness
     position = np.empty_like(order)
     position[order] = np.arange(len(order))
@@ -61,6 +78,8 @@ def recorded_windows(table: WindowTable) -> Windows:
     ranked = _Ranked(
         shares=jnp.asarray(shares[rows]),
         named=jnp.asarray(np.asarray(table.named, np.int32)[rows]),
+        log_error=jnp.asarray(log_error[rows], jnp.float32),
+        spread=jnp.asarray(np.broadcast_to(table.spread, len(rows))[rows], jnp.float32),
         first_segment=jnp.asarray(np.cumsum(segments) - segments),
         segments=jnp.asarray(segments),
         first_window=jnp.asarray(np.cumsum(windows) - windows),
@@ -70,11 +89,26 @@ def recorded_windows(table: WindowTable) -> Windows:
     return Windows(_recorded_draw, ranked)
 
 
-def _recorded_draw(ranked: _Ranked, conditions: Conditions, flow, segment, u) -> tuple[jax.Array, jax.Array]:
+def _recorded_draw(
+    ranked: _Ranked, conditions: Conditions, flow, segment, u
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     flow_bin = (flow >= ranked.flow_edges[1:-1]).sum()
     s = ranked.first_segment[flow_bin] + jnp.floor(segment * ranked.segments[flow_bin]).astype(jnp.int32)
     w = ranked.first_window[s] + jnp.floor(u[0] * ranked.windows[s]).astype(jnp.int32)
-    return ranked.shares[w], ranked.named[w]
+    seen = jnp.clip(flow, ranked.flow_edges[0], ranked.flow_edges[-1]) * jnp.exp(ranked.log_error[w])
+    by_flow = class_shares(seen, ranked.spread[w])
+    known = jnp.isfinite(seen)
+    shares = jnp.where(known, by_flow, ranked.shares[w])
+    return shares, jnp.where(known, by_flow.argmax().astype(jnp.int32), ranked.named[w]), seen
+
+
+def class_shares(flow_seen: jax.Array, spread: jax.Array) -> jax.Array:
+    """(..., 3): P(flow < 90 %), P(90 to 110 %), P(> 110 %) where log flow ~ N(log flow_seen, spread^2);
+    flow_seen in percent, both (...)."""
+    low, high = (
+        jax.scipy.special.ndtr((jnp.log(border) - jnp.log(flow_seen)) / spread) for border in GOOD_BORDERS
+    )
+    return jnp.stack([low, high - low, 1.0 - high], axis=-1)
 
 
 def _check(table: WindowTable) -> None:
@@ -96,6 +130,14 @@ def _check(table: WindowTable) -> None:
         raise ValueError(
             "recorded windows: expected shares from 0 to 1 with sum 1, found others; "
             "normalise each window's shares over its classes"
+        )
+    flows = [np.asarray(column, float) for column in (table.flow_seen, table.spread, table.flow)]
+    if np.isfinite(flows[0]).any() and not all(
+        column.shape == (n,) and (np.isfinite(column) & (column > 0)).all() for column in flows
+    ):
+        raise ValueError(
+            f"recorded windows: expected flow_seen, spread and flow of all {n} windows, positive numbers, or "
+            f"of none, found {', '.join(str((column > 0).sum()) for column in flows)}; record them in one go"
         )
     if (np.diff(table.flow_edges) <= 0).any():
         raise ValueError("recorded windows: expected rising flow edges, found some that fall; sort the bins")

@@ -36,6 +36,7 @@ FLOW_LIMITS, TEMPERATURE_LIMITS = (20.0, 310.0), (180.0, 240.0)
 BLOCKAGE_LIMITS = (1 / 3, 3.0)  # beyond, no setpoint within its limits would bring the flow to 100 %
 HISTORY, CLASSES = 30, 3  # eta and n_c of (8)
 UNDER, GOOD, OVER = 0, 1, 2
+GOOD_BORDERS = (90.0, 110.0)  # percent
 CHANCES = 7  # uniform numbers that a decision takes: three for its window, four for what befalls the machine
 
 
@@ -43,13 +44,15 @@ class Observation(NamedTuple):
     """What the machine shows at a decision. The true flow is not among it, nor a setpoint that would give it
     away: only moves of the flow setpoint mean something.
 
-    shares (3,) of under, good, over in the window, sum 1; named is the window's class 0, 1, 2; flow_move
+    shares (3,) of under, good, over in the window, sum 1; named is the window's class 0, 1, 2; flow_seen the
+    flow that it shows, percent of nominal, NaN of a camera that shows classes only; flow_move
     (percent) is how far the flow setpoint moved since the controller's last observation, as executed after
     limits (0 after a hold); temperature u_hat and target u_bar in °C; step t counts decisions, held ones too.
     """
 
     shares: jax.Array
     named: jax.Array
+    flow_seen: jax.Array
     flow_move: jax.Array
     temperature: jax.Array
     target: jax.Array
@@ -108,10 +111,11 @@ class State(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """draw(table, conditions, flow, segment, u) -> shares (3,), named: a window at the true flow, from
-    uniform numbers u (3,) and the arrays of `table`."""
+    """draw(table, conditions, flow, segment, u) -> shares (3,), named, flow_seen (percent; NaN where the
+    camera shows classes only): a window at the true flow, from uniform numbers u (3,) and the arrays of
+    `table`."""
 
-    draw: Callable[[Any, Conditions, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+    draw: Callable[[Any, Conditions, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]
     table: Any = ()
 
 
@@ -129,7 +133,7 @@ class Trajectory(NamedTuple):
 
 def flow_class(flow: jax.Array) -> jax.Array:
     """0 under 90 %, 1 from 90 to 110 %, 2 above."""
-    return jnp.where(flow < 90.0, UNDER, jnp.where(flow > 110.0, OVER, GOOD))
+    return jnp.where(flow < GOOD_BORDERS[0], UNDER, jnp.where(flow > GOOD_BORDERS[1], OVER, GOOD))
 
 
 def nominal(flow, temperature, *, accuracy: float) -> Conditions:
@@ -144,11 +148,11 @@ def nominal(flow, temperature, *, accuracy: float) -> Conditions:
 
 def paper_windows() -> Windows:
     """(7): the class is right with probability rho, else one of the others; p_i = clip(exp(-alpha |i - x0|) +
-    N(0, sigma^2), 0, 1) for i != x0, 1 at x0; over their sum."""
+    N(0, sigma^2), 0, 1) for i != x0, 1 at x0; over their sum. It shows classes only."""
     return Windows(_paper_draw)
 
 
-def _paper_draw(table, conditions: Conditions, flow, segment, u) -> tuple[jax.Array, jax.Array]:
+def _paper_draw(table, conditions: Conditions, flow, segment, u) -> tuple[jax.Array, jax.Array, jax.Array]:
     wrong = u[0] >= conditions.accuracy
     shift = 1 + (u[0] - conditions.accuracy >= (1.0 - conditions.accuracy) / 2)
     x0 = jnp.where(wrong, (flow_class(flow) + shift) % CLASSES, flow_class(flow))
@@ -158,7 +162,7 @@ def _paper_draw(table, conditions: Conditions, flow, segment, u) -> tuple[jax.Ar
         [z[0], jnp.where(x0 == 0, z[0], z[1]), z[1]]
     )  # two numbers serve, as x0 itself takes none
     prob = jnp.where(distance == 0, 1.0, jnp.clip(jnp.exp(-ALPHA * distance) + noise, 0.0, 1.0))
-    return prob / prob.sum(), x0
+    return prob / prob.sum(), x0, jnp.full_like(u[0], jnp.nan)
 
 
 def _normal(u: jax.Array) -> jax.Array:
@@ -217,8 +221,8 @@ def stepped(
 
 
 def _observe(windows: Windows, conditions: Conditions, state: State, u: jax.Array) -> Observation:
-    shares, named = windows.draw(windows.table, conditions, state.flow, state.segment, u)
-    return Observation(shares, named, state.flow_move, state.temperature, state.target, state.step)
+    shares, named, flow_seen = windows.draw(windows.table, conditions, state.flow, state.segment, u)
+    return Observation(shares, named, flow_seen, state.flow_move, state.temperature, state.target, state.step)
 
 
 def first_history() -> jax.Array:

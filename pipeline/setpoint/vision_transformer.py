@@ -182,11 +182,31 @@ class Head(eqx.Module):
         self.classes = Dense(image_features + temperature_features, CLASSES, rng)
 
 
+# log deviation of a frame's log flow: LOG_DEVIATION[0] +- LOG_DEVIATION[1], 1.1 % to 160 % of the flow
+LOG_DEVIATION = (-2.0, 2.5)
+
+
+class FlowHead(eqx.Module):
+    """Features -> log(flow / 100 %) and its log deviation: one layer, ours; the paper's head names classes
+    only."""
+
+    flow: Dense
+
+    def __init__(self, features: int, rng: np.random.Generator):
+        self.flow = Dense(features, 2, rng)
+
+    def __call__(self, features: Float[Array, "n features"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        mean, z = self.flow(features).T
+        return mean, LOG_DEVIATION[0] + LOG_DEVIATION[1] * jnp.tanh(z)
+
+
 class Classifier(eqx.Module):
-    """Key area and nozzle temperature -> logits of the three flow classes."""
+    """Key area and nozzle temperature -> logits of the three flow classes, and beside them log flow with its
+    log deviation, from the same features."""
 
     body: VisionTransformer | ConvolutionalNetwork
     head: Head
+    flow_head: FlowHead
 
     def features(self, key_area: Array, temperature_degC: Array) -> Float[Array, "n features"]:
         """What the last layer sees: image features, then temperature features. Each key area is scaled to
@@ -204,17 +224,24 @@ class Classifier(eqx.Module):
     def __call__(self, key_area: Array, temperature_degC: Array) -> Float[Array, "n 3"]:
         return self.head.classes(self.features(key_area, temperature_degC))
 
+    def outputs(self, key_area: Array, temperature_degC: Array) -> tuple[Array, Array, Array]:
+        """Logits (n, 3), log(flow / 100 %) (n,) and its log deviation (n,)."""
+        features = self.features(key_area, temperature_degC)
+        return self.head.classes(features), *self.flow_head(features)
+
 
 def vision_transformer(size: Size, rng: np.random.Generator) -> Classifier:
     """A classifier with random weights: PAPER, SMALL, or a size of one's own."""
     return Classifier(
-        VisionTransformer(size, rng), Head(size.width, size.image_features, size.temperature_features, rng)
+        VisionTransformer(size, rng),
+        Head(size.width, size.image_features, size.temperature_features, rng),
+        FlowHead(size.image_features + size.temperature_features, rng),
     )
 
 
 def convolutional(rng: np.random.Generator) -> Classifier:
     """The small CNN with random weights."""
-    return Classifier(ConvolutionalNetwork(rng), Head(84, 32, 16, rng))
+    return Classifier(ConvolutionalNetwork(rng), Head(84, 32, 16, rng), FlowHead(48, rng))
 
 
 def parameters(tree) -> int:

@@ -45,6 +45,7 @@ SECTIONS = (
     "segment_library",
     "tracking",
     "train_agent",
+    "render_frames",
     "train_classifier",
     "train_ilc",
     "tune_weights",

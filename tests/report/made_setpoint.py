@@ -240,7 +240,7 @@ def classifier(seed=0):
         ("image", "calibrated", 0.01),
         ("window", "hard_counts", 0.1),
         ("window", "mean", 0.18),
-        ("window", "log_sum", 0.02),
+        ("window", "flow", 0.02),
     ):
         rows += [
             (
@@ -273,7 +273,7 @@ def classifier(seed=0):
     )
     edges = [20.0, 40.0, 60.0, 80.0, 90.0, 100.0, 110.0, 120.0, 150.0, 200.0, 310.0]
     rows = []
-    for part in ("learn", "judge"):
+    for part in ("learn", "choose", "judge"):
         for b, (low, high) in enumerate(itertools.pairwise(edges)):
             for segment in range(4):
                 middle = (low + high) / 2 + rng.normal(0, 5)
@@ -285,7 +285,9 @@ def classifier(seed=0):
                     if middle > 140
                     else shares / shares.sum()
                 )
-                rows.append((part, b, low, high, 10 * b + segment, *shares, int(shares.argmax())))
+                number, named = 10 * b + segment, int(shares.argmax())
+                seen = max(middle + rng.normal(0, 8), 10.0)
+                rows.append((part, max(middle, 1.0), b, low, high, number, *shares, named, seen, 0.09))
     artifacts.write_table(folder / "windows.parquet", tables.WINDOWS, columns(tables.WINDOWS, rows))
     frames()
 

@@ -62,7 +62,7 @@ def observation(named=1, flow_move=0.0, temperature=210.0, target=210.0, step=0)
     as_float = (
         jnp.asarray(shares, jnp.float32),
         jnp.asarray(named),
-        *(jnp.asarray(x, jnp.float32) for x in (flow_move, temperature, target)),
+        *(jnp.asarray(x, jnp.float32) for x in (np.nan, flow_move, temperature, target)),
     )
     return Observation(*as_float, jnp.asarray(step))
 
@@ -208,7 +208,7 @@ def test_learning_raises_the_reward_from_its_first_to_its_last_steps():
 def test_before_training_the_agent_is_the_greedy_filter(prior_belief):
     network = belief_agent.BeliefNetwork(prior_belief.filter.evidence.shape[0], jax.random.key(0))
     encoder = belief_agent.belief_encoder(prior_belief)
-    (belief, _), x = encoder.encode(network, encoder.start(), observation(named=0))
+    (belief, *_), x = encoder.encode(network, encoder.start(), observation(named=0))
     np.testing.assert_allclose(network(x)[0], prior_belief.values @ belief.sum(axis=0), rtol=1e-5)  # float32
 
 

@@ -12,9 +12,12 @@ from benchmarks.classifier import judge
 from pipeline.setpoint.calibration import (
     ClassifierOutputs,
     Familiar,
+    FlowCalibration,
+    WindowFlow,
     appearance,
     auroc,
     calibrate,
+    class_probabilities,
     conformal_level,
     energy,
     fit_correlation,
@@ -27,6 +30,7 @@ from pipeline.setpoint.calibration import (
     recorded,
     reliability,
     sets,
+    window_flow,
     window_probabilities,
     windows,
 )
@@ -110,28 +114,50 @@ def test_hard_shares_by_hand():
     np.testing.assert_allclose(hard_shares(log_p, np.ones((1, 4), bool)), [[0.5, 0.25, 0.25]])
 
 
-def test_recorded_windows_fall_into_the_bins_of_their_flow():
-    log_p = np.log(np.tile([0.7, 0.2, 0.1], (4, 2, 1)))
-    valid = np.array([[True, True], [True, True], [False, False], [True, False]])
-    table = recorded(
-        log_p,
-        valid,
-        [20.0, 89.9, 95.0, 310.0],
-        [5, 6, 7, 8],
-        correlation=1.0,
-        flow_edges=np.array([20.0, 90, 110, 310]),
+def test_the_flow_of_a_window_by_hand():
+    # weights 100 and 25: (100 log 1.1 + 25 log 0.9) / 125; of frames that repeat each other nothing is won
+    log_flow, deviation = (
+        np.log([[1.1, 0.9, 5.0]] * 2 + [[1.0] * 3]),
+        np.array([[0.1, 0.2, 0.1]] * 2 + [[0.1] * 3]),
     )
+    valid = np.array([[True, True, False], [False] * 3, [True] * 3])
+    found = window_flow(log_flow, deviation, valid, FlowCalibration(1.5, 0.4))
+    mean = (100 * np.log(1.1) + 25 * np.log(0.9)) / 125
+    np.testing.assert_allclose(found.flow_seen, [100 * np.exp(mean), np.nan, 100])
+    np.testing.assert_allclose(found.spread, [1.5 * np.sqrt(1.4 / 125), np.nan, 0.15 * np.sqrt(1.8 / 3)])
+    np.testing.assert_allclose(found.prob[1], 1 / 3)
+    same = window_flow(log_flow[2:], deviation[2:], valid[2:], FlowCalibration(1.0, 1.0))
+    np.testing.assert_allclose(same.spread, 0.1)
+
+
+@pytest.mark.parametrize("log_flow", [-3.0, -0.5, -0.1, 0.0, 0.1, 0.5, 3.0])
+def test_class_probabilities_are_the_normal_law_between_the_borders(log_flow):
+    rng = np.random.default_rng(0)
+    shown = 100 * np.exp(log_flow + 0.08 * rng.standard_normal(400_000))
+    p = class_probabilities(np.array([log_flow]), np.array([0.08]))[0]
+    share = [np.mean(shown < 90), np.mean((shown >= 90) & (shown <= 110)), np.mean(shown > 110)]
+    np.testing.assert_allclose(p, share, atol=0.004)  # five deviations of 400,000 draws
+    assert p.sum() == pytest.approx(1, abs=1e-12)
+    assert (p >= 0).all()
+
+
+def test_recorded_windows_fall_into_the_bins_of_their_flow():
+    seen = WindowFlow(
+        np.array([20.0, 88, np.nan, 300]),
+        np.array([0.1, 0.1, np.nan, 0.1]),
+        np.array([[1.0, 0, 0], [0.6, 0.4, 0], [1 / 3, 1 / 3, 1 / 3], [0, 0, 1]]),
+    )
+    flow, segment, edges = [20.0, 89.9, 95.0, 310.0], [5, 6, 7, 8], np.array([20.0, 90, 110, 310])
+    table = recorded(seen, flow, segment, flow_edges=edges)
     np.testing.assert_array_equal(table.flow_bin, [0, 0, 2])
     np.testing.assert_array_equal(table.segment, [5, 6, 8])
-    np.testing.assert_allclose(table.shares, np.tile([0.7, 0.2, 0.1], (3, 1)))
-    np.testing.assert_array_equal(table.named, [0, 0, 0])
-    with pytest.raises(
-        ValueError,
-        match=re.escape("flows are expected within 20 .. 310 % but 1 are not, the first 400; widen the bins"),
-    ):
-        recorded(
-            log_p[:1], valid[:1], [400.0], [5], correlation=1.0, flow_edges=np.array([20.0, 90, 110, 310])
-        )
+    np.testing.assert_array_equal(table.named, [0, 0, 2])
+    np.testing.assert_array_equal(table.flow_seen, [20, 88, 300])
+    np.testing.assert_array_equal(table.flow, [20, 89.9, 310])
+    np.testing.assert_allclose(table.spread, 0.1)
+    expected = "flows are expected within 20 .. 310 % but 1 are not, the first 400; widen the bins"
+    with pytest.raises(ValueError, match=re.escape(expected)):
+        recorded(seen, [20.0, 89.9, 95.0, 400.0], segment, flow_edges=edges)
 
 
 # ---- reliability

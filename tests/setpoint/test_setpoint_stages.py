@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, classify
-from pipeline.setpoint.calibration import Calibration, Familiar
+from pipeline.setpoint.calibration import KNOTS_PERCENT, Calibration, Familiar, FlowCalibration
 from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.vision_transformer import SMALL as SMALL_SIZE
 from pipeline.setpoint.vision_transformer import named_arrays, vision_transformer
@@ -35,7 +35,7 @@ from pipeline.setpoint.workflow.tables import (
     SCOREBOARD,
     WINDOWS,
 )
-from pipeline.setpoint.workflow.windows import edges, window_rows, window_tables
+from pipeline.setpoint.workflow.windows import WINDOW_PARTS, edges, window_rows, window_tables
 from pipeline.store import artifacts, params
 from pipeline.store.artifacts import read_weights, write_weights
 from pipeline.store.params import Execution
@@ -50,13 +50,14 @@ RECIPE = {"epochs": 2, "cycle_epochs": 2, "warmup_epochs": 0, "batch": 16}
 # a few frames of everything, and as much promised as so few allow
 SMALL = {
     "execution.jobs": 1,
-    "train_classifier.segments": {"learned": 3, "held_out": 1, "calibration": 2, "judged": 2},
-    "train_classifier.frames": {"learned": 1, "held_out": 2, "calibration": SHOTS, "judged": SHOTS},
+    "render_frames.segments": {"learned": 3, "held_out": 1, "calibration": 2, "judged": 2},
+    "render_frames.frames": {"learned": 1, "held_out": 2, "calibration": SHOTS, "judged": SHOTS},
+    "render_frames.sweeps": {"learn": 1, "choose": 1, "judge": 1},
+    "render_frames.sweep_windows": {"learn": 1.0, "choose": 1.0, "judge": 1.0},
     "train_classifier.window": SHOTS,
     "train_classifier.coverage": 0.6,
     "train_classifier.confidence": 0.55,
     "train_classifier.false_alarms": 0.1,
-    "train_classifier.recorded": {"learn": 1, "judge": 1, "learn_windows": 1.0, "judge_windows": 1.0},
     **{f"train_classifier.{network}.{key}": value for network in ("small", "cnn") for key,
     value in RECIPE.items()},
     "train_agent.runs": 1,
@@ -102,6 +103,7 @@ def simulated(tmp_path_factory) -> Path:
     """A project in which the classifier was trained on rendered frames."""
     place = begun(tmp_path_factory.mktemp("simulated"))
     with contextlib.chdir(place):
+        stage("render_frames")
         stage("train_classifier")
     return place
 
@@ -115,16 +117,16 @@ def project(tmp_path, monkeypatch) -> Path:
 @pytest.fixture
 def stored(project) -> Path:
     """A project with a classifier that has learned nothing, and made-up windows; to be spoiled."""
-    known = Calibration(1.0, 0.1, 0.2, Familiar(np.zeros((3, 4)), np.eye(4)), 9.0)
+    knots = np.log(np.array(KNOTS_PERCENT) / 100)
+    flow = FlowCalibration(knots, np.ones(len(knots)), 0.5)
+    known = Calibration(1.0, 0.1, 0.2, Familiar(np.zeros((3, 4)), np.eye(4)), 9.0, flow)
     out = project / "datasets/train_classifier"
     store_classifier(
         out,
         params.load(TrainClassifier, "train_classifier"),
         CalibratedClassifier(vision_transformer(SMALL_SIZE, np.random.default_rng(0)), known),
     )
-    tables = {
-        part: synthetic_table(np.random.default_rng(1), segments=1, windows=2) for part in ("learn", "judge")
-    }
+    tables = {part: synthetic_table(np.random.default_rng(1), segments=1, windows=2) for part in WINDOW_PARTS}
     artifacts.write_table(out / "windows.parquet", WINDOWS, window_rows(tables))
     return project
 
@@ -193,11 +195,17 @@ def test_on_rendered_frames_every_artifact_is_written_with_its_schema(simulated,
     assert course["epoch"].tolist() == [1, 2] * 2
 
 
+def _parts(settings: TrainClassifier) -> parts.Parts:
+    execution = params.load(Execution, "execution")
+    return parts.parts(settings, "datasets/render_frames", "datasets/raw/setpoint", execution)
+
+
 def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(
     simulated, project, monkeypatch
 ):
     p, write, epochs = params.load(TrainClassifier, "train_classifier"), write_weights, []
-    found, _ = parts.parts(p, "datasets/raw/setpoint", params.load(Execution, "execution"))
+    shutil.copytree(simulated / "datasets/render_frames", "datasets/render_frames")
+    found = _parts(p).frames
 
     def killing(path, name, arrays, about):
         write(path, name, arrays, about)
@@ -247,7 +255,7 @@ def test_the_calibrated_classifier_survives_being_stored(simulated, project):
 def test_window_tables_survive_being_written(simulated, tmp_path):
     made = {
         part: synthetic_table(np.random.default_rng(k), segments=3, windows=2)
-        for k, part in enumerate(("learn", "judge"))
+        for k, part in enumerate(WINDOW_PARTS)
     }
     artifacts.write_table(tmp_path / "windows.parquet", WINDOWS, window_rows(made))
     found = window_tables(artifacts.read_table(tmp_path / "windows.parquet", WINDOWS))
@@ -313,7 +321,7 @@ def test_damaged_or_foreign_weights_are_refused_by_name(stored, capsys):
         "evaluate_setpoint", capsys
     )
     write_weights(path, "agents 1", arrays, {"size": "small"})
-    assert f"{path} should hold weights of classifier 1 but has schema agents 1" in refusal(
+    assert f"{path} should hold weights of classifier 2 but has schema agents 1" in refusal(
         "evaluate_setpoint", capsys
     )
     path.unlink()
@@ -365,7 +373,7 @@ def test_on_a_user_s_folder_every_artifact_is_written_and_no_print_is_in_two_par
     assert figures["data"]["valid"] + sum(figures["data"]["rejected"].values()) == figures["data"]["frames"]
     first = artifacts.sha256("datasets/train_classifier"), artifacts.sha256("reports")
     p = params.load(TrainClassifier, "train_classifier")
-    found, _ = parts.parts(p, "datasets/raw/setpoint", params.load(Execution, "execution"))
+    found = _parts(p).frames
     prints = [set(part.print_number.tolist()) for part in found.values()]
     assert sum(map(len, prints)) == len(set.union(*prints)) == PRINTS
     for path in Path("datasets/memo").rglob("*.safetensors"):
@@ -451,7 +459,7 @@ def test_the_whole_loop_runs_and_repeats_to_the_byte(source, frames, tmp_path, m
     shutil.copytree(frames, "datasets/raw/setpoint")
     found = []
     for _ in range(2):
-        for name in ("train_classifier", "train_agent", "evaluate_setpoint"):
+        for name in ("render_frames", "train_classifier", "train_agent", "evaluate_setpoint"):
             stage(name)
         check_classifier(source)
         check_agents()

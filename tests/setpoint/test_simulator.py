@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
 from pipeline.setpoint.simulator import (
@@ -22,7 +23,7 @@ from pipeline.setpoint.simulator import (
     reward,
     rollout,
 )
-from tests.setpoint.synthetic import synthetic_table
+from tests.setpoint.synthetic import synthetic_flow_table, synthetic_table
 
 STEPS, N = 30, 2000  # one shape, so that everything runs in one compiled program
 
@@ -154,6 +155,7 @@ def test_the_paper_s_state_is_thirty_classes_three_shares_and_two_temperatures()
     seen = Observation(
         jnp.array([0.5, 0.3, 0.2]),
         jnp.array(0),
+        jnp.array(jnp.nan),
         jnp.array(0.0),
         jnp.array(205.0),
         jnp.array(210.0),
@@ -207,6 +209,35 @@ def test_a_drawn_window_is_one_of_its_flow_bin_and_all_of_them_come():
     assert drawn == {tuple(row) for row in np.asarray(table.shares[here], np.float32)}
 
 
+def test_a_window_that_shows_a_flow_keeps_its_error_when_it_is_drawn_at_another_flow():
+    table = synthetic_flow_table(np.random.default_rng(0), segments=200, windows=2)
+    windows = recorded_windows(table)
+    here = table.flow_bin == np.searchsorted(table.flow_edges, 101.0, side="right") - 1
+    errors = np.log(table.flow_seen / table.flow)[here]
+    u = jax.random.uniform(jax.random.key(1), (400, 4))
+    conditions = nominal(101.0, 210.0, accuracy=1.0)
+    shares, named, seen = jax.vmap(
+        lambda one: windows.draw(windows.table, conditions, jnp.float32(101.0), one[3], one[:3])
+    )(u)
+    found = np.log(np.asarray(seen) / 101.0)
+    assert np.abs(found[:, None] - errors).min(axis=1).max() < 1e-5  # float32
+    assert len(np.unique(found.round(4))) == len(errors)
+    # the shares are those of N(log flow_seen, spread^2) between 90 and 110 %
+    spread = float(table.spread[0])
+    under = scipy.stats.norm.cdf((np.log(90) - np.log(np.asarray(seen))) / spread)
+    over = scipy.stats.norm.sf((np.log(110) - np.log(np.asarray(seen))) / spread)
+    np.testing.assert_allclose(np.asarray(shares)[:, [0, 2]], np.stack([under, over], axis=1), atol=1e-5)
+    np.testing.assert_array_equal(named, np.asarray(shares).argmax(axis=1))
+
+
+def test_a_table_with_some_flows_only_is_refused():
+    table = synthetic_flow_table(np.random.default_rng(0), segments=200, windows=1)
+    seen = table.flow_seen.copy()
+    seen[3] = np.nan
+    with pytest.raises(ValueError, match="expected flow_seen, spread and flow of all 200 windows.*found 199"):
+        recorded_windows(table._replace(flow_seen=seen))
+
+
 def test_a_sticky_segment_keeps_its_look_when_the_flow_moves_to_another_bin():
     # in both bins segment 7 always looks thin and segment 3 always thick
     table = WindowTable(
@@ -215,6 +246,9 @@ def test_a_sticky_segment_keeps_its_look_when_the_flow_moves_to_another_bin():
         np.array([0, 0, 1, 1]),
         np.array([7, 3, 7, 3]),
         np.array([20.0, 100.0, 310.0]),
+        np.array([50.0, 150.0] * 2),
+        np.full(4, 0.07),
+        np.array([60.0, 60.0, 140.0, 140.0]),
     )
     moves = standing()
     moves[:, 0] = 4

@@ -24,7 +24,7 @@ DIAGRAMS = (
     ("image", "raw", "One image, as trained", "softmax of the network", "ece_image_raw"),
     ("image", "calibrated", "One image, calibrated", "logits over one temperature", "ece_image"),
     ("window", "hard_counts", "A window, counted", "shares of classes, as published", "ece_window_counts"),
-    ("window", "log_sum", "A window, calibrated", "summed logarithms, fitted", "ece_window"),
+    ("window", "flow", "A window, calibrated", "normal law of the flow seen, fitted", "ece_window"),
 )
 
 

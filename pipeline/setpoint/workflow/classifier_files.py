@@ -19,7 +19,7 @@ from pipeline.store import artifacts
 from pipeline.store.artifacts import read_weights, write_weights
 
 SIZES = {"small": SMALL, "paper": PAPER}
-CLASSIFIER_SCHEMA, CALIBRATION = "classifier 1", ("classifier_calibration", 1)
+CLASSIFIER_SCHEMA, CALIBRATION = "classifier 2", ("classifier_calibration", 2)
 
 
 def store_classifier(folder: Path, settings: TrainClassifier, model: CalibratedClassifier) -> None:
@@ -46,6 +46,13 @@ def store_classifier(folder: Path, settings: TrainClassifier, model: CalibratedC
         ),
         "means": (fitted.familiar.means, "1", "mean features of the three classes"),
         "whitening": (fitted.familiar.whitening, "1", "inverse Cholesky factor of their covariance"),
+        "flow_shown": (
+            fitted.flow.shown,
+            "1",
+            "log(flow / 100 %) that frames show on average at the flows of calibration.KNOTS_PERCENT",
+        ),
+        "flow_scale": (fitted.flow.scale, "1", "deviations of frames are multiplied by it there"),
+        "flow_correlation": (np.array(fitted.flow.correlation), "1", "of the errors of a window's frames"),
     }
     artifacts.write_arrays(folder / "calibration.parquet", *CALIBRATION, numbers)
 
@@ -62,7 +69,10 @@ def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedCl
         network = from_named_arrays(
             vision_transformer(SIZES[about["size"]], np.random.default_rng(0)), arrays
         )
-    fitted = artifacts.read_arrays(calibration_path, *CALIBRATION)
+    knots = (len(calibration.KNOTS_PERCENT),)
+    fitted = artifacts.read_arrays(
+        calibration_path, *CALIBRATION, shapes={"flow_shown": knots, "flow_scale": knots}
+    )
     numbers = (float(fitted[name]) for name in ("temperature", "correlation", "level"))
     return CalibratedClassifier(
         network,
@@ -70,5 +80,8 @@ def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedCl
             *numbers,
             calibration.Familiar(fitted["means"], fitted["whitening"]),
             float(fitted["foreign_above"]),
+            calibration.FlowCalibration(
+                fitted["flow_shown"], fitted["flow_scale"], float(fitted["flow_correlation"])
+            ),
         ),
     )

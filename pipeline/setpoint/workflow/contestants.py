@@ -1,4 +1,5 @@
-"""The table of contestants: every controller of the setpoint comparison, in the order of the scoreboard.
+"""The table of contestants: every controller of the setpoint comparison, in the order of simplicity: of two
+that are alike within noise the first runs by default.
 
 A new controller is its own file in pipeline/setpoint/, its line in CONTESTANTS, and its settings. The stage
 builds from this table; the pages take name and kind from the scoreboard, and rank by it.
@@ -11,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pipeline.setpoint import agent, baselines, bayes, belief_agent
+from pipeline.setpoint import agent, baselines, bayes, belief_agent, judging
 from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.simulator import Controller
 from pipeline.setpoint.workflow.agent_files import Agents
@@ -60,6 +61,7 @@ def _after_phase(number: int) -> Callable[[Problem], tuple[Controller, Any] | No
 
 
 CONTESTANTS = (
+    Contestant(judging.DOES_NOTHING, "baseline", lambda problem: (baselines.nothing(), ())),
     Contestant(
         "proportional",
         "baseline",

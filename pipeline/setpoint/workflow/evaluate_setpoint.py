@@ -11,13 +11,13 @@ from tqdm import tqdm
 
 from pipeline.setpoint import deployment, judging, pixels
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, classify
-from pipeline.setpoint.judging import Choice
+from pipeline.setpoint.judging import Case, Choice, Judged
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
-from pipeline.setpoint.score import Score
-from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, rollout
+from pipeline.setpoint.score import BEYOND, Outcomes, Score, summary
+from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Windows, rollout
 from pipeline.setpoint.workflow.contestants import THROUGH_PIXELS, ControllerSpec
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
-from pipeline.statistics import wilson
+from pipeline.statistics import Share, shared_variance, wilson
 
 
 class PixelRollouts(NamedTuple):
@@ -29,46 +29,164 @@ class PixelRollouts(NamedTuple):
     words: tuple[str, ...]
 
 
-def chosen(scores: Mapping[str, Mapping[str, Score]]) -> Choice:
-    """The default: the best worst case."""
-    return judging.choose({name: dict(by_case) for name, by_case in scores.items()})
-
-
 # ---- on the simulators
 
 
-def scores(
-    specs: Mapping[str, ControllerSpec], windows: WindowTable, settings: EvaluateSetpoint
-) -> dict[str, dict[str, Score]]:
-    """Every controller in every case of judging.cases: 21 starts x settings.runs, from one key a case."""
-    by_name: dict[str, dict[str, Score]] = {name: {} for name in specs}
-    cases = judging.cases(
-        recorded_windows(windows), runs=settings.runs, segment_mean_decisions=settings.segment_mean_decisions
+class Contest(NamedTuple):
+    """Scores of every controller in every case, on segments that are read once, and of each how many redraws
+    of them its runs are on."""
+
+    scores: dict[str, dict[str, Score]]
+    redraws: dict[str, int]
+
+
+def bars(settings: EvaluateSetpoint) -> dict[str, float]:
+    """Percent of runs that may leave +-25 % by case: from good starts with the camera right, stuck or blind.
+    A camera of another make, or with moved borders, is told and bars nobody: no rule can know better."""
+    most = settings.most_harmed
+    return {
+        name: most.perfect_percent if name == "perfect" else most.in_band_percent
+        for name in judging.all_cases(1, segment_mean_decisions=1.0)
+        if name in ("perfect", "in band") or name.startswith(("in band, stuck", "in band, blind"))
+    }
+
+
+def chosen(specs: Mapping[str, ControllerSpec], windows: WindowTable, settings: EvaluateSetpoint) -> Choice:
+    """The default, by the segments to choose on. In each of settings.rounds every contestant that may still
+    win runs on settings.redraws further redraws of them; the others run no more."""
+    limits, rounds = bars(settings), settings.rounds
+    asked = {name: case for name, case in _cases(settings).items() if not case.good or name in limits}
+    recorded = judging.redrawn(windows, rounds * settings.redraws, np.random.default_rng([settings.seed, 0]))
+    outcomes: dict[str, dict[str, Outcomes]] = {name: {} for name in specs}
+    left = list(specs)
+    judged: dict[str, Judged] = {}
+    for number in range(rounds):
+        key = jax.random.fold_in(jax.random.key(settings.seed), number)
+        part = _of_round(recorded, number, settings.redraws)
+        for name in left:
+            now = _asked(
+                specs[name], asked, part, settings.redraws, key, f"choose, round {number + 1}: {name}"
+            )
+            outcomes[name] = _with(outcomes[name], now)
+            judged[name] = _judged(outcomes[name], asked, (number + 1) * settings.redraws)
+        if number + 1 < rounds:
+            left = [name for name in judging.still_in(judged, limits) if name in left]
+    return judging.choose(judged, simplest_first=list(specs), bars=limits)
+
+
+def contest(
+    specs: Mapping[str, ControllerSpec], windows: WindowTable, settings: EvaluateSetpoint, default: str
+) -> Contest:
+    """Figures on segments that nothing was trained, tuned or chosen on: the default on all redraws of them,
+    the others on those of one round."""
+    rounds, asked = settings.rounds, _cases(settings)
+    recorded = judging.redrawn(windows, rounds * settings.redraws, np.random.default_rng([settings.seed, 1]))
+    scores, redraws = {}, {}
+    for name, spec in specs.items():
+        outcomes: dict[str, Outcomes] = {}
+        redraws[name] = settings.redraws * (rounds if name == default else 1)
+        for number in range(redraws[name] // settings.redraws):
+            key = jax.random.fold_in(jax.random.key(settings.seed), rounds + number)
+            part = _of_round(recorded, number, settings.redraws)
+            now = _asked(spec, asked, part, settings.redraws, key, f"judge: {name}")
+            outcomes = _with(outcomes, now)
+        scores[name] = _summaries(outcomes, redraws[name])
+    return Contest(scores, redraws)
+
+
+def _summaries(outcomes: Mapping[str, Outcomes], redraws: int) -> dict[str, Score]:
+    """The scores of one controller; what runs on one redraw share is told by all cases alike."""
+    figures: dict[str, list[np.ndarray]] = {"fresh": [], "sticky": []}
+    for case, of in outcomes.items():
+        shares = [of.settled, of.stay] if judging.counts(case) else list(of.beyond.T)
+        if group := judging.alike(case):
+            figures[group] += [share.reshape(redraws, -1) for share in shares]
+    shared = {group: shared_variance(blocks) for group, blocks in figures.items()}
+    return {
+        case: summary(of, redraws=redraws, shared=shared[judging.alike(case)])
+        if judging.alike(case)
+        else summary(of)
+        for case, of in outcomes.items()
+    }
+
+
+def _cases(settings: EvaluateSetpoint) -> dict[str, Case]:
+    return judging.all_cases(settings.runs, segment_mean_decisions=settings.segment_mean_decisions)
+
+
+def _of_round(recorded: Windows, number: int, redraws: int) -> Windows:
+    """The redraws of one round, as many in each, so that all rounds are one program."""
+    part = slice(number * redraws, (number + 1) * redraws)
+    return recorded._replace(table=jax.tree.map(lambda leaf: leaf[part], recorded.table))
+
+
+def _asked(
+    spec: ControllerSpec, cases: Mapping[str, Case], part: Windows, redraws: int, key: jax.Array, words: str
+) -> dict[str, Outcomes]:
+    """One controller's runs in all cases, on each redraw of a round."""
+    return {
+        name: judging.ask(
+            spec.controller,
+            spec.parameters,
+            case,
+            part,
+            jax.random.split(jax.random.fold_in(key, number), redraws),
+        )
+        for number, (name, case) in enumerate(
+            tqdm(cases.items(), desc=f"evaluate_setpoint: {words}", mininterval=2)
+        )
+    }
+
+
+def _with(before: Mapping[str, Outcomes], now: Mapping[str, Outcomes]) -> dict[str, Outcomes]:
+    """Runs of a further round behind those of earlier ones."""
+    if not before:
+        return dict(now)
+    return {case: jax.tree.map(lambda *a: np.concatenate(a), before[case], of) for case, of in now.items()}
+
+
+def _judged(outcomes: Mapping[str, Outcomes], cases: Mapping[str, Case], redraws: int) -> Judged:
+    def blocks(happened: np.ndarray) -> np.ndarray:
+        return happened.reshape(redraws, -1)
+
+    return Judged(
+        {name: blocks(outcomes[name].stay) for name, case in cases.items() if not case.good},
+        {name: blocks(outcomes[name].beyond[:, -1]) for name, case in cases.items() if case.good},
     )
-    with tqdm(
-        total=len(specs) * len(cases), desc="evaluate_setpoint: controllers x cases", mininterval=2
-    ) as bar:
-        for number, (case, (source, conditions)) in enumerate(cases.items()):
-            key = jax.random.fold_in(jax.random.key(settings.seed), number)
-            for name, spec in specs.items():
-                by_name[name][case] = judging.evaluate(
-                    spec.controller, spec.parameters, source, conditions, key
-                )
-                bar.update()
-    return by_name
+
+
+def told(choice: Choice, contest: Contest) -> Choice:
+    """The choice with its figures on the segments that are read once. Its sentence says what it was chosen
+    by, and then these."""
+    worst = {
+        name: min((score.stay.percent, case) for case, score in by_case.items() if judging.counts(case))
+        for name, by_case in contest.scores.items()
+    }
+    share, case = worst[choice.name]
+    stay = contest.scores[choice.name][case].stay
+    others = [worst[name][0] for name in worst if name != choice.name and name not in choice.refused]
+    margin = share - max(others) if others else float("nan")
+    sentence = (
+        f"{choice.sentence} On segments that it was not chosen on, {share:.1f} % ({stay.low:.1f} to "
+        f"{stay.high:.1f}) of its runs settle and stay in its worst case ({case})."
+    )
+    return choice._replace(worst=share, case=case, margin=margin, sentence=sentence)
 
 
 def simulator(case: str) -> str:
+    """Whose windows a case has: paper or recorded; harm, recorded ones from good starts."""
+    if not judging.counts(case):
+        return "harm"
     return "recorded" if case.startswith("recorded") else "paper"
 
 
 def scoreboard(
-    specs: Mapping[str, ControllerSpec], scores: Mapping[str, Mapping[str, Score]], rollouts: PixelRollouts
+    specs: Mapping[str, ControllerSpec], contest: Contest, rollouts: PixelRollouts
 ) -> dict[str, list]:
     """Columns of schema SCOREBOARD."""
     rows = [
-        _score_row(name, specs[name].kind, case, score)
-        for name, by_case in scores.items()
+        _score_row(name, specs[name].kind, case, score, contest.redraws[name])
+        for name, by_case in contest.scores.items()
         for case, score in by_case.items()
     ]
     return _columns(
@@ -77,32 +195,40 @@ def scoreboard(
     )
 
 
-def _score_row(name: str, kind: str, case: str, score: Score) -> dict[str, Any]:
-    shares = {
+def _score_row(name: str, kind: str, case: str, score: Score, redraws: int) -> dict[str, Any]:
+    clogged = case.endswith("clog")
+    shares: dict[str, Share | None] = {
         "settled": score.settled,
         "stay": score.stay,
-        "recovered": score.recovered if case.endswith("clog") else None,
+        "recovered": score.recovered if clogged else None,
+        "back": score.back if clogged else None,
     }
+    harmed = score.beyond if not judging.counts(case) else [None] * len(BEYOND)
+    shares |= {f"beyond_{points}": share for points, share in zip(BEYOND, harmed, strict=True)}
     return {
         "controller": name,
         "kind": kind,
         "simulator": simulator(case),
         "case": case,
-        "counts": True,
+        "counts": judging.counts(case),
         "runs": score.runs,
-        **{
-            f"{key}_{end}percent": np.nan if share is None else getattr(share, end.strip("_") or "percent")
-            for key, share in shares.items()
-            for end in ("", "low_", "high_")
-        },
+        "redraws": 1 if simulator(case) == "paper" else redraws,
+        **{column: value for key, share in shares.items() for column, value in _ends(key, share).items()},
         "median_steps": score.median_steps,
         "p90_steps": score.p90_steps,
+        "recovery_steps": score.recovery_steps if clogged else np.nan,
         "overshoot_p95_percent": score.overshoot_p95,
         "flow_error_percent": score.flow_error,
         "worst_start_flow_percent": score.worst_start[0],
         "worst_start_temperature_degC": score.worst_start[1],
         "worst_start_settled_percent": score.worst_start[2],
     }
+
+
+def _ends(key: str, share: Share | None) -> dict[str, float]:
+    """The three columns of a share, missing where it is none."""
+    values = (np.nan,) * 3 if share is None else share
+    return dict(zip((f"{key}_percent", f"{key}_low_percent", f"{key}_high_percent"), values, strict=True))
 
 
 def _columns(rows: list[dict[str, Any]]) -> dict[str, list]:
@@ -240,9 +366,9 @@ def _pixel_row(name: str, kind: str, case: str, episodes: pixels.Episodes) -> di
     past = np.sign(100.0 - episodes.flow[:, :1]) * (episodes.flow - 100.0)
     starts = episodes.setpoint[:, 0]
     worst = starts[int(since.argmax())]
-    nothing = dict.fromkeys(
-        (f"{key}_{end}percent" for key in ("stay", "recovered") for end in ("", "low_", "high_")), np.nan
-    )
+    nothing: dict[str, float] = {}
+    for key in ("stay", "recovered", "back", *(f"beyond_{points}" for points in BEYOND)):
+        nothing |= _ends(key, None)
     return {
         "controller": name,
         "kind": kind,
@@ -250,12 +376,12 @@ def _pixel_row(name: str, kind: str, case: str, episodes: pixels.Episodes) -> di
         "case": case,
         "counts": False,
         "runs": runs,
-        "settled_percent": share.percent,
-        "settled_low_percent": share.low,
-        "settled_high_percent": share.high,
+        "redraws": 1,
+        **_ends("settled", share),
         **nothing,
         "median_steps": float(np.median(since[settled])) if settled.any() else np.nan,
         "p90_steps": float(np.percentile(since[settled], 90)) if settled.any() else np.nan,
+        "recovery_steps": np.nan,
         "overshoot_p95_percent": float(np.percentile(past.max(axis=1).clip(0), 95)),
         "flow_error_percent": float(np.abs(episodes.flow[:, -DWELL:] - 100.0).mean()),
         "worst_start_flow_percent": float(worst[0]),
@@ -318,12 +444,9 @@ def decisions(name: str, rollouts: PixelRollouts) -> dict[str, list]:
 
 
 def metrics(
-    specs: Mapping[str, ControllerSpec],
-    scores: Mapping[str, Mapping[str, Score]],
-    choice: Choice,
-    rollouts: PixelRollouts,
+    specs: Mapping[str, ControllerSpec], contest: Contest, choice: Choice, rollouts: PixelRollouts
 ) -> dict[str, Any]:
-    """By controller, simulator and case; then the default."""
+    """By controller, simulator and case; then the default, its cases and what it does to good prints."""
     figures: dict[str, Any] = {
         name: {
             source: {
@@ -331,7 +454,7 @@ def metrics(
             }
             for source in dict.fromkeys(map(simulator, by_case))
         }
-        for name, by_case in scores.items()
+        for name, by_case in contest.scores.items()
     }
     for name, episodes in rollouts.calm.items():
         row = _pixel_row(name, specs[name].kind, "calm", episodes)
@@ -343,16 +466,52 @@ def metrics(
                 "flow_error": row["flow_error_percent"],
             }
         }
+    mine = contest.scores[choice.name]
     return figures | {
         "default": choice.name,
         "worst": choice.worst,
         "case": choice.case,
         "margin": _plain(choice.margin),
+        "margin_low": _plain(choice.margin_low),
+        "margin_high": _plain(choice.margin_high),
         "sentence": choice.sentence,
+        "cases": {case: _shares(case, score) for case, score in mine.items() if judging.counts(case)},
+        "harm": {case: _harm(score) for case, score in mine.items() if not judging.counts(case)},
     }
 
 
+def _shares(case: str, score: Score) -> dict[str, float | int | None]:
+    """Of a case of the default: low and high are the ends of the 95 % interval of the runs that stay."""
+    figures: dict[str, float | int | None] = {
+        "runs": score.runs,
+        "settled": score.settled.percent,
+        "stay": score.stay.percent,
+        "low": score.stay.low,
+        "high": score.stay.high,
+    }
+    if case.endswith("clog"):
+        figures |= {
+            "recovered": score.recovered.percent,
+            "recovery_steps": _plain(score.recovery_steps),
+            "back_within_15": score.back.percent,
+        }
+    return figures
+
+
+def _harm(score: Score) -> dict[str, float | int]:
+    """Percent of runs from good starts that leave +-10, 15 and 25 % within 200 decisions, with intervals."""
+    named = {f"beyond_{points}": share for points, share in zip(BEYOND, score.beyond, strict=True)}
+    return (
+        {"runs": score.runs}
+        | {name: share.percent for name, share in named.items()}
+        | {f"{name}_low": share.low for name, share in named.items()}
+        | {f"{name}_high": share.high for name, share in named.items()}
+    )
+
+
 def _figures(case: str, score: Score) -> dict[str, float | None]:
+    if not judging.counts(case):
+        return {f"beyond_{points}": share.percent for points, share in zip(BEYOND, score.beyond, strict=True)}
     return {
         "settled": score.settled.percent,
         "stay": score.stay.percent,

@@ -11,7 +11,7 @@ REACH_PX = 30
 
 
 class Counts(Section):
-    """A number for each of the four parts."""
+    """A number for each of the four parts of the classifier's frames."""
 
     learned: int = Field(ge=1, le=10_000)
     held_out: int = Field(ge=1, le=10_000)
@@ -19,15 +19,32 @@ class Counts(Section):
     judged: int = Field(ge=1, le=10_000)
 
 
-class Recorded(Section):
-    """Segments whose windows over the whole range of flows are recorded for the simulator, and windows of
-    each in a bin of the flow: those that controllers are trained and tuned on (many segments, as what a
-    segment adds stays with its windows), and those that they are judged on."""
+class Sweeps(Section):
+    """Segments whose windows over the whole range of flows stand for the camera in the simulator: those that
+    controllers are trained and tuned on, that the default is chosen on, and that are judged on. Many
+    segments, as what a segment adds stays with its windows."""
 
-    learn: int = Field(ge=1, le=1000)
-    judge: int = Field(ge=1, le=1000)
-    learn_windows: float = Field(gt=0, le=100)
-    judge_windows: float = Field(gt=0, le=100)
+    learn: int = Field(ge=1, le=10_000)
+    choose: int = Field(ge=1, le=10_000)
+    judge: int = Field(ge=1, le=10_000)
+
+
+class SweepWindows(Section):
+    """Windows of each of these segments in a bin of the flow, on average."""
+
+    learn: float = Field(gt=0, le=100)
+    choose: float = Field(gt=0, le=100)
+    judge: float = Field(gt=0, le=100)
+
+
+class RenderFrames(Section):
+    """Section `render_frames`: segments are counted in fifteens, three at each of the five temperatures."""
+
+    seed: int = Field(ge=0, le=2**31)
+    segments: Counts
+    frames: Counts
+    sweeps: Sweeps
+    sweep_windows: SweepWindows
 
 
 class Recipe(Section):
@@ -59,9 +76,7 @@ class TrainClassifier(Section):
     seed: int = Field(ge=0, le=2**31)
     size: Literal["small", "paper"]
     augmentation: Literal["along_bead", "adr"]
-    segments: Counts
     prints: Counts
-    frames: Counts
     window: int = Field(ge=1, le=1000)
     least_score: float = Field(ge=0, le=255)
     tip_px: tuple[Annotated[float, Field(ge=0, le=100_000)], Annotated[float, Field(ge=0, le=100_000)]] | None
@@ -72,7 +87,6 @@ class TrainClassifier(Section):
     coverage: float = Field(gt=0.5, lt=1)
     confidence: float = Field(gt=0.5, lt=1)
     false_alarms: float = Field(gt=0, lt=0.5)
-    recorded: Recorded
 
 
 class Learning(Section):
@@ -114,6 +128,9 @@ class RobustFilter(Section):
     hazard: float = Field(ge=0, lt=1)
     move_cost: float = Field(ge=0, le=10)
     outside_cost: float = Field(ge=0, le=1000)
+    move_fixed_cost: float = Field(ge=0, le=100)
+    known_start_share: float = Field(ge=0, lt=1)
+    known_start_std: float = Field(gt=0, le=1)
 
     def hypotheses(self) -> int:
         return len(self.gains) * (len(self.accuracies) + self.width_bias_levels)
@@ -175,6 +192,9 @@ class ClassFilter(Section):
     hazard: float = Field(ge=0, lt=1)
     move_cost: float = Field(ge=0, le=10)
     outside_cost: float = Field(ge=0, le=1000)
+    move_fixed_cost: float = Field(ge=0, le=100)
+    known_start_share: float = Field(ge=0, lt=1)
+    known_start_std: float = Field(gt=0, le=1)
 
 
 class Baselines(Section):
@@ -208,11 +228,23 @@ class Pixels(Section):
     softening_per_degC: float = Field(ge=0, le=1)
 
 
+class MostHarmed(Section):
+    """Of runs from good starts those that may leave +-25 %, or a controller is no candidate: from 100 %, and
+    from 92.5 to 107.5 % with a camera that is right, stuck or blind for a while."""
+
+    perfect_percent: float = Field(ge=0, le=100)
+    in_band_percent: float = Field(ge=0, le=100)
+
+
 class EvaluateSetpoint(Section):
-    """Section `evaluate_setpoint`."""
+    """Section `evaluate_setpoint`. Segments are redrawn `redraws` times a round, in each of which whoever may
+    still become the default runs `runs` times from each of 21 starts, in every case."""
 
     seed: int = Field(ge=0, le=2**31)
     runs: int = Field(ge=1, le=10_000)
+    redraws: int = Field(ge=2, le=1000)
+    rounds: int = Field(ge=1, le=100)
+    most_harmed: MostHarmed
     segment_mean_decisions: float = Field(ge=1, le=10_000)
     baselines: Baselines
     pixels: Pixels

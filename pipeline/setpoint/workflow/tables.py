@@ -4,7 +4,7 @@ import numpy as np
 
 # the loop's own numbers that its pages draw beside the tables
 from pipeline.setpoint.published import ALPHA, BEST_FLOW, BEST_TEMPERATURE, PHASES, ROTATION  # noqa: F401
-from pipeline.setpoint.score import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND  # noqa: F401
+from pipeline.setpoint.score import BEYOND, FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND  # noqa: F401
 from pipeline.store.tables import BOOL, COUNT, FLOAT, INDEX, NONE, TEXT, Column, Schema
 
 _SHARES = tuple(
@@ -43,7 +43,9 @@ RELIABILITY = Schema(
     1,
     (
         Column("of", TEXT, NONE, "image, or window of frames of one segment"),
-        Column("method", TEXT, NONE, "raw or calibrated (image); hard_counts, mean or log_sum (window)"),
+        Column(
+            "method", TEXT, NONE, "raw or calibrated (image); hard_counts, mean, log_sum or flow (window)"
+        ),
         Column("low", FLOAT, NONE, "confidence from", 0, 1),
         Column("high", FLOAT, NONE, "confidence to", 0, 1),
         Column("count", COUNT, NONE, "images or windows in this bin", low=0),
@@ -64,17 +66,30 @@ CLASSIFIER_CURVE = Schema(
     ),
 )
 
+# what controllers are trained and tuned on, what the default is chosen on, and what is judged once: no
+# segment in two of them
+WINDOW_PARTS = ("learn", "choose", "judge")
+
 WINDOWS = Schema(
     "windows",
-    1,
+    2,
     (
-        Column("part", TEXT, NONE, "learn: controllers are trained and tuned on these; judge: only judged"),
+        Column(
+            "part",
+            TEXT,
+            NONE,
+            "learn: controllers are trained and tuned on these; choose: the default is chosen on these; "
+            "judge: read once, for the figures told",
+        ),
+        Column("flow_percent", FLOAT, "percent", "true flow, of nominal", low=0),
         Column("flow_bin", INDEX, NONE, "bin of the true flow", low=0),
         Column("flow_low_percent", FLOAT, "percent", "its lower edge", low=0),
         Column("flow_high_percent", FLOAT, "percent", "its upper edge", low=0),
         Column("segment", INDEX, NONE, "segment that the window is of", low=0),
         *_SHARES,
         Column("named", INDEX, NONE, f"class of the window: {_CLASS}", 0, 2),
+        Column("flow_seen_percent", FLOAT, "percent", "flow that the window shows, of nominal", low=0),
+        Column("spread", FLOAT, NONE, "its relative standard deviation, that of its logarithm", low=0),
     ),
 )
 
@@ -89,78 +104,115 @@ AGENT_CURVE = Schema(
     ),
 )
 
+
+def _share(name: str, meaning: str) -> tuple[Column, ...]:
+    """A share of runs with its interval: three columns."""
+    return (
+        Column(f"{name}_percent", FLOAT, "percent", meaning, 0, 100, nullable=True),
+        Column(
+            f"{name}_low_percent", FLOAT, "percent", "lower end of its 95 % interval", 0, 100, nullable=True
+        ),
+        Column(f"{name}_high_percent", FLOAT, "percent", "upper end", 0, 100, nullable=True),
+    )
+
+
+_WHO = (
+    Column("controller", TEXT, NONE, "who sets flow and temperature"),
+    Column("kind", TEXT, NONE, "agent, baseline or paper"),
+    Column(
+        "simulator",
+        TEXT,
+        NONE,
+        "paper: eqs. 6-9; recorded: windows of the trained classifier; harm: the same from good starts; "
+        "pixels: rendered frames through the whole chain",
+    ),
+    Column(
+        "case", TEXT, NONE, "what the machine and the camera do: accuracy, clog, gain, persistence, fault"
+    ),
+    Column("counts", BOOL, NONE, "controllers are ranked by this case"),
+    Column("runs", COUNT, NONE, "runs, 21 starts together", low=1),
+)
+_SETTLED = (
+    *_share("settled", "of runs inside 90-110 % and 210 +- 5 degC from some step up to 90 until step 100"),
+    *_share("stay", "settled, and never out from step 100 to 200; missing where runs end before"),
+    *_share(
+        "recovered",
+        "inside from some step up to 90 until step 120: after what happens at step 60; missing where nothing "
+        "does",
+    ),
+)
+_MEDIAN = (
+    Column(
+        "median_steps",
+        FLOAT,
+        NONE,
+        "decisions until inside for good, median of settled runs",
+        low=0,
+        nullable=True,
+    ),
+    Column("p90_steps", FLOAT, NONE, "the same, 90th percentile", low=0, nullable=True),
+)
+_ERRORS = (
+    Column(
+        "overshoot_p95_percent",
+        FLOAT,
+        "percent",
+        "points of flow past 100 % on the far side of the start, 95th percentile",
+        low=0,
+        nullable=True,
+    ),
+    Column(
+        "flow_error_percent",
+        FLOAT,
+        "percent",
+        "mean distance of the true flow from 100 % when settled",
+        low=0,
+        nullable=True,
+    ),
+    Column("worst_start_flow_percent", FLOAT, "percent", "start from which fewest settle", low=0),
+    Column("worst_start_temperature_degC", FLOAT, "degC", "the same start's temperature"),
+    Column("worst_start_settled_percent", FLOAT, "percent", "of runs from there", 0, 100),
+)
+
+# of a champion that an earlier version judged
+SCOREBOARD_1 = Schema("scoreboard", 1, (*_WHO, *_SETTLED, *_MEDIAN, *_ERRORS))
+
 SCOREBOARD = Schema(
     "scoreboard",
-    1,
+    2,
     (
-        Column("controller", TEXT, NONE, "who sets flow and temperature"),
-        Column("kind", TEXT, NONE, "agent, baseline or paper"),
+        *_WHO,
         Column(
-            "simulator",
-            TEXT,
+            "redraws",
+            COUNT,
             NONE,
-            "paper: eqs. 6-9; recorded: windows of the trained classifier; pixels: "
-            "rendered frames through the whole chain",
+            "redraws of the recorded segments that the runs are on, in equal blocks, by which intervals are "
+            "clustered; 1: the runs share nothing, and intervals are Wilson's",
+            low=1,
         ),
-        Column("case", TEXT, NONE, "what the machine does: accuracy, clog, actuator gain, persistence"),
-        Column("counts", BOOL, NONE, "this case counts for the choice of the default"),
-        Column("runs", COUNT, NONE, "runs, 21 starts together", low=1),
+        *_SETTLED,
+        *_share(
+            "back", "within +-15 % from some step up to 90 until step 120; missing where nothing happens"
+        ),
         *(
             column
-            for name, meaning in (
-                (
-                    "settled",
-                    "of runs inside 90-110 % and 210 +- 5 degC from some step up to 90 until step 100",
-                ),
-                ("stay", "settled, and never out from step 100 to 200; missing where runs end before"),
-                (
-                    "recovered",
-                    "inside from some step up to 90 until step 120: after what happens at step 60; "
-                    "missing where nothing does",
-                ),
-            )
-            for column in (
-                Column(f"{name}_percent", FLOAT, "percent", meaning, 0, 100, nullable=True),
-                Column(
-                    f"{name}_low_percent",
-                    FLOAT,
-                    "percent",
-                    "lower end of its 95 % interval (Wilson)",
-                    0,
-                    100,
-                    nullable=True,
-                ),
-                Column(f"{name}_high_percent", FLOAT, "percent", "upper end", 0, 100, nullable=True),
+            for points in BEYOND
+            for column in _share(
+                f"beyond_{points}",
+                f"of runs from good starts farther than {points} points from 100 % at some step up to 200; "
+                "missing from wrong starts",
             )
         ),
+        *_MEDIAN,
         Column(
-            "median_steps",
+            "recovery_steps",
             FLOAT,
             NONE,
-            "decisions until inside for good, median of settled runs",
-            low=0,
+            "decisions from step 60 until inside for good, median of recovered runs; missing where nothing "
+            "happens at step 60",
             nullable=True,
         ),
-        Column("p90_steps", FLOAT, NONE, "the same, 90th percentile", low=0, nullable=True),
-        Column(
-            "overshoot_p95_percent",
-            FLOAT,
-            "percent",
-            "points of flow past 100 % on the far side of the start, 95th percentile",
-            low=0,
-            nullable=True,
-        ),
-        Column(
-            "flow_error_percent",
-            FLOAT,
-            "percent",
-            "mean distance of the true flow from 100 % when settled",
-            low=0,
-            nullable=True,
-        ),
-        Column("worst_start_flow_percent", FLOAT, "percent", "start from which fewest settle", low=0),
-        Column("worst_start_temperature_degC", FLOAT, "degC", "the same start's temperature"),
-        Column("worst_start_settled_percent", FLOAT, "percent", "of runs from there", 0, 100),
+        *_ERRORS,
     ),
 )
 

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from pipeline.setpoint import calibrated_classifier, calibration, classifier, key_area, nozzle_scene
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, WindowPredictions, YardstickClasses
-from pipeline.setpoint.calibration import ClassifierOutputs
+from pipeline.setpoint.calibration import ClassifierOutputs, Promise, WindowTruth
 from pipeline.setpoint.classifier import Labelled, TrainingSettings, TrainState
 from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.vision_transformer import (
@@ -30,7 +30,6 @@ from pipeline.setpoint.workflow.classifier_files import CLASSIFIER_SCHEMA, SIZES
 from pipeline.setpoint.workflow.render_frames import LabelledFrames
 from pipeline.setpoint.workflow.settings import TrainClassifier
 from pipeline.setpoint.workflow.windows import edges
-from pipeline.statistics import wilson
 from pipeline.store import artifacts
 from pipeline.store.artifacts import read_weights, write_weights
 
@@ -174,6 +173,7 @@ def _all(settings: TrainClassifier, frames: LabelledFrames) -> Labelled:
         frames.images,
         frames.temperature,
         frames.label,
+        frames.flow,
         frames.print_number if settings.source == "recordings" else frames.segment,
     )
 
@@ -191,8 +191,7 @@ def judged(settings: TrainClassifier, by_part: Mapping[str, LabelledFrames], net
         outputs["learned"],
         outputs["calibration"],
         length=settings.window,
-        coverage=settings.coverage,
-        confidence=settings.confidence,
+        promise=Promise(settings.coverage, settings.confidence),
         false_alarms=settings.false_alarms,
     )
     windows = calibrated_classifier.window_predictions(fitted, outputs["judged"], length=settings.window)
@@ -210,37 +209,49 @@ def judged(settings: TrainClassifier, by_part: Mapping[str, LabelledFrames], net
 def metrics(
     settings: TrainClassifier, result: Judged, networks: Trained, read: dict[str, Any]
 ) -> dict[str, Any]:
-    """Accuracies with their 95 % intervals (Wilson, as if frames and windows were
-    independent), calibration, what is held, what is foreign."""
-    frames, windows, valid = result.frames, result.windows, result.frames.valid
-    fitted, some = result.model.calibration, result.windows.any_valid
+    """Accuracies with their 95 % intervals by segment, also by flow; calibration, what is held, what is
+    foreign."""
+    frames, valid, fitted = result.frames, result.frames.valid, result.model.calibration
     named = {
         "image": frames.logits.argmax(axis=1),
         "svc_image": result.yardsticks.svc,
         "cnn_image": result.cnn,
         "width_image": result.yardsticks.width,
     }
-    right = {name: (classes == frames.label)[valid] for name, classes in named.items()} | {
-        "window": (windows.prob.argmax(axis=1) == windows.label)[some]
-    }
+    prob, truth = judged_windows(result)
+    right = prob.argmax(axis=1) == truth.label
+    shares = {
+        name: calibration.share_by_segment((classes == frames.label)[valid], frames.segment[valid])
+        for name, classes in named.items()
+    } | {"window": calibration.share_by_segment(right, truth.segment)}
+    uniform = calibration.uniform_share(right, truth)
     errors = calibrated_classifier.reliabilities(fitted, frames, length=settings.window)
-    sets = calibration.sets(windows.prob[some], windows.label[some], fitted.level)
+    sets = calibration.sets(prob, truth.label, fitted.level)
     return {
-        **{f"{name}_accuracy": float(np.mean(hits)) for name, hits in right.items()},
+        **{f"{name}_accuracy": share.percent / 100 for name, share in shares.items()},
         "svc_window_accuracy": result.yardsticks.svc_window_accuracy,
-        "intervals_percent": {name: [wilson(hits).low, wilson(hits).high] for name, hits in right.items()},
-        "images": int(valid.sum()), "windows": int(some.sum()),
+        "intervals_percent": {name: [share.low, share.high] for name, share in shares.items()},
+        "right_70_150": _finite(uniform),
+        "by_flow": [_finite(row) for row in calibration.by_flow(right, truth)],
+        "coverage_by_flow": [
+            _finite(row)
+            for row in calibration.by_flow(
+                calibration.holds_true_class(prob, truth.label, fitted.level), truth
+            )
+        ],
+        "images": int(valid.sum()), "windows": len(right),
         "judged_segments": len(np.unique(frames.segment)),
         "ece_image": errors["image", "calibrated"].error, "ece_image_raw": errors["image", "raw"].error,
         "ece_image_floor": errors["image", "calibrated"].floor,
-        "ece_window": errors["window", "log_sum"].error,
+        "ece_window": errors["window", "flow"].error,
+        "ece_window_log_sum": errors["window", "log_sum"].error,
         "ece_window_counts": errors["window", "hard_counts"].error,
         "ece_window_mean": errors["window", "mean"].error,
-        "ece_window_floor": errors["window", "log_sum"].floor,
+        "ece_window_floor": errors["window", "flow"].floor,
         "temperature": fitted.temperature, "window_correlation": fitted.correlation,
-        "conformal_level": fitted.level,
+        "flow_correlation": fitted.flow.correlation, "conformal_level": fitted.level,
         "conformal": {"asked": settings.coverage, "coverage": sets.coverage, "held": sets.held,
-        "windows": int(some.sum())},
+        "windows": len(right)},
         "out_of_distribution": calibrated_classifier.foreign_detection(result.model, frames, result.data),
         "size": settings.size, "augmentation": settings.augmentation, "source": settings.source,
         "parameters": parameters(networks.network),
@@ -249,6 +260,19 @@ def metrics(
         "best_epoch": {name: int(state.best_epoch) for name, state in networks.curves.items()},
         "data": read,
     }  # fmt: skip
+
+
+def judged_windows(result: Judged) -> tuple[np.ndarray, WindowTruth]:
+    """Probabilities (w, 3) and truth of the judged windows that have a valid frame."""
+    windows = result.windows
+    return windows.seen.prob[windows.any_valid], WindowTruth(
+        *(column[windows.any_valid] for column in windows.truth)
+    )
+
+
+def _finite(row: NamedTuple) -> dict[str, float | None]:
+    """A row for JSON: None where there is no figure."""
+    return {name: value if np.isfinite(value) else None for name, value in row._asdict().items()}
 
 
 def classified(result: Judged, flow: np.ndarray) -> dict[str, np.ndarray]:
@@ -314,32 +338,17 @@ def curve_rows(networks: Trained) -> dict[str, list]:
 def recorded(
     settings: TrainClassifier, model: CalibratedClassifier, by_part: Mapping[str, LabelledFrames]
 ) -> dict[str, WindowTable]:
-    """The windows of "learn" and "judge" as the simulator draws them
-    again; of a folder, windows at one flow."""
-    fitted = model.calibration
-    outputs = {
-        part: calibrated_classifier.outputs(
-            model.network,
-            Labelled(frames.images, frames.temperature, frames.label, frames.segment),
-            frames.valid,
+    """The windows of WINDOW_PARTS as the simulator draws them again; of a folder, windows at one flow."""
+    windows = {}
+    for part, frames in by_part.items():
+        truth = frames.temperature, frames.label, frames.flow, frames.segment
+        outputs = calibrated_classifier.outputs(model.network, Labelled(frames.images, *truth), frames.valid)
+        windows[part] = calibrated_classifier.window_predictions(
+            model.calibration, outputs, length=settings.window
         )
-        for part, frames in by_part.items()
-    }
-    windows = {
-        part: calibrated_classifier.window_predictions(fitted, frames, length=settings.window)
-        for part, frames in outputs.items()
-    }
-    flows = {part: by_part[part].flow[of.rows[:, 0]] for part, of in windows.items()}
-    bins = edges([flows[part][of.any_valid] for part, of in windows.items()])
+    bins = edges([of.truth.flow_percent[of.any_valid] for of in windows.values()])
     return {
-        part: calibration.recorded(
-            calibration.log_probabilities(outputs[part].logits, fitted.temperature)[of.rows],
-            outputs[part].valid[of.rows],
-            flows[part],
-            outputs[part].segment[of.rows[:, 0]],
-            correlation=fitted.correlation,
-            flow_edges=bins,
-        )
+        part: calibration.recorded(of.seen, of.truth.flow_percent, of.truth.segment, flow_edges=bins)
         for part, of in windows.items()
     }
 
@@ -369,7 +378,7 @@ def shown(settings: TrainClassifier, model: CalibratedClassifier, folder: Path) 
         if not any(wanted.values()):
             break
         flow, temperature = (
-            nozzle_scene.draw_flow(rng, i % 3, 1),
+            nozzle_scene.draw_class_flow(rng, i % 3, 1),
             np.array([nozzle_scene.TEMPERATURES[i % 5]]),
         )
         scene = nozzle_scene.render(nozzle_scene.draw_segment(rng), flow, temperature, rng)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.setpoint.recorded import WindowTable
-from pipeline.setpoint.workflow.tables import FLOW_EDGES
+from pipeline.setpoint.workflow.tables import FLOW_EDGES, WINDOW_PARTS
 
 
 def edges(flows: Sequence[np.ndarray]) -> np.ndarray:
@@ -22,25 +22,33 @@ def edges(flows: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def window_rows(tables: dict[str, WindowTable]) -> dict[str, np.ndarray]:
-    """The tables of "learn" and "judge" as columns of schema WINDOWS."""
+    """The tables of WINDOW_PARTS as columns of schema WINDOWS."""
     columns = collections.defaultdict(list)
     for part, table in tables.items():
         columns["part"] += [part] * len(table.named)
+        columns["flow_percent"].append(table.flow)
         columns["flow_bin"].append(table.flow_bin)
         columns["flow_low_percent"].append(table.flow_edges[table.flow_bin])
         columns["flow_high_percent"].append(table.flow_edges[table.flow_bin + 1])
         columns["segment"].append(table.segment)
         columns["named"].append(table.named)
+        columns["flow_seen_percent"].append(table.flow_seen)
+        columns["spread"].append(table.spread)
         for c, name in enumerate(("under", "good", "over")):
             columns[f"p_{name}"].append(table.shares[:, c])
     return {name: values if name == "part" else np.concatenate(values) for name, values in columns.items()}
 
 
 def window_tables(columns: dict[str, np.ndarray]) -> dict[str, WindowTable]:
-    """The reverse of `window_rows`."""
+    """The reverse of `window_rows`. Raises ValueError where a part of WINDOW_PARTS has no window."""
     tables = {}
-    for part in ("learn", "judge"):
-        rows = columns["part"] == part
+    for part in WINDOW_PARTS:
+        rows = np.asarray(columns["part"] == part)
+        if not rows.any():
+            raise ValueError(
+                f"recorded windows: expected some of each part, {', '.join(WINDOW_PARTS)}, but found none of "
+                f"{part}; record them again with ./run dvc repro train_classifier"
+            )
         bins, first = np.unique(columns["flow_bin"][rows], return_index=True)
         low, high = (columns[f"flow_{end}_percent"][rows][first] for end in ("low", "high"))
         shares = np.stack([columns[f"p_{name}"][rows] for name in ("under", "good", "over")], axis=1)
@@ -50,5 +58,8 @@ def window_tables(columns: dict[str, np.ndarray]) -> dict[str, WindowTable]:
             np.searchsorted(bins, columns["flow_bin"][rows]),
             columns["segment"][rows],
             np.append(low, high[-1]),
+            columns["flow_seen_percent"][rows],
+            columns["spread"][rows],
+            columns["flow_percent"][rows],
         )
     return tables

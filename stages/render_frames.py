@@ -1,0 +1,20 @@
+"""Nozzle frames with their labels: renders them, cuts their key areas and writes
+datasets/render_frames/<part>.safetensors; nothing where the frames are recordings. A classifier that is
+trained anew renders nothing anew."""
+
+from pipeline.setpoint.workflow import render_frames
+from pipeline.setpoint.workflow.settings import RenderFrames
+from pipeline.store import artifacts, params
+
+
+def main() -> None:
+    with artifacts.stage("render_frames") as out:
+        settings = params.load(RenderFrames, "render_frames")
+        execution = params.load(params.Execution, "execution")
+        source = params.value("train_classifier.source", one_of=("simulated", "recordings"))
+        by_part = render_frames.rendered(settings, execution) if source == "simulated" else {}
+        render_frames.store_frames(out, by_part)
+
+
+if __name__ == "__main__":
+    main()
