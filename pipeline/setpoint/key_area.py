@@ -33,6 +33,9 @@ OPEN = np.arange(-30, 211, COARSE)
 # a direction from G-code is trusted to this many degrees: the line
 # bends, and the camera's turn is known to a few
 LEEWAY_DEG = 6
+# another line that leaves the tip at least APART_DEG away and is this share as strong leaves it open which is
+# the fresh one
+APART_DEG, RIVAL = 24, 0.35
 # a nozzle this close to where it was calibrated is at home
 HOME_PX = 2
 # what scores within this share of the best belongs to the same line
@@ -97,16 +100,31 @@ def crop(frame: np.ndarray, tip: tuple[float, float]) -> Crop:
 
 
 def find(
-    frame: np.ndarray, tip: tuple[float, float], *, least_score: float, direction_deg: float | None = None
+    frame: np.ndarray,
+    tip: tuple[float, float],
+    *,
+    least_score: float,
+    direction_deg: float | None = None,
+    leeway_deg: int = LEEWAY_DEG,
 ) -> KeyArea:
-    """The key area along the strongest ridge: score = strip - brighter flank, rays on the nozzle left out;
-    rejected below least_score gray levels.
+    """The key area of a frame with its tip (x, y): find_in its crop. Raises ValueError as crop does."""
+    return find_in(
+        crop(frame, tip), least_score=least_score, direction_deg=direction_deg, leeway_deg=leeway_deg
+    )
 
-    With direction_deg, known from G-code, only rays within LEEWAY_DEG of it are looked at, those on the
-    nozzle too. Raises ValueError as crop does.
+
+def find_in(
+    c: Crop, *, least_score: float, direction_deg: float | None = None, leeway_deg: int = LEEWAY_DEG
+) -> KeyArea:
+    """The key area along a ridge: score = strip - brighter flank; rejected below least_score gray levels.
+
+    With direction_deg, known from G-code or from the ground's motion, only rays within leeway_deg of it are
+    looked at, those on the nozzle too, and only lines that pass the tip within MISS steps: neighbours further
+    off are not seen. Without it the strongest ridge that the nozzle does not hide is taken, and where
+    another line is nearly as strong, none: nothing in one picture tells which was laid last.
     """
-    c = crop(frame, tip)
-    angle, miss, score = _ridge(c.gray, direction_deg)
+    ridge = _ridge(c.gray, direction_deg, leeway_deg)
+    angle, miss, score = ridge.angle_deg, ridge.miss_px, ridge.score
     outside = _outside(c, angle, miss)
     reason = ""
     if score < least_score:
@@ -116,6 +134,11 @@ def find(
         )
     elif outside > 0.5:
         reason = f"cut by the frame: {outside:.0%} of the rectangle at {angle:.0f} degrees lie outside"
+    elif ridge.rival_score >= RIVAL * score:
+        reason = (
+            f"several lines: those at {angle:.0f} and {ridge.rival_deg:.0f} degrees stand {score:.1f} and "
+            f"{ridge.rival_score:.1f} gray levels out, and no direction of travel is known"
+        )
     image = np.zeros(SHAPE, np.uint8) if reason else _rectangle(c, angle, miss)
     return KeyArea(image, angle, miss, score, c.padded_share, reason)
 
@@ -246,15 +269,31 @@ def _corner(tip: tuple[float, float], size: int) -> tuple[int, int]:
     return round(float(tip[0])) - size // 2, round(float(tip[1])) - size + 1
 
 
-def _ridge(gray: np.ndarray, direction_deg: float | None) -> tuple[float, float, float]:
-    """(angle in degrees, miss in px, score) of the strongest ridge; without a direction every COARSE degrees,
-    then every degree around the best of them."""
+class _Ridge(NamedTuple):
+    """A ridge, and the strongest one that leaves the tip elsewhere, with a score of 0 where the direction is
+    known."""
+
+    angle_deg: float
+    miss_px: float
+    score: float
+    rival_deg: float = np.nan
+    rival_score: float = 0.0
+
+
+def _ridge(gray: np.ndarray, direction_deg: float | None, leeway_deg: int) -> _Ridge:
+    """The ridge of the fresh line; without a direction every COARSE degrees, then every degree around the
+    best of them."""
     small = cv2.resize(gray, None, fx=1 / STEP, fy=1 / STEP, interpolation=cv2.INTER_AREA).ravel()
+    rival = ()
     if direction_deg is None:
-        coarse = OPEN[_scores(small, _open_profiles()).max(axis=1).argmax()]
+        open_scores = _scores(small, _open_profiles()).max(axis=1)
+        coarse = OPEN[open_scores.argmax()]
         angles = np.arange(coarse - COARSE, coarse + COARSE + 1)
+        away = np.abs((OPEN - coarse + 180) % 360 - 180) >= APART_DEG
+        place = np.where(away, open_scores, -np.inf).argmax()
+        rival = (float(OPEN[place] % 360), float(open_scores[place]))
     else:
-        angles = round(direction_deg) + np.arange(-LEEWAY_DEG, LEEWAY_DEG + 1)
+        angles = round(direction_deg) + np.arange(-leeway_deg, leeway_deg + 1)
     score = _scores(small, _profiles()[:, angles % 360])
     best, at = float(score.max()), int(score.argmax()) % score.shape[1]
     # what is nearly as strong has a say, so that a broad line is taken
@@ -263,7 +302,7 @@ def _ridge(gray: np.ndarray, direction_deg: float | None) -> tuple[float, float,
     weight = np.maximum(score[:, beside] - (best - NEARLY * abs(best) - 1e-6), 0)
     weight /= weight.sum()
     angle, miss = weight.sum(axis=1) @ angles, weight.sum(axis=0) @ MISSES[beside]
-    return float(angle) % 360, float(miss), best
+    return _Ridge(float(angle) % 360, float(miss), best, *rival)
 
 
 def _scores(small: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -143,6 +143,37 @@ def test_a_known_direction_beats_a_brighter_older_bead():
     assert apart(key_area.find(frame, (200, 200), least_score=LEAST, direction_deg=-208).angle_deg, 150) <= 2
 
 
+def test_a_second_line_leaves_it_open_which_is_the_fresh_one_and_a_faint_one_does_not():
+    both = np.maximum(line(150, level=110), line(60, level=140))
+    found = key_area.find(both, (200, 200), least_score=LEAST)
+    assert found.reason.startswith("several lines: those at 60 and 150 degrees stand 80.0 and ")
+    assert not found.image.any()
+    for told in (150, 60):
+        assert key_area.find(both, (200, 200), least_score=LEAST, direction_deg=told).reason == ""
+    faint = np.maximum(line(150, level=75), line(60, level=140))
+    assert key_area.find(faint, (200, 200), least_score=LEAST).reason == ""
+    # the same line on the far side of the nozzle, as of a nozzle that goes over an older one
+    through = np.maximum(line(10), line(190, level=120))
+    assert "several lines" in key_area.find(through, (200, 200), least_score=LEAST).reason
+
+
+@pytest.mark.parametrize("told", [90, 40, 140])
+def test_along_the_told_direction_brighter_neighbours_and_an_infill_are_not_taken_for_the_fresh_line(told):
+    fresh = line(told, width=7, level=110)
+    neighbours = [line(told, width=7, level=200, miss=miss) for miss in (-40, -20, 20, 40)]
+    found = key_area.find(
+        np.maximum.reduce([fresh, *neighbours]), (200, 200), least_score=LEAST, direction_deg=told
+    )
+    assert found.reason == ""
+    assert abs(found.miss_px) <= 3
+    assert found.score == pytest.approx(50, abs=5)  # its own contrast, not the neighbours' 140
+    alone = key_area.find(np.maximum.reduce(neighbours), (200, 200), least_score=LEAST, direction_deg=told)
+    assert alone.reason.startswith("no fresh line")
+    across = [line(told + 60, width=4, level=200, miss=miss) for miss in range(-60, 61, 12)]
+    infill = key_area.find(np.maximum.reduce(across), (200, 200), least_score=LEAST, direction_deg=told)
+    assert infill.reason.startswith("no fresh line")
+
+
 def test_a_broad_bead_is_a_line_too():
     found = key_area.find(line(100, width=22), (200, 200), least_score=LEAST)
     assert found.reason == ""
@@ -345,17 +376,54 @@ def test_a_tip_ten_pixels_off_changes_no_verdict_that_is_clear(shared):
             assert bool(found.reason) == (name != "1011"), (name, dx, dy, found.score)
 
 
-def test_every_real_frame_that_shows_a_bead_is_accepted(shared):
+# the nozzle of the film goes round a circle of 96 frames, over the line of the round before: which way the
+# fresh line leaves it (read off every few frames; where it is hidden behind the nozzle, none)
+ROUND = {
+    3: 175, 6: 171, 9: 167, 15: 149, 18: 140, 21: 126, 24: 98, 27: 71, 30: 47, 33: 33, 36: 19, 39: 13, 42: 8,
+    45: 2, 51: 356, 54: 350, 57: 345, 60: 338, 63: 329, 66: 326, 84: 214, 87: 208, 90: 196, 93: 192, 96: 185,
+}  # fmt: skip
+
+
+def film(shared):
     video = cv2.VideoCapture(str(shared("data/fast_caxton_frames/nozzle_video.gif")))
     frames = []
     while (read := video.read())[0]:
         frames.append(read[1])
     assert len(frames) == 100
-    assert key_area.find_all(frames, (301, 190), least_score=LEAST).valid.all()
-    assert (
-        key_area.find_all(frames, (299, 187), least_score=LEAST).valid.sum() >= 95
-    )  # a click some pixels off
+    return frames
+
+
+def test_on_a_real_film_the_line_of_the_told_direction_is_taken_not_that_of_the_round_before(shared):
+    frames = film(shared)
+    for k, direction in ROUND.items():
+        for tip in ((301, 190), (299, 187)):  # a click some pixels off
+            found = key_area.find(frames[k], tip, least_score=LEAST, direction_deg=direction)
+            assert found.reason == "", (k, found.reason)
+            assert apart(found.angle_deg, direction) <= key_area.LEEWAY_DEG, k
+
+
+def test_on_a_real_film_no_line_is_guessed_where_two_are_seen(shared):
+    frames = film(shared)
+    guessed, wrong = 0, []
+    for k, direction in ROUND.items():
+        strongest = key_area._ridge(key_area.crop(frames[k], (301, 190)).gray, None, 0).angle_deg
+        guessed += apart(strongest, direction) > 90
+        found = key_area.find(frames[k], (301, 190), least_score=LEAST)
+        if apart(found.angle_deg, direction) > 90 and not found.reason:
+            wrong.append(k)
+        if found.reason:
+            assert found.reason.startswith("several lines: those at "), k
+            assert "no direction of travel is known" in found.reason
+    assert guessed >= 8  # the strongest ridge alone is wrong that often
+    assert wrong == []
+
+
+def test_on_real_stills_of_an_infill_the_line_is_that_of_the_told_direction(shared):
     stills = [cv2.imread(str(p)) for p in sorted(shared("data/fast_caxton_frames/imgs").glob("*.jpg"))]
-    found = key_area.find_all(stills, (134, 120), least_score=LEAST)
-    assert found.valid.all()
-    assert (np.abs(found.angle_deg - 78) <= 14).all()  # its edges leave at 65-90 degrees
+    told = key_area.find_all(stills, (134, 120), least_score=LEAST, directions_deg=78.0)
+    assert (np.abs(told.angle_deg - 78) <= key_area.LEEWAY_DEG).all()
+    # strands beside one another leave the nozzle at 66 and at 90 degrees: one that lies as told, or none
+    assert 3 <= told.valid.sum() <= 10
+    assert {reason.partition(":")[0] for reason in told.reasons} == {"", "no fresh line"}
+    untold = key_area.find_all(stills, (134, 120), least_score=LEAST)
+    assert sum(reason.startswith("several lines") for reason in untold.reasons) >= 8

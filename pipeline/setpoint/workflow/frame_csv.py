@@ -24,7 +24,7 @@ OPTIONAL = {
     "print_id": "the file is one print",
     "nozzle_tip_x": "the tip is that of the settings",
     "timestamp": "the order of the rows is not checked",
-    DIRECTION: "the travel direction is found in each picture",
+    DIRECTION: "the travel direction is that of the ground, where it is seen to move, or of the only line",
 }
 # beside flow and target temperature, what is constant within a segment where the file has it
 SETTINGS = ("feed_rate", "z_offset")

@@ -45,6 +45,7 @@ LOOKED_AT = 2000
 # endings of what is written about recordings, and the longest path that is shown
 TEXTS, LONGEST = {".md", ".txt", ".html", ".yaml", ".yml", ".dvc", ""}, 200
 REPEATED, COPY = "an earlier line lists the image", "the frame is a copy of another"
+SEVERAL = "several lines"
 NO_FLOW, NO_TEMPERATURE, NO_PRINT, NO_NAME = (
     "no flow is known",
     "no temperature is known",
@@ -64,6 +65,8 @@ REMEDIES = {
     NO_NAME: "fill in img_path, or remove those lines",
     REPEATED: "remove the lines that repeat others",
     COPY: "record again with a camera that runs, or remove the copies",
+    SEVERAL: "write travel_direction_deg, the way the line leaves the tip in the picture, beside the frames, "
+    "or take frames at 10 a second and more, in which the motion can be seen",
 }
 LOOK = "look at a few with ./run beadline calibrate-tip IMAGE --tip X,Y"
 
@@ -89,8 +92,9 @@ class NozzleFrames(NamedTuple):
     """n frames, file by file and in a CSV print by print: images (n, 16, 48) uint8, zeros where not valid;
     label (n,) 0 under, 1 good, 2 over, -1 unknown; flow (n,) in percent of nominal; temperature (n,) in degC;
     print_number (n,) indexes `prints`; segment (n,) counts the stretches of constant settings; valid (n,); n
-    reasons, empty where valid; angle_deg, score and padded_share (n,) of the front end; `source` says where
-    each frame is from; notes say what was met."""
+    reasons, empty where valid; angle_deg, miss_px, score and padded_share (n,), tip (n, 2) and surroundings
+    (n, measures) of the front end; `source` says where each frame is from, `picture` (n) is its image's path
+    or its recording's with the frame's place in it; notes say what was met."""
 
     images: np.ndarray
     label: np.ndarray
@@ -101,9 +105,13 @@ class NozzleFrames(NamedTuple):
     valid: np.ndarray
     reasons: list[str]
     angle_deg: np.ndarray
+    miss_px: np.ndarray
     score: np.ndarray
     padded_share: np.ndarray
+    tip: np.ndarray
+    surroundings: np.ndarray
     source: list[str]
+    picture: list[tuple[Path, int]]
     prints: tuple[str, ...]
     notes: list[Note]
 
@@ -118,6 +126,7 @@ class _Part(NamedTuple):
     prints: list[str]
     stretch: np.ndarray
     places: list[str]
+    pictures: list[tuple[Path, int]]
     notes: list[Note]
 
 
@@ -161,8 +170,8 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution, *, mem
     running = run_all(every, execution, remains=": what was read is kept")
     results = iter(list(tqdm(running, total=len(every), desc=f"{folder}: frames", mininterval=2)))
     parts = [
-        _of_log(log, [next(results) for _ in pieces], why, notes)
-        for log, (_, notes), why, pieces in zip(logs, listed, reasons, calls, strict=True)
+        _of_log(log, [next(results) for _ in pieces], why, [folder / image for image in images], notes)
+        for log, (images, notes), why, pieces in zip(logs, listed, reasons, calls, strict=True)
     ]
     parts += [_of_recording(path, film) for path, film in zip(recordings, results, strict=True)]
     read = {name for name in there if name.lower().endswith(tuple(files))}
@@ -367,7 +376,9 @@ def _pieces(log: Log) -> Iterator[slice]:
 # ---- parts -> one
 
 
-def _of_log(log: Log, pieces: Sequence[FrameKeyAreas], why: list[str], notes: list[Note]) -> _Part:
+def _of_log(
+    log: Log, pieces: Sequence[FrameKeyAreas], why: list[str], images: list[Path], notes: list[Note]
+) -> _Part:
     areas = concatenate(pieces)
     areas = areas._replace(reasons=[mine or front for mine, front in zip(why, areas.reasons, strict=True)])
     label, labelled = nozzle_scene.label(log.flow), np.isfinite(log.label) & np.isfinite(log.flow)
@@ -388,7 +399,10 @@ def _of_log(log: Log, pieces: Sequence[FrameKeyAreas], why: list[str], notes: li
         f"line {line}, {' '.join(image.split())[-LONGEST:] or 'no image'}"
         for line, image in zip(log.line, log.image, strict=True)
     ]
-    return _Part(log.path, areas, log.flow, log.temperature, log.print_id, log.setting, places, notes)
+    pictures = [(image, -1) for image in images]
+    return _Part(
+        log.path, areas, log.flow, log.temperature, log.print_id, log.setting, places, pictures, notes
+    )
 
 
 def _of_recording(path: Path, film: RecordedFrames) -> _Part:
@@ -406,6 +420,7 @@ def _of_recording(path: Path, film: RecordedFrames) -> _Part:
         film.prints,
         film.stretch,
         places,
+        [(path, i) for i in range(len(places))],
         film.notes,
     )
 
@@ -426,10 +441,7 @@ def _joined(folder: Path, parts: Sequence[_Part], notes: list[Note]) -> NozzleFr
     names = [name for part in parts for name in part.prints]
     prints = tuple(dict.fromkeys(name for name in names if name))
     number = {name: i for i, name in enumerate(prints)}
-    images, angle, score, padded = (
-        np.concatenate([getattr(part.areas, name) for part in parts])
-        for name in ("images", "angle_deg", "score", "padded_share")
-    )
+    areas = concatenate([part.areas for part in parts])
     flow, temperature = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("flow", "temperature")
     )
@@ -440,7 +452,7 @@ def _joined(folder: Path, parts: Sequence[_Part], notes: list[Note]) -> NozzleFr
             f"{folder}: none of {len(valid)} frames can be learned from: "
             f"{worst.message if worst else 'none is listed'}"
         )
-    images = np.where(valid[:, None, None], images, 0).astype(np.uint8).reshape(-1, *SHAPE)
+    images = np.where(valid[:, None, None], areas.images, 0).astype(np.uint8).reshape(-1, *SHAPE)
     label = np.where(np.isfinite(flow), nozzle_scene.label(np.nan_to_num(flow)), -1)
     segment = np.concatenate([part.stretch + start for part, start in zip(parts, starts, strict=False)])
     source = [f"{part.path}: {place}" for part in parts for place in part.places]
@@ -454,10 +466,14 @@ def _joined(folder: Path, parts: Sequence[_Part], notes: list[Note]) -> NozzleFr
         segment,
         valid,
         reasons,
-        angle,
-        score,
-        padded,
+        areas.angle_deg,
+        areas.miss_px,
+        areas.score,
+        areas.padded_share,
+        areas.tip,
+        areas.surroundings,
         source,
+        [picture for part in parts for picture in part.pictures],
         prints,
         notes,
     )

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.reading.image_messages import check_size
-from pipeline.setpoint import key_area
+from pipeline.setpoint import familiar, key_area, travel
 from pipeline.store import artifacts
 from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema
 
@@ -24,10 +24,15 @@ HERE = Path(__file__).parents[2]
 # the code that decides what an entry of the memo holds
 CODE = (
     "setpoint/workflow/frame_images.py", "setpoint/workflow/frame_mcap.py", "setpoint/key_area.py",
+    "setpoint/travel.py", "setpoint/familiar.py",
     "store/mcap_frames.py",
     "reading/image_messages.py", "reading/image_topics.py",
 )  # fmt: skip
 DIGEST_BYTES = 16
+# of so many frames one is measured as the known camera's are: four of a window
+MEASURED = 5
+# frames among which the ground's motion is sought at a time
+IN_A_ROW = 20
 # cameras of 10 and 12 bits may leave the upper ones of 16 empty; a picture as dark as that
 # has fewer than 16 of 256 gray levels in any case
 FILLED_BITS = 12
@@ -41,14 +46,23 @@ MISSING, UNREADABLE, NO_TIP, UNUSABLE = (
 _LISTENING = threading.Lock()
 KEY_AREAS = Schema(
     "key_areas",
-    1,
+    2,
     (
         Column(
             "image", pa.binary(key_area.SHAPE[0] * key_area.SHAPE[1]), NONE, "16 x 48 gray levels, row by row"
         ),
         Column("angle_deg", FLOAT, "deg", "direction of the line, 0 right, 90 down", nullable=True),
+        Column("miss_px", FLOAT, "px", "by which the line passes beside the tip", nullable=True),
         Column("score", FLOAT, NONE, "ridge in gray levels", nullable=True),
         Column("padded_share", FLOAT, NONE, "share of the crop outside the frame", nullable=True),
+        Column("tip_x_px", FLOAT, "px", "where the tip was taken to be", nullable=True),
+        Column("tip_y_px", FLOAT, "px", "where the tip was taken to be", nullable=True),
+        Column(
+            "surroundings",
+            pa.binary(4 * len(familiar.NAMES)),
+            NONE,
+            "measures of familiar.NAMES, single precision, NaN where not taken",
+        ),
         Column("reason", TEXT, NONE, "why there is no key area; empty where there is one"),
         Column("digest", TEXT, NONE, "of the frame: equal frames have equal ones"),
     ),
@@ -56,16 +70,24 @@ KEY_AREAS = Schema(
 
 
 class FrameKeyAreas(NamedTuple):
-    """What the front end made of n frames: images (n, 16, 48) uint8, zeros where rejected;
-    angle_deg, score, padded_share (n,), NaN where nothing was looked at; n reasons, empty where
-    there is a key area; n digests of what the frame held."""
+    """What the front end made of n frames: images (n, 16, 48) uint8, zeros where rejected; angle_deg,
+    miss_px, score, padded_share (n,), NaN where nothing was looked at; tip (n, 2) in px; surroundings (n,
+    measures) float32 of every MEASURED-th frame, NaN of the others and of rejected ones; n reasons, empty
+    where there is a key area; n digests of what the frame held."""
 
     images: np.ndarray
     angle_deg: np.ndarray
+    miss_px: np.ndarray
     score: np.ndarray
     padded_share: np.ndarray
+    tip: np.ndarray
+    surroundings: np.ndarray
     reasons: list[str]
     digests: list[str]
+
+
+# those of its fields that are arrays
+ARRAYS = ("images", "angle_deg", "miss_px", "score", "padded_share", "tip", "surroundings")
 
 
 def read_image(path: str | Path) -> np.ndarray:
@@ -129,32 +151,83 @@ def crop_key_areas(
 def find_key_areas(
     frames: Iterable[np.ndarray | str], tips: np.ndarray, directions_deg: np.ndarray, *, least_score: float
 ) -> FrameKeyAreas:
-    """What the front end makes of n frames, or of a text that says why
-    there is none; digests are left empty."""
-    areas = []
-    for frame, tip, direction in zip(frames, tips, directions_deg, strict=True):
-        reason = (
-            frame if isinstance(frame, str) else _shallow(frame) or ("" if np.isfinite(tip).all() else NO_TIP)
-        )
-        area = key_area.KeyArea(np.zeros(key_area.SHAPE, np.uint8), np.nan, np.nan, np.nan, np.nan, reason)
-        if not reason:
-            try:
-                direction_deg = float(direction) if np.isfinite(direction) else None
-                area = key_area.find(
-                    frame,
-                    (float(tip[0]), float(tip[1])),
-                    least_score=least_score,
-                    direction_deg=direction_deg,
-                )
-            except ValueError as error:
-                area = area._replace(reason=f"{UNUSABLE}: {error}")
-        areas.append(area)
+    """What the front end makes of n frames of one film, or of a text that says why there is none; digests are
+    left empty. A direction that is not known (NaN) is sought in the motion of the ground, where frames follow
+    one another, IN_A_ROW of them in memory at a time."""
+    areas: list[key_area.KeyArea] = []
+    surroundings = np.full((len(tips), len(familiar.NAMES)), np.nan, np.float32)
+    walking = zip(frames, tips, directions_deg, strict=True)
+    while some := list(itertools.islice(((_cropped(f, tip), d) for f, tip, d in walking), IN_A_ROW)):
+        first = len(areas)
+        areas += _found([one for one, _ in some], [float(d) for _, d in some], least_score)
+        for i in range(first, len(areas)):
+            cropped, area = some[i - first][0], areas[i]
+            if i % MEASURED == 0 and not area.reason and not isinstance(cropped, str):
+                surroundings[i] = familiar.surroundings(cropped.gray, area.angle_deg, area.miss_px)
     images = np.array([area.image for area in areas], np.uint8).reshape(-1, *key_area.SHAPE)
     figures = (
         np.array([getattr(area, name) for area in areas], float)
-        for name in ("angle_deg", "score", "padded_share")
+        for name in ("angle_deg", "miss_px", "score", "padded_share")
     )
-    return FrameKeyAreas(images, *figures, [area.reason for area in areas], [""] * len(areas))
+    reasons = [area.reason for area in areas]
+    tip = np.where(np.isfinite(tips), tips, np.nan).reshape(-1, 2)
+    return FrameKeyAreas(images, *figures, tip, surroundings, reasons, [""] * len(areas))
+
+
+def _found(
+    crops: Sequence[key_area.Crop | str], directions_deg: Sequence[float], least_score: float
+) -> list[key_area.KeyArea]:
+    """Key areas of crops that follow one another: along the direction told, or the motion of the ground where
+    it can be seen, else of the only line there is."""
+    moving = _motion(crops, directions_deg)
+    areas = []
+    for i, (one, told) in enumerate(zip(crops, directions_deg, strict=True)):
+        if isinstance(one, str):
+            empty = np.zeros(key_area.SHAPE, np.uint8)
+            areas.append(key_area.KeyArea(empty, np.nan, np.nan, np.nan, np.nan, one))
+        elif np.isfinite(told):
+            areas.append(key_area.find_in(one, least_score=least_score, direction_deg=told))
+        elif np.isfinite(moving[i][0]):
+            areas.append(
+                key_area.find_in(
+                    one, least_score=least_score, direction_deg=moving[i][0], leeway_deg=travel.LEEWAY_DEG
+                )
+            )
+        else:
+            area = key_area.find_in(one, least_score=least_score)
+            several = area.reason.startswith("several lines")
+            areas.append(area._replace(reason=f"{area.reason} ({moving[i][1]})") if several else area)
+    return areas
+
+
+def _motion(
+    crops: Sequence[key_area.Crop | str], directions_deg: Sequence[float]
+) -> dict[int, tuple[float, str]]:
+    """{place: (direction or NaN, why not)} of the frames of which nobody told the direction, as far as they
+    follow one another."""
+    unknown = [
+        i
+        for i, (one, told) in enumerate(zip(crops, directions_deg, strict=True))
+        if not isinstance(one, str) and not np.isfinite(told)
+    ]
+    out: dict[int, tuple[float, str]] = {}
+    for run in np.split(np.array(unknown, int), np.flatnonzero(np.diff(unknown) > 1) + 1):
+        motion = travel.travel([crops[i].gray for i in run])
+        out |= dict(
+            zip(run.tolist(), zip(motion.direction_deg.tolist(), motion.reasons, strict=True), strict=True)
+        )
+    return out
+
+
+def _cropped(frame: np.ndarray | str, tip: np.ndarray) -> key_area.Crop | str:
+    """The crop round the tip (x, y), or the reason why there is none."""
+    reason = frame if isinstance(frame, str) else _shallow(frame)
+    if reason or not np.isfinite(tip).all():
+        return reason or NO_TIP
+    try:
+        return key_area.crop(frame, (float(tip[0]), float(tip[1])))
+    except ValueError as error:
+        return f"{UNUSABLE}: {error}"
 
 
 def _shallow(frame: np.ndarray) -> str:
@@ -170,10 +243,7 @@ def _shallow(frame: np.ndarray) -> str:
 
 def concatenate(parts: Sequence[FrameKeyAreas]) -> FrameKeyAreas:
     """The frames of all parts, one part behind the other."""
-    arrays = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("images", "angle_deg", "score", "padded_share")
-    )
+    arrays = (np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS)
     texts = (
         list(itertools.chain.from_iterable(getattr(part, name) for part in parts))
         for name in ("reasons", "digests")
@@ -240,10 +310,16 @@ def entry_of(memo: Path, *what: Any) -> Path:
 
 
 def write_memo(entry: Path, areas: FrameKeyAreas) -> None:
-    columns = ([image.tobytes() for image in areas.images], *areas[1:])
-    artifacts.write_table(
-        entry, KEY_AREAS, dict(zip([column.name for column in KEY_AREAS.columns], columns, strict=True))
-    )
+    columns = {
+        "image": [image.tobytes() for image in areas.images],
+        **{name: getattr(areas, name) for name in ("angle_deg", "miss_px", "score", "padded_share")},
+        "tip_x_px": areas.tip[:, 0],
+        "tip_y_px": areas.tip[:, 1],
+        "surroundings": [row.astype("<f4").tobytes() for row in areas.surroundings],
+        "reason": areas.reasons,
+        "digest": areas.digests,
+    }
+    artifacts.write_table(entry, KEY_AREAS, columns)
 
 
 def read_memo(entry: Path, count: int) -> FrameKeyAreas | None:
@@ -255,5 +331,8 @@ def read_memo(entry: Path, count: int) -> FrameKeyAreas | None:
     if len(table["image"]) != count:
         return None
     images = np.frombuffer(b"".join(table["image"]), np.uint8).reshape(-1, *key_area.SHAPE)
-    columns = (table[name].tolist() for name in ("reason", "digest"))
-    return FrameKeyAreas(images, table["angle_deg"], table["score"], table["padded_share"], *columns)
+    measures = np.frombuffer(b"".join(table["surroundings"]), "<f4").reshape(-1, len(familiar.NAMES))
+    figures = (table[name] for name in ("angle_deg", "miss_px", "score", "padded_share"))
+    tip = np.column_stack([table["tip_x_px"], table["tip_y_px"]])
+    texts = (table[name].tolist() for name in ("reason", "digest"))
+    return FrameKeyAreas(images, *figures, tip, measures, *texts)

@@ -4,7 +4,7 @@ opens it, and read from that form or from a machine's own topics."""
 import contextlib
 import hashlib
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -137,6 +137,19 @@ def open_film(
                 raise ValueError(f"{error}; map it in {PLACE}.mapping.{name}") from None
     film = read_frames(path, camera, places, in_file, clock=clock, unreadable_share=1.0)
     return film.frames, film.signals, film.notes
+
+
+def frames_at(path: Path, where: Topics, places: Sequence[int]) -> dict[int, np.ndarray]:
+    """{place: gray frame} of a recording's frames that can be decoded, counted from 0 in the order of time;
+    the others are not kept."""
+    frames, _, _ = open_film(path, where)
+    wanted, found = set(places), {}
+    for k, (_, frame) in enumerate(frames):
+        if k in wanted:
+            found[k] = np.array(frame)
+            if len(found) == len(wanted):
+                break
+    return found
 
 
 def _topics(path: Path) -> dict[str, Topic]:

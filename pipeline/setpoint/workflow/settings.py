@@ -2,12 +2,45 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from pipeline.setpoint.material import Material
 from pipeline.store.params import Mapped, Section
 
 # as far as pixels.py looks for the nozzle's tip, in px: a number of its own, since that module imports much
 REACH_PX = 30
+
+
+Degrees = Annotated[float, Field(ge=100, le=500)]
+Percent = Annotated[float, Field(ge=1, le=1000)]
+
+
+class SetpointMaterial(Section):
+    """Section `setpoint_material`: what is printed (material.Material)."""
+
+    best_temperature_degC: float = Field(ge=100, le=500)
+    temperature_range_degC: tuple[Degrees, Degrees]
+    good_flow_percent: tuple[Percent, Percent]
+    flow_limits_percent: tuple[Percent, Percent]
+
+    @model_validator(mode="after")
+    def _in_order(self):
+        low, high = self.temperature_range_degC
+        if not low < self.best_temperature_degC < high:
+            raise ValueError(
+                f"has best_temperature_degC {self.best_temperature_degC:g} but temperature_range_degC "
+                f"[{low:g}, {high:g}]; the best lies between the two"
+            )
+        ends = (self.flow_limits_percent[0], *self.good_flow_percent, self.flow_limits_percent[1])
+        if not ends[0] < ends[1] < 100 < ends[2] < ends[3]:
+            raise ValueError(
+                f"has good_flow_percent [{ends[1]:g}, {ends[2]:g}] and flow_limits_percent [{ends[0]:g}, "
+                f"{ends[3]:g}]; 100 lies between the first two, and they between the limits"
+            )
+        return self
+
+    def material(self) -> Material:
+        return Material(**self.model_dump())
 
 
 class Counts(Section):
