@@ -213,7 +213,7 @@ def shadow(arguments: argparse.Namespace) -> None:
     from pipeline.setpoint.workflow.shadow import deploy
     from pipeline.setpoint.workflow.watch_sources import shown_place, source
 
-    ready = deploy.ready()
+    ready = deploy.ready(str(arguments.levels or ""))
     asked = deploy.asked(
         arguments.flow, arguments.temperature, arguments.tip, once=arguments.once, settings=ready
     )
@@ -222,6 +222,37 @@ def shadow(arguments: argparse.Namespace) -> None:
     with watching.until_told() as stopped:
         watched = watching.watch(frames, ready.deployed, asked, arguments.out, place=place, stopped=stopped)
     print(watching.summary_lines(watched, place))
+
+
+def record_levels(arguments: argparse.Namespace) -> None:
+    """Flows that were held for a minute each before a printer's camera into the correction for that camera,
+    and a page."""
+    from functools import partial
+
+    from pipeline.setpoint.calibrated_classifier import read_frames
+    from pipeline.setpoint.workflow import record_levels as levels
+    from pipeline.setpoint.workflow.frame_folder import read_options
+    from pipeline.setpoint.workflow.shadow import deploy
+    from pipeline.setpoint.workflow.training_print import numbers
+    from pipeline.setpoint.workflow.watch_sources import Recording
+
+    eye = deploy.trained()
+    options, fitted = read_options(eye.view), eye.model.calibration
+    protocol = levels.Protocol(
+        numbers(arguments.flows, "--flows"),
+        deploy.bounded("--hold", arguments.hold),
+        deploy.bounded("--settle", arguments.settle),
+        deploy.bounded("--temperature", arguments.temperature),
+        deploy.pixel(arguments.tip) if arguments.tip else options.tip_px,
+    )
+    place = arguments.source
+    source = levels.source_of(place, lambda path: Recording(path, options.topics))
+    levels_eye = levels.Eye(
+        partial(read_frames, eye.model), fitted.flow, eye.view.window, eye.view.least_score, eye.digest,
+        eye.view.false_alarms,
+    )  # fmt: skip
+    recorded, told = levels.record(source, protocol, levels_eye, place=str(place))
+    print(levels.write(recorded, told, arguments.out, str(place)))
 
 
 def training_print(arguments: argparse.Namespace) -> None:
@@ -259,7 +290,8 @@ def version() -> str:
 def _add_shadow(commands: argparse._SubParsersAction) -> None:
     command = commands.add_parser("shadow", help=shadow.__doc__)
     command.add_argument(
-        "source", help="a folder that fills with pictures, an MCAP file that grows, or the address of a snapshot"
+        "source",
+        help="a folder that fills with pictures, an MCAP file that grows, or the address of a snapshot",
     )
     command.add_argument("--out", type=Path, default=Path("shadow"), metavar="DIR", help="(shadow)")
     command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels")
@@ -269,9 +301,47 @@ def _add_shadow(commands: argparse._SubParsersAction) -> None:
     command.add_argument(
         "--temperature", type=float, default=210.0, help="of the nozzle in °C where the source has none (210)"
     )
+    command.add_argument(
+        "--levels",
+        type=Path,
+        metavar="FILE",
+        help="of record-levels (datasets/levels/levels.parquet, if there)",
+    )
     command.add_argument("--rate", type=float, default=5.0, metavar="HZ", help="snapshots a second (5)")
     command.add_argument("--once", action="store_true", help="end where the source ends")
     command.set_defaults(run=shadow)
+
+
+def _add_record_levels(commands: argparse._SubParsersAction) -> None:
+    command = commands.add_parser("record-levels", help=record_levels.__doc__)
+    command.add_argument("source", type=Path, metavar="FOLDER|MCAP", help="pictures, or a recording")
+    command.add_argument(
+        "--flows", default="60,80,100,125,160", metavar="PERCENT,...",
+        help="in the order in which they were held (60,80,100,125,160)",
+    )  # fmt: skip
+    command.add_argument(
+        "--hold",
+        type=float,
+        default=60.0,
+        metavar="S",
+        help="how long each was held, from the first frame on (60)",
+    )
+    command.add_argument(
+        "--settle",
+        type=float,
+        default=10.0,
+        metavar="S",
+        help="after each change, in which the melt follows (10)",
+    )
+    command.add_argument(
+        "--temperature", type=float, default=210.0, help="of the nozzle in °C where the source has none (210)"
+    )
+    command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels")
+    command.add_argument(
+        "--out", type=Path, default=Path("datasets/levels/levels.parquet"), metavar="FILE",
+        help="where shadow looks for it (datasets/levels/levels.parquet)",
+    )  # fmt: skip
+    command.set_defaults(run=record_levels)
 
 
 def _add_training_print(commands: argparse._SubParsersAction) -> None:
@@ -382,6 +452,7 @@ def main() -> None:
     )
     command.set_defaults(run=calibrate_camera)
     _add_shadow(commands)
+    _add_record_levels(commands)
     _add_training_print(commands)
     nights.add(commands)
     arguments = parser.parse_args()

@@ -97,9 +97,7 @@ class GrowingMcap:
             self.offset = resumed
         return None
 
-    def _of_record(
-        self, opcode: int, body: bytes, wanted: Callable[[Channel], bool]
-    ) -> Iterator[Message]:
+    def _of_record(self, opcode: int, body: bytes, wanted: Callable[[Channel], bool]) -> Iterator[Message]:
         """The messages of a record outside or inside a chunk; a definition is remembered."""
         try:
             if opcode == CHUNK:

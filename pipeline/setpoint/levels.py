@@ -12,6 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.setpoint.calibration import class_probabilities
+from pipeline.setpoint.recorded import WindowTable
+
 # fewer windows say nothing of a level, fewer levels nothing of a curve
 LEAST_LEVELS, LEAST_WINDOWS = 3, 5
 # a camera sees flow where log flow shown rises by so much for each of log flow, at least, and where the
@@ -52,9 +55,7 @@ def fit(windows: LevelWindows) -> Levels:
     dip = np.diff(y) + DIPS * np.hypot(error[1:], error[:-1]) + DIP
     gain = float(np.polyfit(x, y, 1)[0])
     if dip.min() < 0 or gain < LEAST_SLOPE or y[-1] - y[0] < LEAST_APART * within:
-        shown = ", ".join(
-            f"{100 * np.exp(m):.0f} at {q:g} %" for q, m in zip(flows, middle, strict=True)
-        )
+        shown = ", ".join(f"{100 * np.exp(m):.0f} at {q:g} %" for q, m in zip(flows, middle, strict=True))
         raise ValueError(
             f"this camera does not see flow: expected windows that show more where more was commanded, found "
             f"{shown}, windows of one level {100 * within:.0f} % apart; look at a frame with "
@@ -81,6 +82,34 @@ def corrected(levels: Levels, flow_seen: np.ndarray) -> np.ndarray:
 def shown(levels: Levels, flow: np.ndarray) -> np.ndarray:
     """What this camera shows at a flow, both in percent: where a class's border lies for it."""
     return 100 * np.exp(_along(levels.log_flow, levels.log_seen, 1 / levels.slope, np.log(flow / 100)))
+
+
+def probabilities(levels: Levels, flow: np.ndarray) -> np.ndarray:
+    """(n, 3) shares of under, good, over of windows with corrected flows (n,) in percent."""
+    return class_probabilities(np.log(flow / 100), np.full(len(flow), levels.spread))
+
+
+def table(levels: Levels, windows: LevelWindows, flow_edges: np.ndarray) -> WindowTable:
+    """What a controller learns from in place of the classifier's own windows: in the middle of each bin of
+    flow_edges (bins + 1,) in percent, each window errs as it did at its own flow, in log flow. Each level is a
+    segment."""
+    error = np.log(corrected(levels, windows.seen) / windows.flow)
+    _, segment = np.unique(windows.flow, return_inverse=True)
+    middles = np.sqrt(flow_edges[:-1] * flow_edges[1:])
+    flow = np.repeat(middles, len(error))
+    seen = flow * np.exp(np.tile(error, len(middles)))
+    shares = probabilities(levels, seen)
+    flow_bin = np.repeat(np.arange(len(middles)), len(error))
+    return WindowTable(
+        shares,
+        shares.argmax(axis=1),
+        flow_bin,
+        np.tile(segment, len(middles)),
+        np.asarray(flow_edges, float),
+        seen,
+        np.full(len(seen), levels.spread),
+        flow,
+    )
 
 
 def _summaries(windows: LevelWindows) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

@@ -39,7 +39,9 @@ def test_a_new_print_is_told_within_the_spread(camera):
         inside.append(np.mean(np.abs(miss) < 2 * found.spread))
         off.append(abs(np.log(levels.corrected(found, see(100.0)) / 100.0)))
     assert np.mean(inside) > 0.9
-    assert np.percentile(off, 90) < 0.09, "three of the segment's errors: the bent ones flatten to half the slope"
+    assert np.percentile(off, 90) < 0.09, (
+        "three of the segment's errors: the bent ones flatten to half the slope"
+    )
 
 
 def test_without_errors_the_borders_move_to_where_the_camera_shows_them():
@@ -81,7 +83,9 @@ def test_a_level_with_outliers_is_taken_at_its_middle():
 )
 def test_a_camera_that_does_not_see_flow_is_refused(camera, said):
     for seed in range(20):
-        with pytest.raises(ValueError, match="this camera does not see flow: expected .*; look at a frame") as e:
+        with pytest.raises(
+            ValueError, match="this camera does not see flow: expected .*; look at a frame"
+        ) as e:
             levels.fit(record(camera, np.random.default_rng(seed), segment=0.005, window=0.02))
         assert said.partition("found")[0] in str(e.value)
 

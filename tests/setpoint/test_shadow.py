@@ -19,6 +19,8 @@ import pytest
 from mcap.reader import make_reader
 
 from pipeline.setpoint import bayes, deployment
+from pipeline.setpoint.calibrated_classifier import FrameReadings
+from pipeline.setpoint.calibration import KNOTS_PERCENT, FlowCalibration
 from pipeline.setpoint.workflow import decision_log, shadow, watch_sources
 from pipeline.setpoint.workflow.shadow.decide import Asked, Deployed
 from pipeline.setpoint.workflow.shadow.windows import Windows
@@ -40,11 +42,14 @@ def picture(seed: int, half_width: float = 9.0) -> np.ndarray:
     return np.clip(40 + line + nozzle + 6 * rng.standard_normal(y.shape), 0, 255).astype(np.uint8)
 
 
-def by_width(images: np.ndarray, temperature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shares by the rows of the key area that are brighter than its middle level; never foreign."""
-    rows = (images.mean(axis=2) > 128).sum(axis=1)
-    named = np.where(rows < 8, 0, np.where(rows > 13, 2, 1))
-    return np.where(named[:, None] == np.arange(3), 0.9, 0.05), np.zeros(len(images))
+def by_width(images: np.ndarray, temperature: np.ndarray) -> FrameReadings:
+    """Flow by the rows of the key area that the line fills; never foreign."""
+    rows = (images.mean(axis=2) > 180).sum(axis=1)
+    named = np.where(rows < 7, 0, np.where(rows > 13, 2, 1))
+    prob = np.where(named[:, None] == np.arange(3), 0.9, 0.05)
+    return FrameReadings(
+        prob, np.zeros(len(rows)), np.log(np.maximum(rows, 1) / 9.5), np.full(len(rows), 0.1)
+    )
 
 
 def deployed(**changes) -> Deployed:
@@ -58,10 +63,24 @@ def deployed(**changes) -> Deployed:
             *window, least_frames=4, correlation=0.5, foreign_above=9.0, conformal_level=0.15
         )
 
+    knots = np.log(np.array(KNOTS_PERCENT) / 100)
     made = Deployed(
-        by_width, "Bayes", bayes.bayes(1), parameters, FRAMES, 10.0, judge, limits, settle_s=0.5,
+        read=by_width,
+        flow=FlowCalibration(knots, np.ones(len(knots)), 0.5),
+        levels=None,
+        known=None,
+        name="Bayes",
+        controller=bayes.bayes(1),
+        parameters=parameters,
+        window=FRAMES,
+        least_score=10.0,
+        judge=judge,
+        conformal_level=0.15,
+        foreign_above=9.0,
+        limits=limits,
+        settle_s=0.5,
         tip_tolerance_px=8.0,
-    )  # fmt: skip
+    )
     return made._replace(**changes)
 
 
@@ -121,10 +140,10 @@ def test_each_window_names_its_frames_and_why_one_does_not_count(tmp_path):
 
 def test_what_is_foreign_stands_still_or_moved_is_held_with_the_reason(tmp_path):
     def foreign(images, temperature):
-        return by_width(images, temperature)[0], np.full(len(images), 99.0)
+        return by_width(images, temperature)._replace(distance=np.full(len(images), 99.0))
 
     fill(tmp_path / "a", [picture(k) for k in range(FRAMES)])
-    watch(Folder(tmp_path / "a"), tmp_path / "out a", deployed_as=deployed(classify=foreign))
+    watch(Folder(tmp_path / "a"), tmp_path / "out a", deployed_as=deployed(read=foreign))
     fill(tmp_path / "b", [picture(0)] * FRAMES)
     watch(Folder(tmp_path / "b"), tmp_path / "out b")
     shifted = [np.roll(picture(k), (0, 14), (0, 1)) for k in range(FRAMES, 2 * FRAMES)]
@@ -231,7 +250,9 @@ def test_the_page_asks_for_nothing_and_says_that_nothing_is_sent(tmp_path):
     watch(Folder(tmp_path / "in"), tmp_path / "out")
     page = (tmp_path / "out/index.html").read_text()
     assert "Nothing is sent to the printer." in page
-    assert not re.search(r"""(src|href|action)=["'](?!data:)|https?://|@import|url\(|<script|<form|<b>f3""", page)
+    assert not re.search(
+        r"""(src|href|action)=["'](?!data:)|https?://|@import|url\(|<script|<form|<b>f3""", page
+    )
     assert "default-src 'none'" in page and 'http-equiv="refresh"' not in page
     assert "The watch has ended." in page and "Belief over the flow" in page
 
@@ -297,12 +318,14 @@ def test_a_full_disk_costs_no_decision(tmp_path, monkeypatch, capsys):
         return by_width(images, temperature)
 
     fill(tmp_path / "in", [picture(k) for k in range(4 * FRAMES)])
-    watch(Folder(tmp_path / "in"), tmp_path / "out", deployed_as=deployed(classify=rule))
+    watch(Folder(tmp_path / "in"), tmp_path / "out", deployed_as=deployed(read=rule))
     assert [row["decision"] for row in rows(tmp_path / "out")] == [1, 2, 3, 4]
     assert "No space left on device" in capsys.readouterr().err
     assert [path for path in (tmp_path / "out").iterdir() if path.name.startswith(".")] == []
     full[0] = True
-    with pytest.raises(OSError, match="index.html cannot be written .No space left on device.; free some space"):
+    with pytest.raises(
+        OSError, match="index.html cannot be written .No space left on device.; free some space"
+    ):
         watch(Folder(tmp_path / "in"), tmp_path / "out")
 
 
@@ -424,7 +447,7 @@ def test_the_nozzle_video_is_watched_at_the_rate_of_its_camera(tmp_path):
     late = time.monotonic() + 120
     out = tmp_path / "out"
     watched = watch(
-        Folder(tmp_path / "in"), out, deployed_as=deployed(classify=rule, window=20),
+        Folder(tmp_path / "in"), out, deployed_as=deployed(read=rule, window=20),
         asked=Asked(100.0, 210.0, (299.0, 188.0), once=False),
         stopped=lambda: len(lag) == 5 or time.monotonic() > late,
     )  # fmt: skip
@@ -440,14 +463,27 @@ def test_nothing_in_the_watch_could_send():
     """The modules of the watch import nothing that opens a connection, a port or a process; the one that reads
     snapshots names no method and no body."""
     folder = ROOT / "pipeline/setpoint/workflow"
-    files = [*sorted((folder / "shadow").glob("*.py")), folder / "decision_log.py", folder / "watch_sources.py"]
+    files = [
+        *sorted((folder / "shadow").glob("*.py")),
+        folder / "decision_log.py",
+        folder / "watch_sources.py",
+    ]
     for path in files:
         tree = ast.parse(path.read_text())
         names = {
             alias.name.split(".")[0]
             for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names
         } | {(node.module or "").split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}  # fmt: skip
-        assert not names & {"socket", "serial", "subprocess", "requests", "paho", "ftplib", "smtplib", "asyncio"}
+        assert not names & {
+            "socket",
+            "serial",
+            "subprocess",
+            "requests",
+            "paho",
+            "ftplib",
+            "smtplib",
+            "asyncio",
+        }
         if path.name != "watch_sources.py":
             assert not names & {"urllib", "http"}
         calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]

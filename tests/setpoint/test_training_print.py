@@ -60,7 +60,9 @@ def test_the_reader_of_gcode_finds_each_setting_where_the_table_says(printed):
 def test_each_collected_layer_lies_on_one_at_100_percent_and_the_best_temperature(printed):
     printed(*FEW, "--best-temperature", "215")
     rows = table()
-    collected = [(float(row["flow_rate"]), float(row["target_hotend"])) for row in rows if row["collect"] == "1"]
+    collected = [
+        (float(row["flow_rate"]), float(row["target_hotend"])) for row in rows if row["collect"] == "1"
+    ]
     assert sorted(collected) == sorted((f, t) for t in (200.0, 220.0) for f in (50.0, 100.0, 160.0))
     for before, row in zip(rows, rows[1:], strict=False):
         if row["collect"] == "1":

@@ -347,7 +347,9 @@ def test_nobody_at_the_address_is_waited_for():
     assert "http://127.0.0.1:9/ does not answer" in here.waits_for
 
 
-@pytest.mark.parametrize("place", ["ftp://a/b", "http://", "http://a:b/", "file:///etc/passwd", "rtsp://u:p@c/"])
+@pytest.mark.parametrize(
+    "place", ["ftp://a/b", "http://", "http://a:b/", "file:///etc/passwd", "rtsp://u:p@c/"]
+)
 def test_an_address_that_is_none_is_refused_without_its_secret(place):
     with pytest.raises(ValueError, match="expected the address of a snapshot") as refused:
         source(place, ANY, rate_hz=5.0)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.setpoint.familiar import Camera
 from pipeline.setpoint.levels import Levels, LevelWindows
 from pipeline.store import artifacts
 
@@ -14,18 +15,22 @@ SCHEMA = ("levels", 1)
 
 
 class RecordedLevels(NamedTuple):
-    """The correction, the windows that it was fitted on, and the digest of the classifier's weights that showed
-    them: of another classifier it says nothing."""
+    """The correction, the windows that it was fitted on, the digest of the classifier's weights that showed
+    them (of another classifier it says nothing); how this camera looks, None where there were too few windows
+    to know it by, and the distance above which a frame of it is foreign."""
 
     levels: Levels
     windows: LevelWindows
     weights: str
+    camera: Camera | None
+    foreign_above: float
 
 
 def store_levels(path: str | Path, recorded: RecordedLevels) -> None:
     """Raises OSError, one sentence, where it cannot be written."""
     fitted, windows = recorded.levels, recorded.windows
     digest = np.frombuffer(bytes.fromhex(recorded.weights), np.uint8)
+    camera = recorded.camera or Camera(*(np.zeros(0) for _ in Camera._fields))
     artifacts.write_arrays(
         path,
         *SCHEMA,
@@ -37,6 +42,15 @@ def store_levels(path: str | Path, recorded: RecordedLevels) -> None:
             "straight": (np.array(fitted.straight), "1", "1 where the correction is a line"),
             "window_seen": (windows.seen, "percent", "flow that each window showed"),
             "window_flow": (windows.flow, "percent", "flow that was commanded"),
+            "foreign_above": (
+                np.array(recorded.foreign_above),
+                "1",
+                "distance above which a frame is foreign",
+            ),
+            **{
+                f"camera_{name}": (values, "1", f"how this camera looks: familiar.Camera.{name}")
+                for name, values in camera._asdict().items()
+            },
             "weights": (digest, "1", "SHA-256 of the classifier's weights, byte by byte"),
         },
     )
@@ -59,4 +73,7 @@ def restore_levels(path: str | Path, weights: str) -> RecordedLevels:
         float(found["spread"]),
         bool(found["straight"]),
     )
-    return RecordedLevels(fitted, LevelWindows(found["window_seen"], found["window_flow"]), digest)
+    looks = Camera(*(found[f"camera_{name}"] for name in Camera._fields))
+    windows = LevelWindows(found["window_seen"], found["window_flow"])
+    known = looks if looks.scores.size else None
+    return RecordedLevels(fitted, windows, digest, known, float(found["foreign_above"]))

@@ -143,9 +143,7 @@ def program(asked: Print) -> Program:
         first = len(lines) + 1
         moves, length = _raster(asked, z, flow, along_x=number % 2 == GROUND % 2)
         lines += moves
-        settings.append(
-            Setting(flow, temperature, collect, z, first, len(lines), length / asked.speed)
-        )
+        settings.append(Setting(flow, temperature, collect, z, first, len(lines), length / asked.speed))
     return Program(lines + _end(asked, settings[-1].z), settings)
 
 

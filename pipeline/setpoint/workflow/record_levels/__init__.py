@@ -9,9 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.setpoint import levels
+from pipeline.setpoint import familiar, levels
+from pipeline.setpoint.calibrated_classifier import FrameReadings
+from pipeline.setpoint.calibration import FlowCalibration, foreign_above, window_flow
+from pipeline.setpoint.familiar import Camera
 from pipeline.setpoint.levels import Levels, LevelWindows
-from pipeline.setpoint.workflow.frame_images import concatenate, find_key_areas
+from pipeline.setpoint.workflow.frame_images import find_key_areas
+from pipeline.setpoint.workflow.known_camera import FALSE_ALARMS
 from pipeline.setpoint.workflow.levels_files import RecordedLevels, store_levels
 from pipeline.setpoint.workflow.watch_sources import Folder, Recording, Shown, Source
 from pipeline.store import artifacts
@@ -20,8 +24,6 @@ from pipeline.store.printable import printable_page
 # classes lie between these, in percent
 BORDERS = (90.0, 110.0)
 CLASSES = ("under", "good", "over")
-# frames in memory at a time
-TOGETHER = 64
 # of the page's drawing
 WIDTH, HEIGHT, MARGIN = 560, 360, 40
 
@@ -38,14 +40,16 @@ class Protocol(NamedTuple):
 
 
 class Eye(NamedTuple):
-    """What sees: seen(images (n, 16, 48), temperature (n,), valid (n,)) -> flow in percent of one window of n
-    frames, NaN where it shows none; frames of a window; the front end's least score; the digest of its
-    weights."""
+    """What sees: read(images (n, 16, 48), temperature (n,)) -> what n key areas show, what makes a window's
+    flow of it; frames of a window; the front end's least score; the digest of its weights; the share of
+    this camera's frames that may be called foreign."""
 
-    seen: Callable[[np.ndarray, np.ndarray, np.ndarray], float]
+    read: Callable[[np.ndarray, np.ndarray], FrameReadings]
+    flow: FlowCalibration
     window: int
     least_score: float
     weights: str
+    false_alarms: float
 
 
 class Level(NamedTuple):
@@ -62,12 +66,14 @@ class Level(NamedTuple):
 
 
 class _Window(NamedTuple):
-    """One window: its level, what it shows, and its frames with a key area."""
+    """One window: its level, what it shows in percent, its frames, the distances (m,) of those with a key area
+    from what was learned, and how it looks (measures,)."""
 
     flow: float
     seen: float
     frames: int
-    valid: int
+    distance: np.ndarray
+    looks: np.ndarray
 
 
 def record(source: Source, protocol: Protocol, eye: Eye, *, place: str) -> tuple[RecordedLevels, list[Level]]:
@@ -90,7 +96,7 @@ def record(source: Source, protocol: Protocol, eye: Eye, *, place: str) -> tuple
             Level(
                 float(flow),
                 sum(window.frames for window in here),
-                sum(window.valid for window in here),
+                sum(len(window.distance) for window in here),
                 len(here),
                 float(np.median(shows)),
                 float(np.median(corrected)),
@@ -99,7 +105,18 @@ def record(source: Source, protocol: Protocol, eye: Eye, *, place: str) -> tuple
         )
     finite = np.isfinite(seen.seen)
     kept = LevelWindows(seen.seen[finite], seen.flow[finite])
-    return RecordedLevels(fitted, kept, eye.weights), told
+    distances = np.concatenate([window.distance for window in windows])
+    above = float(foreign_above(distances, false_alarms=eye.false_alarms))
+    return RecordedLevels(fitted, kept, eye.weights, _camera(windows), above), told
+
+
+def _camera(windows: Sequence[_Window]) -> Camera | None:
+    """How this camera looks, each window counted as a segment; None where there are too few to know it by."""
+    looks = np.array([window.looks for window in windows])
+    try:
+        return familiar.fit_camera(looks, np.arange(len(looks)), false_alarms=FALSE_ALARMS)
+    except ValueError:
+        return None
 
 
 def write(recorded: RecordedLevels, told: Sequence[Level], out: Path, place: str) -> str:
@@ -152,7 +169,9 @@ def _frames(source: Source, place: str):
             break
     if not count:
         why = source.waits_for or "found none"
-        raise ValueError(f"{place}: expected frames of a printer's camera, {why}; name a folder or an MCAP file")
+        raise ValueError(
+            f"{place}: expected frames of a printer's camera, {why}; name a folder or an MCAP file"
+        )
 
 
 def _of_levels(frames, protocol: Protocol):
@@ -179,23 +198,15 @@ def _of_levels(frames, protocol: Protocol):
 def _seen(window: Sequence[Shown], flow: float, protocol: Protocol, eye: Eye) -> _Window:
     tips = np.array([shown.tip if protocol.tip is None else protocol.tip for shown in window])
     directions = np.array([shown.direction_deg for shown in window])
-    areas = concatenate(
-        [
-            find_key_areas(
-                [shown.frame for shown in window[i : i + TOGETHER]],
-                tips[i : i + TOGETHER],
-                directions[i : i + TOGETHER],
-                least_score=eye.least_score,
-            )
-            for i in range(0, len(window), TOGETHER)
-        ]
-    )
+    areas = find_key_areas([shown.frame for shown in window], tips, directions, least_score=eye.least_score)
     valid = np.array([not reason for reason in areas.reasons])
     temperature = np.array(
         [shown.temperature if np.isfinite(shown.temperature) else protocol.temperature for shown in window]
     )
-    seen = eye.seen(areas.images, temperature, valid) if valid.any() else np.nan
-    return _Window(flow, float(seen), len(window), int(valid.sum()))
+    readings = eye.read(areas.images, temperature)
+    shown = window_flow(readings.log_flow[None], readings.deviation[None], valid[None], eye.flow)
+    looks = familiar.median(areas.surroundings.astype(float))
+    return _Window(flow, float(shown.flow_seen[0]), len(window), readings.distance[valid], looks)
 
 
 def source_of(place: Path, recording: Callable[[Path], Recording]) -> Source:

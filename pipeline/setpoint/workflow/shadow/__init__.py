@@ -37,13 +37,7 @@ class Watched(NamedTuple):
 
 
 def watch(
-    source: Source,
-    deployed: Deployed,
-    asked: Asked,
-    out: Path,
-    *,
-    place: str,
-    stopped: Callable[[], bool],
+    source: Source, deployed: Deployed, asked: Asked, out: Path, *, place: str, stopped: Callable[[], bool]
 ) -> Watched:
     """Watches until `stopped`, or with asked.once until the source ends; `place` is its name as shown.
 

@@ -1,6 +1,5 @@
 """What a window says, and what the deployed controller would do about it. Nothing is sent."""
 
-import contextlib
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -10,13 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint import bayes, deployment, key_area
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, classify
-from pipeline.setpoint.deployment import ACTS, AMBIGUOUS, Limits, Window
+from pipeline.setpoint import bayes, deployment, familiar, key_area, levels
+from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, FrameReadings, read_frames
+from pipeline.setpoint.calibration import FlowCalibration, window_flow
+from pipeline.setpoint.deployment import ACTS, AMBIGUOUS, FOREIGN, Limits, Window
+from pipeline.setpoint.familiar import Camera
+from pipeline.setpoint.levels import Levels
 from pipeline.setpoint.pixels import ADVANTAGE, LIKENESS, LOOKS, REACH_PX, TEMPLATE_PX
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, Observation
 from pipeline.setpoint.workflow.frame_images import FrameKeyAreas, find_key_areas
+from pipeline.setpoint.workflow.known_camera import FALSE_ALARMS
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.setpoint.workflow.watch_sources import Shown
 from pipeline.store.printable import printable
@@ -44,18 +47,25 @@ class Asked(NamedTuple):
 
 
 class Deployed(NamedTuple):
-    """What decides: classify(images (n, 16, 48), temperature (n,)) -> class probabilities (n, 3) and
-    out-of-distribution scores (n,); the default controller with its name and parameters, frames of a window,
-    the front end's least score, how a window is judged, the limits, how long after a move of the setpoint
-    frames are of no use, how far the nozzle may be from where its tip was."""
+    """What decides: read(images (n, 16, 48), temperature (n,)) -> what n key areas show; what makes a window's
+    flow of it, and the levels of this camera, None where none were recorded; how the known camera looks, None
+    where nobody said; the default controller with its name and parameters, frames of a window, the front
+    end's least score, how a window is judged, the share of a conformal set's classes, the distance that is
+    foreign, the limits, how long after a move of the setpoint frames are of no use, how far the nozzle may be
+    from where its tip was."""
 
-    classify: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    read: Callable[[np.ndarray, np.ndarray], FrameReadings]
+    flow: FlowCalibration
+    levels: Levels | None
+    known: Camera | None
     name: str
     controller: Controller
     parameters: Any
     window: int
     least_score: float
     judge: Callable[..., Window]
+    conformal_level: float
+    foreign_above: float
     limits: Limits
     settle_s: float
     tip_tolerance_px: float
@@ -77,9 +87,27 @@ class Decision(NamedTuple):
     row: dict[str, Any]
 
 
+class Seen(NamedTuple):
+    """The flow that a window shows, in percent, corrected where there are levels, and its relative standard
+    deviation; NaN where it shows none."""
+
+    flow: float
+    spread: float
+
+
+class Looks(NamedTuple):
+    """What is known of this printer's camera: its levels, where they were recorded, how it looks, and the
+    distance that is foreign there."""
+
+    levels: Levels | None
+    known: Camera | None
+    foreign_above: float
+
+
 def deployed(
     model: CalibratedClassifier,
     spec: tuple[str, Controller, Any],
+    looks: Looks,
     settings: EvaluateSetpoint,
     view: TrainClassifier,
 ) -> Deployed:
@@ -89,7 +117,7 @@ def deployed(
         deployment.judge_window,
         least_frames=q.least_frames,
         correlation=fitted.correlation,
-        foreign_above=fitted.foreign_above,
+        foreign_above=looks.foreign_above,
         conformal_level=fitted.level,
     )
     limits = Limits(
@@ -97,9 +125,10 @@ def deployed(
         np.array(q.per_action),
         np.array(q.per_minute),
     )
-    return Deployed(
-        partial(classify, model), *spec, view.window, view.least_score, judge, limits, q.wait_s, q.tip_tolerance_px
-    )
+    read = partial(read_frames, model)
+    eye = read, fitted.flow, looks.levels, looks.known
+    rules = judge, fitted.level, looks.foreign_above
+    return Deployed(*eye, *spec, view.window, view.least_score, *rules, limits, q.wait_s, q.tip_tolerance_px)
 
 
 class Mind:
@@ -125,34 +154,58 @@ class Mind:
             np.array([shown.direction_deg for shown in window]),
             least_score=self.deployed.least_score,
         )
-        valid = np.array([not reason for reason in areas.reasons])
-        prob, scores = self.deployed.classify(areas.images, temperature)
-        judged = self.deployed.judge(
-            prob[None], valid[None], scores[None], np.array([self._tip_moved(window, tips, notes)])
-        )
-        would = self._answer(judged, setpoint, float(temperature.mean()), notes)
+        judged, seen = self._judged(areas, temperature, self._tip_moved(window, tips, notes), notes)
+        judged, would = self._answer(judged, seen, setpoint, float(temperature.mean()), notes)
         self.number += 1
         time_s = window[-1].time_s - first_s
         belief = believed(self.memory)
-        pictures = self._pictures(window, tips)
+        pictures = _pictures(window, areas)
         row = _row(self.number, time_s, judged, would, setpoint, belief, window, areas, notes)
+        row |= {"flow_seen_percent": _number(seen.flow), "spread": _number(seen.spread)}
         names = [shown.name for shown in window]
         return Decision(
             self.number, time_s, judged, setpoint, would, belief, names, areas.reasons, pictures, row
         )
 
+    def _judged(
+        self, areas: FrameKeyAreas, temperature: np.ndarray, tip_moved: bool, notes: list[str]
+    ) -> tuple[Window, Seen]:
+        """What the frames say together; its shares are those of the flow that it shows, where it shows one."""
+        of = self.deployed
+        valid = np.array([not reason for reason in areas.reasons])
+        readings = of.read(areas.images, temperature)
+        judged = of.judge(readings.prob[None], valid[None], readings.distance[None], np.array([tip_moved]))
+        counts = valid & (readings.distance <= of.foreign_above)
+        shown = window_flow(readings.log_flow[None], readings.deviation[None], counts[None], of.flow)
+        flow, spread, prob = shown.flow_seen, shown.spread, shown.prob
+        if of.levels is not None:
+            flow, spread = levels.corrected(of.levels, flow), np.array([of.levels.spread])
+            prob = levels.probabilities(of.levels, flow)
+        if np.isfinite(flow[0]):
+            members = prob >= of.conformal_level
+            named = np.where(members.sum(axis=1) == 1, ACTS, AMBIGUOUS)
+            reason = np.where(is_evidence(judged.reason), named, judged.reason)
+            judged = judged._replace(p=prob, label=prob.argmax(axis=1), members=members, reason=reason)
+        if of.known is not None and is_evidence(judged.reason[0]):
+            looks = familiar.median(areas.surroundings.astype(float))
+            if familiar.foreign(of.known, looks[None], false_alarms=FALSE_ALARMS)[0]:
+                notes.append(f"the pictures are none of the known camera: {familiar.unlike(of.known, looks)}")
+                judged = judged._replace(reason=np.array([FOREIGN]))
+        return judged, Seen(float(flow[0]), float(spread[0]))
+
     def _answer(
-        self, judged: Window, setpoint: tuple[float, float], temperature: float, notes: list[str]
-    ) -> np.ndarray:
-        """(2,) the change of flow in percent and target in degC that would be sent, within the limits."""
-        reason = judged.reason[0]
-        if reason not in (ACTS, AMBIGUOUS):
-            return np.zeros(2)
+        self, judged: Window, seen: Seen, setpoint: tuple[float, float], temperature: float, notes: list[str]
+    ) -> tuple[Window, np.ndarray]:
+        """(2,) the change of flow in percent and target in degC that would be sent, within the limits; and the
+        window with the reason that the controller adds."""
+        if not is_evidence(judged.reason[0]):
+            return judged, np.zeros(2)
         move = setpoint[0] - self.shown_flow if np.isfinite(self.shown_flow) else 0.0
         self.shown_flow = setpoint[0]
         shown = Observation(
             shares=jnp.asarray(judged.p[0], jnp.float32),
             named=jnp.int32(judged.label[0]),
+            flow_seen=jnp.float32(seen.flow),
             flow_move=jnp.float32(move),
             temperature=jnp.float32(temperature),
             target=jnp.float32(setpoint[1]),
@@ -160,8 +213,8 @@ class Mind:
         )
         key = jax.random.fold_in(self.key, self.number)
         self.memory, action = self.act(self.deployed.parameters, self.memory, shown, key)
-        if reason != ACTS:
-            return np.zeros(2)
+        if judged.reason[0] != ACTS:
+            return judged, np.zeros(2)
         heats = self.acted % LAMBDA == 0
         wanted = np.array(
             [FLOW_MOVES[int(action.flow)], TEMPERATURE_MOVES[int(action.temperature)] if heats else 0.0]
@@ -174,7 +227,7 @@ class Mind:
                 f"the setpoint {setpoint[0]:g} %, {setpoint[1]:g} degC lies outside the controller's limits"
             )
         at = deployment.setpoints(inside[None], limits)
-        return (deployment.moved(at, wanted[None], np.zeros(1), limits).value - at.value)[0]
+        return judged, (deployment.moved(at, wanted[None], np.zeros(1), limits).value - at.value)[0]
 
     def _tip_moved(self, window: list[Shown], tips: np.ndarray, notes: list[str]) -> bool:
         """Whether the nozzle is elsewhere than on the first frame of the watch."""
@@ -197,19 +250,25 @@ class Mind:
             and nozzle.advantage >= ADVANTAGE
         )
 
-    def _pictures(self, window: list[Shown], tips: np.ndarray) -> list[Drawn]:
-        """Some frames of the window with the key area drawn in."""
-        pictures = []
-        for i in np.unique(np.linspace(0, len(window) - 1, SHOWN).astype(int)):
-            shown, tip = window[i], (float(tips[i, 0]), float(tips[i, 1]))
-            if isinstance(shown.frame, str):
-                continue
-            with contextlib.suppress(ValueError):
-                direction = float(shown.direction_deg) if np.isfinite(shown.direction_deg) else None
-                least = self.deployed.least_score
-                area = key_area.find(shown.frame, tip, least_score=least, direction_deg=direction)
-                pictures.append(Drawn(shown.name, key_area.drawn(shown.frame, tip, area), area.reason))
-        return pictures
+
+def is_evidence(reason: Any) -> Any:
+    """Whether the controller is shown a window: those acted on, and those that cannot tell the classes
+    apart."""
+    return (reason == ACTS) | (reason == AMBIGUOUS)
+
+
+def _pictures(window: list[Shown], areas: FrameKeyAreas) -> list[Drawn]:
+    """Some frames of the window with the key area drawn in."""
+    pictures = []
+    for i in np.unique(np.linspace(0, len(window) - 1, SHOWN).astype(int)):
+        frame, reason = window[i].frame, areas.reasons[i]
+        if isinstance(frame, str) or not np.isfinite(areas.angle_deg[i]):
+            continue
+        figures = (float(column[i]) for column in (areas.angle_deg, areas.miss_px, areas.score))
+        area = key_area.KeyArea(areas.images[i], *figures, float(areas.padded_share[i]), reason)
+        tip = (float(areas.tip[i, 0]), float(areas.tip[i, 1]))
+        pictures.append(Drawn(window[i].name, key_area.drawn(frame, tip, area), reason))
+    return pictures
 
 
 def _known(said: float, otherwise: float) -> float:
@@ -257,7 +316,6 @@ def _row(
         "flow_setpoint_percent": _number(setpoint[0]), "target_degC": _number(setpoint[1]),
         "would_flow_move_percent": float(would[0]), "would_temperature_move_degC": float(would[1]),
         **{f"p_{name}": float(p) for name, p in zip(deployment.CLASSES, judged.p[0], strict=True)},
-        "flow_seen_percent": None, "spread": None,
         "belief_flow_percent": median, "belief_low_percent": low, "belief_high_percent": high,
         "distance": _number(judged.score[0]), "valid": int(judged.valid[0]), "used": int(judged.used[0]),
         "notes": [printable(note) for note in notes],
@@ -275,12 +333,10 @@ def _number(value: float) -> float | None:
 
 
 def would_words(would: np.ndarray, setpoint: tuple[float, float]) -> str:
-    """"flow -5 % (to 95 %)", "change nothing"."""
+    """ "flow -5 % (to 95 %)", "change nothing"."""
     moves = [
         f"{name} {change:+g} {unit} (to {at + change:g} {unit})"
-        for name, change, at, unit in zip(
-            ("flow", "temperature"), would, setpoint, ("%", "°C"), strict=True
-        )
+        for name, change, at, unit in zip(("flow", "temperature"), would, setpoint, ("%", "°C"), strict=True)
         if change
     ]
     return ", ".join(moves) or "change nothing"

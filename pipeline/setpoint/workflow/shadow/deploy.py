@@ -2,19 +2,27 @@
 
 from typing import NamedTuple
 
+from pipeline.setpoint import levels
+from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
 from pipeline.setpoint.workflow import contestants
 from pipeline.setpoint.workflow.agent_files import restore_agents
 from pipeline.setpoint.workflow.classifier_files import restore_classifier
 from pipeline.setpoint.workflow.frame_folder import read_options
 from pipeline.setpoint.workflow.frame_mcap import Topics
+from pipeline.setpoint.workflow.known_camera import restore_camera
+from pipeline.setpoint.workflow.levels_files import LEVELS_FILE, restore_levels
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
-from pipeline.setpoint.workflow.shadow.decide import Asked, Deployed, deployed
+from pipeline.setpoint.workflow.shadow.decide import Asked, Deployed, Looks, deployed
 from pipeline.setpoint.workflow.tables import WINDOWS
 from pipeline.setpoint.workflow.windows import window_tables
 from pipeline.store import artifacts, params
 
-# what a printer can be told: percent of flow, degC, and pictures a second
-BOUNDS = {"--flow": (1.0, 1000.0), "--temperature": (0.0, 600.0), "--rate": (0.05, 100.0)}
+# what a printer can be told: percent of flow, degC; pictures a second; seconds
+BOUNDS = {"--flow": (1.0, 1000.0), "--temperature": (0.0, 600.0), "--rate": (0.05, 100.0),
+          "--hold": (5.0, 3600.0), "--settle": (0.0, 600.0)}  # fmt: skip
+
+
+WEIGHTS = "datasets/train_classifier/weights.safetensors"
 
 
 class Ready(NamedTuple):
@@ -25,21 +33,40 @@ class Ready(NamedTuple):
     tip: tuple[float, float] | None
 
 
-def ready() -> Ready:
-    """The default of evaluate_setpoint with the classifier of train_classifier. Raises ValueError, one
-    sentence, where a stage has not run."""
-    settings = params.load(EvaluateSetpoint, "evaluate_setpoint")
+class Trained(NamedTuple):
+    """The classifier of train_classifier, the digest of its weights, and section `train_classifier`."""
+
+    model: CalibratedClassifier
+    digest: str
+    view: TrainClassifier
+
+
+def trained() -> Trained:
+    """Raises ValueError, one sentence, where the stage has not run."""
     view = params.load(TrainClassifier, "train_classifier")
+    model = restore_classifier(WEIGHTS, "datasets/train_classifier/calibration.parquet")
+    return Trained(model, artifacts.sha256(WEIGHTS), view)
+
+
+def ready(levels_file: str) -> Ready:
+    """The default of evaluate_setpoint with the classifier of train_classifier, and the levels of this camera:
+    of `levels_file`, or where that is empty of LEVELS_FILE, if it is there. Raises ValueError, one sentence,
+    where a stage has not run."""
+    settings = params.load(EvaluateSetpoint, "evaluate_setpoint")
+    model, digest, view = trained()
     name = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
-    model = restore_classifier(
-        "datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet"
-    )
     windows = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
     agents = restore_agents("datasets/train_agent/weights.safetensors")
-    entries = [entry for entry in contestants.CONTESTANTS if entry.name == name]
-    specs = contestants.controllers(
-        contestants.Problem(settings.baselines, agents, windows["learn"]), entries
+    learn, camera = windows["learn"], "datasets/train_classifier/camera.parquet"
+    looks = Looks(
+        None, restore_camera(camera) if artifacts.exists(camera) else None, model.calibration.foreign_above
     )
+    if levels_file or artifacts.exists(LEVELS_FILE):
+        recorded = restore_levels(levels_file or LEVELS_FILE, digest)
+        learn = levels.table(recorded.levels, recorded.windows, learn.flow_edges)
+        looks = Looks(recorded.levels, recorded.camera, recorded.foreign_above)
+    entries = [entry for entry in contestants.CONTESTANTS if entry.name == name]
+    specs = contestants.controllers(contestants.Problem(settings.baselines, agents, learn), entries)
     if name not in specs:
         raise ValueError(
             f"datasets/evaluate_setpoint/choice.json: the default {name!r} is no controller of this version; "
@@ -47,7 +74,7 @@ def ready() -> Ready:
         )
     options = read_options(view)
     spec = (name, specs[name].controller, specs[name].parameters)
-    return Ready(deployed(model, spec, settings, view), options.topics, options.tip_px)
+    return Ready(deployed(model, spec, looks, settings, view), options.topics, options.tip_px)
 
 
 def asked(flow: float, temperature: float, tip: str, *, once: bool, settings: Ready) -> Asked:
@@ -61,7 +88,9 @@ def bounded(flag: str, value: float) -> float:
     """The value of a flag. Raises ValueError where it lies outside BOUNDS."""
     low, high = BOUNDS[flag]
     if not low <= value <= high:
-        raise ValueError(f"{flag}: expected {low:g} to {high:g}, found {value:g}; write a number in that range")
+        raise ValueError(
+            f"{flag}: expected {low:g} to {high:g}, found {value:g}; write a number in that range"
+        )
     return value
 
 
