@@ -28,8 +28,8 @@ import numpy as np
 import scipy.special
 
 from pipeline.setpoint.baselines import temperature_move
-from pipeline.setpoint.published import BEST_FLOW, FLOW_MOVES
-from pipeline.setpoint.recorded import WindowTable, with_flows
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, FLOW_MOVES
+from pipeline.setpoint.recorded import WindowTable, class_shares, with_flows
 from pipeline.setpoint.simulator import (
     CLASSES,
     FLOW_LIMITS,
@@ -64,7 +64,11 @@ class Filter(NamedTuple):
     (H,): that a window shows what the one before did where the flow setpoint stood. hazard: probability a
     decision that the flow jumps. Costs in percent of flow error: move_cost by percent of move, outside_cost
     of a miss beyond 10 %, move_fixed_cost of any move. prior (N,) is the belief about the flow at the
-    start."""
+    start.
+
+    usual_surprise, unlikely_limit and likely_limit are of `surprise_update`: what its own table makes the
+    filter wonder, and from where on the camera is another.
+    """
 
     evidence: jax.Array
     transition: jax.Array
@@ -76,21 +80,26 @@ class Filter(NamedTuple):
     outside_cost: float
     move_fixed_cost: float
     prior: jax.Array
+    usual_surprise: float = 0.0
+    unlikely_limit: float = float("inf")
+    likely_limit: float = float("inf")
 
 
 class FilterState(NamedTuple):
-    """What the filter remembers: belief (H, N), sum 1; the code of the last window, -1 before the first; and
-    how many windows it has seen."""
+    """What the filter remembers: belief (H, N), sum 1; the code of the last window, -1 before the first; how
+    many windows it has seen; and the sums of `surprise_update`."""
 
     belief: jax.Array
     last_code: jax.Array
     windows: jax.Array
+    unlikely: jax.Array | float = 0.0
+    likely: jax.Array | float = 0.0
 
 
 def initial_state(hypotheses: int) -> FilterState:
     """Before the first window, when the belief becomes the filter's prior."""
     belief = jnp.tile(jnp.asarray(PRIOR, jnp.float32) / hypotheses, (hypotheses, 1))
-    return FilterState(belief, jnp.int32(-1), jnp.int32(0))
+    return FilterState(belief, jnp.int32(-1), jnp.int32(0), jnp.float32(0), jnp.float32(0))
 
 
 def start_prior(*, known_start_share: float, known_start_std: float) -> np.ndarray:
@@ -114,11 +123,18 @@ def bayes(hypotheses: int) -> Controller:
             temperature_move(observation),
         )
 
-    return Controller(lambda: initial_state(hypotheses), act)
+    return Controller(lambda: initial_state(hypotheses), act, strange)
 
 
 def filter_update(parameters: Filter, state: FilterState, observation: Observation) -> FilterState:
     """The state after the move that led to this window, and the window."""
+    return surprise_update(parameters, *_filtered(parameters, state, observation))
+
+
+def _filtered(
+    parameters: Filter, state: FilterState, observation: Observation
+) -> tuple[FilterState, jax.Array]:
+    """The state with the new belief, and how much the window surprises, NaN where that does not count."""
     H = len(parameters.gains)
     belief = jnp.where(state.windows == 0, jnp.tile(parameters.prior / H, (H, 1)), state.belief)
     moved = jax.vmap(predict_shift)(belief, parameters.gains * observation.flow_move)
@@ -130,7 +146,47 @@ def filter_update(parameters: Filter, state: FilterState, observation: Observati
     posterior = predicted * (
         repeats * (shown == state.last_code) + (1.0 - repeats) * parameters.evidence[:, shown]
     )
-    return FilterState(posterior / posterior.sum(), shown, state.windows + 1)
+    after = FilterState(posterior / posterior.sum(), shown, state.windows + 1, state.unlikely, state.likely)
+    counts = jnp.isfinite(observation.flow_seen) & (state.windows >= UNSETTLED)
+    return after, jnp.where(counts, _surprise(parameters, predicted, posterior.sum()), jnp.nan)
+
+
+# of the test whether the camera is the table's: windows after the start that do not count, the most that one
+# window counts, what is let pass each window, and how far past its limit a sum may grow
+UNSETTLED, MOST_SURPRISE, ALLOWANCE, CEILING = 2, 2.5, 0.25, 1.3
+
+
+def _surprise(parameters: Filter, predicted: jax.Array, probability: jax.Array) -> jax.Array:
+    """- log P(code | past) - log s of a window that shows a flow; s is the deviation of the code as
+    predicted, so that a wide prediction is not a bad one."""
+    step = jnp.arange(FLOW_CODES, dtype=jnp.float32) - FIRST_GOOD
+    by_flow = parameters.evidence[:, CLASS_CODES:]
+    mean = jnp.sum(jnp.einsum("hcn,c->hn", by_flow, step) * predicted)
+    square = jnp.sum(jnp.einsum("hcn,c->hn", by_flow, step**2) * predicted)
+    return -jnp.log(probability) - 0.5 * jnp.log(jnp.maximum(square - mean**2, 0.1))
+
+
+def surprise_update(parameters: Filter, state: FilterState, surprise: jax.Array) -> FilterState:
+    """Two cumulative sums (Page 1954) of what a window surprises more, and less, than the table's own do:
+    S <- clip(S + (surprise - usual) - allowance, 0, ceiling) and likewise the other way, NaN changes none.
+
+    A camera whose errors are larger than its table says surprises more; one that hardly follows the flow, or
+    repeats itself, surprises less.
+    """
+    excess = jnp.clip(surprise - parameters.usual_surprise, -MOST_SURPRISE, MOST_SURPRISE)
+    sums = [
+        jnp.where(jnp.isnan(surprise), s, jnp.clip(s + sign * excess - ALLOWANCE, 0.0, CEILING * limit))
+        for s, sign, limit in (
+            (state.unlikely, 1.0, parameters.unlikely_limit),
+            (state.likely, -1.0, parameters.likely_limit),
+        )
+    ]
+    return state._replace(unlikely=sums[0], likely=sums[1])
+
+
+def strange(parameters: Filter, state: FilterState) -> jax.Array:
+    """Whether the camera is not the one of the table."""
+    return (state.unlikely > parameters.unlikely_limit) | (state.likely > parameters.likely_limit)
 
 
 def expected_loss(parameters: Filter, belief: jax.Array) -> jax.Array:
@@ -234,7 +290,9 @@ def _class_frequencies(table: WindowTable, biased: np.ndarray, smoothing: float)
     counts = np.zeros((len(centre), CLASS_CODES))
     shown = code(jnp.asarray(table.shares), jnp.asarray(table.named), jnp.full(len(table.named), jnp.nan))
     np.add.at(counts, (table.flow_bin, np.asarray(shown)), 1.0)
-    counts *= (width / counts.sum(axis=1))[:, None]  # as if every percent of flow had been recorded alike
+    counts *= (width / np.maximum(counts.sum(axis=1), 1))[
+        :, None
+    ]  # as if every percent of flow had been recorded alike
     weight = np.exp(-0.5 * ((biased[..., None] - centre) / np.maximum(smoothing, width / 2)) ** 2)
     frequency = weight @ counts
     return frequency / frequency.sum(axis=2, keepdims=True)
@@ -376,6 +434,90 @@ def robust_filter(table: WindowTable, model: CameraErrorModel) -> Filter:
         model.move_fixed_cost,
         jnp.asarray(_prior(model.known_start_share, model.known_start_std)),
     )
+
+
+# decisions and episodes of the quiet prints that set the limits of the surprise, the share of them that may
+# pass each of the two, and decisions that a segment lasts there
+QUIET, QUIET_PRINTS, FALSE_ALARMS, STRETCH = 200, 400, 0.007, (5, 41)
+QUIET_FLOWS = (70.0, 140.0)  # percent: segments that stood there are drawn
+
+
+def watching_filter(table: WindowTable, model: CameraErrorModel) -> Filter:
+    """`robust_filter` that also tells when the camera is not the table's, where the table shows flows.
+
+    The limits come from prints with nothing wrong whose windows are of segments that the filter was not made
+    from: each half of the table's segments in turn is left out.
+    """
+    own = robust_filter(table, model)
+    if not with_flows(table):
+        return own
+    rng = np.random.default_rng(0)
+    segments = np.unique(table.segment)
+    half = rng.permutation(len(segments)) % 2
+    surprise = np.concatenate(
+        [
+            _quiet_surprise(
+                robust_filter(_rows(table, kept), model), *_quiet_prints(_rows(table, ~kept), rng)
+            )
+            for kept in (np.isin(table.segment, segments[half == side]) for side in (0, 1))
+        ]
+    )
+    own = own._replace(usual_surprise=float(np.nanmean(surprise)))
+    greatest = _greatest_sums(own, jnp.asarray(surprise, jnp.float32))
+    limits = np.quantile(np.asarray(greatest), 1.0 - FALSE_ALARMS, axis=0)
+    return own._replace(unlikely_limit=float(limits[0]), likely_limit=float(limits[1]))
+
+
+def _rows(table: WindowTable, mask: np.ndarray) -> WindowTable:
+    columns = {name: getattr(table, name)[mask] for name in table._fields if name != "flow_edges"}
+    return table._replace(**columns)
+
+
+def _quiet_prints(table: WindowTable, rng: np.random.Generator) -> tuple[jax.Array, jax.Array]:
+    """Flows seen at 100 % (prints, decisions): stretches of one segment's errors, its windows at random."""
+    near = (table.flow >= QUIET_FLOWS[0]) & (table.flow <= QUIET_FLOWS[1])
+    error, segment = np.log(table.flow_seen / table.flow)[near], table.segment[near]
+    rows = [np.flatnonzero(segment == s) for s in np.unique(segment)]
+    seen = np.empty((QUIET_PRINTS // 2, QUIET))
+    for line in seen:
+        t = 0
+        while t < QUIET:
+            length = int(rng.integers(*STRETCH))
+            line[t : t + length] = error[rng.choice(rows[rng.integers(len(rows))], length)][: QUIET - t]
+            t += length
+    shares = class_shares(jnp.asarray(100.0 * np.exp(seen), jnp.float32), float(np.median(table.spread)))
+    return jnp.asarray(100.0 * np.exp(seen), jnp.float32), shares
+
+
+@jax.jit
+def _quiet_surprise(parameters: Filter, seen: jax.Array, shares: jax.Array) -> jax.Array:
+    """Surprise (prints, decisions) of a filter at a flow that nobody moves, NaN while unsettled."""
+
+    def one(seen, shares):
+        def window(state, shown):
+            flow_seen, share, t = shown
+            still, target = jnp.float32(0.0), jnp.float32(BEST_TEMPERATURE)
+            named = share.argmax().astype(jnp.int32)
+            return _filtered(
+                parameters, state, Observation(share, named, flow_seen, still, target, target, t)
+            )
+
+        t = jnp.arange(seen.shape[0], dtype=jnp.int32)
+        return jax.lax.scan(window, initial_state(len(parameters.gains)), (seen, shares, t))[1]
+
+    return jax.vmap(one)(seen, shares)
+
+
+def _greatest_sums(parameters: Filter, surprise: jax.Array) -> jax.Array:
+    """(prints, 2): the greatest of both sums over each print's surprise (prints, decisions)."""
+    free = parameters._replace(unlikely_limit=jnp.inf, likely_limit=jnp.inf)
+
+    def window(state, one):
+        state = surprise_update(free, state, one)
+        return state, jnp.stack([state.unlikely, state.likely])
+
+    sums = jax.vmap(lambda line: jax.lax.scan(window, initial_state(1), line)[1])(surprise)
+    return sums.max(axis=1)
 
 
 def _prior(share: float, std: float) -> np.ndarray:

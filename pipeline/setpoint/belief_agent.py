@@ -50,6 +50,7 @@ from pipeline.setpoint.simulator import (
     State,
     Windows,
     flow_class,
+    nominal,
     paper_windows,
     reward,
     rollout,
@@ -256,17 +257,17 @@ def disturbed(disturbances: Disturbances, length: int, key: jax.Array) -> Condit
     of the flow, as errors of extrusion are ratios."""
     u = jax.random.uniform(key, (10,))
     low, high = np.log(FLOW_LIMITS)
-    return Conditions(
-        flow=jnp.exp(low + (high - low) * u[0]),
-        temperature=TEMPERATURE_LIMITS[0] + (TEMPERATURE_LIMITS[1] - TEMPERATURE_LIMITS[0]) * u[1],
+    as_told = nominal(
+        jnp.exp(low + (high - low) * u[0]),
+        TEMPERATURE_LIMITS[0] + (TEMPERATURE_LIMITS[1] - TEMPERATURE_LIMITS[0]) * u[1],
         accuracy=disturbances.accuracy + (1 - disturbances.accuracy) * u[2],
+    )
+    return as_told._replace(
         persistence=jnp.where(u[3] < disturbances.recorded_share, disturbances.longest_segment ** u[4], 0.0),
         gain=disturbances.gain + (1 - disturbances.gain) * u[5],
         clog=disturbances.clog + (1 - disturbances.clog) * u[6],
         clog_step=jnp.where(u[7] < disturbances.clog_share, jnp.floor(length * u[8]), -1.0),
         drift=disturbances.drift * (2 * u[9] - 1),
-        jump_rate=jnp.zeros(()),
-        jump_size=jnp.zeros(()),
     )
 
 

@@ -1,21 +1,59 @@
-"""From the frames of a window to a setpoint that may be sent: hold with a reason, limits, and the wait."""
+"""From the frames of a window to a setpoint that may be sent: what the frames say together, and why it acted.
+When to hold, limits and waits are `actuation`'s, and have their names here too."""
 
 from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.setpoint.actuation import (
+    ACTS,
+    AMBIGUOUS,
+    FEW,
+    FOREIGN,
+    NO_NUMBER,
+    REASONS,
+    STILL,
+    TABLE,
+    TIP,
+    Limits,
+    Setpoints,
+    Waits,
+    at_rest,
+    decide,
+    is_evidence,
+    moved,
+    setpoints,
+    still,
+    wait_after,
+)
 from pipeline.setpoint.calibration import hard_shares, window_probabilities
 
+__all__ = [
+    "ACTS",
+    "AMBIGUOUS",
+    "CLASSES",
+    "FEW",
+    "FOREIGN",
+    "NO_NUMBER",
+    "REASONS",
+    "STILL",
+    "TABLE",
+    "TIP",
+    "Limits",
+    "Setpoints",
+    "Waits",
+    "Window",
+    "at_rest",
+    "decide",
+    "is_evidence",
+    "judge_window",
+    "moved",
+    "setpoints",
+    "still",
+    "wait_after",
+    "why",
+]
 CLASSES = ("under", "good", "over")
-REASONS = (
-    "acts",
-    "too few valid frames",
-    "out of distribution",
-    "tip moved",
-    "the classes cannot be told apart",
-    "the action is not a number",
-)
-ACTS, FEW, FOREIGN, TIP, AMBIGUOUS, NO_NUMBER = range(6)
 
 
 class Window(NamedTuple):
@@ -106,85 +144,6 @@ def _median(scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
     n = mask.sum(axis=1)
     ordered = np.concatenate([ordered, np.full((len(n), 1), np.nan)], axis=1)
     return ordered[np.arange(len(n)), np.where(n > 0, n // 2, -1)]
-
-
-class Limits(NamedTuple):
-    """Of (flow in percent, target temperature in °C), each (2,): the box, the largest change of one action
-    and the travel allowed in any 60 s."""
-
-    low: np.ndarray
-    high: np.ndarray
-    per_action: np.ndarray
-    per_minute: np.ndarray
-
-
-class Setpoints(NamedTuple):
-    """Setpoints as sent, value (E, 2); the moves of the last minute, times (E, H) in s and moves (E,
-    H, 2); `clipped` (E, 4) counts how often the size of one action, the travel of a minute or the
-    box cut a change, and how often it was no number."""
-
-    value: np.ndarray
-    times: np.ndarray
-    moves: np.ndarray
-    clipped: np.ndarray
-
-
-def setpoints(start: np.ndarray, limits: Limits) -> Setpoints:
-    """Setpoints at rest at start (E, 2). Raises ValueError where a start lies outside the box."""
-    start = np.asarray(start, float)
-    outside = ~((start >= limits.low) & (start <= limits.high)).all(axis=1)
-    if outside.any():
-        raise ValueError(
-            f"setpoints: expected a start within {np.asarray(limits.low)} to {np.asarray(limits.high)} (flow "
-            "in percent, target in °C), "
-            f"found {start[outside][0]}; bring the machine there by hand first"
-        )
-    n = len(start)
-    return Setpoints(start, np.zeros((n, 0)), np.zeros((n, 0, 2)), np.zeros((n, 4), int))
-
-
-def moved(state: Setpoints, change: np.ndarray, time_s: np.ndarray, limits: Limits) -> Setpoints:
-    """The setpoints after the wanted change (E, 2) at time_s (E,), cut to the size of one action, to what is
-    left of the last 60 s' travel, and to the box.
-
-    A change that is no number moves nothing. Every cut is counted.
-    """
-    number = np.isfinite(change).all(axis=1)
-    wanted = np.where(number[:, None], change, 0.0)
-    recent = np.asarray(time_s)[:, None] - state.times < 60.0
-    left = np.maximum(limits.per_minute - (np.abs(state.moves) * recent[:, :, None]).sum(axis=1), 0.0)
-    small = np.clip(wanted, -limits.per_action, limits.per_action)
-    allowed = np.clip(small, -left, left)
-    value = np.clip(state.value + allowed, limits.low, limits.high)
-    cuts = np.stack(
-        [
-            (small != wanted).any(axis=1),
-            (allowed != small).any(axis=1),
-            (value != state.value + allowed).any(axis=1),
-            ~number,
-        ],
-        axis=1,
-    )
-    keep = recent.any(axis=0)
-    times = np.concatenate([state.times[:, keep], np.asarray(time_s, float)[:, None]], axis=1)
-    moves = np.concatenate([state.moves[:, keep], (value - state.value)[:, None]], axis=1)
-    return Setpoints(value, times, moves, state.clipped + cuts)
-
-
-class Waits(NamedTuple):
-    """Seconds to the next window after an action that moved the flow,
-    that moved the temperature, that moved nothing."""
-
-    flow_s: float
-    temperature_s: float
-    idle_s: float
-
-
-def wait_after(change: np.ndarray, waits: Waits) -> np.ndarray:
-    """Seconds (E,) to wait after the changes (E, 2) that were really
-    sent: the longest that any of them asks for."""
-    asked = np.where(change != 0, [waits.flow_s, waits.temperature_s], 0.0)
-    return np.maximum(asked.max(axis=1), waits.idle_s)
 
 
 def why(time_s: float, window: Window, i: int, change: np.ndarray) -> str:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pipeline.setpoint import deployment, key_area, nozzle_scene
-from pipeline.setpoint.deployment import ACTS, AMBIGUOUS, Limits, Waits, Window
+from pipeline.setpoint.deployment import ACTS, Limits, Waits, Window
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.simulator import Controller, Observation
 
@@ -163,12 +163,6 @@ class Loop(NamedTuple):
     segment_mean_s: float
 
 
-def _is_evidence(reason: np.ndarray) -> np.ndarray:
-    """Whether the controller is shown a window: those acted on, and
-    those that cannot tell the classes apart."""
-    return (reason == ACTS) | (reason == AMBIGUOUS)
-
-
 def _answer(
     controller: Controller,
     parameters: Any,
@@ -176,11 +170,13 @@ def _answer(
     shown: Observation,
     keys: jax.Array,
     reason: np.ndarray,
-) -> tuple[Any, np.ndarray]:
-    """Memory and the change (E, 2) wanted of flow and target; the target's only where lambda's clock allows
-    it, none where the window is held."""
+) -> tuple[Any, np.ndarray, np.ndarray]:
+    """Memory, the change (E, 2) wanted of flow and target, and the reason (E,); the target's only where
+    lambda's clock allows it, none where the window is held."""
     shown = Observation(*(jnp.asarray(a, jnp.int32 if a.dtype.kind == "i" else jnp.float32) for a in shown))
-    memory, q, u = _decided(controller, parameters, memory, shown, keys, jnp.asarray(_is_evidence(reason)))
+    memory, (q, u), reason_now = _decided(
+        controller, parameters, memory, shown, jnp.asarray(reason, jnp.int32), keys
+    )
     wanted = np.stack(
         [
             np.asarray(FLOW_MOVES)[q],
@@ -188,23 +184,11 @@ def _answer(
         ],
         axis=1,
     )
-    return memory, np.where((reason == ACTS)[:, None], wanted, 0.0)
+    reason = np.asarray(reason_now)
+    return memory, np.where((reason == ACTS)[:, None], wanted, 0.0), reason
 
 
-@eqx.filter_jit
-def _decided(
-    controller: Controller,
-    parameters: Any,
-    memory: Any,
-    shown: Observation,
-    keys: jax.Array,
-    evidence: jax.Array,
-):
-    """Memory, which stays where the window is no evidence, and action indices of every episode."""
-    after, action = jax.vmap(controller.act, (None, 0, 0, 0))(parameters, memory, shown, keys)
-    return jax.tree.map(
-        lambda new, old: jnp.where(evidence.reshape(-1, *[1] * (new.ndim - 1)), new, old), after, memory
-    ), *action
+_decided = eqx.filter_jit(jax.vmap(deployment.decide, (None, None, 0, 0, 0, 0)))
 
 
 class _Cameras(NamedTuple):
@@ -287,13 +271,14 @@ def run(
             setpoints.value[:, 1],
             acted,
         )
-        memory, wanted = _answer(controller, parameters, memory, shown, step_keys, window.reason)
+        memory, wanted, reason = _answer(controller, parameters, memory, shown, step_keys, window.reason)
+        window = window._replace(reason=reason)
         before, setpoints = setpoints, deployment.moved(setpoints, wanted, time_s, loop.limits)
         change = setpoints.value - before.value
         means = flow.mean(axis=1), temperature.mean(axis=1)
         steps.append(_Step(*means, time_s, before.value, change, window, cameras.numbers.copy()))
-        since = np.where(_is_evidence(window.reason), 0.0, since) + change[:, 0]
-        acted = acted + (window.reason == ACTS)
+        since = np.where(deployment.is_evidence(reason), 0.0, since) + change[:, 0]
+        acted = acted + (reason == ACTS)
     last = flow.mean(axis=1), temperature.mean(axis=1)
     return _episodes(steps, *last, setpoints.clipped, pictures)
 

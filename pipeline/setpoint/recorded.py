@@ -17,6 +17,7 @@ import numpy as np
 from pipeline.setpoint.simulator import GOOD_BORDERS, Conditions, Windows
 
 UNSEEN = np.array(np.nan)  # of a table of classes only
+DITHER = 1e-3  # of log flow_seen: a window drawn twice is not a picture that stands still
 
 
 class WindowTable(NamedTuple):
@@ -95,7 +96,9 @@ def _recorded_draw(
     flow_bin = (flow >= ranked.flow_edges[1:-1]).sum()
     s = ranked.first_segment[flow_bin] + jnp.floor(segment * ranked.segments[flow_bin]).astype(jnp.int32)
     w = ranked.first_window[s] + jnp.floor(u[0] * ranked.windows[s]).astype(jnp.int32)
-    seen = jnp.clip(flow, ranked.flow_edges[0], ranked.flow_edges[-1]) * jnp.exp(ranked.log_error[w])
+    seen = jnp.clip(flow, ranked.flow_edges[0], ranked.flow_edges[-1]) * jnp.exp(
+        ranked.log_error[w] + DITHER * u[1]
+    )
     by_flow = class_shares(seen, ranked.spread[w])
     known = jnp.isfinite(seen)
     shares = jnp.where(known, by_flow, ranked.shares[w])

@@ -7,9 +7,10 @@ One decision is one window of frames. At step t the controller sees an
 q_bar <- clip(q_bar + gain a_q, 20, 310), q = blockage q_bar, u_bar <- clip(u_bar + a_u, 180, 240) where t mod
 lambda = 0, u_hat += (u_bar - u_hat) / delta
 
-The commanded flow acts at once, and the class depends on the true flow q alone. What a window shows for a
-flow comes from a `Windows`: `paper_windows()` here, or windows recorded from a trained classifier
-(`recorded.recorded_windows`). Flow is in percent of nominal, temperature in °C.
+What may be sent, how long to wait and when to hold is `actuation`'s, as in the loop through pixels. The
+commanded flow acts at once, or as fast as the melt lets it, and the class depends on the true flow q alone.
+What a window shows for a flow comes from a `Windows`: `paper_windows()` here, or windows recorded from a
+trained classifier (`recorded.recorded_windows`). Flow is in percent of nominal, temperature in °C.
 """
 
 from collections.abc import Callable
@@ -18,7 +19,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from pipeline.setpoint import actuation
+from pipeline.setpoint.actuation import ACTS, FEW, Limits, Setpoints
 from pipeline.setpoint.published import (
     ALPHA,
     BEST_FLOW,
@@ -34,10 +38,19 @@ from pipeline.setpoint.published import (
 STAND = 2  # the index of no move
 FLOW_LIMITS, TEMPERATURE_LIMITS = (20.0, 310.0), (180.0, 240.0)
 BLOCKAGE_LIMITS = (1 / 3, 3.0)  # beyond, no setpoint within its limits would bring the flow to 100 %
+GAIN_LIMITS = (0.5, 1.2)  # that a drifting gain keeps to
+LIMITS = Limits(  # of what is sent: the largest change of one action, and of 60 s
+    *(np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True)),
+    np.array([10.0, 20.0]),
+    np.array([100.0, 60.0]),
+)
+REMEMBERED = 16  # actions of the last 60 s that limits are of: one takes at least 4 s
+WINDOW_S = 1.0
+CLOG_GOES = 1 / 30  # probability a decision, of clogs that come and go
 HISTORY, CLASSES = 30, 3  # eta and n_c of (8)
 UNDER, GOOD, OVER = 0, 1, 2
 GOOD_BORDERS = (90.0, 110.0)  # percent
-CHANCES = 7  # uniform numbers that a decision takes: three for its window, four for what befalls the machine
+CHANCES = 8  # uniform numbers that a decision takes: three for its window, five for what befalls the machine
 
 
 class Observation(NamedTuple):
@@ -67,12 +80,18 @@ class Action(NamedTuple):
     temperature: jax.Array
 
 
+def _never(parameters, memory) -> jax.Array:
+    return jnp.zeros((), bool)
+
+
 class Controller(NamedTuple):
-    """start() -> memory; act(parameters, memory, observation, key) -> (memory, action). Both pure, for one
+    """start() -> memory; act(parameters, memory, observation, key) -> (memory, action); strange(parameters,
+    memory) -> whether the camera is none that the controller knows, so that it should hold. All pure, for one
     episode: vmap over episodes, scan over steps."""
 
     start: Callable[[], Any]
     act: Callable[[Any, Any, Observation, jax.Array], tuple[Any, Action]]
+    strange: Callable[[Any, Any], jax.Array] = _never
 
 
 class Conditions(NamedTuple):
@@ -82,6 +101,12 @@ class Conditions(NamedTuple):
     decisions that a recorded segment lasts on average, 1 is fresh; gain: true move by commanded move; clog:
     factor on the flow from clog_step on, 1 is none; drift: relative change of the flow at each step;
     jump_rate: probability a step that the flow is multiplied by exp(jump_size N(0, 1)).
+
+    As deployed: wait_s after every action; melt_s: time constant with which the flow follows, 0 is at once;
+    gain_drift: relative change of the gain at each step, within GAIN_LIMITS; clog_rate: probability a step
+    that a clog comes, and goes again with CLOG_GOES; seen: factor on the flow that the camera reads, against
+    its record; the camera repeats its window for stuck_for decisions from stuck_from on, and shows nothing
+    for blind_for from blind_from on.
     """
 
     flow: jax.Array
@@ -94,20 +119,41 @@ class Conditions(NamedTuple):
     drift: jax.Array
     jump_rate: jax.Array
     jump_size: jax.Array
+    wait_s: jax.Array
+    melt_s: jax.Array
+    gain_drift: jax.Array
+    clog_rate: jax.Array
+    seen: jax.Array
+    stuck_from: jax.Array
+    stuck_for: jax.Array
+    blind_from: jax.Array
+    blind_for: jax.Array
 
 
 class State(NamedTuple):
-    """flow_bar: q_bar that the moves reach, before blockage; flow: the true q; segment in [0, 1): the
-    recorded conditions that persist, as a rank among segments."""
+    """sent: what the moves reach, (q_bar before blockage, u_bar), and the moves of the last minute; gain and
+    blockage now, clogged by what comes and goes; flow: the true q; flow_move: percent that was sent since the
+    controller last saw a window; segment in [0, 1): the recorded conditions that persist, as a rank among
+    segments; shown: the last window; reason: why it holds, actuation.REASONS; step counts decisions, acted
+    those that were not held."""
 
-    flow_bar: jax.Array
+    sent: Setpoints
+    gain: jax.Array
     blockage: jax.Array
+    clogged: jax.Array
     flow: jax.Array
     flow_move: jax.Array
     temperature: jax.Array
-    target: jax.Array
     segment: jax.Array
+    shown: tuple[jax.Array, jax.Array, jax.Array]
+    reason: jax.Array
+    time_s: jax.Array
     step: jax.Array
+    acted: jax.Array
+
+    @property
+    def target(self) -> jax.Array:
+        return self.sent.value[..., 1]
 
 
 class Windows(NamedTuple):
@@ -121,7 +167,8 @@ class Windows(NamedTuple):
 
 class Trajectory(NamedTuple):
     """n episodes of T decisions: true flow, temperature and target (n, T + 1) with the start first; named (n,
-    T), shares (n, T, 3) and action (n, T) of each decision."""
+    T), shares (n, T, 3), action (n, T) as asked where it was sent, and reason (n, T), actuation.REASONS, of
+    each decision."""
 
     flow: jax.Array
     temperature: jax.Array
@@ -129,6 +176,7 @@ class Trajectory(NamedTuple):
     named: jax.Array
     shares: jax.Array
     action: Action
+    reason: jax.Array
 
 
 def flow_class(flow: jax.Array) -> jax.Array:
@@ -141,8 +189,16 @@ def nominal(flow, temperature, *, accuracy: float) -> Conditions:
     temperature (n,); `_replace` what an episode is to meet."""
     flow = jnp.asarray(flow, float)
     one, zero = jnp.ones_like(flow), jnp.zeros_like(flow)
+    ones = dict.fromkeys(("persistence", "gain", "clog", "seen"), one)
+    values = dict.fromkeys(Conditions._fields, zero) | ones
     return Conditions(
-        flow, jnp.asarray(temperature, float) * one, accuracy * one, one, one, one, zero, zero, zero, zero
+        **values
+        | {
+            "flow": flow,
+            "temperature": jnp.asarray(temperature, float) * one,
+            "accuracy": accuracy * one,
+            "wait_s": 6.0 * one,
+        }
     )
 
 
@@ -180,49 +236,116 @@ def _begun(windows: Windows, conditions: Conditions, u: jax.Array) -> tuple[Stat
         jnp.clip(conditions.flow, *FLOW_LIMITS),
         jnp.clip(conditions.temperature, *TEMPERATURE_LIMITS),
     )
-    zero = jnp.zeros_like(flow)
+    zero, none = jnp.zeros_like(flow), jnp.zeros_like(flow, jnp.int32)
     state = State(
-        flow, zero + 1.0, flow, zero, temperature, temperature, u[6], jnp.zeros_like(flow, jnp.int32)
+        sent=actuation.at_rest(jnp.stack([flow, temperature]), remembered=REMEMBERED),
+        gain=conditions.gain,
+        blockage=zero + 1.0,
+        clogged=zero > 0,
+        flow=flow,
+        flow_move=zero,
+        temperature=temperature,
+        segment=u[6],
+        shown=(jnp.full(CLASSES, 1.0 / CLASSES), none + GOOD, zero + jnp.nan),
+        reason=none + ACTS,
+        time_s=zero,
+        step=none,
+        acted=none,
     )
-    return state, _observe(windows, conditions, state, u[:3])
+    state = _watched(windows, conditions, state, u[:3])
+    return state, _observation(state)
 
 
 def stepped(
     windows: Windows, conditions: Conditions, state: State, action: Action, u: jax.Array
 ) -> tuple[State, Observation]:
-    """One decision of one episode: the action, the lags, whatever befalls the machine, and the next window.
-    The reward is `reward(state.flow, state.temperature, ...)`.
+    """One decision of one episode: the action, the limits and lags, whatever befalls the machine, and the
+    next window. The reward is `reward(state.flow, state.temperature, ...)`.
 
-    u (CHANCES,) are the chances, uniform in [0, 1), which the caller draws for many at once.
+    u (CHANCES,) are the chances, uniform in [0, 1), which the caller draws for many at once. An action that
+    answers a window that holds is not sent.
     """
-    flow_bar = jnp.clip(state.flow_bar + conditions.gain * jnp.asarray(FLOW_MOVES)[action.flow], *FLOW_LIMITS)
-    asked = jnp.where(state.step % LAMBDA == 0, jnp.asarray(TEMPERATURE_MOVES)[action.temperature], 0.0)
-    target = jnp.clip(state.target + asked, *TEMPERATURE_LIMITS)
+    sent, wait_s, executed = _sent(conditions, state, action)
     t = state.step + 1
+    blockage, clogged = _blocked(conditions, state, t, u)
+    reached = blockage * sent.value[0]
+    # the window's middle is what it shows of a melt on its way
+    late = jnp.exp(-(wait_s + WINDOW_S / 2) / jnp.maximum(conditions.melt_s, 1e-3))
+    saw = actuation.is_evidence(state.reason)
+    state = state._replace(
+        sent=sent,
+        gain=jnp.clip(
+            state.gain * (1.0 + conditions.gain_drift),
+            jnp.minimum(conditions.gain, GAIN_LIMITS[0]),
+            jnp.maximum(conditions.gain, GAIN_LIMITS[1]),
+        ),
+        blockage=blockage,
+        clogged=clogged,
+        flow=reached + (state.flow - reached) * late,
+        flow_move=executed + jnp.where(saw, 0.0, state.flow_move),
+        temperature=state.temperature + (sent.value[1] - state.temperature) / DELTA,  # (6)
+        segment=jnp.where(u[5] * conditions.persistence < 1.0, u[6], state.segment),
+        time_s=state.time_s + wait_s + WINDOW_S,
+        step=t,
+        acted=state.acted + (state.reason == ACTS),
+    )
+    state = _watched(windows, conditions, state, u[:3])
+    return state, _observation(state)
+
+
+def _sent(conditions: Conditions, state: State, action: Action) -> tuple[Setpoints, jax.Array, jax.Array]:
+    """What is sent of an action, the wait after it in s, and the flow's executed move in percent as
+    commanded. The flow is limited where it arrives: a move of a reaches gain a."""
+    acts = state.reason == ACTS
+    heeded = acts & (state.acted % LAMBDA == 0)
+    asked = jnp.stack(
+        [
+            jnp.where(acts, jnp.asarray(FLOW_MOVES)[action.flow], 0.0),
+            jnp.where(heeded, jnp.asarray(TEMPERATURE_MOVES)[action.temperature], 0.0),
+        ]
+    )
+    scale = jnp.stack([state.gain, jnp.ones_like(state.gain)])
+    limits = LIMITS._replace(per_action=LIMITS.per_action * scale, per_minute=LIMITS.per_minute * scale)
+    sent = actuation.moved(state.sent, asked * scale, state.time_s, limits)
+    change = sent.value - state.sent.value
+    return (
+        sent,
+        actuation.wait_after(change, actuation.Waits(*3 * (conditions.wait_s,))),
+        change[0] / state.gain,
+    )
+
+
+def _blocked(conditions: Conditions, state: State, t: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Blockage, and whether a clog that comes and goes is there."""
     jump = jnp.where(u[3] < conditions.jump_rate, conditions.jump_size * _normal(u[4]), 0.0)
+    comes = ~state.clogged & (u[7] < conditions.clog_rate)
+    goes = state.clogged & (u[7] > 1.0 - CLOG_GOES)
     blockage = (
         state.blockage
-        * jnp.where(t == conditions.clog_step, conditions.clog, 1.0)
+        * jnp.where((t == conditions.clog_step) | comes, conditions.clog, 1.0)
+        / jnp.where(goes, conditions.clog, 1.0)
         * (1.0 + conditions.drift)
         * jnp.exp(jump)
     )
-    blockage = jnp.clip(blockage, *BLOCKAGE_LIMITS)
-    state = State(
-        flow_bar=flow_bar,
-        blockage=blockage,
-        flow=blockage * flow_bar,
-        flow_move=(flow_bar - state.flow_bar) / conditions.gain,
-        temperature=state.temperature + (target - state.temperature) / DELTA,  # (6)
-        target=target,
-        segment=jnp.where(u[5] * conditions.persistence < 1.0, u[6], state.segment),
-        step=t,
-    )
-    return state, _observe(windows, conditions, state, u[:3])
+    return jnp.clip(blockage, *BLOCKAGE_LIMITS), (state.clogged | comes) & ~goes
 
 
-def _observe(windows: Windows, conditions: Conditions, state: State, u: jax.Array) -> Observation:
-    shares, named, flow_seen = windows.draw(windows.table, conditions, state.flow, state.segment, u)
-    return Observation(shares, named, flow_seen, state.flow_move, state.temperature, state.target, state.step)
+def _watched(windows: Windows, conditions: Conditions, state: State, u: jax.Array) -> State:
+    """The state with the window that the camera shows now, and whether that holds."""
+    fresh = windows.draw(windows.table, conditions, conditions.seen * state.flow, state.segment, u)
+    stuck = _lasts(state.step, conditions.stuck_from, conditions.stuck_for)
+    shown = jax.tree.map(lambda new, old: jnp.where(stuck, old, new), fresh, state.shown)
+    blind = _lasts(state.step, conditions.blind_from, conditions.blind_for)
+    reason = jnp.where(blind, FEW, actuation.still(shown[2], state.shown[2]))
+    return state._replace(shown=shown, reason=reason.astype(jnp.int32))
+
+
+def _lasts(step: jax.Array, begins: jax.Array, decisions: jax.Array) -> jax.Array:
+    return (step >= begins) & (step < begins + decisions)
+
+
+def _observation(state: State) -> Observation:
+    return Observation(*state.shown, state.flow_move, state.temperature, state.sent.value[1], state.acted)
 
 
 def first_history() -> jax.Array:
@@ -279,7 +402,9 @@ def _rolled(
         state, observation, memory = carry
         u, t = chance
         now = jax.vmap(jax.random.fold_in, (0, None))(keys, t)
-        memory, action = jax.vmap(controller.act, (None, 0, 0, 0))(parameters, memory, observation, now)
+        decide = jax.vmap(actuation.decide, (None, None, 0, 0, 0, 0))
+        memory, action, reason = decide(controller, parameters, memory, observation, state.reason, now)
+        state = state._replace(reason=reason)
         after, next_observation = jax.vmap(stepped, (None, 0, 0, 0, 0))(windows, conditions, state, action, u)
         return (after, next_observation, memory), (
             after.flow,
@@ -288,6 +413,7 @@ def _rolled(
             observation.named,
             observation.shares,
             action,
+            reason,
         )
 
     state, observation = jax.vmap(_begun, (None, 0, 0))(windows, conditions, u[0])

@@ -32,7 +32,7 @@ from pipeline.setpoint.agent import (
     with_weights,
 )
 from pipeline.setpoint.judging import evaluate, starts
-from pipeline.setpoint.simulator import STAND, Observation, State, paper_windows
+from pipeline.setpoint.simulator import STAND, Observation, begin, nominal, paper_windows
 from tests.setpoint.synthetic import synthetic_table
 
 SMALL = DqnSettings(gamma=0.99, tau=0.005, batch=64, capacity=512, environments=8, episode=100)
@@ -145,8 +145,8 @@ def test_double_learning_values_the_networks_choice_by_the_target_network():
 
 
 def test_both_heads_are_paid_by_the_ellipse():
-    zero = jnp.zeros(())
-    state = State(zero, zero, jnp.asarray(110.0), zero, jnp.asarray(205.0), zero, zero, zero)
+    at = nominal(110.0, 205.0, accuracy=1.0)
+    state, _ = begin(paper_windows(), at, jax.random.key(0))
     np.testing.assert_allclose(
         ellipse(40.0, 20.0, state), [0.394, 0.394], atol=5e-4
     )  # the check value has three digits

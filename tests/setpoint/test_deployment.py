@@ -13,8 +13,8 @@ from pipeline.setpoint.deployment import (
     AMBIGUOUS,
     FEW,
     FOREIGN,
-    NO_NUMBER,
     REASONS,
+    STILL,
     TIP,
     Limits,
     Waits,
@@ -199,7 +199,7 @@ def test_limits_by_hand():
         state, np.array([[0.0, 0.0], [-10.0, 0.0]]), np.array([67.0, 67.0]), LIMITS
     )  # the move at 7 s is a minute old
     np.testing.assert_array_equal(state.value[1], [30.0, 210.0])
-    assert len(REASONS) == NO_NUMBER + 1
+    assert len(REASONS) == STILL + 1
 
 
 def test_a_start_outside_the_box_is_refused():

@@ -220,8 +220,10 @@ def test_a_window_that_shows_a_flow_keeps_its_error_when_it_is_drawn_at_another_
         lambda one: windows.draw(windows.table, conditions, jnp.float32(101.0), one[3], one[:3])
     )(u)
     found = np.log(np.asarray(seen) / 101.0)
-    assert np.abs(found[:, None] - errors).min(axis=1).max() < 1e-5  # float32
-    assert len(np.unique(found.round(4))) == len(errors)
+    nearest = np.abs(found[:, None] - errors)
+    assert nearest.min(axis=1).max() <= 1e-3 + 1e-5  # the dither, and float32
+    assert set(nearest.argmin(axis=1)) == set(range(len(errors)))
+    assert len(np.unique(found)) > 390  # a window drawn twice is no picture that stands still
     # the shares are those of N(log flow_seen, spread^2) between 90 and 110 %
     spread = float(table.spread[0])
     under = scipy.stats.norm.cdf((np.log(90) - np.log(np.asarray(seen))) / spread)
