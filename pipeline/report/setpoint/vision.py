@@ -18,6 +18,8 @@ from pipeline.report.shared.verdict import Figure, Missing
 from pipeline.setpoint.workflow.tables import ALPHA
 
 CLASSES = ("under", "good", "over")
+# characters of a frame's place in its recording that are shown, its end
+LONGEST = 60
 # borders of the classes in percent of nominal flow
 BORDERS = (90.0, 110.0)
 DIAGRAMS = (
@@ -480,18 +482,49 @@ class Frame(NamedTuple):
     alt: str
 
 
+class Group(NamedTuple):
+    """Frames of one kind, with a heading and the share of all; both empty where there is one kind only."""
+
+    head: str
+    share: str
+    shown: Sequence[Frame]
+
+
 class Frames(NamedTuple):
     missing: Missing | None = None
-    shown: Sequence[Frame] = ()
+    groups: Sequence[Group] = ()
+    lead: str = ""
     origin: Markup = Markup("")
 
 
+# kinds of real frames in the order of the page
+GROUPS = {
+    "accepted": "Accepted, and named rightly",
+    "wrong": "Accepted, and named wrongly: the surest first",
+    "rejected": "Rejected by the front end",
+    "foreign": "Foreign to the classifier",
+}
+RENDERED = "These frames are rendered."
+RECORDED = "These frames are real, of prints that nothing was learned from; shares are of all frames of those prints."
+
+
 def frames(sources: Sources) -> Frames:
-    """Frames with key area and direction drawn in; of a rejected one the reason."""
+    """Frames with key area and direction drawn in, of a rejected one the reason; where the classifier learned
+    from recordings real ones: accepted, wrong, rejected and foreign, each with its share."""
     table = sources.tables["nozzle_frames"]
     if isinstance(table, Missing):
         return Frames(table)
-    return Frames(None, [_frame(row) for row in table], page.origin(sources.source("nozzle_frames")))
+    recorded = [row for row in table if row.get("group") in GROUPS]
+    origin = page.origin(sources.source("nozzle_frames"))
+    if not recorded:
+        return Frames(None, [Group("", "", [_frame(row) for row in table])], RENDERED, origin)
+    groups = []
+    for kind, head in GROUPS.items():
+        mine = [row for row in recorded if row["group"] == kind]
+        share = percent(100 * mine[0]["share"], 2) if mine and mine[0].get("share") is not None else ""
+        if mine:
+            groups.append(Group(head, share, [_frame(row) for row in mine]))
+    return Frames(None, groups, RECORDED, origin)
 
 
 def _frame(row: dict[str, Any]) -> Frame:
@@ -504,6 +537,7 @@ def _frame(row: dict[str, Any]) -> Frame:
         else "not named"
     )
     state = f"{'held' if p else 'rejected'}: {reason}" if reason else judged
+    wrong = row.get("group") == "wrong"
     flow = (
         ""
         if row.get("flow_percent") is None
@@ -515,12 +549,14 @@ def _frame(row: dict[str, Any]) -> Frame:
         if row.get("score") is None
         else f"the line stands out by {short(float(row['score']), 2)} gray levels"
     )
-    place = "" if row.get("place") in (*CLASSES, "rejected") else str(row.get("place", ""))
+    place = "" if row.get("place") in (*CLASSES, "rejected", *GROUPS) else str(row.get("place", ""))
+    source = str(row.get("source") or "")
+    source = source if len(source) <= LONGEST else "\u2026" + source[-LONGEST:]
     return Frame(
         Markup("{}").format(row["uri"]),
         ", ".join(filter(None, (flow, heat))) or "Frame",
         state,
-        bad=bool(reason),
-        foot=", ".join(filter(None, (place, score))),
+        bad=bool(reason) or wrong,
+        foot=", ".join(filter(None, (place, score, source))),
         alt=f"Frame {row['file']}: {state}",
     )
