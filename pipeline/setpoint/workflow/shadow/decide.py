@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.setpoint import bayes, deployment, familiar, key_area, levels
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, FrameReadings, read_frames
 from pipeline.setpoint.calibration import FlowCalibration, window_flow
-from pipeline.setpoint.deployment import ACTS, AMBIGUOUS, FOREIGN, Limits, Window
+from pipeline.setpoint.deployment import ACTS, AMBIGUOUS, FOREIGN, Limits, Window, is_evidence, still
 from pipeline.setpoint.familiar import Camera
 from pipeline.setpoint.levels import Levels
 from pipeline.setpoint.pixels import ADVANTAGE, LIKENESS, LOOKS, REACH_PX, TEMPLATE_PX
@@ -138,9 +138,9 @@ class Mind:
     def __init__(self, deployed: Deployed) -> None:
         self.deployed = deployed
         self.memory = deployed.controller.start()
-        self.acted, self.shown_flow, self.number = 0, np.nan, 0
+        self.acted, self.shown_flow, self.last_seen, self.number = 0, np.nan, np.nan, 0
         self.template: np.ndarray | None = None
-        self.act = eqx.filter_jit(deployed.controller.act)
+        self.decide_jit = eqx.filter_jit(deployment.decide)
         self.key = jax.random.key(0)
 
     def decide(self, window: list[Shown], asked: Asked, first_s: float, notes: list[str]) -> Decision:
@@ -186,6 +186,9 @@ class Mind:
             named = np.where(members.sum(axis=1) == 1, ACTS, AMBIGUOUS)
             reason = np.where(is_evidence(judged.reason), named, judged.reason)
             judged = judged._replace(p=prob, label=prob.argmax(axis=1), members=members, reason=reason)
+        if is_evidence(judged.reason[0]) and still(flow[0], self.last_seen):
+            judged = judged._replace(reason=np.array([int(still(flow[0], self.last_seen))]))
+        self.last_seen = flow[0]
         if of.known is not None and is_evidence(judged.reason[0]):
             looks = familiar.median(areas.surroundings.astype(float))
             if familiar.foreign(of.known, looks[None], false_alarms=FALSE_ALARMS)[0]:
@@ -211,8 +214,15 @@ class Mind:
             target=jnp.float32(setpoint[1]),
             step=jnp.int32(self.acted),
         )
-        key = jax.random.fold_in(self.key, self.number)
-        self.memory, action = self.act(self.deployed.parameters, self.memory, shown, key)
+        self.memory, action, reason = self.decide_jit(
+            self.deployed.controller,
+            self.deployed.parameters,
+            self.memory,
+            shown,
+            jnp.int32(judged.reason[0]),
+            jax.random.fold_in(self.key, self.number),
+        )
+        judged = judged._replace(reason=np.array([int(reason)]))
         if judged.reason[0] != ACTS:
             return judged, np.zeros(2)
         heats = self.acted % LAMBDA == 0
@@ -249,12 +259,6 @@ class Mind:
             and nozzle.correlation >= LIKENESS
             and nozzle.advantage >= ADVANTAGE
         )
-
-
-def is_evidence(reason: Any) -> Any:
-    """Whether the controller is shown a window: those acted on, and those that cannot tell the classes
-    apart."""
-    return (reason == ACTS) | (reason == AMBIGUOUS)
 
 
 def _pictures(window: list[Shown], areas: FrameKeyAreas) -> list[Drawn]:
