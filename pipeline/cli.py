@@ -345,12 +345,13 @@ def _add_record_levels(commands: argparse._SubParsersAction) -> None:
 
 
 def _add_training_print(commands: argparse._SubParsersAction) -> None:
-    command = commands.add_parser("training-print", help=training_print.__doc__.replace("%", "%%"))
+    command = commands.add_parser("training-print", help=str(training_print.__doc__).replace("%", "%%"))
     command.add_argument("out", type=Path, metavar="OUT.gcode")
     for flag, default, metavar, words in (
         ("--flows", "40,60,75,85,92,100,108,115,125,150,200", "PERCENT,...", "steps of the flow"),
         ("--temperatures", "190,200,210,220,230", "DEGC,...", "steps of the nozzle's temperature"),
-        ("--bed", "220,220", "MM,MM", "the bed along x and y"), ("--height", "250", "MM", "room above the bed"),
+        ("--bed", "220,220", "MM,MM", "the bed along x and y"),
+        ("--height", "250", "MM", "room above the bed"),
         ("--size", "50,20", "MM,MM", "the cuboid along x and y"), ("--nozzle", "0.4", "MM", "its diameter"),
         ("--layer", "0.2", "MM", "height of a layer"), ("--filament", "1.75", "MM", "its diameter"),
         ("--speed", "20", "MM/S", "of lines"), ("--travel", "100", "MM/S", "between them"),

@@ -1,7 +1,7 @@
 """An MCAP file while it is being written: its whole records so far, and those that come.
 
-A recorder closes a chunk every second or so, and writes the footer last. What is not whole yet is left for the
-next look; a file that was begun anew is read from its start.
+A recorder closes a chunk every second or so, and writes the footer last. What is not whole yet is left for
+the next look; a file that was begun anew is read from its start.
 """
 
 import struct

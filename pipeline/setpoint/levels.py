@@ -28,9 +28,9 @@ SEGMENT_STD, SEGMENT_LEVELS = 0.05, 3
 
 
 class Levels(NamedTuple):
-    """The correction: log(flow shown / 100 %) knots (k,), rising, and log(flow / 100 %) there (k,); beyond the
-    ends it goes on with `slope`, of log flow by log flow shown. spread is the relative standard deviation of
-    a window's corrected flow. `straight`: whether it is a line."""
+    """The correction: log(flow shown / 100 %) knots (k,), rising, and log(flow / 100 %) there (k,); beyond
+    the ends it goes on with `slope`, of log flow by log flow shown. spread is the relative standard deviation
+    of a window's corrected flow. `straight`: whether it is a line."""
 
     log_seen: np.ndarray
     log_flow: np.ndarray
@@ -91,8 +91,8 @@ def probabilities(levels: Levels, flow: np.ndarray) -> np.ndarray:
 
 def table(levels: Levels, windows: LevelWindows, flow_edges: np.ndarray) -> WindowTable:
     """What a controller learns from in place of the classifier's own windows: in the middle of each bin of
-    flow_edges (bins + 1,) in percent, each window errs as it did at its own flow, in log flow. Each level is a
-    segment."""
+    flow_edges (bins + 1,) in percent, each window errs as it did at its own flow, in log flow. Each level is
+    a segment."""
     error = np.log(corrected(levels, windows.seen) / windows.flow)
     _, segment = np.unique(windows.flow, return_inverse=True)
     middles = np.sqrt(flow_edges[:-1] * flow_edges[1:])
@@ -127,9 +127,9 @@ def _summaries(windows: LevelWindows) -> tuple[np.ndarray, np.ndarray, np.ndarra
     if usable.min() < LEAST_WINDOWS:
         k = int(usable.argmin())
         raise ValueError(
-            f"expected at least {LEAST_WINDOWS} windows that show a flow at {flows[k]:g} %, found {usable[k]} "
-            f"of {count[k]}; hold it longer, or find out with ./run beadline calibrate-tip why frames are "
-            "rejected"
+            f"expected at least {LEAST_WINDOWS} windows that show a flow at {flows[k]:g} %, found "
+            f"{usable[k]} of {count[k]}; hold it longer, or find out with "
+            "./run beadline calibrate-tip why frames are rejected"
         )
     logs = [np.log(windows.seen[number & (windows.flow == flow)] / 100) for flow in flows]
     middle = np.array([np.median(values) for values in logs])

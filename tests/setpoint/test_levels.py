@@ -1,5 +1,5 @@
-"""The correction for another camera, judged on cameras of structures that it does not assume: powers, offsets,
-saturation, and such as see nothing."""
+"""The correction for another camera, judged on cameras of structures that it does not assume: powers,
+offsets, saturation, and such as see nothing."""
 
 import numpy as np
 import pytest

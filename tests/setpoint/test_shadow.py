@@ -1,5 +1,5 @@
-"""`beadline shadow`: what it decides, what it writes, and how it ends. The reader of key areas is a rule on the
-bead's width, none of ours."""
+"""`beadline shadow`: what it decides, what it writes, and how it ends. The reader of key areas is a rule on
+the bead's width, none of ours."""
 
 import ast
 import errno
@@ -157,8 +157,8 @@ def test_what_is_foreign_stands_still_or_moved_is_held_with_the_reason(tmp_path)
 
 
 def test_the_controller_is_told_what_the_print_did_and_never_more(tmp_path):
-    """Where the recording's setpoint moves, the window of both is dropped, frames pass while the melt follows,
-    and the controller hears of the move; what it would have moved itself it never hears of."""
+    """Where the recording's setpoint moves, the window of both is dropped, frames pass while the melt
+    follows, and the controller hears of the move; what it would have moved itself it never hears of."""
     heard = []
     inner = bayes.bayes(1)
 
@@ -459,8 +459,8 @@ def test_the_nozzle_video_is_watched_at_the_rate_of_its_camera(tmp_path):
 
 
 def test_nothing_in_the_watch_could_send():
-    """The modules of the watch import nothing that opens a connection, a port or a process; the one that reads
-    snapshots names no method and no body."""
+    """The modules of the watch import nothing that opens a connection, a port or a process; the one that
+    reads snapshots names no method and no body."""
     folder = ROOT / "pipeline/setpoint/workflow"
     files = [
         *sorted((folder / "shadow").glob("*.py")),
@@ -469,10 +469,10 @@ def test_nothing_in_the_watch_could_send():
     ]
     for path in files:
         tree = ast.parse(path.read_text())
-        names = {
-            alias.name.split(".")[0]
-            for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names
-        } | {(node.module or "").split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}  # fmt: skip
+        plain = [node for node in ast.walk(tree) if isinstance(node, ast.Import)]
+        froms = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+        names = {alias.name.split(".")[0] for node in plain for alias in node.names}
+        names |= {str(node.module).split(".")[0] for node in froms}
         assert not names & {
             "socket",
             "serial",

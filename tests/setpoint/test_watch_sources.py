@@ -254,7 +254,8 @@ def guard(monkeypatch):
 
 @pytest.fixture
 def camera():
-    """A camera whose answers are `script`, one a request: (status, headers, body, bytes promised, seconds)."""
+    """A camera whose answers are `script`, one a request: (status, headers, body, bytes promised,
+    seconds)."""
 
     class Answer(http.server.BaseHTTPRequestHandler):
         def do_GET(self):
@@ -295,7 +296,8 @@ def test_a_camera_that_fails_in_the_middle_is_asked_again_and_nobody_else_is(cam
     camera.script[:] = [
         said(picture(0)), said(b"", 404), said(b"", 503), said(picture(1), seconds=0.8), said(status=0),
         said(picture(2)[:-99], promised=len(picture(2))), said(b"", 302, away), said(b"<html>", 200),
-        said(b"", 200), said(b"x" * (2 << 20)), said(b"--", 200, {"Content-Type": "multipart/x-mixed-replace"}),
+        said(b"", 200), said(b"x" * (2 << 20)),
+        said(b"--", 200, {"Content-Type": "multipart/x-mixed-replace"}),
         said(picture(2)[:-99]), said(picture(3)), said(picture(3)), said(picture(4)),
     ]  # fmt: skip
     here = Snapshots(f"http://me:secret@127.0.0.1:{camera.server_port}/?action=snapshot#a", 50.0)

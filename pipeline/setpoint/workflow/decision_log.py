@@ -92,9 +92,9 @@ class DecisionLog:
     def add(self, log_time: int, row: Mapping[str, Any]) -> None:
         self.rows.append((log_time, row))
         if len(self.rows) >= MOST or time.monotonic() - self.saved_at >= EVERY_S:
-            self.save()
+            self.write_down()
 
-    def save(self) -> None:
+    def write_down(self) -> None:
         """Writes what is not written yet; the next file is begun where this one is full."""
         self.saved_at = time.monotonic()
         if self.saved == len(self.rows):

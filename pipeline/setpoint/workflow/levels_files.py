@@ -57,14 +57,14 @@ def store_levels(path: str | Path, recorded: RecordedLevels) -> None:
 
 
 def restore_levels(path: str | Path, weights: str) -> RecordedLevels:
-    """What `store_levels` wrote. Raises ValueError where it is of another classifier than that with the digest
-    `weights`, or is no such file."""
+    """What `store_levels` wrote. Raises ValueError where it is of another classifier than that with the
+    digest `weights`, or is no such file."""
     found = artifacts.read_arrays(path, *SCHEMA)
     digest = found["weights"].astype(np.uint8).tobytes().hex()
     if digest != weights:
         raise ValueError(
-            f"{path} holds levels that another classifier saw ({digest[:8]}, the classifier is {weights[:8]}); "
-            "record them again with ./run beadline record-levels, or remove the file"
+            f"{path} holds levels that another classifier saw ({digest[:8]}, the classifier is "
+            f"{weights[:8]}); record them again with ./run beadline record-levels, or remove the file"
         )
     fitted = Levels(
         found["log_seen"],

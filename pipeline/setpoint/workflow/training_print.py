@@ -21,11 +21,12 @@ from pipeline.store import artifacts
 BOUNDS = {
     "--bed": (60.0, 2000.0, "mm"), "--height": (10.0, 2000.0, "mm"), "--nozzle": (0.1, 2.0, "mm"),
     "--layer": (0.04, 1.5, "mm"), "--filament": (1.0, 3.5, "mm"), "--speed": (1.0, 300.0, "mm/s"),
-    "--travel": (5.0, 500.0, "mm/s"), "--size": (10.0, 500.0, "mm"), "--bed-temperature": (0.0, 150.0, "degC"),
-    "--best-temperature": (150.0, 320.0, "degC"), "--temperatures": (150.0, 320.0, "degC"),
+    "--travel": (5.0, 500.0, "mm/s"), "--size": (10.0, 500.0, "mm"), "--bed-temperature": (0.0, 150.0,
+    "degC"), "--best-temperature": (150.0, 320.0, "degC"), "--temperatures": (150.0, 320.0, "degC"),
     "--flows": (*FLOW_LIMITS, "percent"), "--melt": (0.5, 200.0, "mm^3/s"),
 }  # fmt: skip
-# of the lines: wider than the nozzle by this; layers of ground below the first setting; mm from the bed's edge
+# of the lines: wider than the nozzle by this; layers of ground below the first setting; mm from the bed's
+# edge
 WIDER, GROUND, MARGIN = 1.2, 2, 5.0
 # the nozzle waits for its temperature so far beside the part and above it
 ASIDE, LIFT = 12.0, 2.0
@@ -38,9 +39,9 @@ COLUMNS = (
 
 
 class Print(NamedTuple):
-    """What is printed: flows in percent, temperatures in degC; bed (x, y) and height, size (x, y) of the cuboid,
-    nozzle, layer and filament in mm; speeds in mm/s; bed and best temperature in degC; melt: the most that
-    the hot end melts, mm^3/s."""
+    """What is printed: flows in percent, temperatures in degC; bed (x, y) and height, size (x, y) of the
+    cuboid, nozzle, layer and filament in mm; speeds in mm/s; bed and best temperature in degC; melt: the most
+    that the hot end melts, mm^3/s."""
 
     flows: tuple[float, ...]
     temperatures: tuple[float, ...]
@@ -270,8 +271,8 @@ def _end(asked: Print, z: float) -> list[str]:
 
 
 def _table(asked: Print, made: Program, print_id: str, tip: tuple[float, float] | None) -> str:
-    """The columns that a folder of frames needs, a line for each layer; timestamp in seconds of extruding moves
-    since the first layer began, without heating and travel."""
+    """The columns that a folder of frames needs, a line for each layer; timestamp in seconds of extruding
+    moves since the first layer began, without heating and travel."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)

@@ -55,8 +55,8 @@ class Shown(NamedTuple):
 
 
 class Source(Protocol):
-    """`frames` gives what came since it was last asked; `waits_for` says why nothing comes, "" where something
-    may; `ended`: nothing more will come; `rest_s`: how long to wait before the next look."""
+    """`frames` gives what came since it was last asked; `waits_for` says why nothing comes, "" where
+    something may; `ended`: nothing more will come; `rest_s`: how long to wait before the next look."""
 
     waits_for: str
     ended: bool

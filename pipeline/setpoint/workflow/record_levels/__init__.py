@@ -1,5 +1,5 @@
-"""`beadline record-levels`: a few flows, held for a minute each before a camera, become the correction of what
-its windows show; and a page beside it."""
+"""`beadline record-levels`: a few flows, held for a minute each before a camera, become the correction of
+what its windows show; and a page beside it."""
 
 import html
 import string
@@ -66,8 +66,8 @@ class Level(NamedTuple):
 
 
 class _Window(NamedTuple):
-    """One window: its level, what it shows in percent, its frames, the distances (m,) of those with a key area
-    from what was learned, and how it looks (measures,)."""
+    """One window: its level, what it shows in percent, its frames, the distances (m,) of those with a key
+    area from what was learned, and how it looks (measures,)."""
 
     flow: float
     seen: float
@@ -127,8 +127,9 @@ def write(recorded: RecordedLevels, told: Sequence[Level], out: Path, place: str
     low, high = levels.shown(recorded.levels, np.array(BORDERS))
     right, count = sum(one.named * one.windows for one in told), sum(one.windows for one in told)
     return (
-        f"{place}: {count} windows at {len(told)} levels; corrected flow to {100 * recorded.levels.spread:.0f} % "
-        f"(one deviation), classes named rightly in {100 * right / count:.0f} % of these windows\n"
+        f"{place}: {count} windows at {len(told)} levels; corrected flow to "
+        f"{100 * recorded.levels.spread:.0f} % (one deviation), classes named rightly in "
+        f"{100 * right / count:.0f} % of these windows\n"
         f"the borders of good, 90 and 110 %, are where this camera shows {low:.0f} and {high:.0f} %\n"
         f"written: {out}, {page}"
     )
@@ -150,8 +151,8 @@ def _windows(source: Source, protocol: Protocol, eye: Eye, place: str) -> list[_
             waiting = []
     if not found:
         raise ValueError(
-            f"{place}: expected at least one window of {eye.window} frames at one flow, found none; hold each "
-            "of --flows for a minute, and begin the recording with the first"
+            f"{place}: expected at least one window of {eye.window} frames at one flow, found none; hold "
+            "each of --flows for a minute, and begin the recording with the first"
         )
     return found
 

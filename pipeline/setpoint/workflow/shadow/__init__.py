@@ -1,11 +1,12 @@
 """`beadline shadow`: watches a printer's camera, decides every window as the deployed controller would, and
-writes down what it would do and why. It sends nothing: nothing here opens a connection but to read pictures."""
+writes down what it would do and why. It sends nothing: nothing here opens a connection but to read
+pictures."""
 
 import contextlib
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,12 +76,12 @@ def watch(
         if asked.once and _has_ended(source, came, quiet, len(decisions)):
             break
         if time.monotonic() - shown_at > PAGE_S:
-            log.save()
+            log.write_down()
             waits = f"No frame came for {silent:.0f} s." if silent > GAP_S else ""
             waits = f"Waiting: {source.waits_for}." if source.waits_for else waits
             shown_at = show(waits, windows.notes)
         _rest(source.rest_s, stopped)
-    log.save()
+    log.write_down()
     show(ENDED, windows.notes)
     if log.trouble:
         raise OSError(log.trouble)
@@ -140,7 +141,7 @@ def _write_page(page: Path, text: str) -> float:
 
 
 @contextlib.contextmanager
-def until_told() -> Iterator[Callable[[], bool]]:
+def until_told() -> Generator[Callable[[], bool]]:
     """A function that says whether Ctrl-C or SIGTERM has come; a second Ctrl-C ends at once."""
     told = []
 

@@ -47,12 +47,12 @@ class Asked(NamedTuple):
 
 
 class Deployed(NamedTuple):
-    """What decides: read(images (n, 16, 48), temperature (n,)) -> what n key areas show; what makes a window's
-    flow of it, and the levels of this camera, None where none were recorded; how the known camera looks, None
-    where nobody said; the default controller with its name and parameters, frames of a window, the front
-    end's least score, how a window is judged, the share of a conformal set's classes, the distance that is
-    foreign, the limits, how long after a move of the setpoint frames are of no use, how far the nozzle may be
-    from where its tip was."""
+    """What decides: read(images (n, 16, 48), temperature (n,)) -> what n key areas show; what makes a
+    window's flow of it, and the levels of this camera, None where none were recorded; how the known camera
+    looks, None where nobody said; the default controller with its name and parameters, frames of a window,
+    the front end's least score, how a window is judged, the share of a conformal set's classes, the distance
+    that is foreign, the limits, how long after a move of the setpoint frames are of no use, how far the
+    nozzle may be from where its tip was."""
 
     read: Callable[[np.ndarray, np.ndarray], FrameReadings]
     flow: FlowCalibration
@@ -72,8 +72,8 @@ class Deployed(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """One window: what was seen, what it would do, and what the page shows of it. belief (N,) over bayes.GRID,
-    or None where the controller has none; pictures are of some of its frames."""
+    """One window: what was seen, what it would do, and what the page shows of it. belief (N,) over
+    bayes.GRID, or None where the controller has none; pictures are of some of its frames."""
 
     number: int
     time_s: float
@@ -170,7 +170,8 @@ class Mind:
     def _judged(
         self, areas: FrameKeyAreas, temperature: np.ndarray, tip_moved: bool, notes: list[str]
     ) -> tuple[Window, Seen]:
-        """What the frames say together; its shares are those of the flow that it shows, where it shows one."""
+        """What the frames say together; its shares are those of the flow that it shows, where it shows
+        one."""
         of = self.deployed
         valid = np.array([not reason for reason in areas.reasons])
         readings = of.read(areas.images, temperature)
@@ -199,8 +200,8 @@ class Mind:
     def _answer(
         self, judged: Window, seen: Seen, setpoint: tuple[float, float], temperature: float, notes: list[str]
     ) -> tuple[Window, np.ndarray]:
-        """(2,) the change of flow in percent and target in degC that would be sent, within the limits; and the
-        window with the reason that the controller adds."""
+        """(2,) the change of flow in percent and target in degC that would be sent, within the limits; and
+        the window with the reason that the controller adds."""
         if not is_evidence(judged.reason[0]):
             return judged, np.zeros(2)
         move = setpoint[0] - self.shown_flow if np.isfinite(self.shown_flow) else 0.0
@@ -241,11 +242,11 @@ class Mind:
 
     def _tip_moved(self, window: list[Shown], tips: np.ndarray, notes: list[str]) -> bool:
         """Whether the nozzle is elsewhere than on the first frame of the watch."""
-        seen = [i for i, shown in enumerate(window) if isinstance(shown.frame, np.ndarray)]
-        some = [window[i].frame for i in seen[:: max(1, len(seen) // LOOKS)]]
-        if not some or not np.isfinite(tips[seen[0]]).all():
+        seen = [(i, shown.frame) for i, shown in enumerate(window) if isinstance(shown.frame, np.ndarray)]
+        if not seen or not np.isfinite(tips[seen[0][0]]).all():
             return False
-        tip = (float(tips[seen[0], 0]), float(tips[seen[0], 1]))
+        some = [frame for _, frame in seen[:: max(1, len(seen) // LOOKS)]]
+        tip = (float(tips[seen[0][0], 0]), float(tips[seen[0][0], 1]))
         try:
             if self.template is None:
                 self.template = key_area.nozzle_template(some[0], tip, size_px=TEMPLATE_PX)

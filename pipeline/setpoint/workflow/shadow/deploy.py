@@ -49,9 +49,9 @@ def trained() -> Trained:
 
 
 def ready(levels_file: str) -> Ready:
-    """The default of evaluate_setpoint with the classifier of train_classifier, and the levels of this camera:
-    of `levels_file`, or where that is empty of LEVELS_FILE, if it is there. Raises ValueError, one sentence,
-    where a stage has not run."""
+    """The default of evaluate_setpoint with the classifier of train_classifier, and the levels of this
+    camera: of `levels_file`, or where that is empty of LEVELS_FILE, if it is there. Raises ValueError, one
+    sentence, where a stage has not run."""
     settings = params.load(EvaluateSetpoint, "evaluate_setpoint")
     model, digest, view = trained()
     name = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
@@ -102,6 +102,7 @@ def pixel(text: str) -> tuple[float, float]:
         x, y = -1.0, -1.0
     if not (0 <= x <= 1e5 and 0 <= y <= 1e5):
         raise ValueError(
-            f"--tip: expected two numbers of pixels such as 571,511, found {text!r}; write X,Y without a blank"
+            f"--tip: expected two numbers of pixels such as 571,511, found {text!r}; "
+            "write X,Y without a blank"
         )
     return x, y

@@ -26,7 +26,8 @@ def render(
     place: str, controller: str, decisions: Sequence[Decision], state: str, notes: Sequence[str], trouble: str
 ) -> str:
     """The page after these decisions, the last one at the end. `state` is a sentence on why nothing comes, ""
-    where frames do; `trouble` why the decisions cannot be written. After ENDED it refreshes itself no more."""
+    where frames do; `trouble` why the decisions cannot be written. After ENDED it refreshes itself no
+    more."""
     last = decisions[-1] if decisions else None
     warnings = [text for text in (state, trouble) if text]
     values = {
@@ -134,4 +135,4 @@ def _embedded(one: Drawn) -> str:
     """A JPEG inside the page."""
     bgr = cv2.cvtColor(one.picture, cv2.COLOR_RGB2BGR)
     data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
-    return "data:image/jpeg;base64," + base64.b64encode(data).decode()
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
