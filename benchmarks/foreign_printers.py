@@ -14,9 +14,6 @@ compresses the scale, drifts from one bias to the next along a line, and shows a
 fifty.
 """
 
-import json
-import sys
-import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path

@@ -106,8 +106,8 @@ class Mean(NamedTuple):
 
 
 def shared_variance(figures: Sequence[np.ndarray]) -> float:
-    """The share of a run's variance that all runs on one redraw have in common (intraclass correlation), pooled
-    over figures (B, n) that are alike: B redraws of what runs share (segments, plants), n runs on each.
+    """The share of a run's variance that all runs on one redraw have in common (intraclass correlation),
+    pooled over figures (B, n) that are alike: B redraws of what runs share, n runs on each.
 
     sum (var_b(mean_b) - s^2 / n) / sum (var_b(mean_b) + (1 - 1 / n) s^2), not below 0, with s^2 the variance
     within a redraw (components of variance: Searle 1971). One figure alone tells it badly: what n runs differ

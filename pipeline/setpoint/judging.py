@@ -1,5 +1,5 @@
-"""Controllers of setpoints on one yardstick: what they are asked (21 wrong starts, good starts that shall stay
-good, cameras that err), on redrawn segments, and the rule by which one of them runs by default.
+"""Controllers of setpoints on one yardstick: what they are asked (21 wrong starts, good starts that shall
+stay good, cameras that err), on redrawn segments, and the rule by which one of them runs by default.
 
 Figures are of the segments that a classifier happened to record. Redrawn with replacement, as often as runs
 have blocks, these segments say how far the figures would move had others been recorded (cluster bootstrap:
@@ -7,10 +7,8 @@ Davison and Hinkley 1997, section 3.8): each block of runs sees a redraw of its 
 """
 
 from collections.abc import Mapping, Sequence
-from functools import cache
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,17 +16,7 @@ import numpy as np
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
 from pipeline.setpoint.score import CLOG_STEP, STEPS, Outcomes, Score, judge, outcomes
-from pipeline.setpoint.simulator import (
-    STAND,
-    Action,
-    Conditions,
-    Controller,
-    Observation,
-    Windows,
-    nominal,
-    paper_windows,
-    rollout,
-)
+from pipeline.setpoint.simulator import Conditions, Controller, Windows, nominal, paper_windows, rollout
 from pipeline.statistics import Mean, Share, effective_runs, redrawn_mean, shared_variance, wilson_interval
 
 START_FLOWS, START_TEMPERATURES = (
@@ -37,8 +25,7 @@ START_FLOWS, START_TEMPERATURES = (
 )  # section 3.4
 STARTS = len(START_FLOWS) * len(START_TEMPERATURES)
 GOOD_STARTS = np.linspace(92.5, 107.5, STARTS)  # percent: prints that nothing is wrong with
-SOUND, STUCK, BLIND = range(3)
-FAULT_STEPS = (20, 50)  # decisions from and until which a camera is stuck or blind
+FAULT_STEP, FAULT_LENGTH = 20, 30  # decision from which, and decisions for which a camera is stuck or blind
 OTHER_CAMERA = (
     1.12,
     0.8,
@@ -48,15 +35,13 @@ DOES_NOTHING = "do nothing"
 
 
 class Camera(NamedTuple):
-    """What it shows instead of the flow q, 100 scale (q / 100)^exponent percent, and its fault: kind SOUND,
-    STUCK (every window as the last one before) or BLIND (no window, so the controller is held), in decisions
-    from .. until - 1."""
+    """It shows 100 scale (q / 100)^exponent percent for the flow q, repeats its last window for stuck_for
+    decisions from FAULT_STEP on, and shows none for blind_for."""
 
     scale: float = 1.0
     exponent: float = 1.0
-    kind: int = SOUND
-    start: int = FAULT_STEPS[0]
-    until: int = FAULT_STEPS[1]
+    stuck_for: int = 0
+    blind_for: int = 0
 
 
 class Case(NamedTuple):
@@ -150,12 +135,11 @@ def cameras() -> dict[str, Camera]:
     """The camera right, of another make, at fault, and with borders moved, by what a case's name ends in."""
     scale, exponent = OTHER_CAMERA
     low, high = MOVED_BORDERS
-    length = FAULT_STEPS[1] - FAULT_STEPS[0]
     return {
         "": Camera(),
         ", another camera": Camera(scale, exponent),
-        f", stuck {length}": Camera(kind=STUCK),
-        f", blind {length}": Camera(kind=BLIND),
+        f", stuck {FAULT_LENGTH}": Camera(stuck_for=FAULT_LENGTH),
+        f", blind {FAULT_LENGTH}": Camera(blind_for=FAULT_LENGTH),
         f", borders {100 * low:g} %": Camera(1 / low),
         f", borders {100 * high:g} %": Camera(1 / high),
     }
@@ -191,42 +175,6 @@ def _shown(table: Shown, conditions: Conditions, flow, segment, u) -> tuple[jax.
     paper = paper_windows().draw((), conditions, flow, segment, u)
     recorded = table.recorded.draw(table.recorded.table, conditions, seen, segment, u)
     return tuple(jnp.where(conditions.persistence > 0, *pair) for pair in zip(recorded, paper, strict=True))
-
-
-class Fault(NamedTuple):
-    kind: jax.Array
-    start: jax.Array
-    until: jax.Array
-
-
-_TOLD = ("flow_move", "temperature", "target", "step")  # of an observation, what no camera says
-
-
-@cache  # one pair of functions, so that what was compiled for it is found again
-def behind_camera(controller: Controller) -> Controller:
-    """The controller behind a camera that may stick or go blind: parameters (Fault, the controller's own).
-
-    Stuck: it is shown the last window again. Blind: it is not asked, and stands; the moves that it missed
-    reach it with its next window.
-    """
-
-    def act(parameters, memory, observation: Observation, key):
-        fault, own = parameters
-        before, shown, missed = memory
-        now = (observation.step >= fault.start) & (observation.step < fault.until)
-        stuck, blind = now & (fault.kind == STUCK), now & (fault.kind == BLIND)
-        window = {name: getattr(observation, name) for name in observation._fields if name not in _TOLD}
-        window = jax.tree.map(lambda last, new: jnp.where(stuck, last, new), shown, window)
-        missed = missed + observation.flow_move
-        after, action = controller.act(own, before, observation._replace(flow_move=missed, **window), key)
-        memory = jax.tree.map(lambda old, new: jnp.where(blind, old, new), (before, missed), (after, 0.0))
-        action = jax.tree.map(lambda move: jnp.where(blind, STAND, move).astype(jnp.int32), action)
-        return (memory[0], window, memory[1]), Action(*action)
-
-    empty = {"shares": jnp.zeros(3), "named": jnp.int32(0)} | (
-        {"flow_seen": jnp.zeros(())} if "flow_seen" in Observation._fields else {}
-    )
-    return Controller(lambda: (controller.start(), empty, jnp.zeros(())), act)
 
 
 # ---- runs on redrawn segments
@@ -279,11 +227,14 @@ def evaluate(
 def ask(controller: Controller, parameters: Any, case: Case, recorded: Windows, keys: jax.Array) -> Outcomes:
     """What becomes of the case's runs (n,) on each redraw of `recorded` (of `redrawn`), one key each (B,):
     B n runs, block by block. The same key, the same chance for every controller."""
-    camera = case.camera
-    fault = Fault(*map(jnp.int32, (camera.kind, camera.start, camera.until)))
-    flow, temperature = _asked(
-        behind_camera(controller), (fault, parameters), shown_by(recorded, camera), case.conditions, keys
+    camera, one = case.camera, jnp.ones_like(case.conditions.flow)
+    conditions = case.conditions._replace(
+        stuck_from=FAULT_STEP * one,
+        stuck_for=camera.stuck_for * one,
+        blind_from=FAULT_STEP * one,
+        blind_for=camera.blind_for * one,
     )
+    flow, temperature = _asked(controller, parameters, shown_by(recorded, camera), conditions, keys)
     return outcomes(*(np.asarray(a).reshape(-1, STEPS + 1) for a in (flow, temperature)))
 
 
@@ -310,8 +261,8 @@ class Judged(NamedTuple):
 
 
 def harmless(of: Judged, bars: Mapping[str, float]) -> str:
-    """ "" where the contestant leaves +-25 % in at most bars[case] percent of the runs of each case, else where
-    it leaves it most beyond its bar."""
+    """ "" where the contestant leaves +-25 % in at most bars[case] percent of the runs of each case; else
+    where it leaves it most beyond its bar."""
     over = {case: 100.0 * float(of.harmed[case].mean()) - bar for case, bar in bars.items()}
     case = max(over, key=lambda name: over[name], default="")
     if not case or over[case] <= 0:

@@ -106,7 +106,7 @@ def outcomes(flow: np.ndarray, temperature: np.ndarray) -> Outcomes:
 
 
 def summary(of: Outcomes, *, redraws: int = 1, shared: float = 0.0) -> Score:
-    """The score of runs that are `redraws` equal blocks, one after the other, each on a redraw of the segments
+    """The score of runs that are `redraws` equal blocks, one after the other, each on a redraw of segments
     of its own, where a block's runs have the share `shared` of their variance in common
     (`statistics.shared_variance`). With one redraw the runs share nothing, and the intervals are Wilson's."""
 

@@ -29,6 +29,7 @@ PAPER_CASES = (
 RECORDED_CASES = tuple(
     f"recorded, {wear}{more}" for wear in ("fresh", "sticky") for more in ("", ", gain 0.6", ", clog")
 )
+HARM_CASES = ("perfect", "in band", "in band, another camera", "in band, stuck 30")
 # runs that are lost in per cent, and how much more of them in a harder case
 LOST = {
     "our agent": (0.2, 0.1),
@@ -59,58 +60,29 @@ def wilson(percent, runs):
 
 
 def scoreboard(lost=LOST, runs=RUNS):
-    """`lost` {controller: (percent of runs lost, more of them for each step of difficulty)}; three cases of
-    the pictures, of which no run is long enough to stay."""
+    """`lost` {controller: (percent of runs lost, more of them for each step of difficulty)}; good starts,
+    which are left in half as many runs; and a case of the pictures, whose runs are too short to stay."""
     rows, nothing = [], (math.nan,) * 3
     for name, (least, more) in lost.items():
-        for simulator, cases in (("paper", PAPER_CASES), ("recorded", RECORDED_CASES)):
+        who = (name, KINDS[name])
+        for simulator, cases in (("paper", PAPER_CASES), ("recorded", RECORDED_CASES), ("harm", HARM_CASES)):
+            counts, redraws = simulator != "harm", 1 if simulator == "paper" else 16
             for hard, case in enumerate(cases):
                 settled, stay = (
                     max(100 - least - more * hard, 0.0),
                     max(100 - 1.5 * least - 1.5 * more * hard, 0.0),
                 )
-                recovered = wilson(max(settled - 1, 0.0), runs) if case.endswith("clog") else nothing
-                rows.append(
-                    (
-                        name,
-                        KINDS[name],
-                        simulator,
-                        case,
-                        True,
-                        runs,
-                        *wilson(settled, runs),
-                        *wilson(stay, runs),
-                        *recovered,
-                        9.0 + hard,
-                        22.0 + 4 * hard,
-                        12.0,
-                        0.8 + 0.2 * hard,
-                        300.0,
-                        230.0,
-                        settled,
-                    )
-                )
+                clogged = wilson(max(settled - 1, 0.0), runs) if case.endswith("clog") else nothing
+                harmed = min((least + more * hard) / 2, 100.0)
+                shares = [wilson(settled, runs), wilson(stay, runs), clogged, clogged]
+                shares += [nothing if counts else wilson(harmed / k, runs) for k in (1, 2, 8)]
+                steps = (9.0 + hard, 22.0 + 4 * hard, 12.0 if case.endswith("clog") else math.nan)
+                errors = (12.0, 0.8 + 0.2 * hard, 300.0, 230.0, settled)
+                rows.append((*who, simulator, case, counts, runs, redraws, *sum(shares, ()), *steps, *errors))
         if name in (DEFAULT, "Bayes, robust", "the paper's agent"):
-            rows.append(
-                (
-                    name,
-                    KINDS[name],
-                    "pixels",
-                    "as published",
-                    False,
-                    21,
-                    *wilson(max(100 - 3 * least, 0.0), 21),
-                    *nothing,
-                    *nothing,
-                    14.0,
-                    30.0,
-                    15.0,
-                    2.0,
-                    30.0,
-                    190.0,
-                    100.0,
-                )
-            )
+            shares = wilson(max(100 - 3 * least, 0.0), 21) + 6 * nothing
+            steps, errors = (14.0, 30.0, math.nan), (15.0, 2.0, 30.0, 190.0, 100.0)
+            rows.append((*who, "pixels", "as published", False, 21, 1, *shares, *steps, *errors))
     artifacts.write_table(
         "datasets/evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD, columns(tables.SCOREBOARD, rows)
     )
@@ -121,8 +93,10 @@ def choice(name=DEFAULT, **more):
         "name": name,
         "worst": 98.95,
         "case": "recorded, sticky, clog",
-        "figure": "stay",
         "margin": 1.15,
+        "margin_low": 0.6,
+        "margin_high": 1.7,
+        "refused": {"proportional": "leaves +-25 % in 24.0 % of the runs (in band), of at most 2 %"},
         "sentence": f"{name} is the default.",
     }
     artifacts.write_json("datasets/evaluate_setpoint/choice.json", said | more)

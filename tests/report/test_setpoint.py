@@ -172,11 +172,14 @@ def test_every_controller_stands_in_every_case_and_its_worst_case_is_bold(projec
     page()
     text = PAGE.read_text()
     tables = re.findall(r'<table class="tab board">.*?</table>', text, re.DOTALL)
-    assert len(tables) == 3 and [table.count("<tr><th") for table in tables] == [8, 8, 4]
+    assert len(tables) == 4 and [table.count("<tr><th") for table in tables] == [8, 8, 8, 4]
     bold = [table.count('<td class="low"') for table in tables]
     # clog at accuracy 0.7 and in sticky windows are alike here; the first one is taken
-    assert bold == [7, 0, 0]
+    assert bold == [7, 0, 0, 0]
     assert "proportional" in tables[0] and "recover 24.0" in tables[0]
+    # proportional leaves +-10, 15 and 25 % from good starts in 15, 7.5 and 1.9 % of its runs
+    assert "beyond 10: 15.0" in tables[2] and "beyond 15: 7.5" in tables[2] and "beyond 25: 1.9" in tables[2]
+    assert "beyond" not in tables[0] + tables[1] + tables[3]
 
 
 def test_the_card_names_the_winner_in_words_and_shows_three_panels(project):

@@ -1,21 +1,18 @@
 """How the settled runs of the setpoint loop's default moved since the accepted run."""
 
-import numpy as np
-
 from pipeline.report.setpoint.verdict import Case, Cell, board
 from pipeline.report.shared.difference import Change
 from pipeline.report.shared.digits import MINUS, THIN, number
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import FAILED, Missing, Question, state
-from pipeline.statistics import wilson
 
 # points closer than this are one: the accepted figures are kept rounded
 SAME = 0.05
 
 
 def change(sources: Sources, case: Case, cell: Cell | None) -> Change:
-    """How the settled runs of the default moved since the accepted run: beyond noise where their intervals,
-    of as many runs as now, do not overlap."""
+    """How the settled runs of the default moved since the accepted run: beyond noise where the
+    interval of the one and as wide a one about the other do not overlap."""
     if (
         sources.accepted is None
         or isinstance(sources.accepted, Missing)
@@ -33,8 +30,8 @@ def change(sources: Sources, case: Case, cell: Cell | None) -> Change:
     points = now.value - before
     if abs(points) < SAME:
         return Change("unchanged")
-    then = wilson(np.arange(cell.runs) < round(before / 100 * cell.runs))
-    if now.low <= then.high and then.low <= now.high:
+    # the accepted figure has the interval of today's: of as many runs, clustered as they are
+    if now.low <= before + now.high - now.value and before - (now.value - now.low) <= now.high:
         return Change("within noise")
     question = Question(0, "", "Settled", "%", sources.declared.rules.settled_percent, True, "")
     text = (

@@ -31,6 +31,7 @@ from pipeline.report.shared.difference import Change
 from pipeline.report.shared.digits import THIN, band, number, percent, quantity
 from pipeline.report.shared.sources import Sources, digest
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, state
+from pipeline.setpoint.workflow.tables import BEYOND
 
 WORDS = (
     "window_of_frames",
@@ -313,6 +314,10 @@ def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> BoardCe
             failed = state(Question(0, "", "", "%", limits[what], True, ""), share) == FAILED
             text = f"{word}{quantity(share.value, '%', 1)}"
             lines.append(Share(text, band(share.low, share.high, 1), failed))
+    for points, share in zip(BEYOND, cell.beyond, strict=False):
+        if isinstance(share, Figure):
+            text = f"beyond {points}: {quantity(share.value, '%', 1)}"
+            lines.append(Share(text, band(share.low, share.high, 1), bad=False))
     steps = (
         "none settles"
         if cell.median != cell.median

@@ -28,9 +28,15 @@ from pipeline.report.shared.verdict import (
     overall,
     state,
 )
+from pipeline.setpoint.workflow.tables import BEYOND
 
 AGENT, PAPER, BASELINE = "agent", "paper", "baseline"
-SIMULATORS = {"paper": "The paper’s simulator", "recorded": "Recorded windows", "pixels": "Through pictures"}
+SIMULATORS = {
+    "paper": "The paper’s simulator",
+    "recorded": "Recorded windows",
+    "harm": "From good starts",
+    "pixels": "Through pictures",
+}
 CLAIM = (
     "The classifier is trained and judged on rendered frames: eight real pictures allow no claim about real "
     "printers."
@@ -46,7 +52,8 @@ HEADS = ("Data\u2011driven", "Best baseline", "baseline")
 
 class Cell(NamedTuple):
     """One controller in one case: shares of runs in percent with their 95 % intervals, or why one is missing.
-    Then steps until inside for good; overshoot and flow error in percent."""
+    Then steps until inside for good; overshoot and flow error in percent; beyond, of good starts those that
+    leave them by each of BEYOND points."""
 
     runs: int
     counts: bool
@@ -58,6 +65,7 @@ class Cell(NamedTuple):
     overshoot: float
     flow_error: float
     worst_start: tuple[float, float, float]
+    beyond: tuple[Figure | Missing, ...] = ()
 
 
 Case = tuple[str, str]  # simulator, case
@@ -145,6 +153,10 @@ def _cell(row: Any) -> Cell:
         row.overshoot_p95_percent,
         row.flow_error_percent,
         (row.worst_start_flow_percent, row.worst_start_temperature_degC, row.worst_start_settled_percent),
+        tuple(
+            _figure(*(getattr(row, f"beyond_{points}_{end}percent") for end in ("", "low_", "high_")))
+            for points in BEYOND
+        ),
     )
 
 
@@ -434,7 +446,7 @@ def summary(sources: Sources, board: Board) -> str:
     noise = ", which is within the noise of these runs" if figure.high >= mine.low else ""
     rival = f"the next, {named(board, others[0])}, in its own ({within(where)}: {share_text(figure)})"
     text += (
-        f", {number(points, 1)} points more than of {rival}{noise}."
+        f", {number(abs(points), 1)} points {'more' if points > 0 else 'fewer'} than of {rival}{noise}."
         if abs(points) >= 0.05
         else f", as many as of {rival}."
     )

@@ -101,7 +101,7 @@ CONTESTANTS = (
         "baseline",
         lambda problem: (
             bayes.bayes(problem.settings.bayes_robust.hypotheses()),
-            bayes.robust_filter(
+            bayes.watching_filter(
                 problem.windows, bayes.CameraErrorModel(**problem.settings.bayes_robust.model_dump())
             ),
         ),

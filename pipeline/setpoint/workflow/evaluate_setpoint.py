@@ -63,12 +63,11 @@ def chosen(specs: Mapping[str, ControllerSpec], windows: WindowTable, settings: 
     for number in range(rounds):
         key = jax.random.fold_in(jax.random.key(settings.seed), number)
         part = _of_round(recorded, number, settings.redraws)
-        for name in left:
-            now = _asked(
-                specs[name], asked, part, settings.redraws, key, f"choose, round {number + 1}: {name}"
-            )
-            outcomes[name] = _with(outcomes[name], now)
-            judged[name] = _judged(outcomes[name], asked, (number + 1) * settings.redraws)
+        with _bar(f"choose, round {number + 1}", len(left) * len(asked)) as bar:
+            for name in left:
+                now = _asked(specs[name], asked, part, settings.redraws, key, bar)
+                outcomes[name] = _with(outcomes[name], now)
+                judged[name] = _judged(outcomes[name], asked, (number + 1) * settings.redraws)
         if number + 1 < rounds:
             left = [name for name in judging.still_in(judged, limits) if name in left]
     return judging.choose(judged, simplest_first=list(specs), bars=limits)
@@ -81,17 +80,20 @@ def contest(
     the others on those of one round."""
     rounds, asked = settings.rounds, _cases(settings)
     recorded = judging.redrawn(windows, rounds * settings.redraws, np.random.default_rng([settings.seed, 1]))
-    scores, redraws = {}, {}
-    for name, spec in specs.items():
-        outcomes: dict[str, Outcomes] = {}
-        redraws[name] = settings.redraws * (rounds if name == default else 1)
-        for number in range(redraws[name] // settings.redraws):
-            key = jax.random.fold_in(jax.random.key(settings.seed), rounds + number)
-            part = _of_round(recorded, number, settings.redraws)
-            now = _asked(spec, asked, part, settings.redraws, key, f"judge: {name}")
-            outcomes = _with(outcomes, now)
-        scores[name] = _summaries(outcomes, redraws[name])
-    return Contest(scores, redraws)
+    scores, of_each = {}, {name: rounds if name == default else 1 for name in specs}
+    with _bar("judge", sum(of_each.values()) * len(asked)) as bar:
+        for name, spec in specs.items():
+            outcomes: dict[str, Outcomes] = {}
+            for number in range(of_each[name]):
+                key = jax.random.fold_in(jax.random.key(settings.seed), rounds + number)
+                part = _of_round(recorded, number, settings.redraws)
+                outcomes = _with(outcomes, _asked(spec, asked, part, settings.redraws, key, bar))
+            scores[name] = _summaries(outcomes, of_each[name] * settings.redraws)
+    return Contest(scores, {name: count * settings.redraws for name, count in of_each.items()})
+
+
+def _bar(words: str, total: int) -> tqdm:
+    return tqdm(total=total, desc=f"evaluate_setpoint: {words}", mininterval=2)
 
 
 def _summaries(outcomes: Mapping[str, Outcomes], redraws: int) -> dict[str, Score]:
@@ -121,21 +123,15 @@ def _of_round(recorded: Windows, number: int, redraws: int) -> Windows:
 
 
 def _asked(
-    spec: ControllerSpec, cases: Mapping[str, Case], part: Windows, redraws: int, key: jax.Array, words: str
+    spec: ControllerSpec, cases: Mapping[str, Case], part: Windows, redraws: int, key: jax.Array, bar: tqdm
 ) -> dict[str, Outcomes]:
     """One controller's runs in all cases, on each redraw of a round."""
-    return {
-        name: judging.ask(
-            spec.controller,
-            spec.parameters,
-            case,
-            part,
-            jax.random.split(jax.random.fold_in(key, number), redraws),
-        )
-        for number, (name, case) in enumerate(
-            tqdm(cases.items(), desc=f"evaluate_setpoint: {words}", mininterval=2)
-        )
-    }
+    found = {}
+    for number, (name, case) in enumerate(cases.items()):
+        keys = jax.random.split(jax.random.fold_in(key, number), redraws)
+        found[name] = judging.ask(spec.controller, spec.parameters, case, part, keys)
+        bar.update()
+    return found
 
 
 def _with(before: Mapping[str, Outcomes], now: Mapping[str, Outcomes]) -> dict[str, Outcomes]:
