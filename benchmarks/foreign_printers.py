@@ -45,8 +45,8 @@ TUNED, REPORTED = 100, 1
 class Case(NamedTuple):
     """What n runs meet. starts (k, 2): flow in percent and temperature in °C, taken in turn; melt_s and waits
     (s); gain and how far it wanders (deviation of its logarithm, a decision); clog: factor on the flow from
-    clog_at on; come_and_go: clogs of 0.6 to 0.85 a decision, each lasting 10 to 60; seen: factor on all that
-    the camera shows; stuck and blind: decisions from fault_at on in which it repeats itself, or shows
+    clog_at on; come_and_go: clogs of 0.6 to 0.85 a decision, each lasting 10 to 60; seen: factor on the flow
+    that the camera reads, against its table; stuck and blind: decisions from fault_at on in which it repeats itself, or shows
     nothing."""
 
     starts: np.ndarray
@@ -254,9 +254,9 @@ def loop(
     since, acted, seen, steps = np.zeros(n), np.zeros(n, int), np.full(n, np.nan), []
     keys = jax.random.split(jax.random.key(seed), n)
     for t in range(DECISIONS):
-        looks, fresh = camera.look(rng, looks, flow)
+        looks, fresh = camera.look(rng, looks, case.seen * flow)
         last, faulty = seen, t - case.fault_at
-        seen = last if 0 <= faulty < case.stuck else np.clip(case.seen * fresh, 15.0, 400.0)
+        seen = last if 0 <= faulty < case.stuck else np.clip(fresh, 15.0, 400.0)
         blind = np.full(n, 0 <= faulty < case.blind)
         reason = np.where(blind, deployment.FEW, deployment.still(np.float32(seen), np.float32(last)))
         shares = window_shares(seen, camera.spread)

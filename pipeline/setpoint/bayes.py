@@ -63,8 +63,8 @@ class Filter(NamedTuple):
     each decision and at each jump of the flow. gains (H,): true by commanded move. window_repeat_probability
     (H,): that a window shows what the one before did where the flow setpoint stood. hazard: probability a
     decision that the flow jumps. Costs in percent of flow error: move_cost by percent of move, outside_cost
-    of a miss beyond 10 %, move_fixed_cost of any move. prior (N,) is the belief about the flow at the
-    start.
+    of a miss beyond 10 %, a border that is known to within border_std percent, move_fixed_cost of any
+    correction. prior (N,) is the belief about the flow at the start.
 
     usual_surprise, unlikely_limit and likely_limit are of `surprise_update`: what its own table makes the
     filter wonder, and from where on the camera is another.
@@ -80,6 +80,7 @@ class Filter(NamedTuple):
     outside_cost: float
     move_fixed_cost: float
     prior: jax.Array
+    border_std: float = 0.0
     usual_surprise: float = 0.0
     unlikely_limit: float = float("inf")
     likely_limit: float = float("inf")
@@ -153,7 +154,7 @@ def _filtered(
 
 # of the test whether the camera is the table's: windows after the start that do not count, the most that one
 # window counts, what is let pass each window, and how far past its limit a sum may grow
-UNSETTLED, MOST_SURPRISE, ALLOWANCE, CEILING = 2, 2.5, 0.25, 1.3
+UNSETTLED, MOST_SURPRISE, ALLOWANCE, CEILING = 2, 2.0, 0.25, 1.3
 
 
 def _surprise(parameters: Filter, predicted: jax.Array, probability: jax.Array) -> jax.Array:
@@ -186,15 +187,30 @@ def surprise_update(parameters: Filter, state: FilterState, surprise: jax.Array)
 
 def strange(parameters: Filter, state: FilterState) -> jax.Array:
     """Whether the camera is not the one of the table."""
-    return (state.unlikely > parameters.unlikely_limit) | (state.likely > parameters.likely_limit)
+    sums = jnp.stack([jnp.asarray(state.unlikely), jnp.asarray(state.likely)])
+    return (
+        sums > jnp.stack([jnp.asarray(parameters.unlikely_limit), jnp.asarray(parameters.likely_limit)])
+    ).any()
+
+
+# corrections that begin with each of the five moves, in percent: a far flow takes many moves, and the fixed
+# cost is of the correction, not of each
+LARGEST = max(FLOW_MOVES)
+FARTHER = (2.0, 4.0, 8.0, 16.0)  # times the largest move
+CORRECTIONS = np.array([*FLOW_MOVES, *(-LARGEST * k for k in FARTHER), *(LARGEST * k for k in FARTHER)])
+BEGINS = np.array([FLOW_MOVES.index(max(-LARGEST, min(LARGEST, c))) for c in CORRECTIONS])
 
 
 def expected_loss(parameters: Filter, belief: jax.Array) -> jax.Array:
-    """Of each of the five moves (5), in percent of flow error."""
+    """Of each of the five moves (5), in percent of flow error: of the best of the corrections that begin with
+    it, were the correction done."""
     moves = jnp.asarray(FLOW_MOVES)
-    miss = jnp.abs(GRID + parameters.gains[:, None] * moves[:, None, None] - BEST_FLOW)  # (5, H, N)
+    miss = jnp.abs(GRID + parameters.gains[:, None] * jnp.asarray(CORRECTIONS)[:, None, None] - BEST_FLOW)
     # of a miss on the border itself, as little as rounding is not outside
-    expected = jnp.sum((miss + parameters.outside_cost * (miss > 10.0 + 1e-3)) * belief, axis=(1, 2))
+    outside = jax.scipy.special.ndtr((miss - 10.0 - 1e-3) / jnp.maximum(parameters.border_std, 1e-4))
+    loss = miss + parameters.outside_cost * outside  # (corrections, H, N)
+    expected = jnp.einsum("chn,hn->c", loss, belief)
+    expected = jax.ops.segment_min(expected, BEGINS, len(FLOW_MOVES))
     return expected + parameters.move_cost * jnp.abs(moves) + parameters.move_fixed_cost * (moves != 0)
 
 
@@ -405,6 +421,7 @@ class CameraErrorModel(NamedTuple):
     move_fixed_cost: float = 0.0
     known_start_share: float = 0.0
     known_start_std: float = 0.05
+    border_std: float = 0.0
 
 
 def robust_filter(table: WindowTable, model: CameraErrorModel) -> Filter:
@@ -433,6 +450,7 @@ def robust_filter(table: WindowTable, model: CameraErrorModel) -> Filter:
         model.outside_cost,
         model.move_fixed_cost,
         jnp.asarray(_prior(model.known_start_share, model.known_start_std)),
+        model.border_std,
     )
 
 
@@ -474,16 +492,21 @@ def _rows(table: WindowTable, mask: np.ndarray) -> WindowTable:
 
 
 def _quiet_prints(table: WindowTable, rng: np.random.Generator) -> tuple[jax.Array, jax.Array]:
-    """Flows seen at 100 % (prints, decisions): stretches of one segment's errors, its windows at random."""
+    """Flows seen at 100 % (prints, decisions), and class shares: stretches of one segment's mean error, with the
+    errors of windows about their segments. These are of any segment, as a camera's windows do not come back
+    as the few of a segment would."""
     near = (table.flow >= QUIET_FLOWS[0]) & (table.flow <= QUIET_FLOWS[1])
-    error, segment = np.log(table.flow_seen / table.flow)[near], table.segment[near]
-    rows = [np.flatnonzero(segment == s) for s in np.unique(segment)]
-    seen = np.empty((QUIET_PRINTS // 2, QUIET))
+    error = np.log(table.flow_seen / table.flow)[near]
+    _, place, counts = np.unique(table.segment[near], return_inverse=True, return_counts=True)
+    mean = np.bincount(place, error) / counts
+    several = counts[place] > 1
+    within = ((error - mean[place]) * np.sqrt(counts / np.maximum(counts - 1, 1))[place])[several]
+    seen = rng.choice(within if several.any() else np.zeros(1), (QUIET_PRINTS // 2, QUIET))
     for line in seen:
         t = 0
         while t < QUIET:
             length = int(rng.integers(*STRETCH))
-            line[t : t + length] = error[rng.choice(rows[rng.integers(len(rows))], length)][: QUIET - t]
+            line[t : t + length] += mean[rng.integers(len(mean))]
             t += length
     shares = class_shares(jnp.asarray(100.0 * np.exp(seen), jnp.float32), float(np.median(table.spread)))
     return jnp.asarray(100.0 * np.exp(seen), jnp.float32), shares

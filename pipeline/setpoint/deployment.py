@@ -1,6 +1,7 @@
 """From the frames of a window to a setpoint that may be sent: what the frames say together, and why it acted.
 When to hold, limits and waits are `actuation`'s, and have their names here too."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -62,7 +63,8 @@ class Window(NamedTuple):
     p (E, 3) soft shares, counts of which the paper makes its shares: shares (E, 3) and scaled (E, 3) of (4),
     label (E,) the class of p, members (E, 3) the conformal set, score (E,) the median out-of-distribution
     score, valid (E,) and used (E,) the frames that were valid and the frames that count, reason (E,). Where
-    no frame counts, p and shares are 1/3 each and the score is NaN.
+    no frame counts, p and shares are 1/3 each and the score is NaN. flow_seen (E,) in percent of nominal and
+    spread (E,), the deviation of its logarithm, NaN where the classifier names classes only.
     """
 
     p: np.ndarray
@@ -74,6 +76,8 @@ class Window(NamedTuple):
     valid: np.ndarray
     used: np.ndarray
     reason: np.ndarray
+    flow_seen: np.ndarray
+    spread: np.ndarray
 
 
 def judge_window(
@@ -82,6 +86,7 @@ def judge_window(
     scores: np.ndarray,
     tip_moved: np.ndarray,
     *,
+    flows: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]] | None = None,
     least_frames: int,
     correlation: float,
     foreign_above: float,
@@ -96,6 +101,10 @@ def judge_window(
     / max p Li and Pattinson 2025, eq. 1-4 members = {c: p_c >= conformal_level} split conformal set (Sadinle,
     Lei, Wasserman 2019) Held: fewer than `least_frames` count (by what cost the most of them), the tip has
     moved, or the set is no single class.
+
+    flows(frames that count (E, W)) -> flow_seen (E,), spread (E,), class probabilities (E, 3) is of a
+    classifier that shows flows (`calibration.window_flow`). Its windows have those probabilities, and are not
+    held for two classes: how sure the flow is, is for the controller to weigh.
     """
     P, valid, scores = np.asarray(probabilities, float), np.asarray(valid, bool), np.asarray(scores, float)
     if (
@@ -120,9 +129,12 @@ def judge_window(
     m = familiar.sum(axis=1)
     logs = np.log(np.clip(P, 1e-6, 1.0))
     p, shares = window_probabilities(logs, familiar, correlation), hard_shares(logs, familiar)
+    flow_seen, spread = np.full((2, len(P)), np.nan)
+    if flows is not None:
+        flow_seen, spread, p = flows(familiar)
     members = p >= conformal_level
     few = np.where(sound.sum(axis=1) >= least_frames, FOREIGN, FEW)
-    reason = np.where(members.sum(axis=1) != 1, AMBIGUOUS, ACTS)
+    reason = np.where((members.sum(axis=1) != 1) & np.isnan(flow_seen), AMBIGUOUS, ACTS)
     reason = np.where(tip_moved, TIP, np.where(m < least_frames, few, reason))
     return Window(
         p,
@@ -134,6 +146,8 @@ def judge_window(
         valid.sum(axis=1),
         m,
         reason,
+        flow_seen,
+        spread,
     )
 
 
@@ -159,6 +173,7 @@ def why(time_s: float, window: Window, i: int, change: np.ndarray) -> str:
             )
             or "no change"
         )
-        return f"{frames}, {CLASSES[window.label[i]]} {window.p[i, window.label[i]]:.2f}; {moves}"
+        seen = "" if np.isnan(window.flow_seen[i]) else f", flow {window.flow_seen[i]:.0f} %"
+        return f"{frames}{seen}, {CLASSES[window.label[i]]} {window.p[i, window.label[i]]:.2f}; {moves}"
     shares = " ".join(f"{name} {p:.2f}" for name, p in zip(CLASSES, window.p[i], strict=True))
     return f"{frames}, {shares}, score {window.score[i]:.3g}; held: {REASONS[window.reason[i]]}"

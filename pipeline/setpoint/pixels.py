@@ -2,6 +2,7 @@
 -> window -> hold or controller -> setpoints."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -145,14 +146,19 @@ class Episodes(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """What is closed into a loop, and how it is deployed: the machine; the classifier classify(images
-    (n, 16, 48), temperature (n,)) -> class probabilities (n, 3), out-of-distribution scores (n,); frames a
-    window at frame_rate_hz, waits, limits, the rule of the window judge(P, valid, scores, tip_moved) ->
-    Window, the least ridge score of a key area, how far the nozzle may be from where its tip was calibrated,
-    and how long a segment's conditions last on average."""
+    """What is closed into a loop, and how it is deployed.
+
+    The machine; the classifier classify(images (n, 16, 48), temperature (n,)) -> class probabilities (n, 3),
+    out-of-distribution scores (n,) and, where it shows flows, log(flow / 100 %) (n,) and its deviation (n,);
+    frames a window at frame_rate_hz, waits, limits, and the rule of the window, judge(P, valid, scores,
+    tip_moved, flows=) -> Window; the least ridge score of a key area, how far the nozzle may be from where
+    its tip was calibrated, and how long a segment's conditions last on average. window_flow(log_flow,
+    deviation, valid), each (E, W), -> flow_seen, spread and class probabilities of windows; None of a
+    classifier that names classes only.
+    """
 
     machine: Machine
-    classify: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    classify: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
     frames: int
     frame_rate_hz: float
     waits: Waits
@@ -161,6 +167,7 @@ class Loop(NamedTuple):
     least_score: float
     tip_tolerance_px: float
     segment_mean_s: float
+    window_flow: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]] | None = None
 
 
 def _answer(
@@ -246,7 +253,7 @@ def run(
     running = at_rest(loop.machine, *setpoints.value.T, tick_s=tick_s)
     memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (E, *jnp.shape(leaf))), controller.start())
     time_s, change = np.zeros(E), np.zeros((E, 2))
-    acted, since = np.zeros(E, int), np.zeros(E)
+    acted, since, seen = np.zeros(E, int), np.zeros(E), np.full(E, np.nan)
     steps: list[_Step] = []
     pictures: dict[tuple[int, int], np.ndarray] = {}
     for decision in range(decisions + 1):
@@ -258,20 +265,21 @@ def run(
             break
         _renew_segments(cameras, time_s, loop.segment_mean_s)
         areas = _window_areas(cameras, flow, temperature, loop, disturbances, decision, draw)
-        P, scores = loop.classify(areas.images.reshape(-1, *key_area.SHAPE), temperature.ravel())
-        window = loop.judge(P.reshape(E, -1, 3), areas.valid, scores.reshape(E, -1), areas.tip_moved)
+        window = _judged(loop, areas, temperature)
+        reason = np.where(window.reason == ACTS, deployment.still(window.flow_seen, seen), window.reason)
+        seen = window.flow_seen
         pictures |= areas.pictures
         step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, decision)
         shown = Observation(
             window.p,
             window.label,
-            np.full(E, np.nan),
+            window.flow_seen,
             since,
             temperature.mean(axis=1),
             setpoints.value[:, 1],
             acted,
         )
-        memory, wanted, reason = _answer(controller, parameters, memory, shown, step_keys, window.reason)
+        memory, wanted, reason = _answer(controller, parameters, memory, shown, step_keys, reason)
         window = window._replace(reason=reason)
         before, setpoints = setpoints, deployment.moved(setpoints, wanted, time_s, loop.limits)
         change = setpoints.value - before.value
@@ -281,6 +289,16 @@ def run(
         acted = acted + (reason == ACTS)
     last = flow.mean(axis=1), temperature.mean(axis=1)
     return _episodes(steps, *last, setpoints.clipped, pictures)
+
+
+def _judged(loop: Loop, areas: "_WindowAreas", temperature: np.ndarray) -> Window:
+    """What the windows of E episodes say, at the temperatures (E, W) of their frames."""
+    E = len(temperature)
+    P, scores, *flows = loop.classify(areas.images.reshape(-1, *key_area.SHAPE), temperature.ravel())
+    shown = P.reshape(E, -1, 3), areas.valid, scores.reshape(E, -1), areas.tip_moved
+    if loop.window_flow is None:
+        return loop.judge(*shown)
+    return loop.judge(*shown, flows=partial(loop.window_flow, *(a.reshape(E, -1) for a in flows)))
 
 
 def _episodes(

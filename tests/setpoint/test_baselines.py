@@ -256,6 +256,26 @@ def test_a_fixed_cost_leaves_a_print_alone_that_may_well_be_good():
     )
 
 
+def test_the_fixed_cost_is_of_a_correction_not_of_each_of_its_moves():
+    """A miss of 40 is worth four moves of 10 at a fixed cost of 12, though one move alone gains 10."""
+    belief = np.zeros((1, len(bayes.GRID)))
+    belief[0, 16] = 1.0  # 60 %
+    parameters = bayes.class_filter(**EXACT, move_fixed_cost=12.0)
+    np.testing.assert_allclose(
+        bayes.expected_loss(parameters, jnp.asarray(belief)), [62.0, 57.0, 40.0, 47.0, 12.0], rtol=1e-5
+    )
+
+
+def test_a_border_known_to_within_some_percent_makes_a_rest_beside_it_dear():
+    belief = np.zeros((1, len(bayes.GRID)))
+    belief[0, 29] = 1.0  # 92.5 %
+    hard = bayes.class_filter(**{**EXACT, "outside_cost": 20.0})
+    soft = hard._replace(border_std=4.0)
+    at_rest = [float(bayes.expected_loss(f, jnp.asarray(belief))[2]) for f in (hard, soft)]
+    assert at_rest[0] == pytest.approx(7.5)
+    assert at_rest[1] == pytest.approx(7.5 + 20 * scipy.stats.norm.cdf(-2.5 / 4), abs=0.01)
+
+
 def test_nothing_never_moves_the_flow_and_brings_the_temperature_home():
     assert moves(nothing(), (), [0, 2, 0, 2]) == [0, 0, 0, 0]
     _, action = nothing().act((), (), seen(0, target=190.0), KEY)
@@ -298,9 +318,10 @@ def test_a_weak_extruder_moves_its_own_hypothesis_by_less_and_asks_for_more(tabl
         ).belief
     )
     np.testing.assert_allclose(after @ bayes.GRID / after.sum(axis=1), [70.0, 65.0], rtol=1e-6)
-    # from 60 % a move of 10 leaves a miss of 30 where the extruder follows, of 35 where it follows by half
+    # from 60 % a correction of 40 ends at 100 where the extruder follows and at 80 where it follows by half,
+    # one of 80 at 140 and 100, one of 10 at 70 and 65; moves of 5 end at 65 and 62.5
     np.testing.assert_allclose(
-        np.asarray(bayes.expected_loss(parameters, belief))[[2, 4]], [40.0, 32.5], rtol=1e-6
+        np.asarray(bayes.expected_loss(parameters, belief))[2:], [40.0, 36.25, 10.0], rtol=1e-6
     )
 
 

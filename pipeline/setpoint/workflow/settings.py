@@ -164,6 +164,7 @@ class RobustFilter(Section):
     move_fixed_cost: float = Field(ge=0, le=100)
     known_start_share: float = Field(ge=0, lt=1)
     known_start_std: float = Field(gt=0, le=1)
+    border_std: float = Field(ge=0, le=100)
 
     def hypotheses(self) -> int:
         return len(self.gains) * (len(self.accuracies) + self.width_bias_levels)
