@@ -9,6 +9,7 @@ on the same core the processor's time tells what the core alone would do.
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,7 @@ import numpy as np
 from pipeline.setpoint import bayes, calibration, deployment, nozzle_scene
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, read_frames
 from pipeline.setpoint.vision_transformer import SMALL, vision_transformer
+from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration, window_flow
 from pipeline.setpoint.workflow import shadow
 from pipeline.setpoint.workflow.frame_mcap import Topics
 from pipeline.setpoint.workflow.shadow.decide import Asked, Deployed
@@ -47,23 +49,24 @@ def deployed() -> Deployed:
     network = vision_transformer(SMALL, np.random.default_rng(0))
     rng = np.random.default_rng(1)
     f = network.head.classes.W.shape[0] + calibration.appearance(np.zeros((1, 16, 48), np.uint8)).shape[1]
-    knots = np.log(np.array(calibration.KNOTS_PERCENT) / 100)
-    flow = calibration.FlowCalibration(knots, np.ones(len(knots)), 0.5)
+    knots = np.log(np.array(KNOTS_PERCENT) / 100)
+    flow = FlowCalibration(knots, np.ones(len(knots)), 0.5)
     familiar = calibration.Familiar(rng.standard_normal((3, f)), np.eye(f))
     model = CalibratedClassifier(network, calibration.Calibration(1.0, 0.5, 0.1, familiar, 1e9, flow))
     limits = deployment.Limits(
         np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([40.0, 40.0])
     )
 
-    def judge(*window):
+    def judge(*window, flows):
         return deployment.judge_window(
-            *window, least_frames=8, correlation=0.5, foreign_above=1e9, conformal_level=0.1
+            *window, flows=flows, least_frames=8, correlation=0.5, foreign_above=1e9, conformal_level=0.1
         )
 
     parameters = bayes.class_filter(accuracy=0.8, hazard=0.02, move_cost=0.5, outside_cost=5.0)
     return Deployed(
-        lambda images, temperature: read_frames(model, images, temperature), flow, None, None, "Bayes",
-        bayes.bayes(1), parameters, WINDOW, 10.0, judge, 0.1, 1e9, limits, 6.0, 10.0,
+        lambda images, temperature: read_frames(model, images, temperature),
+        partial(window_flow, fitted=flow), None, "Bayes",
+        bayes.bayes(1), parameters, WINDOW, 10.0, judge, limits, 6.0, 10.0,
     )  # fmt: skip
 
 

@@ -230,6 +230,7 @@ def record_levels(arguments: argparse.Namespace) -> None:
     from functools import partial
 
     from pipeline.setpoint.calibrated_classifier import read_frames
+    from pipeline.setpoint.window_flow import window_flow
     from pipeline.setpoint.workflow import record_levels as levels
     from pipeline.setpoint.workflow.frame_folder import read_options
     from pipeline.setpoint.workflow.shadow import deploy
@@ -248,8 +249,8 @@ def record_levels(arguments: argparse.Namespace) -> None:
     place = arguments.source
     source = levels.source_of(place, lambda path: Recording(path, options.topics))
     levels_eye = levels.Eye(
-        partial(read_frames, eye.model), fitted.flow, eye.view.window, eye.view.least_score, eye.digest,
-        eye.view.false_alarms,
+        partial(read_frames, eye.model), partial(window_flow, fitted=fitted.flow), eye.view.window,
+        eye.view.least_score, eye.digest, eye.view.false_alarms,
     )  # fmt: skip
     recorded, told = levels.record(source, protocol, levels_eye, place=str(place))
     print(levels.write(recorded, told, arguments.out, str(place)))

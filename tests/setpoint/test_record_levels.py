@@ -2,6 +2,7 @@
 and such as do not suffice. What reads key areas is a rule on the bead's width."""
 
 import re
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,12 +12,13 @@ from pipeline.setpoint.workflow import record_levels
 from pipeline.setpoint.workflow.levels_files import restore_levels
 from pipeline.setpoint.workflow.record_levels import Eye, Protocol
 from pipeline.setpoint.workflow.shadow.decide import Mind
+from pipeline.setpoint.workflow.shadow.deploy import of_camera
 from pipeline.setpoint.workflow.watch_sources import Folder, Shown
 from tests.setpoint.test_shadow import ASKED, FRAMES, TIP, by_width, deployed, fill, picture
 
 FLOWS, HOLD, RATE = (60.0, 80.0, 100.0, 125.0, 160.0), 6.0, 10
 PROTOCOL = Protocol(FLOWS, hold_s=HOLD, settle_s=1.0, temperature=210.0, tip=TIP)
-EYE = Eye(by_width, deployed().flow, FRAMES, least_score=10.0, weights="ab" * 32, false_alarms=0.03)
+EYE = Eye(by_width, deployed().window_flow, FRAMES, least_score=10.0, weights="ab" * 32, false_alarms=0.03)
 
 
 def half_width(flow: float) -> float:
@@ -101,7 +103,8 @@ def test_the_watch_corrects_what_it_sees_and_says_so(recorded):
     """The same window of a bead at 100 %: without levels it is over, with them good."""
     window = [Shown(str(k), k / RATE, picture(9000 + k, half_width(100.0) * 1.05)) for k in range(FRAMES)]
     plain = Mind(deployed()).decide(window, ASKED, 0.0, [])
-    with_levels = Mind(deployed(levels=recorded[0].levels)).decide(window, ASKED, 0.0, [])
+    corrected = partial(of_camera, deployed().window_flow, recorded[0].levels)
+    with_levels = Mind(deployed(window_flow=corrected)).decide(window, ASKED, 0.0, [])
     assert plain.row["flow_seen_percent"] > 108
     assert with_levels.row["flow_seen_percent"] == pytest.approx(105, rel=0.06)
     assert with_levels.judged.label[0] == 1

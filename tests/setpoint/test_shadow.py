@@ -11,6 +11,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,7 @@ from mcap.reader import make_reader
 
 from pipeline.setpoint import bayes, deployment
 from pipeline.setpoint.calibrated_classifier import FrameReadings
-from pipeline.setpoint.calibration import KNOTS_PERCENT, FlowCalibration
+from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration, window_flow
 from pipeline.setpoint.workflow import decision_log, shadow, watch_sources
 from pipeline.setpoint.workflow.shadow.decide import Asked, Deployed
 from pipeline.setpoint.workflow.shadow.windows import Windows
@@ -58,16 +59,15 @@ def deployed(**changes) -> Deployed:
         np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([40.0, 40.0])
     )
 
-    def judge(*window):
+    def judge(*window, flows):
         return deployment.judge_window(
-            *window, least_frames=4, correlation=0.5, foreign_above=9.0, conformal_level=0.15
+            *window, flows=flows, least_frames=4, correlation=0.5, foreign_above=9.0, conformal_level=0.15
         )
 
     knots = np.log(np.array(KNOTS_PERCENT) / 100)
     made = Deployed(
         read=by_width,
-        flow=FlowCalibration(knots, np.ones(len(knots)), 0.5),
-        levels=None,
+        window_flow=partial(window_flow, fitted=FlowCalibration(knots, np.ones(len(knots)), 0.5)),
         known=None,
         name="Bayes",
         controller=bayes.bayes(1),
@@ -75,8 +75,6 @@ def deployed(**changes) -> Deployed:
         window=FRAMES,
         least_score=10.0,
         judge=judge,
-        conformal_level=0.15,
-        foreign_above=9.0,
         limits=limits,
         settle_s=0.5,
         tip_tolerance_px=8.0,

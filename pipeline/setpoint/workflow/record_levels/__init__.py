@@ -11,9 +11,10 @@ import numpy as np
 
 from pipeline.setpoint import familiar, levels
 from pipeline.setpoint.calibrated_classifier import FrameReadings
-from pipeline.setpoint.calibration import FlowCalibration, foreign_above, window_flow
+from pipeline.setpoint.calibration import foreign_above
 from pipeline.setpoint.familiar import Camera
 from pipeline.setpoint.levels import Levels, LevelWindows
+from pipeline.setpoint.window_flow import WindowFlow
 from pipeline.setpoint.workflow.frame_images import find_key_areas
 from pipeline.setpoint.workflow.known_camera import FALSE_ALARMS
 from pipeline.setpoint.workflow.levels_files import RecordedLevels, store_levels
@@ -40,12 +41,12 @@ class Protocol(NamedTuple):
 
 
 class Eye(NamedTuple):
-    """What sees: read(images (n, 16, 48), temperature (n,)) -> what n key areas show, what makes a window's
-    flow of it; frames of a window; the front end's least score; the digest of its weights; the share of
-    this camera's frames that may be called foreign."""
+    """What sees: read(images (n, 16, 48), temperature (n,)) -> what n key areas show; window_flow, what makes
+    a window's flow of it; frames of a window; the front end's least score; the digest of its weights; the
+    share of this camera's frames that may be called foreign."""
 
     read: Callable[[np.ndarray, np.ndarray], FrameReadings]
-    flow: FlowCalibration
+    window_flow: Callable[..., WindowFlow]
     window: int
     least_score: float
     weights: str
@@ -205,7 +206,7 @@ def _seen(window: Sequence[Shown], flow: float, protocol: Protocol, eye: Eye) ->
         [shown.temperature if np.isfinite(shown.temperature) else protocol.temperature for shown in window]
     )
     readings = eye.read(areas.images, temperature)
-    shown = window_flow(readings.log_flow[None], readings.deviation[None], valid[None], eye.flow)
+    shown = eye.window_flow(readings.log_flow[None], readings.deviation[None], valid[None])
     looks = familiar.median(areas.surroundings.astype(float))
     return _Window(flow, float(shown.flow_seen[0]), len(window), readings.distance[valid], looks)
 

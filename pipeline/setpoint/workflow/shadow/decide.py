@@ -9,12 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint import bayes, deployment, familiar, key_area, levels
+from pipeline.setpoint import bayes, deployment, familiar, key_area
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, FrameReadings, read_frames
-from pipeline.setpoint.calibration import FlowCalibration, window_flow
-from pipeline.setpoint.deployment import ACTS, AMBIGUOUS, FOREIGN, Limits, Window, is_evidence, still
+from pipeline.setpoint.deployment import ACTS, FOREIGN, Limits, Window, is_evidence, still
 from pipeline.setpoint.familiar import Camera
-from pipeline.setpoint.levels import Levels
 from pipeline.setpoint.pixels import ADVANTAGE, LIKENESS, LOOKS, REACH_PX, TEMPLATE_PX
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, Observation
@@ -47,16 +45,18 @@ class Asked(NamedTuple):
 
 
 class Deployed(NamedTuple):
-    """What decides: read(images (n, 16, 48), temperature (n,)) -> what n key areas show; what makes a
-    window's flow of it, and the levels of this camera, None where none were recorded; how the known camera
-    looks, None where nobody said; the default controller with its name and parameters, frames of a window,
-    the front end's least score, how a window is judged, the share of a conformal set's classes, the distance
-    that is foreign, the limits, how long after a move of the setpoint frames are of no use, how far the
-    nozzle may be from where its tip was."""
+    """What decides.
+
+    read(images (n, 16, 48), temperature (n,)) -> what n key areas show; window_flow(log_flow, deviation,
+    valid), each (E, W) -> flow_seen in percent, spread and class probabilities of windows, those of this
+    camera where levels were recorded; how the known camera looks, None where nobody said; the default
+    controller with its name and parameters, frames of a window, the front end's least score, how a window is
+    judged, the limits, how long after a move of the setpoint frames are of no use, how far the nozzle may be
+    from where its tip was.
+    """
 
     read: Callable[[np.ndarray, np.ndarray], FrameReadings]
-    flow: FlowCalibration
-    levels: Levels | None
+    window_flow: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
     known: Camera | None
     name: str
     controller: Controller
@@ -64,8 +64,6 @@ class Deployed(NamedTuple):
     window: int
     least_score: float
     judge: Callable[..., Window]
-    conformal_level: float
-    foreign_above: float
     limits: Limits
     settle_s: float
     tip_tolerance_px: float
@@ -87,19 +85,11 @@ class Decision(NamedTuple):
     row: dict[str, Any]
 
 
-class Seen(NamedTuple):
-    """The flow that a window shows, in percent, corrected where there are levels, and its relative standard
-    deviation; NaN where it shows none."""
-
-    flow: float
-    spread: float
-
-
 class Looks(NamedTuple):
-    """What is known of this printer's camera: its levels, where they were recorded, how it looks, and the
-    distance that is foreign there."""
+    """What is known of this printer's camera: what makes a window's flow, as Deployed has it; how it looks,
+    and the distance that is foreign there."""
 
-    levels: Levels | None
+    window_flow: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
     known: Camera | None
     foreign_above: float
 
@@ -126,9 +116,8 @@ def deployed(
         np.array(q.per_minute),
     )
     read = partial(read_frames, model)
-    eye = read, fitted.flow, looks.levels, looks.known
-    rules = judge, fitted.level, looks.foreign_above
-    return Deployed(*eye, *spec, view.window, view.least_score, *rules, limits, q.wait_s, q.tip_tolerance_px)
+    eye = read, looks.window_flow, looks.known
+    return Deployed(*eye, *spec, view.window, view.least_score, judge, limits, q.wait_s, q.tip_tolerance_px)
 
 
 class Mind:
@@ -154,14 +143,14 @@ class Mind:
             np.array([shown.direction_deg for shown in window]),
             least_score=self.deployed.least_score,
         )
-        judged, seen = self._judged(areas, temperature, self._tip_moved(window, tips, notes), notes)
-        judged, would = self._answer(judged, seen, setpoint, float(temperature.mean()), notes)
+        judged = self._judged(areas, temperature, self._tip_moved(window, tips, notes), notes)
+        judged, would = self._answer(judged, setpoint, float(temperature.mean()), notes)
         self.number += 1
         time_s = window[-1].time_s - first_s
         belief = believed(self.memory)
         pictures = _pictures(window, areas)
         row = _row(self.number, time_s, judged, would, setpoint, belief, window, areas, notes)
-        row |= {"flow_seen_percent": _number(seen.flow), "spread": _number(seen.spread)}
+        row |= {"flow_seen_percent": _number(judged.flow_seen[0]), "spread": _number(judged.spread[0])}
         names = [shown.name for shown in window]
         return Decision(
             self.number, time_s, judged, setpoint, would, belief, names, areas.reasons, pictures, row
@@ -169,36 +158,31 @@ class Mind:
 
     def _judged(
         self, areas: FrameKeyAreas, temperature: np.ndarray, tip_moved: bool, notes: list[str]
-    ) -> tuple[Window, Seen]:
-        """What the frames say together; its shares are those of the flow that it shows, where it shows
-        one."""
+    ) -> Window:
+        """What the frames say together."""
         of = self.deployed
         valid = np.array([not reason for reason in areas.reasons])
         readings = of.read(areas.images, temperature)
-        judged = of.judge(readings.prob[None], valid[None], readings.distance[None], np.array([tip_moved]))
-        counts = valid & (readings.distance <= of.foreign_above)
-        shown = window_flow(readings.log_flow[None], readings.deviation[None], counts[None], of.flow)
-        flow, spread, prob = shown.flow_seen, shown.spread, shown.prob
-        if of.levels is not None:
-            flow, spread = levels.corrected(of.levels, flow), np.array([of.levels.spread])
-            prob = levels.probabilities(of.levels, flow)
-        if np.isfinite(flow[0]):
-            members = prob >= of.conformal_level
-            named = np.where(members.sum(axis=1) == 1, ACTS, AMBIGUOUS)
-            reason = np.where(is_evidence(judged.reason), named, judged.reason)
-            judged = judged._replace(p=prob, label=prob.argmax(axis=1), members=members, reason=reason)
-        if is_evidence(judged.reason[0]) and still(flow[0], self.last_seen):
-            judged = judged._replace(reason=np.array([int(still(flow[0], self.last_seen))]))
-        self.last_seen = flow[0]
+        judged = of.judge(
+            readings.prob[None],
+            valid[None],
+            readings.distance[None],
+            np.array([tip_moved]),
+            flows=lambda counts: of.window_flow(readings.log_flow[None], readings.deviation[None], counts),
+        )
+        seen = judged.flow_seen[0]
+        if is_evidence(judged.reason[0]) and still(seen, self.last_seen):
+            judged = judged._replace(reason=np.array([int(still(seen, self.last_seen))]))
+        self.last_seen = seen
         if of.known is not None and is_evidence(judged.reason[0]):
             looks = familiar.median(areas.surroundings.astype(float))
             if familiar.foreign(of.known, looks[None], false_alarms=FALSE_ALARMS)[0]:
                 notes.append(f"the pictures are none of the known camera: {familiar.unlike(of.known, looks)}")
                 judged = judged._replace(reason=np.array([FOREIGN]))
-        return judged, Seen(float(flow[0]), float(spread[0]))
+        return judged
 
     def _answer(
-        self, judged: Window, seen: Seen, setpoint: tuple[float, float], temperature: float, notes: list[str]
+        self, judged: Window, setpoint: tuple[float, float], temperature: float, notes: list[str]
     ) -> tuple[Window, np.ndarray]:
         """(2,) the change of flow in percent and target in degC that would be sent, within the limits; and
         the window with the reason that the controller adds."""
@@ -209,7 +193,7 @@ class Mind:
         shown = Observation(
             shares=jnp.asarray(judged.p[0], jnp.float32),
             named=jnp.int32(judged.label[0]),
-            flow_seen=jnp.float32(seen.flow),
+            flow_seen=jnp.float32(judged.flow_seen[0]),
             flow_move=jnp.float32(move),
             temperature=jnp.float32(temperature),
             target=jnp.float32(setpoint[1]),

@@ -1,9 +1,14 @@
 """The default controller and the trained classifier, as the stages left them, ready to decide."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
+
+import numpy as np
 
 from pipeline.setpoint import levels
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
+from pipeline.setpoint.window_flow import WindowFlow, window_flow
 from pipeline.setpoint.workflow import contestants
 from pipeline.setpoint.workflow.agent_files import restore_agents
 from pipeline.setpoint.workflow.classifier_files import restore_classifier
@@ -58,13 +63,13 @@ def ready(levels_file: str) -> Ready:
     windows = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
     agents = restore_agents("datasets/train_agent/weights.safetensors")
     learn, camera = windows["learn"], "datasets/train_classifier/camera.parquet"
-    looks = Looks(
-        None, restore_camera(camera) if artifacts.exists(camera) else None, model.calibration.foreign_above
-    )
+    flow = partial(window_flow, fitted=model.calibration.flow)
+    known = restore_camera(camera) if artifacts.exists(camera) else None
+    looks = Looks(flow, known, model.calibration.foreign_above)
     if levels_file or artifacts.exists(LEVELS_FILE):
         recorded = restore_levels(levels_file or LEVELS_FILE, digest)
         learn = levels.table(recorded.levels, recorded.windows, learn.flow_edges)
-        looks = Looks(recorded.levels, recorded.camera, recorded.foreign_above)
+        looks = Looks(partial(of_camera, flow, recorded.levels), recorded.camera, recorded.foreign_above)
     entries = [entry for entry in contestants.CONTESTANTS if entry.name == name]
     specs = contestants.controllers(contestants.Problem(settings.baselines, agents, learn), entries)
     if name not in specs:
@@ -75,6 +80,21 @@ def ready(levels_file: str) -> Ready:
     options = read_options(view)
     spec = (name, specs[name].controller, specs[name].parameters)
     return Ready(deployed(model, spec, looks, settings, view), options.topics, options.tip_px)
+
+
+def of_camera(
+    flow: Callable[..., WindowFlow],
+    of: levels.Levels,
+    log_flow: np.ndarray,
+    deviation: np.ndarray,
+    valid: np.ndarray,
+) -> WindowFlow:
+    """What `flow` gives of windows (E, W), corrected by the levels of this camera."""
+    seen = levels.corrected(of, flow(log_flow, deviation, valid).flow_seen)
+    some = np.isfinite(seen)
+    prob = np.full((len(seen), 3), 1 / 3)
+    prob[some] = levels.probabilities(of, seen[some])
+    return WindowFlow(seen, np.where(some, of.spread, np.nan), prob)
 
 
 def asked(flow: float, temperature: float, tip: str, *, once: bool, settings: Ready) -> Asked:
