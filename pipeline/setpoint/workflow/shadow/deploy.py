@@ -62,7 +62,7 @@ def ready(levels_file: str) -> Ready:
     name = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
     windows = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
     agents = restore_agents("datasets/train_agent/weights.safetensors")
-    learn, camera = windows["learn"], "datasets/train_classifier/camera.parquet"
+    learn, camera = windows["learn"], "datasets/train_classifier/known_camera.parquet"
     flow = partial(window_flow, fitted=model.calibration.flow)
     known = restore_camera(camera) if artifacts.exists(camera) else None
     looks = Looks(flow, known, model.calibration.foreign_above)
