@@ -151,3 +151,15 @@ def test_bad_flags_are_one_sentence_and_nothing_is_written(printed, arguments, s
     assert (status, out, len(wrong.splitlines())) == (1, "", 1)
     assert said in wrong and "; " in wrong
     assert list(Path().iterdir()) == []
+
+
+def test_a_table_without_temperature_is_read_with_the_stated_one(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("img_path,flow_rate\na.png,80\nb.png,120\n")
+    with pytest.raises(ValueError, match="expected a column target_hotend or hotend, found none"):
+        read_log(path)
+    log = read_log(path, 210.0)
+    assert log.temperature.tolist() == [210.0, 210.0]
+    assert any("so the stated 210 degC is" in note.message for note in log.notes)
+    path.write_text("img_path,flow_rate,hotend\na.png,80,190\nb.png,120,\n")
+    assert read_log(path, 210.0).temperature == pytest.approx([190.0, np.nan], nan_ok=True)

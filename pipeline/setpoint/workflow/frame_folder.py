@@ -73,19 +73,21 @@ LOOK = "look at a few with ./run beadline calibrate-tip IMAGE --tip X,Y"
 
 class ReadOptions(NamedTuple):
     """How frames are read: the tip (x, y) in px of every frame, or None where the data have it; the least
-    score of a line in gray levels; topics of recordings."""
+    score of a line in gray levels; topics of recordings; the temperature in degC of CSV files that have none,
+    NaN where none is stated."""
 
     tip_px: tuple[float, float] | None
     least_score: float
     topics: Topics
+    hotend: float = np.nan
 
 
 def read_options(settings: TrainClassifier) -> ReadOptions:
     """As section `train_classifier` says."""
     mapping = {name: (m.source, m.unit, m.scale, m.offset) for name, m in settings.topics.mapping.items()}
-    return ReadOptions(
-        settings.tip_px, settings.least_score, Topics(settings.topics.image, settings.topics.time, mapping)
-    )
+    topics = Topics(settings.topics.image, settings.topics.time, mapping)
+    stated = settings.constants.hotend
+    return ReadOptions(settings.tip_px, settings.least_score, topics, np.nan if stated is None else stated)
 
 
 class NozzleFrames(NamedTuple):
@@ -148,7 +150,7 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution, *, mem
             raise ValueError(
                 f"{path} is a link to what is not there; copy the file itself, or remove the link"
             )
-    logs = [read_log(path) for path in files[".csv"]]
+    logs = [read_log(path, options.hotend) for path in files[".csv"]]
     recordings, copies = _different(files[".mcap"])
     if not (logs or recordings):
         raise ValueError(
