@@ -206,12 +206,163 @@ def calibrate_camera(arguments: argparse.Namespace) -> None:
     print(camera.calibrate(asked, out, write=arguments.write))
 
 
+def shadow(arguments: argparse.Namespace) -> None:
+    """Watch a printer's camera: what the controller would do in each window and why,
+    as MCAP and a local page. Nothing is sent."""
+    from pipeline.setpoint.workflow import shadow as watching
+    from pipeline.setpoint.workflow.shadow import deploy
+    from pipeline.setpoint.workflow.watch_sources import shown_place, source
+
+    ready = deploy.ready(str(arguments.levels or ""))
+    asked = deploy.asked(
+        arguments.flow, arguments.temperature, arguments.tip, once=arguments.once, settings=ready
+    )
+    frames = source(arguments.source, ready.topics, rate_hz=deploy.bounded("--rate", arguments.rate))
+    place = shown_place(arguments.source)
+    with watching.until_told() as stopped:
+        watched = watching.watch(frames, ready.deployed, asked, arguments.out, place=place, stopped=stopped)
+    print(watching.summary_lines(watched, place))
+
+
+def record_levels(arguments: argparse.Namespace) -> None:
+    """Flows that were held for a minute each before a printer's camera into the correction for that camera,
+    and a page."""
+    from functools import partial
+
+    from pipeline.setpoint.calibrated_classifier import read_frames
+    from pipeline.setpoint.window_flow import window_flow
+    from pipeline.setpoint.workflow import record_levels as levels
+    from pipeline.setpoint.workflow.frame_folder import read_options
+    from pipeline.setpoint.workflow.shadow import deploy
+    from pipeline.setpoint.workflow.training_print import numbers
+    from pipeline.setpoint.workflow.watch_sources import Recording
+
+    eye = deploy.trained()
+    options, fitted = read_options(eye.view), eye.model.calibration
+    protocol = levels.Protocol(
+        numbers(arguments.flows, "--flows"),
+        deploy.bounded("--hold", arguments.hold),
+        deploy.bounded("--settle", arguments.settle),
+        deploy.bounded("--temperature", arguments.temperature),
+        deploy.pixel(arguments.tip) if arguments.tip else options.tip_px,
+    )
+    place = arguments.source
+    source = levels.source_of(place, lambda path: Recording(path, options.topics))
+    levels_eye = levels.Eye(
+        partial(read_frames, eye.model), partial(window_flow, fitted=fitted.flow), eye.view.window,
+        eye.view.least_score, eye.digest, eye.view.false_alarms,
+    )  # fmt: skip
+    recorded, told = levels.record(source, protocol, levels_eye, place=str(place))
+    print(levels.write(recorded, told, arguments.out, str(place)))
+
+
+def training_print(arguments: argparse.Namespace) -> None:
+    """The G-code of a print from which the classifier learns: flows and temperatures in steps,
+    with a layer at 100 % between; and a table of which setting holds from which line on."""
+    from pipeline.setpoint.workflow import training_print as printing
+    from pipeline.setpoint.workflow.shadow.deploy import pixel
+
+    def one(flag: str) -> float:
+        return printing.numbers(str(getattr(arguments, flag[2:].replace("-", "_"))), flag, 1)[0]
+
+    def pair(flag: str) -> tuple[float, float]:
+        x, y = printing.numbers(getattr(arguments, flag[2:]), flag, 2)
+        return x, y
+
+    asked = printing.Print(
+        flows=printing.numbers(arguments.flows, "--flows"),
+        temperatures=printing.numbers(arguments.temperatures, "--temperatures"),
+        bed=pair("--bed"), height=one("--height"), size=pair("--size"), nozzle=one("--nozzle"),
+        layer=one("--layer"), filament=one("--filament"), speed=one("--speed"), travel=one("--travel"),
+        bed_temperature=one("--bed-temperature"), best_temperature=one("--best-temperature"),
+        melt=one("--melt"),
+    )  # fmt: skip
+    print(printing.write(asked, arguments.out, pixel(arguments.tip) if arguments.tip else None))
+
+
 def version() -> str:
     """The version that pyproject.toml beside the code states; without one, that of the installed package."""
     project = Path(__file__).resolve().parents[1] / "pyproject.toml"
     if project.exists():
         return tomllib.loads(project.read_text(encoding="utf-8"))["project"]["version"]
     return importlib.metadata.version("beadline")
+
+
+def _add_shadow(commands: argparse._SubParsersAction) -> None:
+    command = commands.add_parser("shadow", help=shadow.__doc__)
+    command.add_argument(
+        "source",
+        help="a folder that fills with pictures, an MCAP file that grows, or the address of a snapshot",
+    )
+    command.add_argument("--out", type=Path, default=Path("shadow"), metavar="DIR", help="(shadow)")
+    command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels")
+    command.add_argument(
+        "--flow", type=float, default=100.0, help="flow setpoint in %% where the source has none (100)"
+    )
+    command.add_argument(
+        "--temperature", type=float, default=210.0, help="of the nozzle in °C where the source has none (210)"
+    )
+    command.add_argument(
+        "--levels",
+        type=Path,
+        metavar="FILE",
+        help="of record-levels (datasets/levels/levels.parquet, if there)",
+    )
+    command.add_argument("--rate", type=float, default=5.0, metavar="HZ", help="snapshots a second (5)")
+    command.add_argument("--once", action="store_true", help="end where the source ends")
+    command.set_defaults(run=shadow)
+
+
+def _add_record_levels(commands: argparse._SubParsersAction) -> None:
+    command = commands.add_parser("record-levels", help=record_levels.__doc__)
+    command.add_argument("source", type=Path, metavar="FOLDER|MCAP", help="pictures, or a recording")
+    command.add_argument(
+        "--flows", default="60,80,100,125,160", metavar="PERCENT,...",
+        help="in the order in which they were held (60,80,100,125,160)",
+    )  # fmt: skip
+    command.add_argument(
+        "--hold",
+        type=float,
+        default=60.0,
+        metavar="S",
+        help="how long each was held, from the first frame on (60)",
+    )
+    command.add_argument(
+        "--settle",
+        type=float,
+        default=10.0,
+        metavar="S",
+        help="after each change, in which the melt follows (10)",
+    )
+    command.add_argument(
+        "--temperature", type=float, default=210.0, help="of the nozzle in °C where the source has none (210)"
+    )
+    command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels")
+    command.add_argument(
+        "--out", type=Path, default=Path("datasets/levels/levels.parquet"), metavar="FILE",
+        help="where shadow looks for it (datasets/levels/levels.parquet)",
+    )  # fmt: skip
+    command.set_defaults(run=record_levels)
+
+
+def _add_training_print(commands: argparse._SubParsersAction) -> None:
+    command = commands.add_parser("training-print", help=str(training_print.__doc__).replace("%", "%%"))
+    command.add_argument("out", type=Path, metavar="OUT.gcode")
+    for flag, default, metavar, words in (
+        ("--flows", "40,60,75,85,92,100,108,115,125,150,200", "PERCENT,...", "steps of the flow"),
+        ("--temperatures", "190,200,210,220,230", "DEGC,...", "steps of the nozzle's temperature"),
+        ("--bed", "220,220", "MM,MM", "the bed along x and y"),
+        ("--height", "250", "MM", "room above the bed"),
+        ("--size", "50,20", "MM,MM", "the cuboid along x and y"), ("--nozzle", "0.4", "MM", "its diameter"),
+        ("--layer", "0.2", "MM", "height of a layer"), ("--filament", "1.75", "MM", "its diameter"),
+        ("--speed", "20", "MM/S", "of lines"), ("--travel", "100", "MM/S", "between them"),
+        ("--bed-temperature", "60", "DEGC", "of the bed"),
+        ("--best-temperature", "210", "DEGC", "of the layers between"),
+        ("--melt", "12", "MM^3/S", "the most that the hot end melts"),
+    ):  # fmt: skip
+        command.add_argument(flag, default=default, metavar=metavar, help=f"{words} ({default})")
+    command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels, for the table")
+    command.set_defaults(run=training_print)
 
 
 def main() -> None:
@@ -302,6 +453,9 @@ def main() -> None:
         "--out", type=Path, metavar="FILE", help="the page; default PICTURE.camera.html here"
     )
     command.set_defaults(run=calibrate_camera)
+    _add_shadow(commands)
+    _add_record_levels(commands)
+    _add_training_print(commands)
     nights.add(commands)
     arguments = parser.parse_args()
     try:

@@ -51,19 +51,22 @@ class Log(NamedTuple):
     notes: list[Note]
 
 
-def read_log(path: Path) -> Log:
+def read_log(path: Path, hotend: float = np.nan) -> Log:
     """The frames that a CSV lists, those of a print one behind the other. Raises ValueError, one sentence
     with the line, for a needed column that is not there, text in place of a number, a flow or temperature
-    that no printer has, a label that is no class, and time that runs backwards within a print."""
+    that no printer has, a label that is no class, and time that runs backwards within a print.
+
+    hotend is the temperature of all frames in degC where the file has no column with it; NaN: it must.
+    """
     layout = list_layout(path, lambda row: "img_path" in map(_column, row))
     layout = layout._replace(names=[_column(name) for name in layout.names])
     row_notes, notes = list(layout.notes), []
-    columns = _columns(path, layout, notes)
+    columns = _columns(path, layout, notes, hotend)
     texts, numbers, lines = _rows(path, layout, columns, row_notes)
     notes = [note._replace(message=f"{path}: {note.message}") for note in row_notes] + notes
     count, missing = len(lines), np.full(len(lines), np.nan)
     _check_numbers(path, lines, numbers)
-    temperature = numbers[columns[1]]
+    temperature = numbers.get("target_hotend", numbers.get("hotend", np.full(count, hotend)))
     # a table program may write 0 as 0.0
     prints = [re.sub(r"^(\d+)\.0+$", r"\1", name) for name in texts.get("print_id", [path.stem] * count)]
     # prints one behind the other, each in the order of its rows
@@ -107,12 +110,23 @@ def _column(name: str) -> str:
     return plain if plain in COLUMNS else name
 
 
-def _columns(path: Path, layout: CsvLayout, notes: list[Note]) -> tuple[str, ...]:
+def _columns(path: Path, layout: CsvLayout, notes: list[Note], hotend: float) -> tuple[str, ...]:
     """The columns to read, the image first and the temperature second; raises ValueError where one that is
     needed is not there, and notes those that are lived without."""
     there = layout.names
     temperature = "target_hotend" if "target_hotend" in there or "hotend" not in there else "hotend"
-    for name in ("img_path", temperature, "flow_rate"):
+    stated = np.isfinite(hotend) and temperature not in there
+    if stated:
+        notes.append(
+            Note(
+                "columns",
+                "temperature",
+                1,
+                f"{path}: it has no temperature, so the stated {hotend:g} degC is its frames'",
+            )
+        )
+    needed = ("img_path", "flow_rate") if stated else ("img_path", temperature, "flow_rate")
+    for name in needed:
         if name not in there:
             either = "target_hotend or hotend" if name == temperature else name
             raise ValueError(
@@ -137,7 +151,7 @@ def _columns(path: Path, layout: CsvLayout, notes: list[Note]) -> tuple[str, ...
     if without:
         notes.append(Note("columns", "", len(without), f"{path}: it is read without {', '.join(without)}"))
     optional = [name for name in (*OPTIONAL, "nozzle_tip_y", *SETTINGS, LABELS) if name in there]
-    return ("img_path", temperature, "flow_rate", *optional)
+    return (*needed, *optional)
 
 
 def _rows(

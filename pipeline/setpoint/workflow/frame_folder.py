@@ -73,23 +73,23 @@ LOOK = "look at a few with ./run beadline calibrate-tip IMAGE --tip X,Y"
 
 class ReadOptions(NamedTuple):
     """How frames are read: the tip (x, y) in px of every frame, or None where the data have it; the least
-    score of a line in gray levels; topics of recordings; what is printed."""
+    score of a line in gray levels; topics of recordings; what is printed; the temperature in degC of CSV files
+    that have none, NaN where none is stated."""
 
     tip_px: tuple[float, float] | None
     least_score: float
     topics: Topics
     material: Material = PLA
+    hotend: float = np.nan
 
 
 def read_options(settings: TrainClassifier, material: Material = PLA) -> ReadOptions:
     """As section `train_classifier` says, of a material."""
     mapping = {name: (m.source, m.unit, m.scale, m.offset) for name, m in settings.topics.mapping.items()}
-    return ReadOptions(
-        settings.tip_px,
-        settings.least_score,
-        Topics(settings.topics.image, settings.topics.time, mapping),
-        material,
-    )
+    topics = Topics(settings.topics.image, settings.topics.time, mapping)
+    stated = settings.constants.hotend
+    hotend = np.nan if stated is None else stated
+    return ReadOptions(settings.tip_px, settings.least_score, topics, material, hotend)
 
 
 class NozzleFrames(NamedTuple):
@@ -153,7 +153,7 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution, *, mem
             raise ValueError(
                 f"{path} is a link to what is not there; copy the file itself, or remove the link"
             )
-    logs = [read_log(path) for path in files[".csv"]]
+    logs = [read_log(path, options.hotend) for path in files[".csv"]]
     recordings, copies = _different(files[".mcap"])
     if not (logs or recordings):
         raise ValueError(

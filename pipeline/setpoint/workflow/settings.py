@@ -103,6 +103,12 @@ class RecordedTopics(Section):
     mapping: dict[str, Mapped]
 
 
+class Constants(Section):
+    """What a folder's CSV files do not say because it never changed: the nozzle's temperature in degC."""
+
+    hotend: float | None = Field(ge=0, le=600)
+
+
 class TrainClassifier(Section):
     """Section `train_classifier`."""
 
@@ -114,6 +120,7 @@ class TrainClassifier(Section):
     window: int = Field(ge=1, le=1000)
     least_score: float = Field(ge=0, le=255)
     tip_px: tuple[Annotated[float, Field(ge=0, le=100_000)], Annotated[float, Field(ge=0, le=100_000)]] | None
+    constants: Constants
     topics: RecordedTopics
     small: Recipe
     paper: Recipe

@@ -1,0 +1,184 @@
+"""What another camera shows at flows that are known: a correction of the flow that a window shows, and how
+far it is to be trusted.
+
+A few flows are held for a minute each. Their windows show other flows than were commanded: the camera looks
+from another side, the filament is of another colour. Log flow commanded by log flow shown is fitted by a
+line, or, where that foretells levels left out better, by straight pieces from level to level that never
+fall (isotonic regression; Barlow and others 1972). What remains is the spread: of windows about their level,
+and of levels about the curve.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.setpoint.recorded import WindowTable
+from pipeline.setpoint.window_flow import class_probabilities
+
+# fewer windows say nothing of a level, fewer levels nothing of a curve
+LEAST_LEVELS, LEAST_WINDOWS = 3, 5
+# a camera sees flow where log flow shown rises by so much for each of log flow, at least, and where the
+# levels at the ends lie so many spreads apart
+LEAST_SLOPE, LEAST_APART = 0.2, 3.0
+# a level may lie below the one before by so many of its standard errors, and this of log flow
+DIPS, DIP = 2.0, 0.02
+# relative width that a segment adds to its beads, one deviation, before any level has shown it; and for how
+# many levels that counts
+SEGMENT_STD, SEGMENT_LEVELS = 0.05, 3
+
+
+class Levels(NamedTuple):
+    """The correction: log(flow shown / 100 %) knots (k,), rising, and log(flow / 100 %) there (k,); beyond
+    the ends it goes on with `slope`, of log flow by log flow shown. spread is the relative standard deviation
+    of a window's corrected flow. `straight`: whether it is a line."""
+
+    log_seen: np.ndarray
+    log_flow: np.ndarray
+    slope: float
+    spread: float
+    straight: bool
+
+
+class LevelWindows(NamedTuple):
+    """w windows: flow shown (w,) and commanded (w,), both in percent of nominal."""
+
+    seen: np.ndarray
+    flow: np.ndarray
+
+
+def fit(windows: LevelWindows) -> Levels:
+    """The correction that the windows of a few levels ask for. Raises ValueError, one sentence, where they do
+    not suffice: fewer than LEAST_LEVELS levels, fewer than LEAST_WINDOWS windows of one, or a camera that
+    does not see flow."""
+    flows, middle, error, within = _summaries(windows)
+    x, y = np.log(flows / 100), middle
+    dip = np.diff(y) + DIPS * np.hypot(error[1:], error[:-1]) + DIP
+    gain = float(np.polyfit(x, y, 1)[0])
+    if dip.min() < 0 or gain < LEAST_SLOPE or y[-1] - y[0] < LEAST_APART * within:
+        shown = ", ".join(f"{100 * np.exp(m):.0f} at {q:g} %" for q, m in zip(flows, middle, strict=True))
+        raise ValueError(
+            f"this camera does not see flow: expected windows that show more where more was commanded, found "
+            f"{shown}, windows of one level {100 * within:.0f} % apart; look at a frame with "
+            "./run beadline calibrate-tip IMAGE --tip X,Y, and record again"
+        )
+    straight = _left_out(x, y, _line) <= _left_out(x, y, _pieces)
+    at, value = (_line if straight else _pieces)(y, x)
+    slope = float(np.polyfit(y, x, 1)[0])
+    levels = Levels(at, value, slope, 0.0, bool(straight))
+    # what a level misses a line by is its segment's doing; pieces meet each level, and show nothing of it
+    free = len(x) - 2 if straight else 0
+    missed = float((np.log(corrected(levels, 100 * np.exp(y)) / flows) ** 2).sum()) if straight else 0.0
+    segment = (missed + SEGMENT_LEVELS * (SEGMENT_STD * slope) ** 2) / (free + SEGMENT_LEVELS)
+    # of the next segment, and of those that the correction was fitted on
+    own = segment * (1 + (2 / len(x) if straight else 1.0))
+    return levels._replace(spread=float(np.sqrt((within * slope) ** 2 + own)))
+
+
+def corrected(levels: Levels, flow_seen: np.ndarray) -> np.ndarray:
+    """Flow in percent of nominal of what windows show, in percent, any shape."""
+    return 100 * np.exp(_along(levels.log_seen, levels.log_flow, levels.slope, np.log(flow_seen / 100)))
+
+
+def shown(levels: Levels, flow: np.ndarray) -> np.ndarray:
+    """What this camera shows at a flow, both in percent: where a class's border lies for it."""
+    return 100 * np.exp(_along(levels.log_flow, levels.log_seen, 1 / levels.slope, np.log(flow / 100)))
+
+
+def probabilities(levels: Levels, flow: np.ndarray) -> np.ndarray:
+    """(n, 3) shares of under, good, over of windows with corrected flows (n,) in percent."""
+    return class_probabilities(np.log(flow / 100), np.full(len(flow), levels.spread))
+
+
+def table(levels: Levels, windows: LevelWindows, flow_edges: np.ndarray) -> WindowTable:
+    """What a controller learns from in place of the classifier's own windows: in the middle of each bin of
+    flow_edges (bins + 1,) in percent, each window errs as it did at its own flow, in log flow. Each level is
+    a segment."""
+    error = np.log(corrected(levels, windows.seen) / windows.flow)
+    _, segment = np.unique(windows.flow, return_inverse=True)
+    middles = np.sqrt(flow_edges[:-1] * flow_edges[1:])
+    flow = np.repeat(middles, len(error))
+    seen = flow * np.exp(np.tile(error, len(middles)))
+    shares = probabilities(levels, seen)
+    flow_bin = np.repeat(np.arange(len(middles)), len(error))
+    return WindowTable(
+        shares,
+        shares.argmax(axis=1),
+        flow_bin,
+        np.tile(segment, len(middles)),
+        np.asarray(flow_edges, float),
+        seen,
+        np.full(len(seen), levels.spread),
+        flow,
+    )
+
+
+def _summaries(windows: LevelWindows) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Flows (k,) commanded, rising; the median of log(flow shown / 100 %) (k,) and its standard error; the
+    standard deviation of windows about their level, the same for all."""
+    number = np.isfinite(windows.seen) & (windows.seen > 0)
+    flows, count = np.unique(windows.flow, return_counts=True)
+    usable = np.array([np.sum(number & (windows.flow == flow)) for flow in flows])
+    if len(flows) < LEAST_LEVELS:
+        raise ValueError(
+            f"expected at least {LEAST_LEVELS} levels of flow, found {len(flows)} "
+            f"({', '.join(f'{flow:g} %' for flow in flows) or 'none'}); hold five for a minute each, such as "
+            "60, 80, 100, 125 and 160 %"
+        )
+    if usable.min() < LEAST_WINDOWS:
+        k = int(usable.argmin())
+        raise ValueError(
+            f"expected at least {LEAST_WINDOWS} windows that show a flow at {flows[k]:g} %, found "
+            f"{usable[k]} of {count[k]}; hold it longer, or find out with "
+            "./run beadline calibrate-tip why frames are rejected"
+        )
+    logs = [np.log(windows.seen[number & (windows.flow == flow)] / 100) for flow in flows]
+    middle = np.array([np.median(values) for values in logs])
+    # 1.4826: of a normal law, deviation by median distance; half of a level's windows may be mistaken
+    deviation = np.array(
+        [1.4826 * np.median(np.abs(values - m)) for values, m in zip(logs, middle, strict=True)]
+    )
+    within = float(np.sqrt(np.mean(deviation**2)))
+    return flows, middle, np.maximum(deviation, 1e-9) / np.sqrt(usable), within
+
+
+def _line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two points of the line through (x, y)."""
+    ends = np.array([x.min(), x.max()])
+    return ends, np.polyval(np.polyfit(x, y, 1), ends)
+
+
+def _pieces(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Knots of straight pieces that rise: neighbours that fall are pooled (isotonic regression), each pool at
+    its middle."""
+    order = np.argsort(x, kind="stable")
+    pools = [[x[i], y[i], 1.0] for i in order]
+    i = 0
+    while i + 1 < len(pools):
+        if pools[i + 1][1] > pools[i][1] and pools[i + 1][0] > pools[i][0]:
+            i += 1
+            continue
+        (x1, y1, n1), (x2, y2, n2) = pools[i], pools.pop(i + 1)
+        pools[i] = [(n1 * x1 + n2 * x2) / (n1 + n2), (n1 * y1 + n2 * y2) / (n1 + n2), n1 + n2]
+        i = max(i - 1, 0)
+    if len(pools) < 2:
+        return _line(x, y)
+    knots = np.array(pools)
+    return knots[:, 0], knots[:, 1]
+
+
+def _left_out(x: np.ndarray, y: np.ndarray, kind) -> float:
+    """Mean squared miss, in log flow, of each level between the ends, foretold from the others."""
+    misses = []
+    for i in range(1, len(x) - 1):
+        rest = np.arange(len(x)) != i
+        at, value = kind(y[rest], x[rest])
+        slope = float(np.polyfit(y[rest], x[rest], 1)[0])
+        misses.append(_along(at, value, slope, y[i]) - x[i])
+    return float(np.mean(np.square(misses)))
+
+
+def _along(at: np.ndarray, value: np.ndarray, slope: float, x: np.ndarray) -> np.ndarray:
+    """Linear between the knots, beyond them with `slope`."""
+    x = np.asarray(x, float)
+    inside = np.interp(x, at, value)
+    return inside + slope * (np.minimum(x - at[0], 0) + np.maximum(x - at[-1], 0))

@@ -1,0 +1,128 @@
+"""The default controller and the trained classifier, as the stages left them, ready to decide."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.setpoint import levels
+from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
+from pipeline.setpoint.window_flow import WindowFlow, window_flow
+from pipeline.setpoint.workflow import contestants
+from pipeline.setpoint.workflow.agent_files import restore_agents
+from pipeline.setpoint.workflow.classifier_files import restore_classifier
+from pipeline.setpoint.workflow.frame_folder import read_options
+from pipeline.setpoint.workflow.frame_mcap import Topics
+from pipeline.setpoint.workflow.known_camera import restore_camera
+from pipeline.setpoint.workflow.levels_files import LEVELS_FILE, restore_levels
+from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
+from pipeline.setpoint.workflow.shadow.decide import Asked, Deployed, Looks, deployed
+from pipeline.setpoint.workflow.tables import WINDOWS
+from pipeline.setpoint.workflow.windows import window_tables
+from pipeline.store import artifacts, params
+
+# what a printer can be told: percent of flow, degC; pictures a second; seconds
+BOUNDS = {"--flow": (1.0, 1000.0), "--temperature": (0.0, 600.0), "--rate": (0.05, 100.0),
+          "--hold": (5.0, 3600.0), "--settle": (0.0, 600.0)}  # fmt: skip
+
+
+WEIGHTS = "datasets/train_classifier/weights.safetensors"
+
+
+class Ready(NamedTuple):
+    """What decides; where recordings have what we need; the tip of the settings."""
+
+    deployed: Deployed
+    topics: Topics
+    tip: tuple[float, float] | None
+
+
+class Trained(NamedTuple):
+    """The classifier of train_classifier, the digest of its weights, and section `train_classifier`."""
+
+    model: CalibratedClassifier
+    digest: str
+    view: TrainClassifier
+
+
+def trained() -> Trained:
+    """Raises ValueError, one sentence, where the stage has not run."""
+    view = params.load(TrainClassifier, "train_classifier")
+    model = restore_classifier(WEIGHTS, "datasets/train_classifier/calibration.parquet")
+    return Trained(model, artifacts.sha256(WEIGHTS), view)
+
+
+def ready(levels_file: str) -> Ready:
+    """The default of evaluate_setpoint with the classifier of train_classifier, and the levels of this
+    camera: of `levels_file`, or where that is empty of LEVELS_FILE, if it is there. Raises ValueError, one
+    sentence, where a stage has not run."""
+    settings = params.load(EvaluateSetpoint, "evaluate_setpoint")
+    model, digest, view = trained()
+    name = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
+    windows = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
+    agents = restore_agents("datasets/train_agent/weights.safetensors")
+    learn, camera = windows["learn"], "datasets/train_classifier/known_camera.parquet"
+    flow = partial(window_flow, fitted=model.calibration.flow)
+    known = restore_camera(camera) if artifacts.exists(camera) else None
+    looks = Looks(flow, known, model.calibration.foreign_above)
+    if levels_file or artifacts.exists(LEVELS_FILE):
+        recorded = restore_levels(levels_file or LEVELS_FILE, digest)
+        learn = levels.table(recorded.levels, recorded.windows, learn.flow_edges)
+        looks = Looks(partial(of_camera, flow, recorded.levels), recorded.camera, recorded.foreign_above)
+    entries = [entry for entry in contestants.CONTESTANTS if entry.name == name]
+    specs = contestants.controllers(contestants.Problem(settings.baselines, agents, learn), entries)
+    if name not in specs:
+        raise ValueError(
+            f"datasets/evaluate_setpoint/choice.json: the default {name!r} is no controller of this version; "
+            "make it again with ./run dvc repro evaluate_setpoint"
+        )
+    options = read_options(view)
+    spec = (name, specs[name].controller, specs[name].parameters)
+    return Ready(deployed(model, spec, looks, settings, view), options.topics, options.tip_px)
+
+
+def of_camera(
+    flow: Callable[..., WindowFlow],
+    of: levels.Levels,
+    log_flow: np.ndarray,
+    deviation: np.ndarray,
+    valid: np.ndarray,
+) -> WindowFlow:
+    """What `flow` gives of windows (E, W), corrected by the levels of this camera."""
+    seen = levels.corrected(of, flow(log_flow, deviation, valid).flow_seen)
+    some = np.isfinite(seen)
+    prob = np.full((len(seen), 3), 1 / 3)
+    prob[some] = levels.probabilities(of, seen[some])
+    return WindowFlow(seen, np.where(some, of.spread, np.nan), prob)
+
+
+def asked(flow: float, temperature: float, tip: str, *, once: bool, settings: Ready) -> Asked:
+    """What the command line says, checked; the tip of the settings where it says none."""
+    bounded("--flow", flow)
+    bounded("--temperature", temperature)
+    return Asked(flow, temperature, pixel(tip) if tip else settings.tip, once)
+
+
+def bounded(flag: str, value: float) -> float:
+    """The value of a flag. Raises ValueError where it lies outside BOUNDS."""
+    low, high = BOUNDS[flag]
+    if not low <= value <= high:
+        raise ValueError(
+            f"{flag}: expected {low:g} to {high:g}, found {value:g}; write a number in that range"
+        )
+    return value
+
+
+def pixel(text: str) -> tuple[float, float]:
+    """(571, 511) of "571,511"."""
+    try:
+        x, y = map(float, text.split(","))
+    except ValueError:
+        x, y = -1.0, -1.0
+    if not (0 <= x <= 1e5 and 0 <= y <= 1e5):
+        raise ValueError(
+            f"--tip: expected two numbers of pixels such as 571,511, found {text!r}; "
+            "write X,Y without a blank"
+        )
+    return x, y

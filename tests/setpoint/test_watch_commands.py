@@ -1,0 +1,166 @@
+"""`beadline shadow` and `beadline record-levels` as a person types them, on what the stages leave behind."""
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import jax
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from pipeline import cli
+from pipeline.setpoint import calibration
+from pipeline.setpoint.agent import QNetwork
+from pipeline.setpoint.belief_agent import BeliefNetwork
+from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
+from pipeline.setpoint.calibration import Calibration, Familiar
+from pipeline.setpoint.levels import Levels, LevelWindows
+from pipeline.setpoint.vision_transformer import SMALL, vision_transformer
+from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
+from pipeline.setpoint.workflow import train_agent
+from pipeline.setpoint.workflow.agent_files import Agents, store_agents
+from pipeline.setpoint.workflow.classifier_files import store_classifier
+from pipeline.setpoint.workflow.levels_files import LEVELS_FILE, RecordedLevels, store_levels
+from pipeline.setpoint.workflow.settings import TrainAgent, TrainClassifier
+from pipeline.setpoint.workflow.tables import WINDOWS
+from pipeline.setpoint.workflow.windows import WINDOW_PARTS, window_rows
+from pipeline.store import artifacts, params
+from tests.setpoint.synthetic import synthetic_flow_table
+from tests.setpoint.test_shadow import TIP, picture
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capfd):
+    """command("shadow", ...): status, what was printed, and what was said of errors."""
+    monkeypatch.chdir(tmp_path)
+    for name in (params.FILE, params.EXPERT):
+        Path(name).write_text((ROOT / name).read_text())
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["beadline", *arguments])
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as ended:
+            status = ended.code
+        return status, *capfd.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def trained(command):
+    """A classifier that has learned nothing, made-up windows, agents that have learned nothing."""
+    folder = Path("datasets/train_classifier")
+    network = vision_transformer(SMALL, np.random.default_rng(0))
+    bands = calibration.appearance(np.zeros((1, 16, 48), np.uint8)).shape[1]
+    features = network.head.classes.W.shape[0] + bands
+    knots = np.log(np.array(KNOTS_PERCENT) / 100)
+    known = Calibration(
+        1.0, 0.1, 0.2, Familiar(np.zeros((3, features)), np.eye(features)), 1e9,
+        FlowCalibration(knots, np.ones(len(knots)), 0.5),
+    )  # fmt: skip
+    store_classifier(
+        folder, params.load(TrainClassifier, "train_classifier"), CalibratedClassifier(network, known)
+    )
+    tables = {
+        part: synthetic_flow_table(np.random.default_rng(1), segments=80, windows=3) for part in WINDOW_PARTS
+    }
+    artifacts.write_table(folder / "windows.parquet", WINDOWS, window_rows(tables))
+    belief = train_agent.belief(params.load(TrainAgent, "train_agent").belief_dqn, tables["learn"])
+    keys = jax.random.split(jax.random.key(3), 5)
+    networks = tuple(QNetwork(key) for key in keys[:4])
+    on_belief = BeliefNetwork(belief.filter.evidence.shape[0], keys[4])
+    store_agents(Path("datasets/train_agent/weights.safetensors"), Agents(networks, belief, on_belief))
+    artifacts.write_json("datasets/evaluate_setpoint/choice.json", {"name": "Bayes, robust"})
+
+
+def camera(count: int) -> None:
+    Path("in").mkdir()
+    for k in range(count):
+        cv2.imwrite(f"in/f{k}.png", picture(k, 6.0))
+
+
+def decisions() -> list[dict]:
+    with Path("shadow/decisions-0000.mcap").open("rb") as stream:
+        return [json.loads(message.data) for _, _, message in make_reader(stream).iter_messages()]
+
+
+def test_the_default_watches_a_folder(command, trained):
+    camera(45)
+    tip = f"{TIP[0]:g},{TIP[1]:g}"
+    status, said, wrong = command("shadow", "in", "--once", "--tip", tip)
+    assert (status, wrong) == (0, "")
+    assert "in: 45 frames, 2 decisions" in said and "nothing was sent" in said
+    assert len(decisions()) == 2 and decisions()[0]["flow_seen_percent"] > 0
+    assert "Bayes, robust" in Path("shadow/index.html").read_text()
+
+
+def test_levels_of_this_camera_are_used_and_those_of_another_classifier_are_not(command, trained):
+    camera(20)
+    knots = np.log(np.array([0.5, 2.0]))
+    flow = np.repeat([60.0, 80.0, 100.0, 125.0, 160.0], 6)
+    recorded = RecordedLevels(
+        Levels(knots, knots + np.log(0.5), 1.0, 0.09, True),
+        LevelWindows(2 * flow, flow),
+        artifacts.sha256("datasets/train_classifier/weights.safetensors"),
+        None,
+        1e9,
+    )
+    tip = f"{TIP[0]:g},{TIP[1]:g}"
+    assert command("shadow", "in", "--once", "--tip", tip)[0] == 0
+    plain = decisions()[0]["flow_seen_percent"]
+    Path("shadow/decisions-0000.mcap").unlink()
+    store_levels(LEVELS_FILE, recorded)
+    assert command("shadow", "in", "--once", "--tip", tip)[0] == 0
+    assert decisions()[0]["flow_seen_percent"] == pytest.approx(plain / 2)
+    assert decisions()[0]["spread"] == 0.09
+    store_levels(LEVELS_FILE, recorded._replace(weights="cd" * 32))
+    status, _, wrong = command("shadow", "in", "--once", "--tip", tip)
+    assert status == 1 and "another classifier saw" in wrong and len(wrong.splitlines()) == 1
+
+
+def test_a_classifier_that_learned_nothing_sees_no_flow(command, trained):
+    camera(200)
+    status, said, wrong = command(
+        "record-levels", "in", "--tip", f"{TIP[0]:g},{TIP[1]:g}", "--hold", "5", "--settle", "0"
+    )
+    assert (status, said, len(wrong.splitlines())) == (1, "", 1)
+    assert not Path(LEVELS_FILE).exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["shadow", "in"], "datasets/"), (["record-levels", "in"], "datasets/"),
+    ],
+)  # fmt: skip
+def test_before_the_stages_have_run_it_says_which_to_run(command, arguments, said):
+    status, out, wrong = command(*arguments)
+    assert (status, out, len(wrong.splitlines())) == (1, "", 1)
+    assert said in wrong and "make it again with ./run dvc repro" in wrong
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["shadow", "in", "--flow", "0"], "--flow: expected 1 to 1000, found 0"),
+        (["shadow", "in", "--temperature", "nan"], "--temperature: expected 0 to 600, found nan"),
+        (["shadow", "in", "--rate", "0"], "--rate: expected 0.05 to 100"),
+        (["shadow", "in", "--tip", "1"], "--tip: expected two numbers"),
+        (["shadow", "in", "--levels", "none.parquet"], "none.parquet is missing"),
+        (["shadow", "http://u:secret@/"], "expected the address of a snapshot"),
+        (["record-levels", "none"], "none is missing; name the folder"),
+        (["record-levels", "in", "--hold", "1"], "--hold: expected 5 to 3600"),
+        (["record-levels", "in", "--flows", "a"], "--flows: expected numbers"),
+    ],
+)  # fmt: skip
+def test_bad_flags_are_one_sentence(command, trained, arguments, said):
+    status, out, wrong = command(*arguments)
+    assert (status, out, len(wrong.splitlines())) == (1, "", 1)
+    assert said in wrong and "; " in wrong and "secret" not in wrong
+    assert not Path("shadow").exists()
