@@ -73,8 +73,8 @@ LOOK = "look at a few with ./run beadline calibrate-tip IMAGE --tip X,Y"
 
 class ReadOptions(NamedTuple):
     """How frames are read: the tip (x, y) in px of every frame, or None where the data have it; the least
-    score of a line in gray levels; topics of recordings; what is printed; the temperature in degC of CSV files
-    that have none, NaN where none is stated."""
+    score of a line in gray levels; topics of recordings; what is printed; the temperature in degC of CSV
+    files that have none, NaN where none is stated."""
 
     tip_px: tuple[float, float] | None
     least_score: float
