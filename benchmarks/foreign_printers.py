@@ -208,7 +208,7 @@ def recorded_table(camera: Camera, rng: np.random.Generator, *, segments: int, w
     extra = (EDGES[1:] + EDGES[:-1]) / 2  # one of each bin, so that none is empty
     flow = np.r_[flow, extra]
     memory, shown = camera.begin(rng, len(flow)), []
-    memory = memory._replace(left=np.full(len(flow), windows + 1))
+    memory = memory._replace(left=np.maximum(memory.left, windows + 1))
     for _ in range(windows):
         memory, seen = camera.look(rng, memory, flow)
         shown.append(seen)

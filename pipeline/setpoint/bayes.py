@@ -154,7 +154,8 @@ def _filtered(
 
 # of the test whether the camera is the table's: windows after the start that do not count, the most that one
 # window counts, what is let pass each window, and how far past its limit a sum may grow
-UNSETTLED, MOST_SURPRISE, ALLOWANCE, CEILING = 2, 2.0, 0.5, 1.3
+UNSETTLED, MOST_SURPRISE, CEILING = 2, 2.0, 1.3
+ALLOWANCE, LIKELY_ALLOWANCE = 0.5, 0.75  # a camera steadier than its record is no other, unless by much
 
 
 def _surprise(parameters: Filter, predicted: jax.Array, probability: jax.Array) -> jax.Array:
@@ -176,10 +177,10 @@ def surprise_update(parameters: Filter, state: FilterState, surprise: jax.Array)
     """
     excess = jnp.clip(surprise - parameters.usual_surprise, -MOST_SURPRISE, MOST_SURPRISE)
     sums = [
-        jnp.where(jnp.isnan(surprise), s, jnp.clip(s + sign * excess - ALLOWANCE, 0.0, CEILING * limit))
-        for s, sign, limit in (
-            (state.unlikely, 1.0, parameters.unlikely_limit),
-            (state.likely, -1.0, parameters.likely_limit),
+        jnp.where(jnp.isnan(surprise), s, jnp.clip(s + more, 0.0, CEILING * limit))
+        for s, more, limit in (
+            (state.unlikely, excess - ALLOWANCE, parameters.unlikely_limit),
+            (state.likely, -excess - LIKELY_ALLOWANCE, parameters.likely_limit),
         )
     ]
     return state._replace(unlikely=sums[0], likely=sums[1])
