@@ -304,7 +304,7 @@ def _lead_in(of: Judged, case: str, other: Judged, against: str) -> Mean:
         redrawn_mean(blocks, _shared(judged, alike(name), both))
         for blocks, judged, name in ((ours, of, case), (theirs, other, against))
     ]
-    half = float(np.hypot(*((one.high - one.low) / 2 for one in ends)))
+    half = float(np.hypot(ends[0].high - ends[0].low, ends[1].high - ends[1].low)) / 2
     value = ends[0].value - ends[1].value
     return Mean(value, value - half, value + half)
 
