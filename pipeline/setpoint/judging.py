@@ -280,16 +280,38 @@ def worst_case(of: Judged) -> tuple[float, str]:
 
 def lead(of: Judged, other: Judged) -> Mean:
     """By how many points the worst case of `of` exceeds the worst of the other, with its 95 % interval, from
-    the redraws that both have: same segments, same chance."""
+    the redraws that both have: same segments, same chance.
+
+    The other's worst case lies no higher than any of its cases, so the lower end is the highest of those
+    against each of them: a case that is surely lost counts, also where another may be worse.
+    """
     first, second = worst_case(of)[1], worst_case(other)[1]
-    both = min(len(of.kept[first]), len(other.kept[second]))
+    leads = {case: _lead_in(of, first, other, case) for case in other.kept}
+    return Mean(leads[second].value, max(one.low for one in leads.values()), leads[second].high)
 
-    def beyond(case: str, against: str) -> np.ndarray:
-        return 100.0 * (of.kept[case][:both].astype(float) - other.kept[against][:both])
 
-    groups = {alike(first), alike(second)} - {""}
-    shared = shared_variance([beyond(case, case) for case in of.kept if alike(case) in groups])
-    return redrawn_mean(beyond(first, second), shared)
+def _lead_in(of: Judged, case: str, other: Judged, against: str) -> Mean:
+    """The same of one case of each. Cases alike are compared run by run; of others the variances add."""
+    both = min(len(of.kept[case]), len(other.kept[against]))
+    ours, theirs = (100.0 * blocks[:both].astype(float) for blocks in (of.kept[case], other.kept[against]))
+    group = alike(case)
+    if group == alike(against):
+        alikes = [
+            of.kept[c][:both].astype(float) - other.kept[c][:both] for c in of.kept if alike(c) == group
+        ]
+        return redrawn_mean(ours - theirs, shared_variance(alikes) if group else 0.0)
+    ends = [
+        redrawn_mean(blocks, _shared(judged, alike(name), both))
+        for blocks, judged, name in ((ours, of, case), (theirs, other, against))
+    ]
+    half = float(np.hypot(ends[0].high - ends[0].low, ends[1].high - ends[1].low)) / 2
+    value = ends[0].value - ends[1].value
+    return Mean(value, value - half, value + half)
+
+
+def _shared(of: Judged, group: str, redraws: int) -> float:
+    """What a contestant's runs on one redraw share in the cases of a group."""
+    return shared_variance([of.kept[c][:redraws] for c in of.kept if alike(c) == group]) if group else 0.0
 
 
 def still_in(judged: Mapping[str, Judged], bars: Mapping[str, float]) -> list[str]:

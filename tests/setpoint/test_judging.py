@@ -450,3 +450,20 @@ def test_short_trajectories_are_refused():
         ValueError, match=r"expected trajectories of 200 decisions, found 100; roll out with steps=200"
     ):
         judge(short, short)
+
+
+def test_a_case_that_is_surely_lost_is_no_tie_where_a_worse_one_is_in_doubt():
+    """On half of the redraws the simple one loses nearly all runs of the sticky case, and on none few of the
+    paper's, where it surely lies below the filter's worst."""
+    sticky = np.repeat([[True], [False]], 12, axis=0) & np.ones((24, 20), bool)
+    good = {"in band": np.zeros((24, 20), bool)}
+    paper = ~spread(0.3)
+    simple = Judged({"accuracy 0.7": paper, "recorded, sticky": sticky}, good)
+    filter_ = Judged({"accuracy 0.7": ~spread(0.05), "recorded, sticky": ~spread(0.02)[::-1]}, good)
+    judged = {"simple": simple, "filter": filter_}
+    assert judging.worst_case(simple)[1] == "recorded, sticky"
+    assert lead(filter_, simple).low > 0
+    assert choose(judged, simplest_first=ORDER, bars=BARS).name == "filter"
+    doubt = {"simple": Judged({"recorded, sticky": sticky}, good),
+             "filter": Judged({"recorded, sticky": ~spread(0.02)[::-1]}, good)}  # fmt: skip
+    assert lead(doubt["filter"], doubt["simple"]).value > 40
