@@ -57,7 +57,7 @@ TRAINING = TrainingSettings(
     patience=6,
 )
 EPOCHS = 12
-PROMISE, FALSE_ALARMS = calibration.Promise(coverage=0.95, confidence=0.8, by_flow=0.94), 0.03
+PROMISE, FALSE_ALARMS = calibration.Promise(coverage=0.95, confidence=0.8, by_flow=0.93), 0.03
 # new segments in a bin of flow, windows of so many frames, segments rendered in one go
 A_BIN, LENGTHS, AT_ONCE = 200, (20, 8), 64
 STORED = [f"datasets/train_classifier/{name}" for name in ("weights.safetensors", "calibration.parquet")]
