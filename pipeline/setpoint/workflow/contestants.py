@@ -117,7 +117,9 @@ CONTESTANTS = (
         "our agent",
         "agent",
         lambda problem: (
-            agent.greedy(belief_agent.belief_encoder(problem.agents.belief)),
+            agent.greedy(belief_agent.belief_encoder(problem.agents.belief))._replace(
+                strange=lambda _, memory: bayes.strange(problem.agents.belief.filter, memory)
+            ),
             problem.agents.belief_dqn,
         ),
     ),

@@ -10,11 +10,12 @@ import numpy as np
 from tqdm import tqdm
 
 from pipeline.setpoint import deployment, judging, pixels
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, classify
+from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, read_frames
 from pipeline.setpoint.judging import Case, Choice, Judged
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
 from pipeline.setpoint.score import BEYOND, Outcomes, Score, summary
 from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Windows, rollout
+from pipeline.setpoint.window_flow import window_flow
 from pipeline.setpoint.workflow.contestants import THROUGH_PIXELS, ControllerSpec
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.statistics import Share, shared_variance, wilson
@@ -320,7 +321,7 @@ def _loop(model: CalibratedClassifier, settings: EvaluateSetpoint, view: TrainCl
     q, fitted = settings.pixels, model.calibration
     return pixels.Loop(
         machine=pixels.Machine(q.heater_s, q.heater_delay_s, q.melt_s, q.softening_per_degC),
-        classify=partial(classify, model),
+        classify=partial(read_frames, model),
         frames=view.window,
         frame_rate_hz=q.frame_rate_hz,
         waits=deployment.Waits(q.wait_s, q.wait_s, q.idle_wait_s),
@@ -339,6 +340,7 @@ def _loop(model: CalibratedClassifier, settings: EvaluateSetpoint, view: TrainCl
         least_score=view.least_score,
         tip_tolerance_px=q.tip_tolerance_px,
         segment_mean_s=q.segment_mean_s,
+        window_flow=partial(window_flow, fitted=fitted.flow),
     )
 
 

@@ -84,8 +84,9 @@ def error_model(settings: RobustFilter) -> bayes.CameraErrorModel:
 
 
 def belief(settings: BeliefDqn, windows: WindowTable) -> Belief:
-    """The filter on recorded windows, and the value of each move were the flow observed."""
-    robust = bayes.robust_filter(windows, error_model(settings.filter))
+    """The filter on recorded windows, which tells when the camera is not theirs, and the value of each move
+    were the flow observed."""
+    robust = bayes.watching_filter(windows, error_model(settings.filter))
     values = belief_agent.observed_values(belief_agent.Costs(**settings.costs.model_dump()), settings.gamma)
     return Belief(robust, jnp.asarray(values, jnp.float32), settings.gamma)
 
