@@ -25,7 +25,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.special
 
 from pipeline.setpoint.baselines import temperature_move
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, FLOW_MOVES
