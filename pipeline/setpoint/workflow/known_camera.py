@@ -96,6 +96,12 @@ def store_camera(path: Path, camera: Camera | None) -> None:
     )
 
 
+def known_to_classifier() -> Camera | None:
+    """The camera of what train_classifier learned from; None where that had too few windows to know it by."""
+    path = f"datasets/train_classifier/{FILE}"
+    return restore_camera(path) if artifacts.exists(path) else None
+
+
 def restore_camera(path: str | Path) -> Camera:
     """What `store_camera` wrote. Raises ValueError for a file of other measures."""
     arrays = artifacts.read_arrays(str(path), *KNOWN_CAMERA)
