@@ -13,7 +13,7 @@ from pipeline.setpoint import deployment, familiar, pixels
 from pipeline.setpoint.deployment import ACTS, Limits, Waits
 from pipeline.setpoint.pixels import Loop, Machine, at_rest, calm, run, tick
 from pipeline.setpoint.simulator import Action, Controller
-from pipeline.setpoint.workflow import known_camera, settings
+from pipeline.setpoint.workflow import camera_files, known_camera, settings
 from pipeline.store import params
 
 MACHINE = Machine(heater_s=15.0, heater_delay_s=2.0, melt_s=1.2, softening_per_degC=0.02)
@@ -275,7 +275,7 @@ def camera():
 def test_pictures_of_another_kind_are_held_and_those_of_the_known_camera_are_not(camera):
     """Two windows as they are rendered, then two through a lens so far out of focus as none of the segments;
     where no camera is known, those are acted on."""
-    foreign = functools.partial(familiar.foreign, camera, false_alarms=known_camera.FALSE_ALARMS)
+    foreign = functools.partial(familiar.foreign, camera, false_alarms=camera_files.FALSE_ALARMS)
     loop = CALM_LIGHT._replace(foreign=foreign)
     blurred = calm(6)._replace(blur_px=np.full(6, 6.0), burst_at=np.full(6, 2), burst_for=np.full(6, 2))
     got = run(FILTERED, None, SIX, loop, blurred, decisions=4, rng=np.random.default_rng(3))

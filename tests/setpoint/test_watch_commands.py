@@ -21,6 +21,7 @@ from pipeline.setpoint.vision_transformer import SMALL, vision_transformer
 from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.setpoint.workflow import train_agent
 from pipeline.setpoint.workflow.agent_files import Agents, store_agents
+from pipeline.setpoint.workflow.camera_files import FILE, store_camera
 from pipeline.setpoint.workflow.classifier_files import store_classifier
 from pipeline.setpoint.workflow.levels_files import LEVELS_FILE, RecordedLevels, store_levels
 from pipeline.setpoint.workflow.settings import TrainAgent, TrainClassifier
@@ -67,6 +68,7 @@ def trained(command):
     store_classifier(
         folder, params.load(TrainClassifier, "train_classifier"), CalibratedClassifier(network, known)
     )
+    store_camera(folder / FILE, None)
     tables = {
         part: synthetic_flow_table(np.random.default_rng(1), segments=80, windows=3) for part in WINDOW_PARTS
     }

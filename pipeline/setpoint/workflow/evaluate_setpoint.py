@@ -17,8 +17,8 @@ from pipeline.setpoint.recorded import WindowTable, recorded_windows
 from pipeline.setpoint.score import BEYOND, Outcomes, Score, summary
 from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Windows, rollout
 from pipeline.setpoint.window_flow import window_flow
+from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
 from pipeline.setpoint.workflow.contestants import THROUGH_PIXELS, ControllerSpec
-from pipeline.setpoint.workflow.known_camera import FALSE_ALARMS
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.statistics import Share, shared_variance, wilson
 

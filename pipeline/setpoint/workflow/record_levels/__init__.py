@@ -16,8 +16,8 @@ from pipeline.setpoint.familiar import Camera
 from pipeline.setpoint.levels import Levels, LevelWindows
 from pipeline.setpoint.material import PLA, Material
 from pipeline.setpoint.window_flow import WindowFlow
+from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
 from pipeline.setpoint.workflow.frame_images import find_key_areas
-from pipeline.setpoint.workflow.known_camera import FALSE_ALARMS
 from pipeline.setpoint.workflow.levels_files import RecordedLevels, store_levels
 from pipeline.setpoint.workflow.watch_sources import Folder, Recording, Shown, Source
 from pipeline.store import artifacts

@@ -17,8 +17,8 @@ from pipeline.setpoint.material import PLA, Material
 from pipeline.setpoint.pixels import ADVANTAGE, LIKENESS, LOOKS, REACH_PX, TEMPLATE_PX
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, Observation
+from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
 from pipeline.setpoint.workflow.frame_images import FrameKeyAreas, find_key_areas
-from pipeline.setpoint.workflow.known_camera import FALSE_ALARMS
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.setpoint.workflow.watch_sources import Shown
 from pipeline.store.printable import printable
