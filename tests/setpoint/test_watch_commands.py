@@ -102,6 +102,16 @@ def test_the_default_watches_a_folder(command, trained):
     assert "Bayes, robust" in Path("shadow/index.html").read_text()
 
 
+def test_the_material_of_the_settings_is_what_is_watched(command, trained):
+    camera(20)
+    text = Path(params.FILE).read_text()
+    assert text.count("good_flow_percent: [90, 110]") == 1
+    Path(params.FILE).write_text(text.replace("good_flow_percent: [90, 110]", "good_flow_percent: [85, 120]"))
+    status, _, wrong = command("shadow", "in", "--once", "--tip", f"{TIP[0]:g},{TIP[1]:g}")
+    assert (status, wrong) == (0, "")
+    assert "inside 85 to 120 % with" in Path("shadow/index.html").read_text()
+
+
 def test_levels_of_this_camera_are_used_and_those_of_another_classifier_are_not(command, trained):
     camera(20)
     knots = np.log(np.array([0.5, 2.0]))
