@@ -78,7 +78,7 @@ def scoreboard(lost=LOST, runs=RUNS):
                 clogged = wilson(max(settled - 1, 0.0), runs) if case.endswith("clog") else nothing
                 harmed = 0.0 if name == "do nothing" else min((least + more * hard) / 2, 100.0)
                 shares = [wilson(settled, runs), wilson(stay, runs), clogged, clogged]
-                shares += [nothing if counts else wilson(harmed / k, runs) for k in (1, 2, 8)]
+                shares += [nothing if counts else wilson(harmed / k, RUNS) for k in (1, 2, 8)]
                 steps = (9.0 + hard, 22.0 + 4 * hard, 12.0 if case.endswith("clog") else math.nan)
                 errors = (12.0, 0.8 + 0.2 * hard, 300.0, 230.0, settled)
                 rows.append((*who, simulator, case, counts, runs, redraws, *sum(shares, ()), *steps, *errors))

@@ -19,7 +19,7 @@ TITLE = "Harm against recovery"
 # a clog that halves the evidence: to 0.6 of the flow, and to 0.75
 CLOG, HALF_CLOG = ("recorded", "recorded, sticky, clog"), ("recorded", "recorded, sticky, half clog")
 # ends of the axis of harm in percent: the first that holds every controller, else the last
-AXES = (5.0, 10.0, 20.0, 40.0)
+AXES = (5.0, 10.0, 20.0, 50.0, 100.0)
 
 
 class Contestant(NamedTuple):
@@ -60,9 +60,9 @@ def harms(sources: Sources, board: Board | Missing) -> Harms:
     clog = case_text(CLOG, whole=True)
     caption = (
         f"Across: runs from good starts that leave ±{BEYOND[-1]}{THIN}% of flow within 200 decisions, in "
-        f"the case that is nearest to its bar, or most beyond it. Up: runs that "
-        f"are inside again 60 decisions after a clog ({clog}). Bars: 95{THIN}% intervals. Grey: harm that "
-        "is allowed in some case."
+        f"the case that is nearest to its bar, or most beyond it. Up: runs "
+        f"that are inside again 60 decisions after a clog ({clog}). Crosses: 95{THIN}% intervals of those "
+        "that may run. Grey: harm that is allowed in some case."
     )
     picture = Picture(
         "harm",
@@ -109,7 +109,7 @@ def _row(board: Board, name: str, harm: Harm) -> Contestant:
         share_text(harm.figure),
         band(harm.figure.low, harm.figure.high, 1),
         bad=harm.state == "failed",
-        where=f"{start_text(harm.case)}, ≤ {harm.limit:g}{THIN}%",
+        where=f"{start_text(harm.case)}, ≤\u00a0{harm.limit:g}{THIN}%",
         recovered=share_text(share),
         recovered_band=band(share.low, share.high, 1) if isinstance(share, Figure) else "",
         steps="" if math.isnan(steps) else f"in {number(steps, 0)} decisions",
@@ -146,7 +146,7 @@ def _said(name: str) -> str:
 
 def _chart(board: Board, known: dict[str, Harm]) -> Markup:
     """A point for each controller, with both intervals."""
-    most = max(harm.figure.high for harm in known.values())
+    most = max(harm.figure.value for harm in known.values())
     end = next((end for end in AXES if end >= most), AXES[-1])
     x = charts.Axis(0, end, tuple((float(v), f"{v:g}") for v in np.linspace(0, end, 6)))
     y = charts.Axis(-4, 104, tuple((float(v), str(v)) for v in (0, 25, 50, 75, 100)))
@@ -160,14 +160,15 @@ def _chart(board: Board, known: dict[str, Harm]) -> Markup:
             continue
         a, low, high = (float(v) for v in frame.px([harm.figure.value, harm.figure.low, harm.figure.high]))
         b, bottom, top = (float(v) for v in frame.py([share.value, share.low, share.high]))
-        layers.append(
-            Markup('<path class="whisk" d="M{:.1f} {:.1f}H{:.1f}M{:.1f} {:.1f}V{:.1f}"/>').format(
-                low, b, high, a, bottom, top
+        if name not in board.refused:
+            layers.append(
+                Markup('<path class="whisk pale" d="M{:.1f} {:.1f}H{:.1f}M{:.1f} {:.1f}V{:.1f}"/>').format(
+                    low, b, high, a, bottom, top
+                )
             )
-        )
         mark = page.MARKS[role(board, name)]
         layers.append(charts.dots(frame, harm.figure.value, share.value, f"dot whole {mark}", 4.0))
-        layers.append(_name(frame, name, a, high, b, taken))
+        layers.append(_name(frame, name, a, b, taken))
     mine = known.get(board.default)
     alt = (
         "Harm against recovery"
@@ -185,14 +186,12 @@ def _chart(board: Board, known: dict[str, Harm]) -> Markup:
     )
 
 
-def _name(
-    frame: charts.Frame, name: str, a: float, high: float, b: float, taken: list[tuple[float, float]]
-) -> Markup:
-    """A name right of its point and interval, or left of a point far right; below names that are there."""
-    left, y = a > frame.width * 0.62, b + 4
+def _name(frame: charts.Frame, name: str, a: float, b: float, taken: list[tuple[float, float]]) -> Markup:
+    """A name beside its point, on the side that has room on a phone too; below names that are there."""
+    left, y = a + 14 + 9.5 * len(name) > frame.width, b - 6
     while any(abs(y - other) < 18 and abs(a - where) < 200 for where, other in taken):
         y += 6
     taken.append((a, y))
     return Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(
-        a - 9 if left else max(high, a + 3) + 6, y, "end" if left else "start", name
+        a - 7 if left else a + 7, y, "end" if left else "start", name
     )

@@ -1,6 +1,7 @@
 """The page of the setpoint loop: who sets flow and temperature by default, what each controller makes of each
 case, and what the camera's classifier is worth."""
 
+import re
 from typing import NamedTuple
 
 from markupsafe import Markup
@@ -30,7 +31,7 @@ from pipeline.report.setpoint.verdict import (
 )
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.difference import Change
-from pipeline.report.shared.digits import THIN, band, number, percent, quantity
+from pipeline.report.shared.digits import THIN, band, count, number, percent, quantity
 from pipeline.report.shared.sources import Sources, digest, lookup
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, state
 from pipeline.setpoint.workflow.tables import BEYOND
@@ -131,9 +132,17 @@ def hashes(sources: Sources) -> list[tuple[str, str]]:
 
 
 def choice_sentence(sources: Sources) -> str:
-    """Why the default is the default, as the stage that chose it says."""
+    """Why the default is the default, as the stage that chose it says; who may not run is told as a number,
+    and by name in the table of harm."""
     said = lookup(sources.tables["choice"], "sentence")
-    return "" if isinstance(said, Missing) else str(said).replace("+-", "±")
+    if isinstance(said, Missing):
+        return ""
+    text, refused = re.subn(r" Not asked: .*?\.(?= Not asked:| On segments|$)", "", str(said))
+    if refused:
+        others, spoil = count(refused, "other").capitalize(), "it spoils" if refused == 1 else "they spoil"
+        more = f" {others} may not run: {spoil} more good prints than allowed."
+        text = text.replace(" On segments", f"{more} On segments", 1)
+    return text.replace("+-", "±")
 
 
 class Head(NamedTuple):

@@ -230,9 +230,9 @@ def of_classifier(rule: Rule) -> bool:
 def rules(sources: Sources, board: Board | None) -> tuple[Pair, ...]:
     asked = sources.declared.rules
     return (
+        _does_no_harm(sources, board),
         _control(board, "Settles, worst case", "settled", asked.settled_percent, "settle"),
         _control(board, "Stays, worst case", "stay", asked.stay_percent, "settle and stay"),
-        _does_no_harm(sources, board),
         _accurate(
             sources,
             Question(0, "image_accuracy", "Right, an image", "%", 100 * asked.image_accuracy, True, ""),
@@ -253,10 +253,7 @@ def _control(board: Board | None, name: str, what: str, limit: float, does: str)
     )  # fmt: skip
     if board is None:
         return rule, rule
-    remedy = (
-        "A classifier whose errors persist for fewer decisions, or fewer starts and disturbances to stand "
-        "(evaluate_setpoint)."
-    )
+    remedy = "A classifier whose errors persist for fewer decisions."
 
     def held(controller: str) -> Rule:
         figure, case = worst(board, controller, what)
@@ -334,7 +331,7 @@ def _does_no_harm(sources: Sources, board: Board | None) -> Pair:
             figure=harm.figure,
             text=share_text(harm.figure),
             limit=f"≤ {' or '.join(f'{end:g}' for end in ends)}{THIN}%",
-            reason=f"{case_text(harm.case, whole=True)}: {share_text(harm.figure)} of its runs leave "
+            reason=f"{case_text(harm.case, whole=True)}, {share_text(harm.figure)} of its runs leave "
             f"±{BEYOND[-1]}{THIN}%; at most {harm.limit:g}{THIN}% may."
             f"{undecided(asked, harm.figure, clustered=True)}{beside}",
             remedy="A dearer move (evaluate_setpoint.baselines.bayes_robust.move_fixed_cost), or a "
@@ -379,7 +376,7 @@ def undecided(question: Question, figure: Figure, *, clustered: bool = False) ->
     if clustered:
         times = ((figure.high - figure.low) / 200 / off) ** 2 if off else math.inf
         more = (
-            f"about {number(math.ceil(times), 0)} times as many segments would decide"
+            f"about {number(max(math.ceil(times - 1e-6), 2), 0)} times as many segments would decide"
             if times < 1000
             else "no number of segments would decide"
         )
@@ -526,7 +523,7 @@ def _conditions(asked: Sequence[Rule], rendered: bool) -> str:
     short = [rule for rule in asked if rule.state != PASSED]
     figures = [
         f"{rule.name[:1].lower()}{rule.name[1:]} {rule.limit} (now "
-        f"{rule.text}{', but its interval crosses the limit' if rule.state == UNDECIDED else ''})"
+        f"{rule.text}{', undecided' if rule.state == UNDECIDED else ''})"
         for rule in short
     ]
     real = " Recordings of the real printer: none are in (datasets/raw/setpoint)." if rendered else ""
