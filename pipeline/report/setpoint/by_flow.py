@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.setpoint.verdict import CLASS_BORDERS
+from pipeline.report.setpoint.verdict import CLASS_BORDERS, share_in
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, band, number, percent, quantity
 from pipeline.report.shared.pictures import Column, Picture, placeholder
@@ -53,21 +53,15 @@ def bins(metrics: Mapping | Missing) -> list[Bin] | Missing:
             row["flow_high"],
             row["windows"],
             figure,
-            _figure(sets.get(row["flow_low"])) or Missing("not measured", "no sets were judged"),
+            share_in(sets.get(row["flow_low"])) or Missing("not measured", "no sets were judged"),
             IDEAL_BY_BIN.get(row["flow_low"], float("nan")) if rendered else float("nan"),
             any(border in CLASS_BORDERS for border in (row["flow_low"], row["flow_high"])),
         )
         for row in found
-        if (figure := _figure(row)) is not None
+        if (figure := share_in(row)) is not None
     ]
     rows.sort(key=lambda row: row.right.value)
     return rows or Missing("not measured", "no bin of flow holds a window")
-
-
-def _figure(row: Mapping[str, Any] | None) -> Figure | None:
-    """None of a bin without windows."""
-    values = [None if row is None else row.get(key) for key in ("percent", "low", "high")]
-    return None if None in values else Figure(*map(float, values))
 
 
 def place(row: Bin) -> str:
@@ -141,8 +135,7 @@ def finding(rows: Sequence[Bin], every: Any, held: Any) -> str:
     away = [row for row in rows if not row.beside]
     if rows[0].beside and away:
         text += " It lies beside a border of the classes. " + _worst("Worst away from the borders: ", away[0])
-    if not isinstance(every, Missing):
-        share = Figure(*(float(every[key]) for key in ("percent", "low", "high")))
+    if not isinstance(every, Missing) and (share := share_in(every)):
         text += (
             f" Were every flow from 70 to 150{THIN}% as frequent: {quantity(share.value, '%', 1)} "
             f"({band(share.low, share.high, 1)})"

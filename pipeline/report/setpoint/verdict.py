@@ -341,14 +341,20 @@ def _does_no_harm(sources: Sources, board: Board | None) -> Pair:
     return held(board.learned()), held(board.baseline())
 
 
+def share_in(row: Mapping[str, Any] | None) -> Figure | None:
+    """A share with its interval as train_classifier.json gives it; None where it counts no window."""
+    ends = [None if row is None else row.get(key) for key in ("percent", "low", "high")]
+    if any(end is None for end in ends):
+        return None
+    value, low, high = (float(end) for end in ends if end is not None)
+    return Figure(value, low, high)
+
+
 def _right_by_flow(sources: Sources, limit: float) -> Pair:
     """Windows named rightly were every flow from 70 to 150 % as frequent; yardsticks are not judged so."""
     name, found = f"Right, 70–150{THIN}% of flow", lookup(sources.metrics["train_classifier"], "right_70_150")
-    figure = (
-        found
-        if isinstance(found, Missing)
-        else Figure(*(float(found[key]) for key in ("percent", "low", "high")))
-    )
+    share = found if isinstance(found, Missing) else share_in(found)
+    figure = share or Missing(OPEN, "no window lies between 70 and 150 % of flow")
     question = Question(0, "right_70_150", name, "%", limit, True, "")
     mine = Rule(
         name,
