@@ -14,7 +14,7 @@ from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, read_f
 from pipeline.setpoint.familiar import Camera
 from pipeline.setpoint.judging import Case, Choice, Judged
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
-from pipeline.setpoint.score import BEYOND, Outcomes, Score, summary
+from pipeline.setpoint.score import BEYOND, Outcomes, Score, harm_bar, summary
 from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Windows, rollout
 from pipeline.setpoint.window_flow import window_flow
 from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
@@ -47,11 +47,11 @@ def bars(settings: EvaluateSetpoint) -> dict[str, float]:
     """Percent of runs that may leave +-25 % by case: from good starts with the camera right, stuck or blind.
     A camera of another make, or with moved borders, is told and bars nobody: no rule can know better."""
     most = settings.most_harmed
-    return {
-        name: most.perfect_percent if name == "perfect" else most.in_band_percent
+    of_each = {
+        name: harm_bar(name, perfect=most.perfect_percent, in_band=most.in_band_percent)
         for name in judging.all_cases(1, segment_mean_decisions=1.0)
-        if name in ("perfect", "in band") or name.startswith(("in band, stuck", "in band, blind"))
     }
+    return {name: bar for name, bar in of_each.items() if bar is not None}
 
 
 def chosen(specs: Mapping[str, ControllerSpec], windows: WindowTable, settings: EvaluateSetpoint) -> Choice:
