@@ -5,6 +5,7 @@ and choice.json, the default with its worst case."""
 
 from pipeline.setpoint.workflow import contestants, evaluate_setpoint
 from pipeline.setpoint.workflow.agent_files import restore_agents
+from pipeline.setpoint.workflow.camera_files import restore_camera
 from pipeline.setpoint.workflow.classifier_files import restore_classifier
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.setpoint.workflow.tables import DECISIONS, PATHS, SCOREBOARD, WINDOWS
@@ -29,7 +30,8 @@ def main() -> None:
         choice = evaluate_setpoint.chosen(controllers, windows["choose"], settings)
         contest = evaluate_setpoint.contest(controllers, windows["judge"], settings, choice.name)
         choice = evaluate_setpoint.told(choice, contest)
-        rollouts = evaluate_setpoint.pixel_rollouts(controllers, choice, model, settings, view)
+        known = restore_camera("datasets/train_classifier/known_camera.parquet")
+        rollouts = evaluate_setpoint.pixel_rollouts(controllers, choice, model, settings, view, known)
         artifacts.write_table(
             out / "scoreboard.parquet",
             SCOREBOARD,

@@ -9,13 +9,15 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.setpoint import deployment, judging, pixels
+from pipeline.setpoint import deployment, familiar, judging, pixels
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, read_frames
+from pipeline.setpoint.familiar import Camera
 from pipeline.setpoint.judging import Case, Choice, Judged
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
 from pipeline.setpoint.score import BEYOND, Outcomes, Score, harm_bar, summary
 from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Windows, rollout
 from pipeline.setpoint.window_flow import window_flow
+from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
 from pipeline.setpoint.workflow.contestants import THROUGH_PIXELS, ControllerSpec
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.statistics import Share, shared_variance, wilson
@@ -279,12 +281,13 @@ def pixel_rollouts(
     model: CalibratedClassifier,
     settings: EvaluateSetpoint,
     view: TrainClassifier,
+    known: Camera | None,
 ) -> PixelRollouts:
     """The default, and our agent or the robust filter beside it, from some starts; and two
-    episodes in which something befalls the default."""
+    episodes in which something befalls the default. Windows that are not of the known camera are held."""
     names = dict.fromkeys((choice.name, *THROUGH_PIXELS))
     start, disturbances, words = _disturbed(settings)
-    at, loop = some_starts(settings), _loop(model, settings, view)
+    at, loop = some_starts(settings), _loop(model, settings, view, known)
     with tqdm(total=3, desc="evaluate_setpoint: through pixels", mininterval=2) as bar:
         calm = {}
         for name in list(names)[:2]:
@@ -316,7 +319,9 @@ def _through(
     )
 
 
-def _loop(model: CalibratedClassifier, settings: EvaluateSetpoint, view: TrainClassifier) -> pixels.Loop:
+def _loop(
+    model: CalibratedClassifier, settings: EvaluateSetpoint, view: TrainClassifier, known: Camera | None
+) -> pixels.Loop:
     """The loop as deployed, with limits of what one action and one minute may change."""
     q, fitted = settings.pixels, model.calibration
     return pixels.Loop(
@@ -341,6 +346,7 @@ def _loop(model: CalibratedClassifier, settings: EvaluateSetpoint, view: TrainCl
         tip_tolerance_px=q.tip_tolerance_px,
         segment_mean_s=q.segment_mean_s,
         window_flow=partial(window_flow, fitted=fitted.flow),
+        foreign=known and partial(familiar.foreign, known, false_alarms=FALSE_ALARMS),
     )
 
 
