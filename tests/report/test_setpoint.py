@@ -14,7 +14,7 @@ from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.shared.verdict import Figure, Question
 from pipeline.setpoint.simulator import reward
-from pipeline.setpoint.workflow.tables import PATHS
+from pipeline.setpoint.workflow.tables import PATHS, harm_bar
 from pipeline.store import artifacts, params
 from stages.report import main
 from tests.report import made_setpoint
@@ -230,6 +230,14 @@ def test_a_default_that_spoils_good_prints_fails_by_the_case_most_beyond_its_bar
         "First failed rule: does no harm. Best, by runs that settle and stay, is the agent: from good "
         "starts, perfect, 1.9 % of its runs leave ±25 %; at most 1 % may. Doing nothing spoils 0.0 %."
     ) in text
+
+
+def test_a_camera_of_another_make_bars_nobody_and_a_blind_one_does():
+    bars = {
+        case: harm_bar(case, perfect=1.0, in_band=2.0)
+        for case in ("perfect", "perfect, stuck 30", "in band", "in band, blind 30", "in band, borders 92 %")
+    }
+    assert list(bars.values()) == [1.0, None, 2.0, 2.0, None]
 
 
 def test_harm_that_may_be_chance_is_undecided_and_says_how_many_segments_would_tell(project):

@@ -174,7 +174,7 @@ def _chart(rows: Sequence[Bin]) -> Markup:
     rows = sorted(rows)
     x = charts.Axis(rows[0].low, rows[-1].high, tuple((v, f"{v:g}") for v in _ticks(rows)))
     y = charts.Axis(0, 104, tuple((float(v), str(v)) for v in (0, 25, 50, 75, 100)))
-    frame = charts.Frame(x, y, 568, 380, 34, 20, 22)
+    frame = charts.Frame(x, y, 568, 380, 42, 20, 24)
     layers = []
     for row in rows:
         a, b = (float(v) for v in frame.px([row.low, row.high]))

@@ -150,7 +150,7 @@ def _chart(board: Board, known: dict[str, Harm]) -> Markup:
     end = next((end for end in AXES if end >= most), AXES[-1])
     x = charts.Axis(0, end, tuple((float(v), f"{v:g}") for v in np.linspace(0, end, 6)))
     y = charts.Axis(-4, 104, tuple((float(v), str(v)) for v in (0, 25, 50, 75, 100)))
-    frame = charts.Frame(x, y, 568, 340, 34, 20, 22, right=12)
+    frame = charts.Frame(x, y, 568, 340, 42, 20, 24, right=12)
     allowed = max(harm.limit for harm in known.values())
     layers: list[Markup] = [charts.interval(frame, 0.0, allowed, "allow")]
     taken: list[tuple[float, float]] = []
