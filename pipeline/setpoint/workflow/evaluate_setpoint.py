@@ -18,7 +18,7 @@ from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Windows
 from pipeline.setpoint.window_flow import window_flow
 from pipeline.setpoint.workflow.contestants import THROUGH_PIXELS, ControllerSpec
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
-from pipeline.statistics import Share, shared_variance, wilson
+from pipeline.statistics import Mean, Share, shared_variance, wilson
 
 
 class PixelRollouts(NamedTuple):
@@ -34,10 +34,11 @@ class PixelRollouts(NamedTuple):
 
 
 class Contest(NamedTuple):
-    """Scores of every controller in every case, on segments that are read once, and of each how many redraws
-    of them its runs are on."""
+    """Scores of every controller in every case, on segments that are read once; its runs there, and of each
+    how many redraws of them these are on."""
 
     scores: dict[str, dict[str, Score]]
+    judged: dict[str, Judged]
     redraws: dict[str, int]
 
 
@@ -81,7 +82,7 @@ def contest(
     the others on those of one round."""
     rounds, asked = settings.rounds, _cases(settings)
     recorded = judging.redrawn(windows, rounds * settings.redraws, np.random.default_rng([settings.seed, 1]))
-    scores, of_each = {}, {name: rounds if name == default else 1 for name in specs}
+    scores, judged, of_each = {}, {}, {name: rounds if name == default else 1 for name in specs}
     with _bar("judge", sum(of_each.values()) * len(asked)) as bar:
         for name, spec in specs.items():
             outcomes: dict[str, Outcomes] = {}
@@ -90,7 +91,8 @@ def contest(
                 part = _of_round(recorded, number, settings.redraws)
                 outcomes = _with(outcomes, _asked(spec, asked, part, settings.redraws, key, bar))
             scores[name] = _summaries(outcomes, of_each[name] * settings.redraws)
-    return Contest(scores, {name: count * settings.redraws for name, count in of_each.items()})
+            judged[name] = _judged(outcomes, asked, of_each[name] * settings.redraws)
+    return Contest(scores, judged, {name: count * settings.redraws for name, count in of_each.items()})
 
 
 def _bar(words: str, total: int) -> tqdm:
@@ -153,21 +155,27 @@ def _judged(outcomes: Mapping[str, Outcomes], cases: Mapping[str, Case], redraws
 
 
 def told(choice: Choice, contest: Contest) -> Choice:
-    """The choice with its figures on the segments that are read once. Its sentence says what it was chosen
-    by, and then these."""
-    worst = {
-        name: min((score.stay.percent, case) for case, score in by_case.items() if judging.counts(case))
-        for name, by_case in contest.scores.items()
-    }
-    share, case = worst[choice.name]
+    """The choice with its figures on the segments that are read once; the margin there over the strongest
+    other, with its interval, is of the redraws that both ran on. Its sentence says what it was chosen by, and
+    then these."""
+    mine = contest.judged[choice.name]
+    case = judging.worst_case(mine)[1]
     stay = contest.scores[choice.name][case].stay
-    others = [worst[name][0] for name in worst if name != choice.name and name not in choice.refused]
-    margin = share - max(others) if others else float("nan")
+    others = [of for name, of in contest.judged.items() if name not in (choice.name, *choice.refused)]
+    nothing = Mean(*3 * (float("nan"),))
+    margin = judging.lead(mine, max(others, key=lambda of: judging.worst_case(of)[0])) if others else nothing
     sentence = (
-        f"{choice.sentence} On segments that it was not chosen on, {share:.1f} % ({stay.low:.1f} to "
+        f"{choice.sentence} On segments that it was not chosen on, {stay.percent:.1f} % ({stay.low:.1f} to "
         f"{stay.high:.1f}) of its runs settle and stay in its worst case ({case})."
     )
-    return choice._replace(worst=share, case=case, margin=margin, sentence=sentence)
+    return choice._replace(
+        worst=stay.percent,
+        case=case,
+        margin=margin.value,
+        margin_low=margin.low,
+        margin_high=margin.high,
+        sentence=sentence,
+    )
 
 
 def simulator(case: str) -> str:
