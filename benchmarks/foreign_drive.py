@@ -209,8 +209,9 @@ def judged(printer: Printer, section: TrainIlc, kind: str, index: int, plant: in
 
 
 class PartRow(NamedTuple):
-    """One part composed for one plant under the drive: the true error, its forecast, and the least reachable
-    one, in % of on-off control under the same drive; whether the command obeyed."""
+    """One part composed for one plant under the drive, in % of on-off control under the same drive: the true
+    error, its forecast with both ends, whether that was judged, and the least reachable error; whether the
+    command obeyed."""
 
     kind: str
     material: str
@@ -218,7 +219,10 @@ class PartRow(NamedTuple):
     part: str
     ramps: str
     true_percent: float
+    low_percent: float
     forecast_percent: float
+    high_percent: float
+    judged: bool
     reachable_percent: float
     ratio: float
     obeyed: bool
@@ -259,13 +263,17 @@ def _judged_part(
     first = obeyed(r / nominal.gain, drive, sample_time_s=Ts)
     true, on_off = (rms(r - flow(e, u, sample_time_s=Ts)) for u in (stream.u, first))
     least = min(true, rms(r - flow(free, best(e, r, drive, Ts, stream.u), sample_time_s=Ts)))
-    forecast = next(
-        one.rms_percent_of_on_off
-        for one in part.composed.predictions
-        if (one.tool, one.composer) == (stream.tool, stream.composer)
+    told = next(one for one in part.composed.predictions if one.chosen and one.tool == stream.tool)
+    percents = (100 * true / on_off, told.low, told.median, told.high, stream.judged.judged)
+    return PartRow(
+        *of, *percents, 100 * least / on_off, true / least, follows(stream.u, drive, sample_time_s=Ts)
     )
-    percents = (100 * true / on_off, float(forecast), 100 * least / on_off)
-    return PartRow(*of, *percents, true / least, follows(stream.u, drive, sample_time_s=Ts))
+
+
+def covered(rows: list[PartRow]) -> float | None:
+    """Share in % of the judged forecasts that hold the true error; None where none is judged."""
+    told = [row.low_percent <= row.true_percent <= row.high_percent for row in rows if row.judged]
+    return 100 * float(np.mean(told)) if told else None
 
 
 def part_summary(rows: list[PartRow]) -> dict:
@@ -280,6 +288,8 @@ def part_summary(rows: list[PartRow]) -> dict:
             "plants": len(some),
             "true_percent": float(np.median([row.true_percent for row in some])),
             "forecast_percent": float(np.median([row.forecast_percent for row in some])),
+            "judged_percent": 100 * float(np.mean([row.judged for row in some])),
+            "covered_percent": covered(some),
             "reachable_percent": float(np.median([row.reachable_percent for row in some])),
             "ratio_median": float(np.median([row.ratio for row in some])),
             "ratio_worst": float(np.max([row.ratio for row in some])),
