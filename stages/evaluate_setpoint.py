@@ -3,6 +3,8 @@ and datasets/train_agent; writes datasets/evaluate_setpoint: scoreboard.parquet,
 paths.parquet of one run from each start, decisions.parquet of two episodes through pixels,
 and choice.json, the default with its worst case."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 from pipeline.setpoint.workflow import contestants, evaluate_setpoint
 from pipeline.setpoint.workflow.agent_files import restore_agents
 from pipeline.setpoint.workflow.classifier_files import restore_classifier
@@ -27,19 +29,18 @@ def main() -> None:
             contestants.Problem(settings.baselines, agents, windows["learn"])
         )
         choice = evaluate_setpoint.chosen(controllers, windows["choose"], settings)
-        contest = evaluate_setpoint.contest(controllers, windows["judge"], settings, choice.name)
-        choice = evaluate_setpoint.told(choice, contest)
-        rollouts = evaluate_setpoint.pixel_rollouts(controllers, choice, model, settings, view)
+        with ThreadPoolExecutor(1) as beside:
+            through = beside.submit(
+                evaluate_setpoint.pixel_rollouts, controllers, choice, model, settings, view
+            )
+            contest = evaluate_setpoint.contest(controllers, windows["judge"], settings, choice.name)
+        rollouts, choice = through.result(), evaluate_setpoint.told(choice, contest)
         artifacts.write_table(
             out / "scoreboard.parquet",
             SCOREBOARD,
             evaluate_setpoint.scoreboard(controllers, contest, rollouts),
         )
-        artifacts.write_table(
-            out / "paths.parquet",
-            PATHS,
-            evaluate_setpoint.paths(controllers, windows["judge"], settings, rollouts),
-        )
+        artifacts.write_table(out / "paths.parquet", PATHS, evaluate_setpoint.paths(contest, rollouts))
         artifacts.write_table(
             out / "decisions.parquet", DECISIONS, evaluate_setpoint.decisions(choice.name, rollouts)
         )

@@ -220,14 +220,12 @@ def predict_shift(belief: jax.Array, move: jax.Array) -> jax.Array:
     what would leave the grid stays on its last point."""
     steps = jnp.floor(move / SPACING)
     fraction = move / SPACING - steps
-    source = jnp.arange(len(GRID)) - steps.astype(jnp.int32)
-
-    def at(index):
-        return jnp.where(
-            (index >= 0) & (index < len(GRID)), belief[..., jnp.clip(index, 0, len(GRID) - 1)], 0.0
-        )
-
-    moved = (1.0 - fraction) * at(source) + fraction * at(source - 1)
+    # one slice of the belief between zeros: looking up each point takes thrice as long
+    room = len(GRID) + 1
+    padded = jnp.pad(belief, [(0, 0)] * (belief.ndim - 1) + [(room + 1, room)])
+    first = room - jnp.clip(steps.astype(jnp.int32), -room, room)
+    came = jax.lax.dynamic_slice_in_dim(padded, first, len(GRID) + 1, axis=-1)
+    moved = (1.0 - fraction) * came[..., 1:] + fraction * came[..., :-1]
     last = jnp.arange(len(GRID)) == jnp.where(move > 0, len(GRID) - 1, 0)
     return moved + last * (belief.sum(axis=-1, keepdims=True) - moved.sum(axis=-1, keepdims=True))
 

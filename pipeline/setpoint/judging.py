@@ -225,9 +225,16 @@ def evaluate(
     return judge(trajectory.flow, trajectory.temperature)
 
 
-def ask(controller: Controller, parameters: Any, case: Case, recorded: Windows, keys: jax.Array) -> Outcomes:
-    """What becomes of the case's runs (n,) on each redraw of `recorded` (of `redrawn`), one key each (B,):
-    B n runs, block by block. The same key, the same chance for every controller."""
+class Runs(NamedTuple):
+    """Flow and temperature, (B, n, STEPS + 1) of n runs on each of B redraws; the start is the first."""
+
+    flow: np.ndarray
+    temperature: np.ndarray
+
+
+def runs(controller: Controller, parameters: Any, case: Case, recorded: Windows, keys: jax.Array) -> Runs:
+    """The case's runs (n,) on each redraw of `recorded` (of `redrawn`), one key each (B,). The same key, the
+    same chance for every controller."""
     camera, one = case.camera, jnp.ones_like(case.conditions.flow)
     conditions = case.conditions._replace(
         stuck_from=FAULT_STEP * one,
@@ -235,8 +242,24 @@ def ask(controller: Controller, parameters: Any, case: Case, recorded: Windows, 
         blind_from=FAULT_STEP * one,
         blind_for=camera.blind_for * one,
     )
-    flow, temperature = _asked(controller, parameters, shown_by(recorded, camera), conditions, keys)
-    return outcomes(*(np.asarray(a).reshape(-1, STEPS + 1) for a in (flow, temperature)))
+    found = _asked(controller, parameters, shown_by(recorded, camera), conditions, keys)
+    return Runs(*map(np.asarray, found))
+
+
+def become(of: Runs) -> Outcomes:
+    """What becomes of all runs, block by block (B n,)."""
+    return outcomes(*(a.reshape(-1, STEPS + 1) for a in of))
+
+
+def first_of_each(of: Runs) -> Runs:
+    """The first run (21, STEPS + 1) from each of the `starts`, on the first redraw."""
+    shape = len(START_FLOWS), -1, len(START_TEMPERATURES), STEPS + 1
+    return Runs(*(a[0].reshape(shape)[:, 0].reshape(STARTS, STEPS + 1) for a in of))
+
+
+def ask(controller: Controller, parameters: Any, case: Case, recorded: Windows, keys: jax.Array) -> Outcomes:
+    """What becomes of the case's `runs`."""
+    return become(runs(controller, parameters, case, recorded, keys))
 
 
 def _asked(controller: Controller, parameters, windows: Windows, conditions: Conditions, keys):

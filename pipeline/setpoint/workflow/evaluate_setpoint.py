@@ -1,9 +1,11 @@
 """What evaluate_setpoint does: every controller behind one interface, judged on both simulators and through
 pixels."""
 
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -11,10 +13,10 @@ from tqdm import tqdm
 
 from pipeline.setpoint import deployment, judging, pixels
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, read_frames
-from pipeline.setpoint.judging import Case, Choice, Judged
-from pipeline.setpoint.recorded import WindowTable, recorded_windows
+from pipeline.setpoint.judging import Case, Choice, Judged, Runs
+from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.score import BEYOND, Outcomes, Score, summary
-from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Windows, rollout
+from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, Windows
 from pipeline.setpoint.window_flow import window_flow
 from pipeline.setpoint.workflow.contestants import THROUGH_PIXELS, ControllerSpec
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
@@ -35,11 +37,17 @@ class PixelRollouts(NamedTuple):
 
 class Contest(NamedTuple):
     """Scores of every controller in every case, on segments that are read once; its runs there, and of each
-    how many redraws of them these are on."""
+    how many redraws of them these are on; by controller and case of PATHS_OF the first run from each start.
+    """
 
     scores: dict[str, dict[str, Score]]
     judged: dict[str, Judged]
     redraws: dict[str, int]
+    paths: dict[str, Mapping[str, Runs]]
+
+
+# the cases of which the page draws runs, and so many decisions of them
+PATHS_OF, PATH_STEPS = ("accuracy 0.7", "recorded, fresh"), 100
 
 
 def bars(settings: EvaluateSetpoint) -> dict[str, float]:
@@ -59,17 +67,17 @@ def chosen(specs: Mapping[str, ControllerSpec], windows: WindowTable, settings: 
     limits, rounds = bars(settings), settings.rounds
     asked = {name: case for name, case in _cases(settings).items() if not case.good or name in limits}
     recorded = judging.redrawn(windows, rounds * settings.redraws, np.random.default_rng([settings.seed, 0]))
-    outcomes: dict[str, dict[str, Outcomes]] = {name: {} for name in specs}
+    found: dict[str, dict[str, Outcomes]] = {name: {} for name in specs}
     left = list(specs)
     judged: dict[str, Judged] = {}
     for number in range(rounds):
         key = jax.random.fold_in(jax.random.key(settings.seed), number)
         part = _of_round(recorded, number, settings.redraws)
         with _bar(f"choose, round {number + 1}", len(left) * len(asked)) as bar:
-            for name in left:
-                now = _asked(specs[name], asked, part, settings.redraws, key, bar)
-                outcomes[name] = _with(outcomes[name], now)
-                judged[name] = _judged(outcomes[name], asked, (number + 1) * settings.redraws)
+            runs = partial(_asked, cases=asked, part=part, redraws=settings.redraws, key=key, bar=bar)
+            for name, now in _each(specs, left, lambda name, runs=runs: runs(specs[name])).items():
+                found[name] = _with(found[name], now.outcomes)
+                judged[name] = _judged(found[name], asked, (number + 1) * settings.redraws)
         if number + 1 < rounds:
             left = [name for name in judging.still_in(judged, limits) if name in left]
     return judging.choose(judged, simplest_first=list(specs), bars=limits)
@@ -82,17 +90,45 @@ def contest(
     the others on those of one round."""
     rounds, asked = settings.rounds, _cases(settings)
     recorded = judging.redrawn(windows, rounds * settings.redraws, np.random.default_rng([settings.seed, 1]))
-    scores, judged, of_each = {}, {}, {name: rounds if name == default else 1 for name in specs}
+    of_each = {name: rounds if name == default else 1 for name in specs}
+    parts = [_of_round(recorded, number, settings.redraws) for number in range(rounds)]
+
+    def runs(name: str) -> tuple[dict[str, Score], Judged, Mapping[str, Runs]]:
+        found: dict[str, Outcomes] = {}
+        paths: Mapping[str, Runs] = {}
+        for number in range(of_each[name]):
+            key = jax.random.fold_in(jax.random.key(settings.seed), rounds + number)
+            now = _asked(specs[name], asked, parts[number], settings.redraws, key, bar)
+            found, paths = _with(found, now.outcomes), paths or now.paths
+        redraws = of_each[name] * settings.redraws
+        return _summaries(found, redraws), _judged(found, asked, redraws), paths
+
     with _bar("judge", sum(of_each.values()) * len(asked)) as bar:
-        for name, spec in specs.items():
-            outcomes: dict[str, Outcomes] = {}
-            for number in range(of_each[name]):
-                key = jax.random.fold_in(jax.random.key(settings.seed), rounds + number)
-                part = _of_round(recorded, number, settings.redraws)
-                outcomes = _with(outcomes, _asked(spec, asked, part, settings.redraws, key, bar))
-            scores[name] = _summaries(outcomes, of_each[name] * settings.redraws)
-            judged[name] = _judged(outcomes, asked, of_each[name] * settings.redraws)
-    return Contest(scores, judged, {name: count * settings.redraws for name, count in of_each.items()})
+        done = _each(specs, list(specs), runs)
+    redraws = {name: count * settings.redraws for name, count in of_each.items()}
+    return Contest(
+        {name: scores for name, (scores, _, _) in done.items()},
+        {name: judged for name, (_, judged, _) in done.items()},
+        redraws,
+        {name: paths for name, (_, _, paths) in done.items()},
+    )
+
+
+T = TypeVar("T")
+
+
+def _each(
+    specs: Mapping[str, ControllerSpec], names: Sequence[str], work: Callable[[str], T]
+) -> dict[str, T]:
+    """work(name) of each contestant, on every core at once. Those of one controller follow each other, as
+    they share what is compiled; the elaborate ones begin. What comes out does not depend on the cores."""
+    alike: dict[Controller, list[str]] = {}
+    for name in names:
+        alike.setdefault(specs[name].controller, []).append(name)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        done = pool.map(lambda group: {name: work(name) for name in group}, [*alike.values()][::-1])
+        found = {name: one for group in done for name, one in group.items()}
+    return {name: found[name] for name in names}
 
 
 def _bar(words: str, total: int) -> tqdm:
@@ -125,16 +161,26 @@ def _of_round(recorded: Windows, number: int, redraws: int) -> Windows:
     return recorded._replace(table=jax.tree.map(lambda leaf: leaf[part], recorded.table))
 
 
+class Asked(NamedTuple):
+    """By case what became of one controller's runs; and the first of them from each start, of PATHS_OF."""
+
+    outcomes: dict[str, Outcomes]
+    paths: dict[str, Runs]
+
+
 def _asked(
     spec: ControllerSpec, cases: Mapping[str, Case], part: Windows, redraws: int, key: jax.Array, bar: tqdm
-) -> dict[str, Outcomes]:
+) -> Asked:
     """One controller's runs in all cases, on each redraw of a round."""
-    found = {}
+    found, paths = {}, {}
     for number, (name, case) in enumerate(cases.items()):
         keys = jax.random.split(jax.random.fold_in(key, number), redraws)
-        found[name] = judging.ask(spec.controller, spec.parameters, case, part, keys)
+        of = judging.runs(spec.controller, spec.parameters, case, part, keys)
+        found[name] = judging.become(of)
+        if name in PATHS_OF:
+            paths[name] = judging.first_of_each(of)
         bar.update()
-    return found
+    return Asked(found, paths)
 
 
 def _with(before: Mapping[str, Outcomes], now: Mapping[str, Outcomes]) -> dict[str, Outcomes]:
@@ -240,25 +286,13 @@ def _columns(rows: list[dict[str, Any]]) -> dict[str, list]:
     return {name: [row[name] for row in rows] for name in rows[0]}
 
 
-def paths(
-    specs: Mapping[str, ControllerSpec],
-    windows: WindowTable,
-    settings: EvaluateSetpoint,
-    rollouts: PixelRollouts,
-) -> dict[str, Any]:
+def paths(contest: Contest, rollouts: PixelRollouts) -> dict[str, Any]:
     """Columns of schema PATHS: one run from each of the 21 starts, at accuracy 0.7 on the paper's simulator
     and on fresh recorded windows, and those through pixels."""
     pieces = []
-    cases = judging.cases(
-        recorded_windows(windows), runs=1, segment_mean_decisions=settings.segment_mean_decisions
-    )
-    for case in ("accuracy 0.7", "recorded, fresh"):
-        source, conditions = cases[case]
-        for name, spec in specs.items():
-            trajectory = rollout(
-                spec.controller, spec.parameters, source, conditions, jax.random.key(settings.seed), steps=100
-            )
-            flow, temperature = np.asarray(trajectory.flow, float), np.asarray(trajectory.temperature, float)
+    for case in PATHS_OF:
+        for name, of in contest.paths.items():
+            flow, temperature = (np.asarray(a[:, : PATH_STEPS + 1], float) for a in of[case])
             pieces.append(((name, simulator(case), case), flow, temperature))
     for name, episodes in rollouts.calm.items():
         pieces.append(((name, "pixels", "calm"), episodes.flow, episodes.temperature))
