@@ -1,14 +1,13 @@
 """The closed loop through pixels: 21 starts x runs, published wait and window beside those derived from
 measurements, and what befalls camera and nozzle.
 
-`./run python -m benchmarks.setpoint_pixels [runs] [weights.npz]` prints the figures beside the bars and
-writes benchmarks/results/setpoint_pixels.json; 10 runs are the whole. The small vision transformer is trained
-here, or read from weights.npz (which is written where it does not exist). Nothing is fitted to the segments
-that the loop runs through: network, calibration, recorded windows and episodes have generators of their own.
+`./run python -m benchmarks.setpoint_pixels [runs]` prints the figures beside the bars and writes
+benchmarks/results/setpoint_pixels.json; 10 runs are the whole. The classifier is the one that
+datasets/train_classifier holds; make it with `./run dvc repro train_classifier`. Nothing was fitted to the
+segments that the loop runs through: recorded windows and episodes have generators of their own.
 """
 
 import functools
-import itertools
 import json
 import os
 import sys
@@ -31,12 +30,13 @@ from benchmarks.waits import (
 )
 from pipeline.setpoint import calibration, deployment, judging, nozzle_scene, pixels
 from pipeline.setpoint.baselines import Proportional, proportional
-from pipeline.setpoint.bayes import CameraErrorModel, bayes, robust_filter
-from pipeline.setpoint.classifier import Labelled, TrainingSettings, along_bead, predict, train, untrained
+from pipeline.setpoint.bayes import CameraErrorModel, bayes, watching_filter
+from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, read_frames
 from pipeline.setpoint.deployment import ACTS, Limits, Waits
 from pipeline.setpoint.pixels import Disturbances, Episodes, Loop, Machine, calm
 from pipeline.setpoint.recorded import WindowTable
-from pipeline.setpoint.vision_transformer import SMALL, from_named_arrays, named_arrays, vision_transformer
+from pipeline.setpoint.window_flow import WindowFlow, window_flow
+from pipeline.setpoint.workflow.classifier_files import restore_classifier
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint
 from pipeline.statistics import wilson
 from pipeline.store import params
@@ -52,101 +52,44 @@ EDGES = np.r_[20, 30, 40, 50, 60, np.arange(70, 130.1, 2.5), 150, 180, 220, 260,
 SECTION = params.load(EvaluateSetpoint, "evaluate_setpoint")
 ROBUST, TIP_TOLERANCE_PX = SECTION.baselines.bayes_robust, SECTION.pixels.tip_tolerance_px
 SEGMENTS = 24  # whose windows are recorded
-TRAINING = TrainingSettings(
-    cycle_epochs=25,
-    warmup_epochs=2,
-    batch=64,
-    learning_rate=1e-3,
-    weight_decay=0.01,
-    smoothing=0.0,
-    averaging=0.99,
-    patience=25,
-)
+STORED = [f"datasets/train_classifier/{name}" for name in ("weights.safetensors", "calibration.parquet")]
 
 
-class CameraModel(NamedTuple):
-    """A calibrated classifier: classify(images, temperature) ->
-    probabilities, scores; the rest as in calibration."""
+class HeldOut(NamedTuple):
+    """The classifier on frames of new segments: the share of images that it names rightly, and rho (LONGEST,)
+    of its errors."""
 
-    classify: object
-    correlation: float
-    level: float
-    foreign_above: float
-    rho: np.ndarray
     image_accuracy: float
+    rho: np.ndarray
 
 
-def scenes(seed: int, segments: int, frames: int) -> tuple[Labelled, np.ndarray]:
-    """Key areas of rendered scenes, and which are valid."""
-    d = nozzle_scene.data_set(
-        np.random.default_rng(seed), segments=segments, frames=frames, least_score=LEAST_SCORE
-    )
-    return Labelled(d.images, d.temperature.astype(np.float32), d.label, d.segment + 100_000 * seed), d.valid
+def held_out(model: CalibratedClassifier, segments: int = 180) -> HeldOut:
+    """As `HeldOut` has it, on segments with the flows that it was calibrated with."""
+    rng = np.random.default_rng(3)
+    temperature = np.resize(nozzle_scene.TEMPERATURES, segments)
+    flow = nozzle_scene.draw_flow(rng, segments)
+    made = nozzle_scene.filmed(rng, flow, temperature, frames=LONGEST, least_score=LEAST_SCORE)
+    prob = read_frames(model, made.images, made.temperature).prob
+    wrong = np.where(made.valid, 1 - prob[np.arange(len(prob)), made.label], np.nan)
+    right = float(np.mean((prob.argmax(axis=1) == made.label)[made.valid]))
+    return HeldOut(right, autocorrelation(wrong.reshape(-1, LONGEST), longest=LONGEST))
 
 
-def camera_model(weights: Path | None) -> CameraModel:
-    """The small vision transformer, trained or read, and calibrated on segments that it never saw."""
-    learned, learned_valid = scenes(1, 30, 10)
-    network = vision_transformer(SMALL, np.random.default_rng(0))
-    if weights and weights.exists():
-        network = from_named_arrays(network, dict(np.load(weights)))
-    else:
-        held, held_valid = scenes(2, 4, 20)
-        network = train(
-            untrained(network, epochs=25),
-            learned.take(np.flatnonzero(learned_valid)),
-            held.take(np.flatnonzero(held_valid)),
-            TRAINING,
-            key=jax.random.key(0),
-            augment=along_bead,
-        ).best
-        if weights:
-            np.savez(weights, **named_arrays(network))
-    familiar = calibration.fit_familiar(
-        predict(network, learned.key_area[learned_valid], learned.temperature_degC[learned_valid]).features,
-        learned.label[learned_valid],
-    )
-    held, valid = scenes(3, 12, LONGEST)
-    prediction = predict(network, held.key_area, held.temperature_degC)
-    T = calibration.fit_temperature(prediction.logits[valid], held.label[valid])
-    log_p, shape = calibration.log_probabilities(prediction.logits, T), (-1, LONGEST)
-    label, windows = held.label.reshape(shape)[:, 0], log_p.reshape(*shape, 3)
-    correlation = calibration.fit_correlation(windows, valid.reshape(shape), label)
-    p = calibration.window_probabilities(windows, valid.reshape(shape), correlation)
-    level = calibration.conformal_level(
-        p, label, held.segment.reshape(shape)[:, 0], coverage=0.9, confidence=0.5
-    )
-    foreign_above = calibration.foreign_above(
-        calibration.mahalanobis(familiar, prediction.features[valid]), false_alarms=0.02
-    )
-    errors = np.where(valid, 1 - np.exp(log_p[np.arange(len(log_p)), held.label]), np.nan).reshape(shape)
-
-    def classify(images, temperature):
-        prediction = predict(network, images, temperature)
-        return np.exp(calibration.log_probabilities(prediction.logits, T)), calibration.mahalanobis(
-            familiar, prediction.features
-        )
-
-    right = float(np.mean((log_p.argmax(axis=1) == held.label)[valid]))
-    rho = autocorrelation(errors, longest=LONGEST)
-    return CameraModel(classify, correlation, level, foreign_above, rho, right)
-
-
-def recorded(camera: CameraModel, frames: int, segments: int) -> WindowTable:
+def recorded(model: CalibratedClassifier, frames: int, segments: int) -> WindowTable:
     """Windows of segments, each at every bin of the flow."""
-    rng, rows = np.random.default_rng(4), []
-    for s in range(segments):
-        segment = nozzle_scene.draw_segment(rng)
-        for low, high in itertools.pairwise(EDGES):
-            flow, temperature = rng.uniform(low, high), rng.uniform(200, 220)
-            made = nozzle_scene.render(segment, np.full(frames, flow), np.full(frames, temperature), rng)
-            areas = nozzle_scene.key_areas(made, least_score=LEAST_SCORE)
-            p, score = camera.classify(areas.images, made.temperature)
-            rows.append(
-                (np.log(np.clip(p, 1e-6, 1.0)), areas.valid & (score <= camera.foreign_above), flow, s)
-            )
-    log_p, valid, flow, segment = (np.array(column) for column in zip(*rows, strict=True))
-    return calibration.recorded(log_p, valid, flow, segment, correlation=camera.correlation, flow_edges=EDGES)
+    rng, fitted, flows, seen = np.random.default_rng(4), model.calibration, [], []
+    for _ in range(segments):
+        segment, degrees = nozzle_scene.draw_segment(rng), rng.choice(nozzle_scene.TEMPERATURES)
+        flow = rng.uniform(EDGES[:-1], EDGES[1:])
+        made = nozzle_scene.render(segment, np.repeat(flow, frames), degrees, rng)
+        areas = nozzle_scene.key_areas(made, least_score=LEAST_SCORE)
+        read = read_frames(model, areas.images, made.temperature)
+        rows = read.log_flow, read.deviation, areas.valid & (read.distance <= fitted.foreign_above)
+        seen.append(window_flow(*(a.reshape(-1, frames) for a in rows), fitted.flow))
+        flows.append(flow)
+    windows = WindowFlow(*(np.concatenate(columns) for columns in zip(*seen, strict=True)))
+    number = np.repeat(np.arange(segments), len(EDGES) - 1)
+    return calibration.recorded(windows, np.concatenate(flows), number, flow_edges=EDGES)
 
 
 def measured_waits(rng: np.random.Generator) -> tuple[Waits, dict]:
@@ -232,30 +175,31 @@ def bursts(n: int) -> dict[str, Disturbances]:
     }
 
 
-def main(runs: int, weights: Path | None) -> None:
+def main(runs: int) -> None:
     cv2.setNumThreads(1)
-    camera = camera_model(weights)
+    model = restore_classifier(*STORED)
+    fitted, new = model.calibration, held_out(model)
     waits, measured = measured_waits(np.random.default_rng(5))
-    frames = window_frames(camera.rho, wait_s=waits.flow_s, frame_rate_hz=RATE_HZ)
-    effective = effective_frames(camera.rho)
+    frames = window_frames(new.rho, wait_s=waits.flow_s, frame_rate_hz=RATE_HZ)
+    effective = effective_frames(new.rho)
     report = {
         "command": f"./run python -m benchmarks.setpoint_pixels {runs}", "machine": {"cores": os.cpu_count()},
         "bar": "21 starts x 10: >= 95 % settled",
-        "image_accuracy": round(camera.image_accuracy, 3),
+        "image_accuracy": round(new.image_accuracy, 3),
         "measured_waits_s": {k: round(v, 2) for k, v in measured.items()}, "window_frames": frames,
         "effective_frames": {str(frames): round(float(effective[frames - 1]), 2),
         "20": round(float(effective[19]), 2)}, "segment_s": SEGMENT_S, "cases": {},
     }  # fmt: skip
     print(json.dumps(report), flush=True)
-    table = recorded(camera, frames, SEGMENTS)
+    table = recorded(model, frames, SEGMENTS)
     judge = functools.partial(
-        deployment.judge_window, least_frames=max(2, round(0.4 * frames)), correlation=camera.correlation,
-        foreign_above=camera.foreign_above,
-        conformal_level=camera.level,
+        deployment.judge_window, least_frames=max(2, round(0.4 * frames)), correlation=fitted.correlation,
+        foreign_above=fitted.foreign_above,
+        conformal_level=fitted.level,
     )  # fmt: skip
     published = Loop(
         machine=MACHINE,
-        classify=camera.classify,
+        classify=functools.partial(read_frames, model),
         frames=frames,
         frame_rate_hz=RATE_HZ,
         waits=Waits(6.0, 6.0, 6.0),
@@ -264,13 +208,14 @@ def main(runs: int, weights: Path | None) -> None:
         least_score=LEAST_SCORE,
         tip_tolerance_px=TIP_TOLERANCE_PX,
         segment_mean_s=SEGMENT_S,
+        window_flow=functools.partial(window_flow, fitted=fitted.flow),
     )
     starts = np.array([[f, t] for f in judging.START_FLOWS for t in judging.START_TEMPERATURES])
 
     def robust(loop):
         decisions = max(SEGMENT_S / (loop.waits.flow_s + frames / RATE_HZ), 1.2)
         model = CameraErrorModel(**ROBUST.model_dump() | {"segment_mean_decisions": decisions})
-        return bayes(ROBUST.hypotheses()), robust_filter(table, model)
+        return bayes(ROBUST.hypotheses()), watching_filter(table, model)
 
     def case(name, controller, loop, disturbances, decisions, judged):
         began, n = time.process_time(), len(disturbances.clog)
@@ -290,12 +235,13 @@ def main(runs: int, weights: Path | None) -> None:
         RESULTS.write_text(json.dumps(report, indent=2) + "\n")
 
     derived, n, few = published._replace(waits=waits), 21 * runs, 21 * max(1, runs // 5)
+    filtered = robust(published)
     clog = calm(few)._replace(clog=np.full(few, 0.6), clog_at=np.full(few, 60))
-    case("Bayes, robust, wait 6 s", robust(published), published, calm(n), 100, summary)
+    case("Bayes, robust, wait 6 s", filtered, published, calm(n), 100, summary)
     case("Bayes, robust, derived wait", robust(derived), derived, calm(n), 100, summary)
     for name, disturbances in bursts(21).items():
-        case(name, robust(published), published, disturbances, 20, held_after)
-    case("Bayes, robust, clog x 0.6 at 60 of 120", robust(published), published, clog, 120, summary)
+        case(name, filtered, published, disturbances, 20, held_after)
+    case("Bayes, robust, clog x 0.6 at 60 of 120", filtered, published, clog, 120, summary)
     case(
         "filtered proportional, wait 6 s",
         (proportional(), Proportional(gain=11.4, time_constant=11.2)),
@@ -307,4 +253,4 @@ def main(runs: int, weights: Path | None) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10, Path(sys.argv[2]) if len(sys.argv) > 2 else None)
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10)

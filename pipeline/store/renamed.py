@@ -42,6 +42,8 @@ PARAMETERS: dict[str, str] = {
     "train_agent.paper": "train_agent.li_2025",
     "train_classifier.frames": "render_frames.frames",
     "train_classifier.recorded": "render_frames.sweeps",
+    "train_classifier.recorded.judge_windows": "render_frames.sweep_windows.judge",
+    "train_classifier.recorded.learn_windows": "render_frames.sweep_windows.learn",
     "train_classifier.segments": "render_frames.segments",
     "train_ilc.law": "train_ilc.model_inverse",
     "train_ilc.paper": "train_ilc.hoelzle_2009",

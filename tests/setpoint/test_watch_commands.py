@@ -1,6 +1,8 @@
 """`beadline shadow` and `beadline record-levels` as a person types them, on what the stages leave behind."""
 
+import contextlib
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -53,9 +55,24 @@ def command(tmp_path, monkeypatch, capfd):
     return run
 
 
-@pytest.fixture
-def trained(command):
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
     """A classifier that has learned nothing, made-up windows, agents that have learned nothing."""
+    place = tmp_path_factory.mktemp("made")
+    for name in (params.FILE, params.EXPERT):
+        shutil.copy(ROOT / name, place)
+    with contextlib.chdir(place):
+        make()
+    return place / "datasets"
+
+
+@pytest.fixture
+def trained(command, made) -> None:
+    """What the stages leave behind, to be spoiled."""
+    shutil.copytree(made, "datasets")
+
+
+def make() -> None:
     folder = Path("datasets/train_classifier")
     network = vision_transformer(SMALL, np.random.default_rng(0))
     bands = calibration.appearance(np.zeros((1, 16, 48), np.uint8)).shape[1]

@@ -22,7 +22,7 @@ from pipeline.setpoint.window_flow import window_flow
 from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
 from pipeline.setpoint.workflow.contestants import THROUGH_PIXELS, ControllerSpec
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
-from pipeline.statistics import Share, shared_variance, wilson
+from pipeline.statistics import Mean, Share, shared_variance, wilson
 
 
 class PixelRollouts(NamedTuple):
@@ -38,11 +38,12 @@ class PixelRollouts(NamedTuple):
 
 
 class Contest(NamedTuple):
-    """Scores of every controller in every case, on segments that are read once, and of each how many redraws
-    of them its runs are on; by controller and case of PATHS_OF the first
-    run from each start."""
+    """Scores of every controller in every case, on segments that are read once; its runs there, and of each
+    how many redraws of them these are on; by controller and case of PATHS_OF the first run from each start.
+    """
 
     scores: dict[str, dict[str, Score]]
+    judged: dict[str, Judged]
     redraws: dict[str, int]
     paths: dict[str, Mapping[str, Runs]]
 
@@ -94,22 +95,24 @@ def contest(
     of_each = {name: rounds if name == default else 1 for name in specs}
     parts = [_of_round(recorded, number, settings.redraws) for number in range(rounds)]
 
-    def runs(name: str) -> tuple[dict[str, Score], Mapping[str, Runs]]:
+    def runs(name: str) -> tuple[dict[str, Score], Judged, Mapping[str, Runs]]:
         found: dict[str, Outcomes] = {}
         paths: Mapping[str, Runs] = {}
         for number in range(of_each[name]):
             key = jax.random.fold_in(jax.random.key(settings.seed), rounds + number)
             now = _asked(specs[name], asked, parts[number], settings.redraws, key, bar)
             found, paths = _with(found, now.outcomes), paths or now.paths
-        return _summaries(found, of_each[name] * settings.redraws), paths
+        redraws = of_each[name] * settings.redraws
+        return _summaries(found, redraws), _judged(found, asked, redraws), paths
 
     with _bar("judge", sum(of_each.values()) * len(asked)) as bar:
         done = _each(specs, list(specs), runs)
     redraws = {name: count * settings.redraws for name, count in of_each.items()}
     return Contest(
-        {name: scores for name, (scores, _) in done.items()},
+        {name: scores for name, (scores, _, _) in done.items()},
+        {name: judged for name, (_, judged, _) in done.items()},
         redraws,
-        {name: paths for name, (_, paths) in done.items()},
+        {name: paths for name, (_, _, paths) in done.items()},
     )
 
 
@@ -200,21 +203,27 @@ def _judged(outcomes: Mapping[str, Outcomes], cases: Mapping[str, Case], redraws
 
 
 def told(choice: Choice, contest: Contest) -> Choice:
-    """The choice with its figures on the segments that are read once. Its sentence says what it was chosen
-    by, and then these."""
-    worst = {
-        name: min((score.stay.percent, case) for case, score in by_case.items() if judging.counts(case))
-        for name, by_case in contest.scores.items()
-    }
-    share, case = worst[choice.name]
+    """The choice with its figures on the segments that are read once; the margin there over the strongest
+    other, with its interval, is of the redraws that both ran on. Its sentence says what it was chosen by, and
+    then these."""
+    mine = contest.judged[choice.name]
+    case = judging.worst_case(mine)[1]
     stay = contest.scores[choice.name][case].stay
-    others = [worst[name][0] for name in worst if name != choice.name and name not in choice.refused]
-    margin = share - max(others) if others else float("nan")
+    others = [of for name, of in contest.judged.items() if name not in (choice.name, *choice.refused)]
+    nothing = Mean(*3 * (float("nan"),))
+    margin = judging.lead(mine, max(others, key=lambda of: judging.worst_case(of)[0])) if others else nothing
     sentence = (
-        f"{choice.sentence} On segments that it was not chosen on, {share:.1f} % ({stay.low:.1f} to "
+        f"{choice.sentence} On segments that it was not chosen on, {stay.percent:.1f} % ({stay.low:.1f} to "
         f"{stay.high:.1f}) of its runs settle and stay in its worst case ({case})."
     )
-    return choice._replace(worst=share, case=case, margin=margin, sentence=sentence)
+    return choice._replace(
+        worst=stay.percent,
+        case=case,
+        margin=margin.value,
+        margin_low=margin.low,
+        margin_high=margin.high,
+        sentence=sentence,
+    )
 
 
 def simulator(case: str) -> str:
