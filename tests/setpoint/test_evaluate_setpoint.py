@@ -75,20 +75,50 @@ def check_margin(told, contest):
     assert told.margin_low <= told.margin <= told.margin_high
 
 
+def test_the_number_of_cores_changes_nothing_and_the_runs_drawn_are_among_those_judged(settings, monkeypatch):
+    specs = controllers(
+        Problem(settings.baselines, agents=None, windows=None),
+        [line for line in CONTESTANTS if line.name in SIMPLE],
+    )
+    table = synthetic_table(np.random.default_rng(2), segments=6, windows=2)
+    several = settings.model_copy(update={"runs": 2, "redraws": 2, "rounds": 1})
+    contests = []
+    for cores in (1, 3):
+        monkeypatch.setattr(evaluate_setpoint.os, "cpu_count", lambda cores=cores: cores)
+        contests.append(evaluate_setpoint.contest(specs, table, several, "do nothing"))
+    one, three = contests
+    assert list(one.scores) == list(three.scores) == list(specs)
+    rows = [evaluate_setpoint.scoreboard(specs, contest, NO_PIXELS) for contest in contests]
+    np.testing.assert_equal(*rows)
+    columns = evaluate_setpoint.paths(one, NO_PIXELS)
+    np.testing.assert_equal(columns, evaluate_setpoint.paths(three, NO_PIXELS))
+    assert len(columns["flow_percent"]) == len(SIMPLE) * 2 * 21 * 101
+    for name in SIMPLE:
+        drawn = one.paths[name]["accuracy 0.7"]
+        assert set(drawn.flow[:, 0]) == set(judging.START_FLOWS)
+        starts = judging.starts(1, accuracy=0.7)
+        np.testing.assert_array_equal(drawn.flow[:, 0], starts.flow)
+        np.testing.assert_array_equal(drawn.temperature[:, 0], starts.temperature)
+    assert (np.ptp(one.paths["do nothing"]["recorded, fresh"].flow, axis=1) < 1e-3).all()
+    assert np.ptp(one.paths["sequential test"]["recorded, fresh"].flow, axis=1).max() > 50
+
+
 def test_who_cannot_win_any_more_runs_in_one_round_only(settings, monkeypatch):
     """Runs are made up: of 21 from wrong starts, so many are kept."""
     kept = {"do nothing": 0, "slow": 5, "good": 20, "better": 21}
     specs = {name: ControllerSpec("baseline", baselines.nothing(), name) for name in kept}
     asked = collections.Counter()
 
-    def ask(controller, name, case, part, keys):
+    def runs(controller, name, case, part, keys):
         asked[name] += 1
         n = 21 * len(keys)
         stay = np.tile(np.arange(21) < kept[name], len(keys))
         empty = dict.fromkeys(Outcomes._fields, np.zeros(n))
         return Outcomes(**empty | {"stay": stay, "beyond": np.zeros((n, 3), bool)})
 
-    monkeypatch.setattr(judging, "ask", ask)
+    monkeypatch.setattr(judging, "runs", runs)
+    for made_of_runs in ("become", "first_of_each"):
+        monkeypatch.setattr(judging, made_of_runs, lambda of: of)
     table = synthetic_table(np.random.default_rng(1), segments=2, windows=1)
     longer = settings.model_copy(update={"redraws": 8, "rounds": 3})
     choice = evaluate_setpoint.chosen(specs, table, longer)

@@ -288,7 +288,7 @@ def _columns(rows: list[dict[str, Any]]) -> dict[str, list]:
 
 def paths(contest: Contest, rollouts: PixelRollouts) -> dict[str, Any]:
     """Columns of schema PATHS: one run from each of the 21 starts, at accuracy 0.7 on the paper's simulator
-    and on fresh recorded windows, and those through pixels."""
+    and on fresh recorded windows, of those judged; and those through pixels."""
     pieces = []
     for case in PATHS_OF:
         for name, of in contest.paths.items():
