@@ -233,12 +233,14 @@ def record_levels(arguments: argparse.Namespace) -> None:
     from pipeline.setpoint.window_flow import window_flow
     from pipeline.setpoint.workflow import record_levels as levels
     from pipeline.setpoint.workflow.frame_folder import read_options
+    from pipeline.setpoint.workflow.settings import SetpointMaterial
     from pipeline.setpoint.workflow.shadow import deploy
     from pipeline.setpoint.workflow.training_print import numbers
     from pipeline.setpoint.workflow.watch_sources import Recording
 
     eye = deploy.trained()
     options, fitted = read_options(eye.view), eye.model.calibration
+    material = params.load(SetpointMaterial, "setpoint_material").material()
     protocol = levels.Protocol(
         numbers(arguments.flows, "--flows"),
         deploy.bounded("--hold", arguments.hold),
@@ -250,10 +252,10 @@ def record_levels(arguments: argparse.Namespace) -> None:
     source = levels.source_of(place, lambda path: Recording(path, options.topics))
     levels_eye = levels.Eye(
         partial(read_frames, eye.model), partial(window_flow, fitted=fitted.flow), eye.view.window,
-        eye.view.least_score, eye.digest, eye.view.false_alarms,
+        eye.view.least_score, eye.digest, eye.view.false_alarms, material,
     )  # fmt: skip
     recorded, told = levels.record(source, protocol, levels_eye, place=str(place))
-    print(levels.write(recorded, told, arguments.out, str(place)))
+    print(levels.write(recorded, told, arguments.out, str(place), material))
 
 
 def training_print(arguments: argparse.Namespace) -> None:

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from pipeline.setpoint.workflow import contestants, evaluate_setpoint
 from pipeline.setpoint.workflow.agent_files import restore_agents
+from pipeline.setpoint.workflow.camera_files import restore_camera
 from pipeline.setpoint.workflow.classifier_files import restore_classifier
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.setpoint.workflow.tables import DECISIONS, PATHS, SCOREBOARD, WINDOWS
@@ -29,9 +30,10 @@ def main() -> None:
             contestants.Problem(settings.baselines, agents, windows["learn"])
         )
         choice = evaluate_setpoint.chosen(controllers, windows["choose"], settings)
+        known = restore_camera("datasets/train_classifier/known_camera.parquet")
         with ThreadPoolExecutor(1) as beside:
             through = beside.submit(
-                evaluate_setpoint.pixel_rollouts, controllers, choice, model, settings, view
+                evaluate_setpoint.pixel_rollouts, controllers, choice, model, settings, view, known
             )
             contest = evaluate_setpoint.contest(controllers, windows["judge"], settings, choice.name)
         rollouts, choice = through.result(), evaluate_setpoint.told(choice, contest)

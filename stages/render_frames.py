@@ -2,7 +2,7 @@
 datasets/render_frames/<part>.safetensors, frames.json with how many, and known_camera.parquet; no part where
 the frames are recordings. A classifier that is trained anew renders nothing anew."""
 
-from pipeline.setpoint.workflow import known_camera, render_frames
+from pipeline.setpoint.workflow import camera_files, known_camera, render_frames
 from pipeline.setpoint.workflow.settings import RenderFrames
 from pipeline.store import artifacts, params
 
@@ -15,8 +15,9 @@ def main() -> None:
         by_part = render_frames.rendered(settings, execution) if source == "simulated" else {}
         render_frames.store_frames(out, by_part)
         artifacts.write_json(out / "frames.json", render_frames.counts(by_part))
-        camera = known_camera.drawn(settings, execution) if source == "simulated" else None
-        known_camera.store_camera(out / known_camera.FILE, camera)
+        if source == "simulated":
+            camera = known_camera.drawn(settings, execution)
+            camera_files.store_camera(out / camera_files.FILE, camera)
 
 
 if __name__ == "__main__":

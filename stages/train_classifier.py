@@ -5,7 +5,7 @@ the simulator, frames for the page, and known_camera.parquet, by which frames of
 
 from pathlib import Path
 
-from pipeline.setpoint.workflow import gallery, known_camera, parts, train_classifier
+from pipeline.setpoint.workflow import camera_files, gallery, known_camera, parts, train_classifier
 from pipeline.setpoint.workflow.classifier_files import store_classifier
 from pipeline.setpoint.workflow.settings import SetpointMaterial, TrainClassifier
 from pipeline.setpoint.workflow.tables import CLASSIFIED, CLASSIFIER_CURVE, RELIABILITY, WINDOWS
@@ -50,7 +50,7 @@ def main() -> None:
             gallery.write_frames(settings, material, judged.model, found.recorded, prints, out / "frames"),
         )
         camera = known_camera.known(Path("datasets/render_frames"), found.recorded, length=settings.window)
-        known_camera.store_camera(out / known_camera.FILE, camera)
+        camera_files.store_camera(out / camera_files.FILE, camera)
         artifacts.write_metrics(
             "train_classifier", train_classifier.metrics(settings, judged, networks, found.read)
         )

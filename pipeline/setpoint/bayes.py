@@ -25,7 +25,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.special
 
 from pipeline.setpoint.baselines import temperature_move
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, FLOW_MOVES
@@ -64,7 +63,7 @@ class Filter(NamedTuple):
     (H,): that a window shows what the one before did where the flow setpoint stood. hazard: probability a
     decision that the flow jumps. Costs in percent of flow error: move_cost by percent of move, outside_cost
     of a miss beyond 10 %, a border that is known to within border_std percent, move_fixed_cost of any
-    correction. prior (N,) is the belief about the flow at the start.
+    correction. prior (H, N) is the belief at the start.
 
     usual_surprise, unlikely_limit and likely_limit are of `surprise_update`: what its own table makes the
     filter wonder, and from where on the camera is another.
@@ -136,8 +135,7 @@ def _filtered(
     parameters: Filter, state: FilterState, observation: Observation
 ) -> tuple[FilterState, jax.Array]:
     """The state with the new belief, and how much the window surprises, NaN where that does not count."""
-    H = len(parameters.gains)
-    belief = jnp.where(state.windows == 0, jnp.tile(parameters.prior / H, (H, 1)), state.belief)
+    belief = jnp.where(state.windows == 0, parameters.prior, state.belief)
     moved = jax.vmap(predict_shift)(belief, parameters.gains * observation.flow_move)
     jumped = (parameters.after_jump.T @ belief.sum(axis=1))[:, None] * jnp.asarray(PRIOR, jnp.float32)
     predicted = parameters.transition.T @ ((1.0 - parameters.hazard) * moved + parameters.hazard * jumped)
@@ -274,18 +272,32 @@ def _paper_levels() -> np.ndarray:
     return 0.99 * frequency + 0.01 / LEVELS
 
 
+TAIL = 4.0  # degrees of freedom: a segment far from all others is rare, not impossible
+
+
+def bias_levels(levels: int) -> tuple[np.ndarray, np.ndarray]:
+    """z (levels,), the biases that a segment may have, in deviations and evenly over +-3 of them, and their
+    weights (levels,), sum 1, of Student's t with TAIL degrees of freedom.
+
+    What no level reaches is taken for another flow, and corrected: of rendered segments one in twenty lies
+    beyond two deviations.
+    """
+    z = np.linspace(-3.0, 3.0, levels) if levels > 1 else np.zeros(1)
+    weight = (1.0 + z**2 / TAIL) ** (-(TAIL + 1.0) / 2.0)
+    return z, weight / weight.sum()
+
+
 def recorded_evidence(
     table: WindowTable, *, width_bias_std: float, width_bias_levels: int, floor: float, smoothing: float
 ) -> np.ndarray:
     """(width_bias_levels, CODES, N): how likely each code is by flow, under hypothesis j as if the flow were
-    q exp(width_bias_std z_j), z_j the middles of width_bias_levels equal parts of N(0, 1). Codes of classes
-    and codes of flows have sum 1 each.
+    q exp(width_bias_std z_j), z_j of `bias_levels`. Codes of classes and codes of flows have sum 1 each.
 
     width_bias_std: relative width that a segment adds to its beads, one deviation, which a table that shows
     flows corrects by its own segments; floor: share of windows that may show anything; smoothing over flow in
     percent, one deviation, at least half a bin.
     """
-    z = scipy.special.ndtri((np.arange(width_bias_levels) + 0.5) / width_bias_levels)
+    z, _ = bias_levels(width_bias_levels)
     by_class = _class_frequencies(table, GRID * np.exp(width_bias_std * z)[:, None], smoothing)
     by_flow = np.full((width_bias_levels, len(GRID), FLOW_CODES), 1 / FLOW_CODES)
     if with_flows(table):
@@ -391,6 +403,7 @@ def robust_filter(table: WindowTable, model: CameraErrorModel) -> Filter:
     )
     anywhere, gains = len(model.accuracies), model.gains
     evidence = np.concatenate([*(class_evidence(accuracy) for accuracy in model.accuracies), recorded])
+    prior = _prior(model.known_start_share, model.known_start_std)
     transition = np.kron(np.eye(len(gains)), _mode_transition(model))
     after_jump = np.kron(np.full((len(gains), len(gains)), 1 / len(gains)), np.eye(len(evidence)))
     repeats = np.repeat([0.0, model.window_repeat_probability], [anywhere, model.width_bias_levels])
@@ -404,7 +417,7 @@ def robust_filter(table: WindowTable, model: CameraErrorModel) -> Filter:
         model.move_cost,
         model.outside_cost,
         model.move_fixed_cost,
-        jnp.asarray(_prior(model.known_start_share, model.known_start_std)),
+        jnp.asarray(np.tile(_ways(model), len(gains))[:, None] / len(gains) * prior, jnp.float32),
         model.border_std,
     )
 
@@ -507,14 +520,21 @@ def _mode_transition(model: CameraErrorModel) -> np.ndarray:
     them alike; a width bias lasts segment_mean_decisions."""
     anywhere, levels = len(model.accuracies), model.width_bias_levels
     segment, switch = model.segment_mean_decisions, model.mode_switch_probability
-    ways = anywhere + 1
-    transition = np.full((anywhere + levels, anywhere + levels), switch / ways)
-    transition[:, anywhere:] /= levels
+    _, weight = bias_levels(levels)
+    to = np.concatenate([np.ones(anywhere), weight]) / (anywhere + 1)
+    transition = np.tile(switch * to, (anywhere + levels, 1))
     transition[:anywhere, :anywhere] += (1.0 - switch) * np.eye(anywhere)
     transition[anywhere:, anywhere:] += (1.0 - switch) * (
-        (1.0 - 1.0 / segment) * np.eye(levels) + 1.0 / segment / levels
+        (1.0 - 1.0 / segment) * np.eye(levels) + np.tile(weight / segment, (levels, 1))
     )
     return transition
+
+
+def _ways(model: CameraErrorModel) -> np.ndarray:
+    """(anywhere + levels,) how likely each manner of erring is at the start, sum 1."""
+    _, weight = bias_levels(model.width_bias_levels)
+    ways = np.concatenate([np.ones(len(model.accuracies)), model.width_bias_levels * weight])
+    return ways / ways.sum()
 
 
 def class_filter(
@@ -539,5 +559,5 @@ def class_filter(
         move_cost,
         outside_cost,
         move_fixed_cost,
-        jnp.asarray(_prior(known_start_share, known_start_std)),
+        jnp.asarray(_prior(known_start_share, known_start_std))[None],
     )

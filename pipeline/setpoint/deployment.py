@@ -45,6 +45,7 @@ __all__ = [
     "Waits",
     "Window",
     "at_rest",
+    "camera_seen",
     "decide",
     "is_evidence",
     "judge_window",
@@ -158,6 +159,24 @@ def _median(scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
     n = mask.sum(axis=1)
     ordered = np.concatenate([ordered, np.full((len(n), 1), np.nan)], axis=1)
     return ordered[np.arange(len(n)), np.where(n > 0, n // 2, -1)]
+
+
+def camera_seen(
+    window: Window,
+    last_seen: np.ndarray,
+    looks: np.ndarray,
+    foreign: Callable[[np.ndarray], np.ndarray] | None,
+) -> Window:
+    """E windows, held too where the picture stands still or is of no camera that is known.
+
+    last_seen (E,) is the flow that the window before showed, NaN where there was none; looks (E, measures)
+    how the windows look (`familiar`), NaN where no frame was measured; foreign(looks) -> (E,) bool, None
+    where no camera is known.
+    """
+    reason = np.where(window.reason == ACTS, still(window.flow_seen, last_seen), window.reason)
+    if foreign is not None:
+        reason = np.where(is_evidence(reason) & foreign(looks), FOREIGN, reason)
+    return window._replace(reason=reason)
 
 
 def why(time_s: float, window: Window, i: int, change: np.ndarray) -> str:

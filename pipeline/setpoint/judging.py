@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
-from pipeline.setpoint.score import CLOG_STEP, STEPS, Outcomes, Score, judge, outcomes
+from pipeline.setpoint.score import CLOG_STEP, DOES_NOTHING, STEPS, Outcomes, Score, judge, outcomes
 from pipeline.setpoint.simulator import Conditions, Controller, Windows, nominal, paper_windows, rollout
 from pipeline.statistics import Mean, Share, effective_runs, redrawn_mean, shared_variance, wilson_interval
 
@@ -31,7 +31,6 @@ OTHER_CAMERA = (
     0.8,
 )  # scale and exponent: it shows 12 % more at 100 %, and ratios smaller than they are
 MOVED_BORDERS = (0.92, 1.08)  # of those learned
-DOES_NOTHING = "do nothing"
 
 
 class Camera(NamedTuple):

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint import deployment, key_area, nozzle_scene
+from pipeline.setpoint import deployment, familiar, key_area, nozzle_scene
 from pipeline.setpoint.deployment import ACTS, Limits, Waits, Window
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.simulator import Controller, Observation
@@ -154,7 +154,8 @@ class Loop(NamedTuple):
     tip_moved, flows=) -> Window; the least ridge score of a key area, how far the nozzle may be from where
     its tip was calibrated, and how long a segment's conditions last on average. window_flow(log_flow,
     deviation, valid), each (E, W), -> flow_seen, spread and class probabilities of windows; None of a
-    classifier that names classes only.
+    classifier that names classes only. foreign(looks (E, measures)) -> (E,) whether windows are of no camera
+    that is known (`familiar.foreign`); None where none is known.
     """
 
     machine: Machine
@@ -168,6 +169,7 @@ class Loop(NamedTuple):
     tip_tolerance_px: float
     segment_mean_s: float
     window_flow: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]] | None = None
+    foreign: Callable[[np.ndarray], np.ndarray] | None = None
 
 
 def _answer(
@@ -265,8 +267,7 @@ def run(
             break
         _renew_segments(cameras, time_s, loop.segment_mean_s)
         areas = _window_areas(cameras, flow, temperature, loop, disturbances, decision, draw)
-        window = _judged(loop, areas, temperature)
-        reason = np.where(window.reason == ACTS, deployment.still(window.flow_seen, seen), window.reason)
+        window = deployment.camera_seen(_judged(loop, areas, temperature), seen, areas.looks, loop.foreign)
         seen = window.flow_seen
         pictures |= areas.pictures
         step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, decision)
@@ -279,7 +280,7 @@ def run(
             setpoints.value[:, 1],
             acted,
         )
-        memory, wanted, reason = _answer(controller, parameters, memory, shown, step_keys, reason)
+        memory, wanted, reason = _answer(controller, parameters, memory, shown, step_keys, window.reason)
         window = window._replace(reason=reason)
         before, setpoints = setpoints, deployment.moved(setpoints, wanted, time_s, loop.limits)
         change = setpoints.value - before.value
@@ -359,11 +360,13 @@ def _next_segment(segment, rng: np.random.Generator):
 
 class _WindowAreas(NamedTuple):
     """Key areas (E, W, 16, 48) uint8, whether they are valid (E, W), whether the nozzle is elsewhere than
-    where it was calibrated (E,), and the pictures asked for."""
+    where it was calibrated (E,), how the windows look (E, measures), NaN where nobody asks, and the pictures
+    asked for."""
 
     images: np.ndarray
     valid: np.ndarray
     tip_moved: np.ndarray
+    looks: np.ndarray
     pictures: dict[tuple[int, int], np.ndarray]
 
 
@@ -378,6 +381,7 @@ def _window_areas(
 ) -> _WindowAreas:
     """What the cameras show of flow and temperature (E, W)."""
     images, valid, moved, pictures = [], [], [], {}
+    looks = np.full((len(cameras.segments), len(familiar.NAMES)), np.nan)
     for i, segment in enumerate(cameras.segments):
         scene = nozzle_scene.render(segment, flow[i], temperature[i], cameras.rngs[i])
         frames, tip = _filmed(scene.frames, disturbances, i, decision, segment.tip), segment.tip
@@ -390,6 +394,8 @@ def _window_areas(
         nozzle = key_area.drift(some, cameras.templates[i], tip, reach_px=REACH_PX)
         images.append(areas.images)
         valid.append(areas.valid)
+        if loop.foreign is not None:
+            looks[i] = familiar.of_window(frames, np.array(tip), areas)
         moved.append(
             np.hypot(*nozzle.offset_px) > loop.tip_tolerance_px
             and nozzle.correlation >= LIKENESS
@@ -400,7 +406,7 @@ def _window_areas(
                 frames[0], tip, least_score=loop.least_score, direction_deg=segment.direction_deg
             )
             pictures[i, decision] = key_area.drawn(frames[0], tip, one)
-    return _WindowAreas(np.stack(images), np.stack(valid), np.array(moved), pictures)
+    return _WindowAreas(np.stack(images), np.stack(valid), np.array(moved), looks, pictures)
 
 
 def settled_since(episodes: Episodes) -> np.ndarray:

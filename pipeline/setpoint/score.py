@@ -16,9 +16,19 @@ SETTLED_BY, DWELL_UNTIL, STEPS = (
 )  # inside from some step <= 90 until 100; never out from 100 to 200 is staying
 CLOG_STEP, RECOVERED_UNTIL = 60, 120
 BEYOND = (10, 15, 25)  # points of flow past which a run from a good start counts as harmed
+DOES_NOTHING = "do nothing"  # the contestant that leaves every print alone
 BACK_BAND = 15.0  # within which a half clogged nozzle shall be brought back
 # float32 sums of moves end a hair outside a border that they are on
 ROUNDING = 1e-3
+
+
+def harm_bar(case: str, *, perfect: float, in_band: float) -> float | None:
+    """Percent of runs from good starts that may leave +-25 % in this case: with the camera right, stuck or
+    blind. None where nobody is barred: of a camera of another make, or with moved borders, no rule can know
+    better, and harm is only told."""
+    if case == "perfect":
+        return perfect
+    return in_band if case == "in band" or case.startswith(("in band, stuck", "in band, blind")) else None
 
 
 class Outcomes(NamedTuple):

@@ -14,7 +14,7 @@ from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.shared.verdict import Figure, Question
 from pipeline.setpoint.simulator import reward
-from pipeline.setpoint.workflow.tables import PATHS
+from pipeline.setpoint.workflow.tables import PATHS, harm_bar
 from pipeline.store import artifacts, params
 from stages.report import main
 from tests.report import made_setpoint
@@ -44,7 +44,7 @@ def lost(**percent):
 def test_the_default_is_named_with_its_worst_case_and_its_lead_over_the_next(project):
     text = page()
     # by hand: 100 - 1.5 (0.2 + 5 x 0.1) = 98.95, and 97.6 for the next
-    assert "Rehearsal passed: the agent. All six rules passed." in text
+    assert "Rehearsal passed: the agent. All seven rules passed." in text
     assert (
         "In its worst case (the paper’s simulator, accuracy 70 %, clog) 99.0 % of 2,100 runs settle "
         "and stay, 1.1 points more than of the next, the baseline “Bayes, robust”" in text
@@ -68,7 +68,7 @@ def test_a_baseline_may_win_and_then_the_page_says_how_far_the_agent_came(projec
     made_setpoint.scoreboard(lost(our_agent=(1.0, 2.0)))
     made_setpoint.choice("Bayes, robust", margin=9.0)
     text = page()
-    assert "Rehearsal passed: the baseline “Bayes, robust”. All six rules passed." in text
+    assert "Rehearsal passed: the baseline “Bayes, robust”. All seven rules passed." in text
     # 100 - 1.5 (1 + 10) = 83.5, behind the sequential test's 88.6
     assert "9.0 points more than of the next, the baseline “sequential test”" in text
     assert "The agent did not earn it: 83.5 % (the paper’s simulator, accuracy 70 %, clog)." in text
@@ -172,10 +172,10 @@ def test_every_controller_stands_in_every_case_and_its_worst_case_is_bold(projec
     page()
     text = PAGE.read_text()
     tables = re.findall(r'<table class="tab board">.*?</table>', text, re.DOTALL)
-    assert len(tables) == 4 and [table.count("<tr><th") for table in tables] == [8, 8, 8, 4]
+    assert len(tables) == 4 and [table.count("<tr><th") for table in tables] == [9, 9, 9, 4]
     bold = [table.count('<td class="low"') for table in tables]
     # clog at accuracy 0.7 and in sticky windows are alike here; the first one is taken
-    assert bold == [7, 0, 0, 0]
+    assert bold == [8, 0, 0, 0]
     assert "proportional" in tables[0] and "recover 24.0" in tables[0]
     # proportional leaves +-10, 15 and 25 % from good starts in 15, 7.5 and 1.9 % of its runs
     assert "beyond 10: 15.0" in tables[2] and "beyond 15: 7.5" in tables[2] and "beyond 25: 1.9" in tables[2]
@@ -209,6 +209,147 @@ def test_how_a_figure_moved_since_the_accepted_run_is_said(project):
     # 99.5 % now, 99.1 to 99.7
     assert "+2.5 points · better" in text and "new" in text
     assert text.count("points · better") == 1 and "within noise" in text
+
+
+# ---- first, no harm
+
+
+def harm_rules(project):
+    """State and text of the rule for what learned and for the baseline, and the page's text."""
+    text = page()
+    row = PAGE.read_text().split('<a href="#harm">Does no harm</a>')[1].split("</tr>")[0]
+    return re.findall(r'<span class="vh">(.*?): </span>(.*?)</td>', row), text
+
+
+def test_a_default_that_spoils_good_prints_fails_by_the_case_most_beyond_its_bar(project):
+    # by hand: beyond 25 in (30 + 4 hard) / 2 / 8 %: 1.9 of at most 1 from 100 %, 2.6 of 2 with a stuck camera
+    made_setpoint.scoreboard(lost(our_agent=(30.0, 4.0)))
+    rules, text = harm_rules(project)
+    assert rules == [("failed", "1.9\u202f%"), ("passed", "0.0\u202f%")]
+    assert (
+        "First failed rule: does no harm. Best, by runs that settle and stay, is the agent: from good "
+        "starts, perfect, 1.9 % of its runs leave ±25 %; at most 1 % may. Doing nothing spoils 0.0 %."
+    ) in text
+
+
+def test_a_camera_of_another_make_bars_nobody_and_a_blind_one_does():
+    bars = {
+        case: harm_bar(case, perfect=1.0, in_band=2.0)
+        for case in ("perfect", "perfect, stuck 30", "in band", "in band, blind 30", "in band, borders 92 %")
+    }
+    assert list(bars.values()) == [1.0, None, 2.0, 2.0, None]
+
+
+def test_harm_that_may_be_chance_is_undecided_and_says_how_many_segments_would_tell(project):
+    # perfect: 15 / 2 / 8 = 0.94 % of 2,100 runs, at most 1
+    made_setpoint.scoreboard(lost(our_agent=(15.0, 0.0)))
+    assert harm_rules(project)[0][0] == ("undecided", "0.9\u202f%")
+    # half the interval is four times as wide as the distance from the limit: 16 times the segments
+    asked = Question(0, "", "", "%", 1.0, False, "")
+    assert setpoint_verdict.undecided(asked, Figure(0.9, 0.5, 1.3), clustered=True).endswith(
+        "about 16 times as many segments would decide."
+    )
+    assert setpoint_verdict.undecided(asked, Figure(0.5, 0.2, 0.9), clustered=True) == ""
+
+
+def test_harm_without_a_declared_bar_is_not_measured_and_does_not_pass(project):
+    sections = params.read("params.yaml")
+    del sections["evaluate_setpoint"]["most_harmed"]
+    Path("params.yaml").write_text(yaml.safe_dump(sections))
+    rules, text = harm_rules(project)
+    assert rules == [("not measured", "not measured")] * 2 and "First open rule: does no harm." in text
+
+
+def test_harm_stands_beside_recovery_with_doing_nothing_and_who_may_not_run_last(project):
+    text = page()
+    # our agent recovers 100 - 0.2 - 5 x 0.1 - 1 = 98.3 %, doing nothing 100 - 90 - 5 - 1 = 4 %
+    assert (
+        "Our agent spoils 0.0 % of good prints (perfect start; at most 1 % may be). It recovers 98.3 %"
+        in text
+    )
+    assert (
+        "Doing nothing spoils 0.0 % of good prints (perfect start; at most 1 % may be). It recovers 4.0 %"
+        in text
+    )
+    table = PAGE.read_text().split('tight harms"')[1].split("</table>")[0]
+    rows = [re.sub(r"<.*?>|\s+", " ", row) for row in table.split("<tr>")[2:]]
+    assert len(rows) == 8 and "proportional" in rows[-1] and "may not run" in rows[-1]
+    assert sum("may not run" in row for row in rows) == 1
+    assert "on 16 redraws of the segments" in text
+
+
+def test_the_default_is_the_baseline_that_is_shown_and_judged_though_another_is_better(project):
+    # the simplest of those within noise: filtered proportional stays behind the robust filter
+    made_setpoint.choice(
+        "filtered proportional",
+        margin=-8.0,
+        margin_low=-20.0,
+        margin_high=4.0,
+        refused={"proportional": "leaves +-25 % in 24.6 % of the runs (in band), of at most 2 %"},
+        sentence="filtered proportional is the default: it is simpler. Not asked: proportional leaves +-25 % "
+        "in 24.6 % of the runs (in band), of at most 2 %. On segments that it was not chosen on, 53.5 %.",
+    )
+    text = page()
+    # by hand: 100 - (1 + 5 x 6) = 69 % settle in its worst case; of the robust filter 98.4
+    assert "First failed rule: settles, worst case." in text
+    assert "“filtered proportional”: in its worst case" in text and "69.0 % of its runs settle" in text
+    assert "8.0 points fewer than of the next" in text and "−20.0 to 4.0 points and within noise" in text
+    assert (
+        "Why this default: filtered proportional is the default: it is simpler. One other may not run: it "
+        "spoils more good prints than allowed. On segments that it was not chosen on, 53.5 %."
+    ) in text
+
+
+# ---- what the camera sees, by flow
+
+
+def test_right_and_covered_are_told_by_flow_the_worst_bin_first(project):
+    text = page()
+    assert (
+        "Worst bin: 105–110 % of flow, 40 % right (36–43), 200 windows; the ideal reader reaches 62 % there. "
+        "It lies beside a border of the classes. Worst away from the borders: 70–75 % of flow, 90 % right"
+    ) in text
+    assert (
+        "Were every flow from 70 to 150 % as frequent: 82.5 % (80.1–84.9); the ideal reader 88.0 %." in text
+    )
+    assert "every segment carries a width bias of 5 %" in text
+    table = PAGE.read_text().split("tight by-flow")[1].split("</table>")[0]
+    places = re.findall(r'<th scope="row" class="v">(\d+)–', table)
+    assert places[:4] == ["105", "85", "90", "110"] and len(places) == 16
+    assert table.count('<tr class="beside">') == 4
+    chart = PAGE.read_text().split('aria-labelledby="by-flow"')[1].split("</svg>")[0]
+    assert chart.count('class="bin"') == 12 and chart.count('class="bin beside"') == 4
+    # the share over all flows is no rule of the verdict
+    assert "93.1" not in PAGE.read_text().split('<table class="rules')[1].split("</table>")[0]
+
+
+def test_the_ideal_reader_is_named_of_rendered_beads_only(project):
+    change("train_classifier", source="recordings")
+    assert "ideal reader" not in page()
+
+
+def test_without_figures_by_flow_the_page_says_so_and_the_rule_is_open(project):
+    change("train_classifier", by_flow=None, right_70_150=None)
+    text = page()
+    assert "First open rule: right, 70–150 % of flow." in text
+    section = PAGE.read_text().split('aria-labelledby="by-flow"')[1].split("</section>")[0]
+    assert "Not measured" in section and '<svg class="plot' not in section
+
+
+# ---- the paper's agent
+
+
+def test_claims_of_the_paper_stand_beside_results_and_guesses_are_named(project):
+    page()
+    section = PAGE.read_text().split('aria-labelledby="claims"')[1].split("</section>")[0]
+    rows = [re.sub(r"<.*?>|\s+", " ", row).split() for row in section.split("<tr>")[1:]]
+    told = [" ".join(row) for row in rows]
+    assert any(row.endswith("rests at, flow 95 % 91 %") for row in told)
+    assert any("least flow once near 100 % 75 % never near 100 %" in row for row in told)
+    assert any("after phase 1" in row and "range of flow, second half not printed 0 %" in row for row in told)
+    text = " ".join(told)
+    assert "replay buffer, steps 131,072" in text and "limits of flow, % 20, 310" in text
+    assert "all four phases, judged with classes that are always right" in PAGE.read_text()
 
 
 # ---- the figures themselves

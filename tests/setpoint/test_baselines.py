@@ -21,7 +21,7 @@ from pipeline.setpoint.baselines import (
 )
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
 from pipeline.setpoint.recorded import recorded_windows
-from pipeline.setpoint.simulator import Observation, nominal, paper_windows
+from pipeline.setpoint.simulator import STAND, Observation, nominal, paper_windows
 from tests.setpoint.synthetic import synthetic_flow_table, synthetic_table
 
 KEY = jax.random.key(0)
@@ -222,8 +222,38 @@ def test_recorded_evidence_of_flows_is_the_camera_s_own_error_about_each_flow():
     )
     # bins of 2.5 % and their smoothing add 2.6 % in squares; 60 windows a flow give 0.9 % to a mean
     np.testing.assert_allclose(std[2], np.hypot(0.06, 0.026), atol=0.012)
-    bias = scipy.stats.norm.ppf((np.arange(5) + 0.5) / 5) * 0.04
-    np.testing.assert_allclose(mean.mean(axis=1), bias, atol=0.008)
+    z, weight = bayes.bias_levels(5)
+    np.testing.assert_allclose(mean.mean(axis=1), z * 0.04, atol=0.008)
+    np.testing.assert_array_equal([z.min(), z.max()], [-3.0, 3.0])
+    assert weight.sum() == pytest.approx(1.0)
+    # beyond two deviations 1 part of 4 in a hundred lies in a normal distribution, and more here
+    assert 0.04 < weight[np.abs(z) > 2].sum() < 0.15
+
+
+def test_a_segment_that_lies_far_off_is_not_taken_for_a_flow_that_changed():
+    """Ten quiet windows, then ten of a segment that is 2.4 deviations wider: 60 prints of 60 are left alone
+    (of levels that end at 1.5 deviations 8 in 10 are moved); a flow that jumps to 140 % is corrected."""
+    table = synthetic_flow_table(np.random.default_rng(5), segments=300, windows=8)
+    model = ROBUST._replace(segment_mean_decisions=15.0, width_bias_levels=7, gains=[1.0], border_std=4.0)
+    model = model._replace(move_fixed_cost=4.0, outside_cost=20.0, known_start_share=0.7)
+    parameters = bayes.robust_filter(table, model)
+
+    @jax.jit
+    def moves(line):
+        def window(state, flow_seen):
+            state = bayes.filter_update(parameters, state, seen_flow(flow_seen))
+            return state, jnp.argmin(bayes.expected_loss(parameters, state.belief))
+
+        return jax.lax.scan(window, bayes.initial_state(len(parameters.gains)), line)[1]
+
+    seen = 100 * np.exp(np.random.default_rng(0).normal(0, 0.05, (60, 20)))
+    later = np.arange(20) >= 10
+    wide, jumped = (
+        np.asarray(jax.vmap(moves)(jnp.asarray(seen * np.where(later, flow, 1.0), jnp.float32)))
+        for flow in (1.13, 1.4)
+    )
+    assert (wide != STAND).any(axis=1).mean() <= 0.05
+    assert (jumped[:, 13:] < STAND).mean() > 0.95
 
 
 def test_the_prior_of_the_start_holds_what_is_known_of_the_print():

@@ -22,6 +22,7 @@ from pipeline.setpoint.deployment import (
     Limits,
     Waits,
     at_rest,
+    camera_seen,
     decide,
     judge_window,
     moved,
@@ -366,6 +367,19 @@ def test_a_controller_remembers_what_is_evidence_and_is_asked_whether_the_camera
     assert (int(memory), int(after)) == (4 if remembers else 3, reason)
     _, _, after = decide(asked, 4, jnp.int32(3), nothing, jnp.int32(reason), key)
     assert int(after) == (TABLE if reason == ACTS else reason)
+
+
+def test_a_window_of_no_known_camera_is_held_and_keeps_a_reason_that_it_has():
+    """Of five windows the first is familiar, the second foreign, the third both foreign and still, the fourth
+    was held before, of the fifth no frame was measured."""
+    window = judge_window(
+        np.tile(UNDER, (5, 20, 1)), np.ones((5, 20), bool), np.zeros((5, 20)), np.arange(5) == 3, **RULES
+    )._replace(flow_seen=np.array([90.0, 91.0, 92.0, 93.0, 94.0]))
+    last = np.array([np.nan, 90.0, 92.0, np.nan, np.nan])
+    looks = np.array([[0.0], [9.0], [9.0], [9.0], [np.nan]])
+    seen = camera_seen(window, last, looks, lambda looks: looks[:, 0] > 5)
+    assert seen.reason.tolist() == [ACTS, FOREIGN, STILL, TIP, ACTS]
+    assert camera_seen(window, last, looks, None).reason.tolist() == [ACTS, ACTS, STILL, TIP, ACTS]
 
 
 def test_jax_and_numpy_take_the_same_limits():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.setpoint import calibrated_classifier, familiar
-from pipeline.setpoint.workflow import frame_folder, gallery, known_camera
+from pipeline.setpoint.workflow import camera_files, frame_folder, gallery, known_camera
 from tests.nozzle_folders import ANY, FLOWS, LEAST, SHOTS, folder, read, rows, scenes
 
 COUNT = 2 * len(FLOWS) * SHOTS
@@ -112,11 +112,13 @@ def test_a_camera_comes_back_from_its_file_and_one_of_other_measures_is_refused(
     camera = familiar.fit_camera(
         rng.standard_normal((220, len(familiar.NAMES))), np.arange(220), false_alarms=0.01
     )
-    known_camera.store_camera(tmp_path / "camera.parquet", camera)
-    again = known_camera.restore_camera(tmp_path / "camera.parquet")
+    camera_files.store_camera(tmp_path / "camera.parquet", camera)
+    again = camera_files.restore_camera(tmp_path / "camera.parquet")
     for ours, theirs in zip(camera, again, strict=True):
         np.testing.assert_array_equal(ours, theirs)
+    camera_files.store_camera(tmp_path / "none.parquet", None)
+    assert camera_files.restore_camera(tmp_path / "none.parquet") is None
     few = familiar.fit_camera(rng.standard_normal((220, 5)), np.arange(220), false_alarms=0.01)
-    known_camera.store_camera(tmp_path / "few.parquet", few)
+    camera_files.store_camera(tmp_path / "few.parquet", few)
     with pytest.raises(ValueError, match=r"expected 28 measures, found \(5,\)"):
-        known_camera.restore_camera(tmp_path / "few.parquet")
+        camera_files.restore_camera(tmp_path / "few.parquet")

@@ -9,11 +9,12 @@ import pytest
 from scipy.stats import norm
 
 from benchmarks.waits import settling_s, step_response
-from pipeline.setpoint import deployment, pixels
+from pipeline.setpoint import deployment, familiar, pixels
 from pipeline.setpoint.deployment import ACTS, Limits, Waits
 from pipeline.setpoint.pixels import Loop, Machine, at_rest, calm, run, tick
 from pipeline.setpoint.simulator import Action, Controller
-from pipeline.setpoint.workflow import settings
+from pipeline.setpoint.workflow import camera_files, known_camera, settings
+from pipeline.store import params
 
 MACHINE = Machine(heater_s=15.0, heater_delay_s=2.0, melt_s=1.2, softening_per_degC=0.02)
 LIMITS = Limits(
@@ -123,7 +124,8 @@ def numbers(monkeypatch):
             )
             images[i, :, 0, 0], images[i, :, 0, 1] = width % 256, width // 256
         valid = np.stack([rng.random(loop.frames) > 0.06 for rng in cameras.rngs])
-        return pixels._WindowAreas(images, valid, np.zeros(len(valid), bool), {})
+        looks = np.full((len(valid), len(familiar.NAMES)), np.nan)
+        return pixels._WindowAreas(images, valid, np.zeros(len(valid), bool), looks, {})
 
     monkeypatch.setattr(pixels, "_next_segment", lambda segment, rng: 0.05 * rng.normal())
     monkeypatch.setattr(pixels, "_window_areas", areas)
@@ -259,6 +261,30 @@ def test_a_camera_that_moved_is_held_for_that_and_one_that_shook_a_little_is_not
     ).mean() >= 0.8  # a dark nozzle before a dark plate may not be found again
     assert (moved.sent[moved.windows.reason == deployment.TIP] == 0).all()
     assert (shaken.windows.reason == deployment.TIP).sum() <= 1  # of 24: nor where it is, once in a while
+
+
+@pytest.fixture(scope="module")
+def camera():
+    """That of rendered segments, seen in one window each."""
+    settings_of = params.load(settings.RenderFrames, "render_frames")
+    return known_camera.drawn(
+        settings_of.model_copy(update={"camera_segments": 240}), params.load(params.Execution, "execution")
+    )
+
+
+def test_pictures_of_another_kind_are_held_and_those_of_the_known_camera_are_not(camera):
+    """Two windows as they are rendered, then two through a lens so far out of focus as none of the segments;
+    where no camera is known, those are acted on."""
+    foreign = functools.partial(familiar.foreign, camera, false_alarms=camera_files.FALSE_ALARMS)
+    loop = CALM_LIGHT._replace(foreign=foreign)
+    blurred = calm(6)._replace(blur_px=np.full(6, 6.0), burst_at=np.full(6, 2), burst_for=np.full(6, 2))
+    got = run(FILTERED, None, SIX, loop, blurred, decisions=4, rng=np.random.default_rng(3))
+    ungated = run(FILTERED, None, SIX, CALM_LIGHT, blurred, decisions=4, rng=np.random.default_rng(3))
+    seen = deployment.is_evidence(ungated.windows.reason)
+    held = got.windows.reason == deployment.FOREIGN
+    assert held[:, :2].mean() <= 0.1
+    assert seen[:, 2:].any() and held[:, 2:][seen[:, 2:]].all()
+    assert (got.sent[held] == 0).all()
 
 
 def test_a_picture_without_any_detail_is_held():

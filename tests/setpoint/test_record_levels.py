@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.setpoint import levels
+from pipeline.setpoint.material import Material
 from pipeline.setpoint.workflow import record_levels
 from pipeline.setpoint.workflow.levels_files import restore_levels
 from pipeline.setpoint.workflow.record_levels import Eye, Protocol
@@ -85,6 +86,30 @@ def test_a_folder_of_pictures_is_a_recording(tmp_path, recorded):
     fill(tmp_path / "in", [shown.frame for shown in frames], period_s=1 / RATE)
     found, _ = record_levels.record(Folder(tmp_path / "in"), PROTOCOL, EYE, place="in")
     assert found.windows.seen == pytest.approx(recorded[0].windows.seen)
+
+
+def test_levels_of_another_material_are_kept_as_what_they_stand_for(tmp_path, recorded):
+    """Held at other flows that stand for the same ones of the published material, the same pictures give the
+    same correction; what a person is told is of what was printed."""
+    other = Material(250.0, (220.0, 280.0), (85.0, 120.0), (20.0, 310.0))
+    flows = tuple(float(other.own_flow(np.array(flow))) for flow in FLOWS)
+    degrees = []
+
+    def read(images, temperature):
+        degrees.append(float(temperature.mean()))
+        return by_width(images, temperature)
+
+    eye = EYE._replace(read=read, material=other)
+    protocol = PROTOCOL._replace(flows=flows, temperature=250.0)
+    found, told = record_levels.record(Given(film(1)), protocol, eye, place="the camera")
+    assert degrees == pytest.approx([210.0] * len(degrees))
+    assert found.windows.flow == pytest.approx(recorded[0].windows.flow)
+    assert found.levels.log_flow == pytest.approx(recorded[0].levels.log_flow)
+    assert [level.flow for level in told] == pytest.approx(sorted(flows))
+    words = record_levels.write(found, told, tmp_path / "levels.parquet", "a", other)
+    assert "the borders of good, 85 and 120 %" in words
+    low = float(other.own_flow(levels.shown(found.levels, np.array([90.0])))[0])
+    assert f"This camera shows {low:.0f} % where the flow is 85 %" in (tmp_path / "levels.html").read_text()
 
 
 def test_levels_go_to_a_file_and_back_and_not_to_another_classifier(recorded, tmp_path):

@@ -19,7 +19,7 @@ from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.vision_transformer import SMALL as SMALL_SIZE
 from pipeline.setpoint.vision_transformer import named_arrays, vision_transformer
 from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
-from pipeline.setpoint.workflow import known_camera, parts, render_frames, train_agent, train_classifier
+from pipeline.setpoint.workflow import camera_files, parts, render_frames, train_agent, train_classifier
 from pipeline.setpoint.workflow.agent_files import AGENTS_SCHEMA, Agents, restore_agents, store_agents
 from pipeline.setpoint.workflow.classifier_files import (
     CLASSIFIER_SCHEMA,
@@ -177,7 +177,7 @@ def check_classifier(source: str) -> dict:
     expected |= {f"frames/{row['file']}" for row in frames}
     # real frames stand by what became of them; these folders are too small to know a camera by
     assert all(("group" in row) == (source == "recordings") for row in frames)
-    expected |= {known_camera.FILE} if source == "simulated" else set()
+    expected |= {camera_files.FILE} if source == "simulated" else set()
     courses = {f"{figure}.tsv" for figure in ("training_loss", "held_out_loss", "held_out_accuracy")}
     expected |= {
         f"live/plots/metrics/{learner}/{name}"

@@ -21,6 +21,7 @@ from mcap.reader import make_reader
 
 from pipeline.setpoint import bayes, deployment
 from pipeline.setpoint.calibrated_classifier import FrameReadings
+from pipeline.setpoint.material import PLA, Material
 from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration, window_flow
 from pipeline.setpoint.workflow import decision_log, shadow, watch_sources
 from pipeline.setpoint.workflow.shadow.decide import Asked, Deployed
@@ -190,6 +191,47 @@ def test_a_move_is_cut_to_the_limits(tmp_path):
     watch(Folder(tmp_path / "in"), tmp_path / "beyond", asked=ASKED._replace(flow=400.0))
     assert any("outside the controller's limits" in note for row in rows(tmp_path / "beyond")
                for note in row["notes"])  # fmt: skip
+
+
+# twice as thick a line is good, and a hotter nozzle
+OTHER = Material(250.0, (220.0, 280.0), (85.0, 120.0), (20.0, 310.0))
+
+
+def test_another_material_is_seen_and_answered_as_what_it_stands_for(tmp_path):
+    """115 % of it is good, as 107 % of the published one is; and what the published one would be sent is sent
+    as a flow of it."""
+    stands = float(OTHER.published_flow(np.array(115.0)))
+    assert 90 < stands < 110
+    fill(tmp_path / "in", [picture(k, 2.0) for k in range(4 * FRAMES)])
+    asked = ASKED._replace(flow=115.0, temperature=250.0)
+    told = []
+
+    def read(images, temperature):
+        told.append(float(temperature.mean()))
+        return by_width(images, temperature)
+
+    as_published = ASKED._replace(flow=stands, temperature=210.0)
+    watch(Folder(tmp_path / "in"), tmp_path / "a", asked=as_published, deployed_as=deployed(read=read))
+    watch(
+        Folder(tmp_path / "in"), tmp_path / "b", asked=asked, deployed_as=deployed(read=read, material=OTHER)
+    )
+    assert told == pytest.approx([210.0] * 8)
+    for one, other in zip(rows(tmp_path / "a"), rows(tmp_path / "b"), strict=True):
+        assert one["reason"] == other["reason"] == "acts"
+        sent = one["flow_setpoint_percent"] + one["would_flow_move_percent"]
+        assert other["flow_setpoint_percent"] == 115.0
+        assert other["would_flow_move_percent"] == pytest.approx(OTHER.own_flow(np.array(sent)) - 115.0)
+        assert other["would_flow_move_percent"] > one["would_flow_move_percent"] > 0
+        for key in ("flow_seen_percent", "belief_flow_percent"):
+            assert other[key] == pytest.approx(OTHER.own_flow(np.array(one[key])), rel=0.01)
+            assert other[key] != one[key]
+    assert "inside 85 to 120 % with" in (tmp_path / "b/index.html").read_text()
+    assert "inside 90 to 110 % with" in (tmp_path / "a/index.html").read_text()
+
+
+def test_the_published_material_is_itself():
+    flow = np.array([20.0, 90.0, 97.3, 110.0, 310.0])
+    assert np.array_equal(PLA.own_flow(flow), flow)
 
 
 def test_once_ends_where_a_camera_has_shown_a_window_and_where_nothing_is_there(tmp_path, monkeypatch):

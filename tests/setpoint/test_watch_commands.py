@@ -23,6 +23,7 @@ from pipeline.setpoint.vision_transformer import SMALL, vision_transformer
 from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.setpoint.workflow import train_agent
 from pipeline.setpoint.workflow.agent_files import Agents, store_agents
+from pipeline.setpoint.workflow.camera_files import FILE, store_camera
 from pipeline.setpoint.workflow.classifier_files import store_classifier
 from pipeline.setpoint.workflow.levels_files import LEVELS_FILE, RecordedLevels, store_levels
 from pipeline.setpoint.workflow.settings import TrainAgent, TrainClassifier
@@ -84,6 +85,7 @@ def make() -> None:
     store_classifier(
         folder, params.load(TrainClassifier, "train_classifier"), CalibratedClassifier(network, known)
     )
+    store_camera(folder / FILE, None)
     tables = {
         part: synthetic_flow_table(np.random.default_rng(1), segments=80, windows=3) for part in WINDOW_PARTS
     }
@@ -115,6 +117,16 @@ def test_the_default_watches_a_folder(command, trained):
     assert "in: 45 frames, 2 decisions" in said and "nothing was sent" in said
     assert len(decisions()) == 2 and decisions()[0]["flow_seen_percent"] > 0
     assert "Bayes, robust" in Path("shadow/index.html").read_text()
+
+
+def test_the_material_of_the_settings_is_what_is_watched(command, trained):
+    camera(20)
+    text = Path(params.FILE).read_text()
+    assert text.count("good_flow_percent: [90, 110]") == 1
+    Path(params.FILE).write_text(text.replace("good_flow_percent: [90, 110]", "good_flow_percent: [85, 120]"))
+    status, _, wrong = command("shadow", "in", "--once", "--tip", f"{TIP[0]:g},{TIP[1]:g}")
+    assert (status, wrong) == (0, "")
+    assert "inside 85 to 120 % with" in Path("shadow/index.html").read_text()
 
 
 def test_levels_of_this_camera_are_used_and_those_of_another_classifier_are_not(command, trained):

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from pipeline.report.setpoint.verdict import AGENT, BASELINE, PAPER, Board, Case, case_text, role
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, number, percent
+from pipeline.report.shared.digits import THIN, number, percent, quantity
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Figure, Missing
@@ -37,6 +37,7 @@ TAUGHT = {
     "phase3": ("The paper’s agent", "phases 1 to 3, judged with classes that are always right"),
     "phase3_at_0.7": ("The paper’s agent", f"phases 1 to 3, judged with 70{THIN}% right"),
     "phase4": ("The paper’s agent", f"all four phases, judged with 70{THIN}% right"),
+    "phase4_at_1": ("The paper’s agent", "all four phases, judged with classes that are always right"),
     "belief_dqn": ("Our agent", "as deployed, judged with classes that are always right"),
     "belief_dqn_at_0.7": ("Our agent", f"as deployed, judged with 70{THIN}% right"),
 }
@@ -484,4 +485,84 @@ def _best_round(metrics: dict[str, Any]) -> str:
     return (
         f"Of ours round {best_round} of {rounds} is kept: {after} a step on episodes it did not learn from, "
         f"{before} before any training."
+    )
+
+
+# ---- what the paper claims of its agent, and what it does not print
+
+
+# figures of a single start, in the order of the table: their words and their unit
+CLAIMED = {
+    "rests_at": ("rests at, flow", "%"),
+    "least": ("least flow once near 100 %", "%"),
+    "most": ("most flow once near 100 %", "%"),
+    "flow_range": ("range of flow, second half", "%"),
+    "temperature_range": ("range of temperature, second half", "°C"),
+}
+RANGES = ("flow_range", "temperature_range")
+
+
+class Claim(NamedTuple):
+    """One figure of one start: what the paper prints, and what ours comes to; `first`: the start's first."""
+
+    start: str
+    first: bool
+    figure: str
+    printed: str
+    ours: str
+
+
+def claims(sources: Sources) -> list[Claim] | Missing:
+    """What Li and Pattinson (2025) tell of single starts beside our agent trained as they say."""
+    found = lookup(sources.metrics["train_agent"], "claims")
+    if isinstance(found, Missing):
+        return found
+    rows = []
+    for start, pair in found.items():
+        printed, measured = pair.get("printed") or {}, pair.get("measured") or {}
+        ranges = not printed or any(key in printed for key in RANGES)
+        keys = RANGES if ranges else ("rests_at", "least", "most", "flow_range")
+        for key in keys:
+            words, unit = CLAIMED[key]
+            value, ours = printed.get(key), measured.get(key)
+            rows.append(
+                Claim(
+                    str(start),
+                    key == keys[0],
+                    words,
+                    "not printed" if value is None else quantity(float(value), unit, 0),
+                    "never near 100\u202f%" if ours is None else quantity(float(ours), unit, 0),
+                )
+            )
+    return rows
+
+
+GUESSED = {
+    "delta": "delta of (6), steps",
+    "alpha": "alpha of (7)",
+    "sigma": "sigma of (7)",
+    "flow_limits_percent": "limits of flow, %",
+    "target_limits_degC": "limits of the target, °C",
+    "target_at_the_start": "target at the start",
+    "updates_by_phase": "updates, phase by phase",
+    "environments": "environments side by side",
+    "replay_capacity": "replay buffer, steps",
+    "explore_by_phase": "exploration at the start of each phase",
+    "explore_least": "least exploration",
+}
+
+
+def guesses(sources: Sources) -> list[tuple[str, str]]:
+    """What the paper does not print and we set; [] where nothing was trained."""
+    found = lookup(sources.metrics["train_agent"], "guesses")
+    if isinstance(found, Missing):
+        return []
+    return [(GUESSED.get(name, str(name)), _plain(value)) for name, value in found.items()]
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(_plain, value))
+    return (
+        f"{value:,}" if isinstance(value, int) else f"{value:g}" if isinstance(value, float) else str(value)
     )

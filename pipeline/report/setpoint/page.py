@@ -1,13 +1,16 @@
 """The page of the setpoint loop: who sets flow and temperature by default, what each controller makes of each
 case, and what the camera's classifier is worth."""
 
+import re
 from typing import NamedTuple
 
 from markupsafe import Markup
 
 from pipeline.report.deposition.page import flat
 from pipeline.report.setpoint import agent as setpoint_agent
+from pipeline.report.setpoint import by_flow as setpoint_by_flow
 from pipeline.report.setpoint import change as setpoint_change
+from pipeline.report.setpoint import harm as setpoint_harm
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.setpoint.verdict import (
@@ -28,8 +31,8 @@ from pipeline.report.setpoint.verdict import (
 )
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.difference import Change
-from pipeline.report.shared.digits import THIN, band, number, percent, quantity
-from pipeline.report.shared.sources import Sources, digest
+from pipeline.report.shared.digits import THIN, band, count, number, percent, quantity
+from pipeline.report.shared.sources import Sources, digest, lookup
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, state
 from pipeline.setpoint.workflow.tables import BEYOND
 
@@ -64,6 +67,7 @@ def render(sources: Sources) -> str:
     """The text of setpoint.html."""
     judged, scores = verdict(sources), board(sources)
     judged_scores = None if isinstance(scores, Missing) else scores
+    claimed = setpoint_agent.claims(sources)
     return page.render(
         "setpoint.html",
         here="setpoint",
@@ -73,7 +77,7 @@ def render(sources: Sources) -> str:
         if judged_scores is None
         else (
             *HEADS[:2],
-            role(judged_scores, judged_scores.best(BASELINE)) if judged_scores.best(BASELINE) else HEADS[2],
+            role(judged_scores, judged_scores.baseline()) if judged_scores.baseline() else HEADS[2],
         ),
         second=judged_scores is not None
         and bool(judged_scores.default)
@@ -84,11 +88,17 @@ def render(sources: Sources) -> str:
         answers=answers(sources, judged_scores) if judged_scores else [],
         boards=boards(sources, judged_scores) if judged_scores else [],
         worsts=worsts(judged_scores) if judged_scores else [],
+        harms=setpoint_harm.harms(sources, scores),
+        why_default=choice_sentence(sources),
         ways=setpoint_agent.ways(sources, scores),
         strips=setpoint_why.strips(sources),
         training=setpoint_agent.training(sources),
         by_accuracy=setpoint_agent.by_accuracy(sources, scores),
         phases=setpoint_agent.phases(sources),
+        claims=[] if isinstance(claimed, Missing) else claimed,
+        claims_missing=claimed if isinstance(claimed, Missing) else None,
+        guesses=setpoint_agent.guesses(sources),
+        by_flow=setpoint_by_flow.by_flow(sources),
         yardsticks=setpoint_vision.yardsticks(sources),
         reliability=setpoint_vision.reliability(sources),
         confusion=setpoint_vision.confusion(sources),
@@ -121,6 +131,20 @@ def hashes(sources: Sources) -> list[tuple[str, str]]:
     ]
 
 
+def choice_sentence(sources: Sources) -> str:
+    """Why the default is the default, as the stage that chose it says; who may not run is told as a number,
+    and by name in the table of harm."""
+    said = lookup(sources.tables["choice"], "sentence")
+    if isinstance(said, Missing):
+        return ""
+    text, refused = re.subn(r" Not asked: .*?\.(?= Not asked:| On segments|$)", "", str(said))
+    if refused:
+        others, spoil = count(refused, "other").capitalize(), "it spoils" if refused == 1 else "they spoil"
+        more = f" {others} may not run: {spoil} more good prints than allowed."
+        text = text.replace(" On segments", f"{more} On segments", 1)
+    return text.replace("+-", "±")
+
+
 class Head(NamedTuple):
     """A controller of the first screen; `default`: it is the one that runs."""
 
@@ -131,8 +155,8 @@ class Head(NamedTuple):
 
 
 def heads(scores: Board | None) -> list[Head]:
-    """The two controllers of the first screen: what learned, and the best baseline."""
-    pair = ("", "") if scores is None else (scores.learned(), scores.best(BASELINE))
+    """The two controllers of the first screen: what learned, and a baseline: the default or the best."""
+    pair = ("", "") if scores is None else (scores.learned(), scores.baseline())
     return [
         Head(
             name or "none",
@@ -171,9 +195,9 @@ class Answer(NamedTuple):
 
 
 def answers(sources: Sources, scores: Board) -> list[Answer]:
-    """Runs that settle and stay of what learned and of the best baseline; the strip shows the runs that are
+    """Runs that settle and stay of what learned and of a baseline; the strip shows the runs that are
     lost, as a share of those that may be."""
-    pair = (scores.learned(), scores.best(BASELINE))
+    pair = (scores.learned(), scores.baseline())
     cases = [
         case
         for case in scores.cases

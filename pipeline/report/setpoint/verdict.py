@@ -28,7 +28,7 @@ from pipeline.report.shared.verdict import (
     overall,
     state,
 )
-from pipeline.setpoint.workflow.tables import BEYOND
+from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, harm_bar
 
 AGENT, PAPER, BASELINE = "agent", "paper", "baseline"
 SIMULATORS = {
@@ -47,13 +47,17 @@ CLAIM_RECORDED = (
     "on these printers only."
 )
 # what the two columns of its rules are, and the mark of the second
-HEADS = ("Data\u2011driven", "Best baseline", "baseline")
+HEADS = ("Data\u2011driven", "Baseline", "baseline")
+
+
+NO_CLOG = Missing("not applicable", "nothing happens in this case")
 
 
 class Cell(NamedTuple):
     """One controller in one case: shares of runs in percent with their 95 % intervals, or why one is missing.
     Then steps until inside for good; overshoot and flow error in percent; beyond, of good starts those that
-    leave them by each of BEYOND points."""
+    leave them by each of BEYOND points; back, within +-15 % after a clog, and decisions until inside again.
+    redraws of the segments, by which the intervals are clustered."""
 
     runs: int
     counts: bool
@@ -66,20 +70,26 @@ class Cell(NamedTuple):
     flow_error: float
     worst_start: tuple[float, float, float]
     beyond: tuple[Figure | Missing, ...] = ()
+    back: Figure | Missing = NO_CLOG
+    recovery_steps: float = math.nan
+    redraws: int = 1
 
 
+# borders of the classes in percent of nominal flow
+CLASS_BORDERS = (90.0, 110.0)
 Case = tuple[str, str]  # simulator, case
 
 
 class Board(NamedTuple):
     """Who was judged, the best worst case first, with the kind of each; cases in the table's order; who runs
-    by default ("" where nobody chose)."""
+    by default ("" where nobody chose); who may not, and why. Those who may not stand behind the others."""
 
     names: list[str]
     kinds: Mapping[str, str]
     cases: list[Case]
     cells: Mapping[tuple[str, Case], Cell]
     default: str
+    refused: Mapping[str, str]
 
     def counting(self, name: str) -> list[tuple[Case, Cell]]:
         """The cases that count for the choice."""
@@ -88,6 +98,11 @@ class Board(NamedTuple):
     def best(self, *kinds: str) -> str:
         """Of these kinds, the one with the best worst case; "" where there is none."""
         return next((name for name in self.names if self.kinds[name] in kinds), "")
+
+    def baseline(self) -> str:
+        """The baseline that is shown: the default where it is one, else the best."""
+        mine = self.default and self.kinds[self.default] == BASELINE
+        return self.default if mine else self.best(BASELINE)
 
     def learned(self) -> str:
         """The agent that competes: the default where it is one, else ours, else the paper's."""
@@ -134,9 +149,12 @@ def board(sources: Sources) -> Board | Missing:
     rows: list[Any] = list(pd.DataFrame(table).itertuples())
     cells = {(row.controller, (row.simulator, row.case)): _cell(row) for row in rows}
     kinds = {row.controller: row.kind for row in rows}
-    unranked = Board(list(kinds), kinds, list(dict.fromkeys(case for _, case in cells)), cells, "")
-    ranked = sorted(kinds, key=lambda name: _rank(unranked, name), reverse=True)
-    chosen = str(choice.get("name", "")) if isinstance(choice, Mapping) else ""
+    said = choice if isinstance(choice, Mapping) else {}
+    refused = said.get("refused")
+    refused = {name: str(why) for name, why in refused.items()} if isinstance(refused, Mapping) else {}
+    unranked = Board(list(kinds), kinds, list(dict.fromkeys(case for _, case in cells)), cells, "", refused)
+    ranked = sorted(kinds, key=lambda name: (name not in refused, _rank(unranked, name)), reverse=True)
+    chosen = str(said.get("name", ""))
     return unranked._replace(names=ranked, default=chosen if chosen in kinds else "")
 
 
@@ -157,6 +175,9 @@ def _cell(row: Any) -> Cell:
             _figure(*(getattr(row, f"beyond_{points}_{end}percent") for end in ("", "low_", "high_")))
             for points in BEYOND
         ),
+        _figure(row.back_percent, row.back_low_percent, row.back_high_percent),
+        row.recovery_steps,
+        row.redraws,
     )
 
 
@@ -198,7 +219,7 @@ def share_text(figure: Figure | Missing) -> str:
 
 # of each a pair: what learned, and the best baseline; a rule of the classifier holds for every controller
 Pair = tuple[Rule, Rule]
-SEEING = ("vision", "reliability")
+SEEING = ("vision", "by-flow", "reliability")
 
 
 def of_classifier(rule: Rule) -> bool:
@@ -209,6 +230,7 @@ def of_classifier(rule: Rule) -> bool:
 def rules(sources: Sources, board: Board | None) -> tuple[Pair, ...]:
     asked = sources.declared.rules
     return (
+        _does_no_harm(sources, board),
         _control(board, "Settles, worst case", "settled", asked.settled_percent, "settle"),
         _control(board, "Stays, worst case", "stay", asked.stay_percent, "settle and stay"),
         _accurate(
@@ -217,12 +239,7 @@ def rules(sources: Sources, board: Board | None) -> tuple[Pair, ...]:
             ("svc", "cnn", "width"),
             "frames of segments it never saw",
         ),
-        _accurate(
-            sources,
-            Question(0, "window_accuracy", "Right, a window", "%", 100 * asked.window_accuracy, True, ""),
-            ("svc",),
-            "windows of segments it never saw",
-        ),
+        _right_by_flow(sources, 100 * asked.window_accuracy),
         _calibrated(sources, "Calibrated, an image", asked.ece_image, ("ece_image", "ece_image_raw")),
         _calibrated(sources, "Calibrated, a window", asked.ece_window, ("ece_window", "ece_window_counts")),
     )
@@ -236,30 +253,140 @@ def _control(board: Board | None, name: str, what: str, limit: float, does: str)
     )  # fmt: skip
     if board is None:
         return rule, rule
-    remedy = (
-        "A classifier whose errors persist for fewer decisions, or fewer starts and disturbances to stand "
-        "(evaluate_setpoint)."
-    )
+    remedy = "A classifier whose errors persist for fewer decisions."
 
     def held(controller: str) -> Rule:
         figure, case = worst(board, controller, what)
+        shares = case is not None and board.cells[controller, case].redraws > 1
         reason = (
             figure.sentence()
             if isinstance(figure, Missing)
             else f"In its worst case ({within(case)}) {share_text(figure)} of its runs {does}; "
-            f"{limit:g}{THIN}% are asked for.{undecided(question, figure)}"
+            f"{limit:g}{THIN}% are asked for.{undecided(question, figure, clustered=shares)}"
         )
         return rule._replace(figure=figure, text=share_text(figure), reason=reason, remedy=remedy)
 
-    return held(board.learned()), held(board.best(BASELINE))
+    return held(board.learned()), held(board.baseline())
 
 
-def undecided(question: Question, figure: Figure) -> str:
-    """How many runs would tell, where the interval straddles the
-    limit: z^2 p (1 - p) / (p - limit)^2 at 95 %."""
+class Harm(NamedTuple):
+    """Of the runs of one controller from good starts those that leave +-25 %, and how many may, in percent;
+    its state, and the case."""
+
+    figure: Figure
+    limit: float
+    state: str
+    case: Case
+
+
+def bars(sources: Sources, board: Board) -> dict[Case, float]:
+    """Percent of runs that may leave +-25 % from good starts, by case; {} where nobody declared it."""
+    most = sources.declared.everything.get("evaluate_setpoint", {}).get("most_harmed") or {}
+    perfect, in_band = most.get("perfect_percent"), most.get("in_band_percent")
+    if perfect is None or in_band is None:
+        return {}
+    harm = [case for case in board.cases if case[0] == "harm"]
+    limits = {case: harm_bar(case[1], perfect=perfect, in_band=in_band) for case in harm}
+    return {case: limit for case, limit in limits.items() if limit is not None}
+
+
+def harm_of(board: Board, name: str, limits: Mapping[Case, float]) -> Harm | Missing:
+    """The barred case that decides: of the gravest state the one that is most beyond its bar."""
+    found = []
+    for case, limit in limits.items():
+        cell = board.cells.get((name, case))
+        if cell and cell.beyond and isinstance(share := cell.beyond[-1], Figure):
+            question = Question(0, "harm", "Does no harm", "%", limit, False, "")
+            found.append(Harm(share, limit, state(question, share), case))
+    order = (PASSED, UNDECIDED, FAILED)
+    return max(
+        found,
+        key=lambda harm: (order.index(harm.state), harm.figure.value - harm.limit),
+        default=Missing("not measured", f"no run of {name or 'any controller'} from a good start"),
+    )
+
+
+def _does_no_harm(sources: Sources, board: Board | None) -> Pair:
+    """How often a print that was good is spoilt, beside what doing nothing spoils."""
+    question = Question(0, "harm", "Does no harm", "%", 0.0, False, "")
+    rule = Rule(
+        "Does no harm", question, Missing(OPEN, ""), text=OPEN, place="harm",
+        reason="Nothing was judged from good starts.",
+        remedy="Run ./run dvc repro evaluate_setpoint.",
+    )  # fmt: skip
+    limits = bars(sources, board) if board else {}
+    if board is None or not limits:
+        return rule, rule
+    idle = harm_of(board, DOES_NOTHING, limits)
+    beside = "" if isinstance(idle, Missing) else f" Doing nothing spoils {share_text(idle.figure)}."
+    ends = sorted(set(limits.values()))
+
+    def held(name: str) -> Rule:
+        harm = harm_of(board, name, limits)
+        if isinstance(harm, Missing):
+            return rule._replace(reason=harm.sentence())
+        asked = question._replace(limit=harm.limit)
+        return rule._replace(
+            question=asked,
+            figure=harm.figure,
+            text=share_text(harm.figure),
+            limit=f"≤ {' or '.join(f'{end:g}' for end in ends)}{THIN}%",
+            reason=f"{case_text(harm.case, whole=True)}, {share_text(harm.figure)} of its runs leave "
+            f"±{BEYOND[-1]}{THIN}%; at most {harm.limit:g}{THIN}% may."
+            f"{undecided(asked, harm.figure, clustered=True)}{beside}",
+            remedy="A dearer move (evaluate_setpoint.baselines.bayes_robust.move_fixed_cost), or a "
+            "classifier with a smaller spread.",
+        )
+
+    return held(board.learned()), held(board.baseline())
+
+
+def share_in(row: Mapping[str, Any] | None) -> Figure | None:
+    """A share with its interval as train_classifier.json gives it; None where it counts no window."""
+    ends = [None if row is None else row.get(key) for key in ("percent", "low", "high")]
+    if any(end is None for end in ends):
+        return None
+    value, low, high = (float(end) for end in ends if end is not None)
+    return Figure(value, low, high)
+
+
+def _right_by_flow(sources: Sources, limit: float) -> Pair:
+    """Windows named rightly were every flow from 70 to 150 % as frequent; yardsticks are not judged so."""
+    name, found = f"Right, 70–150{THIN}% of flow", lookup(sources.metrics["train_classifier"], "right_70_150")
+    share = found if isinstance(found, Missing) else share_in(found)
+    figure = share or Missing(OPEN, "no window lies between 70 and 150 % of flow")
+    question = Question(0, "right_70_150", name, "%", limit, True, "")
+    mine = Rule(
+        name,
+        question,
+        figure,
+        text=share_text(figure),
+        limit=f"≥ {limit:g}{THIN}%",
+        place="by-flow",
+        reason=figure.sentence()
+        if isinstance(figure, Missing)
+        else f"Were every flow from 70 to 150{THIN}% as frequent, {share_text(figure)} of the windows would "
+        f"be named rightly; {limit:g}{THIN}% are asked for.{undecided(question, figure, clustered=True)}",
+        remedy="More segments to train on (render_frames.segments), or another view of the nozzle.",
+    )
+    gap = Missing("not applicable", "the yardsticks are judged on windows of all flows")
+    return mine, mine._replace(figure=gap, text="not judged so")
+
+
+def undecided(question: Question, figure: Figure, *, clustered: bool = False) -> str:
+    """What would tell, where the interval straddles the limit: of runs that share nothing
+    z^2 p (1 - p) / (p - limit)^2 at 95 %; of clustered ones the segments by which the interval shrinks."""
     if state(question, figure) != UNDECIDED:
         return ""
     p, off = figure.value / 100, abs(figure.value - question.limit) / 100
+    if clustered:
+        times = ((figure.high - figure.low) / 200 / off) ** 2 if off else math.inf
+        more = (
+            f"about {number(max(math.ceil(times - 1e-6), 2), 0)} times as many segments would decide"
+            if times < 1000
+            else "no number of segments would decide"
+        )
+        return f" Its interval, {band(figure.low, figure.high, 1)}, straddles that; {more}."
     needed = 1.96**2 * p * (1 - p) / off**2 if off else math.inf
     more = (
         f"about {_round(needed):,} runs in all would decide"
@@ -294,7 +421,7 @@ def _accurate(sources: Sources, question: Question, others: Sequence[str], of: s
         mine.sentence()
         if isinstance(mine, Missing)
         else f"The classifier names {share_text(mine)} of {of} rightly; "
-        f"{question.limit:g}{THIN}% are asked for.{undecided(question, mine)}"
+        f"{question.limit:g}{THIN}% are asked for.{undecided(question, mine, clustered=True)}"
     )
     rule = Rule(
         question.title,
@@ -402,7 +529,7 @@ def _conditions(asked: Sequence[Rule], rendered: bool) -> str:
     short = [rule for rule in asked if rule.state != PASSED]
     figures = [
         f"{rule.name[:1].lower()}{rule.name[1:]} {rule.limit} (now "
-        f"{rule.text}{', but its interval crosses the limit' if rule.state == UNDECIDED else ''})"
+        f"{rule.text}{', undecided' if rule.state == UNDECIDED else ''})"
         for rule in short
     ]
     real = " Recordings of the real printer: none are in (datasets/raw/setpoint)." if rendered else ""
@@ -429,6 +556,16 @@ def named(board: Board, name: str) -> str:
     )
 
 
+def _noise(choice: Any, mine: Figure, other: Figure) -> str:
+    """The interval of the margin where the choice gives one, and whether it is within noise."""
+    ends = [lookup(choice, f"margin_{end}") for end in ("low", "high")]
+    if any(isinstance(end, Missing) for end in ends):
+        return ", which is within the noise of these runs" if other.high >= mine.low else ""
+    low, high = (float(end) for end in ends)
+    within_noise = " and within noise" if low <= 0 <= high else ""
+    return f" (95{THIN}% interval {band(low, high, 1)} points{within_noise})"
+
+
 def summary(sources: Sources, board: Board) -> str:
     """The default's worst case, by how much it beats the next, and,
     where the agent is neither, how far it came."""
@@ -443,7 +580,7 @@ def summary(sources: Sources, board: Board) -> str:
     figure, where = worst(board, others[0], "lasting")
     margin = lookup(sources.tables["choice"], "margin")
     points = mine.value - figure.value if isinstance(margin, Missing) else float(margin)
-    noise = ", which is within the noise of these runs" if figure.high >= mine.low else ""
+    noise = _noise(sources.tables["choice"], mine, figure)
     rival = f"the next, {named(board, others[0])}, in its own ({within(where)}: {share_text(figure)})"
     text += (
         f", {number(abs(points), 1)} points {'more' if points > 0 else 'fewer'} than of {rival}{noise}."

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.setpoint.verdict import NAMES, accuracy, share_text
+from pipeline.report.setpoint.verdict import CLASS_BORDERS, NAMES, accuracy, share_text
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, band, number, percent, quantity, short
 from pipeline.report.shared.pictures import Column, Picture, placeholder
@@ -20,8 +20,6 @@ from pipeline.setpoint.workflow.tables import ALPHA
 CLASSES = ("under", "good", "over")
 # characters of a frame's place in its recording that are shown, its end
 LONGEST = 60
-# borders of the classes in percent of nominal flow
-BORDERS = (90.0, 110.0)
 DIAGRAMS = (
     ("image", "raw", "One image, as trained", "softmax of the network", "ece_image_raw"),
     ("image", "calibrated", "One image, calibrated", "logits over one temperature", "ece_image"),
@@ -183,7 +181,9 @@ def distributions(sources: Sources) -> Picture:
         190,
         30,
     )
-    steps = np.array([0.0, BORDERS[0], BORDERS[0], BORDERS[1], BORDERS[1], frame.x.high])
+    steps = np.array(
+        [0.0, CLASS_BORDERS[0], CLASS_BORDERS[0], CLASS_BORDERS[1], CLASS_BORDERS[1], frame.x.high]
+    )
     label = np.array([0, 0, 1, 1, 2, 2])
     ideal = np.exp(-ALPHA * np.abs(np.arange(3)[None, :] - label[:, None]))
     recorded, published = "Recorded windows", "The paper’s simulator"
@@ -250,7 +250,7 @@ def _good(frame: charts.Frame) -> Markup:
 
 
 def _box(frame: charts.Frame) -> tuple[float, float, int, int]:
-    a, b = (float(v) for v in frame.px(BORDERS))
+    a, b = (float(v) for v in frame.px(CLASS_BORDERS))
     return a, b - a, frame.above, frame.height - frame.below - frame.above
 
 
@@ -261,7 +261,7 @@ def _by_bin(mine: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     windows[shares] = windows[shares].div(windows[shares].max(axis=1), axis=0)
     windows["flow"] = (windows.flow_low_percent + windows.flow_high_percent) / 2
     flow = windows.groupby("flow_bin").flow.transform("mean")
-    windows["right"] = windows.named == np.searchsorted(BORDERS, flow, side="right")
+    windows["right"] = windows.named == np.searchsorted(CLASS_BORDERS, flow, side="right")
     means = windows.groupby("flow_bin")[["flow", *shares, "right"]].mean()
     return means.flow.to_numpy(), means[shares].to_numpy(), 100 * means.right.to_numpy()
 

@@ -11,13 +11,15 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.setpoint import deployment, judging, pixels
+from pipeline.setpoint import deployment, familiar, judging, pixels
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, read_frames
+from pipeline.setpoint.familiar import Camera
 from pipeline.setpoint.judging import Case, Choice, Judged, Runs
 from pipeline.setpoint.recorded import WindowTable
-from pipeline.setpoint.score import BEYOND, Outcomes, Score, summary
+from pipeline.setpoint.score import BEYOND, Outcomes, Score, harm_bar, summary
 from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, Windows
 from pipeline.setpoint.window_flow import window_flow
+from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
 from pipeline.setpoint.workflow.contestants import THROUGH_PIXELS, ControllerSpec
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.statistics import Mean, Share, shared_variance, wilson
@@ -54,11 +56,11 @@ def bars(settings: EvaluateSetpoint) -> dict[str, float]:
     """Percent of runs that may leave +-25 % by case: from good starts with the camera right, stuck or blind.
     A camera of another make, or with moved borders, is told and bars nobody: no rule can know better."""
     most = settings.most_harmed
-    return {
-        name: most.perfect_percent if name == "perfect" else most.in_band_percent
+    of_each = {
+        name: harm_bar(name, perfect=most.perfect_percent, in_band=most.in_band_percent)
         for name in judging.all_cases(1, segment_mean_decisions=1.0)
-        if name in ("perfect", "in band") or name.startswith(("in band, stuck", "in band, blind"))
     }
+    return {name: bar for name, bar in of_each.items() if bar is not None}
 
 
 def chosen(specs: Mapping[str, ControllerSpec], windows: WindowTable, settings: EvaluateSetpoint) -> Choice:
@@ -321,12 +323,13 @@ def pixel_rollouts(
     model: CalibratedClassifier,
     settings: EvaluateSetpoint,
     view: TrainClassifier,
+    known: Camera | None,
 ) -> PixelRollouts:
     """The default, and our agent or the robust filter beside it, from some starts; and two
-    episodes in which something befalls the default."""
+    episodes in which something befalls the default. Windows that are not of the known camera are held."""
     names = dict.fromkeys((choice.name, *THROUGH_PIXELS))
     start, disturbances, words = _disturbed(settings)
-    at, loop = some_starts(settings), _loop(model, settings, view)
+    at, loop = some_starts(settings), _loop(model, settings, view, known)
     with tqdm(total=3, desc="evaluate_setpoint: through pixels", mininterval=2) as bar:
         calm = {}
         for name in list(names)[:2]:
@@ -358,7 +361,9 @@ def _through(
     )
 
 
-def _loop(model: CalibratedClassifier, settings: EvaluateSetpoint, view: TrainClassifier) -> pixels.Loop:
+def _loop(
+    model: CalibratedClassifier, settings: EvaluateSetpoint, view: TrainClassifier, known: Camera | None
+) -> pixels.Loop:
     """The loop as deployed, with limits of what one action and one minute may change."""
     q, fitted = settings.pixels, model.calibration
     return pixels.Loop(
@@ -383,6 +388,7 @@ def _loop(model: CalibratedClassifier, settings: EvaluateSetpoint, view: TrainCl
         tip_tolerance_px=q.tip_tolerance_px,
         segment_mean_s=q.segment_mean_s,
         window_flow=partial(window_flow, fitted=fitted.flow),
+        foreign=known and partial(familiar.foreign, known, false_alarms=FALSE_ALARMS),
     )
 
 

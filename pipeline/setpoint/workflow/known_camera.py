@@ -1,5 +1,5 @@
 """The camera that the classifier was made for, by the look of its frames: of rendered segments, or of a
-user's folder; to a file and back."""
+user's folder."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,16 +10,12 @@ from tqdm import tqdm
 
 from pipeline.setpoint import familiar, nozzle_scene
 from pipeline.setpoint.familiar import Camera
+from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS, FILE, restore_camera
 from pipeline.setpoint.workflow.frame_folder import NozzleFrames
 from pipeline.setpoint.workflow.settings import RenderFrames
-from pipeline.store import artifacts
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
 
-FILE, KNOWN_CAMERA = "known_camera.parquet", ("known_camera", 1)
-# of windows of the known camera, the share that may be called foreign; pictures of other machines lie so far
-# off that it may be small
-FALSE_ALARMS = 0.01
 # of rendered segments, the place among the seeds of the stage, and the score below which a frame is not
 # measured
 STREAM, LEAST_SCORE = 20, 10.0
@@ -77,31 +73,3 @@ def window_medians(frames: NozzleFrames, *, length: int) -> tuple[np.ndarray, np
     windows = np.array(rows, float).reshape(-1, frames.surroundings.shape[1])
     sound = np.isfinite(windows).all(axis=1)
     return windows[sound], np.array(stretch, int)[sound]
-
-
-def store_camera(path: Path, camera: Camera | None) -> None:
-    """Writes the camera; nothing where there is none."""
-    if camera is None:
-        return
-    units = "1", "as the measures of familiar.NAMES"
-    artifacts.write_arrays(
-        path,
-        *KNOWN_CAMERA,
-        {
-            "mean": (camera.mean, *units),
-            "deviation": (camera.deviation, *units),
-            "whitening": (camera.whitening, "1", "inverse Cholesky factor of the measures in deviations"),
-            "scores": (camera.scores, "1", "of windows of other segments, rising"),
-        },
-    )
-
-
-def restore_camera(path: str | Path) -> Camera:
-    """What `store_camera` wrote. Raises ValueError for a file of other measures."""
-    arrays = artifacts.read_arrays(str(path), *KNOWN_CAMERA)
-    if arrays["mean"].shape != (len(familiar.NAMES),):
-        raise ValueError(
-            f"{path}: expected {len(familiar.NAMES)} measures, found {arrays['mean'].shape}; "
-            f"{artifacts.remedy(str(path))}"
-        )
-    return Camera(*(arrays[name] for name in Camera._fields))

@@ -40,8 +40,16 @@ def store_levels(path: str | Path, recorded: RecordedLevels) -> None:
             "slope": (np.array(fitted.slope), "1", "of log flow by log shown, beyond the knots"),
             "spread": (np.array(fitted.spread), "1", "relative deviation of a window's corrected flow"),
             "straight": (np.array(fitted.straight), "1", "1 where the correction is a line"),
-            "window_seen": (windows.seen, "percent", "flow that each window showed"),
-            "window_flow": (windows.flow, "percent", "flow that was commanded"),
+            "window_seen": (
+                windows.seen,
+                "percent",
+                "flow of the published material that each window showed",
+            ),
+            "window_flow": (
+                windows.flow,
+                "percent",
+                "flow that was commanded, carried to the published material",
+            ),
             "foreign_above": (
                 np.array(recorded.foreign_above),
                 "1",

@@ -4,7 +4,7 @@ import numpy as np
 
 # the loop's own numbers that its pages draw beside the tables
 from pipeline.setpoint.published import ALPHA, BEST_FLOW, BEST_TEMPERATURE, PHASES, ROTATION  # noqa: F401
-from pipeline.setpoint.score import BEYOND, FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND  # noqa: F401
+from pipeline.setpoint.score import BEYOND, DOES_NOTHING, FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND, harm_bar  # noqa: F401
 from pipeline.store.tables import BOOL, COUNT, FLOAT, INDEX, NONE, TEXT, Column, Schema
 
 _SHARES = tuple(

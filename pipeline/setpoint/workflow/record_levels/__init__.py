@@ -14,17 +14,17 @@ from pipeline.setpoint.calibrated_classifier import FrameReadings
 from pipeline.setpoint.calibration import foreign_above
 from pipeline.setpoint.familiar import Camera
 from pipeline.setpoint.levels import Levels, LevelWindows
+from pipeline.setpoint.material import PLA, Material
 from pipeline.setpoint.window_flow import WindowFlow
+from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
 from pipeline.setpoint.workflow.frame_images import find_key_areas
-from pipeline.setpoint.workflow.known_camera import FALSE_ALARMS
 from pipeline.setpoint.workflow.levels_files import RecordedLevels, store_levels
 from pipeline.setpoint.workflow.watch_sources import Folder, Recording, Shown, Source
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
 
-# classes lie between these, in percent
-BORDERS = (90.0, 110.0)
-CLASSES = ("under", "good", "over")
+# classes of the published material lie between these, in percent
+BORDERS = np.array(PLA.good_flow_percent)
 # of the page's drawing
 WIDTH, HEIGHT, MARGIN = 560, 360, 40
 
@@ -43,7 +43,8 @@ class Protocol(NamedTuple):
 class Eye(NamedTuple):
     """What sees: read(images (n, 16, 48), temperature (n,)) -> what n key areas show; window_flow, what makes
     a window's flow of it; frames of a window; the front end's least score; the digest of its weights; the
-    share of this camera's frames that may be called foreign."""
+    share of this camera's frames that may be called foreign; what is printed. It knows the published material
+    alone: flows and temperatures of another enter and leave as what they stand for."""
 
     read: Callable[[np.ndarray, np.ndarray], FrameReadings]
     window_flow: Callable[..., WindowFlow]
@@ -51,11 +52,13 @@ class Eye(NamedTuple):
     least_score: float
     weights: str
     false_alarms: float
+    material: Material = PLA
 
 
 class Level(NamedTuple):
-    """What was seen at one flow: frames and those with a key area, windows, the median of what they show and
-    of what it becomes, in percent, and the share of windows whose class is named rightly."""
+    """What was seen at one flow of the material that is printed: frames and those with a key area, windows,
+    the median of what they show and of what it becomes, in percent, and the share of windows whose class is
+    named rightly."""
 
     flow: float
     frames: int
@@ -67,8 +70,8 @@ class Level(NamedTuple):
 
 
 class _Window(NamedTuple):
-    """One window: its level, what it shows in percent, its frames, the distances (m,) of those with a key
-    area from what was learned, and how it looks (measures,)."""
+    """One window: its level and what it shows, in percent of the published material, its frames, the
+    distances (m,) of those with a key area from what was learned, and how it looks (measures,)."""
 
     flow: float
     seen: float
@@ -95,12 +98,12 @@ def record(source: Source, protocol: Protocol, eye: Eye, *, place: str) -> tuple
         right = np.digitize(corrected, BORDERS) == np.digitize(flow, BORDERS)
         told.append(
             Level(
-                float(flow),
+                float(eye.material.own_flow(flow)),
                 sum(window.frames for window in here),
                 sum(len(window.distance) for window in here),
                 len(here),
-                float(np.median(shows)),
-                float(np.median(corrected)),
+                float(eye.material.own_flow(np.median(shows))),
+                float(eye.material.own_flow(np.median(corrected))),
                 float(np.mean(right)),
             )
         )
@@ -120,18 +123,22 @@ def _camera(windows: Sequence[_Window]) -> Camera | None:
         return None
 
 
-def write(recorded: RecordedLevels, told: Sequence[Level], out: Path, place: str) -> str:
-    """Writes the levels to `out` and a page beside it; what a person is told."""
+def write(
+    recorded: RecordedLevels, told: Sequence[Level], out: Path, place: str, material: Material = PLA
+) -> str:
+    """Writes the levels to `out` and a page beside it; what a person is told, in flows of what is printed."""
     page = out.with_suffix(".html")
     store_levels(out, recorded)
-    artifacts.write_text(page, _page(recorded, told, place))
-    low, high = levels.shown(recorded.levels, np.array(BORDERS))
+    artifacts.write_text(page, _page(recorded, told, place, material))
+    low, high = material.own_flow(levels.shown(recorded.levels, BORDERS))
+    thin, thick = material.good_flow_percent
     right, count = sum(one.named * one.windows for one in told), sum(one.windows for one in told)
     return (
         f"{place}: {count} windows at {len(told)} levels; corrected flow to "
         f"{100 * recorded.levels.spread:.0f} % (one deviation), classes named rightly in "
         f"{100 * right / count:.0f} % of these windows\n"
-        f"the borders of good, 90 and 110 %, are where this camera shows {low:.0f} and {high:.0f} %\n"
+        f"the borders of good, {thin:g} and {thick:g} %, are where this camera shows {low:.0f} and "
+        f"{high:.0f} %\n"
         f"written: {out}, {page}"
     )
 
@@ -202,12 +209,15 @@ def _seen(window: Sequence[Shown], flow: float, protocol: Protocol, eye: Eye) ->
     directions = np.array([shown.direction_deg for shown in window])
     areas = find_key_areas([shown.frame for shown in window], tips, directions, least_score=eye.least_score)
     valid = np.array([not reason for reason in areas.reasons])
-    temperature = np.array(
-        [shown.temperature if np.isfinite(shown.temperature) else protocol.temperature for shown in window]
+    temperature = eye.material.published_temperature(
+        np.array(
+            [one.temperature if np.isfinite(one.temperature) else protocol.temperature for one in window]
+        )
     )
     readings = eye.read(areas.images, temperature)
     shown = eye.window_flow(readings.log_flow[None], readings.deviation[None], valid[None])
     looks = familiar.median(areas.surroundings.astype(float))
+    flow = float(eye.material.published_flow(np.array(flow)))
     return _Window(flow, float(shown.flow_seen[0]), len(window), readings.distance[valid], looks)
 
 
@@ -221,9 +231,9 @@ def source_of(place: Path, recording: Callable[[Path], Recording]) -> Source:
 # ---- the page
 
 
-def _page(recorded: RecordedLevels, told: Sequence[Level], place: str) -> str:
+def _page(recorded: RecordedLevels, told: Sequence[Level], place: str, material: Material) -> str:
     fitted = recorded.levels
-    low, high = levels.shown(fitted, np.array(BORDERS))
+    low, high = material.own_flow(levels.shown(fitted, BORDERS))
     rows = "".join(
         f"<tr><td>{one.flow:g}</td><td>{one.windows}</td><td>{one.valid} of {one.frames}</td>"
         f"<td>{one.seen:.0f}</td><td>{one.corrected:.0f}</td><td>{100 * one.named:.0f} %</td></tr>"
@@ -234,18 +244,21 @@ def _page(recorded: RecordedLevels, told: Sequence[Level], place: str) -> str:
         "spread": f"{100 * fitted.spread:.0f}",
         "low": f"{low:.0f}",
         "high": f"{high:.0f}",
+        "thin": f"{material.good_flow_percent[0]:g}",
+        "thick": f"{material.good_flow_percent[1]:g}",
         "kind": "a line in the logarithms" if fitted.straight else "straight pieces from level to level",
         "rows": rows,
-        "drawing": _drawing(fitted, recorded.windows),
+        "drawing": _drawing(fitted, recorded.windows, material),
     }
     template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
     return printable_page(string.Template(template).substitute(values))
 
 
-def _drawing(fitted: Levels, windows: LevelWindows) -> str:
+def _drawing(fitted: Levels, published: LevelWindows, material: Material) -> str:
     """Windows as dots over the flow commanded, and the curve; both axes logarithmic, in percent."""
+    windows = LevelWindows(*(material.own_flow(column) for column in published))
     curve_flow = np.geomspace(windows.flow.min() / 1.1, windows.flow.max() * 1.1, 40)
-    curve = levels.shown(fitted, curve_flow)
+    curve = material.own_flow(levels.shown(fitted, material.published_flow(curve_flow)))
     across = np.log([curve_flow[0], curve_flow[-1]])
     up = np.log([min(windows.seen.min(), curve.min()) / 1.05, max(windows.seen.max(), curve.max()) * 1.05])
 
@@ -269,7 +282,7 @@ def _drawing(fitted: Levels, windows: LevelWindows) -> str:
     marks = "".join(
         f'<line x1="{MARGIN}" x2="{WIDTH}" y1="{y(seen):.1f}" y2="{y(seen):.1f}" class="border"/>'
         f'<text x="{MARGIN - 4}" y="{y(seen) + 4:.1f}" text-anchor="end">{seen:.0f}</text>'
-        for seen in levels.shown(fitted, np.array(BORDERS))
+        for seen in material.own_flow(levels.shown(fitted, BORDERS))
     )
     return (
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="flow shown over flow commanded">'

@@ -50,9 +50,9 @@ def watch(
     decisions: list[Decision] = []
 
     def show(state: str, notes: list[str]) -> float:
-        return _write_page(page, render(place, deployed.name, decisions, state, notes, log.trouble))
+        return _write_page(page, render(place, deployed, decisions, state, notes, log.trouble))
 
-    artifacts.write_text(page, render(place, deployed.name, [], "The watch begins.", [], ""))
+    artifacts.write_text(page, render(place, deployed, [], "The watch begins.", [], ""))
     shown_at = came_at = there_at = time.monotonic()
     remarks = 0
     while not stopped():

@@ -11,13 +11,14 @@ import numpy as np
 
 from pipeline.setpoint import bayes, deployment, familiar, key_area
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, FrameReadings, read_frames
-from pipeline.setpoint.deployment import ACTS, FOREIGN, Limits, Window, is_evidence, still
+from pipeline.setpoint.deployment import ACTS, FOREIGN, Limits, Window, camera_seen, is_evidence
 from pipeline.setpoint.familiar import Camera
+from pipeline.setpoint.material import PLA, Material
 from pipeline.setpoint.pixels import ADVANTAGE, LIKENESS, LOOKS, REACH_PX, TEMPLATE_PX
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, Observation
+from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
 from pipeline.setpoint.workflow.frame_images import FrameKeyAreas, find_key_areas
-from pipeline.setpoint.workflow.known_camera import FALSE_ALARMS
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.setpoint.workflow.watch_sources import Shown
 from pipeline.store.printable import printable
@@ -52,7 +53,7 @@ class Deployed(NamedTuple):
     camera where levels were recorded; how the known camera looks, None where nobody said; the default
     controller with its name and parameters, frames of a window, the front end's least score, how a window is
     judged, the limits, how long after a move of the setpoint frames are of no use, how far the nozzle may be
-    from where its tip was.
+    from where its tip was. All of it is of the published material; `material` is the one that is printed.
     """
 
     read: Callable[[np.ndarray, np.ndarray], FrameReadings]
@@ -67,11 +68,13 @@ class Deployed(NamedTuple):
     limits: Limits
     settle_s: float
     tip_tolerance_px: float
+    material: Material = PLA
 
 
 class Decision(NamedTuple):
-    """One window: what was seen, what it would do, and what the page shows of it. belief (N,) over
-    bayes.GRID, or None where the controller has none; pictures are of some of its frames."""
+    """One window: what was seen, what it would do, and what the page shows of it; setpoint, would and flow
+    seen are of the material that is printed. belief (N,) over bayes.GRID, flows of the published one, or None
+    where the controller has none; pictures are of some of its frames."""
 
     number: int
     time_s: float
@@ -100,6 +103,7 @@ def deployed(
     looks: Looks,
     settings: EvaluateSetpoint,
     view: TrainClassifier,
+    material: Material,
 ) -> Deployed:
     """The loop as it is deployed through pixels, without a machine."""
     q, fitted = settings.pixels, model.calibration
@@ -117,7 +121,9 @@ def deployed(
     )
     read = partial(read_frames, model)
     eye = read, looks.window_flow, looks.known
-    return Deployed(*eye, *spec, view.window, view.least_score, judge, limits, q.wait_s, q.tip_tolerance_px)
+    return Deployed(
+        *eye, *spec, view.window, view.least_score, judge, limits, q.wait_s, q.tip_tolerance_px, material
+    )
 
 
 class Mind:
@@ -143,14 +149,18 @@ class Mind:
             np.array([shown.direction_deg for shown in window]),
             least_score=self.deployed.least_score,
         )
-        judged = self._judged(areas, temperature, self._tip_moved(window, tips, notes), notes)
-        judged, would = self._answer(judged, setpoint, float(temperature.mean()), notes)
+        material = self.deployed.material
+        seen_at = material.published_temperature(temperature)
+        judged = self._judged(areas, seen_at, self._tip_moved(window, tips, notes), notes)
+        judged, would = self._answer(judged, setpoint, float(seen_at.mean()), notes)
+        judged = _own(judged, material)
         self.number += 1
         time_s = window[-1].time_s - first_s
         belief = believed(self.memory)
         pictures = _pictures(window, areas)
-        row = _row(self.number, time_s, judged, would, setpoint, belief, window, areas, notes)
-        row |= {"flow_seen_percent": _number(judged.flow_seen[0]), "spread": _number(judged.spread[0])}
+        row = _row(self.number, time_s, judged, would, setpoint, window, areas, notes)
+        low, median, high = (None, None, None) if belief is None else belief_range(belief, material)
+        row |= {"belief_flow_percent": median, "belief_low_percent": low, "belief_high_percent": high}
         names = [shown.name for shown in window]
         return Decision(
             self.number, time_s, judged, setpoint, would, belief, names, areas.reasons, pictures, row
@@ -170,33 +180,33 @@ class Mind:
             np.array([tip_moved]),
             flows=lambda counts: of.window_flow(readings.log_flow[None], readings.deviation[None], counts),
         )
-        seen = judged.flow_seen[0]
-        if is_evidence(judged.reason[0]) and still(seen, self.last_seen):
-            judged = judged._replace(reason=np.array([int(still(seen, self.last_seen))]))
-        self.last_seen = seen
-        if of.known is not None and is_evidence(judged.reason[0]):
-            looks = familiar.median(areas.surroundings.astype(float))
-            if familiar.foreign(of.known, looks[None], false_alarms=FALSE_ALARMS)[0]:
-                notes.append(f"the pictures are none of the known camera: {familiar.unlike(of.known, looks)}")
-                judged = judged._replace(reason=np.array([FOREIGN]))
+        looks, was = familiar.median(areas.surroundings.astype(float)), judged.reason[0]
+        foreign = of.known and partial(familiar.foreign, of.known, false_alarms=FALSE_ALARMS)
+        judged = camera_seen(judged, np.array([self.last_seen]), looks[None], foreign)
+        self.last_seen = judged.flow_seen[0]
+        if of.known is not None and judged.reason[0] == FOREIGN != was:
+            notes.append(f"the pictures are none of the known camera: {familiar.unlike(of.known, looks)}")
         return judged
 
     def _answer(
         self, judged: Window, setpoint: tuple[float, float], temperature: float, notes: list[str]
     ) -> tuple[Window, np.ndarray]:
         """(2,) the change of flow in percent and target in degC that would be sent, within the limits; and
-        the window with the reason that the controller adds."""
+        the window with the reason that the controller adds. Setpoint and change are of the material that is
+        printed, window and temperature of the published one."""
         if not is_evidence(judged.reason[0]):
             return judged, np.zeros(2)
-        move = setpoint[0] - self.shown_flow if np.isfinite(self.shown_flow) else 0.0
-        self.shown_flow = setpoint[0]
+        material = self.deployed.material
+        published = _published(material, setpoint)
+        move = published[0] - self.shown_flow if np.isfinite(self.shown_flow) else 0.0
+        self.shown_flow = published[0]
         shown = Observation(
             shares=jnp.asarray(judged.p[0], jnp.float32),
             named=jnp.int32(judged.label[0]),
             flow_seen=jnp.float32(judged.flow_seen[0]),
             flow_move=jnp.float32(move),
             temperature=jnp.float32(temperature),
-            target=jnp.float32(setpoint[1]),
+            target=jnp.float32(published[1]),
             step=jnp.int32(self.acted),
         )
         self.memory, action, reason = self.decide_jit(
@@ -216,13 +226,14 @@ class Mind:
         )
         self.acted += 1
         limits = self.deployed.limits
-        inside = np.clip(setpoint, limits.low, limits.high)
-        if (inside != setpoint).any():
+        inside = np.clip(published, limits.low, limits.high)
+        if (inside != published).any():
             notes.append(
                 f"the setpoint {setpoint[0]:g} %, {setpoint[1]:g} degC lies outside the controller's limits"
             )
         at = deployment.setpoints(inside[None], limits)
-        return judged, (deployment.moved(at, wanted[None], np.zeros(1), limits).value - at.value)[0]
+        after = deployment.moved(at, wanted[None], np.zeros(1), limits).value[0]
+        return judged, _own_setpoint(material, after) - _own_setpoint(material, inside)
 
     def _tip_moved(self, window: list[Shown], tips: np.ndarray, notes: list[str]) -> bool:
         """Whether the nozzle is elsewhere than on the first frame of the watch."""
@@ -244,6 +255,30 @@ class Mind:
             and nozzle.correlation >= LIKENESS
             and nozzle.advantage >= ADVANTAGE
         )
+
+
+def _published(material: Material, setpoint: tuple[float, float]) -> np.ndarray:
+    """(2,) flow in percent and target in degC of the published material that stand for a setpoint."""
+    return np.array(
+        [
+            material.published_flow(np.array(setpoint[0])),
+            material.published_temperature(np.array(setpoint[1])),
+        ]
+    )
+
+
+def _own_setpoint(material: Material, published: np.ndarray) -> np.ndarray:
+    """The inverse of _published."""
+    return np.array([material.own_flow(published[0]), material.own_temperature(published[1])])
+
+
+def _own(judged: Window, material: Material) -> Window:
+    """The flow that windows show, and its deviation, as of the material that is printed."""
+    seen, step = judged.flow_seen, np.exp(judged.spread)
+    if material == PLA:
+        return judged
+    own = np.log(material.own_flow(seen * step) / material.own_flow(seen / step)) / 2
+    return judged._replace(flow_seen=material.own_flow(seen), spread=own)
 
 
 def _pictures(window: list[Shown], areas: FrameKeyAreas) -> list[Drawn]:
@@ -278,9 +313,9 @@ def believed(memory: Any) -> np.ndarray | None:
     return total / total.sum()
 
 
-def belief_range(belief: np.ndarray) -> tuple[float, float, float]:
-    """The flows in percent below which 5, 50 and 95 % of the belief lie."""
-    low, median, high = np.interp([0.05, 0.5, 0.95], np.cumsum(belief), bayes.GRID)
+def belief_range(belief: np.ndarray, material: Material) -> tuple[float, float, float]:
+    """The flows in percent, of a material, below which 5, 50 and 95 % of the belief lie."""
+    low, median, high = np.interp([0.05, 0.5, 0.95], np.cumsum(belief), material.own_flow(bayes.GRID))
     return float(low), float(median), float(high)
 
 
@@ -290,13 +325,11 @@ def _row(
     judged: Window,
     would: np.ndarray,
     setpoint: tuple[float, float],
-    belief: np.ndarray | None,
     window: list[Shown],
     areas: FrameKeyAreas,
     notes: list[str],
 ) -> dict[str, Any]:
-    """The fields of decision_log.FIELDS."""
-    low, median, high = (None, None, None) if belief is None else belief_range(belief)
+    """The fields of decision_log.FIELDS but those of the belief."""
     acts = judged.reason[0] == ACTS
     return {
         "decision": number, "time_s": _number(time_s), "reason": deployment.REASONS[judged.reason[0]],
@@ -305,7 +338,7 @@ def _row(
         "flow_setpoint_percent": _number(setpoint[0]), "target_degC": _number(setpoint[1]),
         "would_flow_move_percent": float(would[0]), "would_temperature_move_degC": float(would[1]),
         **{f"p_{name}": float(p) for name, p in zip(deployment.CLASSES, judged.p[0], strict=True)},
-        "belief_flow_percent": median, "belief_low_percent": low, "belief_high_percent": high,
+        "flow_seen_percent": _number(judged.flow_seen[0]), "spread": _number(judged.spread[0]),
         "distance": _number(judged.score[0]), "valid": int(judged.valid[0]), "used": int(judged.used[0]),
         "notes": [printable(note) for note in notes],
         "frames": [
@@ -324,7 +357,7 @@ def _number(value: float) -> float | None:
 def would_words(would: np.ndarray, setpoint: tuple[float, float]) -> str:
     """ "flow -5 % (to 95 %)", "change nothing"."""
     moves = [
-        f"{name} {change:+g} {unit} (to {at + change:g} {unit})"
+        f"{name} {change:+.4g} {unit} (to {at + change:.4g} {unit})"
         for name, change, at, unit in zip(("flow", "temperature"), would, setpoint, ("%", "°C"), strict=True)
         if change
     ]

@@ -11,12 +11,12 @@ from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
 from pipeline.setpoint.window_flow import WindowFlow, window_flow
 from pipeline.setpoint.workflow import contestants
 from pipeline.setpoint.workflow.agent_files import restore_agents
+from pipeline.setpoint.workflow.camera_files import restore_camera
 from pipeline.setpoint.workflow.classifier_files import restore_classifier
 from pipeline.setpoint.workflow.frame_folder import read_options
 from pipeline.setpoint.workflow.frame_mcap import Topics
-from pipeline.setpoint.workflow.known_camera import restore_camera
 from pipeline.setpoint.workflow.levels_files import LEVELS_FILE, restore_levels
-from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
+from pipeline.setpoint.workflow.settings import EvaluateSetpoint, SetpointMaterial, TrainClassifier
 from pipeline.setpoint.workflow.shadow.decide import Asked, Deployed, Looks, deployed
 from pipeline.setpoint.workflow.tables import WINDOWS
 from pipeline.setpoint.workflow.windows import window_tables
@@ -28,6 +28,7 @@ BOUNDS = {"--flow": (1.0, 1000.0), "--temperature": (0.0, 600.0), "--rate": (0.0
 
 
 WEIGHTS = "datasets/train_classifier/weights.safetensors"
+CAMERA = "datasets/train_classifier/known_camera.parquet"
 
 
 class Ready(NamedTuple):
@@ -62,10 +63,9 @@ def ready(levels_file: str) -> Ready:
     name = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
     windows = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
     agents = restore_agents("datasets/train_agent/weights.safetensors")
-    learn, camera = windows["learn"], "datasets/train_classifier/known_camera.parquet"
+    learn = windows["learn"]
     flow = partial(window_flow, fitted=model.calibration.flow)
-    known = restore_camera(camera) if artifacts.exists(camera) else None
-    looks = Looks(flow, known, model.calibration.foreign_above)
+    looks = Looks(flow, restore_camera(CAMERA), model.calibration.foreign_above)
     if levels_file or artifacts.exists(LEVELS_FILE):
         recorded = restore_levels(levels_file or LEVELS_FILE, digest)
         learn = levels.table(recorded.levels, recorded.windows, learn.flow_edges)
@@ -79,7 +79,8 @@ def ready(levels_file: str) -> Ready:
         )
     options = read_options(view)
     spec = (name, specs[name].controller, specs[name].parameters)
-    return Ready(deployed(model, spec, looks, settings, view), options.topics, options.tip_px)
+    material = params.load(SetpointMaterial, "setpoint_material").material()
+    return Ready(deployed(model, spec, looks, settings, view, material), options.topics, options.tip_px)
 
 
 def of_camera(

@@ -12,32 +12,33 @@ import numpy as np
 
 from pipeline.setpoint import bayes, deployment
 from pipeline.setpoint.deployment import ACTS
-from pipeline.setpoint.workflow.shadow.decide import Decision, Drawn
+from pipeline.setpoint.material import GOOD, Material
+from pipeline.setpoint.workflow.shadow.decide import Decision, Deployed, Drawn
 from pipeline.store.printable import printable, printable_page
 
 COLOURS = ("#3b76c4", "#2f9e5a", "#d0662a")
 ENDED = "The watch has ended."
 # of the drawing of the belief
-WIDTH, HEIGHT, TICKS = 640, 90, (20, 50, 90, 110, 150, 200, 310)
+WIDTH, HEIGHT, TICKS = 640, 90, (20, 50, 150, 200, 310)
 REASONS_LISTED, NOTES_LISTED = 5, 10
 
 
 def render(
-    place: str, controller: str, decisions: Sequence[Decision], state: str, notes: Sequence[str], trouble: str
+    place: str, of: Deployed, decisions: Sequence[Decision], state: str, notes: Sequence[str], trouble: str
 ) -> str:
-    """The page after these decisions, the last one at the end. `state` is a sentence on why nothing comes, ""
-    where frames do; `trouble` why the decisions cannot be written. After ENDED it refreshes itself no
-    more."""
+    """The page after these decisions of `of`, the last one at the end. `state` is a sentence on why nothing
+    comes, "" where frames do; `trouble` why the decisions cannot be written. After ENDED it refreshes itself
+    no more."""
     last = decisions[-1] if decisions else None
     warnings = [text for text in (state, trouble) if text]
     values = {
         "place": _text(place),
-        "controller": _text(controller),
+        "controller": _text(of.name),
         "refresh": "" if state == ENDED else '<meta http-equiv="refresh" content="2">',
         "warnings": "".join(f"<p class=warning>{_text(text)}</p>" for text in warnings),
         "would": "<p class=big>No window yet.</p>" if last is None else _would(last),
         "shares": "" if last is None else _shares(last),
-        "belief": "" if last is None or last.belief is None else _belief(last.belief),
+        "belief": "" if last is None or last.belief is None else _belief(last.belief, of.material),
         "frames": "" if last is None else _frames(last),
         "rows": "".join(_row(decision) for decision in reversed(decisions)),
         "notes": _list([*notes][-NOTES_LISTED:]),
@@ -74,23 +75,28 @@ def _shares(last: Decision) -> str:
     return f"<h2>What the window shows</h2><table>{bars}</table><p class=quiet>{counted}</p>"
 
 
-def _belief(belief: np.ndarray) -> str:
-    """The belief over flow as a drawing, on a logarithmic axis, with the good range shaded."""
-    low, high = np.log(bayes.GRID[[0, -1]])
+def _belief(belief: np.ndarray, material: Material) -> str:
+    """The belief over the flow of a material as a drawing, on a logarithmic axis, with the good range
+    shaded."""
+    grid, (thin, thick) = material.own_flow(bayes.GRID), material.good_flow_percent
+    low, high = np.log(grid[[0, -1]])
 
     def place(flow: float) -> float:
         return float(WIDTH * (np.log(flow) - low) / (high - low))
 
-    density = belief * bayes.GRID  # by logarithm of the flow
+    density = belief / np.gradient(np.log(grid))  # by logarithm of the flow
     tops = HEIGHT - (HEIGHT - 10) * density / density.max()
-    points = " ".join(f"{place(q):.1f},{y:.1f}" for q, y in zip(bayes.GRID, tops, strict=True))
+    points = " ".join(f"{place(q):.1f},{y:.1f}" for q, y in zip(grid, tops, strict=True))
     ticks = "".join(
-        f'<text x="{place(q):.0f}" y="{HEIGHT + 16}" text-anchor="middle">{q}</text>' for q in TICKS
+        f'<text x="{place(q):.0f}" y="{HEIGHT + 16}" text-anchor="middle">{q:g}</text>'
+        for q in sorted({*TICKS, thin, thick})
+        if grid[0] <= q <= grid[-1]
     )
-    good = f'<rect x="{place(90):.1f}" width="{place(110) - place(90):.1f}" height="{HEIGHT}" class="good"/>'
-    median = float(np.interp(0.5, np.cumsum(belief), bayes.GRID))
-    inside = float(belief[(bayes.GRID >= 90.0) & (bayes.GRID <= 110.0)].sum())
-    words = f"Most likely about {median:.0f} %; inside 90 to 110 % with probability {inside:.2f}."
+    width = place(thick) - place(thin)
+    good = f'<rect x="{place(thin):.1f}" width="{width:.1f}" height="{HEIGHT}" class="good"/>'
+    median = float(np.interp(0.5, np.cumsum(belief), grid))
+    inside = float(belief[material.label(grid) == GOOD].sum())
+    words = f"Most likely about {median:.0f} %; inside {thin:g} to {thick:g} % with probability {inside:.2f}."
     return (
         f'<h2>Belief over the flow</h2><svg viewBox="-10 0 {WIDTH + 20} {HEIGHT + 22}" role="img" '
         f'aria-label="belief over flow in percent">{good}'

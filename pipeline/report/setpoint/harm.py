@@ -1,0 +1,197 @@
+"""What controllers do to prints that were good, and what that buys: harm against recovery."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from markupsafe import Markup
+
+from pipeline.report.setpoint.verdict import Board, Case, Harm, bars, case_text, harm_of, role, share_text
+from pipeline.report.shared import charts, page
+from pipeline.report.shared.digits import THIN, band, number
+from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.verdict import Figure, Missing
+from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING
+
+TITLE = "Harm against recovery"
+# a clog that halves the evidence: to 0.6 of the flow, and to 0.75
+CLOG, HALF_CLOG = ("recorded", "recorded, sticky, clog"), ("recorded", "recorded, sticky, half clog")
+# ends of the axis of harm in percent: the first that holds every controller, else the last
+AXES = (5.0, 10.0, 20.0, 50.0, 100.0)
+
+
+class Contestant(NamedTuple):
+    """One controller: its harm where it is nearest to its bar, and what it recovers, in words."""
+
+    name: str
+    mark: str
+    default: bool
+    harm: str
+    harm_band: str
+    bad: bool
+    where: str
+    recovered: str
+    recovered_band: str
+    steps: str
+    back: str
+    back_band: str
+    why: str
+
+
+class Harms(NamedTuple):
+    picture: Picture
+    rows: Sequence[Contestant] = ()
+    clustered: str = ""
+
+
+def harms(sources: Sources, board: Board | Missing) -> Harms:
+    """The chart, and the contestants as a table: those that may run first."""
+    if isinstance(board, Missing):
+        return Harms(placeholder("harm", TITLE, board))
+    limits = bars(sources, board)
+    found = {name: harm_of(board, name, limits) for name in board.names}
+    known = {name: harm for name, harm in found.items() if isinstance(harm, Harm)}
+    if not known:
+        gap = Missing("not measured", "no run from a good start", "Run ./run dvc repro evaluate_setpoint")
+        return Harms(placeholder("harm", TITLE, gap))
+    rows = [_row(board, name, harm) for name, harm in known.items()]
+    clog = case_text(CLOG, whole=True)
+    caption = (
+        f"Across: runs from good starts that leave ±{BEYOND[-1]}{THIN}% of flow within 200 decisions, in "
+        f"the case that is nearest to its bar, or most beyond it. Up: runs "
+        f"that are inside again 60 decisions after a clog ({clog}). Crosses: 95{THIN}% intervals of those "
+        "that may run. Grey: harm that is allowed in some case."
+    )
+    picture = Picture(
+        "harm",
+        TITLE,
+        _finding(board, known, limits),
+        [Column("Runs recovered from a clog", "in per cent, against harm", "", [_chart(board, known)])],
+        caption,
+        page.origin(sources.source("scoreboard", "choice")),
+    )
+    return Harms(picture, rows, clustered(board))
+
+
+def clustered(board: Board) -> str:
+    """How the intervals of the scoreboard were made."""
+    redraws = sorted({cell.redraws for cell in board.cells.values() if cell.redraws > 1})
+    if not redraws:
+        return f"Intervals are Wilson’s, 95{THIN}%."
+    many = f"{redraws[0]:,}" if len(redraws) == 1 else f"{redraws[0]:,} to {redraws[-1]:,}"
+    return (
+        f"Intervals, 95{THIN}%, are clustered by segment on recorded windows and from good starts: runs are "
+        f"on {many} redraws of the segments. On the paper’s simulator runs share nothing, and intervals are "
+        "Wilson’s."
+    )
+
+
+def start_text(case: Case) -> str:
+    """ "in band, stuck 30" -> "in-band start, stuck 30"."""
+    return case_text(case).replace("perfect", "perfect start").replace("in band", "in-band start")
+
+
+def _recovered(board: Board, name: str, what: str = "recovered", case: Case = CLOG) -> Figure | Missing:
+    cell = board.cells.get((name, case))
+    return Missing("not measured", "this case was not run") if cell is None else getattr(cell, what)
+
+
+def _row(board: Board, name: str, harm: Harm) -> Contestant:
+    share, back = _recovered(board, name), _recovered(board, name, "back", HALF_CLOG)
+    cell = board.cells.get((name, CLOG))
+    steps = math.nan if cell is None else cell.recovery_steps
+    return Contestant(
+        name,
+        role(board, name),
+        name == board.default,
+        share_text(harm.figure),
+        band(harm.figure.low, harm.figure.high, 1),
+        bad=harm.state == "failed",
+        where=f"{start_text(harm.case)}, ≤\u00a0{harm.limit:g}{THIN}%",
+        recovered=share_text(share),
+        recovered_band=band(share.low, share.high, 1) if isinstance(share, Figure) else "",
+        steps="" if math.isnan(steps) else f"in {number(steps, 0)} decisions",
+        back=share_text(back),
+        back_band=band(back.low, back.high, 1) if isinstance(back, Figure) else "",
+        why="may not run" if name in board.refused else "",
+    )
+
+
+def _finding(board: Board, known: dict[str, Harm], limits: dict[Case, float]) -> str:
+    """The default, then doing nothing, then the controller that recovers most, with its harm."""
+    sentences = []
+    for name in dict.fromkeys((board.default, DOES_NOTHING)):
+        if name in known:
+            harm = known[name]
+            sentences.append(
+                f"{_said(name)} spoils {share_text(harm.figure)} of good prints "
+                f"({start_text(harm.case)}; at most {harm.limit:g}{THIN}% may be). It recovers "
+                f"{share_text(_recovered(board, name))} of clogs."
+            )
+    shares = {name: share for name in known if isinstance(share := _recovered(board, name), Figure)}
+    most = max(shares, key=lambda name: shares[name].value, default="")
+    if most and most not in (board.default, DOES_NOTHING):
+        sentences.append(
+            f"Most clogs, {share_text(shares[most])}, are recovered by {most}. It spoils "
+            f"{share_text(known[most].figure)}."
+        )
+    return " ".join(sentences)
+
+
+def _said(name: str) -> str:
+    return "Doing nothing" if name == DOES_NOTHING else name[:1].upper() + name[1:]
+
+
+def _chart(board: Board, known: dict[str, Harm]) -> Markup:
+    """A point for each controller, with both intervals."""
+    most = max(harm.figure.value for harm in known.values())
+    end = next((end for end in AXES if end >= most), AXES[-1])
+    x = charts.Axis(0, end, tuple((float(v), f"{v:g}") for v in np.linspace(0, end, 6)))
+    y = charts.Axis(-4, 104, tuple((float(v), str(v)) for v in (0, 25, 50, 75, 100)))
+    frame = charts.Frame(x, y, 568, 340, 42, 20, 24, right=12)
+    allowed = max(harm.limit for harm in known.values())
+    layers: list[Markup] = [charts.interval(frame, 0.0, allowed, "allow")]
+    taken: list[tuple[float, float]] = []
+    for name, harm in known.items():
+        share = _recovered(board, name)
+        if isinstance(share, Missing):
+            continue
+        a, low, high = (float(v) for v in frame.px([harm.figure.value, harm.figure.low, harm.figure.high]))
+        b, bottom, top = (float(v) for v in frame.py([share.value, share.low, share.high]))
+        if name not in board.refused:
+            layers.append(
+                Markup('<path class="whisk pale" d="M{:.1f} {:.1f}H{:.1f}M{:.1f} {:.1f}V{:.1f}"/>').format(
+                    low, b, high, a, bottom, top
+                )
+            )
+        mark = page.MARKS[role(board, name)]
+        layers.append(charts.dots(frame, harm.figure.value, share.value, f"dot whole {mark}", 4.0))
+        layers.append(_name(frame, name, a, b, taken))
+    mine = known.get(board.default)
+    alt = (
+        "Harm against recovery"
+        if mine is None
+        else f"{board.default} spoils {share_text(mine.figure)} of good prints and recovers "
+        f"{share_text(_recovered(board, board.default))} of clogs"
+    )
+    return charts.panel(
+        frame,
+        layers,
+        alt=alt,
+        css="mb wide big",
+        title="% of clogs recovered, against % harmed",
+        units=("%", "%"),
+    )
+
+
+def _name(frame: charts.Frame, name: str, a: float, b: float, taken: list[tuple[float, float]]) -> Markup:
+    """A name beside its point, on the side that has room on a phone too; below names that are there."""
+    left, y = a + 14 + 9.5 * len(name) > frame.width, b - 6
+    while any(abs(y - other) < 18 and abs(a - where) < 200 for where, other in taken):
+        y += 6
+    taken.append((a, y))
+    return Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(
+        a - 7 if left else a + 7, y, "end" if left else "start", name
+    )
