@@ -61,6 +61,20 @@ def test_what_is_told_is_of_other_segments_and_the_default_s_harm_stands_by_case
     assert followed["beyond_10"] > 20
 
 
+def check_margin(told, contest):
+    """By hand, of the redraws that both ran on: value and interval are of the same segments."""
+    worst = {
+        name: min((runs.mean(), case) for case, runs in of.kept.items())
+        for name, of in contest.judged.items()
+        if name not in told.refused
+    }
+    rival = max((name for name in worst if name != told.name), key=lambda name: worst[name][0])
+    ours, theirs = (contest.judged[name].kept[worst[name][1]][:3] for name in (told.name, rival))
+    assert told.case == worst[told.name][1]
+    assert told.margin == pytest.approx(100 * (ours.mean() - theirs.mean()))
+    assert told.margin_low <= told.margin <= told.margin_high
+
+
 def test_the_number_of_cores_changes_nothing_and_the_runs_drawn_are_among_those_judged(settings, monkeypatch):
     specs = controllers(
         Problem(settings.baselines, agents=None, windows=None),
@@ -87,20 +101,6 @@ def test_the_number_of_cores_changes_nothing_and_the_runs_drawn_are_among_those_
         np.testing.assert_array_equal(drawn.temperature[:, 0], starts.temperature)
     assert (np.ptp(one.paths["do nothing"]["recorded, fresh"].flow, axis=1) < 1e-3).all()
     assert np.ptp(one.paths["sequential test"]["recorded, fresh"].flow, axis=1).max() > 50
-
-
-def check_margin(told, contest):
-    """By hand, of the redraws that both ran on: value and interval are of the same segments."""
-    worst = {
-        name: min((runs.mean(), case) for case, runs in of.kept.items())
-        for name, of in contest.judged.items()
-        if name not in told.refused
-    }
-    rival = max((name for name in worst if name != told.name), key=lambda name: worst[name][0])
-    ours, theirs = (contest.judged[name].kept[worst[name][1]][:3] for name in (told.name, rival))
-    assert told.case == worst[told.name][1]
-    assert told.margin == pytest.approx(100 * (ours.mean() - theirs.mean()))
-    assert told.margin_low <= told.margin <= told.margin_high
 
 
 def test_who_cannot_win_any_more_runs_in_one_round_only(settings, monkeypatch):
