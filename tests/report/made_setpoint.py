@@ -191,6 +191,7 @@ def classifier(seed=0):
     """Frames, windows, diagrams and courses whose accuracy is about what the metrics say."""
     rng, folder = np.random.default_rng(seed), Path("datasets/train_classifier")
     n = 1500
+    artifacts.write_json("datasets/render_frames/frames.json", {"judged": {"frames": n, "segments": 75}})
     flow, heat = rng.uniform(40, 250, n), rng.choice([190.0, 200.0, 210.0, 220.0, 230.0], n)
     label = np.searchsorted([90.0, 110.0], flow, side="right")
     seen = np.searchsorted([90.0, 110.0], flow + rng.normal(0, 14, n), side="right")

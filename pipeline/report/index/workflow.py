@@ -24,7 +24,8 @@ READS: dict[str, tuple[str, ...]] = {
     "train_ilc": (),
     "segment_library": ("train_ilc",),
     "compose_parts": ("segment_library", "train_ilc"),
-    "train_classifier": (),
+    "render_frames": (),
+    "train_classifier": ("render_frames",),
     "train_agent": ("train_classifier",),
     "evaluate_setpoint": ("train_classifier", "train_agent"),
 }
