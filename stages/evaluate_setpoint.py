@@ -46,7 +46,7 @@ def main() -> None:
         artifacts.write_table(
             out / "decisions.parquet", DECISIONS, evaluate_setpoint.decisions(choice.name, rollouts)
         )
-        artifacts.write_json(out / "choice.json", choice)
+        artifacts.write_json(out / "choice.json", evaluate_setpoint.choice_record(choice))
         artifacts.write_metrics(
             "evaluate_setpoint", evaluate_setpoint.metrics(controllers, contest, choice, rollouts)
         )

@@ -61,6 +61,14 @@ def test_what_is_told_is_of_other_segments_and_the_default_s_harm_stands_by_case
     assert followed["beyond_10"] > 20
 
 
+def test_where_nothing_else_may_run_the_choice_is_written_without_a_margin(tmp_path):
+    alone = judging.Choice("do nothing", 0.0, "accuracy 1", *3 * (float("nan"),), {"ours": "harms"}, "Alone.")
+    artifacts.write_json(tmp_path / "choice.json", evaluate_setpoint.choice_record(alone))
+    read = artifacts.read_json(tmp_path / "choice.json")
+    assert [read[name] for name in ("margin", "margin_low", "margin_high")] == [None] * 3
+    assert (read["name"], read["worst"], read["refused"]) == ("do nothing", 0.0, {"ours": "harms"})
+
+
 def check_margin(told, contest):
     """By hand, of the redraws that both ran on: value and interval are of the same segments."""
     worst = {

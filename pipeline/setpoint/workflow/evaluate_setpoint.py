@@ -226,6 +226,13 @@ def told(choice: Choice, contest: Contest) -> Choice:
     )
 
 
+def choice_record(choice: Choice) -> dict[str, Any]:
+    """What choice.json holds: null where there is no figure, as of a margin where nothing else may run."""
+    return {
+        name: _plain(value) if isinstance(value, float) else value for name, value in choice._asdict().items()
+    }
+
+
 def simulator(case: str) -> str:
     """Whose windows a case has: paper or recorded; harm, recorded ones from good starts."""
     if not judging.counts(case):
