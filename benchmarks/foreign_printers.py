@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
-from pipeline.setpoint import bayes, deployment
+from pipeline.setpoint import actuation, bayes
 from pipeline.setpoint.baselines import nearest, nothing, temperature_move
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
 from pipeline.setpoint.recorded import WindowTable
@@ -37,7 +37,7 @@ from pipeline.store import params
 
 RESULTS = Path(__file__).parent / "results" / "foreign_printers.json"
 DECISIONS, WINDOW_S, HEATER_S = 200, 1.0, 15.0
-LIMITS = deployment.Limits(
+LIMITS = actuation.Limits(
     np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([100.0, 60.0])
 )
 START_FLOWS, START_TEMPERATURES = (30.0, 60.0, 80.0, 120.0, 150.0, 200.0, 300.0), (190.0, 210.0, 230.0)
@@ -231,7 +231,7 @@ def window_shares(seen: np.ndarray, spread: np.ndarray | float) -> np.ndarray:
 
 class Runs(NamedTuple):
     """flow and temperature (n, D + 1), before the first decision and after each; moves (n, D) of the flow as
-    sent; reason (n, D) of deployment.REASONS."""
+    sent; reason (n, D) of actuation.REASONS."""
 
     flow: np.ndarray
     temperature: np.ndarray
@@ -252,7 +252,7 @@ def loop(
         printer.begin(rng, case, start[:, 0]),
         camera.begin(rng, n),
     )
-    sent, flow, temperature = deployment.setpoints(start, LIMITS), start[:, 0], start[:, 1]
+    sent, flow, temperature = actuation.setpoints(start, LIMITS), start[:, 0], start[:, 1]
     clog = np.ones(n), np.zeros(n)
     memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *jnp.shape(leaf))), controller.start())
     since, acted, seen, steps = np.zeros(n), np.zeros(n, int), np.full(n, np.nan), []
@@ -262,12 +262,12 @@ def loop(
         last, faulty = seen, t - case.fault_at
         seen = last if 0 <= faulty < case.stuck else np.clip(fresh, 15.0, 400.0)
         blind = np.full(n, 0 <= faulty < case.blind)
-        reason = np.where(blind, deployment.FEW, deployment.still(np.float32(seen), np.float32(last)))
+        reason = np.where(blind, actuation.FEW, actuation.still(np.float32(seen), np.float32(last)))
         shares = window_shares(seen, camera.spread)
         shown = _observation(shares, seen, since, temperature, sent.value[:, 1], acted)
         memory, action, reason = _decided(controller, parameters, memory, shown, jnp.asarray(reason), keys)
         reason = np.asarray(reason)
-        acts, clock = reason == deployment.ACTS, acted % 10 == 0
+        acts, clock = reason == actuation.ACTS, acted % 10 == 0
         wanted = np.stack(
             [
                 np.asarray(FLOW_MOVES)[action.flow] * acts,
@@ -275,9 +275,9 @@ def loop(
             ],
             axis=1,
         )
-        before, sent = sent.value, deployment.moved(sent, wanted, t * (wait_s + WINDOW_S), LIMITS)
+        before, sent = sent.value, actuation.moved(sent, wanted, t * (wait_s + WINDOW_S), LIMITS)
         move = sent.value[:, 0] - before[:, 0]
-        since = move + np.where(deployment.is_evidence(reason), 0.0, since)
+        since = move + np.where(actuation.is_evidence(reason), 0.0, since)
         acted = acted + acts
         clog = _clogged(rng, case, t + 1, *clog)
         state, flow = printer.feed(rng, case, state, move, wait_s, clog[0])
@@ -291,7 +291,7 @@ def loop(
     )  # fmt: skip
 
 
-_decided = eqx.filter_jit(jax.vmap(deployment.decide, (None, None, 0, 0, 0, 0)))
+_decided = eqx.filter_jit(jax.vmap(actuation.decide, (None, None, 0, 0, 0, 0)))
 
 
 def _observation(shares, seen, since, temperature, target, acted) -> Observation:
@@ -423,7 +423,7 @@ def figures(runs: Runs, case: Case) -> dict[str, Any]:
     good = outcomes(runs, case)
     back = np.array([_since(one[case.clog_at :]) for one in (miss <= 15 + 1e-3)[:, :121]])
     again = np.array([_since(one[case.clog_at :]) for one in inside[:, :121]])
-    held = runs.reason == deployment.TABLE
+    held = runs.reason == actuation.TABLE
     share = {
         "beyond_10": (miss > 10 + 1e-3).any(axis=1),
         "beyond_25": (miss > 25 + 1e-3).any(axis=1),

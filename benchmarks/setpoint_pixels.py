@@ -28,11 +28,11 @@ from benchmarks.waits import (
     step_response,
     window_frames,
 )
-from pipeline.setpoint import calibration, deployment, judging, nozzle_scene, pixels
+from pipeline.setpoint import actuation, calibration, deployment, judging, nozzle_scene, pixels
+from pipeline.setpoint.actuation import ACTS, Limits, Waits
 from pipeline.setpoint.baselines import Proportional, proportional
 from pipeline.setpoint.bayes import CameraErrorModel, bayes, watching_filter
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, read_frames
-from pipeline.setpoint.deployment import ACTS, Limits, Waits
 from pipeline.setpoint.pixels import Disturbances, Episodes, Loop, Machine, calm
 from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.window_flow import WindowFlow, window_flow
@@ -145,8 +145,8 @@ def summary(e: Episodes) -> dict:
 def reasons(reason: np.ndarray) -> dict[str, float]:
     return dict(
         zip(
-            deployment.REASONS,
-            (np.bincount(reason.ravel(), minlength=len(deployment.REASONS)) / reason.size).round(3).tolist(),
+            actuation.REASONS,
+            (np.bincount(reason.ravel(), minlength=len(actuation.REASONS)) / reason.size).round(3).tolist(),
             strict=True,
         )
     )

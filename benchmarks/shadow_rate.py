@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.setpoint import bayes, calibration, deployment, nozzle_scene
+from pipeline.setpoint import actuation, bayes, calibration, deployment, nozzle_scene
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, read_frames
 from pipeline.setpoint.vision_transformer import SMALL, vision_transformer
 from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration, window_flow
@@ -53,7 +53,7 @@ def deployed() -> Deployed:
     flow = FlowCalibration(knots, np.ones(len(knots)), 0.5)
     familiar = calibration.Familiar(rng.standard_normal((3, f)), np.eye(f))
     model = CalibratedClassifier(network, calibration.Calibration(1.0, 0.5, 0.1, familiar, 1e9, flow))
-    limits = deployment.Limits(
+    limits = actuation.Limits(
         np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([40.0, 40.0])
     )
 

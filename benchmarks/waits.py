@@ -4,7 +4,7 @@ machine and errors of a classifier ask for them."""
 import numpy as np
 
 from pipeline.setpoint import pixels
-from pipeline.setpoint.deployment import Waits
+from pipeline.setpoint.actuation import Waits
 from pipeline.setpoint.pixels import Machine
 
 

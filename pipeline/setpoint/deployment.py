@@ -1,60 +1,14 @@
 """From the frames of a window to a setpoint that may be sent: what the frames say together, and why it acted.
-When to hold, limits and waits are `actuation`'s, and have their names here too."""
+When to hold, limits and waits are `actuation`'s."""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.setpoint.actuation import (
-    ACTS,
-    AMBIGUOUS,
-    FEW,
-    FOREIGN,
-    NO_NUMBER,
-    REASONS,
-    STILL,
-    TABLE,
-    TIP,
-    Limits,
-    Setpoints,
-    Waits,
-    at_rest,
-    decide,
-    is_evidence,
-    moved,
-    setpoints,
-    still,
-    wait_after,
-)
+from pipeline.setpoint.actuation import ACTS, AMBIGUOUS, FEW, FOREIGN, REASONS, TIP, is_evidence, still
 from pipeline.setpoint.calibration import hard_shares, window_probabilities
 
-__all__ = [
-    "ACTS",
-    "AMBIGUOUS",
-    "CLASSES",
-    "FEW",
-    "FOREIGN",
-    "NO_NUMBER",
-    "REASONS",
-    "STILL",
-    "TABLE",
-    "TIP",
-    "Limits",
-    "Setpoints",
-    "Waits",
-    "Window",
-    "at_rest",
-    "camera_seen",
-    "decide",
-    "is_evidence",
-    "judge_window",
-    "moved",
-    "setpoints",
-    "still",
-    "wait_after",
-    "why",
-]
 CLASSES = ("under", "good", "over")
 
 

@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint import deployment, familiar, key_area, nozzle_scene
-from pipeline.setpoint.deployment import ACTS, Limits, Waits, Window
+from pipeline.setpoint import actuation, deployment, familiar, key_area, nozzle_scene
+from pipeline.setpoint.actuation import ACTS, Limits, Waits
+from pipeline.setpoint.deployment import Window
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.simulator import Controller, Observation
 
@@ -131,7 +132,7 @@ class Episodes(NamedTuple):
 
     Per decision (E, D): time_s at the window's end, setpoint and sent (E, D, 2) flow and target before, and
     the change that was sent, windows (each field (E, D, ...)), segment number; clipped (E, 4) as in
-    deployment.Setpoints; pictures (350, 350, 3) uint8 by (episode, decision), the key area drawn in.
+    actuation.Setpoints; pictures (350, 350, 3) uint8 by (episode, decision), the key area drawn in.
     """
 
     flow: np.ndarray
@@ -197,7 +198,7 @@ def _answer(
     return memory, np.where((reason == ACTS)[:, None], wanted, 0.0), reason
 
 
-_decided = eqx.filter_jit(jax.vmap(deployment.decide, (None, None, 0, 0, 0, 0)))
+_decided = eqx.filter_jit(jax.vmap(actuation.decide, (None, None, 0, 0, 0, 0)))
 
 
 class _Cameras(NamedTuple):
@@ -251,7 +252,7 @@ def run(
         )
     cameras = _Cameras(rng.spawn(E), [None] * E, [None] * E, np.zeros(E), np.zeros(E, int))
     keys = jax.random.split(jax.random.key(int(rng.integers(2**31))), E)
-    setpoints = deployment.setpoints(start, loop.limits)
+    setpoints = actuation.setpoints(start, loop.limits)
     running = at_rest(loop.machine, *setpoints.value.T, tick_s=tick_s)
     memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (E, *jnp.shape(leaf))), controller.start())
     time_s, change = np.zeros(E), np.zeros((E, 2))
@@ -260,7 +261,7 @@ def run(
     pictures: dict[tuple[int, int], np.ndarray] = {}
     for decision in range(decisions + 1):
         clog = np.where(decision >= disturbances.clog_at, disturbances.clog, 1.0)
-        ticks = np.rint(deployment.wait_after(change, loop.waits) / tick_s).astype(int) * (decision > 0)
+        ticks = np.rint(actuation.wait_after(change, loop.waits) / tick_s).astype(int) * (decision > 0)
         running, flow, temperature = _filmed_window(loop, running, setpoints.value, clog, ticks)
         time_s = time_s + (ticks + loop.frames) * tick_s
         if decision == decisions:
@@ -282,11 +283,11 @@ def run(
         )
         memory, wanted, reason = _answer(controller, parameters, memory, shown, step_keys, window.reason)
         window = window._replace(reason=reason)
-        before, setpoints = setpoints, deployment.moved(setpoints, wanted, time_s, loop.limits)
+        before, setpoints = setpoints, actuation.moved(setpoints, wanted, time_s, loop.limits)
         change = setpoints.value - before.value
         means = flow.mean(axis=1), temperature.mean(axis=1)
         steps.append(_Step(*means, time_s, before.value, change, window, cameras.numbers.copy()))
-        since = np.where(deployment.is_evidence(reason), 0.0, since) + change[:, 0]
+        since = np.where(actuation.is_evidence(reason), 0.0, since) + change[:, 0]
         acted = acted + (reason == ACTS)
     last = flow.mean(axis=1), temperature.mean(axis=1)
     return _episodes(steps, *last, setpoints.clipped, pictures)

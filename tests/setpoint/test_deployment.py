@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from benchmarks.waits import autocorrelation, derived_waits, effective_frames, settling_s, window_frames
-from pipeline.setpoint.deployment import (
+from pipeline.setpoint.actuation import (
     ACTS,
     AMBIGUOUS,
     FEW,
@@ -22,15 +22,13 @@ from pipeline.setpoint.deployment import (
     Limits,
     Waits,
     at_rest,
-    camera_seen,
     decide,
-    judge_window,
     moved,
     setpoints,
     still,
     wait_after,
-    why,
 )
+from pipeline.setpoint.deployment import camera_seen, judge_window, why
 from pipeline.setpoint.simulator import Action, Controller
 
 RULES = {"least_frames": 8, "correlation": 0.45, "foreign_above": 5.0, "conformal_level": 0.2}

@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import norm
 
 from benchmarks.waits import settling_s, step_response
-from pipeline.setpoint import deployment, familiar, pixels
-from pipeline.setpoint.deployment import ACTS, Limits, Waits
+from pipeline.setpoint import actuation, deployment, familiar, pixels
+from pipeline.setpoint.actuation import ACTS, Limits, Waits
 from pipeline.setpoint.pixels import Loop, Machine, at_rest, calm, run, tick
 from pipeline.setpoint.simulator import Action, Controller
 from pipeline.setpoint.workflow import camera_files, known_camera, settings
@@ -171,7 +171,7 @@ def test_a_held_window_moves_nothing_and_the_controller_does_not_hear_of_it(numb
     got = run(FILTERED, None, STARTS, LOOP, d, decisions=20, rng=np.random.default_rng(1))
     held = got.windows.reason != ACTS
     assert held[:, 3:8].all()
-    assert (got.windows.reason[:, 3:8] == deployment.FOREIGN).all()
+    assert (got.windows.reason[:, 3:8] == actuation.FOREIGN).all()
     assert (got.sent[held] == 0).all()
     np.testing.assert_array_equal(got.setpoint[:, 3], got.setpoint[:, 8])
 
@@ -257,10 +257,10 @@ def test_a_camera_that_moved_is_held_for_that_and_one_that_shook_a_little_is_not
         for d in (far, little)
     )
     assert (
-        moved.windows.reason[:, 1:] == deployment.TIP
+        moved.windows.reason[:, 1:] == actuation.TIP
     ).mean() >= 0.8  # a dark nozzle before a dark plate may not be found again
-    assert (moved.sent[moved.windows.reason == deployment.TIP] == 0).all()
-    assert (shaken.windows.reason == deployment.TIP).sum() <= 1  # of 24: nor where it is, once in a while
+    assert (moved.sent[moved.windows.reason == actuation.TIP] == 0).all()
+    assert (shaken.windows.reason == actuation.TIP).sum() <= 1  # of 24: nor where it is, once in a while
 
 
 @pytest.fixture(scope="module")
@@ -280,8 +280,8 @@ def test_pictures_of_another_kind_are_held_and_those_of_the_known_camera_are_not
     blurred = calm(6)._replace(blur_px=np.full(6, 6.0), burst_at=np.full(6, 2), burst_for=np.full(6, 2))
     got = run(FILTERED, None, SIX, loop, blurred, decisions=4, rng=np.random.default_rng(3))
     ungated = run(FILTERED, None, SIX, CALM_LIGHT, blurred, decisions=4, rng=np.random.default_rng(3))
-    seen = deployment.is_evidence(ungated.windows.reason)
-    held = got.windows.reason == deployment.FOREIGN
+    seen = actuation.is_evidence(ungated.windows.reason)
+    held = got.windows.reason == actuation.FOREIGN
     assert held[:, :2].mean() <= 0.1
     assert seen[:, 2:].any() and held[:, 2:][seen[:, 2:]].all()
     assert (got.sent[held] == 0).all()

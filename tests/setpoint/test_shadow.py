@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from pipeline.setpoint import bayes, deployment
+from pipeline.setpoint import actuation, bayes, deployment
 from pipeline.setpoint.calibrated_classifier import FrameReadings
 from pipeline.setpoint.material import PLA, Material
 from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration, window_flow
@@ -56,7 +56,7 @@ def by_width(images: np.ndarray, temperature: np.ndarray) -> FrameReadings:
 
 def deployed(**changes) -> Deployed:
     parameters = bayes.class_filter(accuracy=0.8, hazard=0.02, move_cost=0.2, outside_cost=2.0)
-    limits = deployment.Limits(
+    limits = actuation.Limits(
         np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([40.0, 40.0])
     )
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.setpoint import deployment, familiar, judging, pixels
+from pipeline.setpoint import actuation, deployment, familiar, judging, pixels
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, read_frames
 from pipeline.setpoint.familiar import Camera
 from pipeline.setpoint.judging import Case, Choice, Judged, Runs
@@ -378,8 +378,8 @@ def _loop(
         classify=partial(read_frames, model),
         frames=view.window,
         frame_rate_hz=q.frame_rate_hz,
-        waits=deployment.Waits(q.wait_s, q.wait_s, q.idle_wait_s),
-        limits=deployment.Limits(
+        waits=actuation.Waits(q.wait_s, q.wait_s, q.idle_wait_s),
+        limits=actuation.Limits(
             *(np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True)),
             np.array(q.per_action),
             np.array(q.per_minute),
@@ -486,7 +486,7 @@ def decisions(name: str, rollouts: PixelRollouts) -> dict[str, list]:
                     "distance": score if np.isfinite(score) else np.nan,
                     "flow_move_percent": sent[0],
                     "temperature_move_degC": sent[1],
-                    "held": bool(window.reason[i] != deployment.ACTS),
+                    "held": bool(window.reason[i] != actuation.ACTS),
                     "why": deployment.why(episodes.time_s[i, d], window, i, sent),
                 }
             )

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint import bayes, deployment, familiar, key_area
+from pipeline.setpoint import actuation, bayes, deployment, familiar, key_area
+from pipeline.setpoint.actuation import ACTS, FOREIGN, Limits, is_evidence
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, FrameReadings, read_frames
-from pipeline.setpoint.deployment import ACTS, FOREIGN, Limits, Window, camera_seen, is_evidence
+from pipeline.setpoint.deployment import Window, camera_seen
 from pipeline.setpoint.familiar import Camera
 from pipeline.setpoint.material import PLA, Material
 from pipeline.setpoint.pixels import ADVANTAGE, LIKENESS, LOOKS, REACH_PX, TEMPLATE_PX
@@ -135,7 +136,7 @@ class Mind:
         self.memory = deployed.controller.start()
         self.acted, self.shown_flow, self.last_seen, self.number = 0, np.nan, np.nan, 0
         self.template: np.ndarray | None = None
-        self.decide_jit = eqx.filter_jit(deployment.decide)
+        self.decide_jit = eqx.filter_jit(actuation.decide)
         self.key = jax.random.key(0)
 
     def decide(self, window: list[Shown], asked: Asked, first_s: float, notes: list[str]) -> Decision:
@@ -231,8 +232,8 @@ class Mind:
             notes.append(
                 f"the setpoint {setpoint[0]:g} %, {setpoint[1]:g} degC lies outside the controller's limits"
             )
-        at = deployment.setpoints(inside[None], limits)
-        after = deployment.moved(at, wanted[None], np.zeros(1), limits).value[0]
+        at = actuation.setpoints(inside[None], limits)
+        after = actuation.moved(at, wanted[None], np.zeros(1), limits).value[0]
         return judged, _own_setpoint(material, after) - _own_setpoint(material, inside)
 
     def _tip_moved(self, window: list[Shown], tips: np.ndarray, notes: list[str]) -> bool:
@@ -332,7 +333,7 @@ def _row(
     """The fields of decision_log.FIELDS but those of the belief."""
     acts = judged.reason[0] == ACTS
     return {
-        "decision": number, "time_s": _number(time_s), "reason": deployment.REASONS[judged.reason[0]],
+        "decision": number, "time_s": _number(time_s), "reason": actuation.REASONS[judged.reason[0]],
         "would": would_words(would, setpoint) if acts else "hold",
         "why": deployment.why(time_s, judged, 0, would),
         "flow_setpoint_percent": _number(setpoint[0]), "target_degC": _number(setpoint[1]),

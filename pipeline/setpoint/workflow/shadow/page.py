@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.setpoint import bayes, deployment
-from pipeline.setpoint.deployment import ACTS
+from pipeline.setpoint import actuation, bayes, deployment
+from pipeline.setpoint.actuation import ACTS
 from pipeline.setpoint.material import GOOD, Material
 from pipeline.setpoint.workflow.shadow.decide import Decision, Deployed, Drawn
 from pipeline.store.printable import printable, printable_page
@@ -123,7 +123,7 @@ def _frames(last: Decision) -> str:
 
 def _row(one: Decision) -> str:
     acts = one.judged.reason[0] == ACTS
-    does = _text(one.row["would"]) if acts else f"hold: {_text(deployment.REASONS[one.judged.reason[0]])}"
+    does = _text(one.row["would"]) if acts else f"hold: {_text(actuation.REASONS[one.judged.reason[0]])}"
     shares = " ".join(f"{p:.2f}" for p in one.judged.p[0])
     median = one.row["belief_flow_percent"]
     belief = "" if median is None else f"{median:.0f} %"
