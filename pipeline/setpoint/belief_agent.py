@@ -155,24 +155,24 @@ def standing_values(observation: Observation, gamma: float) -> jax.Array:
 def belief_encoder(of: Belief) -> ObservationEncoder:
     """x = [values of the flow's actions (5), pooled belief, hypotheses (H), values of the temperature's
     actions (5), u_hat, u_bar, clock, heeded]."""
-    hypotheses = of.filter.evidence.shape[0]
-    pooling = jnp.asarray(POOLING, jnp.float32)
+    # the belief's tables are arguments: as constants each of them would be compiled anew
+    return ObservationEncoder(Partial(bayes.initial_state, of.filter.evidence.shape[0]), Partial(_encoded, of))
 
-    def encode(network, state, observation):
-        state = bayes.filter_update(of.filter, state, observation)
-        belief = state.belief
-        flow, clock = belief.sum(axis=0), observation.step % LAMBDA
-        temperatures = (
-            jnp.stack([observation.temperature, observation.target]) - BEST_TEMPERATURE
-        ) / TEMPERATURE_SCALE
-        rest = [
-            standing_values(observation, slower(of.gamma)),
-            temperatures,
-            jnp.stack([clock / LAMBDA, clock == 0]),
-        ]
-        return state, jnp.concatenate([of.values @ flow, flow @ pooling, belief.sum(axis=1), *rest])
 
-    return ObservationEncoder(lambda: bayes.initial_state(hypotheses), encode)
+def _encoded(of: Belief, network, state: bayes.FilterState, observation: Observation):
+    state = bayes.filter_update(of.filter, state, observation)
+    belief = state.belief
+    flow, clock = belief.sum(axis=0), observation.step % LAMBDA
+    temperatures = (
+        jnp.stack([observation.temperature, observation.target]) - BEST_TEMPERATURE
+    ) / TEMPERATURE_SCALE
+    rest = [
+        standing_values(observation, slower(of.gamma)),
+        temperatures,
+        jnp.stack([clock / LAMBDA, clock == 0]),
+    ]
+    pooled = flow @ jnp.asarray(POOLING, jnp.float32)
+    return state, jnp.concatenate([of.values @ flow, pooled, belief.sum(axis=1), *rest])
 
 
 class Correction(eqx.Module):
