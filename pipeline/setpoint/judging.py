@@ -352,21 +352,17 @@ def _shared(of: Judged, group: str, redraws: int) -> float:
 
 
 def still_in(judged: Mapping[str, Judged], bars: Mapping[str, float]) -> list[str]:
-    """Who may still become the default: whose worst case does not lie below that of the best harmless one,
-    interval by interval, and whose harm is not beyond its bar by the whole of its interval."""
+    """Who may still become the default: whose worst case is not surely below that of the best harmless one,
+    redraw by redraw (`lead`, by which `choose` tells ties), and whose harm is not beyond its bar by the whole
+    of its interval."""
     sound = [name for name, of in judged.items() if not harmless(of, bars)] or list(judged)
     best = max(sound, key=lambda name: worst_case(judged[name])[0])
-    least = _worst_share(judged[best]).low
     return [
         name
         for name, of in judged.items()
-        if _worst_share(of).high >= least
+        if (name == best or lead(judged[best], of).low <= 0)
         and all(_interval(of, of.harmed, case).low <= bar for case, bar in bars.items())
     ]
-
-
-def _worst_share(of: Judged) -> Share:
-    return _interval(of, of.kept, worst_case(of)[1])
 
 
 def _interval(of: Judged, figures: Mapping[str, np.ndarray], case: str) -> Share:
