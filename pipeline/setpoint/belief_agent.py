@@ -156,7 +156,9 @@ def belief_encoder(of: Belief) -> ObservationEncoder:
     """x = [values of the flow's actions (5), pooled belief, hypotheses (H), values of the temperature's
     actions (5), u_hat, u_bar, clock, heeded]."""
     # the belief's tables are arguments: as constants each of them would be compiled anew
-    return ObservationEncoder(Partial(bayes.initial_state, of.filter.evidence.shape[0]), Partial(_encoded, of))
+    return ObservationEncoder(
+        Partial(bayes.initial_state, of.filter.evidence.shape[0]), Partial(_encoded, of)
+    )
 
 
 def _encoded(of: Belief, network, state: bayes.FilterState, observation: Observation):

@@ -303,7 +303,7 @@ def _lay(
     level: float,
 ) -> None:
     """Draws the fresh bead: level falls as 1 - shading rho^2 with rho = 2 t / w across
-    it, a specular line at specular_at, rough edges. place: segment.along in whole px; level: of the ground."""
+    it, a specular line at specular_at, rough edges. place: segment.along in whole px; level of the ground."""
     turn, beside, light = (
         np.tan(np.deg2rad(TURN_DEG)) * rng.standard_normal(),
         PLACE_PX * rng.standard_normal(),

@@ -3,10 +3,11 @@ beside their yardsticks; tables, metrics and a few frames of it."""
 
 import contextlib
 import functools
+import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import jax
@@ -194,15 +195,22 @@ def _all(settings: TrainClassifier, frames: LabelledFrames) -> Labelled:
     )
 
 
+OUTPUTS_OF = ("learned", "calibration", "judged")
+Given = TypeVar("Given")
+Made = TypeVar("Made")
+
+
+def _each(parts: Mapping[str, Given], work: Callable[[Given], Made]) -> dict[str, Made]:
+    """work of each part, on every core at once; what comes out does not depend on the cores."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return dict(zip(parts, pool.map(work, parts.values()), strict=True))
+
+
 def judged(settings: TrainClassifier, by_part: Mapping[str, LabelledFrames], networks: Trained) -> Judged:
     """The networks calibrated on one part and judged on another, beside their yardsticks."""
     learned, data = fewer(Labelled(*by_part["learned"].labelled())), _all(settings, by_part["judged"])
-    outputs = {
-        part: calibrated_classifier.outputs(
-            networks.network, _all(settings, by_part[part]), by_part[part].valid
-        )
-        for part in ("learned", "calibration", "judged")
-    }
+    parts = {part: (_all(settings, by_part[part]), by_part[part].valid) for part in OUTPUTS_OF}
+    outputs = _each(parts, lambda part: calibrated_classifier.outputs(networks.network, *part))
     fitted = calibration.calibrate(
         outputs["learned"],
         outputs["calibration"],
@@ -355,13 +363,13 @@ def recorded(
     settings: TrainClassifier, model: CalibratedClassifier, by_part: Mapping[str, LabelledFrames]
 ) -> dict[str, WindowTable]:
     """The windows of WINDOW_PARTS as the simulator draws them again; of a folder, windows at one flow."""
-    windows = {}
-    for part, frames in by_part.items():
+
+    def of(frames: LabelledFrames) -> WindowPredictions:
         truth = frames.temperature, frames.label, frames.flow, frames.segment
         outputs = calibrated_classifier.outputs(model.network, Labelled(frames.images, *truth), frames.valid)
-        windows[part] = calibrated_classifier.window_predictions(
-            model.calibration, outputs, length=settings.window
-        )
+        return calibrated_classifier.window_predictions(model.calibration, outputs, length=settings.window)
+
+    windows = _each(by_part, of)
     bins = edges([of.truth.flow_percent[of.any_valid] for of in windows.values()])
     return {
         part: calibration.recorded(of.seen, of.truth.flow_percent, of.truth.segment, flow_edges=bins)
