@@ -7,7 +7,7 @@ import optax
 import pytest
 from jax.tree_util import Partial
 
-from pipeline.setpoint import bayes, belief_agent
+from pipeline.setpoint import bayes, belief_agent, simulator
 from pipeline.setpoint.agent import (
     DqnProblem,
     DqnSettings,
@@ -28,6 +28,7 @@ from pipeline.setpoint.agent import (
     paper_encoder,
     phase,
     train_published,
+    untrained,
     weights,
     with_weights,
 )
@@ -210,6 +211,26 @@ def test_before_training_the_agent_is_the_greedy_filter(prior_belief):
     encoder = belief_agent.belief_encoder(prior_belief)
     (belief, *_), x = encoder.encode(network, encoder.start(), observation(named=0))
     np.testing.assert_allclose(network(x)[0], prior_belief.values @ belief.sum(axis=0), rtol=1e-5)  # float32
+
+
+def test_agents_on_other_beliefs_are_one_program(prior_belief):
+    network = belief_agent.BeliefNetwork(prior_belief.filter.evidence.shape[0], jax.random.key(0))
+    windows, from_two = paper_windows(), starts(1, accuracy=1.0)
+    other = prior_belief._replace(values=2 * prior_belief.values)
+    compiled = []
+    for of in (prior_belief, other):
+        evaluate(greedy(belief_agent.belief_encoder(of)), network, windows, from_two, jax.random.key(0))
+        compiled.append(simulator._rolled._cached._cache_size())
+    assert compiled[0] == compiled[1]
+
+
+def test_weights_find_their_places_by_shapes_alone():
+    network = QNetwork(jax.random.key(0), 4)
+    shapes = untrained(QNetwork, 4)
+    found = with_weights(shapes, weights(network))
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool((a == b).all()), found, network))
+    with pytest.raises(ValueError, match=r"'vision.weight' is of shape \(256, 8\) in this network"):
+        with_weights(untrained(QNetwork, 5), weights(network))
 
 
 def test_the_value_of_an_observed_flow_moves_it_by_the_shortest_way_and_holds_it_at_100():

@@ -23,7 +23,7 @@ from pipeline.setpoint.recorded import recorded_windows
 from pipeline.setpoint.score import judge, outcomes, summary
 from pipeline.setpoint.simulator import STAND, Action, Controller, nominal
 from pipeline.statistics import effective_runs, redrawn_mean, redrawn_share, shared_variance, wilson
-from tests.setpoint.synthetic import synthetic_table
+from tests.setpoint.synthetic import synthetic_flow_table, synthetic_table
 
 
 def path(*pieces):
@@ -276,6 +276,25 @@ def test_redraws_are_whole_segments_and_what_fills_them_up_is_never_drawn():
     assert 6 <= np.mean(used) <= 9
 
 
+def test_a_redraw_of_flows_shows_what_its_segments_show_whatever_it_is_filled_up_with():
+    """Segments of unlike length, so that redraws differ in theirs; one room for tables of any size."""
+    table = synthetic_flow_table(np.random.default_rng(0), segments=40, windows=9)
+    some = np.random.default_rng(1).random(len(table.flow)) < 0.6
+    columns = {name: getattr(table, name)[some] for name in table._fields if name != "flow_edges"}
+    table = table._replace(**columns, flow_edges=np.array([20.0, 90.0, 110.0, 310.0]))
+    table = table._replace(flow_bin=np.digitize(table.flow, table.flow_edges[1:-1]))
+    room, again = judging.room([table, TABLE]), np.random.default_rng(2)
+    stacked = judging.redrawn(table, 4, np.random.default_rng(2), room=room)
+    assert stacked.table.log_flow.shape == stacked.table.shares.shape[:2] == (4, room)
+    flows = np.linspace(21, 310, 60)
+    for b in range(4):
+        one = recorded_windows(judging.redraw(table, again))
+        of = stacked._replace(table=jax.tree.map(lambda leaf, b=b: leaf[b], stacked.table))
+        for u in (0.0, 0.4, 0.999):
+            for x, y in zip(windows_at(of, flows, 1.0, u), windows_at(one, flows, 1.0, u), strict=True):
+                np.testing.assert_array_equal(x, y)
+
+
 def test_a_bin_of_one_segment_keeps_it():
     table = TABLE._replace(segment=TABLE.flow_bin)
     for seed in range(5):
@@ -434,6 +453,12 @@ def test_the_race_is_left_by_who_cannot_win_any_more_and_by_nobody_else():
         "hasty": contestant(0.999, 0.999, harmed=spread(0.025), seed=5),  # perhaps not above 2 %
     }
     assert still_in(judged, BARS) == ["simple", "filter", "hasty"]
+    # run by run the worse one is told apart where the two intervals would overlap
+    rng = np.random.default_rng(6)
+    better = rng.random((24, 20)) < 0.6
+    both = {"a": better, "b": better & (rng.random((24, 20)) < 0.92)}
+    pair = {name: Judged({"accuracy 0.7": kept}, judged["simple"].harmed) for name, kept in both.items()}
+    assert still_in(pair, BARS) == ["a"]
     # the harmful is better than all, and ends nobody's race
     assert still_in({name: judged[name] for name in ("simple", "harmful")}, BARS) == ["simple"]
 
