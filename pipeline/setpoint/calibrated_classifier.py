@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import scipy.special
 
-from pipeline.setpoint import calibration, yardsticks
+from pipeline.setpoint import calibration
 from pipeline.setpoint.calibration import Calibration, ClassifierOutputs, Reliability, WindowFlow, WindowTruth
 from pipeline.setpoint.classifier import Labelled, predict
 from pipeline.setpoint.vision_transformer import Classifier
@@ -171,6 +171,8 @@ def yardstick_classes(
 ) -> YardstickClasses:
     """Both yardsticks, fitted on the valid frames that the network
     learned, on the frames `data` and their windows."""
+    from pipeline.setpoint import yardsticks  # here, as who only classifies needs none
+
     machine = yardsticks.fit_profile_machine(
         learned.key_area, learned.temperature_degC, learned.label, learned.segment
     )

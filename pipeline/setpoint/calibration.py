@@ -13,7 +13,6 @@ import scipy.linalg
 import scipy.optimize
 import scipy.special
 import scipy.stats
-import sklearn.covariance
 
 from pipeline.setpoint.classifier import Labelled, Prediction
 from pipeline.setpoint.recorded import WindowTable
@@ -343,7 +342,9 @@ def fit_familiar(features: np.ndarray, label: np.ndarray) -> Familiar:
     covariance shrunk (Ledoit and Wolf 2004)."""
     features, label = np.asarray(features, float), np.asarray(label)
     means = np.array([features[label == c].mean(axis=0) for c in range(CLASSES)])
-    covariance = sklearn.covariance.LedoitWolf(assume_centered=True).fit(features - means[label]).covariance_
+    from sklearn.covariance import LedoitWolf  # here, as who only classifies fits none
+
+    covariance = LedoitWolf(assume_centered=True).fit(features - means[label]).covariance_
     covariance += 1e-9 * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
     L = np.linalg.cholesky(covariance)
     return Familiar(means, scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True))

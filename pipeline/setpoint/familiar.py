@@ -14,7 +14,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import scipy.linalg
-import sklearn.covariance
 
 from pipeline.setpoint import key_area
 from pipeline.setpoint.key_area import LENGTH, SIDE, KeyAreas
@@ -206,7 +205,10 @@ def fit_camera(windows: np.ndarray, segment: np.ndarray, *, false_alarms: float)
         )
     learned = windows[np.isin(segment, names[::2])]
     mean, deviation = learned.mean(axis=0), learned.std(axis=0) + 1e-6
-    covariance = sklearn.covariance.LedoitWolf().fit((learned - mean) / deviation).covariance_
+    # here, as whoever renders, watches or controls fits none, and it takes longer to import than all else
+    from sklearn.covariance import LedoitWolf
+
+    covariance = LedoitWolf().fit((learned - mean) / deviation).covariance_
     L = np.linalg.cholesky(covariance + 1e-9 * np.eye(len(covariance)))
     whitening = scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True)
     camera = Camera(mean, deviation, whitening, np.zeros(0))
