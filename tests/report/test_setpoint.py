@@ -52,6 +52,21 @@ def test_the_default_is_named_with_its_worst_case_and_its_lead_over_the_next(pro
     assert re.search(r"<title>(.*?) ·", PAGE.read_text())[1] == "Setpoint: Rehearsal passed: the agent"
 
 
+def test_who_may_not_run_is_no_next(project):
+    harm = "leaves +-25 % in 24.0 % of the runs (in band), of at most 2 %"
+    made_setpoint.scoreboard(lost(our_agent=(1.0, 2.0)))
+    made_setpoint.choice("filtered proportional", margin=9.0, refused={"Bayes, robust": harm})
+    assert "points more than of the next, the baseline “sequential test”" in page()
+    made_setpoint.choice("Bayes, robust", margin=9.0, refused={"our agent": harm})
+    assert "The agent may not run, for its harm." in page() and "did not earn it" not in page()
+    kinds = made_setpoint.KINDS
+    barred = {name: harm for name in kinds if name != "Bayes, robust"}
+    nothing = {"margin": None, "margin_low": None, "margin_high": None}
+    made_setpoint.choice("Bayes, robust", refused=barred, **nothing)
+    text = page()
+    assert "settle and stay. Nothing else may run." in text and "the next," not in text
+
+
 def test_what_may_be_claimed_stands_in_the_verdict_and_on_page_one(project):
     claim = (
         "The classifier is trained and judged on rendered frames: eight real pictures "

@@ -262,6 +262,7 @@ def windows_of(frames: list[Shown], length: int = 4) -> tuple[list[list[float]],
 def test_a_gap_begins_a_window_anew():
     full, notes = windows_of(shown(0, 0.1, 0.2, 9.0, 9.1, 9.2, 9.3))
     assert full == [[9.0, 9.1, 9.2, 9.3]]
+    assert windows_of(shown(0, 9.0))[1] == ["no frame came for 9 s; 1 frame fills no window"]
     assert notes == ["no frame came for 8.8 s; 3 frames fill no window"]
 
 
@@ -278,6 +279,9 @@ def test_a_frame_that_is_late_is_left_out_and_a_clock_set_back_is_followed():
 def test_ten_thousand_notes_are_told_in_few():
     notes = windows_of(shown(5.0, *([4.0, 4.0, 5.0] * 3000)))[1]
     assert len(notes) == 21 and "notes before these" in notes[0]
+    windows = Windows(4, settle_s=6.0)
+    windows.notes = [""] * 21
+    assert windows.taken_notes()[0] == "1 note before these"
 
 
 # ---- what it writes
@@ -295,6 +299,17 @@ def test_the_page_asks_for_nothing_and_says_that_nothing_is_sent(tmp_path):
     )
     assert "default-src 'none'" in page and 'http-equiv="refresh"' not in page
     assert "The watch has ended." in page and "Belief over the flow" in page
+
+
+def test_one_frame_is_no_frames(tmp_path):
+    (tmp_path / "in").mkdir()
+    fill(tmp_path / "in", [picture(0)])
+    said = shadow.summary_lines(watch(Folder(tmp_path / "in"), tmp_path / "out"), "in")
+    assert "in: 1 frame, no window of them" in said
+    of = deployed()
+    watch(Folder(tmp_path / "in"), tmp_path / "one", deployed_as=of._replace(window=1))
+    page = (tmp_path / "one/index.html").read_text()
+    assert "1 of 1 frame counts, 1 shows a line" in page
 
 
 def test_while_it_runs_the_page_refreshes_itself_and_says_what_it_waits_for(tmp_path):

@@ -567,16 +567,17 @@ def _noise(choice: Any, mine: Figure, other: Figure) -> str:
 
 
 def summary(sources: Sources, board: Board) -> str:
-    """The default's worst case, by how much it beats the next, and,
+    """The default's worst case, by how much it beats the next of those that may run, and,
     where the agent is neither, how far it came."""
     mine, place = worst(board, board.default, "lasting")
     if place is None:
         return ""
     runs = board.cells[board.default, place].runs
     text = f"In its worst case ({within(place)}) {share_text(mine)} of {runs:,} runs settle and stay"
-    others = [name for name in board.names if name != board.default and worst(board, name, "lasting")[1]]
+    judged = [name for name in board.names if name != board.default and worst(board, name, "lasting")[1]]
+    others = [name for name in judged if name not in board.refused]
     if not others:
-        return f"{text}. Nothing else was judged."
+        return f"{text}. {'Nothing else may run' if judged else 'Nothing else was judged'}."
     figure, where = worst(board, others[0], "lasting")
     margin = lookup(sources.tables["choice"], "margin")
     points = mine.value - figure.value if isinstance(margin, Missing) else float(margin)
@@ -594,4 +595,6 @@ def summary(sources: Sources, board: Board) -> str:
     if where is None:
         return text
     name = named(board, learned)
+    if learned in board.refused:
+        return f"{text} {name[:1].upper()}{name[1:]} may not run, for its harm."
     return f"{text} {name[:1].upper()}{name[1:]} did not earn it: {share_text(figure)} ({within(where)})."

@@ -17,7 +17,7 @@ from pipeline.setpoint.workflow.shadow.page import ENDED, render
 from pipeline.setpoint.workflow.shadow.windows import GAP_S, Windows
 from pipeline.setpoint.workflow.watch_sources import Recording, Snapshots, Source
 from pipeline.store import artifacts
-from pipeline.store.printable import printable
+from pipeline.store.printable import counted, printable
 
 # with --once, a recording without footer has ended where nothing came for so long
 SILENT_S = 5.0
@@ -90,12 +90,11 @@ def watch(
 
 def summary_lines(watched: Watched, place: str) -> str:
     """What the command prints at its end."""
+    frames = counted(watched.frames, "frame")
     if not watched.decisions:
-        return (
-            f"{place}: {watched.frames} frames, no window of them; nothing was sent\nwritten: {watched.page}"
-        )
+        return f"{place}: {frames}, no window of them; nothing was sent\nwritten: {watched.page}"
     return (
-        f"{place}: {watched.frames} frames, {watched.decisions} decisions, {watched.acts} of them would have "
+        f"{place}: {frames}, {counted(watched.decisions, 'decision')}, {watched.acts} of them would have "
         f"acted; nothing was sent\nwritten: {watched.page}, {watched.log}"
     )
 
