@@ -239,7 +239,7 @@ def rules(sources: Sources, board: Board | None) -> tuple[Pair, ...]:
             ("svc", "cnn", "width"),
             "frames of segments it never saw",
         ),
-        _right_by_flow(sources, 100 * asked.window_accuracy),
+        _right_by_flow(sources, 100 * asked.window_right_70_150),
         _calibrated(sources, "Calibrated, an image", asked.ece_image, ("ece_image", "ece_image_raw")),
         _calibrated(sources, "Calibrated, a window", asked.ece_window, ("ece_window", "ece_window_counts")),
     )
