@@ -76,6 +76,12 @@ def test_what_may_be_claimed_stands_in_the_verdict_and_on_page_one(project):
     sections = params.read("params.yaml")
     sections["train_classifier"]["source"] = "recordings"
     Path("params.yaml").write_text(yaml.safe_dump(sections))
+    shared = "the folder has too few prints to keep them apart"
+    for apart in (True, False):
+        figures = artifacts.read_metrics("train_classifier")
+        figures["data"]["windows_apart"] = apart
+        artifacts.write_metrics("train_classifier", figures)
+        assert (shared in page()) is (shared in Page(INDEX).text) is not apart
     assert claim not in page() and "recordings of datasets/raw/setpoint, split by print" in Page(PAGE).text
 
 
@@ -316,6 +322,14 @@ def test_the_default_is_the_baseline_that_is_shown_and_judged_though_another_is_
 
 
 # ---- what the camera sees, by flow
+
+
+def test_windows_of_all_flows_are_held_against_no_bar(project):
+    """The rule asks for flows from 70 to 150 %; an image's bar is of all flows."""
+    figures = artifacts.read_metrics("train_classifier") | {"window_accuracy": 0.5, "image_accuracy": 0.5}
+    artifacts.write_metrics("train_classifier", figures)
+    main()
+    assert len(re.findall(r'class="num bad">50.0', PAGE.read_text())) == 1
 
 
 def test_right_and_covered_are_told_by_flow_the_worst_bin_first(project):

@@ -46,6 +46,10 @@ CLAIM_RECORDED = (
     "it is known "
     "on these printers only."
 )
+NOT_APART = (
+    " Controllers learn, are chosen and judged on windows of prints that the classifier was calibrated, chosen "
+    "and judged on: the folder has too few prints to keep them apart."
+)
 # what the two columns of its rules are, and the mark of the second
 HEADS = ("Data\u2011driven", "Baseline", "baseline")
 
@@ -478,6 +482,8 @@ def verdict(sources: Sources) -> Verdict:
     scores = board(sources)
     recorded = sources.declared.everything.get("train_classifier", {}).get("source") == "recordings"
     claim, words = (CLAIM_RECORDED, TRIAL) if recorded else (CLAIM, REHEARSAL)
+    if recorded and lookup(sources.metrics["train_classifier"], "data.windows_apart") is False:
+        claim += NOT_APART
     if isinstance(scores, Missing) or not scores.default:
         gap = scores if isinstance(scores, Missing) else sources.tables["choice"]
         return Verdict(
