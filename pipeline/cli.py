@@ -297,7 +297,9 @@ def _add_shadow(commands: argparse._SubParsersAction) -> None:
         "source",
         help="a folder that fills with pictures, an MCAP file that grows, or the address of a snapshot",
     )
-    command.add_argument("--out", type=Path, default=Path("shadow"), metavar="DIR", help="for page and decisions (shadow)")
+    command.add_argument(
+        "--out", type=Path, default=Path("shadow"), metavar="DIR", help="for page and decisions (shadow)"
+    )
     command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels")
     command.add_argument(
         "--flow", type=float, default=100.0, help="flow setpoint in %% where the source has none (100)"

@@ -73,7 +73,9 @@ def test_where_they_do_not_the_classifier_keeps_all_and_it_is_said(given):
 def test_a_part_without_a_window_is_refused_in_one_sentence(part):
     given = folder(4)
     given[part] = prints(200, 4, frames=WINDOW - 1)
-    with pytest.raises(ValueError, match=f"expected 4 frames in a row at one class .* for {part}, found none"):
+    with pytest.raises(
+        ValueError, match=f"expected 4 frames in a row at one class .* for {part}, found none"
+    ):
         parts.with_windows(settings(), given)
     given[part] = prints(200, 4)._replace(valid=np.zeros(12 * WINDOW, bool))
     with pytest.raises(ValueError, match=f"for {part}, found none in 48; record longer stretches"):

@@ -255,7 +255,9 @@ def test_where_there_was_no_window_it_says_why(tmp_path, monkeypatch):
         return shadow.summary_lines(watch(source, tmp_path / "out"), "in")
 
     (tmp_path / "in").mkdir()
-    assert "in: 0 frames, no window of them: it lacks a picture (.jpg, .jpeg," in said(Folder(tmp_path / "in"))
+    assert "in: 0 frames, no window of them: it lacks a picture (.jpg, .jpeg," in said(
+        Folder(tmp_path / "in")
+    )
     fill(tmp_path / "in", [b"\x89PNG and no more"])
     assert (
         f"in: 1 frame, no window of them: expected {FRAMES} frames in a row at one flow; f0.png: the image "

@@ -323,7 +323,8 @@ def test_a_camera_that_fails_in_the_middle_is_asked_again_and_nobody_else_is(cam
 
 
 @pytest.mark.parametrize(
-    ("at_once", "drop"), [(b"", b"H"), (b"HTTP/1.1 200 OK\r\nX-A: ", b"a"), (b"HTTP/1.1 200 OK\r\n\r\n", b"x")]
+    ("at_once", "drop"),
+    [(b"", b"H"), (b"HTTP/1.1 200 OK\r\nX-A: ", b"a"), (b"HTTP/1.1 200 OK\r\n\r\n", b"x")],
 )
 def test_a_camera_that_drips_is_given_up(monkeypatch, at_once, drop):
     """In the line of its status, in its headers, or in its picture."""
