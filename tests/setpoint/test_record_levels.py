@@ -157,7 +157,7 @@ def test_a_controller_learns_from_the_levels_in_place_of_the_classifier(recorded
         ([one._replace(flow=50.0) for one in film(5, FLOWS[:1])], "expected windows of 8 frames at 5 flows"),
         ([one._replace(time_s=one.time_s / 1000) for one in film(6)],
          "0 flows in them; record all of --flows, and copy pictures with their times (cp -p)"),
-        ([], "the camera: expected frames of a printer's camera, found none: it lacks a picture; name a folder"),
+        ([], "the camera: expected frames of a printer's camera, found none: it lacks a picture; name"),
     ],
     ids=["two levels", "blind", "no line", "other flows", "copied without their times", "empty"],
 )  # fmt: skip

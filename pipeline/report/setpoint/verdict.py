@@ -47,8 +47,8 @@ CLAIM_RECORDED = (
     "on these printers only."
 )
 NOT_APART = (
-    " Controllers learn, are chosen and judged on windows of prints that the classifier was calibrated, chosen "
-    "and judged on: the folder has too few prints to keep them apart."
+    " Controllers learn, are chosen and judged on windows of prints that the classifier was calibrated, "
+    "chosen and judged on: the folder has too few prints to keep them apart."
 )
 # what the two columns of its rules are, and the mark of the second
 HEADS = ("Data\u2011driven", "Baseline", "baseline")

@@ -100,8 +100,9 @@ def with_windows(
     for part in ("judged", "calibration", "held_out"):
         if not len(_windows(settings, by_part[part])):
             raise ValueError(
-                f"expected {settings.window} frames in a row at one class in the frames for {part}, found none "
-                f"in {len(by_part[part].label)}; record longer stretches, or lower train_classifier.window"
+                f"expected {settings.window} frames in a row at one class in the frames for {part}, found "
+                f"none in {len(by_part[part].label)}; record longer stretches, or lower "
+                "train_classifier.window"
             )
     taken = (by_part[part] for part in ("calibration", "held_out", "judged"))
     return by_part, dict(zip(WINDOW_PARTS, taken, strict=True)), False

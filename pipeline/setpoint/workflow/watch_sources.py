@@ -61,16 +61,18 @@ class Source(Protocol):
     how long to wait before the next look."""
 
     waits_for: str
-    lacks: str
     ended: bool
     rest_s: float
+
+    @property
+    def lacks(self) -> str: ...
 
     def frames(self) -> Iterator[Shown]: ...
 
 
 def source(place: str, topics: Topics, *, rate_hz: float) -> Source:
-    """The source that a path or an address names. Raises ValueError for an address that is none, and for a file
-    that is no recording."""
+    """The source that a path or an address names. Raises ValueError for an address that is none, and for a
+    file that is no recording."""
     if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", place):
         return Snapshots(place, rate_hz)
     if place.lower().endswith(".mcap") and not Path(place).is_dir():

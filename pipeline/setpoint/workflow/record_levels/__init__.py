@@ -190,8 +190,8 @@ def _frames(source: Source, place: str):
     if not count:
         why = source.waits_for or f"it lacks {source.lacks}"
         raise ValueError(
-            f"{place}: expected frames of a printer's camera, found none: {why}; name a folder of pictures or "
-            "an MCAP file"
+            f"{place}: expected frames of a printer's camera, found none: {why}; name a folder of pictures "
+            "or an MCAP file"
         )
 
 

@@ -103,8 +103,8 @@ def summary_lines(watched: Watched, place: str) -> str:
         why = printable(watched.why)
         return f"{place}: {frames}, no window of them: {why}; nothing was sent\nwritten: {watched.page}"
     return (
-        f"{place}: {frames}, {counted(watched.decisions, 'decision')}: {watched.changes} would have changed a "
-        f"setpoint, {watched.held} held; nothing was sent\nwritten: {watched.page}, {watched.log}"
+        f"{place}: {frames}, {counted(watched.decisions, 'decision')}: {watched.changes} would have changed "
+        f"a setpoint, {watched.held} held; nothing was sent\nwritten: {watched.page}, {watched.log}"
     )
 
 
