@@ -461,7 +461,8 @@ def test_told_to_end_it_ends_with_all_written(tmp_path, number):
     process.send_signal(number)
     said, wrong = process.communicate(timeout=60)
     assert (process.returncode, wrong) == (0, "")
-    assert "27 frames, 3 decisions:" in said and "nothing was sent" in said
+    # it may be told before it has looked at the last three, which fill no window
+    assert re.search(r"2[4-7] frames, 3 decisions:", said) and "nothing was sent" in said
     assert time.monotonic() - began < 10
     assert [row["decision"] for row in rows(tmp_path / "out")] == [1, 2, 3]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["decisions-0000.mcap", "index.html"]
