@@ -219,6 +219,7 @@ def shadow(arguments: argparse.Namespace) -> None:
     )
     frames = source(arguments.source, ready.topics, rate_hz=deploy.bounded("--rate", arguments.rate))
     place = shown_place(arguments.source)
+    print(f"{place}: open {arguments.out / 'index.html'}; Ctrl-C ends the watch", flush=True)
     with watching.until_told() as stopped:
         watched = watching.watch(frames, ready.deployed, asked, arguments.out, place=place, stopped=stopped)
     print(watching.summary_lines(watched, place))
@@ -291,12 +292,14 @@ def version() -> str:
 
 
 def _add_shadow(commands: argparse._SubParsersAction) -> None:
-    command = commands.add_parser("shadow", help=shadow.__doc__)
+    command = commands.add_parser("shadow", help=shadow.__doc__, description=shadow.__doc__)
     command.add_argument(
         "source",
         help="a folder that fills with pictures, an MCAP file that grows, or the address of a snapshot",
     )
-    command.add_argument("--out", type=Path, default=Path("shadow"), metavar="DIR", help="(shadow)")
+    command.add_argument(
+        "--out", type=Path, default=Path("shadow"), metavar="DIR", help="for page and decisions (shadow)"
+    )
     command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels")
     command.add_argument(
         "--flow", type=float, default=100.0, help="flow setpoint in %% where the source has none (100)"
@@ -316,8 +319,13 @@ def _add_shadow(commands: argparse._SubParsersAction) -> None:
 
 
 def _add_record_levels(commands: argparse._SubParsersAction) -> None:
-    command = commands.add_parser("record-levels", help=record_levels.__doc__)
-    command.add_argument("source", type=Path, metavar="FOLDER|MCAP", help="pictures, or a recording")
+    command = commands.add_parser(
+        "record-levels", help=record_levels.__doc__, description=record_levels.__doc__
+    )
+    command.add_argument(
+        "source", type=Path, metavar="FOLDER|MCAP",
+        help="pictures, each of the time when its file was written, or a recording",
+    )  # fmt: skip
     command.add_argument(
         "--flows", default="60,80,100,125,160", metavar="PERCENT,...",
         help="in the order in which they were held (60,80,100,125,160)",
@@ -348,8 +356,9 @@ def _add_record_levels(commands: argparse._SubParsersAction) -> None:
 
 
 def _add_training_print(commands: argparse._SubParsersAction) -> None:
-    command = commands.add_parser("training-print", help=str(training_print.__doc__).replace("%", "%%"))
-    command.add_argument("out", type=Path, metavar="OUT.gcode")
+    words = str(training_print.__doc__).replace("%", "%%")
+    command = commands.add_parser("training-print", help=words, description=words)
+    command.add_argument("out", type=Path, metavar="OUT.gcode", help="the table stands beside it")
     for flag, default, metavar, words in (
         ("--flows", "40,60,75,85,92,100,108,115,125,150,200", "PERCENT,...", "steps of the flow"),
         ("--temperatures", "190,200,210,220,230", "DEGC,...", "steps of the nozzle's temperature"),

@@ -216,7 +216,7 @@ def parse(text: str | bytes, *, extruder: str = "") -> Program:
     extrusion where the program leaves it open ("U", "M42 P4", ...).
 
     Raises ValueError, in one sentence, for what is no G-code text at all: binary, empty, or without a single
-    G, M or T word; and for an extruder that the program does not have.
+    G, M or T word that can be read; and for an extruder that the program does not have.
     """
     data, refusals, state = text_bytes(text), Refusals(), State()
     lines, state.cubic = data.count(b"\n"), CUBIC in data[:4096]
@@ -228,7 +228,7 @@ def parse(text: str | bytes, *, extruder: str = "") -> Program:
         if len(words.line) or not out.columns:
             _gather(_commands(words, state, refusals), state, refusals, out)
     if not out.words:
-        raise no_program(lines)
+        raise no_program(data, lines, refusals)
     moves, driver, flow, volumetric = _moved(out, extruder)
     others = out.others + [
         pair for name, pairs in out.lines_of.items() if name not in driver for pair in pairs

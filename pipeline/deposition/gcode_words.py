@@ -77,6 +77,8 @@ WORD = re.compile(r"\s*([A-Za-z])\s*([+-]?(?:\d+\.?\d*|\.\d+))?")
 EXPONENT = re.compile(r"[eE][+-]\d+(?![\d.])")
 # a number with an exponent that has no sign: its e is read as a word
 UNSIGNED = re.compile(r"(?=([A-Za-z]\s*([+-]?(?:\d+\.?\d*|\.\d+)[eE]\d+)(?![\d.])))")
+# how a line of G-code begins, behind its number: G, M or T with a number
+BEGUN = re.compile(rb"^[ \t]*(?:[Nn][ \t]*\d+[ \t]*)?[GMTgmt][ \t]*\d", re.MULTILINE)
 MACRO = re.compile(r"[A-Za-z_][A-Za-z_]{2,}[\w.]*(?=[\s=]|$)|if\b")
 ACCELERATION = re.compile(r"SET_VELOCITY_LIMIT\b.*\bACCEL\s*=\s*(\d+\.?\d*)", re.IGNORECASE)
 ACTIVATE = re.compile(r"ACTIVATE_EXTRUDER\b.*\bEXTRUDER\s*=\s*extruder(\d*)", re.IGNORECASE)
@@ -117,7 +119,7 @@ def text_bytes(text: str | bytes) -> bytes:
 
 def chunks(data: bytes, refusals: Refusals) -> Iterator[Words]:
     """The words of the program, some CHUNK bytes of whole lines at a time. Raises ValueError where no line
-    of the first ENOUGH that hold anything has a G, M or T word."""
+    of the first ENOUGH that hold anything has a G, M or T word that can be read."""
     at, first, found, filled = 0, 1, False, 0
     while at < len(data):
         end = data.find(b"\n", min(at + CHUNK, len(data) - 1)) + 1
@@ -132,12 +134,25 @@ def chunks(data: bytes, refusals: Refusals) -> Iterator[Words]:
         found = found or bool(np.isin(words.letter, np.frombuffer(b"GMT", np.uint8)).any())
         filled += words.filled
         if filled > ENOUGH and not found:
-            raise no_program(first + count - 1, "the first ")
+            raise no_program(data, first + count - 1, refusals, "the first ")
         yield words
         at, first = end, first + count
 
 
-def no_program(lines: int, which: str = "") -> ValueError:
+def no_program(data: bytes, lines: int, refusals: Refusals, which: str = "") -> ValueError:
+    """Why the first `lines` lines of a program hold no G, M or T word: what was refused of the first line
+    that begins with one, or that none does."""
+    begun = BEGUN.search(data)
+    line = data.count(b"\n", 0, begun.start()) + 1 if begun else lines + 1
+    if begun and line <= lines and line in refusals.lines:
+        alone, text = Refusals(), data[begun.start() : begun.start() + LONGEST + 1].partition(b"\n")[0]
+        _chunk(_shorter(COMMENT.sub(b" ", text) + b"\n", line, alone)[0], line, alone)
+        others = len(set(refusals.lines)) - 1
+        more = f" (and {others:,} more {'lines' if others > 1 else 'line'})" if others else ""
+        return ValueError(
+            f"the program holds no G-code that can be read: line {line:,}: {alone.grouped()[0].why}{more}; "
+            "export it again"
+        )
     return ValueError(
         "the program holds no G-code: expected lines such as 'G1 X10 F600', "
         f"found {which}{lines} lines without a G, M or T word"

@@ -17,6 +17,11 @@ def printable(text: str) -> str:
     return _UNSEEN.sub(lambda found: _written_out(ord(found[0])), text)
 
 
+def counted(number: int, one: str, many: str = "") -> str:
+    """ "1 frame", "20 frames"."""
+    return f"{number:,} {one if number == 1 else many or one + 's'}"
+
+
 def printable_page(page: str) -> str:
     """A page without control characters, also in the JSON that its scripts read."""
     return _IN_JSON.sub(r"\\\\u", printable(page))

@@ -58,6 +58,10 @@ RETIRED: dict[str, str] = {
     "panel.judging.seeds": "panel.judging.seed draws plants and noise",
     "panel.training.seeds": "panel.training.seed draws plants and noise",
     "report.gap_percent": "the gap to the optimum is shown and decides nothing",
+    "report.window_accuracy": (
+        "it was asked of windows of all flows; report.window_right_70_150 asks for a share right where every "
+        "flow from 70 to 150 % is as frequent"
+    ),
     "report.worst_case_gap_percent": "the rules are asked at the 90 % quantile of all cases",
     "tune_weights.acquisition": "every contestant has the same search, expected improvement",
     "tune_weights.q_high": "each contestant has parameters of its own (workflow/contestants.py)",

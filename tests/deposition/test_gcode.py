@@ -647,6 +647,24 @@ def test_a_number_that_cannot_be_read_is_refused_for_its_own_reason(line, why):
     assert program.moves.end[:, 0].tolist() == [1, 20] and program.moves.feed.tolist() == [10, 10]
 
 
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("G1 X1 E1e400\n", r"line 1: expected numbers below 1e\+09, found E1e400; export it again"),
+        ("1,5\n; a note\n\nN7 g1 Xnan ; no\n", "line 4: expected letters .* found 'Xnan' .and 1 more line."),
+        ("G1 X Y5\n" * 30_000, "line 1: expected letters with a number each, .*29,999 more lines"),
+        ("G1 X1 " * 20_000, "line 1: expected at most 65,536 characters in a line, found more"),
+        ("N1 G1 X1*7\n", "line 1: expected the checksum 7 of the line"),
+        ("Gladly\nMonday\n1,5\n5 G1\n", "4 lines without a G, M or T word"),
+        ("hello\n" * 60_000 + "G1 X1e999\n", "the first 4.* lines without a G, M or T word"),
+    ],
+)
+def test_a_program_all_of_whose_commands_are_refused_says_which_and_why(text, why):
+    with pytest.raises(ValueError, match=why) as refused:
+        parse(text)
+    assert "\n" not in str(refused.value)
+
+
 def test_an_e_right_behind_a_number_is_a_word_of_a_compact_line():
     program = parse("M83\nG1X10E1F600\nG1X2E3\nG1 X5E2\ng1x6e4\n")
     assert program.refusals == [] and program.moves.e.tolist() == [1, 3, 2, 4]

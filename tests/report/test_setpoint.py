@@ -52,6 +52,21 @@ def test_the_default_is_named_with_its_worst_case_and_its_lead_over_the_next(pro
     assert re.search(r"<title>(.*?) ·", PAGE.read_text())[1] == "Setpoint: Rehearsal passed: the agent"
 
 
+def test_who_may_not_run_is_no_next(project):
+    harm = "leaves +-25 % in 24.0 % of the runs (in band), of at most 2 %"
+    made_setpoint.scoreboard(lost(our_agent=(1.0, 2.0)))
+    made_setpoint.choice("filtered proportional", margin=9.0, refused={"Bayes, robust": harm})
+    assert "points more than of the next, the baseline “sequential test”" in page()
+    made_setpoint.choice("Bayes, robust", margin=9.0, refused={"our agent": harm})
+    assert "The agent may not run, for its harm." in page() and "did not earn it" not in page()
+    kinds = made_setpoint.KINDS
+    barred = {name: harm for name in kinds if name != "Bayes, robust"}
+    nothing = {"margin": None, "margin_low": None, "margin_high": None}
+    made_setpoint.choice("Bayes, robust", refused=barred, **nothing)
+    text = page()
+    assert "settle and stay. Nothing else may run." in text and "the next," not in text
+
+
 def test_what_may_be_claimed_stands_in_the_verdict_and_on_page_one(project):
     claim = (
         "The classifier is trained and judged on rendered frames: eight real pictures "
@@ -61,6 +76,12 @@ def test_what_may_be_claimed_stands_in_the_verdict_and_on_page_one(project):
     sections = params.read("params.yaml")
     sections["train_classifier"]["source"] = "recordings"
     Path("params.yaml").write_text(yaml.safe_dump(sections))
+    shared = "the folder has too few prints to keep them apart"
+    for apart in (True, False):
+        figures = artifacts.read_metrics("train_classifier")
+        figures["data"]["windows_apart"] = apart
+        artifacts.write_metrics("train_classifier", figures)
+        assert (shared in page()) is (shared in Page(INDEX).text) is not apart
     assert claim not in page() and "recordings of datasets/raw/setpoint, split by print" in Page(PAGE).text
 
 
@@ -301,6 +322,14 @@ def test_the_default_is_the_baseline_that_is_shown_and_judged_though_another_is_
 
 
 # ---- what the camera sees, by flow
+
+
+def test_windows_of_all_flows_are_held_against_no_bar(project):
+    """The rule asks for flows from 70 to 150 %; an image's bar is of all flows."""
+    figures = artifacts.read_metrics("train_classifier") | {"window_accuracy": 0.5, "image_accuracy": 0.5}
+    artifacts.write_metrics("train_classifier", figures)
+    main()
+    assert len(re.findall(r'class="num bad">50.0', PAGE.read_text())) == 1
 
 
 def test_right_and_covered_are_told_by_flow_the_worst_bin_first(project):

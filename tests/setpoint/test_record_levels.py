@@ -41,7 +41,7 @@ def film(seed: int, flows=FLOWS, told: bool = False, see=half_width) -> list[Sho
 class Given:
     """A source that has ended."""
 
-    waits_for, ended, rest_s = "", True, 0.0
+    waits_for, lacks, ended, rest_s = "", "a picture", True, 0.0
 
     def __init__(self, frames: list[Shown]):
         self.left = frames
@@ -154,10 +154,12 @@ def test_a_controller_learns_from_the_levels_in_place_of_the_classifier(recorded
         (film(3, told=True, see=lambda flow: 6.0), "the camera: this camera does not see flow"),
         ([one._replace(frame=np.full((180, 240), 90, np.uint8)) for one in film(4)],
          "at least 5 windows that show a flow at 60 %, found 0 of 6"),
-        ([one._replace(flow=50.0) for one in film(5, FLOWS[:1])], "expected at least one window of 8 frames"),
-        ([], "the camera: expected frames of a printer's camera, found none"),
+        ([one._replace(flow=50.0) for one in film(5, FLOWS[:1])], "expected windows of 8 frames at 5 flows"),
+        ([one._replace(time_s=one.time_s / 1000) for one in film(6)],
+         "0 flows in them; record all of --flows, and copy pictures with their times (cp -p)"),
+        ([], "the camera: expected frames of a printer's camera, found none: it lacks a picture; name"),
     ],
-    ids=["two levels", "blind", "no line", "other flows", "empty"],
+    ids=["two levels", "blind", "no line", "other flows", "copied without their times", "empty"],
 )  # fmt: skip
 def test_what_does_not_suffice_is_refused_in_one_sentence(frames, said):
     with pytest.raises(ValueError, match=re.escape(said)) as refused:

@@ -440,6 +440,9 @@ def test_on_a_user_s_folder_every_artifact_is_written_and_no_print_is_in_two_par
     assert figures["data"]["prints"] == PRINTS
     assert figures["data"]["valid"] + sum(figures["data"]["rejected"].values()) == figures["data"]["frames"]
     first = artifacts.sha256("datasets/train_classifier"), artifacts.sha256("reports")
+    # twelve prints are too few to keep windows of their own
+    assert figures["data"]["windows_apart"] is False
+    assert figures["data"]["window_prints"] == {"learn": 3, "choose": 2, "judge": 3}
     p = params.load(TrainClassifier, "train_classifier")
     found = _parts(p).frames
     prints = [set(part.print_number.tolist()) for part in found.values()]

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from pipeline.setpoint import actuation, bayes, deployment
 from pipeline.setpoint.calibrated_classifier import FrameReadings
@@ -118,7 +119,12 @@ def test_a_thin_line_asks_for_more_and_a_broad_one_for_less(tmp_path):
         fill(tmp_path / name, [picture(k, half_width) for k in range(3 * FRAMES)])
         watched = watch(Folder(tmp_path / name), tmp_path / f"out {name}")
         last = rows(tmp_path / f"out {name}")[-1]
-        assert (watched.decisions, watched.acts, last["reason"]) == (3, 3, "acts")
+        assert (watched.decisions, watched.changes, watched.held, last["reason"]) == (
+            3,
+            3 * abs(sign),
+            0,
+            "acts",
+        )
         assert np.sign(last["would_flow_move_percent"]) == sign
         assert (last["valid"], last["used"]) == (FRAMES, FRAMES)
         low, median, high = (last[f"belief_{key}_percent"] for key in ("low", "flow", "high"))
@@ -170,7 +176,7 @@ def test_the_controller_is_told_what_the_print_did_and_never_more(tmp_path):
     frames = [Shown(str(k), k * 0.1, picture(k), 80.0 if k < 20 else 95.0) for k in range(60)]
 
     class Given:
-        waits_for, ended, rest_s = "", True, 0.0
+        waits_for, lacks, ended, rest_s = "", "a picture", True, 0.0
 
         def frames(self):
             given, frames[:] = frames[:], []
@@ -242,8 +248,48 @@ def test_once_ends_where_a_camera_has_shown_a_window_and_where_nothing_is_there(
 
     assert watch(Camera("http://127.0.0.1:9/", 100.0), tmp_path / "a").decisions == 1
     monkeypatch.setattr(shadow, "IN_VAIN_S", 0.2)
-    with pytest.raises(OSError, match="the folder .*none is not there yet; start it first, or watch without"):
+    with pytest.raises(OSError, match="the folder .*none is not there yet; start the camera first, or"):
         watch(Folder(tmp_path / "none"), tmp_path / "b")
+
+
+def test_where_there_was_no_window_it_says_why(tmp_path, monkeypatch):
+    monkeypatch.setattr(shadow, "SILENT_S", 0.2)
+    monkeypatch.setattr(watch_sources, "SETTLE_S", 0.2)
+
+    def said(source) -> str:
+        return shadow.summary_lines(watch(source, tmp_path / "out"), "in")
+
+    (tmp_path / "in").mkdir()
+    assert "in: 0 frames, no window of them: it lacks a picture (.jpg, .jpeg," in said(
+        Folder(tmp_path / "in")
+    )
+    fill(tmp_path / "in", [b"\x89PNG and no more"])
+    assert (
+        f"in: 1 frame, no window of them: expected {FRAMES} frames in a row at one flow; f0.png: the image "
+        "cannot be read: a picture of 16 bytes without its end; nothing was sent"
+    ) in said(Folder(tmp_path / "in"))
+    for name, topics in (("/flow", "/flow"), ("", "no messages")):
+        path = tmp_path / "no.mcap"
+        with path.open("wb") as stream:
+            writer = Writer(stream)
+            writer.start()
+            if name:
+                schema = writer.register_schema("a", "jsonschema", b"{}")
+                writer.add_message(writer.register_channel(name, "json", schema), 1, b"{}", 1)
+            writer.finish()
+        assert f"0 frames, no window of them: it lacks a topic with images; it holds {topics};" in said(
+            Recording(path, ANY)
+        )
+
+
+def test_a_decision_that_changes_nothing_is_told_apart_from_one_that_is_held(tmp_path):
+    (tmp_path / "in").mkdir()
+    fill(tmp_path / "in", [picture(k) for k in range(FRAMES)])
+    still = deployed()
+    still = still._replace(limits=still.limits._replace(per_action=np.zeros(2)))
+    watched = watch(Folder(tmp_path / "in"), tmp_path / "out", deployed_as=still)
+    assert (watched.decisions, watched.changes, watched.held) == (1, 0, 0)
+    assert "1 decision: 0 would have changed a setpoint, 0 held" in shadow.summary_lines(watched, "in")
 
 
 # ---- which frames make a window
@@ -262,6 +308,7 @@ def windows_of(frames: list[Shown], length: int = 4) -> tuple[list[list[float]],
 def test_a_gap_begins_a_window_anew():
     full, notes = windows_of(shown(0, 0.1, 0.2, 9.0, 9.1, 9.2, 9.3))
     assert full == [[9.0, 9.1, 9.2, 9.3]]
+    assert windows_of(shown(0, 9.0))[1] == ["no frame came for 9 s; 1 frame fills no window"]
     assert notes == ["no frame came for 8.8 s; 3 frames fill no window"]
 
 
@@ -278,6 +325,9 @@ def test_a_frame_that_is_late_is_left_out_and_a_clock_set_back_is_followed():
 def test_ten_thousand_notes_are_told_in_few():
     notes = windows_of(shown(5.0, *([4.0, 4.0, 5.0] * 3000)))[1]
     assert len(notes) == 21 and "notes before these" in notes[0]
+    windows = Windows(4, settle_s=6.0)
+    windows.notes = [""] * 21
+    assert windows.taken_notes()[0] == "1 note before these"
 
 
 # ---- what it writes
@@ -295,6 +345,17 @@ def test_the_page_asks_for_nothing_and_says_that_nothing_is_sent(tmp_path):
     )
     assert "default-src 'none'" in page and 'http-equiv="refresh"' not in page
     assert "The watch has ended." in page and "Belief over the flow" in page
+
+
+def test_one_frame_is_no_frames(tmp_path):
+    (tmp_path / "in").mkdir()
+    fill(tmp_path / "in", [picture(0)])
+    said = shadow.summary_lines(watch(Folder(tmp_path / "in"), tmp_path / "out"), "in")
+    assert "in: 1 frame, no window of them" in said
+    of = deployed()
+    watch(Folder(tmp_path / "in"), tmp_path / "one", deployed_as=of._replace(window=1))
+    page = (tmp_path / "one/index.html").read_text()
+    assert "1 of 1 frame counts, 1 shows a line" in page
 
 
 def test_while_it_runs_the_page_refreshes_itself_and_says_what_it_waits_for(tmp_path):
@@ -400,7 +461,8 @@ def test_told_to_end_it_ends_with_all_written(tmp_path, number):
     process.send_signal(number)
     said, wrong = process.communicate(timeout=60)
     assert (process.returncode, wrong) == (0, "")
-    assert "27 frames, 3 decisions" in said and "nothing was sent" in said
+    # it may be told before it has looked at the last three, which fill no window
+    assert re.search(r"2[4-7] frames, 3 decisions:", said) and "nothing was sent" in said
     assert time.monotonic() - began < 10
     assert [row["decision"] for row in rows(tmp_path / "out")] == [1, 2, 3]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["decisions-0000.mcap", "index.html"]

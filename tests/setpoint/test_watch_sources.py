@@ -1,9 +1,11 @@
 """Sources of a watch: folders that fill, recordings that grow, cameras over HTTP that fail."""
 
+import contextlib
 import http.server
 import os
 import re
 import socket
+import socketserver
 import threading
 import time
 
@@ -307,8 +309,8 @@ def test_a_camera_that_fails_in_the_middle_is_asked_again_and_nobody_else_is(cam
         shown += here.frames()
         states.append(here.waits_for)
     whole = [isinstance(one.frame, np.ndarray) for one in shown]
-    assert whole == [True, False, False, False, True, False, True]
-    assert reasons(shown)[5] == COPY
+    assert whole == [True, False, False, True, False, True]
+    assert reasons(shown)[4] == COPY
     told = ("404", "503", "timed out", "closed connection", "(IncompleteRead|broke off)", "302")
     for state, words in zip(states[1:7], told, strict=True):
         assert re.search(f"(does not answer|answers) .*{words}", state)
@@ -320,28 +322,42 @@ def test_a_camera_that_fails_in_the_middle_is_asked_again_and_nobody_else_is(cam
     assert guard, "the guard sees connections"
 
 
-def test_a_camera_that_drips_is_given_up(camera, monkeypatch):
+@pytest.mark.parametrize(
+    ("at_once", "drop"),
+    [(b"", b"H"), (b"HTTP/1.1 200 OK\r\nX-A: ", b"a"), (b"HTTP/1.1 200 OK\r\n\r\n", b"x")],
+)
+def test_a_camera_that_drips_is_given_up(monkeypatch, at_once, drop):
+    """In the line of its status, in its headers, or in its picture."""
     monkeypatch.setattr(watch_sources, "TIMEOUT_S", 0.3)
+    ended = threading.Event()
 
-    class Slow:
-        headers = camera.RequestHandlerClass.MessageClass()
+    class Drip(socketserver.BaseRequestHandler):
+        def handle(self):
+            with contextlib.suppress(OSError):
+                self.request.sendall(at_once)
+                while not ended.wait(0.05):
+                    self.request.sendall(drop)
 
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *about):
-            return None
-
-        def read1(self, size):
-            time.sleep(0.1)
-            return b"x"
-
-    here = Snapshots("http://127.0.0.1:1/", 5.0)
-    monkeypatch.setattr(here.opener, "open", lambda request, timeout: Slow())
-    began = time.monotonic()
-    assert list(here.frames()) == []
-    assert time.monotonic() - began < 2.0
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Drip) as server:
+        server.daemon_threads = True
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        here = Snapshots(f"http://127.0.0.1:{server.server_address[1]}/", 5.0)
+        began = time.monotonic()
+        assert list(here.frames()) == []
+        assert time.monotonic() - began < 2.0
+        ended.set()
+        server.shutdown()
     assert "took more than 0.3 s" in here.waits_for
+
+
+def test_a_page_in_place_of_a_picture_and_an_empty_answer_are_told(camera):
+    html = {"Content-Type": "text/html; charset=utf-8"}
+    camera.script[:] = [said(b"<html>log in", 200, html), said(b""), said(picture(0))]
+    here = Snapshots(f"http://127.0.0.1:{camera.server_port}/", 50.0)
+    assert list(here.frames()) == []
+    assert "it shows text/html, no picture; name the address of a snapshot" in here.waits_for
+    assert list(here.frames()) == [] and "its answer is empty" in here.waits_for
+    assert len(list(here.frames())) == 1 and here.waits_for == ""
 
 
 def test_nobody_at_the_address_is_waited_for():
@@ -357,6 +373,14 @@ def test_an_address_that_is_none_is_refused_without_its_secret(place):
     with pytest.raises(ValueError, match="expected the address of a snapshot") as refused:
         source(place, ANY, rate_hz=5.0)
     assert "u:p" not in str(refused.value)
+
+
+def test_a_file_that_is_no_recording_is_refused(tmp_path):
+    (tmp_path / "a.png").write_bytes(picture(0, ".png"))
+    with pytest.raises(ValueError, match=r"a.png: expected a folder of pictures.* found another file; name"):
+        source(str(tmp_path / "a.png"), ANY, rate_hz=5.0)
+    (tmp_path / "of.mcap").mkdir()
+    assert isinstance(source(str(tmp_path / "of.mcap"), ANY, rate_hz=5.0), Folder)
 
 
 def test_the_kind_of_a_source_is_told_by_its_name(tmp_path):

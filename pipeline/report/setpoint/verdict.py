@@ -46,6 +46,10 @@ CLAIM_RECORDED = (
     "it is known "
     "on these printers only."
 )
+NOT_APART = (
+    " Controllers learn, are chosen and judged on windows of prints that the classifier was calibrated, "
+    "chosen and judged on: the folder has too few prints to keep them apart."
+)
 # what the two columns of its rules are, and the mark of the second
 HEADS = ("Data\u2011driven", "Baseline", "baseline")
 
@@ -239,7 +243,7 @@ def rules(sources: Sources, board: Board | None) -> tuple[Pair, ...]:
             ("svc", "cnn", "width"),
             "frames of segments it never saw",
         ),
-        _right_by_flow(sources, 100 * asked.window_accuracy),
+        _right_by_flow(sources, 100 * asked.window_right_70_150),
         _calibrated(sources, "Calibrated, an image", asked.ece_image, ("ece_image", "ece_image_raw")),
         _calibrated(sources, "Calibrated, a window", asked.ece_window, ("ece_window", "ece_window_counts")),
     )
@@ -478,6 +482,8 @@ def verdict(sources: Sources) -> Verdict:
     scores = board(sources)
     recorded = sources.declared.everything.get("train_classifier", {}).get("source") == "recordings"
     claim, words = (CLAIM_RECORDED, TRIAL) if recorded else (CLAIM, REHEARSAL)
+    if recorded and lookup(sources.metrics["train_classifier"], "data.windows_apart") is False:
+        claim += NOT_APART
     if isinstance(scores, Missing) or not scores.default:
         gap = scores if isinstance(scores, Missing) else sources.tables["choice"]
         return Verdict(
@@ -567,16 +573,17 @@ def _noise(choice: Any, mine: Figure, other: Figure) -> str:
 
 
 def summary(sources: Sources, board: Board) -> str:
-    """The default's worst case, by how much it beats the next, and,
+    """The default's worst case, by how much it beats the next of those that may run, and,
     where the agent is neither, how far it came."""
     mine, place = worst(board, board.default, "lasting")
     if place is None:
         return ""
     runs = board.cells[board.default, place].runs
     text = f"In its worst case ({within(place)}) {share_text(mine)} of {runs:,} runs settle and stay"
-    others = [name for name in board.names if name != board.default and worst(board, name, "lasting")[1]]
+    judged = [name for name in board.names if name != board.default and worst(board, name, "lasting")[1]]
+    others = [name for name in judged if name not in board.refused]
     if not others:
-        return f"{text}. Nothing else was judged."
+        return f"{text}. {'Nothing else may run' if judged else 'Nothing else was judged'}."
     figure, where = worst(board, others[0], "lasting")
     margin = lookup(sources.tables["choice"], "margin")
     points = mine.value - figure.value if isinstance(margin, Missing) else float(margin)
@@ -594,4 +601,6 @@ def summary(sources: Sources, board: Board) -> str:
     if where is None:
         return text
     name = named(board, learned)
+    if learned in board.refused:
+        return f"{text} {name[:1].upper()}{name[1:]} may not run, for its harm."
     return f"{text} {name[:1].upper()}{name[1:]} did not earn it: {share_text(figure)} ({within(where)})."

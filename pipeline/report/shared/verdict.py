@@ -33,7 +33,7 @@ class ReportRules(params.Section):
     settled_percent: float = Field(gt=0, le=100)
     stay_percent: float = Field(gt=0, le=100)
     image_accuracy: float = Field(gt=0, le=1)
-    window_accuracy: float = Field(gt=0, le=1)
+    window_right_70_150: float = Field(gt=0, le=1)
     ece_image: float = Field(gt=0, le=1)
     ece_window: float = Field(gt=0, le=1)
 

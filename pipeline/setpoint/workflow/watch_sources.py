@@ -9,6 +9,7 @@ import base64
 import contextlib
 import hashlib
 import http.client
+import io
 import os
 import re
 import time
@@ -17,7 +18,7 @@ import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -56,20 +57,32 @@ class Shown(NamedTuple):
 
 class Source(Protocol):
     """`frames` gives what came since it was last asked; `waits_for` says why nothing comes, "" where
-    something may; `ended`: nothing more will come; `rest_s`: how long to wait before the next look."""
+    something may; `lacks` what a source that is there has none of; `ended`: nothing more will come; `rest_s`:
+    how long to wait before the next look."""
 
     waits_for: str
     ended: bool
     rest_s: float
 
+    @property
+    def lacks(self) -> str: ...
+
     def frames(self) -> Iterator[Shown]: ...
 
 
 def source(place: str, topics: Topics, *, rate_hz: float) -> Source:
-    """The source that a path or an address names. Raises ValueError for an address that is none."""
+    """The source that a path or an address names. Raises ValueError for an address that is none, and for a
+    file that is no recording."""
     if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", place):
         return Snapshots(place, rate_hz)
-    return Recording(Path(place), topics) if place.lower().endswith(".mcap") else Folder(Path(place))
+    if place.lower().endswith(".mcap") and not Path(place).is_dir():
+        return Recording(Path(place), topics)
+    if Path(place).is_file():
+        raise ValueError(
+            f"{place}: expected a folder of pictures, a recording (.mcap) or an address, found another file; "
+            "name the folder that it is in"
+        )
+    return Folder(Path(place))
 
 
 def shown_place(place: str) -> str:
@@ -85,6 +98,7 @@ class Folder:
 
     def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
         self.path, self.clock, self.rest_s = path, clock, LOOK_S
+        self.lacks = f"a picture ({', '.join(PICTURES)})"
         self.waits_for, self.ended = f"the folder {path} is not there yet", False
         self.done: set[str] = set()
         self.unfinished: dict[str, tuple[int, float]] = {}
@@ -169,7 +183,14 @@ class Recording:
         self.decoders: dict[int, tuple[list[str], Decode] | None] = {}
         self.reads: dict[int, image_messages.Read] = {}
         self.camera, self.others = where.image, set()
-        self.before, self.count = b"", 0
+        self.before, self.count, self.others_held = b"", 0, set()
+
+    @property
+    def lacks(self) -> str:
+        """Images among the topics that it has."""
+        topics = sorted(self.others_held)
+        named = f"{', '.join(topics[:5])}{', ...' if len(topics) > 5 else ''}" if topics else "no messages"
+        return f"a topic with images; it holds {named}"
 
     @property
     def damage(self) -> list[str]:
@@ -179,6 +200,7 @@ class Recording:
         try:
             for message in self.file.messages(lambda channel: True):
                 if not image_messages.is_image(message.channel):
+                    self.others_held.add(message.channel.topic)
                     self._hold(message)
                 elif self._is_camera(message.channel):
                     yield self._frame(message)
@@ -273,6 +295,49 @@ class _SameHost(urllib.request.HTTPRedirectHandler):
         return None
 
 
+class _Until(io.RawIOBase):
+    """The bytes of an answer, until its time is over: a camera that drips is given up in its headers too."""
+
+    def __init__(self, raw: io.RawIOBase, until: float) -> None:
+        self.of, self.until = raw, until
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int | None:
+        if time.monotonic() > self.until:
+            raise TimeoutError(f"its answer took more than {TIMEOUT_S:g} s")
+        return self.of.readinto(buffer)
+
+    def close(self) -> None:
+        self.of.close()
+        super().close()
+
+
+class _Answer(http.client.HTTPResponse):
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.fp = io.BufferedReader(_Until(self.fp.detach(), time.monotonic() + TIMEOUT_S))
+
+
+class _Plain(http.client.HTTPConnection):
+    response_class = _Answer
+
+
+class _Secure(http.client.HTTPSConnection):
+    response_class = _Answer
+
+
+class _TimelyPlain(urllib.request.HTTPHandler):
+    def http_open(self, req):
+        return self.do_open(_Plain, req)
+
+
+class _TimelySecure(urllib.request.HTTPSHandler):
+    def https_open(self, req):
+        return self.do_open(_Secure, req)
+
+
 class Snapshots:
     """A picture for each request. Only the address that was named is asked, without a proxy."""
 
@@ -294,9 +359,11 @@ class Snapshots:
         if parts.username is not None:
             pair = f"{urllib.parse.unquote(parts.username)}:{urllib.parse.unquote(parts.password or '')}"
             self.headers["Authorization"] = f"Basic {base64.b64encode(pair.encode()).decode()}"
-        self.opener = urllib.request.build_opener(urllib.request.ProxyHandler({}), _SameHost())
+        self.opener = urllib.request.build_opener(
+            urllib.request.ProxyHandler({}), _SameHost(), _TimelyPlain(), _TimelySecure()
+        )
         self.period_s, self.rest_s, self.ended = 1 / rate_hz, 0.0, False
-        self.waits_for = f"{self.shown} has not answered yet"
+        self.waits_for, self.lacks = f"{self.shown} has not answered yet", "a picture"
         self.count, self.before = 0, b""
 
     def frames(self) -> Iterator[Shown]:
@@ -328,17 +395,19 @@ class Snapshots:
             kind = answer.headers.get_content_type()
             if kind.startswith("multipart/"):
                 raise OSError("it is a stream of pictures; name the address of a single one")
-            until, parts, size = time.monotonic() + TIMEOUT_S, [], 0
+            if kind.startswith("text/") and "Content-Type" in answer.headers:
+                raise OSError(f"it shows {kind}, no picture; name the address of a snapshot")
+            parts, size = [], 0
             while part := answer.read1(1 << 16):
                 parts.append(part)
                 size += len(part)
                 if size > LARGEST_PICTURE:
                     raise OSError(f"its answer is longer than {LARGEST_PICTURE >> 20} MB")
-                if time.monotonic() > until:
-                    raise TimeoutError(f"its answer took more than {TIMEOUT_S:g} s")
             promised = answer.headers.get("Content-Length", "")
             if promised.isdigit() and int(promised) != size:
                 raise OSError(f"its answer broke off after {size} of {promised} bytes")
+            if not size:
+                raise OSError("its answer is empty")
             return b"".join(parts)
 
 

@@ -21,7 +21,7 @@ from pipeline.setpoint.workflow.frame_images import find_key_areas
 from pipeline.setpoint.workflow.levels_files import RecordedLevels, store_levels
 from pipeline.setpoint.workflow.watch_sources import Folder, Recording, Shown, Source
 from pipeline.store import artifacts
-from pipeline.store.printable import printable_page
+from pipeline.store.printable import counted, printable_page
 
 # classes of the published material lie between these, in percent
 BORDERS = np.array(PLA.good_flow_percent)
@@ -150,19 +150,30 @@ def _windows(source: Source, protocol: Protocol, eye: Eye, place: str) -> list[_
     """The windows of the levels, a few frames in memory at a time."""
     found: list[_Window] = []
     waiting: list[tuple[float, Shown]] = []
-    for flow, shown in _of_levels(_frames(source, place), protocol):
+    times: list[float] = []
+    for flow, shown in _of_levels(_timed(_frames(source, place), times), protocol):
         if waiting and waiting[-1][0] != flow:
             waiting = []
         waiting.append((flow, shown))
         if len(waiting) == eye.window:
             found.append(_seen([one for _, one in waiting], flow, protocol, eye))
             waiting = []
-    if not found:
+    levels_found, span = len({window.flow for window in found}), max(times) - min(times)
+    if not found or (levels_found < levels.LEAST_LEVELS and span < protocol.hold_s):
         raise ValueError(
-            f"{place}: expected at least one window of {eye.window} frames at one flow, found none; hold "
-            "each of --flows for a minute, and begin the recording with the first"
+            f"{place}: expected windows of {eye.window} frames at {len(protocol.flows)} flows, each held for "
+            f"{protocol.hold_s:g} s, found {counted(len(times), 'frame')} within {span:.3g} s, "
+            f"{counted(levels_found, 'flow')} in them; record all of --flows, and copy pictures with their "
+            "times (cp -p)"
         )
     return found
+
+
+def _timed(frames, times: list[float]):
+    """The frames; their times are put into `times`."""
+    for shown in frames:
+        times.append(shown.time_s)
+        yield shown
 
 
 def _frames(source: Source, place: str):
@@ -177,9 +188,10 @@ def _frames(source: Source, place: str):
         if source.waits_for or not came and (source.ended or not isinstance(source, Folder)):
             break
     if not count:
-        why = source.waits_for or "found none"
+        why = source.waits_for or f"it lacks {source.lacks}"
         raise ValueError(
-            f"{place}: expected frames of a printer's camera, {why}; name a folder or an MCAP file"
+            f"{place}: expected frames of a printer's camera, found none: {why}; name a folder of pictures "
+            "or an MCAP file"
         )
 
 

@@ -17,7 +17,7 @@ from pipeline.setpoint.workflow.shadow.page import ENDED, render
 from pipeline.setpoint.workflow.shadow.windows import GAP_S, Windows
 from pipeline.setpoint.workflow.watch_sources import Recording, Snapshots, Source
 from pipeline.store import artifacts
-from pipeline.store.printable import printable
+from pipeline.store.printable import counted, printable
 
 # with --once, a recording without footer has ended where nothing came for so long
 SILENT_S = 5.0
@@ -28,13 +28,16 @@ PAGE_S, LISTED = 2.0, 30
 
 
 class Watched(NamedTuple):
-    """What a watch saw: frames, decisions, how many of them would have acted, and the files."""
+    """What a watch saw: frames, decisions, how many of them would have changed a setpoint and how many were
+    held, and the files; where there was no window, why."""
 
     frames: int
     decisions: int
-    acts: int
+    changes: int
+    held: int
     page: Path
     log: Path
+    why: str = ""
 
 
 def watch(
@@ -46,7 +49,8 @@ def watch(
     """
     about = {"source": place, "controller": deployed.name, "sent": "nothing"}
     log, windows, mind = DecisionLog(out, about), Windows(deployed.window, deployed.settle_s), Mind(deployed)
-    page, frames, acts, first = out / "index.html", 0, 0, log.path
+    page, frames, first = out / "index.html", 0, log.path
+    changes, held, broken = 0, 0, ""
     decisions: list[Decision] = []
 
     def show(state: str, notes: list[str]) -> float:
@@ -59,11 +63,13 @@ def watch(
         came = False
         for shown in source.frames():
             came, frames, came_at = True, frames + 1, time.monotonic()
+            broken = f"; {shown.name}: {shown.frame}" if isinstance(shown.frame, str) else broken
             full = windows.add(shown)
             if full is not None:
                 notes, remarks = windows.taken_notes() + _damage(source)[remarks:], len(_damage(source))
                 decision = mind.decide(full, asked, windows.first_s, notes)
-                acts += bool(decision.judged.reason[0] == ACTS)
+                changes += bool(decision.would.any())
+                held += bool(decision.judged.reason[0] != ACTS)
                 # of those before, the page shows no pictures
                 decisions = [*(one._replace(pictures=[]) for one in decisions[1 - LISTED :]), decision]
                 log.add(_log_time(full[-1].time_s), decision.row)
@@ -85,18 +91,20 @@ def watch(
     show(ENDED, windows.notes)
     if log.trouble:
         raise OSError(log.trouble)
-    return Watched(frames, mind.number, acts, page, first)
+    why = f"expected {counted(deployed.window, 'frame')} in a row at one flow{broken}"
+    why = why if frames else source.waits_for or f"it lacks {source.lacks}"
+    return Watched(frames, mind.number, changes, held, page, first, why)
 
 
 def summary_lines(watched: Watched, place: str) -> str:
     """What the command prints at its end."""
+    frames = counted(watched.frames, "frame")
     if not watched.decisions:
-        return (
-            f"{place}: {watched.frames} frames, no window of them; nothing was sent\nwritten: {watched.page}"
-        )
+        why = printable(watched.why)
+        return f"{place}: {frames}, no window of them: {why}; nothing was sent\nwritten: {watched.page}"
     return (
-        f"{place}: {watched.frames} frames, {watched.decisions} decisions, {watched.acts} of them would have "
-        f"acted; nothing was sent\nwritten: {watched.page}, {watched.log}"
+        f"{place}: {frames}, {counted(watched.decisions, 'decision')}: {watched.changes} would have changed "
+        f"a setpoint, {watched.held} held; nothing was sent\nwritten: {watched.page}, {watched.log}"
     )
 
 
@@ -116,7 +124,7 @@ def _has_ended(source: Source, came: bool, quiet_s: float, decisions: int) -> bo
     if isinstance(source, Snapshots) and decisions:
         return True
     if source.waits_for and quiet_s > IN_VAIN_S:
-        raise OSError(f"{source.waits_for}; start it first, or watch without --once")
+        raise OSError(f"{source.waits_for}; start the camera first, or watch without --once")
     return not came and not source.waits_for and (source.ended or quiet_s > SILENT_S)
 
 

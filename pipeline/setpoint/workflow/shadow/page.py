@@ -14,7 +14,7 @@ from pipeline.setpoint import actuation, bayes, deployment
 from pipeline.setpoint.actuation import ACTS
 from pipeline.setpoint.material import GOOD, Material
 from pipeline.setpoint.workflow.shadow.decide import Decision, Deployed, Drawn
-from pipeline.store.printable import printable, printable_page
+from pipeline.store.printable import counted, printable, printable_page
 
 COLOURS = ("#3b76c4", "#2f9e5a", "#d0662a")
 ENDED = "The watch has ended."
@@ -71,8 +71,12 @@ def _shares(last: Decision) -> str:
         f'<rect width="{260 * p:.1f}" height="14" fill="{colour}"/></svg></td><td>{p:.2f}</td></tr>'
         for name, p, colour in zip(deployment.CLASSES, last.judged.p[0], COLOURS, strict=True)
     )
-    counted = f"{last.judged.used[0]} of {len(last.names)} frames count, {last.judged.valid[0]} show a line"
-    return f"<h2>What the window shows</h2><table>{bars}</table><p class=quiet>{counted}</p>"
+    used, valid = int(last.judged.used[0]), int(last.judged.valid[0])
+    frames = (
+        f"{used} of {counted(len(last.names), 'frame')} {'counts' if used == 1 else 'count'}, "
+        f"{valid} {'shows' if valid == 1 else 'show'} a line"
+    )
+    return f"<h2>What the window shows</h2><table>{bars}</table><p class=quiet>{frames}</p>"
 
 
 def _belief(belief: np.ndarray, material: Material) -> str:

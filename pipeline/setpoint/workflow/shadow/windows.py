@@ -3,6 +3,7 @@
 import numpy as np
 
 from pipeline.setpoint.workflow.watch_sources import Shown
+from pipeline.store.printable import counted
 
 # frames further apart than this are of no one window
 GAP_S = 2.0
@@ -39,7 +40,7 @@ class Windows:
             self.waited += 1
             return None
         if self.waited:
-            self.notes.append(f"{self.waited} frames passed while the melt followed the setpoint")
+            self.notes.append(f"{counted(self.waited, 'frame')} passed while the melt followed the setpoint")
             self.waited = 0
         self.frames.append(shown)
         if len(self.frames) < self.length:
@@ -63,11 +64,16 @@ class Windows:
         return True
 
     def _drop(self, why: str) -> None:
-        begun = f"; {len(self.frames)} frames fill no window" if self.frames else ""
+        count = len(self.frames)
+        begun = f"; {counted(count, 'frame')} {'fills' if count == 1 else 'fill'} no window" if count else ""
         self.notes.append(f"{why}{begun}")
         self.frames = []
 
     def taken_notes(self) -> list[str]:
         """The notes since the last call, of many the last ones."""
         notes, self.notes = self.notes, []
-        return [f"{len(notes) - NOTED} notes before these", *notes[-NOTED:]] if len(notes) > NOTED else notes
+        return (
+            [f"{counted(len(notes) - NOTED, 'note')} before these", *notes[-NOTED:]]
+            if len(notes) > NOTED
+            else notes
+        )
