@@ -228,7 +228,7 @@ def test_a_default_that_spoils_good_prints_fails_by_the_case_most_beyond_its_bar
     assert rules == [("failed", "1.9\u202f%"), ("passed", "0.0\u202f%")]
     assert (
         "First failed rule: does no harm. Best, by runs that settle and stay, is the agent: from good "
-        "starts, perfect, 1.9 % of its runs leave ±25 %; at most 1 % may. Doing nothing spoils 0.0 %."
+        "starts, perfect, 1.9 % of its runs leave ±25 %; at most 1 % may. With doing nothing 0.0 % do."
     ) in text
 
 
@@ -262,15 +262,14 @@ def test_harm_without_a_declared_bar_is_not_measured_and_does_not_pass(project):
 
 def test_harm_stands_beside_recovery_with_doing_nothing_and_who_may_not_run_last(project):
     text = page()
-    # our agent recovers 100 - 0.2 - 5 x 0.1 - 1 = 98.3 %, doing nothing 100 - 90 - 5 - 1 = 4 %
-    assert (
-        "Our agent spoils 0.0 % of good prints (perfect start; at most 1 % may be). It recovers 98.3 %"
-        in text
-    )
-    assert (
-        "Doing nothing spoils 0.0 % of good prints (perfect start; at most 1 % may be). It recovers 4.0 %"
-        in text
-    )
+    # our agent leaves ±10 % in 0.2 / 2, and recovers 100 - 0.2 - 5 x 0.1 - 1 = 98.3 %; doing nothing 100 - 90 - 5 - 1 = 4 %
+    for said in (
+        "Our agent takes 0.0 % of good prints beyond ±25 % of flow (perfect start; at most 1 % may be), and "
+        "0.1 % beyond ±10 %. It recovers 98.3 %",
+        "Doing nothing takes 0.0 % of good prints beyond ±25 % of flow (perfect start; at most 1 % may be), "
+        "and 0.0 % beyond ±10 %. It recovers 4.0 %",
+    ):
+        assert said in text
     table = PAGE.read_text().split('tight harms"')[1].split("</table>")[0]
     rows = [re.sub(r"<.*?>|\s+", " ", row) for row in table.split("<tr>")[2:]]
     assert len(rows) == 8 and "proportional" in rows[-1] and "may not run" in rows[-1]

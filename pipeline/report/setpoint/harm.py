@@ -126,18 +126,23 @@ def _finding(board: Board, known: dict[str, Harm], limits: dict[Case, float]) ->
         if name in known:
             harm = known[name]
             sentences.append(
-                f"{_said(name)} spoils {share_text(harm.figure)} of good prints "
-                f"({start_text(harm.case)}; at most {harm.limit:g}{THIN}% may be). It recovers "
+                f"{_said(name)} takes {_taken(harm)} ({start_text(harm.case)}; at most {harm.limit:g}{THIN}% "
+                f"may be), and {share_text(board.cells[name, harm.case].beyond[0])} beyond "
+                f"±{BEYOND[0]}{THIN}%. It recovers "
                 f"{share_text(_recovered(board, name))} of clogs."
             )
     shares = {name: share for name in known if isinstance(share := _recovered(board, name), Figure)}
     most = max(shares, key=lambda name: shares[name].value, default="")
     if most and most not in (board.default, DOES_NOTHING):
         sentences.append(
-            f"Most clogs, {share_text(shares[most])}, are recovered by {most}. It spoils "
-            f"{share_text(known[most].figure)}."
+            f"Most clogs, {share_text(shares[most])}, are recovered by {most}. It takes "
+            f"{_taken(known[most])}."
         )
     return " ".join(sentences)
+
+
+def _taken(harm: Harm) -> str:
+    return f"{share_text(harm.figure)} of good prints beyond ±{BEYOND[-1]}{THIN}% of flow"
 
 
 def _said(name: str) -> str:
@@ -173,7 +178,7 @@ def _chart(board: Board, known: dict[str, Harm]) -> Markup:
     alt = (
         "Harm against recovery"
         if mine is None
-        else f"{board.default} spoils {share_text(mine.figure)} of good prints and recovers "
+        else f"{board.default} takes {_taken(mine)} and recovers "
         f"{share_text(_recovered(board, board.default))} of clogs"
     )
     return charts.panel(

@@ -318,7 +318,7 @@ def _does_no_harm(sources: Sources, board: Board | None) -> Pair:
     if board is None or not limits:
         return rule, rule
     idle = harm_of(board, DOES_NOTHING, limits)
-    beside = "" if isinstance(idle, Missing) else f" Doing nothing spoils {share_text(idle.figure)}."
+    beside = "" if isinstance(idle, Missing) else f" With doing nothing {share_text(idle.figure)} do."
     ends = sorted(set(limits.values()))
 
     def held(name: str) -> Rule:
