@@ -5,6 +5,7 @@ and choice.json, the default with its worst case."""
 
 from concurrent.futures import ThreadPoolExecutor
 
+from pipeline.setpoint import judging
 from pipeline.setpoint.workflow import contestants, evaluate_setpoint
 from pipeline.setpoint.workflow.agent_files import restore_agents
 from pipeline.setpoint.workflow.camera_files import restore_camera
@@ -29,13 +30,16 @@ def main() -> None:
         controllers = contestants.controllers(
             contestants.Problem(settings.baselines, agents, windows["learn"])
         )
-        choice = evaluate_setpoint.chosen(controllers, windows["choose"], settings)
+        room = judging.room([windows["choose"], windows["judge"]])  # one program for both
+        choice = evaluate_setpoint.chosen(controllers, windows["choose"], settings, room=room)
         known = restore_camera("datasets/train_classifier/known_camera.parquet")
         with ThreadPoolExecutor(1) as beside:
             through = beside.submit(
                 evaluate_setpoint.pixel_rollouts, controllers, choice, model, settings, view, known
             )
-            contest = evaluate_setpoint.contest(controllers, windows["judge"], settings, choice.name)
+            contest = evaluate_setpoint.contest(
+                controllers, windows["judge"], settings, choice.name, room=room
+            )
         rollouts, choice = through.result(), evaluate_setpoint.told(choice, contest)
         artifacts.write_table(
             out / "scoreboard.parquet",

@@ -8,7 +8,7 @@ still looks ahead.
 """
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -98,19 +98,19 @@ def paper_encoder(history: int = HISTORY) -> ObservationEncoder:
         temperatures = state.at[camera:].add(-BEST_TEMPERATURE).at[camera:].divide(TEMPERATURE_SCALE)
         return remembered(classes, observation.named), temperatures
 
-    return ObservationEncoder(partial(first_history, history), encode)
+    return ObservationEncoder(Partial(first_history, history), Partial(encode))
 
 
 def greedy(encoder: ObservationEncoder) -> Controller:
     """The controller that takes the best action of each head; its parameters are the network. The simulator
     heeds the temperature's every 10th step."""
+    return Controller(encoder.start, Partial(_best_action, encoder.encode))
 
-    def act(network, memory, observation, key):
-        memory, x = encoder.encode(network, memory, observation)
-        best = network(x).argmax(axis=1)
-        return memory, Action(best[0], best[1])
 
-    return Controller(encoder.start, act)
+def _best_action(encode, network, memory, observation, key):
+    memory, x = encode(network, memory, observation)
+    best = network(x).argmax(axis=1)
+    return memory, Action(best[0], best[1])
 
 
 # ---- learning
@@ -396,26 +396,33 @@ def train_published(key: jax.Array, settings: PublishedTraining, *, on_step=None
 
 def weights(network: eqx.Module) -> dict[str, np.ndarray]:
     """The network's arrays by their place in it, for the edge to write."""
-    return {
-        jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf)
-        for path, leaf in jax.tree_util.tree_leaves_with_path(network)
-    }
+    return {_place(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(network)}
+
+
+def _place(path) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".")
+
+
+def untrained(make: Callable[..., eqx.Module], *sizes: int) -> eqx.Module:
+    """make(key, *sizes) with the shapes of its arrays only, for `with_weights`: what draws weights takes long
+    to compile, and these would be thrown away."""
+    return eqx.filter_eval_shape(lambda key: make(key, *sizes), jax.random.key(0))
 
 
 def with_weights(network: eqx.Module, arrays: dict[str, np.ndarray]) -> eqx.Module:
-    """The network with these arrays in the places of its own.
+    """The network with these arrays in the places of its own, of which the shapes suffice (`untrained`).
 
     Raises ValueError where names or shapes are those of another architecture.
     """
-    own = weights(network)
+    own = {_place(path): np.shape(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(network)}
     wrong = sorted(own.keys() ^ arrays.keys()) or [
-        name for name in own if own[name].shape != np.shape(arrays[name])
+        name for name in own if own[name] != np.shape(arrays[name])
     ]
     if wrong:
         shape = f"shape {np.shape(arrays[wrong[0]])}" if wrong[0] in arrays else "none"
         raise ValueError(
             f"weights of another architecture: {wrong[0]!r} is "
-            f"{f'of shape {own[wrong[0]].shape}' if wrong[0] in own else 'unknown'} in this "
+            f"{f'of shape {own[wrong[0]]}' if wrong[0] in own else 'unknown'} in this "
             f"network and {shape} in "
             "the file; train again, or load them into the network that they were trained in"
         )

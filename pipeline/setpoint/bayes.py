@@ -200,6 +200,8 @@ def code(shares: jax.Array, named: jax.Array, flow_seen: jax.Array) -> jax.Array
     return jnp.where(jnp.isfinite(flow_seen), by_flow, by_class)
 
 
+_codes = jax.jit(code)
+
 CODE_CLASS = np.r_[  # (CODES,) the class that a code names
     np.arange(CLASS_CODES) // LEVELS,
     np.digitize(np.arange(FLOW_CODES), [FIRST_GOOD, FIRST_GOOD + BINS_OF_GOOD]),
@@ -223,13 +225,15 @@ def _paper_levels() -> np.ndarray:
     u = jnp.stack(jnp.meshgrid(*2 * [(jnp.arange(100) + 0.5) / 100], indexing="ij"), axis=-1).reshape(-1, 2)
     frequency = np.zeros(CLASS_CODES)
     for flow in (50.0, 100.0, 150.0):
-        drawn = jax.vmap(
-            lambda pair, flow=flow: paper_windows().draw(
-                (), nominal(flow, 210.0, accuracy=1.0), flow, 0.0, jnp.concatenate([jnp.zeros(1), pair])
-            )
-        )(u)
-        frequency += np.bincount(np.asarray(code(*drawn)), minlength=CLASS_CODES) / len(u)
+        frequency += np.bincount(np.asarray(_paper_codes(flow, u)), minlength=CLASS_CODES) / len(u)
     return 0.99 * frequency + 0.01 / LEVELS
+
+
+@jax.jit  # as one program: each operation on its own takes longer to compile
+def _paper_codes(flow: jax.Array, u: jax.Array) -> jax.Array:
+    conditions = nominal(flow, 210.0, accuracy=1.0)
+    pairs = jnp.concatenate([jnp.zeros((len(u), 1)), u], axis=1)
+    return code(*jax.vmap(lambda pair: paper_windows().draw((), conditions, flow, 0.0, pair))(pairs))
 
 
 TAIL = 4.0  # degrees of freedom: a segment far from all others is rare, not impossible
@@ -275,7 +279,7 @@ def _class_frequencies(table: WindowTable, biased: np.ndarray, smoothing: float)
     edges = np.asarray(table.flow_edges, float)
     centre, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
     counts = np.zeros((len(centre), CLASS_CODES))
-    shown = code(jnp.asarray(table.shares), jnp.asarray(table.named), jnp.full(len(table.named), jnp.nan))
+    shown = _codes(table.shares, table.named, np.full(len(table.named), np.nan, np.float32))
     np.add.at(counts, (table.flow_bin, np.asarray(shown)), 1.0)
     counts *= (width / np.maximum(counts.sum(axis=1), 1))[
         :, None

@@ -159,6 +159,7 @@ def along_bead(key: Array, x: Float[Array, "n 16 48"]) -> Float[Array, "n 16 48"
 
 
 AT_ONCE = 512  # images looked at together: what the paper's size holds of them then stays below 1 GB
+AT_ONCE_ON_CPU = 16  # images predicted together: what a CPU's caches hold, and little of it padded
 ADAM = optax.scale_by_adam()  # Kingma and Ba 2015, its own beta 0.9 and 0.999
 
 
@@ -400,13 +401,14 @@ def _predict(network: Classifier, key_area: Array, temperature_degC: Array) -> t
 
 
 def predict(
-    network: Classifier, key_area: np.ndarray, temperature_degC: np.ndarray, *, batch: int = AT_ONCE
+    network: Classifier, key_area: np.ndarray, temperature_degC: np.ndarray, *, batch: int | None = None
 ) -> Prediction:
     """Logits, features and flow of key areas (n, 16, 48) at temperatures (n,), from the mean features of each
     area's four mirror images: a bead has no left, right, head or tail.
 
-    It takes batches, the last one padded, so that one program serves any n.
+    It takes batches, the last one padded, so that one program serves any n: on a CPU of AT_ONCE_ON_CPU.
     """
+    batch = batch or (AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE)
     key_area, temperature_degC = (
         np.asarray(key_area),
         np.broadcast_to(np.asarray(temperature_degC, np.float32), len(key_area)),

@@ -179,21 +179,36 @@ def _shown(table: Shown, conditions: Conditions, flow, segment, u) -> tuple[jax.
 # ---- runs on redrawn segments
 
 
-def redrawn(table: WindowTable, redraws: int, rng: np.random.Generator) -> Windows:
+def redrawn(table: WindowTable, redraws: int, rng: np.random.Generator, *, room: int = 0) -> Windows:
     """`redraws` tables of as many segments as the table has, drawn from them with replacement: a source whose
-    arrays have a leading axis (redraws,).
+    arrays have a leading axis (redraws,), and room for as many windows and segments at least. Tables with the
+    same room are one program.
 
     A bin of the flow that a redraw leaves without a window keeps its own segments: of prints that stand at
     one flow each there may be no other.
     """
     sources = [recorded_windows(redraw(table, rng)) for _ in range(redraws)]
+    fixed = ("first_segment", "segments", "flow_edges", "seen")  # one for each bin
 
-    def stacked(*leaves: jax.Array) -> jax.Array:
-        longest = max(map(len, leaves))
-        # what is filled up is never drawn: counts say where a segment ends
-        return jnp.stack([jnp.pad(a, [(0, longest - len(a))] + [(0, 0)] * (a.ndim - 1)) for a in leaves])
+    def stacked(name: str) -> jax.Array:
+        arrays = [np.asarray(getattr(source.table, name)) for source in sources]
+        longest = max(*map(len, arrays), 0 if name in fixed else room)
+        # what is filled up is never drawn: counts say where a segment ends, and no flow lies beyond infinity
+        whole = np.full(
+            (redraws, longest, *arrays[0].shape[1:]), np.inf if name == "log_flow" else 0, arrays[0].dtype
+        )
+        for row, a in zip(whole, arrays, strict=True):
+            row[: len(a)] = a
+        return jnp.asarray(whole)
 
-    return sources[0]._replace(table=jax.tree.map(stacked, *(source.table for source in sources)))
+    ranked = sources[0].table
+    return sources[0]._replace(table=ranked._replace(**{name: stacked(name) for name in ranked._fields}))
+
+
+def room(tables: Sequence[WindowTable]) -> int:
+    """The most windows that a redraw of any of the tables may have."""
+    counts = [np.unique(table.segment, return_counts=True)[1] for table in tables]
+    return max(len(of) * int(of.max()) + len(table.segment) for of, table in zip(counts, tables, strict=True))
 
 
 def redraw(table: WindowTable, rng: np.random.Generator) -> WindowTable:
@@ -337,21 +352,17 @@ def _shared(of: Judged, group: str, redraws: int) -> float:
 
 
 def still_in(judged: Mapping[str, Judged], bars: Mapping[str, float]) -> list[str]:
-    """Who may still become the default: whose worst case does not lie below that of the best harmless one,
-    interval by interval, and whose harm is not beyond its bar by the whole of its interval."""
+    """Who may still become the default: whose worst case is not surely below that of the best harmless one,
+    redraw by redraw (`lead`, by which `choose` tells ties), and whose harm is not beyond its bar by the whole
+    of its interval."""
     sound = [name for name, of in judged.items() if not harmless(of, bars)] or list(judged)
     best = max(sound, key=lambda name: worst_case(judged[name])[0])
-    least = _worst_share(judged[best]).low
     return [
         name
         for name, of in judged.items()
-        if _worst_share(of).high >= least
+        if (name == best or lead(judged[best], of).low <= 0)
         and all(_interval(of, of.harmed, case).low <= bar for case, bar in bars.items())
     ]
-
-
-def _worst_share(of: Judged) -> Share:
-    return _interval(of, of.kept, worst_case(of)[1])
 
 
 def _interval(of: Judged, figures: Mapping[str, np.ndarray], case: str) -> Share:

@@ -153,10 +153,11 @@ def render(segment: Segment, flow: np.ndarray, temperature: np.ndarray, rng: np.
         np.int16
     )
     frames = np.empty((n, SIDE, SIDE), np.uint8)
+    place, level = segment.along.astype(np.intp), float(segment.ground.mean())
     for k in range(n):
         picture = _moved(segment, rng)
         if line[k]:
-            _lay(picture, segment, width[k], gloss[k], rng)
+            _lay(picture, segment, width[k], gloss[k], rng, place=place, level=level)
         cv2.copyTo(segment.nozzle, segment.mask, picture)
         soft = cv2.GaussianBlur(picture, (0, 0), segment.blur_px * focus[k])
         first = int(rng.integers(0, spare))
@@ -291,10 +292,19 @@ def _moved(segment: Segment, rng: np.random.Generator) -> np.ndarray:
     return cv2.add(segment.ground, segment.texture[y : y + SIDE, x : x + SIDE], dtype=cv2.CV_8U)
 
 
-def _lay(picture: np.ndarray, segment: Segment, width: float, gloss: float, rng: np.random.Generator) -> None:
+def _lay(
+    picture: np.ndarray,
+    segment: Segment,
+    width: float,
+    gloss: float,
+    rng: np.random.Generator,
+    *,
+    place: np.ndarray,
+    level: float,
+) -> None:
     """Draws the fresh bead: level falls as 1 - shading rho^2 with rho = 2 t / w across
-    it, a specular line at specular_at, rough edges."""
-    turn, place, light = (
+    it, a specular line at specular_at, rough edges. place: segment.along in whole px; level: of the ground."""
+    turn, beside, light = (
         np.tan(np.deg2rad(TURN_DEG)) * rng.standard_normal(),
         PLACE_PX * rng.standard_normal(),
         1 + FLICKER * rng.standard_normal(),
@@ -302,13 +312,13 @@ def _lay(picture: np.ndarray, segment: Segment, width: float, gloss: float, rng:
     shading, specular_at = rng.uniform(*SHADING), rng.uniform(*SPECULAR_AT)
     rough = cv2.GaussianBlur(rng.standard_normal((1, SIDE), dtype=np.float32), (0, 0), ROUGH_GRAIN_PX)[0]
     rough *= ROUGHNESS / rough.std()
-    t = segment.across - np.float32(turn) * segment.along - np.float32(place)
-    half = np.float32(width / 2) * (1 + rough[segment.along.astype(np.intp)])
+    t = segment.across - np.float32(turn) * segment.along - np.float32(beside)
+    half = (np.float32(width / 2) * (1 + rough))[place]
     near = np.flatnonzero(np.abs(t) < half + 0.5)
     t, half, at = t[near], half[near], segment.at[near]
     cover = np.clip(half - np.abs(t) + 0.5, 0, 1)
     rho = np.clip(t / np.maximum(half, 0.5), -1, 1)
     line = segment.specular * gloss * np.exp(-0.5 * ((t - specular_at * half) / SPECULAR_PX) ** 2)
     flat = picture.reshape(-1)
-    level = light * (float(segment.ground.mean()) + segment.contrast * (1 - shading * rho * rho) + line)
-    flat[at] = np.clip(flat[at] * (1 - cover) + level * cover, 0, 255)
+    bead = light * (level + segment.contrast * (1 - shading * rho * rho) + line)
+    flat[at] = np.clip(flat[at] * (1 - cover) + bead * cover, 0, 255)

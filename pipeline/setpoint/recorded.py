@@ -52,7 +52,8 @@ NEAREST = 40  # windows that an error is drawn from, or all where there are fewe
 class _Ranked(NamedTuple):
     """Windows sorted by bin, then by the rank of their segment: segments of bin b are first_segment[b] + 0 ..
     segments[b] - 1, their windows likewise. Of those that show flows, sorted by log_flow (n,): their errors
-    about their segments (n,) and spread (n,); and bias (segments,) of the segments, rising."""
+    about their segments (n,) and spread (n,); and bias (segments,) of the segments, rising. seen: how many of
+    these windows and biases there are, as what a redraw is filled up with behind them is none."""
 
     shares: jax.Array
     named: jax.Array
@@ -65,6 +66,7 @@ class _Ranked(NamedTuple):
     first_window: jax.Array
     windows: jax.Array
     flow_edges: jax.Array
+    seen: jax.Array
 
 
 class SegmentErrors(NamedTuple):
@@ -140,6 +142,7 @@ def recorded_windows(table: WindowTable) -> Windows:
         first_window=jnp.asarray(np.cumsum(windows) - windows),
         windows=jnp.asarray(windows),
         flow_edges=jnp.asarray(table.flow_edges, jnp.float32),
+        seen=jnp.asarray([len(log_flow), len(bias)], jnp.int32),
     )
     return Windows(_recorded_draw, ranked)
 
@@ -161,11 +164,11 @@ def _recorded_draw(
     s = ranked.first_segment[flow_bin] + jnp.floor(segment * ranked.segments[flow_bin]).astype(jnp.int32)
     w = ranked.first_window[s] + jnp.floor(u[0] * ranked.windows[s]).astype(jnp.int32)
     q = jnp.clip(flow, ranked.flow_edges[0], ranked.flow_edges[-1])
-    n = len(ranked.log_flow)
-    some = min(NEAREST, n)
+    n, biases = ranked.seen
+    some = jnp.minimum(NEAREST, n)
     first = jnp.clip(jnp.searchsorted(ranked.log_flow, jnp.log(q)) - some // 2, 0, n - some)
     near = first + jnp.floor(u[0] * some).astype(jnp.int32)
-    bias = ranked.bias[jnp.floor(segment * len(ranked.bias)).astype(jnp.int32)]
+    bias = ranked.bias[jnp.floor(segment * biases).astype(jnp.int32)]
     seen = q * jnp.exp(bias + ranked.error[near] + DITHER * u[1])
     by_flow = class_shares(seen, ranked.spread[near])
     known = jnp.isfinite(seen)

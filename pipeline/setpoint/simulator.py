@@ -380,15 +380,16 @@ def rollout(
     compiled program, the same key the same bytes."""
     n = conditions.flow.shape[0]
     own, world = jax.random.split(key)  # the controller's chance is not the world's
-    # chance is drawn outside of the program, as its generator takes longer to compile than the rest
-    return _rolled(
-        controller,
-        parameters,
-        windows,
-        conditions,
-        jax.random.split(own, n),
-        jax.random.uniform(world, (steps + 1, n, CHANCES)),
-    )
+    # chance is drawn outside of the program, as its generator takes longer to compile than the rest; so are
+    # the first windows, which are the same program for every controller
+    u = jax.random.uniform(world, (steps + 1, n, CHANCES))
+    first = _first(windows, conditions, u)
+    return _rolled(controller, parameters, windows, conditions, jax.random.split(own, n), first, u)
+
+
+@eqx.filter_jit
+def _first(windows: Windows, conditions: Conditions, u: jax.Array) -> tuple[State, Observation]:
+    return jax.vmap(_begun, (None, 0, 0))(windows, conditions, u[0])
 
 
 @eqx.filter_jit
@@ -398,6 +399,7 @@ def _rolled(
     windows: Windows,
     conditions: Conditions,
     keys: jax.Array,
+    first: tuple[State, Observation],
     u: jax.Array,
 ) -> Trajectory:
     def decide(carry, chance):
@@ -418,7 +420,7 @@ def _rolled(
             reason,
         )
 
-    state, observation = jax.vmap(_begun, (None, 0, 0))(windows, conditions, u[0])
+    state, observation = first
     memory = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf, (len(keys), *jnp.shape(leaf))), controller.start()
     )

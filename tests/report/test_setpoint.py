@@ -262,7 +262,8 @@ def test_harm_without_a_declared_bar_is_not_measured_and_does_not_pass(project):
 
 def test_harm_stands_beside_recovery_with_doing_nothing_and_who_may_not_run_last(project):
     text = page()
-    # our agent leaves ±10 % in 0.2 / 2, and recovers 100 - 0.2 - 5 x 0.1 - 1 = 98.3 %; doing nothing 100 - 90 - 5 - 1 = 4 %
+    # our agent leaves ±10 % in 0.2 / 2 % and recovers 100 - 0.2 - 5 x 0.1 - 1 = 98.3 %,
+    # doing nothing 100 - 90 - 5 - 1 = 4 %
     for said in (
         "Our agent takes 0.0 % of good prints beyond ±25 % of flow (perfect start; at most 1 % may be), and "
         "0.1 % beyond ±10 %. It recovers 98.3 %",

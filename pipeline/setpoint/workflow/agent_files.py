@@ -58,7 +58,8 @@ def restore_agents(path: str) -> Agents:
             )
         )
         hypotheses = model.evidence.shape[0]
-        network = agent.with_weights(BeliefNetwork(hypotheses, jax.random.key(0)), parts.pop(OURS))
+        shapes = agent.untrained(lambda key: BeliefNetwork(hypotheses, key))
+        network = agent.with_weights(shapes, parts.pop(OURS))
         li_2025 = tuple(_network(part) for part in parts.values())
         return Agents(li_2025, Belief(model, *(belief[name] for name in Belief._fields[1:])), network)
 
@@ -84,8 +85,8 @@ def restore_published(path: Path) -> agent.Published:
 def _network(part: dict[str, np.ndarray]) -> QNetwork:
     """The network of these arrays, whose history is as long as they say."""
     numbers = np.shape(part.get("vision.weight", np.zeros((256, HISTORY + CLASSES))))
-    network = QNetwork(jax.random.key(0), max(numbers[-1] - CLASSES, 1))
-    return cast(QNetwork, agent.with_weights(network, part))
+    shapes = agent.untrained(QNetwork, max(numbers[-1] - CLASSES, 1))
+    return cast(QNetwork, agent.with_weights(shapes, part))
 
 
 def _part(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:

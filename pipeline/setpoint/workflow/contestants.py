@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.tree_util import Partial
 
 from pipeline.setpoint import agent, baselines, bayes, belief_agent, judging
 from pipeline.setpoint.recorded import WindowTable
@@ -46,6 +47,10 @@ class ControllerSpec(NamedTuple):
     kind: str
     controller: Controller
     parameters: Any
+
+
+def _strange(of: bayes.Filter, network: Any, memory: Any) -> jax.Array:
+    return bayes.strange(of, memory)
 
 
 @cache  # one controller for all phases, so that what was compiled for it is found again
@@ -118,7 +123,7 @@ CONTESTANTS = (
         "agent",
         lambda problem: (
             agent.greedy(belief_agent.belief_encoder(problem.agents.belief))._replace(
-                strange=lambda _, memory: bayes.strange(problem.agents.belief.filter, memory)
+                strange=Partial(_strange, problem.agents.belief.filter)
             ),
             problem.agents.belief_dqn,
         ),

@@ -63,12 +63,15 @@ def bars(settings: EvaluateSetpoint) -> dict[str, float]:
     return {name: bar for name, bar in of_each.items() if bar is not None}
 
 
-def chosen(specs: Mapping[str, ControllerSpec], windows: WindowTable, settings: EvaluateSetpoint) -> Choice:
+def chosen(
+    specs: Mapping[str, ControllerSpec], windows: WindowTable, settings: EvaluateSetpoint, *, room: int = 0
+) -> Choice:
     """The default, by the segments to choose on. In each of settings.rounds every contestant that may still
     win runs on settings.redraws further redraws of them; the others run no more."""
     limits, rounds = bars(settings), settings.rounds
     asked = {name: case for name, case in _cases(settings).items() if not case.good or name in limits}
-    recorded = judging.redrawn(windows, rounds * settings.redraws, np.random.default_rng([settings.seed, 0]))
+    rng = np.random.default_rng([settings.seed, 0])
+    recorded = judging.redrawn(windows, rounds * settings.redraws, rng, room=room)
     found: dict[str, dict[str, Outcomes]] = {name: {} for name in specs}
     left = list(specs)
     judged: dict[str, Judged] = {}
@@ -86,12 +89,18 @@ def chosen(specs: Mapping[str, ControllerSpec], windows: WindowTable, settings: 
 
 
 def contest(
-    specs: Mapping[str, ControllerSpec], windows: WindowTable, settings: EvaluateSetpoint, default: str
+    specs: Mapping[str, ControllerSpec],
+    windows: WindowTable,
+    settings: EvaluateSetpoint,
+    default: str,
+    *,
+    room: int = 0,
 ) -> Contest:
     """Figures on segments that nothing was trained, tuned or chosen on: the default on all redraws of them,
     the others on those of one round."""
     rounds, asked = settings.rounds, _cases(settings)
-    recorded = judging.redrawn(windows, rounds * settings.redraws, np.random.default_rng([settings.seed, 1]))
+    rng = np.random.default_rng([settings.seed, 1])
+    recorded = judging.redrawn(windows, rounds * settings.redraws, rng, room=room)
     of_each = {name: rounds if name == default else 1 for name in specs}
     parts = [_of_round(recorded, number, settings.redraws) for number in range(rounds)]
 

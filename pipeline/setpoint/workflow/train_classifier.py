@@ -4,6 +4,7 @@ beside their yardsticks; tables, metrics and a few frames of it."""
 import contextlib
 import functools
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,7 +72,7 @@ def trained(
         ),
         "convolutional network": (convolutional(np.random.default_rng([settings.seed, 11])), settings.cnn),
     }
-    curves = {}
+    trainings: dict[str, Callable[[], TrainState]] = {}
     to_learn = {"vision transformer": learned, "convolutional network": fewer(learned)}
     for i, (name, (network, recipe)) in enumerate(untrained.items()):
         inputs = settings.size, settings.augmentation, settings.seed, recipe.model_dump()
@@ -85,7 +86,13 @@ def trained(
             augment=AUGMENTATIONS[settings.augmentation],
         )
         state = classifier.untrained(network, epochs=recipe.epochs)
-        curves[name] = _resumed(train, state, name, checkpoints / f"{joblib.hash(what)}.safetensors")
+        trainings[name] = functools.partial(
+            _resumed, train, state, name, checkpoints / f"{joblib.hash(what)}.safetensors"
+        )
+    # at the same time: neither keeps both cores busy, and neither knows of the other
+    with ThreadPoolExecutor(len(trainings)) as pool:
+        running = {name: pool.submit(training) for name, training in trainings.items()}
+    curves = {name: training.result() for name, training in running.items()}
     return Trained(curves["vision transformer"].best, curves["convolutional network"].best, curves)
 
 
