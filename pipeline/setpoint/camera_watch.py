@@ -32,7 +32,7 @@ WIDE = 0.5  # deviation of log flow, of what goes anywhere
 MOVE_DOUBT = 0.5  # of a commanded move, the share that may not come
 RESTART, MOST = 1e-5, 2.5  # a window counts at most so many nats
 ABOVE = 4.0  # nats beyond its limit that a sum may grow, so that a camera is found to be the table's again
-EXCUSE = 2.5  # nats by which short segments must explain the windows better
+EXCUSE, EXCUSED = 0.0, 5.0  # nats by which short segments must explain the windows better, and may at most
 KNOTS_PERCENT = np.array([30.0, 50.0, 70.0, 85.0, 100.0, 120.0, 150.0, 200.0, 300.0])
 KNOT_WIDTH = 0.15  # of log flow
 
@@ -99,7 +99,7 @@ def update(of: Errors, state: WatchState, flow_seen: jax.Array, move: jax.Array)
         shifted + mean,
         spread,
         jnp.logaddexp(state.strength, jnp.log(RESTART)) + ratio,
-        jnp.clip(state.excused + against, -2 * EXCUSE, 2 * EXCUSE),
+        jnp.clip(state.excused + against, -EXCUSED, EXCUSED),
     )
     unseen = WatchState(shifted, variance, jnp.asarray(state.strength), jnp.asarray(state.excused))
     return jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(flow_seen), new, old), after, unseen)
@@ -115,7 +115,7 @@ def strange(state: WatchState, unlikely: jax.Array | float, likely: jax.Array | 
     """Whether the windows are of another camera: noisier ones than `unlikely` lets pass, unless their
     segments are short; or steadier ones than `likely` does."""
     noisier, steadier = greatest(state)
-    return ((noisier > unlikely) & (jnp.min(state.excused) < EXCUSE)) | (steadier > likely)
+    return ((noisier > unlikely) & (jnp.min(state.excused) <= EXCUSE)) | (steadier > likely)
 
 
 def greatest(state: WatchState) -> jax.Array:
