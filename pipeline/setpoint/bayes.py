@@ -26,9 +26,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pipeline.setpoint import camera_watch
 from pipeline.setpoint.baselines import temperature_move
-from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, FLOW_MOVES
-from pipeline.setpoint.recorded import WindowTable, class_shares, segment_errors, with_flows
+from pipeline.setpoint.camera_watch import Errors, WatchState
+from pipeline.setpoint.published import BEST_FLOW, FLOW_MOVES
+from pipeline.setpoint.recorded import WindowTable, segment_errors, smooth_mean, with_flows
 from pipeline.setpoint.simulator import (
     CLASSES,
     FLOW_LIMITS,
@@ -65,8 +67,8 @@ class Filter(NamedTuple):
     of a miss beyond 10 %, a border that is known to within border_std percent, move_fixed_cost of any
     correction. prior (H, N) is the belief at the start.
 
-    usual_surprise, unlikely_limit and likely_limit are of `surprise_update`: what its own table makes the
-    filter wonder, and from where on the camera is another.
+    window_noise (knots,), segment_bias, unlikely_limit and likely_limit are of `camera_watch`: the errors of
+    the table's own camera, and from where on the camera is another.
     """
 
     evidence: jax.Array
@@ -80,26 +82,26 @@ class Filter(NamedTuple):
     move_fixed_cost: float
     prior: jax.Array
     border_std: float = 0.0
-    usual_surprise: float = 0.0
+    window_noise: jax.Array | np.ndarray = np.full(len(camera_watch.KNOTS_PERCENT), 0.05, np.float32)
+    segment_bias: float = 0.05
     unlikely_limit: float = float("inf")
     likely_limit: float = float("inf")
 
 
 class FilterState(NamedTuple):
     """What the filter remembers: belief (H, N), sum 1; the code of the last window, -1 before the first; how
-    many windows it has seen; and the sums of `surprise_update`."""
+    many windows it has seen; and what `camera_watch` remembers."""
 
     belief: jax.Array
     last_code: jax.Array
     windows: jax.Array
-    unlikely: jax.Array | float = 0.0
-    likely: jax.Array | float = 0.0
+    watch: WatchState = camera_watch.start()
 
 
 def initial_state(hypotheses: int) -> FilterState:
     """Before the first window, when the belief becomes the filter's prior."""
     belief = jnp.tile(jnp.asarray(PRIOR, jnp.float32) / hypotheses, (hypotheses, 1))
-    return FilterState(belief, jnp.int32(-1), jnp.int32(0), jnp.float32(0), jnp.float32(0))
+    return FilterState(belief, jnp.int32(-1), jnp.int32(0), jax.tree.map(jnp.asarray, camera_watch.start()))
 
 
 def start_prior(*, known_start_share: float, known_start_std: float) -> np.ndarray:
@@ -119,7 +121,7 @@ def bayes(hypotheses: int) -> Controller:
     ) -> tuple[FilterState, Action]:
         state = filter_update(parameters, state, observation)
         return state, Action(
-            jnp.argmin(expected_loss(parameters, state.belief)).astype(jnp.int32),
+            jnp.argmin(expected_loss(parameters, state.belief, observation.flow_move)).astype(jnp.int32),
             temperature_move(observation),
         )
 
@@ -128,13 +130,6 @@ def bayes(hypotheses: int) -> Controller:
 
 def filter_update(parameters: Filter, state: FilterState, observation: Observation) -> FilterState:
     """The state after the move that led to this window, and the window."""
-    return surprise_update(parameters, *_filtered(parameters, state, observation))
-
-
-def _filtered(
-    parameters: Filter, state: FilterState, observation: Observation
-) -> tuple[FilterState, jax.Array]:
-    """The state with the new belief, and how much the window surprises, NaN where that does not count."""
     belief = jnp.where(state.windows == 0, parameters.prior, state.belief)
     moved = jax.vmap(predict_shift)(belief, parameters.gains * observation.flow_move)
     jumped = (parameters.after_jump.T @ belief.sum(axis=1))[:, None] * jnp.asarray(PRIOR, jnp.float32)
@@ -145,51 +140,15 @@ def _filtered(
     posterior = predicted * (
         repeats * (shown == state.last_code) + (1.0 - repeats) * parameters.evidence[:, shown]
     )
-    after = FilterState(posterior / posterior.sum(), shown, state.windows + 1, state.unlikely, state.likely)
-    counts = jnp.isfinite(observation.flow_seen) & (state.windows >= UNSETTLED)
-    return after, jnp.where(counts, _surprise(parameters, predicted, posterior.sum()), jnp.nan)
-
-
-# of the test whether the camera is the table's: windows after the start that do not count, the most that one
-# window counts, what is let pass each window, and how far past its limit a sum may grow
-UNSETTLED, MOST_SURPRISE, CEILING = 2, 2.0, 1.3
-ALLOWANCE, LIKELY_ALLOWANCE = 0.5, 0.75  # a camera steadier than its record is no other, unless by much
-
-
-def _surprise(parameters: Filter, predicted: jax.Array, probability: jax.Array) -> jax.Array:
-    """- log P(code | past) - log s of a window that shows a flow; s is the deviation of the code as
-    predicted, so that a wide prediction is not a bad one."""
-    step = jnp.arange(FLOW_CODES, dtype=jnp.float32) - FIRST_GOOD
-    by_flow = parameters.evidence[:, CLASS_CODES:]
-    mean = jnp.sum(jnp.einsum("hcn,c->hn", by_flow, step) * predicted)
-    square = jnp.sum(jnp.einsum("hcn,c->hn", by_flow, step**2) * predicted)
-    return -jnp.log(probability) - 0.5 * jnp.log(jnp.maximum(square - mean**2, 0.1))
-
-
-def surprise_update(parameters: Filter, state: FilterState, surprise: jax.Array) -> FilterState:
-    """Two cumulative sums (Page 1954) of what a window surprises more, and less, than the table's own do:
-    S <- clip(S + (surprise - usual) - allowance, 0, ceiling) and likewise the other way, NaN changes none.
-
-    A camera whose errors are larger than its table says surprises more; one that hardly follows the flow, or
-    repeats itself, surprises less.
-    """
-    excess = jnp.clip(surprise - parameters.usual_surprise, -MOST_SURPRISE, MOST_SURPRISE)
-    sums = [
-        jnp.where(jnp.isnan(surprise), s, jnp.clip(s + more, 0.0, CEILING * limit))
-        for s, more, limit in (
-            (state.unlikely, excess - ALLOWANCE, parameters.unlikely_limit),
-            (state.likely, -excess - LIKELY_ALLOWANCE, parameters.likely_limit),
-        )
-    ]
-    return state._replace(unlikely=sums[0], likely=sums[1])
+    own = Errors(parameters.window_noise, parameters.segment_bias)
+    watch = camera_watch.update(own, state.watch, observation.flow_seen, observation.flow_move)
+    watch = camera_watch.limited(watch, parameters.unlikely_limit, parameters.likely_limit)
+    return FilterState(posterior / posterior.sum(), shown, state.windows + 1, watch)
 
 
 def strange(parameters: Filter, state: FilterState) -> jax.Array:
     """Whether the camera is not the one of the table."""
-    sums = jnp.stack([jnp.asarray(state.unlikely), jnp.asarray(state.likely)])
-    return (
-        sums > jnp.stack([jnp.asarray(parameters.unlikely_limit), jnp.asarray(parameters.likely_limit)])
-    ).any()
+    return camera_watch.strange(state.watch, parameters.unlikely_limit, parameters.likely_limit)
 
 
 # corrections that begin with each of the five moves, in percent: a far flow takes many moves, and the fixed
@@ -200,9 +159,9 @@ CORRECTIONS = np.array([*FLOW_MOVES, *(-LARGEST * k for k in FARTHER), *(LARGEST
 BEGINS = np.array([FLOW_MOVES.index(max(-LARGEST, min(LARGEST, c))) for c in CORRECTIONS])
 
 
-def expected_loss(parameters: Filter, belief: jax.Array) -> jax.Array:
+def expected_loss(parameters: Filter, belief: jax.Array, last_move: jax.Array | float = 0.0) -> jax.Array:
     """Of each of the five moves (5), in percent of flow error: of the best of the corrections that begin with
-    it, were the correction done."""
+    it, were the correction done. What goes on in the direction of last_move is no correction of its own."""
     moves = jnp.asarray(FLOW_MOVES)
     miss = jnp.abs(GRID + parameters.gains[:, None] * jnp.asarray(CORRECTIONS)[:, None, None] - BEST_FLOW)
     # of a miss on the border itself, as little as rounding is not outside
@@ -210,7 +169,8 @@ def expected_loss(parameters: Filter, belief: jax.Array) -> jax.Array:
     loss = miss + parameters.outside_cost * outside  # (corrections, H, N)
     expected = jnp.einsum("chn,hn->c", loss, belief)
     expected = jax.ops.segment_min(expected, BEGINS, len(FLOW_MOVES))
-    return expected + parameters.move_cost * jnp.abs(moves) + parameters.move_fixed_cost * (moves != 0)
+    begins = (moves != 0) & (moves * last_move <= 0)
+    return expected + parameters.move_cost * jnp.abs(moves) + parameters.move_fixed_cost * begins
 
 
 def predict_shift(belief: jax.Array, move: jax.Array) -> jax.Array:
@@ -426,93 +386,84 @@ def robust_filter(table: WindowTable, model: CameraErrorModel) -> Filter:
     )
 
 
-# decisions and episodes of the quiet prints that set the limits of the surprise, the share of them that may
-# pass each of the two, and decisions that a segment lasts there
-QUIET, QUIET_PRINTS, FALSE_ALARMS, STRETCH = 200, 400, 0.007, (5, 41)
+# decisions and episodes of the quiet prints that set the limits of the watch, the share of them that may pass
+# each of the two, decisions that a segment lasts there, and how often the flow is moved
+QUIET, QUIET_PRINTS, FALSE_ALARMS, STRETCH, TRIED = 200, 2000, 0.007, (5, 41), 0.05
 QUIET_FLOWS = (70.0, 140.0)  # percent: segments that stood there are drawn
 
 
 def watching_filter(table: WindowTable, model: CameraErrorModel) -> Filter:
-    """`robust_filter` that also tells when the camera is not the table's, where the table shows flows.
-
-    The limits come from prints with nothing wrong whose windows are of segments that the filter was not made
-    from: each half of the table's segments in turn is left out.
-    """
+    """`robust_filter` that also tells when the camera is not the table's, where the table shows flows and
+    several windows of a segment. The limits come from prints with nothing wrong."""
     own = robust_filter(table, model)
-    if not with_flows(table):
+    if not with_flows(table) or len(np.unique(table.segment)) == len(table.segment):
         return own
-    rng = np.random.default_rng(0)
-    segments = np.unique(table.segment)
-    half = rng.permutation(len(segments)) % 2
-    surprise = np.concatenate(
-        [
-            _quiet_surprise(
-                robust_filter(_rows(table, kept), model), *_quiet_prints(_rows(table, ~kept), rng)
-            )
-            for kept in (np.isin(table.segment, segments[half == side]) for side in (0, 1))
-        ]
-    )
-    own = own._replace(usual_surprise=float(np.nanmean(surprise)))
-    greatest = _greatest_sums(own, jnp.asarray(surprise, jnp.float32))
+    flow, within = _window_noise(table)
+    bias = segment_errors(table, width_bias_std=model.width_bias_std).bias_std
+    errors = camera_watch.errors(flow, within, bias)
+    prints = _quiet_prints(table, flow, within, np.random.default_rng(0))
+    greatest = _greatest_sums(errors, *map(jnp.asarray, prints))
     limits = np.quantile(np.asarray(greatest), 1.0 - FALSE_ALARMS, axis=0)
-    return own._replace(unlikely_limit=float(limits[0]), likely_limit=float(limits[1]))
+    noise = np.asarray(errors.noise, np.float32)
+    return own._replace(
+        window_noise=noise, segment_bias=float(errors.bias), unlikely_limit=float(limits[0]),
+        likely_limit=float(limits[1]),
+    )  # fmt: skip
 
 
-def _rows(table: WindowTable, mask: np.ndarray) -> WindowTable:
-    columns = {name: getattr(table, name)[mask] for name in table._fields if name != "flow_edges"}
-    return table._replace(**columns)
+def _window_noise(table: WindowTable) -> tuple[np.ndarray, np.ndarray]:
+    """Flows (n,) in percent and how far log flow_seen departs there from one window of a segment to the next,
+    over sqrt 2: what drifts over a segment is not noise of its windows."""
+    order = np.argsort(table.segment, kind="stable")
+    log_flow, error = np.log(table.flow)[order], np.log(table.flow_seen / table.flow)[order]
+    error = error - smooth_mean(log_flow, error)
+    same = np.diff(np.asarray(table.segment)[order]) == 0
+    return np.exp((log_flow[1:] + log_flow[:-1]) / 2)[same], (np.diff(error) / np.sqrt(2.0))[same]
 
 
-def _quiet_prints(table: WindowTable, rng: np.random.Generator) -> tuple[jax.Array, jax.Array]:
-    """Flows seen at 100 % (prints, decisions), and class shares: stretches of one segment's mean error, and
-    the errors of windows about their segments. These are of any segment: a camera's windows do not come back
-    as the few of a segment would."""
-    near = (table.flow >= QUIET_FLOWS[0]) & (table.flow <= QUIET_FLOWS[1])
-    error = np.log(table.flow_seen / table.flow)[near]
-    _, place, counts = np.unique(table.segment[near], return_inverse=True, return_counts=True)
-    mean = np.bincount(place, error) / counts
-    several = counts[place] > 1
-    within = ((error - mean[place]) * np.sqrt(counts / np.maximum(counts - 1, 1))[place])[several]
-    seen = rng.choice(within if several.any() else np.zeros(1), (QUIET_PRINTS // 2, QUIET))
-    for line in seen:
-        t = 0
-        while t < QUIET:
-            length = int(rng.integers(*STRETCH))
-            line[t : t + length] += mean[rng.integers(len(mean))]
-            t += length
-    flow_seen = jnp.asarray(100.0 * np.exp(seen), jnp.float32)
-    return flow_seen, jax.jit(class_shares)(flow_seen, float(np.median(table.spread)))
+def _quiet_prints(
+    table: WindowTable, flow: np.ndarray, within: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Flows seen (prints, decisions) around 100 %, and the moves that led there: stretches of one segment's
+    mean error, and noise `within` of any segment at `flow`: a camera's windows do not come back as the few of
+    a segment would. Half of the prints are moved now and then, and back, by a gain."""
+
+    def near(flow: np.ndarray) -> np.ndarray:
+        some = (flow >= QUIET_FLOWS[0]) & (flow <= QUIET_FLOWS[1])
+        return some | ~some.any()
+
+    here = near(table.flow)
+    _, place, counts = np.unique(table.segment[here], return_inverse=True, return_counts=True)
+    mean = np.bincount(place, np.log(table.flow_seen / table.flow)[here]) / counts
+    noise = within[near(flow)]
+    seen = rng.choice(np.r_[noise, -noise], (QUIET_PRINTS, QUIET))
+    left, bias = np.zeros(QUIET_PRINTS, int), np.zeros(QUIET_PRINTS)
+    for t in range(QUIET):
+        over = left <= 0
+        bias = np.where(over, mean[rng.integers(len(mean), size=QUIET_PRINTS)], bias)
+        left = np.where(over, rng.integers(*STRETCH, QUIET_PRINTS), left) - 1
+        seen[:, t] += bias
+    moves = rng.choice([-10.0, -5.0, 5.0, 10.0], seen.shape) * (rng.random(seen.shape) < TRIED)
+    moves[: QUIET_PRINTS // 2] = 0.0
+    moves[:, 1:] -= moves[:, :-1]  # there and back
+    moves[:, 0] = 0.0
+    reached = np.cumsum(moves, axis=1) * rng.uniform(0.5, 1.2, (QUIET_PRINTS, 1))
+    return np.maximum(100.0 + reached, 20.0) * np.exp(seen), moves
 
 
 @jax.jit
-def _quiet_surprise(parameters: Filter, seen: jax.Array, shares: jax.Array) -> jax.Array:
-    """Surprise (prints, decisions) of a filter at a flow that nobody moves, NaN while unsettled."""
+def _greatest_sums(errors: Errors, seen: jax.Array, moves: jax.Array) -> jax.Array:
+    """(prints, 2): the greatest of both sums over each print's flows seen and moves (prints, decisions)."""
 
-    def one(seen, shares):
-        def window(state, shown):
-            flow_seen, share, t = shown
-            still, target = jnp.float32(0.0), jnp.float32(BEST_TEMPERATURE)
-            named = share.argmax().astype(jnp.int32)
-            return _filtered(
-                parameters, state, Observation(share, named, flow_seen, still, target, target, t)
-            )
+    def window(state, shown):
+        state = camera_watch.update(errors, state, *shown)
+        return state, camera_watch.greatest(state)
 
-        t = jnp.arange(seen.shape[0], dtype=jnp.int32)
-        return jax.lax.scan(window, initial_state(len(parameters.gains)), (seen, shares, t))[1]
+    def one(seen, moves):
+        begin = jax.tree.map(jnp.asarray, camera_watch.start())
+        return jax.lax.scan(window, begin, (seen, moves))[1].max(axis=0)
 
-    return jax.vmap(one)(seen, shares)
-
-
-def _greatest_sums(parameters: Filter, surprise: jax.Array) -> jax.Array:
-    """(prints, 2): the greatest of both sums over each print's surprise (prints, decisions)."""
-    free = parameters._replace(unlikely_limit=jnp.inf, likely_limit=jnp.inf)
-
-    def window(state, one):
-        state = surprise_update(free, state, one)
-        return state, jnp.stack([state.unlikely, state.likely])
-
-    sums = jax.vmap(lambda line: jax.lax.scan(window, initial_state(1), line)[1])(surprise)
-    return sums.max(axis=1)
+    return jax.vmap(one)(seen.astype(jnp.float32), moves.astype(jnp.float32))
 
 
 def _prior(share: float, std: float) -> np.ndarray:

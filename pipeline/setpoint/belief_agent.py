@@ -62,6 +62,7 @@ SINGLE = (
 )  # percent of flow between which the network sees every point of the grid; outside it sees groups of GROUP
 GROUP = 4
 VALIDATION = 384  # episodes, the same after each round: the mean cost of a step to about 2 %
+AT_REST = 0.1  # by which a move's value lies below standing's where the filter rests
 AHEAD = 40  # steps after which a heater of (6) has 1e-4 of its way left
 
 
@@ -153,8 +154,8 @@ def standing_values(observation: Observation, gamma: float) -> jax.Array:
 
 
 def belief_encoder(of: Belief) -> ObservationEncoder:
-    """x = [values of the flow's actions (5), pooled belief, hypotheses (H), values of the temperature's
-    actions (5), u_hat, u_bar, clock, heeded]."""
+    """x = [whether the filter itself would rest, values of the flow's actions (5), pooled belief, hypotheses
+    (H), values of the temperature's actions (5), u_hat, u_bar, clock, heeded]."""
     # the belief's tables are arguments: as constants each of them would be compiled anew
     return ObservationEncoder(
         Partial(bayes.initial_state, of.filter.evidence.shape[0]), Partial(_encoded, of)
@@ -174,7 +175,11 @@ def _encoded(of: Belief, network, state: bayes.FilterState, observation: Observa
         jnp.stack([clock / LAMBDA, clock == 0]),
     ]
     pooled = flow @ jnp.asarray(POOLING, jnp.float32)
-    return state, jnp.concatenate([of.values @ flow, pooled, belief.sum(axis=1), *rest])
+    rests = bayes.expected_loss(of.filter, belief, observation.flow_move).argmin() == STAND
+    values = of.values @ flow
+    return state, jnp.concatenate(
+        [rests[None].astype(values.dtype), values, pooled, belief.sum(axis=1), *rest]
+    )
 
 
 class Correction(eqx.Module):
@@ -200,7 +205,7 @@ class Correction(eqx.Module):
 
 class BeliefNetwork(eqx.Module):
     """Q (2, 5): of each head the values that it starts from and their correction; the
-    temperature's sees temperatures and clock alone."""
+    temperature's sees temperatures and clock alone. No move of the flow is best where the filter rests."""
 
     flow: Correction
     temperature: Correction
@@ -211,11 +216,14 @@ class BeliefNetwork(eqx.Module):
         self.temperature = Correction((ACTIONS + 4, 32), keys[1])
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        flow_part, temperature_part = x[: -ACTIONS - 4], x[-ACTIONS - 4 :]
+        rests, flow_part, temperature_part = x[0] > 0, x[1 : -ACTIONS - 4], x[-ACTIONS - 4 :]
         values, temperature_values = flow_part[:ACTIONS], temperature_part[:ACTIONS]
         heeded = temperature_part[-1] > 0
         correction = self.temperature(temperature_part)
         Q = values + self.flow(flow_part.at[:ACTIONS].add(-values.max()))
+        # where the filter rests so does the agent: it may do less harm than the filter, and no more
+        below = jnp.minimum(Q, jax.lax.stop_gradient(Q[STAND]) - AT_REST)
+        Q = jnp.where(rests & (jnp.arange(ACTIONS) != STAND), below, Q)
         return jnp.stack(
             [Q, temperature_values + jnp.where(heeded, correction, correction[STAND])]
         )  # what is not heeded is standing

@@ -89,7 +89,7 @@ def segment_errors(table: WindowTable, *, width_bias_std: float) -> SegmentError
     cannot tell its bias from what the camera does at that flow: errors are taken about the smoothed mean."""
     log_flow = np.log(table.flow)
     error = np.log(table.flow_seen) - log_flow
-    mean = _smooth_mean(log_flow, error)
+    mean = smooth_mean(log_flow, error)
     _, place, counts = np.unique(table.segment, return_inverse=True, return_counts=True)
     about = error - mean
     segment_mean = np.bincount(place, about) / counts
@@ -109,7 +109,7 @@ def segment_errors(table: WindowTable, *, width_bias_std: float) -> SegmentError
 MEAN_BANDWIDTH = 0.08  # of log flow, one deviation: over which a camera's mean error is smooth
 
 
-def _smooth_mean(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def smooth_mean(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """The kernel mean (n,) of y over x, read at every x."""
     at = np.linspace(x.min(), x.max(), 200)
     weight = np.exp(-0.5 * ((at[:, None] - x) / MEAN_BANDWIDTH) ** 2)
