@@ -32,7 +32,8 @@ WIDE = 0.5  # deviation of log flow, of what goes anywhere
 MOVE_DOUBT = 0.5  # of a commanded move, the share that may not come
 RESTART, MOST = 1e-5, 2.5  # a window counts at most so many nats
 ABOVE = 4.0  # nats beyond its limit that a sum may grow, so that a camera is found to be the table's again
-EXCUSE, EXCUSED = 0.0, 5.0  # nats by which short segments must explain the windows better, and may at most
+# nats: short segments excuse unless a noisier camera explains the windows better by so many; at most
+EXCUSE, EXCUSED = -1.5, 5.0
 KNOTS_PERCENT = np.array([30.0, 50.0, 70.0, 85.0, 100.0, 120.0, 150.0, 200.0, 300.0])
 KNOT_WIDTH = 0.15  # of log flow
 
