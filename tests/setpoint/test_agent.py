@@ -213,6 +213,22 @@ def test_before_training_the_agent_is_the_greedy_filter(prior_belief):
     np.testing.assert_allclose(network(x)[0], prior_belief.values @ belief.sum(axis=0), rtol=1e-5)  # float32
 
 
+def test_where_the_filter_rests_so_does_the_agent_whatever_it_learned(prior_belief):
+    costs = {"move_cost": 0.25, "outside_cost": 20.0, "move_fixed_cost": 4.0}
+    table = synthetic_table(np.random.default_rng(1), segments=20, windows=5)
+    model = bayes.robust_filter(table, bayes.CameraErrorModel(**{**FILTER, **costs}))
+    encoder = belief_agent.belief_encoder(prior_belief._replace(filter=model))
+    _, good = encoder.encode(None, encoder.start(), observation(named=1))
+    assert good[0] == 1
+    moves = set()
+    for seed in range(8):
+        network = belief_agent.BeliefNetwork(len(model.evidence), jax.random.key(seed))
+        loud = jax.tree.map(lambda w: w + jax.random.normal(jax.random.key(seed), w.shape), network)
+        assert loud(good)[0].argmax() == STAND
+        moves.add(int(loud(good.at[0].set(0.0))[0].argmax()))
+    assert moves - {STAND}
+
+
 def test_agents_on_other_beliefs_are_one_program(prior_belief):
     network = belief_agent.BeliefNetwork(prior_belief.filter.evidence.shape[0], jax.random.key(0))
     windows, from_two = paper_windows(), starts(1, accuracy=1.0)
