@@ -290,6 +290,10 @@ def _asked(controller: Controller, parameters, windows: Windows, conditions: Con
 # ---- the choice
 
 
+# points of the mean over the cases within which two contestants are alike
+ALIKE_POINTS = 2.0
+
+
 class Judged(NamedTuple):
     """A contestant's runs by case, each (B, n) on B redraws: kept, settled and stayed (from wrong starts);
     harmed, farther than +-25 % from 100 % (from good starts)."""
@@ -327,6 +331,22 @@ def lead(of: Judged, other: Judged) -> Mean:
     return Mean(leads[second].value, max(one.low for one in leads.values()), leads[second].high)
 
 
+def lead_on_average(of: Judged, other: Judged) -> Mean:
+    """The same of the mean over the cases: a worst case can be one segment's doing, and then hides who is
+    better everywhere else. The redraws that both have are the sample."""
+    both = min(min(len(blocks) for blocks in one.kept.values()) for one in (of, other))
+    leads = [of.kept[c][:both].mean(axis=1) - other.kept[c][:both].mean(axis=1) for c in of.kept]
+    return redrawn_mean(100.0 * np.mean(leads, axis=0)[:, None], 1.0)
+
+
+def surely_better(judged: Mapping[str, Judged], best: str, name: str) -> bool:
+    """Whether `best` is told from another: in the worst case, or on average by more than ALIKE_POINTS. From
+    doing nothing by the worst case alone."""
+    if lead(judged[best], judged[name]).low > 0:
+        return True
+    return name != DOES_NOTHING and lead_on_average(judged[best], judged[name]).low > ALIKE_POINTS
+
+
 def _lead_in(of: Judged, case: str, other: Judged, against: str) -> Mean:
     """The same of one case of each. Cases alike are compared run by run; of others the variances add."""
     both = min(len(of.kept[case]), len(other.kept[against]))
@@ -352,15 +372,14 @@ def _shared(of: Judged, group: str, redraws: int) -> float:
 
 
 def still_in(judged: Mapping[str, Judged], bars: Mapping[str, float]) -> list[str]:
-    """Who may still become the default: whose worst case is not surely below that of the best harmless one,
-    redraw by redraw (`lead`, by which `choose` tells ties), and whose harm is not beyond its bar by the whole
-    of its interval."""
+    """Who may still become the default: whom the best harmless one is not surely better than, as `choose`
+    tells ties, and whose harm is not beyond its bar by the whole of its interval."""
     sound = [name for name, of in judged.items() if not harmless(of, bars)] or list(judged)
     best = max(sound, key=lambda name: worst_case(judged[name])[0])
     return [
         name
         for name, of in judged.items()
-        if (name == best or lead(judged[best], of).low <= 0)
+        if (name == best or not surely_better(judged, best, name))
         and all(_interval(of, of.harmed, case).low <= bar for case, bar in bars.items())
     ]
 
@@ -378,8 +397,8 @@ def _interval(of: Judged, figures: Mapping[str, np.ndarray], case: str) -> Share
 def choose(
     judged: Mapping[str, Judged], *, simplest_first: Sequence[str], bars: Mapping[str, float]
 ) -> Choice:
-    """The default: of the contestants that do no harm the simplest whose worst case is not worse than the
-    best one's beyond its 95 % interval.
+    """The default: of the contestants that do no harm the simplest that the one with the best worst case is
+    not `surely_better` than.
 
     simplest_first: names in the order of simplicity. bars: percent of runs that may leave +-25 % from good
     starts, by case. Raises ValueError where contestants were not judged on the same cases, where a name has
@@ -394,7 +413,7 @@ def choose(
             f'add "{DOES_NOTHING}"'
         )
     best = max(candidates, key=lambda name: worst_case(judged[name])[0])
-    ties = [name for name in candidates if name == best or lead(judged[best], judged[name]).low <= 0]
+    ties = [name for name in candidates if name == best or not surely_better(judged, best, name)]
     name = ties[0]
     worst, case = worst_case(judged[name])
     rest = [other for other in candidates if other != name]
@@ -403,7 +422,7 @@ def choose(
     else:
         rival = max(rest, key=lambda other: worst_case(judged[other])[0])
         margin = lead(judged[name], judged[rival])
-        why = _reason(name, rival, judged[rival], margin)
+        why = _reason(name, rival, judged, margin)
     opening = (
         f"{name} is the default: in its worst case ({case}) {100 * worst:.1f} % of the runs settle and stay"
     )
@@ -411,14 +430,20 @@ def choose(
     return Choice(name, 100 * worst, case, *margin, refused, f"{opening}; {why}.{beside}")
 
 
-def _reason(name: str, rival: str, of: Judged, margin: Mean) -> str:
-    worst, case = worst_case(of)
+def _reason(name: str, rival: str, judged: Mapping[str, Judged], margin: Mean) -> str:
+    worst, case = worst_case(judged[rival])
     other = f"{rival} {100 * worst:.1f} % in its own ({case})"
     ends = f"95 % interval {margin.low:+.1f} to {margin.high:+.1f} points"
     if margin.low > 0:
         return f"that is {margin.value:.1f} points more than of {other}, {ends}"
     if name == DOES_NOTHING:
         return f"no controller does better beyond noise, the best is {other}, {ends}"
+    mean = lead_on_average(judged[name], judged[rival])
+    if mean.low > ALIKE_POINTS:
+        return (
+            f"{other} is within noise ({ends}), but over the cases on average {name} keeps {mean.value:.1f} "
+            f"points more ({mean.low:+.1f} to {mean.high:+.1f})"
+        )
     return f"{other} is within noise ({ends}), and of two alike the simpler runs"
 
 

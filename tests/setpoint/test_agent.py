@@ -223,7 +223,8 @@ def test_where_the_filter_rests_so_does_the_agent_whatever_it_learned(prior_beli
     moves = set()
     for seed in range(8):
         network = belief_agent.BeliefNetwork(len(model.evidence), jax.random.key(seed))
-        loud = jax.tree.map(lambda w: w + jax.random.normal(jax.random.key(seed), w.shape), network)
+        key = jax.random.key(seed)
+        loud = jax.tree.map(lambda w, key=key: w + jax.random.normal(key, w.shape), network)
         assert loud(good)[0].argmax() == STAND
         moves.add(int(loud(good.at[0].set(0.0))[0].argmax()))
     assert moves - {STAND}

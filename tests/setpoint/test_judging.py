@@ -469,6 +469,31 @@ def test_two_are_compared_on_the_redraws_that_both_have():
     assert lead(of, early) == (0, 0, 0)
 
 
+def test_alike_in_the_worst_case_is_not_alike_where_another_is_better_on_average():
+    """One case that both lose on half of the redraws hides who keeps the others; doing nothing is left for a
+    better worst case only."""
+    sticky = np.repeat([[True], [False]], 12, axis=0) & np.ones((24, 20), bool)
+    good = {"in band": np.zeros((24, 20), bool)}
+    one_more = sticky.copy()
+    one_more[-1, 0] = True
+    plain = Judged({"accuracy 0.7": ~spread(0.3), "recorded, sticky": sticky}, good)
+    filter_ = Judged({"accuracy 0.7": ~spread(0.1), "recorded, sticky": one_more}, good)
+    judged = {"simple": plain, "filter": filter_}
+    assert lead(filter_, plain).low <= 0
+    average = judging.lead_on_average(filter_, plain)
+    assert average.value == pytest.approx(100 * (0.2 + 1 / 480) / 2)
+    choice = choose(judged, simplest_first=ORDER, bars=BARS)
+    assert choice.name == "filter"
+    assert "over the cases on average filter keeps 10" in choice.sentence
+    assert still_in(judged, BARS) == ["filter"]
+    assert choose({DOES_NOTHING: plain, "filter": filter_}, simplest_first=ORDER, bars=BARS).name == (
+        DOES_NOTHING
+    )
+    # better by less than counts
+    near = filter_._replace(kept={**filter_.kept, "accuracy 0.7": ~spread(0.28)})
+    assert choose({"simple": plain, "filter": near}, simplest_first=ORDER, bars=BARS).name == "simple"
+
+
 def test_short_trajectories_are_refused():
     short = np.full((1, 101), 100.0)
     with pytest.raises(
