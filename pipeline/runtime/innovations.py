@@ -83,9 +83,9 @@ def watch(
     noise_degC: np.ndarray,
     spread: Spread,
     *,
-    drift: float = 0.2,
-    follows: float = 0.5,
-    unexplained: float = 0.1,
+    drift: float = 0.05,
+    follows: float = 0.3,
+    unexplained: float = 0.25,
 ) -> Watch:
     """The observer of the stationary Riccati equation: outputs are moved a step by `follows` of the sensors'
     noise (p,), along the state that inputs reach, and the drift wanders by `drift` of it."""

@@ -318,8 +318,11 @@ def acted(s: Supervision, k: Kept, applied: np.ndarray | None) -> np.ndarray:
     u = k.asked
     if applied is not None:
         off = np.abs(applied - k.asked) > APPLIED * (s.watch.high - s.watch.low)
-        for i in np.flatnonzero(off | ~np.isfinite(applied)):
-            said(k, COMMAND, int(i), float(applied[i]))
+        wrong = np.flatnonzero(off | ~np.isfinite(applied))
+        if len(wrong) > 1:
+            said(k, COMMAND, 0, 0.0, ALL_INPUTS)
+        elif len(wrong):
+            said(k, COMMAND, int(wrong[0]), float(applied[wrong[0]]))
         u = np.where(np.isfinite(applied), applied, k.asked)
     if k.lacks.any() or k.stuck.any():
         u = np.where(k.stuck > 0, s.watch.high, u * (1 - k.lacks))
@@ -645,10 +648,11 @@ class Supervised:
         samples = timed(s, k, t_s)
         r_now, y_star = self._target(r)
         filled = followed(s, k, self.memory, y, y_star, applied, samples)
-        if k.counters[MODE] in (LAW, PI):
-            verified(s, k, filled, y_star)
-        for j in np.flatnonzero(np.abs(self._miss) > s.reach_degC):
+        beyond = np.flatnonzero(np.abs(self._miss) > s.reach_degC)
+        for j in beyond:
             said(k, REACH, int(j), -self._miss[j])
+        if k.counters[MODE] in (LAW, PI) and not len(beyond):
+            verified(s, k, filled, y_star)
         u, mode = self._driven(filled, r, r_now, y_star)
         return Decision(u.copy(), MODES[mode], self._causes(t_s) if mode != LAW else ())
 
