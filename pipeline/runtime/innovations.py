@@ -29,11 +29,12 @@ from pipeline.temperature.tracking import reached_state, riccati
 
 SLOW_SAMPLES = 10.0  # time constant of the slow sensor that the bank holds
 MOST_Z = 1e4  # deviations: beyond it an innovation counts as this
-LEARNED_BELOW = 3.5  # deviations: what is more surprising teaches nothing about the plant
+LEARNED_BELOW = 5.0  # deviations: what is more surprising teaches nothing about the plant
 DOUBTED = 3.0  # of a sum below: while one is above, nothing is learned
 TELLS = 0.01  # share of the variance at rest that a plant of the spread must be able to move
 KEPT = 2e-4  # share a sample by which what was learned goes back to the spread
-CALM = 1.5  # deviations a sample that a sum of innovations forgets (CUSUM, Page 1954)
+CALM = 1.5  # deviations a sample that a sum of innovations forgets at rest (CUSUM, Page 1954)
+STIRRED = 3.0  # and more where the spread leaves all open: what a plant of it does there, it does for long
 ODD = 3.0  # deviations, or sum of them, from which the bank is followed
 MOST_LATE, EARLY = 12, 5  # samples: the longest dead time that the bank starts before, and an earlier start
 RING = MOST_LATE + EARLY + 10  # samples kept, so that the bank can start before the first odd one
@@ -278,8 +279,9 @@ def seen(watch: Watch, memory: Memory, y: np.ndarray, trusted: np.ndarray) -> Se
     v, sd = trusted * (e - told), np.sqrt(variance)
     z = np.minimum(np.maximum(v / sd, -MOST_Z), MOST_Z)
     sums = memory.sums
-    sums[0] = np.maximum(sums[0] + z - CALM, 0.0)
-    sums[1] = np.maximum(sums[1] - z - CALM, 0.0)
+    forgets = CALM + STIRRED * (1 - watch.floor / variance)
+    sums[0] = np.maximum(sums[0] + z - forgets, 0.0)
+    sums[1] = np.maximum(sums[1] - z - forgets, 0.0)
     # what moves no output teaches nothing
     telling = (moved * moved).sum(axis=1).max() > TELLS * watch.floor.max()
     if telling and sums.max() < DOUBTED and np.abs(z).max() < LEARNED_BELOW:

@@ -575,7 +575,8 @@ def sentence(machine: Machine, kind: int, signal: int, amount: float, other: int
         DEADLINE: f"a sample came {amount:.3g} s after the one before",
         MODEL: f"the readings are {amount:.0f} deviations from what any plant of the spread would show, and "
         "no single fault explains them",
-        REACH: f"{name} is asked for {amount:+.1f} degC beyond what the inputs can hold",
+        REACH: f"{name} is asked for {amount:.1f} degC more or less than its limits and the inputs can hold: the last "
+        "reference in reach stays",
     }[kind]
     also = f"; {KINDS[other].replace('_', ' ')} would show the same" if 0 <= other != kind else ""
     return said + also + "."
@@ -604,7 +605,8 @@ class Supervised:
         self.kept = kept(self.supervision)
         self.memory = innovations.remembered(self.supervision.watch, self.supervision.bank)
         self._reference: Reference | None = None
-        self._w, self._Y, self._miss = np.zeros(1), np.zeros((0, 1)), np.zeros(0)
+        self._w, self._Y, self._beyond = np.zeros(1), np.zeros((0, 1)), np.zeros(0)
+        self._in_reach = np.full(len(exported.machine.outputs), np.nan)
 
     def watch(self, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> None:
         """One sample in manual, as RunningController has it; what is wrong is told by the first `step`."""
@@ -648,9 +650,13 @@ class Supervised:
         samples = timed(s, k, t_s)
         r_now, y_star = self._target(r)
         filled = followed(s, k, self.memory, y, y_star, applied, samples)
-        beyond = np.flatnonzero(np.abs(self._miss) > s.reach_degC)
+        beyond = np.flatnonzero(self._beyond > s.reach_degC)
         for j in beyond:
-            said(k, REACH, int(j), -self._miss[j])
+            said(k, REACH, int(j), self._beyond[j])
+        if len(beyond):
+            if not np.isfinite(self._in_reach).all():
+                self._in_reach = filled
+            r = r_now = self._in_reach
         if k.counters[MODE] in (LAW, PI) and not len(beyond):
             verified(s, k, filled, y_star)
         u, mode = self._driven(filled, r, r_now, y_star)
@@ -697,7 +703,11 @@ class Supervised:
             mine = r if isinstance(r, Reference) else constant(r)
             at = rest(self.exported.model, mine, self.exported.controller.limits)
             self._reference, self._w = mine, np.array(mine.w0, float)
-            self._Y, self._miss = at.Y, at.miss
+            self._Y, r0 = at.Y, mine.H @ mine.w0
+            outside = np.maximum(r0 - self.supervision.high, self.supervision.low - r0)
+            self._beyond = np.maximum(np.abs(at.miss), outside)
+            if (self._beyond <= self.supervision.reach_degC).all():
+                self._in_reach = r0
         elif len(self._w) > 1:
             self._w = mine.F @ self._w
         return mine.H @ self._w, self._Y @ self._w
@@ -729,7 +739,7 @@ class Supervised:
         for group in (self.kept, self.memory):
             arrays |= {name: np.array(part) for name, part in group._asdict().items()}
         return arrays | {
-            "miss": self._miss, "Y": self._Y, "w": self._w,
+            "beyond": self._beyond, "in_reach": self._in_reach, "Y": self._Y, "w": self._w,
             **{f"reference.{name}": np.array(part) for name, part in self._reference._asdict().items()},
         }  # fmt: skip
 
@@ -753,4 +763,5 @@ class Supervised:
         for name, part in mine.items():
             part[...] = arrays[name]
         self._reference = Reference(*(np.array(arrays[f"reference.{name}"]) for name in Reference._fields))
-        self._w, self._Y, self._miss = (np.array(arrays[name]) for name in ("w", "Y", "miss"))
+        self._w, self._Y = np.array(arrays["w"]), np.array(arrays["Y"])
+        self._beyond, self._in_reach = np.array(arrays["beyond"]), np.array(arrays["in_reach"])
