@@ -27,7 +27,7 @@ import numpy as np
 from pipeline.runtime import supervisor
 from pipeline.runtime.machine import Exported, Machine, Signal
 from pipeline.store import params
-from pipeline.temperature import baseline, controller, governor, panel
+from pipeline.temperature import baseline, controller, governor
 from pipeline.temperature import plant as plants
 from pipeline.temperature.plant import Plant, strictly_proper
 from pipeline.temperature.workflow import cases, evaluate_temperature, learned, settings
@@ -43,6 +43,10 @@ SAID = {
     ("sensor_drift", "heater_weak"),  # "or its zone loses as much more heat than the model knows"
     ("heater_weak", "sensor_offset"),  # "or its zone gains or loses heat that no input explains"
     ("heater_stuck_off", "sensor_offset"),
+    ("command_not_applied", "heater_stuck_on"),  # "or goes on with an older command"
+    ("command_not_applied", "heater_stuck_off"),
+    ("command_not_applied", "heater_weak"),
+    ("sensor_drift", "heater_stuck_off"),
     ("model_no_longer_right", "sensor_offset"),
     ("model_no_longer_right", "heater_weak"),
     ("model_no_longer_right", "sensor_slow"),  # "or its zone has become slower"
@@ -134,7 +138,6 @@ class HotParts(NamedTuple):
 
 
 HOT_END = HotParts((14.0,), (0.11,), (6e-11,), (40.0,), 0.0, 1.2, 0.9, 0.06, 0.05, 0.3, (205.0,))
-HOT_END_SLOW = HOT_END._replace(sample_time_s=1.0, noise_degC=0.1, step_degC=0.12, capacity=(20.0,))
 TWO_ZONES = HotParts(
     (30.0, 22.0), (0.14, 0.11), (7e-11, 6e-11), (60.0, 45.0), 0.25, 1.5, 1.2, 0.08, 0.06, 1.0, (190.0, 215.0)
 )
@@ -382,7 +385,7 @@ def played(rig: Rig, kind: str, seed: int) -> Outcome:
     (p, m) = rig.exported.supervision.peak.shape
     heaters = min(m, 6) if rig.name == "study" else m
     T = rig.exported.machine.sample_time_s
-    warm = 90 if rig.name == "study" else round(300 / T)
+    warm = 90 if rig.name == "study" else round(170 / T)
     begins = warm + int(rng.integers(10, 60))
     fault = Fault(
         kind,
@@ -456,6 +459,14 @@ def _outcome(rig: Rig, fault: Fault, faulty: dict[str, Any], healthy: dict[str, 
         fault.kind in ("deadline_missed", "clock_jump", "model_no_longer_right") or "command" in fault.kind
     )
     right = first is not None and (whole or first.signal in signals.values())
+    if first is not None and (fault.kind, first.kind) in SAID:
+        # the zone of the heater, or the heater of the zone
+        peak = rig.exported.supervision.peak
+        names = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+        if first.signal in names[0] and fault.kind == "sensor_drift":
+            right = peak[fault.output, names[0].index(first.signal)] > 0.1 * peak[fault.output].max()
+        elif first.signal in names[1] and fault.kind.startswith("heater"):
+            right = peak[names[1].index(first.signal), fault.input] > 0.1 * peak[:, fault.input].max()
     beside = ""
     if first is not None and "would show the same" in first.sentence:
         beside = first.sentence.split("; ")[-1].split(" would show")[0].replace(" ", "_")
@@ -568,7 +579,6 @@ def step_us(rig: Rig, steps: int = 1500) -> dict[str, float]:
 RIGS: dict[str, Callable[[], Rig]] = {
     "study": study,
     "hot end": lambda: hot_end("hot end", HOT_END),
-    "hot end, 1 s": lambda: hot_end("hot end, 1 s", HOT_END_SLOW),
     "hot end of two zones": lambda: hot_end("hot end of two zones", TWO_ZONES),
 }
 
