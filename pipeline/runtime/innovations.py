@@ -43,7 +43,7 @@ MOVING, COINCIDENCE = (
     6.0,
 )  # what a sensor's lag would show, from which its zone moves; -2 log of the prior
 MISFIT = 0.005  # share of what is seen that even the right signature leaves: the model is not the machine
-SELDOM = 4.0  # -2 log of the prior of a sensor that drifts within seconds, beside a heater's
+SELDOM = 2.0  # -2 log of the prior of a sensor that drifts within seconds, beside a heater's
 CATCH_UP = 3  # rows of the ring that the bank takes in a step
 
 
