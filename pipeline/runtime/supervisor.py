@@ -781,10 +781,9 @@ class Supervised:
             arrays |= {f"pi.{name}": part for name, part in self.pi.saved().items()}
         for group in (self.kept, self.memory):
             arrays |= {name: np.array(part) for name, part in group._asdict().items()}
-        return arrays | {
-            "beyond": self._beyond, "in_reach": self._in_reach, "Y": self._Y, "w": self._w,
-            **{f"reference.{name}": np.array(part) for name, part in self._reference._asdict().items()},
-        }  # fmt: skip
+        mine = {"beyond": self._beyond, "in_reach": self._in_reach, "Y": self._Y, "w": self._w}
+        mine |= self._reference._asdict()
+        return arrays | {f"aim.{name}": np.array(part) for name, part in mine.items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Goes on from what another of the same controller `saved`. Raises ValueError where its arrays are
@@ -805,8 +804,12 @@ class Supervised:
                 runner.restore(own)
         for name, part in mine.items():
             part[...] = arrays[name]
-        self._reference = Reference(*(np.array(arrays[f"reference.{name}"]) for name in Reference._fields))
-        self._w, self._Y = np.array(arrays["w"]), np.array(arrays["Y"])
-        self._beyond, self._in_reach = np.array(arrays["beyond"]), np.array(arrays["in_reach"])
+        aim = {
+            name.removeprefix("aim."): np.array(arrays[name]) for name in arrays if name.startswith("aim.")
+        }
+        self._reference = Reference(*(aim[name] for name in Reference._fields))
+        self._w, self._Y, self._beyond, self._in_reach = (
+            aim[name] for name in ("w", "Y", "beyond", "in_reach")
+        )
         self._out = [int(j) for j in np.flatnonzero(self._beyond > self.supervision.reach_degC)]
         self._now = self._reference.H @ self._w, self._Y @ self._w
