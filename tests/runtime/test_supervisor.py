@@ -126,7 +126,7 @@ def test_a_faulty_sensor_is_named_and_its_safe_mode_asked_for(kind):
     at, cause = first(decisions)
     assert (cause.kind, cause.signal) == (kind, "zone_2")
     assert at <= 10 and decisions[at + 10].mode == SAFE[kind]
-    assert abs(cause.since_s - 200) <= 12
+    assert abs(cause.since_s - 200) <= 20
 
 
 HEATERS = {
@@ -167,7 +167,7 @@ def test_a_slow_sensor_is_seen_before_its_zone_errs_by_5_degC():
 
     worst = []
     for k in range(60):
-        decision = run.go(1, reading=lambda y, _: reading(y, k), r=lambda _: R + 8.0)[0]
+        decision = run.go(1, reading=lambda y, _, k=k: reading(y, k), r=lambda _: R + 8.0)[0]
         if decision.mode != "law":
             break
         worst.append(np.abs(run.true() - R - 8.0)[0] if k > 30 else 0.0)
