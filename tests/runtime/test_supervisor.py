@@ -284,6 +284,27 @@ def test_a_signature_is_what_the_fault_does_to_the_innovation():
     assert np.abs(off).max() > 0
 
 
+def test_a_reading_that_is_no_number_is_seen_in_any_place():
+    s = exported().supervision
+    for j in (0, 1):
+        k = supervisor.kept(s)
+        supervisor.read(s, k, R)
+        supervisor.read(s, k, put(j, lambda y, k: np.nan)(R + 0.1, 0))
+        assert list(np.flatnonzero(k.since[supervisor.NAN] >= 0)) == [j]
+
+
+def test_the_mode_is_safe_for_what_would_show_the_same():
+    s = exported().supervision
+    k = supervisor.kept(s)
+    supervisor.said(k, supervisor.OFFSET, 0, 2.0)
+    assert supervisor.MODES[supervisor.mode_of(s, k)] == "hold"
+    k = supervisor.kept(s)
+    supervisor.said(k, supervisor.OFFSET, 0, 2.0, supervisor.ON)
+    assert supervisor.MODES[supervisor.mode_of(s, k)] == "off"
+    words = supervisor.sentence(WIRED, supervisor.OFFSET, 0, 2.0, supervisor.ON)
+    assert "zone_1 is off by +2.0 degC" in words and "heater stuck on would show the same" in words
+
+
 def test_a_simulated_controller_runs_only_in_a_rehearsal():
     with pytest.raises(
         ValueError, match="pi: it was made for a simulated plant and runs only with rehearsal=True"
