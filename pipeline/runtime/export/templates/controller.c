@@ -54,13 +54,6 @@ static void forget_all(supervisor_kept *k)
     k->alarmed = -1;
 }
 
-static void forget_suspicion(innovation_memory *o)
-{
-    memset(o->sums, 0, sizeof o->sums);
-    o->age = -1;
-    o->ahead = 0;
-}
-
 beadline_result beadline_init(beadline_controller *c, const beadline_machine *machine, int rehearsal)
 {
     int i, j, kind, signal;
@@ -76,7 +69,7 @@ beadline_result beadline_init(beadline_controller *c, const beadline_machine *ma
     if (BEADLINE_SIMULATED && !rehearsal)
         return BEADLINE_ONLY_REHEARSAL;
     forget_all(&c->kept);
-    forget_suspicion(&c->memory);
+    rest_observer(&c->memory);
     for (kind = 0; kind < KINDS; kind++)
         for (signal = 0; signal < SIGNALS; signal++)
             c->kept.other[kind][signal] = -1;
@@ -97,14 +90,23 @@ beadline_result beadline_init(beadline_controller *c, const beadline_machine *ma
     return BEADLINE_DONE;
 }
 
-/* The target of reference r, found anew where r changed */
+/* The target of reference r, found anew where r changed, and whether it is in reach */
 static void turn_to(beadline_controller *c, const double *r)
 {
     double u[INPUTS];
+    int j, reached = 1;
     if (c->aimed && !memcmp(c->r, r, sizeof c->r))
         return;
     memcpy(c->r, r, sizeof c->r);
     feasible_target(&the_law, r, u, c->y_star);
+    for (j = 0; j < OUTPUTS; j++) {
+        double outside = fmax(r[j] - supervisor_high[j], supervisor_low[j] - r[j]);
+        c->beyond[j] = fmax(fabs(c->y_star[j] - r[j]), outside);
+        reached &= c->beyond[j] <= REACH_DEGC;
+    }
+    if (reached)
+        memcpy(c->in_reach, r, sizeof c->in_reach);
+    c->has_reached |= reached;
     c->aimed = 1;
 }
 
@@ -141,7 +143,7 @@ beadline_result beadline_acknowledge(beadline_controller *c)
     if (!c->ready)
         return BEADLINE_NOT_READY;
     forget_all(&c->kept);
-    forget_suspicion(&c->memory);
+    rest_observer(&c->memory);
     return BEADLINE_DONE;
 }
 
@@ -159,16 +161,16 @@ beadline_result beadline_restore(beadline_controller *c, const beadline_controll
 }
 
 /* Inputs of a safe mode */
-static void be_safe(beadline_controller *c, int mode, const double *y, double *u)
+static void be_safe(beadline_controller *c, int mode, const double *y, const double *r, double *u)
 {
     supervisor_kept *k = &c->kept;
     int i;
     if (mode == MODE_PI) {
         if (k->mode != MODE_PI) {
-            law_watch(&the_fallback, &c->fallback, k->asked, y, c->r);
+            law_watch(&the_fallback, &c->fallback, k->asked, y, r);
             law_hand_over(&the_fallback, &c->fallback, y);
         }
-        law_step(&the_fallback, &c->fallback, y, c->r, u);
+        law_step(&the_fallback, &c->fallback, y, r, u);
         return;
     }
     for (i = 0; i < INPUTS; i++)
@@ -176,7 +178,7 @@ static void be_safe(beadline_controller *c, int mode, const double *y, double *u
 }
 
 /* Inputs of the mode that the causes ask for; the law watches where it does not drive */
-static int drive(beadline_controller *c, const double *y, double *u)
+static int drive(beadline_controller *c, const double *y, const double *r, double *u)
 {
     supervisor_kept *k = &c->kept;
     int i, j, settled = 1, mode = find_mode(k);
@@ -185,14 +187,14 @@ static int drive(beadline_controller *c, const double *y, double *u)
     if (mode == MODE_LAW) {
         if (k->mode != MODE_LAW)
             law_hand_over(&the_law, &c->law, y);
-        law_step(&the_law, &c->law, y, c->r, u);
+        law_step(&the_law, &c->law, y, r, u);
         for (j = 0; j < OUTPUTS; j++)
             settled &= fabs(y[j] - c->y_star[j]) < SETTLED_DEGC;
         for (i = 0; i < INPUTS && settled; i++)
             k->held[i] += HELD_SHARE * (u[i] - k->held[i]);
     } else {
-        be_safe(c, mode, y, u);
-        law_watch(&the_law, &c->law, u, y, c->r);
+        be_safe(c, mode, y, r, u);
+        law_watch(&the_law, &c->law, u, y, r);
     }
     memcpy(k->asked, u, sizeof k->asked);
     k->mode = mode;
@@ -218,7 +220,7 @@ static int of_input(int kind)
 static void tell_causes(const beadline_controller *c, double t_s, beadline_decision *d)
 {
     const supervisor_kept *k = &c->kept;
-    int kind, signal, j, worst = 0;
+    int kind, signal;
     for (kind = 0; kind < KINDS; kind++)
         for (signal = 0; signal < SIGNALS; signal++)
             if (k->since[kind][signal] >= 0) {
@@ -229,11 +231,7 @@ static void tell_causes(const beadline_controller *c, double t_s, beadline_decis
             }
     if (d->causes)
         return;
-    for (j = 1; j < OUTPUTS; j++)
-        if (fmax(c->memory.sums[0][j], c->memory.sums[1][j])
-            > fmax(c->memory.sums[0][worst], c->memory.sums[1][worst]))
-            worst = j;
-    add_cause(d, MODEL_NO_LONGER_RIGHT, worst, -1, 0.0, t_s - k->alarmed * BEADLINE_SAMPLE_TIME_S);
+    add_cause(d, MODEL_NO_LONGER_RIGHT, loudest(&c->memory), -1, 0.0, t_s - k->alarmed * BEADLINE_SAMPLE_TIME_S);
 }
 
 beadline_result beadline_step(beadline_controller *c, const double *y, const double *r, double t_s,
@@ -241,7 +239,7 @@ beadline_result beadline_step(beadline_controller *c, const double *y, const dou
 {
     supervisor_kept *k = &c->kept;
     double filled[OUTPUTS];
-    int j, samples;
+    int j, samples, out_of_reach = 0;
     if (!c->ready || !c->law.seen)
         return BEADLINE_NOT_READY;
     if (!all_finite(r, OUTPUTS) || !isfinite(t_s))
@@ -253,13 +251,19 @@ beadline_result beadline_step(beadline_controller *c, const double *y, const dou
     samples = tell_time(k, t_s);
     turn_to(c, r);
     follow(k, &c->memory, y, c->y_star, applied, samples, filled);
-    if (k->mode == MODE_LAW || k->mode == MODE_PI)
-        verify_heaters(k, filled, c->y_star);
     for (j = 0; j < OUTPUTS; j++)
-        if (fabs(c->y_star[j] - r[j]) > REACH_DEGC)
-            say(k, REFERENCE_OUT_OF_REACH, j, r[j] - c->y_star[j], -1);
+        if (c->beyond[j] > REACH_DEGC) {
+            say(k, REFERENCE_OUT_OF_REACH, j, c->beyond[j], -1);
+            out_of_reach = 1;
+        }
+    if (out_of_reach && !c->has_reached) {
+        memcpy(c->in_reach, filled, sizeof filled);
+        c->has_reached = 1;
+    }
+    if (!out_of_reach && (k->mode == MODE_LAW || k->mode == MODE_PI))
+        verify_heaters(k, filled, c->y_star);
     decision->causes = 0;
-    decision->mode = drive(c, filled, decision->u);
+    decision->mode = drive(c, filled, out_of_reach ? c->in_reach : r, decision->u);
     if (decision->mode != MODE_LAW)
         tell_causes(c, t_s, decision);
     return BEADLINE_DONE;

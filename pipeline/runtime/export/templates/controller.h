@@ -22,8 +22,9 @@ typedef struct {
     law_state law, fallback;
     supervisor_kept kept;
     innovation_memory memory;
-    double r[OUTPUTS], y_star[OUTPUTS];
-    int aimed, ready;
+    double r[OUTPUTS], y_star[OUTPUTS];       /* reference and target */
+    double beyond[OUTPUTS], in_reach[OUTPUTS]; /* degC beyond reach; the last reference in reach */
+    int aimed, has_reached, ready;
 } beadline_controller;
 
 /* Why a call did nothing */

@@ -1,13 +1,19 @@
 /* ---- the observer of the model: innovations, and what the plant's spread explains of them */
 
+/* No suspicion: sums and bank begin anew */
+static void rest_observer(innovation_memory *o)
+{
+    memset(o->sums, 0, sizeof o->sums);
+    o->age = -1;
+    o->ahead = 0;
+}
+
 static void start_observer(innovation_memory *o, const double *y)
 {
     memcpy(o->x, watch_start_0, sizeof o->x);
     add_product(o->x, watch_start[0], y, WATCH, OUTPUTS);
     memset(o->X, 0, sizeof o->X);
-    memset(o->sums, 0, sizeof o->sums);
-    o->age = -1;
-    o->ahead = 0;
+    rest_observer(o);
 }
 
 /* after = (A - L C) before, for `columns` columns side by side */
@@ -28,8 +34,9 @@ static void through_observer(double *after, const double *before, int columns)
                 after[i * columns + k] += watch_A[i][j] * before[j * columns + k];
 }
 
-/* x and X a sample on: inputs u acted since the sample whose innovation was e */
-static void advance(innovation_memory *o, const double *u, const double *e)
+/* x and X a sample on: inputs u acted since the sample whose innovation was e; `moved` is how far the outputs
+ * should have moved */
+static void advance(innovation_memory *o, const double *u, const double *e, double *moved)
 {
     double on[WATCH], y[OUTPUTS], X[WATCH][THETA], change[INPUTS];
     int i, j;
@@ -53,6 +60,8 @@ static void advance(innovation_memory *o, const double *u, const double *e)
     add_product(o->x, watch_L[0], e, WATCH, OUTPUTS);
     memcpy(o->u[0], o->u[1], sizeof o->u[0]);
     memcpy(o->u[1], u, sizeof o->u[1]);
+    for (j = 0; j < OUTPUTS; j++)
+        moved[j] = dot(watch_C[j], on, WATCH) + watch_d[j] - y[j];
 }
 
 /* e in degC; z in deviations, of what no plant of the spread explains; sd in degC; expected the forecast */
@@ -69,12 +78,26 @@ static double largest(const double *values, int count)
     return most;
 }
 
+/* theta and P after innovations v of a variance: recursive least squares, which forgets */
+static void learn(innovation_memory *o, double PS[OUTPUTS][THETA], const double *v, const double *variance)
+{
+    double kept = (1 - KEPT) * (1 - KEPT);
+    int i, j, k;
+    for (j = 0; j < OUTPUTS; j++)
+        for (i = 0; i < THETA; i++) {
+            o->theta[j][i] = (o->theta[j][i] + PS[j][i] * (v[j] / variance[j])) * (1 - KEPT);
+            for (k = 0; k < THETA; k++)
+                o->P[j][i][k] = (o->P[j][i][k] - PS[j][i] * (PS[j][k] / variance[j])) * kept;
+            o->P[j][i][i] += (1 - kept) * (watch_prior[i] * watch_prior[i]);
+        }
+}
+
 static void see(innovation_memory *o, const double *y, const double *trusted, innovation *now)
 {
-    double PS[OUTPUTS][THETA], v[OUTPUTS], variance[OUTPUTS], kept = (1 - KEPT) * (1 - KEPT), odd = 0.0;
+    double PS[OUTPUTS][THETA], v[OUTPUTS], variance[OUTPUTS], odd = 0.0, tells = 0.0;
     int i, j, k;
     for (j = 0; j < OUTPUTS; j++) {
-        double S[THETA] = {0}, told, moved = 0.0;
+        double S[THETA] = {0}, told, moved = 0.0, forgets;
         double expected = dot(watch_C[j], o->x, WATCH) + watch_d[j];
         for (i = 0; i < WATCH; i++)
             for (k = 0; k < THETA; k++)
@@ -90,19 +113,16 @@ static void see(innovation_memory *o, const double *y, const double *trusted, in
         now->sd[j] = sqrt(variance[j]);
         now->z[j] = cut(v[j] / now->sd[j], -MOST_Z, MOST_Z);
         now->expected[j] = expected + told;
-        o->sums[0][j] = fmax(o->sums[0][j] + now->z[j] - CALM, 0.0);
-        o->sums[1][j] = fmax(o->sums[1][j] - now->z[j] - CALM, 0.0);
+        forgets = CALM + STIRRED * (1 - watch_floor[j] / variance[j]);
+        o->sums[0][j] = fmax(o->sums[0][j] + now->z[j] - forgets, 0.0);
+        o->sums[1][j] = fmax(o->sums[1][j] - now->z[j] - forgets, 0.0);
         odd = fmax(odd, fabs(now->z[j]));
+        tells = fmax(tells, moved);
     }
-    if (!(largest(o->sums[0], 2 * OUTPUTS) < DOUBTED && odd < LEARNED_BELOW))
-        return;
-    for (j = 0; j < OUTPUTS; j++)
-        for (i = 0; i < THETA; i++) {
-            o->theta[j][i] = (o->theta[j][i] + PS[j][i] * (v[j] / variance[j])) * (1 - KEPT);
-            for (k = 0; k < THETA; k++)
-                o->P[j][i][k] = (o->P[j][i][k] - PS[j][i] * (PS[j][k] / variance[j])) * kept;
-            o->P[j][i][i] += (1 - kept) * (watch_prior[i] * watch_prior[i]);
-        }
+    /* what moves no output teaches nothing */
+    if (tells > TELLS * largest(watch_floor, OUTPUTS) && largest(o->sums[0], 2 * OUTPUTS) < DOUBTED
+        && odd < LEARNED_BELOW)
+        learn(o, PS, v, variance);
 }
 
 static void push_row(double *ring, const double *row, int length)
@@ -178,7 +198,7 @@ static void take_row(innovation_memory *o)
         if (sensor >= 0) {
             double after = bank_form[h] == FORM_RAMP ? since + bank_back[h] : 1.0;
             if (bank_form[h] == FORM_LAG)
-                after = SLOW_KEEPS * (o->f[h] - o->dy[row][sensor]);
+                after = bank_lag[h] * (o->f[h] - o->dy[row][sensor]);
             o->f[h] = since >= -bank_back[h] ? after : 0.0;
         }
     }
@@ -203,8 +223,9 @@ static int any_sum(const innovation_memory *o)
     return largest(o->sums[0], 2 * OUTPUTS) > 0;
 }
 
-/* Starts the bank where an innovation is odd, ends it where no sum is left, and takes the newest rows */
-static void suspect(innovation_memory *o)
+/* Starts the bank where an innovation is odd, ends it where no sum is left and nothing alarms, and takes the
+ * newest rows */
+static void suspect(innovation_memory *o, int alarmed)
 {
     double odd = largest(o->sums[0], 2 * OUTPUTS);
     int j, rows;
@@ -214,7 +235,7 @@ static void suspect(innovation_memory *o)
         begin_bank(o);
     else if (o->age >= 0) {
         o->ahead++;
-        if (!any_sum(o)) {
+        if (!alarmed && !any_sum(o)) {
             o->age = -1;
             o->ahead = 0;
         }
@@ -522,26 +543,29 @@ static int find_mode(const supervisor_kept *k)
     return k->alarmed >= 0 && severity[worst] < severity[MODE_HOLD] ? MODE_HOLD : worst;
 }
 
+/* The output whose sum is largest */
+static int loudest(const innovation_memory *o)
+{
+    int j, most = 0;
+    for (j = 1; j < OUTPUTS; j++)
+        if (fmax(o->sums[0][j], o->sums[1][j]) > fmax(o->sums[0][most], o->sums[1][most]))
+            most = j;
+    return most;
+}
+
 /* The alarm, and its end where it is decided, or where the sensor that raised it is seen to be wrong */
 static void raise_alarm(supervisor_kept *k, innovation_memory *o)
 {
-    int j, trusted = 0;
     if (k->alarmed < 0) {
         if (largest(o->sums[0], 2 * OUTPUTS) > ALARM)
             k->alarmed = 0;
         return;
     }
     k->alarmed++;
-    if (!diagnose(k, o)) {
-        for (j = 0; j < OUTPUTS; j++)
-            trusted |= (o->sums[0][j] != 0 || o->sums[1][j] != 0) && k->trusted[j] > 0;
-        if (trusted)
-            return;
+    if (diagnose(k, o) || k->alarmed > 2 * DECIDED_BY || !(k->trusted[loudest(o)] > 0)) {
+        k->alarmed = -1;
+        rest_observer(o);
     }
-    k->alarmed = -1;
-    memset(o->sums, 0, sizeof o->sums);
-    o->age = -1;
-    o->ahead = 0;
 }
 
 /* One sample of outputs y, inputs `applied` since the one before; filled is y with what is not trusted as
@@ -549,7 +573,7 @@ static void raise_alarm(supervisor_kept *k, innovation_memory *o)
 static void follow(supervisor_kept *k, innovation_memory *o, const double *y, const double *y_star,
                    const double *applied, int samples, double *filled)
 {
-    double u[INPUTS], start[OUTPUTS], dy[OUTPUTS];
+    double u[INPUTS], start[OUTPUTS], moved[OUTPUTS] = {0};
     static const double none[OUTPUTS] = {0};
     innovation now;
     int j, step, first = k->samples == 0;
@@ -563,17 +587,16 @@ static void follow(supervisor_kept *k, innovation_memory *o, const double *y, co
         memcpy(o->u[1], u, sizeof u);
     } else
         for (step = 0; step < samples; step++)
-            advance(o, u, step == 0 ? k->e : none);
+            advance(o, u, step == 0 ? k->e : none, moved);
     distrust(k, y);
     see(o, y, k->trusted, &now);
     for (j = 0; j < OUTPUTS; j++) {
         k->square[j] += NOISE_FORGETS * (fmin(now.z[j] * now.z[j], 1e4) - k->square[j]);
         k->lag[j] += NOISE_FORGETS * (cut(now.z[j] * k->z[j], -1e4, 1e4) - k->lag[j]);
         k->z[j] = now.z[j];
-        dy[j] = first ? 0.0 : now.expected[j] - k->expected[j];
     }
-    keep(o, &now, dy);
-    suspect(o);
+    keep(o, &now, moved);
+    suspect(o, k->alarmed >= 0);
     memcpy(k->expected, now.expected, sizeof now.expected);
     memcpy(k->e, now.e, sizeof now.e);
     for (j = 0; j < OUTPUTS; j++)

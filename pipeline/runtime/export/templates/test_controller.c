@@ -97,7 +97,7 @@ static void before(int what, const double *y)
 }
 
 typedef struct {
-    long rows, modes, causes;
+    long rows, modes, causes, differing, first;
     double largest, seconds;
     double x[STATES], u[INPUTS], y[OUTPUTS];
 } played;
@@ -108,7 +108,7 @@ static void play(const double *row, const double *start, played *p)
     const double *manual = reading + OUTPUTS, *share = manual + INPUTS, *extra = share + INPUTS;
     const double *expected = extra + INPUTS;
     double y[OUTPUTS], applied[INPUTS];
-    int i, j, what = (int)row[0];
+    int i, j, what = (int)row[0], differs = 0, wrong_mode, wrong_cause;
     clock_t began;
     if (what == BEGIN) {
         refuses_others();
@@ -134,15 +134,24 @@ static void play(const double *row, const double *start, played *p)
         beadline_step(&controller, y, r, number[0], row[1] > 0 && what != HAND_OVER ? applied : NULL, &decision);
         p->seconds += (double)(clock() - began) / CLOCKS_PER_SEC;
         memcpy(p->u, decision.u, sizeof p->u);
-        p->modes += decision.mode != (int)row[2];
-        p->causes += (decision.mode == MODE_LAW ? 0 : causes_of(&decision)) != (int)row[3];
+        wrong_mode = decision.mode != (int)row[2];
+        wrong_cause = (decision.mode == MODE_LAW ? 0 : causes_of(&decision)) != (int)row[3];
+        p->modes += wrong_mode;
+        p->causes += wrong_cause;
+        differs = wrong_mode || wrong_cause;
     }
     for (i = 0; i < INPUTS; i++) {
         double difference = fabs(p->u[i] - expected[i]) / input_range[i];
+        if (!(difference <= TOLERANCE))
+            differs = 1;
         if (!(difference <= p->largest))
             p->largest = difference;
         applied[i] = share[i] * p->u[i] + extra[i];
     }
+    if (differs)
+        p->differing++;
+    if (differs && p->first < 0)
+        p->first = p->rows;
     heat(p->x, applied);
     p->rows++;
 }
@@ -160,6 +169,7 @@ int main(int count, char **arguments)
         puts("golden.csv is missing or broken; export the controller again");
         return 1;
     }
+    p.first = -1;
     while (fgets(line, sizeof line, file)) {
         if (!numbers(row, WHOLE + NUMBERS)) {
             puts("golden.csv has a broken line; export the controller again");
@@ -170,6 +180,7 @@ int main(int count, char **arguments)
     fclose(file);
     printf("{\"rows\": %ld, \"largest_difference\": %.3g, \"modes_differ\": %ld, \"causes_differ\": %ld, ", p.rows,
            p.largest, p.modes, p.causes);
+    printf("\"rows_differ\": %ld, \"first_differs\": %ld, ", p.differing, p.first);
     printf("\"step_us\": %.3f, \"state_bytes\": %lu}\n", p.rows ? 1e6 * p.seconds / (double)p.rows : 0.0,
            (unsigned long)sizeof controller);
     return !(p.rows > 0 && p.largest <= TOLERANCE && p.modes == 0 && p.causes == 0);
