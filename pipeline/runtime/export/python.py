@@ -95,7 +95,7 @@ def _head(exported: Exported, certificate_sha256: str) -> str:
         for kind, signals in (("input", machine.inputs), ("output", machine.outputs))
         for one in signals
     )
-    imports = "\n".join(sorted(set(LIBRARIES.values()) - {"import numpy as np"}))
+    imports = "\n".join(dict.fromkeys(line for line in LIBRARIES.values() if "numpy" not in line))
     return (
         f'"""Controller {exported.name} of one machine, sampled every {machine.sample_time_s:g} s:\n\n{names}\n'
         "Generated; do not edit. Needs numpy. `controller(...)` gives the object: in manual `watch` each sample,\n"

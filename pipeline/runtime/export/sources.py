@@ -16,8 +16,8 @@ Place = tuple[str, str]  # module and name
 # what an exported file imports, and how
 LIBRARIES: dict[Place, str] = {
     ("math", ""): "import math",
-    ("collections.abc", "Mapping"): "from collections.abc import Mapping",
-    ("collections.abc", "Sequence"): "from collections.abc import Sequence",
+    ("collections.abc", "Mapping"): "from collections.abc import Mapping, Sequence",
+    ("collections.abc", "Sequence"): "from collections.abc import Mapping, Sequence",
     ("typing", "NamedTuple"): "from typing import NamedTuple",
     ("numpy", ""): "import numpy as np",
 }
@@ -56,6 +56,13 @@ def parsed(module: str) -> Module:
     return Module(text.splitlines(), definitions, imported)
 
 
+def _imports(node: ast.stmt) -> bool:
+    """Whether a method imports a library by itself: it is of no use beside a machine, and stays behind."""
+    return isinstance(node, ast.FunctionDef) and any(
+        isinstance(one, ast.Import | ast.ImportFrom) for one in ast.walk(node)
+    )
+
+
 class _Uses(ast.NodeVisitor):
     """Names and module.name pairs that a definition uses, each with its node; annotations do not count."""
 
@@ -65,6 +72,8 @@ class _Uses(ast.NodeVisitor):
         self.local: set[str] = set()
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
+        if _imports(node):
+            return
         outer = self.local
         stored = (one for one in ast.walk(node) if isinstance(one, ast.Name | ast.arg))
         self.local = outer | {
@@ -157,6 +166,11 @@ def _text(place: Place, uses: list[tuple[ast.expr, Place]], names: Mapping[Place
     for line, start, end, text in sorted(edits, reverse=True):
         raw = lines[line].encode()
         lines[line] = (raw[:start] + text.encode() + raw[end:]).decode()
+    for method in getattr(node, "body", []):
+        if _imports(method):
+            start = min([method.lineno, *(one.lineno for one in method.decorator_list)])
+            for number in range(start - 1, method.end_lineno + 1):
+                lines.pop(number, None)
     while source.lines[first - 2].startswith("#") and not source.lines[first - 2].startswith("# ----"):
         first -= 1
         lines[first] = source.lines[first - 1]
