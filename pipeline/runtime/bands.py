@@ -6,7 +6,7 @@ is a plant that the record does not contradict. Blocks keep what is not white: d
 has.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from pipeline.temperature.window import Window, observer_form, predictor
 
 Segments = Sequence[np.ndarray]
 LEAST_BLOCKS = 20  # fewer blocks than this say little of how far a resample may lie
+CHUNK = 50  # resamples whose moments are held at once
 
 
 class Rows(NamedTuple):
@@ -114,9 +115,7 @@ def predictors(of: Moments, taken: np.ndarray, data: Rows, *, gain_spread: float
     k = 1 + data.w.shape[1]
     Theta, theta_0 = np.empty((len(taken), p, k - 1)), np.empty((len(taken), p))
     covariance = np.empty((len(taken), p, p))
-    flat = of.blocks.reshape(len(of.blocks), -1)
-    for i, counts in enumerate(taken):
-        S = (counts @ flat).reshape(k + p, k + p)
+    for i, S in enumerate(_summed(of, taken)):
         normal, right = S[:k, :k].copy(), S[:k, k:]
         if gain_spread:
             normal += gain_spread**2 * _own_moments(S, of, m, p, data.N)
@@ -127,6 +126,13 @@ def predictors(of: Moments, taken: np.ndarray, data: Rows, *, gain_spread: float
         Theta[i] = solution[1:].T / of.scale
         theta_0[i] = of.base + solution[0] - Theta[i] @ of.centre
     return Predictors(Theta, theta_0, covariance, data.N)
+
+
+def _summed(of: Moments, taken: np.ndarray) -> Iterator[np.ndarray]:
+    """The moments (k, k) of each resample, CHUNK resamples a product."""
+    flat, shape = of.blocks.reshape(len(of.blocks), -1), of.blocks.shape[1:]
+    for first in range(0, len(taken), CHUNK):
+        yield from (taken[first : first + CHUNK] @ flat).reshape(-1, *shape)
 
 
 def _own_moments(S: np.ndarray, of: Moments, m: int, p: int, N: int) -> np.ndarray:
@@ -164,12 +170,12 @@ def bands(
     """
     data = rows(u, y, learning.N)
     of = moments(data, block or max(2 * learning.N, 10))
-    whole = np.ones((1, len(of.starts)))
-    here = _gain(data, of, whole[0], learning)
-    found = []
-    for counts in drawn(of, resamples, rng):
+    taken = np.vstack([np.ones((1, len(of.starts))), drawn(of, resamples, rng)])
+    learned = predictors(of, taken, data, gain_spread=learning.gain_spread)
+    here, found = _gain(data, of, taken[0], learned.window(0), learning), []
+    for k in range(1, resamples + 1):
         try:
-            found.append(_gain(data, of, counts, learning))
+            found.append(_gain(data, of, taken[k], learned.window(k), learning))
         except (ValueError, np.linalg.LinAlgError):
             continue
     if 2 * len(found) < resamples:
@@ -181,9 +187,8 @@ def bands(
     return Bands(here, low, high, level, len(found))
 
 
-def _gain(data: Rows, of: Moments, counts: np.ndarray, learning: Learning) -> np.ndarray:
-    """[K K_r] (m, N (m+p) + p) of one resample."""
-    learned = predictors(of, counts[None], data, gain_spread=learning.gain_spread).window(0)
+def _gain(data: Rows, of: Moments, counts: np.ndarray, learned: Window, learning: Learning) -> np.ndarray:
+    """[K K_r] (m, N (m+p) + p) of one resample, whose window model is `learned`."""
     Q, R = np.diag(learning.q), np.diag(learning.r)
     if learning.route == "window":
         model, T = observer_form(learned)

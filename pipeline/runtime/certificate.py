@@ -134,15 +134,16 @@ class Violation(NamedTuple):
     plants: int
 
 
-class GainBand(NamedTuple):
-    """One learned gain u = -K w - K_r r, its band at `level`; `on` names the signal and its lag in samples,
-    or the reference."""
+class GainBands(NamedTuple):
+    """Bands of the learned gains u = -K w - K_r r at `level`, by `resamples` of the record: rows by input, and
+    columns `on`, a signal so many samples before or a reference."""
 
-    input: str
-    on: str
-    gain: float
-    low: float
-    high: float
+    level: float
+    resamples: int
+    on: tuple[str, ...]
+    gain: tuple[tuple[float, ...], ...]
+    low: tuple[tuple[float, ...], ...]
+    high: tuple[tuple[float, ...], ...]
 
 
 class Certificate(NamedTuple):
@@ -163,7 +164,7 @@ class Certificate(NamedTuple):
     margins: MarginsFound | None
     worst: Worst | None
     violations: tuple[Violation, ...]
-    bands: tuple[GainBand, ...]
+    bands: GainBands | None
     rules: tuple[RuleResult, ...]
     verdict: Literal["passed", "refused"]
     first_failed: str | None
@@ -252,7 +253,7 @@ class _Shown(NamedTuple):
     margins: MarginsFound | None = None
     worst: Worst | None = None
     violations: tuple[Violation, ...] = ()
-    bands: tuple[GainBand, ...] = ()
+    bands: GainBands | None = None
 
 
 class _Evidence(NamedTuple):
@@ -837,18 +838,17 @@ def _run(controller: Deployed, plants: tuple, plan: _Schedule, rules: Rules) -> 
 
 def _gain_bands(
     exported: Exported, record: Record, learning: bands.Learning, rules: Rules, rng: np.random.Generator
-) -> tuple[GainBand, ...]:
+) -> GainBands:
     found = bands.bands(record.u, record.y, learning, resamples=rules.resamples, rng=rng)
     machine, N = exported.machine, learning.N
     inputs, outputs = [one.name for one in machine.inputs], [one.name for one in machine.outputs]
     on = [f"{name} {lag} before" for lag in range(1, N + 1) for name in inputs]
     on += [f"{name} {lag} before" for lag in range(1, N + 1) for name in outputs]
     on += [f"reference of {name}" for name in outputs]
-    return tuple(
-        GainBand(name, column, *(float(part[i, j]) for part in found[:3]))
-        for i, name in enumerate(inputs)
-        for j, column in enumerate(on)
+    gain, low, high = (
+        tuple(tuple(float(f"{one:.6g}") for one in row) for row in part) for part in found[:3]
     )
+    return GainBands(found.level, found.resamples, tuple(on), gain, low, high)
 
 
 # ---- as JSON
@@ -909,7 +909,7 @@ def _read(about: dict[str, Any]) -> Certificate:
         and MarginsFound(margins["plants"], tuple(margins["disk"]), tuple(margins["delay_s"])),
         "worst": worst and Worst(**(worst | {"settled_error_degC": tuple(worst["settled_error_degC"])})),
         "violations": tuple(Violation(**one) for one in about["violations"]),
-        "bands": tuple(GainBand(**one) for one in about["bands"]),
+        "bands": about["bands"] and GainBands(**{name: _tuples(part) for name, part in about["bands"].items()}),
         "rules": tuple(RuleResult(**one) for one in about["rules"]),
     }
     certificate = Certificate(**made)
@@ -919,6 +919,10 @@ def _read(about: dict[str, Any]) -> Certificate:
     if tuple(one.name for one in certificate.rules) != RULES:
         raise ValueError("its rules are not those of this version")
     return certificate
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def _plain(value: Any) -> Any:
