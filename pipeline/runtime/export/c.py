@@ -383,7 +383,9 @@ def supervising(s: supervisor.Supervision) -> str:
     for name in ("form", "signal", "back"):
         text += integers(f"bank_{name}", getattr(bank, name))
     lag = getattr(bank, "lag", None)
-    text += table("bank_lag", np.full(len(bank.form), 1 - 1 / innovations.SLOW_SAMPLES) if lag is None else lag)
+    text += table(
+        "bank_lag", np.full(len(bank.form), 1 - 1 / innovations.SLOW_SAMPLES) if lag is None else lag
+    )
     text += table("bank_least", innovations.LEAST) + table("bank_most", innovations.MOST)
     text += integers("supervisor_mode", s.mode)
     arrays = {
