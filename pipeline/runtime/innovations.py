@@ -27,11 +27,10 @@ import scipy.linalg
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
 from pipeline.temperature.tracking import reached_state, riccati
 
-SLOW_SAMPLES = 10.0  # time constant of the slow sensor that the bank holds
+SLOW_SAMPLES = (5.0, 18.0)  # time constants of the slow sensors that the bank holds
 MOST_Z = 1e4  # deviations: beyond it an innovation counts as this
-LEARNED_BELOW = 5.0  # deviations: what is more surprising teaches nothing about the plant
 DOUBTED = 3.0  # of a sum below: while one is above, nothing is learned
-TELLS = 0.01  # share of the variance at rest that a plant of the spread must be able to move
+TELLS = 0.5  # share of the variance at rest that a plant of the spread must be able to move
 KEPT = 2e-4  # share a sample by which what was learned goes back to the spread
 CALM = 1.5  # deviations a sample that a sum of innovations forgets at rest (CUSUM, Page 1954)
 STIRRED = 3.0  # and more where the spread leaves all open: what a plant of it does there, it does for long
@@ -44,9 +43,9 @@ CATCH_UP = 3  # rows of the ring that the bank takes in a step
 class Watch(NamedTuple):
     """Constants of the observer.
 
-    A, F = A - L C (n, n), B (n, m), C (p, n), b (n,), d (p,), L (n, p); heat (n, p) is the state that warms
-    each output by 1 degC; started at start y + start_0. prior (m + 3,) deviations of theta; floor (p,) variance
-    in degC^2 of an honest innovation at rest; `unexplained` is the share of what moves an output that no
+    A, F = A - L C (n, n), B (n, m), C (p, n), b (n,), d (p,), L (n, p); loss (n, n) and warm (n,) are how more heat lost moves x,
+    loss x - warm; ones (m + 3,); started at start y + start_0. prior (m + 3,) deviations of theta; floor (p,) variance
+    in degC^2 of an honest innovation at rest, sd its root, `least` the smallest; `unexplained` is the share of what moves an output that no
     theta explains; low, high (m,) in percent; strongest (m,) is the output that each input moves most.
     """
 
@@ -57,11 +56,15 @@ class Watch(NamedTuple):
     d: np.ndarray
     L: np.ndarray
     F: np.ndarray
-    heat: np.ndarray
+    loss: np.ndarray
+    warm: np.ndarray
+    ones: np.ndarray
     start: np.ndarray
     start_0: np.ndarray
     prior: np.ndarray
     floor: np.ndarray
+    sd: np.ndarray
+    least: float
     unexplained: float
     low: np.ndarray
     high: np.ndarray
@@ -99,6 +102,7 @@ def watch(
     P = riccati(A.T, C.T, scipy.linalg.block_diag(moved @ moved.T, np.diag((drift * noise) ** 2)), sensors)
     L = A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
     heat = np.vstack([likely, np.zeros((p, p))])
+    floor = np.diag(C @ P @ C.T) + noise**2
     return Watch(
         A=A,
         B=np.vstack([model.B, np.zeros((p, m))]),
@@ -107,11 +111,15 @@ def watch(
         d=model.d,
         L=L,
         F=A - L @ C,
-        heat=heat,
-        start=heat,
+        loss=-heat @ C,
+        warm=heat @ model.d,
+        ones=np.ones(m + 3),
+        start=heat.copy(),
         start_0=-heat @ model.d,
         prior=np.r_[np.full(m, spread.gain), spread.late, spread.pace, spread.loss],
-        floor=np.diag(C @ P @ C.T) + noise**2,
+        floor=floor,
+        sd=np.sqrt(floor),
+        least=float(floor.min()),
         unexplained=unexplained,
         low=limits[0],
         high=limits[1],
@@ -131,12 +139,13 @@ MOST = np.array([1.8, 1.5, 1.6, 1e9, 1e9, 3.0])
 
 
 class Bank(NamedTuple):
-    """What each hypothesis is: its form, its input or output, and how many samples before the first odd
-    innovation it begins, each (h,)."""
+    """What each hypothesis is: its form, its input or output, how many samples before the first odd
+    innovation it begins, and the share of a lag that a slow sensor keeps a sample, each (h,)."""
 
     form: np.ndarray
     signal: np.ndarray
     back: np.ndarray
+    lag: np.ndarray
 
 
 def bank(model: Plant) -> Bank:
@@ -144,14 +153,15 @@ def bank(model: Plant) -> Bank:
     output is late, and from EARLY more; no command applied; every sensor off by a step or a ramp, or slow."""
     pulses = np.abs(markov_parameters(strictly_proper(model), MOST_LATE))
     strongest = pulses.max(axis=0).argmax(axis=0)
-    rows: list[tuple[int, int, int]] = []
+    rows: list[tuple[int, int, int, float]] = []
     for i in range(model.m):
         own = pulses[:, strongest[i], i]
         late = 1 + int(np.argmax(own >= 0.1 * own.max()))
-        rows += [(form, i, late + early) for form in (ON, LESS) for early in (0, EARLY)]
-        rows += [(NOT_APPLIED, 0, late)] if i == 0 else []
+        rows += [(form, i, late + early, 0.0) for form in (ON, LESS) for early in (0, EARLY)]
+        rows += [(NOT_APPLIED, 0, late, 0.0)] if i == 0 else []
     for j in range(model.p):
-        rows += [(STEP, j, 0), (RAMP, j, 1), (RAMP, j, 1 + EARLY), (LAG, j, 1), (LAG, j, 1 + EARLY)]
+        rows += [(STEP, j, 0, 0.0), (RAMP, j, 1, 0.0), (RAMP, j, 1 + EARLY, 0.0)]
+        rows += [(LAG, j, 1, 1 - 1 / tau) for tau in SLOW_SAMPLES]
     return Bank(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
@@ -159,27 +169,26 @@ def bank(model: Plant) -> Bank:
 
 
 class Memory(NamedTuple):
-    """x (n,), X (n, m + 3), theta (p, m + 3) and its covariance P (p, m + 3, m + 3) of the module's formula;
-    u (2, m) the inputs of the last two samples, newest last; sums (2, p) of innovations upward and downward.
+    """Z (n, m + 4), the columns x and X of the module's formula, theta (p, m + 3) and its covariance P
+    (p, m + 3, m + 3); V and Y are room to compute in; u (2, m) the inputs of the last two samples, newest last; sums (2, p) of innovations
+    upward and downward.
 
-    The ring: rows of past samples, newest last; before (RING, 2 m) the inputs of the two samples before it,
-    z, sd and dy (RING, p) the innovation in deviations, the deviation, and what the output should have moved.
+    ring (RING, 2 m + 3 p), past samples, newest last: the inputs of the sample before it and of the one before
+    that, the innovation in deviations, the deviation, and what the output should have moved.
 
     The bank of h hypotheses: Xb (n, h); f (h,) of a slow sensor, in degC; cross, square (h, p) and own (p,)
     the sums of s z, s s and z z; u0 (m,) the input before, gain (m,) and late the plant's as learned until
     then; age the rows taken, -1 while it rests; ahead the rows of the ring still to take.
     """
 
-    x: np.ndarray
-    X: np.ndarray
+    Z: np.ndarray
+    V: np.ndarray
+    Y: np.ndarray
     theta: np.ndarray
     P: np.ndarray
     u: np.ndarray
     sums: np.ndarray
-    before: np.ndarray
-    z: np.ndarray
-    sd: np.ndarray
-    dy: np.ndarray
+    ring: np.ndarray
     Xb: np.ndarray
     f: np.ndarray
     cross: np.ndarray
@@ -197,16 +206,14 @@ def remembered(watch: Watch, bank: Bank) -> Memory:
     n, (m, p, h) = len(watch.A), (watch.B.shape[1], len(watch.d), len(bank.form))
     M = m + 3
     return Memory(
-        x=np.zeros(n),
-        X=np.zeros((n, M)),
+        Z=np.zeros((n, 1 + M)),
+        V=np.zeros((n, 1 + M)),
+        Y=np.zeros((n, 1 + M)),
         theta=np.zeros((p, M)),
         P=np.tile(np.diag(watch.prior**2), (p, 1, 1)),
         u=np.zeros((2, m)),
         sums=np.zeros((2, p)),
-        before=np.zeros((RING, 2 * m)),
-        z=np.zeros((RING, p)),
-        sd=np.ones((RING, p)),
-        dy=np.zeros((RING, p)),
+        ring=np.tile(np.r_[np.zeros(2 * m + p), np.ones(p), np.zeros(p)], (RING, 1)),
         Xb=np.zeros((n, h)),
         f=np.zeros(h),
         cross=np.zeros((h, p)),
@@ -222,8 +229,8 @@ def remembered(watch: Watch, bank: Bank) -> Memory:
 
 def started(watch: Watch, memory: Memory, y: np.ndarray) -> None:
     """The observer at outputs y (p,) measured, with nothing learned lost."""
-    memory.x[:] = watch.start @ y + watch.start_0
-    memory.X[:] = 0.0
+    memory.Z[:] = 0.0
+    memory.Z[:, 0] = watch.start @ y + watch.start_0
     rested(memory)
 
 
@@ -239,54 +246,59 @@ def rested(memory: Memory) -> None:
 def advanced(watch: Watch, memory: Memory, u: np.ndarray, e: np.ndarray) -> np.ndarray:
     """x and X a sample on: inputs u (m,) acted since the sample whose innovation was e (p,), in degC; how far
     (p,) the outputs should have moved."""
-    m, x, X = len(u), memory.x, memory.X
+    m, Z = len(u), memory.Z
+    V = memory.V
+    x = Z[:, 0].copy()
     on = watch.A @ x + watch.B @ u + watch.b
-    y = watch.C @ x + watch.d
-    after = watch.F @ X
-    after[:, :m] += watch.B * u
-    after[:, m] += watch.B @ (memory.u[1] - u)
-    after[:, m + 1] += x - on
-    after[:, m + 2] -= watch.heat @ y
-    X[:] = after
-    x[:] = on
-    x += watch.L @ e
+    V[:, 0] = on + watch.L @ e
+    V[:, 1 : m + 1] = watch.B * u
+    V[:, m + 1] = watch.B @ (memory.u[1] - u)
+    V[:, m + 2] = x - on
+    V[:, m + 3] = watch.loss @ x - watch.warm
+    Z[:, 0] = 0.0
+    np.matmul(watch.F, Z, out=memory.Y)
+    np.add(memory.Y, V, out=Z)
     memory.u[0] = memory.u[1]
     memory.u[1] = u
-    return watch.C @ on + watch.d - y
+    return watch.C @ (on - x)
 
 
 class Seen(NamedTuple):
     """e (p,) the innovation in degC, 0 where the output is not trusted; z (p,) what no plant of the spread
-    explains, in deviations; sd (p,) the deviation in degC; expected (p,) the output as forecast, in degC."""
+    explains, in deviations; sd (p,) the deviation in degC; expected (p,) the output as forecast, in degC; the
+    largest of all sums."""
 
     e: np.ndarray
     z: np.ndarray
     sd: np.ndarray
     expected: np.ndarray
+    highest: float
 
 
 def seen(watch: Watch, memory: Memory, y: np.ndarray, trusted: np.ndarray) -> Seen:
     """The innovation of outputs y (p,), which tells only where `trusted` (p,) is 1; learns theta from it
     where nothing is odd, and follows its sums."""
-    theta, P = memory.theta, memory.P
-    S = watch.C @ memory.X
-    expected = watch.C @ memory.x + watch.d
+    forecast = watch.C @ memory.Z
+    expected, S = forecast[:, 0] + watch.d, forecast[:, 1:]
     e = np.where(trusted > 0, y - expected, 0.0)
-    PS = (P @ S[:, :, None])[:, :, 0]
+    told = (S * memory.theta) @ watch.ones
+    v, sd, variance, forgets = e - trusted * told, watch.sd, watch.floor, CALM
     moved = S * watch.prior
-    variance = watch.floor + watch.unexplained**2 * (moved * moved).sum(axis=1) + (S * PS).sum(axis=1)
-    told = (S * theta).sum(axis=1)
-    v, sd = trusted * (e - told), np.sqrt(variance)
-    z = np.minimum(np.maximum(v / sd, -MOST_Z), MOST_Z)
-    sums = memory.sums
-    forgets = CALM + STIRRED * (1 - watch.floor / variance)
-    sums[0] = np.maximum(sums[0] + z - forgets, 0.0)
-    sums[1] = np.maximum(sums[1] - z - forgets, 0.0)
-    # what moves no output teaches nothing
-    telling = (moved * moved).sum(axis=1).max() > TELLS * watch.floor.max()
-    if telling and sums.max() < DOUBTED and np.abs(z).max() < LEARNED_BELOW:
+    stirred = (moved * moved) @ watch.ones
+    # what moves no output leaves nothing open, and teaches nothing about the plant
+    telling = max(stirred.tolist()) > TELLS * watch.least
+    if telling:
+        PS = (memory.P @ S[:, :, None])[:, :, 0]
+        variance = watch.floor + watch.unexplained**2 * stirred + (S * PS) @ watch.ones
+        sd, forgets = np.sqrt(variance), CALM + STIRRED * (1 - watch.floor / variance)
+    z, sums = v / sd, memory.sums
+    sums[0] += np.minimum(z, MOST_Z) - forgets
+    sums[1] -= np.maximum(z, -MOST_Z) + forgets
+    np.maximum(sums, 0.0, out=sums)
+    highest = max(sums.ravel().tolist())
+    if telling and highest < DOUBTED:
         _learned(watch, memory, PS, v, variance)
-    return Seen(e, z, sd, expected + told)
+    return Seen(e, z, sd, expected + told, highest)
 
 
 def _learned(watch: Watch, memory: Memory, PS, v, variance) -> None:
@@ -300,30 +312,29 @@ def _learned(watch: Watch, memory: Memory, PS, v, variance) -> None:
     P[:, diagonal, diagonal] += (1 - (1 - KEPT) ** 2) * watch.prior**2
 
 
-def kept(memory: Memory, now: Seen, dy: np.ndarray) -> None:
-    """The ring with the newest sample; dy (p,) in degC is what each output should have moved."""
-    for ring, row in ((memory.z, now.z), (memory.sd, now.sd), (memory.dy, dy)):
-        ring[:-1] = ring[1:]
-        ring[-1] = row
-    m = memory.u.shape[1]
-    memory.before[:-1] = memory.before[1:]
-    memory.before[-1, :m], memory.before[-1, m:] = memory.u[1], memory.u[0]
+def kept(memory: Memory, now: Seen, moved: np.ndarray) -> None:
+    """The ring with the newest sample; `moved` (p,) in degC is what each output should have moved."""
+    (m, p), ring = (memory.u.shape[1], len(now.z)), memory.ring
+    ring[:-1] = ring[1:]
+    row = ring[-1]
+    row[:m], row[m : 2 * m] = memory.u[1], memory.u[0]
+    row[2 * m : 2 * m + p], row[2 * m + p : 2 * m + 2 * p], row[2 * m + 2 * p :] = now.z, now.sd, moved
 
 
 # ---- the bank
 
 
-def suspected(watch: Watch, bank: Bank, memory: Memory, *, alarmed: bool) -> None:
-    """Starts the bank where the newest innovation or a sum is odd, ends it where no sum is left and
-    nothing is `alarmed`, and takes the newest rows of the ring."""
+def suspected(watch: Watch, bank: Bank, memory: Memory, now: Seen, *, alarmed: bool) -> None:
+    """Starts the bank where the newest innovation or a sum is odd, ends it where no sum is left and nothing
+    is `alarmed`, and takes the newest rows of the ring."""
     age, ahead = memory.age, memory.ahead
-    odd = max(np.abs(memory.z[-1]).max(), memory.sums.max()) > ODD
-    if age[0] < 0 and odd:
-        _begun(watch, bank, memory)
-    elif age[0] >= 0:
+    if age[0] < 0:
+        if now.highest > 0 and max(now.highest, np.abs(now.z).max()) > ODD:
+            _begun(watch, bank, memory)
+    elif not alarmed and now.highest <= 0:
+        age[0], ahead[0] = -1, 0
+    else:
         ahead[0] += 1
-        if not alarmed and not memory.sums.any():
-            age[0], ahead[0] = -1, 0
     for _ in range(min(CATCH_UP, int(ahead[0]))):
         _taken(watch, bank, memory)
 
@@ -331,7 +342,7 @@ def suspected(watch: Watch, bank: Bank, memory: Memory, *, alarmed: bool) -> Non
 def _begun(watch: Watch, bank: Bank, memory: Memory) -> None:
     m, longest = memory.u.shape[1], int(bank.back.max())
     memory.age[0], memory.ahead[0] = 0, longest + 1
-    memory.u0[:] = memory.before[-1 - longest, :m]
+    memory.u0[:] = memory.ring[-1 - longest, :m]
     for part in (memory.Xb, memory.f, memory.cross, memory.square, memory.own):
         part[:] = 0.0
     certainty = 1 / memory.P[:, m, m]
@@ -345,7 +356,9 @@ def _taken(watch: Watch, bank: Bank, memory: Memory) -> None:
     since = int(memory.age[0]) - int(bank.back.max())  # samples since the first odd innovation
     acts, shows = since - 1 >= -bank.back, since >= -bank.back
     form, signal, late = bank.form, bank.signal, memory.late[0]
-    u = (1 - late) * memory.before[row, :m] + late * memory.before[row, m:]
+    past = memory.ring[row]
+    u = (1 - late) * past[:m] + late * past[m : 2 * m]
+    z, sd, moved = past[2 * m :].reshape(3, p)
     # how far each input is off, as a share of each hypothesis' amplitude
     off = np.zeros((m, len(form)))
     inputs = np.flatnonzero(form <= LESS)
@@ -358,14 +371,13 @@ def _taken(watch: Watch, bank: Bank, memory: Memory) -> None:
     direct = np.zeros((p, len(form)))
     direct[j, np.flatnonzero(sensors)] = memory.f[sensors]
     memory.Xb[:] = watch.F @ memory.Xb + acts * (watch.B @ off - watch.L @ direct)
-    lag = 1 - 1 / SLOW_SAMPLES
     after = np.where(form == RAMP, since + bank.back, 1.0)
-    after = np.where(form == LAG, lag * (memory.f - memory.dy[row][signal % p]), after)
+    after = np.where(form == LAG, bank.lag * (memory.f - moved[signal % p]), after)
     memory.f[:] = np.where(sensors & shows, after, 0.0)
     s = watch.C @ memory.Xb
     s[j, np.flatnonzero(sensors)] += memory.f[sensors]
-    s = (s / memory.sd[row][:, None]).T
-    z = memory.z[row]
+    s = (s / sd[:, None]).T
+    z = np.minimum(np.maximum(z, -MOST_Z), MOST_Z)
     memory.cross[:] += s * z
     memory.square[:] += s * s
     memory.own[:] += z * z

@@ -74,10 +74,11 @@ OF_INPUT = (ON, OFF, WEAK, COMMAND)
 OF_OUTPUT = (RUNAWAY, RANGE, NAN, FROZEN, OFFSET, SLOW, NOISY)
 
 ALARM = 7.0  # of a sum of innovations, in deviations
-DECIDED_AFTER, DECIDED_BY = 3, 9  # samples from the alarm: where one cause is clear, and at the latest
-TOLD_APART = 6.0  # of -2 log likelihood, by which one cause is clear of another, or of none
+DECIDED_AFTER, DECIDED_BY = 4, 9  # samples from the alarm: where one cause is clear, and at the latest
+TOLD_APART = 8.0  # of -2 log likelihood, by which one cause is clear of another, or of none
 UNEXPLAINED, UNEXPLAINED_SHARE = 12.0, 0.3  # mean square that is left of an output, and its share
 DEAD_SHARE = 0.75  # of its command that a heater lacks, from which it is off, not weak
+MOST_Z = 100.0  # deviations that count
 FORGETS = 1 / 8  # share a sample of the mean squares by which noise is told
 NOISY_SQUARE, NOISY_LAG = 6.0, 0.3  # mean square, and its share at lag one, of a noisy sensor
 CHANCE = 1e-9  # that a sensor repeats itself so often
@@ -223,8 +224,8 @@ class Kept(NamedTuple):
     quantum the smallest move seen; square and lag, means of z(t)^2 and z(t) z(t-1); z the last; trusted 1 or
     0; absurd 1 where it left its range by itself; expected and e the last forecast and innovation; gap, error, goal and waited of verify_heater in degC, degC s, degC, s. By input
     (m,): held the inputs that hold; asked the last command; lacks the share that a weak heater lacks; stuck 1
-    where it is on. Counters (5,): samples, samples since the alarm (-1: none), mode, whether the clock
-    was read, samples in all. clock_s (2,): the clock at the
+    where it is on. Counters (8,): samples, samples since the alarm (-1: none), mode, whether the clock
+    was read, samples in all, causes that are there, whether a heater is stuck or weak, whether a zone is colder than it should be. clock_s (2,): the clock at the
     last sample, and the supervisor's own time, which never falls.
     """
 
@@ -253,7 +254,7 @@ class Kept(NamedTuple):
     clock_s: np.ndarray
 
 
-SAMPLES, ALARMED, MODE, CLOCKED, STEPS = range(5)
+SAMPLES, ALARMED, MODE, CLOCKED, STEPS, ACTIVE, CHANGED, COLDER = range(8)
 
 
 def kept(s: Supervision) -> Kept:
@@ -282,7 +283,7 @@ def kept(s: Supervision) -> Kept:
         asked=np.zeros(m),
         lacks=np.zeros(m),
         stuck=np.zeros(m),
-        counters=np.array([0, -1, 0, 0, 0]),
+        counters=np.array([0, -1, 0, 0, 0, 0, 0, 0]),
         clock_s=np.zeros(2),
     )
 
@@ -295,6 +296,7 @@ def said(k: Kept, kind: int, signal: int, amount: float = 0.0, other: int = -1) 
     t_s = k.clock_s[1]
     if k.since[kind, signal] < 0:
         k.since[kind, signal], k.amount[kind, signal], k.other[kind, signal] = t_s, amount, other
+        k.counters[ACTIVE] += 1
     k.last[kind, signal] = t_s
 
 
@@ -324,13 +326,20 @@ def acted(s: Supervision, k: Kept, applied: np.ndarray | None) -> np.ndarray:
         elif len(wrong):
             said(k, COMMAND, int(wrong[0]), float(applied[wrong[0]]))
         u = np.where(np.isfinite(applied), applied, k.asked)
-    if k.lacks.any() or k.stuck.any():
+    if k.counters[CHANGED]:
         u = np.where(k.stuck > 0, s.watch.high, u * (1 - k.lacks))
     return u
 
 
 def read(s: Supervision, k: Kept, y: np.ndarray) -> None:
     """Readings that are none, out of range, or the same for too long."""
+    moves = np.abs(y - k.y)
+    # one comparison for all: a reading that is none compares as false
+    if min((y - s.low).tolist()) >= 0 <= min((s.high - y).tolist()) and min(moves.tolist()) > 1e-9:
+        k.quantum[:] = np.minimum(k.quantum, moves)
+        k.repeats[:] = 0
+        k.y[:] = y
+        return
     for j in range(len(y)):
         value = y[j]
         if not math.isfinite(value):
@@ -362,16 +371,22 @@ def repeats_at_most(quantum: float, noise: float) -> float:
 def verified(s: Supervision, k: Kept, y: np.ndarray, y_star: np.ndarray) -> None:
     """verify_heater of Klipper: an output colder than its target must gain `gain_degC` in `check_s`, or the
     time it is colder than its hysteresis adds up."""
-    T = s.sample_time_s
+    T, colder = s.sample_time_s, y_star - s.hysteresis_degC - y
+    if max(colder.tolist()) <= 0:
+        if k.counters[COLDER]:
+            k.counters[COLDER] = 0
+            k.error[:] = k.waited[:] = 0.0
+        return
+    k.counters[COLDER] = 1
     for j in range(len(y)):
-        below = y_star[j] - s.hysteresis_degC[j] - y[j]
+        below = colder[j]
         if not below > 0 or not k.trusted[j]:
-            k.error[j], k.waited[j], k.goal[j] = 0.0, 0.0, y[j] + s.gain_degC[j]
+            k.error[j] = k.waited[j] = 0.0
             continue
-        k.waited[j] += T
-        if y[j] >= k.goal[j]:
+        if k.waited[j] == 0 or y[j] >= k.goal[j]:
             k.goal[j], k.waited[j], k.error[j] = y[j] + s.gain_degC[j], 0.0, 0.0
-        elif k.waited[j] > s.check_s[j]:
+        k.waited[j] += T
+        if k.waited[j] > s.check_s[j]:
             k.error[j] += below * T
             if k.error[j] > s.error_degC_s[j]:
                 said(k, RUNAWAY, j, below)
@@ -379,8 +394,9 @@ def verified(s: Supervision, k: Kept, y: np.ndarray, y_star: np.ndarray) -> None
 
 def noted(k: Kept, z: np.ndarray) -> None:
     """Mean squares of the innovation, and at lag one."""
-    k.square[:] += FORGETS * (np.minimum(z * z, 1e4) - k.square)
-    k.lag[:] += FORGETS * (np.minimum(np.maximum(z * k.z, -1e4), 1e4) - k.lag)
+    z = np.minimum(np.maximum(z, -MOST_Z), MOST_Z)
+    k.square[:] += FORGETS * (z * z - k.square)
+    k.lag[:] += FORGETS * (z * k.z - k.lag)
     k.z[:] = z
 
 
@@ -443,13 +459,14 @@ def _explained(
 ) -> None:
     """The cause, and the observer freed of what it did to it."""
     kind, signal, best = named
-    memory.x[:] += amount * memory.Xb[:, best]
+    memory.Z[:, 0] += amount * memory.Xb[:, best]
     if kind in (OFFSET, RUNAWAY) and k.since[RANGE, signal] >= 0:
         k.absurd[signal] = 1.0  # the reading left its range at once: that is its reason
         return
     if kind == COMMAND:
         other = ALL_INPUTS
     said(k, kind, signal, amount * memory.f[best] if kind == OFFSET else amount, other)
+    k.counters[CHANGED] = int(k.counters[CHANGED] or kind in (ON, OFF, WEAK))
     if kind == ON:
         k.stuck[signal] = 1.0
     elif kind in (OFF, WEAK):
@@ -459,6 +476,9 @@ def _explained(
 def distrusted(s: Supervision, k: Kept, y: np.ndarray) -> None:
     """Sensors that do not count now; an offset is gone where the reading is nearer to the forecast than half
     of it."""
+    if not k.counters[ACTIVE]:  # not even one that gives no number
+        k.trusted[:] = 1.0
+        return
     for j in range(len(y)):
         bad = k.since[NAN, j] >= 0 or k.since[FROZEN, j] >= 0 or k.since[SLOW, j] >= 0
         bad = bad or k.since[OFFSET, j] >= 0 or k.absurd[j] > 0
@@ -473,19 +493,22 @@ def distrusted(s: Supervision, k: Kept, y: np.ndarray) -> None:
 
 def gone(s: Supervision, k: Kept) -> bool:
     """Forgets causes that were not there for their time; whether one of a sensor went."""
-    active = k.since >= 0
-    if not active.any():
+    if not k.counters[ACTIVE]:
         return False
+    active = k.since >= 0
     k.absurd[:] = np.where(k.since[RANGE, : len(k.absurd)] >= 0, k.absurd, 0.0)
     went = active & (k.clock_s[1] - k.last > s.back_s[:, None])
     k.since[went], k.last[went], k.other[went] = -1.0, -1.0, -1
+    k.counters[ACTIVE] -= int(went.sum())
     return bool(went[list(OF_OUTPUT)].any())
 
 
 def mode_of(s: Supervision, k: Kept) -> int:
     """The most severe of the modes that the causes declare; hold while an alarm is not decided."""
+    if not k.counters[ACTIVE]:
+        return LAW if k.counters[ALARMED] < 0 else HOLD
     modes = s.mode[(k.since >= 0).any(axis=1)]
-    worst = int(modes[SEVERITY[modes].argmax()]) if len(modes) else LAW
+    worst = int(modes[SEVERITY[modes].argmax()])
     if k.counters[ALARMED] >= 0 and SEVERITY[worst] < SEVERITY[HOLD]:
         return HOLD
     return worst
@@ -516,10 +539,10 @@ def followed(
     now = innovations.seen(watch, memory, y, k.trusted)
     noted(k, now.z)
     innovations.kept(memory, now, moved)
-    innovations.suspected(watch, s.bank, memory, alarmed=bool(k.counters[ALARMED] >= 0))
+    innovations.suspected(watch, s.bank, memory, now, alarmed=bool(k.counters[ALARMED] >= 0))
     k.expected[:], k.e[:] = now.expected, now.e
-    filled = np.where(k.trusted > 0, y, now.expected)
-    alarmed(s, k, memory)
+    filled = np.where(k.trusted > 0, y, now.expected) if k.counters[ACTIVE] else y
+    alarmed(s, k, memory, now.highest)
     if gone(s, k):
         # a sensor counts again: what it showed meanwhile does not
         innovations.started(watch, memory, filled)
@@ -534,11 +557,11 @@ def _loudest(memory: innovations.Memory) -> int:
     return int(np.maximum(memory.sums[0], memory.sums[1]).argmax())
 
 
-def alarmed(s: Supervision, k: Kept, memory: innovations.Memory) -> None:
+def alarmed(s: Supervision, k: Kept, memory: innovations.Memory, highest: float) -> None:
     """The alarm, and its end where it is decided, or where the sensor that raised it is seen to be wrong."""
     c = k.counters
     if c[ALARMED] < 0:
-        if memory.sums.max() > ALARM:
+        if highest > ALARM:
             c[ALARMED] = 0
         return
     c[ALARMED] += 1
@@ -606,6 +629,7 @@ class Supervised:
         self.memory = innovations.remembered(self.supervision.watch, self.supervision.bank)
         self._reference: Reference | None = None
         self._w, self._Y, self._beyond = np.zeros(1), np.zeros((0, 1)), np.zeros(0)
+        self._out: list[int] = []
         self._in_reach = np.full(len(exported.machine.outputs), np.nan)
 
     def watch(self, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> None:
@@ -626,6 +650,7 @@ class Supervised:
         """A person has mended what was wrong: every cause is forgotten, and what was taken from it."""
         k = self.kept
         k.since[:] = k.last[:] = -1.0
+        k.counters[ACTIVE] = k.counters[CHANGED] = 0
         for part in (k.lacks, k.stuck, k.absurd, k.error, k.waited):
             part[:] = 0.0
         k.counters[SAMPLES], k.counters[ALARMED] = 0, -1
@@ -650,14 +675,13 @@ class Supervised:
         samples = timed(s, k, t_s)
         r_now, y_star = self._target(r)
         filled = followed(s, k, self.memory, y, y_star, applied, samples)
-        beyond = np.flatnonzero(self._beyond > s.reach_degC)
-        for j in beyond:
-            said(k, REACH, int(j), self._beyond[j])
-        if len(beyond):
+        for j in self._out:
+            said(k, REACH, j, self._beyond[j])
+        if self._out:
             if not np.isfinite(self._in_reach).all():
                 self._in_reach = filled
             r = r_now = self._in_reach
-        if k.counters[MODE] in (LAW, PI) and not len(beyond):
+        if k.counters[MODE] in (LAW, PI) and not self._out:
             verified(s, k, filled, y_star)
         u, mode = self._driven(filled, r, r_now, y_star)
         return Decision(u.copy(), MODES[mode], self._causes(t_s) if mode != LAW else ())
@@ -672,7 +696,7 @@ class Supervised:
             if before != LAW:
                 self.law.hand_over(y)
             u = self.law.step(y, r, n)
-            if (np.abs(y - y_star) < SETTLED_DEGC).all():
+            if max(np.abs(y - y_star).tolist()) < SETTLED_DEGC:
                 k.held[:] += HELD_SHARE * (u - k.held)
         else:
             u = self._safe(mode, before, y, r_now, n)
@@ -698,7 +722,7 @@ class Supervised:
             same = mine is not None and (r is mine or all(map(np.array_equal, r, mine)))
         else:
             r = np.asarray(r, float)
-            same = mine is not None and len(self._w) == 1 and np.array_equal(mine.H[:, 0], r)
+            same = mine is not None and len(self._w) == 1 and bool((mine.H[:, 0] == r).all())
         if mine is None or not same:
             mine = r if isinstance(r, Reference) else constant(r)
             at = rest(self.exported.model, mine, self.exported.controller.limits)
@@ -706,11 +730,14 @@ class Supervised:
             self._Y, r0 = at.Y, mine.H @ mine.w0
             outside = np.maximum(r0 - self.supervision.high, self.supervision.low - r0)
             self._beyond = np.maximum(np.abs(at.miss), outside)
-            if (self._beyond <= self.supervision.reach_degC).all():
+            self._out = [int(j) for j in np.flatnonzero(self._beyond > self.supervision.reach_degC)]
+            if not self._out:
                 self._in_reach = r0
+            self._now = mine.H @ self._w, self._Y @ self._w
         elif len(self._w) > 1:
             self._w = mine.F @ self._w
-        return mine.H @ self._w, self._Y @ self._w
+            self._now = mine.H @ self._w, self._Y @ self._w
+        return self._now
 
     def _causes(self, t_s: float) -> tuple[Cause, ...]:
         """Every cause that is there, the first of KINDS first."""
@@ -765,3 +792,5 @@ class Supervised:
         self._reference = Reference(*(np.array(arrays[f"reference.{name}"]) for name in Reference._fields))
         self._w, self._Y = np.array(arrays["w"]), np.array(arrays["Y"])
         self._beyond, self._in_reach = np.array(arrays["beyond"]), np.array(arrays["in_reach"])
+        self._out = [int(j) for j in np.flatnonzero(self._beyond > self.supervision.reach_degC)]
+        self._now = self._reference.H @ self._w, self._Y @ self._w
