@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.stats
 
 from pipeline.temperature.kernel import Tuples, regress, value_iteration, window_shift, windows
 from pipeline.temperature.plant import observability_matrix
@@ -164,9 +165,10 @@ def bands(
 ) -> Bands:
     """Bands of the learned gains by resampling blocks of the record, two windows long by itself.
 
-    Studentised about the gain of the record: K -+ t s, s the deviation over resamples about their mean, and
-    shifted by their bias, which is that of the regression. Resamples that give no gain are left out.
-    Raises ValueError where fewer than half of them give one.
+    2 K - mean +- z s of the resamples: bias-corrected, as the regression's bias shows in them once more
+    (Efron and Tibshirani 1993, 10.6), and by their deviation. Quantiles of the resamples held some gains in
+    54 % of records where 90 % were wanted, these in 82 % (benchmarks/certificates.py). Resamples that give no
+    gain are left out. Raises ValueError where fewer than half of them give one.
     """
     data = rows(u, y, learning.N)
     of = moments(data, block or max(2 * learning.N, 10))
@@ -183,8 +185,18 @@ def bands(
             f"bands: only {len(found)} of {resamples} resamples of the record give a gain; record longer, or "
             "lower the window"
         )
-    low, high = np.quantile(found, [(1 - level) / 2, (1 + level) / 2], axis=0)
-    return Bands(here, low, high, level, len(found))
+    centre = 2 * here - np.mean(found, axis=0)
+    reach = scipy.stats.norm.ppf((1 + level) / 2) * np.std(found, axis=0, ddof=1)
+    return Bands(here, centre - reach, centre + reach, level, len(found))
+
+
+def gain(u: Segments, y: Segments, learning: Learning) -> np.ndarray:
+    """[K K_r] (m, N (m+p) + p) of the record itself."""
+    data = rows(u, y, learning.N)
+    of = moments(data, max(2 * learning.N, 10))
+    taken = np.ones((1, len(of.starts)))
+    learned = predictors(of, taken, data, gain_spread=learning.gain_spread)
+    return _gain(data, of, taken[0], learned.window(0), learning)
 
 
 def _gain(data: Rows, of: Moments, counts: np.ndarray, learned: Window, learning: Learning) -> np.ndarray:
@@ -227,11 +239,5 @@ def _predicted(learned: Window, data: Rows, of: Moments, counts: np.ndarray) -> 
     measured = data.y[rows]
     base = measured.mean(axis=0)
     return Tuples(
-        np.hstack([x, one]),
-        data.u[rows],
-        measured - base,
-        np.hstack([x_next, one]),
-        features,
-        data.N,
-        base,
+        np.hstack([x, one]), data.u[rows], measured - base, np.hstack([x_next, one]), features, data.N, base
     )

@@ -20,7 +20,16 @@ import numpy as np
 from pipeline.runtime import bands
 from pipeline.runtime.machine import Exported, Signal, controller_sha256
 from pipeline.temperature import scorecard
-from pipeline.temperature.controller import Aim, Deployed, aim, batch_step, constant, handed_over, rest, watched
+from pipeline.temperature.controller import (
+    Aim,
+    Deployed,
+    aim,
+    batch_step,
+    constant,
+    handed_over,
+    rest,
+    watched,
+)
 from pipeline.temperature.plant import Plant, hold_output, strictly_proper
 from pipeline.temperature.validation import one_step_errors, predicted_ahead
 from pipeline.temperature.window import learn, observer_form, predictor
@@ -38,7 +47,8 @@ ROUNDING = 1e-6
 class Record(NamedTuple):
     """What a certificate rests on: signals as recorded, and the segments that were learned from, u (T, m), y
     (T, p); `newest` segments come from the machine as it is now, by the wires that the controller will have.
-    All are without gaps."""
+    All are without gaps. `cold_degC` (p,) is what the sensors read of the cold machine, None where nobody
+    looked."""
 
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
@@ -47,6 +57,7 @@ class Record(NamedTuple):
     y: list[np.ndarray]
     newest_u: list[np.ndarray]
     newest_y: list[np.ndarray]
+    cold_degC: np.ndarray | None = None
 
 
 class Rules(NamedTuple):
@@ -57,10 +68,11 @@ class Rules(NamedTuple):
     Margins hold on nine of ten plants of family and record. `samples` are those for each unknown of a
     window model. `moves` is the least share of an input's range that it moves by itself. Of the newest
     record's movement over `ahead` steps the model may miss `unexplained` beyond what the record's own window
-    model misses, and `coloured` of an error's variance may be foretold by errors and inputs before. `noise`:
-    the deviation of a settled mean as a share of the settled error allowed. At rest without inputs a machine
-    is as warm as its room, `room_degC`. `reach`: by how much of the recorded span references may lie beyond
-    it.
+    model misses, and of errors of one step `coloured_degC` may be foretold by errors and inputs before.
+    `noise`: the deviation of a settled mean as a share of the settled error allowed. A cold machine is as
+    warm as its room, `room_degC`; where no cold reading is given, the record's window models must not
+    contradict `extrapolated_degC` at rest without inputs, wider by what a line from hot to cold misses.
+    `reach`: by how much of the recorded span references may lie beyond it.
     """
 
     references: np.ndarray
@@ -80,9 +92,10 @@ class Rules(NamedTuple):
     moves: float = 0.002
     ahead: int = 20
     unexplained: float = 0.35
-    coloured: float = 0.5
+    coloured_degC: float = 0.25
     noise: float = 1.0
-    room_degC: tuple[float, float] = (-20.0, 50.0)
+    room_degC: tuple[float, float] = (5.0, 45.0)
+    extrapolated_degC: tuple[float, float] = (-50.0, 110.0)
     reach: float = 0.5
 
 
@@ -188,6 +201,18 @@ def certify(
     the arrays of the record do not have the machine's number of signals.
     """
     _check(exported, record, rules)
+    with np.errstate(all="ignore"):  # what diverges is a finding
+        return _certified(exported, family, record, rules, rng, learning)
+
+
+def _certified(
+    exported: Exported,
+    family: Sequence[Plant],
+    record: Record,
+    rules: Rules,
+    rng: np.random.Generator,
+    learning: bands.Learning | None,
+) -> Certificate:
     results = [*_of_signals(exported, record, rules)]
     shown = _Shown()
     if all(one.passed for one in results):
@@ -310,9 +335,7 @@ def _of_signals(exported: Exported, record: Record, rules: Rules) -> list[RuleRe
     machine = exported.machine
     pairs = [*zip(machine.inputs, record.inputs, strict=False)]
     pairs += [*zip(machine.outputs, record.outputs, strict=False)]
-    names = [
-        [one.name for one in (*of.inputs, *of.outputs)] for of in (machine, record)
-    ]
+    names = [[one.name for one in (*of.inputs, *of.outputs)] for of in (machine, record)]
     wrong = [f"{a} is recorded as {b}" for a, b in zip(*names, strict=False) if a != b]
     if len(names[0]) != len(names[1]):
         wrong = [f"{len(names[0])} are expected and {len(names[1])} recorded"]
@@ -329,7 +352,13 @@ def _of_signals(exported: Exported, record: Record, rules: Rules) -> list[RuleRe
             f"The record is of other signals: {', '.join(wrong)}.",
         ),
         _result(
-            "units", not units, None, None, "", "Units are the machine's.", f"Units differ: {', '.join(units)}."
+            "units",
+            not units,
+            None,
+            None,
+            "",
+            "Units are the machine's.",
+            f"Units differ: {', '.join(units)}.",
         ),
         _result(
             "sample_time",
@@ -401,7 +430,7 @@ def _of_evidence(
     sampled = bands.predictors(of, bands.drawn(of, rules.plants, rng), data)
     results += [
         _of_noise(sampled, outputs, rules),
-        _of_room(sampled, outputs, rules),
+        _of_room(record, sampled, outputs, rules),
         *_of_newest(exported, record, N, rules),
     ]
     return _Evidence(sampled), results
@@ -444,14 +473,15 @@ def _of_excitation(exported: Exported, record: Record, N: int, rules: Rules) -> 
 
 
 def _own_moves(u: Segments, y: Segments, N: int) -> np.ndarray:
-    """Deviation (m,) of what the window and the other inputs do not foretell of each input."""
+    """Deviation (m,) of what the window, the outputs now and the other inputs do not foretell of each input:
+    what a controller makes of its measurements tells nothing of the plant."""
     try:
         data = bands.rows(u, y, N)
     except ValueError:
         return np.zeros(u[0].shape[1])
     m, own = data.u.shape[1], []
     for j in range(m):
-        columns = np.hstack([np.ones((len(data.w), 1)), data.w, np.delete(data.u, j, axis=1)])
+        columns = np.hstack([np.ones((len(data.w), 1)), data.w, data.y, np.delete(data.u, j, axis=1)])
         if len(columns) <= columns.shape[1]:
             return np.zeros(m)
         size = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
@@ -491,27 +521,40 @@ def _of_noise(sampled: bands.Predictors, outputs: Sequence[str], rules: Rules) -
     )
 
 
-def _of_room(sampled: bands.Predictors, outputs: Sequence[str], rules: Rules) -> RuleResult:
-    """Where the record tells how warm the machine is without inputs, it must be a room. A reading in °F or K
-    is not."""
-    p, N = len(outputs), sampled.N
-    m = sampled.Theta.shape[2] // N - p
-    of_y = sampled.Theta[:, :, N * m :].reshape(len(sampled.Theta), p, N, p).sum(axis=2)
-    balance = np.eye(p) - of_y
-    fine = np.linalg.cond(balance) < 1e12
-    at_rest = np.linalg.solve(balance[fine], sampled.theta_0[fine][:, :, None])[:, :, 0]
-    low, high = np.quantile(at_rest, [0.025, 0.975], axis=0)
-    off = np.maximum(low - rules.room_degC[1], rules.room_degC[0] - high)
+def _of_room(record: Record, sampled: bands.Predictors, outputs: Sequence[str], rules: Rules) -> RuleResult:
+    """A cold machine is as warm as its room. A reading in °F or K is not."""
+    if record.cold_degC is not None:
+        low = high = np.asarray(record.cold_degC, float)
+        limit, said = rules.room_degC, "A cold machine reads"
+    else:
+        low, high = _extrapolated(sampled, len(outputs))
+        limit, said = (
+            rules.extrapolated_degC,
+            "With its inputs off, drawn out from where it was recorded, it is at",
+        )
+    off = np.maximum(low - limit[1], limit[0] - high)
     worst = int(off.argmax())
     return _at_most(
         "room",
         float(off[worst]),
         0.0,
         "degC beyond a room",
-        "With its inputs off the machine may be as warm as a room.",
-        f"With its inputs off {outputs[worst]} would be at {low[worst]:.0f} to {high[worst]:.0f} °C, which is "
-        "no room: the sensor is in another unit, or something heats that is not recorded.",
+        f"{said} what a room may be.",
+        f"{said} {low[worst]:.0f} to {high[worst]:.0f} °C on {outputs[worst]}, which is no room: the sensor is in "
+        "another unit, or something heats that is not recorded.",
     )
+
+
+def _extrapolated(sampled: bands.Predictors, p: int) -> tuple[np.ndarray, np.ndarray]:
+    """The band of 95 % (p,) of the outputs at rest without inputs, over the window models."""
+    N = sampled.N
+    m = sampled.Theta.shape[2] // N - p
+    of_y = sampled.Theta[:, :, N * m :].reshape(len(sampled.Theta), p, N, p).sum(axis=2)
+    balance = np.eye(p) - of_y
+    fine = np.linalg.cond(balance) < 1e12
+    at_rest = np.linalg.solve(balance[fine], sampled.theta_0[fine][:, :, None])[:, :, 0]
+    low, high = np.quantile(at_rest, [0.025, 0.975], axis=0)
+    return low, high
 
 
 def _of_newest(exported: Exported, record: Record, N: int, rules: Rules) -> list[RuleResult]:
@@ -520,8 +563,8 @@ def _of_newest(exported: Exported, record: Record, N: int, rules: Rules) -> list
     u, y = record.newest_u, record.newest_y
     missed = _unexplained(model, u, y, min(N, _longest(u, y, rules)), rules.ahead)
     worst = int(missed.argmax())
-    share, whole = _foretold(model, u, y)
-    colour = int(share.argmax())
+    foretold = _foretold(model, u, y)
+    colour = int(foretold.argmax())
     return [
         _at_most(
             "unexplained",
@@ -534,12 +577,12 @@ def _of_newest(exported: Exported, record: Record, N: int, rules: Rules) -> list
         ),
         _at_most(
             "coloured",
-            float(share[colour]),
-            rules.coloured,
-            "of the error's variance",
-            f"Errors of one step have at most {100 * share[colour]:.0f} % that could have been foretold.",
-            f"{100 * share[colour]:.0f} % of the one-step error of {outputs[colour]}, {whole[colour]:.2g} °C, "
-            "could have been foretold.",
+            float(foretold[colour]),
+            rules.coloured_degC,
+            "degC",
+            f"Of errors of one step {foretold[colour]:.2g} °C at most could have been foretold.",
+            f"Of the errors of one step of {outputs[colour]} {foretold[colour]:.2g} °C could have been foretold: "
+            "the model misses what the newest record shows.",
         ),
     ]
 
@@ -573,9 +616,9 @@ def _bounded(predicted: np.ndarray) -> np.ndarray:
     return np.clip(np.nan_to_num(predicted, nan=DIVERGED), -DIVERGED, DIVERGED)
 
 
-def _foretold(model: Plant, u: Segments, y: Segments) -> tuple[np.ndarray, np.ndarray]:
-    """Share (p,) of the variance of one-step errors that errors and inputs of the LAGS samples before
-    foretell, less what as many numbers foretell by chance; and their deviation (p,) in °C."""
+def _foretold(model: Plant, u: Segments, y: Segments) -> np.ndarray:
+    """Deviation (p,) in °C of the part of one-step errors that errors and inputs of the LAGS samples before
+    foretell, less what as many numbers foretell by chance."""
     errors = [_bounded(part) for part in one_step_errors(model, u, y)]
     inputs = [a - a.mean(axis=0) for a in u]
     keep = [k for k, part in enumerate(errors) if len(part) > 2 * LAGS]
@@ -583,11 +626,10 @@ def _foretold(model: Plant, u: Segments, y: Segments) -> tuple[np.ndarray, np.nd
     z = np.hstack([np.ones((len(data.w), 1)), data.w])
     p = data.y.shape[1]
     if len(z) <= 2 * z.shape[1]:
-        return np.ones(p), data.y.std(axis=0)
+        return np.full(p, np.inf)
     left = data.y - z @ np.linalg.lstsq(z, data.y, rcond=1e-10)[0]
     inflated = len(z) / (len(z) - z.shape[1])
-    total = np.maximum((data.y**2).mean(axis=0), np.finfo(float).tiny)
-    return np.maximum(1 - inflated * (left**2).mean(axis=0) / total, 0.0), np.sqrt(total)
+    return np.sqrt(np.maximum((data.y**2).mean(axis=0) - inflated * (left**2).mean(axis=0), 0.0))
 
 
 # ---- would it work?
@@ -603,7 +645,9 @@ def _of_loop(
     plants += [("record", observer_form(sampled.window(k), at)[0]) for k in some]
     poles = tuple(_poles(of, plant, exported.controller) for of, plant in plants)
     margins = _margins([plant for _, plant in plants], exported.controller)
-    worst, crossing, settled = _worst(exported, [plant for of, plant in plants if of == "spread"], sampled, rules, rng)
+    worst, crossing, settled = _worst(
+        exported, [plant for of, plant in plants if of == "spread"], sampled, rules, rng
+    )
     violations = tuple(
         Violation(signal.name, float(crossing[:, o].max()), int((crossing[:, o] > rules.crossing_degC).sum()))
         for o, signal in enumerate(exported.machine.outputs)
@@ -718,7 +762,11 @@ def _loops(sampled: bands.Predictors) -> _Loops:
 
 
 def _worst(
-    exported: Exported, spread: Sequence[Plant], sampled: bands.Predictors, rules: Rules, rng: np.random.Generator
+    exported: Exported,
+    spread: Sequence[Plant],
+    sampled: bands.Predictors,
+    rules: Rules,
+    rng: np.random.Generator,
 ) -> tuple[Worst, np.ndarray, np.ndarray]:
     """The sampled plants and the spread under the controller as deployed: the summary, by how many °C each
     crosses limits (s, p), and settled errors (s,)."""
@@ -733,11 +781,7 @@ def _worst(
     diverged = int((settled >= DIVERGED).sum())
     failing = int((settled > rules.settled_error_degC).sum())
     figures = [float(np.quantile(settled, share, method="higher")) for share in (0.5, 0.99, 1.0)]
-    return (
-        Worst(len(settled), (figures[0], figures[1], figures[2]), failing, diverged),
-        crossing,
-        settled,
-    )
+    return (Worst(len(settled), (figures[0], figures[1], figures[2]), failing, diverged), crossing, settled)
 
 
 class _Schedule(NamedTuple):
@@ -788,11 +832,19 @@ def _spread_runs(
     plan, limits = _schedule(exported, rules), exported.controller.limits
     held = [hold_output(plant, np.asarray(rules.start, float)) for plant in spread]
     most = max(plant.n for plant in spread)
-    A, B, C = (np.zeros((len(spread), *shape)) for shape in ((most, most), (most, spread[0].m), (spread[0].p, most)))
+    A, B, C = (
+        np.zeros((len(spread), *shape)) for shape in ((most, most), (most, spread[0].m), (spread[0].p, most))
+    )
     x, b = np.zeros((len(spread), most)), np.zeros((len(spread), most))
     for k, plant in enumerate(spread):
         n = plant.n
-        A[k, :n, :n], B[k, :n], C[k, :, :n], b[k, :n], x[k, :n] = plant.A, plant.B, plant.C, plant.b, held[k][0]
+        A[k, :n, :n], B[k, :n], C[k, :, :n], b[k, :n], x[k, :n] = (
+            plant.A,
+            plant.B,
+            plant.C,
+            plant.b,
+            held[k][0],
+        )
     d = np.stack([plant.d for plant in spread])
     u = np.clip(np.stack([one[1] for one in held]), limits.low, limits.high)
 
@@ -845,9 +897,7 @@ def _gain_bands(
     on = [f"{name} {lag} before" for lag in range(1, N + 1) for name in inputs]
     on += [f"{name} {lag} before" for lag in range(1, N + 1) for name in outputs]
     on += [f"reference of {name}" for name in outputs]
-    gain, low, high = (
-        tuple(tuple(float(f"{one:.6g}") for one in row) for row in part) for part in found[:3]
-    )
+    gain, low, high = (tuple(tuple(float(f"{one:.6g}") for one in row) for row in part) for part in found[:3])
     return GainBands(found.level, found.resamples, tuple(on), gain, low, high)
 
 
@@ -856,7 +906,9 @@ def _gain_bands(
 
 def to_json(certificate: Certificate) -> str:
     """Canonical JSON: sorted keys, no blanks; limits that are not declared are null."""
-    return json.dumps(_plain(certificate), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return json.dumps(
+        _plain(certificate), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+    )
 
 
 def sha256(certificate: Certificate) -> str:
@@ -909,7 +961,8 @@ def _read(about: dict[str, Any]) -> Certificate:
         and MarginsFound(margins["plants"], tuple(margins["disk"]), tuple(margins["delay_s"])),
         "worst": worst and Worst(**(worst | {"settled_error_degC": tuple(worst["settled_error_degC"])})),
         "violations": tuple(Violation(**one) for one in about["violations"]),
-        "bands": about["bands"] and GainBands(**{name: _tuples(part) for name, part in about["bands"].items()}),
+        "bands": about["bands"]
+        and GainBands(**{name: _tuples(part) for name, part in about["bands"].items()}),
         "rules": tuple(RuleResult(**one) for one in about["rules"]),
     }
     certificate = Certificate(**made)
