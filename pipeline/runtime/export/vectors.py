@@ -85,8 +85,10 @@ def _episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script
     do = np.full(steps, STEP)
     do[:MANUAL], do[0], do[MANUAL] = WATCH, BEGIN, HAND_OVER
     do[rng.integers(MANUAL + 1, steps, 2)] = RESTORE
-    reach = 150 * noise
-    r = np.repeat(at.y + rng.uniform(-1, 1, (-(-steps // 60), p)) * reach, 60, axis=0)[:steps]
+    reach = _reach(exported) if rng.random() < 0.5 else 150 * noise
+    each = max(60, steps // 3)
+    asked = at.y + rng.uniform(-1, 1, (-(-steps // each), p)) * reach
+    r = np.repeat(asked, each, axis=0)[:steps]
     r[:MANUAL] = at.y
     made = Script(
         do=do,
@@ -105,6 +107,16 @@ def _episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script
     if last < steps and rng.random() < 0.5:
         made.do[last] = ACKNOWLEDGE
     return made
+
+
+def _reach(exported: Exported) -> np.ndarray:
+    """How far (p,) in degC references may lie from the start: a little beyond the outputs' limits, so that the
+    governor acts and some are out of reach."""
+    bottom, top = (
+        np.array([getattr(one, side) for one in exported.machine.outputs]) for side in ("low", "high")
+    )
+    span = np.where(np.isfinite(top - bottom), top - bottom, 300 * exported.supervision.noise_degC)
+    return 0.52 * span
 
 
 FAULTS = ("none", "none", "lost", "frozen", "offset", "noisy", "cold", "on", "off", "weak", "late", "jump")
