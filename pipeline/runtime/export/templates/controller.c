@@ -158,6 +158,8 @@ beadline_result beadline_restore(beadline_controller *c, const beadline_controll
     if (!all_finite(saved->law.z, MEMORY + OUTPUTS + INPUTS) || !all_finite(saved->memory.x, WATCH))
         return BEADLINE_BAD_INPUT;
     *c = *saved;
+    if (c->kept.mode != MODE_PI)
+        c->fallback.seen = 0; /* the fallback begins anew, as where the object is restored */
     return BEADLINE_DONE;
 }
 
