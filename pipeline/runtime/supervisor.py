@@ -92,8 +92,8 @@ class Supervision(NamedTuple):
     """Thresholds and declared safe modes, the arrays by kind (k,), input (m,) or output (p,).
 
     `mode` (k,) the number in MODES, `back_s` (k,) seconds without the cause after which the law takes over
-    again, inf: a person acknowledges it. low, high (p,) in degC between which a reading is one. peak (p, m) in
-    degC per percent: how fast each input moves each output. `hysteresis_degC`, `gain_degC`, `check_s` and
+    again, inf: a person acknowledges it. low, high (p,) in degC between which a reading is one. peak (p, m)
+    in degC per percent: how fast each input moves each output. `hysteresis_degC`, `gain_degC`, `check_s` and
     `error_degC_s` are verify_heater's. `early`, `late`, `jump` are shares of the sample time: less than
     `early` or more than `jump` is no time between two samples, more than `late` is a deadline missed.
     `reach_degC`: a target that far from its reference is out of reach.
@@ -147,7 +147,7 @@ def supervision(
         )
     T = machine.sample_time_s
     waits = max(30 * T, 10.0) if back_s is None else back_s
-    limits = tuple(np.array([getattr(i, side) for i in machine.inputs]) for side in ("low", "high"))
+    limits = np.array([i.low for i in machine.inputs]), np.array([i.high for i in machine.inputs])
     pulses = markov_parameters(strictly_proper(model), innovations.MOST_LATE)
     check = _check_s(model, limits, T)
     return Supervision(
@@ -219,14 +219,21 @@ class Decision(NamedTuple):
 class Kept(NamedTuple):
     """All that the supervisor remembers beside innovations.Memory, arrays that are changed in place.
 
-    By kind and signal (k, w): since, last in s of the supervisor's own time, -1 where not so; amount; other, the number of
-    the kind that would show the same, -1 for none. By output (p,): y the last reading; repeats of it, and
-    quantum the smallest move seen; square and lag, means of z(t)^2 and z(t) z(t-1); z the last; trusted 1 or
-    0; absurd 1 where it left its range by itself; expected and e the last forecast and innovation; gap, error, goal and waited of verify_heater in degC, degC s, degC, s. By input
-    (m,): held the inputs that hold; asked the last command; lacks the share that a weak heater lacks; stuck 1
-    where it is on. Counters (8,): samples, samples since the alarm (-1: none), mode, whether the clock
-    was read, samples in all, causes that are there, whether a heater is stuck or weak, whether a zone is colder than it should be. clock_s (2,): the clock at the
-    last sample, and the supervisor's own time, which never falls.
+    By kind and signal (k, w): since, last in s of the supervisor's own time, -1 where not so; amount; other,
+    the number of the kind that would show the same, -1 for none, ALL_INPUTS where it is of every input.
+
+    By output (p,): y the last reading; repeats of it, and quantum the smallest move seen; square and lag,
+    means of z(t)^2 and z(t) z(t-1), z the last; trusted 1 or 0; absurd 1 where it left its range by itself;
+    expected and e the last forecast and innovation; error, goal and waited of verify_heater in degC s, degC
+    and s.
+
+    By input (m,): held the inputs that hold; asked the last command; lacks the share that a weak heater
+    lacks; stuck 1 where it is on.
+
+    counters (8,): samples since the start or an acknowledgement; samples since the alarm, -1 for none; mode;
+    1 once the clock was read; samples in all; causes that are there; 1 where a heater is stuck or weak; 1
+    where a zone is colder than it should be. clock_s (2,): the clock at the last sample, and the supervisor's
+    own time, which never falls.
     """
 
     since: np.ndarray
@@ -511,7 +518,10 @@ def mode_of(s: Supervision, k: Kept) -> int:
     """The most severe of the modes that the causes declare; hold while an alarm is not decided."""
     if not k.counters[ACTIVE]:
         return LAW if k.counters[ALARMED] < 0 else HOLD
-    modes = s.mode[(k.since >= 0).any(axis=1)]
+    kinds, signals = np.nonzero(k.since >= 0)
+    beside = k.other[kinds, signals]
+    # a mode that is safe for what would show the same, too
+    modes = s.mode[np.r_[kinds, beside[beside >= 0]]]
     worst = int(modes[SEVERITY[modes].argmax()])
     if k.counters[ALARMED] >= 0 and SEVERITY[worst] < SEVERITY[HOLD]:
         return HOLD
@@ -590,17 +600,18 @@ def sentence(machine: Machine, kind: int, signal: int, amount: float, other: int
     names = machine.inputs if kind in OF_INPUT else machine.outputs
     name = names[signal].name if signal < len(names) else "machine"
     said = {
-        ON: f"{name} heats whatever it is told ({100 * amount:.0f} % of its full power): only the mains can "
-        "stop it, switch them off",
-        OFF: f"{name} does not heat whatever it is told: its zone cools",
-        WEAK: f"{name} lacks {100 * amount:.0f} % of its power, or its zone loses as much more heat than the "
-        "model knows",
+        ON: f"{name} heats whatever it is told, or goes on with an older command ({100 * amount:.0f} % of "
+        "what it could add): only the mains can stop it, switch them off",
+        OFF: f"{name} does not heat whatever it is told, or goes on with an older command: its zone cools",
+        WEAK: f"{name} does {100 * amount:.0f} % less than it is told: it lacks power, goes on with an older "
+        "command, or its zone loses more heat than the model knows",
         RUNAWAY: f"{name} reads ever colder than heat can explain: it is out of place, or its zone is not "
         "heated",
         RANGE: f"{name} reads {amount:.1f} degC, outside its declared limits",
         NAN: f"{name} gives no number",
         FROZEN: f"{name} has read {amount:.2f} degC for longer than chance allows",
-        OFFSET: f"{name} is off by {amount:+.1f} degC, or its zone gains or loses heat that no input explains",
+        OFFSET: f"{name} is off by {amount:+.1f} degC, or its zone gains or loses heat that no input "
+        "explains",
         SLOW: f"{name} follows late, or its zone has become slower",
         NOISY: f"{name} is {amount:.0f} times as noisy as it was",
         COMMAND: f"{name} applied {amount:.1f} percent, not what it was told"
@@ -610,8 +621,8 @@ def sentence(machine: Machine, kind: int, signal: int, amount: float, other: int
         DEADLINE: f"a sample came {amount:.3g} s after the one before",
         MODEL: f"the readings are {amount:.0f} deviations from what any plant of the spread would show, and "
         "no single fault explains them",
-        REACH: f"{name} is asked for {amount:.1f} degC more or less than its limits and the inputs can hold: the last "
-        "reference in reach stays",
+        REACH: f"{name} is asked for {amount:.1f} degC more or less than its limits and the inputs can hold: "
+        "the last reference in reach stays",
     }[kind]
     also = f"; {KINDS[other].replace('_', ' ')} would show the same" if 0 <= other != kind else ""
     return said + also + "."
@@ -687,9 +698,9 @@ class Supervised:
         samples = timed(s, k, t_s)
         r_now, y_star = self._target(r)
         filled = followed(s, k, self.memory, y, y_star, applied, samples)
-        for j in self._out:
-            said(k, REACH, j, self._beyond[j])
         if self._out:
+            j = int(self._beyond.argmax())
+            said(k, REACH, j, self._beyond[j])
             if not np.isfinite(self._in_reach).all():
                 self._in_reach = filled
             r = r_now = self._in_reach
@@ -720,7 +731,7 @@ class Supervised:
         limits = self.exported.controller.limits
         if mode == OFF_MODE:
             return limits.low.copy()
-        if mode == PI:
+        if mode == PI and self.pi is not None:
             if before != PI:
                 self.pi.watch(self.kept.asked, y, r)
                 self.pi.hand_over(y)
@@ -773,14 +784,13 @@ class Supervised:
     def saved(self) -> dict[str, np.ndarray]:
         """All that it remembers, as arrays. Raises ValueError before the first watch."""
         arrays = {f"law.{name}": part for name, part in self.law.saved().items()}
-        if self.kept.counters[MODE] == PI:
+        if self.pi is not None and self.kept.counters[MODE] == PI:
             arrays |= {f"pi.{name}": part for name, part in self.pi.saved().items()}
         for group in (self.kept, self.memory):
             arrays |= {name: np.array(part) for name, part in group._asdict().items()}
-        return arrays | {
-            "beyond": self._beyond, "in_reach": self._in_reach, "Y": self._Y, "w": self._w,
-            **{f"reference.{name}": np.array(part) for name, part in self._reference._asdict().items()},
-        }  # fmt: skip
+        mine = {"beyond": self._beyond, "in_reach": self._in_reach, "Y": self._Y, "w": self._w}
+        mine |= {} if self._reference is None else self._reference._asdict()
+        return arrays | {f"aim.{name}": np.array(part) for name, part in mine.items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Goes on from what another of the same controller `saved`. Raises ValueError where its arrays are
@@ -801,8 +811,12 @@ class Supervised:
                 runner.restore(own)
         for name, part in mine.items():
             part[...] = arrays[name]
-        self._reference = Reference(*(np.array(arrays[f"reference.{name}"]) for name in Reference._fields))
-        self._w, self._Y = np.array(arrays["w"]), np.array(arrays["Y"])
-        self._beyond, self._in_reach = np.array(arrays["beyond"]), np.array(arrays["in_reach"])
+        aim = {
+            name.removeprefix("aim."): np.array(arrays[name]) for name in arrays if name.startswith("aim.")
+        }
+        self._reference = Reference(*(aim[name] for name in Reference._fields))
+        self._w, self._Y, self._beyond, self._in_reach = (
+            aim[name] for name in ("w", "Y", "beyond", "in_reach")
+        )
         self._out = [int(j) for j in np.flatnonzero(self._beyond > self.supervision.reach_degC)]
         self._now = self._reference.H @ self._w, self._Y @ self._w
