@@ -367,6 +367,8 @@ OF_INNOVATIONS = (
     "ODD",
     "CATCH_UP",
     "MOVING",
+    "MISFIT",
+    "SELDOM",
     "COINCIDENCE",
 )
 OF_SUPERVISOR = (

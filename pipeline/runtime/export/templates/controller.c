@@ -242,7 +242,7 @@ beadline_result beadline_step(beadline_controller *c, const double *y, const dou
 {
     supervisor_kept *k = &c->kept;
     double filled[OUTPUTS];
-    int j, samples, out_of_reach = 0;
+    int j, samples, out_of_reach, farthest = 0;
     if (!c->ready || !c->law.seen)
         return BEADLINE_NOT_READY;
     if (!all_finite(r, OUTPUTS) || !isfinite(t_s))
@@ -254,11 +254,12 @@ beadline_result beadline_step(beadline_controller *c, const double *y, const dou
     samples = tell_time(k, t_s);
     turn_to(c, r);
     follow(k, &c->memory, y, c->y_star, applied, samples, filled);
-    for (j = 0; j < OUTPUTS; j++)
-        if (c->beyond[j] > REACH_DEGC) {
-            say(k, REFERENCE_OUT_OF_REACH, j, c->beyond[j], -1);
-            out_of_reach = 1;
-        }
+    for (j = 1; j < OUTPUTS; j++)
+        if (c->beyond[j] > c->beyond[farthest])
+            farthest = j;
+    out_of_reach = c->beyond[farthest] > REACH_DEGC;
+    if (out_of_reach)
+        say(k, REFERENCE_OUT_OF_REACH, farthest, c->beyond[farthest], -1);
     if (out_of_reach && !c->has_reached) {
         memcpy(c->in_reach, filled, sizeof filled);
         c->has_reached = 1;
