@@ -1,5 +1,5 @@
-"""Exported code against the object: C and Python ask for the same inputs over limits, faults and hand-overs, and
-neither runs for another machine."""
+"""Exported code against the object: C and Python ask for the same inputs over limits, faults and hand-overs,
+and neither runs for another machine."""
 
 import ast
 import importlib.util
@@ -133,7 +133,8 @@ def test_the_c_refuses_every_other_machine_in_words(tmp_path):
     (folder / "ask.c").write_text(
         '#include "controller.h"\n#include <stdio.h>\n'
         "int main(void) { static beadline_controller c; beadline_machine m = {BEADLINE_PLANT_SHA256, "
-        '"percent", "K", 1.0, 2, 2};\n puts(beadline_why(beadline_init(&c, &m, 0)));\n m.output_unit = "degC"; '
+        '"percent", "K", 1.0, 2, 2};\n puts(beadline_why(beadline_init(&c, &m, 0)));\n '
+        'm.output_unit = "degC"; '
         "puts(beadline_why(beadline_init(&c, &m, 0)));\n m.sample_time_s = 0.3; "
         "puts(beadline_why(beadline_init(&c, &m, 0))); return 0; }\n"
     )

@@ -1,8 +1,8 @@
-"""Golden vectors: what the object does on its own model, with noise, changed references, faults and hand-overs.
+"""Golden vectors: what the object does on its own model, with noise, changed references, faults, hand-overs.
 
 A script says what happens to machine and controller at each sample. `played` runs it with any object that has
-the calls of supervisor.Supervised; the C test runs the same script with the exported code. Both close the loop
-themselves: outputs fed to a law that is unstable by itself would tell rounding errors apart and nothing else.
+the calls of supervisor.Supervised; the C test runs the same script with the exported code. Both close the
+loop themselves: outputs fed to a law that is unstable by itself would tell rounding errors apart, no more.
 
     x(t+1) = A x + B (share u + extra) + b,   y = C x + d + add, or what `reading` says
 """
@@ -16,7 +16,7 @@ from pipeline.runtime.machine import Exported
 from pipeline.runtime.supervisor import KINDS, MODES
 from pipeline.temperature.plant import Plant, hold_output, strictly_proper
 
-# what is done at a sample: in manual; a step; before it hand over, save and restore, or acknowledge; begin anew
+# what is done at a sample: in manual; a step; before it hand over, restore, or acknowledge; begin anew
 WATCH, STEP, HAND_OVER, RESTORE, ACKNOWLEDGE, BEGIN = range(6)
 # readings that are none of the plant's: no number at all, and the one before once more
 LOST, REPEATED = np.inf, -np.inf
@@ -48,7 +48,7 @@ class Played(NamedTuple):
 
 
 class Start(NamedTuple):
-    """Where an episode begins: the model's state x (n,), the inputs u (m,) that hold it, the outputs y (p,)."""
+    """Where an episode begins: the model's state x (n,), the inputs u (m,) that hold it, outputs y (p,)."""
 
     x: np.ndarray
     u: np.ndarray
@@ -117,8 +117,8 @@ def episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script:
 
 
 def _reach(exported: Exported) -> np.ndarray:
-    """How far (p,) in degC references may lie from the start: a little beyond the outputs' limits, so that the
-    governor acts and some are out of reach."""
+    """How far (p,) in degC references may lie from the start: a little beyond the outputs' limits, so that
+    the governor acts and some are out of reach."""
     bottom, top = (
         np.array([getattr(one, side) for one in exported.machine.outputs]) for side in ("low", "high")
     )
@@ -220,8 +220,8 @@ class Determined(NamedTuple):
     differs: float
 
 
-def determined(exported: Exported, make: Any, script: Script) -> Determined:
-    """Plays an episode, and REPLAYS times more with readings that differ by UNSURE up or down.
+def determined(exported: Exported, make: Any, script: Script, *, replays: int = 3) -> Determined:
+    """Plays an episode, and `replays` times more with readings that differ by UNSURE up or down.
 
     Where inputs that hardly move an output stand near a limit, `tracking.feasible_target` leaves to the last
     bit which of equally good inputs it takes. There the object disagrees with itself, and nobody can agree
@@ -230,7 +230,7 @@ def determined(exported: Exported, make: Any, script: Script) -> Determined:
     at, rng = start(exported), np.random.default_rng(0)
     span = np.array([signal.high - signal.low for signal in exported.machine.inputs])
     one, differs = played(make, exported.model, at, script), 0.0
-    for _ in range(REPLAYS):
+    for _ in range(replays):
         shift = UNSURE * rng.choice([-1.0, 1.0], script.add.shape)
         other = played(make, exported.model, at, script._replace(add=script.add + shift))
         same = np.array_equal(one.mode, other.mode) and np.array_equal(one.causes, other.causes)
@@ -238,7 +238,6 @@ def determined(exported: Exported, make: Any, script: Script) -> Determined:
     return Determined(one, differs)
 
 
-REPLAYS = 3
 # largest share of an input's range by which readings moved by UNSURE may move an input: a law's own gains
 OWN_GAINS = 1e-6
 
