@@ -3,9 +3,9 @@ and sanitizers.
 
 `./run python -m benchmarks.exported` writes benchmarks/results/exported.json. The laws are the tuned
 contestants on the study's machine, from datasets/ (identify_plant, learn_kernel, tune_weights, ingest). Each
-episode is played by the object and by the C, both in closed loop. `own` is by how much the object differs from
-itself when its readings move by 1e-9 degC: where that is more than its gains explain, rounding decides, and
-the episode is counted apart.
+episode is played by the object and by the C, both in closed loop. `own` is by how much the object differs
+from itself when its readings move by 1e-9 degC: where that is more than its gains explain, rounding decides,
+and the episode is counted apart.
 """
 
 import argparse
