@@ -5,11 +5,14 @@ learned gains hold the gains?
 `gate` or `bands` behind it plays one of them.
 
 gate: 300 bad controllers and 300 good ones, each with the record that it was made from and a newest record
-through its own wires. Bad: unstable on its own true plant, or settled error over twice the limit there. Good:
-every rule that can be asked of a true plant holds there with 20 % to spare. True plants are written apart from
-`Plant`: zones of heat in watts, some with radiation, dead time, a sensor that lags and coarse steps, and the
-study's machine redrawn. Only the draw knows which cause a controller has; a cause whose controller works is no
-bad one and is drawn again.
+through its own wires. Bad: unstable on its own true plant, or settled error over twice the limit there.
+Good: every rule that can be asked of a true plant holds there with 20 % to spare. True plants are written
+apart from `Plant`: zones of heat in watts, some with radiation, dead time, a sensor that lags and coarse
+steps, and the study's machine redrawn. Only the draw knows which cause a controller has; a cause whose
+controller works is no bad one and is drawn again.
+
+unseen: bad controllers whose inputs are in another scale in all that was ever recorded, the newest record
+too, which then came by other wires. No test of that record can tell them; how many pass is said.
 
 bands: 200 fresh records of one machine; how often the band of each entry holds the gain that the same
 regression finds in a record of 400,000 samples.
@@ -347,8 +350,8 @@ def _changed(truth: Truth, rng: np.random.Generator) -> Truth:
 
 def _other_unit(learned, now, cold: np.ndarray, rng: np.random.Generator, *, unseen: bool):
     """Inputs as shares, of 255 or in tenths of a percent; temperatures in °F, K or tenths: in the learned
-    record, and in half of the cases in all that was ever read. `unseen`: an input in another scale in all that
-    was ever recorded, which nothing can tell but the newest record by the controller's own wires."""
+    record, and in half of the cases in all that was ever read. `unseen`: inputs in another scale in all that
+    was ever recorded, which nothing can tell but a newest record by the controller's own wires."""
     scales = ((0.01, 1.0, 0.0), (2.55, 1.0, 0.0), (0.1, 1.0, 0.0))
     scales += ((1.0, 1.8, 32.0), (1.0, 1.0, KELVIN), (1.0, 0.1, 0.0))
     which = int(rng.integers(1, 3) if unseen else rng.integers(0, 6))
@@ -558,6 +561,9 @@ def gate(count: int = COUNT, *, seed: int = 1, jobs: int = 2) -> dict:
     calls = [joblib.delayed(judged)(cause, seed * 100_000 + k) for k, cause in enumerate(causes)]
     results = joblib.Parallel(n_jobs=jobs, verbose=1)(calls)
     bad, good = [one for one in results if one.cause], [one for one in results if not one.cause]
+    unseen = joblib.Parallel(n_jobs=jobs)(
+        joblib.delayed(judged)("unseen_unit", seed * 100_000 + 90_000 + k) for k in range(max(count // 15, 2))
+    )
     return {
         "bad": {
             "count": len(bad),
@@ -567,6 +573,7 @@ def gate(count: int = COUNT, *, seed: int = 1, jobs: int = 2) -> dict:
         "good": {"count": len(good)}
         | _summary(good)
         | {"refused_percent": 100.0 * sum(one.verdict == "refused" for one in good) / len(good)},
+        "unseen": _summary(unseen),
         "plants": dict(Counter(one.kind for one in results)),
         "routes": dict(Counter(one.route for one in results)),
         "seconds_per_certificate": float(np.mean([one.seconds for one in results])),
