@@ -72,7 +72,7 @@ class Rules(NamedTuple):
     settled: int = 50
     settled_error_degC: float = 0.5
     crossing_degC: float = 1.0
-    failing: float = 0.05
+    failing: float = 0.1
     disk_margin: float = 0.2
     delay_margin_s: float = 0.0
     plants: int = 1000
