@@ -670,16 +670,15 @@ def band_cover(jobs: int = 2) -> dict:
 
 def main() -> None:
     which = sys.argv[1:] or ["gate", "bands"]
-    found = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    started = time.time()
-    if "gate" in which:
-        count = next((int(one) for one in which if one.isdigit()), COUNT)
-        found["gate"] = gate(count)
-        shown = {key: value for key, value in found["gate"].items() if key != "cases"}
+    for name, played in (("gate", gate), ("bands", band_cover)):
+        if name not in which:
+            continue
+        started = time.time()
+        table = played()
+        found = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+        artifacts.write_json(RESULTS, found | {name: table})
+        shown = {key: value for key, value in table.items() if key != "cases"}
         print(json.dumps(shown, indent=1), f"{time.time() - started:.0f} s")
-    if "bands" in which:
-        found["bands"] = band_cover()
-    artifacts.write_json(RESULTS, found)
 
 
 if __name__ == "__main__":

@@ -309,8 +309,12 @@ def _at_least(name: str, found: float, limit: float, unit: str, good: str, bad: 
 def _result(
     name: str, passed: bool, found: float | None, limit: float | None, unit: str, good: str, bad: str
 ) -> RuleResult:
-    finite = [None if one is None or not np.isfinite(one) else float(one) for one in (found, limit)]
-    return RuleResult(name, passed, *finite, unit, good if passed else bad)
+    return RuleResult(name, passed, _finite(found), _finite(limit), unit, good if passed else bad)
+
+
+def _finite(value: float | None) -> float | None:
+    """JSON knows no infinity."""
+    return None if value is None or not np.isfinite(value) else float(value)
 
 
 # ---- is the record of this machine?
