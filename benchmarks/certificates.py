@@ -22,6 +22,7 @@ import json
 import sys
 import time
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,6 +48,7 @@ from pipeline.temperature.plant import plant as make_plant
 
 RESULTS = Path(__file__).parent / "results" / "certificates.json"
 COUNT = 300
+SAMPLED, COMPARED = 200, 20  # plants a certificate here; of so many cases one has all 1,000 beside them
 CAUSES = (
     "few_samples",
     "noise",
@@ -466,7 +468,7 @@ def asked(case: Draw) -> certificate.Rules:
         disk_margin=DISK,
         longest_window=6 if len(case.inputs) > 3 else 12,
         poles_of=12,
-        plants=1000 if len(case.inputs) <= 3 else 300,
+        plants=SAMPLED,
         resamples=200,
     )
 
@@ -508,6 +510,7 @@ class Judged(NamedTuple):
     seconds: float
     tried: int
     found: dict[str, float | None]
+    verdict_of_1000: str | None
 
 
 def judged(cause: str, seed: int) -> Judged:
@@ -532,6 +535,9 @@ def judged(cause: str, seed: int) -> Judged:
                 raise ValueError(f"{cause}: no such controller in {tried} draws")
             continue
         found, seconds = certified(exported, family, case, rules)
+        all_of_them = None
+        if seed % COMPARED == 0:
+            all_of_them = certified(exported, family, case, rules._replace(plants=1000))[0].verdict
         return Judged(
             cause,
             case.truth.kind,
@@ -542,6 +548,7 @@ def judged(cause: str, seed: int) -> Judged:
             seconds,
             tried,
             {one.name: one.found for one in found.rules if one.asked},
+            all_of_them,
         )
 
 
@@ -555,14 +562,22 @@ def certified(exported: Exported, family, case: Draw, rules) -> tuple[certificat
     return found, time.process_time() - started
 
 
-def gate(count: int = COUNT, *, seed: int = 1, jobs: int = 3) -> dict:
+def listed(count: int, seed: int) -> list[tuple[str, int]]:
+    """Cause and seed of every case: bad ones, good ones, unseen ones."""
     causes = [CAUSES[k % len(CAUSES)] for k in range(count)] + [""] * count
-    calls = [joblib.delayed(judged)(cause, seed * 100_000 + k) for k, cause in enumerate(causes)]
-    results = joblib.Parallel(n_jobs=jobs, verbose=1)(calls)
+    causes += ["unseen_unit"] * max(count // 15, 2)
+    return [(cause, seed * 100_000 + k) for k, cause in enumerate(causes)]
+
+
+def gate(count: int = COUNT, *, seed: int = 1, jobs: int = 2) -> dict:
+    calls = [joblib.delayed(judged)(*one) for one in listed(count, seed)]
+    return summarised(joblib.Parallel(n_jobs=jobs, verbose=1)(calls))
+
+
+def summarised(results: Sequence[Judged]) -> dict:
+    unseen = [one for one in results if one.cause == "unseen_unit"]
+    results = [one for one in results if one.cause != "unseen_unit"]
     bad, good = [one for one in results if one.cause], [one for one in results if not one.cause]
-    unseen = joblib.Parallel(n_jobs=jobs)(
-        joblib.delayed(judged)("unseen_unit", seed * 100_000 + 90_000 + k) for k in range(max(count // 15, 2))
-    )
     return {
         "bad": {
             "count": len(bad),
@@ -573,6 +588,8 @@ def gate(count: int = COUNT, *, seed: int = 1, jobs: int = 3) -> dict:
         | _summary(good)
         | {"refused_percent": 100.0 * sum(one.verdict == "refused" for one in good) / len(good)},
         "unseen": _summary(unseen),
+        "sampled_plants": SAMPLED,
+        "of_1000": _compared(results),
         "plants": dict(Counter(one.kind for one in results)),
         "routes": dict(Counter(one.route for one in results)),
         "seconds_per_certificate": float(np.mean([one.seconds for one in results])),
@@ -594,6 +611,12 @@ def gate(count: int = COUNT, *, seed: int = 1, jobs: int = 3) -> dict:
     }
 
 
+def _compared(results: Sequence[Judged]) -> dict:
+    """Whether 1,000 sampled plants would have said otherwise."""
+    both = [one for one in results if one.verdict_of_1000]
+    return {"cases": len(both), "other_verdict": sum(one.verdict != one.verdict_of_1000 for one in both)}
+
+
 def _summary(results: list[Judged]) -> dict:
     return {
         "of": len(results),
@@ -607,7 +630,7 @@ def _summary(results: list[Judged]) -> dict:
 # ---- bands
 
 RECORDS, SAMPLES, LONG, LEVEL = 200, 2000, 300_000, 0.9
-SWING, NOISE, RESAMPLES = 15.0, 0.1, 100
+SWING, NOISE, RESAMPLES = 15.0, 0.1, 40
 LEARNING = {
     route: bands.Learning(route, 4, np.ones(3), np.full(3, 0.3), GAMMA, spread)
     for route, spread in (("window", 0.0), ("kernel", 0.05))
