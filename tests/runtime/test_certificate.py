@@ -182,7 +182,7 @@ def test_a_newest_record_too_short_to_say_anything_is_refused():
 
 def test_errors_that_could_have_been_foretold_are_refused():
     sluggish = designed(zones())
-    still = sluggish.model._replace(K=np.zeros((2, 2)), d=np.array([3.0, 0.0]))
+    still = sluggish.model._replace(K=np.zeros((2, 2)), B=0.8 * sluggish.model.B)
     found = certified(sluggish._replace(model=still), rules=RULES._replace(unexplained=10.0))
     assert "could have been foretold" in refused_by("coloured", found)
 
@@ -229,6 +229,13 @@ def test_an_output_that_crosses_its_limit_is_refused():
     found = certified(made._replace(machine=tight), record=record)
     assert "an output crosses its limit" in refused_by("violations", found)
     assert found.violations[0].output == "zone_1" and found.violations[0].worst_degC > 1.0
+
+
+def test_another_room_on_another_day_is_no_integrator():
+    warmer = zones()._replace(b=zones().b * 30.0 / ROOM)
+    found = certified(record=evidence(zones(), newest=warmer))
+    assert found.verdict == "passed"
+    assert found.worst.settled_error_degC[1] < 0.2
 
 
 # ---- the record of it
