@@ -686,7 +686,7 @@ def _of_loop(
     )
     shown = _Shown(poles, margins, worst, violations)
     return shown, [
-        _of_poles(poles),
+        _of_poles(poles, rules),
         _at_least(
             "disk_margin",
             margins.disk[1],
@@ -708,17 +708,23 @@ def _poles(of: str, plant: Plant, controller: Deployed) -> Poles:
     return Poles(of, float(np.abs(found).max()), shown)
 
 
-def _of_poles(poles: Sequence[Poles]) -> RuleResult:
+def _of_poles(poles: Sequence[Poles], rules: Rules) -> RuleResult:
+    """All of model and spread within the unit circle, and of the record's plants all but a share
+    `rules.failing`: a resample's slowest pole may lie outside by chance."""
+    declared = [one for one in poles if one.of != "record"]
+    sampled = [one for one in poles if one.of == "record"]
+    outside = [sum(one.radius >= 1 for one in part) for part in (declared, sampled)]
     worst = max(poles, key=lambda one: one.radius)
-    outside = sum(one.radius >= 1 for one in poles)
     return _result(
         "poles",
-        outside == 0,
+        outside[0] == 0 and outside[1] <= rules.failing * len(sampled),
         worst.radius,
         1.0,
         "1",
-        f"On {len(poles)} plants every pole lies within {worst.radius:.4f}.",
-        f"On {outside} of {len(poles)} plants a pole lies outside the unit circle, at {worst.radius:.4f}.",
+        f"On {len(poles) - outside[1]} of {len(poles)} plants, model and spread among them, every pole lies "
+        "within the unit circle.",
+        f"On {outside[0]} of {len(declared)} plants of model and spread, and {outside[1]} of {len(sampled)} "
+        f"of the record, a pole lies outside the unit circle, at {worst.radius:.4f}.",
     )
 
 
