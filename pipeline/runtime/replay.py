@@ -132,7 +132,7 @@ def _aimed(
     def of(reference: Reference) -> Aim:
         return aim(law, rest(model, reference, limits), reference)
 
-    asked, which = np.unique(log.r, axis=0, return_inverse=True)
+    asked, which = _held(log.r)
     if len(asked) > MOST_REFERENCES:
         raise ValueError(
             f"the references take {len(asked)} values, expected at most {MOST_REFERENCES} that are held; "
@@ -140,9 +140,16 @@ def _aimed(
         )
     aims = [of(constant(r)) for r in asked]
     feeds, targets = (np.array([getattr(one, name)[:, 0] for one in aims]) for name in ("feed", "Y"))
-    feeds, targets = feeds[which.ravel()], targets[which.ravel()]
+    feeds, targets = feeds[which], targets[which]
     at = min(hold, len(log.y) - 1)
     return feeds, targets, of(constant(log.y[at])).feed[:, 0] - feeds[at]
+
+
+def _held(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The references that are asked for (k, p), and which of them at each sample (T,)."""
+    new = np.r_[True, (r[1:] != r[:-1]).any(axis=1)]
+    asked, which = np.unique(r[new], axis=0, return_inverse=True)
+    return asked, which.ravel()[np.cumsum(new) - 1]
 
 
 def _without_integral(controller: Deployed, log: Log, feeds: np.ndarray) -> np.ndarray:
