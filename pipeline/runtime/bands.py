@@ -1,0 +1,243 @@
+"""What a record leaves open: predictors and gains learned again from resampled blocks of its samples.
+
+The regression of a window model (temperature/window.py) needs second moments only. Those of a block of
+consecutive samples are summed once; a resample (Kuensch 1989) is then a sum of blocks and one solve, and each
+is a plant that the record does not contradict. Blocks keep what is not white: drift, and what no linear model
+has.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.stats
+
+from pipeline.temperature.kernel import Tuples, regress, value_iteration, window_shift, windows
+from pipeline.temperature.plant import observability_matrix
+from pipeline.temperature.tracking import gains
+from pipeline.temperature.window import Window, observer_form, predictor
+
+Segments = Sequence[np.ndarray]
+LEAST_BLOCKS = 20  # fewer blocks than this say little of how far a resample may lie
+CHUNK = 50  # resamples whose moments are held at once
+
+
+class Rows(NamedTuple):
+    """The complete windows of a record, one a row: w (samples, N (m+p)), inputs u (samples, m), outputs y
+    (samples, p) of the same instant."""
+
+    w: np.ndarray
+    u: np.ndarray
+    y: np.ndarray
+    N: int
+
+
+class Moments(NamedTuple):
+    """Second moments (blocks, k, k) of the columns [1, (w - centre) / scale, y - base] over each block of
+    `block` rows; `starts` (blocks,) are their first rows."""
+
+    blocks: np.ndarray
+    starts: np.ndarray
+    block: int
+    centre: np.ndarray
+    scale: np.ndarray
+    base: np.ndarray
+
+
+class Predictors(NamedTuple):
+    """Window models, one a resample: Theta (count, p, N (m+p)), theta_0 (count, p), covariance of the
+    innovation (count, p, p)."""
+
+    Theta: np.ndarray
+    theta_0: np.ndarray
+    covariance: np.ndarray
+    N: int
+
+    def window(self, index: int) -> Window:
+        return Window(
+            self.Theta[index], self.theta_0[index], self.covariance[index], self.N, 0, np.zeros((0, 3))
+        )
+
+
+class Learning(NamedTuple):
+    """How the gains were learned: by which route, from windows of N samples, with weights diag(q) (p,),
+    diag(r) (m,), the discount and the spread of input gains that window.learn allows for."""
+
+    route: Literal["window", "kernel"]
+    N: int
+    q: np.ndarray
+    r: np.ndarray
+    gamma: float
+    gain_spread: float = 0.0
+
+
+class Bands(NamedTuple):
+    """Gains u = -K w - K_r r of the record, and the ends of their bands at `level`: each (m, N (m+p) + p),
+    the columns of K before those of K_r, in percent per percent and percent per °C. `resamples` is how many
+    gave a gain."""
+
+    gain: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    level: float
+    resamples: int
+
+
+# ---- predictors
+
+
+def rows(u: Segments, y: Segments, N: int) -> Rows:
+    """Raises ValueError where no segment is longer than N samples."""
+    return Rows(*windows(u, y, N), N)
+
+
+def moments(data: Rows, block: int) -> Moments:
+    """Blocks of `block` rows, shorter where the record has fewer than LEAST_BLOCKS of them."""
+    samples = len(data.w)
+    block = max(min(block, samples // LEAST_BLOCKS), 1)
+    starts = np.arange(0, samples, block)
+    centre, base = data.w.mean(axis=0), data.y.mean(axis=0)
+    scale = np.maximum(data.w.std(axis=0), 1e-12 * np.maximum(np.abs(centre), 1.0))
+    columns = np.hstack([np.ones((samples, 1)), (data.w - centre) / scale, data.y - base])
+    parts = np.stack([columns[a : a + block].T @ columns[a : a + block] for a in starts])
+    return Moments(parts, starts, block, centre, scale, base)
+
+
+def drawn(of: Moments, count: int, rng: np.random.Generator) -> np.ndarray:
+    """How often each block is taken (count, blocks), as many blocks as there are."""
+    blocks = len(of.starts)
+    return rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=count).astype(float)
+
+
+def predictors(of: Moments, taken: np.ndarray, data: Rows, *, gain_spread: float = 0.0) -> Predictors:
+    """One window model for each row of `taken` (count, blocks), by least squares with a constant."""
+    m, p = data.u.shape[1], data.y.shape[1]
+    k = 1 + data.w.shape[1]
+    Theta, theta_0 = np.empty((len(taken), p, k - 1)), np.empty((len(taken), p))
+    covariance = np.empty((len(taken), p, p))
+    for i, S in enumerate(_summed(of, taken)):
+        normal, right = S[:k, :k].copy(), S[:k, k:]
+        if gain_spread:
+            normal += gain_spread**2 * _own_moments(S, of, m, p, data.N)
+        normal[np.diag_indices(k)] *= 1 + 1e-10  # a signal that stands still in these blocks
+        solution = scipy.linalg.cho_solve(scipy.linalg.cho_factor(normal, lower=True), right)
+        residual = S[k:, k:] - solution.T @ right - right.T @ solution + solution.T @ S[:k, :k] @ solution
+        covariance[i] = residual / max(S[0, 0] - k, 1.0)
+        Theta[i] = solution[1:].T / of.scale
+        theta_0[i] = of.base + solution[0] - Theta[i] @ of.centre
+    return Predictors(Theta, theta_0, covariance, data.N)
+
+
+def _summed(of: Moments, taken: np.ndarray) -> Iterator[np.ndarray]:
+    """The moments (k, k) of each resample, CHUNK resamples a product."""
+    flat, shape = of.blocks.reshape(len(of.blocks), -1), of.blocks.shape[1:]
+    for first in range(0, len(taken), CHUNK):
+        yield from (taken[first : first + CHUNK] @ flat).reshape(-1, *shape)
+
+
+def _own_moments(S: np.ndarray, of: Moments, m: int, p: int, N: int) -> np.ndarray:
+    """Second moments of each input's own lags about zero, in the scaled columns, inputs apart from one
+    another; zero for all else."""
+    k = 1 + N * (m + p)
+    own = np.zeros((k, k))
+    ratio = of.centre / of.scale
+    for channel in range(m):
+        lags = np.arange(channel, N * m, m)
+        at, c = 1 + lags, ratio[lags]
+        first = np.outer(c, S[0, at])
+        own[np.ix_(at, at)] = S[np.ix_(at, at)] + first + first.T + S[0, 0] * np.outer(c, c)
+    return own
+
+
+# ---- gains
+
+
+def bands(
+    u: Segments,
+    y: Segments,
+    learning: Learning,
+    *,
+    resamples: int = 200,
+    level: float = 0.9,
+    block: int | None = None,
+    rng: np.random.Generator,
+) -> Bands:
+    """Bands of the learned gains by resampling blocks of the record, two windows long by itself.
+
+    2 K - mean +- z s of the resamples: bias-corrected, as the regression's bias shows in them once more
+    (Efron and Tibshirani 1993, 10.6), and by their deviation. Quantiles of the resamples held some gains in
+    54 % of records where 90 % were wanted, these in 82 % (benchmarks/certificates.py). Resamples that give no
+    gain are left out. Raises ValueError where fewer than half of them give one.
+    """
+    data = rows(u, y, learning.N)
+    of = moments(data, block or max(2 * learning.N, 10))
+    taken = np.vstack([np.ones((1, len(of.starts))), drawn(of, resamples, rng)])
+    learned = predictors(of, taken, data, gain_spread=learning.gain_spread)
+    here, found = _gain(data, of, taken[0], learned.window(0), learning), []
+    for k in range(1, resamples + 1):
+        try:
+            found.append(_gain(data, of, taken[k], learned.window(k), learning))
+        except (ValueError, np.linalg.LinAlgError):
+            continue
+    if 2 * len(found) < resamples:
+        raise ValueError(
+            f"bands: only {len(found)} of {resamples} resamples of the record give a gain; record longer, or "
+            "lower the window"
+        )
+    centre = 2 * here - np.mean(found, axis=0)
+    reach = scipy.stats.norm.ppf((1 + level) / 2) * np.std(found, axis=0, ddof=1)
+    return Bands(here, centre - reach, centre + reach, level, len(found))
+
+
+def gain(u: Segments, y: Segments, learning: Learning) -> np.ndarray:
+    """[K K_r] (m, N (m+p) + p) of the record itself."""
+    data = rows(u, y, learning.N)
+    of = moments(data, max(2 * learning.N, 10))
+    taken = np.ones((1, len(of.starts)))
+    learned = predictors(of, taken, data, gain_spread=learning.gain_spread)
+    return _gain(data, of, taken[0], learned.window(0), learning)
+
+
+def _gain(data: Rows, of: Moments, counts: np.ndarray, learned: Window, learning: Learning) -> np.ndarray:
+    """[K K_r] (m, N (m+p) + p) of one resample, whose window model is `learned`."""
+    Q, R = np.diag(learning.q), np.diag(learning.r)
+    if learning.route == "window":
+        model, T = observer_form(learned)
+        found = gains(model, Q, R, learning.gamma)
+        return np.hstack([found.K_x @ T, found.K_r])
+    solution = value_iteration(regress(_predicted(learned, data, of, counts)), Q, R, learning.gamma)
+    return np.hstack([solution.K, solution.K_r])
+
+
+def _predicted(learned: Window, data: Rows, of: Moments, counts: np.ndarray) -> Tuples:
+    """window.predicted_tuples of resampled rows: the state is what the window predicts of the next two
+    outputs, and the moments come from the blocks."""
+    m, p, width = data.u.shape[1], data.y.shape[1], data.w.shape[1]
+    index = np.concatenate([np.repeat(a, int(c)) for a, c in enumerate(counts)])
+    rows = (of.starts[index][:, None] + np.arange(of.block)).ravel()
+    rows = rows[rows < len(data.w)]
+    S = (counts @ of.blocks.reshape(len(counts), -1)).reshape(of.blocks.shape[1:])
+    mean = S[0, 1 : 1 + width] / S[0, 0]
+    centre = of.centre + mean * of.scale
+    second = (S[1 : 1 + width, 1 : 1 + width] / S[0, 0] - np.outer(mean, mean)) * np.outer(of.scale, of.scale)
+    model = predictor(learned)
+    free = observability_matrix(model.A, model.C, 2)
+    power, axes = np.linalg.eigh(second)
+    left, sv, _ = np.linalg.svd(free @ (axes * np.sqrt(np.maximum(power, 0.0))), full_matrices=False)
+    noise = np.sqrt(np.diag(learned.covariance).max())
+    order = int((sv > np.maximum(2 * noise, 1e-7 * sv[0])).sum())
+    if order == 0:
+        raise ValueError("the window predicts nothing beyond the noise of the sensors")
+    T = left[:, :order].T @ free / sv[:order, None]
+    A, B_u, B_y = window_shift(m, p, data.N)
+    x = (data.w @ T.T)[rows] - T @ centre
+    x_next = (data.w @ (T @ A).T + data.u @ (T @ B_u).T + data.y @ (T @ B_y).T)[rows] - T @ centre
+    one = np.ones((len(rows), 1))
+    features = np.zeros((order + 1, width + 1))
+    features[:order, :-1], features[:order, -1], features[order:, -1] = T, -T @ centre, 1.0
+    measured = data.y[rows]
+    base = measured.mean(axis=0)
+    return Tuples(
+        np.hstack([x, one]), data.u[rows], measured - base, np.hstack([x_next, one]), features, data.N, base
+    )

@@ -1,0 +1,89 @@
+/* A controller of heaters for one machine, with limits, governor, hand-over and supervisor. C99, no heap, no
+ * clock, no file. Inputs in percent, outputs in degC, in the order of machine.h.
+ *
+ *     beadline_init                    once; refuses another plant, unit or sample time
+ *     beadline_watch                   each sample in manual, at least one
+ *     beadline_hand_over               once, when the law takes over
+ *     beadline_step                    each sample from then on
+ *
+ * All that it remembers lies in a beadline_controller: to save it, copy it; beadline_restore goes on from the
+ * copy. One thread at a time may use one.
+ */
+#ifndef BEADLINE_CONTROLLER_H
+#define BEADLINE_CONTROLLER_H
+
+#include "machine.h"
+
+@law.h@
+@supervisor.h@
+/* ---- the controller */
+
+typedef struct {
+    law_state law, fallback;
+    supervisor_kept kept;
+    innovation_memory memory;
+    double r[OUTPUTS], y_star[OUTPUTS];       /* reference and target */
+    double beyond[OUTPUTS], in_reach[OUTPUTS]; /* degC beyond reach; the last reference in reach */
+    int aimed, has_reached, ready;
+} beadline_controller;
+
+/* Why a call did nothing */
+typedef enum {
+    BEADLINE_DONE,
+    BEADLINE_OTHER_PLANT,
+    BEADLINE_OTHER_SAMPLE_TIME,
+    BEADLINE_OTHER_UNIT,
+    BEADLINE_OTHER_SIGNALS,
+    BEADLINE_ONLY_REHEARSAL,
+    BEADLINE_NOT_READY,
+    BEADLINE_BAD_INPUT,
+    BEADLINE_OTHER_SAVE
+} beadline_result;
+
+/* The machine as the caller knows it */
+typedef struct {
+    const char *plant_sha256, *input_unit, *output_unit;
+    double sample_time_s;
+    int inputs, outputs;
+} beadline_machine;
+
+/* A cause of a safe mode: `signal` is the number of an input or output, -1 of the machine as a whole; `other`
+ * a kind that would show the same, -1 for none */
+typedef struct {
+    int kind, signal, other;
+    double amount, since_s;
+} beadline_cause;
+
+typedef struct {
+    double u[INPUTS]; /* percent, to apply */
+    int mode, causes;
+    beadline_cause cause[KINDS * SIGNALS];
+} beadline_decision;
+
+/* Makes c ready. `rehearsal` 1: a controller of a simulated plant may run, beside a simulation only. */
+beadline_result beadline_init(beadline_controller *c, const beadline_machine *machine, int rehearsal);
+
+/* One sample in manual: inputs u were applied, outputs y measured before, reference r */
+beadline_result beadline_watch(beadline_controller *c, const double *u, const double *y, const double *r);
+
+/* From manual to the law without a bump, at outputs y measured now */
+beadline_result beadline_hand_over(beadline_controller *c, const double *y);
+
+/* What to apply from outputs y measured at t_s of the machine's clock, NAN where a sensor gives none, under
+ * the constant reference r. `applied`: inputs that acted since the last sample, NULL where nothing reads them
+ * back. */
+beadline_result beadline_step(beadline_controller *c, const double *y, const double *r, double t_s,
+                              const double *applied, beadline_decision *decision);
+
+/* A person has mended what was wrong: every cause is forgotten */
+beadline_result beadline_acknowledge(beadline_controller *c);
+
+/* Goes on from a copy that was saved from this controller, of this certificate */
+beadline_result beadline_restore(beadline_controller *c, const beadline_controller *saved,
+                                 const char *certificate_sha256);
+
+/* A result, or a kind of cause, in one sentence */
+const char *beadline_why(beadline_result result);
+const char *beadline_reason(int kind);
+
+#endif

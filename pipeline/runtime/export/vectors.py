@@ -1,0 +1,203 @@
+"""Golden vectors: what the object does on its own model, with noise, changed references, faults and hand-overs.
+
+A script says what happens to machine and controller at each sample. `played` runs it with any object that has
+the calls of supervisor.Supervised; the C test runs the same script with the exported code. Both close the loop
+themselves: outputs fed to a law that is unstable by itself would tell rounding errors apart and nothing else.
+
+    x(t+1) = A x + B (share u + extra) + b,   y = C x + d + add, or what `reading` says
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.runtime.machine import Exported
+from pipeline.runtime.supervisor import KINDS, MODES
+from pipeline.temperature.plant import Plant, hold_output, strictly_proper
+
+# what is done at a sample: in manual; a step; before it hand over, save and restore, or acknowledge; begin anew
+WATCH, STEP, HAND_OVER, RESTORE, ACKNOWLEDGE, BEGIN = range(6)
+# readings that are none of the plant's: no number at all, and the one before once more
+LOST, REPEATED = np.inf, -np.inf
+TOLERANCE = 1e-9  # of each input's range
+
+
+class Script(NamedTuple):
+    """By sample (T,): do, t_s, told (1: the controller reads back what was applied); r, add, reading (T, p)
+    in degC, reading NaN where it is the plant's; manual, share, extra (T, m)."""
+
+    do: np.ndarray
+    t_s: np.ndarray
+    told: np.ndarray
+    r: np.ndarray
+    add: np.ndarray
+    reading: np.ndarray
+    manual: np.ndarray
+    share: np.ndarray
+    extra: np.ndarray
+
+
+class Played(NamedTuple):
+    """By sample: inputs u (T, m) asked for, mode (T,) and causes (T,), a bit for each of KINDS."""
+
+    u: np.ndarray
+    mode: np.ndarray
+    causes: np.ndarray
+
+
+class Start(NamedTuple):
+    """Where an episode begins: the model's state x (n,), the inputs u (m,) that hold it, the outputs y (p,)."""
+
+    x: np.ndarray
+    u: np.ndarray
+    y: np.ndarray
+
+
+def start(exported: Exported) -> Start:
+    """The model at rest in the middle of its outputs' limits; where none is declared, at a third of the
+    inputs' range."""
+    model, machine = strictly_proper(exported.model), exported.machine
+    low, high = (np.array([getattr(one, side) for one in machine.inputs]) for side in ("low", "high"))
+    bottom, top = (np.array([getattr(one, side) for one in machine.outputs]) for side in ("low", "high"))
+    third = low + (high - low) / 3
+    if np.isfinite(bottom).all() and np.isfinite(top).all():
+        x, u = hold_output(model, (bottom + top) / 2)
+        return Start(x, np.clip(u, low, high), model.C @ x + model.d)
+    x = np.linalg.lstsq(np.eye(model.n) - model.A, model.B @ third + model.b, rcond=None)[0]
+    return Start(x, third, model.C @ x + model.d)
+
+
+def script(exported: Exported, *, episodes: int, steps: int, rng: np.random.Generator) -> Script:
+    """Episodes of `steps` samples: 25 in manual, then the law with references that change, and in most of
+    them one fault for a while."""
+    parts = [_episode(exported, steps, rng) for _ in range(episodes)]
+    return Script(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+MANUAL = 25
+
+
+def _episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script:
+    machine, at = exported.machine, start(exported)
+    (m, p), T = (len(machine.inputs), len(machine.outputs)), machine.sample_time_s
+    low, high = (np.array([getattr(one, side) for one in machine.inputs]) for side in ("low", "high"))
+    noise = exported.supervision.noise_degC
+    do = np.full(steps, STEP)
+    do[:MANUAL], do[0], do[MANUAL] = WATCH, BEGIN, HAND_OVER
+    do[rng.integers(MANUAL + 1, steps, 2)] = RESTORE
+    reach = 150 * noise
+    r = np.repeat(at.y + rng.uniform(-1, 1, (-(-steps // 60), p)) * reach, 60, axis=0)[:steps]
+    r[:MANUAL] = at.y
+    made = Script(
+        do=do,
+        t_s=T * np.arange(steps),
+        told=np.full(steps, int(rng.integers(2))),
+        r=r,
+        add=rng.normal(0, noise, (steps, p)),
+        reading=np.full((steps, p), np.nan),
+        manual=np.clip(at.u + 0.05 * (high - low) * rng.normal(size=(steps, m)), low, high),
+        share=np.ones((steps, m)),
+        extra=np.zeros((steps, m)),
+    )
+    first = int(rng.integers(MANUAL + 20, max(steps - 40, MANUAL + 21)))
+    last = min(first + int(rng.integers(5, 80)), steps)
+    fault(made, str(rng.choice(FAULTS)), slice(first, last), exported, rng)
+    if last < steps and rng.random() < 0.5:
+        made.do[last] = ACKNOWLEDGE
+    return made
+
+
+FAULTS = ("none", "none", "lost", "frozen", "offset", "noisy", "cold", "on", "off", "weak", "late", "jump")
+
+
+def fault(made: Script, kind: str, when: slice, exported: Exported, rng: np.random.Generator) -> None:
+    """Puts a fault of one signal into a script."""
+    (m, p), noise = (made.manual.shape[1], made.r.shape[1]), exported.supervision.noise_degC
+    i, j = int(rng.integers(m)), int(rng.integers(p))
+    high, T = exported.machine.inputs[i].high, exported.machine.sample_time_s
+    if kind == "lost":
+        made.reading[when, j] = LOST
+    elif kind == "frozen":
+        made.reading[when, j] = REPEATED
+    elif kind == "offset":
+        made.add[when, j] += 60 * noise[j] * rng.choice([-1.0, 1.0])
+    elif kind == "noisy":
+        made.add[when, j] *= 12.0
+    elif kind == "cold":
+        made.reading[when, j] = -300.0
+    elif kind == "on":
+        made.share[when, i], made.extra[when, i] = 0.0, high
+    elif kind == "off":
+        made.share[when, i] = 0.0
+    elif kind == "weak":
+        made.share[when, i] = 0.5
+    elif kind == "late":
+        made.t_s[when.start :] += 2.4 * T
+    elif kind == "jump":
+        made.t_s[when.start :] += 500.0 * T
+
+
+def played(make: Any, model: Plant, at: Start, script: Script) -> Played:
+    """The script run on `model` with the object that `make()` gives."""
+    plant = strictly_proper(model)
+    T, m = script.manual.shape
+    out = Played(np.zeros((T, m)), np.zeros(T, int), np.zeros(T, int))
+    x, u, y = at.x, at.u, at.y
+    one = make()
+    for t in range(T):
+        if script.do[t] == BEGIN:
+            x, u, y, one = at.x, at.u, at.y, make()
+        applied = script.share[t] * u + script.extra[t] if t else u
+        y = _read(plant.C @ x + plant.d + script.add[t], script.reading[t], y)
+        if script.do[t] in (WATCH, BEGIN):
+            u = script.manual[t]
+            one.watch(u, y, script.r[t])
+        else:
+            one = _before(one, make, script.do[t], y)
+            told = applied if script.told[t] and script.do[t] != HAND_OVER else None
+            decision = one.step(y, script.r[t], script.t_s[t], told)
+            u = decision.u
+            out.mode[t] = MODES.index(decision.mode)
+            out.causes[t] = sum({1 << KINDS.index(cause.kind) for cause in decision.causes})
+        out.u[t] = u
+        x = plant.A @ x + plant.B @ (script.share[t] * u + script.extra[t]) + plant.b
+    return out
+
+
+def _read(measured: np.ndarray, reading: np.ndarray, before: np.ndarray) -> np.ndarray:
+    y = np.where(np.isnan(reading), measured, reading)
+    return np.where(reading == LOST, np.nan, np.where(reading == REPEATED, before, y))
+
+
+def _before(one: Any, make: Any, do: int, y: np.ndarray) -> Any:
+    """What is done before the step."""
+    if do == HAND_OVER:
+        one.hand_over(y)
+    elif do == ACKNOWLEDGE:
+        one.acknowledge()
+    elif do == RESTORE:
+        saved, one = one.saved(), make()
+        one.restore(saved)
+    return one
+
+
+def as_csv(exported: Exported, at: Start, script: Script, done: Played) -> str:
+    """golden.csv: the start in its first line, then a line a sample, numbers as they read back bit by bit."""
+    lines = [",".join(map(repr, np.r_[at.x, at.u, at.y].tolist()))]
+    columns = [script.do, script.told, done.mode, done.causes]
+    for t in range(len(script.do)):
+        whole = [str(int(column[t])) for column in columns]
+        parts = (script.r, script.add, script.reading, script.manual, script.share, script.extra, done.u)
+        numbers = np.concatenate([[script.t_s[t]], *(part[t] for part in parts)])
+        lines.append(",".join(whole + list(map(repr, numbers.tolist()))))
+    return "\n".join(lines) + "\n"
+
+
+def golden(exported: Exported, *, episodes: int = 6, steps: int = 160, seed: int = 1) -> str:
+    """golden.csv of a controller: what its object does."""
+    from pipeline.runtime.supervisor import Supervised
+
+    asked = script(exported, episodes=episodes, steps=steps, rng=np.random.default_rng(seed))
+    at = start(exported)
+    done = played(lambda: Supervised(exported, rehearsal=True), exported.model, at, asked)
+    return as_csv(exported, at, asked, done)
