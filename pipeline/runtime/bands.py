@@ -1,4 +1,5 @@
-"""What a record leaves open: predictors and gains learned again from resampled blocks of its samples.
+"""What a record leaves open: window models and gains learned again from resampled blocks of its samples, and
+what a controller does on those plants.
 
 The regression of a window model (temperature/window.py) needs second moments only. Those of a block of
 consecutive samples are summed once; a resample (Kuensch 1989) is then a sum of blocks and one solve, and each
@@ -6,20 +7,23 @@ is a plant that the record does not contradict. Blocks keep what is not white: d
 has.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy.linalg
 import scipy.stats
 
+from pipeline.temperature.controller import Deployed, aim, batch_step, constant, handed_over, rest, watched
 from pipeline.temperature.kernel import Tuples, regress, value_iteration, window_shift, windows
-from pipeline.temperature.plant import observability_matrix
+from pipeline.temperature.panel import padded
+from pipeline.temperature.plant import Plant, hold_output, observability_matrix
 from pipeline.temperature.tracking import gains
 from pipeline.temperature.window import Window, observer_form, predictor
 
 Segments = Sequence[np.ndarray]
 LEAST_BLOCKS = 20  # fewer blocks than this say little of how far a resample may lie
+DIVERGED = 1e6  # °C
 CHUNK = 50  # resamples whose moments are held at once
 
 
@@ -241,3 +245,135 @@ def _predicted(learned: Window, data: Rows, of: Moments, counts: np.ndarray) -> 
     return Tuples(
         np.hstack([x, one]), data.u[rows], measured - base, np.hstack([x_next, one]), features, data.N, base
     )
+
+
+# ---- the controller on what the record leaves open
+
+
+class Asked(NamedTuple):
+    """From rest at `start` (p,) °C the references (g, p) °C, `steps` each; an error is settled as the mean of
+    the last `settled` steps."""
+
+    references: np.ndarray
+    start: np.ndarray
+    steps: int
+    settled: int
+
+
+class Met(NamedTuple):
+    """Of s plants: settled error (s,) in °C, the largest over references and outputs, DIVERGED where it does
+    not stay finite; lowest and highest outputs (s, p) in °C."""
+
+    settled_error: np.ndarray
+    lowest: np.ndarray
+    highest: np.ndarray
+
+
+class _Plants(NamedTuple):
+    """s plants: state x (s, n) and inputs u (s, m) at rest, outputs of a state, the state after inputs and
+    measured outputs, and a draw of the sensors' noise (s, p)."""
+
+    x: np.ndarray
+    u: np.ndarray
+    outputs: Callable[[np.ndarray], np.ndarray]
+    after: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+    noise: Callable[[], np.ndarray]
+
+
+def met(
+    controller: Deployed, model: Plant, sampled: Predictors, asked: Asked, rng: np.random.Generator
+) -> Met:
+    """Window models under the controller as deployed, all at once, with innovations of their own covariance.
+
+    In observer form (window.observer_form) x_i(t+1) = x_{i+1} + A_i y + B_i u, and what is measured drives
+    it. Each starts at rest by the input of least norm that holds it there, as near as limits allow.
+    """
+    s, p, width = sampled.Theta.shape
+    N = sampled.N
+    m = width // N - p
+    of_u, of_y = (
+        part.reshape(s, p, N, -1).transpose(0, 2, 1, 3)
+        for part in (sampled.Theta[:, :, : N * m], sampled.Theta[:, :, N * m :])
+    )
+    needed = asked.start - of_y.sum(axis=1) @ asked.start - sampled.theta_0
+    u = np.matmul(np.linalg.pinv(of_u.sum(axis=1)), needed[:, :, None])[:, :, 0]
+    u = np.clip(u, controller.limits.low, controller.limits.high)
+    drive = of_y @ asked.start + np.einsum("sipm,sm->sip", of_u, u)
+    x = drive[:, ::-1].cumsum(axis=1)[:, ::-1].reshape(s, -1)
+    F, G = of_y.reshape(s, N * p, p), of_u.reshape(s, N * p, m)
+    values, axes = np.linalg.eigh(sampled.covariance)
+    root = (axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]).transpose(0, 2, 1)
+
+    def after(x: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+        moved = np.matmul(F, y[:, :, None])[:, :, 0] + np.matmul(G, u[:, :, None])[:, :, 0]
+        moved[:, :-p] += x[:, p:]
+        return moved
+
+    plants = _Plants(
+        x,
+        u,
+        lambda x: x[:, :p] + sampled.theta_0,
+        after,
+        lambda: np.matmul(rng.standard_normal((s, 1, p)), root)[:, 0],
+    )
+    return _run(controller, model, plants, asked)
+
+
+def met_spread(
+    controller: Deployed,
+    model: Plant,
+    spread: Sequence[Plant],
+    asked: Asked,
+    noise: np.ndarray,
+    rng: np.random.Generator,
+) -> Met:
+    """The same for plants of a spread, sensors with white noise (p,) °C."""
+    held = [hold_output(plant, asked.start) for plant in spread]
+    plants = padded(spread)
+    A, B, C, b, d = (np.stack([getattr(plant, name) for plant in plants]) for name in "ABCbd")
+    x = np.stack([np.pad(one[0], (0, A.shape[1] - len(one[0]))) for one in held])
+    u = np.clip(np.stack([one[1] for one in held]), controller.limits.low, controller.limits.high)
+
+    def after(x: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.matmul(A, x[:, :, None])[:, :, 0] + np.matmul(B, u[:, :, None])[:, :, 0] + b
+
+    return _run(
+        controller,
+        model,
+        _Plants(
+            x,
+            u,
+            lambda x: np.matmul(C, x[:, :, None])[:, :, 0] + d,
+            after,
+            lambda: noise * rng.standard_normal(d.shape),
+        ),
+        asked,
+    )
+
+
+def _run(controller: Deployed, model: Plant, plants: _Plants, asked: Asked) -> Met:
+    law, limits = controller.law, controller.limits
+    at = [constant(r) for r in (asked.start, *asked.references)]
+    here, *aims = [aim(law, rest(model, one, limits), one) for one in at]
+    x, u, s = plants.x, plants.u, len(plants.x)
+    y = plants.outputs(x)
+    state = watched(controller, None, u, y + plants.noise(), np.tile(asked.references[0], (s, 1)))
+    state = handed_over(controller, state, y, [here] * s)
+    settled, lowest, highest = np.zeros(s), y, y
+    for r, one in zip(asked.references, aims, strict=True):
+        feed, target = np.tile(one.feed[:, 0], (s, 1)), np.tile(one.Y[:, 0], (s, 1))
+        wanted, late = np.tile(r, (s, 1)), np.zeros_like(y)
+        for t in range(asked.steps):
+            y = plants.outputs(x)
+            measured = y + plants.noise()
+            u, _, state = batch_step(controller, state, measured, wanted, feed, target)
+            x = plants.after(x, u, measured)
+            if not np.abs(x).max() < DIVERGED:
+                x = np.clip(np.nan_to_num(x), -DIVERGED, DIVERGED)
+                state = state._replace(z=np.clip(np.nan_to_num(state.z), -DIVERGED, DIVERGED))
+            lowest, highest = np.minimum(lowest, y), np.maximum(highest, y)
+            if t >= asked.steps - asked.settled:
+                late += (y - r) / asked.settled
+        off = np.abs(late).max(axis=1)
+        settled = np.maximum(settled, np.where(np.abs(y).max(axis=1) > DIVERGED / 10, DIVERGED, off))
+    return Met(settled, lowest, highest)

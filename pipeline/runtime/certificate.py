@@ -20,17 +20,9 @@ import numpy as np
 from pipeline.runtime import bands
 from pipeline.runtime.machine import Exported, Signal, controller_sha256
 from pipeline.temperature import scorecard
-from pipeline.temperature.controller import (
-    Aim,
-    Deployed,
-    aim,
-    batch_step,
-    constant,
-    handed_over,
-    rest,
-    watched,
-)
-from pipeline.temperature.plant import Plant, hold_output, strictly_proper
+from pipeline.temperature.controller import Deployed
+from pipeline.temperature.plant import Plant, strictly_proper
+from pipeline.temperature.tracking import robust_observer_gain
 from pipeline.temperature.validation import one_step_errors, predicted_ahead
 from pipeline.temperature.window import learn, observer_form, predictor
 
@@ -38,10 +30,8 @@ VERSION, LOOP = 1, "temperature"
 Segments = Sequence[np.ndarray]
 POLES_SHOWN = 12  # of each plant, the largest
 LAGS = 5  # of errors and inputs from which a coloured error could have been foretold
-DIVERGED = 1e6  # °C
 # share of the largest command that is allowed: a record that never leaves it is in another unit (0..1)
 SCALE = 0.015
-ROUNDING = 1e-6
 
 
 class Record(NamedTuple):
@@ -68,7 +58,8 @@ class Rules(NamedTuple):
     Margins hold on nine of ten plants of family and record. `samples` are those for each unknown of a
     window model. `moves` is the least share of an input's range that it moves by itself. Of the newest
     record's movement over `ahead` steps the model may miss `unexplained` beyond what the record's own window
-    model misses, and of errors of one step `coloured_degC` may be foretold by errors and inputs before.
+    model misses, and of errors of one step no more than the settled error allowed may be foretold by errors
+    and inputs before. On the window model of the newest record alone twice that error is allowed.
     `noise`: the deviation of a settled mean as a share of the settled error allowed. A cold machine is as
     warm as its room, `room_degC`; where no cold reading is given, the record's window models must not
     contradict `extrapolated_degC` at rest without inputs, wider by what a line from hot to cold misses.
@@ -81,7 +72,7 @@ class Rules(NamedTuple):
     settled: int = 50
     settled_error_degC: float = 0.5
     crossing_degC: float = 1.0
-    failing: float = 0.01
+    failing: float = 0.05
     disk_margin: float = 0.2
     delay_margin_s: float = 0.0
     plants: int = 1000
@@ -91,9 +82,8 @@ class Rules(NamedTuple):
     samples: float = 5.0
     moves: float = 0.002
     ahead: int = 20
-    unexplained: float = 0.35
-    coloured_degC: float = 0.25
-    noise: float = 1.0
+    unexplained: float = 0.5
+    noise: float = 0.3
     room_degC: tuple[float, float] = (5.0, 45.0)
     extrapolated_degC: tuple[float, float] = (-50.0, 110.0)
     reach: float = 0.5
@@ -265,6 +255,7 @@ RULES = (
     "room",
     "unexplained",
     "coloured",
+    "newest",
     "poles",
     "disk_margin",
     "delay_margin",
@@ -559,9 +550,13 @@ def _extrapolated(sampled: bands.Predictors, p: int) -> tuple[np.ndarray, np.nda
 
 def _of_newest(exported: Exported, record: Record, N: int, rules: Rules) -> list[RuleResult]:
     """The newest record against the model, beside what a window model of its own makes of it."""
-    outputs, model = [one.name for one in exported.machine.outputs], strictly_proper(exported.model)
+    outputs, model = [one.name for one in exported.machine.outputs], _following(exported.model)
     u, y = record.newest_u, record.newest_y
-    missed = _unexplained(model, u, y, min(N, _longest(u, y, rules)), rules.ahead)
+    own = _own_model(u, y, min(N, _longest(u, y, rules)), rules.ahead)
+    if own is None:
+        bad = f"The newest record has {sum(map(len, u))} samples, too few to hold the model against it."
+        return [_result("unexplained", False, None, rules.unexplained, "", "", bad)]
+    missed = _unexplained(model, own, u, y, rules.ahead)
     worst = int(missed.argmax())
     foretold = _foretold(model, u, y)
     colour = int(foretold.argmax())
@@ -578,42 +573,69 @@ def _of_newest(exported: Exported, record: Record, N: int, rules: Rules) -> list
         _at_most(
             "coloured",
             float(foretold[colour]),
-            rules.coloured_degC,
+            rules.settled_error_degC,
             "degC",
             f"Of errors of one step {foretold[colour]:.2g} °C at most could have been foretold.",
             f"Of the errors of one step of {outputs[colour]} {foretold[colour]:.2g} °C could have been foretold: "
             "the model misses what the newest record shows.",
         ),
+        _on_newest(exported, own, rules),
     ]
 
 
-def _unexplained(model: Plant, u: Segments, y: Segments, N: int, ahead: int) -> np.ndarray:
-    """Share (p,) of the outputs' movement over `ahead` steps that the model misses beyond what a window model
-    of the same segments misses; inf where there is too little to say."""
-    p = y[0].shape[1]
-    usable = [k for k, a in enumerate(u) if len(a) > 4 * ahead]
-    if N < 1 or not usable:
-        return np.full(p, np.inf)
-    us, ys = [u[k] for k in usable], [y[k] for k in usable]
-    data = bands.rows(us, ys, N)
+def _on_newest(exported: Exported, own: bands.Predictors, rules: Rules) -> RuleResult:
+    """The controller on the window model of the newest record alone, without noise."""
+    quiet = own._replace(covariance=np.zeros_like(own.covariance))
+    met = bands.met(exported.controller, exported.model, quiet, _asked(rules), np.random.default_rng(0))
+    found = float(met.settled_error[0])
+    return _at_most(
+        "newest",
+        found,
+        2 * rules.settled_error_degC,
+        "degC",
+        f"On what the newest record alone shows it settles within {found:.2g} °C.",
+        f"On what the newest record alone shows it does not settle: {found:.3g} °C remain.",
+    )
+
+
+def _following(model: Plant) -> Plant:
+    """The model with a gain that follows its outputs: its own, or one that is stable where its own is not."""
+    model = strictly_proper(model)
+    if np.abs(np.linalg.eigvals(model.A - model.K @ model.C)).max() < 1:
+        return model
+    return model._replace(K=robust_observer_gain(model, 1.0))
+
+
+def _own_model(u: Segments, y: Segments, N: int, ahead: int) -> bands.Predictors | None:
+    """The window model of these segments alone; None where they are too short."""
+    if N < 1 or not any(len(a) > 4 * ahead for a in u):
+        return None
+    data = bands.rows(u, y, N)
     of = bands.moments(data, len(data.w))
-    own = predictor(bands.predictors(of, np.ones((1, len(of.starts))), data).window(0), model.sample_time_s)
-    squares = np.zeros((3, p))
-    count = 0
-    for a, b in zip(us, ys, strict=True):
-        first = 2 * ahead
-        errors = [b - _bounded(predicted_ahead(plant, a, b, ahead)) for plant in (model, own)]
+    return bands.predictors(of, np.ones((1, len(of.starts))), data)
+
+
+def _unexplained(model: Plant, own: bands.Predictors, u: Segments, y: Segments, ahead: int) -> np.ndarray:
+    """Share (p,) of the outputs' movement over `ahead` steps that the model misses beyond what a window model
+    of the same segments misses."""
+    of_own = predictor(own.window(0), model.sample_time_s)
+    squares, first = np.zeros((3, y[0].shape[1])), 2 * ahead
+    count, N = 0, own.N
+    for a, b in zip(u, y, strict=True):
+        if len(a) <= 4 * ahead:
+            continue
+        errors = [b - _bounded(predicted_ahead(plant, a, b, ahead)) for plant in (model, of_own)]
         moved = b[ahead:] - b[:-ahead]
         for k, part in enumerate((errors[0][first:], errors[1][first:], moved[first - ahead :])):
             squares[k] += (part**2).sum(axis=0)
         count += len(b) - first
     by_model, by_own, moved = squares / count
-    by_own = by_own * (1 + 2 * data.w.shape[1] / len(data.w))  # it was fitted to these
+    by_own = by_own * (1 + 2 * N * (model.m + model.p) / count)  # it was fitted to these
     return np.sqrt(np.maximum(by_model - by_own, 0.0) / np.maximum(moved, np.finfo(float).tiny))
 
 
 def _bounded(predicted: np.ndarray) -> np.ndarray:
-    return np.clip(np.nan_to_num(predicted, nan=DIVERGED), -DIVERGED, DIVERGED)
+    return np.clip(np.nan_to_num(predicted, nan=bands.DIVERGED), -bands.DIVERGED, bands.DIVERGED)
 
 
 def _foretold(model: Plant, u: Segments, y: Segments) -> np.ndarray:
@@ -645,9 +667,7 @@ def _of_loop(
     plants += [("record", observer_form(sampled.window(k), at)[0]) for k in some]
     poles = tuple(_poles(of, plant, exported.controller) for of, plant in plants)
     margins = _margins([plant for _, plant in plants], exported.controller)
-    worst, crossing, settled = _worst(
-        exported, [plant for of, plant in plants if of == "spread"], sampled, rules, rng
-    )
+    worst, crossing = _worst(exported, [plant for of, plant in plants if of == "spread"], sampled, rules, rng)
     violations = tuple(
         Violation(signal.name, float(crossing[:, o].max()), int((crossing[:, o] > rules.crossing_degC).sum()))
         for o, signal in enumerate(exported.machine.outputs)
@@ -665,7 +685,7 @@ def _of_loop(
             f"A tenth of the plants has a disk margin below {margins.disk[1]:.2g}.",
         ),
         _of_delay(margins, rules),
-        *_of_worst(worst, crossing, settled, rules),
+        *_of_worst(worst, crossing, rules),
     ]
 
 
@@ -713,7 +733,7 @@ def _of_delay(margins: MarginsFound, rules: Rules) -> RuleResult:
     )
 
 
-def _of_worst(worst: Worst, crossing: np.ndarray, settled: np.ndarray, rules: Rules) -> list[RuleResult]:
+def _of_worst(worst: Worst, crossing: np.ndarray, rules: Rules) -> list[RuleResult]:
     allowed = rules.failing * worst.plants
     crossed = int((crossing > rules.crossing_degC).any(axis=1).sum())
     return [
@@ -739,153 +759,36 @@ def _of_worst(worst: Worst, crossing: np.ndarray, settled: np.ndarray, rules: Ru
     ]
 
 
-class _Loops(NamedTuple):
-    """s plants in one form: x(t+1) = shift(x) + F y + G u + b, ŷ = x[:p] + d of window models, where y is
-    measured; F (s, N p, p), G (s, N p, m), d (s, p)."""
-
-    F: np.ndarray
-    G: np.ndarray
-    b: np.ndarray
-    d: np.ndarray
-    root: np.ndarray
-
-
-def _loops(sampled: bands.Predictors) -> _Loops:
-    s, p, width = sampled.Theta.shape
-    N = sampled.N
-    m = width // N - p
-    G = sampled.Theta[:, :, : N * m].reshape(s, p, N, m).transpose(0, 2, 1, 3).reshape(s, N * p, m)
-    F = sampled.Theta[:, :, N * m :].reshape(s, p, N, p).transpose(0, 2, 1, 3).reshape(s, N * p, p)
-    ridge = 1e-12 * np.eye(p)
-    root = np.linalg.cholesky(sampled.covariance + ridge).transpose(0, 2, 1)
-    return _Loops(F, G, np.zeros((s, N * p)), sampled.theta_0, root)
-
-
 def _worst(
     exported: Exported,
     spread: Sequence[Plant],
     sampled: bands.Predictors,
     rules: Rules,
     rng: np.random.Generator,
-) -> tuple[Worst, np.ndarray, np.ndarray]:
-    """The sampled plants and the spread under the controller as deployed: the summary, by how many °C each
-    crosses limits (s, p), and settled errors (s,)."""
+) -> tuple[Worst, np.ndarray]:
+    """The sampled plants and the spread under the controller as deployed, and by how many °C each crosses
+    limits (s, p)."""
     low, high = np.array([(one.low, one.high) for one in exported.machine.outputs]).T
-    noise = np.sqrt(np.median(np.einsum("sii->si", sampled.covariance), axis=0))
-    parts = [_sampled_runs(exported, sampled, rules, rng)]
+    asked = _asked(rules)
+    parts = [bands.met(exported.controller, exported.model, sampled, asked, rng)]
     if spread:
-        parts.append(_spread_runs(exported, spread, noise, rules, rng))
-    settled = np.concatenate([part[0] for part in parts])
-    peak = np.concatenate([part[1] for part in parts], axis=1)
-    crossing = np.maximum(np.maximum(low - peak[0], peak[1] - high), 0.0)
-    diverged = int((settled >= DIVERGED).sum())
-    failing = int((settled > rules.settled_error_degC).sum())
-    figures = [float(np.quantile(settled, share, method="higher")) for share in (0.5, 0.99, 1.0)]
-    return (Worst(len(settled), (figures[0], figures[1], figures[2]), failing, diverged), crossing, settled)
-
-
-class _Schedule(NamedTuple):
-    """Where it starts, by which input, and what is aimed at."""
-
-    u0: np.ndarray
-    here: Aim
-    aims: list[Aim]
-
-
-def _schedule(exported: Exported, rules: Rules) -> _Schedule:
-    law, limits = exported.controller.law, exported.controller.limits
-    start = rest(exported.model, constant(rules.start), limits)
-    aims = [
-        aim(law, rest(exported.model, constant(r), limits), constant(r)) for r in np.asarray(rules.references)
-    ]
-    return _Schedule(start.U[:, 0], aim(law, start, constant(rules.start)), aims)
-
-
-def _sampled_runs(
-    exported: Exported, sampled: bands.Predictors, rules: Rules, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    loops, plan = _loops(sampled), _schedule(exported, rules)
-    s, p = loops.d.shape
-    m = loops.G.shape[2]
-    u, y = np.tile(plan.u0, (s, 1)), np.tile(rules.start, (s, 1))
-    # every lag of the memory holds the start
-    drive = (loops.F @ y[:, :, None] + loops.G @ u[:, :, None])[:, :, 0].reshape(s, -1, p)
-    x = drive[:, ::-1].cumsum(axis=1)[:, ::-1].reshape(s, -1)
-
-    def outputs(x: np.ndarray) -> np.ndarray:
-        return x[:, :p] + loops.d
-
-    def after(x: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
-        moved = np.matmul(loops.F, y[:, :, None])[:, :, 0] + np.matmul(loops.G, u[:, :, None])[:, :, 0]
-        moved[:, :-p] += x[:, p:]
-        return moved
-
-    def noise() -> np.ndarray:
-        return np.matmul(rng.standard_normal((s, 1, p)), loops.root)[:, 0]
-
-    return _run(exported.controller, (x, u, outputs, after, noise), plan, rules)
-
-
-def _spread_runs(
-    exported: Exported, spread: Sequence[Plant], deviation: np.ndarray, rules: Rules, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    plan, limits = _schedule(exported, rules), exported.controller.limits
-    held = [hold_output(plant, np.asarray(rules.start, float)) for plant in spread]
-    most = max(plant.n for plant in spread)
-    A, B, C = (
-        np.zeros((len(spread), *shape)) for shape in ((most, most), (most, spread[0].m), (spread[0].p, most))
+        noise = np.sqrt(np.median(np.einsum("sii->si", sampled.covariance), axis=0))
+        parts.append(bands.met_spread(exported.controller, exported.model, spread, asked, noise, rng))
+    settled = np.concatenate([part.settled_error for part in parts])
+    lowest, highest = (
+        np.concatenate([getattr(part, side) for part in parts]) for side in ("lowest", "highest")
     )
-    x, b = np.zeros((len(spread), most)), np.zeros((len(spread), most))
-    for k, plant in enumerate(spread):
-        n = plant.n
-        A[k, :n, :n], B[k, :n], C[k, :, :n], b[k, :n], x[k, :n] = (
-            plant.A,
-            plant.B,
-            plant.C,
-            plant.b,
-            held[k][0],
-        )
-    d = np.stack([plant.d for plant in spread])
-    u = np.clip(np.stack([one[1] for one in held]), limits.low, limits.high)
-
-    def outputs(x: np.ndarray) -> np.ndarray:
-        return np.matmul(C, x[:, :, None])[:, :, 0] + d
-
-    def after(x: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return np.matmul(A, x[:, :, None])[:, :, 0] + np.matmul(B, u[:, :, None])[:, :, 0] + b
-
-    def noise() -> np.ndarray:
-        return deviation * rng.standard_normal((len(spread), spread[0].p))
-
-    return _run(exported.controller, (x, u, outputs, after, noise), plan, rules)
+    crossing = np.maximum(np.maximum(low - lowest, highest - high), 0.0)
+    figures = [float(np.quantile(settled, share, method="higher")) for share in (0.5, 0.99, 1.0)]
+    failing = int((settled > rules.settled_error_degC).sum())
+    diverged = int((settled >= bands.DIVERGED).sum())
+    return Worst(len(settled), (figures[0], figures[1], figures[2]), failing, diverged), crossing
 
 
-def _run(controller: Deployed, plants: tuple, plan: _Schedule, rules: Rules) -> tuple[np.ndarray, np.ndarray]:
-    """Settled error (s,) in °C, the largest over references and outputs, and the lowest and highest output
-    (2, s, p)."""
-    x, u, outputs, after, noise = plants
-    references, s = np.asarray(rules.references, float), len(x)
-    y = outputs(x)
-    state = watched(controller, None, u, y + noise(), np.tile(references[0], (s, 1)))
-    state = handed_over(controller, state, y, [plan.here] * s)
-    settled, peak = np.zeros(s), np.stack([y, y])
-    for r, one in zip(references, plan.aims, strict=True):
-        feed, target = np.tile(one.feed[:, 0], (s, 1)), np.tile(one.Y[:, 0], (s, 1))
-        wanted, late = np.tile(r, (s, 1)), np.zeros_like(y)
-        for t in range(rules.steps):
-            y = outputs(x)
-            measured = y + noise()
-            u, _, state = batch_step(controller, state, measured, wanted, feed, target)
-            x = after(x, u, measured)
-            if not np.abs(x).max() < DIVERGED:
-                x = np.clip(np.nan_to_num(x), -DIVERGED, DIVERGED)
-                state = state._replace(z=np.clip(np.nan_to_num(state.z), -DIVERGED, DIVERGED))
-            peak = np.stack([np.minimum(peak[0], y), np.maximum(peak[1], y)])
-            if t >= rules.steps - rules.settled:
-                late += (y - r) / rules.settled
-        off = np.abs(late).max(axis=1)
-        settled = np.maximum(settled, np.where(np.abs(y).max(axis=1) > DIVERGED / 10, DIVERGED, off))
-    return settled, peak
+def _asked(rules: Rules) -> bands.Asked:
+    return bands.Asked(
+        np.asarray(rules.references, float), np.asarray(rules.start, float), rules.steps, rules.settled
+    )
 
 
 def _gain_bands(
