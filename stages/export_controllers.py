@@ -50,10 +50,8 @@ def main() -> None:
             played = artifacts.read_table("datasets/evaluate_temperature/trajectories.parquet", shown)
             difference = export.replayed(one, judged, played)
             export.check_same(one, difference)
-            asked = export.asked(
-                judged, evaluate_temperature.resolved(rules, panel, rehearsal), tuning, settings
-            )
-            certificate = export.certified(one, judged, asked, record, settings.seed)
+            resolved = evaluate_temperature.resolved(rules, panel, rehearsal)
+            certificate = export.certified(one, judged, resolved, settings, record)
             temperature = export.write_temperature(
                 out / "temperature", one, certificate, {"judged": difference}
             )

@@ -19,7 +19,7 @@ from pipeline.temperature.identification import gapless
 from pipeline.temperature.workflow import cases, evaluate_temperature, record
 from pipeline.temperature.workflow.contestants import BY_NAME, Problem
 from pipeline.temperature.workflow.learned import Learned
-from pipeline.temperature.workflow.settings import Plant, TemperatureRules, TuneWeights
+from pipeline.temperature.workflow.settings import Plant, TemperatureRules
 
 FALLBACK = "pi_simc"  # the safe mode "pi"; where the machine allows none, inputs are held
 NEWEST = 0.25  # of a single recording, its end, stands for the machine as it is now
@@ -113,28 +113,38 @@ def evidence(path: str, declared: Plant) -> certificate.Record:
 
 
 def asked(
-    judged: Judged, rules: TemperatureRules, tuning: TuneWeights, settings: ExportControllers
+    judged: Judged, rules: TemperatureRules, settings: ExportControllers, seen: certificate.Record
 ) -> certificate.Rules:
-    """What the certificate asks: the constant references of the judging half from the middle start, and the
-    limits of the verdict; margins are the least ones that tuning keeps."""
+    """What the certificate asks: those of the judging half's constant references that the record reaches,
+    from where the record is coolest, within the settled error of the verdict. What lies further off was
+    rehearsed only. Where the record reaches none, all are asked, and refused."""
     judging, setting = judged.setting.rehearsal.judging, judged.setting
     constants = sorted({int(judging.asked[row, 0]) for row in np.flatnonzero(judging.kind == "constant")})
+    every = np.array([judging.references[index].H[:, 0] for index in constants])
+    y = np.concatenate([*seen.y, *seen.newest_y])
+    low, high = y.min(axis=0), y.max(axis=0)
+    near = (every >= low - REACH * (high - low)) & (every <= high + REACH * (high - low))
     return certificate.Rules(
-        references=np.array([judging.references[index].H[:, 0] for index in constants]),
-        start=judging.starts[len(judging.starts) // 2],
+        references=every[near.all(axis=1)] if near.all(axis=1).any() else every,
+        start=np.quantile(y, COOLEST, axis=0),
         steps=judging.steps // 2,
         settled=min(setting.settled, judging.steps // 4),
         settled_error_degC=rules.settled_error_degC,
-        disk_margin=tuning.least_disk_margin,
-        delay_margin_s=setting.faster * tuning.least_delay_margin_s,
         plants=settings.plants,
         resamples=settings.resamples,
     )
 
 
-def certified(made: Exported, judged: Judged, rules: certificate.Rules, path: str, seed: int) -> Certificate:
-    rng = np.random.default_rng(seed)
-    return certificate.certify(made, judged.learned.spread, evidence(path, judged.machine), rules, rng)
+REACH = 0.25  # of the recorded span, beyond which no reference is certified
+COOLEST = 0.05  # quantile of the recorded temperatures
+
+
+def certified(
+    made: Exported, judged: Judged, rules: TemperatureRules, settings: ExportControllers, path: str
+) -> Certificate:
+    """The certificate on the record at `path`."""
+    seen, rng = evidence(path, judged.machine), np.random.default_rng(settings.seed)
+    return certificate.certify(made, judged.learned.spread, seen, asked(judged, rules, settings, seen), rng)
 
 
 # ---- what runs is what was judged
