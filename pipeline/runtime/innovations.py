@@ -37,6 +37,10 @@ STIRRED = 3.0  # and more where the spread leaves all open: what a plant of it d
 ODD = 3.0  # deviations, or sum of them, from which the bank is followed
 MOST_LATE, EARLY = 12, 5  # samples: the longest dead time that the bank starts before, and an earlier start
 RING = MOST_LATE + EARLY + 10  # samples kept, so that the bank can start before the first odd one
+MOVING, COINCIDENCE = (
+    50.0,
+    6.0,
+)  # what a sensor's lag would show, from which its zone moves; -2 log of the prior
 CATCH_UP = 3  # rows of the ring that the bank takes in a step
 
 
@@ -55,6 +59,7 @@ class Watch(NamedTuple):
     b: np.ndarray
     d: np.ndarray
     L: np.ndarray
+    hurried: np.ndarray
     F: np.ndarray
     loss: np.ndarray
     warm: np.ndarray
@@ -110,6 +115,7 @@ def watch(
         b=np.r_[model.b, np.zeros(p)],
         d=model.d,
         L=L,
+        hurried=np.vstack([np.zeros((n, p)), HURRIED * np.eye(p)]) - np.vstack([np.zeros((n, p)), L[n:]]),
         F=A - L @ C,
         loss=-heat @ C,
         warm=heat @ model.d,
@@ -127,6 +133,7 @@ def watch(
     )
 
 
+HURRIED = 0.1  # of an innovation, by which the drift follows in manual
 LEAK = 0.9999  # of the drift, kept a step
 
 # ---- the hypotheses
@@ -359,6 +366,7 @@ def _taken(watch: Watch, bank: Bank, memory: Memory) -> None:
     past = memory.ring[row]
     u = (1 - late) * past[:m] + late * past[m : 2 * m]
     z, sd, moved = past[2 * m :].reshape(3, p)
+    moved = (1 - late) * moved + late * memory.ring[row - 1, 2 * m + 2 * p :]
     # how far each input is off, as a share of each hypothesis' amplitude
     off = np.zeros((m, len(form)))
     inputs = np.flatnonzero(form <= LESS)
@@ -406,5 +414,9 @@ def judged(bank: Bank, memory: Memory) -> Verdict:
     left = np.maximum((memory.own - 2 * a * memory.cross + a * a * memory.square) / n, 0.0)
     own = memory.own / n
     cost = n * np.log(np.maximum(left, 1.0)).sum(axis=1)
+    # an offset seldom begins just where its zone moves; a slow sensor is seen nowhere else
+    lagging = (bank.form == LAG) & (memory.square.sum(axis=1) > MOVING)
+    offset = (bank.form == STEP) | (bank.form == RAMP)
+    cost[offset & np.isin(bank.signal, bank.signal[lagging])] += COINCIDENCE
     none = n * float(np.log(np.maximum(own, 1.0)).sum())
     return Verdict(cost, amplitude, none, left[int(cost.argmin())], own)

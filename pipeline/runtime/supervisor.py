@@ -334,8 +334,12 @@ def acted(s: Supervision, k: Kept, applied: np.ndarray | None) -> np.ndarray:
 def read(s: Supervision, k: Kept, y: np.ndarray) -> None:
     """Readings that are none, out of range, or the same for too long."""
     moves = np.abs(y - k.y)
-    # one comparison for all: a reading that is none compares as false
-    if min((y - s.low).tolist()) >= 0 <= min((s.high - y).tolist()) and min(moves.tolist()) > 1e-9:
+    # one comparison for all, where every reading is one
+    if (
+        math.isfinite(sum(y.tolist()))
+        and min((y - s.low).tolist()) >= 0 <= min((s.high - y).tolist())
+        and min(moves.tolist()) > 1e-9
+    ):
         k.quantum[:] = np.minimum(k.quantum, moves)
         k.repeats[:] = 0
         k.y[:] = y
@@ -523,8 +527,9 @@ def followed(
     applied,
     samples: int,
 ) -> np.ndarray:
-    """One sample of outputs y (p,), of which targets were y_star, inputs `applied` since the one before;
-    y (p,) with what is not trusted as forecast."""
+    """One sample of outputs y (p,), of which targets were y_star, inputs `applied` since the one before, none
+    of `samples` in manual; y (p,) with what is not trusted as forecast."""
+    manual, samples = samples == 0, max(samples, 1)
     watch, first = s.watch, k.counters[SAMPLES] == 0
     u = acted(s, k, applied)
     read(s, k, y)
@@ -534,7 +539,11 @@ def followed(
         memory.u[:] = u
     else:
         for step in range(samples):
-            moved = innovations.advanced(watch, memory, u, k.e if step == 0 else 0.0 * k.e)
+            e = k.e if step == 0 else 0.0 * k.e
+            moved = innovations.advanced(watch, memory, u, e)
+            if manual:
+                memory.Z[:, 0] += watch.hurried @ e
+                memory.Z[:, 1:] = 0.0
     distrusted(s, k, y)
     now = innovations.seen(watch, memory, y, k.trusted)
     noted(k, now.z)
@@ -542,7 +551,10 @@ def followed(
     innovations.suspected(watch, s.bank, memory, now, alarmed=bool(k.counters[ALARMED] >= 0))
     k.expected[:], k.e[:] = now.expected, now.e
     filled = np.where(k.trusted > 0, y, now.expected) if k.counters[ACTIVE] else y
-    alarmed(s, k, memory, now.highest)
+    if manual:
+        innovations.rested(memory)
+    else:
+        alarmed(s, k, memory, now.highest)
     if gone(s, k):
         # a sensor counts again: what it showed meanwhile does not
         innovations.started(watch, memory, filled)
@@ -637,7 +649,7 @@ class Supervised:
         u, y = np.asarray(u, float), np.asarray(y, float)
         r_now, y_star = self._target(r)
         k = self.kept
-        filled = followed(self.supervision, k, self.memory, y, y_star, None, 1)
+        filled = followed(self.supervision, k, self.memory, y, y_star, None, 0)
         k.clock_s[1] += self.supervision.sample_time_s
         k.asked[:] = k.held[:] = u
         self.law.watch(u, filled, r_now)
