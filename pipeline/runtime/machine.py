@@ -308,7 +308,7 @@ def _number(value: float) -> float | None:
 
 
 def _exported(about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Exported:
-    kinds = typing.get_type_hints(Exported, _names())
+    kinds = typing.get_type_hints(Exported, localns=_names())
     try:
         inputs, outputs = (
             tuple(

@@ -357,7 +357,7 @@ def _law(name: str, deployed: Deployed) -> str:
 # ---- the supervisor in numbers
 
 # names in tables.h of the constants of innovations.py and supervisor.py
-OF_INNOVATIONS = ("MOST_Z", "LEARNED_BELOW", "DOUBTED", "TELLS", "KEPT", "CALM", "STIRRED", "ODD", "CATCH_UP")
+OF_INNOVATIONS = ("MOST_Z", "DOUBTED", "TELLS", "KEPT", "CALM", "STIRRED", "ODD", "CATCH_UP")
 OF_SUPERVISOR = (
     "ALARM", "DECIDED_AFTER", "DECIDED_BY", "TOLD_APART", "UNEXPLAINED", "UNEXPLAINED_SHARE", "DEAD_SHARE",
     "NOISY_SQUARE", "NOISY_LAG", "CHANCE", "REPEATS_LEAST", "SETTLED_DEGC", "HELD_SHARE", "APPLIED",
@@ -372,20 +372,19 @@ def supervising(s: supervisor.Supervision) -> str:
     text = "\n/* ---- the supervisor, as supervisor.Supervision and innovations.Watch have it */\n\n"
     text += "".join(define(name, getattr(innovations, name)) for name in OF_INNOVATIONS)
     text += "".join(define(name, getattr(supervisor, name)) for name in OF_SUPERVISOR)
-    text += define("NOISE_FORGETS", supervisor.FORGETS) + define("EARLY", s.early) + define("LATE", s.late)
+    text += define("WATCH_LEAST", watch.least)
+    text += define("NOISE_FORGETS", supervisor.FORGETS) + define("NOISE_MOST_Z", supervisor.MOST_Z)
+    text += define("EARLY", s.early) + define("LATE", s.late)
     text += define("JUMP", s.jump) + define("REACH_DEGC", s.reach_degC)
     text += define("UNEXPLAINED_BY_THETA", watch.unexplained)
     text += define("LONGEST_BACK", int(bank.back.max()))
     text += "".join(define(f"FORM_{name}", getattr(innovations, name)) for name in FORMS)
-    for name in ("A", "B", "C", "L", "heat", "start", "start_0", "b", "d", "prior", "floor", "low", "high"):
+    for name in ("A", "B", "C", "L", "start", "start_0", "b", "d", "prior", "floor", "low", "high"):
         text += table(f"watch_{name}", getattr(watch, name))
     text += integers("watch_strongest", watch.strongest)
     for name in ("form", "signal", "back"):
         text += integers(f"bank_{name}", getattr(bank, name))
-    lag = getattr(bank, "lag", None)
-    text += table(
-        "bank_lag", np.full(len(bank.form), 1 - 1 / innovations.SLOW_SAMPLES) if lag is None else lag
-    )
+    text += table("bank_lag", bank.lag)
     text += table("bank_least", innovations.LEAST) + table("bank_most", innovations.MOST)
     text += integers("supervisor_mode", s.mode)
     arrays = {

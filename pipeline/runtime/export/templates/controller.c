@@ -51,6 +51,7 @@ static void forget_all(supervisor_kept *k)
     memset(k->error, 0, sizeof k->error);
     memset(k->waited, 0, sizeof k->waited);
     k->samples = 0;
+    k->active = 0;
     k->alarmed = -1;
 }
 

@@ -53,7 +53,7 @@ static void advance(innovation_memory *o, const double *u, const double *e, doub
             X[i][j] += watch_B[i][j] * u[j];
         X[i][INPUTS] += dot(watch_B[i], change, INPUTS);
         X[i][INPUTS + 1] += o->x[i] - on[i];
-        X[i][INPUTS + 2] -= dot(watch_heat[i], y, OUTPUTS);
+        X[i][INPUTS + 2] -= dot(watch_start[i], y, OUTPUTS);
     }
     memcpy(o->X, X, sizeof X);
     memcpy(o->x, on, sizeof on);
@@ -64,9 +64,10 @@ static void advance(innovation_memory *o, const double *u, const double *e, doub
         moved[j] = dot(watch_C[j], on, WATCH) + watch_d[j] - y[j];
 }
 
-/* e in degC; z in deviations, of what no plant of the spread explains; sd in degC; expected the forecast */
+/* e in degC; z in deviations, of what no plant of the spread explains; sd in degC; expected the forecast;
+ * the highest of all sums */
 typedef struct {
-    double e[OUTPUTS], z[OUTPUTS], sd[OUTPUTS], expected[OUTPUTS];
+    double e[OUTPUTS], z[OUTPUTS], sd[OUTPUTS], expected[OUTPUTS], highest;
 } innovation;
 
 static double largest(const double *values, int count)
@@ -94,34 +95,37 @@ static void learn(innovation_memory *o, double PS[OUTPUTS][THETA], const double 
 
 static void see(innovation_memory *o, const double *y, const double *trusted, innovation *now)
 {
-    double PS[OUTPUTS][THETA], v[OUTPUTS], variance[OUTPUTS], odd = 0.0, tells = 0.0;
-    int i, j, k;
+    double S[OUTPUTS][THETA] = {{0}}, PS[OUTPUTS][THETA] = {{0}}, stirred[OUTPUTS] = {0};
+    double v[OUTPUTS], variance[OUTPUTS], forgets;
+    int i, j, k, telling;
     for (j = 0; j < OUTPUTS; j++) {
-        double S[THETA] = {0}, told, moved = 0.0, forgets;
-        double expected = dot(watch_C[j], o->x, WATCH) + watch_d[j];
+        double expected = dot(watch_C[j], o->x, WATCH) + watch_d[j], told;
         for (i = 0; i < WATCH; i++)
             for (k = 0; k < THETA; k++)
-                S[k] += watch_C[j][i] * o->X[i][k];
-        now->e[j] = trusted[j] > 0 ? y[j] - expected : 0.0;
-        memset(PS[j], 0, sizeof PS[j]);
-        add_product(PS[j], o->P[j][0], S, THETA, THETA);
+                S[j][k] += watch_C[j][i] * o->X[i][k];
         for (k = 0; k < THETA; k++)
-            moved += S[k] * watch_prior[k] * (S[k] * watch_prior[k]);
-        variance[j] = watch_floor[j] + UNEXPLAINED_BY_THETA * UNEXPLAINED_BY_THETA * moved + dot(S, PS[j], THETA);
-        told = dot(S, o->theta[j], THETA);
-        v[j] = trusted[j] * (now->e[j] - told);
-        now->sd[j] = sqrt(variance[j]);
-        now->z[j] = cut(v[j] / now->sd[j], -MOST_Z, MOST_Z);
+            stirred[j] += S[j][k] * watch_prior[k] * (S[j][k] * watch_prior[k]);
+        told = dot(S[j], o->theta[j], THETA);
+        now->e[j] = trusted[j] > 0 ? y[j] - expected : 0.0;
         now->expected[j] = expected + told;
-        forgets = CALM + STIRRED * (1 - watch_floor[j] / variance[j]);
-        o->sums[0][j] = fmax(o->sums[0][j] + now->z[j] - forgets, 0.0);
-        o->sums[1][j] = fmax(o->sums[1][j] - now->z[j] - forgets, 0.0);
-        odd = fmax(odd, fabs(now->z[j]));
-        tells = fmax(tells, moved);
+        v[j] = now->e[j] - trusted[j] * told;
     }
-    /* what moves no output teaches nothing */
-    if (tells > TELLS * largest(watch_floor, OUTPUTS) && largest(o->sums[0], 2 * OUTPUTS) < DOUBTED
-        && odd < LEARNED_BELOW)
+    /* what moves no output leaves nothing open, and teaches nothing about the plant */
+    telling = largest(stirred, OUTPUTS) > TELLS * WATCH_LEAST;
+    for (j = 0; j < OUTPUTS; j++) {
+        variance[j] = watch_floor[j];
+        if (telling) {
+            add_product(PS[j], o->P[j][0], S[j], THETA, THETA);
+            variance[j] += UNEXPLAINED_BY_THETA * UNEXPLAINED_BY_THETA * stirred[j] + dot(S[j], PS[j], THETA);
+        }
+        now->sd[j] = sqrt(variance[j]);
+        now->z[j] = v[j] / now->sd[j];
+        forgets = telling ? CALM + STIRRED * (1 - watch_floor[j] / variance[j]) : CALM;
+        o->sums[0][j] = fmax(o->sums[0][j] + (fmin(now->z[j], MOST_Z) - forgets), 0.0);
+        o->sums[1][j] = fmax(o->sums[1][j] - (fmax(now->z[j], -MOST_Z) + forgets), 0.0);
+    }
+    now->highest = largest(o->sums[0], 2 * OUTPUTS);
+    if (telling && now->highest < DOUBTED)
         learn(o, PS, v, variance);
 }
 
@@ -183,7 +187,7 @@ static void inputs_off(const innovation_memory *o, int h, const double *u, doubl
 static void take_row(innovation_memory *o)
 {
     static const double none[INPUTS] = {0};
-    double u[INPUTS], off[INPUTS], (*Xb)[BANK] = o->next;
+    double u[INPUTS], off[INPUTS], z[OUTPUTS], (*Xb)[BANK] = o->next;
     int i, j, h, row = RING - o->ahead, since = o->age - LONGEST_BACK;
     for (i = 0; i < INPUTS; i++)
         u[i] = (1 - o->late) * o->before[row][i] + o->late * o->before[row][INPUTS + i];
@@ -203,42 +207,39 @@ static void take_row(innovation_memory *o)
         }
     }
     memcpy(o->Xb, o->next, sizeof o->Xb);
+    for (j = 0; j < OUTPUTS; j++)
+        z[j] = cut(o->z[row][j], -MOST_Z, MOST_Z);
     for (h = 0; h < BANK; h++)
         for (j = 0; j < OUTPUTS; j++) {
             double s = bank_form[h] >= FORM_STEP && bank_signal[h] == j ? o->f[h] : 0.0, seen = 0.0;
             for (i = 0; i < WATCH; i++)
                 seen += watch_C[j][i] * Xb[i][h];
             s = (seen + s) / o->sd[row][j];
-            o->cross[h][j] += s * o->z[row][j];
+            o->cross[h][j] += s * z[j];
             o->square[h][j] += s * s;
         }
     for (j = 0; j < OUTPUTS; j++)
-        o->own[j] += o->z[row][j] * o->z[row][j];
+        o->own[j] += z[j] * z[j];
     o->age++;
     o->ahead--;
 }
 
-static int any_sum(const innovation_memory *o)
-{
-    return largest(o->sums[0], 2 * OUTPUTS) > 0;
-}
-
 /* Starts the bank where an innovation is odd, ends it where no sum is left and nothing alarms, and takes the
  * newest rows */
-static void suspect(innovation_memory *o, int alarmed)
+static void suspect(innovation_memory *o, const innovation *now, int alarmed)
 {
-    double odd = largest(o->sums[0], 2 * OUTPUTS);
+    double odd = now->highest;
     int j, rows;
     for (j = 0; j < OUTPUTS; j++)
-        odd = fmax(odd, fabs(o->z[RING - 1][j]));
-    if (o->age < 0 && odd > ODD)
-        begin_bank(o);
-    else if (o->age >= 0) {
+        odd = fmax(odd, fabs(now->z[j]));
+    if (o->age < 0) {
+        if (now->highest > 0 && odd > ODD)
+            begin_bank(o);
+    } else if (!alarmed && !(now->highest > 0)) {
+        o->age = -1;
+        o->ahead = 0;
+    } else {
         o->ahead++;
-        if (!alarmed && !any_sum(o)) {
-            o->age = -1;
-            o->ahead = 0;
-        }
     }
     for (rows = o->ahead < CATCH_UP ? o->ahead : CATCH_UP; rows > 0; rows--)
         take_row(o);
@@ -312,6 +313,7 @@ static void say(supervisor_kept *k, int kind, int signal, double amount, int oth
         k->since[kind][signal] = k->clock_s[1];
         k->amount[kind][signal] = amount;
         k->other[kind][signal] = other;
+        k->active++;
     }
     k->last[kind][signal] = k->clock_s[1];
 }
@@ -333,18 +335,19 @@ static int tell_time(supervisor_kept *k, double t_s)
 /* Inputs that acted since the last sample, as far as is known */
 static void find_acted(supervisor_kept *k, const double *applied, double *u)
 {
-    int i;
+    int i, wrong = 0, which = 0;
     for (i = 0; i < INPUTS; i++) {
-        u[i] = k->asked[i];
-        if (applied && !isfinite(applied[i]))
-            say(k, COMMAND_NOT_APPLIED, i, applied[i], -1);
-        else if (applied) {
-            if (fabs(applied[i] - k->asked[i]) > APPLIED * (watch_high[i] - watch_low[i]))
-                say(k, COMMAND_NOT_APPLIED, i, applied[i], -1);
-            u[i] = applied[i];
+        u[i] = applied && isfinite(applied[i]) ? applied[i] : k->asked[i];
+        if (applied && !(fabs(applied[i] - k->asked[i]) <= APPLIED * (watch_high[i] - watch_low[i]))) {
+            wrong++;
+            which = i;
         }
         u[i] = k->stuck[i] > 0 ? watch_high[i] : u[i] * (1 - k->lacks[i]);
     }
+    if (wrong > 1)
+        say(k, COMMAND_NOT_APPLIED, 0, 0.0, ALL_INPUTS);
+    else if (wrong)
+        say(k, COMMAND_NOT_APPLIED, which, applied[which], -1);
 }
 
 static double same_by_chance(double quantum, double noise)
@@ -390,17 +393,17 @@ static void verify_heaters(supervisor_kept *k, const double *y, const double *y_
 {
     int j;
     for (j = 0; j < OUTPUTS; j++) {
-        double below = y_star[j] - supervisor_hysteresis[j] - y[j], goal = y[j] + supervisor_gain[j];
+        double below = y_star[j] - supervisor_hysteresis[j] - y[j];
         if (!(below > 0) || !(k->trusted[j] > 0)) {
             k->error[j] = k->waited[j] = 0.0;
-            k->goal[j] = goal;
             continue;
         }
-        k->waited[j] += BEADLINE_SAMPLE_TIME_S;
-        if (y[j] >= k->goal[j]) {
-            k->goal[j] = goal;
+        if (!(k->waited[j] > 0) || y[j] >= k->goal[j]) {
+            k->goal[j] = y[j] + supervisor_gain[j];
             k->waited[j] = k->error[j] = 0.0;
-        } else if (k->waited[j] > supervisor_check_s[j]) {
+        }
+        k->waited[j] += BEADLINE_SAMPLE_TIME_S;
+        if (k->waited[j] > supervisor_check_s[j]) {
             k->error[j] += below * BEADLINE_SAMPLE_TIME_S;
             if (k->error[j] > supervisor_error_degC_s[j])
                 say(k, THERMAL_RUNAWAY, j, below, -1);
@@ -493,7 +496,9 @@ static int diagnose(supervisor_kept *k, innovation_memory *o)
 static void distrust(supervisor_kept *k, const double *y)
 {
     int j;
-    for (j = 0; j < OUTPUTS; j++) {
+    for (j = 0; j < OUTPUTS; j++)
+        k->trusted[j] = 1.0;
+    for (j = 0; j < OUTPUTS && k->active; j++) {
         double off = fabs(y[j] - k->expected[j]);
         int bad = k->since[SENSOR_NAN][j] >= 0 || k->since[SENSOR_FROZEN][j] >= 0
                   || k->since[SENSOR_SLOW][j] >= 0 || k->since[SENSOR_OFFSET][j] >= 0 || k->absurd[j] > 0
@@ -514,11 +519,8 @@ static int of_output(int kind)
 /* Forgets causes that were not there for their time; whether one of a sensor went */
 static int forget(supervisor_kept *k)
 {
-    int kind, signal, j, active = 0, sensor = 0;
-    for (kind = 0; kind < KINDS; kind++)
-        for (signal = 0; signal < SIGNALS; signal++)
-            active |= k->since[kind][signal] >= 0;
-    for (j = 0; j < OUTPUTS && active; j++)
+    int kind, signal, j, sensor = 0;
+    for (j = 0; j < OUTPUTS && k->active; j++)
         if (!(k->since[OUT_OF_RANGE][j] >= 0))
             k->absurd[j] = 0.0;
     for (kind = 0; kind < KINDS; kind++)
@@ -527,6 +529,7 @@ static int forget(supervisor_kept *k)
                 && k->clock_s[1] - k->last[kind][signal] > supervisor_back_s[kind]) {
                 k->since[kind][signal] = k->last[kind][signal] = -1.0;
                 k->other[kind][signal] = -1;
+                k->active--;
                 sensor |= of_output(kind);
             }
     return sensor;
@@ -554,10 +557,10 @@ static int loudest(const innovation_memory *o)
 }
 
 /* The alarm, and its end where it is decided, or where the sensor that raised it is seen to be wrong */
-static void raise_alarm(supervisor_kept *k, innovation_memory *o)
+static void raise_alarm(supervisor_kept *k, innovation_memory *o, double highest)
 {
     if (k->alarmed < 0) {
-        if (largest(o->sums[0], 2 * OUTPUTS) > ALARM)
+        if (highest > ALARM)
             k->alarmed = 0;
         return;
     }
@@ -591,17 +594,18 @@ static void follow(supervisor_kept *k, innovation_memory *o, const double *y, co
     distrust(k, y);
     see(o, y, k->trusted, &now);
     for (j = 0; j < OUTPUTS; j++) {
-        k->square[j] += NOISE_FORGETS * (fmin(now.z[j] * now.z[j], 1e4) - k->square[j]);
-        k->lag[j] += NOISE_FORGETS * (cut(now.z[j] * k->z[j], -1e4, 1e4) - k->lag[j]);
-        k->z[j] = now.z[j];
+        double z = cut(now.z[j], -NOISE_MOST_Z, NOISE_MOST_Z);
+        k->square[j] += NOISE_FORGETS * (z * z - k->square[j]);
+        k->lag[j] += NOISE_FORGETS * (z * k->z[j] - k->lag[j]);
+        k->z[j] = z;
     }
     keep(o, &now, moved);
-    suspect(o, k->alarmed >= 0);
+    suspect(o, &now, k->alarmed >= 0);
     memcpy(k->expected, now.expected, sizeof now.expected);
     memcpy(k->e, now.e, sizeof now.e);
     for (j = 0; j < OUTPUTS; j++)
         filled[j] = k->trusted[j] > 0 ? y[j] : now.expected[j];
-    raise_alarm(k, o);
+    raise_alarm(k, o, now.highest);
     if (forget(k)) {
         start_observer(o, filled);
         memset(k->e, 0, sizeof k->e);
