@@ -282,6 +282,14 @@ def training_print(arguments: argparse.Namespace) -> None:
     print(printing.write(asked, arguments.out, pixel(arguments.tip) if arguments.tip else None))
 
 
+def export(arguments: argparse.Namespace) -> None:
+    """A certified controller as C99 without heap, as one file of Python, or as settings for Klipper and
+    Kalico."""
+    from pipeline.runtime.workflow.exports import export as write
+
+    print(write(arguments.controller, arguments.to, arguments.out, arguments.section, arguments.power))
+
+
 def version() -> str:
     """The version that pyproject.toml beside the code states; without one, that of the installed package."""
     project = Path(__file__).resolve().parents[1] / "pyproject.toml"
@@ -365,6 +373,18 @@ def _add_training_print(commands: argparse._SubParsersAction) -> None:
         command.add_argument(flag, default=default, metavar=metavar, help=f"{words} ({default})")
     command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels, for the table")
     command.set_defaults(run=training_print)
+
+
+def _add_export(commands: argparse._SubParsersAction) -> None:
+    command = commands.add_parser("export", help=export.__doc__)
+    command.add_argument("controller", type=Path, metavar="CONTROLLER", help="a folder with controller.json")
+    command.add_argument("--to", required=True, choices=("c", "python", "klipper"))
+    command.add_argument("--out", type=Path, metavar="DIR", help="(CONTROLLER/c, .../python, .../klipper)")
+    command.add_argument(
+        "--section", default="extruder", choices=("extruder", "heater_bed"), help="of printer.cfg (extruder)"
+    )
+    command.add_argument("--power", type=float, metavar="W", help="of the heater, for Kalico's MPC")
+    command.set_defaults(run=export)
 
 
 def main() -> None:
@@ -458,6 +478,7 @@ def main() -> None:
     _add_shadow(commands)
     _add_record_levels(commands)
     _add_training_print(commands)
+    _add_export(commands)
     nights.add(commands)
     arguments = parser.parse_args()
     try:

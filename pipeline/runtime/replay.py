@@ -1,5 +1,4 @@
-"""What a controller would have asked on a recorded machine, sample by sample, and where a recording is off the
-support of what it was learned from.
+"""What a controller would have asked on a recorded machine, sample by sample.
 
 The law sees what the machine measured and what it was really given: its memory, its integrator and its
 governor go on from the recorded inputs, as those of `temperature.controller.RunningController` do where
@@ -15,9 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.temperature.controller import Aim, Deployed, Reference, aim, constant, rest
-from pipeline.temperature.governor import Governor, corrected, governed, instants, predicted, started
-from pipeline.temperature.plant import Plant, markov_parameters
-from pipeline.temperature.tracking import robust_observer_gain
+from pipeline.temperature.governor import Governor, corrected, governed, predicted, started
+from pipeline.temperature.plant import Plant
 
 # ---- in chunks
 
@@ -27,9 +25,10 @@ MOST_REFERENCES = 500  # each is aimed at by a quadratic programme
 
 
 def scanned(A: np.ndarray, drive: np.ndarray, first: np.ndarray, shift: int = 0) -> np.ndarray:
-    """z (T + 1, q) with z(0) = first (q,) and z(t+1) = A z(t) + drive(t), drive (T, q): every chunk from zero,
-    the chunks' ends one after the other, then every chunk from where it starts. `shift`: A moves z on by so
-    many entries."""
+    """z (T + 1, q) with z(0) = first (q,) and z(t+1) = A z(t) + drive(t), drive (T, q).
+
+    Every chunk goes from zero; then the chunks' ends are joined one after the other; then every chunk goes
+    from where it starts. `shift`: A moves z on by so many entries."""
     T, q = drive.shape
     chunks = -(-T // CHUNK)
     padded = np.zeros((chunks * CHUNK, q))

@@ -1,6 +1,8 @@
-"""What export_controllers does: the controller that the temperature loop's verdict recommends is rebuilt as it
-was judged, certified and written; the setpoint loop's eyes and filter are written for a machine without jax;
-of the deposition loop the commands that compose wrote are named."""
+"""What export_controllers does.
+
+The controller that the temperature loop's verdict recommends is rebuilt as it was judged, certified and
+written; the setpoint loop's eyes and filter are written for a machine without jax (export_setpoint.py); of
+the deposition loop the commands that compose wrote are named."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,10 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.runtime import certificate, machine, supervisor
+from pipeline.runtime import bands, certificate, machine, supervisor
 from pipeline.runtime.certificate import Certificate
-from pipeline.runtime.export import c, python, vectors
+from pipeline.runtime.export import vectors
 from pipeline.runtime.machine import Exported
+from pipeline.runtime.workflow import exports
 from pipeline.runtime.workflow.settings import ExportControllers
 from pipeline.store import artifacts
 from pipeline.temperature import controller, panel
@@ -108,7 +111,11 @@ def evidence(path: str, declared: Plant) -> certificate.Record:
         last[longest : longest + 1] = [False, True]
         last = [flag and i == longest + 1 for i, flag in enumerate(last)]
     wired = wired_to(declared)
-    parts = [[piece[k] for piece, flag in zip(pieces, last, strict=True) if flag == new] for new in (0, 1) for k in (0, 1)]
+    parts = [
+        [piece[k] for piece, flag in zip(pieces, last, strict=True) if flag == new]
+        for new in (0, 1)
+        for k in (0, 1)
+    ]
     return certificate.Record(wired.inputs, wired.outputs, wired.sample_time_s, *parts)
 
 
@@ -144,7 +151,19 @@ def certified(
 ) -> Certificate:
     """The certificate on the record at `path`."""
     seen, rng = evidence(path, judged.machine), np.random.default_rng(settings.seed)
-    return certificate.certify(made, judged.learned.spread, seen, asked(judged, rules, settings, seen), rng)
+    asks, how = asked(judged, rules, settings, seen), learning(made.name, judged)
+    return certificate.certify(made, judged.learned.spread, seen, asks, rng, learning=how)
+
+
+def learning(name: str, judged: Judged) -> bands.Learning | None:
+    """How the gains of a contestant were learned from the record; None where they are those of a model."""
+    problem, of = judged.problem, BY_NAME[name].learned_from
+    if of not in ("window", "kernel") or (of == "kernel" and problem.kernel is None):
+        return None
+    N = problem.window.N if of == "window" else problem.kernel.N
+    effort = float(judged.weights[name]["effort_weight"])
+    p, m = problem.plant.p, problem.plant.m
+    return bands.Learning(of, N, np.ones(p), np.full(m, effort), problem.gamma)
 
 
 # ---- what runs is what was judged
@@ -191,9 +210,9 @@ def check_same(made: Exported, difference: float) -> None:
     span = max(one.high - one.low for one in made.machine.inputs)
     if not difference <= SAME * span:
         raise ValueError(
-            f"datasets/evaluate_temperature/trajectories.parquet: {made.name} asks for commands {difference:g} "
-            f"percent away from those that were judged; expected at most {SAME * span:g}; make it again with "
-            "./run dvc repro evaluate_temperature"
+            f"datasets/evaluate_temperature/trajectories.parquet: {made.name} asks for commands "
+            f"{difference:g} percent away from those that were judged; expected at most {SAME * span:g}; "
+            "make it again with ./run dvc repro evaluate_temperature"
         )
 
 
@@ -230,16 +249,18 @@ class Written(NamedTuple):
     unit: str
 
 
-def write_temperature(folder: Path, made: Exported, shown: Certificate, differences: dict[str, float]) -> Written:
+def write_temperature(
+    folder: Path, made: Exported, shown: Certificate, differences: dict[str, float]
+) -> Written:
     """controller.json, arrays.safetensors, certificate.json, c/ and python/; of one that was refused the
     certificate alone."""
     if shown.verdict != "passed":
         artifacts.write_text(folder / machine.CERTIFICATE, certificate.to_json(shown))
         return Written(made.name, brief(shown), refusal(shown), {}, differences, "percent")
     machine.write(folder, made, shown)
-    for name, text in c.files(made, shown, vectors.golden(made)).items():
+    for name, text in exports.files(made, shown, "c", "", None).items():
         artifacts.write_text(folder / "c" / name, text)
-    code = python.text(made, shown)
+    code = exports.files(made, shown, "python", "", None)["controller.py"]
     artifacts.write_text(folder / "python" / "controller.py", code)
     differences = differences | {"python": of_python(made, code)}
     return Written(made.name, brief(shown), "", hashes(folder), differences, "percent")
