@@ -33,14 +33,17 @@ DOUBTED = 3.0  # of a sum below: while one is above, nothing is learned
 TELLS = 0.5  # share of the variance at rest that a plant of the spread must be able to move
 KEPT = 2e-4  # share a sample by which what was learned goes back to the spread
 CALM = 1.5  # deviations a sample that a sum of innovations forgets at rest (CUSUM, Page 1954)
-STIRRED = 3.0  # and more where the spread leaves all open: what a plant of it does there, it does for long
+STIRRED = 2.2  # and more where the spread leaves all open: what a plant of it does there, it does for long
 ODD = 3.0  # deviations, or sum of them, from which the bank is followed
-MOST_LATE, EARLY = 12, 5  # samples: the longest dead time that the bank starts before, and an earlier start
-RING = MOST_LATE + EARLY + 10  # samples kept, so that the bank can start before the first odd one
+MOST_LATE = 12  # samples: the longest dead time that the bank starts before
+EARLIER = (0, 1, 2, 3, 5)  # samples by which a fault may have begun before it was to be seen
+RING = MOST_LATE + EARLIER[-1] + 10  # samples kept, so that the bank can start before the first odd one
 MOVING, COINCIDENCE = (
     50.0,
     6.0,
 )  # what a sensor's lag would show, from which its zone moves; -2 log of the prior
+MISFIT = 0.005  # share of what is seen that even the right signature leaves: the model is not the machine
+SELDOM = 2.0  # -2 log of the prior of a sensor that drifts within seconds, beside a heater's
 CATCH_UP = 3  # rows of the ring that the bank takes in a step
 
 
@@ -157,17 +160,17 @@ class Bank(NamedTuple):
 
 def bank(model: Plant) -> Bank:
     """Every input stuck on, or acting less than its command, from as many samples before as its strongest
-    output is late, and from EARLY more; no command applied; every sensor off by a step or a ramp, or slow."""
+    output is late, and EARLIER; no command applied; every sensor off by a step or a ramp, or slow."""
     pulses = np.abs(markov_parameters(strictly_proper(model), MOST_LATE))
     strongest = pulses.max(axis=0).argmax(axis=0)
     rows: list[tuple[int, int, int, float]] = []
     for i in range(model.m):
         own = pulses[:, strongest[i], i]
         late = 1 + int(np.argmax(own >= 0.1 * own.max()))
-        rows += [(form, i, late + early, 0.0) for form in (ON, LESS) for early in (0, EARLY)]
-        rows += [(NOT_APPLIED, 0, late, 0.0)] if i == 0 else []
+        rows += [(form, i, late + early, 0.0) for form in (ON, LESS) for early in EARLIER]
+        rows += [(NOT_APPLIED, 0, late + early, 0.0) for early in EARLIER if i == 0]
     for j in range(model.p):
-        rows += [(STEP, j, 0, 0.0), (RAMP, j, 1, 0.0), (RAMP, j, 1 + EARLY, 0.0)]
+        rows += [(STEP, j, 0, 0.0), *((RAMP, j, 1 + early, 0.0) for early in EARLIER)]
         rows += [(LAG, j, 1, 1 - 1 / tau) for tau in SLOW_SAMPLES]
     return Bank(*(np.array(column) for column in zip(*rows, strict=True)))
 
@@ -413,10 +416,11 @@ def judged(bank: Bank, memory: Memory) -> Verdict:
     a = amplitude[:, None]
     left = np.maximum((memory.own - 2 * a * memory.cross + a * a * memory.square) / n, 0.0)
     own = memory.own / n
-    cost = n * np.log(np.maximum(left, 1.0)).sum(axis=1)
+    cost = n * np.log(np.maximum(left, 1 + MISFIT * own)).sum(axis=1)
     # an offset seldom begins just where its zone moves; a slow sensor is seen nowhere else
     lagging = (bank.form == LAG) & (memory.square.sum(axis=1) > MOVING)
     offset = (bank.form == STEP) | (bank.form == RAMP)
     cost[offset & np.isin(bank.signal, bank.signal[lagging])] += COINCIDENCE
-    none = n * float(np.log(np.maximum(own, 1.0)).sum())
+    cost[bank.form == RAMP] += SELDOM
+    none = n * float(np.log(np.maximum(own, 1 + MISFIT * own)).sum())
     return Verdict(cost, amplitude, none, left[int(cost.argmin())], own)

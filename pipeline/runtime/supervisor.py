@@ -511,7 +511,10 @@ def mode_of(s: Supervision, k: Kept) -> int:
     """The most severe of the modes that the causes declare; hold while an alarm is not decided."""
     if not k.counters[ACTIVE]:
         return LAW if k.counters[ALARMED] < 0 else HOLD
-    modes = s.mode[(k.since >= 0).any(axis=1)]
+    kinds, signals = np.nonzero(k.since >= 0)
+    beside = k.other[kinds, signals]
+    # a mode that is safe for what would show the same, too
+    modes = s.mode[np.r_[kinds, beside[beside >= 0]]]
     worst = int(modes[SEVERITY[modes].argmax()])
     if k.counters[ALARMED] >= 0 and SEVERITY[worst] < SEVERITY[HOLD]:
         return HOLD
@@ -590,17 +593,18 @@ def sentence(machine: Machine, kind: int, signal: int, amount: float, other: int
     names = machine.inputs if kind in OF_INPUT else machine.outputs
     name = names[signal].name if signal < len(names) else "machine"
     said = {
-        ON: f"{name} heats whatever it is told ({100 * amount:.0f} % of its full power): only the mains can "
-        "stop it, switch them off",
-        OFF: f"{name} does not heat whatever it is told: its zone cools",
-        WEAK: f"{name} lacks {100 * amount:.0f} % of its power, or its zone loses as much more heat than the "
-        "model knows",
+        ON: f"{name} heats whatever it is told, or goes on with an older command ({100 * amount:.0f} % of what "
+        "it could add): only the mains can stop it, switch them off",
+        OFF: f"{name} does not heat whatever it is told, or goes on with an older command, and its zone cools",
+        WEAK: f"{name} does {100 * amount:.0f} % less than it is told: it lacks power, goes on with an older "
+        "command, or its zone loses more heat than the model knows",
         RUNAWAY: f"{name} reads ever colder than heat can explain: it is out of place, or its zone is not "
         "heated",
         RANGE: f"{name} reads {amount:.1f} degC, outside its declared limits",
         NAN: f"{name} gives no number",
         FROZEN: f"{name} has read {amount:.2f} degC for longer than chance allows",
-        OFFSET: f"{name} is off by {amount:+.1f} degC, or its zone gains or loses heat that no input explains",
+        OFFSET: f"{name} is off by {amount:+.1f} degC, or its zone gains or loses heat that no input "
+        "explains",
         SLOW: f"{name} follows late, or its zone has become slower",
         NOISY: f"{name} is {amount:.0f} times as noisy as it was",
         COMMAND: f"{name} applied {amount:.1f} percent, not what it was told"
@@ -687,9 +691,9 @@ class Supervised:
         samples = timed(s, k, t_s)
         r_now, y_star = self._target(r)
         filled = followed(s, k, self.memory, y, y_star, applied, samples)
-        for j in self._out:
-            said(k, REACH, j, self._beyond[j])
         if self._out:
+            j = int(self._beyond.argmax())
+            said(k, REACH, j, self._beyond[j])
             if not np.isfinite(self._in_reach).all():
                 self._in_reach = filled
             r = r_now = self._in_reach
@@ -777,10 +781,9 @@ class Supervised:
             arrays |= {f"pi.{name}": part for name, part in self.pi.saved().items()}
         for group in (self.kept, self.memory):
             arrays |= {name: np.array(part) for name, part in group._asdict().items()}
-        return arrays | {
-            "beyond": self._beyond, "in_reach": self._in_reach, "Y": self._Y, "w": self._w,
-            **{f"reference.{name}": np.array(part) for name, part in self._reference._asdict().items()},
-        }  # fmt: skip
+        mine = {"beyond": self._beyond, "in_reach": self._in_reach, "Y": self._Y, "w": self._w}
+        mine |= self._reference._asdict()
+        return arrays | {f"aim.{name}": np.array(part) for name, part in mine.items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Goes on from what another of the same controller `saved`. Raises ValueError where its arrays are
@@ -801,8 +804,12 @@ class Supervised:
                 runner.restore(own)
         for name, part in mine.items():
             part[...] = arrays[name]
-        self._reference = Reference(*(np.array(arrays[f"reference.{name}"]) for name in Reference._fields))
-        self._w, self._Y = np.array(arrays["w"]), np.array(arrays["Y"])
-        self._beyond, self._in_reach = np.array(arrays["beyond"]), np.array(arrays["in_reach"])
+        aim = {
+            name.removeprefix("aim."): np.array(arrays[name]) for name in arrays if name.startswith("aim.")
+        }
+        self._reference = Reference(*(aim[name] for name in Reference._fields))
+        self._w, self._Y, self._beyond, self._in_reach = (
+            aim[name] for name in ("w", "Y", "beyond", "in_reach")
+        )
         self._out = [int(j) for j in np.flatnonzero(self._beyond > self.supervision.reach_degC)]
         self._now = self._reference.H @ self._w, self._Y @ self._w

@@ -1,0 +1,306 @@
+"""The supervisor on a machine of two zones that no stage made: quiet where the plant is honest, and every
+fault named, with its safe mode and the way back."""
+
+import numpy as np
+import pytest
+
+from pipeline.runtime import innovations, supervisor
+from pipeline.runtime.machine import Exported, Machine, Signal
+from pipeline.runtime.supervisor import SAFE, Supervised, supervision
+from pipeline.temperature import baseline, controller
+from pipeline.temperature.governor import Limits
+from pipeline.temperature.panel import delayed
+from pipeline.temperature.plant import plant
+
+LOW, HIGH = np.zeros(2), np.full(2, 100.0)
+NOISE, ROOM, R = 0.1, 20.0, np.array([150.0, 180.0])
+# a zone cools by 2 % a sample towards the room; 45 and 55 percent hold the references
+MODEL = plant([[0.98, 0.003], [0.002, 0.978]], np.diag([0.055, 0.065]), np.eye(2), d=[ROOM, ROOM])
+WIRED = Machine(
+    tuple(Signal(f"heater_{i}", "percent", 0.0, 100.0) for i in (1, 2)),
+    tuple(Signal(f"zone_{i}", "degC", 0.0, 260.0) for i in (1, 2)),
+    1.0,
+)
+
+
+def exported(**changed) -> Exported:
+    made = baseline.controller(MODEL, (LOW, HIGH), horizon=400, noise_degC=np.full(2, NOISE))
+    law = made.design(np.ones(2), np.ones(2), 0.0)
+    deployed = controller.deployed(law, Limits(LOW, HIGH, np.full(2, np.inf)), integral_limit=1.0)
+    watched = supervision(MODEL, [MODEL], WIRED, np.full(2, NOISE), **changed)
+    return Exported("pi", WIRED, deployed, made.model, deployed, watched, True, "", "")
+
+
+class Run:
+    """A plant that differs from the model as its spread allows: stronger heaters, and late by a sample."""
+
+    def __init__(self, *, seed: int = 0, late: bool = True, gain=(1.1, 0.93), **changed):
+        self.plant = delayed(MODEL._replace(B=MODEL.B * gain), late)
+        self.rng, self.t, self.skew = np.random.default_rng(seed), 0, 0.0
+        self.supervised = Supervised(exported(**changed), rehearsal=True)
+        u = np.linalg.solve(MODEL.B * gain, (np.eye(2) - MODEL.A) @ (R - ROOM))
+        self.x = np.r_[R - ROOM, u]
+        for _ in range(30):
+            self.supervised.watch(u, self.read(), R)
+            self.advance(u)
+        self.supervised.hand_over(self.read())
+
+    def true(self) -> np.ndarray:
+        return self.plant.C @ self.x + self.plant.d
+
+    def read(self) -> np.ndarray:
+        return self.true() + NOISE * self.rng.standard_normal(2)
+
+    def advance(self, u: np.ndarray) -> None:
+        self.x = self.plant.A @ self.x + self.plant.B @ u
+
+    def go(self, steps: int, *, reading=None, command=None, r=None, applied: bool = False) -> list:
+        """Decisions of `steps` samples; reading(y, k) and command(u, k) are what the fault makes of them."""
+        decisions, told = [], None
+        for k in range(steps):
+            y = self.read()
+            y = y if reading is None else reading(y.copy(), k)
+            asked = R if r is None else r(k)
+            decisions.append(self.supervised.step(y, asked, self.t + self.skew, told if applied else None))
+            told = decisions[-1].u if command is None else command(decisions[-1].u.copy(), k)
+            self.advance(told)
+            self.t += 1
+        return decisions
+
+
+def steps_of(k: int) -> np.ndarray:
+    return R + (8.0 if k // 60 % 2 else -4.0)
+
+
+def first(decisions) -> tuple[int, supervisor.Cause]:
+    """The sample of the first safe mode, and the cause named first ten samples later."""
+    at = next(k for k, one in enumerate(decisions) if one.mode != "law")
+    return at, decisions[min(at + 10, len(decisions) - 1)].causes[0]
+
+
+def test_an_honest_plant_of_the_spread_is_left_to_the_law():
+    for seed, late in ((1, True), (2, False)):
+        run = Run(seed=seed, late=late)
+        assert {one.mode for one in run.go(1500, r=steps_of)} == {"law"}
+
+
+def test_what_the_plant_differs_by_is_learned():
+    run = Run(seed=3, late=False, gain=(1.12, 1.0))
+    before = run.supervised.memory.P[0, 0, 0]
+    run.go(800, r=steps_of)
+    theta, P = run.supervised.memory.theta, run.supervised.memory.P
+    # two deviations of what is left open
+    assert abs(theta[0, 0] - 0.12) < 2 * np.sqrt(P[0, 0, 0]) + 0.03 and P[0, 0, 0] < 0.5 * before
+
+
+def frozen(y, k, held=[None]):  # noqa: B006, the fault remembers
+    held[0] = y[1] if k == 0 else held[0]
+    y[1] = held[0]
+    return y
+
+
+def put(j, value):
+    def reading(y, k):
+        y[j] = value(y[j], k)
+        return y
+
+    return reading
+
+
+NOISY = np.random.default_rng(9).standard_normal(200)
+SENSORS = {
+    "sensor_nan": put(1, lambda y, k: np.nan),
+    "out_of_range": put(1, lambda y, k: 400.0),
+    "sensor_frozen": frozen,
+    "sensor_offset": put(1, lambda y, k: y + 4.0),
+    "sensor_noisy": put(1, lambda y, k: y + 1.2 * NOISY[k]),
+    "thermal_runaway": put(1, lambda y, k: 25 + (y - 25) * np.exp(-(k + 1) / 8)),
+}
+
+
+@pytest.mark.parametrize("kind", SENSORS)
+def test_a_faulty_sensor_is_named_and_its_safe_mode_asked_for(kind):
+    run = Run(seed=5)
+    run.go(200, r=steps_of)
+    decisions = run.go(60, reading=SENSORS[kind])
+    at, cause = first(decisions)
+    assert (cause.kind, cause.signal) == (kind, "zone_2")
+    assert at <= 10 and decisions[at + 10].mode == SAFE[kind]
+    assert abs(cause.since_s - 200) <= 12
+
+
+HEATERS = {
+    "heater_stuck_on": lambda u, k: np.r_[100.0, u[1]],
+    "heater_stuck_off": lambda u, k: np.r_[0.0, u[1]],
+    "heater_weak": lambda u, k: u * [0.5, 1.0],
+}
+
+
+@pytest.mark.parametrize("kind", HEATERS)
+def test_a_faulty_heater_is_named_within_ten_samples(kind):
+    run = Run(seed=6)
+    run.go(200, r=steps_of)
+    decisions = run.go(40, command=HEATERS[kind])
+    at, cause = first(decisions)
+    assert (cause.kind, cause.signal) == (kind, "heater_1") and at <= 10
+    assert decisions[-1].mode == SAFE[kind]
+    assert ("mains" in cause.sentence) == (kind == "heater_stuck_on")
+
+
+def test_what_only_the_mains_can_stop_stays_until_a_person_acknowledges_it():
+    run = Run(seed=6)
+    run.go(100)
+    run.go(40, command=HEATERS["heater_stuck_on"])
+    assert {one.mode for one in run.go(400)} == {"off"}
+    run.x[:2] = R - ROOM
+    run.supervised.acknowledge()
+    assert run.go(100)[-1].mode == "law"
+
+
+def test_a_slow_sensor_is_seen_before_its_zone_errs_by_5_degC():
+    run, slow = Run(seed=8), {}
+    run.go(200, r=steps_of)
+
+    def reading(y, k):
+        slow["y"] = slow.get("y", y[0]) + (y[0] - slow.get("y", y[0])) / 12
+        return np.r_[slow["y"] + NOISE * NOISY[k], y[1]]
+
+    worst = []
+    for k in range(60):
+        decision = run.go(1, reading=lambda y, _: reading(y, k), r=lambda _: R + 8.0)[0]
+        if decision.mode != "law":
+            break
+        worst.append(np.abs(run.true() - R - 8.0)[0] if k > 30 else 0.0)
+    assert decision.mode != "law" and max(worst, default=0.0) < 5
+
+
+def test_commands_that_are_not_applied_are_named_from_their_readback():
+    run = Run(seed=9)
+    run.go(50)
+    decisions = run.go(20, command=lambda u, k: np.r_[u[0] + 20.0, u[1]], applied=True)
+    at, cause = first(decisions)
+    assert at == 1 and (cause.kind, cause.signal) == ("command_not_applied", "heater_1")
+
+
+def test_a_late_sample_and_a_clock_that_jumps_are_told_apart():
+    for gap_s, kind in ((3.0, "deadline_missed"), (-3600.0, "clock_jump"), (3600.0, "clock_jump")):
+        run = Run(seed=10)
+        run.go(50)
+        run.skew = gap_s
+        decision = run.go(1)[0]
+        assert (decision.mode, decision.causes[0].kind) == ("hold", kind)
+        assert f"{gap_s + 1:.3g} s" in decision.causes[0].sentence
+        # by its own time, which a jump does not move
+        assert run.go(45)[-1].mode == "law"
+
+
+def test_a_reference_out_of_reach_leaves_the_last_one_that_was_not():
+    run = Run(seed=11)
+    run.go(60)
+    decisions = run.go(80, r=lambda k: R + [0.0, 200.0])
+    assert decisions[0].causes[0].kind == "reference_out_of_reach" and decisions[0].mode == "pi"
+    assert decisions[0].causes[0].signal == "zone_2"
+    np.testing.assert_allclose(run.true(), R, atol=1.0)  # ten deviations of the noise
+    assert run.go(60)[-1].mode == "law"
+
+
+def test_another_machine_than_the_model_s_is_said_to_be_one():
+    run = Run(seed=12)
+    run.go(200, r=steps_of)
+    other = MODEL.B * [[0.4, 1.0], [1.0, 2.2]]
+    run.plant = delayed(MODEL._replace(B=other), True)
+    at, cause = first(run.go(40, r=lambda k: R + 6.0))
+    assert at <= 10 and cause.kind == "model_no_longer_right"
+
+
+def test_the_law_comes_back_without_a_bump():
+    run = Run(seed=13)
+    before = run.go(200)[-1].u
+    assert run.go(20, reading=SENSORS["sensor_nan"])[-1].mode == "hold"
+    decisions = run.go(60)
+    modes = [one.mode for one in decisions]
+    back = modes.index("law")
+    # after back_s of 30 s, and there for good
+    assert 29 <= back <= 31 and set(modes[back:]) == {"law"}
+    jump = np.abs(decisions[back].u - decisions[back - 1].u).max()
+    gain = np.abs(run.supervised.exported.controller.law.D).max()
+    # what noise moves a proportional law by in one sample, and no more
+    assert jump < 5 * gain * NOISE + 0.5 and np.abs(decisions[-1].u - before).max() < 10
+
+
+def test_what_is_saved_goes_on_bit_by_bit():
+    one, other = Run(seed=14), Run(seed=14)
+    one.go(40, r=steps_of)
+    one.go(15, reading=SENSORS["sensor_offset"])
+    other.supervised.restore(one.supervised.saved())
+    for k in range(60):
+        y = R + np.sin(k) + np.array([0.0, 3.0])
+        a, b = (run.supervised.step(y, R, 55.0 + k) for run in (one, other))
+        assert a.mode == b.mode and a.causes == b.causes
+        np.testing.assert_array_equal(a.u, b.u)
+
+
+def test_verify_heater_waits_its_time_and_then_adds_up_degrees_and_seconds():
+    s = exported().supervision
+    k = supervisor.kept(s)
+    wait, limit = s.check_s[0], s.error_degC_s[0]
+    y = R - [s.hysteresis_degC[0] + 10.0, 0.0]
+    due = int(wait) + int(np.floor(limit / 10.0)) + 1  # 10 degC for 1 s a sample
+    for t in range(1, due + 2):
+        supervisor.verified(s, k, y, R)
+        assert (k.since[supervisor.RUNAWAY, 0] >= 0) == (t >= due), t
+    warming = supervisor.kept(s)
+    for t in range(3 * due):  # it gains its degrees in time
+        y = R - [200.0 - t * 1.5 * s.gain_degC[0] / wait, 0.0]
+        supervisor.verified(s, warming, y, R)
+    assert warming.since[supervisor.RUNAWAY, 0] < 0
+
+
+def test_a_coarse_converter_may_repeat_itself():
+    assert supervisor.repeats_at_most(1e-4, 0.1) == supervisor.REPEATS_LEAST
+    # erf(0.1 / (2 sqrt 2 0.1)) = 0.3829 stay in one step: ln 1e-9 / ln 0.3829 repeats
+    assert supervisor.repeats_at_most(0.1, 0.1) == pytest.approx(np.log(1e-9) / np.log(0.3829), rel=1e-3)
+    assert supervisor.repeats_at_most(np.inf, 0.1) == np.inf
+
+
+def test_a_signature_is_what_the_fault_does_to_the_innovation():
+    """Two observers, one of a plant whose heater is off: what they differ by is the signature."""
+    s = exported().supervision
+    watch, memory = s.watch, innovations.remembered(s.watch, s.bank)
+    x, u = np.zeros(len(watch.A)), np.array([40.0, 50.0])
+    column = int(np.flatnonzero((s.bank.form == innovations.LESS) & (s.bank.signal == 0))[0])
+    back = int(s.bank.back[column])
+    memory.ring[:, :4] = np.r_[u, u]
+    memory.gain[:], memory.age[0] = 1.0, 0
+    off, Xb, rows = np.zeros(len(watch.A)), [], int(s.bank.back.max()) + 4
+    memory.ahead[0] = rows
+    for row in range(rows):
+        since = row - int(s.bank.back.max())
+        innovations._taken(watch, s.bank, memory)
+        x = watch.F @ x + (since - 1 >= -back) * -(watch.B[:, 0] * u[0])
+        off = x
+        Xb.append(memory.Xb[:, column].copy())
+        np.testing.assert_allclose(Xb[-1], off, atol=1e-9)  # the same sums in another order
+    assert np.abs(off).max() > 0
+
+
+def test_a_simulated_controller_runs_only_in_a_rehearsal():
+    with pytest.raises(
+        ValueError, match="pi: it was made for a simulated plant and runs only with rehearsal=True"
+    ):
+        Supervised(exported())
+
+
+def test_bad_input_is_refused_in_a_sentence():
+    with pytest.raises(ValueError, match=r"noise in degC above zero, found \[0. 0.\]"):
+        supervision(MODEL, [MODEL], WIRED, np.zeros(2))
+    with pytest.raises(ValueError, match="declare the safe mode of every kind"):
+        supervision(MODEL, [MODEL], WIRED, np.full(2, NOISE), modes={"sensor_nan": "law"})
+    run = Run()
+    with pytest.raises(ValueError, match=r"expects 2 temperatures but was given an array of shape \(3,\)"):
+        run.supervised.step(np.zeros(3), R, 0.0)
+    saved = Run(seed=2).supervised
+    saved.step(R, R, 0.0)
+    arrays = saved.saved() | {"theta": np.zeros(3)}
+    with pytest.raises(ValueError, match="restored from theta of shape"):
+        run.supervised.restore(arrays)
