@@ -44,7 +44,7 @@ def limits_of(zones: int, *, rate: float = np.inf) -> Limits:
 
 
 def guard(model: Plant, limits: Limits) -> Governor:
-    outputs = OutputLimits(np.zeros(model.p), np.full(model.p, 250.0), np.full(model.p, 3 * NOISE), 0.5)
+    outputs = OutputLimits(np.zeros(model.p), np.full(model.p, 250.0), np.full(model.p, 3 * NOISE), 0.05)
     return governor([model], limits, outputs, STRENGTH)
 
 

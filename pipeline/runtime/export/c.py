@@ -357,7 +357,18 @@ def _law(name: str, deployed: Deployed) -> str:
 # ---- the supervisor in numbers
 
 # names in tables.h of the constants of innovations.py and supervisor.py
-OF_INNOVATIONS = ("MOST_Z", "DOUBTED", "TELLS", "KEPT", "CALM", "STIRRED", "ODD", "CATCH_UP")
+OF_INNOVATIONS = (
+    "MOST_Z",
+    "DOUBTED",
+    "TELLS",
+    "KEPT",
+    "CALM",
+    "STIRRED",
+    "ODD",
+    "CATCH_UP",
+    "MOVING",
+    "COINCIDENCE",
+)
 OF_SUPERVISOR = (
     "ALARM", "DECIDED_AFTER", "DECIDED_BY", "TOLD_APART", "UNEXPLAINED", "UNEXPLAINED_SHARE", "DEAD_SHARE",
     "NOISY_SQUARE", "NOISY_LAG", "CHANCE", "REPEATS_LEAST", "SETTLED_DEGC", "HELD_SHARE", "APPLIED",
@@ -379,7 +390,21 @@ def supervising(s: supervisor.Supervision) -> str:
     text += define("UNEXPLAINED_BY_THETA", watch.unexplained)
     text += define("LONGEST_BACK", int(bank.back.max()))
     text += "".join(define(f"FORM_{name}", getattr(innovations, name)) for name in FORMS)
-    for name in ("A", "B", "C", "L", "start", "start_0", "b", "d", "prior", "floor", "low", "high"):
+    for name in (
+        "A",
+        "B",
+        "C",
+        "L",
+        "hurried",
+        "start",
+        "start_0",
+        "b",
+        "d",
+        "prior",
+        "floor",
+        "low",
+        "high",
+    ):
         text += table(f"watch_{name}", getattr(watch, name))
     text += integers("watch_strongest", watch.strongest)
     for name in ("form", "signal", "back"):

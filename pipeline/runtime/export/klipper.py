@@ -109,11 +109,7 @@ def pid(exported: Exported) -> Pid:
     model, limits = strictly_proper(exported.model), exported.controller.limits
     T = exported.machine.sample_time_s
     pairs = baseline.pairing(
-        model,
-        limits.low,
-        limits.high,
-        horizon=_horizon(T),
-        noise_degC=exported.supervision.noise_degC,
+        model, limits.low, limits.high, horizon=_horizon(T), noise_degC=exported.supervision.noise_degC
     )
     if not pairs.gain[0] > 0:
         raise ValueError(

@@ -14,12 +14,14 @@ import numpy as np
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.supervisor import KINDS, MODES
 from pipeline.temperature.plant import Plant, hold_output, strictly_proper
+from pipeline.temperature.tracking import feasible_target
 
 # what is done at a sample: in manual; a step; before it hand over, save and restore, or acknowledge; begin anew
 WATCH, STEP, HAND_OVER, RESTORE, ACKNOWLEDGE, BEGIN = range(6)
 # readings that are none of the plant's: no number at all, and the one before once more
 LOST, REPEATED = np.inf, -np.inf
 TOLERANCE = 1e-9  # of each input's range
+UNSURE = 1e-11  # degC: what no reference is known to, and more than rounding
 
 
 class Script(NamedTuple):
@@ -85,8 +87,10 @@ def _episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script
     do = np.full(steps, STEP)
     do[:MANUAL], do[0], do[MANUAL] = WATCH, BEGIN, HAND_OVER
     do[rng.integers(MANUAL + 1, steps, 2)] = RESTORE
-    reach = 150 * noise
-    r = np.repeat(at.y + rng.uniform(-1, 1, (-(-steps // 60), p)) * reach, 60, axis=0)[:steps]
+    reach = _reach(exported) if rng.random() < 0.5 else 150 * noise
+    each = max(60, steps // 3)
+    asked = np.array([_asked(exported, at.y, reach, rng) for _ in range(-(-steps // each))])
+    r = np.repeat(asked, each, axis=0)[:steps]
     r[:MANUAL] = at.y
     made = Script(
         do=do,
@@ -105,6 +109,40 @@ def _episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script
     if last < steps and rng.random() < 0.5:
         made.do[last] = ACKNOWLEDGE
     return made
+
+
+def _asked(exported: Exported, y: np.ndarray, reach: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A reference (p,) within `reach` of y whose target is determined."""
+    for _ in range(50):
+        r = y + rng.uniform(-1, 1, len(y)) * reach
+        if determined(exported, r):
+            return r
+    return y
+
+
+def determined(exported: Exported, r: np.ndarray) -> bool:
+    """Whether the target of reference r (p,) is one and the same however sums are rounded.
+
+    Where inputs that hardly move an output stand near a limit, `tracking.feasible_target` leaves to the last
+    bit which of equally good inputs it takes: another CPU takes another, and so does C. Five in a thousand
+    references of the study's machine whose zones lie far apart are such, of its panel none.
+    """
+    limits = exported.controller.limits
+    at = [
+        feasible_target(exported.model, r + shift, limits.low, limits.high).u
+        for shift in (-UNSURE, 0.0, UNSURE)
+    ]
+    return float(np.ptp(at, axis=0).max()) < TOLERANCE * float((limits.high - limits.low).min())
+
+
+def _reach(exported: Exported) -> np.ndarray:
+    """How far (p,) in degC references may lie from the start: a little beyond the outputs' limits, so that the
+    governor acts and some are out of reach."""
+    bottom, top = (
+        np.array([getattr(one, side) for one in exported.machine.outputs]) for side in ("low", "high")
+    )
+    span = np.where(np.isfinite(top - bottom), top - bottom, 300 * exported.supervision.noise_degC)
+    return 0.52 * span
 
 
 FAULTS = ("none", "none", "lost", "frozen", "offset", "noisy", "cold", "on", "off", "weak", "late", "jump")

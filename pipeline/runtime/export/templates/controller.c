@@ -119,7 +119,7 @@ beadline_result beadline_watch(beadline_controller *c, const double *u, const do
     if (!all_finite(u, INPUTS) || !all_finite(r, OUTPUTS))
         return BEADLINE_BAD_INPUT;
     turn_to(c, r);
-    follow(&c->kept, &c->memory, y, c->y_star, NULL, 1, filled);
+    follow(&c->kept, &c->memory, y, c->y_star, NULL, 0, filled);
     c->kept.clock_s[1] += BEADLINE_SAMPLE_TIME_S;
     memcpy(c->kept.asked, u, sizeof c->kept.asked);
     memcpy(c->kept.held, u, sizeof c->kept.held);

@@ -183,6 +183,12 @@ static void inputs_off(const innovation_memory *o, int h, const double *u, doubl
     }
 }
 
+/* How far an output should have moved, as late as the plant is */
+static double lagged_move(const innovation_memory *o, int row, int j)
+{
+    return (1 - o->late) * o->dy[row][j] + o->late * o->dy[row > 0 ? row - 1 : RING - 1][j];
+}
+
 /* One row of the ring: Xb of every hypothesis a sample on, and its sums */
 static void take_row(innovation_memory *o)
 {
@@ -202,7 +208,7 @@ static void take_row(innovation_memory *o)
         if (sensor >= 0) {
             double after = bank_form[h] == FORM_RAMP ? since + bank_back[h] : 1.0;
             if (bank_form[h] == FORM_LAG)
-                after = bank_lag[h] * (o->f[h] - o->dy[row][sensor]);
+                after = bank_lag[h] * (o->f[h] - lagged_move(o, row, sensor));
             o->f[h] = since >= -bank_back[h] ? after : 0.0;
         }
     }
@@ -251,6 +257,20 @@ typedef struct {
     int best;
 } verdict;
 
+/* Whether a sensor's lag would show: an offset seldom begins just where its zone moves */
+static int moving(const innovation_memory *o, int signal)
+{
+    int h, j;
+    for (h = 0; h < BANK; h++) {
+        double square = 0.0;
+        for (j = 0; j < OUTPUTS; j++)
+            square += o->square[h][j];
+        if (bank_form[h] == FORM_LAG && bank_signal[h] == signal && square > MOVING)
+            return 1;
+    }
+    return 0;
+}
+
 static double left_by(const innovation_memory *o, int h, int j, double a, int n)
 {
     return fmax((o->own[j] - 2 * a * o->cross[h][j] + a * a * o->square[h][j]) / n, 0.0);
@@ -275,6 +295,8 @@ static void judge(const innovation_memory *o, verdict *v)
         v->cost[h] = 0.0;
         for (j = 0; j < OUTPUTS; j++)
             v->cost[h] += n * log(fmax(left_by(o, h, j, v->amplitude[h], n), 1.0));
+        if ((bank_form[h] == FORM_STEP || bank_form[h] == FORM_RAMP) && moving(o, bank_signal[h]))
+            v->cost[h] += COINCIDENCE;
         if (v->cost[h] < v->cost[v->best])
             v->best = h;
     }
@@ -571,8 +593,15 @@ static void raise_alarm(supervisor_kept *k, innovation_memory *o, double highest
     }
 }
 
-/* One sample of outputs y, inputs `applied` since the one before; filled is y with what is not trusted as
- * forecast */
+/* In manual the drift follows fast, and nothing is learned of the plant */
+static void hurry(innovation_memory *o, const double *e)
+{
+    add_product(o->x, watch_hurried[0], e, WATCH, OUTPUTS);
+    memset(o->X, 0, sizeof o->X);
+}
+
+/* One sample of outputs y, inputs `applied` since the one before, none of `samples` in manual; filled is y with
+ * what is not trusted as forecast */
 static void follow(supervisor_kept *k, innovation_memory *o, const double *y, const double *y_star,
                    const double *applied, int samples, double *filled)
 {
@@ -589,8 +618,11 @@ static void follow(supervisor_kept *k, innovation_memory *o, const double *y, co
         memcpy(o->u[0], u, sizeof u);
         memcpy(o->u[1], u, sizeof u);
     } else
-        for (step = 0; step < samples; step++)
+        for (step = 0; step < (samples > 0 ? samples : 1); step++) {
             advance(o, u, step == 0 ? k->e : none, moved);
+            if (samples == 0)
+                hurry(o, k->e);
+        }
     distrust(k, y);
     see(o, y, k->trusted, &now);
     for (j = 0; j < OUTPUTS; j++) {
@@ -605,7 +637,10 @@ static void follow(supervisor_kept *k, innovation_memory *o, const double *y, co
     memcpy(k->e, now.e, sizeof now.e);
     for (j = 0; j < OUTPUTS; j++)
         filled[j] = k->trusted[j] > 0 ? y[j] : now.expected[j];
-    raise_alarm(k, o, now.highest);
+    if (samples == 0)
+        rest_observer(o);
+    else
+        raise_alarm(k, o, now.highest);
     if (forget(k)) {
         start_observer(o, filled);
         memset(k->e, 0, sizeof k->e);

@@ -1,0 +1,320 @@
+"""Exported code against the object: C and Python ask for the same inputs over limits, faults and hand-overs, and
+neither runs for another machine."""
+
+import ast
+import importlib.util
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from pipeline.runtime.certificate import sha256
+from pipeline.runtime.export import c, klipper, python, standalone, vectors
+from pipeline.runtime.export.vectors import TOLERANCE
+from pipeline.runtime.machine import Exported
+from pipeline.runtime.supervisor import KINDS, MODES, Supervised
+from pipeline.temperature import tracking
+from pipeline.temperature.controller import ramp
+from pipeline.temperature.plant import hold_output
+from tests.runtime.deployed_machines import LAWS, block_and_sensor, exported, limits_of, passed, refused
+
+COMPILER = shutil.which("cc")
+needs_cc = pytest.mark.skipif(COMPILER is None, reason="no C compiler cc on this machine; install one")
+EPISODES, STEPS = 8, 150
+
+
+def written(folder: Path, of: Exported, *, episodes: int = EPISODES, steps: int = STEPS) -> Path:
+    """The exported C in a folder."""
+    folder.mkdir(exist_ok=True)
+    golden = vectors.golden(of, episodes=episodes, steps=steps)
+    for name, text in c.files(of, passed(of), golden).items():
+        (folder / name).write_text(text)
+    return folder
+
+
+def made(folder: Path, target: str = "test") -> subprocess.CompletedProcess:
+    return subprocess.run(["make", "-s", target], cwd=folder, capture_output=True, text=True)
+
+
+def loaded(folder: Path, of: Exported) -> ModuleType:
+    """The exported Python file as a module."""
+    (folder / "exported_controller.py").write_text(python.text(of, passed(of)))
+    spec = importlib.util.spec_from_file_location("exported_controller", folder / "exported_controller.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def whose(of: Exported) -> dict:
+    return {
+        "plant_sha256": of.plant_sha256,
+        "sample_time_s": of.machine.sample_time_s,
+        "input_unit": "percent",
+        "output_unit": "degC",
+    }
+
+
+# ---- C
+
+
+@needs_cc
+@pytest.mark.parametrize("kind", LAWS)
+def test_c_without_a_warning_asks_for_what_the_object_asked_for(kind, tmp_path):
+    done = made(written(tmp_path, exported(kind)))
+    assert done.returncode == 0, done.stdout + done.stderr
+    figures = json.loads(done.stdout)
+    assert figures["rows"] == EPISODES * STEPS
+    assert figures["largest_difference"] <= TOLERANCE
+    assert figures["modes_differ"] == figures["causes_differ"] == 0
+
+
+@needs_cc
+def test_the_golden_vectors_reach_limits_safe_modes_and_hand_overs():
+    of = exported()
+    script = vectors.script(of, episodes=EPISODES, steps=STEPS, rng=np.random.default_rng(1))
+    done = vectors.played(lambda: Supervised(of, rehearsal=True), of.model, vectors.start(of), script)
+    assert (done.u == 0).any() and (done.u == 100).any()
+    assert len(set(done.mode)) >= 3 and np.bitwise_or.reduce(done.causes).bit_count() >= 4
+    assert {vectors.HAND_OVER, vectors.RESTORE, vectors.BEGIN} <= set(script.do)
+
+
+@needs_cc
+@pytest.mark.parametrize(
+    "kind, before, after",
+    [
+        ("lqg", "k->held[i] += HELD_SHARE", "k->held[i] += 1.01 * HELD_SHARE"),
+        ("lqg", "s->xi[j] += l->integral[j]", "s->xi[j] += 1.0001 * l->integral[j]"),
+        ("lqg", "u[i] = fmax(u[i] - most / size", "u[i] = fmax(u[i] - 1.001 * most / size"),
+        ("lqg", "diagonal = A[k][k] > 0 ? -sqrt(size)", "diagonal = A[k][k] > 0 ? -1.001 * sqrt(size)"),
+        ("lqg", "*c = *saved;", "c->law = saved->law;"),
+        ("lqg", "o->theta[j][i] + PS[j][i]", "o->theta[j][i] + 1.01 * PS[j][i]"),
+        ("hold", "k->waited[j] += BEADLINE_SAMPLE_TIME_S", "k->waited[j] += 3 * BEADLINE_SAMPLE_TIME_S"),
+    ],
+)
+def test_a_change_of_the_c_does_not_pass_its_golden_vectors(kind, before, after, tmp_path):
+    written(tmp_path, exported(kind), steps=STEPS if kind == "lqg" else 450)
+    code = (tmp_path / "controller.c").read_text()
+    assert before in code
+    (tmp_path / "controller.c").write_text(code.replace(before, after))
+    assert made(tmp_path).returncode != 0
+
+
+@needs_cc
+def test_c_reads_and_writes_nothing_that_is_not_its_own(tmp_path):
+    folder = written(tmp_path, exported("window"), episodes=3)
+    built = made(folder, "sanitized")
+    if built.returncode and "cannot find" in built.stderr:
+        pytest.skip("the compiler has no sanitizers")
+    assert built.returncode == 0, built.stderr
+    done = subprocess.run(["./sanitized", "golden.csv"], cwd=folder, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@needs_cc
+def test_the_c_allocates_nothing_and_asks_no_clock(tmp_path):
+    folder = written(tmp_path, exported(), episodes=1)
+    subprocess.run(["cc", "-std=c99", "-O2", "-c", "controller.c"], cwd=folder, check=True)
+    symbols = subprocess.run(["nm", "-u", "controller.o"], cwd=folder, capture_output=True, text=True).stdout
+    called = set(re.findall(r"U (\w+)", symbols))
+    assert called <= {"erf", "exp", "log", "pow", "sqrt", "fmax", "fmin", "memcpy", "memset", "memmove",
+                      "strcmp", "memcmp", "bcmp", "__stack_chk_fail", "_GLOBAL_OFFSET_TABLE_"}  # fmt: skip
+
+
+@needs_cc
+def test_the_c_refuses_every_other_machine_in_words(tmp_path):
+    """Each refusal is tested by test_controller.c too, before each episode."""
+    folder = written(tmp_path, exported(simulated=False), episodes=1)
+    (folder / "ask.c").write_text(
+        '#include "controller.h"\n#include <stdio.h>\n'
+        "int main(void) { static beadline_controller c; beadline_machine m = {BEADLINE_PLANT_SHA256, "
+        '"percent", "K", 1.0, 2, 2};\n puts(beadline_why(beadline_init(&c, &m, 0)));\n m.output_unit = "degC"; '
+        "puts(beadline_why(beadline_init(&c, &m, 0)));\n m.sample_time_s = 0.3; "
+        "puts(beadline_why(beadline_init(&c, &m, 0))); return 0; }\n"
+    )
+    subprocess.run(["cc", "-std=c99", "-o", "ask", "ask.c", "controller.c", "-lm"], cwd=folder, check=True)
+    said = subprocess.run(["./ask"], cwd=folder, capture_output=True, text=True).stdout.splitlines()
+    assert said == [
+        "the certificate is of other units; convert the signals as machine.h says",
+        "done",
+        "the certificate is of another sample time; sample as machine.h says",
+    ]
+
+
+def test_the_c_names_certificate_plant_units_and_sample_time():
+    of = exported()
+    header = c.files(of, passed(of), "")["machine.h"]
+    for text in (sha256(passed(of)), of.plant_sha256, '"percent"', '"degC"', "BEADLINE_SAMPLE_TIME_S 1.0"):
+        assert text in header
+    assert "#define BEADLINE_SIMULATED 1" in header and "#define OUTPUT_SENSOR_2 1" in header
+
+
+def test_numbers_in_c_read_back_bit_by_bit():
+    values = np.random.default_rng(1).normal(size=500) * 10.0 ** np.arange(-250, 250)
+    text = c.table("values", values)
+    numbers = [float(word) for word in re.findall(r"[-+\d.e]+(?=[,\n])", text.split("{", 1)[1])]
+    assert numbers == values.tolist()
+
+
+# ---- the target
+
+
+@pytest.mark.parametrize("zones", [1, 3])
+def test_the_target_without_scipy_is_the_target(zones):
+    """Bit by bit: the same operations in the same order, out of reach and within it."""
+    model, limits = block_and_sensor(zones=zones), limits_of(zones)
+    rng = np.random.default_rng(zones)
+    for r in rng.uniform(-20, 420, (60, zones)):
+        ours = [standalone._steady(model, r, limits.low, limits.high, slack) for slack in (0.0, 3.0, 49.0)]
+        theirs = [tracking._steady(model, r, limits.low, limits.high, slack) for slack in (0.0, 3.0, 49.0)]
+        for one, other in zip(ours, theirs, strict=True):
+            assert np.array_equal(one.u, other.u) and np.array_equal(one.miss, other.miss)
+
+
+# ---- Python
+
+
+@pytest.mark.parametrize("kind", ["lqg", "window", "printer_pid"])
+def test_the_python_file_is_the_object_bit_by_bit(kind, tmp_path):
+    of = exported(kind)
+    module = loaded(tmp_path, of)
+    script = vectors.script(of, episodes=4, steps=STEPS, rng=np.random.default_rng(2))
+    at = vectors.start(of)
+    ours = vectors.played(lambda: Supervised(of, rehearsal=True), of.model, at, script)
+    theirs = vectors.played(lambda: module.controller(**whose(of), rehearsal=True), of.model, at, script)
+    assert np.array_equal(ours.u, theirs.u)
+    assert np.array_equal(ours.mode, theirs.mode) and np.array_equal(ours.causes, theirs.causes)
+
+
+def test_the_python_file_imports_numpy_and_the_language_only(tmp_path):
+    of = exported()
+    text = python.text(of, passed(of))
+    nodes = [one for one in ast.walk(ast.parse(text)) if isinstance(one, ast.Import | ast.ImportFrom)]
+    names = [one.module if isinstance(one, ast.ImportFrom) else one.names[0].name for one in nodes]
+    assert set(names) == {
+        "__future__", "base64", "math", "collections.abc", "typing", "numpy",
+    }  # fmt: skip
+    assert sha256(passed(of)) in text and of.plant_sha256 in text
+
+
+@pytest.mark.parametrize(
+    "what, changed",
+    [
+        ("plant", {"plant_sha256": "0" * 64}),
+        ("sample time in s", {"sample_time_s": 0.3}),
+        ("unit of inputs", {"input_unit": "W"}),
+        ("unit of outputs", {"output_unit": "K"}),
+    ],
+)
+def test_the_python_file_refuses_another_machine(what, changed, tmp_path):
+    of = exported()
+    with pytest.raises(ValueError, match=f"its certificate is of another {what}"):
+        loaded(tmp_path, of).controller(**(whose(of) | changed), rehearsal=True)
+
+
+def test_a_simulated_controller_runs_in_a_rehearsal_only(tmp_path):
+    of = exported()
+    module = loaded(tmp_path, of)
+    with pytest.raises(ValueError, match="runs only with rehearsal=True"):
+        module.controller(**whose(of))
+    real = exported(simulated=False)
+    assert loaded(tmp_path, real).controller(**whose(real)) is not None
+
+
+def test_the_python_file_refuses_a_reference_that_moves(tmp_path):
+    of = exported()
+    module = loaded(tmp_path, of)
+    one = module.controller(**whose(of), rehearsal=True)
+    at = vectors.start(of)
+    one.watch(at.u, at.y, at.y)
+    with pytest.raises(ValueError, match="expected a constant reference but found one of 2 states"):
+        one.step(at.y, module.Reference(*ramp(at.y, np.ones(2))), 1.0)
+
+
+@pytest.mark.parametrize("export", [lambda of, why: c.files(of, why, ""), python.text])
+def test_nothing_is_exported_without_a_passed_certificate_of_this_controller(export):
+    of = exported()
+    with pytest.raises(ValueError, match="its certificate was refused by rule settled_error; nothing is exp"):
+        export(of, refused(of, "settled_error"))
+    with pytest.raises(ValueError, match="the certificate is of another plant"):
+        export(of, passed(of)._replace(plant_sha256="0" * 64))
+    with pytest.raises(ValueError, match="input heater_1: the limit high is missing"):
+        bare = of.machine.inputs[0]._replace(high=np.inf)
+        export(of._replace(machine=of.machine._replace(inputs=(bare, of.machine.inputs[1]))), passed(of))
+
+
+# ---- Klipper and Kalico
+
+POWER_W = 40.0
+
+
+def test_kalicos_parameters_are_those_of_the_block():
+    """The model is a block and a sensor: 20 J/K, 0.15 W/K, a lag of 8 s, by construction."""
+    found = klipper.mpc(block_and_sensor(zones=1), POWER_W)
+    expected = (20.0, 0.15, 1 / 8)
+    assert np.allclose(found[:3], expected, rtol=1e-6) and found.error < 1e-6
+
+
+@pytest.mark.parametrize("sample_time_s", [0.3, 1.0])
+def test_klippers_pid_settles_the_heater_by_klippers_own_formula(sample_time_s):
+    """Every 0.3 s, duty 0..1, gains divided by 255; from the room to 210 degC, overshoot under 3 degC."""
+    made, T = klipper.pid(exported(zones=1, sample_time_s=sample_time_s)), 0.3
+    plant = block_and_sensor(zones=1, sample_time_s=T)
+    x, integral, y = hold_output(plant, np.array([25.0]))[0], 0.0, []
+    for _ in range(4000):
+        y.append(float(plant.C[0] @ x + plant.d[0]))
+        error = 210.0 - y[-1]
+        wished = (made.Kp * error + made.Ki * (integral + T * error)) / 255.0
+        duty = min(max(wished, 0.0), 1.0)
+        integral += T * error if wished == duty else 0.0
+        x = plant.A @ x + plant.B @ [100.0 * duty] + plant.b
+    assert max(y) < 213.0 and abs(y[-1] - 210.0) < 0.2
+    assert max(abs(one - 210.0) for one in y[1500:]) < 2.0
+
+
+def test_printer_cfg_names_the_options_of_their_documentation():
+    """pid_Kp, pid_Ki, pid_Kd, max_power, min_temp, max_temp of Klipper's Config_Reference.md; heater_power,
+    block_heat_capacity, ambient_transfer, sensor_responsiveness of Kalico's MPC.md."""
+    of = exported(zones=1)
+    text = klipper.settings(of, passed(of), section="extruder", heater_power_W=POWER_W)
+    options = re.findall(r"^(?:# )?([a-z]\w+): ", text, re.M)
+    assert options == [
+        "control", "pid_Kp", "pid_Ki", "pid_Kd", "max_power", "min_temp", "max_temp",
+        "control", "heater_power", "block_heat_capacity", "ambient_transfer", "sensor_responsiveness",
+    ]  # fmt: skip
+    assert "block_heat_capacity: 20  # J/K" in text and "ambient_transfer: 0.15  # W/K" in text
+    assert "# Rehearsal: the plant was simulated" in text and sha256(passed(of)) in text
+
+
+def test_klipper_gets_no_machine_that_it_cannot_control():
+    of, two = exported(zones=1), exported(zones=2)
+    with pytest.raises(
+        ValueError, match="inputs heater_1, heater_2 and outputs sensor_1, sensor_2; export it"
+    ):
+        klipper.settings(two, passed(two), section="extruder")
+    with pytest.raises(ValueError, match="section fan: expected one of extruder, heater_bed"):
+        klipper.settings(of, passed(of), section="fan")
+    with pytest.raises(ValueError, match="heater_power: expected watts above zero but found -4"):
+        klipper.settings(of, passed(of), section="extruder", heater_power_W=-4.0)
+    with pytest.raises(ValueError, match="its certificate was refused by rule poles"):
+        klipper.settings(of, refused(of, "poles"), section="extruder")
+
+
+def test_kalico_gets_no_model_that_is_no_block_and_sensor():
+    model = block_and_sensor(zones=1)
+    rings = model._replace(A=np.array([[0.98, -0.2], [0.2, 0.98]]))
+    with pytest.raises(ValueError, match="off that of a heater block and a sensor"):
+        klipper.mpc(rings, POWER_W)
+
+
+def test_kinds_and_modes_have_the_same_numbers_in_c():
+    header = (c.TEMPLATES / "supervisor.h").read_text()
+    kinds = re.findall(r"\b[A-Z][A-Z_]+\b(?=,)", header.split("enum {")[1].split("KINDS")[0])
+    assert [name.lower() for name in kinds] == list(KINDS)
+    modes = re.findall(r"MODE_(\w+)", header)
+    assert [name.lower() for name in modes] == list(MODES)
