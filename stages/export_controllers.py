@@ -52,8 +52,9 @@ def main() -> None:
             export.check_same(one, difference)
             resolved = evaluate_temperature.resolved(rules, panel, rehearsal)
             certificate = export.certified(one, judged, resolved, settings, record)
+            within = export.supported(one, judged, panel, settings.seed, record)
             temperature = export.write_temperature(
-                out / "temperature", one, certificate, {"judged": difference}
+                out / "temperature", one, certificate, within, {"judged": difference}
             )
         model = restore_classifier(
             "datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet"

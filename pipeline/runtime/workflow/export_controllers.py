@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.runtime import bands, certificate, machine, supervisor
+from pipeline.runtime import bands, certificate, machine, supervisor, support
 from pipeline.runtime.certificate import Certificate
 from pipeline.runtime.export import vectors
 from pipeline.runtime.machine import Exported
-from pipeline.runtime.workflow import exports
+from pipeline.runtime.replay import Log
+from pipeline.runtime.workflow import exports, replay
 from pipeline.runtime.workflow.settings import ExportControllers
 from pipeline.store import artifacts
 from pipeline.temperature import controller, panel
@@ -22,7 +23,7 @@ from pipeline.temperature.identification import gapless
 from pipeline.temperature.workflow import cases, evaluate_temperature, record
 from pipeline.temperature.workflow.contestants import BY_NAME, Problem
 from pipeline.temperature.workflow.learned import Learned
-from pipeline.temperature.workflow.settings import Plant, TemperatureRules
+from pipeline.temperature.workflow.settings import Panel, Plant, TemperatureRules
 
 FALLBACK = "pi_simc"  # the safe mode "pi"; where the machine allows none, inputs are held
 NEWEST = 0.25  # of a single recording, its end, stands for the machine as it is now
@@ -166,6 +167,35 @@ def learning(name: str, judged: Judged) -> bands.Learning | None:
     return bands.Learning(of, N, np.ones(p), np.full(m, effort), problem.gamma)
 
 
+# ---- support
+
+
+def supported(made: Exported, judged: Judged, declared: Panel, seed: int, path: str) -> support.Support:
+    """What a replay holds a recording against: plants drawn anew from the spread forecast; honest logs are
+    those of the training half under this controller."""
+    learned, half = judged.learned, judged.setting.rehearsal.training
+    around, rng = [learned.model, *learned.spread], np.random.default_rng(seed)
+    spread = cases.spread_of(declared) if judged.simulated else cases.spread_around(declared, learned.model)
+    plants = panel.padded(panel.drawn(around, FORECASTING, spread, cells=False, rng=rng))
+    aimed = panel.aims(made.controller.law, panel.rests(made.model, half, judged.setting.limits), half)
+    run, noise = panel.rolled_out(made.controller, half, aimed), panel.noise_of(half)[: half.hold]
+    honest = []
+    for case in range(len(half.plant)):
+        plant, still = half.plants[half.plant[case]], np.ones((half.hold, 1))
+        held = plant.C @ half.x0[case] + plant.d + noise[:, case]
+        parts = (still * half.u0[case], run.u[:, case]), (held, run.measured[:, case]), (
+            still * run.r[0, case], run.r[:, case],
+        )  # fmt: skip
+        honest.append(Log(*(np.concatenate(part) for part in parts)))
+    seen = evidence(path, judged.machine)
+    recorded = [
+        Log(u, y, y) for u, y in zip([*seen.u, *seen.newest_u], [*seen.y, *seen.newest_y], strict=True)
+    ]
+    return support.support(plants, honest, judged.setting.rehearsal.noise, recorded)
+
+
+FORECASTING = 16  # plants
+
 # ---- what runs is what was judged
 
 
@@ -250,14 +280,15 @@ class Written(NamedTuple):
 
 
 def write_temperature(
-    folder: Path, made: Exported, shown: Certificate, differences: dict[str, float]
+    folder: Path, made: Exported, shown: Certificate, within: support.Support, differences: dict[str, float]
 ) -> Written:
-    """controller.json, arrays.safetensors, certificate.json, c/ and python/; of one that was refused the
-    certificate alone."""
+    """controller.json, arrays.safetensors, certificate.json, support.safetensors, c/ and python/; of one that
+    was refused the certificate alone."""
     if shown.verdict != "passed":
         artifacts.write_text(folder / machine.CERTIFICATE, certificate.to_json(shown))
         return Written(made.name, brief(shown), refusal(shown), {}, differences, "percent")
     machine.write(folder, made, shown)
+    replay.write_support(folder, within, shown.controller_sha256)
     for name, text in exports.files(made, shown, "c", "", None).items():
         artifacts.write_text(folder / "c" / name, text)
     code = exports.files(made, shown, "python", "", None)["controller.py"]
