@@ -296,8 +296,8 @@ def replay(arguments: argparse.Namespace) -> None:
     if _shows_frames(arguments.controller):
         place = arguments.recording
         shadow(argparse.Namespace(
-            source=str(place), out=arguments.out, tip="", flow=100.0, temperature=210.0, levels=None, rate=5.0,
-            once=True,
+            source=str(place), out=arguments.out, tip="", flow=100.0, temperature=210.0, levels=None,
+            rate=5.0, once=True,
         ))  # fmt: skip
         return
     from pipeline.report.replay import page

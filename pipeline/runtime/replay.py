@@ -222,7 +222,7 @@ def _conditional(
 
 
 WARM_UP = 3000  # samples after which what a governor at its own pace remembers has faded to 3e-7
-SIDE_BY_SIDE = 200  # chunks of a long recording
+SIDE_BY_SIDE = 400  # chunks of a long recording
 
 
 def _governed(

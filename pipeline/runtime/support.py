@@ -29,7 +29,7 @@ HONEST = 0.95  # of honest logs have no larger share of forecasts that are off
 LEAST_SHARE = 0.05  # and a log is never off for fewer
 TAU, DRIFT, LEAK, UNHURRIED = 0.2, 0.06, 1e-4, 16  # of the observers, as of the governor's
 AT_ONCE = 4  # forecasts begin so often within the steps that one goes
-MOST_SAMPLES = 100_000  # of a long log forecasts are judged in stretches, so many samples in all
+MOST_SAMPLES = 60_000  # of a long log forecasts are judged in stretches, so many samples in all
 STRETCH = 2_000
 
 
@@ -61,16 +61,16 @@ def horizon(spread: Sequence[Plant]) -> int:
     return int(instants(spread)[-1])
 
 
-def forecasts(spread: Sequence[Plant], log: Log, noise: np.ndarray, steps: int) -> Forecasts:
+def forecasts(watches: Sequence["Watch"], log: Log, noise: np.ndarray, steps: int) -> Forecasts:
     """Forecasts over `steps` samples, AT_ONCE of them under way at a time; none in the first 2 `steps`, while
     the observers find the machine."""
     start = np.arange(2 * steps, len(log.u) - steps, max(steps // AT_ONCE, 1))
     if not len(start):
         return Forecasts(start, np.zeros(0))
-    told = np.stack([_told(one, log, start, steps) for one in spread])
+    told = np.stack([_told(one, log, start, steps) for one in watches])
     mean = told.mean(axis=0)
     apart = told - mean
-    S = np.einsum("kai,kaj->aij", apart, apart) / (len(spread) - 1)
+    S = np.einsum("kai,kaj->aij", apart, apart) / (len(watches) - 1)
     e = log.y[start + steps] - mean
     near = S + np.diag((NOISES * noise) ** 2)
     return Forecasts(start, np.sqrt(np.einsum("ai,ai->a", e, np.linalg.solve(near, e[..., None])[..., 0])))
@@ -79,7 +79,7 @@ def forecasts(spread: Sequence[Plant], log: Log, noise: np.ndarray, steps: int) 
 NOISES = 2.0  # deviations: of the sample that is forecast, and of those from which
 
 
-class _Watch(NamedTuple):
+class Watch(NamedTuple):
     """An observer L of the state [x; w] of one plant: w (p,) in °C a step is a drift that the plant does not
     explain, so that a steady disagreement (another ambient, more heat lost) vanishes from its forecasts, as
     in temperature.governor. `first` (n, p) finds x of the first outputs."""
@@ -93,7 +93,7 @@ class _Watch(NamedTuple):
     first: np.ndarray
 
 
-def _watch(plant: Plant, steps: int) -> _Watch:
+def watched_by(plant: Plant, steps: int) -> Watch:
     """Process noise comes in by the inputs, sensors are TAU percent^2 of every input noisier, and the drift
     wanders a step by DRIFT of what a percent of every input does at most."""
     n, p, slower = plant.n, plant.p, max(steps / UNHURRIED, 1.0)
@@ -106,14 +106,13 @@ def _watch(plant: Plant, steps: int) -> _Watch:
     P = riccati(A.T, C.T, noise, sensors)
     L = A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
     none = np.zeros((p, plant.m))
-    return _Watch(A, np.vstack([plant.B, none]), C, np.r_[plant.b, np.zeros(p)], plant.d, L, likely)
+    return Watch(A, np.vstack([plant.B, none]), C, np.r_[plant.b, np.zeros(p)], plant.d, L, likely)
 
 
-def _told(plant: Plant, log: Log, start: np.ndarray, steps: int) -> np.ndarray:
+def _told(watch: Watch, log: Log, start: np.ndarray, steps: int) -> np.ndarray:
     """Outputs (a, p) that a plant forecasts `steps` samples after each start (a,)."""
-    watch = _watch(plant, steps)
     moved, states = watch.A - watch.L @ watch.C, np.empty((len(start), len(watch.A)))
-    x = np.r_[watch.first @ (log.y[0] - watch.d), np.zeros(plant.p)]
+    x = np.r_[watch.first @ (log.y[0] - watch.d), np.zeros(len(watch.C))]
     for first in range(0, len(log.u), BLOCK):
         rows = slice(first, first + BLOCK)
         inside = np.flatnonzero((start >= first) & (start < first + BLOCK))
@@ -131,7 +130,8 @@ def support(
     """Of logs of the controller's own plants, whose sensors have noise (p,); the ranges are those of the logs
     that were `seen`, too. Raises ValueError where no log is long enough."""
     steps = horizon(spread)
-    runs = [forecasts(spread, log, noise_degC, steps) for log in honest if len(log.u) > 4 * steps]
+    watches = [watched_by(one, steps) for one in spread]
+    runs = [forecasts(watches, log, noise_degC, steps) for log in honest if len(log.u) > 4 * steps]
     if not runs:
         raise ValueError(
             f"support: expected a log of more than {4 * steps} samples to tell what an honest one is, found "
@@ -168,9 +168,9 @@ def told(within: Support, log: Log) -> Told:
     ):
         off[((values < low) | (values > high)).any(axis=1)] |= kind
     count, every = 0, max(within.steps // AT_ONCE, 1)
-    missed = 0
+    missed, watches = 0, [watched_by(one, within.steps) for one in within.spread]
     for first, part in _stretches(log):
-        run = forecasts(within.spread, part, within.noise, within.steps)
+        run = forecasts(watches, part, within.noise, within.steps)
         count += len(run.d)
         for start in first + run.start[run.d > within.furthest]:
             missed += 1

@@ -1,5 +1,5 @@
-"""The page of one replayed recording: what was measured and applied, what the controller would have asked, and
-what held it back. It is made of arrays alone, and needs nothing but itself."""
+"""The page of one replayed recording: what was measured and applied, what the controller would have asked,
+and what held it back. It is made of arrays alone, and needs nothing but itself."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

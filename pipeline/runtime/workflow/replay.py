@@ -17,8 +17,8 @@ from pipeline.temperature.workflow.settings import Ingest, Plant
 
 HOLD = 30  # samples that the law watches first
 MESSAGES = 50_000  # of replay.mcap at most: a longer recording is thinned evenly
-WATCHED = 20_000  # samples that the supervisor watches, in stretches of a long recording
-STRETCH = 2_000
+WATCHED = 10_000  # samples that the supervisor watches, in stretches of a long recording
+STRETCH = 1_000
 SUPPORT = "support.safetensors"
 
 
@@ -165,11 +165,12 @@ def replayed(made: Exported, within: support.Support | None, table: Table, r: np
     runs, offs, told = [], [], []
     cuts = np.flatnonzero(np.diff(table.segment)) + 1
     for log in map(Log, np.split(u, cuts), np.split(y, cuts), np.split(r, cuts)):
+        offs.append(_told(within, log))
+        if offs[-1].abstains:
+            runs.append((replay.Replayed(log.u, log.u, log.u, log.r), np.zeros(log.u.shape, int)))
+            continue
         run = replay.replayed(made.controller, made.model, log, hold=min(HOLD, len(log.u)))
         runs.append((run, replay.why(made.controller, log, run)))
-        offs.append(
-            support.told(within, log) if within else support.Told(np.zeros(len(log.u), np.int8), 0.0, False)
-        )
     joined = replay.Replayed(*(np.concatenate(part) for part in zip(*(run for run, _ in runs), strict=True)))
     length = np.array([len(one.off) for one in offs])
     abstains = bool(length[[one.abstains for one in offs]].sum() > 0.5 * length.sum())
@@ -182,6 +183,12 @@ def replayed(made: Exported, within: support.Support | None, table: Table, r: np
         table.time_s, u, joined.wished, joined.asked, np.concatenate([why for _, why in runs]), y, r,
         joined.target, np.concatenate([one.off for one in offs]), cause, abstains, tuple(told),
     )  # fmt: skip
+
+
+def _told(within: support.Support | None, log: Log) -> support.Told:
+    if within is None:
+        return support.Told(np.zeros(len(log.u), np.int8), 0.0, False)
+    return support.told(within, log)
 
 
 def _filled(values: np.ndarray) -> np.ndarray:
@@ -198,8 +205,8 @@ def _filled(values: np.ndarray) -> np.ndarray:
 
 
 def _causes(made: Exported, log: Log, cuts: np.ndarray) -> np.ndarray:
-    """The first cause (T,) that the supervisor has while it watches, as an index of supervisor.KINDS; -1 where
-    it has none, and where it did not watch."""
+    """The first cause (T,) that the supervisor has while it watches, as an index of supervisor.KINDS; -1
+    where it has none, and where it did not watch."""
     T, cause = len(log.u), np.full(len(log.u), -1, np.int8)
     starts = [0] if T <= WATCHED else np.linspace(0, T - STRETCH, WATCHED // STRETCH).astype(int)
     length = T if T <= WATCHED else STRETCH
@@ -283,7 +290,10 @@ def layout(made: Exported) -> dict[str, Any]:
     def plot(title: str, names: Sequence[str]) -> dict[str, Any]:
         return {
             "title": title,
-            "paths": [{"value": f"/replay.{name}", "enabled": True, "timestampMethod": "receiveTime"} for name in names],
+            "paths": [
+                {"value": f"/replay.{name}", "enabled": True, "timestampMethod": "receiveTime"}
+                for name in names
+            ],
             "showXAxisLabels": True, "showYAxisLabels": True, "showLegend": True, "legendDisplay": "floating",
             "isSynced": True, "xAxisVal": "timestamp", "sidebarDimension": 240,
         }  # fmt: skip
