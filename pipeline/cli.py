@@ -283,6 +283,45 @@ def training_print(arguments: argparse.Namespace) -> None:
     print(printing.write(asked, arguments.out, pixel(arguments.tip) if arguments.tip else None))
 
 
+def export(arguments: argparse.Namespace) -> None:
+    """A certified controller as C99 without heap, as one file of Python, or as settings for Klipper and
+    Kalico."""
+    from pipeline.runtime.workflow.exports import export as write
+
+    print(write(arguments.controller, arguments.to, arguments.out, arguments.section, arguments.power))
+
+
+def replay(arguments: argparse.Namespace) -> None:
+    """A recording, and what a certified controller would have asked on it and why not: as MCAP with a layout
+    for Foxglove, and a page. Frames of the nozzle's camera go through the loop of shadow. Nothing is sent."""
+    if _shows_frames(arguments.controller):
+        place = arguments.recording
+        shadow(argparse.Namespace(
+            source=str(place), out=arguments.out, tip="", flow=100.0, temperature=210.0, levels=None,
+            rate=5.0, once=True,
+        ))  # fmt: skip
+        return
+    from pipeline.report.replay import page
+    from pipeline.runtime.workflow import replay as replaying
+    from pipeline.setpoint.workflow.training_print import numbers
+
+    reference = numbers(arguments.reference, "--reference") if arguments.reference else ()
+    asked = replaying.Asked(tuple(reference), arguments.out)
+    done, made, told = replaying.replay_recording(arguments.controller, arguments.recording, asked)
+    inputs, outputs = ([one.name for one in side] for side in (made.machine.inputs, made.machine.outputs))
+    shown = page.Shown(
+        done.time_s, done.applied, done.asked, done.measured, done.reference, done.off, inputs, outputs, told
+    )
+    artifacts.write_text(arguments.out / "index.html", page.render(shown))
+    print(f"{arguments.recording}: {told['samples']} samples. {page.decision(told)}")
+    print(f"written: {arguments.out}/index.html, replay.mcap, layout.json, replay.json")
+
+
+def _shows_frames(folder: Path) -> bool:
+    """Whether a controller's folder is that of the setpoint loop, whose recordings are frames."""
+    return (folder / "classifier.safetensors").exists() and not (folder / "controller.json").exists()
+
+
 def version() -> str:
     """The version that pyproject.toml beside the code states; without one, that of the installed package."""
     project = Path(__file__).resolve().parents[1] / "pyproject.toml"
@@ -376,6 +415,29 @@ def _add_training_print(commands: argparse._SubParsersAction) -> None:
     command.set_defaults(run=training_print)
 
 
+def _add_export(commands: argparse._SubParsersAction) -> None:
+    command = commands.add_parser("export", help=export.__doc__)
+    command.add_argument("controller", type=Path, metavar="CONTROLLER", help="a folder with controller.json")
+    command.add_argument("--to", required=True, choices=("c", "python", "klipper"))
+    command.add_argument("--out", type=Path, metavar="DIR", help="(CONTROLLER/c, .../python, .../klipper)")
+    command.add_argument(
+        "--section", default="extruder", choices=("extruder", "heater_bed"), help="of printer.cfg (extruder)"
+    )
+    command.add_argument("--power", type=float, metavar="W", help="of the heater, for Kalico's MPC")
+    command.set_defaults(run=export)
+
+
+def _add_replay(commands: argparse._SubParsersAction) -> None:
+    command = commands.add_parser("replay", help=replay.__doc__)
+    command.add_argument("controller", type=Path, metavar="CONTROLLER", help="a folder with controller.json")
+    command.add_argument("recording", type=Path, metavar="RECORDING", help="CSV, Parquet, MCAP, klippy.log")
+    command.add_argument("--out", type=Path, default=Path("replay"), metavar="DIR", help="(replay)")
+    command.add_argument(
+        "--reference", default="", metavar="DEGC,...", help="one an output, where the recording has none"
+    )
+    command.set_defaults(run=replay)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         prog="beadline", description="Extrusion-printer recordings into controllers that can be trusted."
@@ -467,6 +529,8 @@ def main() -> None:
     _add_shadow(commands)
     _add_record_levels(commands)
     _add_training_print(commands)
+    _add_export(commands)
+    _add_replay(commands)
     nights.add(commands)
     arguments = parser.parse_args()
     try:

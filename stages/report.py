@@ -1,5 +1,5 @@
 """Artifacts -> pages: reports/index.html, temperature.html, identification.html, deposition.html,
-setpoint.html.
+setpoint.html, certificate.html.
 
 It reads the metrics and tables of every stage and reports/accepted.json. A missing file is shown as missing.
 Every file read is hashed, and the pages carry the hashes. The drift on page one is that of the last night
@@ -8,6 +8,7 @@ Every file read is hashed, and the pages carry the hashes. The drift on page one
 
 import hashlib
 
+from pipeline.report.certificate import page as certificate_page
 from pipeline.report.deposition import page as deposition_page
 from pipeline.report.identification import page as identification_page
 from pipeline.report.index import page as index_page
@@ -36,6 +37,7 @@ METRICS = {
     "train_classifier": "reports/metrics/train_classifier.json",
     "train_agent": "reports/metrics/train_agent.json",
     "evaluate_setpoint": "reports/metrics/evaluate_setpoint.json",
+    "export_controllers": "reports/metrics/export_controllers.json",
 }
 FOLDERS = {
     "ingest": "datasets/ingest",
@@ -49,6 +51,7 @@ FOLDERS = {
     "train_classifier": "datasets/train_classifier",
     "train_agent": "datasets/train_agent",
     "evaluate_setpoint": "datasets/evaluate_setpoint",
+    "export_controllers": "datasets/export_controllers",
 }
 # the relearnings of the study's machine, an accepted result of `./run python -m benchmarks.temperature`
 RELEARNED = "benchmarks/results/temperature_relearned.json"
@@ -67,12 +70,14 @@ def main() -> None:
             "identification": identification_page.render(sources),
             "deposition": deposition_page.render(sources),
             "setpoint": setpoint_page.render(sources),
+            "certificate": certificate_page.render(sources),
         }
         artifacts.write_text("reports/index.html", pages["index"])
         artifacts.write_text("reports/temperature.html", pages["temperature"])
         artifacts.write_text("reports/identification.html", pages["identification"])
         artifacts.write_text("reports/deposition.html", pages["deposition"])
         artifacts.write_text("reports/setpoint.html", pages["setpoint"])
+        artifacts.write_text("reports/certificate.html", pages["certificate"])
         artifacts.write_metrics(
             "report",
             {

@@ -77,11 +77,11 @@ class File(NamedTuple):
     @property
     def room(self) -> str:
         """stages, store, reading, report, nightly, runtime, statistics, cli; of a loop temperature its
-        methods, temperature/workflow, and tables, settings and contestants apart."""
+        methods, temperature/workflow, and tables, settings and contestants apart; runtime likewise."""
         parts = self.name.removesuffix(".py").split("/")
         if parts[0] != "pipeline" or len(parts) < 2:
             return parts[0]
-        if parts[1] in LOOPS and parts[2:3] == ["workflow"]:
+        if parts[1] in (*LOOPS, "runtime") and parts[2:3] == ["workflow"]:
             return (
                 f"{parts[1]}/{parts[3]}"
                 if parts[3:] in (["tables"], ["settings"], ["contestants"])
@@ -156,6 +156,10 @@ def may_know(room: str, target: str) -> bool:
         return target in ("store", "statistics", "report") or described
     if room == "runtime":  # 4: beside a machine run the methods
         return target in (*LOOPS, "store", "statistics", "runtime")
+    if room == "runtime/settings":
+        return target in ("store", "runtime/settings")
+    if room == "runtime/workflow":  # what is exported and replayed is read as the loops' stages left it
+        return target.split("/")[0] in (*LOOPS, "store", "reading", "statistics", "runtime")
     if room in ("store", "reading"):  # 5: below the loops
         return target in ("store", "reading", "statistics")
     return True  # nightly, cli and stages

@@ -125,7 +125,12 @@ def test_what_the_five_rules_forbid_is_seen(tmp_path):
         pipeline__deposition__ilc="import scipy.linalg\nfrom stages import ingest",
         pipeline__runtime__guard="import time\nfrom pipeline.temperature import "
         "plant\nfrom pipeline.store import artifacts\n"
-        "from pipeline.temperature.workflow import ingest",
+        "from pipeline.temperature.workflow import ingest\nfrom pipeline.reading import csv_layout",
+        pipeline__runtime__workflow__settings="from pipeline.store import artifacts\n"
+        "from pipeline.runtime import guard",
+        pipeline__runtime__workflow__replay="from pipeline.temperature.workflow import ingest\n"
+        "from pipeline.reading import csv_layout\nfrom pipeline.runtime import guard\n"
+        "from pipeline.report import page",
         pipeline__report__page="from pipeline.temperature.workflow import contestants, tables, "
         "settings\nfrom pipeline.temperature import "
         "plant\nfrom pipeline.nightly import night",
@@ -142,6 +147,9 @@ def test_what_the_five_rules_forbid_is_seen(tmp_path):
         "pipeline/report/page.py:2 imports pipeline.temperature.plant",
         "pipeline/report/page.py:3 imports pipeline.nightly.night",
         "pipeline/runtime/guard.py:4 imports pipeline.temperature.workflow.ingest",
+        "pipeline/runtime/guard.py:5 imports pipeline.reading.csv_layout",
+        "pipeline/runtime/workflow/replay.py:4 imports pipeline.report.page",
+        "pipeline/runtime/workflow/settings.py:2 imports pipeline.runtime.guard",
         "pipeline/statistics.py:2 imports pathlib",
         "pipeline/store/tables.py:1 imports pipeline.temperature.workflow.tables",
         "pipeline/temperature/bad.py:1 imports time",

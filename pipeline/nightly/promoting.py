@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.nightly import champion, judge, reporting, screening
 from pipeline.nightly.decision import decide
 from pipeline.nightly.processes import STATE, dvc
+from pipeline.nightly.reproducing import wiring
 from pipeline.nightly.settings import Loop, Nightly
 from pipeline.report.nightly import record
 from pipeline.report.nightly.production import Champion, ChampionMetrics, ChampionState, Lineage, candidate_of
@@ -26,12 +27,16 @@ from pipeline.temperature.workflow.settings import Plant
 MEASURED = (
     "probe_machine", "generate_probing", "learn_kernel", "ingest", "identify_plant", "tune_weights",
     "evaluate_temperature", "reproduce_study", "train_ilc", "segment_library", "compose_parts",
-    "train_classifier", "train_agent", "evaluate_setpoint",
+    "train_classifier", "train_agent", "evaluate_setpoint", "export_controllers",
 )  # fmt: skip
 REPORT = "reports/metrics/report.json"
 ACCEPTED, RELEARNED = "reports/accepted.json", "benchmarks/results/temperature_relearned.json"
 # artifacts that only some contestants are designed from, and that a record may not determine
 OPTIONAL = {f"datasets/{path}" for path in judge.DESIGNED_FROM.values()}
+# the certified controller of the temperature loop, installed beside what it was designed from
+CERTIFYING, EXPORTED = "export_controllers", "datasets/export_controllers/temperature"
+CERTIFICATE = f"{EXPORTED}/certificate.json"
+CERTIFIED = (f"{EXPORTED}/controller.json", f"{EXPORTED}/arrays.safetensors", CERTIFICATE)
 
 
 class JudgedLoop(NamedTuple):
@@ -61,7 +66,12 @@ def judged(
         decisions[name] = decision = decision._replace(verdict=verdict)
         if decision.promotes or decision.decision == CANDIDATE:
             state = _placed(settings, name, night, state, JudgedLoop(decision, metrics), made_from)
-        if name in state.candidates and verdict is not None and verdict.state == PASSED:
+        if (
+            name in state.candidates
+            and decision.decision != CANDIDATE
+            and verdict
+            and verdict.state == PASSED
+        ):
             state = _without_candidate(state, name)
     if all(decision.decision == record.FAILED for decision in decisions.values()):
         whys = (f"{name}: {decision.reasons[0]}" for name, decision in decisions.items())
@@ -141,7 +151,9 @@ def decided(
         return _kept(f"the challenger is that of {run}, which was rolled back by hand")
     judging = judge.judge(loop, settings)
     if not passes:
-        return _candidate(judging, verdict, state.candidates.get(name), files)
+        return _candidate(judging, verdict, state.candidates.get(name), files, verdict.sentence)
+    if verdict and (why := uncertified(loop, contestant)):
+        return _candidate(judging, verdict, state.candidates.get(name), files, why)
     own = f"datasets/{judge.DESIGNED_FROM[contestant]}" if contestant in judge.DESIGNED_FROM else ""
     if own and own not in loop.artifacts:
         return _kept(
@@ -191,17 +203,47 @@ def _metrics(evidence: judge.Evidence) -> ChampionMetrics:
     return ChampionMetrics(evidence.panel, mean_cost if np.isfinite(mean_cost) else None, guards)
 
 
+def uncertified(loop: Loop, contestant: str) -> str:
+    """Why a challenger of the temperature loop that passes the page's rules has no certificate; empty where
+    it has one, and where the project has no stage that certifies."""
+    if not _asks_for_one(loop):
+        return ""
+    if not artifacts.exists(CERTIFICATE):
+        return f"no certificate: {CERTIFYING} wrote none of {contestant}"
+    shown = artifacts.read_json(CERTIFICATE)
+    if shown.get("controller") != contestant:
+        return f"no certificate: that of {CERTIFYING} is of {shown.get('controller')}, not of {contestant}"
+    if shown.get("verdict") != "passed":
+        return f"certificate refused by its rule {str(shown.get('first_failed')).replace('_', ' ')}"
+    if lacking := champion.missing(CERTIFIED):
+        return f"no certified controller: {lacking[0]} is missing"
+    return ""
+
+
+def certified(loop: Loop) -> list[str]:
+    """The files of a certified controller that are there, for the champion's folder."""
+    return [path for path in CERTIFIED if _asks_for_one(loop) and Path(path).is_file()]
+
+
+def _asks_for_one(loop: Loop) -> bool:
+    """Whether a loop's champion needs a certificate: that of the temperature loop, where the project has the
+    stage that certifies."""
+    wired = loop.judge == "temperature" and Path("dvc.yaml").is_file()
+    return wired and CERTIFYING in wiring({}).upstream
+
+
 def _candidate(
-    judging: judge.Judge, verdict: Verdict, before: Champion | None, files: list[str]
+    judging: judge.Judge, verdict: Verdict, before: Champion | None, files: list[str], why: str
 ) -> JudgedLoop:
-    """A challenger that the page's rules keep out of production, with what it measures all the same."""
-    decision = LoopDecision(CANDIDATE, [verdict.sentence])
+    """A challenger that the page's rules or its certificate keep out of production, and `why`, with what it
+    measures all the same."""
+    decision = LoopDecision(CANDIDATE, [why])
     if before and before.contestant == verdict.subject and champion.same(before.installed.files, files):
         return JudgedLoop(decision, before.metrics)
     try:
         evidence = judging.measure(Path("datasets"), verdict.subject)
     except ValueError as reason:
-        return JudgedLoop(decision._replace(reasons=[verdict.sentence, f"not measured: {reason}"]))
+        return JudgedLoop(decision._replace(reasons=[why, f"not measured: {reason}"]))
     guards = {name: record.Guard(None, figure, None) for name, figure in evidence.guards.items()}
     return JudgedLoop(decision._replace(guards=guards), _metrics(evidence))
 
@@ -221,7 +263,9 @@ def _placed(
     else:
         reference = None if waits else screening.reference(settings.loops[name], Path("datasets"))
         beside = {screening.REFERENCE: reference} if reference else {}
-        installed = champion.install(candidate_of(name) if waits else name, files, beside)
+        installed = champion.install(
+            candidate_of(name) if waits else name, [*files, *certified(settings.loops[name])], beside
+        )
         run, when = night.run, night.when
     one = Champion(run, when, "; ".join(decision.reasons), installed, metrics, lineage)
     if verdict:

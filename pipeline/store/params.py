@@ -32,6 +32,7 @@ SECTIONS = (
     "evaluate_setpoint",
     "evaluate_temperature",
     "execution",
+    "export_controllers",
     "generate_probing",
     "identify_plant",
     "ingest",

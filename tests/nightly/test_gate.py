@@ -26,7 +26,7 @@ from pipeline.store import artifacts, params
 from stages import report
 from tests.conftest import ROOT
 from tests.nightly.toy_nights import Project, entered
-from tests.report import made, made_setpoint
+from tests.report import made, made_certificate, made_setpoint
 from tests.report.conftest import populate
 
 LOOPS = {
@@ -321,6 +321,46 @@ def test_page_and_night_never_disagree(project, seed):
     )
     assert sorted(listed) == passed, (first, expected)
     assert not re.search(r"\d{7,} ?%|e\+?\d+ ?%", words(page) + summary)
+
+
+CERTIFYING = """stages:
+  export_controllers:
+    cmd: python -m stages.export_controllers
+    outs: [datasets/export_controllers: {persist: true}]
+"""
+
+
+@pytest.mark.parametrize(
+    ("refused", "controller", "there", "why"),
+    [
+        ("", "subspace_lqg", True, ""),
+        ("disk_margin", "subspace_lqg", True, "certificate refused by its rule disk margin"),
+        ("", "pi", True, "that of export_controllers is of pi, not of subspace_lqg"),
+        ("", "subspace_lqg", False, "export_controllers wrote none of subspace_lqg"),
+    ],
+)
+def test_a_champion_of_the_heaters_has_a_passed_certificate_of_its_own(
+    project, refused, controller, there, why
+):
+    """Where the project has the stage that certifies: what passes the page's rules alone is a candidate."""
+    path = Path(promoting.CERTIFICATE)
+    artifacts.write_json(path, made_certificate.certificate(refused) | {"controller": controller})
+    if not there:
+        path.unlink()
+    for name in promoting.CERTIFIED[:2]:
+        Path(name).write_text("whole")
+    Path("dvc.yaml").write_text(CERTIFYING)
+    asked = settings()
+    tonight, after = promoting.judged(asked, TONIGHT, ChampionState(), lineage=Lineage)
+    Path("dvc.yaml").unlink()
+    decision = tonight.decisions["temperature"]
+    assert decision.verdict.state == PASSED and decision.promotes == (not why)
+    assert why in " ".join(decision.reasons)
+    assert ("temperature" in after.candidates) == bool(why)
+    page = words(nightly_page.render([tonight], after, asked))
+    assert why in page
+    # a refused one's certificate lies beside the candidate all the same; the other loops ask for none
+    assert all(tonight.decisions[loop].promotes for loop in LOOPS if loop != "temperature")
 
 
 def test_the_night_reads_what_the_pages_are_made_of():

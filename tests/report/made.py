@@ -19,7 +19,7 @@ from pipeline.deposition.workflow.tables import (
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import tables
 from pipeline.temperature.workflow.settings import Plant
-from tests.report import made_setpoint
+from tests.report import made_certificate, made_setpoint
 
 ROOT = Path(__file__).resolve().parents[2]
 CONTESTANTS = ("hold", "pi_simc", "pi", "subspace_lqg", "varx_riccati", "learned_kernel", "exact_model")
@@ -394,6 +394,7 @@ def write(root, *, samples=400, recording="good.mcap"):
     machine = declared(root)
     for stage, figures in metrics().items():
         artifacts.write_metrics(stage, figures)
+    made_certificate.write()
     data = Path("datasets")
     artifacts.write_table(
         data / "ingest/record.parquet",

@@ -7,7 +7,7 @@ import pytest
 
 from tests.report.conftest import MACHINE
 
-PAGES = ("index", "temperature", "identification", "deposition", "setpoint")
+PAGES = ("index", "temperature", "identification", "deposition", "setpoint", "certificate")
 # name, width and theme of the pages that are loaded once for all tests that look at them
 WIDE = [(name, 1280, "light") for name in PAGES]
 DARK = [(name, 1024, "dark") for name in PAGES]

@@ -22,7 +22,8 @@ INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT = (
     Path(f"reports/{name}.html")
     for name in ("index", "temperature", "identification", "deposition", "setpoint")
 )
-PAGES = (INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT)
+CERTIFICATE = Path("reports/certificate.html")
+PAGES = (INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT, CERTIFICATE)
 
 
 class Page(HTMLParser):

@@ -53,7 +53,7 @@ def test_a_stage_is_as_accepted_made_anew_or_not_there(project):
     }
     artifacts.write_json("reports/accepted.json", {"metrics": metrics, "params": {}, "hashes": hashes})
     main()
-    assert "The results of 15 of 15 stages are those of the accepted run, to the byte." in Page(PAGE_ONE).text
+    assert "The results of 16 of 16 stages are those of the accepted run, to the byte." in Page(PAGE_ONE).text
     artifacts.write_json("datasets/tune_weights/weights.json", {"contestants": {"pi": {"cost": 3.0}}})
     Path("datasets/segment_library/library.parquet").unlink()
     main()

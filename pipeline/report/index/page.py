@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from markupsafe import Markup
 
+from pipeline.report.certificate import exported
 from pipeline.report.deposition import change as deposition_change
 from pipeline.report.deposition import rules as deposition_rules
 from pipeline.report.index import cards, workflow
@@ -71,6 +72,8 @@ def render(sources: Sources, judged: Judgement) -> str:
         ],
         difference=difference_parts(sources, judged),
         workflow=workflow.figure(sources),
+        exported=[] if isinstance(leaving := exported.lines(sources), Missing) else leaving,
+        from_exported=page.origin(sources.source("export_controllers")),
         from_accepted=sources.source("accepted"),
         words=words.chosen(sources, words.INDEX),
         sources=list(sources.read.values()),
@@ -281,7 +284,9 @@ def hashes(sources: Sources) -> list[tuple[str, str]]:
         next((s.sha256 for path, s in sources.read.items() if path.endswith(end)), "missing")
         for end in ("ingest/record.parquet", "evaluate_temperature/cases.parquet")
     )
+    certificate = next((s.sha256 for s in sources.source("certificate")), "")
     return [
+        *([("certificate", certificate[:8])] if certificate else []),
         ("data", data[:8]),
         ("parameters", digest(sources.declared.everything)[:8]),
         ("code", sources.code[:8]),

@@ -28,6 +28,17 @@ READS: dict[str, tuple[str, ...]] = {
     "train_classifier": ("render_frames",),
     "train_agent": ("train_classifier",),
     "evaluate_setpoint": ("train_classifier", "train_agent"),
+    "export_controllers": (
+        "evaluate_temperature",
+        "ingest",
+        "identify_plant",
+        "learn_kernel",
+        "tune_weights",
+        "train_classifier",
+        "train_agent",
+        "evaluate_setpoint",
+        "compose_parts",
+    ),
 }
 SAME, CHANGED, GONE, FIRST = "as accepted", "made anew", "not there", "first run"
 OTHER = "other machine"

@@ -177,9 +177,21 @@ def _champions(champions: Mapping[str, Champion]) -> list[dict[str, str]]:
             "contestant": heading(champion.contestant),
             "rehearsal": "rehearsal" if champion.rehearsal else "",
             "verdict": champion.verdict,
+            "exported": _exported(champion),
         }
         for name, champion in champions.items()
     ]
+
+
+def _exported(champion: Champion) -> str:
+    """The certified controller in a champion's folder, with the hash of its certificate; empty where it has
+    none."""
+    files = champion.installed.files
+    found = next((path for path in files if path.endswith("/certificate.json")), "")
+    folder = found.removesuffix("certificate.json")
+    if not found or f"{folder}controller.json" not in files:
+        return ""
+    return f"{folder}controller.json, certificate {files[found][:8]}"
 
 
 def _decision(name: str, decision: LoopDecision) -> dict[str, Any]:
@@ -187,7 +199,11 @@ def _decision(name: str, decision: LoopDecision) -> dict[str, Any]:
     return {
         "loop": name,
         "decision": decision.decision,
-        "reasons": decision.reasons if decision.decision != record.CANDIDATE else decision.reasons[1:],
+        "reasons": [
+            reason
+            for reason in decision.reasons
+            if not decision.verdict or reason != decision.verdict.sentence
+        ],
         "page": decision.verdict,
         "paired": _paired(decision.paired),
         "guards": guards,

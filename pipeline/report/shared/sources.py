@@ -252,6 +252,13 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("paths", "evaluate_setpoint", "paths.parquet", *table(PATHS)),
         ("decisions", "evaluate_setpoint", "decisions.parquet", *table(DECISIONS)),
         ("choice", "evaluate_setpoint", "choice.json", "choice", artifacts.read_json),
+        (
+            "certificate",
+            "export_controllers",
+            "temperature/certificate.json",
+            "certificate 1",
+            artifacts.read_json,
+        ),
     ]
 
 

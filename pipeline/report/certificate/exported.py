@@ -1,0 +1,64 @@
+"""What leaves the house, a line a loop: the file, its certificate and its hash, from the metrics of
+export_controllers."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from pipeline.report.shared.digits import count
+from pipeline.report.shared.sources import Sources, lookup
+from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing
+from pipeline.report.temperature.contestants import BY_NAME, in_a_sentence
+
+STAGE, LOOPS = "export_controllers", ("temperature", "deposition", "setpoint")
+FOLDER = "datasets/export_controllers"
+REHEARSAL, MAY_RUN = "Rehearsal: certificate passed.", "May run."
+REFUSED, NONE = "Certificate refused.", "No certificate."
+
+
+class Line(NamedTuple):
+    """One loop: whether a certificate passed, in words; the controller, the folder or the file to load with
+    its SHA-256, how many files there are, the certificate's SHA-256, and why there is no more."""
+
+    loop: str
+    state: str
+    word: str
+    name: str
+    file: str
+    sha256: str
+    files: str
+    certificate: str
+    why: str
+
+
+def lines(sources: Sources) -> list[Line] | Missing:
+    """One a loop, or why there are none."""
+    metrics = sources.metrics.get(STAGE) or Missing(OPEN, f"{STAGE} has not run")
+    if isinstance(metrics, Missing):
+        return metrics
+    return [_line(loop, metrics) for loop in LOOPS]
+
+
+def _line(loop: str, metrics: Mapping[str, Any]) -> Line:
+    fields = lookup(metrics, loop, what=f"{loop} loop")
+    if isinstance(fields, Missing):
+        return Line(loop, OPEN, NONE, "", "", "", "", "", fields.sentence())
+    shown, files = fields.get("certificate"), dict(fields.get("files") or {})
+    first = next(iter(files), "")
+    main = next((path for path in files if path.endswith("controller.json")), first)
+    state, word = OPEN, NONE
+    if isinstance(shown, Mapping):
+        passed = shown.get("verdict") == "passed"
+        state = PASSED if passed else FAILED
+        word = (REHEARSAL if shown.get("evidence") == "simulated" else MAY_RUN) if passed else REFUSED
+    name = str(fields.get("contestant") or "")
+    return Line(
+        loop,
+        state,
+        word,
+        in_a_sentence(name) if name in BY_NAME else name,
+        main if main.startswith("datasets/") or not main else f"{FOLDER}/{main}",
+        files.get(main, ""),
+        count(len(files), "file") if files else "",
+        str(shown.get("sha256") or "") if isinstance(shown, Mapping) else "",
+        str(fields.get("why") or ""),
+    )

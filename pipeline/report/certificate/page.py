@@ -1,0 +1,220 @@
+"""The page of the certificate: what was found by each rule, poles, margins, the worst plants, bands of gains,
+and the files that leave the house."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.report.certificate import exported
+from pipeline.report.shared import charts, page, words
+from pipeline.report.shared.digits import number, with_unit
+from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing
+from pipeline.report.temperature.contestants import BY_NAME, heading
+
+WORDS = ("rehearsal", "margin_disk", "margin_delay", "spread", "step", "hash")
+MOST_BANDS = 40  # gains that are listed, those that are surest of all inputs first
+CIRCLE = np.linspace(0, 2 * np.pi, 181)
+
+
+class RuleRow(NamedTuple):
+    """A rule: its state, what was found, the limit, and the sentence."""
+
+    name: str
+    state: str
+    found: str
+    limit: str
+    sentence: str
+
+
+class Head(NamedTuple):
+    """What the page says first."""
+
+    state: str
+    decision: str
+    lead: str
+    reason: str
+    remedy: str
+    claim: str = ""
+    changed: str = ""
+    rules: Sequence[Any] = ()
+    heads: Sequence[Any] = ()
+
+
+def render(sources: Sources) -> str:
+    """The text of certificate.html."""
+    shown = sources.tables.get("certificate") or Missing(OPEN, "export_controllers has not run")
+    lines = exported.lines(sources)
+    whole = not isinstance(shown, Missing)
+    return page.render(
+        "certificate.html",
+        here="certificate",
+        title="Certificate",
+        head=head(shown, lines),
+        missing_certificate=None if whole else shown,
+        rules=rule_rows(shown) if whole else [],
+        about=about(shown) if whole else [],
+        poles=poles(sources, shown),
+        margins=margins(shown) if whole else [],
+        bands=band_rows(shown) if whole else [],
+        lines=[] if isinstance(lines, Missing) else lines,
+        origin_of=page.origin(sources.source("certificate", "export_controllers")),
+        differences=differences(sources),
+        words=words.chosen(sources, WORDS),
+        sources=list(sources.read.values()),
+        absent=sources.absent,
+        hashes=[("certificate", s.sha256[:8]) for s in sources.source("certificate")],
+    )
+
+
+def head(shown: Mapping[str, Any] | Missing, lines: Sequence[exported.Line] | Missing) -> Head:
+    """Passed or refused, and the first rule that failed."""
+    if isinstance(lines, Missing):
+        return Head("open", "No certificate.", "", lines.sentence(), "")
+    mine = next(line for line in lines if line.loop == "temperature")
+    state = {PASSED: "passed", FAILED: "failed"}.get(mine.state, "open")
+    if isinstance(shown, Missing) or mine.state == OPEN:
+        return Head(state, mine.word, "", mine.why, "")
+    if mine.state == FAILED:
+        rule = str(shown.get("first_failed") or "").replace("_", " ")
+        return Head(
+            state, mine.word, f"First failed rule: {rule}.", mine.why, "Nothing of this loop is exported."
+        )
+    limits = "It holds for this plant, these units and this sample time, and nothing else."
+    return Head(state, f"{mine.word} {mine.name[:1].upper()}{mine.name[1:]}.", "", limits, "")
+
+
+def rule_rows(shown: Mapping[str, Any]) -> list[RuleRow]:
+    """The rules in the order in which they were asked."""
+    rows = []
+    for rule in shown["rules"]:
+        state = OPEN if not rule.get("asked", True) else PASSED if rule["passed"] else FAILED
+        found, limit = (_figure(rule.get(key), rule.get("unit") or "") for key in ("found", "limit"))
+        rows.append(RuleRow(rule["name"].replace("_", " "), state, found, limit, rule["sentence"]))
+    return rows
+
+
+def _figure(value: float | None, unit: str) -> str:
+    """A number with its unit; empty where a rule counts nothing."""
+    if value is None:
+        return ""
+    text = number(value, 0) if abs(value) >= 100 else f"{value:.3g}"
+    return text if unit in ("", "1") else f"{text} {unit.replace('degC', '°C')}"
+
+
+def about(shown: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What it was made for."""
+    name = shown["controller"]
+    learned, newest = shown["samples"]
+    return [
+        ("Controller", heading(name) if name in BY_NAME else name),
+        ("Evidence", shown["evidence"]),
+        ("Sample time", with_unit(shown["sample_time_s"], "s", 2)),
+        *(
+            (side.capitalize(), "; ".join(_signal(one) for one in shown[side]))
+            for side in ("inputs", "outputs")
+        ),
+        ("Record", f"{learned} samples learned from, {newest} of the newest"),
+        *((f"SHA-256 of {key}", shown[f"{key}_sha256"]) for key in ("controller", "plant", "spread")),
+    ]
+
+
+def _signal(one: Mapping[str, Any]) -> str:
+    low, high = ("none" if one[side] is None else f"{one[side]:g}" for side in ("low", "high"))
+    return f"{one['name']} in {one['unit']}, {low} to {high}"
+
+
+def poles(sources: Sources, shown: Mapping[str, Any] | Missing) -> Picture:
+    """Closed-loop poles: of the model, of its spread and of what the record leaves open."""
+    title = "Poles of the closed loop"
+    if isinstance(shown, Missing):
+        return placeholder("poles", title, shown)
+    if not shown["poles"]:
+        return placeholder(
+            "poles", title, Missing(OPEN, "An earlier rule refused, so that none was computed")
+        )
+    largest = max(one["radius"] for one in shown["poles"])
+    columns = [
+        Column(name, small, "", [_circle(shown["poles"], near=near, largest=largest)])
+        for name, small, near in (
+            ("The unit circle", "real part right, imaginary part up", False),
+            ("The slowest", "enlarged", True),
+        )
+    ]
+    plants = len(shown["poles"])
+    text = f"On {plants} plants the largest pole is of size {number(largest, 4)}: "
+    text += "stable." if largest < 1 else "not stable."
+    caption = "Crosses: the identified model. Dots: plants of its spread, and of what the record leaves open."
+    return Picture("poles", title, text, columns, caption, page.origin(sources.source("certificate")))
+
+
+def _circle(loops: Sequence[Mapping[str, Any]], *, near: bool, largest: float):
+    low, high, up = (0.8, 1.02, 0.12) if near else (-1.1, 1.1, 1.1)
+    frame = charts.Frame(
+        charts.linear(low, high, ticks=3), charts.linear(-up, up, ticks=3), width=270, height=256, above=6
+    )
+    edge = np.cos(CIRCLE), np.sin(CIRCLE)
+    layers = [charts.line(frame, *_inside(frame, *edge), "lim line thin", most=len(CIRCLE))]
+    for model in (False, True):
+        points = [pair for one in loops if (one["of"] == "model") == model for pair in one["poles"]]
+        if points:
+            real, imag = _inside(frame, *np.array(points, float).T)
+            layers.append(
+                charts.crosses(frame, real, imag) if model else charts.dots(frame, real, imag, "try", 1.7)
+            )
+    alt = f"{len(loops)} closed loops, the largest pole of size {number(largest, 4)}"
+    return charts.panel(frame, layers, alt=alt)
+
+
+def _inside(frame: charts.Frame, real: np.ndarray, imag: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    inside = (real >= frame.x.low) & (real <= frame.x.high) & (imag >= frame.y.low) & (imag <= frame.y.high)
+    return real[inside], imag[inside]
+
+
+def margins(shown: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
+    """Figures over plants: median, nine of ten (margins) or 99 % (errors), worst."""
+    rows = []
+    found, worst = shown.get("margins"), shown.get("worst")
+    if found:
+        for name, key, unit in (("Disk margin", "disk", ""), ("Delay margin", "delay_s", "s")):
+            rows.append((name, *("unlimited" if v is None else _figure(v, unit) for v in found[key])))
+    if worst:
+        rows.append(("Settled error", *(_figure(v, "°C") for v in worst["settled_error_degC"])))
+    return rows
+
+
+def band_rows(shown: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
+    """Gains whose bands are surest, the ones furthest from zero by their own width first."""
+    bands = shown.get("bands")
+    if not bands:
+        return []
+    gain, low, high = (np.array(bands[key], float) for key in ("gain", "low", "high"))
+    sure = np.abs(gain) / np.maximum(high - low, 1e-12)
+    order = np.argsort(-sure, axis=None, kind="stable")[:MOST_BANDS]
+    inputs = [one["name"] for one in shown["inputs"]]
+    return [
+        (inputs[i], bands["on"][j], f"{gain[i, j]:.3g}", f"{low[i, j]:.3g} to {high[i, j]:.3g}")
+        for i, j in zip(*np.unravel_index(order, gain.shape), strict=True)
+    ]
+
+
+def differences(sources: Sources) -> list[tuple[str, str]]:
+    """How far what is exported is from what was judged."""
+    metrics = sources.metrics.get("export_controllers")
+    if not isinstance(metrics, Mapping):
+        return []
+    named = {
+        "judged": "the object against the judged commands of the deciding case",
+        "python": "the file of Python against the object, with limits, faults and hand-overs",
+        "log_flow": "log flow of the exported classifier against the network",
+    }
+    return [
+        (
+            f"{loop.capitalize()}: {named.get(name, name)}",
+            f"{value:.2g} {fields['unit'].replace('1', '')}".strip(),
+        )
+        for loop, fields in metrics.items()
+        for name, value in (fields.get("largest_difference") or {}).items()
+    ]

@@ -1,0 +1,45 @@
+"""`beadline export`: a certified controller in the form that a machine can run. The stage export_controllers
+writes the same files."""
+
+from pathlib import Path
+
+from pipeline.runtime import certificate, machine
+from pipeline.runtime.certificate import Certificate
+from pipeline.runtime.export import c, klipper, python, vectors
+from pipeline.runtime.machine import Exported
+from pipeline.store import artifacts
+
+REHEARSAL = "Rehearsal: it was made for a simulated plant, and runs only where it is told so."
+TRIAL = "May run: its certificate was passed on recordings of the machine."
+
+
+def files(made: Exported, shown: Certificate, to: str, section: str, power_W: float | None) -> dict[str, str]:
+    """The files of one form, name to text. Raises ValueError, naming what is missing, where the machine or
+    the certificate does not allow it."""
+    if to == "c":
+        return c.files(made, shown, vectors.golden(made))
+    if to == "python":
+        return {"controller.py": python.text(made, shown)}
+    return {"printer.cfg": klipper.settings(made, shown, section=section, heater_power_W=power_W)}
+
+
+def export(folder: Path, to: str, out: Path | None, section: str, power_W: float | None) -> str:
+    """Writes the files of one form, and says which and of what."""
+    if power_W is not None and not 0 < power_W < 1e5:
+        raise ValueError(
+            f"--power: expected the heater's power above 0 W, found {power_W:g}; read it off the heater"
+        )
+    target = folder / to if out is None else out
+    if target.exists() and not target.is_dir():
+        raise ValueError(
+            f"--out {target}: should be a folder but is a file; name a folder, which is made where it is "
+            "missing"
+        )
+    made, shown = machine.read(folder)
+    texts = files(made, shown, to, section, power_W)
+    for name, text in texts.items():
+        artifacts.write_text(target / name, text)
+    written = ", ".join(str(target / name) for name in sorted(texts))
+    word = REHEARSAL if made.simulated else TRIAL
+    digest = certificate.sha256(shown)
+    return f"{made.name}, certificate {digest[:12]}. {word}\nwritten: {written}"

@@ -1,0 +1,55 @@
+"""The page of the certificate and the last lines of page one: what leaves the house, and why where nothing
+does."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.store import artifacts
+from stages.report import main
+from tests.report import made_certificate
+from tests.report.test_pages import Page
+
+PAGE, INDEX = Path("reports/certificate.html"), Path("reports/index.html")
+
+
+def test_a_passed_certificate_of_a_simulated_plant_is_a_rehearsal(project):
+    made_certificate.write()
+    main()
+    page, first = Page(PAGE).text, Page(INDEX).text
+    assert "Rehearsal: certificate passed." in page and "May run" not in page + first
+    digest = artifacts.sha256(made_certificate.PATH)
+    for text in (page, first):
+        whole = " ".join(text.split())
+        assert (
+            "datasets/export_controllers/temperature/controller.json" in whole and "one of two files" in whole
+        )
+        assert digest[:8] in text and "44444444" in text
+    assert "On 2 plants the largest pole is of size 0.9975: stable." in page
+    assert "unlimited" in page and "1.5 to 2.6" in page and "1.1e-13 percent" in page
+    assert "<b>told</b>" not in PAGE.read_text()
+
+
+def test_only_recordings_make_a_certificate_say_that_it_may_run(project):
+    made_certificate.write(evidence="recorded")
+    main()
+    assert "May run. PI, tuned." in Page(PAGE).text and "May run." in Page(INDEX).text
+
+
+def test_a_refused_certificate_names_its_first_failed_rule_and_no_file(project):
+    made_certificate.write("disk_margin")
+    main()
+    page, first = Page(PAGE).text, Page(INDEX).text
+    assert "Certificate refused. First failed rule: disk margin." in page
+    assert "Nothing of this loop is exported." in page
+    assert "Not asked, because disk_margin failed." in page
+    assert [part in page for part in ("disk margin : failed", "settled error : not measured")] == [True, True]
+    assert "Certificate refused." in first and "temperature/controller.json" not in first
+
+
+@pytest.mark.parametrize("lost", [made_certificate.PATH, "reports/metrics/export_controllers.json"])
+def test_where_nothing_was_exported_both_pages_say_so(project, lost):
+    Path(lost).unlink()
+    main()
+    assert "export_controllers is not there" in Page(PAGE).text
+    assert ("Nothing was exported." in Page(INDEX).text) == lost.startswith("reports")

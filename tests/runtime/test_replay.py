@@ -1,0 +1,152 @@
+"""A replay says what the object would have asked, to the last digits, and says nothing of another machine."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pipeline.runtime import replay, support
+from pipeline.runtime.replay import Log
+from pipeline.temperature import baseline, controller, governor, panel, tracking, window
+from pipeline.temperature.controller import Deployed, RunningController, compact, deployed
+from pipeline.temperature.governor import Limits
+from pipeline.temperature.plant import Plant, baam
+from pipeline.temperature.study import data_sets
+
+LIMITS = Limits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
+SLOW = LIMITS._replace(rate=np.full(7, 4.0))
+REFERENCE = np.array([150.0, 160.0, 170.0, 175.0, 180.0])
+SPREAD = panel.Spread(0.15, 0.2, 0.005, 0.5, 8.0)
+NOISE = np.full(5, 0.1)
+
+
+def guard() -> governor.Governor:
+    family, strength = panel.corners([baam()], SPREAD)
+    outputs = governor.OutputLimits(np.full(5, -np.inf), np.full(5, 190.0), np.full(5, 0.3), 0.5)
+    return governor.governor(family, LIMITS, outputs, strength)
+
+
+@cache
+def ready(name: str) -> tuple[Deployed, Plant]:
+    ones = np.ones(5), np.ones(7)
+    if name == "pi":
+        made = baseline.controller(baam(), (LIMITS.low, LIMITS.high), horizon=600)
+        return deployed(made.design(*ones, 0.05), SLOW, integral_limit=1.0), made.model
+    if name == "window":
+        u, y = data_sets(np.random.default_rng(1), 1500, 1)
+        learned = window.learn([u[:, 0]], [y[:, 0]], longest=4)
+        made = window.controller(learned, 0.99)
+        law = compact(made.design(*ones, 0.05), learned.N)
+        return deployed(law, LIMITS, integral_limit=1.0, governor=guard()), made.model
+    made = tracking.model_based(baam(), 0.99, tau=1.0)
+    return deployed(made.design(*ones, 0.05), LIMITS, integral_limit=1.0, governor=guard()), made.model
+
+
+@cache
+def log(steps: int = 700) -> Log:
+    """The study's machine under random heat about its rest, with references in steps."""
+    rng, plant = np.random.default_rng(3), baam()
+    x = np.full(6, 150.0)
+    u0 = np.linalg.lstsq(plant.B, x - plant.A @ x, rcond=None)[0]
+    u = np.clip(u0 + np.repeat(rng.uniform(-1, 1, (steps // 20, 7)), 20, axis=0), 0, 100)
+    y = np.empty((len(u), 5))
+    for t in range(len(u)):
+        y[t] = plant.C @ x + plant.d + NOISE * rng.standard_normal(5)
+        x = plant.A @ x + plant.B @ u[t]
+    r = np.where(np.arange(len(u))[:, None] < 300, REFERENCE, REFERENCE - 6)
+    return Log(u, y, r)
+
+
+def by_the_object(made: Deployed, model: Plant, of: Log, hold: int) -> np.ndarray:
+    """Commands of the object where at each sample what was recorded is applied in the place of what it asks:
+    an object of its own for each sample would take minutes, so that its state is carried on."""
+    asked = of.u.copy()
+    running = RunningController(made, model)
+    for t in range(hold):
+        running.watch(of.u[t], of.y[t], of.r[t])
+    running.hand_over(of.y[hold])
+    for t in range(hold, len(of.u)):
+        before = running._state
+        asked[t] = running.step(of.y[t], of.r[t], t)
+        feed, y_star, _ = running._now
+        law, u = made.law, of.u[t][None]
+        wished = feed - law.K @ before.z[0] - law.D @ of.y[t] - law.K_r @ before.xi[0]
+        x = (
+            before.x
+            if made.governor is None
+            else governor.observed(made.governor, before.x, u, of.y[t][None])
+        )
+        xi = controller._integrated(made, before.xi, (y_star - of.y[t])[None], u, wished[None])
+        z = controller._remembered(made, before.z, u, of.y[t][None], of.r[t][None])
+        running._state = controller.State(z, xi, u, x)
+    return asked
+
+
+@pytest.mark.parametrize("name", ["pi", "window", "lqg"])
+def test_a_replay_asks_what_the_object_would_have_asked(name, monkeypatch):
+    made, model = ready(name)
+    # chunks much shorter than the log, so that their seams lie in it
+    monkeypatch.setattr(replay, "CHUNK", 64)
+    monkeypatch.setattr(replay, "BLOCK", 256)
+    run = replay.replayed(made, model, log(), hold=30)
+    expected = by_the_object(made, model, log(), 30)
+    assert np.abs(run.asked - expected).max() < 1e-9 * 100
+    held = replay.why(made, log(), run)
+    assert {"pi": "rate", "window": "governor", "lqg": "governor"}[name] in {
+        replay.WHY[k] for k in np.unique(held)
+    }
+    np.testing.assert_array_equal(held[np.abs(run.asked - run.wished).max(axis=1) == 0], 0)
+
+
+def test_chunks_are_the_recursion_sample_by_sample():
+    rng = np.random.default_rng(0)
+    A, drive, z = (
+        0.9 * np.linalg.qr(rng.standard_normal((4, 4)))[0],
+        rng.standard_normal((1203, 4)),
+        np.ones(4),
+    )
+    walked = replay.scanned(A, drive, z)
+    for t in range(1203):
+        np.testing.assert_allclose(walked[t], z, atol=1e-11)
+        z = A @ z + drive[t]
+    shifting = np.eye(6, k=2)
+    by_shift, plain = (replay.scanned(shifting, np.tile(drive, 2)[:, :6], np.ones(6), k) for k in (2, 0))
+    np.testing.assert_allclose(by_shift, plain, atol=1e-12)
+
+
+def test_a_reference_that_never_holds_still_is_refused():
+    made, model = ready("pi")
+    moving = log()._replace(r=log().y)
+    with pytest.raises(
+        ValueError, match="the references take 7.. values, expected at most 500 that are held"
+    ):
+        replay.replayed(made, model, moving)
+
+
+# ---- support
+
+
+@cache
+def within() -> support.Support:
+    rng = np.random.default_rng(5)
+    plants = panel.padded(panel.drawn([baam()], 8, SPREAD, cells=True, rng=rng))
+    parts = np.array_split(np.arange(len(log().u)), 3)
+    return support.support(plants, [Log(*(part[rows] for part in log())) for rows in parts], NOISE)
+
+
+def test_a_log_of_the_machine_is_on_support_and_one_wired_wrong_is_not():
+    assert not support.told(within(), log()).abstains
+    for wrong in (
+        log()._replace(u=log().u[:, [1, 0, 2, 3, 4, 5, 6]] * 3),
+        log()._replace(u=log().u / 100),
+        log()._replace(y=1.8 * log().y + 32),
+    ):
+        said = support.told(within(), wrong)
+        assert said.abstains and said.off.any()
+
+
+def test_what_leaves_its_range_is_off_at_that_sample():
+    hot = log().y.copy()
+    hot[400] += 40.0
+    off = support.told(within(), log()._replace(y=hot)).off
+    np.testing.assert_array_equal(np.flatnonzero(off & support.TEMPERATURE), [400])
