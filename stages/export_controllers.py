@@ -3,6 +3,9 @@ wrote, what train_classifier, train_agent and evaluate_setpoint left, and what c
 datasets/export_controllers: temperature/ (controller.json, arrays.safetensors, certificate.json, c/, python/)
 and setpoint/. Where the certificate is refused it is all that is written of that loop."""
 
+from pipeline.report.shared.sources import read_relearned
+from pipeline.report.shared.verdict import ReportRules
+from pipeline.report.temperature.judgement import winner
 from pipeline.runtime.workflow import export_controllers as export
 from pipeline.runtime.workflow import export_setpoint
 from pipeline.runtime.workflow.settings import ExportControllers
@@ -16,6 +19,9 @@ from pipeline.store import artifacts, params
 from pipeline.temperature import plant
 from pipeline.temperature.workflow import cases, evaluate_temperature, learned, tables
 from pipeline.temperature.workflow.settings import Panel, Plant, TemperatureRules, Tracking, TuneWeights
+
+# the relearnings of the study's machine: part of the verdict that names the controller
+RELEARNED = "benchmarks/results/temperature_relearned.json"
 
 
 def main() -> None:
@@ -42,7 +48,18 @@ def main() -> None:
         problem = learned.problem(made, tracking, setting, truth)
         summary = artifacts.read_json("datasets/evaluate_temperature/summary.json")
         judged = export.Judged(machine, made, setting, problem, weights, summary, simulated)
-        name, why = export.chosen(summary)
+        verdict = winner(
+            {
+                "identify_plant": artifacts.read_metrics("identify_plant"),
+                "learn_kernel": artifacts.read_metrics("learn_kernel"),
+                "evaluate_temperature": artifacts.read_metrics("evaluate_temperature"),
+            },
+            params.load(ReportRules, "report"),
+            machine,
+            read_relearned(RELEARNED) if artifacts.exists(RELEARNED) else None,
+            recorded=not simulated,
+        )
+        name, why = export.chosen(verdict.winner, f"{verdict.decision} {verdict.lead}")
         temperature = export.nothing(why)
         if name:
             one = export.exported(judged, name)

@@ -60,10 +60,14 @@ def test_an_exported_machine_is_the_declared_one():
 
 @pytest.mark.parametrize(
     ("best", "name", "why"),
-    [("pi", "pi", ""), (None, "", "No contestant passes"), ("hold", "", "Doing nothing is recommended")],
+    [
+        ("pi", "pi", ""),
+        (None, "", "The verdict names no controller to run: Rehearsal failed."),
+        ("hold", "", "Doing nothing is recommended"),
+    ],
 )
 def test_nothing_is_exported_where_the_verdict_recommends_no_controller(best, name, why):
-    found, reason = export.chosen({"best": best})
+    found, reason = export.chosen(best, "Rehearsal failed.")
     assert found == name and reason.startswith(why)
     assert export.nothing(reason).files == {}
 

@@ -3,14 +3,14 @@ moved since the accepted run."""
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pipeline.report.identification.model import UNTRUSTED, trust
 from pipeline.report.shared.difference import Difference, Move, difference, moves
 from pipeline.report.shared.digits import count
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import OPEN, PASSED, Answers, Figure, Question, Verdict
-from pipeline.report.temperature.answers import comparison, entry, of_contestant
+from pipeline.report.shared.verdict import OPEN, PASSED, Answers, Figure, Question, ReportRules, Verdict
+from pipeline.report.temperature.answers import Metrics, comparison, entry, of_contestant
 from pipeline.report.temperature.contestants import YARDSTICKS, heading, kind
 from pipeline.report.temperature.drifted import Drift, drift
 from pipeline.report.temperature.pairs import PairSentence, deciding_sentence, pair_names, pair_sentence
@@ -25,6 +25,7 @@ from pipeline.report.temperature.verdict import (
     rival,
     standings,
 )
+from pipeline.temperature.workflow.settings import Plant
 
 
 class Judgement(NamedTuple):
@@ -51,18 +52,36 @@ class Judgement(NamedTuple):
 
 def relearned_date(sources: Sources) -> str:
     """The date of the relearnings, where they are of this machine; else ""."""
-    if sources.recorded or not isinstance(sources.relearned, dict):
-        return ""
-    if entry(sources.relearned, "machine", "outputs") != [o.name for o in sources.declared.machine.outputs]:
-        return ""
-    return str(sources.relearned.get("date") or "")
+    relearned = of_this_machine(sources.relearned, sources.declared.machine, recorded=sources.recorded)
+    return str(relearned.get("date") or "") if relearned else ""
+
+
+def of_this_machine(relearned: Any, machine: Plant, *, recorded: bool) -> Mapping[str, Any] | None:
+    """The relearnings, where they are of this simulated machine."""
+    if recorded or not isinstance(relearned, dict):
+        return None
+    outputs = [output.name for output in machine.outputs]
+    return relearned if entry(relearned, "machine", "outputs") == outputs else None
+
+
+def winner(
+    metrics: Metrics, rules: ReportRules, machine: Plant, relearned: Any, *, recorded: bool
+) -> Verdict:
+    """The verdict that the run gives by itself: without a night's drift, and without who runs today."""
+    return decide(
+        metrics,
+        rules,
+        recorded=recorded,
+        undeclared=undeclared_outputs(machine),
+        relearned=of_this_machine(relearned, machine, recorded=recorded),
+    )
 
 
 def judgement(sources: Sources, *, named: str = "") -> Judgement:
     """What the pages say; where somebody has `named` the contestant that runs, the verdict is about it."""
     metrics, rules = sources.metrics, sources.declared.rules
     drifted = drift(sources)
-    undeclared = undeclared_outputs(sources)
+    undeclared = undeclared_outputs(sources.declared.machine)
     asked = questions(rules, comparison(metrics))
     relearned = sources.relearned if relearned_date(sources) else None
     held = standings(metrics, rules, undeclared=undeclared, drift=drifted.answer, relearned=relearned)
@@ -102,10 +121,9 @@ def judgement(sources: Sources, *, named: str = "") -> Judgement:
     )
 
 
-def undeclared_outputs(sources: Sources) -> list[str]:
+def undeclared_outputs(machine: Plant) -> list[str]:
     """Outputs whose lowest or highest allowed temperature nobody declared."""
-    outputs = sources.declared.machine.outputs
-    return [output.name for output in outputs if output.low is None or output.high is None]
+    return [output.name for output in machine.outputs if output.low is None or output.high is None]
 
 
 def incumbent_of(sources: Sources) -> str:

@@ -41,14 +41,14 @@ class Judged(NamedTuple):
     simulated: bool
 
 
-def chosen(summary: Mapping[str, Any]) -> tuple[str, str]:
-    """The contestant that the verdict recommends, and why there is none where there is none."""
-    best = summary.get("best")
-    if best is None:
-        return "", "No contestant passes the rules of evaluate_temperature, so that none is recommended."
-    if best == "hold":
+def chosen(winner: str | None, said: str) -> tuple[str, str]:
+    """The contestant that the verdict names, and why there is none where there is none; `said` is what the
+    verdict says."""
+    if not winner:
+        return "", f"The verdict names no controller to run: {said}"
+    if winner == "hold":
         return "", "Doing nothing is recommended: there is no controller to export."
-    return str(best), ""
+    return winner, ""
 
 
 def exported(judged: Judged, name: str) -> Exported:
