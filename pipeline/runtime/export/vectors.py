@@ -242,14 +242,17 @@ def determined(exported: Exported, make: Any, script: Script, *, replays: int = 
 OWN_GAINS = 1e-6
 
 
-def golden(exported: Exported, *, episodes: int = 5, steps: int = 120, seed: int = 1) -> str:
-    """golden.csv of a controller: what its object does in `episodes` that rounding does not decide."""
+def golden(
+    exported: Exported, *, episodes: int = 5, steps: int = 120, seed: int = 1, replays: int = 3
+) -> str:
+    """golden.csv of a controller: what its object does in `episodes` that rounding does not decide, as
+    `replays` of each show."""
     from pipeline.runtime.supervisor import Supervised
 
     rng, scripts, done = np.random.default_rng(seed), [], []
     for _ in range(10 * episodes):
         asked = episode(exported, steps, rng)
-        found = determined(exported, lambda: Supervised(exported, rehearsal=True), asked)
+        found = determined(exported, lambda: Supervised(exported, rehearsal=True), asked, replays=replays)
         if found.differs <= OWN_GAINS:
             scripts.append(asked)
             done.append(found.done)

@@ -63,7 +63,8 @@ beadline_result beadline_init(beadline_controller *c, const beadline_machine *ma
         return BEADLINE_OTHER_PLANT;
     if (machine->sample_time_s < BEADLINE_SAMPLE_TIME_S || machine->sample_time_s > BEADLINE_SAMPLE_TIME_S)
         return BEADLINE_OTHER_SAMPLE_TIME;
-    if (strcmp(machine->input_unit, BEADLINE_INPUT_UNIT) || strcmp(machine->output_unit, BEADLINE_OUTPUT_UNIT))
+    if (strcmp(machine->input_unit, BEADLINE_INPUT_UNIT)
+        || strcmp(machine->output_unit, BEADLINE_OUTPUT_UNIT))
         return BEADLINE_OTHER_UNIT;
     if (machine->inputs != INPUTS || machine->outputs != OUTPUTS)
         return BEADLINE_OTHER_SIGNALS;
@@ -228,13 +229,15 @@ static void tell_causes(const beadline_controller *c, double t_s, beadline_decis
         for (signal = 0; signal < SIGNALS; signal++)
             if (k->since[kind][signal] >= 0) {
                 int other = k->other[kind][signal];
-                int of = (of_input(kind) || of_output(kind) || kind == REFERENCE_OUT_OF_REACH) && other != ALL_INPUTS;
+                int of = other != ALL_INPUTS
+                         && (of_input(kind) || of_output(kind) || kind == REFERENCE_OUT_OF_REACH);
                 add_cause(d, kind, of ? signal : -1, other == kind ? -1 : other < 0 ? -1 : other,
                           k->amount[kind][signal], t_s - (k->clock_s[1] - k->since[kind][signal]));
             }
     if (d->causes)
         return;
-    add_cause(d, MODEL_NO_LONGER_RIGHT, loudest(&c->memory), -1, 0.0, t_s - k->alarmed * BEADLINE_SAMPLE_TIME_S);
+    add_cause(d, MODEL_NO_LONGER_RIGHT, loudest(&c->memory), -1, 0.0,
+              t_s - k->alarmed * BEADLINE_SAMPLE_TIME_S);
 }
 
 beadline_result beadline_step(beadline_controller *c, const double *y, const double *r, double t_s,

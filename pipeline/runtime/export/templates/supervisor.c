@@ -251,7 +251,8 @@ static void suspect(innovation_memory *o, const innovation *now, int alarmed)
         take_row(o);
 }
 
-/* What the bank says: cost and amplitude of every hypothesis; mean squares that the best leaves, and there were */
+/* What the bank says: cost and amplitude of every hypothesis; mean squares that the best leaves, and that
+ * there were */
 typedef struct {
     double cost[BANK], amplitude[BANK], none, left[OUTPUTS], own[OUTPUTS];
     int best;
@@ -313,11 +314,11 @@ static const int severity[4] = {0, 2, 1, 3};
 
 
 static const char *const reasons[KINDS] = {
-    "a heater heats whatever it is told, or goes on with an older command: only the mains can stop it, switch "
-    "them off",
+    "a heater heats whatever it is told, or goes on with an older command: only the mains can stop it, "
+    "switch them off",
     "a heater does not heat whatever it is told, or goes on with an older command: its zone cools",
-    "a heater does less than it is told: it lacks power, goes on with an older command, or its zone loses more "
-    "heat than the model knows",
+    "a heater does less than it is told: it lacks power, goes on with an older command, or its zone loses "
+    "more heat than the model knows",
     "a zone reads ever colder than heat can explain: its sensor is out of place, or it is not heated",
     "a sensor reads outside its declared limits",
     "a sensor gives no number",
@@ -611,8 +612,8 @@ static void hurry(innovation_memory *o, const double *e)
     memset(o->X, 0, sizeof o->X);
 }
 
-/* One sample of outputs y, inputs `applied` since the one before, none of `samples` in manual; filled is y with
- * what is not trusted as forecast */
+/* One sample of outputs y, inputs `applied` since the one before, none of `samples` in manual; filled is y
+ * with what is not trusted as forecast */
 static void follow(supervisor_kept *k, innovation_memory *o, const double *y, const double *y_star,
                    const double *applied, int samples, double *filled)
 {
