@@ -159,8 +159,14 @@ class Told(NamedTuple):
     abstains: bool
 
 
-def told(within: Support, log: Log) -> Told:
-    """Where a log is off support. One too short for a forecast is judged by its ranges alone."""
+def watches_of(within: Support) -> list[Watch]:
+    """The observers of the plants that forecast: the same for every log."""
+    return [watched_by(one, within.steps) for one in within.spread]
+
+
+def told(within: Support, log: Log, watches: Sequence[Watch]) -> Told:
+    """Where a log is off support, by `watches_of` it. One too short for a forecast is judged by its ranges
+    alone."""
     off = np.zeros(len(log.u), np.int8)
     for low, high, values, kind in (
         (within.temperature_low, within.temperature_high, log.y, TEMPERATURE),
@@ -168,7 +174,7 @@ def told(within: Support, log: Log) -> Told:
     ):
         off[((values < low) | (values > high)).any(axis=1)] |= kind
     count, every = 0, max(within.steps // AT_ONCE, 1)
-    missed, watches = 0, [watched_by(one, within.steps) for one in within.spread]
+    missed = 0
     for first, part in _stretches(log):
         run = forecasts(watches, part, within.noise, within.steps)
         count += len(run.d)

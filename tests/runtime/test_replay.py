@@ -134,19 +134,23 @@ def within() -> support.Support:
     return support.support(plants, [Log(*(part[rows] for part in log())) for rows in parts], NOISE)
 
 
+def told(of: Log) -> support.Told:
+    return support.told(within(), of, support.watches_of(within()))
+
+
 def test_a_log_of_the_machine_is_on_support_and_one_wired_wrong_is_not():
-    assert not support.told(within(), log()).abstains
+    assert not told(log()).abstains
     for wrong in (
         log()._replace(u=log().u[:, [1, 0, 2, 3, 4, 5, 6]] * 3),
         log()._replace(u=log().u / 100),
         log()._replace(y=1.8 * log().y + 32),
     ):
-        said = support.told(within(), wrong)
+        said = told(wrong)
         assert said.abstains and said.off.any()
 
 
 def test_what_leaves_its_range_is_off_at_that_sample():
     hot = log().y.copy()
     hot[400] += 40.0
-    off = support.told(within(), log()._replace(y=hot)).off
+    off = told(log()._replace(y=hot)).off
     np.testing.assert_array_equal(np.flatnonzero(off & support.TEMPERATURE), [400])

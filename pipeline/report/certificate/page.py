@@ -194,9 +194,11 @@ def band_rows(shown: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     sure = np.abs(gain) / np.maximum(high - low, 1e-12)
     order = np.argsort(-sure, axis=None, kind="stable")[:MOST_BANDS]
     inputs = [one["name"] for one in shown["inputs"]]
+    columns = gain.shape[1]
+    at = [divmod(int(k), columns) for k in order]
     return [
-        (inputs[i], bands["on"][j], f"{gain[i, j]:.3g}", f"{low[i, j]:.3g} to {high[i, j]:.3g}")
-        for i, j in zip(*np.unravel_index(order, gain.shape), strict=True)
+        (inputs[i], str(bands["on"][j]), f"{gain[i, j]:.3g}", f"{low[i, j]:.3g} to {high[i, j]:.3g}")
+        for i, j in at
     ]
 
 

@@ -60,8 +60,8 @@ def decision(told: Mapping[str, Any]) -> str:
     means = told["asked_otherwise_percent"] or {}
     if not means:
         return "The recording is too short for a replay."
-    most = max(means, key=means.get)
-    return f"It would have asked otherwise by {means[most]:.2g} percent on average at most, on {most}."
+    most, name = max((mean, name) for name, mean in means.items())
+    return f"It would have asked otherwise by {most:.2g} percent on average at most, on {name}."
 
 
 def rows(told: Mapping[str, Any]) -> list[tuple[str, str]]:

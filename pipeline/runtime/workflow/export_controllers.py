@@ -112,12 +112,18 @@ def evidence(path: str, declared: Plant) -> certificate.Record:
         last[longest : longest + 1] = [False, True]
         last = [flag and i == longest + 1 for i, flag in enumerate(last)]
     wired = wired_to(declared)
-    parts = [
-        [piece[k] for piece, flag in zip(pieces, last, strict=True) if flag == new]
-        for new in (0, 1)
-        for k in (0, 1)
-    ]
-    return certificate.Record(wired.inputs, wired.outputs, wired.sample_time_s, *parts)
+    learned, newest = (
+        [piece for piece, flag in zip(pieces, last, strict=True) if flag == new] for new in (False, True)
+    )
+    return certificate.Record(
+        wired.inputs,
+        wired.outputs,
+        wired.sample_time_s,
+        [piece[0] for piece in learned],
+        [piece[1] for piece in learned],
+        [piece[0] for piece in newest],
+        [piece[1] for piece in newest],
+    )
 
 
 def asked(
@@ -159,9 +165,12 @@ def certified(
 def learning(name: str, judged: Judged) -> bands.Learning | None:
     """How the gains of a contestant were learned from the record; None where they are those of a model."""
     problem, of = judged.problem, BY_NAME[name].learned_from
-    if of not in ("window", "kernel") or (of == "kernel" and problem.kernel is None):
+    if of == "window":
+        N = problem.window.N
+    elif of == "kernel" and problem.kernel is not None:
+        N = problem.kernel.N
+    else:
         return None
-    N = problem.window.N if of == "window" else problem.kernel.N
     effort = float(judged.weights[name]["effort_weight"])
     p, m = problem.plant.p, problem.plant.m
     return bands.Learning(of, N, np.ones(p), np.full(m, effort), problem.gamma)

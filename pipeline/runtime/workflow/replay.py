@@ -76,9 +76,17 @@ def read_support(folder: Path, made: Exported) -> support.Support | None:
         type(made.model)(*(arrays[f"spread.{name}"][i] for name in names))
         for i in range(len(arrays["spread.A"]))
     )
-    plain = {name: arrays[name] for name in support.Support._fields if name != "spread"}
-    numbers = {name: float(plain[name]) for name in ("furthest", "allowed")}
-    return support.Support(**(plain | numbers | {"spread": plants, "steps": int(plain["steps"])}))
+    return support.Support(
+        arrays["temperature_low"],
+        arrays["temperature_high"],
+        arrays["command_low"],
+        arrays["command_high"],
+        plants,
+        arrays["noise"],
+        int(arrays["steps"]),
+        float(arrays["furthest"]),
+        float(arrays["allowed"]),
+    )
 
 
 # ---- the recording
@@ -163,9 +171,10 @@ def replayed(made: Exported, within: support.Support | None, table: Table, r: np
     masked = np.stack([table.masked[one.name] for one in (*wired.inputs, *wired.outputs)], axis=1).any(axis=1)
     u, y, r = (_filled(part) for part in (u, y, r))
     runs, offs, told = [], [], []
+    watches = support.watches_of(within) if within else []
     cuts = np.flatnonzero(np.diff(table.segment)) + 1
     for log in map(Log, np.split(u, cuts), np.split(y, cuts), np.split(r, cuts)):
-        offs.append(_told(within, log))
+        offs.append(_told(within, log, watches))
         if offs[-1].abstains:
             runs.append((replay.Replayed(log.u, log.u, log.u, log.r), np.zeros(log.u.shape, int)))
             continue
@@ -185,10 +194,10 @@ def replayed(made: Exported, within: support.Support | None, table: Table, r: np
     )  # fmt: skip
 
 
-def _told(within: support.Support | None, log: Log) -> support.Told:
+def _told(within: support.Support | None, log: Log, watches: Sequence[support.Watch]) -> support.Told:
     if within is None:
         return support.Told(np.zeros(len(log.u), np.int8), 0.0, False)
-    return support.told(within, log)
+    return support.told(within, log, watches)
 
 
 def _filled(values: np.ndarray) -> np.ndarray:
