@@ -1,5 +1,5 @@
 """Artifacts -> pages: reports/index.html, temperature.html, identification.html, deposition.html,
-setpoint.html, certificate.html.
+setpoint.html, certificate.html, viewer.html with its columns in reports/data.
 
 It reads the metrics and tables of every stage and reports/accepted.json. A missing file is shown as missing.
 Every file read is hashed, and the pages carry the hashes. The drift on page one is that of the last night
@@ -18,6 +18,7 @@ from pipeline.report.shared.sources import Declared, collect, digest
 from pipeline.report.shared.verdict import ReportRules
 from pipeline.report.temperature import page as temperature_page
 from pipeline.report.temperature.judgement import judgement, shown
+from pipeline.report.viewer import page as viewer_page
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow.settings import Plant
 
@@ -64,6 +65,7 @@ def main() -> None:
             declared, METRICS, FOLDERS, "reports/accepted.json", ("pipeline", "stages"), RELEARNED
         )
         judged = judgement(sources)
+        viewer = viewer_page.render(sources, judged)
         pages = {
             "index": index_page.render(sources, judged),
             "temperature": temperature_page.render(sources, judged),
@@ -71,6 +73,7 @@ def main() -> None:
             "deposition": deposition_page.render(sources),
             "setpoint": setpoint_page.render(sources),
             "certificate": certificate_page.render(sources),
+            "viewer": viewer.text,
         }
         artifacts.write_text("reports/index.html", pages["index"])
         artifacts.write_text("reports/temperature.html", pages["temperature"])
@@ -78,6 +81,8 @@ def main() -> None:
         artifacts.write_text("reports/deposition.html", pages["deposition"])
         artifacts.write_text("reports/setpoint.html", pages["setpoint"])
         artifacts.write_text("reports/certificate.html", pages["certificate"])
+        artifacts.write_text("reports/viewer.html", pages["viewer"])
+        artifacts.write_folder("reports/data", viewer.files)
         artifacts.write_metrics(
             "report",
             {

@@ -14,7 +14,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 
@@ -31,6 +31,7 @@ from pipeline.store.printable import printable
 from pipeline.store.tables import ARRAYS, Column, Schema
 
 DATASETS, REPORTS = Path("datasets"), Path("reports")
+WHOLE = ".whole"  # inside a stage: the folder that it lies in will hold nothing else
 CSV_ROWS = 1 << 15  # written at once: text takes ten times the memory of its numbers
 
 # inside a stage: the folder where what goes to reports/ waits until the stage has ended well
@@ -240,6 +241,22 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
+def write_folder(path: str | Path, files: Mapping[str, str | bytes]) -> None:
+    """A folder below reports/ that holds exactly these files, texts in UTF-8, once the stage ends well: what
+    an earlier run left in it goes. Outside a stage it is no longer whole if a write fails."""
+    waiting = _waiting.get()
+    folder = waiting / path if waiting else Path(path)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, content in {**files, WHOLE: ""}.items():
+        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+    # all are written before the first is waited for: a disk takes many at once
+    for name in files:
+        _on_disk(folder / name)
+    if not waiting:
+        (folder / WHOLE).unlink()
+        _drop_others(files, folder)
+
+
 def write_jpeg(path: str | Path, picture: np.ndarray) -> None:
     """A picture (h, w, 3) uint8 in RGB, at the quality of a page."""
     done, data = cv2.imencode(
@@ -395,6 +412,10 @@ def stage(name: str) -> Iterator[Path]:
         folder.mkdir(parents=True)
         yield folder
         _replace(folder, retired, DATASETS / name)
+        for whole in sorted(waiting.rglob(WHOLE)):
+            whole.unlink()
+            names = [file.name for file in whole.parent.iterdir()]
+            _drop_others(names, whole.parent.relative_to(waiting))
         for temporary in sorted(file for file in waiting.rglob("*") if file.is_file()):
             target = temporary.relative_to(waiting)
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -408,6 +429,14 @@ def stage(name: str) -> Iterator[Path]:
         _waiting.reset(token)
         for left in (folder, waiting):
             shutil.rmtree(left, ignore_errors=True)
+
+
+def _drop_others(names: Iterable[str], folder: Path) -> None:
+    """Removes the files of a folder that have none of these names."""
+    kept = set(names)
+    for file in sorted(folder.glob("*")):
+        if file.is_file() and file.name not in kept:
+            file.unlink()
 
 
 def _replace(folder: Path, retired: Path, target: Path) -> None:

@@ -224,6 +224,10 @@ def test_no_address_leaves_the_folder_and_every_link_leads_somewhere(project):
             if link.startswith("data:image/jpeg;base64,"):
                 continue
             file, _, place = link.partition("#")
+            # what stands behind its # is a view: test_viewer holds it against what the viewer has
+            if file == "viewer.html":
+                assert Path("reports/viewer.html").exists()
+                continue
             assert (file or name) in pages, link
             assert not place or place in pages[file or name].ids, link
         css = " ".join(re.findall(r"<style>(.*?)</style>", (Path("reports") / name).read_text(), re.DOTALL))

@@ -239,7 +239,14 @@ def commands(sources: Sources) -> Picture:
         shown,
         "Plunger command of the model inversion, in multiples of the steady command, against time in s. "
         f"Beyond ± {REACH:g} it runs along the edge.",
-        page.origin(sources.source("lessons")),
+        page.origin(
+            sources.source("lessons"),
+            material=materials,
+            routine="0",
+            law=law,
+            trial=sorted({"0", str(min(1, last)), str(last)}),
+            y="command_mm",
+        ),
     )
 
 
@@ -331,7 +338,16 @@ def corner(sources: Sources) -> Picture:
         shown,
         f"{'Measured' if real(sources) else 'True'} flow in mm³/s against time since the gantry’s pause "
         "began, in s; dashed: wanted.",
-        page.origin(sources.source("lessons")),
+        page.origin(
+            sources.source("lessons"),
+            material=materials,
+            routine="0",
+            law=laws,
+            trial=sorted(
+                {str(int(_trials(table, materials[0], law)["trial"].max(initial=0))) for law in laws}
+            ),
+            y=kind,
+        ),
     )
 
 
@@ -471,7 +487,9 @@ def measured(sources: Sources) -> Picture:
         shown,
         f"Measured flow in mm³/s against time in s{below}. "
         "Grey: the gantry stands, only the volume of the pause is seen, and nothing is learned there.",
-        page.origin(sources.source("lessons", "filmed")),
+        page.origin(
+            sources.source("lessons", "filmed"), material=materials, routine="0", law="pixels", trial="0"
+        ),
     )
 
 

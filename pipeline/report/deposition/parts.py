@@ -86,7 +86,7 @@ def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Pi
         f"Light beyond ±{100 * RIGHT:g}{THIN}%, dark beyond ±{100 * FAR:g}{THIN}% of a full line’s flow; "
         "of a long part the worst of each stretch. "
         f"{'Forecast.' if real(sources) else 'True flow of the simulated machine.'}",
-        page.origin(sources.source("signals")),
+        page.origin(sources.source("signals"), part=part),
     )
 
 

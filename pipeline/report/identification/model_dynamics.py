@@ -63,7 +63,13 @@ def steps(sources: Sources) -> Matrix:
         f"excursion; delay: what is left of the time to 63.2{THIN}%.{more}"
     )
     return Matrix(
-        "steps", title, text, rows, caption, page.origin(sources.source("steps", "dynamics")), size.across
+        "steps",
+        title,
+        text,
+        rows,
+        caption,
+        page.origin(sources.source("steps", "dynamics"), y="response"),
+        size.across,
     )
 
 

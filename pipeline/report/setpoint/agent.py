@@ -122,7 +122,9 @@ def _ways(sources: Sources, board: Board, table: Table, case: Case, i: int) -> P
         f"{', '.join(number(level, 1) for level in LEVELS)} outwards. Ring: start; filled: end, "
         f"vermillion outside. Grey: {BEST_FLOW - FLOW_BAND:g}–{BEST_FLOW + FLOW_BAND:g}{THIN}% and "
         f"{BEST_TEMPERATURE:g}{THIN}±{THIN}{TEMPERATURE_BAND:g}{THIN}°C. Below: flow against decisions.",
-        page.origin(sources.source("paths")),
+        page.origin(
+            sources.source("paths"), simulator=case[0], case=case[1], controller=shown(board, table, case)
+        ),
     )
 
 

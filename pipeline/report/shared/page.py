@@ -4,6 +4,8 @@ import base64
 import functools
 import hashlib
 import itertools
+import urllib.parse
+from collections.abc import Sequence
 
 import jinja2
 from markupsafe import Markup, escape
@@ -120,11 +122,40 @@ def missing(gap: Missing) -> Markup:
     )
 
 
-def origin(sources: list[Source]) -> Markup:
-    """Where the figures beside it are from: stage, artifact, schema,
-    hash; the whole hash is in the provenance."""
+# sources that the viewer shows by the same name; a test holds them against its tables
+IN_VIEWER = (
+    "trajectories",
+    "record",
+    "holdout",
+    "steps",
+    "trials",
+    "lessons",
+    "signals",
+    "decisions",
+    "paths",
+    "agents",
+)
+
+
+def in_viewer(table: str, **place: str | Sequence[str]) -> Markup:
+    """A link to a table's place in the viewer: values by key, lines by `y`, as its address has them."""
+    state = urllib.parse.urlencode({"t": table} | place, doseq=True, quote_via=urllib.parse.quote)
+    return Markup('<a class="in-viewer" href="viewer.html#{}">Open in the viewer</a>').format(state)
+
+
+def origin(sources: list[Source], **place: str | Sequence[str]) -> Markup:
+    """Where the figures beside it are from: stage, artifact, schema, hash; the whole hash is in the
+    provenance. A time series is linked to its place in the viewer, which `place` tells."""
     if not sources:
         return Markup("")
+    series = next((source.name for source in sources if source.name in IN_VIEWER), None)
+    if series:
+        return Markup('{} <p class="src">{}.</p>').format(files(sources), in_viewer(series, **place))
+    return files(sources)
+
+
+def files(sources: list[Source]) -> Markup:
+    """The artifacts by name, each linked to its line of the provenance."""
     parts = [
         Markup('<a href="#{}"><code>{}</code></a>').format(anchor(s.path), s.path.split("/", 1)[1])
         for s in sources

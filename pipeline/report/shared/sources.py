@@ -138,6 +138,8 @@ def collect(
             del read[path]
         elif isinstance(tables[name], Missing):
             absent[path] = tables[name]
+    # the pages show the reference routine, a third of all rows; the viewer shows every one
+    tables["every_lesson"], tables["lessons"] = tables["lessons"], _first_routine(tables["lessons"])
     for name, stage in (("frames", "train_ilc"), ("nozzle_frames", "train_classifier")):
         for frame in [] if isinstance(tables[name], Missing) else tables[name]:
             path = frame["path"]
@@ -231,7 +233,7 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("study", "reproduce_study", "study.parquet", *table(schemas.STUDY)),
         ("parity", "reproduce_study", "parity.parquet", *table(schemas.PARITY)),
         ("trials", "train_ilc", "trials.parquet", *table(TRIALS)),
-        ("lessons", "train_ilc", "lessons.parquet", f"{LESSONS.name} {LESSONS.version}", _first_routine),
+        ("lessons", "train_ilc", "lessons.parquet", *table(LESSONS)),
         ("filmed", "train_ilc", "filmed.parquet", *table(FILMED)),
         ("models", "train_ilc", "models.json", "models", artifacts.read_json),
         ("frames", "train_ilc", "frames/frames.json", "frames 1", _frames),
@@ -262,9 +264,10 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
     ]
 
 
-def _first_routine(path: str) -> Table:
-    """The lessons of the reference routine, a third of all rows; the pages show no other."""
-    table = artifacts.read_table(path, LESSONS)
+def _first_routine(table: Table | Missing) -> Table | Missing:
+    """The lessons of the reference routine."""
+    if isinstance(table, Missing):
+        return table
     rows = table["routine"] == 0
     return {name: values[rows] for name, values in table.items()}
 

@@ -76,8 +76,15 @@ def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
         shown,
         f"{_extent(whole, runs)}Above: true temperature of every zone in °C, dashed its reference. Below: "
         "every command in per cent as the machine was given it; grey: within its limits. Against time in s.",
-        page.origin(sources.source("trajectories")),
+        page.origin(sources.source("trajectories"), **_viewed(sources, name, list(runs))),
     )
+
+
+def _viewed(sources: Sources, name: str, contestants: list[str]) -> dict[str, list[str]]:
+    """The same in the viewer: every zone's temperature and every command as given."""
+    machine = sources.declared.machine
+    lines = [o.name for o in machine.outputs] + [f"{i.name}_applied" for i in machine.inputs]
+    return {"case_name": [name], "contestant": contestants, "y": lines, "p": ["unit"]}
 
 
 def _early(runs: dict[str, Table], settling_s: float) -> dict[str, Table]:

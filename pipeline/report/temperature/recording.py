@@ -110,7 +110,9 @@ def record(sources: Sources) -> Picture:
             "Against time in s, recordings one after the other; at most 480 points a signal, highest and "
             "lowest of each stretch kept. Grey: flagged; vermillion: masked."
         ),
-        page.origin(sources.source("record", "quality")),
+        page.origin(
+            sources.source("record", "quality"), y=[s.name for s in (*machine.acting, *machine.outputs)]
+        ),
     )
 
 

@@ -1,0 +1,211 @@
+"""The viewer: a page that draws any time series of the run, the files of its columns, and, for where no
+script runs, the picture of the deciding case."""
+
+import base64
+import hashlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from markupsafe import Markup
+
+from pipeline.report.shared import charts, page
+from pipeline.report.shared.digits import THIN, number, short
+from pipeline.report.shared.sources import Sources, Table
+from pipeline.report.shared.verdict import Missing
+from pipeline.report.temperature.answers import comparison, entry
+from pipeline.report.temperature.contestants import heading
+from pipeline.report.temperature.judgement import Judgement
+from pipeline.report.temperature.pictures import drawn
+from pipeline.report.viewer import packed, series
+
+VENDOR = Path(__file__).parent / "vendor"
+LIBRARY = "uPlot.js"
+
+
+class Row(NamedTuple):
+    """A table as the page lists it: what it is, and where it can be had whole."""
+
+    title: str
+    note: str
+    rows: str
+    link: str
+    size: str
+    source: str
+    missing: Missing | None
+    left_out: str
+
+
+class Viewer(NamedTuple):
+    """The text of viewer.html, and the files of the folder data/ beside it."""
+
+    text: str
+    files: dict[str, str | bytes]
+
+
+def render(sources: Sources, judged: Judgement) -> Viewer:
+    """viewer.html and what it loads."""
+    files: dict[str, str | bytes] = {LIBRARY: _library()}
+    room = packed.LARGEST - sum(map(len, files.values()))
+    entries, rows = [], []
+    for shown in series.tables(sources):
+        table = sources.tables["every_lesson" if shown.name == "lessons" else shown.name]
+        if isinstance(table, Missing):
+            rows.append(Row(shown.title, shown.note, "", "", "", "", table, ""))
+            continue
+        source = sources.source(shown.name)[0]
+        link, copy, size = packed.download(source, room)
+        room -= sum(map(len, copy.values()))
+        found = packed.packed(shown, table, room)
+        room -= sum(map(len, found.files.values()))
+        files |= {**copy, **found.files}
+        if found.entry["books"]:
+            entries.append(found.entry | {"link": link, "size": size, "path": source.path})
+        left_out = _left_out(found.entry)
+        count = number(found.entry["rows"], 0)
+        rows.append(Row(shown.title, shown.note, count, link, size, source.path, None, left_out))
+    script = page.environment().get_template("viewer.js").render().strip()
+    text = page.render(
+        "viewer.html",
+        here="viewer",
+        title="Viewer",
+        rows=rows,
+        still=still(sources, judged),
+        data=Markup(packed.script_safe({"tables": entries, "start": start(sources, judged)})),
+        own=Markup(script),
+        own_digest=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        library_style=Markup((VENDOR / "uPlot.min.css").read_text(encoding="utf-8").strip()),
+        convention=not sources.recorded,
+        bound=number(packed.LARGEST / 1e6, 0),
+        sources=[s for s in sources.read.values() if s.path in {row.source for row in rows}],
+        absent={},
+        hashes=[],
+    )
+    return Viewer(text, dict(sorted(files.items())))
+
+
+def _library() -> str:
+    """uPlot behind its licence."""
+    licence = (VENDOR / "LICENSE").read_text(encoding="utf-8").strip()
+    return f"/*!\n{licence}\n*/\n" + (VENDOR / "uPlot.iife.min.js").read_text(encoding="utf-8")
+
+
+def _left_out(entry: dict[str, Any]) -> str:
+    """What of a table the viewer does not have, in words; "" where it has all of it."""
+    parts = []
+    if entry["runs_left_out"]:
+        parts.append(f"{number(entry['runs_left_out'], 0)} runs have no room here")
+    if entry["events_left_out"]:
+        parts.append(f"{number(entry['events_left_out'], 0)} later events have no room here")
+    return f"{'; '.join(parts)}: see the Parquet file." if parts else ""
+
+
+# ---- the deciding case
+
+
+def start(sources: Sources, judged: Judgement) -> dict[str, Any]:
+    """What the viewer shows where its address says nothing: the deciding case of the temperature loop."""
+    table = sources.tables["trajectories"]
+    if isinstance(table, Missing) or not len(table["time_s"]):
+        return {}
+    runs, zone = _deciding(sources, judged, table)
+    if not runs:
+        return {}
+    place = {"t": "trajectories", "case_name": ["deciding"], "contestant": list(runs), "y": [zone]}
+    seconds = _until_settled(table, runs, zone)
+    if seconds < float(table["time_s"].max()):
+        place["x"] = [0.0, seconds]
+    return place
+
+
+def _deciding(sources: Sources, judged: Judgement, table: Table) -> tuple[dict[str, np.ndarray], str]:
+    """Rows of the deciding case under everybody whom the temperature page draws, and the output that the
+    subject of the verdict leaves furthest from its reference."""
+    runs = {
+        who: np.flatnonzero((table["contestant"] == who) & (table["case_name"] == "deciding"))
+        for who in drawn(sources, judged)
+    }
+    runs = {who: rows for who, rows in runs.items() if len(rows)}
+    names = [output.name for output in sources.declared.machine.outputs]
+    if not runs:
+        return {}, names[0]
+    rows = runs.get(judged.subject, next(iter(runs.values())))
+    settled = entry(comparison(sources.metrics), "settled_steps")
+    last = rows[-(settled if isinstance(settled, int) else max(len(rows) // 10, 1)) :]
+    apart = [float(np.abs(np.mean(table[name][last] - table[f"{name}_reference"][last]))) for name in names]
+    return runs, names[int(np.argmax(np.nan_to_num(apart, nan=np.inf)))]
+
+
+def _until_settled(table: Table, runs: dict[str, np.ndarray], zone: str) -> float:
+    """Three times as long as the slowest takes to come within 2 % of its way to a constant reference; to the
+    end of one that moves."""
+    rows = np.concatenate(list(runs.values()))
+    time, away = table["time_s"][rows], np.abs(table[zone][rows] - table[f"{zone}_reference"][rows])
+    if np.ptp(table[f"{zone}_reference"][rows]) > 0 or not np.isfinite(away).all():
+        return float(time.max())
+    outside = time[away > 0.02 * away.max()]
+    return float(min(3 * outside.max(initial=0.0) + 1, time.max()))
+
+
+class Still(NamedTuple):
+    """A picture that needs no script; `missing` in its place."""
+
+    text: str
+    picture: Markup
+    names: list[str]
+    origin: Markup = Markup("")
+    missing: Missing | None = None
+
+
+STYLES = {"dd": "line dd", "mb": "line", "bl": "line bl"}
+
+
+def still(sources: Sources, judged: Judgement) -> Still:
+    """The output furthest from its reference in the deciding case, a numbered line a contestant."""
+    table = sources.tables["trajectories"]
+    if isinstance(table, Missing):
+        return Still("", Markup(""), [], missing=table)
+    runs, zone = _deciding(sources, judged, table)
+    if not runs:
+        gap = Missing("not measured", "no trajectory of the deciding case was recorded")
+        return Still("", Markup(""), [], missing=gap)
+    label = sources.zone([o.name for o in sources.declared.machine.outputs].index(zone))
+    seconds, time = _until_settled(table, runs, zone), table["time_s"]
+    early = {who: rows[time[rows] <= seconds] for who, rows in runs.items()}
+    frame = charts.Frame(
+        charts.linear(0, seconds or 1.0),
+        _degrees(table, np.concatenate(list(early.values())), zone),
+        width=360,
+        height=240,
+        left=44,
+        below=20,
+        above=20,
+        right=18,
+    )
+    first = next(iter(early.values()))
+    layers = [charts.line(frame, time[first], table[f"{zone}_reference"][first], "ref")]
+    names, used = [], set()
+    for i, (who, rows) in enumerate(early.items(), 1):
+        style, y = STYLES.get(page.MARKS.get(who, "bl"), "line"), table[zone][rows]
+        layers.append(charts.line(frame, time[rows], y, style + (" dash" if style in used else "")))
+        used.add(style)
+        end = float(np.abs(table[zone] - table[f"{zone}_reference"])[runs[who][-1]])
+        names.append(f"{i} {heading(who)}: ends {short(end, 2)}{THIN}°C from it")
+        # a number of its own height each, where the line comes by
+        at = int(np.argmax(np.abs(y - y[0]) >= np.ptp(y) * i / (len(runs) + 1)))
+        layers.append(charts.label(frame, time[rows[at]], y[at], str(i), dx=5, dy=4))
+    text = f"The deciding case: {label} under {len(runs)} contestants, dashed its reference."
+    shown = f"The first {short(seconds, 2)} s. " if seconds < float(time.max()) else ""
+    alt, units = f"{text} {'; '.join(names)}", ("s", "°C")
+    picture = charts.panel(frame, layers, alt=alt, css="mb", title=f"{label}, °C", units=units)
+    return Still(f"{text} {shown}".strip(), picture, names, page.files(sources.source("trajectories")))
+
+
+def _degrees(table: Table, rows: np.ndarray, zone: str) -> charts.Axis:
+    """Room for a zone and its reference; what is lost runs along the edge."""
+    values = np.concatenate([table[zone][rows], table[f"{zone}_reference"][rows]])
+    values = values[np.isfinite(values) & (np.abs(values) < 1e4)]
+    if not len(values):
+        return charts.linear(0, 1)
+    room = 0.05 * float(np.ptp(values)) or 1.0
+    return charts.linear(float(values.min()) - room, float(values.max()) + room)
