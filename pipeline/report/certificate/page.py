@@ -173,7 +173,7 @@ def _inside(frame: charts.Frame, real: np.ndarray, imag: np.ndarray) -> tuple[np
     return real[inside], imag[inside]
 
 
-def margins(shown: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
+def margins(shown: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Figures over plants: median, nine of ten (margins) or 99 % (errors), worst."""
     rows = []
     found, worst = shown.get("margins"), shown.get("worst")
