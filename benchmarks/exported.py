@@ -112,6 +112,7 @@ def one_episode(of: Exported, folder: Path, number: int) -> dict[str, Any]:
     if ran.returncode:
         own = vectors.determined(of, make, script, replays=12).differs
     return figures | {
+        "number": number,
         "sanitizers_said": clean.stderr != "" or not clean.stdout,
         "own": own,
         "modes": sorted(set(done.mode.tolist())),
@@ -147,6 +148,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     agree = [row for row in rows if row["own"] is None]
     apart = [row for row in rows if row["own"] is not None]
     rounding = [row for row in apart if row["own"] > vectors.OWN_GAINS]
+    beside = [row for row in apart if row["own"] <= vectors.OWN_GAINS]
     causes = int(np.bitwise_or.reduce([row["causes"] for row in rows]))
     return {
         "steps": sum(row["rows"] for row in rows),
@@ -156,7 +158,8 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "their_largest_difference_of_range": max(
             (row["largest_difference"] for row in rounding), default=0.0
         ),
-        "episodes_that_differ_beside": len(apart) - len(rounding),
+        "episodes_that_differ_beside": [row["number"] for row in beside],
+        "largest_difference_beside_of_range": max((row["largest_difference"] for row in beside), default=0.0),
         "sanitizers_said": sum(row["sanitizers_said"] for row in rows),
         "modes": sorted({mode for row in rows for mode in row["modes"]}),
         "kinds": [kind for i, kind in enumerate(supervisor.KINDS) if causes >> i & 1],

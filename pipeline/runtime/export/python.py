@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.runtime.certificate import Certificate, sha256
+from pipeline.runtime.export import standalone
 from pipeline.runtime.export.sources import LIBRARIES, Place, gathered
 from pipeline.runtime.machine import Exported, check, check_certificate
 
-HOME = "pipeline.runtime.export.standalone"
+HOME = standalone.__name__
 ENTRIES: list[Place] = [("pipeline.runtime.supervisor", "Supervised")]
 REPLACED: dict[Place, Place] = {
     ("pipeline.temperature.tracking", "_steady"): (HOME, "_steady"),

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.runtime.export import flow_filter, flow_reader
 from pipeline.setpoint import bayes
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
 from pipeline.setpoint.published import FLOW_MOVES
@@ -14,8 +15,7 @@ from pipeline.setpoint.vision_transformer import VisionTransformer, named_arrays
 from pipeline.setpoint.window_flow import KNOTS_PERCENT
 from pipeline.store import artifacts
 
-HERE = Path(__file__).parent
-READERS = ("flow_reader.py", "flow_filter.py")
+READERS = tuple(Path(reader.__file__) for reader in (flow_reader, flow_filter))
 
 
 class Exported(NamedTuple):
@@ -27,7 +27,7 @@ class Exported(NamedTuple):
 
 
 def exported(model: CalibratedClassifier, parameters: bayes.Filter) -> Exported:
-    readers = {name: (HERE / name).read_text(encoding="utf-8") for name in READERS}
+    readers = {path.name: path.read_text(encoding="utf-8") for path in READERS}
     return Exported(classifier_arrays(model), filter_arrays(parameters), readers)
 
 
