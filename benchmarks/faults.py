@@ -2,10 +2,10 @@
 
 `./run python -m benchmarks.faults` writes benchmarks/results/faults.json, machine by machine. Every kind of
 fault is played 50 times on the study's machine (the panel's 60 plants, with their noise) and on machines
-written apart from `Plant`: a hot end of one heater and one sensor, and one of two zones, with radiation, a fan,
-dead time, a sensor's lag and a converter's steps; their models are identified from a record as a user's would
-be. Then 200 hours without a fault (120 on the study's machine): references that change, disturbances of the
-allowed size. `--cases 5 --hours 2` plays fewer, `--machines study` only these.
+written apart from `Plant`: a hot end of one heater and one sensor, and one of two zones, with radiation, a
+fan, dead time, a sensor's lag and a converter's steps; their models are identified from a record as a user's
+would be. Then 200 hours without a fault (120 on the study's machine): references that change, disturbances of
+the allowed size. `--cases 5 --hours 2` plays fewer, `--machines study` only these.
 
 A fault is seen in time where a safe mode is asked for within 10 samples of the moment the innovation first
 passes 5 deviations of an honest one; a slow kind before its zone errs by 5 degC from what it would do without

@@ -42,7 +42,7 @@ MOVING, COINCIDENCE = (
     50.0,
     6.0,
 )  # what a sensor's lag would show, from which its zone moves; -2 log of the prior
-MISFIT = 0.005  # share of what is seen that even the right signature leaves: the model is not the machine
+MISFIT = 0.005  # share of what is seen that even the right signature leaves: no model is the machine
 SELDOM = 2.0  # -2 log of the prior of a sensor that drifts within seconds, beside a heater's
 CATCH_UP = 3  # rows of the ring that the bank takes in a step
 
@@ -50,10 +50,13 @@ CATCH_UP = 3  # rows of the ring that the bank takes in a step
 class Watch(NamedTuple):
     """Constants of the observer.
 
-    A, F = A - L C (n, n), B (n, m), C (p, n), b (n,), d (p,), L (n, p); loss (n, n) and warm (n,) are how more heat lost moves x,
-    loss x - warm; ones (m + 3,); started at start y + start_0. prior (m + 3,) deviations of theta; floor (p,) variance
-    in degC^2 of an honest innovation at rest, sd its root, `least` the smallest; `unexplained` is the share of what moves an output that no
-    theta explains; low, high (m,) in percent; strongest (m,) is the output that each input moves most.
+    A, F = A - L C (n, n), B (n, m), C (p, n), b (n,), d (p,), L (n, p) of the module's formula; `hurried`
+    (n, p) is added to L in manual, where the drift is still to be found. loss (n, n) and warm (n,): more heat
+    lost moves x by loss x - warm. x starts at start y + start_0. ones (m + 3,) sum a row.
+
+    prior (m + 3,) deviations of theta; floor (p,) variance in degC^2 of an honest innovation at rest, sd its
+    root, `least` the smallest; `unexplained` is the share of what moves an output that no theta explains.
+    low, high (m,) in percent; strongest (m,) is the output that each input moves most.
     """
 
     A: np.ndarray
@@ -118,7 +121,7 @@ def watch(
         b=np.r_[model.b, np.zeros(p)],
         d=model.d,
         L=L,
-        hurried=np.vstack([np.zeros((n, p)), HURRIED * np.eye(p)]) - np.vstack([np.zeros((n, p)), L[n:]]),
+        hurried=np.vstack([np.zeros((n, p)), HURRIED * np.eye(p) - L[n:]]),
         F=A - L @ C,
         loss=-heat @ C,
         warm=heat @ model.d,
@@ -179,16 +182,16 @@ def bank(model: Plant) -> Bank:
 
 
 class Memory(NamedTuple):
-    """Z (n, m + 4), the columns x and X of the module's formula, theta (p, m + 3) and its covariance P
-    (p, m + 3, m + 3); V and Y are room to compute in; u (2, m) the inputs of the last two samples, newest last; sums (2, p) of innovations
-    upward and downward.
+    """Z (n, m + 4), the columns x and X of the module's formula; V and Y of the same size are room to compute
+    in. theta (p, m + 3) and its covariance P (p, m + 3, m + 3). u (2, m) the inputs of the last two samples,
+    newest last; sums (2, p) of innovations upward and downward.
 
-    ring (RING, 2 m + 3 p), past samples, newest last: the inputs of the sample before it and of the one before
-    that, the innovation in deviations, the deviation, and what the output should have moved.
+    ring (RING, 2 m + 3 p), past samples, newest last: the inputs of the sample before it and of the one
+    before that, the innovation in deviations, the deviation, and what the output should have moved.
 
-    The bank of h hypotheses: Xb (n, h); f (h,) of a slow sensor, in degC; cross, square (h, p) and own (p,)
-    the sums of s z, s s and z z; u0 (m,) the input before, gain (m,) and late the plant's as learned until
-    then; age the rows taken, -1 while it rests; ahead the rows of the ring still to take.
+    The bank of h hypotheses: Xb (n, h); f (h,) how far a sensor is off, in degC; cross, square (h, p) and own
+    (p,) the sums of s z, s s and z z; u0 (m,) the input before, gain (m,) and late the plant's as learned
+    until then; age the rows taken, -1 while it rests; ahead the rows of the ring still to take.
     """
 
     Z: np.ndarray

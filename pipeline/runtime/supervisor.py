@@ -92,8 +92,8 @@ class Supervision(NamedTuple):
     """Thresholds and declared safe modes, the arrays by kind (k,), input (m,) or output (p,).
 
     `mode` (k,) the number in MODES, `back_s` (k,) seconds without the cause after which the law takes over
-    again, inf: a person acknowledges it. low, high (p,) in degC between which a reading is one. peak (p, m) in
-    degC per percent: how fast each input moves each output. `hysteresis_degC`, `gain_degC`, `check_s` and
+    again, inf: a person acknowledges it. low, high (p,) in degC between which a reading is one. peak (p, m)
+    in degC per percent: how fast each input moves each output. `hysteresis_degC`, `gain_degC`, `check_s` and
     `error_degC_s` are verify_heater's. `early`, `late`, `jump` are shares of the sample time: less than
     `early` or more than `jump` is no time between two samples, more than `late` is a deadline missed.
     `reach_degC`: a target that far from its reference is out of reach.
@@ -147,7 +147,7 @@ def supervision(
         )
     T = machine.sample_time_s
     waits = max(30 * T, 10.0) if back_s is None else back_s
-    limits = tuple(np.array([getattr(i, side) for i in machine.inputs]) for side in ("low", "high"))
+    limits = np.array([i.low for i in machine.inputs]), np.array([i.high for i in machine.inputs])
     pulses = markov_parameters(strictly_proper(model), innovations.MOST_LATE)
     check = _check_s(model, limits, T)
     return Supervision(
@@ -219,14 +219,21 @@ class Decision(NamedTuple):
 class Kept(NamedTuple):
     """All that the supervisor remembers beside innovations.Memory, arrays that are changed in place.
 
-    By kind and signal (k, w): since, last in s of the supervisor's own time, -1 where not so; amount; other, the number of
-    the kind that would show the same, -1 for none. By output (p,): y the last reading; repeats of it, and
-    quantum the smallest move seen; square and lag, means of z(t)^2 and z(t) z(t-1); z the last; trusted 1 or
-    0; absurd 1 where it left its range by itself; expected and e the last forecast and innovation; gap, error, goal and waited of verify_heater in degC, degC s, degC, s. By input
-    (m,): held the inputs that hold; asked the last command; lacks the share that a weak heater lacks; stuck 1
-    where it is on. Counters (8,): samples, samples since the alarm (-1: none), mode, whether the clock
-    was read, samples in all, causes that are there, whether a heater is stuck or weak, whether a zone is colder than it should be. clock_s (2,): the clock at the
-    last sample, and the supervisor's own time, which never falls.
+    By kind and signal (k, w): since, last in s of the supervisor's own time, -1 where not so; amount; other,
+    the number of the kind that would show the same, -1 for none, ALL_INPUTS where it is of every input.
+
+    By output (p,): y the last reading; repeats of it, and quantum the smallest move seen; square and lag,
+    means of z(t)^2 and z(t) z(t-1), z the last; trusted 1 or 0; absurd 1 where it left its range by itself;
+    expected and e the last forecast and innovation; error, goal and waited of verify_heater in degC s, degC
+    and s.
+
+    By input (m,): held the inputs that hold; asked the last command; lacks the share that a weak heater
+    lacks; stuck 1 where it is on.
+
+    counters (8,): samples since the start or an acknowledgement; samples since the alarm, -1 for none; mode;
+    1 once the clock was read; samples in all; causes that are there; 1 where a heater is stuck or weak; 1
+    where a zone is colder than it should be. clock_s (2,): the clock at the last sample, and the supervisor's
+    own time, which never falls.
     """
 
     since: np.ndarray
@@ -593,9 +600,9 @@ def sentence(machine: Machine, kind: int, signal: int, amount: float, other: int
     names = machine.inputs if kind in OF_INPUT else machine.outputs
     name = names[signal].name if signal < len(names) else "machine"
     said = {
-        ON: f"{name} heats whatever it is told, or goes on with an older command ({100 * amount:.0f} % of what "
-        "it could add): only the mains can stop it, switch them off",
-        OFF: f"{name} does not heat whatever it is told, or goes on with an older command, and its zone cools",
+        ON: f"{name} heats whatever it is told, or goes on with an older command ({100 * amount:.0f} % of "
+        "what it could add): only the mains can stop it, switch them off",
+        OFF: f"{name} does not heat whatever it is told, or goes on with an older command: its zone cools",
         WEAK: f"{name} does {100 * amount:.0f} % less than it is told: it lacks power, goes on with an older "
         "command, or its zone loses more heat than the model knows",
         RUNAWAY: f"{name} reads ever colder than heat can explain: it is out of place, or its zone is not "
@@ -614,8 +621,8 @@ def sentence(machine: Machine, kind: int, signal: int, amount: float, other: int
         DEADLINE: f"a sample came {amount:.3g} s after the one before",
         MODEL: f"the readings are {amount:.0f} deviations from what any plant of the spread would show, and "
         "no single fault explains them",
-        REACH: f"{name} is asked for {amount:.1f} degC more or less than its limits and the inputs can hold: the last "
-        "reference in reach stays",
+        REACH: f"{name} is asked for {amount:.1f} degC more or less than its limits and the inputs can hold: "
+        "the last reference in reach stays",
     }[kind]
     also = f"; {KINDS[other].replace('_', ' ')} would show the same" if 0 <= other != kind else ""
     return said + also + "."
@@ -724,7 +731,7 @@ class Supervised:
         limits = self.exported.controller.limits
         if mode == OFF_MODE:
             return limits.low.copy()
-        if mode == PI:
+        if mode == PI and self.pi is not None:
             if before != PI:
                 self.pi.watch(self.kept.asked, y, r)
                 self.pi.hand_over(y)
@@ -777,12 +784,12 @@ class Supervised:
     def saved(self) -> dict[str, np.ndarray]:
         """All that it remembers, as arrays. Raises ValueError before the first watch."""
         arrays = {f"law.{name}": part for name, part in self.law.saved().items()}
-        if self.kept.counters[MODE] == PI:
+        if self.pi is not None and self.kept.counters[MODE] == PI:
             arrays |= {f"pi.{name}": part for name, part in self.pi.saved().items()}
         for group in (self.kept, self.memory):
             arrays |= {name: np.array(part) for name, part in group._asdict().items()}
         mine = {"beyond": self._beyond, "in_reach": self._in_reach, "Y": self._Y, "w": self._w}
-        mine |= self._reference._asdict()
+        mine |= {} if self._reference is None else self._reference._asdict()
         return arrays | {f"aim.{name}": np.array(part) for name, part in mine.items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:

@@ -126,7 +126,7 @@ def test_a_faulty_sensor_is_named_and_its_safe_mode_asked_for(kind):
     at, cause = first(decisions)
     assert (cause.kind, cause.signal) == (kind, "zone_2")
     assert at <= 10 and decisions[at + 10].mode == SAFE[kind]
-    assert abs(cause.since_s - 200) <= 12
+    assert abs(cause.since_s - 200) <= 20
 
 
 HEATERS = {
@@ -167,7 +167,7 @@ def test_a_slow_sensor_is_seen_before_its_zone_errs_by_5_degC():
 
     worst = []
     for k in range(60):
-        decision = run.go(1, reading=lambda y, _: reading(y, k), r=lambda _: R + 8.0)[0]
+        decision = run.go(1, reading=lambda y, _, k=k: reading(y, k), r=lambda _: R + 8.0)[0]
         if decision.mode != "law":
             break
         worst.append(np.abs(run.true() - R - 8.0)[0] if k > 30 else 0.0)
@@ -282,6 +282,27 @@ def test_a_signature_is_what_the_fault_does_to_the_innovation():
         Xb.append(memory.Xb[:, column].copy())
         np.testing.assert_allclose(Xb[-1], off, atol=1e-9)  # the same sums in another order
     assert np.abs(off).max() > 0
+
+
+def test_a_reading_that_is_no_number_is_seen_in_any_place():
+    s = exported().supervision
+    for j in (0, 1):
+        k = supervisor.kept(s)
+        supervisor.read(s, k, R)
+        supervisor.read(s, k, put(j, lambda y, k: np.nan)(R + 0.1, 0))
+        assert list(np.flatnonzero(k.since[supervisor.NAN] >= 0)) == [j]
+
+
+def test_the_mode_is_safe_for_what_would_show_the_same():
+    s = exported().supervision
+    k = supervisor.kept(s)
+    supervisor.said(k, supervisor.OFFSET, 0, 2.0)
+    assert supervisor.MODES[supervisor.mode_of(s, k)] == "hold"
+    k = supervisor.kept(s)
+    supervisor.said(k, supervisor.OFFSET, 0, 2.0, supervisor.ON)
+    assert supervisor.MODES[supervisor.mode_of(s, k)] == "off"
+    words = supervisor.sentence(WIRED, supervisor.OFFSET, 0, 2.0, supervisor.ON)
+    assert "zone_1 is off by +2.0 degC" in words and "heater stuck on would show the same" in words
 
 
 def test_a_simulated_controller_runs_only_in_a_rehearsal():
