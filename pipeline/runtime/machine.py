@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import safetensors.numpy
+from safetensors.numpy import save as as_bytes
 
 from pipeline.store import artifacts
 from pipeline.temperature.controller import Deployed
@@ -255,7 +255,7 @@ def read(folder: str | Path) -> tuple[Exported, Certificate]:
 def controller_sha256(exported: Exported) -> str:
     """SHA-256 of controller.json and arrays.safetensors, one after the other, as `write` writes them."""
     text, arrays = _parts(exported)
-    packed = safetensors.numpy.save(dict(sorted(arrays.items())), {"beadline": "schema=controller"})
+    packed = as_bytes(dict(sorted(arrays.items())), {"beadline": "schema=controller"})
     return hashlib.sha256(text.encode() + packed).hexdigest()
 
 

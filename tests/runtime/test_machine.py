@@ -1,5 +1,5 @@
-"""A controller and its certificate in a folder: what is written is read bit by bit, and nothing that was changed,
-is missing, or is of another machine passes."""
+"""A controller and its certificate in a folder: what is written is read bit by bit, and nothing that was
+changed, is missing, or is of another machine passes."""
 
 import hashlib
 import json

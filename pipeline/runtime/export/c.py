@@ -152,7 +152,7 @@ def governor_of(exported: Exported) -> Governor | None:
 def machine_header(exported: Exported, certificate_sha256: str) -> str:
     machine, at = exported.machine, sizes(exported)
     lines = [
-        "/* The machine that this controller is made for. Generated; do not edit: beadline_init refuses another.",
+        "/* The machine that this controller is made for; beadline_init refuses others. Do not edit.",
         f" * Contestant {exported.name}. */",
         "#ifndef BEADLINE_MACHINE_H",
         "#define BEADLINE_MACHINE_H",
@@ -194,7 +194,7 @@ def tables(exported: Exported) -> str:
 def plant_header(exported: Exported) -> str:
     """test_plant.h: the model, which test_controller.c heats."""
     model = strictly_proper(exported.model)
-    text = "/* The model, which the test heats: x(t+1) = A x + B u + b, y = C x + d. Generated; do not edit. */\n\n"
+    text = "/* The model that the test heats: x(t+1) = A x + B u + b, y = C x + d. Do not edit. */\n\n"
     arrays = {"A": model.A, "B": model.B, "C": model.C, "b": model.b, "d": model.d}
     text += define("STATES", model.n)
     text += table("input_range", np.array([one.high - one.low for one in exported.machine.inputs]))
@@ -367,6 +367,8 @@ OF_INNOVATIONS = (
     "ODD",
     "CATCH_UP",
     "MOVING",
+    "MISFIT",
+    "SELDOM",
     "COINCIDENCE",
 )
 OF_SUPERVISOR = (

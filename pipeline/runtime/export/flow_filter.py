@@ -1,6 +1,6 @@
-"""The Bayes filter of the flow with numpy alone: each window moves the belief, and the move of least expected
-loss follows. Reads filter.safetensors with flow_reader.read_safetensors. Letters as in the project's bayes.py.
-"""
+"""The Bayes filter of the flow with numpy alone: each window moves the belief, and the move of least
+expected loss follows. Reads filter.safetensors with flow_reader.read_safetensors. Letters as in the project's
+bayes.py."""
 
 import math
 
@@ -37,7 +37,9 @@ def shifted(f, belief, move):
 def update(f, state, shares, named, flow_seen, flow_move):
     """The state after `flow_move` percent and the window that followed it."""
     belief, hazard = state["belief"], float(f["hazard"])
-    moved = np.stack([shifted(f, one, gain * flow_move) for one, gain in zip(belief, f["gains"])])
+    moved = np.stack(
+        [shifted(f, one, gain * flow_move) for one, gain in zip(belief, f["gains"], strict=True)]
+    )
     jumped = (f["after_jump"].T @ belief.sum(axis=1))[:, None] * f["grid_prior"]
     predicted = f["transition"].T @ ((1 - hazard) * moved + hazard * jumped)
     shown = code(f, shares, named, flow_seen)

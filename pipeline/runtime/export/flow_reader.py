@@ -1,5 +1,6 @@
-"""The flow classifier with numpy alone: key areas -> class logits, log flow and its deviation; windows -> flow
-and class probabilities. Reads classifier.safetensors, which lies beside this file where it is exported."""
+"""The flow classifier with numpy alone: key areas -> class logits, log flow and its deviation; windows ->
+flow and class probabilities. Reads classifier.safetensors, which lies beside this file where it is
+exported."""
 
 import json
 import math

@@ -140,8 +140,8 @@ def mpc(model: Plant, heater_power_W: float) -> Mpc:
     error = float(np.abs(left).max() / np.abs(response).max())
     if not (gain > 0 and error < STRANGE):
         raise ValueError(
-            f"the model's step response is {100 * error:.0f} % of its height off that of a heater block and a "
-            f"sensor, of at most {100 * STRANGE:.0f} %; leave Kalico's own MPC_CALIBRATE to find its model"
+            f"the model's step response is {100 * error:.0f} % of its height off that of a heater block and "
+            f"a sensor, of at most {100 * STRANGE:.0f} %; leave Kalico's own MPC_CALIBRATE to find its model"
         )
     transfer = heater_power_W / 100.0 / gain
     return Mpc(transfer * block_s, transfer, 1.0 / sensor_s, error)

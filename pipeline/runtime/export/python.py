@@ -97,8 +97,9 @@ def _head(exported: Exported, certificate_sha256: str) -> str:
     )
     imports = "\n".join(dict.fromkeys(line for line in LIBRARIES.values() if "numpy" not in line))
     return (
-        f'"""Controller {exported.name} of one machine, sampled every {machine.sample_time_s:g} s:\n\n{names}\n'
-        "Generated; do not edit. Needs numpy. `controller(...)` gives the object: in manual `watch` each sample,\n"
+        f'"""Controller {exported.name} of one machine, sampled every {machine.sample_time_s:g} s:\n\n'
+        f"{names}\nGenerated; do not edit. Needs numpy. `controller(...)` gives the object: in manual "
+        "`watch` each sample,\n"
         'then `hand_over` once, then `step` each sample.\n"""\n\n'
         "from __future__ import annotations\n\nimport base64\n"
         f"{imports}\n\nimport numpy as np\n\n"

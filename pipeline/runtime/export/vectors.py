@@ -1,12 +1,13 @@
-"""Golden vectors: what the object does on its own model, with noise, changed references, faults and hand-overs.
+"""Golden vectors: what the object does on its own model, with noise, changed references, faults, hand-overs.
 
 A script says what happens to machine and controller at each sample. `played` runs it with any object that has
-the calls of supervisor.Supervised; the C test runs the same script with the exported code. Both close the loop
-themselves: outputs fed to a law that is unstable by itself would tell rounding errors apart and nothing else.
+the calls of supervisor.Supervised; the C test runs the same script with the exported code. Both close the
+loop themselves: outputs fed to a law that is unstable by itself would tell rounding errors apart, no more.
 
     x(t+1) = A x + B (share u + extra) + b,   y = C x + d + add, or what `reading` says
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,14 +15,13 @@ import numpy as np
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.supervisor import KINDS, MODES
 from pipeline.temperature.plant import Plant, hold_output, strictly_proper
-from pipeline.temperature.tracking import feasible_target
 
-# what is done at a sample: in manual; a step; before it hand over, save and restore, or acknowledge; begin anew
+# what is done at a sample: in manual; a step; before it hand over, restore, or acknowledge; begin anew
 WATCH, STEP, HAND_OVER, RESTORE, ACKNOWLEDGE, BEGIN = range(6)
 # readings that are none of the plant's: no number at all, and the one before once more
 LOST, REPEATED = np.inf, -np.inf
 TOLERANCE = 1e-9  # of each input's range
-UNSURE = 1e-11  # degC: what no reference is known to, and more than rounding
+UNSURE = 1e-9  # degC: what no reading is known to, and more than rounding of any forecast
 
 
 class Script(NamedTuple):
@@ -48,7 +48,7 @@ class Played(NamedTuple):
 
 
 class Start(NamedTuple):
-    """Where an episode begins: the model's state x (n,), the inputs u (m,) that hold it, the outputs y (p,)."""
+    """Where an episode begins: the model's state x (n,), the inputs u (m,) that hold it, outputs y (p,)."""
 
     x: np.ndarray
     u: np.ndarray
@@ -70,16 +70,21 @@ def start(exported: Exported) -> Start:
 
 
 def script(exported: Exported, *, episodes: int, steps: int, rng: np.random.Generator) -> Script:
-    """Episodes of `steps` samples: 25 in manual, then the law with references that change, and in most of
-    them one fault for a while."""
-    parts = [_episode(exported, steps, rng) for _ in range(episodes)]
-    return Script(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    """Several episodes, one after the other."""
+    return joined([episode(exported, steps, rng) for _ in range(episodes)])
+
+
+def joined(parts: Sequence[Any]) -> Any:
+    """Scripts, or what was played, one after the other."""
+    return type(parts[0])(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 MANUAL = 25
 
 
-def _episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script:
+def episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script:
+    """`steps` samples: MANUAL in manual, then the law with references that change, and in most episodes one
+    fault for a while."""
     machine, at = exported.machine, start(exported)
     (m, p), T = (len(machine.inputs), len(machine.outputs)), machine.sample_time_s
     low, high = (np.array([getattr(one, side) for one in machine.inputs]) for side in ("low", "high"))
@@ -89,7 +94,7 @@ def _episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script
     do[rng.integers(MANUAL + 1, steps, 2)] = RESTORE
     reach = _reach(exported) if rng.random() < 0.5 else 150 * noise
     each = max(60, steps // 3)
-    asked = np.array([_asked(exported, at.y, reach, rng) for _ in range(-(-steps // each))])
+    asked = at.y + rng.uniform(-1, 1, (-(-steps // each), p)) * reach
     r = np.repeat(asked, each, axis=0)[:steps]
     r[:MANUAL] = at.y
     made = Script(
@@ -111,33 +116,9 @@ def _episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script
     return made
 
 
-def _asked(exported: Exported, y: np.ndarray, reach: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A reference (p,) within `reach` of y whose target is determined."""
-    for _ in range(50):
-        r = y + rng.uniform(-1, 1, len(y)) * reach
-        if determined(exported, r):
-            return r
-    return y
-
-
-def determined(exported: Exported, r: np.ndarray) -> bool:
-    """Whether the target of reference r (p,) is one and the same however sums are rounded.
-
-    Where inputs that hardly move an output stand near a limit, `tracking.feasible_target` leaves to the last
-    bit which of equally good inputs it takes: another CPU takes another, and so does C. Five in a thousand
-    references of the study's machine whose zones lie far apart are such, of its panel none.
-    """
-    limits = exported.controller.limits
-    at = [
-        feasible_target(exported.model, r + shift, limits.low, limits.high).u
-        for shift in (-UNSURE, 0.0, UNSURE)
-    ]
-    return float(np.ptp(at, axis=0).max()) < TOLERANCE * float((limits.high - limits.low).min())
-
-
 def _reach(exported: Exported) -> np.ndarray:
-    """How far (p,) in degC references may lie from the start: a little beyond the outputs' limits, so that the
-    governor acts and some are out of reach."""
+    """How far (p,) in degC references may lie from the start: a little beyond the outputs' limits, so that
+    the governor acts and some are out of reach."""
     bottom, top = (
         np.array([getattr(one, side) for one in exported.machine.outputs]) for side in ("low", "high")
     )
@@ -219,7 +200,7 @@ def _before(one: Any, make: Any, do: int, y: np.ndarray) -> Any:
     return one
 
 
-def as_csv(exported: Exported, at: Start, script: Script, done: Played) -> str:
+def as_csv(at: Start, script: Script, done: Played) -> str:
     """golden.csv: the start in its first line, then a line a sample, numbers as they read back bit by bit."""
     lines = [",".join(map(repr, np.r_[at.x, at.u, at.y].tolist()))]
     columns = [script.do, script.told, done.mode, done.causes]
@@ -231,11 +212,53 @@ def as_csv(exported: Exported, at: Start, script: Script, done: Played) -> str:
     return "\n".join(lines) + "\n"
 
 
-def golden(exported: Exported, *, episodes: int = 6, steps: int = 160, seed: int = 1) -> str:
-    """golden.csv of a controller: what its object does."""
+class Determined(NamedTuple):
+    """What an episode did, and by how much at most, as a share of an input's range, the object asked for
+    something else when its readings moved by UNSURE; infinite where a mode or a cause was another."""
+
+    done: Played
+    differs: float
+
+
+def determined(exported: Exported, make: Any, script: Script, *, replays: int = 3) -> Determined:
+    """Plays an episode, and `replays` times more with readings that differ by UNSURE up or down.
+
+    Where inputs that hardly move an output stand near a limit, `tracking.feasible_target` leaves to the last
+    bit which of equally good inputs it takes. There the object disagrees with itself, and nobody can agree
+    with it: not on another CPU, and not in C.
+    """
+    at, rng = start(exported), np.random.default_rng(0)
+    span = np.array([signal.high - signal.low for signal in exported.machine.inputs])
+    one, differs = played(make, exported.model, at, script), 0.0
+    for _ in range(replays):
+        shift = UNSURE * rng.choice([-1.0, 1.0], script.add.shape)
+        other = played(make, exported.model, at, script._replace(add=script.add + shift))
+        same = np.array_equal(one.mode, other.mode) and np.array_equal(one.causes, other.causes)
+        differs = max(differs, float((np.abs(one.u - other.u) / span).max()) if same else np.inf)
+    return Determined(one, differs)
+
+
+# largest share of an input's range by which readings moved by UNSURE may move an input: a law's own gains
+OWN_GAINS = 1e-6
+
+
+def golden(
+    exported: Exported, *, episodes: int = 5, steps: int = 120, seed: int = 1, replays: int = 3
+) -> str:
+    """golden.csv of a controller: what its object does in `episodes` that rounding does not decide, as
+    `replays` of each show."""
     from pipeline.runtime.supervisor import Supervised
 
-    asked = script(exported, episodes=episodes, steps=steps, rng=np.random.default_rng(seed))
-    at = start(exported)
-    done = played(lambda: Supervised(exported, rehearsal=True), exported.model, at, asked)
-    return as_csv(exported, at, asked, done)
+    rng, scripts, done = np.random.default_rng(seed), [], []
+    for _ in range(10 * episodes):
+        asked = episode(exported, steps, rng)
+        found = determined(exported, lambda: Supervised(exported, rehearsal=True), asked, replays=replays)
+        if found.differs <= OWN_GAINS:
+            scripts.append(asked)
+            done.append(found.done)
+        if len(done) == episodes:
+            return as_csv(start(exported), joined(scripts), joined(done))
+    raise ValueError(
+        f"controller {exported.name}: expected {episodes} episodes that rounding does not decide but found "
+        f"{len(done)} in {10 * episodes}; look at the targets of its model"
+    )

@@ -63,7 +63,8 @@ beadline_result beadline_init(beadline_controller *c, const beadline_machine *ma
         return BEADLINE_OTHER_PLANT;
     if (machine->sample_time_s < BEADLINE_SAMPLE_TIME_S || machine->sample_time_s > BEADLINE_SAMPLE_TIME_S)
         return BEADLINE_OTHER_SAMPLE_TIME;
-    if (strcmp(machine->input_unit, BEADLINE_INPUT_UNIT) || strcmp(machine->output_unit, BEADLINE_OUTPUT_UNIT))
+    if (strcmp(machine->input_unit, BEADLINE_INPUT_UNIT)
+        || strcmp(machine->output_unit, BEADLINE_OUTPUT_UNIT))
         return BEADLINE_OTHER_UNIT;
     if (machine->inputs != INPUTS || machine->outputs != OUTPUTS)
         return BEADLINE_OTHER_SIGNALS;
@@ -158,6 +159,8 @@ beadline_result beadline_restore(beadline_controller *c, const beadline_controll
     if (!all_finite(saved->law.z, MEMORY + OUTPUTS + INPUTS) || !all_finite(saved->memory.x, WATCH))
         return BEADLINE_BAD_INPUT;
     *c = *saved;
+    if (c->kept.mode != MODE_PI)
+        c->fallback.seen = 0; /* the fallback begins anew, as where the object is restored */
     return BEADLINE_DONE;
 }
 
@@ -226,13 +229,15 @@ static void tell_causes(const beadline_controller *c, double t_s, beadline_decis
         for (signal = 0; signal < SIGNALS; signal++)
             if (k->since[kind][signal] >= 0) {
                 int other = k->other[kind][signal];
-                int of = (of_input(kind) || of_output(kind) || kind == REFERENCE_OUT_OF_REACH) && other != ALL_INPUTS;
+                int of = other != ALL_INPUTS
+                         && (of_input(kind) || of_output(kind) || kind == REFERENCE_OUT_OF_REACH);
                 add_cause(d, kind, of ? signal : -1, other == kind ? -1 : other < 0 ? -1 : other,
                           k->amount[kind][signal], t_s - (k->clock_s[1] - k->since[kind][signal]));
             }
     if (d->causes)
         return;
-    add_cause(d, MODEL_NO_LONGER_RIGHT, loudest(&c->memory), -1, 0.0, t_s - k->alarmed * BEADLINE_SAMPLE_TIME_S);
+    add_cause(d, MODEL_NO_LONGER_RIGHT, loudest(&c->memory), -1, 0.0,
+              t_s - k->alarmed * BEADLINE_SAMPLE_TIME_S);
 }
 
 beadline_result beadline_step(beadline_controller *c, const double *y, const double *r, double t_s,
@@ -240,7 +245,7 @@ beadline_result beadline_step(beadline_controller *c, const double *y, const dou
 {
     supervisor_kept *k = &c->kept;
     double filled[OUTPUTS];
-    int j, samples, out_of_reach = 0;
+    int j, samples, out_of_reach, farthest = 0;
     if (!c->ready || !c->law.seen)
         return BEADLINE_NOT_READY;
     if (!all_finite(r, OUTPUTS) || !isfinite(t_s))
@@ -252,11 +257,12 @@ beadline_result beadline_step(beadline_controller *c, const double *y, const dou
     samples = tell_time(k, t_s);
     turn_to(c, r);
     follow(k, &c->memory, y, c->y_star, applied, samples, filled);
-    for (j = 0; j < OUTPUTS; j++)
-        if (c->beyond[j] > REACH_DEGC) {
-            say(k, REFERENCE_OUT_OF_REACH, j, c->beyond[j], -1);
-            out_of_reach = 1;
-        }
+    for (j = 1; j < OUTPUTS; j++)
+        if (c->beyond[j] > c->beyond[farthest])
+            farthest = j;
+    out_of_reach = c->beyond[farthest] > REACH_DEGC;
+    if (out_of_reach)
+        say(k, REFERENCE_OUT_OF_REACH, farthest, c->beyond[farthest], -1);
     if (out_of_reach && !c->has_reached) {
         memcpy(c->in_reach, filled, sizeof filled);
         c->has_reached = 1;

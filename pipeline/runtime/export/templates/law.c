@@ -107,14 +107,14 @@ static void least_squares(double A[ROWS][INPUTS], double *b, int columns, double
     }
 }
 
-/* One bounded problem: min |rows x - right|^2, low <= x <= high. `at` is -1, 1 where x stands at low, high. */
+/* One bounded problem: min |rows x - right|^2, low <= x <= high; `at` is -1, 1 where x stands at low, high */
 typedef struct {
     const double (*rows)[INPUTS];
     double right[ROWS], low[INPUTS], high[INPUTS], x[INPUTS], gradient[INPUTS], cost;
     int at[INPUTS];
 } bounded;
 
-/* z of the inputs that are free, the others where they stand; `index` tells which they are; returns how many */
+/* z of the inputs that are free, the others where they stand; `index` tells which; returns how many */
 static int solve_free(const bounded *b, double *z, int *index)
 {
     double A[ROWS][INPUTS], right[ROWS];
@@ -248,8 +248,8 @@ static double steady(const law *l, const double *r, double slack, double *u, dou
     return sqrt(miss);
 }
 
-/* The target y_star nearest to r that the inputs can hold, and among those the one that keeps them as far from
- * their limits as `AIM_TOLERANCE` degC of reach allow; u holds it */
+/* The target y_star nearest to r that the inputs can hold, and among those the one that keeps them as far
+ * from their limits as `AIM_TOLERANCE` degC of reach allow; u holds it */
 static void feasible_target(const law *l, const double *r, double *u, double *y_star)
 {
     double wider_u[INPUTS], wider_y[OUTPUTS], slack = 0.0, step = AIM_FIRST;
@@ -439,7 +439,8 @@ static void find_room(const side *s, const double *u, const double *low, double 
 }
 
 /* One projection of u onto the most violated row of output j */
-static void project_output(const side *s, double room[MEMBERS][FORECASTS], int j, const double *low, double *u)
+static void project_output(const side *s, double room[MEMBERS][FORECASTS], int j, const double *low,
+                           double *u)
 {
     double most = -INFINITY, size = 0.0, direction[INPUTS];
     int f, i, row, worst_f = -1, worst = 0;
@@ -499,7 +500,8 @@ static void negate(double *u)
 }
 
 /* u as near to what was asked as the forecasts allow, within low..high; the high limit has the last word */
-static void govern(const member_state *x, const double *y_star, const double *low, const double *high, double *u)
+static void govern(const member_state *x, const double *y_star, const double *low, const double *high,
+                   double *u)
 {
     side below, above;
     double negative_high[INPUTS];
@@ -561,7 +563,8 @@ static void law_watch(const law *l, law_state *s, const double *u, const double 
 }
 
 /* u wished at target feed, without xi's part where `xi` is NULL */
-static void wish(const law *l, const law_state *s, const double *feed, const double *y, const double *xi, double *u)
+static void wish(const law *l, const law_state *s, const double *feed, const double *y, const double *xi,
+                 double *u)
 {
     double asked[INPUTS] = {0};
     int i;
@@ -591,7 +594,8 @@ static void law_hand_over(const law *l, law_state *s, const double *y)
 }
 
 /* xi a sample on where the command is cut: it rests there, and -K_r xi stays within the limits */
-static void integrate_conditionally(const law *l, law_state *s, const double *error, const double *u, const double *wished)
+static void integrate_conditionally(const law *l, law_state *s, const double *error, const double *u,
+                                    const double *wished)
 {
     double after[OUTPUTS], share[INPUTS], within;
     int i, j, inside;

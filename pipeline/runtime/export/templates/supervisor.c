@@ -251,7 +251,8 @@ static void suspect(innovation_memory *o, const innovation *now, int alarmed)
         take_row(o);
 }
 
-/* What the bank says: cost and amplitude of every hypothesis; mean squares that the best leaves, and there were */
+/* What the bank says: cost and amplitude of every hypothesis; mean squares that the best leaves, and that
+ * there were */
 typedef struct {
     double cost[BANK], amplitude[BANK], none, left[OUTPUTS], own[OUTPUTS];
     int best;
@@ -283,7 +284,7 @@ static void judge(const innovation_memory *o, verdict *v)
     v->best = 0;
     for (j = 0; j < OUTPUTS; j++) {
         v->own[j] = o->own[j] / n;
-        v->none += n * log(fmax(v->own[j], 1.0));
+        v->none += n * log(fmax(v->own[j], 1 + MISFIT * v->own[j]));
     }
     for (h = 0; h < BANK; h++) {
         double cross = 0.0, square = 0.0;
@@ -294,9 +295,11 @@ static void judge(const innovation_memory *o, verdict *v)
         v->amplitude[h] = cut(cross / fmax(square, 1e-9), bank_least[bank_form[h]], bank_most[bank_form[h]]);
         v->cost[h] = 0.0;
         for (j = 0; j < OUTPUTS; j++)
-            v->cost[h] += n * log(fmax(left_by(o, h, j, v->amplitude[h], n), 1.0));
+            v->cost[h] += n * log(fmax(left_by(o, h, j, v->amplitude[h], n), 1 + MISFIT * v->own[j]));
         if ((bank_form[h] == FORM_STEP || bank_form[h] == FORM_RAMP) && moving(o, bank_signal[h]))
             v->cost[h] += COINCIDENCE;
+        if (bank_form[h] == FORM_RAMP)
+            v->cost[h] += SELDOM;
         if (v->cost[h] < v->cost[v->best])
             v->best = h;
     }
@@ -311,9 +314,11 @@ static const int severity[4] = {0, 2, 1, 3};
 
 
 static const char *const reasons[KINDS] = {
-    "a heater heats whatever it is told: only the mains can stop it, switch them off",
-    "a heater does not heat whatever it is told: its zone cools",
-    "a heater lacks power, or its zone loses more heat than the model knows",
+    "a heater heats whatever it is told, or goes on with an older command: only the mains can stop it, "
+    "switch them off",
+    "a heater does not heat whatever it is told, or goes on with an older command: its zone cools",
+    "a heater does less than it is told: it lacks power, goes on with an older command, or its zone loses "
+    "more heat than the model knows",
     "a zone reads ever colder than heat can explain: its sensor is out of place, or it is not heated",
     "a sensor reads outside its declared limits",
     "a sensor gives no number",
@@ -325,7 +330,7 @@ static const char *const reasons[KINDS] = {
     "the clock jumped between two samples",
     "a sample came late",
     "the readings are not what any plant of the spread would show, and no single fault explains them",
-    "a reference is beyond what the inputs can hold",
+    "a reference is beyond what its limits and the inputs can hold: the last one in reach stays",
 };
 
 /* The cause is there now; what was said of it first stays */
@@ -557,14 +562,21 @@ static int forget(supervisor_kept *k)
     return sensor;
 }
 
-/* The most severe of the modes that the causes declare; hold while an alarm is not decided */
+/* The most severe of the modes that the causes declare, and of those that would show the same; hold while an
+ * alarm is not decided */
 static int find_mode(const supervisor_kept *k)
 {
     int kind, signal, worst = MODE_LAW;
     for (kind = 0; kind < KINDS; kind++)
-        for (signal = 0; signal < SIGNALS; signal++)
-            if (k->since[kind][signal] >= 0 && severity[supervisor_mode[kind]] > severity[worst])
+        for (signal = 0; signal < SIGNALS; signal++) {
+            int other = k->other[kind][signal];
+            if (!(k->since[kind][signal] >= 0))
+                continue;
+            if (severity[supervisor_mode[kind]] > severity[worst])
                 worst = supervisor_mode[kind];
+            if (other >= 0 && severity[supervisor_mode[other]] > severity[worst])
+                worst = supervisor_mode[other];
+        }
     return k->alarmed >= 0 && severity[worst] < severity[MODE_HOLD] ? MODE_HOLD : worst;
 }
 
@@ -600,8 +612,8 @@ static void hurry(innovation_memory *o, const double *e)
     memset(o->X, 0, sizeof o->X);
 }
 
-/* One sample of outputs y, inputs `applied` since the one before, none of `samples` in manual; filled is y with
- * what is not trusted as forecast */
+/* One sample of outputs y, inputs `applied` since the one before, none of `samples` in manual; filled is y
+ * with what is not trusted as forecast */
 static void follow(supervisor_kept *k, innovation_memory *o, const double *y, const double *y_star,
                    const double *applied, int samples, double *filled)
 {

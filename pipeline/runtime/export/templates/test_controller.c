@@ -1,5 +1,5 @@
-/* Plays golden.csv: the controller on its own model, with noise, changed references, faults and hand-overs, and
- * compares every input with what the project's object asked for. Ends with 0 where all are equal. */
+/* Plays golden.csv: the controller on its own model, with noise, changed references, faults and hand-overs,
+ * and compares every input with what the project's object asked for. Ends with 0 where all are equal. */
 #include "controller.h"
 
 #include <math.h>
@@ -70,7 +70,8 @@ static int refuses_others(void)
            && beadline_init(&controller, &unit, 1) == BEADLINE_OTHER_UNIT
            && beadline_init(&controller, &time_s, 1) == BEADLINE_OTHER_SAMPLE_TIME
            && beadline_init(&controller, &signals, 1) == BEADLINE_OTHER_SIGNALS
-           && beadline_init(&controller, &right, 0) == (BEADLINE_SIMULATED ? BEADLINE_ONLY_REHEARSAL : BEADLINE_DONE)
+           && beadline_init(&controller, &right, 0)
+                  == (BEADLINE_SIMULATED ? BEADLINE_ONLY_REHEARSAL : BEADLINE_DONE)
            && beadline_init(&controller, &right, 1) == BEADLINE_DONE;
 }
 
@@ -131,7 +132,8 @@ static void play(const double *row, const double *start, played *p)
     } else {
         before(what, y);
         began = clock();
-        beadline_step(&controller, y, r, number[0], row[1] > 0 && what != HAND_OVER ? applied : NULL, &decision);
+        beadline_step(&controller, y, r, number[0], row[1] > 0 && what != HAND_OVER ? applied : NULL,
+                      &decision);
         p->seconds += (double)(clock() - began) / CLOCKS_PER_SEC;
         memcpy(p->u, decision.u, sizeof p->u);
         wrong_mode = decision.mode != (int)row[2];
@@ -178,8 +180,8 @@ int main(int count, char **arguments)
         play(row, start, &p);
     }
     fclose(file);
-    printf("{\"rows\": %ld, \"largest_difference\": %.3g, \"modes_differ\": %ld, \"causes_differ\": %ld, ", p.rows,
-           p.largest, p.modes, p.causes);
+    printf("{\"rows\": %ld, \"largest_difference\": %.3g, ", p.rows, p.largest);
+    printf("\"modes_differ\": %ld, \"causes_differ\": %ld, ", p.modes, p.causes);
     printf("\"rows_differ\": %ld, \"first_differs\": %ld, ", p.differing, p.first);
     printf("\"step_us\": %.3f, \"state_bytes\": %lu}\n", p.rows ? 1e6 * p.seconds / (double)p.rows : 0.0,
            (unsigned long)sizeof controller);
