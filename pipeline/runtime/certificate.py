@@ -394,7 +394,8 @@ def _of_limits(exported: Exported, record: Record) -> RuleResult:
 def _of_evidence(
     exported: Exported, record: Record, rules: Rules, rng: np.random.Generator
 ) -> tuple[bands.Predictors | None, list[RuleResult]]:
-    u, y = [*record.u, *record.newest_u], [*record.y, *record.newest_y]
+    u = [*_levelled(record.u, record.newest_u), *record.newest_u]
+    y = [*_levelled(record.y, record.newest_y), *record.newest_y]
     outputs = [one.name for one in exported.machine.outputs]
     longest = _longest(u, y, rules)
     if longest < 1:
@@ -424,6 +425,12 @@ def _of_evidence(
         *_of_newest(exported, record, N, rules),
     ]
     return sampled, results
+
+
+def _levelled(learned: Segments, newest: Segments) -> list[np.ndarray]:
+    """The learned segments about the mean of the newest: a constant for each in every regression
+    (Frisch-Waugh). With one for both, a room that differs between them looks like an integrator."""
+    return [part - np.vstack(learned).mean(axis=0) + np.vstack(newest).mean(axis=0) for part in learned]
 
 
 def _longest(u: Segments, y: Segments, rules: Rules) -> int:
@@ -626,7 +633,8 @@ def _unexplained(model: Plant, own: bands.Predictors, u: Segments, y: Segments, 
         errors = [b - _bounded(predicted_ahead(plant, a, b, ahead)) for plant in (model, of_own)]
         moved = b[ahead:] - b[:-ahead]
         for k, part in enumerate((errors[0][first:], errors[1][first:], moved[first - ahead :])):
-            squares[k] += (part**2).sum(axis=0)
+            # about the mean: another room is not another plant
+            squares[k] += len(part) * part.var(axis=0)
         count += len(b) - first
     by_model, by_own, moved = squares / count
     by_own = by_own * (1 + 2 * N * (model.m + model.p) / count)  # it was fitted to these
@@ -650,7 +658,7 @@ def _foretold(model: Plant, u: Segments, y: Segments) -> np.ndarray:
         return np.full(p, np.inf)
     left = data.y - z @ np.linalg.lstsq(z, data.y, rcond=1e-10)[0]
     inflated = len(z) / (len(z) - z.shape[1])
-    return np.sqrt(np.maximum((data.y**2).mean(axis=0) - inflated * (left**2).mean(axis=0), 0.0))
+    return np.sqrt(np.maximum(data.y.var(axis=0) - inflated * (left**2).mean(axis=0), 0.0))
 
 
 # ---- would it work?
@@ -678,7 +686,7 @@ def _of_loop(
     )
     shown = _Shown(poles, margins, worst, violations)
     return shown, [
-        _of_poles(poles),
+        _of_poles(poles, rules),
         _at_least(
             "disk_margin",
             margins.disk[1],
@@ -700,17 +708,23 @@ def _poles(of: str, plant: Plant, controller: Deployed) -> Poles:
     return Poles(of, float(np.abs(found).max()), shown)
 
 
-def _of_poles(poles: Sequence[Poles]) -> RuleResult:
+def _of_poles(poles: Sequence[Poles], rules: Rules) -> RuleResult:
+    """All of model and spread within the unit circle, and of the record's plants all but a share
+    `rules.failing`: a resample's slowest pole may lie outside by chance."""
+    declared = [one for one in poles if one.of != "record"]
+    sampled = [one for one in poles if one.of == "record"]
+    outside = [sum(one.radius >= 1 for one in part) for part in (declared, sampled)]
     worst = max(poles, key=lambda one: one.radius)
-    outside = sum(one.radius >= 1 for one in poles)
     return _result(
         "poles",
-        outside == 0,
+        outside[0] == 0 and outside[1] <= rules.failing * len(sampled),
         worst.radius,
         1.0,
         "1",
-        f"On {len(poles)} plants every pole lies within {worst.radius:.4f}.",
-        f"On {outside} of {len(poles)} plants a pole lies outside the unit circle, at {worst.radius:.4f}.",
+        f"On {len(poles) - outside[1]} of {len(poles)} plants, model and spread among them, every pole lies "
+        "within the unit circle.",
+        f"On {outside[0]} of {len(declared)} plants of model and spread, and {outside[1]} of {len(sampled)} "
+        f"of the record, a pole lies outside the unit circle, at {worst.radius:.4f}.",
     )
 
 
