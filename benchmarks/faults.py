@@ -107,8 +107,8 @@ class Linear(Simulated):
         self.plant = self.plant._replace(B=self.plant.B * gains, A=_regained(self.plant, gains))
 
     def disturb(self, rng: np.random.Generator) -> None:
-        """The room gets warmer or colder by up to 8 degC, within 8 degC of what it was at first; 0.8 % of that
-        a step reach each zone."""
+        """The room gets warmer or colder by up to 8 degC, within 8 degC of what it was at first; 0.8 % of
+        that a step reach each zone."""
         n, before = self.plant.n - self.plant.m, self.ambient[0] / 0.008
         room = np.clip(before + rng.uniform(-8, 8), -8, 8)
         self.ambient = np.r_[np.full(n, 0.008 * room), np.zeros(self.plant.m)]
