@@ -26,7 +26,7 @@ from tests.runtime.deployed_machines import LAWS, block_and_sensor, exported, li
 
 COMPILER = shutil.which("cc")
 needs_cc = pytest.mark.skipif(COMPILER is None, reason="no C compiler cc on this machine; install one")
-EPISODES, STEPS = 7, 150
+EPISODES, STEPS = 8, 150
 
 
 @cache
