@@ -92,8 +92,18 @@ def rule_rows(shown: Mapping[str, Any]) -> list[RuleRow]:
     for rule in shown["rules"]:
         state = OPEN if not rule.get("asked", True) else PASSED if rule["passed"] else FAILED
         found, limit = (_figure(rule.get(key), rule.get("unit") or "") for key in ("found", "limit"))
-        rows.append(RuleRow(rule["name"].replace("_", " "), state, found, limit, rule["sentence"]))
+        rows.append(
+            RuleRow(rule["name"].replace("_", " "), state, found, f"{_side(rule)}{limit}", rule["sentence"])
+        )
     return rows
+
+
+def _side(rule: Mapping[str, Any]) -> str:
+    """On which side of its limit a figure passes: the one where it lies, or does not."""
+    found, limit = rule.get("found"), rule.get("limit")
+    if found is None or limit is None or found == limit or not rule.get("asked", True):
+        return ""
+    return "≥ " if (found > limit) == rule["passed"] else "≤ "
 
 
 def _figure(value: float | None, unit: str) -> str:
