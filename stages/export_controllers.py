@@ -1,7 +1,8 @@
 """The controller that the verdict recommends, certified and written: reads what evaluate_temperature read and
 wrote, what train_classifier, train_agent and evaluate_setpoint left, and what compose_parts wrote; writes
 datasets/export_controllers: temperature/ (controller.json, arrays.safetensors, certificate.json, c/, python/)
-and setpoint/. Where the certificate is refused it is all that is written of that loop."""
+setpoint/, and exported.json, which says what there is and why not. Where the certificate is refused it is all
+that is written of that loop."""
 
 from pipeline.report.shared.sources import read_relearned
 from pipeline.report.shared.verdict import ReportRules
@@ -86,10 +87,9 @@ def main() -> None:
         deposition = export.deposition(
             ("datasets/compose_parts/signals.parquet", "datasets/compose_parts/lines.parquet")
         )
-        artifacts.write_metrics(
-            "export_controllers",
-            export.metrics({"temperature": temperature, "setpoint": setpoint, "deposition": deposition}),
-        )
+        shown = export.metrics({"temperature": temperature, "setpoint": setpoint, "deposition": deposition})
+        artifacts.write_json(out / "exported.json", shown)
+        artifacts.write_metrics("export_controllers", shown)
 
 
 if __name__ == "__main__":

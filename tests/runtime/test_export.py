@@ -96,7 +96,6 @@ def test_the_golden_vectors_reach_limits_safe_modes_and_hand_overs():
     [
         ("lqg", "k->held[i] += HELD_SHARE", "k->held[i] += 1.01 * HELD_SHARE"),
         ("lqg", "s->xi[j] += l->integral[j]", "s->xi[j] += 1.0001 * l->integral[j]"),
-        ("lqg", "u[i] = fmax(u[i] - most / size", "u[i] = fmax(u[i] - 1.001 * most / size"),
         ("lqg", "diagonal = A[k][k] > 0 ? -sqrt(size)", "diagonal = A[k][k] > 0 ? -1.001 * sqrt(size)"),
         ("lqg", "*c = *saved;", "c->law = saved->law;"),
         ("lqg", "o->theta[j][i] + PS[j][i]", "o->theta[j][i] + 1.01 * PS[j][i]"),

@@ -230,12 +230,14 @@ def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(
     with pytest.raises(KeyboardInterrupt):
         train_classifier.trained(p, found)
     once = train_classifier.trained(p, found)
-    assert epochs == [1, 2, 1, 2], "of the first network one epoch was left, of the second both"
+    assert sorted(epochs) == [1, 1, 2, 2], (
+        "each epoch of both networks, which learn at once, was learned once"
+    )
     # a damaged checkpoint is begun anew
     for path in Path("datasets/memo/train_classifier").glob("*.safetensors"):
         path.write_bytes(path.read_bytes()[:1000])
     twice = train_classifier.trained(p, found)
-    assert epochs == [1, 2, 1, 2, 1, 2, 1, 2]
+    assert sorted(epochs) == [1, 1, 1, 1, 2, 2, 2, 2]
     whole, _ = read_weights(simulated / "datasets/train_classifier/weights.safetensors", CLASSIFIER_SCHEMA)
     for arrays in (named_arrays(once.network), named_arrays(twice.network)):
         assert arrays.keys() == whole.keys()
