@@ -100,6 +100,8 @@ class Governor(NamedTuple):
 
 # steps ahead at most
 LONGEST = 120
+# shares of its peak from which on a pulse response is looked at, and up to which closely
+REACHED, SHOULDER = 0.2, 0.9
 # projections over all outputs, and over both sides: inputs mostly move one output each, so that a few suffice
 SWEEPS, ROUNDS = 8, 2
 # percent by which rows are equal, or missed: one case by itself takes the same steps as among many
@@ -167,15 +169,26 @@ def _near(plant: Plant, limits: Limits, overshoot: float, strength: Strength) ->
 
 
 def instants(family: Sequence[Plant]) -> np.ndarray:
-    """Steps ahead at which the members are looked at: now; and in ever wider steps from that at which an
-    output's pulse response is first at its peak, to four times that after which the strongest of the slowest
-    member is, 16 at least."""
+    """Steps ahead at which the members are looked at: now; by steps of a quarter from that at which an
+    output's pulse response is first at REACHED of its peak to that at which every output's is at its
+    SHOULDER; and in ever wider steps from the first peak, to four times that after which the strongest of the
+    slowest member is, 16 at least.
+
+    Heat that is already on its way peaks in an output sooner than a pulse from now does: whoever looks from
+    the pulse's peak on sees it only when it is past. Nearer than REACHED a command does so little that every
+    error of the forecast would shut the inputs.
+    """
     pulses = [np.abs(markov_parameters(plant, LONGEST)).max(axis=2) for plant in family]
     first = 1 + min(int(pulse.argmax(axis=0).min()) for pulse in pulses)
     peak = 1 + max(int(pulse.max(axis=1).argmax()) for pulse in pulses)
     last = min(max(4 * peak, 16), LONGEST)
-    wider = first + np.r_[0, 2 ** np.arange(7)]
-    return np.unique(np.r_[0, wider[wider < last], last])
+    shares = [pulse / np.maximum(pulse.max(axis=0), 1e-300) for pulse in pulses]
+    near = [1 + min(int((share >= REACHED).argmax(axis=0).min()) for share in shares)]
+    full = 1 + max(int((share >= SHOULDER).argmax(axis=0).max()) for share in shares)
+    while near[-1] < max(first, full):
+        near.append(near[-1] + max(1, near[-1] // 4))
+    between = np.r_[near, first, first + 2 ** np.arange(7)]
+    return np.unique(np.r_[0, between[between < last], last])
 
 
 def _drifting(plant: Plant, leak: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
