@@ -4,8 +4,9 @@ and sanitizers.
 `./run python -m benchmarks.exported` writes benchmarks/results/exported.json. The laws are the tuned
 contestants on the study's machine, from datasets/ (identify_plant, learn_kernel, tune_weights, ingest). Each
 episode is played by the object and by the C, both in closed loop. `own` is by how much the object differs
-from itself when its readings move by 1e-9 degC: where that is more than its gains explain, rounding decides,
-and the episode is counted apart.
+from itself when its readings move by 1e-9 degC: where that is more than its gains explain, the loop itself
+magnifies rounding (a law that swings between its limits may double it every sample), and the episode is
+counted apart. `step_us` is the median over episodes beside whatever else the CPU had to do.
 """
 
 import argparse
@@ -143,6 +144,13 @@ def exported_python(of: Exported, episodes: int) -> float:
     return float(np.abs(ours.u - theirs.u).max())
 
 
+def measured_on() -> dict[str, str]:
+    """The processor and the compiler of cycles and bytes."""
+    said = subprocess.run(["cc", "--version"], capture_output=True, text=True, check=True).stdout
+    cpu = re.findall(r"model name\s*: (.+)", Path("/proc/cpuinfo").read_text())[0]
+    return {"cpu": cpu, "compiler": said.splitlines()[0] + " -O2"}
+
+
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Of one law's episodes; those that rounding decides apart."""
     agree = [row for row in rows if row["own"] is None]
@@ -154,7 +162,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "steps": sum(row["rows"] for row in rows),
         "episodes": len(rows),
         "largest_difference_of_range": max(row["largest_difference"] for row in agree),
-        "episodes_that_rounding_decides": len(rounding),
+        "episodes_whose_loop_magnifies_rounding": [row["number"] for row in rounding],
         "their_largest_difference_of_range": max(
             (row["largest_difference"] for row in rounding), default=0.0
         ),
@@ -186,9 +194,8 @@ def main() -> None:
         found["step_cycles"] = round(found["step_us"] * 1e-6 * hertz)
         results[name] = {**found, **size, "python_largest_difference": exported_python(of, 4)}
         print(name, json.dumps(results[name]), f"{time.perf_counter() - began:.0f} s", flush=True)
-        artifacts.write_json(
-            RESULTS, {"steps": sum(one["steps"] for one in results.values()), "laws": results}
-        )
+        steps = sum(one["steps"] for one in results.values())
+        artifacts.write_json(RESULTS, {"steps": steps, **measured_on(), "laws": results})
 
 
 if __name__ == "__main__":

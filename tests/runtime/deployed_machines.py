@@ -1,4 +1,4 @@
-"""Controllers of two small machines as they leave the house, for tests of what is written and read."""
+"""Controllers of small machines, and of the study's, as they leave the house, for tests of what is written and read."""
 
 from functools import cache
 
@@ -11,14 +11,14 @@ from pipeline.runtime.machine import Exported, Machine, Signal, controller_sha25
 from pipeline.temperature import baseline, printer_pid, tracking
 from pipeline.temperature.controller import Deployed, compact, deployed
 from pipeline.temperature.governor import Governor, Limits, OutputLimits, Strength, governor
-from pipeline.temperature.plant import Plant, plant
+from pipeline.temperature.plant import Plant, baam, plant
 from pipeline.temperature.tracking import Law, still_law
 from pipeline.temperature.window import controller, learn
 
 INTEGRAL_LIMIT = 1.0
 NOISE = 0.1
 STRENGTH = Strength(0.85, 1.15, 0.1)
-LAWS = ("lqg", "window", "pi", "printer_pid", "hold", "slow")
+LAWS = ("lqg", "window", "pi", "printer_pid", "hold", "slow", "tight")
 
 
 def block_and_sensor(*, zones: int, sample_time_s: float = 1.0) -> Plant:
@@ -43,8 +43,8 @@ def limits_of(zones: int, *, rate: float = np.inf) -> Limits:
     return Limits(np.zeros(zones), np.full(zones, 100.0), np.full(zones, rate))
 
 
-def guard(model: Plant, limits: Limits) -> Governor:
-    outputs = OutputLimits(np.zeros(model.p), np.full(model.p, 250.0), np.full(model.p, 3 * NOISE), 0.05)
+def guard(model: Plant, limits: Limits, high: float = 250.0) -> Governor:
+    outputs = OutputLimits(np.zeros(model.p), np.full(model.p, high), np.full(model.p, 3 * NOISE), 0.05)
     return governor([model], limits, outputs, STRENGTH)
 
 
@@ -62,9 +62,10 @@ def _windowed(model: Plant) -> tuple[Law, Plant]:
 
 
 def _law(kind: str, model: Plant, limits: Limits) -> tuple[Law, Plant]:
-    if kind in ("lqg", "slow"):
+    if kind in ("lqg", "slow", "tight", "study"):
         made = tracking.model_based(model, 0.99, tau=1.0)
-        return made.design(np.ones(model.p), np.full(model.m, 0.1), 0.05), model
+        effort = 1e-4 if kind == "tight" else 0.1
+        return made.design(np.ones(model.p), np.full(model.m, effort), 0.05), model
     if kind == "window":
         return _windowed(model)
     if kind == "pi":
@@ -84,14 +85,17 @@ def _pi(model: Plant, limits: Limits) -> Law:
 def exported(
     kind: str = "lqg", *, zones: int = 2, simulated: bool = True, sample_time_s: float = 1.0
 ) -> Exported:
-    """A controller of `zones` heaters and sensors by a law of LAWS; "slow" has a rate limit."""
-    plant_, limits = block_and_sensor(zones=zones, sample_time_s=sample_time_s), limits_of(zones)
-    limits = limits_of(zones, rate=4.0) if kind == "slow" else limits
+    """A controller of `zones` heaters and sensors by a law of LAWS; "slow" has a rate limit, "tight" outputs
+    that may rise 5 degC above where its episodes begin. "study": the study's machine, more inputs than
+    outputs."""
+    plant_ = baam() if kind == "study" else block_and_sensor(zones=zones, sample_time_s=sample_time_s)
+    limits = limits_of(plant_.m, rate=4.0 if kind == "slow" else np.inf)
     law, model = _law(kind, plant_, limits)
-    watched = None if kind in ("hold", "printer_pid") else guard(plant_, limits)
+    high = 130.0 if kind == "tight" else 250.0
+    watched = None if kind in ("hold", "printer_pid") else guard(plant_, limits, high)
     machine = Machine(
-        tuple(Signal(f"heater_{i + 1}", "percent", 0.0, 100.0) for i in range(zones)),
-        tuple(Signal(f"sensor_{i + 1}", "degC", 0.0, 250.0) for i in range(zones)),
+        tuple(Signal(f"heater_{i + 1}", "percent", 0.0, 100.0) for i in range(plant_.m)),
+        tuple(Signal(f"sensor_{i + 1}", "degC", 0.0, 250.0) for i in range(plant_.p)),
         sample_time_s,
     )
     return Exported(
@@ -100,7 +104,7 @@ def exported(
         controller=_deployed(law, limits, watched, holds=kind == "hold"),
         model=model,
         fallback=None if kind == "pi" else _deployed(_pi(plant_, limits), limits, watched),
-        supervision=supervisor.supervision(plant_, [], machine, np.full(zones, NOISE)),
+        supervision=supervisor.supervision(plant_, [], machine, np.full(plant_.p, NOISE)),
         simulated=simulated,
         plant_sha256=plants_sha256([plant_]),
         spread_sha256=plants_sha256([]),

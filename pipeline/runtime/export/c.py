@@ -17,6 +17,7 @@ from pipeline.runtime.certificate import Certificate, sha256
 from pipeline.runtime.export.names import identifier
 from pipeline.runtime.machine import Exported, check, check_certificate
 from pipeline.temperature import governor as governing
+from pipeline.temperature import tracking
 from pipeline.temperature.controller import Deployed, Rest, aim, constant
 from pipeline.temperature.governor import Governor
 from pipeline.temperature.plant import Plant, strictly_proper
@@ -213,15 +214,13 @@ def _aiming(exported: Exported) -> str:
             define("AIM_FINEST", 1e-3),
             define("AIM_FIRST", narrowest / 4),
             define("AIM_WIDEST", 0.49 * narrowest),
-            define("OPTIMAL", 1e-15),
-            table("aim_rows", np.vstack([rows, LIGHT * np.eye(exported.model.m)])),
+            define("ROUNDING", tracking.ROUNDING),
+            define("FALL", tracking.FALL),
+            table("aim_rows", np.vstack([rows, tracking.LIGHT * np.eye(exported.model.m)])),
             table("aim_rest", rest),
             table("aim_d", exported.model.d),
         ]
     )
-
-
-LIGHT = 1e-6
 
 
 def at_rest(model: Plant) -> tuple[np.ndarray, np.ndarray]:

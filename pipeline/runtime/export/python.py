@@ -18,7 +18,6 @@ from pipeline.runtime.machine import Exported, check, check_certificate
 HOME = standalone.__name__
 ENTRIES: list[Place] = [("pipeline.runtime.supervisor", "Supervised")]
 REPLACED: dict[Place, Place] = {
-    ("pipeline.temperature.tracking", "_steady"): (HOME, "_steady"),
     ("pipeline.temperature.controller", "_triangular"): (HOME, "_triangular"),
 }
 ORDER = [
@@ -62,10 +61,14 @@ class Stored(NamedTuple):
         raise ValueError(f"an exported file holds records, arrays, numbers and text but found {type(value)}")
 
     def array(self, value: np.ndarray) -> str:
+        """In the order in which it lies in memory: products of matrices round by that."""
         kind = {"f": "<f8", "i": "<i8", "u": "<i8", "b": "|b1"}[value.dtype.kind]
         start = sum(map(len, self.parts))
-        self.parts.append(np.ascontiguousarray(value, kind).tobytes())
-        return f"_array({start}, {tuple(value.shape)}, {kind!r})"
+        axes = np.argsort([-stride for stride in value.strides], kind="stable")
+        lying = value.transpose(axes)
+        self.parts.append(np.ascontiguousarray(lying, kind).tobytes())
+        turned = "" if np.array_equal(axes, range(value.ndim)) else f".transpose{tuple(np.argsort(axes).tolist())}"
+        return f"_array({start}, {tuple(lying.shape)}, {kind!r}){turned}"
 
 
 def text(exported: Exported, certificate: Certificate) -> str:

@@ -110,7 +110,7 @@ static void least_squares(double A[ROWS][INPUTS], double *b, int columns, double
 /* One bounded problem: min |rows x - right|^2, low <= x <= high; `at` is -1, 1 where x stands at low, high */
 typedef struct {
     const double (*rows)[INPUTS];
-    double right[ROWS], low[INPUTS], high[INPUTS], x[INPUTS], gradient[INPUTS], cost;
+    double right[ROWS], low[INPUTS], high[INPUTS], x[INPUTS], gain[INPUTS], cost;
     int at[INPUTS];
 } bounded;
 
@@ -134,30 +134,27 @@ static int solve_free(const bounded *b, double *z, int *index)
     return count;
 }
 
+/* The cost, and by how much more than rounding it falls where an input leaves the limit it stands at */
 static void look(bounded *b)
 {
-    double miss[ROWS];
+    double miss[ROWS], terms[ROWS];
     int i, j;
     b->cost = 0.0;
     for (i = 0; i < ROWS; i++) {
         miss[i] = dot(b->rows[i], b->x, INPUTS) - b->right[i];
+        terms[i] = fabs(b->right[i]);
+        for (j = 0; j < INPUTS; j++)
+            terms[i] += fabs(b->rows[i][j] * b->x[j]);
         b->cost += 0.5 * miss[i] * miss[i];
     }
     for (j = 0; j < INPUTS; j++) {
-        b->gradient[j] = 0.0;
-        for (i = 0; i < ROWS; i++)
-            b->gradient[j] += b->rows[i][j] * miss[i];
+        double gradient = 0.0, doubt = 0.0;
+        for (i = 0; i < ROWS; i++) {
+            gradient += b->rows[i][j] * miss[i];
+            doubt += fabs(b->rows[i][j]) * terms[i];
+        }
+        b->gain[j] = gradient * b->at[j] - ROUNDING * doubt;
     }
-}
-
-/* How far the point is from an optimum */
-static double optimality(const bounded *b)
-{
-    double worst = -INFINITY;
-    int j;
-    for (j = 0; j < INPUTS; j++)
-        worst = fmax(worst, b->at[j] ? b->gradient[j] * b->at[j] : fabs(b->gradient[j]));
-    return worst;
 }
 
 /* Moves towards z until an input meets a limit, which it then keeps; returns whether one did */
@@ -210,17 +207,19 @@ static void minimise(bounded *b)
         }
     } while (cuts && count > cuts);
     look(b);
-    for (round = 0; round < INPUTS && optimality(b) >= OPTIMAL; round++) {
+    for (round = 0; round < INPUTS; round++) {
         for (j = 1, best = 0; j < INPUTS; j++)
-            if (b->gradient[j] * b->at[j] > b->gradient[best] * b->at[best])
+            if (b->gain[j] > b->gain[best])
                 best = j;
+        if (b->gain[best] <= 0)
+            break;
         b->at[best] = 0;
         do
             count = solve_free(b, z, index);
         while (move_until_bound(b, z, index, count));
         before = b->cost;
         look(b);
-        if (before - b->cost < OPTIMAL * before)
+        if (before - b->cost < FALL * before)
             break;
     }
 }
