@@ -1,4 +1,5 @@
-"""Controllers of small machines, and of the study's, as they leave the house, for tests of what is written and read."""
+"""Controllers of small machines, and of the study's, as they leave the house, for tests of what is written and
+read."""
 
 from functools import cache
 

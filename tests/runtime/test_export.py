@@ -158,6 +158,28 @@ def test_the_c_refuses_every_other_machine_in_words(tmp_path):
     ]
 
 
+@needs_cc
+def test_the_stack_is_told_and_its_readme_names_the_machine(tmp_path):
+    of = exported(simulated=False)
+    text = written(tmp_path, of, episodes=1).joinpath("README.txt").read_text()
+    for part in (
+        "heater_2, percent, 0 to 100",
+        "sensor_1, degC, 0 to 250",
+        sha256(passed(of)),
+        of.plant_sha256,
+    ):
+        assert part in text
+    assert "@" not in text and "simulated" not in text
+    assert "plant was simulated" in c.readme(exported(), "")
+    told = made(tmp_path, "stack")
+    if "fstack-usage" in told.stderr:
+        pytest.skip("the compiler does not tell its stack")
+    bytes_of = json.loads(told.stdout)
+    # forecasts of both sides alone: 2 members' worth of what FORECASTS rows of doubles take
+    rows = len(of.controller.governor.above[0])
+    assert 2 * 8 * rows < bytes_of["largest_frame_bytes"] < bytes_of["stack_bytes"] < 64_000
+
+
 def test_the_c_names_certificate_plant_units_and_sample_time():
     of = exported()
     header = c.files(of, passed(of), "")["machine.h"]
@@ -179,7 +201,9 @@ def test_numbers_in_c_read_back_bit_by_bit():
 def redundant(rng: np.random.Generator) -> tuple[Plant, np.ndarray]:
     """Six inputs that heat four outputs, and references (40, 4): some beyond what the inputs reach."""
     model = block_and_sensor(zones=4)
-    more = model._replace(B=model.B @ np.hstack([np.eye(4), rng.uniform(0.1, 0.6, (4, 2))]), D=np.zeros((4, 6)))
+    more = model._replace(
+        B=model.B @ np.hstack([np.eye(4), rng.uniform(0.1, 0.6, (4, 2))]), D=np.zeros((4, 6))
+    )
     return more, rng.uniform(0, 320, (40, 4))
 
 

@@ -137,7 +137,7 @@ def greedy(of: Blocks, *, gain: float, seconds: float = 450.0) -> np.ndarray:
 @pytest.mark.parametrize("name", MACHINES)
 def test_full_power_is_stopped_below_the_limit(name: str):
     """The margin of 0.3 °C is for noise of 0.1: at most a noise deviation beyond what is declared."""
-    worst = [greedy(MACHINES[name], gain=gain).max() for gain in (0.87, 1.0, 1.14)]
+    worst = [greedy(MACHINES[name], gain=gain).max() for gain in (0.87, 1.14)]
     assert max(worst) <= NOISE
     # it is used: what is not dared is at most what the strength leaves open
     assert max(worst) > -1.0
@@ -203,3 +203,13 @@ def test_a_law_is_kept_from_its_limit_settles_no_later_and_rests_as_quietly(name
     assert watched.settled <= alone.settled
     # what noise makes of the law's own gains, once it has arrived
     assert watched.restless <= 1.05 * alone.restless + 0.01
+
+
+def test_a_lag_outside_the_declared_spread_costs_two_degrees_where_a_heater_is_quick():
+    """4 °C a second and a lag 15 % longer than the model's: what the README says is not promised."""
+    of = MACHINES["quick heater"]
+    alone, watched = (
+        controlled(of, effort=1e-4, gain=1.12, lag=1.15, watched=watched) for watched in (False, True)
+    )
+    assert alone.beyond_limit > 10.0
+    assert 0.0 < watched.beyond_limit < 2.0

@@ -45,6 +45,7 @@ def code(exported: Exported, certificate_sha256: str) -> dict[str, str]:
         "machine.h": machine_header(exported, certificate_sha256),
         "tables.h": tables(exported),
         "test_plant.h": plant_header(exported),
+        "README.txt": readme(exported, certificate_sha256),
     }
 
 
@@ -57,6 +58,28 @@ def _assembled(name: str) -> str:
     text = _template(name)
     for part in PARTS:
         text = text.replace(f"@{part}@", _template(part).rstrip())
+    return text
+
+
+def readme(exported: Exported, certificate_sha256: str) -> str:
+    """README.txt: what it is for, how it is called, and how its stack and its steps are measured."""
+    signals = "".join(
+        f"{kind:<8}{one.name}, {one.unit}, {one.low:g} to {one.high:g}\n"
+        for kind, group in (("input", exported.machine.inputs), ("output", exported.machine.outputs))
+        for one in group
+    )
+    simulated = "The plant was simulated: beadline_init asks for rehearsal = 1, beside a simulation only.\n"
+    parts = {
+        "contestant": exported.name,
+        "sample_time": f"{exported.machine.sample_time_s:g}",
+        "signals": signals,
+        "certificate": certificate_sha256,
+        "plant": exported.plant_sha256,
+        "simulated": simulated if exported.simulated else "",
+    }
+    text = _template("README.txt")
+    for name, value in parts.items():
+        text = text.replace(f"@{name}@", value)
     return text
 
 

@@ -17,9 +17,7 @@ from pipeline.runtime.machine import Exported, check, check_certificate
 
 HOME = standalone.__name__
 ENTRIES: list[Place] = [("pipeline.runtime.supervisor", "Supervised")]
-REPLACED: dict[Place, Place] = {
-    ("pipeline.temperature.controller", "_triangular"): (HOME, "_triangular"),
-}
+REPLACED: dict[Place, Place] = {("pipeline.temperature.controller", "_triangular"): (HOME, "_triangular")}
 ORDER = [
     "pipeline.temperature.plant",
     "pipeline.temperature.tracking",
@@ -67,7 +65,9 @@ class Stored(NamedTuple):
         axes = np.argsort([-stride for stride in value.strides], kind="stable")
         lying = value.transpose(axes)
         self.parts.append(np.ascontiguousarray(lying, kind).tobytes())
-        turned = "" if np.array_equal(axes, range(value.ndim)) else f".transpose{tuple(np.argsort(axes).tolist())}"
+        turned = (
+            "" if np.array_equal(axes, range(value.ndim)) else f".transpose{tuple(np.argsort(axes).tolist())}"
+        )
         return f"_array({start}, {tuple(lying.shape)}, {kind!r}){turned}"
 
 
