@@ -147,8 +147,8 @@ def filter_update(parameters: Filter, state: FilterState, observation: Observati
 
 
 def led(transition: jax.Array, belief: jax.Array) -> jax.Array:
-    """transition.T @ belief (H, N), term after term: as one product of many episodes it would be cut where the
-    CPU's caches end, and what is left there summed in another order."""
+    """transition.T @ belief (H, N), term after term: as one product of many episodes it would be cut where
+    the CPU's caches end, and what is left there summed in another order."""
     return sum(to[:, None] * of for to, of in zip(transition, belief, strict=True))
 
 
