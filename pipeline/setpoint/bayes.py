@@ -16,6 +16,12 @@ wider or narrower. Which it is, and how the extruder follows, shows by itself. b
 gains alike: what clogs a nozzle changes how its flow follows, too. Windows of a segment are alike:
 where the flow setpoint stood, one shows with window_repeat_probability what the one before did,
 whatever the flow, so that ten alike are not ten witnesses.
+
+What holds it below its bars (benchmarks.setpoint_limits, segments that it was not made from): of clogs by a
+quarter 74 % settle, and 90 % were it told when they come: until the segment ends, a clog looks like a segment
+whose beads look thin. Where each window is a segment of its own and the nozzle clogs, 85 % settle, 93 without
+the watch, to which such a camera is another, and 96 if told as well. Prints in the band leave 15 % in 5.2 %
+of the runs, and in 0.8 % with the table of the very segments that they are watched by.
 """
 
 from collections.abc import Sequence
