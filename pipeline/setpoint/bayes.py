@@ -16,6 +16,12 @@ wider or narrower. Which it is, and how the extruder follows, shows by itself. b
 gains alike: what clogs a nozzle changes how its flow follows, too. Windows of a segment are alike:
 where the flow setpoint stood, one shows with window_repeat_probability what the one before did,
 whatever the flow, so that ten alike are not ten witnesses.
+
+What holds it below its bars (benchmarks.setpoint_limits, segments that it was not made from): of clogs by a
+quarter 74 % settle, and 90 % were it told when they come: until the segment ends, a clog looks like a segment
+whose beads look thin. Where each window is a segment of its own and the nozzle clogs, 85 % settle, 93 without
+the watch, to which such a camera is another, and 96 if told as well. Prints in the band leave 15 % in 5.2 %
+of the runs, and in 0.8 % with the table of the very segments that they are watched by.
 """
 
 from collections.abc import Sequence
@@ -133,7 +139,7 @@ def filter_update(parameters: Filter, state: FilterState, observation: Observati
     belief = jnp.where(state.windows == 0, parameters.prior, state.belief)
     moved = jax.vmap(predict_shift)(belief, parameters.gains * observation.flow_move)
     jumped = (parameters.after_jump.T @ belief.sum(axis=1))[:, None] * jnp.asarray(PRIOR, jnp.float32)
-    predicted = parameters.transition.T @ ((1.0 - parameters.hazard) * moved + parameters.hazard * jumped)
+    predicted = led(parameters.transition, (1.0 - parameters.hazard) * moved + parameters.hazard * jumped)
     shown = code(observation.shares, observation.named, observation.flow_seen)
     may_repeat = (state.last_code >= 0) & (observation.flow_move == 0)
     repeats = (parameters.window_repeat_probability * may_repeat)[:, None]
@@ -144,6 +150,12 @@ def filter_update(parameters: Filter, state: FilterState, observation: Observati
     watch = camera_watch.update(own, state.watch, observation.flow_seen, observation.flow_move)
     watch = camera_watch.limited(watch, parameters.unlikely_limit, parameters.likely_limit)
     return FilterState(posterior / posterior.sum(), shown, state.windows + 1, watch)
+
+
+def led(transition: jax.Array, belief: jax.Array) -> jax.Array:
+    """transition.T @ belief (H, N), term after term: as one product of many episodes it would be cut where
+    the CPU's caches end, and what is left there summed in another order."""
+    return sum(to[:, None] * of for to, of in zip(transition, belief, strict=True))
 
 
 def strange(parameters: Filter, state: FilterState) -> jax.Array:
@@ -167,7 +179,8 @@ def expected_loss(parameters: Filter, belief: jax.Array, last_move: jax.Array | 
     # of a miss on the border itself, as little as rounding is not outside
     outside = jax.scipy.special.ndtr((miss - 10.0 - 1e-3) / jnp.maximum(parameters.border_std, 1e-4))
     loss = miss + parameters.outside_cost * outside  # (corrections, H, N)
-    expected = jnp.einsum("chn,hn->c", loss, belief)
+    # of each hypothesis, then of all: a sum of H N terms is cut by the size of the CPU's caches
+    expected = sum(jnp.einsum("chn,hn->hc", loss, belief))
     expected = jax.ops.segment_min(expected, BEGINS, len(FLOW_MOVES))
     begins = (moves != 0) & (moves * last_move <= 0)
     return expected + parameters.move_cost * jnp.abs(moves) + parameters.move_fixed_cost * begins

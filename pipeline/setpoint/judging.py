@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
@@ -290,7 +291,7 @@ def _asked(controller: Controller, parameters, windows: Windows, conditions: Con
 # ---- the choice
 
 
-# points of the mean over the cases within which two contestants are alike
+# points within which two contestants are alike, in the worst case and on average over the cases
 ALIKE_POINTS = 2.0
 
 
@@ -324,25 +325,36 @@ def lead(of: Judged, other: Judged) -> Mean:
     the redraws that both have: same segments, same chance.
 
     The other's worst case lies no higher than any of its cases, so the lower end is the highest of those
-    against each of them: a case that is surely lost counts, also where another may be worse.
+    against each of them: a case that is surely lost counts, also where another may be worse. The intervals
+    hold in all these comparisons at once (`_at_once`).
     """
     first, second = worst_case(of)[1], worst_case(other)[1]
     leads = {case: _lead_in(of, first, other, case) for case in other.kept}
     return Mean(leads[second].value, max(one.low for one in leads.values()), leads[second].high)
 
 
+def _at_once(of: Mean, redraws: int, comparisons: int) -> Mean:
+    """The interval of one comparison widened so that those of so many hold at once in 95 % (Bonferroni, with
+    Student's t of redraws - 1): the highest of thirteen lower ends lies too high by chance far more often
+    than one does."""
+    alone, all_of_them = scipy.special.stdtrit(redraws - 1, 1.0 - 0.025 / np.array([1, comparisons]))
+    half = float((of.high - of.low) / 2 * all_of_them / alone)
+    return Mean(of.value, of.value - half, of.value + half)
+
+
 def lead_on_average(of: Judged, other: Judged) -> Mean:
     """The same of the mean over the cases: a worst case can be one segment's doing, and then hides who is
-    better everywhere else. The redraws that both have are the sample."""
+    better everywhere else. The redraws that both have are the sample. One comparison, so its interval is of
+    itself alone."""
     both = min(min(len(blocks) for blocks in one.kept.values()) for one in (of, other))
     leads = [of.kept[c][:both].mean(axis=1) - other.kept[c][:both].mean(axis=1) for c in of.kept]
     return redrawn_mean(100.0 * np.mean(leads, axis=0)[:, None], 1.0)
 
 
 def surely_better(judged: Mapping[str, Judged], best: str, name: str) -> bool:
-    """Whether `best` is told from another: in the worst case, or on average by more than ALIKE_POINTS. From
+    """Whether `best` is told from another by more than ALIKE_POINTS: in the worst case, or on average. From
     doing nothing by the worst case alone."""
-    if lead(judged[best], judged[name]).low > 0:
+    if lead(judged[best], judged[name]).low > ALIKE_POINTS:
         return True
     return name != DOES_NOTHING and lead_on_average(judged[best], judged[name]).low > ALIKE_POINTS
 
@@ -356,14 +368,15 @@ def _lead_in(of: Judged, case: str, other: Judged, against: str) -> Mean:
         alikes = [
             of.kept[c][:both].astype(float) - other.kept[c][:both] for c in of.kept if alike(c) == group
         ]
-        return redrawn_mean(ours - theirs, shared_variance(alikes) if group else 0.0)
+        told = redrawn_mean(ours - theirs, shared_variance(alikes) if group else 0.0)
+        return _at_once(told, both, len(other.kept))
     ends = [
         redrawn_mean(blocks, _shared(judged, alike(name), both))
         for blocks, judged, name in ((ours, of, case), (theirs, other, against))
     ]
     half = float(np.hypot(ends[0].high - ends[0].low, ends[1].high - ends[1].low)) / 2
     value = ends[0].value - ends[1].value
-    return Mean(value, value - half, value + half)
+    return _at_once(Mean(value, value - half, value + half), both, len(other.kept))
 
 
 def _shared(of: Judged, group: str, redraws: int) -> float:
@@ -433,18 +446,23 @@ def choose(
 def _reason(name: str, rival: str, judged: Mapping[str, Judged], margin: Mean) -> str:
     worst, case = worst_case(judged[rival])
     other = f"{rival} {100 * worst:.1f} % in its own ({case})"
-    ends = f"95 % interval {margin.low:+.1f} to {margin.high:+.1f} points"
-    if margin.low > 0:
+    ends = f"95 % interval over all cases at once {margin.low:+.1f} to {margin.high:+.1f} points"
+    if margin.low > ALIKE_POINTS:
         return f"that is {margin.value:.1f} points more than of {other}, {ends}"
     if name == DOES_NOTHING:
         return f"no controller does better beyond noise, the best is {other}, {ends}"
+    near = (
+        "is within noise"
+        if margin.low <= 0 <= margin.high
+        else f"is told from it by no more than {ALIKE_POINTS:g} points"
+    )
     mean = lead_on_average(judged[name], judged[rival])
     if mean.low > ALIKE_POINTS:
         return (
-            f"{other} is within noise ({ends}), but over the cases on average {name} keeps {mean.value:.1f} "
+            f"{other} {near} ({ends}), but over the cases on average {name} keeps {mean.value:.1f} "
             f"points more ({mean.low:+.1f} to {mean.high:+.1f})"
         )
-    return f"{other} is within noise ({ends}), and of two alike the simpler runs"
+    return f"{other} {near} ({ends}), and of two alike the simpler runs"
 
 
 def _check(judged: Mapping[str, Judged], simplest_first: Sequence[str], bars: Mapping[str, float]) -> None:

@@ -2,6 +2,7 @@
 and the trial's figures on the paper's simulator."""
 
 import itertools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from pipeline.setpoint import bayes, camera_watch, judging
+from pipeline.setpoint import agent, bayes, camera_watch, judging
 from pipeline.setpoint.baselines import (
     Proportional,
     SequentialTest,
@@ -163,6 +164,38 @@ def test_the_move_is_the_one_with_the_least_expected_loss():
         [25.25, 18.25, 7.5, 7.0, 6.5],
         rtol=1e-6,
     )
+
+
+def _beliefs(episodes: int, hypotheses: int) -> jnp.ndarray:
+    belief = np.random.default_rng(3).dirichlet(np.full(hypotheses * len(bayes.GRID), 0.3), episodes)
+    return jnp.asarray(belief.reshape(episodes, hypotheses, -1), jnp.float32)
+
+
+def test_a_belief_is_led_on_by_the_same_bytes_however_many_are_with_it():
+    """A product of many episodes is cut by the CPU's second cache, and sums what is left in another order."""
+    belief, many = _beliefs(800, 18), jax.jit(jax.vmap(bayes.led, (None, 0)))
+    transition = jnp.asarray(np.random.default_rng(4).dirichlet(np.ones(18), 18), jnp.float32)
+    together = many(transition, belief)
+    np.testing.assert_allclose(together, jnp.einsum("kh,ekn->ehn", transition, belief), rtol=1e-5)
+    apart = np.concatenate([many(transition, few) for few in np.split(belief, 200)])
+    assert np.asarray(together).tobytes() == apart.tobytes()
+
+
+def test_no_product_of_the_filter_sums_more_terms_than_every_cpu_sums_at_once(table):
+    """Of the program of the expected loss, as it is compiled for many episodes."""
+    parameters = bayes.robust_filter(table, ROBUST)
+    hypotheses = len(parameters.gains)
+    many = jax.jit(jax.vmap(bayes.expected_loss, (None, 0, None)))
+    text = many.lower(parameters, _beliefs(32, hypotheses), 0.0).compile().as_text()
+    shapes = {
+        name: [int(n) for n in sizes.split(",") if n]
+        for name, sizes in re.findall(r"(\S+?)(?: =|:) \w+\[([\d,]*)\]", text.replace("%", ""))
+    }
+    products = re.findall(r" dot\(%?(\S+), .*lhs_contracting_dims=\{([\d,]+)\}", text)
+    sums = [np.prod([shapes[left][int(axis)] for axis in axes.split(",")]) for left, axes in products]
+    assert sums and max(sums) <= agent.SHORT
+    # what the products of all hypotheses at once would sum
+    assert hypotheses * len(bayes.GRID) > agent.SHORT
 
 
 def test_evidence_sums_to_one_for_every_flow_and_transitions_for_every_hypothesis(table):

@@ -376,13 +376,34 @@ def test_within_noise_the_simpler_runs_whatever_the_order_of_the_table():
     assert "is within noise" in choice.sentence
     assert "of two alike the simpler runs" in choice.sentence
     # the same difference where redraws tell the two apart
-    both = blocks(0.95, seed=3)
-    better = both | blocks(0.4, seed=4)
+    both = blocks(0.9, seed=3)
     far = {
-        "agent": Judged({"clog": better}, close["agent"].harmed),
+        "agent": Judged({"clog": both | blocks(0.7, seed=4)}, close["agent"].harmed),
         "filter": Judged({"clog": both}, close["agent"].harmed),
     }
     assert choose(far, simplest_first=ORDER, bars=BARS).name == "agent"
+
+
+def test_what_is_told_apart_by_less_than_counts_is_alike():
+    """On every redraw the agent loses one run of 100 less than the filter: sure, and too little."""
+    all_but = {lost: np.arange(100) >= lost * np.ones((24, 1)) for lost in (4, 7, 8)}
+    good = {"in band": np.zeros((24, 100), bool)}
+    of = {lost: Judged({"clog": kept}, good) for lost, kept in all_but.items()}
+    one = lead(of[7], of[8])
+    assert 0 < one.low <= one.value == pytest.approx(1.0)
+    assert choose({"filter": of[8], "agent": of[7]}, simplest_first=ORDER, bars=BARS).name == "filter"
+    assert choose({"filter": of[8], "agent": of[4]}, simplest_first=ORDER, bars=BARS).name == "agent"
+
+
+def test_two_alike_are_told_apart_by_chance_no_oftener_than_said_however_many_cases_there_are():
+    """Both keep half of their runs in their worst case; the other has thirteen such cases to be told from."""
+    rng, names = np.random.default_rng(11), [f"accuracy {n}" for n in range(13)]
+    sure, told = np.ones((12, 21), bool), 0
+    for _ in range(400):
+        of = Judged({name: sure if n else rng.random((12, 21)) < 0.5 for n, name in enumerate(names)}, {})
+        other = Judged({name: rng.random((12, 21)) < 0.5 for name in names}, {})
+        told += lead(of, other).low > 0
+    assert told / 400 <= 0.025
 
 
 def test_an_interval_of_segments_makes_a_tie_of_what_runs_alone_would_tell_apart():
@@ -456,7 +477,7 @@ def test_the_race_is_left_by_who_cannot_win_any_more_and_by_nobody_else():
     # run by run the worse one is told apart where the two intervals would overlap
     rng = np.random.default_rng(6)
     better = rng.random((24, 20)) < 0.6
-    both = {"a": better, "b": better & (rng.random((24, 20)) < 0.92)}
+    both = {"a": better, "b": better & (rng.random((24, 20)) < 0.85)}
     pair = {name: Judged({"accuracy 0.7": kept}, judged["simple"].harmed) for name, kept in both.items()}
     assert still_in(pair, BARS) == ["a"]
     # the harmful is better than all, and ends nobody's race
