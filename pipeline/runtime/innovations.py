@@ -247,6 +247,20 @@ def started(watch: Watch, memory: Memory, y: np.ndarray) -> None:
     rested(memory)
 
 
+def drift(memory: Memory, p: int) -> np.ndarray:
+    """The rows (p, m + 4) of Z that are the drift in degC a step: as followed, and as each theta moves it."""
+    return memory.Z[-p:]
+
+
+def drift_sd(watch: Watch, noise_degC: np.ndarray) -> np.ndarray:
+    """Deviation (p,) in degC a step of the observer's drift, of which the sensors' noise (p,) is all that
+    there is: X = F X F' + L R L'."""
+    F, X = watch.F, watch.L @ np.diag(noise_degC**2) @ watch.L.T
+    for _ in range(14):  # each step doubles the samples that count: 16,384
+        F, X = F @ F, X + F @ X @ F.T
+    return np.sqrt(np.diag(X)[-len(noise_degC) :])
+
+
 def rested(memory: Memory) -> None:
     """No suspicion: sums and bank begin anew."""
     memory.sums[:] = 0.0
