@@ -341,11 +341,9 @@ def _learned(watch: Watch, memory: Memory, PS, v, variance) -> None:
 
 def kept(memory: Memory, now: Seen, moved: np.ndarray) -> None:
     """The ring with the newest sample; `moved` (p,) in degC is what each output should have moved."""
-    (m, p), ring = (memory.u.shape[1], len(now.z)), memory.ring
+    ring = memory.ring
     ring[:-1] = ring[1:]
-    row = ring[-1]
-    row[:m], row[m : 2 * m] = memory.u[1], memory.u[0]
-    row[2 * m : 2 * m + p], row[2 * m + p : 2 * m + 2 * p], row[2 * m + 2 * p :] = now.z, now.sd, moved
+    np.concatenate((memory.u[1], memory.u[0], now.z, now.sd, moved), out=ring[-1])
 
 
 # ---- the bank
@@ -356,7 +354,7 @@ def suspected(watch: Watch, bank: Bank, memory: Memory, now: Seen, *, alarmed: b
     is `alarmed`, and takes the newest rows of the ring."""
     age, ahead = memory.age, memory.ahead
     if age[0] < 0:
-        if now.highest > 0 and max(now.highest, np.abs(now.z).max()) > ODD:
+        if now.highest > 0 and max(now.highest, *map(abs, now.z.tolist())) > ODD:
             _begun(watch, bank, memory)
     elif not alarmed and now.highest <= 0:
         age[0], ahead[0] = -1, 0

@@ -420,9 +420,9 @@ def verified(s: Supervision, k: Kept, y: np.ndarray, y_star: np.ndarray) -> None
 
 def noted(k: Kept, z: np.ndarray) -> None:
     """Mean squares of the innovation, and at lag one."""
-    z = np.minimum(np.maximum(z, -MOST_Z), MOST_Z)
-    k.square[:] += FORGETS * (z * z - k.square)
-    k.lag[:] += FORGETS * (z * k.z - k.lag)
+    z, square, lag = np.minimum(np.maximum(z, -MOST_Z), MOST_Z), k.square, k.lag
+    square += FORGETS * (z * z - square)
+    lag += FORGETS * (z * k.z - lag)
     k.z[:] = z
 
 
@@ -614,7 +614,8 @@ def heated(s: Supervision, k: Kept, memory: innovations.Memory) -> None:
     """An output that drifts within seconds by more than the heat that surroundings may take or give, while
     nothing else is odd: the observer has followed it, so that no sum shows it. Of that, what a plant of the
     spread may do does not count."""
-    away = innovations.drift(memory, len(k.drift)) - k.drift
+    mean = k.drift
+    away = innovations.drift(memory, len(mean)) - mean
     quiet = not k.counters[ACTIVE] and k.counters[ALARMED] < 0
     if quiet and max((np.abs(away[:, 0]) - s.heat).tolist()) > 0:
         for j, X in enumerate(away[:, 1:]):
@@ -623,8 +624,8 @@ def heated(s: Supervision, k: Kept, memory: innovations.Memory) -> None:
             left = math.sqrt(s.watch.unexplained**2 * (stirred @ stirred) + X @ (memory.P[j] @ X))
             if abs(off) > s.heat[j] + LEFT_OPEN * left:
                 said(k, OFFSET, j, off / FORGETS)
-                innovations.drift(memory, len(k.drift))[j, 0] -= off
-    k.drift[:] += SLOWLY * away
+                innovations.drift(memory, len(mean))[j, 0] -= off
+    mean += SLOWLY * away
 
 
 # ---- in words
@@ -754,8 +755,9 @@ class Supervised:
             if before != LAW:
                 self.law.hand_over(y)
             u = self.law.step(y, r, n)
-            if max(np.abs(y - y_star).tolist()) < SETTLED_DEGC:
-                k.held[:] += HELD_SHARE * (u - k.held)
+            held, off = k.held, (y - y_star).tolist()
+            if -SETTLED_DEGC < min(off) and max(off) < SETTLED_DEGC:
+                held += HELD_SHARE * (u - held)
         else:
             u = self._safe(mode, before, y, r_now, n)
             self.law.watch(u, y, r_now)
