@@ -2,13 +2,14 @@
 learned gains hold the gains?
 
 `./run python -m benchmarks.certificates` prints both tables and writes benchmarks/results/certificates.json;
-`gate` or `bands` behind it plays one of them.
+`gate` or `bands` behind it plays one of them; `--seed` of the gate, `--count` of its bad and of its good
+controllers, `--jobs`.
 
 gate: 300 bad controllers and 300 good ones, each with the record that it was made from and a newest record
 through its own wires. Bad: unstable on its own true plant, or settled error over twice the limit there.
-Good: every rule that can be asked of a true plant holds there with 20 % to spare. True plants are written
-apart from `Plant`: zones of heat in watts, some with radiation, dead time, a sensor that lags and coarse
-steps, and the study's machine redrawn. Only the draw knows which cause a controller has; a cause whose
+Good: every rule that can be asked of a true plant holds there with 20 % to spare, margins too. True plants
+are written apart from `Plant`: zones of heat in watts, some with radiation, dead time, a sensor that lags and
+coarse steps, and the study's machine redrawn. Only the draw knows which cause a controller has; a cause whose
 controller works is no bad one and is drawn again.
 
 unseen: bad controllers whose inputs are in another scale in all that was ever recorded, the newest record
@@ -18,8 +19,8 @@ bands: 200 fresh records of one machine; how often the band of each entry holds 
 regression finds in a record of 300,000 samples.
 """
 
+import argparse
 import json
-import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -29,7 +30,7 @@ from typing import NamedTuple
 import joblib
 import numpy as np
 
-from pipeline.runtime import bands, certificate
+from pipeline.runtime import bands, certificate, certify
 from pipeline.runtime.machine import Exported, Machine, Signal, plants_sha256
 from pipeline.store import artifacts
 from pipeline.temperature import (
@@ -47,7 +48,7 @@ from pipeline.temperature.plant import Plant, hold_output, simulate, strictly_pr
 from pipeline.temperature.plant import plant as make_plant
 
 RESULTS = Path(__file__).parent / "results" / "certificates.json"
-COUNT = 300
+COUNT, SEED = 300, 53  # nothing was tuned on the cases of this seed
 SAMPLED, COMPARED = 200, 20  # plants a certificate here; of so many cases one has all 1,000 beside them
 CAUSES = (
     "few_samples",
@@ -58,7 +59,7 @@ CAUSES = (
     "stale_plant",
     "wrong_sample_time",
 )
-SETTLED_ERROR, CROSSING, DISK, GAMMA = 0.5, 2.0, 0.25, 0.99
+SETTLED_ERROR, CROSSING, DISK, DELAY_S, GAMMA = 0.5, 2.0, 0.4, 1.0, 0.99
 SPARE, LATE = 0.8, 1.2
 KELVIN = 273.15
 
@@ -439,6 +440,7 @@ class Outcome(NamedTuple):
     settled_error: float
     crossing: float
     disk: float
+    delay_s: float
     radius: float
 
     @property
@@ -452,6 +454,7 @@ class Outcome(NamedTuple):
             and self.settled_error <= SPARE * SETTLED_ERROR
             and self.crossing <= SPARE * CROSSING
             and self.disk >= LATE * DISK
+            and self.delay_s >= LATE * DELAY_S
         )
 
 
@@ -466,6 +469,7 @@ def asked(case: Draw) -> certificate.Rules:
         settled_error_degC=SETTLED_ERROR,
         crossing_degC=CROSSING,
         disk_margin=DISK,
+        delay_margin_s=DELAY_S,
         longest_window=6 if len(case.inputs) > 3 else 12,
         poles_of=12,
         plants=SAMPLED,
@@ -478,7 +482,7 @@ def outcome(exported: Exported, case: Draw, rules: certificate.Rules, rng: np.ra
     at = held(case.truth, rules.start)
     local = linearised(case.truth, case.operating)
     if at is None or local is None:
-        return Outcome(0.0, np.inf, 0.0, 0.0)
+        return Outcome(0.0, np.inf, 0.0, 0.0, 0.0)
     low = scorecard.margins([local], exported.controller.law, grid=60)[0]
     run, runs = Running(case.truth, *at), controller.RunningController(exported.controller, exported.model)
     for _ in range(3):
@@ -497,7 +501,7 @@ def outcome(exported: Exported, case: Draw, rules: certificate.Rules, rng: np.ra
                 late += (run.sensor - r) / rules.settled
         worst = max(worst, float(np.abs(late).max()))
     crossing = float(np.maximum(highest - limit, 0.0).max())
-    return Outcome(worst, crossing, low.disk, low.radius)
+    return Outcome(worst, crossing, low.disk, low.delay_s, low.radius)
 
 
 class Judged(NamedTuple):
@@ -558,7 +562,7 @@ def certified(exported: Exported, family, case: Draw, rules) -> tuple[certificat
         case.inputs, case.outputs, case.recorded_every, [u], [y], [nu], [ny], case.cold
     )
     started = time.process_time()
-    found = certificate.certify(exported, family, record, rules, np.random.default_rng(1))
+    found = certify.certify(exported, family, record, rules, np.random.default_rng(1))
     return found, time.process_time() - started
 
 
@@ -569,12 +573,12 @@ def listed(count: int, seed: int) -> list[tuple[str, int]]:
     return [(cause, seed * 100_000 + k) for k, cause in enumerate(causes)]
 
 
-def gate(count: int = COUNT, *, seed: int = 11, jobs: int = 2) -> dict:
+def gate(count: int = COUNT, *, seed: int = SEED, jobs: int = 2) -> dict:
     calls = [joblib.delayed(judged)(*one) for one in listed(count, seed)]
-    return summarised(joblib.Parallel(n_jobs=jobs, verbose=1)(calls))
+    return summarised(joblib.Parallel(n_jobs=jobs, verbose=1)(calls), seed)
 
 
-def summarised(results: Sequence[Judged]) -> dict:
+def summarised(results: Sequence[Judged], seed: int) -> dict:
     unseen = [one for one in results if one.cause == "unseen_unit"]
     results = [one for one in results if one.cause != "unseen_unit"]
     bad, good = [one for one in results if one.cause], [one for one in results if not one.cause]
@@ -588,6 +592,7 @@ def summarised(results: Sequence[Judged]) -> dict:
         | _summary(good)
         | {"refused_percent": 100.0 * sum(one.verdict == "refused" for one in good) / len(good)},
         "unseen": _summary(unseen),
+        "seed": seed,
         "sampled_plants": SAMPLED,
         "of_1000": _compared(results),
         "plants": dict(Counter(one.kind for one in results)),
@@ -604,6 +609,7 @@ def summarised(results: Sequence[Judged]) -> dict:
                 round(min(one.outcome.settled_error, 1e6), 3),
                 round(one.outcome.radius, 4),
                 round(one.outcome.disk, 3),
+                round(min(one.outcome.delay_s, 1e6), 2),
                 one.tried,
             ]
             for one in results
@@ -692,12 +698,20 @@ def band_cover(jobs: int = 2) -> dict:
 
 
 def main() -> None:
-    which = sys.argv[1:] or ["gate", "bands"]
-    for name, played in (("gate", gate), ("bands", band_cover)):
-        if name not in which:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("which", nargs="*", default=["gate", "bands"])
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--count", type=int, default=COUNT)
+    parser.add_argument("--jobs", type=int, default=2)
+    arguments = parser.parse_args()
+    for name in ("gate", "bands"):
+        if name not in arguments.which:
             continue
         started = time.time()
-        table = played()
+        if name == "gate":
+            table = gate(arguments.count, seed=arguments.seed, jobs=arguments.jobs)
+        else:
+            table = band_cover(arguments.jobs)
         found = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
         artifacts.write_json(RESULTS, found | {name: table})
         shown = {key: value for key, value in table.items() if key != "cases"}

@@ -11,7 +11,8 @@ A fault is seen in time where a safe mode is asked for within 10 samples of the 
 passes 5 deviations of an honest one; a slow kind before its zone errs by 5 degC from what it would do without
 the fault. `right` counts the first cause named, 10 samples after the safe mode; `said` those too where the
 cause is the one that the sentence names beside it. Cases whose fault shows nowhere (a heater that is off
-while it is told nothing) are `silent`, and counted apart.
+while it is told nothing) are `silent`, and counted apart; `unseen` are those for which no safe mode was asked
+although the zone erred by 5 degC.
 """
 
 import argparse
@@ -510,6 +511,7 @@ def summary(kind: str, outcomes: list[Outcome]) -> dict[str, Any]:
         "silent": len(outcomes) - len(shown),
         "before_the_fault": len(early),
         "seen": len(seen),
+        "unseen": len(shown) - len(early) - len(seen),
         "in_time": len(in_time),
         "right": len(right),
         "said": len(said),
@@ -630,7 +632,7 @@ def one_machine(rig: Rig, arguments: argparse.Namespace) -> dict[str, Any]:
     hours, alarms = sum(part["hours"] for part in parts), sum(part["alarms"] for part in parts)
     total = {
         key: sum(row[key] for row in by_kind.values())
-        for key in ("cases", "silent", "seen", "in_time", "right", "said", "before_the_fault")
+        for key in ("cases", "silent", "seen", "unseen", "in_time", "right", "said", "before_the_fault")
     }
     return {
         "faults": by_kind,

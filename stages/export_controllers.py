@@ -59,6 +59,12 @@ def main() -> None:
             machine,
             read_relearned(RELEARNED) if artifacts.exists(RELEARNED) else None,
             recorded=not simulated,
+            model={
+                "residuals": artifacts.read_table(
+                    "datasets/identify_plant/residuals.parquet", tables.RESIDUALS
+                ),
+                "dynamics": artifacts.read_table("datasets/identify_plant/dynamics.parquet", tables.DYNAMICS),
+            },
         )
         name, why = export.chosen(verdict.winner, f"{verdict.decision} {verdict.lead}")
         temperature = export.nothing(why)

@@ -72,7 +72,7 @@ def main() -> None:
             "identification": identification_page.render(sources),
             "deposition": deposition_page.render(sources),
             "setpoint": setpoint_page.render(sources),
-            "certificate": certificate_page.render(sources),
+            "certificate": certificate_page.render(sources, judged.verdict),
             "viewer": viewer.text,
         }
         artifacts.write_text("reports/index.html", pages["index"])

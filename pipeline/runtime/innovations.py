@@ -247,6 +247,20 @@ def started(watch: Watch, memory: Memory, y: np.ndarray) -> None:
     rested(memory)
 
 
+def drift(memory: Memory, p: int) -> np.ndarray:
+    """The rows (p, m + 4) of Z that are the drift in degC a step: as followed, and as each theta moves it."""
+    return memory.Z[-p:]
+
+
+def drift_sd(watch: Watch, noise_degC: np.ndarray) -> np.ndarray:
+    """Deviation (p,) in degC a step of the observer's drift, of which the sensors' noise (p,) is all that
+    there is: X = F X F' + L R L'."""
+    F, X = watch.F, watch.L @ np.diag(noise_degC**2) @ watch.L.T
+    for _ in range(14):  # each step doubles the samples that count: 16,384
+        F, X = F @ F, X + F @ X @ F.T
+    return np.sqrt(np.diag(X)[-len(noise_degC) :])
+
+
 def rested(memory: Memory) -> None:
     """No suspicion: sums and bank begin anew."""
     memory.sums[:] = 0.0
@@ -327,11 +341,9 @@ def _learned(watch: Watch, memory: Memory, PS, v, variance) -> None:
 
 def kept(memory: Memory, now: Seen, moved: np.ndarray) -> None:
     """The ring with the newest sample; `moved` (p,) in degC is what each output should have moved."""
-    (m, p), ring = (memory.u.shape[1], len(now.z)), memory.ring
+    ring = memory.ring
     ring[:-1] = ring[1:]
-    row = ring[-1]
-    row[:m], row[m : 2 * m] = memory.u[1], memory.u[0]
-    row[2 * m : 2 * m + p], row[2 * m + p : 2 * m + 2 * p], row[2 * m + 2 * p :] = now.z, now.sd, moved
+    np.concatenate((memory.u[1], memory.u[0], now.z, now.sd, moved), out=ring[-1])
 
 
 # ---- the bank
@@ -342,7 +354,7 @@ def suspected(watch: Watch, bank: Bank, memory: Memory, now: Seen, *, alarmed: b
     is `alarmed`, and takes the newest rows of the ring."""
     age, ahead = memory.age, memory.ahead
     if age[0] < 0:
-        if now.highest > 0 and max(now.highest, np.abs(now.z).max()) > ODD:
+        if now.highest > 0 and max(now.highest, *map(abs, now.z.tolist())) > ODD:
             _begun(watch, bank, memory)
     elif not alarmed and now.highest <= 0:
         age[0], ahead[0] = -1, 0

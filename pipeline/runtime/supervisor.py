@@ -85,6 +85,10 @@ CHANCE = 1e-9  # that a sensor repeats itself so often
 REPEATS_LEAST = 5
 SETTLED_DEGC = 5.0  # from the target: where inputs are such as can be held
 HELD_SHARE = 1 / 30  # share a sample of the mean of inputs that hold
+HEAT = 0.06  # share of the strongest input's range: heat that a zone gains or loses, and no input explains
+SLOWLY = 1 / 100  # share a sample of the mean drift, from which such heat is counted
+SURELY = 8.0  # deviations of the observer's drift at rest, and
+LEFT_OPEN = 2.0  # of what the spread leaves open of it
 APPLIED = 0.01  # share of an input's range by which it may differ from the command
 
 
@@ -96,7 +100,8 @@ class Supervision(NamedTuple):
     in degC per percent: how fast each input moves each output. `hysteresis_degC`, `gain_degC`, `check_s` and
     `error_degC_s` are verify_heater's. `early`, `late`, `jump` are shares of the sample time: less than
     `early` or more than `jump` is no time between two samples, more than `late` is a deadline missed.
-    `reach_degC`: a target that far from its reference is out of reach.
+    `reach_degC`: a target that far from its reference is out of reach. `heat` (p,) in degC a sample: how far
+    the observer's drift may be from its mean.
     """
 
     watch: innovations.Watch
@@ -116,6 +121,7 @@ class Supervision(NamedTuple):
     late: float
     jump: float
     reach_degC: float
+    heat: np.ndarray
 
 
 def supervision(
@@ -150,15 +156,17 @@ def supervision(
     limits = np.array([i.low for i in machine.inputs]), np.array([i.high for i in machine.inputs])
     pulses = markov_parameters(strictly_proper(model), innovations.MOST_LATE)
     check = _check_s(model, limits, T)
+    watch = innovations.watch(model, limits, noise, spread or spread_of(model, family))
+    peak = np.abs(pulses).max(axis=0)
     return Supervision(
-        watch=innovations.watch(model, limits, noise, spread or spread_of(model, family)),
+        watch=watch,
         bank=innovations.bank(model),
         mode=np.array([MODES.index(modes[kind]) for kind in KINDS]),
         back_s=np.array([np.inf if kind in LATCHED else waits for kind in KINDS]),
         low=np.array([o.low for o in machine.outputs]),
         high=np.array([o.high for o in machine.outputs]),
         noise_degC=noise,
-        peak=np.abs(pulses).max(axis=0),
+        peak=peak,
         hysteresis_degC=np.maximum(5.0, 6 * noise),
         gain_degC=np.maximum(2.0, 6 * noise),
         check_s=check,
@@ -168,6 +176,9 @@ def supervision(
         late=1.5,
         jump=10.0,
         reach_degC=max(0.5, 3 * float(noise.max())),
+        heat=np.maximum(
+            HEAT * (peak * (limits[1] - limits[0])).max(axis=1), SURELY * innovations.drift_sd(watch, noise)
+        ),
     )
 
 
@@ -227,6 +238,8 @@ class Kept(NamedTuple):
     expected and e the last forecast and innovation; error, goal and waited of verify_heater in degC s, degC
     and s.
 
+    drift (p, m + 4) the mean of innovations.drift.
+
     By input (m,): held the inputs that hold; asked the last command; lacks the share that a weak heater
     lacks; stuck 1 where it is on.
 
@@ -253,6 +266,7 @@ class Kept(NamedTuple):
     error: np.ndarray
     goal: np.ndarray
     waited: np.ndarray
+    drift: np.ndarray
     held: np.ndarray
     asked: np.ndarray
     lacks: np.ndarray
@@ -286,6 +300,7 @@ def kept(s: Supervision) -> Kept:
         error=np.zeros(p),
         goal=np.full(p, -np.inf),
         waited=np.zeros(p),
+        drift=np.zeros((p, m + 4)),
         held=np.zeros(m),
         asked=np.zeros(m),
         lacks=np.zeros(m),
@@ -405,9 +420,9 @@ def verified(s: Supervision, k: Kept, y: np.ndarray, y_star: np.ndarray) -> None
 
 def noted(k: Kept, z: np.ndarray) -> None:
     """Mean squares of the innovation, and at lag one."""
-    z = np.minimum(np.maximum(z, -MOST_Z), MOST_Z)
-    k.square[:] += FORGETS * (z * z - k.square)
-    k.lag[:] += FORGETS * (z * k.z - k.lag)
+    z, square, lag = np.minimum(np.maximum(z, -MOST_Z), MOST_Z), k.square, k.lag
+    square += FORGETS * (z * z - square)
+    lag += FORGETS * (z * k.z - lag)
     k.z[:] = z
 
 
@@ -563,12 +578,15 @@ def followed(
     filled = np.where(k.trusted > 0, y, now.expected) if k.counters[ACTIVE] else y
     if manual:
         innovations.rested(memory)
+        k.drift[:] = innovations.drift(memory, len(y))
     else:
         alarmed(s, k, memory, now.highest)
+        heated(s, k, memory)
     if gone(s, k):
         # a sensor counts again: what it showed meanwhile does not
         innovations.started(watch, memory, filled)
         k.e[:] = 0.0
+        k.drift[:] = 0.0
     k.counters[SAMPLES] += 1
     k.counters[STEPS] += 1
     return filled
@@ -590,6 +608,24 @@ def alarmed(s: Supervision, k: Kept, memory: innovations.Memory, highest: float)
     if diagnosed(s, k, memory) or c[ALARMED] > 2 * DECIDED_BY or not k.trusted[_loudest(memory)]:
         c[ALARMED] = -1
         innovations.rested(memory)
+
+
+def heated(s: Supervision, k: Kept, memory: innovations.Memory) -> None:
+    """An output that drifts within seconds by more than the heat that surroundings may take or give, while
+    nothing else is odd: the observer has followed it, so that no sum shows it. Of that, what a plant of the
+    spread may do does not count."""
+    mean = k.drift
+    away = innovations.drift(memory, len(mean)) - mean
+    quiet = not k.counters[ACTIVE] and k.counters[ALARMED] < 0
+    if quiet and max((np.abs(away[:, 0]) - s.heat).tolist()) > 0:
+        for j, X in enumerate(away[:, 1:]):
+            off = away[j, 0] + X @ memory.theta[j]
+            stirred = X * s.watch.prior
+            left = math.sqrt(s.watch.unexplained**2 * (stirred @ stirred) + X @ (memory.P[j] @ X))
+            if abs(off) > s.heat[j] + LEFT_OPEN * left:
+                said(k, OFFSET, j, off / FORGETS)
+                innovations.drift(memory, len(mean))[j, 0] -= off
+    mean += SLOWLY * away
 
 
 # ---- in words
@@ -719,8 +755,9 @@ class Supervised:
             if before != LAW:
                 self.law.hand_over(y)
             u = self.law.step(y, r, n)
-            if max(np.abs(y - y_star).tolist()) < SETTLED_DEGC:
-                k.held[:] += HELD_SHARE * (u - k.held)
+            held, off = k.held, (y - y_star).tolist()
+            if -SETTLED_DEGC < min(off) and max(off) < SETTLED_DEGC:
+                held += HELD_SHARE * (u - held)
         else:
             u = self._safe(mode, before, y, r_now, n)
             self.law.watch(u, y, r_now)

@@ -2,10 +2,16 @@
 does."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from pipeline.store import artifacts
+from pipeline.report.certificate import exported
+from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, ReportRules, Verdict
+from pipeline.report.temperature import judgement
+from pipeline.report.temperature.judgement import trust_first
+from pipeline.store import artifacts, params
+from pipeline.temperature.workflow.settings import Plant
 from stages.report import main
 from tests.report import made_certificate
 from tests.report.test_pages import Page
@@ -31,10 +37,36 @@ def test_a_passed_certificate_of_a_simulated_plant_is_a_rehearsal(project):
     assert "<b>told</b>" not in PAGE.read_text()
 
 
-def test_only_recordings_make_a_certificate_say_that_it_may_run(project):
+def test_a_certificate_of_recordings_says_no_more_than_page_one(project):
     made_certificate.write(evidence="recorded")
+    shown = SimpleNamespace(metrics={"export_controllers": artifacts.read_metrics("export_controllers")})
+    ready = Verdict("temperature", PASSED, "Ready for a supervised trial.", "", "", "", "", "pi")
+    line = exported.lines(shown, ready)[0]
+    assert (line.state, line.word, line.why) == (PASSED, "May run.", "")
+    for verdict in (
+        ready._replace(winner="varx_riccati"),
+        trust_first(ready, ready._replace(decision="Do not trust this model.", state=FAILED)),
+    ):
+        line = exported.lines(shown, verdict)[0]
+        assert (line.state, line.word) == (OPEN, "Certificate passed, not ready.")
+        assert line.why == f"Page one says: {verdict.decision} {verdict.lead}".strip()
+    # the pages of a machine whose page one names no such controller
     main()
-    assert "May run. PI, tuned." in Page(PAGE).text and "May run." in Page(INDEX).text
+    assert "May run" not in Page(PAGE).text + Page(INDEX).text
+    assert "Certificate passed, not ready." in Page(PAGE).text
+
+
+def test_a_model_that_nobody_may_trust_exports_nothing(monkeypatch):
+    passed = Verdict("temperature", PASSED, "Ready.", "", "", "", "", "pi")
+    doubted = passed._replace(decision="Do not trust this model.", state=FAILED)
+    monkeypatch.setattr(judgement, "decide", lambda *_, **__: passed)
+    monkeypatch.setattr(judgement, "trust", lambda _: doubted)
+    machine = params.load(Plant, "plant")
+    for recorded, winner in ((True, None), (False, "pi")):
+        found = judgement.winner(
+            {}, params.load(ReportRules, "report"), machine, None, recorded=recorded, model={}
+        )
+        assert found.winner == winner
 
 
 def test_a_refused_certificate_names_its_first_failed_rule_and_no_file(project):

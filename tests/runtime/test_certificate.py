@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.runtime import bands, certificate, machine
-from pipeline.runtime.certificate import Record, Rules, certify, from_json, sha256, to_json
+from pipeline.runtime.certificate import Record, Rules, from_json, sha256, to_json
+from pipeline.runtime.certify import certify
 from pipeline.runtime.machine import Exported, Machine, Signal, plants_sha256
 from pipeline.temperature import controller, kernel, plant, tracking, window
 from pipeline.temperature.governor import Limits
@@ -88,7 +89,7 @@ def test_an_honest_controller_passes_every_rule_in_the_declared_order(passed):
     assert all(rule.passed and rule.asked and rule.sentence.endswith(".") for rule in passed.rules)
     assert passed.worst.plants == RULES.plants + len(FAMILY)
     assert passed.worst.settled_error_degC[2] < RULES.settled_error_degC
-    assert {one.of for one in passed.poles} == {"model", "spread", "record"}
+    assert {one.of for one in passed.poles} == {"model", "spread", "record", "newest"}
     assert passed.margins.disk[0] >= passed.margins.disk[1] >= passed.margins.disk[2] > 0.2
     assert passed.evidence == "recorded" and passed.samples == (800, 500)
 
@@ -208,9 +209,24 @@ def test_poles_outside_the_unit_circle_are_refused():
 
 
 def test_thin_margins_are_refused():
-    assert "disk margin below" in refused_by("disk_margin", certified(rules=RULES._replace(disk_margin=1.9)))
-    late = RULES._replace(delay_margin_s=100.0)
-    assert "a delay of" in refused_by("delay_margin", certified(rules=late))
+    sentence = refused_by("disk_margin", certified(rules=RULES._replace(disk_margin=1.9)))
+    assert "of the median plant is" in sentence and "where 1.9 is asked" in sentence
+    found = certified(rules=RULES._replace(delay_margin_s=100.0))
+    assert "where 100 is asked" in refused_by("delay_margin", found)
+    # what the median plant has, asked of nine in ten
+    most = certified().margins.disk[0]
+    found = certified(rules=RULES._replace(disk_margin=most, tail=1.0))
+    assert "of the median plant is" not in refused_by("disk_margin", found)
+
+
+def test_margins_are_asked_of_the_machine_as_it_is_now():
+    """On a machine that heats 2.5 times as much by now, were the model let pass, the plants of the whole
+    record have the margin that is asked, and those of its newest part have not."""
+    tight, now = designed(zones(), effort=0.002), evidence(zones(), newest=zones(gain=2.5))
+    blind = RULES._replace(unexplained=10.0, settled_error_degC=5.0, disk_margin=1.3, tail=0.8)
+    assert certified(tight, rules=blind).verdict == "passed"
+    sentence = refused_by("disk_margin", certified(tight, now, blind))
+    assert sentence.startswith("The disk margin on what the newest record alone shows is")
 
 
 def test_an_error_that_stays_on_more_than_a_few_plants_is_refused():

@@ -105,6 +105,7 @@ def test_the_golden_vectors_reach_limits_safe_modes_and_hand_overs():
         ("lqg", "diagonal = A[k][k] > 0 ? -sqrt(size)", "diagonal = A[k][k] > 0 ? -1.001 * sqrt(size)"),
         ("lqg", "*c = *saved;", "c->law = saved->law;"),
         ("lqg", "o->theta[j][i] + PS[j][i]", "o->theta[j][i] + 1.01 * PS[j][i]"),
+        ("lqg", "supervisor_heat[j] + LEFT_OPEN", "supervisor_heat[j] + 99 * LEFT_OPEN"),
         ("hold", "k->waited[j] += BEADLINE_SAMPLE_TIME_S", "k->waited[j] += 3 * BEADLINE_SAMPLE_TIME_S"),
     ],
 )

@@ -228,6 +228,64 @@ def test_the_law_comes_back_without_a_bump():
     assert jump < 5 * gain * NOISE + 0.5 and np.abs(decisions[-1].u - before).max() < 10
 
 
+def test_a_drift_that_its_observer_has_followed_is_seen_where_surroundings_cannot_take_so_much():
+    s = exported().supervision
+    np.testing.assert_allclose(s.heat, supervisor.HEAT * 100 * np.array([0.055, 0.065]), rtol=0.01)
+    for step, kinds in ((1.2, {"sensor_offset"}), (0.8, set())):
+        k, memory = supervisor.kept(s), innovations.remembered(s.watch, s.bank)
+        innovations.drift(memory, 2)[1, 0] = -step * s.heat[1]
+        for _ in range(20):
+            supervisor.heated(s, k, memory)
+        assert {supervisor.KINDS[kind] for kind in np.flatnonzero((k.since >= 0).any(axis=1))} == kinds
+        # of two zones the one that drifts, and the observer freed of it
+        assert k.since[supervisor.OFFSET, 0] < 0
+        assert (innovations.drift(memory, 2)[1, 0] == 0) == bool(kinds)
+
+
+BACK = {
+    # how the law is left, and for how many samples
+    "hold": ({"reading": put(1, lambda y, k: np.nan)}, 25),
+    "pi": ({"r": lambda k: R + [0.0, 200.0]}, 25),
+    "off": ({"command": lambda u, k: np.r_[u[0] + 20.0, u[1]], "applied": True}, 3),
+}
+
+
+def return_from(mode: str, *, handed: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """By how much the inputs (m,) move when the law takes over again, and by how much they should: what it
+    aims at for its target less what it aims at for where the machine is."""
+    run = Run(seed=21)
+    law, kept = run.supervised.law, run.supervised.kept
+    law.controller = law.controller._replace(integral_limit=1e3)
+    run.go(150, r=steps_of)
+    how, samples = BACK[mode]
+    before = run.go(samples, **how)[-1]
+    assert before.mode == mode
+    if not handed:
+        law.hand_over = lambda y: None
+    for _ in range(45):
+        readings, r = [], run.true() + 0.5  # from where the machine has got to, within the inputs' limits
+        now = run.go(1, reading=lambda y, k, to=readings: to.append(y) or y, r=lambda k, r=r: r)[0]
+        if now.mode == "law":
+            break
+        assert now.mode == mode
+        before = now
+    assert now.mode == "law"
+    seen = np.where(kept.trusted > 0, readings[0], kept.expected)
+    to, at = (
+        controller.aim(law.controller.law, controller.rest(law.model, one, law.controller.limits), one).feed
+        for one in map(controller.constant, (r, seen))
+    )
+    return now.u - before.u, (to - at)[:, 0]
+
+
+@pytest.mark.parametrize("mode", BACK)
+def test_the_law_comes_back_from_each_safe_mode_where_its_inputs_are(mode):
+    moved, aimed = return_from(mode)
+    np.testing.assert_allclose(moved, aimed, atol=1e-6)  # of 100 percent: the target is found to 1e-8
+    moved, aimed = return_from(mode, handed=False)
+    assert np.abs(moved - aimed).max() > 1.0
+
+
 def test_what_is_saved_goes_on_bit_by_bit():
     one, other = Run(seed=14), Run(seed=14)
     one.go(40, r=steps_of)

@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 
 from pipeline.report.shared.digits import count
 from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing
+from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 from pipeline.report.temperature.contestants import BY_NAME, in_a_sentence
 
 STAGE, LOOPS = "export_controllers", ("temperature", "deposition", "setpoint")
 FOLDER = "datasets/export_controllers"
 REHEARSAL, MAY_RUN = "Rehearsal: certificate passed.", "May run."
+NOT_READY = "Certificate passed, not ready."
 REFUSED, NONE = "Certificate refused.", "No certificate."
 
 
@@ -30,15 +31,16 @@ class Line(NamedTuple):
     why: str
 
 
-def lines(sources: Sources) -> list[Line] | Missing:
-    """One a loop, or why there are none."""
+def lines(sources: Sources, verdict: Verdict) -> list[Line] | Missing:
+    """One a loop, or why there are none. A certificate says no more than the temperature loop's `verdict` on
+    page one: it may run where that is passed, for this controller."""
     metrics = sources.metrics.get(STAGE) or Missing(OPEN, f"{STAGE} has not run")
     if isinstance(metrics, Missing):
         return metrics
-    return [_line(loop, metrics) for loop in LOOPS]
+    return [_line(loop, metrics, verdict) for loop in LOOPS]
 
 
-def _line(loop: str, metrics: Mapping[str, Any]) -> Line:
+def _line(loop: str, metrics: Mapping[str, Any], verdict: Verdict) -> Line:
     fields = lookup(metrics, loop, what=f"{loop} loop")
     if isinstance(fields, Missing):
         return Line(loop, OPEN, NONE, "", "", "", "", "", fields.sentence())
@@ -46,11 +48,14 @@ def _line(loop: str, metrics: Mapping[str, Any]) -> Line:
     first = next(iter(files), "")
     main = next((path for path in files if path.endswith("controller.json")), first)
     state, word = OPEN, NONE
+    name, why = str(fields.get("contestant") or ""), str(fields.get("why") or "")
     if isinstance(shown, Mapping):
         passed = shown.get("verdict") == "passed"
         state = PASSED if passed else FAILED
         word = (REHEARSAL if shown.get("evidence") == "simulated" else MAY_RUN) if passed else REFUSED
-    name = str(fields.get("contestant") or "")
+    if word == MAY_RUN and not (verdict.state == PASSED and verdict.winner == name):
+        state, word = OPEN, NOT_READY
+        why = f"Page one says: {verdict.decision} {verdict.lead}".strip()
     return Line(
         loop,
         state,
@@ -60,5 +65,5 @@ def _line(loop: str, metrics: Mapping[str, Any]) -> Line:
         files.get(main, ""),
         count(len(files), "file") if files else "",
         str(shown.get("sha256") or "") if isinstance(shown, Mapping) else "",
-        str(fields.get("why") or ""),
+        why,
     )

@@ -11,7 +11,7 @@ from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.digits import number, with_unit
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing
+from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 from pipeline.report.temperature.contestants import BY_NAME, heading
 
 WORDS = ("rehearsal", "margin_disk", "margin_delay", "spread", "step", "hash")
@@ -43,10 +43,10 @@ class Head(NamedTuple):
     heads: Sequence[Any] = ()
 
 
-def render(sources: Sources) -> str:
-    """The text of certificate.html."""
+def render(sources: Sources, verdict: Verdict) -> str:
+    """The text of certificate.html; `verdict` is that of the temperature loop on page one."""
     shown = sources.tables.get("certificate") or Missing(OPEN, "export_controllers has not run")
-    lines = exported.lines(sources)
+    lines = exported.lines(sources, verdict)
     whole = not isinstance(shown, Missing)
     return page.render(
         "certificate.html",

@@ -72,7 +72,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         ],
         difference=difference_parts(sources, judged),
         workflow=workflow.figure(sources),
-        exported=[] if isinstance(leaving := exported.lines(sources), Missing) else leaving,
+        exported=[] if isinstance(leaving := exported.lines(sources, judged.verdict), Missing) else leaving,
         from_exported=page.origin(sources.source("export_controllers")),
         from_accepted=sources.source("accepted"),
         words=words.chosen(sources, words.INDEX),

@@ -8,8 +8,17 @@ from typing import Any, NamedTuple
 from pipeline.report.identification.model import UNTRUSTED, trust
 from pipeline.report.shared.difference import Difference, Move, difference, moves
 from pipeline.report.shared.digits import count
-from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import OPEN, PASSED, Answers, Figure, Question, ReportRules, Verdict
+from pipeline.report.shared.sources import Declared, Sources, Table
+from pipeline.report.shared.verdict import (
+    OPEN,
+    PASSED,
+    Answers,
+    Figure,
+    Missing,
+    Question,
+    ReportRules,
+    Verdict,
+)
 from pipeline.report.temperature.answers import Metrics, comparison, entry, of_contestant
 from pipeline.report.temperature.contestants import YARDSTICKS, heading, kind
 from pipeline.report.temperature.drifted import Drift, drift
@@ -65,15 +74,27 @@ def of_this_machine(relearned: Any, machine: Plant, *, recorded: bool) -> Mappin
 
 
 def winner(
-    metrics: Metrics, rules: ReportRules, machine: Plant, relearned: Any, *, recorded: bool
+    metrics: Metrics,
+    rules: ReportRules,
+    machine: Plant,
+    relearned: Any,
+    *,
+    recorded: bool,
+    model: Mapping[str, Table | Missing],
 ) -> Verdict:
-    """The verdict that the run gives by itself: without a night's drift, and without who runs today."""
-    return decide(
+    """The verdict that the run gives by itself: without a night's drift, and without who runs today; `model`
+    are the tables by which page one trusts a recorded machine's model, "residuals" and "dynamics"."""
+    verdict = decide(
         metrics,
         rules,
         recorded=recorded,
         undeclared=undeclared_outputs(machine),
         relearned=of_this_machine(relearned, machine, recorded=recorded),
+    )
+    if not recorded:
+        return verdict
+    return trust_first(
+        verdict, trust(Sources(Declared(rules, machine, {}), metrics, model, {}, {}, None, "", {}))
     )
 
 

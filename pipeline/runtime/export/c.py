@@ -396,7 +396,7 @@ OF_INNOVATIONS = (
 OF_SUPERVISOR = (
     "ALARM", "DECIDED_AFTER", "DECIDED_BY", "TOLD_APART", "UNEXPLAINED", "UNEXPLAINED_SHARE", "DEAD_SHARE",
     "NOISY_SQUARE", "NOISY_LAG", "CHANCE", "REPEATS_LEAST", "SETTLED_DEGC", "HELD_SHARE", "APPLIED",
-    "ALL_INPUTS",
+    "ALL_INPUTS", "SLOWLY", "LEFT_OPEN",
 )  # fmt: skip
 FORMS = ("ON", "LESS", "NOT_APPLIED", "STEP", "RAMP", "LAG")
 
@@ -439,7 +439,7 @@ def supervising(s: supervisor.Supervision) -> str:
     arrays = {
         "back_s": s.back_s, "low": s.low, "high": s.high, "noise": s.noise_degC, "peak": s.peak,
         "hysteresis": s.hysteresis_degC, "gain": s.gain_degC, "check_s": s.check_s,
-        "error_degC_s": s.error_degC_s,
+        "error_degC_s": s.error_degC_s, "heat": s.heat,
     }  # fmt: skip
     return text + "".join(table(f"supervisor_{name}", values) for name, values in arrays.items())
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.runtime import bands, certificate, machine, supervisor, support
+from pipeline.runtime import bands, certificate, certify, machine, supervisor, support
 from pipeline.runtime.certificate import Certificate
 from pipeline.runtime.export import vectors
 from pipeline.runtime.machine import Exported
@@ -130,8 +130,8 @@ def asked(
     judged: Judged, rules: TemperatureRules, settings: ExportControllers, seen: certificate.Record
 ) -> certificate.Rules:
     """What the certificate asks: those of the judging half's constant references that the record reaches,
-    from where the record is coolest, within the settled error of the verdict. What lies further off was
-    rehearsed only. Where the record reaches none, all are asked, and refused."""
+    from where the record is coolest, within the settled error and with the margins of the verdict. What lies
+    further off was rehearsed only. Where the record reaches none, all are asked, and refused."""
     judging, setting = judged.setting.rehearsal.judging, judged.setting
     constants = sorted({int(judging.asked[row, 0]) for row in np.flatnonzero(judging.kind == "constant")})
     every = np.array([judging.references[index].H[:, 0] for index in constants])
@@ -144,6 +144,8 @@ def asked(
         steps=judging.steps // 2,
         settled=min(setting.settled, judging.steps // 4),
         settled_error_degC=rules.settled_error_degC,
+        disk_margin=rules.disk_margin,
+        delay_margin_s=rules.delay_margin_s,
         plants=settings.plants,
         resamples=settings.resamples,
     )
@@ -159,7 +161,7 @@ def certified(
     """The certificate on the record at `path`."""
     seen, rng = evidence(path, judged.machine), np.random.default_rng(settings.seed)
     asks, how = asked(judged, rules, settings, seen), learning(made.name, judged)
-    return certificate.certify(made, judged.learned.spread, seen, asks, rng, learning=how)
+    return certify.certify(made, judged.learned.spread, seen, asks, rng, learning=how)
 
 
 def learning(name: str, judged: Judged) -> bands.Learning | None:

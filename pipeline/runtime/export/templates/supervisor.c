@@ -605,6 +605,43 @@ static void raise_alarm(supervisor_kept *k, innovation_memory *o, double highest
     }
 }
 
+static void remember_drift(supervisor_kept *k, const innovation_memory *o)
+{
+    int j;
+    for (j = 0; j < OUTPUTS; j++) {
+        k->drift[j][0] = o->x[WATCH - OUTPUTS + j];
+        memcpy(k->drift[j] + 1, o->X[WATCH - OUTPUTS + j], sizeof o->X[0]);
+    }
+}
+
+/* An output that drifts by more than the heat that surroundings may take or give, while nothing else is odd;
+ * what a plant of the spread may do does not count */
+static void tell_heat(supervisor_kept *k, innovation_memory *o)
+{
+    int i, j, told = 0, at = WATCH - OUTPUTS;
+    double away[OUTPUTS][1 + THETA];
+    for (j = 0; j < OUTPUTS; j++) {
+        for (i = 0; i <= THETA; i++)
+            away[j][i] = (i ? o->X[at + j][i - 1] : o->x[at + j]) - k->drift[j][i];
+        told |= !k->active && k->alarmed < 0 && fabs(away[j][0]) > supervisor_heat[j];
+    }
+    for (j = 0; j < OUTPUTS && told; j++) {
+        const double *X = away[j] + 1;
+        double off = away[j][0] + dot(X, o->theta[j], THETA), stirred = 0.0, PX[THETA] = {0}, left;
+        for (i = 0; i < THETA; i++)
+            stirred += X[i] * watch_prior[i] * (X[i] * watch_prior[i]);
+        add_product(PX, o->P[j][0], X, THETA, THETA);
+        left = sqrt(UNEXPLAINED_BY_THETA * UNEXPLAINED_BY_THETA * stirred + dot(X, PX, THETA));
+        if (fabs(off) > supervisor_heat[j] + LEFT_OPEN * left) {
+            say(k, SENSOR_OFFSET, j, off / NOISE_FORGETS, -1);
+            o->x[at + j] -= off;
+        }
+    }
+    for (j = 0; j < OUTPUTS; j++)
+        for (i = 0; i <= THETA; i++)
+            k->drift[j][i] += SLOWLY * away[j][i];
+}
+
 /* In manual the drift follows fast, and nothing is learned of the plant */
 static void hurry(innovation_memory *o, const double *e)
 {
@@ -649,13 +686,17 @@ static void follow(supervisor_kept *k, innovation_memory *o, const double *y, co
     memcpy(k->e, now.e, sizeof now.e);
     for (j = 0; j < OUTPUTS; j++)
         filled[j] = k->trusted[j] > 0 ? y[j] : now.expected[j];
-    if (samples == 0)
+    if (samples == 0) {
         rest_observer(o);
-    else
+        remember_drift(k, o);
+    } else {
         raise_alarm(k, o, now.highest);
+        tell_heat(k, o);
+    }
     if (forget(k)) {
         start_observer(o, filled);
         memset(k->e, 0, sizeof k->e);
+        memset(k->drift, 0, sizeof k->drift);
     }
     k->samples++;
 }

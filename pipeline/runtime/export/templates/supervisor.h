@@ -27,6 +27,7 @@ typedef struct {
     int other[KINDS][SIGNALS], repeats[OUTPUTS];
     double y[OUTPUTS], quantum[OUTPUTS], square[OUTPUTS], lag[OUTPUTS], z[OUTPUTS], trusted[OUTPUTS];
     double absurd[OUTPUTS], expected[OUTPUTS], e[OUTPUTS], error[OUTPUTS], goal[OUTPUTS], waited[OUTPUTS];
+    double drift[OUTPUTS][1 + THETA];
     double held[INPUTS], asked[INPUTS], lacks[INPUTS], stuck[INPUTS], clock_s[2];
     int samples, alarmed, mode, clocked, active; /* active: causes that are there */
 } supervisor_kept;
