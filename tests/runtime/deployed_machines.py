@@ -1,5 +1,4 @@
-"""Controllers of small machines, and of the study's, as they leave the house, for tests of what is written and
-read."""
+"""Controllers of small machines, and of the study's, as they leave the house, for tests of files."""
 
 from functools import cache
 

@@ -223,9 +223,9 @@ class Determined(NamedTuple):
 def determined(exported: Exported, make: Any, script: Script, *, replays: int = 3) -> Determined:
     """Plays an episode, and `replays` times more with readings that differ by UNSURE up or down.
 
-    Where inputs that hardly move an output stand near a limit, `tracking.feasible_target` leaves to the last
-    bit which of equally good inputs it takes. There the object disagrees with itself, and nobody can agree
-    with it: not on another CPU, and not in C.
+    Where a law swings between its governor and its limits, the loop itself may magnify rounding, twofold a
+    sample. There the object disagrees with itself, and nobody can agree with it: not on another CPU, and not
+    in C.
     """
     at, rng = start(exported), np.random.default_rng(0)
     span = np.array([signal.high - signal.low for signal in exported.machine.inputs])
@@ -245,7 +245,7 @@ OWN_GAINS = 1e-6
 def golden(
     exported: Exported, *, episodes: int = 5, steps: int = 120, seed: int = 1, replays: int = 3
 ) -> str:
-    """golden.csv of a controller: what its object does in `episodes` that rounding does not decide, as
+    """golden.csv of a controller: what its object does in `episodes` that do not magnify rounding, as
     `replays` of each show."""
     from pipeline.runtime.supervisor import Supervised
 
