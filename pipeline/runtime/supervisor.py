@@ -562,6 +562,7 @@ def followed(
     if first:
         innovations.started(watch, memory, np.where(np.isfinite(y), y, y_star))
         memory.u[:] = u
+        k.drift[:] = 0.0
     else:
         for step in range(samples):
             e = k.e if step == 0 else 0.0 * k.e

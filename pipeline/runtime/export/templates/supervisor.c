@@ -666,6 +666,7 @@ static void follow(supervisor_kept *k, innovation_memory *o, const double *y, co
         start_observer(o, start);
         memcpy(o->u[0], u, sizeof u);
         memcpy(o->u[1], u, sizeof u);
+        memset(k->drift, 0, sizeof k->drift);
     } else
         for (step = 0; step < (samples > 0 ? samples : 1); step++) {
             advance(o, u, step == 0 ? k->e : none, moved);
