@@ -200,9 +200,7 @@ def study() -> dict[str, Any]:
     watch, rng = support.watched_by(within.spread, within.steps), np.random.default_rng(SEED)
     played = honest_logs(made, drawn_anew()[0])
     some, m, p = played[::2], made.controller.limits.low.size, made.model.p
-    kinds = {
-        name: [change(one.log) for one in some] for name, change in wired_wrong(m, p).items()
-    }
+    kinds = {name: [change(one.log) for one in some] for name, change in wired_wrong(m, p).items()}
     kinds |= {
         "other set points, 40 degC hotter": [other_set_points(one, 40.0) for one in some],
         "twice as slow": [slower(one, 2.0, rng) for one in some],
@@ -240,29 +238,26 @@ INPUTS = (("steps", 0.95), ("staircase", 0.8), ("walk", 0.75))
 ROOMS_DEGC = (-2.0, 0.0, 2.0)  # a bench kit's record spans 20 degC
 
 
-def logged(machine: SmallMachine, seed: int) -> Log:
-    u, y = small_machines.record(machine, seed)
-    return Log(u, y, y)
-
-
-def fresh(machine: SmallMachine, seed: int) -> Log:
-    """Another log of the same owner: other inputs, another season."""
+def fresh(machine: SmallMachine, seed: int, within: tuple[np.ndarray, np.ndarray]) -> Log:
+    """Another log of the same owner: other inputs (T, m) `within` those of the record, another season."""
     record, share = INPUTS[seed % 3]
-    return logged(
-        machine._replace(
-            record=record,
-            centre=tuple(share * level for level in machine.centre),
-            room_degC=machine.room_degC + ROOMS_DEGC[seed // 3 % 3],
-        ),
-        seed,
+    machine = machine._replace(
+        record=record,
+        centre=tuple(share * level for level in machine.centre),
+        room_degC=machine.room_degC + ROOMS_DEGC[seed // 3 % 3],
     )
+    rng = np.random.default_rng(seed)
+    u = np.clip(small_machines.inputs(machine, rng), *within)
+    state, y = small_machines.at_rest(machine, np.zeros(machine.m)), np.empty((len(u), machine.p))
+    for t, applied in enumerate(u):
+        y[t] = small_machines.measured(machine, state, rng)
+        state = small_machines.advanced(machine, state, applied)
+    return Log(u, y, y)
 
 
 def changed(machine: SmallMachine) -> dict[str, SmallMachine]:
     """The same machine with other parts."""
-    scaled = {
-        name: tuple(2.0 * value for value in getattr(machine, name)) for name in ("capacity", "loss")
-    }
+    scaled = {name: tuple(2.0 * value for value in getattr(machine, name)) for name in ("capacity", "loss")}
     power = np.asarray(machine.power)
     return {
         "twice the mass": machine._replace(capacity=scaled["capacity"]),
@@ -284,17 +279,20 @@ def of_record(recording: Recording) -> support.Support:
     return support.support(plants, [], np.full(recording.y.shape[1], 0.1), [log])
 
 
-def of_small(machine: SmallMachine, records: dict[str, Recording], real: dict[str, Log]) -> dict[str, Counted]:
-    within = of_record(records[machine.name])
+def of_small(
+    machine: SmallMachine, records: dict[str, Recording], real: dict[str, Log]
+) -> dict[str, Counted]:
+    recording = records[machine.name]
+    within, span = of_record(recording), (recording.u.min(axis=0), recording.u.max(axis=0))
     watch = support.watched_by(within.spread, within.steps)
-    logs = [fresh(machine, seed) for seed in SEEDS]
+    logs = [fresh(machine, seed, span) for seed in SEEDS]
     table = {"own": counted(within, watch, logs)}
     for name, other in changed(machine).items():
-        table[name] = counted(within, watch, [fresh(other, seed) for seed in SEEDS])
+        table[name] = counted(within, watch, [fresh(other, seed, span) for seed in SEEDS])
     for name, change in wired_wrong(machine.m, machine.p).items():
         table[name] = counted(within, watch, [change(log) for log in logs])
     others = [
-        fresh(other, seed)
+        fresh(other, seed, span)
         for other in MACHINES
         if other.name != machine.name and (other.m, other.p) == (machine.m, machine.p)
         for seed in (SEEDS[0], SEEDS[1])
@@ -311,7 +309,11 @@ def small() -> dict[str, dict[str, Counted]]:
     tables = {}
     for machine in MACHINES:
         tables[machine.name] = of_small(machine, records, real)
-        print(machine.name, {name: round(row.abstains, 2) for name, row in tables[machine.name].items()}, flush=True)
+        print(
+            machine.name,
+            {name: round(row.abstains, 2) for name, row in tables[machine.name].items()},
+            flush=True,
+        )
     return tables
 
 

@@ -34,7 +34,7 @@ NEARLY_ALL = 0.99  # of the forecasts on honest plants are no further off
 HONEST = 0.96  # of honest logs keep every limit
 LEAST_SHARE = 0.05  # of a log, beyond whose ranges it is off
 LEAST_FIGURES = (0.05, 1.0, 1.0)  # below which no log is off, whatever the honest ones were
-FEW, FEW_LOGS = 1.25, 30
+FEW, FEW_LOGS = 1.5, 30
 STILL = 0.3  # of `rest`, by which the plants' forecasts differ where next to nothing moves
 TAU, DRIFT, LEAK, UNHURRIED = 0.2, 0.06, 1e-4, 16  # of the observers, as of the governor's
 AT_ONCE = 4  # forecasts begin so often within the steps that one goes
@@ -214,9 +214,11 @@ def support(
 
 
 def _pieces(log: Log, steps: int) -> list[Log]:
-    """A recording in up to PIECES parts, each long enough to be judged by itself."""
+    """A recording whole, and in up to PIECES parts, each long enough to be judged by itself: what a mixture
+    may be, and leave, differs with the length."""
     count = min(max(len(log.u) // (5 * steps), 1), PIECES)
-    return [Log(*part) for part in zip(*(np.array_split(one, count) for one in log), strict=True)]
+    parts = [Log(*part) for part in zip(*(np.array_split(one, count) for one in log), strict=True)]
+    return [log, *parts] if count > 1 else parts
 
 
 PIECES = 8
