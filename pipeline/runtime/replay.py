@@ -9,6 +9,7 @@ All that is linear runs through a recording in chunks side by side; what is not 
 chain of a few numbers, or forgets, and starts each chunk early enough.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -19,46 +20,50 @@ from pipeline.temperature.plant import Plant
 
 # ---- in chunks
 
-CHUNK = 500  # samples that are walked one by one, for all chunks of a block at once
+CHUNK = 500  # samples at most that are walked one by one, for all chunks of a block at once
 BLOCK = 1 << 17  # samples whose memories are held at once
 MOST_REFERENCES = 500  # each is aimed at by a quadratic programme
 
 
 def scanned(A: np.ndarray, drive: np.ndarray, first: np.ndarray, shift: int = 0) -> np.ndarray:
-    """z (T + 1, q) with z(0) = first (q,) and z(t+1) = A z(t) + drive(t), drive (T, q).
+    """z (..., T + 1, q) with z(0) = first (..., q) and z(t+1) = A z(t) + drive(t), A (..., q, q), drive
+    (..., T, q).
 
     Every chunk goes from zero; then the chunks' ends are joined one after the other; then every chunk goes
     from where it starts. `shift`: A moves z on by so many entries."""
-    T, q = drive.shape
-    chunks = -(-T // CHUNK)
-    padded = np.zeros((chunks * CHUNK, q))
-    padded[:T] = drive
-    by_chunk = padded.reshape(chunks, CHUNK, q)
-    ends = _walked(A, by_chunk, np.zeros((chunks, q)), shift, keep=False)[:, 0]
-    far, starts = np.linalg.matrix_power(A, CHUNK), np.empty((chunks, q))
+    *sides, T, q = drive.shape
+    length = min(max(math.isqrt(T), 1), CHUNK)
+    chunks = -(-T // length)
+    padded = np.zeros((*sides, chunks * length, q))
+    padded[..., :T, :] = drive
+    by_chunk = padded.reshape(*sides, chunks, length, q)
+    still = np.zeros((*sides, chunks, q))
+    ends = _walked(A, by_chunk, still, shift, keep=False)[..., 0, :]
+    far, starts = np.linalg.matrix_power(A, length), np.empty((*sides, chunks, q))
     at = first
     for chunk in range(chunks):
-        starts[chunk] = at
-        at = far @ at + ends[chunk]
-    walked = _walked(A, by_chunk, starts, shift, keep=True).reshape(chunks * CHUNK, q)
-    return np.concatenate([first[None], walked[:T]])
+        starts[..., chunk, :] = at
+        at = np.matmul(far, at[..., None])[..., 0] + ends[..., chunk, :]
+    walked = _walked(A, by_chunk, starts, shift, keep=True).reshape(*sides, chunks * length, q)
+    return np.concatenate([first[..., None, :], walked[..., :T, :]], axis=-2)
 
 
 def _walked(A: np.ndarray, drive: np.ndarray, z: np.ndarray, shift: int, *, keep: bool) -> np.ndarray:
-    """z after each sample (s, c, q) of chunks with drive (s, c, q), from z (s, q); the last alone unless
-    `keep`."""
-    walked = np.empty((len(drive), drive.shape[1] if keep else 1, drive.shape[2]))
-    for t in range(drive.shape[1]):
-        after = drive[:, t].copy()
+    """z after each sample (..., s, c, q) of chunks with drive (..., s, c, q), from z (..., s, q); the last
+    alone unless `keep`."""
+    *sides, length, q = drive.shape
+    walked = np.empty((*sides, length if keep else 1, q))
+    for t in range(length):
+        after = drive[..., t, :].copy()
         if shift:
-            after[:, :-shift] += z[:, shift:]
+            after[..., :-shift] += z[..., shift:]
         else:
-            after += z @ A.T
+            after += np.matmul(z, A.swapaxes(-1, -2))
         z = after
         if keep:
-            walked[:, t] = z
+            walked[..., t, :] = z
     if not keep:
-        walked[:, 0] = z
+        walked[..., 0, :] = z
     return walked
 
 
@@ -195,15 +200,37 @@ def _integral(
     return xi
 
 
-def _chain(pull: np.ndarray, error: np.ndarray, share: float, most: float, at: float) -> list[float]:
-    """xi (T,) of one output whose integrator nothing couples to another's."""
-    states = []
-    for away, off in zip(pull.tolist(), error.tolist(), strict=True):
-        states.append(at)
-        shift = away - at
-        beyond = shift - most if shift > most else shift + most if shift < -most else 0.0
-        at += share * (off + (most if beyond > most else -most if beyond < -most else beyond))
+def _chain(pull: np.ndarray, error: np.ndarray, share: float, most: float, at: float) -> np.ndarray:
+    """xi (T,) of one output whose integrator nothing couples to another's.
+
+    Where no command is cut by more than `most`, xi is the sum of errors: it is taken for a stretch at once up
+    to the first sample at which one is, and from there sample by sample."""
+    states, T, t, stretch = np.empty(len(pull)), len(pull), 0, BY_HAND
+    summed = np.empty(MOST_AT_ONCE + 1)
+    while t < T:
+        ahead = summed[: min(stretch, T - t) + 1]
+        ahead[0], ahead[1:] = at, share * error[t : t + len(ahead) - 1]
+        np.cumsum(ahead, out=ahead)
+        free = np.abs(pull[t : t + len(ahead) - 1] - ahead[:-1]) <= most
+        whole = len(free) if free.all() else int(free.argmin())
+        states[t : t + whole], at = ahead[:whole], float(ahead[whole])
+        t += whole
+        if whole == len(free):
+            stretch = min(2 * stretch, MOST_AT_ONCE)
+            continue
+        stretch, rows = BY_HAND, slice(t, t + BY_HAND)
+        walked = []
+        for away, off in zip(pull[rows].tolist(), error[rows].tolist(), strict=True):
+            walked.append(at)
+            shift = away - at
+            beyond = shift - most if shift > most else shift + most if shift < -most else 0.0
+            at += share * (off + (most if beyond > most else -most if beyond < -most else beyond))
+        states[rows] = walked
+        t += len(walked)
     return states
+
+
+BY_HAND, MOST_AT_ONCE = 128, 1 << 13
 
 
 def _conditional(

@@ -2,14 +2,20 @@
 commands beyond what was seen, and outputs that no plant of its spread would have had.
 
 Plants of the spread each forecast the outputs a few samples ahead, every one from its own observer and with
-the inputs that were applied. How much they differ among themselves is what the spread leaves open, there and
-then. The machine's miss e (p,) of their mean is held against it,
+the inputs that were applied. f_k (p,) is what plant k of K forecasts more than their mean, e (p,) the
+machine's miss of that mean. Two questions are asked of them.
 
-    d^2 = e' (S + R)^-1 e,   S the forecasts' covariance (p, p), R what the sensors' noise adds,
+Sample by sample: is e larger than the plants differ? d^2 = e' (S + R)^-1 e, S the covariance (p, p) of the
+f_k, R what the sensors' noise adds. A forecast is off where d is larger than nearly always on the
+controller's own plants.
 
-and a forecast is off where d is larger than nearly always on the controller's own plants. A log is off
-support where more of its forecasts are off than of an honest log, or its signals leave their ranges.
-"""
+Of the log as a whole: the machine is one plant all along. Were it of the spread, one mixture c (K,) would
+explain all its misses, e = sum_k c_k f_k + rest, c ~ N(0, I / (K - 1)), the rest as large as on honest logs.
+The most likely c is a ridge regression. `misfit` is the mean square of what it leaves, `departure` the mean
+square of c, in units of the spread. Swapped sensors misfit; a gain far from the spread departs.
+
+A steady disagreement is taken for weather (another ambient, more heat lost) by every observer. So a log in
+which nothing moves tells nothing of which sensor is which, or of what a heater's percent is worth."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -25,8 +31,11 @@ from pipeline.temperature.tracking import reached_state, riccati
 TEMPERATURE, COMMAND, FORECAST = 1, 2, 4
 BEYOND = 0.1  # of a range: signals may leave it by so much
 NEARLY_ALL = 0.99  # of the forecasts on honest plants are no further off
-HONEST = 0.95  # of honest logs have no larger share of forecasts that are off
-LEAST_SHARE = 0.05  # and a log is never off for fewer
+HONEST = 0.96  # of honest logs keep every limit
+LEAST_SHARE = 0.05  # of a log, beyond whose ranges it is off
+LEAST_FIGURES = (0.05, 1.0, 1.0)  # below which no log is off, whatever the honest ones were
+FEW, FEW_LOGS = 1.5, 30
+STILL = 0.3  # of `rest`, by which the plants' forecasts differ where next to nothing moves
 TAU, DRIFT, LEAK, UNHURRIED = 0.2, 0.06, 1e-4, 16  # of the observers, as of the governor's
 AT_ONCE = 4  # forecasts begin so often within the steps that one goes
 MOST_SAMPLES = 60_000  # of a long log forecasts are judged in stretches, so many samples in all
@@ -35,8 +44,8 @@ STRETCH = 2_000
 
 class Support(NamedTuple):
     """low, high (p,) in °C of temperatures and (m,) in percent of commands; `spread` are the plants that
-    forecast, `steps` samples ahead, with sensors' noise (p,) in °C; `furthest` d is allowed, and `allowed`
-    the share of forecasts that may be further off in an honest log."""
+    forecast, `steps` samples ahead, with sensors' noise (p,) in °C; `furthest` d is allowed; `rest` (p,) in
+    °C what honest logs leave unexplained; `allowed` (3,) the limits of a log's `figures`."""
 
     temperature_low: np.ndarray
     temperature_high: np.ndarray
@@ -46,43 +55,78 @@ class Support(NamedTuple):
     noise: np.ndarray
     steps: int
     furthest: float
-    allowed: float
+    rest: np.ndarray
+    allowed: np.ndarray
 
 
 class Forecasts(NamedTuple):
-    """Forecasts of a log: the sample at which each begins (a,), and how far off it is, d (a,)."""
+    """Forecasts of a log: the sample at which each begins (a,), what each plant forecasts more than their
+    mean (K, a, p), and the machine's miss of the mean (a, p), in °C."""
 
     start: np.ndarray
-    d: np.ndarray
+    apart: np.ndarray
+    miss: np.ndarray
 
 
 def horizon(spread: Sequence[Plant]) -> int:
-    """Samples after which an input has shown what it does: the furthest instant of the governor."""
-    return int(instants(spread)[-1])
+    """Samples after which an input has shown what it does: the furthest instant of the governor, of the
+    middle one of the plants. Further ahead weather and doubt about the plants cover what is wrong."""
+    return int(np.median([instants([one])[-1] for one in spread]))
 
 
-def forecasts(watches: Sequence["Watch"], log: Log, noise: np.ndarray, steps: int) -> Forecasts:
+def forecasts(watch: "Watch", log: Log, steps: int) -> Forecasts:
     """Forecasts over `steps` samples, AT_ONCE of them under way at a time; none in the first 2 `steps`, while
     the observers find the machine."""
     start = np.arange(2 * steps, len(log.u) - steps, max(steps // AT_ONCE, 1))
-    if not len(start):
-        return Forecasts(start, np.zeros(0))
-    told = np.stack([_told(one, log, start, steps) for one in watches])
+    told = _told(watch, log, start, steps)
     mean = told.mean(axis=0)
-    apart = told - mean
-    S = np.einsum("kai,kaj->aij", apart, apart) / (len(watches) - 1)
-    e = log.y[start + steps] - mean
+    return Forecasts(start, told - mean, log.y[start + steps] - mean)
+
+
+def distances(run: Forecasts, noise: np.ndarray) -> np.ndarray:
+    """d (a,) of every forecast, with sensors' noise (p,)."""
+    S = np.einsum("kai,kaj->aij", run.apart, run.apart) / (len(run.apart) - 1)
     near = S + np.diag((NOISES * noise) ** 2)
-    return Forecasts(start, np.sqrt(np.einsum("ai,ai->a", e, np.linalg.solve(near, e[..., None])[..., 0])))
+    whitened = np.linalg.solve(near, run.miss[..., None])[..., 0]
+    return np.sqrt(np.einsum("ai,ai->a", run.miss, whitened))
 
 
 NOISES = 2.0  # deviations: of the sample that is forecast, and of those from which
 
 
+class Explained(NamedTuple):
+    """The mixture c (K,) of the plants that explains a log best, and what it leaves (a, p) in °C."""
+
+    c: np.ndarray
+    left: np.ndarray
+
+
+def explained(run: Forecasts, rest: np.ndarray) -> Explained:
+    """c = (F'F + (K - 1) I)^-1 F'e of all forecasts, each output in units of `rest` (p,)."""
+    K = len(run.apart)
+    F = (run.apart / rest).reshape(K, -1)
+    c = np.linalg.solve(F @ F.T + (K - 1) * np.eye(K), F @ (run.miss / rest).ravel())
+    return Explained(c, run.miss - np.tensordot(c, run.apart, axes=1))
+
+
+def figures(run: Forecasts, noise: np.ndarray, furthest: float, rest: np.ndarray) -> np.ndarray:
+    """Of a log: the share of forecasts further off than `furthest`, its misfit, and its departure."""
+    if not len(run.start):
+        return np.zeros(3)
+    fitted = explained(run, rest)
+    return np.array(
+        [
+            (distances(run, noise) > furthest).mean(),
+            ((fitted.left / rest) ** 2).mean(),
+            (len(fitted.c) - 1) * (fitted.c**2).mean(),
+        ]
+    )
+
+
 class Watch(NamedTuple):
-    """An observer L of the state [x; w] of one plant: w (p,) in °C a step is a drift that the plant does not
-    explain, so that a steady disagreement (another ambient, more heat lost) vanishes from its forecasts, as
-    in temperature.governor. `first` (n, p) finds x of the first outputs."""
+    """Observers L of the states [x; w] of K plants, one behind the other: w (p,) in °C a step is a drift that
+    the plant does not explain, so that a steady disagreement (another ambient, more heat lost) vanishes from
+    its forecasts, as in temperature.governor. `first` (K, n, p) finds x of the first outputs."""
 
     A: np.ndarray
     B: np.ndarray
@@ -93,7 +137,12 @@ class Watch(NamedTuple):
     first: np.ndarray
 
 
-def watched_by(plant: Plant, steps: int) -> Watch:
+def watched_by(spread: Sequence[Plant], steps: int) -> Watch:
+    """The observers of plants of one order: the same for every log."""
+    return Watch(*(np.stack(part) for part in zip(*(_watch(one, steps) for one in spread), strict=True)))
+
+
+def _watch(plant: Plant, steps: int) -> tuple[np.ndarray, ...]:
     """Process noise comes in by the inputs, sensors are TAU percent^2 of every input noisier, and the drift
     wanders a step by DRIFT of what a percent of every input does at most."""
     n, p, slower = plant.n, plant.p, max(steps / UNHURRIED, 1.0)
@@ -106,39 +155,53 @@ def watched_by(plant: Plant, steps: int) -> Watch:
     P = riccati(A.T, C.T, noise, sensors)
     L = A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
     none = np.zeros((p, plant.m))
-    return Watch(A, np.vstack([plant.B, none]), C, np.r_[plant.b, np.zeros(p)], plant.d, L, likely)
+    return A, np.vstack([plant.B, none]), C, np.r_[plant.b, np.zeros(p)], plant.d, L, likely
 
 
 def _told(watch: Watch, log: Log, start: np.ndarray, steps: int) -> np.ndarray:
-    """Outputs (a, p) that a plant forecasts `steps` samples after each start (a,)."""
-    moved, states = watch.A - watch.L @ watch.C, np.empty((len(start), len(watch.A)))
-    x = np.r_[watch.first @ (log.y[0] - watch.d), np.zeros(len(watch.C))]
-    for first in range(0, len(log.u), BLOCK):
-        rows = slice(first, first + BLOCK)
-        inside = np.flatnonzero((start >= first) & (start < first + BLOCK))
-        drive = log.u[rows] @ watch.B.T + (log.y[rows] - watch.d) @ watch.L.T + watch.b
+    """Outputs (K, a, p) that the plants forecast `steps` samples after each start (a,)."""
+    K, p = watch.d.shape
+    away = (log.y[0] - watch.d)[..., None]
+    x = np.concatenate([np.matmul(watch.first, away)[..., 0], np.zeros((K, p))], axis=1)
+    moved, states = watch.A - watch.L @ watch.C, np.empty((K, len(start), x.shape[1]))
+    B, b, L = watch.B.swapaxes(1, 2), watch.b[:, None], watch.L.swapaxes(1, 2)
+    for first in range(0, len(log.u), BLOCK // K):
+        rows = slice(first, first + BLOCK // K)
+        inside = np.flatnonzero((start >= rows.start) & (start < rows.stop))
+        drive = np.matmul(log.u[rows], B) + np.matmul(log.y[rows] - watch.d[:, None], L) + b
         walked = scanned(moved, drive, x)
-        states[inside], x = walked[start[inside] - first], walked[-1]
+        states[:, inside], x = walked[:, start[inside] - first], walked[:, -1]
     for step in range(steps):
-        states = states @ watch.A.T + log.u[start + step] @ watch.B.T + watch.b
-    return states @ watch.C.T + watch.d
+        states = np.matmul(states, watch.A.swapaxes(1, 2)) + np.matmul(log.u[start + step], B) + b
+    return np.matmul(states, watch.C.swapaxes(1, 2)) + watch.d[:, None]
 
 
 def support(
     spread: Sequence[Plant], honest: Sequence[Log], noise_degC: np.ndarray, seen: Sequence[Log] = ()
 ) -> Support:
-    """Of logs of the controller's own plants, whose sensors have noise (p,); the ranges are those of the logs
-    that were `seen`, too. Raises ValueError where no log is long enough."""
+    """Of logs of the controller's own plants, whose sensors have noise (p,), and of recordings of the machine
+    that were `seen`: these are on support whatever the plants say. Raises ValueError where no log is long
+    enough."""
     steps = horizon(spread)
-    watches = [watched_by(one, steps) for one in spread]
-    runs = [forecasts(watches, log, noise_degC, steps) for log in honest if len(log.u) > 4 * steps]
-    if not runs:
+    watch, noise = watched_by(spread, steps), np.asarray(noise_degC, float)
+    groups = [
+        [forecasts(watch, log, steps) for log in logs if len(log.u) > 4 * steps]
+        for logs in (honest, [piece for log in seen for piece in _pieces(log, steps)])
+    ]
+    groups = [runs for runs in groups if runs]
+    if not groups:
         raise ValueError(
             f"support: expected a log of more than {4 * steps} samples to tell what an honest one is, found "
             "none; record longer"
         )
-    furthest = float(np.quantile(np.concatenate([run.d for run in runs]), NEARLY_ALL))
-    shares = [float((run.d > furthest).mean()) for run in runs]
+    furthest = max(
+        float(np.quantile(np.concatenate([distances(run, noise) for run in runs]), NEARLY_ALL))
+        for runs in groups
+    )
+    rest = np.max([_rest(runs, NOISES * noise) for runs in groups], axis=0)
+    limits = [
+        _seldom_above(np.array([figures(run, noise, furthest, rest) for run in runs])) for runs in groups
+    ]
     ranges = []
     for parts in ([log.y for log in (*honest, *seen)], [log.u for log in (*honest, *seen)]):
         low, high = (
@@ -146,44 +209,76 @@ def support(
             for side in ("min", "max")
         )
         ranges += [low - BEYOND * (high - low), high + BEYOND * (high - low)]
-    allowed = max(float(np.quantile(shares, HONEST)), LEAST_SHARE)
-    return Support(*ranges, tuple(spread), np.asarray(noise_degC, float), steps, furthest, allowed)
+    allowed = np.max([LEAST_FIGURES, *limits], axis=0)
+    return Support(*ranges, tuple(spread), noise, steps, furthest, rest, allowed)
+
+
+def _pieces(log: Log, steps: int) -> list[Log]:
+    """A recording whole, and in up to PIECES parts, each long enough to be judged by itself: what a mixture
+    may be, and leave, differs with the length."""
+    count = min(max(len(log.u) // (5 * steps), 1), PIECES)
+    parts = [Log(*part) for part in zip(*(np.array_split(one, count) for one in log), strict=True)]
+    return [log, *parts] if count > 1 else parts
+
+
+PIECES = 8
+
+
+def _rest(runs: Sequence[Forecasts], rest: np.ndarray) -> np.ndarray:
+    """Deviation (p,) in °C of what mixtures leave of honest logs; at least a hundredth of where it began."""
+    least = 0.01 * rest + 1e-9
+    for _ in range(3):
+        left = [(explained(run, np.maximum(rest, least)).left ** 2).mean(axis=0) for run in runs]
+        rest = np.sqrt(np.mean(left, axis=0))
+    return np.maximum(rest, least)
+
+
+def _seldom_above(found: np.ndarray) -> np.ndarray:
+    """Limits (k,), all at one quantile, of which few new logs pass any: of many honest ones' figures (n, k)
+    those that a share HONEST of them keep; of few, the largest and more."""
+    n = len(found)
+    if n < FEW_LOGS:
+        return FEW * found.max(axis=0)
+    ranked = np.sort(found, axis=0)
+    kept = [(found <= limits).all(axis=1).mean() >= HONEST for limits in ranked]
+    return ranked[int(np.argmax(kept))]
 
 
 class Told(NamedTuple):
-    """What is said of a log: by sample (T,) the sum of TEMPERATURE, COMMAND and FORECAST, and the share of
-    forecasts that are off; `abstains`: a replay of it says nothing of this controller."""
+    """What is said of a log: by sample (T,) the sum of TEMPERATURE, COMMAND and FORECAST; its `figures` over
+    what they may be (3,), above 1 off support; the share of samples outside the ranges; `abstains`: a replay
+    of it says nothing of this controller; `still`: so little moves that it cannot be told whether signals
+    are wired or scaled as they were."""
 
     off: np.ndarray
-    forecasts_off: float
+    figures: np.ndarray
+    outside: float
     abstains: bool
+    still: bool
 
 
-def watches_of(within: Support) -> list[Watch]:
-    """The observers of the plants that forecast: the same for every log."""
-    return [watched_by(one, within.steps) for one in within.spread]
-
-
-def told(within: Support, log: Log, watches: Sequence[Watch]) -> Told:
-    """Where a log is off support, by `watches_of` it. One too short for a forecast is judged by its ranges
-    alone."""
+def told(within: Support, log: Log, watch: Watch) -> Told:
+    """Where a log is off support, by `watched_by` of its plants. One too short for a forecast is judged by
+    its ranges alone."""
     off = np.zeros(len(log.u), np.int8)
     for low, high, values, kind in (
         (within.temperature_low, within.temperature_high, log.y, TEMPERATURE),
         (within.command_low, within.command_high, log.u, COMMAND),
     ):
         off[((values < low) | (values > high)).any(axis=1)] |= kind
-    count, every = 0, max(within.steps // AT_ONCE, 1)
-    missed = 0
+    every, runs = max(within.steps // AT_ONCE, 1), []
     for first, part in _stretches(log):
-        run = forecasts(watches, part, within.noise, within.steps)
-        count += len(run.d)
-        for start in first + run.start[run.d > within.furthest]:
-            missed += 1
+        runs.append(forecasts(watch, part, within.steps))
+        far = distances(runs[-1], within.noise) > within.furthest
+        for start in first + runs[-1].start[far]:
             off[start + within.steps - every : start + within.steps] |= FORECAST
+    joined = Forecasts(
+        *(np.concatenate(part, axis=-2 if part[0].ndim > 1 else 0) for part in zip(*runs, strict=True))
+    )
+    over = figures(joined, within.noise, within.furthest, within.rest) / within.allowed
     outside = float((off & (TEMPERATURE | COMMAND) != 0).mean()) if len(off) else 0.0
-    share = missed / count if count else 0.0
-    return Told(off, share, share > within.allowed or outside > LEAST_SHARE)
+    moves = np.sqrt(np.mean((joined.apart / within.rest) ** 2)) if len(joined.start) else 0.0
+    return Told(off, over, outside, bool((over > 1).any()) or outside > LEAST_SHARE, bool(moves < STILL))
 
 
 def _stretches(log: Log) -> list[tuple[int, Log]]:

@@ -370,6 +370,7 @@ def test_printer_cfg_names_the_options_of_their_documentation():
     options = re.findall(r"^(?:# )?([a-z]\w+): ", text, re.M)
     assert options == [
         "control", "pid_Kp", "pid_Ki", "pid_Kd", "max_power", "min_temp", "max_temp",
+        "heater", "plant", "rehearsal",
         "control", "heater_power", "block_heat_capacity", "ambient_transfer", "sensor_responsiveness",
     ]  # fmt: skip
     assert "block_heat_capacity: 20  # J/K" in text and "ambient_transfer: 0.15  # W/K" in text

@@ -135,7 +135,7 @@ def within() -> support.Support:
 
 
 def told(of: Log) -> support.Told:
-    return support.told(within(), of, support.watches_of(within()))
+    return support.told(within(), of, support.watched_by(within().spread, within().steps))
 
 
 def test_a_log_of_the_machine_is_on_support_and_one_wired_wrong_is_not():

@@ -16,16 +16,19 @@ block_heat_capacity is C in J/K, ambient_transfer h in W/K, sensor_responsivenes
 the model's step response and from the heater's power, which only the owner knows.
 """
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import scipy.optimize
 
 from pipeline.runtime.certificate import Certificate, sha256
+from pipeline.runtime.export import python
 from pipeline.runtime.machine import Exported, check, check_certificate
 from pipeline.temperature import baseline
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
 
+MODULE = Path(__file__).parent / "templates" / "beadline.py"  # for klippy/extras/
 SECTIONS = ("extruder", "heater_bed")
 PID_PARAM_BASE = 255.0
 HORIZON_S, LONGEST = 600.0, 2000  # of the step response that is fitted, in s and in samples at most
@@ -82,9 +85,32 @@ def settings(
     for option, value in (("min_temp", sensor.low), ("max_temp", sensor.high)):
         if np.isfinite(value):
             lines.append(f"{option}: {value:g}  # degC, declared for {sensor.name}")
+    lines += _module_lines(exported, section)
     if heater_power_W is not None:
         lines += _mpc_lines(mpc(exported.model, heater_power_W), heater_power_W, section)
     return "\n".join(lines) + "\n"
+
+
+def module(exported: Exported, certificate: Certificate) -> dict[str, str]:
+    """The two files for klippy/extras/ by which the controller itself runs the heater. Raises ValueError as
+    `settings` does."""
+    one_heater(exported)
+    return {
+        MODULE.name: MODULE.read_text(encoding="utf-8"),
+        "beadline_controller.py": python.text(exported, certificate),
+    }
+
+
+def _module_lines(exported: Exported, section: str) -> list[str]:
+    return [
+        "",
+        f"# The controller itself in place of this PID, which goes on where it fails: copy {MODULE.name} and",
+        "# beadline_controller.py to klippy/extras/, and remove the # before these lines:",
+        "# [beadline]",
+        f"# heater: {section}",
+        f"# plant: {exported.plant_sha256}",
+        *(["# rehearsal: True  # the plant was simulated: never on a printer"] if exported.simulated else []),
+    ]
 
 
 def one_heater(exported: Exported) -> None:

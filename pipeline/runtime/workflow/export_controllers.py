@@ -183,15 +183,15 @@ def learning(name: str, judged: Judged) -> bands.Learning | None:
 
 def supported(made: Exported, judged: Judged, declared: Panel, seed: int, path: str) -> support.Support:
     """What a replay holds a recording against: plants drawn anew from the spread forecast; honest logs are
-    those of the training half under this controller."""
-    learned, half = judged.learned, judged.setting.rehearsal.training
+    those of the judging half under this controller."""
+    learned, half = judged.learned, judged.setting.rehearsal.judging
     around, rng = [learned.model, *learned.spread], np.random.default_rng(seed)
     spread = cases.spread_of(declared) if judged.simulated else cases.spread_around(declared, learned.model)
     plants = panel.padded(panel.drawn(around, FORECASTING, spread, cells=False, rng=rng))
     aimed = panel.aims(made.controller.law, panel.rests(made.model, half, judged.setting.limits), half)
     run, noise = panel.rolled_out(made.controller, half, aimed), panel.noise_of(half)[: half.hold]
     honest = []
-    for case in range(len(half.plant)):
+    for case in np.unique(np.linspace(0, len(half.plant) - 1, HONEST_LOGS).astype(int)):
         plant, still = half.plants[half.plant[case]], np.ones((half.hold, 1))
         held = plant.C @ half.x0[case] + plant.d + noise[:, case]
         parts = (still * half.u0[case], run.u[:, case]), (held, run.measured[:, case]), (
@@ -205,7 +205,7 @@ def supported(made: Exported, judged: Judged, declared: Panel, seed: int, path: 
     return support.support(plants, honest, judged.setting.rehearsal.noise, recorded)
 
 
-FORECASTING = 16  # plants
+FORECASTING, HONEST_LOGS = 24, 200  # plants, and logs at most
 
 # ---- what runs is what was judged
 

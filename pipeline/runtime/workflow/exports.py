@@ -20,7 +20,8 @@ def files(made: Exported, shown: Certificate, to: str, section: str, power_W: fl
         return c.files(made, shown, vectors.golden(made))
     if to == "python":
         return {"controller.py": python.text(made, shown)}
-    return {"printer.cfg": klipper.settings(made, shown, section=section, heater_power_W=power_W)}
+    shown_settings = klipper.settings(made, shown, section=section, heater_power_W=power_W)
+    return {"printer.cfg": shown_settings, **klipper.module(made, shown)}
 
 
 def export(folder: Path, to: str, out: Path | None, section: str, power_W: float | None) -> str:

@@ -59,7 +59,7 @@ def write_support(folder: Path, within: support.Support, controller_sha256: str)
     }
     numbers = {k: np.asarray(v, float) for k, v in within._asdict().items() if k != "spread"}
     artifacts.write_weights(
-        folder / SUPPORT, "support 1", plants | numbers, {"controller": controller_sha256}
+        folder / SUPPORT, "support 2", plants | numbers, {"controller": controller_sha256}
     )
 
 
@@ -68,7 +68,7 @@ def read_support(folder: Path, made: Exported) -> support.Support | None:
     controller."""
     if not artifacts.exists(folder / SUPPORT):
         return None
-    arrays, about = artifacts.read_weights(folder / SUPPORT, "support 1")
+    arrays, about = artifacts.read_weights(folder / SUPPORT, "support 2")
     if about.get("controller") != machine.controller_sha256(made):
         raise ValueError(f"{folder / SUPPORT}: it is of another controller than the folder; export it again")
     names = type(made.model)._fields
@@ -85,7 +85,8 @@ def read_support(folder: Path, made: Exported) -> support.Support | None:
         arrays["noise"],
         int(arrays["steps"]),
         float(arrays["furthest"]),
-        float(arrays["allowed"]),
+        arrays["rest"],
+        arrays["allowed"],
     )
 
 
@@ -171,10 +172,10 @@ def replayed(made: Exported, within: support.Support | None, table: Table, r: np
     masked = np.stack([table.masked[one.name] for one in (*wired.inputs, *wired.outputs)], axis=1).any(axis=1)
     u, y, r = (_filled(part) for part in (u, y, r))
     runs, offs, told = [], [], []
-    watches = support.watches_of(within) if within else []
+    watch = support.watched_by(within.spread, within.steps) if within else None
     cuts = np.flatnonzero(np.diff(table.segment)) + 1
     for log in map(Log, np.split(u, cuts), np.split(y, cuts), np.split(r, cuts)):
-        offs.append(_told(within, log, watches))
+        offs.append(_told(within, log, watch))
         if offs[-1].abstains:
             runs.append((replay.Replayed(log.u, log.u, log.u, log.r), np.zeros(log.u.shape, int)))
             continue
@@ -194,10 +195,10 @@ def replayed(made: Exported, within: support.Support | None, table: Table, r: np
     )  # fmt: skip
 
 
-def _told(within: support.Support | None, log: Log, watches: Sequence[support.Watch]) -> support.Told:
-    if within is None:
-        return support.Told(np.zeros(len(log.u), np.int8), 0.0, False)
-    return support.told(within, log, watches)
+def _told(within: support.Support | None, log: Log, watch: support.Watch | None) -> support.Told:
+    if within is None or watch is None:
+        return support.Told(np.zeros(len(log.u), np.int8), np.zeros(3), 0.0, False, False)
+    return support.told(within, log, watch)
 
 
 def _filled(values: np.ndarray) -> np.ndarray:
