@@ -96,13 +96,3 @@ def test_it_says_why_it_abstains(folder, tmp_path):
     recording(tmp_path / "swapped.csv", log._replace(y=log.y[:, ::-1]))
     done, _, told = replayed(folder, tmp_path / "swapped.csv")[0]
     assert done.abstains and any("signals may be swapped" in note for note in told["notes"])
-
-
-def test_of_a_recording_in_which_nothing_moves_it_says_what_cannot_be_told(folder, tmp_path):
-    plant, rng = block_and_sensor(zones=2), np.random.default_rng(1)
-    u = np.full((T, 2), 40.0)
-    rest = plant.C @ np.linalg.solve(np.eye(plant.n) - plant.A, plant.B @ u[0]) + plant.d
-    log = Log(u, rest + 0.1 * rng.standard_normal((T, 2)), u)
-    recording(tmp_path / "still.csv", log)
-    done, _, told = replayed(folder, tmp_path / "still.csv")[0]
-    assert support.STILL_TOLD in told["notes"]
