@@ -2,8 +2,7 @@
 datasets/evaluate_temperature: cases.parquet, trajectories.parquet and summary.json."""
 
 from pipeline.store import artifacts, params
-from pipeline.temperature import plant
-from pipeline.temperature.workflow import cases, evaluate_temperature, learned, tables
+from pipeline.temperature.workflow import evaluate_temperature, learned, tables
 from pipeline.temperature.workflow.settings import (
     EvaluateTemperature,
     Panel,
@@ -34,13 +33,12 @@ def main() -> None:
             machine,
         )
         weights = evaluate_temperature.read_weights("datasets/tune_weights/weights.json", machine)
-        truth = plant.baam()._replace(sample_time_s=machine.sample_time_s) if simulated else None
-        family = [made.model, *made.spread]
-        rehearsal = cases.rehearsed(panel, machine, truth, family, "datasets/ingest/record.parquet")
-        setting = cases.shared(tuning, machine, tracking, panel, rehearsal, family)
-        problem = learned.problem(made, tracking, setting, truth)
-        rules = evaluate_temperature.resolved(params.load(TemperatureRules, "report"), panel, rehearsal)
-        judged = evaluate_temperature.judged(settings, machine, setting, problem, weights, rules, execution)
+        record = "datasets/ingest/record.parquet"
+        posed = learned.posed(made, machine, panel, tracking, tuning, record, simulated=simulated)
+        rules = evaluate_temperature.resolved(params.load(TemperatureRules, "report"), panel, posed.rehearsal)
+        judged = evaluate_temperature.judged(
+            settings, machine, posed.setting, posed.problem, weights, rules, execution
+        )
         artifacts.write_table(out / "cases.parquet", tables.CASES, judged.cases)
         artifacts.write_table(
             out / "trajectories.parquet",

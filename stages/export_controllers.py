@@ -17,8 +17,7 @@ from pipeline.setpoint.workflow.settings import EvaluateSetpoint
 from pipeline.setpoint.workflow.tables import WINDOWS
 from pipeline.setpoint.workflow.windows import window_tables
 from pipeline.store import artifacts, params
-from pipeline.temperature import plant
-from pipeline.temperature.workflow import cases, evaluate_temperature, learned, tables
+from pipeline.temperature.workflow import evaluate_temperature, learned, tables
 from pipeline.temperature.workflow.settings import Panel, Plant, TemperatureRules, Tracking, TuneWeights
 
 # the relearnings of the study's machine: part of the verdict that names the controller
@@ -42,13 +41,10 @@ def main() -> None:
             machine,
         )
         weights = evaluate_temperature.read_weights("datasets/tune_weights/weights.json", machine)
-        truth = plant.baam()._replace(sample_time_s=machine.sample_time_s) if simulated else None
-        family, record = [made.model, *made.spread], "datasets/ingest/record.parquet"
-        rehearsal = cases.rehearsed(panel, machine, truth, family, record)
-        setting = cases.shared(tuning, machine, tracking, panel, rehearsal, family)
-        problem = learned.problem(made, tracking, setting, truth)
+        record = "datasets/ingest/record.parquet"
+        posed = learned.posed(made, machine, panel, tracking, tuning, record, simulated=simulated)
         summary = artifacts.read_json("datasets/evaluate_temperature/summary.json")
-        judged = export.Judged(machine, made, setting, problem, weights, summary, simulated)
+        judged = export.Judged(machine, made, posed.setting, posed.problem, weights, summary, simulated)
         verdict = winner(
             {
                 "identify_plant": artifacts.read_metrics("identify_plant"),
@@ -74,7 +70,7 @@ def main() -> None:
             played = artifacts.read_table("datasets/evaluate_temperature/trajectories.parquet", shown)
             difference = export.replayed(one, judged, played)
             export.check_same(one, difference)
-            resolved = evaluate_temperature.resolved(rules, panel, rehearsal)
+            resolved = evaluate_temperature.resolved(rules, panel, posed.rehearsal)
             certificate = export.certified(one, judged, resolved, settings, record)
             within = export.supported(one, judged, panel, settings.seed, record)
             temperature = export.write_temperature(

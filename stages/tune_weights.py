@@ -3,8 +3,7 @@ wrote; writes datasets/tune_weights/weights.json and history.parquet. No data st
 weights."""
 
 from pipeline.store import artifacts, params
-from pipeline.temperature import plant
-from pipeline.temperature.workflow import cases, learned, tables, tune_weights
+from pipeline.temperature.workflow import learned, tables, tune_weights
 from pipeline.temperature.workflow.settings import Panel, Plant, Tracking, TuneWeights
 
 
@@ -21,12 +20,9 @@ def main() -> None:
             "datasets/ingest/printer_pid.json",
             machine,
         )
-        truth = plant.baam()._replace(sample_time_s=machine.sample_time_s) if simulated else None
-        family = [made.model, *made.spread]
-        rehearsal = cases.rehearsed(panel, machine, truth, family, "datasets/ingest/record.parquet")
-        setting = cases.shared(settings, machine, tracking, panel, rehearsal, family)
-        problem = learned.problem(made, tracking, setting, truth)
-        tuned = tune_weights.tuned(settings, problem, setting, execution)
+        record = "datasets/ingest/record.parquet"
+        posed = learned.posed(made, machine, panel, tracking, settings, record, simulated=simulated)
+        tuned = tune_weights.tuned(settings, posed.problem, posed.setting, execution)
         artifacts.write_json(out / "weights.json", tuned.weights)
         artifacts.write_table(out / "history.parquet", tables.TUNING, tuned.history)
         artifacts.write_learning_curve(

@@ -33,8 +33,9 @@ BEYOND = 0.1  # of a range: signals may leave it by so much
 NEARLY_ALL = 0.99  # of the forecasts on honest plants are no further off
 HONEST = 0.96  # of honest logs keep every limit
 LEAST_SHARE = 0.05  # of a log, beyond whose ranges it is off
-LEAST_FIGURES = (0.05, 1.0, 1.0)  # below which no log is off, whatever the honest ones were
+LEAST_FIGURES = (0.05, 1.5, 1.0)  # below which no log is off, whatever the honest ones were
 FEW, FEW_LOGS = 1.5, 30
+ENOUGH = 100
 STILL = 0.3  # of `rest`, by which the plants' forecasts differ where next to nothing moves
 TAU, DRIFT, LEAK, UNHURRIED = 0.2, 0.06, 1e-4, 16  # of the observers, as of the governor's
 AT_ONCE = 4  # forecasts begin so often within the steps that one goes
@@ -102,10 +103,12 @@ class Explained(NamedTuple):
 
 
 def explained(run: Forecasts, rest: np.ndarray) -> Explained:
-    """c = (F'F + (K - 1) I)^-1 F'e of all forecasts, each output in units of `rest` (p,)."""
+    """c = (w F'F + (K - 1) I)^-1 w F'e of all forecasts, each output in units of `rest` (p,). What is left is
+    alike from one forecast to the next: a long log counts as one of ENOUGH forecasts, w = ENOUGH / their
+    number, or little errors that never change would pass for another machine."""
     K = len(run.apart)
-    F = (run.apart / rest).reshape(K, -1)
-    c = np.linalg.solve(F @ F.T + (K - 1) * np.eye(K), F @ (run.miss / rest).ravel())
+    F, weight = (run.apart / rest).reshape(K, -1), min(ENOUGH / len(run.start), 1.0)
+    c = np.linalg.solve(weight * F @ F.T + (K - 1) * np.eye(K), weight * F @ (run.miss / rest).ravel())
     return Explained(c, run.miss - np.tensordot(c, run.apart, axes=1))
 
 
@@ -279,6 +282,26 @@ def told(within: Support, log: Log, watch: Watch) -> Told:
     outside = float((off & (TEMPERATURE | COMMAND) != 0).mean()) if len(off) else 0.0
     moves = np.sqrt(np.mean((joined.apart / within.rest) ** 2)) if len(joined.start) else 0.0
     return Told(off, over, outside, bool((over > 1).any()) or outside > LEAST_SHARE, bool(moves < STILL))
+
+
+def reasons(said: Told) -> list[str]:
+    """Why a log is off support, the strongest reason first; or what could not be told of it."""
+    found = [(said.outside / LEAST_SHARE, OUTSIDE)] + list(zip(said.figures, OF_FIGURES, strict=True))
+    over = sorted((one for one in found if one[0] > 1), key=lambda one: -one[0])
+    return [sentence.format(times) for times, sentence in over] + ([STILL_TOLD] if said.still else [])
+
+
+OUTSIDE = "Temperatures or commands lie outside what was seen, {:.2g} times as often as they may."
+OF_FIGURES = (
+    "Forecasts miss by more than the plants of the spread differ, {:.2g} times as often as they may.",
+    "What no plant of the spread explains is {:.2g} times what it may be: signals may be swapped, or the "
+    "machine is another.",
+    "Gains or time constants lie outside the spread, by {:.2g} times of what they may.",
+)
+STILL_TOLD = (
+    "Next to nothing moves in the recording: swapped sensors or heaters, a wrong unit or another gain could "
+    "not be told from it."
+)
 
 
 def _stretches(log: Log) -> list[tuple[int, Log]]:

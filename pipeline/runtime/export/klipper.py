@@ -28,7 +28,7 @@ from pipeline.runtime.machine import Exported, check, check_certificate
 from pipeline.temperature import baseline
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
 
-MODULE = Path(__file__).parent / "templates" / "beadline.py"  # for klippy/extras/
+MODULE = Path(__file__).parent / "templates" / "beadline.py.txt"  # for klippy/extras/
 SECTIONS = ("extruder", "heater_bed")
 PID_PARAM_BASE = 255.0
 HORIZON_S, LONGEST = 600.0, 2000  # of the step response that is fitted, in s and in samples at most
@@ -96,7 +96,7 @@ def module(exported: Exported, certificate: Certificate) -> dict[str, str]:
     `settings` does."""
     one_heater(exported)
     return {
-        MODULE.name: MODULE.read_text(encoding="utf-8"),
+        MODULE.stem: MODULE.read_text(encoding="utf-8"),
         "beadline_controller.py": python.text(exported, certificate),
     }
 
@@ -104,7 +104,7 @@ def module(exported: Exported, certificate: Certificate) -> dict[str, str]:
 def _module_lines(exported: Exported, section: str) -> list[str]:
     return [
         "",
-        f"# The controller itself in place of this PID, which goes on where it fails: copy {MODULE.name} and",
+        f"# The controller itself in place of this PID, which goes on where it fails: copy {MODULE.stem} and",
         "# beadline_controller.py to klippy/extras/, and remove the # before these lines:",
         "# [beadline]",
         f"# heater: {section}",

@@ -185,6 +185,9 @@ def replayed(made: Exported, within: support.Support | None, table: Table, r: np
     length = np.array([len(one.off) for one in offs])
     abstains = bool(length[[one.abstains for one in offs]].sum() > 0.5 * length.sum())
     cause = _causes(made, Log(u, y, r), cuts)
+    # of several segments the longest that is off speaks; of none the longest
+    spoken = max(offs, key=lambda one: (one.abstains == abstains, len(one.off)))
+    told += support.reasons(spoken)
     if within is None:
         told.append("The folder holds no support: whether the recording is off it is not known.")
     if masked.any():

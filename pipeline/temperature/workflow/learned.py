@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 from pipeline.store import artifacts
 from pipeline.temperature import kernel, plant, window
 from pipeline.temperature.printer_pid import HeaterPid
-from pipeline.temperature.workflow import contestants
+from pipeline.temperature.workflow import cases, contestants
 from pipeline.temperature.workflow.cases import Setting
+from pipeline.temperature.workflow.settings import Panel, Tracking, TuneWeights
 from pipeline.temperature.workflow.settings import Plant as Machine
-from pipeline.temperature.workflow.settings import Tracking
 
 
 class Learned(NamedTuple):
@@ -76,6 +76,33 @@ def _heater_pids(pids: list[dict[str, Any]], machine: Machine) -> tuple[HeaterPi
         for pid in pids
         if pid["input"] in inputs and pid["output"] in outputs
     )
+
+
+class Posed(NamedTuple):
+    """What contestants are tuned on, judged on, and designed from."""
+
+    rehearsal: cases.Rehearsal
+    setting: Setting
+    problem: contestants.Problem
+
+
+def posed(
+    learned: Learned,
+    machine: Machine,
+    panel: Panel,
+    tracking: Tracking,
+    tuning: TuneWeights,
+    record: str | Path,
+    *,
+    simulated: bool,
+) -> Posed:
+    """The same for tuning, judging and export. A simulated machine is the study's; otherwise cases follow
+    from the record of ingest."""
+    truth = plant.baam()._replace(sample_time_s=machine.sample_time_s) if simulated else None
+    family = [learned.model, *learned.spread]
+    rehearsal = cases.rehearsed(panel, machine, truth, family, str(record))
+    setting = cases.shared(tuning, machine, tracking, panel, rehearsal, family)
+    return Posed(rehearsal, setting, problem(learned, tracking, setting, truth))
 
 
 def problem(

@@ -1,0 +1,98 @@
+"""What `beadline replay` leaves of a recording: every file opens, and names what is in the others."""
+
+import json
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+from mcap.reader import make_reader
+
+from pipeline.runtime import machine, support
+from pipeline.runtime.replay import Log
+from pipeline.runtime.workflow import replay
+from pipeline.store import artifacts
+from pipeline.temperature import panel
+from tests.runtime.deployed_machines import block_and_sensor, exported, passed
+
+T = 400
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A controller's folder with its support."""
+    of, rng = exported("pi"), np.random.default_rng(2)
+    folder = tmp_path / "controller"
+    machine.write(folder, of, passed(of))
+    plants = panel.padded(
+        panel.drawn([of.model], 8, panel.Spread(0.15, 0.2, 0.0, 0.0, 5.0), cells=False, rng=rng)
+    )
+    logs = [rolled(seed) for seed in range(4)]
+    within = support.support(plants, [], np.full(2, 0.1), logs)
+    replay.write_support(folder, within, machine.controller_sha256(of))
+    monkeypatch.chdir(tmp_path)
+    return folder
+
+
+def rolled(seed: int) -> Log:
+    """The block and sensor of two zones under steps."""
+    plant, rng = block_and_sensor(zones=2), np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(20, 60, (T // 40, 2)), 40, axis=0)
+    x, y = np.linalg.solve(np.eye(plant.n) - plant.A, plant.B @ u[0]), np.empty((T, 2))
+    for t in range(T):
+        y[t] = plant.C @ x + plant.d + 0.1 * rng.standard_normal(2)
+        x = plant.A @ x + plant.B @ u[t]
+    return Log(u, y, np.full((T, 2), 150.0))
+
+
+def recording(path, log: Log) -> None:
+    columns = {"heater_1": log.u[:, 0], "heater_2": log.u[:, 1]}
+    columns |= {"sensor_1": log.y[:, 0], "sensor_2": log.y[:, 1]}
+    time = np.arange(float(T))
+    if path.suffix == ".mcap":
+        units = {name: "percent" if name.startswith("heater") else "degC" for name in columns}
+        shown = {name: (values, units[name], "as recorded") for name, values in columns.items()}
+        artifacts.write_recording(path, time, shown, topic="/machine")
+        return
+    table = pa.table({"time_s": time, **columns})
+    (pa.csv.write_csv if path.suffix == ".csv" else pa.parquet.write_table)(table, path)
+
+
+def replayed(folder, path):
+    out = path.with_suffix("")
+    return replay.replay_recording(folder, path, replay.Asked((150.0, 150.0), out)), out
+
+
+def test_every_topic_of_the_layout_is_in_the_recording_it_is_for(folder, tmp_path):
+    recording(tmp_path / "print.csv", rolled(9))
+    (_, _, told), out = replayed(folder, tmp_path / "print.csv")
+    with open(out / "replay.mcap", "rb") as stream:
+        messages = [(channel.topic, json.loads(message.data)) for _, channel, message in
+                    make_reader(stream).iter_messages()]  # fmt: skip
+    assert len(messages) == T == told["samples"]
+    panels = json.loads((out / "layout.json").read_text())["configById"]
+    paths = [one["value"] for panel_ in panels.values() for one in panel_["paths"]]
+    assert len(paths) > 8
+    for path in paths:
+        topic, name = path.split(".")
+        assert all(at == topic and name in fields for at, fields in messages)
+
+
+def test_the_three_formats_of_one_recording_are_answered_alike(folder, tmp_path):
+    answers = []
+    for ending in ("csv", "parquet", "mcap"):
+        path = tmp_path / ending / f"print.{ending}"
+        path.parent.mkdir()
+        recording(path, rolled(9))
+        answers.append(replayed(folder, path)[0][0].asked)
+    assert np.array_equal(answers[0], answers[1])
+    # nanoseconds of the MCAP's clock
+    np.testing.assert_allclose(answers[0], answers[2], atol=1e-6)
+
+
+def test_it_says_why_it_abstains(folder, tmp_path):
+    log = rolled(9)
+    recording(tmp_path / "swapped.csv", log._replace(y=log.y[:, ::-1]))
+    done, _, told = replayed(folder, tmp_path / "swapped.csv")[0]
+    assert done.abstains and any("signals may be swapped" in note for note in told["notes"])
