@@ -47,9 +47,8 @@ def choices(
         choice = evaluate_setpoint.chosen(specs, one, settings, room=room)
         found.append({"name": choice.name, "margin": choice.margin, "sentence": choice.sentence})
         print(f"redraw {seed}: {choice.sentence}", flush=True)
-        keep(
-            {"redraws": len(found), "choices": found, "same": None}
-        )  # a run that is stopped keeps what it found
+        # a run that is stopped keeps what it found
+        keep({"redraws": len(found), "choices": found, "same": None})
     return found
 
 
