@@ -47,6 +47,8 @@ def choices(
         choice = evaluate_setpoint.chosen(specs, one, settings, room=room)
         found.append({"name": choice.name, "margin": choice.margin, "sentence": choice.sentence})
         print(f"redraw {seed}: {choice.sentence}", flush=True)
+        # a run that is stopped keeps what it found
+        keep({"redraws": len(found), "choices": found, "same": None})
     return found
 
 
@@ -78,31 +80,28 @@ def held(
     return rows
 
 
+def keep(results: dict[str, Any]) -> None:
+    """These beside what the file has of earlier runs."""
+    before = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
+    RESULTS.write_text(json.dumps(before | results, indent=1) + "\n")
+
+
 def main(redraws: int, repeats: int) -> None:
     settings = params.load(EvaluateSetpoint, "evaluate_setpoint")
     tables = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
     agents = restore_agents("datasets/train_agent/weights.safetensors")
     specs = contestants.controllers(contestants.Problem(settings.baselines, agents, tables["learn"]))
     default = json.loads(Path("datasets/evaluate_setpoint/choice.json").read_text())["name"]
-    results: dict[str, Any] = {}
     if redraws:
         began = time.process_time()
         found = choices(specs, tables["choose"], settings, redraws)
-        results |= {
-            "redraws": redraws,
-            "choices": found,
-            "default": default,
-            "same": sum(row["name"] == default for row in found),
-            "choice_cpu_s": round((time.process_time() - began) / redraws, 1),
-        }
-    if repeats:
-        rows = {
-            name: held(specs[name], tables["judge"], settings, repeats)
-            for name in dict.fromkeys((SIMPLE, default))
-        }
-        results |= {"repeats": repeats, "held": rows}
-    before = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
-    RESULTS.write_text(json.dumps(before | results, indent=1) + "\n")
+        cost = (time.process_time() - began) / redraws
+        same = sum(row["name"] == default for row in found)
+        keep({"default": default, "same": same, "choice_cpu_s": round(cost, 1)})
+    rows: dict[str, Any] = {}
+    for name in dict.fromkeys((SIMPLE, default)) if repeats else ():
+        rows[name] = held(specs[name], tables["judge"], settings, repeats)
+        keep({"repeats": repeats, "held": rows})
 
 
 if __name__ == "__main__":
