@@ -92,7 +92,7 @@ def test_two_hundred_revisions_are_drawn_within_ten_seconds_with_their_own_figur
     assert [run.subject for run in runs] == [f"run {k}" for k in range(200)]
     text = PAGE.read_text()
     assert (
-        text.count('<svg class="plot') == 9 + 2 + 3
+        text.count('<svg class="plot') == 9 + 2 + 3 + 4
         and len(re.findall(r"<tr><th scope=\"row\"><code>[0-9a-f]{8}</code>", text)) == 200
     )
     assert "data-driven from 1 % to 2.99 %" in text.replace("\u202f", " ")
@@ -145,15 +145,15 @@ def test_a_revision_before_the_pages_kept_figures_is_read_from_its_scorecard_and
     # by hand: the gap, the largest one of the spread, the quantile of today, the worse material after
     # learning
     assert (
-        first.figures["window"]["gap_percent"] == (0.5, 0.4, 0.65)
-        and first.figures["window"]["worst_case_gap_percent"] == (0.65,) * 3
-        and first.figures["pi"]["cost"] == pytest.approx((0.5, 0.45, 0.55))
+        first.figures["window"]["gap_percent"][:3] == (0.5, 0.4, 0.65)
+        and first.figures["window"]["worst_case_gap_percent"][:3] == (0.65,) * 3
+        and first.figures["pi"]["cost"][:3] == pytest.approx((0.5, 0.45, 0.55))
     )
     assert {key: f.value for key, f in first.figures["deposition"].items()} == {
         "flow_error_percent": 2.5,
         "learned_percent": 5.0,
     }
-    assert broken.figures.keys() == {"deposition"}
+    assert broken.figures.keys() == {"deposition", "setpoint"} and not any(broken.figures.values())
     assert new.figures["window"]["settling_s"].high == np.inf
     command(monkeypatch)
     assert "not measured" in Page(PAGE).text
