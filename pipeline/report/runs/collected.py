@@ -1,6 +1,7 @@
-"""Accepted runs, nights, DVC experiments and other revisions of the figures -> one list of runs, each with its
-figures, its parameters, and where its artifacts are."""
+"""Accepted runs, nights, DVC experiments and other revisions of the figures -> one list of runs, each with
+its figures, its parameters, and where its artifacts are."""
 
+import datetime
 import functools
 import json
 import re
@@ -25,10 +26,10 @@ MOST_PARAMETERS, LONGEST_VALUE = 5000, 120
 
 
 class Run(NamedTuple):
-    """One run. Its kind: accepted, night, experiment, revision (committed, and nobody accepted it), files (not
-    committed). `name` is a night's or an experiment's. {dotted key: value in words} of its parameters, or why
-    there are none in `no_parameters`. `lock` is its dvc.lock; `base` the commit that an experiment began from.
-    `note`: how a night ended."""
+    """One run. Its kind: accepted, night, experiment, revision (committed, and nobody accepted it), files
+    (not committed). `name` is a night's or an experiment's. {dotted key: value in words} of its parameters,
+    or why there are none in `no_parameters`. `lock` is its dvc.lock; `base` the commit that an experiment
+    began from. `note`: how a night ended."""
 
     kind: str
     name: str
@@ -70,8 +71,8 @@ def collected(most: int, asked: Sequence[Column]) -> Collected:
             f"{METRICS}: git has no revision of it; commit the figures of a run first (git add {METRICS})"
         )
     commits = sorted([*revisions, *tried], key=lambda commit: commit.date)[-most:]
-    read = _read(commits)
     known = _Memory(asked)
+    read = _read(commits, known.stages)
     runs = [_run(commit, read, known) for commit in commits]
     now = _now(known)
     if now.measured.figures and now.measured.figures != _last(runs).measured.figures:
@@ -92,16 +93,14 @@ def _said(runs: Sequence[Run]) -> set[str]:
 
 def _instant(date: str) -> str:
     """Dates of one zone in the order of time; git writes each author's own."""
-    import datetime
-
     try:
         return datetime.datetime.fromisoformat(date).astimezone(datetime.UTC).isoformat()
     except ValueError:
         return ""
 
 
-def _read(commits: Sequence[Commit]) -> _Read:
-    paths = [f"{METRICS}/{name}.json" for name in FILES]
+def _read(commits: Sequence[Commit], stages: Sequence[str]) -> _Read:
+    paths = [f"{METRICS}/{name}.json" for name in stages]
     places = [f"{commit.hash}:{path}" for commit in commits for path in (*paths, NIGHTLY, *PARAMETERS, LOCK)]
     places += [f"{commit.base}:{LOCK}" for commit in commits if commit.base]
     objects = stored.objects(places)
@@ -116,14 +115,15 @@ class _Memory:
 
     def __init__(self, asked: Sequence[Column]):
         self.asked = asked
+        self.stages = tuple(dict.fromkeys([*FILES, *(column.stage for column in asked)]))
         self.measured: dict[Any, Measured] = {}
         self.parameters: dict[Any, tuple[Mapping[str, str], str]] = {}
 
 
 def _run(commit: Commit, read: _Read, known: _Memory) -> Run:
     stale = _stale(read.text(f"{commit.base}:{LOCK}"), read.text(f"{commit.hash}:{LOCK}"))
-    objects = tuple(read.objects[f"{commit.hash}:{METRICS}/{name}.json"] for name in FILES)
-    texts = {name: read.texts.get(key) for name, key in zip(FILES, objects, strict=True)}
+    objects = tuple(read.objects[f"{commit.hash}:{METRICS}/{name}.json"] for name in known.stages)
+    texts = {name: read.texts.get(key) for name, key in zip(known.stages, objects, strict=True)}
     key = (objects, tuple(stale.items()))
     if key not in known.measured:
         known.measured[key] = _measured(texts, stale if commit.base else {}, known.asked)
@@ -169,7 +169,7 @@ def _measured(
 
 def _now(known: _Memory) -> Run:
     """The files as they lie there."""
-    texts = {name: _bytes(Path(f"{METRICS}/{name}.json")) for name in FILES}
+    texts = {name: _bytes(Path(f"{METRICS}/{name}.json")) for name in known.stages}
     found, why = parameters([_bytes(Path(path)) for path in PARAMETERS])
     lock = (_bytes(Path(LOCK)) or b"").decode(errors="replace")
     return Run("files", "", "", "", "not committed", _measured(texts, {}, known.asked), found, why, lock)
@@ -183,7 +183,7 @@ def _bytes(path: Path) -> bytes | None:
 
 
 def _nights(told: set[str], asked: Sequence[Column]) -> tuple[list[Run], list[str]]:
-    """Nights that this checkout remembers and git does not have: those that failed, or kept what was there."""
+    """Nights that this checkout remembers and git does not have: they failed, or kept what was there."""
     if not NIGHTS.exists():
         return [], []
     try:
@@ -329,23 +329,3 @@ def varied(runs: Sequence[Run]) -> list[str]:
     sets = [run.parameters for run in runs if run.parameters]
     keys = dict.fromkeys(key for each in sets for key in each)
     return [key for key in keys if len({each.get(key) for each in sets}) > 1]
-
-
-def metric(files: Mapping[str, Any], name: str) -> float | None:
-    """The number at STAGE:dotted.key of {stage: its metrics}; None where there is none."""
-    stage, _, key = name.partition(":")
-    found = at(section(files, stage), key)
-    return float(found) if isinstance(found, int | float) and not isinstance(found, bool) else None
-
-
-def at(data: Any, key: str) -> Any:
-    """What stands at a dotted key; a name may have dots of its own, such as "accuracy 0.9". None where nothing
-    does."""
-    if not key:
-        return data
-    names = key.split(".")
-    for many in range(len(names), 0, -1):
-        name = ".".join(names[:many])
-        if isinstance(data, Mapping) and name in data:
-            return at(data[name], ".".join(names[many:]))
-    return None

@@ -27,12 +27,13 @@ STAGES = {
     "setpoint": ("evaluate_setpoint", "train_classifier"),
 }
 
-# names of the comparison before controllers were judged as deployed: its figures are others under the same keys
+# names of the comparison before controllers were judged as deployed: same keys, other figures
 BEFORE = ("window", "model_based", "baseline", "kernel", "data_driven")
 
 
 class Column(NamedTuple):
-    """A figure that the table of runs has: its loop, the stage that gives it, and what is asked of it."""
+    """A figure that the table of runs has: its loop ("" for a metric that somebody named), the stage that
+    gives it, and what is asked of it."""
 
     loop: str
     stage: str
@@ -40,7 +41,7 @@ class Column(NamedTuple):
 
     @property
     def key(self) -> str:
-        return f"{self.loop}.{self.question.key}"
+        return f"{self.loop}.{self.question.key}" if self.loop else self.question.key
 
 
 class Measured(NamedTuple):
@@ -88,6 +89,17 @@ def columns(rules: ReportRules) -> list[Column]:
     return [*heat, *parts, *camera]
 
 
+def named(metric: str) -> Column:
+    """The column of a metric as STAGE:dotted.key of reports/metrics. Raises ValueError where it is none."""
+    stage, _, key = metric.partition(":")
+    if not stage.isidentifier() or not key:
+        raise ValueError(
+            "expected a metric as STAGE:dotted.key, such as "
+            f"tune_weights:contestants.subspace_lqg.cost, found {metric}"
+        )
+    return Column("", stage, Question(0, metric, metric, "", math.inf, False, ""))
+
+
 # ---- plain data of unknown shape
 
 
@@ -95,6 +107,19 @@ def section(data: Any, key: str) -> dict:
     """What stands under a key; {} where that is no section."""
     found = data.get(key) if isinstance(data, Mapping) else None
     return found if isinstance(found, dict) else {}
+
+
+def at(data: Any, key: str) -> Any:
+    """What stands at a dotted key; a name may have dots of its own, such as "accuracy 0.9". None where
+    nothing does."""
+    if not key:
+        return data
+    names = key.split(".")
+    for many in range(len(names), 0, -1):
+        name = ".".join(names[:many])
+        if isinstance(data, Mapping) and name in data:
+            return at(data[name], ".".join(names[many:]))
+    return None
 
 
 def finite(value: Any) -> float | None:
@@ -222,6 +247,9 @@ def measured(metrics: Mapping[str, dict], gone: Mapping[str, str], asked: Sequen
     }
     found = {f"{loop}.{key}": each for loop, keys in loops.items() for key, each in keys.items()}
     earlier = not winner and bool(shown or section(heat, "controllers"))
+    for column in (column for column in asked if not column.loop):
+        value = finite(at(section(metrics, column.stage), column.key.partition(":")[2]))
+        found |= {} if value is None else {column.key: _once(value)}
     missing = {
         column.key: gone.get(column.stage) or _why(column, earlier=earlier)
         for column in asked
