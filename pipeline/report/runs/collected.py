@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from pipeline.report.runs import history, stored
-from pipeline.report.runs.figures import FILES, Column, Measured, measured, section, today
+from pipeline.report.runs.figures import FILES, Column, Measured, measured, today
 from pipeline.report.runs.stored import ACCEPTED, METRICS, NIGHTLY, Commit
 from pipeline.report.shared.digits import shortened
 from pipeline.store import artifacts, params, renamed

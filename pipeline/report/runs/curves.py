@@ -1,5 +1,5 @@
-"""Curves of a run out of DVC's cache, by the hashes of its dvc.lock: the deciding case of the temperature loop,
-learning of the deposition loop, the flow of the setpoint loop. Each is small enough for a page."""
+"""Curves of a run out of DVC's cache, by the hashes of its dvc.lock: the deciding case of the temperature
+loop, learning of the deposition loop, the flow of the setpoint loop. Each is small enough for a page."""
 
 import functools
 import hashlib

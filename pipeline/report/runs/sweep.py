@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,9 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts
 from pipeline.report.shared.digits import count, short
+from pipeline.store import artifacts
 
+FILE, MOST = Path(".beadline/sweeps.json"), 100
 SEED = re.compile(r"(^|[._])seeds?$")
 # series that a picture can name at the ends of their lines
 MOST_SERIES, TICKS = 6, 6
@@ -179,6 +182,22 @@ def caption(sweep: Sweep) -> str:
     if failed:
         parts.append(f"{count(failed, 'experiment')} gave no figure.".capitalize())
     return " ".join(parts)
+
+
+def remembered() -> tuple[list[Sweep], list[str]]:
+    """The sweeps of this checkout, the oldest first, and a sentence where their file cannot be read."""
+    if not FILE.exists():
+        return [], []
+    try:
+        return read(artifacts.read_json(FILE)), []
+    except (ValueError, OSError) as error:
+        return [], [f"Sweeps are left out: {' '.join(str(error).split())}."]
+
+
+def remember(sweep: Sweep) -> None:
+    """One more sweep; one of the same metric and keys takes the place of its last."""
+    before = [each for each in remembered()[0] if (each.metric, each.keys) != (sweep.metric, sweep.keys)]
+    artifacts.write_json(FILE, [written(each) for each in [*before, sweep][-MOST:]])
 
 
 def read(rows: object) -> list[Sweep]:
