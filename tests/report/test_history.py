@@ -212,28 +212,6 @@ def test_without_a_git_or_a_revision_it_says_so_and_writes_nothing(
     assert not PAGE.exists()
 
 
-def test_a_sweep_names_every_experiment_by_whole_keys_and_its_page_cuts_no_name(empty, monkeypatch):
-    from pipeline.nightly import sweeping
-
-    monkeypatch.setattr(sweeping, "dvc", lambda *_, **__: None)
-    monkeypatch.setattr(
-        sweeping, "git", lambda verb, *_: "0123" if verb == "rev-parse" else '{"practical": {"cost": 1.5}}'
-    )
-    settings = ["tune_weights.seed=1,2", "train_agent.seed=3", "generate_probing.samples=9000"]
-    text = sweeping.sweep(settings, "tune_weights", "tune_weights:practical.cost")
-    names = [
-        f"sweep-tune_weights_seed-{seed}-train_agent_seed-3-generate_probing_samples-9000" for seed in (1, 2)
-    ]
-    page = Path("reports/sweep.html").read_text()
-    for name in names:
-        assert name in text and f"<bdi>{name}</bdi>" in page
-    assert Path("reports/sweep.csv").read_text().splitlines() == [
-        "experiment,tune_weights.seed,train_agent.seed,generate_probing.samples,tune_weights:practical.cost",
-        f"{names[0]},1,3,9000,1.5",
-        f"{names[1]},2,3,9000,1.5",
-    ]
-
-
 def test_in_a_browser_it_says_nothing_on_the_console_and_sorts_by_a_figure(empty, monkeypatch, open_page):
     commits([(f"run {k}", {"report.json": report(gap)}) for k, gap in enumerate((2.0, 0.5, 12.0))])
     command(monkeypatch)

@@ -72,19 +72,16 @@ def collected(most: int, asked: Sequence[Column]) -> Collected:
         )
     commits = sorted([*revisions, *tried], key=lambda commit: commit.date)[-most:]
     known = _Memory(asked)
-    read = _read(commits, known.stages)
+    last = revisions[-1]
+    read = _read([*commits, last], known.stages)
     runs = [_run(commit, read, known) for commit in commits]
     now = _now(known)
-    if now.measured.figures and now.measured.figures != _last(runs).measured.figures:
+    # an experiment leaves the files as they are
+    if now.measured.figures and now.measured.figures != _run(last, read, known).measured.figures:
         runs.append(now)
     nights, troubles = _nights({run.name for run in runs if run.kind == "night"} | _said(runs), asked)
     runs = sorted([*runs, *nights], key=lambda run: (not run.date, _instant(run.date)))
     return Collected(runs[-most:], troubles)
-
-
-def _last(runs: Sequence[Run]) -> Run:
-    """The last revision: an experiment leaves the files as they are."""
-    return next((run for run in reversed(runs) if run.kind != "experiment"), runs[-1])
 
 
 def _said(runs: Sequence[Run]) -> set[str]:

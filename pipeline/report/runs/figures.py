@@ -136,9 +136,10 @@ def figure(ends: Any, middle: str = "median") -> Figure | None:
     """A figure of {middle, low, high}; null is without end. None for data that are no figure."""
     if not isinstance(ends, Mapping) or not {middle, "low", "high"} <= ends.keys():
         return None
-    values = [math.inf if ends[end] is None else finite(ends[end]) for end in (middle, "low", "high")]
-    whole = [value for value in values if value is not None]
-    return Figure(*whole) if len(whole) == 3 else None
+    value, low, high = (
+        math.inf if ends[end] is None else finite(ends[end]) for end in (middle, "low", "high")
+    )
+    return None if value is None or low is None or high is None else Figure(value, low, high)
 
 
 def figures(bands: Any) -> dict[str, Figure]:
@@ -250,20 +251,18 @@ def measured(metrics: Mapping[str, dict], gone: Mapping[str, str], asked: Sequen
     for column in (column for column in asked if not column.loop):
         value = finite(at(section(metrics, column.stage), column.key.partition(":")[2]))
         found |= {} if value is None else {column.key: _once(value)}
-    missing = {
-        column.key: gone.get(column.stage) or _why(column, earlier=earlier)
-        for column in asked
-        if column.key not in found
-    }
+    missing = {column.key: _why(column, gone, earlier=earlier) for column in asked if column.key not in found}
     default = camera.get("default")
     controllers = {"temperature": winner, "setpoint": default if isinstance(default, str) else ""}
     return Measured(found, missing, controllers, _verdicts(report))
 
 
-def _why(column: Column, *, earlier: bool) -> str:
+def _why(column: Column, gone: Mapping[str, str], *, earlier: bool) -> str:
     if column.loop == "temperature" and earlier:
         return "of an earlier comparison, which did not judge controllers as deployed"
-    return f"{column.stage}.json has no such figure: of an earlier version, or edited"
+    return (
+        gone.get(column.stage) or f"{column.stage}.json has no such figure: of an earlier version, or edited"
+    )
 
 
 def _winner(verdict: Mapping, heat: Mapping, shown: Mapping) -> str:

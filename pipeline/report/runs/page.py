@@ -133,15 +133,15 @@ def _row(run: Run, asked: Sequence[Column], keys: Sequence[str]) -> Row:
     if run.no_parameters and keys:
         reasons |= {run.no_parameters: None}
     who = [heading(name) for name in run.measured.controllers.values() if name]
-    missing = ["not measured" if run.no_parameters else "not set", *keys][:1]
+    unset = "not measured" if run.no_parameters else "not set"
     return Row(
         run,
         name_of(run),
         WORDS[run.kind],
         [run.measured.verdicts.get(loop, "none kept") for loop in LOOPS],
-        ", ".join(who) or "none kept",
+        " · ".join(who) or "none kept",
         [_cell(run, column) for column in asked],
-        [run.parameters.get(key, missing[0]) for key in keys],
+        [run.parameters.get(key, unset) for key in keys],
         "; ".join(reasons),
     )
 
@@ -193,11 +193,11 @@ def data(runs: Sequence[Run], asked: Sequence[Column], packed: curves.Packed) ->
             "figures": [_triple(figures[c.key]) if c.key in figures else None for c in asked],
             "missing": [numbered(run.measured.missing.get(c.key, "")) for c in asked],
             "verdicts": [run.measured.verdicts.get(loop, "") for loop in LOOPS],
-            "who": [run.measured.controllers.get(loop, "") for loop in LOOPS],
+            "who": [heading(run.measured.controllers.get(loop, "")) for loop in LOOPS],
             "changes": changes,
             "none": run.no_parameters,
             "file": file,
-            "curves": [numbered("\0".join(curve)) for curve in drawn],
+            "curves": [numbered("\n".join(curve)) for curve in drawn],
             "why": numbered(why),
         }
         entries.append(entry)

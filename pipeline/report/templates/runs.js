@@ -13,10 +13,10 @@
     held = { ...held };
     for (let i = 0; i < run.changes.length; i += 2) { const key = texts[run.changes[i]]; if (run.changes[i + 1] < 0) delete held[key]; else held[key] = texts[run.changes[i + 1]]; }
     run.parameters = held;
-    run.drawn = run.curves.map((code, k) => { const [name, who, across, up] = texts[code].split("\0"); return { name, who, across, up, k }; });
+    run.drawn = run.curves.map((code, k) => { const [name, who, across, up] = texts[code].split("\n"); return { name, who, across, up, k }; });
   }
   const byId = new Map(runs.map(run => [run.id, run]));
-  const label = run => `${run.name}${run.name === run.id ? "" : ""}, ${kinds[run.kind]}${run.date ? `, ${run.date}` : ""}`;
+  const label = run => `${run.name}, ${kinds[run.kind]}${run.date ? `, ${run.date}` : ""}`;
   const say = value => value === Infinity ? "never" : value === 0 ? "0" : Math.abs(value) >= 1e7 || Math.abs(value) < 1e-4 ? value.toExponential(3).replace("-", "\u2212") : (+value.toPrecision(4)).toLocaleString("en", { maximumFractionDigits: 9 }).replace("-", "\u2212");
   const unit = column => column.unit ? `\u202f${column.unit}` : "";
   const inDegrees = (value, column) => value === Infinity ? column.beyond : say(value) + unit(column);
@@ -24,8 +24,9 @@
 
   /* ---- the state and its address */
 
-  const accepted = runs.findLastIndex(run => run.kind === 0), last = runs.length - 1;
-  const first = accepted === last ? runs.slice(0, -1).findLastIndex(run => run.kind === 0) : accepted;
+  /* the last run beside the last accepted one that had other figures */
+  const last = runs.length - 1, same = run => JSON.stringify(run.figures) === JSON.stringify(runs[last].figures);
+  const first = runs.findLastIndex((run, i) => i < last && run.kind === 0 && !same(run));
   const state = { a: runs[first < 0 ? Math.max(last - 1, 0) : first].id, b: runs[last].id, x: "", y: "", curve: "", kinds: kinds.map((_, k) => k), find: "" };
   const complaints = [];
   const wanted = new URLSearchParams(location.hash.slice(1));
