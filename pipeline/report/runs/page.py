@@ -60,7 +60,8 @@ class Row(NamedTuple):
 class Drawn(NamedTuple):
     """A sweep in words and as a picture."""
 
-    title: str
+    metric: str
+    over: str
     picture: Markup
     finding: str
     caption: str
@@ -232,6 +233,4 @@ def _triple(figure) -> list[float | str]:
 
 def _drawn(swept: Sweep) -> Drawn:
     keys = ", ".join(swept.keys)
-    return Drawn(
-        f"{swept.metric} over {keys}", sweep.picture(swept), sweep.finding(swept), sweep.caption(swept)
-    )
+    return Drawn(swept.metric, keys, sweep.picture(swept), sweep.finding(swept), sweep.caption(swept))
