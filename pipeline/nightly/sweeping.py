@@ -133,9 +133,8 @@ def _stages() -> Mapping[str, Mapping[str, set[str]]]:
     except FileNotFoundError:
         raise ValueError(f"{WIRING} is missing; run this in the root of the project") from None
     except (yaml.YAMLError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
-        raise ValueError(
-            f"{WIRING}: expected stages with deps and outs ({error}); restore the file"
-        ) from None
+        why = " ".join(str(error).split())
+        raise ValueError(f"{WIRING}: expected stages with deps and outs ({why}); restore the file") from None
 
 
 def _before(target: str, stages: Mapping[str, Mapping[str, set[str]]]) -> set[str]:
