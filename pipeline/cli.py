@@ -115,10 +115,7 @@ def runs(arguments: argparse.Namespace) -> None:
     asked = [*figures.columns(params.load(ReportRules, "report")), *map(figures.named, names)]
     found = collected.collected(arguments.most, asked)
     found = found._replace(troubles=[*found.troubles, *troubles])
-    lock = Path(collected.LOCK)
-    made = runs_page.render(
-        found, asked, sweeps, lock.read_text(encoding="utf-8", errors="replace") if lock.exists() else ""
-    )
+    made = runs_page.render(found, asked, sweeps)
     artifacts.write_text("reports/runs.html", made.text)
     artifacts.write_folder(runs_page.FOLDER, made.files)
     print(f"reports/runs.html: {len(found.runs)} runs, the last {runs_page.name_of(found.runs[-1])}")

@@ -52,7 +52,7 @@ def sweep(settings: Sequence[str], target: str, metric: str) -> str:
         done.append(_point(chosen, target, metric, head))
         made = Sweep(metric, tuple(points[0]), tuple(done))
         _write(made)
-    swept.remember(made)
+        swept.remember(made)
     files = (
         "reports/sweep.csv, reports/sweep.html; ./run beadline runs sets them beside other runs; "
         "to take one: dvc exp apply NAME"

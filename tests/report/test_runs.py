@@ -299,7 +299,7 @@ def cached(folder):
 def test_curves_are_those_of_the_artifacts_and_what_is_not_in_the_cache_is_told(empty):
     text, heat = cached(empty)
     runs = found(Made("one", {**metrics(), "dvc.lock": text}), Made("two", metrics(30.0)))
-    told = curves.curves(runs[0], "")
+    told = curves.curves(runs[0], {})
     assert [curve.name for curve in told.curves] == [
         "Temperature of zone_1, deciding case",
         "Flow error left by trial, material A",
@@ -309,7 +309,7 @@ def test_curves_are_those_of_the_artifacts_and_what_is_not_in_the_cache_is_told(
     np.testing.assert_allclose(told.curves[1].y, [100.0, 30.0], rtol=1e-12)
     assert "evaluate_setpoint/paths.parquet is not in DVC’s cache here; git checkout" in told.why
     # both revisions have that dvc.lock, so that both have one file
-    packed = curves.packed(runs, "")
+    packed = curves.packed(runs, {})
     assert len(packed.files) == 1 and packed.places[0] == packed.places[1]
 
 
@@ -319,7 +319,7 @@ def test_a_damaged_table_leaves_its_curve_out_and_says_so(empty):
         if path.is_file() and path.read_bytes()[:4] == b"PAR1":
             path.write_bytes(b"PAR1 and nothing else")
     runs = found(Made("one", {**metrics(), "dvc.lock": text}))
-    told = curves.curves(runs[0], "")
+    told = curves.curves(runs[0], {})
     assert told.curves == []
     assert "trajectories.parquet is damaged, or of another version" in told.why
 
@@ -328,7 +328,7 @@ def test_curves_beyond_the_room_are_left_out_and_told(empty, monkeypatch):
     text, _ = cached(empty)
     runs = found(Made("one", {**metrics(), "dvc.lock": text}))
     monkeypatch.setattr(curves, "LARGEST", 100)
-    packed = curves.packed(runs, "")
+    packed = curves.packed(runs, {})
     assert packed.files == {} and packed.why == ["there is no room for more curves beside this page"]
 
 

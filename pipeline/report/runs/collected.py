@@ -21,6 +21,7 @@ KINDS = ("accepted", "night", "experiment", "revision", "files")
 NIGHTS = Path(".beadline/nights.json")
 LOCK = "dvc.lock"
 PARAMETERS = (params.FILE, params.EXPERT)
+Lock = Mapping[str, str]  # {stage: its block} of a dvc.lock
 # of one run; a file with more holds no parameters of ours
 MOST_PARAMETERS, LONGEST_VALUE = 5000, 120
 
@@ -28,8 +29,8 @@ MOST_PARAMETERS, LONGEST_VALUE = 5000, 120
 class Run(NamedTuple):
     """One run. Its kind: accepted, night, experiment, revision (committed, and nobody accepted it), files
     (not committed). `name` is a night's or an experiment's. {dotted key: value in words} of its parameters,
-    or why there are none in `no_parameters`. `lock` is its dvc.lock; `base` the commit that an experiment
-    began from. `note`: how a night ended."""
+    or why there are none in `no_parameters`. `made`: md5 of each stage's folder by its dvc.lock; `base` the
+    commit that an experiment began from. `note`: how a night ended."""
 
     kind: str
     name: str
@@ -39,7 +40,7 @@ class Run(NamedTuple):
     measured: Measured
     parameters: Mapping[str, str] = {}
     no_parameters: str = ""
-    lock: str = ""
+    made: Mapping[str, str] = {}
     base: str = ""
     note: str = ""
 
@@ -52,15 +53,20 @@ class Collected(NamedTuple):
 
 
 class _Read(NamedTuple):
-    """Files of runs: {REVISION:PATH: object}, and each object's text."""
+    """Files of runs: {REVISION:PATH: object}, each object's text, and of each dvc.lock its stages."""
 
     objects: Mapping[str, str]
     texts: Mapping[str, bytes]
+    locks: Mapping[str, Lock]
 
     def text(self, place: str) -> bytes | None:
         """None where the file is not there."""
         name = self.objects.get(place, "")
         return self.texts.get(name) if name else None
+
+    def lock(self, commit: str) -> Lock:
+        """The stages of a commit's dvc.lock; none where it has none."""
+        return self.locks.get(self.objects.get(f"{commit}:{LOCK}", ""), {})
 
 
 def collected(most: int, asked: Sequence[Column]) -> Collected:
@@ -96,12 +102,22 @@ def _instant(date: str) -> str:
         return ""
 
 
-def _read(commits: Sequence[Commit], stages: Sequence[str]) -> _Read:
-    paths = [f"{METRICS}/{name}.json" for name in stages]
+def _read(commits: Sequence[Commit], names: Sequence[str]) -> _Read:
+    paths = [f"{METRICS}/{name}.json" for name in names]
     places = [f"{commit.hash}:{path}" for commit in commits for path in (*paths, NIGHTLY, *PARAMETERS, LOCK)]
     places += [f"{commit.base}:{LOCK}" for commit in commits if commit.base]
     objects = stored.objects(places)
-    return _Read(dict(zip(places, objects, strict=True)), dict(stored.contents(objects)))
+    at = dict(zip(places, objects, strict=True))
+    wiring = {name for place, name in at.items() if place.endswith(f":{LOCK}")}
+    texts, locks, same = {}, {}, {}
+    for name, text in stored.contents(objects):
+        if name in wiring:
+            # a block that many runs share is kept once
+            found = stages(text.decode(errors="replace"))
+            locks[name] = {stage: same.setdefault(block, block) for stage, block in found.items()}
+        else:
+            texts[name] = text
+    return _Read(at, texts, locks)
 
 
 # ---- one run
@@ -113,17 +129,25 @@ class _Memory:
     def __init__(self, asked: Sequence[Column]):
         self.asked = asked
         self.stages = tuple(dict.fromkeys([*FILES, *(column.stage for column in asked)]))
+        self.files: dict[tuple[str, bytes], dict] = {}
         self.measured: dict[Any, Measured] = {}
         self.parameters: dict[Any, tuple[Mapping[str, str], str]] = {}
 
+    def file(self, name: str, text: bytes) -> dict:
+        """A stage's metrics under today's names; {} of what is no JSON."""
+        if (name, text) not in self.files:
+            self.files[name, text] = today({name: history.plain(text)})[name]
+        return self.files[name, text]
+
 
 def _run(commit: Commit, read: _Read, known: _Memory) -> Run:
-    stale = _stale(read.text(f"{commit.base}:{LOCK}"), read.text(f"{commit.hash}:{LOCK}"))
+    lock = read.lock(commit.hash)
+    stale = _stale(read.lock(commit.base), lock) if commit.base else {}
     objects = tuple(read.objects[f"{commit.hash}:{METRICS}/{name}.json"] for name in known.stages)
     texts = {name: read.texts.get(key) for name, key in zip(known.stages, objects, strict=True)}
     key = (objects, tuple(stale.items()))
     if key not in known.measured:
-        known.measured[key] = _measured(texts, stale if commit.base else {}, known.asked)
+        known.measured[key] = _measured(texts, stale, known)
     files = tuple(read.objects[f"{commit.hash}:{path}"] for path in PARAMETERS)
     if files not in known.parameters:
         known.parameters[files] = parameters([read.text(f"{commit.hash}:{path}") for path in PARAMETERS])
@@ -142,34 +166,37 @@ def _run(commit: Commit, read: _Read, known: _Memory) -> Run:
         commit.subject,
         known.measured[key],
         *known.parameters[files],
-        lock=(read.text(f"{commit.hash}:{LOCK}") or b"").decode(errors="replace"),
+        made=folders(lock),
         base=commit.base,
         note=str(night.get("decision") or ""),
     )
 
 
-def _measured(
-    texts: Mapping[str, bytes | None], stale: Mapping[str, str], asked: Sequence[Column]
-) -> Measured:
+def _measured(texts: Mapping[str, bytes | None], stale: Mapping[str, str], known: _Memory) -> Measured:
     """The figures of {stage: its file}, and why others are not there."""
     gone, files = {}, {}
     for name, text in texts.items():
-        files[name] = {} if text is None or name in stale else history.plain(text)
+        files[name] = {} if text is None or name in stale else known.file(name, text)
         if name in stale:
             gone[name] = f"{name} was not run again after {stale[name]} changed"
         elif text is None:
             gone[name] = f"there is no {name}.json"
         elif not files[name]:
             gone[name] = f"{name}.json is empty, or damaged"
-    return measured(today(files), gone, asked)
+    return measured(files, gone, known.asked)
 
 
 def _now(known: _Memory) -> Run:
     """The files as they lie there."""
     texts = {name: _bytes(Path(f"{METRICS}/{name}.json")) for name in known.stages}
     found, why = parameters([_bytes(Path(path)) for path in PARAMETERS])
-    lock = (_bytes(Path(LOCK)) or b"").decode(errors="replace")
-    return Run("files", "", "", "", "not committed", _measured(texts, {}, known.asked), found, why, lock)
+    own = _measured(texts, {}, known)
+    return Run("files", "", "", "", "not committed", own, found, why, made=folders(lock_now()))
+
+
+def lock_now() -> Lock:
+    """The stages of dvc.lock as it lies there."""
+    return stages((_bytes(Path(LOCK)) or b"").decode(errors="replace"))
 
 
 def _bytes(path: Path) -> bytes | None:
@@ -266,59 +293,64 @@ def _flatten(place: str, data: Any, found: dict[str, str]) -> None:
 # ---- what an experiment did not run again
 
 
-def _stale(base: bytes | None, own: bytes | None) -> dict[str, str]:
+def _stale(before: Lock, now: Lock) -> dict[str, str]:
     """{stage whose figures are the base's, though what it reads changed: the stage that changed}, off the
     dvc.lock of an experiment and of the commit that it began from. DVC runs no stage behind the target."""
-    if base is None or own is None or base == own:
+    if not before or not now:
         return {}
-    before, now = (stages(text.decode(errors="replace")) for text in (base, own))
-    made = {stage: _places(block, "outs") for stage, block in now.items()}
-    changed = {stage: stage for stage, block in now.items() if block != before.get(stage)}
+    changed = {
+        out: stage
+        for stage, block in now.items()
+        if block != before.get(stage)
+        for out, md5 in outs(block).items()
+        if outs(before.get(stage, "")).get(out) != md5
+    }
+    left = {stage: block for stage, block in now.items() if block == before.get(stage)}
     stale: dict[str, str] = {}
-    left = [stage for stage in now if stage not in changed]
-    while True:
-        more = {}
-        for stage in left:
-            read = _places(now[stage], "deps")
-            sources = [
-                other
-                for other in (*changed, *stale)
-                if any(
-                    path == out or path.startswith(f"{out}/")
-                    for path in read
-                    for out, md5 in made[other].items()
-                    if other in stale or _places(before.get(other, ""), "outs").get(out) != md5
-                )
-            ]
-            if sources:
-                more[stage] = stale.get(sources[0], sources[0])
-        if not more:
-            return stale
+    while more := {
+        stage: changed[min(hit)] for stage, block in left.items() if (hit := changed.keys() & _read_by(block))
+    }:
         stale |= more
-        left = [stage for stage in left if stage not in more]
+        changed |= {out: source for stage, source in more.items() for out in outs(left.pop(stage))}
+    return stale
 
 
-def stages(lock: str) -> Mapping[str, str]:
-    """{stage: its block} of a dvc.lock."""
+def stages(lock: str) -> Lock:
+    """{stage: its block} of the text of a dvc.lock."""
     return {head.strip().rstrip(":"): block for head, block in stored.blocks(lock, 2).items()}
 
 
+# as DVC writes the files of a stage
+FILE = re.compile(r"^    - path: (.+)\n(?:      (?!md5:).*\n)*      md5: (\S+)", re.MULTILINE)
+
+
 @functools.lru_cache(maxsize=5000)
-def _places(block: str, what: str) -> Mapping[str, str]:
-    """{path: md5} of the deps or outs of a stage's block; {} where it is none."""
-    try:
-        data = yaml.load(block, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except yaml.YAMLError:
-        return {}
-    entries = next(iter(data.values()), {}) if isinstance(data, dict) else {}
-    listed = entries.get(what) if isinstance(entries, dict) else None
-    rows = [row for row in listed or [] if isinstance(row, dict)]
-    return {str(row.get("path")): str(row.get("md5")) for row in rows}
+def outs(block: str) -> Mapping[str, str]:
+    """{path: md5} of what a stage made, by its block of a dvc.lock."""
+    return dict(FILE.findall(_part(block, "    outs:")))
 
 
-def outs(lock: str, stage: str) -> Mapping[str, str]:
-    """{path: md5} of what a stage made, by the dvc.lock of a run."""
-    return _places(stages(lock).get(stage, ""), "outs")
+@functools.lru_cache(maxsize=5000)
+def _read_by(block: str) -> frozenset[str]:
+    """The paths that a stage read, and the folders that these lie in."""
+    paths = [path for path, _ in FILE.findall(_part(block, "    deps:"))]
+    ends = [[*range(len(path)), len(path)] for path in paths]
+    return frozenset(
+        path[:end]
+        for path, places in zip(paths, ends, strict=True)
+        for end in places
+        if end == len(path) or path[end] == "/"
+    )
+
+
+def _part(block: str, head: str) -> str:
+    return stored.blocks(block, 4).get(head, "")
+
+
+def folders(lock: Lock) -> dict[str, str]:
+    """{stage: md5 of datasets/STAGE} of a dvc.lock."""
+    found = {stage: outs(block).get(f"datasets/{stage}", "") for stage, block in lock.items()}
+    return {stage: md5 for stage, md5 in found.items() if md5}
 
 
 def varied(runs: Sequence[Run]) -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow.parquet as parquet
 from pyarrow import ArrowException
 
-from pipeline.report.runs.collected import Run, outs
+from pipeline.report.runs.collected import Run
 from pipeline.report.shared import charts
 from pipeline.report.viewer.packed import column_file
 
@@ -49,16 +49,16 @@ class Packed(NamedTuple):
     why: list[str]
 
 
-def packed(runs: Sequence[Run], lock: str) -> Packed:
-    """The curves of these runs, the newest first into the room that there is. `lock`: dvc.lock as it lies
-    there, whose artifacts are in datasets/ too."""
+def packed(runs: Sequence[Run], now: Mapping[str, str]) -> Packed:
+    """The curves of these runs, the newest first into the room that there is. `now`: the md5 of
+    each stage's folder as it lies in datasets/."""
     files: dict[str, str] = {}
     known: dict[str, tuple[str, list]] = {}
     places, reasons, room = [], [], LARGEST
     for run in reversed(runs):
         key = _key(run)
         if key not in known:
-            found = curves(run, lock)
+            found = curves(run, now)
             text = "".join(
                 column_file(f"{key}.{k}.x", [curve.x.astype("<f8")])
                 + column_file(f"{key}.{k}", [curve.y.astype("<f4")])
@@ -81,14 +81,14 @@ STAGES = ("evaluate_temperature", "train_ilc", "evaluate_setpoint")
 
 def _key(run: Run) -> str:
     """Runs of the same artifacts under the same controllers have the same curves."""
-    made = [outs(run.lock, stage).get(f"datasets/{stage}", "") for stage in STAGES]
+    made = [run.made.get(stage, "") for stage in STAGES]
     told = json.dumps([made, dict(run.measured.controllers)], sort_keys=True)
     return hashlib.sha256(told.encode()).hexdigest()[:16]
 
 
-def curves(run: Run, lock: str) -> Found:
+def curves(run: Run, now: Mapping[str, str]) -> Found:
     """The curves of a run as far as its artifacts are here."""
-    if not run.lock:
+    if not run.made:
         return Found([], "this run has no dvc.lock")
     found: list[Curve] = []
     reasons = []
@@ -98,7 +98,7 @@ def curves(run: Run, lock: str) -> Found:
         ("evaluate_setpoint", "paths.parquet", _setpoint),
     )
     for stage, name, read in readers:
-        path = place(run.lock, lock, stage, name)
+        path = place(stage, name, run.made.get(stage, ""), now)
         if path is None:
             reasons.append(f"{stage}/{name} is not in DVC’s cache here")
             continue
@@ -115,12 +115,12 @@ def curves(run: Run, lock: str) -> Found:
     )
 
 
-def place(own: str, now: str, stage: str, name: str) -> Path | None:
-    """Where a file of a stage's folder lies: in DVC's cache, or in datasets/ where `now` made the same."""
-    folder = f"datasets/{stage}"
-    md5 = outs(own, stage).get(folder, "")
-    if md5 and outs(now, stage).get(folder) == md5 and Path(folder, name).is_file():
-        return Path(folder, name)
+def place(stage: str, name: str, md5: str, now: Mapping[str, str]) -> Path | None:
+    """Where a file of a stage's folder lies: in datasets/ where the folder has that md5 now, else in DVC's
+    cache."""
+    here = Path("datasets", stage, name)
+    if md5 and now.get(stage) == md5 and here.is_file():
+        return here
     entry = next((each for each in _listed(md5) if each[0] == name), None)
     found = _cached(entry[1]) if entry else None
     return found if found and found.is_file() else None

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from pipeline.report.runs import curves, sweep
-from pipeline.report.runs.collected import KINDS, Collected, Run, varied
+from pipeline.report.runs.collected import KINDS, Collected, Run, folders, lock_now, varied
 from pipeline.report.runs.figures import LOOPS, Column
 from pipeline.report.runs.sweep import Sweep
 from pipeline.report.shared import page
@@ -74,10 +74,10 @@ class Pages(NamedTuple):
     files: dict[str, str]
 
 
-def render(found: Collected, asked: Sequence[Column], sweeps: Sequence[Sweep], lock: str) -> Pages:
-    """runs.html and what it loads. `lock`: dvc.lock as it lies there."""
+def render(found: Collected, asked: Sequence[Column], sweeps: Sequence[Sweep]) -> Pages:
+    """runs.html and what it loads."""
     runs = found.runs
-    packed = curves.packed(runs, lock)
+    packed = curves.packed(runs, folders(lock_now()))
     keys = _parameter_columns(runs)
     script = page.environment().get_template("runs.js").render().strip()
     text = page.render(

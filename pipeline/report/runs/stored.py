@@ -100,7 +100,8 @@ def _lines(names: Iterable[str]) -> str:
 
 def blocks(text: str, indent: int = 0) -> Mapping[str, str]:
     """{first line of a block: the block} of YAML whose keys stand `indent` spaces from the left; comments and
-    empty lines before the first block are left out."""
-    heads = list(re.finditer(rf"^ {{{indent}}}(?=[^\s#])[^\n]*", text, re.MULTILINE))
+    empty lines before the first block are left out. A list may stand as far left as its own key."""
+    first = r"[^\s#-]" if indent else r"[^\s#]"
+    heads = list(re.finditer(rf"^ {{{indent}}}(?={first})[^\n]*", text, re.MULTILINE))
     ends = [*(head.start() for head in heads[1:]), len(text)]
     return {head[0]: text[head.start() : end] for head, end in zip(heads, ends, strict=False)}
