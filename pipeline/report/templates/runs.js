@@ -10,7 +10,7 @@
   let held = {};
   for (const run of runs) {
     run.figures = run.figures.map(triple => triple && (triple.length === 1 ? [triple[0], triple[0], triple[0]] : triple).map(endless));
-    held = { ...held };
+    if (run.changes.length) held = { ...held };
     for (let i = 0; i < run.changes.length; i += 2) { const key = texts[run.changes[i]]; if (run.changes[i + 1] < 0) delete held[key]; else held[key] = texts[run.changes[i + 1]]; }
     run.parameters = held;
     run.drawn = run.curves.map((code, k) => { const [name, who, across, up] = texts[code].split("\n"); return { name, who, across, up, k }; });
@@ -49,7 +49,7 @@
     const words = state.find.toLowerCase().split(/\s+/).filter(Boolean);
     runs.forEach(run => {
       const row = rowOf.get(run);
-      run.text ??= row.textContent.toLowerCase();
+      if (words.length) run.text ??= row.textContent.toLowerCase();
       row.hidden = !state.kinds.includes(run.kind) || !words.every(word => run.text.includes(word));
     });
     shown.textContent = `${left().length} of ${runs.length} runs`;
