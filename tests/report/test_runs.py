@@ -313,6 +313,14 @@ def test_curves_are_those_of_the_artifacts_and_what_is_not_in_the_cache_is_told(
     assert len(packed.files) == 1 and packed.places[0] == packed.places[1]
 
 
+def test_a_run_that_judged_no_controller_has_no_curve_of_one_and_says_so(empty):
+    text, _ = cached(empty)
+    runs = found(Made("one", {"reports/metrics/ingest.json": "{}", "dvc.lock": text}))
+    told = curves.curves(runs[0], {})
+    assert [curve.name for curve in told.curves] == ["Flow error left by trial, material A"]
+    assert "no controller of the temperature loop has figures in this run" in told.why
+
+
 def test_a_damaged_table_leaves_its_curve_out_and_says_so(empty):
     text, _ = cached(empty)
     for path in curves.CACHE.rglob("*"):

@@ -76,6 +76,8 @@ def packed(runs: Sequence[Run], now: Mapping[str, str]) -> Packed:
     return Packed(files, places[::-1], reasons[::-1])
 
 
+# whose curves are those of the controller that the loop's figures are of
+LOOP = {"evaluate_temperature": "temperature", "evaluate_setpoint": "setpoint"}
 STAGES = ("evaluate_temperature", "train_ilc", "evaluate_setpoint")
 
 
@@ -98,6 +100,9 @@ def curves(run: Run, now: Mapping[str, str]) -> Found:
         ("evaluate_setpoint", "paths.parquet", _setpoint),
     )
     for stage, name, read in readers:
+        if (loop := LOOP.get(stage)) and not run.measured.controllers.get(loop):
+            reasons.append(f"no controller of the {loop} loop has figures in this run")
+            continue
         path = place(stage, name, run.made.get(stage, ""), now)
         if path is None:
             reasons.append(f"{stage}/{name} is not in DVC’s cache here")
