@@ -103,6 +103,26 @@ def history(arguments: argparse.Namespace) -> None:
     print(f"reports/history.html: {len(found)} runs, the last {found[-1].commit[:8] or 'not committed'}")
 
 
+def runs(arguments: argparse.Namespace) -> None:
+    """Write reports/runs.html: accepted runs, nights and DVC experiments in one table, with parameters and
+    figures of all three loops; two of them side by side; one column against another; the sweeps."""
+    from pipeline.report.runs import collected, figures, sweep
+    from pipeline.report.runs import page as runs_page
+    from pipeline.report.shared.verdict import ReportRules
+
+    sweeps, troubles = sweep.remembered()
+    names = dict.fromkeys([*arguments.also, *(swept.metric for swept in sweeps[-runs_page.MOST_SWEEPS :])])
+    asked = [*figures.columns(params.load(ReportRules, "report")), *map(figures.named, names)]
+    found = collected.collected(arguments.most, asked)
+    found = found._replace(troubles=[*found.troubles, *troubles])
+    made = runs_page.render(found, asked, sweeps)
+    artifacts.write_text("reports/runs.html", made.text)
+    artifacts.write_folder(runs_page.FOLDER, made.files)
+    print(f"reports/runs.html: {len(found.runs)} runs, the last {runs_page.name_of(found.runs[-1])}")
+    for trouble in found.troubles:
+        print(printable(trouble))
+
+
 def inspect(arguments: argparse.Namespace) -> None:
     """What is in a recording: signals, rates, jitter, gaps, ranges,
     damage; and a mapping to paste into params.yaml."""
@@ -415,6 +435,16 @@ def _add_training_print(commands: argparse._SubParsersAction) -> None:
     command.set_defaults(run=training_print)
 
 
+def _add_runs(commands: argparse._SubParsersAction) -> None:
+    command = commands.add_parser("runs", help=runs.__doc__, description=runs.__doc__)
+    command.add_argument("--most", type=int, default=1000, help="runs at most, the newest first (1000)")
+    command.add_argument(
+        "--also", action="append", default=[], metavar="STAGE:KEY",
+        help="a column more: a figure below reports/metrics, such as tune_weights:contestants.pi.cost",
+    )  # fmt: skip
+    command.set_defaults(run=runs)
+
+
 def _add_export(commands: argparse._SubParsersAction) -> None:
     command = commands.add_parser("export", help=export.__doc__)
     command.add_argument("controller", type=Path, metavar="CONTROLLER", help="a folder with controller.json")
@@ -451,6 +481,7 @@ def main() -> None:
         "--most", type=int, default=500, help="revisions to read at most, the newest first (500)"
     )
     command.set_defaults(run=history)
+    _add_runs(commands)
     command = commands.add_parser("inspect", help=inspect.__doc__)
     command.add_argument("file", type=Path)
     command.set_defaults(run=inspect)

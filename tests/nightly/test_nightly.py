@@ -28,6 +28,7 @@ from pipeline.nightly import (
     watch,
 )
 from pipeline.report.nightly.production import Champion
+from pipeline.store import artifacts
 from tests.nightly.toy_nights import Project, entered
 
 TOMORROW = datetime.timedelta(days=1)
@@ -515,7 +516,7 @@ def test_a_sweep_runs_every_point_beside_the_working_tree_and_tabulates_it(proje
     assert table == ["experiment,shift,learn:mean", "sweep-shift-1,1,12.0", "sweep-shift-2,2,13.0"]
     assert (
         project.folder / "datasets/learn/model.json"
-    ).read_bytes() == before and "lowest in experiment 1" in (
+    ).read_bytes() == before and "lowest at shift 1, 12" in (
         project.folder / "reports/sweep.html"
     ).read_text()
     assert project.run("git", "diff", "--stat").stdout == ""
@@ -525,6 +526,8 @@ def test_a_sweep_finds_the_file_of_each_key(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("params.yaml").write_text("learn: {window: null}")
     Path("params.expert.yaml").write_text("learn: {seed: 1}")
+    Path("dvc.yaml").write_text("stages: {learn: {cmd: learn}}")
+    artifacts.write_metrics("learn", {"cost": 1.0})
     asked = []
     monkeypatch.setattr(
         sweeping, "dvc", lambda *words, log: asked.append(words[words.index("--set-param") : -1])

@@ -92,7 +92,7 @@ def test_two_hundred_revisions_are_drawn_within_ten_seconds_with_their_own_figur
     assert [run.subject for run in runs] == [f"run {k}" for k in range(200)]
     text = PAGE.read_text()
     assert (
-        text.count('<svg class="plot') == 9 + 2 + 3
+        text.count('<svg class="plot') == 9 + 2 + 3 + 4
         and len(re.findall(r"<tr><th scope=\"row\"><code>[0-9a-f]{8}</code>", text)) == 200
     )
     assert "data-driven from 1 % to 2.99 %" in text.replace("\u202f", " ")
@@ -145,15 +145,15 @@ def test_a_revision_before_the_pages_kept_figures_is_read_from_its_scorecard_and
     # by hand: the gap, the largest one of the spread, the quantile of today, the worse material after
     # learning
     assert (
-        first.figures["window"]["gap_percent"] == (0.5, 0.4, 0.65)
-        and first.figures["window"]["worst_case_gap_percent"] == (0.65,) * 3
-        and first.figures["pi"]["cost"] == pytest.approx((0.5, 0.45, 0.55))
+        first.figures["window"]["gap_percent"][:3] == (0.5, 0.4, 0.65)
+        and first.figures["window"]["worst_case_gap_percent"][:3] == (0.65,) * 3
+        and first.figures["pi"]["cost"][:3] == pytest.approx((0.5, 0.45, 0.55))
     )
     assert {key: f.value for key, f in first.figures["deposition"].items()} == {
         "flow_error_percent": 2.5,
         "learned_percent": 5.0,
     }
-    assert broken.figures.keys() == {"deposition"}
+    assert broken.figures.keys() == {"deposition", "setpoint"} and not broken.figures["setpoint"]
     assert new.figures["window"]["settling_s"].high == np.inf
     command(monkeypatch)
     assert "not measured" in Page(PAGE).text
@@ -210,28 +210,6 @@ def test_without_a_git_or_a_revision_it_says_so_and_writes_nothing(
         command(monkeypatch)
     assert re.search(sentence, capsys.readouterr().err)
     assert not PAGE.exists()
-
-
-def test_a_sweep_names_every_experiment_by_whole_keys_and_its_page_cuts_no_name(empty, monkeypatch):
-    from pipeline.nightly import sweeping
-
-    monkeypatch.setattr(sweeping, "dvc", lambda *_, **__: None)
-    monkeypatch.setattr(
-        sweeping, "git", lambda verb, *_: "0123" if verb == "rev-parse" else '{"practical": {"cost": 1.5}}'
-    )
-    settings = ["tune_weights.seed=1,2", "train_agent.seed=3", "generate_probing.samples=9000"]
-    text = sweeping.sweep(settings, "tune_weights", "tune_weights:practical.cost")
-    names = [
-        f"sweep-tune_weights_seed-{seed}-train_agent_seed-3-generate_probing_samples-9000" for seed in (1, 2)
-    ]
-    page = Path("reports/sweep.html").read_text()
-    for name in names:
-        assert name in text and f"<bdi>{name}</bdi>" in page
-    assert Path("reports/sweep.csv").read_text().splitlines() == [
-        "experiment,tune_weights.seed,train_agent.seed,generate_probing.samples,tune_weights:practical.cost",
-        f"{names[0]},1,3,9000,1.5",
-        f"{names[1]},2,3,9000,1.5",
-    ]
 
 
 def test_in_a_browser_it_says_nothing_on_the_console_and_sorts_by_a_figure(empty, monkeypatch, open_page):

@@ -1,4 +1,5 @@
-"""The page of the history: the twelve figures run by run as small multiples, and a table of the runs."""
+"""The page of the history: the figures of the three loops run by run as small multiples, and a table of the
+runs."""
 
 import math
 import re
@@ -8,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.runs.history import Figure, Revision
+from pipeline.report.runs.figures import parts_questions, setpoint_questions
+from pipeline.report.runs.history import Revision
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import beyond_meaning, count, decimals, quantity, short
-from pipeline.report.shared.verdict import Question, ReportRules
+from pipeline.report.shared.verdict import Figure, Question, ReportRules
 from pipeline.report.temperature.verdict import questions
 
 # controller of the artifacts -> class of its line and its name; of the deposition loop only the composer in
@@ -53,13 +55,7 @@ def render(runs: Sequence[Revision], rules: ReportRules, *, pages: Sequence[tupl
         for question in OLD
         if any(_figure(run, name, question.key) for run in runs for name in BEFORE)
     ]
-    parts = [
-        Question(
-            0, "flow_error_percent", "Worst flow error of a part", "%", rules.flow_error_percent, False, ""
-        ),
-        Question(0, "line_volume_percent", "Worst line’s volume", "%", rules.line_volume_percent, False, ""),
-        Question(0, "learned_percent", "Left after learning", "%", rules.learned_percent, False, ""),
-    ]
+    parts, camera = parts_questions(rules), setpoint_questions(rules)
     return page.render(
         "history.html",
         here="history",
@@ -81,9 +77,14 @@ def render(runs: Sequence[Revision], rules: ReportRules, *, pages: Sequence[tupl
                 "parts",
                 [_panel(question, runs, {"deposition": ("dd", "composer in use")}) for question in parts],
             ),
+            (
+                "Setpoint",
+                "camera",
+                [_panel(question, runs, {"setpoint": ("dd", "the default")}) for question in camera],
+            ),
         ],
-        heads=[question.title for question in (*asked, *old, *parts)],
-        rows=[_row(run, (*asked, *old, *parts)) for run in reversed(runs[-ROWS:])],
+        heads=[question.title for question in (*asked, *old, *parts, *camera)],
+        rows=[_row(run, (*asked, *old, *parts, *camera)) for run in reversed(runs[-ROWS:])],
         more=max(len(runs) - ROWS, 0),
     )
 
@@ -145,7 +146,9 @@ def _alternative(question: Question, runs: int, changes: Sequence[str]) -> str:
 
 
 def _ends(figure: Figure | None) -> tuple[float, float, float]:
-    return (math.nan,) * 3 if figure is None else tuple(v if math.isfinite(v) else math.nan for v in figure)
+    return (
+        (math.nan,) * 3 if figure is None else tuple(v if math.isfinite(v) else math.nan for v in figure[:3])
+    )
 
 
 def _words(question: Question, value: float) -> str:
@@ -190,7 +193,7 @@ def _row(run: Revision, asked: Sequence[Question]) -> Row:
     cells = []
     for question in asked:
         # margins of earlier runs have today's keys, but are medians on the nominal plant
-        names = ("window",) if question in OLD else (run.winner, "subspace_lqg", "deposition")
+        names = ("window",) if question in OLD else (run.winner, "subspace_lqg", "deposition", "setpoint")
         figure = next(filter(None, (_figure(run, name, question.key) for name in names)), None)
         if figure is None:
             cells.append(Cell("not measured"))

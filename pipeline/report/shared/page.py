@@ -76,7 +76,7 @@ def environment() -> jinja2.Environment:
 
 
 # pages that the command line writes, linked where they are
-BESIDE = (("nightly", "Nightly"), ("history", "History"))
+BESIDE = (("nightly", "Nightly"), ("runs", "Runs"), ("history", "History"))
 
 
 def render(template: str, **values) -> str:

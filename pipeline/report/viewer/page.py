@@ -45,7 +45,7 @@ class Viewer(NamedTuple):
 
 def render(sources: Sources, judged: Judgement) -> Viewer:
     """viewer.html and what it loads."""
-    files: dict[str, str | bytes] = {LIBRARY: _library()}
+    files: dict[str, str | bytes] = {LIBRARY: library()}
     room = packed.LARGEST - sum(map(len, files.values()))
     entries, rows = [], []
     for shown in series.tables(sources):
@@ -84,7 +84,7 @@ def render(sources: Sources, judged: Judgement) -> Viewer:
     return Viewer(text, dict(sorted(files.items())))
 
 
-def _library() -> str:
+def library() -> str:
     """uPlot behind its licence."""
     licence = (VENDOR / "LICENSE").read_text(encoding="utf-8").strip()
     return f"/*!\n{licence}\n*/\n" + (VENDOR / "uPlot.iife.min.js").read_text(encoding="utf-8")
