@@ -137,7 +137,23 @@ def starts(path: Trajectory, place: slice) -> dict[str, Any]:
         "stay": told.stay.percent,
         "median_steps": float(told.median_steps) if np.isfinite(told.median_steps) else None,
         "by_start": by_start,
+        "by_figure": {
+            name: float(np.mean([by_start[f"{flow:g}, {temperature:g}"] for flow in flows]))
+            for name, (flows, temperature) in APPENDIX.items()
+        },
     }
+
+
+# the starts of each figure of the appendix: flows in percent, temperature in °C
+LOW, HIGH = (30.0, 60.0, 80.0), (120.0, 150.0, 200.0, 300.0)
+APPENDIX = {
+    "a_1": (LOW[1:], 190.0),
+    "a_2": (LOW, 210.0),
+    "a_3": (LOW, 230.0),
+    "a_4": (HIGH, 190.0),
+    "a_5": (HIGH, 210.0),
+    "a_6": (HIGH[:3], 230.0),
+}
 
 
 def waits(path: Trajectory, places: dict[str, slice]) -> dict[str, Any]:
@@ -156,6 +172,13 @@ def waits(path: Trajectory, places: dict[str, slice]) -> dict[str, Any]:
     return out
 
 
+def scaled(shares: list[list[float]]) -> bool:
+    """Whether every window has its largest share at one, and the others are noisy below it."""
+    table = np.array(shares)
+    others = np.sort(table, axis=1)[:, :2]
+    return bool((table.max(axis=1) == 1).all() and others.std() > 0.05 and others.mean() < 0.5)
+
+
 def reward_figures() -> dict[str, float]:
     """(14)-(16) at the points that check the turn of the ellipse."""
     points = {"at_110_205": (110.0, 205.0), "at_110_215": (110.0, 215.0)}
@@ -172,7 +195,7 @@ def rewards_of(agents: Agents, episode: int) -> dict[str, Any]:
     ends = {f"phase_{i + 1}": {"begins": part[0], "ends": part[-1]} for i, part in enumerate(phases)}
     falls = [after[0] < before[-1] for before, after in itertools.pairwise(phases)]
     learns = [part[-1] > part[0] for part in phases]
-    shape = {"falls_at_each": all(falls), "rises_within_each": all(learns)}
+    shape = {"as_told": all(falls) and all(learns)}
     return {"by_phase": phases, "updates": [len(part) for part in agents.rewards], **ends, **shape}
 
 
@@ -197,6 +220,19 @@ def table_2(settings: TrainAgent) -> dict[str, float]:
         "b": PHASES[0][1],
         "rotation_deg": math.degrees(ROTATION),
         "history": own.history,
+    }
+
+
+def arithmetic() -> dict[str, Any]:
+    """Numbers of the paper that follow from others of it."""
+    seen, valid, combinations, each = 69_668, 56_225, 15, 300
+    steps, seconds = (95, 40), (6.44, 9.43)
+    rests, least, most = 95.0, 75.0, 130.0
+    return {
+        "valid_percent": 100 * valid / seen,
+        "pictures": [combinations * each, valid - combinations * each],
+        "minutes": [count * each_s / 60 for count, each_s in zip(steps, seconds, strict=True)],
+        "case_1_percent": [100 * (1 - least / rests), 100 * (most / rests - 1)],
     }
 
 
@@ -240,6 +276,18 @@ def main() -> None:
         "seeds": seeds(),
         "parameters": sizes(agents),
         "table_2": table_2(settings),
+        "arithmetic": arithmetic(),
+        "distribution_is_scaled": scaled(result["agents"]["phase_3"]["figure_3_100"]["run"]["shares"]),
+        "settings": {
+            "right_percent": 100 * RHO,
+            "runs": RUNS,
+            "shown": SHOWN,
+            "resting": RESTING,
+            "starts": {name: list(start) for name, start in SINGLE.items()},
+            "waits_s": list(WAITS_S),
+            "melt_s": MELTS_S[-1],
+            "semi_axes": [length for pair in PHASES for length in pair],
+        },
         "guesses": train_agent.guesses(settings.li_2025),
     }
     papers.write("setpoint", result)
