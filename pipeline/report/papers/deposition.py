@@ -49,7 +49,7 @@ def pictures(results: Mapping[str, Any], sources: Sources) -> list[Drawn]:
             "Figure 10",
             "Sequenced basis signals",
             [_sequenced(results["figure_9"]), _printed(results["figure_9"])],
-            "Strokes: where a task begins. Our gantry hardly slows at a corner, so its signal is nearly level.",
+            "Strokes: where a task begins. Our gantry hardly slows at a corner: its signal is nearly level.",
         ),
         Drawn(
             "Figure 12",
@@ -157,7 +157,7 @@ def _level(signal: list[float]) -> str:
 
 def _sequence(part: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     rows = zip(range(1, len(part["tasks"]) + 1), part["tasks"], part["begin_s"], strict=True)
-    return ["", "Task", "Begins at, s"], [[str(i), task, number(begin, 1)] for i, task, begin in rows]
+    return ["Order", "Task", "Begins at, s"], [[str(i), task, number(begin, 1)] for i, task, begin in rows]
 
 
 def _sequenced(part: Mapping[str, Any]) -> Markup:

@@ -27,8 +27,8 @@ RULES = (
     "entries",
     "not_judged",
 )
-# a unit of the last digit, and what arithmetic adds
-HALF = 0.5 + 1e-6
+# what arithmetic adds to a difference, as a share of it
+ROUNDING = 1e-9
 
 
 class Entry(NamedTuple):
@@ -192,7 +192,8 @@ def _verdict(one: Mapping[str, Any], ours: Any, entries: list[Entry]) -> str:
         return HOLDS if (ours <= bound if rule == "at_most" else ours >= bound) else FAILS
     if rule == "within":
         apart = max(100 * abs(b / a - 1) for a, b in zip(_list(printed), _list(ours), strict=True))
-        return HOLDS if apart <= one["percent"] else SHAPE if apart <= one.get("shape_percent", 0) else FAILS
+        near, far = (one.get(key, 0) * (1 + ROUNDING) for key in ("percent", "shape_percent"))
+        return HOLDS if apart <= near else SHAPE if apart <= far else FAILS
     return HOLDS if _digits(one, ours) else FAILS
 
 
@@ -200,7 +201,8 @@ def _digits(one: Mapping[str, Any], ours: Any) -> bool:
     """Whether ours, rounded or cut to as many decimals, is what is printed."""
     step = 10.0 ** -one["places"]
     pairs = list(zip(_list(one["printed"]), _list(ours), strict=True))
-    return all(abs(b - a) <= HALF * step or 0 <= (b - a) * math.copysign(1, a) < step for a, b in pairs)
+    half, whole = step * (0.5 + ROUNDING), step * (1 - ROUNDING)
+    return all(abs(b - a) <= half or 0 <= (b - a) * math.copysign(1, a) < whole for a, b in pairs)
 
 
 def _same(printed: Any, ours: Any) -> bool:
