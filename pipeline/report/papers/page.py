@@ -2,7 +2,7 @@
 ours with its verdict; then our data in the papers' axes."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from pipeline.report.papers import deposition, setpoint, temperature
 from pipeline.report.papers.figures import Drawn
@@ -85,13 +85,3 @@ def brief(paper: Paper) -> list[tuple[str, list[str]]]:
     """The places of the rows that do not hold, and of those that cannot be judged, each once."""
     places = {verdict: [row.at for row in paper.rows if row.verdict == verdict] for verdict in (FAILS, OPEN)}
     return [(verdict, list(dict.fromkeys(at))) for verdict, at in places.items() if at]
-
-
-def judged(sources: Sources, files: Mapping[str, tuple[str, str]]) -> dict[str, Any]:
-    """Counts of verdicts by paper, for the metrics of the stage."""
-    out: dict[str, Any] = {}
-    for key, (printed, results) in files.items():
-        paper = read(printed, results, sources.metrics)
-        if not isinstance(paper, Missing):
-            out[key] = {verdict.replace(" ", "_"): paper.count(verdict) for verdict in VERDICTS}
-    return out
