@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks import papers_deposition, papers_setpoint, papers_temperature
-from pipeline.report.papers import page, rows
+from pipeline.report.papers import page, rows, setpoint
 from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS
 from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import Missing
@@ -195,6 +195,24 @@ def test_a_paper_whose_files_are_not_there_is_a_hole_that_says_how_to_make_them(
     gone = {"temperature": (PAPERS["temperature"][0], str(tmp_path / "temperature.json"))}
     text = page.render(sources(), gone)
     assert "./run python -m benchmarks.papers_temperature" in text and "No paper is set beside us" in text
+
+
+def test_the_confusion_of_the_classes_is_counted_in_percent_of_the_true_class():
+    table = {
+        "label": np.array([0, 0, 1, 2]),
+        "named": np.array([0, 1, 1, 0]),
+        "temperature_degC": np.array([190.4, 209.0, 211.0, 189.0]),
+    }
+    heads, shares = setpoint._confusion(table)
+    assert heads[1:] == ["insufficient", "optimal", "excessive"]
+    assert shares == [
+        ["insufficient", "50", "50", "0"],
+        ["optimal", "0", "100", "0"],
+        ["excessive", "100", "0", "0"],
+    ]
+    heads, right = setpoint._by_temperature(table)
+    assert heads[1:] == ["190 °C", "210 °C"]
+    assert right == [["insufficient", "100", "0"], ["optimal", "", "100"], ["excessive", "0", ""]]
 
 
 def test_two_renderings_are_the_same_bytes():

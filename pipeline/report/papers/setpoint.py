@@ -220,27 +220,38 @@ def _vision(sources: Sources) -> list[Drawn]:
             )
         )
     if not isinstance(classified, Missing):
-        out.append(
-            Drawn(
-                "Figure 5 (c)",
-                "Named as, in per cent of the pictures of a class",
-                [],
-                "Of the last run, all temperatures together, pictures that nothing was learned on.",
-                _confusion(classified),
-            )
+        tables = (
+            ("Named as, in per cent of the pictures of a class", _confusion(classified)),
+            ("Named right, in per cent, by temperature", _by_temperature(classified)),
         )
+        told = "Of the last run, pictures that nothing was learned on."
+        out += [Drawn("Figure 5 (c)", title, [], told, table) for title, table in tables]
     return out
 
 
 def _confusion(table: Mapping[str, np.ndarray]) -> tuple[list[str], list[list[str]]]:
-    shares = np.stack([table[name] for name in ("p_under", "p_good", "p_over")], axis=1)
-    named, rows = shares.argmax(axis=1), []
-    for label, title in enumerate(CLASSES):
-        mine = named[table["label"] == label]
-        rows.append(
-            [title, *(number(100 * float((mine == k).mean()), 1) if len(mine) else "" for k in range(3))]
-        )
+    """Per cent of the pictures of a true class that are named so."""
+    rows = [
+        [title, *(_percent(table["named"][table["label"] == label] == k) for k in range(len(CLASSES)))]
+        for label, title in enumerate(CLASSES)
+    ]
     return ["True class", *CLASSES], rows
+
+
+def _by_temperature(table: Mapping[str, np.ndarray]) -> tuple[list[str], list[list[str]]]:
+    """Per cent of the pictures of a true class that are named right, by nozzle temperature to ten degrees."""
+    near = np.round(table["temperature_degC"], -1)
+    levels = np.unique(near)
+    right = table["named"] == table["label"]
+    rows = [
+        [title, *(_percent(right[(table["label"] == label) & (near == level)]) for level in levels)]
+        for label, title in enumerate(CLASSES)
+    ]
+    return ["True class", *(f"{level:g} °C" for level in levels)], rows
+
+
+def _percent(mask: np.ndarray) -> str:
+    return number(100 * float(mask.mean()), 0) if len(mask) else ""
 
 
 def _starts(by_start: Mapping[str, float]) -> tuple[list[str], list[list[str]]]:
