@@ -1,5 +1,5 @@
 """Artifacts -> pages: reports/index.html, temperature.html, identification.html, deposition.html,
-setpoint.html, certificate.html, viewer.html with its columns in reports/data.
+setpoint.html, certificate.html, papers.html, viewer.html with its columns in reports/data.
 
 It reads the metrics and tables of every stage and reports/accepted.json. A missing file is shown as missing.
 Every file read is hashed, and the pages carry the hashes. The drift on page one is that of the last night
@@ -12,6 +12,7 @@ from pipeline.report.certificate import page as certificate_page
 from pipeline.report.deposition import page as deposition_page
 from pipeline.report.identification import page as identification_page
 from pipeline.report.index import page as index_page
+from pipeline.report.papers import page as papers_page
 from pipeline.report.setpoint import page as setpoint_page
 from pipeline.report.shared import headline
 from pipeline.report.shared.sources import Declared, collect, digest
@@ -57,6 +58,13 @@ FOLDERS = {
 # the relearnings of the study's machine, an accepted result of `./run python -m benchmarks.temperature`
 RELEARNED = "benchmarks/results/temperature_relearned.json"
 
+# what the papers print, and ours beside it, accepted results of `./run python -m benchmarks.papers_NAME`
+PAPERS = {
+    "temperature": ("datasets/papers/temperature.toml", "benchmarks/results/papers/temperature.json"),
+    "setpoint": ("datasets/papers/setpoint.toml", "benchmarks/results/papers/setpoint.json"),
+    "deposition": ("datasets/papers/deposition.toml", "benchmarks/results/papers/deposition.json"),
+}
+
 
 def main() -> None:
     with artifacts.stage("report"):
@@ -73,6 +81,7 @@ def main() -> None:
             "deposition": deposition_page.render(sources),
             "setpoint": setpoint_page.render(sources),
             "certificate": certificate_page.render(sources, judged.verdict),
+            "papers": papers_page.render(sources, PAPERS),
             "viewer": viewer.text,
         }
         artifacts.write_text("reports/index.html", pages["index"])
@@ -81,6 +90,7 @@ def main() -> None:
         artifacts.write_text("reports/deposition.html", pages["deposition"])
         artifacts.write_text("reports/setpoint.html", pages["setpoint"])
         artifacts.write_text("reports/certificate.html", pages["certificate"])
+        artifacts.write_text("reports/papers.html", pages["papers"])
         artifacts.write_text("reports/viewer.html", pages["viewer"])
         artifacts.write_folder("reports/data", viewer.files)
         artifacts.write_metrics(

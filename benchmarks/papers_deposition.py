@@ -1,0 +1,255 @@
+"""Hoelzle, Alleyne and Wagoner Johnson 2009 beside us: every figure of the paper on its own nominal machine,
+and the same law on a machine that is not its model.
+
+`./run python -m benchmarks.papers_deposition` writes benchmarks/results/papers/deposition.json, which
+reports/papers.html shows; seconds. The paper prints neither lengths nor speeds of its training routine: ours
+is that of benchmarks.ilc, a pulse of two plateaus with a pause of 0.6 s between them, at 50 Hz.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import papers
+from benchmarks.composition import FIG_9, MACHINE, NOZZLE, PART, PARTS, forbidden, percent
+from benchmarks.ilc import (
+    AREA,
+    HOELZLE,
+    HOELZLE_Q,
+    MATERIALS,
+    NO_ROLL_BACK,
+    NOISE,
+    SPEED,
+    STEADY,
+    TS,
+    causal_q,
+)
+from pipeline.deposition import ilc
+from pipeline.deposition.composition import Learned, compose, learn, priority
+from pipeline.deposition.drive import UNLIMITED
+from pipeline.deposition.extruder import Extruder, Routine, disturb, flow, frequency_response, routine
+from pipeline.deposition.gcode import Kind, Program, parse
+from pipeline.deposition.library import CORNER, START, STOP, TASKS, Training
+from pipeline.deposition.motion import plan
+
+FIVE = Path(__file__).parents[1] / "datasets" / "papers" / "tic_tac_toe_five_tasks.gcode"
+COMMAND = "./run python -m benchmarks.papers_deposition"
+TRIALS, SHOWN = 31, (0, 15, 30)  # figure 3 shows these, figure 5 the command of the last
+PAUSE_S = 0.6
+DELAYS_S = (0.0, 0.1, 0.15)
+ON_S, LIBRARY_ON_S = (
+    6.0,
+    14.0,
+)  # plateaus of three time constants of B: those of 6 s are too short to cut a library from
+
+
+def trained(on_s: float) -> Routine:
+    """The training routine: off, on, pause, on, off."""
+    return routine(
+        off_s=4, on_s=on_s, pause_s=PAUSE_S, tail_s=8, speed=SPEED, bead_area_mm2=AREA, ramp_s=0.15,
+        sample_time_s=TS,
+    )  # fmt: skip
+
+
+def learned(plant: Extruder, nominal: Extruder, r: np.ndarray, q=ilc.zero_phase) -> list[ilc.Trial]:
+    """TRIALS updates of the paper's law (2) from on-off control, the drive without limits, no roll-back."""
+    rng = np.random.default_rng(0)
+    law = ilc.hoelzle_law(r, nominal, q, HOELZLE, drive=UNLIMITED, sample_time_s=TS)
+
+    def measure(u: np.ndarray) -> ilc.Trial:
+        y = flow(plant, u, sample_time_s=TS)
+        return ilc.Trial(u, disturb(y, rng, steady_flow=STEADY, **NOISE), y)
+
+    return ilc.learn(law, measure, r / nominal.gain, r, trials=TRIALS, rise=NO_ROLL_BACK)
+
+
+def ratios(trials: list[ilc.Trial], r: np.ndarray) -> list[float]:
+    """R.m.s. error of the true flow in percent of trial 0's."""
+    errors = [float(np.sqrt(np.mean((trial.truth - r) ** 2))) for trial in trials]
+    return [100 * error / errors[0] for error in errors]
+
+
+def thinned(x: np.ndarray, every: int = 5, digits: int = 4) -> list[float]:
+    """A curve for a picture."""
+    return [round(float(value), digits) for value in np.asarray(x, float)[::every]]
+
+
+def learning(task: Routine) -> dict[str, Any]:
+    """Figures 3 to 5: A and B on their nominal machines, A with delays that the model lacks, and with a Q
+    that runs forward only."""
+    out: dict[str, Any] = {"time_s": thinned(task.time_s, digits=2), "wanted": thinned(task.r / STEADY)}
+    printing, commands = task.r > 0, {}
+    for name, nominal in MATERIALS.items():
+        trials = learned(nominal, nominal, task.r)
+        ratio, u = ratios(trials, task.r), trials[TRIALS].u
+        commands[name] = u
+        out[name] = {
+            "flow": {f"trial_{j}": thinned(trials[j].truth / STEADY) for j in SHOWN},
+            "ratio": [round(value, 3) for value in ratio],
+            "ratio_30": ratio[30],
+            "best": min(ratio),
+            "first_below_20": next(j for j, value in enumerate(ratio) if value < 20),
+            "command": thinned(u),
+            "steady_mm": STEADY / nominal.gain,
+            "peak_mm": float(np.abs(u).max()),
+            "rms_mm": float(np.sqrt(np.mean(u[printing] ** 2))),
+        }
+    delayed = MATERIALS["A"]
+    out["delays"] = {
+        f"delay_{round(1000 * delay)}_ms": [
+            round(value, 3)
+            for value in ratios(learned(delayed._replace(delay_s=delay), delayed, task.r), task.r)
+        ]
+        for delay in DELAYS_S
+    }
+    out["gamma"] = {f"delay_{round(1000 * delay)}_ms": convergence(delay) for delay in DELAYS_S}
+    out["late"] = {name: rows[-1] for name, rows in out["delays"].items()}
+    out["causal_best"] = min(ratios(learned(delayed, delayed, task.r, causal_q), task.r))
+    out["effort"] = {
+        f"{key}_ratio": out["B"][f"{key}_mm"] / out["A"][f"{key}_mm"] for key in ("steady", "rms", "peak")
+    }
+    out["excursion_ratio"] = float(np.ptp(commands["B"]) / np.ptp(commands["A"]))
+    return out
+
+
+def convergence(delay_s: float) -> float:
+    """max |Q (1 - L P)| of the law for material A on a machine that is `delay_s` later than its model."""
+    f, nominal = np.linspace(0.0, 24.9, 4000), MATERIALS["A"]
+    Q = ilc.magnitude(f, sample_time_s=TS, **HOELZLE_Q) ** 2
+    L = ilc.hoelzle_filter(f, nominal, HOELZLE, sample_time_s=TS)
+    P = frequency_response(nominal._replace(delay_s=delay_s), f, sample_time_s=TS)
+    return float(ilc.gamma(Q, L, P))
+
+
+def library(task: Routine) -> tuple[Learned, dict[str, Any]]:
+    """Figure 6 and matrix (3): the commands of the last trials of A and B, cut into basis signals."""
+    trainings = []
+    for name, nominal in MATERIALS.items():
+        trials = learned(nominal, nominal, task.r)
+        trainings.append(
+            Training(name, NOZZLE, task, np.array([t.u for t in trials]), np.array([t.y for t in trials]))
+        )
+    known = learn(trainings, sample_time_s=TS)
+    rows = [
+        {
+            "material": basis.material,
+            "task": basis.task,
+            "lead": basis.lead,
+            "length": len(basis.signal),
+            "signal": thinned(basis.signal, every=2),
+        }
+        for basis in known.library.columns
+    ]
+    marks = {name: list(span) for name, span in known.library.marks.items()}
+    events = {START: [task.start_s] * 2, CORNER: list(task.pause_s), STOP: [task.stop_s] * 2}
+    in_first = known.library.columns[0].material
+    tasks = {row["task"] for row in rows if row["material"] == in_first}
+    steady, peak = STEADY / MATERIALS["A"].gain, float(np.abs(trainings[0].u[-1]).max())
+    jump = max(one.percent for one in known.checks if one.assumption == 4) * steady / peak
+    return known, {
+        "columns": rows,
+        "all_five": tasks == set(TASKS),
+        "jump_percent_of_peak": jump,
+        "marks_s": marks,
+        "events_s": events,
+        "command": thinned(trainings[0].u[-1]),
+        "time_s": thinned(task.time_s, digits=2),
+    }
+
+
+def composed(known: Learned, path: Path, tools: dict[int, str], *, curves: bool) -> dict[str, Any]:
+    """One part by the paper's rule of priority: its tasks, their commands, and the error of the true flow in
+    percent of on-off control, on the nominal machines."""
+    program = parse(path.read_text())
+    made = compose(known, program, plan(program.moves, **MACHINE), PART, materials=tools)
+    tasks = made.tasks
+    counts = {name: int((tasks.task == name).sum()) for name in TASKS}
+    out: dict[str, Any] = {
+        "tasks": tasks.task.tolist(),
+        "begin_s": [round(float(t), 3) for t in tasks.begin_s],
+        "forbidden": len(forbidden(tasks.task, tasks.tool)),
+        "counts": {name.replace("-", "_").lower(): count for name, count in counts.items()},
+        "all_five": all(counts.values()),
+        "lines": len(made.lines.line),
+        "duration_s": TS * len(made.streams[0].r),
+        "percent": {},
+    }
+    for stream in made.streams:
+        where = (known.library, stream.material, NOZZLE, tasks, made.lines, stream.tool)
+        u, plant = priority(*where, samples=len(stream.r)), MATERIALS[stream.material]
+        out["percent"][stream.material] = percent(plant, plant, u, stream.r)
+        if curves:
+            y = flow(plant, u, sample_time_s=TS)
+            out |= {
+                "command": thinned(u),
+                "flow": thinned(y / STEADY),
+                "wanted": thinned(stream.r / STEADY),
+                "time_s": thinned(np.arange(len(u)) * TS, digits=2),
+            }
+        else:
+            out["path"] = drawn(program)
+    return out | {"worst_percent": max(out["percent"].values())}
+
+
+def drawn(program: Program) -> list[dict[str, Any]]:
+    """Each printed move as a line of points in mm, with its tool: figure 12."""
+    moves, rows = program.moves, []
+    for k in np.flatnonzero((moves.kind == Kind.EXTRUDE) & (moves.length > 0)):
+        start, end = moves.start[k, :2], moves.end[k, :2]
+        points = np.array([start, end])
+        if np.isfinite(moves.centre[k]).all():
+            turn = np.linspace(0.0, moves.angle[k], 25)[:, None]
+            arm = start - moves.centre[k]
+            across = np.array([-arm[1], arm[0]])
+            points = moves.centre[k] + arm * np.cos(turn) + across * np.sin(turn)
+        rows.append(
+            {
+                "tool": int(moves.tool[k]),
+                "x": [round(float(v), 2) for v in points[:, 0]],
+                "y": [round(float(v), 2) for v in points[:, 1]],
+            }
+        )
+    return rows
+
+
+def table_1() -> dict[str, Any]:
+    """What table I and (2) list, as it was used here."""
+    return {
+        "gain": [nominal.gain for nominal in MATERIALS.values()],
+        "time_constant_s": [nominal.time_constant_s for nominal in MATERIALS.values()],
+        "learning_gain": HOELZLE.learning_gain,
+        "cutoff_hz": HOELZLE.cutoff_hz,
+        "order": HOELZLE.order,
+        "hierarchy": list(TASKS),
+        "plateau_s": ON_S,
+        "library_plateau_s": LIBRARY_ON_S,
+        "pause_s": PAUSE_S,
+        "rate_hz": 1 / TS,
+        "delays_ms": [1000 * delay for delay in DELAYS_S],
+    }
+
+
+def main() -> None:
+    task = trained(LIBRARY_ON_S)
+    known, cut = library(task)
+    figure_9 = composed(known, PARTS / "fig9.gcode", {0: "A"}, curves=True)
+    parts = {
+        name: composed(known, path, {0: "A", 1: "B"}, curves=False)
+        for name, path in (("tic_tac_toe", PARTS / "tic_tac_toe.gcode"), ("five_tasks", FIVE))
+    }
+    result = {
+        "command": COMMAND,
+        "learning": learning(trained(ON_S)),
+        "library": cut,
+        "figure_9": figure_9 | {"as_printed": figure_9["tasks"] == FIG_9},
+        **parts,
+        "forbidden": sum(part["forbidden"] for part in (figure_9, *parts.values())),
+        "part_over_routine": parts["five_tasks"]["duration_s"] / float(task.time_s[-1] + TS),
+        "settings": table_1(),
+    }
+    papers.write("deposition", result)
+
+
+if __name__ == "__main__":
+    main()

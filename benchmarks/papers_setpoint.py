@@ -1,0 +1,297 @@
+"""Li and Pattinson 2025 beside us: the agent of the paper on the paper's own simulator, phase by phase, the
+single runs that it shows, both readings of its rho, and how long to wait.
+
+`./run python -m benchmarks.papers_setpoint` writes benchmarks/results/papers/setpoint.json, which
+reports/papers.html shows. It takes the agent from datasets/memo/train_agent where that was trained with the
+same settings, else it trains it, and once more with rho read the other way: minutes. The paper prints neither
+delta, alpha nor sigma of its simulator: ours are in pipeline/setpoint/published.py.
+"""
+
+import itertools
+import json
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import papers
+from pipeline.setpoint import agent, judging, score
+from pipeline.setpoint.published import PHASES, ROTATION
+from pipeline.setpoint.simulator import Conditions, Trajectory, nominal, paper_windows, reward, rollout
+from pipeline.setpoint.vision_transformer import PAPER, parameters, vision_transformer
+from pipeline.setpoint.workflow import train_agent
+from pipeline.setpoint.workflow.settings import TrainAgent
+from pipeline.store import params
+
+SEEDS = Path(__file__).parent / "results" / "agent.json"
+COMMAND = "./run python -m benchmarks.papers_setpoint"
+MEMO = Path("datasets/memo/train_agent")
+RUNS, STEPS, SHOWN, RESTING = 100, 200, 100, 20
+# start of the single runs: flow in percent, temperature in °C
+SINGLE = {
+    "figure_3": (191.0, 213.3),
+    "figure_7": (232.0, 190.0),
+    "case_1": (300.0, 230.0),
+    "case_2": (30.0, 190.0),
+}
+PICTURES = {
+    ("phase_3", "figure_3_100"),
+    *((f"phase_{i}", "figure_7_100") for i in (1, 2, 3)),
+    *((f"phase_{i}", "figure_7_70") for i in (3, 4)),
+    ("phase_4", "case_1_70"),
+    ("phase_4", "case_2_70"),
+}
+WAITS_S, MELTS_S = (3.0, 6.0), (0.0, 2.0, 4.0)
+RHO = 0.7
+
+
+class Agents(NamedTuple):
+    """The networks after each phase, the fourth with the class right with probability 0.7 and with 0.3, and
+    the mean reward of a step of each phase."""
+
+    by_name: dict[str, agent.QNetwork]
+    rewards: list[np.ndarray]
+
+
+def trained(settings: TrainAgent) -> Agents:
+    """The paper's agent, and the one whose phase 4 takes rho for the probability of a wrong class."""
+    other = settings.model_copy(update={"li_2025": settings.li_2025.model_copy(update={"accuracy": 1 - RHO})})
+    MEMO.mkdir(parents=True, exist_ok=True)
+    as_read, otherwise = (
+        train_agent.published_agent(one, MEMO, lambda *_: None) for one in (settings, other)
+    )
+    by_name = {f"phase_{i + 1}": network for i, network in enumerate(as_read.networks)}
+    by_name["phase_4_rho_wrong"] = otherwise.networks[-1]
+    return Agents(by_name, [np.asarray(part) for part in as_read.rewards])
+
+
+def asked() -> tuple[Conditions, dict[str, slice]]:
+    """Everything that each agent is asked, as one batch, and where in it."""
+    parts, places, end = [], {}, 0
+
+    def add(name: str, part: Conditions) -> None:
+        nonlocal end
+        parts.append(part)
+        places[name] = slice(end, end + part.flow.shape[0])
+        end += part.flow.shape[0]
+
+    for accuracy in (1.0, RHO, 1 - RHO):
+        add(f"starts_{100 * accuracy:.0f}", judging.starts(20, accuracy=accuracy))
+    for name, (flow, temperature) in SINGLE.items():
+        for accuracy in (1.0, RHO):
+            add(f"{name}_{100 * accuracy:.0f}", nominal(np.full(RUNS, flow), temperature, accuracy=accuracy))
+    for wait_s in WAITS_S:
+        for melt_s in MELTS_S:
+            part = nominal(np.full(RUNS, SINGLE["case_2"][0]), SINGLE["case_2"][1], accuracy=1.0)
+            ones = jnp.ones(RUNS)
+            add(
+                f"wait_{wait_s:.0f}_melt_{melt_s:.0f}",
+                part._replace(wait_s=wait_s * ones, melt_s=melt_s * ones),
+            )
+    return jax.tree.map(lambda *fields: jnp.concatenate(fields), *parts), places
+
+
+def single(path: Trajectory, place: slice, *, shown: bool) -> dict[str, Any]:
+    """One start: where it rests, how far it goes past once it came near, and the first of its runs."""
+    q, u = (np.asarray(a, float)[place, : SHOWN + 1] for a in (path.flow, path.temperature))
+    since = np.maximum.accumulate(np.abs(q - 100.0) <= 10.0 + 1e-3, axis=1)
+    came = since.any(axis=1)
+    least, most = (
+        float(np.median(bound(np.where(since, q, fill), axis=1)[came])) if came.any() else None
+        for bound, fill in ((np.min, np.inf), (np.max, -np.inf))
+    )
+    shares = np.asarray(path.shares, float)[place.start, :SHOWN]
+    run = {
+        "flow": [round(float(v), 2) for v in q[0]],
+        "temperature": [round(float(v), 2) for v in u[0]],
+        "shares": [[round(float(v), 3) for v in row / row.max()] for row in shares],
+    }
+    return {
+        "rests_at": float(np.median(q[:, -RESTING:].mean(axis=1))),
+        "rests_at_degC": float(np.median(u[:, -RESTING:].mean(axis=1))),
+        "least": least,
+        "most": most,
+        "least_degC": float(np.median(u.min(axis=1))),
+        "flow_range": float(np.median(np.ptp(q[:, SHOWN // 2 :], axis=1))),
+        "temperature_range": float(np.median(np.ptp(u[:, SHOWN // 2 :], axis=1))),
+    } | ({"run": run} if shown else {})
+
+
+def starts(path: Trajectory, place: slice) -> dict[str, Any]:
+    """The 21 starts: settled and staying, in percent, and settled by start."""
+    q, u = (np.asarray(a)[place] for a in (path.flow, path.temperature))
+    told = score.judge(q, u)
+    settled = score.outcomes(q, u).settled
+    by_start = {
+        f"{flow:g}, {temperature:g}": 100.0
+        * float(settled[(q[:, 0] == flow) & (np.abs(u[:, 0] - temperature) < 1e-3)].mean())
+        for temperature in judging.START_TEMPERATURES
+        for flow in judging.START_FLOWS
+    }
+    return {
+        "runs": told.runs,
+        "settled": told.settled.percent,
+        "stay": told.stay.percent,
+        "median_steps": float(told.median_steps) if np.isfinite(told.median_steps) else None,
+        "by_start": by_start,
+        "by_figure": {
+            name: float(np.mean([by_start[f"{flow:g}, {temperature:g}"] for flow in flows]))
+            for name, (flows, temperature) in APPENDIX.items()
+        },
+    }
+
+
+# the starts of each figure of the appendix: flows in percent, temperature in °C
+LOW, HIGH = (30.0, 60.0, 80.0), (120.0, 150.0, 200.0, 300.0)
+APPENDIX = {
+    "a_1": (LOW[1:], 190.0),
+    "a_2": (LOW, 210.0),
+    "a_3": (LOW, 230.0),
+    "a_4": (HIGH, 190.0),
+    "a_5": (HIGH, 210.0),
+    "a_6": (HIGH[:3], 230.0),
+}
+
+
+def waits(path: Trajectory, places: dict[str, slice]) -> dict[str, Any]:
+    """Steps from (30 %, 190 °C) until a run is in the band for good, and how many get there."""
+    out = {}
+    for name, place in places.items():
+        if name.startswith("wait"):
+            of = score.outcomes(np.asarray(path.flow)[place], np.asarray(path.temperature)[place])
+            out[name] = {
+                "settled": 100.0 * float(of.settled.mean()),
+                "steps": float(np.median(of.entered[of.settled])) if of.settled.any() else None,
+            }
+            if name.endswith("melt_4"):
+                flow = np.asarray(path.flow)[place.start, : SHOWN + 1]
+                out[name]["flow"] = [round(float(v), 2) for v in flow]
+    return out
+
+
+def scaled(shares: list[list[float]]) -> bool:
+    """Whether every window has its largest share at one, and the others are noisy below it."""
+    table = np.array(shares)
+    others = np.sort(table, axis=1)[:, :2]
+    return bool((table.max(axis=1) == 1).all() and others.std() > 0.05 and others.mean() < 0.5)
+
+
+def reward_figures() -> dict[str, float]:
+    """(14)-(16) at the points that check the turn of the ellipse."""
+    points = {"at_110_205": (110.0, 205.0), "at_110_215": (110.0, 215.0)}
+    a, b = PHASES[0]
+    return {name: float(reward(jnp.array(q), jnp.array(u), a=a, b=b)) for name, (q, u) in points.items()}
+
+
+def rewards_of(agents: Agents, episode: int) -> dict[str, Any]:
+    """Figure 6: the mean reward of a step times the steps of an episode, 50 means a phase."""
+    phases = [
+        [round(episode * float(part.mean()), 3) for part in np.array_split(values, 50)]
+        for values in agents.rewards
+    ]
+    ends = {f"phase_{i + 1}": {"begins": part[0], "ends": part[-1]} for i, part in enumerate(phases)}
+    falls = [after[0] < before[-1] for before, after in itertools.pairwise(phases)]
+    learns = [part[-1] > part[0] for part in phases]
+    shape = {"as_told": all(falls) and all(learns)}
+    return {"by_phase": phases, "updates": [len(part) for part in agents.rewards], **ends, **shape}
+
+
+def seeds() -> dict[str, Any]:
+    """Settled in percent at accuracy 0.7 over the training seeds of benchmarks.agent, after phase 4."""
+    rows = json.loads(SEEDS.read_text())
+    settled = [row["four phases"]["accuracy 0.7"]["settled"] for name, row in rows.items() if "seed" in name]
+    return {"settled": settled, "least": min(settled), "most": max(settled), "seeds": len(settled)}
+
+
+def table_2(settings: TrainAgent) -> dict[str, float]:
+    """What table 2 lists, as it was used here."""
+    own = settings.li_2025
+    return {
+        "gamma": own.gamma,
+        "tau": own.tau,
+        "flow_actions": own.flow_actions,
+        "batch": own.batch,
+        "learning_rate": own.learning_rate,
+        "episode": own.episode,
+        "a": PHASES[0][0],
+        "b": PHASES[0][1],
+        "rotation_deg": math.degrees(ROTATION),
+        "history": own.history,
+    }
+
+
+def arithmetic() -> dict[str, Any]:
+    """Numbers of the paper that follow from others of it."""
+    seen, valid, combinations, each = 69_668, 56_225, 15, 300
+    steps, seconds = (95, 40), (6.44, 9.43)
+    rests, least, most = 95.0, 75.0, 130.0
+    return {
+        "valid_percent": 100 * valid / seen,
+        "pictures": [combinations * each, valid - combinations * each],
+        "minutes": [count * each_s / 60 for count, each_s in zip(steps, seconds, strict=True)],
+        "case_1_percent": [100 * (1 - least / rests), 100 * (most / rests - 1)],
+    }
+
+
+def sizes(networks: Agents) -> dict[str, Any]:
+    """Parameters of the networks, and what table 1 lists."""
+    classifier = vision_transformer(PAPER, np.random.default_rng(0))
+    return {
+        "head": parameters(classifier.head),
+        "vision_transformer_millions": parameters(classifier.body) / 1e6,
+        "layers": PAPER.layers,
+        "width": PAPER.width,
+        "patch": PAPER.patch[0],
+        "heads": PAPER.heads,
+        "dqn": sum(np.size(leaf) for leaf in jax.tree.leaves(networks.by_name["phase_1"])),
+    }
+
+
+def main() -> None:
+    settings = params.load(TrainAgent, "train_agent")
+    agents, (conditions, places) = trained(settings), asked()
+    controller = agent.greedy(agent.paper_encoder(settings.li_2025.history))
+    conditions = conditions._replace(
+        flow_actions=settings.li_2025.flow_actions * jnp.ones_like(conditions.flow)
+    )
+    key, result = jax.random.key(settings.seed + 2), {"command": COMMAND, "agents": {}}
+    for name, network in agents.by_name.items():
+        path = rollout(controller, network, paper_windows(), conditions, key, steps=STEPS)
+        row = {place: starts(path, where) for place, where in places.items() if place.startswith("starts")}
+        row |= {
+            place: single(path, where, shown=(name, place) in PICTURES)
+            for place, where in places.items()
+            if place.startswith(("case", "figure"))
+        }
+        result["agents"][name] = row | {"waits": waits(path, places)}
+        print(
+            name, {place: round(of["settled"], 1) for place, of in row.items() if "settled" in of}, flush=True
+        )
+    result |= {
+        "reward": reward_figures(),
+        "learning": rewards_of(agents, settings.li_2025.episode),
+        "seeds": seeds(),
+        "parameters": sizes(agents),
+        "table_2": table_2(settings),
+        "arithmetic": arithmetic(),
+        "distribution_is_scaled": scaled(result["agents"]["phase_3"]["figure_3_100"]["run"]["shares"]),
+        "settings": {
+            "right_percent": 100 * RHO,
+            "runs": RUNS,
+            "shown": SHOWN,
+            "resting": RESTING,
+            "starts": {name: list(start) for name, start in SINGLE.items()},
+            "waits_s": list(WAITS_S),
+            "melt_s": MELTS_S[-1],
+            "semi_axes": [length for pair in PHASES for length in pair],
+        },
+        "guesses": train_agent.guesses(settings.li_2025),
+    }
+    papers.write("setpoint", result)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""papers.html: for each paper every table, every figure and every number that is a result, printed beside
+ours with its verdict; then our data in the papers' axes."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from pipeline.report.papers import deposition, setpoint, temperature
+from pipeline.report.papers.figures import Drawn
+from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS, Paper, Row, read
+from pipeline.report.shared import page
+from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.verdict import Missing
+
+# glyph of a verdict, by the states that the pages know
+GLYPHS = {HOLDS: "passed", SHAPE: "passed", FAILS: "failed", OPEN: "open"}
+PICTURES = {
+    "temperature": temperature.pictures,
+    "deposition": deposition.pictures,
+    "setpoint": setpoint.pictures,
+}
+
+
+class Shown(NamedTuple):
+    """A paper as the page shows it: its anchor, the places that do not hold or cannot be judged, rows,
+    pictures, and the files that they are from."""
+
+    key: str
+    paper: Paper
+    brief: list[tuple[str, list[str]]]
+    rows: list[Row]
+    pictures: list[Drawn]
+    files: Sequence[str]
+
+
+class Count(NamedTuple):
+    """A line of the table at the top."""
+
+    key: str
+    title: str
+    rows: int
+    counts: list[int]
+
+
+def render(sources: Sources, files: Mapping[str, tuple[str, str]]) -> str:
+    """The page of the papers in `files`, {key: (printed, results)}."""
+    shown, gaps = [], []
+    for key, (printed, results) in files.items():
+        paper = read(printed, results, sources.metrics)
+        if isinstance(paper, Missing):
+            gaps.append((key, paper))
+            continue
+        pictures = PICTURES[key](paper.results, sources)
+        shown.append(Shown(key, paper, brief(paper), paper.rows, pictures, (printed, results)))
+    counts = [
+        Count(one.key, one.paper.title, len(one.rows), [one.paper.count(verdict) for verdict in VERDICTS])
+        for one in shown
+    ]
+    return page.render(
+        "papers.html",
+        here="papers",
+        title="Three papers beside us",
+        decision=decision([one.paper for one in shown]),
+        verdicts=VERDICTS,
+        counts=counts,
+        papers=shown,
+        gaps=gaps,
+        state=GLYPHS,
+        fails=FAILS,
+    )
+
+
+def decision(papers: Sequence[Paper]) -> str:
+    """What all papers come to, in a sentence."""
+    rows = sum(len(paper.rows) for paper in papers)
+    if not rows:
+        return "No paper is set beside us: the results are not there."
+    holds, shape, fails, opened = (sum(paper.count(verdict) for paper in papers) for verdict in VERDICTS)
+    return (
+        f"Of {rows} tables, figures and numbers of the papers {holds} hold, {shape} hold in shape, "
+        f"{fails} do not hold, and {opened} cannot be judged."
+    )
+
+
+def brief(paper: Paper) -> list[tuple[str, list[str]]]:
+    """The places of the rows that do not hold, and of those that cannot be judged, each once."""
+    places = {verdict: [row.at for row in paper.rows if row.verdict == verdict] for verdict in (FAILS, OPEN)}
+    return [(verdict, list(dict.fromkeys(at))) for verdict, at in places.items() if at]

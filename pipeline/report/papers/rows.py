@@ -1,0 +1,251 @@
+"""What the papers print, row by row, beside ours: the verdict of each row by its rule, and its words with
+the figures put in. Printed values stand in datasets/papers/*.toml, ours in benchmarks/results/papers/*.json
+and in the metrics of the run."""
+
+import math
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pipeline.report.shared.digits import number
+from pipeline.report.shared.verdict import Missing
+from pipeline.store import artifacts
+
+HOLDS, SHAPE, FAILS, OPEN = "holds", "holds in shape", "does not hold", "cannot be judged"
+VERDICTS = (HOLDS, SHAPE, FAILS, OPEN)
+RULES = (
+    "digits",
+    "same",
+    "at_most",
+    "at_least",
+    "within",
+    "between",
+    "claim",
+    "shape",
+    "entries",
+    "not_judged",
+)
+# what arithmetic adds to a difference, as a share of it
+ROUNDING = 1e-9
+
+
+class Entry(NamedTuple):
+    """A line of a table of the paper: its name, what is printed, ours, and whether they agree."""
+
+    name: str
+    printed: str
+    ours: str
+    verdict: str
+
+
+class Row(NamedTuple):
+    """A table, a figure or a number of a paper: its place there, what it says, printed and ours as text, the
+    verdict, how it is counted and why they part, and the lines of a table."""
+
+    at: str
+    what: str
+    printed: str
+    ours: str
+    verdict: str
+    why: str
+    entries: list[Entry]
+
+
+class Paper(NamedTuple):
+    """A paper: key of its files, title, citation, the finding, the rows, the results behind them and the
+    command that made these."""
+
+    key: str
+    title: str
+    cite: str
+    told: str
+    rows: list[Row]
+    results: Mapping[str, Any]
+    command: str
+
+    def count(self, verdict: str) -> int:
+        return sum(row.verdict == verdict for row in self.rows)
+
+
+def read(printed: str, results: str, metrics: Mapping[str, Any]) -> "Paper | Missing":
+    """A paper from its two files and the metrics of the run, by stage. A file that is not there is a Missing.
+
+    Raises ValueError, naming file and row, where a row has an unknown rule or asks for a figure that the
+    results do not hold.
+    """
+    for path, remedy in ((printed, f"git checkout {printed}"), (results, _command(results))):
+        if not artifacts.exists(path):
+            return Missing("not measured", f"{path} is not there", f"Run {remedy}")
+    try:
+        told = tomllib.loads(Path(printed).read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{printed}: {error}; bring it back with git checkout {printed}") from None
+    found = artifacts.read_json(results)
+    rows = [_row(one, found, metrics, f"{printed}: row {i + 1}") for i, one in enumerate(told["row"])]
+    head = told["paper"]
+    return Paper(
+        Path(printed).stem,
+        head["title"],
+        head["cite"],
+        _filled(head["told"], found, metrics, None, f"{printed}: told"),
+        rows,
+        found,
+        found["command"],
+    )
+
+
+def _command(results: str) -> str:
+    return f"./run python -m benchmarks.papers_{Path(results).stem}"
+
+
+# ---- a row
+
+
+def _row(one: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -> Row:
+    place = f"{place}, {one.get('at')}"
+    rule = one["rule"]
+    if rule not in RULES:
+        raise ValueError(
+            f"{place}: expected one of the rules {', '.join(RULES)}, found {rule!r}; write one of them"
+        )
+    entries = [_entry(line, found, metrics, place) for line in one.get("entries", ())]
+    ours = _ours(one, found, metrics, place)
+    unit = _filled(one.get("unit", ""), found, metrics, None, place)
+    places = one.get("places")
+    printed = _text(one.get("printed"), unit if not isinstance(one.get("printed"), str) else "", places)
+    if entries:
+        agree = sum(entry.verdict == HOLDS for entry in entries)
+        printed, shown = f"{len(entries)} entries", f"{agree} of {len(entries)} as printed"
+    else:
+        shown = _shown(ours, unit, one.get("ours_places", places))
+    verdict = _verdict(one, ours, entries)
+    why = _filled(one.get("why", ""), found, metrics, printed, place)
+    return Row(one["at"], one["what"], printed, shown, verdict, why, entries)
+
+
+def _entry(line: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -> Entry:
+    ours = _ours(line, found, metrics, place)
+    agrees = _same(line["printed"], ours) if "places" not in line else _digits(line, ours)
+    texts = (_text(value, "", line.get("places")) for value in (line["printed"], ours))
+    return Entry(line["name"], *texts, HOLDS if agrees else FAILS)
+
+
+def _ours(one: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -> Any:
+    """Our figure or figures, scaled; None where the row has none, a Missing where the run has not got it."""
+    asked, scale = one.get("ours"), one.get("scale", 1)
+    if asked is None:
+        return None
+    several = isinstance(asked, list)
+    values = [look_up(path, found, metrics, place) for path in (asked if several else [asked])]
+    gap = next((value for value in values if isinstance(value, Missing)), None)
+    if gap:
+        return gap
+    values = [value * scale if scale != 1 else value for value in values]
+    return values if several else values[0]
+
+
+def look_up(path: str, found: Mapping[str, Any], metrics: Mapping[str, Any], place: str) -> Any:
+    """The value at a dotted path of the results, or after "run:" of the metrics; a number counts in a list.
+
+    Raises ValueError where the results lack it; what the run lacks is a Missing.
+    """
+    in_run = path.startswith("run:")
+    stage, *_ = keys = path.removeprefix("run:").split(".")
+    value: Any = metrics if in_run else found
+    for key in keys:
+        if isinstance(value, Missing):
+            return value
+        try:
+            value = value[int(key)] if isinstance(value, list) else value[key]
+        except (KeyError, IndexError, TypeError, ValueError):
+            if in_run:
+                return Missing("not measured", f"{path} is not among what {stage} measured")
+            raise ValueError(
+                f"{place}: expected {path} among the results, found none; make them anew with the command in "
+                "their file"
+            ) from None
+    return value
+
+
+# ---- verdicts
+
+
+def _verdict(one: Mapping[str, Any], ours: Any, entries: list[Entry]) -> str:
+    """The verdict of a row by its rule."""
+    rule, printed = one["rule"], one.get("printed")
+    if rule == "not_judged" or isinstance(ours, Missing) or not one.get("judged", True):
+        return OPEN
+    if rule == "entries":
+        agree = sum(entry.verdict == HOLDS for entry in entries)
+        return HOLDS if agree == len(entries) else SHAPE if agree else FAILS
+    if rule in ("claim", "shape"):
+        return (HOLDS if rule == "claim" else SHAPE) if ours else FAILS
+    if rule == "same":
+        return HOLDS if _same(printed, ours) else FAILS
+    if rule == "between":
+        low, high = sorted(ours)
+        return SHAPE if low <= printed <= high else FAILS
+    if rule in ("at_most", "at_least"):
+        bound = one.get("bound", printed)
+        return HOLDS if (ours <= bound if rule == "at_most" else ours >= bound) else FAILS
+    if rule == "within":
+        apart = max(100 * abs(b / a - 1) for a, b in zip(_list(printed), _list(ours), strict=True))
+        near, far = (one.get(key, 0) * (1 + ROUNDING) for key in ("percent", "shape_percent"))
+        return HOLDS if apart <= near else SHAPE if apart <= far else FAILS
+    return HOLDS if _digits(one, ours) else FAILS
+
+
+def _digits(one: Mapping[str, Any], ours: Any) -> bool:
+    """Whether ours, rounded or cut to as many decimals, is what is printed."""
+    step = 10.0 ** -one["places"]
+    pairs = list(zip(_list(one["printed"]), _list(ours), strict=True))
+    half, whole = step * (0.5 + ROUNDING), step * (1 - ROUNDING)
+    return all(abs(b - a) <= half or 0 <= (b - a) * math.copysign(1, a) < whole for a, b in pairs)
+
+
+def _same(printed: Any, ours: Any) -> bool:
+    return _list(printed) == _list(ours)
+
+
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
+
+
+# ---- words
+
+
+def _text(value: Any, unit: str, places: int | None) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, list):
+        return ", ".join(_text(one, "", places) for one in value) + (f" {unit}" if unit else "")
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, str):
+        return value
+    shown = number(value, places) if places is not None else f"{value:,g}" if value < 1e6 else f"{value:,}"
+    return f"{shown} {unit}" if unit else shown
+
+
+def _shown(ours: Any, unit: str, places: int | None) -> str:
+    """Ours as text. A small number keeps a digit, so that nothing reads as zero that is not."""
+    if isinstance(ours, Missing):
+        return "not measured in this run"
+    if isinstance(ours, float) and places is not None and 0 < abs(ours) < 0.5 * 10.0**-places:
+        return f"below {number(10.0**-places, places)} {unit}".strip()
+    return _text(ours, unit, places)
+
+
+def _filled(text: str, found: Mapping, metrics: Mapping, printed: str | None, place: str) -> str:
+    """The words with {path:places} replaced by our figures, and {printed} by what the row prints."""
+
+    def put(match: re.Match[str]) -> str:
+        path, _, places = match[1].partition(":")
+        if path == "printed":
+            return printed or ""
+        value = look_up(path, found, metrics, place)
+        return _text(value, "", int(places) if places else None)
+
+    return re.sub(r"\{([^{}]+)\}", put, text)

@@ -1,0 +1,331 @@
+"""papers.html: each table and figure of the papers has its row, a verdict is what its rule says, figures come
+from the results and never from prose, and the results are what their benchmarks make."""
+
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import papers_deposition, papers_setpoint, papers_temperature
+from pipeline.report.papers import page, rows, setpoint
+from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS
+from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.verdict import Missing
+from pipeline.setpoint.workflow import train_agent
+from pipeline.setpoint.workflow.settings import TrainAgent
+from pipeline.store import params
+from pipeline.temperature import published
+from pipeline.temperature.kernel import exact_gains
+from pipeline.temperature.plant import baam
+from pipeline.temperature.tracking import gains
+from pipeline.temperature.workflow.record import read_published
+
+ROOT = Path(__file__).resolve().parents[2]
+SEEDS = {
+    "temperature": "seeds/seed1_zavrakli_output_feedback_rl.txt",
+    "setpoint": "seeds/seed2_li_pattinson_uncertainty_rl.txt",
+    "deposition": "seeds/seed3_hoelzle_ilc_basis_library.txt",
+}
+PAPERS = {
+    name: (str(ROOT / f"datasets/papers/{name}.toml"), str(ROOT / f"benchmarks/results/papers/{name}.json"))
+    for name in SEEDS
+}
+METRICS = {
+    "train_classifier": {"image_accuracy": 0.75, "window_accuracy": 0.9, "data": {"valid_share": 0.94}}
+}
+
+
+def printed(name):
+    return tomllib.loads(Path(PAPERS[name][0]).read_text(encoding="utf-8"))
+
+
+def results(name):
+    return json.loads(Path(PAPERS[name][1]).read_text())
+
+
+def sources(metrics=METRICS):
+    gap = Missing("not measured", "nothing ran")
+    return Sources(None, metrics, {"course": gap, "classified": gap}, {}, {}, None, "", {})
+
+
+# ---- nothing of a paper is left out
+
+
+@pytest.mark.parametrize("name", SEEDS)
+def test_every_table_and_figure_of_a_paper_has_its_row_and_a_verdict(name):
+    told = printed(name)
+    paper = rows.read(*PAPERS[name], METRICS)
+    places = {row.at for row in paper.rows}
+    for caption in told["paper"]["captions"]:
+        assert any(re.fullmatch(rf"{re.escape(caption)}(?: \(.*|, .*)?", at) for at in places), caption
+    assert {row.verdict for row in paper.rows} <= set(VERDICTS)
+    assert all(row.why for row in paper.rows if row.verdict in (OPEN,) and row.ours == "")
+
+
+@pytest.mark.parametrize("name", SEEDS)
+def test_the_captions_listed_are_those_of_the_papers_text(name, shared):
+    text = shared(SEEDS[name]).read_text(encoding="utf-8")
+    found = {
+        f"{'Table' if kind.lower() == 'table' else 'Figure'} {number}"
+        for kind, number in re.findall(
+            r"(?m)^\s*(Figure|Fig\.|Table|TABLE) ((?:A\.)?\d+|[IVX]+)(?=[:.]|\s*$)", text
+        )
+    }
+    assert found == set(printed(name)["paper"]["captions"])
+
+
+@pytest.mark.parametrize("name", SEEDS)
+def test_numbers_that_are_printed_stand_in_the_papers_text(name, shared):
+    # 183.436.2 is one of the spellings
+    text = re.sub(r"[.,\s]", "", shared(SEEDS[name]).read_text(encoding="utf-8"))
+    for row in printed(name)["row"]:
+        if row["rule"] == "digits" and "places" in row:
+            for value in rows._list(row["printed"]):
+                spellings = {f"{value:.{row['places']}f}", f"{value:g}", f"{value:.4f}".rstrip("0")}
+                assert any(spelling.replace(".", "") in text for spelling in spellings), (row["at"], value)
+
+
+# ---- verdicts
+
+
+def judged(ours, **row):
+    found = {"ours": ours}
+    asked = {"at": "Figure 1", "what": "x", "ours": "ours"} | row
+    return rows._row(asked, found, {}, "here").verdict
+
+
+@pytest.mark.parametrize(
+    ("ours", "verdict"),
+    [(0.0376, HOLDS), (0.03764, HOLDS), (0.03769, HOLDS), (0.0375, FAILS), (0.0377, FAILS), (2.87, FAILS)],
+)
+def test_digits_hold_where_ours_rounded_or_cut_is_what_is_printed(ours, verdict):
+    assert judged(ours, rule="digits", printed=0.0376, places=4) == verdict
+    assert judged([0.0376, ours], rule="digits", printed=[0.0376, 0.0376], places=4) == verdict
+
+
+@pytest.mark.parametrize(
+    ("rule", "ours", "verdict"),
+    [
+        ({"rule": "at_most", "printed": 20}, 20.0, HOLDS),
+        ({"rule": "at_most", "printed": 20}, 20.1, FAILS),
+        ({"rule": "at_most", "printed": "small", "bound": 1}, 2.0, FAILS),
+        ({"rule": "at_least", "printed": "all", "bound": 95}, 94.9, FAILS),
+        ({"rule": "at_least", "printed": "all", "bound": 95}, 95.0, HOLDS),
+        ({"rule": "within", "printed": 100, "percent": 1, "shape_percent": 10}, 101.0, HOLDS),
+        ({"rule": "within", "printed": 100, "percent": 1, "shape_percent": 10}, 92.0, SHAPE),
+        ({"rule": "within", "printed": 100, "percent": 1, "shape_percent": 10}, 89.0, FAILS),
+        ({"rule": "within", "printed": 100, "percent": 1}, 102.0, FAILS),
+        ({"rule": "between", "printed": 1.5}, [1.9, 1.2], SHAPE),
+        ({"rule": "between", "printed": 1.5}, [1.6, 1.9], FAILS),
+        ({"rule": "same", "printed": ["Stop", "Start"]}, ["Stop", "Start"], HOLDS),
+        ({"rule": "same", "printed": ["Stop", "Start"]}, ["Start", "Stop"], FAILS),
+        ({"rule": "claim", "printed": "so"}, True, HOLDS),
+        ({"rule": "claim", "printed": "so"}, False, FAILS),
+        ({"rule": "shape", "printed": "so"}, True, SHAPE),
+        ({"rule": "shape", "printed": "so"}, False, FAILS),
+        ({"rule": "not_judged", "printed": 1}, 1, OPEN),
+    ],
+)
+def test_a_rule_says_what_it_says(rule, ours, verdict):
+    assert judged(ours, **rule) == verdict
+
+
+def test_a_table_holds_in_shape_where_some_of_its_entries_do():
+    entries = [
+        {"name": "a", "printed": 1, "ours": "ours"},
+        {"name": "b", "printed": 0.01, "places": 2, "ours": "b"},
+    ]
+    row = {"at": "Table 1", "what": "x", "rule": "entries", "entries": entries}
+    for b, verdict in ((0.01, HOLDS), (0.1, SHAPE)):
+        assert rows._row(row, {"ours": 1, "b": b}, {}, "here").verdict == verdict
+    assert rows._row(row, {"ours": 2, "b": 0.1}, {}, "here").verdict == FAILS
+
+
+def test_what_the_run_lacks_is_open_and_what_the_results_lack_or_a_wrong_rule_is_refused_by_its_row():
+    row = {"at": "Figure 5", "what": "x", "printed": 1, "rule": "at_most", "ours": "run:train_classifier.a.b"}
+    made = rows._row(row, {}, {"train_classifier": Missing("failed", "it stopped")}, "here")
+    assert (made.verdict, made.ours) == (OPEN, "not measured in this run")
+    with pytest.raises(ValueError, match=r"here, Figure 5: expected a.b among the results"):
+        rows._row(row | {"ours": "a.b"}, {"a": {}}, {}, "here")
+    with pytest.raises(ValueError, match=r"here, Figure 5: expected one of the rules .* found 'roughly'"):
+        rows._row(row | {"rule": "roughly"}, {}, {}, "here")
+
+
+# ---- prose has no numbers of its own
+
+# references to places of a paper, and matrices
+REFERENCES = (
+    r"(?:Figures?|Tables?|Sections?|Equations?|Algorithm|phase|trial) [\d.]+(?: (?:to|and) [\d.]+)*",
+    r"\(\d+\)(?: (?:to|and) \(\d+\))*",
+    r"\(8/3\) I",
+    r"1-norm",
+    r"\{[^{}]*\}",
+    r"\|[^|]*\|",
+)
+
+
+@pytest.mark.parametrize("name", SEEDS)
+def test_no_number_is_typed_in_what_is_said_of_ours(name):
+    told = printed(name)
+    for text in [told["paper"]["told"], *(row.get("why", "") for row in told["row"])]:
+        rest = re.sub("|".join(REFERENCES), "", text)
+        assert not re.search(r"\d", rest), text
+
+
+# ---- the page
+
+
+def test_the_page_shows_every_row_of_every_paper_and_counts_them():
+    text = page.render(sources(), PAPERS)
+    papers = [rows.read(*files, METRICS) for files in PAPERS.values()]
+    assert text.count('<td class="at" role="cell">') == sum(len(paper.rows) for paper in papers)
+    counts = [sum(paper.count(verdict) for paper in papers) for verdict in VERDICTS]
+    assert page.decision(papers) == (
+        f"Of {sum(counts)} tables, figures and numbers of the papers {counts[0]} hold, {counts[1]} hold in "
+        f"shape, {counts[2]} do not hold, and {counts[3]} cannot be judged."
+    )
+    assert page.decision(papers) in text
+    assert text.count("<article>") > 25 and ">nan" not in text and "None" not in text
+
+
+def test_a_paper_whose_files_are_not_there_is_a_hole_that_says_how_to_make_them(tmp_path):
+    gone = {"temperature": (PAPERS["temperature"][0], str(tmp_path / "temperature.json"))}
+    text = page.render(sources(), gone)
+    assert "./run python -m benchmarks.papers_temperature" in text and "No paper is set beside us" in text
+
+
+def test_the_confusion_of_the_classes_is_counted_in_percent_of_the_true_class():
+    table = {
+        "label": np.array([0, 0, 1, 2]),
+        "named": np.array([0, 1, 1, 0]),
+        "temperature_degC": np.array([190.4, 209.0, 211.0, 189.0]),
+    }
+    heads, shares = setpoint._confusion(table)
+    assert heads[1:] == ["insufficient", "optimal", "excessive"]
+    assert shares == [
+        ["insufficient", "50", "50", "0"],
+        ["optimal", "0", "100", "0"],
+        ["excessive", "100", "0", "0"],
+    ]
+    heads, right = setpoint._by_temperature(table)
+    assert heads[1:] == ["190 °C", "210 °C"]
+    assert right == [["insufficient", "100", "0"], ["optimal", "", "100"], ["excessive", "0", ""]]
+
+
+def test_two_renderings_are_the_same_bytes():
+    assert page.render(sources(), PAPERS) == page.render(sources(), PAPERS)
+
+
+@pytest.mark.parametrize(
+    ("width", "theme", "rules"),
+    [
+        (390, "light", None),
+        (1280, "light", {"rules": {"color-contrast": {"enabled": False}}}),
+        pytest.param(1280, "light", {}, marks=pytest.mark.slow),
+        pytest.param(390, "light", {}, marks=pytest.mark.slow),
+        pytest.param(1280, "dark", {"runOnly": ["color-contrast"]}, marks=pytest.mark.slow),
+    ],
+)
+def test_nothing_overflows_texts_can_be_read_and_axe_finds_nothing(browser, tmp_path, width, theme, rules):
+    (tmp_path / "papers.html").write_text(page.render(sources(), PAPERS), encoding="utf-8")
+    context = browser.new_context(viewport={"width": width, "height": 800}, color_scheme=theme)
+    shown = context.new_page()
+    shown.goto(f"file://{tmp_path}/papers.html")
+    assert shown.evaluate("document.documentElement.scrollWidth") <= width
+    small = """() => [...document.querySelectorAll("svg.plot text")].filter(e =>
+        parseFloat(getComputedStyle(e).fontSize) * e.ownerSVGElement.getBoundingClientRect().width
+        / e.ownerSVGElement.viewBox.baseVal.width < 11).length"""
+    assert shown.evaluate(small) == 0
+    violations = []
+    if rules is not None:
+        axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+        options = {"resultTypes": ["violations"]} | rules
+        violations = axe.Axe().run(shown, options=options).response["violations"]
+    context.close()
+    assert [(one["id"], one["nodes"][0]["html"][:120]) for one in violations] == []
+
+
+# ---- the results are what the benchmarks make
+
+
+def test_r_s_generator_draws_the_studys_record():
+    u, y = papers_temperature.record(300)
+    _, stored_u, stored_y = read_published(str(ROOT / "datasets/published"))
+    np.testing.assert_allclose(u, stored_u[:300], atol=1e-10)
+    np.testing.assert_allclose(y, stored_y[:300], atol=1e-10)
+
+
+def test_the_runs_of_the_temperature_paper_are_those_that_the_stage_counts():
+    K0, *_ = read_published(str(ROOT / "datasets/published"))
+    found, ours = results("temperature"), published.model_based(published.IDENTITY, K0)
+    run = papers_temperature.observer_based(published.IDENTITY, K0)
+    assert (run.J[99], run.J[999]) == pytest.approx((ours.J100, ours.J1000), rel=1e-12)
+    assert found["model_based"]["identity"]["J1000"] == pytest.approx(ours.J1000, rel=1e-9)
+    assert found["model_based"]["identity"]["y"] == pytest.approx(run.y[99], rel=1e-12)
+    # any gain on a window does for the count of the data-driven runs
+    plant = baam()
+    best = gains(plant, np.eye(5), np.eye(7), published.GAMMA)
+    K, K_r = exact_gains(plant, best, 6)
+    told = published.data_driven(
+        published.IDENTITY[0], np.column_stack([K, K_r @ published.REFERENCE / 1000])
+    )
+    mine = papers_temperature.data_driven(published.IDENTITY[0], np.hstack([K, K_r]))
+    assert (mine.J[100], mine.J[1000]) == pytest.approx((told.J100, told.J1000), rel=1e-9)
+    assert np.linalg.norm(mine.y[99] - published.REFERENCE) == pytest.approx(told.error, abs=1e-9)
+
+
+def test_the_temperature_results_are_made_of_the_rows_and_the_stop_that_they_name():
+    u, y = papers_temperature.record(360)
+    few, many = papers_temperature.squares(u, y, (200, 300))
+    alone = papers_temperature.squares(u[:207], y[:207], (200,))[0]
+    # the same normal equations, whether or not more rows follow, up to the basis of the windows
+    assert np.linalg.norm(few.gram) == pytest.approx(np.linalg.norm(alone.gram), rel=1e-6)
+    assert np.trace(many.gram) > np.trace(few.gram)
+    found = results("temperature")["data_driven"]
+    assert found["rows"] == papers_temperature.SAMPLES + papers_temperature.LENGTH
+    assert found["tuned"]["error"] == found["tried"]["rows_15084"]["error"]
+
+
+def test_the_bandwidth_the_gain_and_the_ranks_are_the_machines():
+    assert papers_temperature.machine() == pytest.approx(results("temperature")["machine"])
+
+
+def test_the_deposition_results_are_made_by_the_law_on_its_nominal_machine():
+    found, task = results("deposition"), papers_deposition.trained(papers_deposition.ON_S)
+    nominal = papers_deposition.MATERIALS["A"]
+    ratio = papers_deposition.ratios(papers_deposition.learned(nominal, nominal, task.r), task.r)
+    assert found["learning"]["A"]["ratio"] == pytest.approx(ratio, abs=1e-3)
+    assert found["settings"] == json.loads(json.dumps(papers_deposition.table_1()))
+    # a Q that runs forward only is another law
+    causal = papers_deposition.learned(nominal, nominal, task.r, papers_deposition.causal_q)
+    assert min(papers_deposition.ratios(causal, task.r)) > 2 * min(ratio)
+
+
+def test_the_part_with_all_five_tasks_has_them_in_both_materials():
+    counts = results("deposition")["five_tasks"]["counts"]
+    assert min(counts.values()) > 0 and results("deposition")["tic_tac_toe"]["counts"]["corner"] == 0
+    tools = {row["tool"] for row in results("deposition")["five_tasks"]["path"]}
+    assert tools == {0, 1}
+
+
+def test_the_setpoint_results_are_of_the_settings_in_force():
+    settings, found = params.load(TrainAgent, "train_agent", ROOT / "params.yaml"), results("setpoint")
+    assert found["guesses"] == json.loads(json.dumps(train_agent.guesses(settings.li_2025)))
+    assert found["table_2"] == pytest.approx(papers_setpoint.table_2(settings))
+    assert found["arithmetic"] == json.loads(json.dumps(papers_setpoint.arithmetic()))
+    assert found["reward"] == pytest.approx(papers_setpoint.reward_figures(), rel=1e-5)
+    assert found["seeds"] == papers_setpoint.seeds()
+
+
+def test_a_single_start_is_told_by_its_own_runs():
+    class Path_:
+        flow = np.array([[200.0] * 40 + [100.0, 80.0] * 31, [200.0] * 40 + [100.0, 90.0] * 31])
+        temperature = np.full((2, 102), 210.0)
+        shares = np.full((2, 101, 3), 1 / 3)
+
+    told = papers_setpoint.single(Path_, slice(0, 2), shown=False)
+    assert (told["least"], told["most"], told["flow_range"]) == (85.0, 100.0, 15.0)
+    assert told["rests_at"] == pytest.approx(92.5, abs=0.5) and "run" not in told
