@@ -60,10 +60,10 @@ def environment() -> jinja2.Environment:
         "mark": mark,
         "bdi": bdi,
         "origin": origin,
+        "linked": linked,
         "missing": missing,
         "anchor": anchor,
         "term": term,
-        "hashed": hashed,
         "word_id": word_id,
     }
     script = Markup(templates.get_template("page.js").render().strip())
@@ -154,13 +154,23 @@ def origin(sources: list[Source], **place: str | Sequence[str]) -> Markup:
     return files(sources)
 
 
-def files(sources: list[Source]) -> Markup:
-    """The artifacts by name, each linked to its line of the provenance."""
+def files(sources: Sequence[Source]) -> Markup:
+    """The artifacts by name: a click gives the file, the title its digest."""
+    return Markup('<p class="src">From {}.</p>').format(linked(sources)) if sources else Markup("")
+
+
+def linked(sources: Sequence[Source], *, short: bool = False) -> Markup:
+    """The links to these files, with commas between them; `short`: without their folder."""
     parts = [
-        Markup('<a href="#{}"><code>{}</code></a>').format(anchor(s.path), s.path.split("/", 1)[1])
-        for s in sources
+        Markup('<a class="from" href="{}" title="{}, SHA-256 {}"><code>{}</code></a>').format(
+            source.link,
+            source.path,
+            source.sha256[:8],
+            source.path.rsplit("/", 1)[1] if short else source.path.split("/", 1)[1],
+        )
+        for source in sources
     ]
-    return Markup('<p class="src">From {}.</p>').format(Markup(", ").join(parts))
+    return Markup(", ").join(parts)
 
 
 def word_id(word: str) -> str:
@@ -171,17 +181,10 @@ def term(word: str, text: str = "") -> Markup:
     """A word of the page's list, linked to its meaning there; where a script runs,
     the meaning stands beside it on hover and focus."""
     return (
-        Markup('<a class="term" href="#{}">{}</a>').format(word_id(word), text or word)
+        Markup('<a class="term" href="words.html#{}">{}</a>').format(word_id(word), text or word)
         if word
         else escape(text)
     )
-
-
-def hashed(short: str, sources: list[Source]) -> Markup:
-    """The first digits of a hash, linked to the artifact that has it, where it is one's."""
-    source = next((source for source in sources if source.sha256.startswith(short)), None)
-    code = Markup("<code>{}</code>").format(short)
-    return Markup('<a href="#{}">{}</a>').format(anchor(source.path), code) if source else code
 
 
 def anchor(path: str) -> str:
