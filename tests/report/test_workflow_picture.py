@@ -4,7 +4,7 @@ from pathlib import Path
 
 import yaml
 
-from pipeline.report.index import workflow
+from pipeline.report.about import workflow
 from pipeline.store import artifacts
 from stages.report import main
 from tests.report.test_pages import INDEX as PAGE_ONE
@@ -28,7 +28,7 @@ def test_the_drawn_stages_are_those_of_dvc_yaml_and_read_what_they_read_there(ro
         if stage != "report"
     }
     assert {stage: set(found) for stage, found in workflow.READS.items()} == reads, (
-        "add the stage to READS in pipeline/report/index/workflow.py"
+        "add the stage to READS in pipeline/report/about/workflow.py"
     )
 
 

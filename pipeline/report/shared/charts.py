@@ -224,9 +224,10 @@ def panel(
             frame.width - frame.right, frame.height - 2, across
         )
     return Markup(
-        '<svg class="plot {}" viewBox="0 0 {} {}" role="img" aria-label="{}"{}>{}{}{}</svg>'
+        '<svg class="plot {}" style="--w:{}px" viewBox="0 0 {} {}" role="img" aria-label="{}"{}>{}{}{}</svg>'
     ).format(
         css,
+        frame.width,
         frame.width,
         frame.height,
         alt,

@@ -4,6 +4,7 @@ import base64
 import functools
 import hashlib
 import itertools
+import re
 import urllib.parse
 from collections.abc import Sequence
 
@@ -11,6 +12,7 @@ import jinja2
 from markupsafe import Markup, escape
 
 from pipeline.report.shared import digits
+from pipeline.report.shared.pictures import Column
 from pipeline.report.shared.sources import Source
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 from pipeline.store import artifacts
@@ -71,7 +73,12 @@ def environment() -> jinja2.Environment:
         "script": script,
         "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     }
-    templates.filters |= {"shortened": digits.shortened, "typeset": digits.typeset, "count": digits.count}
+    templates.filters |= {
+        "widest": widest,
+        "shortened": digits.shortened,
+        "typeset": digits.typeset,
+        "count": digits.count,
+    }
     return templates
 
 
@@ -95,6 +102,12 @@ def glyph(state: str) -> Markup:
     return Markup('<svg class="g{}" aria-hidden="true"><use href="#{}"/></svg>').format(
         bad, GLYPHS.get(state, "open")
     )
+
+
+def widest(columns: Sequence[Column]) -> int:
+    """Width in px for which the widest chart of these columns was drawn."""
+    panels = "".join(str(panel) for column in columns for panel in column.panels)
+    return max(map(int, re.findall(r'style="--w:(\d+)px"', panels)), default=208)
 
 
 def mark(controller: str) -> Markup:

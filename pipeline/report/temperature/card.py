@@ -105,7 +105,7 @@ def _step(sources: Sources, verdict: Verdict) -> Step:
     if not verdict.winner and verdict.state not in (PASSED, FAILED):
         return Step("Run the stages of this loop.", "./run dvc repro evaluate_temperature")
     if not sources.recorded:
-        return Step("Record your own machine for 20 minutes.", "./run beadline init RECORDING.csv --copy")
+        return Step("Record your own machine.", "./run beadline init RECORDING.csv --copy")
     if verdict.state == PASSED:
         folder = "datasets/export_controllers/temperature"
         return Step(
