@@ -134,13 +134,14 @@ def test_a_small_table_is_copied_beside_the_page_and_a_large_one_linked(tmp_path
     path = Path("datasets/ingest/record.parquet")
     path.parent.mkdir(parents=True)
     path.write_bytes(b"x" * 1000)
-    source = Source("record", path.as_posix(), "ingest", "record 1", "0")
-    assert packed.download(source, 10**6) == (
-        "data/ingest.record.parquet",
-        {"ingest.record.parquet": b"x" * 1000},
-        "1 kB",
-    )
-    assert packed.download(source, 999)[:2] == ("../datasets/ingest/record.parquet", {})
+    read = {path.as_posix(): Source("record", path.as_posix(), "ingest", "record 1", "0")}
+    [source] = linked(read).values()
+    assert source.link == "data/ingest.record.parquet" and packed.size_of(source) == "1 kB"
+    for bound in ("LARGEST_COPY", "LARGEST_COPIES"):
+        with monkeypatch.context() as tight:
+            tight.setattr(f"pipeline.report.shared.sources.{bound}", 999)
+            [source] = linked(read).values()
+            assert source.link == "../datasets/ingest/record.parquet"
 
 
 def test_the_folder_holds_what_this_run_wrote_and_nothing_older(project):
@@ -188,6 +189,7 @@ def test_a_series_that_has_no_room_is_listed_and_the_others_are_shown(project, m
     from stages.report import main
 
     monkeypatch.setattr(packed, "LARGEST", 60_000)
+    monkeypatch.setattr("pipeline.report.shared.sources.LARGEST_COPIES", 1000)
     main()
     tables = [table["name"] for table in manifest(Path("reports"))["tables"]]
     text = Path("reports/viewer.html").read_text(encoding="utf-8")

@@ -28,18 +28,19 @@ class Moved(NamedTuple):
 
 
 class LoopChange(NamedTuple):
-    """One loop: the figures that moved, of how many that both runs have."""
+    """One loop: the figures that moved, of how many that both runs have, and how many only this one has."""
 
     loop: str
     moved: Sequence[Moved]
     of: int
+    new: int = 0
 
     def sentence(self) -> str:
         """ "2 of 18 figures moved: settled error +0.39 °C · worse; ..."."""
         if not self.of:
             return "nothing to compare with."
         if not self.moved:
-            return f"none of {count(self.of, 'figure')} moved beyond its noise."
+            return f"no figure of {self.of} moved beyond its noise."
         listed = "; ".join(f"{one.title} {one.text}" for one in self.moved[:NAMED])
         more = f"; and {len(self.moved) - NAMED} more" if len(self.moved) > NAMED else ""
         return f"{len(self.moved)} of {count(self.of, 'figure')} moved: {listed}{more}."
@@ -68,7 +69,7 @@ def changes(sources: Sources, judged: Judgement) -> Changes:
     if sources.another_machine:
         return Changes(ANOTHER, "Deposition and setpoint are compared.", loops=loops)
     if not moved:
-        nothing = judged.changed is not None and judged.changed.empty
+        nothing = judged.changed is not None and judged.changed.empty and not any(one.new for one in loops)
         strong = "Nothing changed; no figure moved." if nothing else "No figure moved beyond its noise."
         return Changes(strong, "" if nothing else beside, loops=loops)
     figures = f"{moved} of {compared} figures moved"
@@ -84,22 +85,25 @@ def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
     streams = deposition_moves(sources)
     cases = setpoint_change.changes(sources)
     return [
-        LoopChange("temperature", [_moved(move) for move in mine if move.moved], _both(mine)),
-        LoopChange("deposition", [_moved(move) for move in streams if move.moved], _both(streams)),
+        LoopChange("temperature", temperature, *_counted([move for _, move in mine])),
+        LoopChange("deposition", [_moved(move) for move in streams if move.moved], *_counted(streams)),
         LoopChange(
             "setpoint",
             [Moved(name, change.text, change.worse) for name, change in cases if change.moved],
             sum(change.text not in ("first run", "new") for _, change in cases),
+            sum(change.text == "new" for _, change in cases),
         ),
     ]
 
 
-def _both(moves: Sequence[Move]) -> int:
-    return sum(move.before is not None and not isinstance(move.now, Missing) for move in moves)
+def _counted(moves: Sequence[Move]) -> tuple[int, int]:
+    """How many figures both runs have, and how many only this one has."""
+    both = sum(move.before is not None and not isinstance(move.now, Missing) for move in moves)
+    return both, sum(move.word == "new" for move in moves)
 
 
-def _moved(move: Move) -> Moved:
-    title = move.question.title
+def _moved(move: Move, whose: str = "") -> Moved:
+    title = f"{move.question.title}{whose}"
     return Moved(f"{title[:1].lower()}{title[1:]}", move.text(), move.word == "worse")
 
 

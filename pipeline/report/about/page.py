@@ -13,7 +13,10 @@ def render_workflow(sources: Sources) -> str:
 
 def render_words(sources: Sources) -> str:
     """The text of words.html: every word of every page, in alphabetical order."""
-    every = sorted(set(words.glossary(sources).values()), key=lambda pair: pair[0].lower())
+    meanings: dict[str, list[str]] = {}
+    for word, meaning in words.glossary(sources).values():
+        meanings.setdefault(word, []).append(meaning)
+    every = sorted(meanings.items(), key=lambda pair: pair[0].lower())
     return page.render("words.html", here="words", title="Words", words=every)
 
 
