@@ -1,6 +1,7 @@
 """This run against the accepted one: equal runs differ in nothing, one change is named where it is, and a
 figure moves where its bands part."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from pipeline import cli
 from pipeline.store import artifacts, renamed
 from stages.report import main
 from tests.report import made
-from tests.report.test_pages import INDEX, TEMPERATURE, Page, change
+from tests.report.test_pages import DIFFERENCE, INDEX, TEMPERATURE, Page, change
 
 DEPOSITION = Path("reports/deposition.html")
 SCORES = {

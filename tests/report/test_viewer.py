@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from pipeline.report.shared import page as shared_page
-from pipeline.report.shared.sources import Declared, Source, collect
+from pipeline.report.shared.sources import Declared, Source, collect, linked
 from pipeline.report.shared.verdict import ReportRules
 from pipeline.report.temperature.judgement import judgement
 from pipeline.report.viewer import packed

@@ -11,6 +11,7 @@ from pipeline.report.shared.difference import Difference, Move
 from pipeline.report.shared.digits import count
 from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import Missing
+from pipeline.report.temperature.contestants import in_a_sentence
 from pipeline.report.temperature.judgement import Judgement
 
 ANOTHER = "The accepted run is of another machine: nothing to compare."
@@ -80,7 +81,14 @@ def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
     """Temperature: figures of the contestant and its rival; deposition: flow error of every stream; setpoint:
     settled runs of every case of the default that counts."""
     mine = [
-        move for name in dict.fromkeys((judged.subject, judged.rival)) for move in judged.moved.get(name, [])
+        (name, move)
+        for name in dict.fromkeys((judged.subject, judged.rival))
+        for move in judged.moved.get(name, [])
+    ]
+    temperature = [
+        _moved(move, "" if name == judged.subject else f" of {in_a_sentence(name)}")
+        for name, move in mine
+        if move.moved
     ]
     streams = deposition_moves(sources)
     cases = setpoint_change.changes(sources)

@@ -19,13 +19,15 @@ from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing, Verdic
 from pipeline.report.temperature import card as temperature_card
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.twelve import drift_state
+from pipeline.store import artifacts
 
 # the gravest first
 GRAVEST = (FAILED, OPEN, PASSED)
 
 
 class File(NamedTuple):
-    """What leaves the house of one loop: the file to load with its digest, and its certificate."""
+    """What leaves the house of one loop: the file to load with its digest, and its certificate; whether the file
+    is there to be linked."""
 
     loop: str
     name: str
@@ -34,6 +36,7 @@ class File(NamedTuple):
     state: str
     word: str
     certificate: str
+    there: bool
 
 
 def render(sources: Sources, judged: Judgement) -> str:
@@ -129,6 +132,15 @@ def files(sources: Sources) -> list[File] | Missing:
     if isinstance(lines, Missing):
         return lines
     return [
-        File(line.loop, line.name, line.file, line.sha256, line.state, line.word, line.certificate)
+        File(
+            line.loop,
+            line.name,
+            line.file,
+            line.sha256,
+            line.state,
+            line.word,
+            line.certificate,
+            bool(line.file) and artifacts.exists(line.file),
+        )
         for line in lines
     ]
