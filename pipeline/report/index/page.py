@@ -26,8 +26,8 @@ GRAVEST = (FAILED, OPEN, PASSED)
 
 
 class File(NamedTuple):
-    """What leaves the house of one loop: the file to load with its digest, and its certificate; whether the file
-    is there to be linked."""
+    """What leaves the house of one loop: the file to load with its digest, and its certificate; whether the
+    file is there to be linked."""
 
     loop: str
     name: str
