@@ -99,7 +99,6 @@ def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
             "setpoint",
             [Moved(name, change.text, change.worse) for name, change in cases if change.moved],
             sum(change.text not in ("first run", "new") for _, change in cases),
-            sum(change.text == "new" for _, change in cases),
         ),
     ]
 
