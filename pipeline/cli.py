@@ -86,6 +86,13 @@ def verify(_: argparse.Namespace) -> None:
     print(provenance.summary(provenance.checks()))
 
 
+def screenshots(arguments: argparse.Namespace) -> None:
+    """Take the pictures of the README: page one and the viewer, as they are in reports/."""
+    from pipeline.report import screenshots as pictures
+
+    print(f"written: {', '.join(path.as_posix() for path in pictures.take(arguments.folder))}")
+
+
 def history(arguments: argparse.Namespace) -> None:
     """Write reports/history.html: the figures of every run that git holds, as trends and as a table."""
     from tqdm import tqdm
@@ -446,7 +453,7 @@ def _add_runs(commands: argparse._SubParsersAction) -> None:
 
 
 def _add_export(commands: argparse._SubParsersAction) -> None:
-    command = commands.add_parser("export", help=export.__doc__)
+    command = commands.add_parser("export", help=export.__doc__, description=export.__doc__)
     command.add_argument("controller", type=Path, metavar="CONTROLLER", help="a folder with controller.json")
     command.add_argument("--to", required=True, choices=("c", "python", "klipper"))
     command.add_argument("--out", type=Path, metavar="DIR", help="(CONTROLLER/c, .../python, .../klipper)")
@@ -458,7 +465,7 @@ def _add_export(commands: argparse._SubParsersAction) -> None:
 
 
 def _add_replay(commands: argparse._SubParsersAction) -> None:
-    command = commands.add_parser("replay", help=replay.__doc__)
+    command = commands.add_parser("replay", help=replay.__doc__, description=replay.__doc__)
     command.add_argument("controller", type=Path, metavar="CONTROLLER", help="a folder with controller.json")
     command.add_argument("recording", type=Path, metavar="RECORDING", help="CSV, Parquet, MCAP, klippy.log")
     command.add_argument("--out", type=Path, default=Path("replay"), metavar="DIR", help="(replay)")
@@ -468,24 +475,64 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
     command.set_defaults(run=replay)
 
 
+# what stands behind ./run beadline COMMAND in the example of its --help
+EXAMPLES = {
+    "accept": "",
+    "verify": "",
+    "history": "--most 100",
+    "screenshots": "",
+    "inspect": "log.csv",
+    "init": "log.csv --copy",
+    "first-experiment": "--hold 200",
+    "compose": "part.gcode --as csv,gcode --out jobs",
+    "calibrate-tip": "frame.png --tip 320,240",
+    "calibrate-camera": "lines.png --widths 0.4,0.6,0.8 --pitch 3",
+    "shadow": "frames --once",
+    "record-levels": "frames --flows 60,80,100,125,160",
+    "training-print": "training.gcode",
+    "export": "datasets/export_controllers/temperature --to c",
+    "replay": "datasets/export_controllers/temperature log.csv",
+    "nightly": "",
+    "rollback": "night-0042",
+    "sweep": "-S tune_weights.seed=1,2,3 --target tune_weights "
+    "--metric tune_weights:contestants.subspace_lqg.cost",
+    "runs": "",
+}
+STATUSES = "0 done; 1 refused, and one sentence says why; 2 a wrong option"
+OTHER_STATUSES = {
+    "nightly": "0 promoted, kept or nothing new; 1 failed; 3 drift alarm; 4 recordings set aside; "
+    "75 another night is at work",
+    "verify": "0 all match; 1 something does not, and is named; 2 a wrong option",
+}
+
+
+def _tell(name: str, command: argparse.ArgumentParser) -> None:
+    """Behind a command's options: an example and the exit statuses."""
+    example = f"./run beadline {name} {EXAMPLES.get(name, '')}".rstrip()
+    command.epilog = f"Example: {example} | Exit status: {OTHER_STATUSES.get(name, STATUSES)}"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         prog="beadline", description="Extrusion-printer recordings into controllers that can be trusted."
     )
     parser.add_argument("--version", action="version", version=f"beadline {version()}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    commands.add_parser("accept", help=accept.__doc__).set_defaults(run=accept)
-    commands.add_parser("verify", help=verify.__doc__).set_defaults(run=verify)
-    command = commands.add_parser("history", help=history.__doc__)
+    commands.add_parser("accept", help=accept.__doc__, description=accept.__doc__).set_defaults(run=accept)
+    commands.add_parser("verify", help=verify.__doc__, description=verify.__doc__).set_defaults(run=verify)
+    command = commands.add_parser("history", help=history.__doc__, description=history.__doc__)
     command.add_argument(
         "--most", type=int, default=500, help="revisions to read at most, the newest first (500)"
     )
     command.set_defaults(run=history)
     _add_runs(commands)
-    command = commands.add_parser("inspect", help=inspect.__doc__)
+    command = commands.add_parser("screenshots", help=screenshots.__doc__, description=screenshots.__doc__)
+    command.add_argument("--folder", type=Path, default=Path("reports"), metavar="DIR", help="(reports)")
+    command.set_defaults(run=screenshots)
+    command = commands.add_parser("inspect", help=inspect.__doc__, description=inspect.__doc__)
     command.add_argument("file", type=Path)
     command.set_defaults(run=inspect)
-    command = commands.add_parser("init", help=init.__doc__)
+    command = commands.add_parser("init", help=init.__doc__, description=init.__doc__)
     command.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING")
     command.add_argument("--copy", action="store_true", help="copy them into datasets/raw/temperature")
     command.add_argument("--force", action="store_true", help="overwrite values that were edited")
@@ -496,11 +543,13 @@ def main() -> None:
         help="the sample time of recordings that do not say it",
     )
     command.set_defaults(run=init)
-    command = commands.add_parser("first-experiment", help=first_experiment.__doc__)
+    command = commands.add_parser(
+        "first-experiment", help=first_experiment.__doc__, description=first_experiment.__doc__
+    )
     command.add_argument("--hold", type=float, default=300.0, help="seconds of a step at most (300)")
     command.add_argument("--out", type=Path, default=Path("first_experiment.csv"), metavar="FILE")
     command.set_defaults(run=first_experiment)
-    command = commands.add_parser("compose", help=compose.__doc__)
+    command = commands.add_parser("compose", help=compose.__doc__, description=compose.__doc__)
     command.add_argument("part", type=Path, help="the part program (G-code)")
     command.add_argument("--out", type=Path, default=Path("."), help="folder for signal, tasks and report")
     command.add_argument(
@@ -533,14 +582,18 @@ def main() -> None:
         "--verify", action="store_true", help="also the shortest print that shows whether the forecast holds"
     )
     command.set_defaults(run=compose)
-    command = commands.add_parser("calibrate-tip", help=calibrate_tip.__doc__)
+    command = commands.add_parser(
+        "calibrate-tip", help=calibrate_tip.__doc__, description=calibrate_tip.__doc__
+    )
     command.add_argument("image", type=Path, help="a frame of the nozzle's camera")
     command.add_argument(
         "--tip", default="", metavar="X,Y", help="the tip in pixels, from the left and from the top"
     )
     command.add_argument("--out", type=Path, metavar="FILE", help="the page; default IMAGE.tip.html here")
     command.set_defaults(run=calibrate_tip)
-    command = commands.add_parser("calibrate-camera", help=calibrate_camera.__doc__)
+    command = commands.add_parser(
+        "calibrate-camera", help=calibrate_camera.__doc__, description=calibrate_camera.__doc__
+    )
     command.add_argument(
         "images", type=Path, nargs="+", metavar="PICTURE",
         help="a picture or an MCAP recording for each line, or one picture of all lines",
@@ -563,6 +616,8 @@ def main() -> None:
     _add_export(commands)
     _add_replay(commands)
     nights.add(commands)
+    for name, command in commands.choices.items():
+        _tell(name, command)
     arguments = parser.parse_args()
     try:
         arguments.run(arguments)

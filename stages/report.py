@@ -1,5 +1,6 @@
-"""Artifacts -> pages: reports/index.html, temperature.html, identification.html, deposition.html,
-setpoint.html, certificate.html, papers.html, viewer.html with its columns in reports/data.
+"""Artifacts -> pages: reports/index.html, a page a loop (temperature.html, identification.html,
+deposition.html, setpoint.html), certificate.html, papers.html, viewer.html with its columns in reports/data,
+and beside them difference.html, workflow.html, provenance.html, words.html.
 
 It reads the metrics and tables of every stage and reports/accepted.json. A missing file is shown as missing.
 Every file read is hashed, and the pages carry the hashes. The drift on page one is that of the last night
@@ -8,6 +9,8 @@ Every file read is hashed, and the pages carry the hashes. The drift on page one
 
 import hashlib
 
+from pipeline.report.about import difference as difference_page
+from pipeline.report.about import page as about_page
 from pipeline.report.certificate import page as certificate_page
 from pipeline.report.deposition import page as deposition_page
 from pipeline.report.identification import page as identification_page
@@ -83,6 +86,10 @@ def main() -> None:
             "certificate": certificate_page.render(sources, judged.verdict),
             "papers": papers_page.render(sources, PAPERS),
             "viewer": viewer.text,
+            "difference": difference_page.render(sources, judged),
+            "workflow": about_page.render_workflow(sources),
+            "provenance": about_page.render_provenance(sources),
+            "words": about_page.render_words(sources),
         }
         artifacts.write_text("reports/index.html", pages["index"])
         artifacts.write_text("reports/temperature.html", pages["temperature"])
@@ -92,6 +99,10 @@ def main() -> None:
         artifacts.write_text("reports/certificate.html", pages["certificate"])
         artifacts.write_text("reports/papers.html", pages["papers"])
         artifacts.write_text("reports/viewer.html", pages["viewer"])
+        artifacts.write_text("reports/difference.html", pages["difference"])
+        artifacts.write_text("reports/workflow.html", pages["workflow"])
+        artifacts.write_text("reports/provenance.html", pages["provenance"])
+        artifacts.write_text("reports/words.html", pages["words"])
         artifacts.write_folder("reports/data", viewer.files)
         artifacts.write_metrics(
             "report",

@@ -33,14 +33,15 @@ def night(**drift):
         },
     )
     main()
-    text = Page(INDEX).text
-    return re.search(r"Drift since commissioning (.*?) 12 Provenance", text)[1]
+    text = Page(TEMPERATURE).text
+    return re.search(r"Drift since commissioning (.*?) From metrics", text)[1]
 
 
 def test_before_the_first_night_drift_is_not_measured(project):
     main()
-    assert "Not measured. The nightly job measures it and has not run." in Page(INDEX).text
-    assert "nightly.html" not in INDEX.read_text()
+    assert "Not measured. The nightly job measures it and has not run." in Page(TEMPERATURE).text
+    assert "Drift is not measured in any loop." in Page(INDEX).text
+    assert "nightly.html" not in TEMPERATURE.read_text()
 
 
 def test_no_alarm_passes_the_rule_and_names_what_moved_most_against_its_noise(project):
@@ -49,7 +50,7 @@ def test_no_alarm_passes_the_rule_and_names_what_moved_most_against_its_noise(pr
         == "None found. Largest change of the machine: gain of heater_1, 3.2 % ± 4.1. night-0003, 2026-11-20"
     )
     assert figures()["verdict"]["lead"] == "All rules passed on 6 simulated plants."
-    assert 'href="nightly.html"' in INDEX.read_text()
+    assert 'href="nightly.html"' in TEMPERATURE.read_text()
 
 
 def test_an_alarm_fails_the_rule_for_every_controller_and_gives_the_cause(project):
@@ -89,12 +90,12 @@ def test_what_is_watched_is_undecided_and_a_night_without_recordings_measures_no
 def test_a_broken_file_of_the_night_is_said_so(project):
     NIGHT.write_text("{")
     main()
-    assert "nightly.json is not whole JSON" in Page(INDEX).text
+    assert "nightly.json is not whole JSON" in Page(TEMPERATURE).text
 
 
 def test_text_of_the_night_is_escaped(project):
     night(alarms=[{"loop": "temperature", "cause": "<script>alert(1)</script>"}])
-    assert "<script>alert" not in INDEX.read_text()
+    assert "<script>alert" not in INDEX.read_text() + TEMPERATURE.read_text()
 
 
 def test_a_later_night_is_no_change_of_what_the_pages_were_made_from(project):

@@ -1,7 +1,6 @@
-"""Page one's sentence and its three rows: what is claimed of each, in few
-words, however long the sentences of the stages are."""
+"""Page one's sentence: what is claimed of each loop, in few words."""
 
-from pipeline.report.shared.headline import LINE, LINES, Loop, _fitted, _lines, decision, state
+from pipeline.report.shared.headline import Loop, decision, state
 
 
 def loop(name="temperature", state="passed", reason="It costs 1 % more.", remedy=""):
@@ -45,25 +44,3 @@ def test_the_page_takes_the_colour_of_the_worst_loop_that_was_measured():
     assert state(three("passed", "open", "not measured")) == "open"
     assert state(three("passed", "passed", "not measured")) == "passed"
     assert state(three("not measured", "not measured", "not measured")) == "open"
-
-
-def test_sentences_of_any_length_fit_the_first_screen_and_what_is_cut_says_so():
-    long = [loop(reason="x" * 900, remedy="Do this. " * 40)] * 3
-    found = _fitted(long)
-    assert sum(map(_lines, found)) <= LINES
-    assert all(one.reason.endswith("…") and one.decision == "Run it." for one in found)
-
-
-def test_remedies_come_whole_and_those_of_a_loop_that_did_not_pass_come_first():
-    # each remedy is two lines long: beside three rows of one line there is room for all but one
-    remedy = (
-        "Record the machine again, longer than before, with every input moving at once" + ", again" * 8 + "."
-    )
-    assert LINE < len(remedy) <= 2 * LINE
-    found = _fitted(
-        [loop(remedy=remedy), loop(remedy=f"{remedy} {remedy}"), loop(state="failed", remedy=remedy)]
-    )
-    assert found[2].remedy == remedy and all(
-        one.remedy in ("", remedy, f"{remedy} {remedy}") for one in found
-    )
-    assert sum(map(_lines, found)) <= LINES

@@ -93,15 +93,29 @@ def test_a_change_of_parameters_code_or_a_page_is_found(checked, path, sentence)
     assert sentence in wrong()
 
 
-def test_a_figure_whose_source_is_not_in_the_provenance_or_has_another_hash_is_found(checked):
-    page = Path("reports/index.html")
-    metrics = artifacts.read_metrics("report")
+def test_a_link_to_other_bytes_than_were_read_or_with_another_hash_is_found(checked):
+    page, path = Path("reports/index.html"), "reports/metrics/evaluate_temperature.json"
+    recorded = artifacts.read_metrics("report")["read"][path]
     text = page.read_text()
-    page.write_text(text.replace("</main>", '<p class="src"><a href="#from-nowhere">x</a></p></main>'))
-    assert "reports/index.html refers to from-nowhere, which is not among its sources" in wrong()
-    recorded = metrics["read"]["reports/metrics/ingest.json"]
-    page.write_text(text.replace(recorded, "0" * 64))
-    assert "reports/index.html gives another hash of reports/metrics/ingest.json than was read" in wrong()
+    page.write_text(text.replace(f"SHA-256 {recorded[:8]}", f"SHA-256 {'0' * 8}"))
+    assert f"reports/index.html gives another hash of {path} than was read" in wrong()
+    page.write_text(text.replace('href="metrics/evaluate_temperature.json"', 'href="metrics/ingest.json"'))
+    assert (
+        f"reports/index.html leads to reports/metrics/ingest.json, which is not {path} as it was read"
+        in wrong()
+    )
+    page.write_text(text)
+    every, row = Path("reports/provenance.html"), artifacts.read_metrics("report")["read"]
+    every.write_text(every.read_text().replace(row["datasets/ingest/record.parquet"], "1" * 64))
+    assert (
+        "reports/provenance.html gives another hash of datasets/ingest/record.parquet than was read"
+        in wrong()
+    )
+
+
+def test_a_copy_beside_the_pages_that_is_not_what_was_read_is_found(checked):
+    flip("reports/data/ingest.record.parquet")
+    assert any("leads to reports/data/ingest.record.parquet, which is not" in one for one in wrong())
 
 
 def test_what_dvc_recorded_otherwise_is_found_and_a_source_of_no_stage_too(checked):

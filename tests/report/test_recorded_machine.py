@@ -77,7 +77,7 @@ def test_words_of_a_recorded_machine_speak_of_a_trial_and_of_a_simulated_one_of_
     declare("generate_probing", source="recordings")
     main()
     text = Page(TEMPERATURE).text
-    assert "Rehearsal" not in text.split("Words used here")[0]
+    assert "Rehearsal" not in text
     assert "Not ready." in text or "Ready for a supervised trial: subspace + LQG." in text
 
 
@@ -89,7 +89,7 @@ def test_outputs_without_low_and_high_leave_the_rule_open_and_it_does_not_pass(r
     main()
     text = Page(TEMPERATURE).text
     assert "First open rule: crossings." in text or "Do not trust this model." in text
-    assert "low and high of zone_1, zone_2 are not declared" in Page(INDEX).text or "trust" in text
+    assert "low and high of zone_1, zone_2 are not declared" in text or "trust" in text
     assert figures()["verdict"]["winner"] is None
 
 

@@ -4,11 +4,10 @@ from pathlib import Path
 
 import yaml
 
-from pipeline.report.index import workflow
+from pipeline.report.about import workflow
 from pipeline.store import artifacts
 from stages.report import main
-from tests.report.test_pages import INDEX as PAGE_ONE
-from tests.report.test_pages import Page
+from tests.report.test_pages import WORKFLOW, Page
 
 
 def test_the_drawn_stages_are_those_of_dvc_yaml_and_read_what_they_read_there(root):
@@ -28,7 +27,7 @@ def test_the_drawn_stages_are_those_of_dvc_yaml_and_read_what_they_read_there(ro
         if stage != "report"
     }
     assert {stage: set(found) for stage, found in workflow.READS.items()} == reads, (
-        "add the stage to READS in pipeline/report/index/workflow.py"
+        "add the stage to READS in pipeline/report/about/workflow.py"
     )
 
 
@@ -42,7 +41,7 @@ def test_no_two_stages_share_a_place_and_every_arrow_points_right():
 
 def test_a_stage_is_as_accepted_made_anew_or_not_there(project):
     main()
-    assert "No run was accepted yet: nothing says what is new." in Page(PAGE_ONE).text
+    assert "No run was accepted yet: nothing says what is new." in Page(WORKFLOW).text
     metrics = {
         path.stem: artifacts.read_json(path)
         for path in Path("reports/metrics").glob("*.json")
@@ -53,10 +52,10 @@ def test_a_stage_is_as_accepted_made_anew_or_not_there(project):
     }
     artifacts.write_json("reports/accepted.json", {"metrics": metrics, "params": {}, "hashes": hashes})
     main()
-    assert "The results of 16 of 16 stages are those of the accepted run, to the byte." in Page(PAGE_ONE).text
+    assert "The results of 16 of 16 stages are those of the accepted run, to the byte." in Page(WORKFLOW).text
     artifacts.write_json("datasets/tune_weights/weights.json", {"contestants": {"pi": {"cost": 3.0}}})
     Path("datasets/segment_library/library.parquet").unlink()
     main()
-    text = PAGE_ONE.read_text()
+    text = WORKFLOW.read_text()
     assert "New results begin at tune_weights." in text
     assert "Made anew: tune_weights; not there: segment_library; as accepted: " in text

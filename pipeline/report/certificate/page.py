@@ -63,9 +63,6 @@ def render(sources: Sources, verdict: Verdict) -> str:
         origin_of=page.origin(sources.source("certificate", "export_controllers")),
         differences=differences(sources),
         words=words.chosen(sources, WORDS),
-        sources=list(sources.read.values()),
-        absent=sources.absent,
-        hashes=[("certificate", s.sha256[:8]) for s in sources.source("certificate")],
     )
 
 

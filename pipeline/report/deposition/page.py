@@ -32,7 +32,7 @@ from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Change, Move
 from pipeline.report.shared.digits import THIN, number, percent, short
 from pipeline.report.shared.pictures import Column, Picture, placeholder
-from pipeline.report.shared.sources import Sources, Table, digest, lookup
+from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Figure, Missing, Question, ReportRules
 
 WORDS = (
@@ -102,31 +102,11 @@ def render(sources: Sources) -> str:
         refused=deposition_parts.refused(sources),
         declared=declared(sources),
         words=words.chosen(sources, WORDS),
-        sources=list(sources.read.values()),
-        absent=sources.absent,
-        hashes=hashes(sources),
         from_scores=sources.source("scores", "compose_parts"),
         from_film=sources.source("filmed", "models", "train_ilc", "learned"),
         from_library=sources.source("library", "learned", "models"),
         from_lines=sources.source("lines", "conformance"),
     )
-
-
-def hashes(sources: Sources) -> list[tuple[str, str]]:
-    """Short digests by which two pages can be told to be of one run."""
-    tables = {source.name: source.sha256 for source in sources.read.values()}
-    artifacts = [
-        (word, tables.get(name, "missing"))
-        for word, name in (("trials", "trials"), ("library", "library"), ("scores", "scores"))
-    ]
-    return [
-        (name, value[:8])
-        for name, value in [
-            *artifacts,
-            ("parameters", digest(sources.declared.everything)),
-            ("code", sources.code),
-        ]
-    ]
 
 
 def _beforehand(sources: Sources) -> str:

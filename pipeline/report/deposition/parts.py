@@ -157,9 +157,10 @@ def _drawn(mine: Table, error: np.ndarray, prints: np.ndarray, alt: str) -> Mark
         f"{height - 1:.0f}",
         short(bar, 2),
     )
-    return Markup('<svg class="plot map" viewBox="0 0 {} {}" role="img" aria-label="{}">{}{}</svg>').format(
-        f"{width:.0f}", f"{height:.0f}", alt, Markup("").join(layers), ruler
-    )
+    size = f"{width:.0f}", f"{height:.0f}"
+    return Markup(
+        '<svg class="plot map" style="--w:{}px" viewBox="0 0 {} {}" role="img" aria-label="{}">{}{}</svg>'
+    ).format(size[0], *size, alt, Markup("").join(layers), ruler)
 
 
 def _thinned(error: np.ndarray, prints: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -15,7 +15,6 @@ from pipeline.report.identification import (
     next_experiment,
 )
 from pipeline.report.identification.model import LEAST_FIT, Fit, ahead_words, fits, trust
-from pipeline.report.index import page as index_page
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.digits import MINUS, THIN, band, count, decimals, number, percent, quantity, short
 from pipeline.report.shared.sources import Sources, lookup
@@ -86,9 +85,6 @@ def render(sources: Sources) -> str:
         from_heaters=sources.source("first_order", "ingest"),
         from_record=sources.source("record", "quality", "ingest", "identify_plant"),
         words=words.chosen(sources, WORDS),
-        sources=list(sources.read.values()),
-        absent=sources.absent,
-        hashes=index_page.hashes(sources),
     )
 
 

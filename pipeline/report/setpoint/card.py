@@ -1,148 +1,231 @@
-"""The setpoint loop's card on page one: Bayes filter, agent and proportional control, the winner in words."""
+"""The setpoint loop on page one: the default, the agent, and doing nothing; and the cases of the rule that
+decides."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.index.cards import Card, Cell, Row, heads, unbuilt
-from pipeline.report.setpoint.agent import CASES
 from pipeline.report.setpoint.verdict import (
     BASELINE,
-    PASSED,
     Board,
+    Case,
+    Harm,
+    bars,
     board,
     case_text,
-    named,
+    harm_of,
+    lasting,
+    role,
     share_text,
-    verdict,
     within,
     worst,
 )
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import number
-from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import ROLES, Figure, Missing
-from pipeline.setpoint.workflow.tables import BEST_FLOW, FLOW_BAND
+from pipeline.report.shared.card import Card, Cell, Deciding, Entrant, Row, Step, best_of, of_verdict
+from pipeline.report.shared.digits import THIN, band, count
+from pipeline.report.shared.sources import Sources, lookup
+from pipeline.report.shared.verdict import FAILED, PASSED, Figure, Missing, Verdict
+from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING
 
-FLOOR, CEILING = 1.0, 300.0
-ORDER = ("model_based", "data_driven", "baseline")
+MOVES = "Nozzle camera to setpoints"
+# cases that the picture has room for, the worst first
+MOST_CASES = 8
 
 
-def controllers(scores: Board) -> dict[str, str]:
-    """Who stands for each role: the best Bayes filter, the agent that competes, the best proportional
-    control, or else the best of the other baselines."""
-
-    def first(fits: Callable[[str], bool]) -> str:
-        return next(
-            (name for name in scores.names if scores.kinds[name] == BASELINE and fits(name.lower())), ""
+def card(sources: Sources, verdict: Verdict) -> Card:
+    """Settling, staying and harm of the default, the agent and doing nothing."""
+    scores, step = board(sources), _step(sources, verdict)
+    if isinstance(scores, Missing) or not verdict.winner:
+        why = scores.sentence() if isinstance(scores, Missing) else verdict.reason
+        return of_verdict(
+            verdict, MOVES, step, entrants=[], rows=[], basis="", beside="", sources=[], missing=why
         )
-
-    bayes = first(lambda name: "bayes" in name)
-    plain = first(lambda name: "proportional" in name) or first(lambda name: "bayes" not in name)
-    return {"model_based": bayes, "data_driven": scores.learned(), "baseline": plain}
-
-
-def setpoint(sources: Sources) -> Card:
-    judged, scores = verdict(sources), board(sources)
-    if isinstance(scores, Missing) or not judged.winner:
-        why = scores.sentence() if isinstance(scores, Missing) else judged.reason
-        return unbuilt("setpoint", why)._replace(link="setpoint.html")
-    who = controllers(scores)
-    role = next((role for role, name in who.items() if name == judged.winner), "baseline")
-    table = sources.tables["paths"]
-    case = CASES[1]
-    rules = sources.declared.rules
-    passed, winner = judged.state == PASSED, ROLES[role]
-    who_wins = "The baseline" if role == "baseline" else winner.capitalize().replace("-", "\u2011")
-    sparks = zip((who[role] for role in ORDER), ("mb", "dd", "bl"), strict=True)
-    return Card(
-        id="setpoint",
-        name="Setpoint",
-        link="setpoint.html",
-        moves="Nozzle camera to flow and temperature setpoints",
-        state=judged.decision.split(":")[0].rstrip("."),
-        mark=role if passed else None,
-        win=(f"{who_wins} wins.", _win(scores, judged.winner)) if passed else (judged.lead, judged.reason),
-        caption="Flow’s distance from 100\u00a0%, 90th percentile of 21 starts over 100 decisions, log "
-        f"scale {FLOOR:g} to {CEILING:g}\u00a0%: {case_text(case, whole=True)}. Grey: within "
-        f"{FLOW_BAND:g}\u00a0%.",
-        panels=[_spark(table, name, case, css, named=i == 0) for i, (name, css) in enumerate(sparks)],
-        heads=heads(ORDER, [who[role] or "none judged" for role in ORDER]),
+    names, asked = shown(sources, scores), sources.declared.rules
+    limits = bars(sources, scores)
+    harms = [harm_of(scores, name, limits) for name in names]
+    ends = " or ".join(f"{end:g}" for end in sorted(set(limits.values())))
+    clustered = any(cell.redraws > 1 for cell in scores.cells.values())
+    return of_verdict(
+        verdict,
+        MOVES,
+        step,
+        entrants=[Entrant(role(scores, name), name, note) for name, note in _notes(sources, scores, names)],
         rows=[
-            Row(title, _cells([worst(scores, who[role], what)[0] for role in ORDER], limit))
-            for title, what, limit in (
-                ("Settle, worst case", "settled", rules.settled_percent),
-                ("Settle and stay, worst case", "stay", rules.stay_percent),
-                ("Recover from a clog", "recovered", rules.settled_percent),
-            )
+            _shares("Settles", scores, names, "settled", asked.settled_percent),
+            _shares("Stays", scores, names, "stay", asked.stay_percent),
+            Row("Harm", f"≤ {ends}{THIN}%", _harm_cells(harms)),
         ],
-        note=judged.note,
-        sources=sources.source("scoreboard", "paths", "choice"),
+        basis=f"Worst case of each; small: 95{THIN}% interval{', by segment' if clustered else ''}. Harm: "
+        f"good prints that leave ±{BEYOND[-1]}{THIN}%.",
+        beside=_beside(scores, names),
+        sources=sources.source("scoreboard"),
     )
 
 
-def _win(scores: Board, default: str) -> str:
-    """The default's worst case beside those of the others."""
-    mine, place = worst(scores, default, "lasting")
-    if place is None:
+def shown(sources: Sources, scores: Board) -> list[str]:
+    """The default, then the agent (the best rule where the agent is the default), then what was accepted,
+    else doing nothing."""
+    mine = scores.default
+    other = scores.learned() if scores.kinds[mine] == BASELINE else scores.best(BASELINE)
+    third = [accepted(sources), DOES_NOTHING, *scores.names]
+    names = [mine, *([other] if other else [])]
+    return [*names, *[name for name in third if name in scores.kinds and name not in names][:1]]
+
+
+def accepted(sources: Sources) -> str:
+    """The default of the accepted run; "" without one."""
+    if not isinstance(sources.accepted, dict):
         return ""
-    name = named(scores, default)
-    others = [
-        f"{named(scores, other)} {share_text(worst(scores, other, 'lasting')[0])}"
-        for other in scores.names
-        if other != default
-    ][:2]
-    beside = f"; next in their own worst cases: {', '.join(others)}" if others else ""
-    return (
-        f"{name[:1].upper()}{name[1:]}: {share_text(mine)} of runs settle and stay in its worst case "
-        f"({within(place)}){beside}."
-    )
+    found = lookup(sources.accepted, "metrics.evaluate_setpoint.default")
+    return "" if isinstance(found, Missing) else str(found)
 
 
-def _cells(figures: Sequence[Figure | Missing], limit: float) -> list[Cell]:
-    most = max((figure.value for figure in figures if isinstance(figure, Figure)), default=math.nan)
+def _notes(sources: Sources, scores: Board, names: Sequence[str]) -> list[tuple[str, str]]:
+    before = accepted(sources)
+    kinds = {BASELINE: "rule", "agent": "data-driven", "paper": "the paper’s"}
     return [
-        Cell(
-            share_text(figure),
-            best=isinstance(figure, Figure) and figure.value == most,
-            bad=isinstance(figure, Figure) and figure.high < limit,
+        (
+            name,
+            "as accepted" if name == before else "closest" if i == 0
+            else "yardstick" if name == DOES_NOTHING else kinds.get(scores.kinds[name], "rule"),
         )
-        for figure in figures
+        for i, name in enumerate(names)
+    ]  # fmt: skip
+
+
+def _shares(title: str, scores: Board, names: Sequence[str], what: str, limit: float) -> Row:
+    figures = [worst(scores, name, what)[0] for name in names]
+    best = best_of([f.value if isinstance(f, Figure) else None for f in figures], at_least=True)
+    return Row(title, f"≥ {limit:g}{THIN}%", [_share(f, best, bad=_below(f, limit)) for f in figures])
+
+
+def _below(figure: Figure | Missing, limit: float) -> bool:
+    return isinstance(figure, Figure) and figure.high < limit
+
+
+def _share(figure: Figure | Missing, best: float | None, *, bad: bool) -> Cell:
+    if isinstance(figure, Missing):
+        return Cell(figure.state)
+    return Cell(share_text(figure), band(figure.low, figure.high, 1), figure.value == best, bad)
+
+
+def _harm_cells(harms: Sequence[Harm | Missing]) -> list[Cell]:
+    best = best_of([h.figure.value if isinstance(h, Harm) else None for h in harms], at_least=False)
+    return [
+        Cell(harm.state) if isinstance(harm, Missing) else _share(harm.figure, best, bad=harm.state == FAILED)
+        for harm in harms
     ]
 
 
-def _spark(table: Table | Missing, name: str, case: tuple[str, str], css: str, *, named: bool) -> Markup:
-    gap = (
-        table
-        if isinstance(table, Missing)
-        else Missing("not measured", f"no way of {name or 'any controller'} was kept")
+def _beside(scores: Board, names: Sequence[str]) -> str:
+    """Where the default and the agent fare worst."""
+    _, mine = worst(scores, names[0], "lasting")
+    figure, place = worst(scores, names[1], "lasting") if len(names) > 1 else (Missing("", ""), None)
+    if mine is None:
+        return ""
+    text = f"Worst case of {names[0]}: {within(mine)}."
+    if place is None or place == mine:
+        return text
+    return f"{text} Of {names[1]}: {within(place)}, {share_text(figure)} settle and stay."
+
+
+def _step(sources: Sources, verdict: Verdict) -> Step:
+    if not verdict.winner:
+        return Step("Run the stages of this loop.", "./run dvc repro evaluate_setpoint")
+    if verdict.rehearsal:
+        return Step(
+            "Print the training print and put its frames into datasets/raw/setpoint.",
+            "./run beadline training-print training.gcode",
+        )
+    if verdict.state == PASSED:
+        return Step("Watch a print without steering it.", "./run beadline shadow FRAMES")
+    return Step(f"{verdict.remedy.split('To try: ')[-1].split('. ')[0].rstrip('.')}.", "./run dvc repro")
+
+
+# ---- the cases of the rule that decides
+
+
+def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
+    """Runs that settle, or settle and stay, in every case that counts, the worst first: the default, the
+    agent and doing nothing."""
+    scores = board(sources)
+    if isinstance(scores, Missing):
+        return scores
+    if not scores.default:
+        return Missing("not measured", "No controller was chosen")
+    stays, asked = verdict.rule.startswith("Stays"), sources.declared.rules
+    limit = asked.stay_percent if stays else asked.settled_percent
+    what, does = ("stay", "settle and stay") if stays else ("settled", "settle")
+    names = shown(sources, scores)
+    cases = [case for case, cell in scores.counting(scores.default) if isinstance(_of(cell, what), Figure)]
+    cases.sort(key=lambda case: _value(scores, names[0], case, what))
+    if not cases:
+        return Missing("not measured", "no case counts")
+    first, more = cases[0], len(cases) - MOST_CASES
+    listed = ", ".join(f"{name} {_text(scores, name, first, what)}" for name in names)
+    finding = f"Runs that {does}, by case; the case that decides first, {within(first)}: {listed}."
+    sizes = ((566, 212, 190), (350, 250, 150))
+    wide, narrow = (_drawn(scores, names, cases[:MOST_CASES], what, limit, finding, size) for size in sizes)
+    beyond = f" {count(more, 'better case').capitalize()} on the loop’s page." if more > 0 else ""
+    return Deciding(
+        "Setpoint, the case that decides",
+        finding,
+        wide,
+        narrow,
+        f"Line: the limit, {limit:g}{THIN}%. Bars: 95{THIN}% intervals.{beyond}",
+        page.linked(sources.source("scoreboard")),
+        [Entrant(role(scores, name), name, "") for name in names],
     )
-    rows = (
-        None
-        if isinstance(table, Missing)
-        else (table["controller"] == name) & (table["simulator"] == case[0]) & (table["case"] == case[1])
+
+
+def _of(cell, what: str) -> Figure | Missing:
+    return cell.settled if what == "settled" else lasting(cell)
+
+
+def _value(scores: Board, name: str, case: Case, what: str) -> float:
+    cell = scores.cells.get((name, case))
+    figure = None if cell is None else _of(cell, what)
+    return figure.value if isinstance(figure, Figure) else np.inf
+
+
+def _text(scores: Board, name: str, case: Case, what: str) -> str:
+    cell = scores.cells.get((name, case))
+    return "not run" if cell is None else share_text(_of(cell, what))
+
+
+def _drawn(
+    scores: Board, names: Sequence[str], cases: Sequence[Case], what: str, limit: float, alt: str,
+    size: tuple[int, int, int],
+) -> Markup:  # fmt: skip
+    """A row a case, a mark with its interval a controller."""
+    width, height, left = size
+    x = charts.Axis(0, 100, tuple((float(v), str(v)) for v in (0, 25, 50, 75, 100)))
+    frame = charts.Frame(x, charts.Axis(-0.5, len(cases) - 0.5, ()), width, height, left, 34, 8, 14)
+    a = float(frame.px(limit))
+    layers = [Markup('<line class="lim" x1="{:.1f}" x2="{:.1f}" y1="8" y2="{}"/>').format(a, a, height - 34)]
+    for i, case in enumerate(cases):
+        lane = len(cases) - 1 - i
+        layers.append(charts.label(frame, 0.0, lane, _short(case, left), anchor="end", dx=-8, dy=4))
+        for k, name in enumerate(names):
+            cell = scores.cells.get((name, case))
+            figure = None if cell is None else _of(cell, what)
+            if isinstance(figure, Figure):
+                layers.append(_lane(frame, lane + 0.24 * (1 - k), figure, page.MARKS[role(scores, name)]))
+    return charts.panel(frame, layers, alt=alt, css="mb lead-picture", across="runs, %", units=("%", ""))
+
+
+def _short(case: Case, left: int) -> str:
+    """A case's name as long as there is room for it left of the axis, 7 px a letter."""
+    text = case_text(case, whole=True).replace("Recorded windows", "Windows").replace("simulator", "sim.")
+    most = left // 7
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def _lane(frame: charts.Frame, at: float, figure: Figure, css: str) -> Markup:
+    low, middle, high = (float(value) for value in frame.px([figure.low, figure.value, figure.high]))
+    y = float(frame.py(at))
+    bar = Markup('<line class="{}" x1="{:.1f}" x2="{:.1f}" y1="{:.1f}" y2="{:.1f}"/>').format(
+        css, low, high, y, y
     )
-    if rows is None or not rows.any():
-        return Markup('<div class="hole">{}</div>').format(page.missing(gap))
-    off = pd.Series(np.abs(table["flow_percent"][rows] - BEST_FLOW)).groupby(table["step"][rows])
-    reached = off.quantile(0.9)
-    steps, curve = reached.index.to_numpy(), reached.to_numpy()
-    bad = bool(curve[-1] > FLOW_BAND)
-    alt = (
-        f"{name}: nine of ten starts are within {number(float(curve[-1]), 1)} % of full flow after "
-        f"{int(steps[-1])} decisions, {'outside' if bad else 'inside'} the {FLOW_BAND:g} % asked for"
-    )
-    axis = charts.logarithmic(FLOOR, CEILING)._replace(low=FLOOR, high=CEILING)
-    return charts.spark(
-        steps.astype(float),
-        np.maximum(curve, FLOOR),
-        axis,
-        css=css,
-        limit=FLOW_BAND,
-        alt=alt,
-        limit_label=f"limit {FLOW_BAND:g}" if named else "",
-        units=("decisions", "%"),
-    )
+    return Markup("{}{}").format(bar, charts.mark(css, f"{middle:.1f}", y))

@@ -1,6 +1,6 @@
 """How the settled runs of the setpoint loop's default moved since the accepted run."""
 
-from pipeline.report.setpoint.verdict import Case, Cell, board
+from pipeline.report.setpoint.verdict import Case, Cell, board, within
 from pipeline.report.shared.difference import Change
 from pipeline.report.shared.digits import MINUS, THIN, number
 from pipeline.report.shared.sources import Sources, lookup
@@ -41,10 +41,10 @@ def change(sources: Sources, case: Case, cell: Cell | None) -> Change:
     return Change(text, moved=True, worse=points < 0 and state(question, now) == FAILED)
 
 
-def moved_cases(sources: Sources) -> tuple[int, int]:
-    """How many cases of the default moved beyond noise, of how many that count."""
+def changes(sources: Sources) -> list[tuple[str, Change]]:
+    """Every case of the default that counts, with how its settled runs moved."""
     scores = board(sources)
     if isinstance(scores, Missing) or not scores.default:
-        return 0, 0
-    changes = [change(sources, case, cell) for case, cell in scores.counting(scores.default)]
-    return sum(case.moved for case in changes), len(changes)
+        return []
+    counting = scores.counting(scores.default)
+    return [(within(case), change(sources, case, cell)) for case, cell in counting]

@@ -32,7 +32,7 @@ from pipeline.report.setpoint.verdict import (
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.difference import Change
 from pipeline.report.shared.digits import THIN, band, count, number, percent, quantity
-from pipeline.report.shared.sources import Sources, digest, lookup
+from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, state
 from pipeline.setpoint.workflow.tables import BEYOND
 
@@ -108,27 +108,10 @@ def render(sources: Sources) -> str:
         data=setpoint_vision.data(sources),
         declared=[(section, flat(sources.declared.everything.get(section, {}))) for section in SECTIONS],
         words=words.chosen(sources, WORDS),
-        sources=list(sources.read.values()),
-        absent=sources.absent,
-        hashes=hashes(sources),
         from_board=sources.source("scoreboard", "choice"),
         from_agents=sources.source("train_agent"),
         from_classifier=sources.source("train_classifier", "classified"),
     )
-
-
-def hashes(sources: Sources) -> list[tuple[str, str]]:
-    """Short digests by which two pages can be told to be of one run."""
-    tables = {source.name: source.sha256 for source in sources.read.values()}
-    digests = [(name, tables.get(name, "missing")) for name in ("classified", "scoreboard", "choice")]
-    return [
-        (name, value[:8])
-        for name, value in [
-            *digests,
-            ("parameters", digest(sources.declared.everything)),
-            ("code", sources.code),
-        ]
-    ]
 
 
 def choice_sentence(sources: Sources) -> str:

@@ -151,9 +151,9 @@ def _matrix(counts: np.ndarray, degrees: float) -> Markup:
         f"At {degrees:g} °C: under {number(shares[0, 0], 0)} %, good {number(shares[1, 1], 0)} %, over "
         f"{number(shares[2, 2], 0)} % named rightly"
     )
-    return Markup('<svg class="plot mb" viewBox="0 0 208 146" role="img" aria-label="{}">{}</svg>').format(
-        alt, Markup("").join(cells)
-    )
+    return Markup(
+        '<svg class="plot mb" style="--w:208px" viewBox="0 0 208 146" role="img" aria-label="{}">{}</svg>'
+    ).format(alt, Markup("").join(cells))
 
 
 # ---- windows

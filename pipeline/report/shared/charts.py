@@ -72,13 +72,11 @@ def _lane(question: Question, css: str, figure: Figure, y: int) -> Markup:
     if middle >= 2.0:
         # beyond the scale: the mark keeps its shape, and an arrow says that it goes on
         arrow = Markup('<path class="more {}" d="M-7 {}l4 3.5l-4 3.5"/>').format(css, _n(y - 3.5))
-        return Markup('{}<svg x="100%" overflow="visible">{}{}</svg>').format(
-            bar, _mark(css, "-14", y), arrow
-        )
-    return Markup("{}{}").format(bar, _mark(css, f"{_n(max(50 * middle, 0.8))}%", y))
+        return Markup('{}<svg x="100%" overflow="visible">{}{}</svg>').format(bar, mark(css, "-14", y), arrow)
+    return Markup("{}{}").format(bar, mark(css, f"{_n(max(50 * middle, 0.8))}%", y))
 
 
-def _mark(css: str, x: str, y: float) -> Markup:
+def mark(css: str, x: str, y: float) -> Markup:
     kind = css.split()[0]
     if kind == "mb":
         return Markup(
@@ -187,11 +185,13 @@ def panel(
     alt: str,
     css: str = "mb",
     title: str = "",
+    across: str = "",
     x_ticks: bool = True,
     units: tuple[str, str] = ("", ""),
 ) -> Markup:
-    """The layers on their axes; `title` stands above the y axis and names quantity and unit, `alt` states the
-    finding, `units` (across, up) stand behind the values that the pointer reads off.
+    """The layers on their axes; `title` stands above the y axis and names quantity and unit, `across` below
+    the x axis where the frame has 30 px for it, `alt` states the finding, `units` (across, up) stand behind
+    the values that the pointer reads off.
     """
     axes = []
     for value, label in frame.y.ticks:
@@ -203,6 +203,7 @@ def panel(
             ).format(frame.left, frame.width - frame.right, _n(y), _n(y), frame.left - 4, _n(y + 3.5), label)
         )
     base = frame.height - frame.below
+    foot = frame.height - (16 if across else 2)
     for value, label in frame.x.ticks if x_ticks else ():
         x = float(frame.px(value))
         anchor = "start" if x < frame.left + 5 else "end" if x > frame.width - frame.right - 8 else "middle"
@@ -210,18 +211,23 @@ def panel(
             Markup(
                 '<line class="ax" x1="{}" x2="{}" y1="{}" y2="{}"/><text x="{}" y="{}" '
                 'text-anchor="{}">{}</text>'
-            ).format(_n(x), _n(x), base, base + 3, _n(x), frame.height - 2, anchor, label)
+            ).format(_n(x), _n(x), base, base + 3, _n(x), foot, anchor, label)
         )
     axes.append(
         Markup('<line class="ax" x1="{}" x2="{}" y1="{}" y2="{}"/>').format(
             frame.left, frame.width - frame.right, base, base
         )
     )
-    head = Markup('<text class="yt" x="0" y="9">{}</text>').format(title) if title else ""
+    head = Markup('<text class="yt" x="0" y="9">{}</text>').format(title) if title else Markup("")
+    if across:
+        head += Markup('<text class="yt" x="{}" y="{}" text-anchor="end">{}</text>').format(
+            frame.width - frame.right, frame.height - 2, across
+        )
     return Markup(
-        '<svg class="plot {}" viewBox="0 0 {} {}" role="img" aria-label="{}"{}>{}{}{}</svg>'
+        '<svg class="plot {}" style="--w:{}px" viewBox="0 0 {} {}" role="img" aria-label="{}"{}>{}{}{}</svg>'
     ).format(
         css,
+        frame.width,
         frame.width,
         frame.height,
         alt,

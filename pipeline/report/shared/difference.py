@@ -66,6 +66,20 @@ class Difference(NamedTuple):
         return not (self.inputs or self.parameters or self.artifacts or self.code == "changed")
 
 
+def accepted(sources: Sources) -> dict[str, str]:
+    """The day on which the run was accepted, and the commit that was checked out; older files do not say."""
+    run = sources.accepted if isinstance(sources.accepted, dict) else {}
+    told = run.get("accepted")
+    if not isinstance(told, dict):
+        return {}
+    return {key: str(told[key])[:40] for key in ("on", "commit") if key in told}
+
+
+def accepted_on(sources: Sources) -> str:
+    """The day of the accepted run; "" where nothing tells it."""
+    return accepted(sources).get("on", "")
+
+
 def difference(sources: Sources) -> Difference | None:
     """None where no run was accepted yet."""
     before = sources.accepted

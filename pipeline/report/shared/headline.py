@@ -1,8 +1,6 @@
 """What page one says first: one sentence for the machine, and a row for each loop with its
 decision, the rule that decided it and what to do."""
 
-import math
-import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -15,9 +13,6 @@ from pipeline.report.temperature.judgement import Judgement
 NAMES = ("temperature", "deposition", "setpoint")
 MOVES = ("heaters to barrel", "plunger to flow", "camera to setpoints")
 ABSENT = "not measured"
-# what the first screen has room for beside the answers: lines in all,
-# and letters in a line of the widest font
-LINES, LINE = 11, 72
 
 
 class Loop(NamedTuple):
@@ -46,79 +41,23 @@ def verdicts(sources: Sources, judged: Judgement) -> dict[str, Verdict]:
 
 
 def loops(sources: Sources, judged: Judgement) -> list[Loop]:
-    """Temperature, deposition, setpoint, each as short as page one has
-    room for; the loop's own page has the whole."""
-    mine, parts, camera = verdicts(sources, judged).values()
-    return _fitted(
-        [
+    """Temperature, deposition, setpoint: the verdict of each as the head of page one counts it."""
+    shown = []
+    for (name, verdict), moves in zip(verdicts(sources, judged).items(), MOVES, strict=True):
+        measured = name == "temperature" or verdict.winner
+        shown.append(
             Loop(
-                "temperature",
-                MOVES[0],
-                mine.word,
-                mine.decision,
-                mine.lead,
-                mine.reason,
-                mine.remedy,
-                sources.recorded,
-            ),
-            *(
-                Loop(
-                    verdict.loop,
-                    moves,
-                    verdict.word if verdict.winner else ABSENT,
-                    verdict.decision,
-                    verdict.lead,
-                    _first(verdict.reason),
-                    verdict.remedy,
-                    not simulated(sources, verdict.loop),
-                )
-                for verdict, moves in zip((parts, camera), MOVES[1:], strict=True)
-            ),
-        ]
-    )
-
-
-def _first(text: str) -> str:
-    """The first sentence, up to its first semicolon where that is long."""
-    sentence = re.split(_SENTENCES, text, maxsplit=1)[0]
-    return (
-        sentence
-        if len(sentence) <= 2 * LINE + 20
-        else re.split(r"; ", sentence, maxsplit=1)[0].rstrip(".") + "."
-    )
-
-
-_SENTENCES = r"(?<=[.!?]) (?=[A-Z])"
-
-
-def _fitted(loops: Sequence[Loop]) -> list[Loop]:
-    """Where there is no room for all reasons, those that take more than a third of it are cut at their end;
-    then remedies by whole sentences, those of a loop that did not pass first.
-    """
-    fitted = [loop._replace(remedy="") for loop in loops]
-    if sum(map(_lines, fitted)) > LINES:
-        fitted = [
-            loop._replace(
-                reason=_cut(loop.reason, LINES // 3 * LINE - len(loop.decision) - len(loop.lead) - 2)
+                name,
+                moves,
+                verdict.word if measured else ABSENT,
+                verdict.decision,
+                verdict.lead,
+                verdict.reason,
+                verdict.remedy,
+                sources.recorded if name == "temperature" else not simulated(sources, name),
             )
-            for loop in fitted
-        ]
-    for i in sorted(range(len(loops)), key=lambda i: loops[i].state == "passed"):
-        for sentence in filter(None, re.split(_SENTENCES, loops[i].remedy)):
-            longer = fitted[i]._replace(remedy=f"{fitted[i].remedy} {sentence}".strip())
-            if sum(_lines(loop) for loop in [*fitted[:i], longer, *fitted[i + 1 :]]) > LINES:
-                break
-            fitted[i] = longer
-    return fitted
-
-
-def _cut(text: str, room: int) -> str:
-    room = max(room, LINE)
-    return text if len(text) <= room else text[: room - 1].rstrip() + "…"
-
-
-def _lines(loop: Loop) -> int:
-    return math.ceil(len(f"{loop.decision} {loop.lead} {loop.reason} {loop.remedy}".rstrip()) / LINE)
+        )
+    return shown
 
 
 SOURCES = {"temperature": "generate_probing", "deposition": "train_ilc", "setpoint": "train_classifier"}

@@ -4,6 +4,7 @@ import base64
 import functools
 import hashlib
 import itertools
+import re
 import urllib.parse
 from collections.abc import Sequence
 
@@ -11,6 +12,7 @@ import jinja2
 from markupsafe import Markup, escape
 
 from pipeline.report.shared import digits
+from pipeline.report.shared.pictures import Column
 from pipeline.report.shared.sources import Source
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 from pipeline.store import artifacts
@@ -60,10 +62,10 @@ def environment() -> jinja2.Environment:
         "mark": mark,
         "bdi": bdi,
         "origin": origin,
+        "linked": linked,
         "missing": missing,
         "anchor": anchor,
         "term": term,
-        "hashed": hashed,
         "word_id": word_id,
     }
     script = Markup(templates.get_template("page.js").render().strip())
@@ -71,7 +73,12 @@ def environment() -> jinja2.Environment:
         "script": script,
         "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     }
-    templates.filters |= {"shortened": digits.shortened, "typeset": digits.typeset, "count": digits.count}
+    templates.filters |= {
+        "widest": widest,
+        "shortened": digits.shortened,
+        "typeset": digits.typeset,
+        "count": digits.count,
+    }
     return templates
 
 
@@ -95,6 +102,12 @@ def glyph(state: str) -> Markup:
     return Markup('<svg class="g{}" aria-hidden="true"><use href="#{}"/></svg>').format(
         bad, GLYPHS.get(state, "open")
     )
+
+
+def widest(columns: Sequence[Column]) -> int:
+    """Width in px for which the widest chart of these columns was drawn."""
+    panels = "".join(str(panel) for column in columns for panel in column.panels)
+    return max(map(int, re.findall(r'style="--w:(\d+)px"', panels)), default=208)
 
 
 def mark(controller: str) -> Markup:
@@ -154,13 +167,23 @@ def origin(sources: list[Source], **place: str | Sequence[str]) -> Markup:
     return files(sources)
 
 
-def files(sources: list[Source]) -> Markup:
-    """The artifacts by name, each linked to its line of the provenance."""
+def files(sources: Sequence[Source]) -> Markup:
+    """The artifacts by name: a click gives the file, the title its digest."""
+    return Markup('<p class="src">From {}.</p>').format(linked(sources)) if sources else Markup("")
+
+
+def linked(sources: Sequence[Source], *, short: bool = False) -> Markup:
+    """The links to these files, with commas between them; `short`: without their folder."""
     parts = [
-        Markup('<a href="#{}"><code>{}</code></a>').format(anchor(s.path), s.path.split("/", 1)[1])
-        for s in sources
+        Markup('<a class="from" href="{}" title="{}, SHA-256 {}"><code>{}</code></a>').format(
+            source.link,
+            source.path,
+            source.sha256[:8],
+            source.path.rsplit("/", 1)[1] if short else source.path.split("/", 1)[1],
+        )
+        for source in sources
     ]
-    return Markup('<p class="src">From {}.</p>').format(Markup(", ").join(parts))
+    return Markup(", ").join(parts)
 
 
 def word_id(word: str) -> str:
@@ -171,17 +194,10 @@ def term(word: str, text: str = "") -> Markup:
     """A word of the page's list, linked to its meaning there; where a script runs,
     the meaning stands beside it on hover and focus."""
     return (
-        Markup('<a class="term" href="#{}">{}</a>').format(word_id(word), text or word)
+        Markup('<a class="term" href="words.html#{}">{}</a>').format(word_id(word), text or word)
         if word
         else escape(text)
     )
-
-
-def hashed(short: str, sources: list[Source]) -> Markup:
-    """The first digits of a hash, linked to the artifact that has it, where it is one's."""
-    source = next((source for source in sources if source.sha256.startswith(short)), None)
-    code = Markup("<code>{}</code>").format(short)
-    return Markup('<a href="#{}">{}</a>').format(anchor(source.path), code) if source else code
 
 
 def anchor(path: str) -> str:

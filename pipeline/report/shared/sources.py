@@ -50,7 +50,8 @@ class Declared(NamedTuple):
 
 class Source(NamedTuple):
     """One file that the pages show: what it is called here (a table's name, or the stage of metrics), the
-    stage that wrote it, name and version of its schema, and the digest of its bytes.
+    stage that wrote it, name and version of its schema, the digest of its bytes, and where it is found from
+    the pages.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Source(NamedTuple):
     stage: str
     schema: str
     sha256: str
+    link: str = ""
 
 
 class Sources(NamedTuple):
@@ -162,9 +164,40 @@ def collect(
         )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
     files = code_files(code)
+    read = linked(read)
     return Sources(
         declared, figures, tables, read, absent, before or None, folders_of_code, files, night, relearned
     )
+
+
+# bytes of a file, and of all files together, that are copied beside the pages
+LARGEST_COPY, LARGEST_COPIES = 4_000_000, 10_000_000
+
+
+def linked(read: Mapping[str, Source]) -> dict[str, Source]:
+    """The same with the link to each file: where it lies below reports/; else a copy in reports/data, so that
+    the folder of the pages is whole by itself, where the file is small; else its place below datasets/."""
+    room, taken, found = LARGEST_COPIES, set(), {}
+    for path, source in read.items():
+        name, size = f"{source.stage}.{Path(path).name}", Path(path).stat().st_size
+        if path.startswith("reports/"):
+            link = path.removeprefix("reports/")
+        elif size <= min(LARGEST_COPY, room) and name not in taken:
+            link, room = f"data/{name}", room - size
+            taken.add(name)
+        else:
+            link = f"../{path}"
+        found[path] = source._replace(link=link)
+    return found
+
+
+def copies(sources: Sources) -> dict[str, bytes]:
+    """Name in reports/data -> bytes of every file that the pages link to there."""
+    return {
+        source.link.removeprefix("data/"): Path(path).read_bytes()
+        for path, source in sources.read.items()
+        if source.link.startswith("data/")
+    }
 
 
 def code_files(folders: tuple[str, ...]) -> dict[str, str]:

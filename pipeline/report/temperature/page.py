@@ -2,14 +2,14 @@
 the study, words, provenance."""
 
 from pipeline.report.identification.model import trust
-from pipeline.report.index import page as index_page
 from pipeline.report.shared import headline, page, words
+from pipeline.report.shared.difference import accepted_on
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature import findings, pictures, recording, scorecard, study
+from pipeline.report.temperature import findings, pictures, recording, scorecard, study, twelve
+from pipeline.report.temperature.answers import comparison, refused
 from pipeline.report.temperature.answers import judged as names_judged
-from pipeline.report.temperature.answers import refused
 from pipeline.report.temperature.contestants import BY_NAME
-from pipeline.report.temperature.judgement import Judgement, relearned_date, verdict_parts
+from pipeline.report.temperature.judgement import Judgement, heads, relearned_date, verdict_parts
 from pipeline.report.temperature.pairs import prior_sentence
 
 WORDS = (
@@ -44,6 +44,12 @@ def render(sources: Sources, judged: Judgement) -> str:
         here="temperature",
         title=f"Temperature: {judged.verdict.decision.rstrip('.')}",
         verdict=verdict_parts(judged, claim=headline.claim(sources, ("temperature",))),
+        answers=twelve.rows(sources, judged),
+        setting=scorecard.setting(comparison(sources.metrics)),
+        heads=heads(judged),
+        drift=judged.drifted,
+        drift_state=twelve.drift_state(judged),
+        accepted_on=accepted_on(sources),
         pair=judged.pair,
         best=judged.best,
         deciding=judged.deciding,
@@ -63,9 +69,6 @@ def render(sources: Sources, judged: Judgement) -> str:
         weights=scorecard.weights(sources),
         trusted=trust(sources),
         words=words.chosen(sources, (*dict.fromkeys(contestants), *WORDS)),
-        sources=list(sources.read.values()),
-        absent=sources.absent,
-        hashes=index_page.hashes(sources),
         from_scorecard=sources.source("evaluate_temperature", "cases", "relearned"),
         from_quality=sources.source("quality"),
         from_weights=sources.source("weights"),

@@ -243,7 +243,9 @@
     if (!now) return;
     const day = new Date(now.date).toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric", timeZone: "UTC" });
     const commit = now.commit === "none" ? "no commit" : `commit ${now.commit}${now.changed ? " with uncommitted changes" : ""}`;
-    page.querySelector("main").after(make("footer", { className: "wrap made" }, `Last run on ${now.cpu}, pins ${now.pins}, beadline ${now.version}, ${commit}, ${day}`));
+    const first = page.querySelector("[data-run]");
+    if (first) first.textContent = `beadline ${now.version}, ${commit}, ${now.cpu}, pins ${now.pins}, ${day}.`;
+    else page.querySelector("main").after(make("footer", { className: "wrap made" }, `Last run on ${now.cpu}, pins ${now.pins}, beadline ${now.version}, ${commit}, ${day}`));
     page.querySelectorAll("[data-made]").forEach(cell => { cell.textContent = day; });
     /* the page carries the accepted run's machine only where inputs, parameters and code are the same */
     const place = page.querySelector("[data-machine]"), then = place && JSON.parse(place.dataset.machine);

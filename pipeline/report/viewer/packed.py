@@ -17,7 +17,7 @@ from pipeline.report.viewer.series import UNITS, Shown, runs
 
 # of the folder, in bytes: what a reader will still send to a colleague; of one copied table; of one table's
 # events, which stand in the page
-LARGEST, LARGEST_COPY, MOST_EVENTS = 32_000_000, 4_000_000, 2000
+LARGEST, MOST_EVENTS = 32_000_000, 2000
 # a book of no more bytes is one file; of a larger one each column is loaded when it is asked for
 ONE_FILE = 1_500_000
 
@@ -158,16 +158,10 @@ def column_file(name: str, parts: list[np.ndarray]) -> str:
     return f'beadlineSeries({json.dumps(name)},{size},{json.dumps(at, separators=(",", ":"))},"{text}");\n'
 
 
-def download(source: Source, room: int) -> tuple[str, dict[str, bytes], str]:
-    """Where the table itself is found from the page: a copy beside it where that is small, else its place
-    below datasets/. The link, the copy, and its size in words."""
-    path = Path(source.path)
-    size = path.stat().st_size
-    words = f"{number(size / 1e6, 1)} MB" if size >= 1e5 else f"{number(size / 1e3, 0)} kB"
-    if size > min(LARGEST_COPY, room):
-        return f"../{source.path}", {}, words
-    name = f"{source.stage}.{path.name}"
-    return f"data/{name}", {name: path.read_bytes()}, words
+def size_of(source: Source) -> str:
+    """Size of the file in words."""
+    size = Path(source.path).stat().st_size
+    return f"{number(size / 1e6, 1)} MB" if size >= 1e5 else f"{number(size / 1e3, 0)} kB"
 
 
 def script_safe(data: Mapping[str, Any]) -> str:

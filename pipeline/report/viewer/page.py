@@ -11,12 +11,11 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, number, short
-from pipeline.report.shared.sources import Sources, Table
+from pipeline.report.shared.sources import Sources, copies
 from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.answers import comparison, entry
 from pipeline.report.temperature.contestants import heading
+from pipeline.report.temperature.deciding import degrees, runs_of, until_settled
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.report.temperature.pictures import drawn
 from pipeline.report.viewer import packed, series
 
 VENDOR = Path(__file__).parent / "vendor"
@@ -45,7 +44,7 @@ class Viewer(NamedTuple):
 
 def render(sources: Sources, judged: Judgement) -> Viewer:
     """viewer.html and what it loads."""
-    files: dict[str, str | bytes] = {LIBRARY: library()}
+    files: dict[str, str | bytes] = {LIBRARY: library(), **copies(sources)}
     room = packed.LARGEST - sum(map(len, files.values()))
     entries, rows = [], []
     for shown in series.tables(sources):
@@ -54,11 +53,10 @@ def render(sources: Sources, judged: Judgement) -> Viewer:
             rows.append(Row(shown.title, shown.note, "", "", "", "", table, ""))
             continue
         source = sources.source(shown.name)[0]
-        link, copy, size = packed.download(source, room)
-        room -= sum(map(len, copy.values()))
+        link, size = source.link, packed.size_of(source)
         found = packed.packed(shown, table, room)
         room -= sum(map(len, found.files.values()))
-        files |= {**copy, **found.files}
+        files |= found.files
         if found.entry["books"]:
             entries.append(found.entry | {"link": link, "size": size, "path": source.path})
         left_out = _left_out(found.entry)
@@ -77,9 +75,6 @@ def render(sources: Sources, judged: Judgement) -> Viewer:
         library_style=Markup((VENDOR / "uPlot.min.css").read_text(encoding="utf-8").strip()),
         convention=not sources.recorded,
         bound=number(packed.LARGEST / 1e6, 0),
-        sources=[s for s in sources.read.values() if s.path in {row.source for row in rows}],
-        absent={},
-        hashes=[],
     )
     return Viewer(text, dict(sorted(files.items())))
 
@@ -108,43 +103,14 @@ def start(sources: Sources, judged: Judgement) -> dict[str, Any]:
     table = sources.tables["trajectories"]
     if isinstance(table, Missing) or not len(table["time_s"]):
         return {}
-    runs, zone = _deciding(sources, judged, table)
+    runs, zone = runs_of(sources, judged, table)
     if not runs:
         return {}
     place = {"t": "trajectories", "case_name": ["deciding"], "contestant": list(runs), "y": [zone]}
-    seconds = _until_settled(table, runs, zone)
+    seconds = until_settled(table, runs, zone)
     if seconds < float(table["time_s"].max()):
         place["x"] = [0.0, seconds]
     return place
-
-
-def _deciding(sources: Sources, judged: Judgement, table: Table) -> tuple[dict[str, np.ndarray], str]:
-    """Rows of the deciding case under everybody whom the temperature page draws, and the output that the
-    subject of the verdict leaves furthest from its reference."""
-    runs = {
-        who: np.flatnonzero((table["contestant"] == who) & (table["case_name"] == "deciding"))
-        for who in drawn(sources, judged)
-    }
-    runs = {who: rows for who, rows in runs.items() if len(rows)}
-    names = [output.name for output in sources.declared.machine.outputs]
-    if not runs:
-        return {}, names[0]
-    rows = runs.get(judged.subject, next(iter(runs.values())))
-    settled = entry(comparison(sources.metrics), "settled_steps")
-    last = rows[-(settled if isinstance(settled, int) else max(len(rows) // 10, 1)) :]
-    apart = [float(np.abs(np.mean(table[name][last] - table[f"{name}_reference"][last]))) for name in names]
-    return runs, names[int(np.argmax(np.nan_to_num(apart, nan=np.inf)))]
-
-
-def _until_settled(table: Table, runs: dict[str, np.ndarray], zone: str) -> float:
-    """Three times as long as the slowest takes to come within 2 % of its way to a constant reference; to the
-    end of one that moves."""
-    rows = np.concatenate(list(runs.values()))
-    time, away = table["time_s"][rows], np.abs(table[zone][rows] - table[f"{zone}_reference"][rows])
-    if np.ptp(table[f"{zone}_reference"][rows]) > 0 or not np.isfinite(away).all():
-        return float(time.max())
-    outside = time[away > 0.02 * away.max()]
-    return float(min(3 * outside.max(initial=0.0) + 1, time.max()))
 
 
 class Still(NamedTuple):
@@ -165,16 +131,16 @@ def still(sources: Sources, judged: Judgement) -> Still:
     table = sources.tables["trajectories"]
     if isinstance(table, Missing):
         return Still("", Markup(""), [], missing=table)
-    runs, zone = _deciding(sources, judged, table)
+    runs, zone = runs_of(sources, judged, table)
     if not runs:
         gap = Missing("not measured", "no trajectory of the deciding case was recorded")
         return Still("", Markup(""), [], missing=gap)
     label = sources.zone([o.name for o in sources.declared.machine.outputs].index(zone))
-    seconds, time = _until_settled(table, runs, zone), table["time_s"]
+    seconds, time = until_settled(table, runs, zone), table["time_s"]
     early = {who: rows[time[rows] <= seconds] for who, rows in runs.items()}
     frame = charts.Frame(
         charts.linear(0, seconds or 1.0),
-        _degrees(table, np.concatenate(list(early.values())), zone),
+        degrees(table, np.concatenate(list(early.values())), zone),
         width=360,
         height=240,
         left=44,
@@ -199,13 +165,3 @@ def still(sources: Sources, judged: Judgement) -> Still:
     alt, units = f"{text} {'; '.join(names)}", ("s", "°C")
     picture = charts.panel(frame, layers, alt=alt, css="mb", title=f"{label}, °C", units=units)
     return Still(f"{text} {shown}".strip(), picture, names, page.files(sources.source("trajectories")))
-
-
-def _degrees(table: Table, rows: np.ndarray, zone: str) -> charts.Axis:
-    """Room for a zone and its reference; what is lost runs along the edge."""
-    values = np.concatenate([table[zone][rows], table[f"{zone}_reference"][rows]])
-    values = values[np.isfinite(values) & (np.abs(values) < 1e4)]
-    if not len(values):
-        return charts.linear(0, 1)
-    room = 0.05 * float(np.ptp(values)) or 1.0
-    return charts.linear(float(values.min()) - room, float(values.max()) + room)

@@ -180,6 +180,6 @@ def _drawn(states: Mapping[str, str], alt: str) -> Markup:
         )
         for stage, word in states.items()
     ]
-    return Markup('<svg class="plot dag" viewBox="0 0 {} {}" role="img" aria-label="{}">{}{}</svg>').format(
-        width, height, alt, Markup("").join(arrows), Markup("").join(boxes)
-    )
+    return Markup(
+        '<svg class="plot dag" style="--w:{}px" viewBox="0 0 {} {}" role="img" aria-label="{}">{}{}</svg>'
+    ).format(width, width, height, alt, Markup("").join(arrows), Markup("").join(boxes))

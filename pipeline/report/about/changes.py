@@ -1,0 +1,131 @@
+"""What changed since the accepted run, of all three loops: page one's sentences, and how many figures of each
+loop moved."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from pipeline.report.deposition import change as deposition_change
+from pipeline.report.deposition import rules as deposition_rules
+from pipeline.report.setpoint import change as setpoint_change
+from pipeline.report.shared.difference import Difference, Move
+from pipeline.report.shared.digits import count
+from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.verdict import Missing
+from pipeline.report.temperature.contestants import in_a_sentence
+from pipeline.report.temperature.judgement import Judgement
+
+ANOTHER = "The accepted run is of another machine: nothing to compare."
+# figures of a loop that page one names
+NAMED = 2
+
+
+class Moved(NamedTuple):
+    """A figure that moved beyond its noise: what it is, by how much ("+0.39 °C · worse"), and whether that is
+    worse."""
+
+    title: str
+    text: str
+    worse: bool
+
+
+class LoopChange(NamedTuple):
+    """One loop: the figures that moved, of how many that both runs have, and how many only this one has."""
+
+    loop: str
+    moved: Sequence[Moved]
+    of: int
+    new: int = 0
+
+    def sentence(self) -> str:
+        """ "2 of 18 figures moved: settled error +0.39 °C · worse; ..."."""
+        if not self.of:
+            return "nothing to compare with."
+        if not self.moved:
+            return f"no figure of {self.of} moved beyond its noise."
+        listed = "; ".join(f"{one.title} {one.text}" for one in self.moved[:NAMED])
+        more = f"; and {len(self.moved) - NAMED} more" if len(self.moved) > NAMED else ""
+        return f"{len(self.moved)} of {count(self.of, 'figure')} moved: {listed}{more}."
+
+
+class Changes(NamedTuple):
+    """Page one's answer: `strong`, then `text`; `alone` stands in the place of `strong` where the page finds,
+    by script, that nothing but the machine differs. Then the loops."""
+
+    strong: str
+    text: str = ""
+    alone: str = ""
+    loops: Sequence[LoopChange] = ()
+
+
+def changes(sources: Sources, judged: Judgement) -> Changes:
+    """What changed since the accepted run, of all loops."""
+    accepted = sources.accepted
+    if isinstance(accepted, Missing):
+        return Changes("The accepted run cannot be read.", accepted.sentence())
+    if accepted is None:
+        return Changes("First run: nothing to compare with.", "./run beadline accept marks this one as good.")
+    loops = of_loops(sources, judged)
+    moved, compared = sum(len(loop.moved) for loop in loops), sum(loop.of for loop in loops)
+    beside = inputs(judged.changed) if judged.changed else ""
+    if sources.another_machine:
+        return Changes(ANOTHER, "Deposition and setpoint are compared.", loops=loops)
+    if not moved:
+        nothing = judged.changed is not None and judged.changed.empty and not any(one.new for one in loops)
+        strong = "Nothing changed; no figure moved." if nothing else "No figure moved beyond its noise."
+        return Changes(strong, "" if nothing else beside, loops=loops)
+    figures = f"{moved} of {compared} figures moved"
+    return Changes(f"{figures} beyond their noise.", beside, f"{figures} with the machine alone.", loops)
+
+
+def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
+    """Temperature: figures of the contestant and its rival; deposition: flow error of every stream; setpoint:
+    settled runs of every case of the default that counts."""
+    mine = [
+        (name, move)
+        for name in dict.fromkeys((judged.subject, judged.rival))
+        for move in judged.moved.get(name, [])
+    ]
+    temperature = [
+        _moved(move, "" if name == judged.subject else f" of {in_a_sentence(name)}")
+        for name, move in mine
+        if move.moved
+    ]
+    streams = deposition_moves(sources)
+    cases = setpoint_change.changes(sources)
+    return [
+        LoopChange("temperature", temperature, *_counted([move for _, move in mine])),
+        LoopChange("deposition", [_moved(move) for move in streams if move.moved], *_counted(streams)),
+        LoopChange(
+            "setpoint",
+            [Moved(name, change.text, change.worse) for name, change in cases if change.moved],
+            sum(change.text not in ("first run", "new") for _, change in cases),
+        ),
+    ]
+
+
+def _counted(moves: Sequence[Move]) -> tuple[int, int]:
+    """How many figures both runs have, and how many only this one has."""
+    both = sum(move.before is not None and not isinstance(move.now, Missing) for move in moves)
+    return both, sum(move.word == "new" for move in moves)
+
+
+def _moved(move: Move, whose: str = "") -> Moved:
+    title = f"{move.question.title}{whose}"
+    return Moved(f"{title[:1].lower()}{title[1:]}", move.text(), move.word == "worse")
+
+
+def deposition_moves(sources: Sources) -> list[Move]:
+    """Flow errors of the composer in use, stream by stream."""
+    parts = deposition_rules.structures(sources)
+    return [] if isinstance(parts, Missing) else deposition_change.moves(sources, parts)
+
+
+def inputs(changed: Difference) -> str:
+    """ "Changed: code, 4 parameters." """
+    parts = [
+        count(len(changed.inputs), "recording") if changed.inputs else "",
+        count(len(changed.parameters), "parameter") if changed.parameters else "",
+        "code" if changed.code == "changed" else "",
+        count(len(changed.artifacts), "artifact") if changed.artifacts else "",
+    ]
+    return f"Changed: {', '.join(filter(None, parts))}." if any(parts) else "Nothing else changed."

@@ -1,0 +1,190 @@
+"""The deposition loop on page one: the composer in use, the other one and on-off control; and the part on
+which the composer in use fares worst."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from markupsafe import Markup
+
+from pipeline.report.deposition.rules import LIBRARY, MARK, NAMES, OURS, Structure, real, structures, worst
+from pipeline.report.shared import charts, page
+from pipeline.report.shared.card import Card, Cell, Deciding, Entrant, Row, Step, best_of, note_of, of_verdict
+from pipeline.report.shared.digits import THIN, band, count, decimals, number, percent
+from pipeline.report.shared.sources import Sources, Table
+from pipeline.report.shared.verdict import PASSED, Missing, Verdict
+
+MOVES = "Plunger command to flow at the nozzle"
+# how long a stretch of a part is drawn, s
+STRETCH_S = 6.0
+STYLES = {"basis": "line dd", "priority": "line", "superposition": "line dash", "on_off": "line bl"}
+
+Read = Callable[[Structure, str], float | None]
+
+
+def card(sources: Sources, verdict: Verdict) -> Card:
+    """Flow error, line volume and what learning the part itself would gain, of three composers."""
+    parts, names = structures(sources), shown(verdict.winner or "")
+    step = _step(sources, verdict)
+    if isinstance(parts, Missing):
+        return of_verdict(
+            verdict, MOVES, step, entrants=[], rows=[], basis="", beside="", sources=[],
+            missing=parts.sentence(),
+        )  # fmt: skip
+    asked = sources.declared.rules
+    known = [part for part in parts if not part.unknown()]
+    whose = "forecasts of the identified machine" if real(sources) else "true flow of simulated machines"
+    other = worst(known, names[1])
+    return of_verdict(
+        verdict,
+        MOVES,
+        step,
+        entrants=[
+            Entrant(MARK[name], NAMES[name], _note(name) if i else note_of(verdict))
+            for i, name in enumerate(names)
+        ],
+        rows=[
+            _row("Flow error", known, names, _error, asked.flow_error_percent, "≤", "%"),
+            _row("Line volume", known, names, _volume, asked.line_volume_percent, "±", "%"),
+            _row("Above learning it", known, names, _above, asked.above_whole_points, "≤", "points"),
+        ],
+        basis=f"Worst of {count(len(known), 'stream')}, {whose}; small: range. Error in % of on\u2011off’s.",
+        beside=""
+        if other is None
+        else f"{NAMES[names[1]]} is worst on {other[1].part}, {other[1].material}: {percent(other[0], 2)}.",
+        sources=sources.source("scores"),
+    )
+
+
+def shown(winner: str) -> list[str]:
+    """The composer in use, the other one of the pair, on-off control."""
+    if winner == "on_off":
+        return ["on_off", OURS, LIBRARY]
+    return [winner or OURS, LIBRARY if winner in (OURS, "") else OURS, "on_off"]
+
+
+def _note(name: str) -> str:
+    return {"basis": "data-driven", "on_off": "yardstick"}.get(name, "the paper’s")
+
+
+# ---- the figures
+
+
+def _error(part: Structure, name: str) -> float | None:
+    return part.scores[name].error if name in part.scores else None
+
+
+def _volume(part: Structure, name: str) -> float | None:
+    return part.scores[name].worst_line if name in part.scores else None
+
+
+def _above(part: Structure, name: str) -> float | None:
+    """Points above what learned this very part; None where nothing did."""
+    both = name in part.scores and "ilc" in part.scores
+    return part.scores[name].error - part.scores["ilc"].error if both else None
+
+
+def _row(
+    title: str, parts: Sequence[Structure], names: Sequence[str], read: Read, limit: float, sign: str,
+    unit: str,
+) -> Row:  # fmt: skip
+    """The largest figure of each composer, the range over all streams beside it."""
+    each = {name: [value for part in parts if (value := read(part, name)) is not None] for name in names}
+    most = [max(values) if values else None for values in each.values()]
+    best = best_of(most, at_least=False)
+    cells = [
+        _cell(values, unit, best=max(values, default=None) == best is not None, limit=limit)
+        for values in each.values()
+    ]
+    return Row(title, f"{sign}{'' if sign == '±' else ' '}{limit:g}{THIN}{unit}", cells)
+
+
+def _cell(values: Sequence[float], unit: str, *, best: bool, limit: float) -> Cell:
+    if not values:
+        return Cell("not measured")
+    low, high = min(values), max(values)
+    places = min(decimals(low, high, value=high), 1)
+    return Cell(f"{number(high, places)}{THIN}{unit}", band(low, high, places), best, bad=high > limit)
+
+
+def _step(sources: Sources, verdict: Verdict) -> Step:
+    if not verdict.winner:
+        return Step("Run the stages of this loop.", "./run dvc repro compose_parts")
+    if verdict.state != PASSED and verdict.remedy:
+        return Step(f"{verdict.remedy.rstrip('.')}; then run it again.", "./run dvc repro")
+    if real(sources):
+        return Step("Compose the commands of a part.", "./run beadline compose PART.gcode")
+    return Step("Compose a part of your own.", "./run beadline compose PART.gcode --verify")
+
+
+# ---- the part that decides
+
+
+def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
+    """Six seconds of the part on which the composer in use fares worst, about its largest error."""
+    parts, table = structures(sources), sources.tables["signals"]
+    if isinstance(parts, Missing):
+        return parts
+    if isinstance(table, Missing):
+        return table
+    names = shown(verdict.winner or "")
+    found = worst([part for part in parts if not part.unknown()], names[0])
+    rows = [] if found is None else _stretch(table, found[1], names[0])
+    if found is None or not len(rows):
+        return Missing("not measured", "no flow of the part that decides was kept")
+    part = found[1]
+    stretch = {key: table[key][rows] for key in table}
+    drawn = [name for name in names if np.isfinite(stretch.get(f"{name}_mm3_per_s", np.nan)).any()]
+    listed = ", ".join(
+        f"{i} {NAMES[name].lower()} {percent(part.scores[name].error, 2)}"
+        for i, name in enumerate(drawn, 1)
+        if name in part.scores
+    )
+    finding = (
+        f"{part.part}, material {part.material}, about the largest error: wanted flow dashed. "
+        f"Error in per cent of on\u2011off control’s: {listed}."
+    )
+    wide, narrow = (_drawn(stretch, drawn, finding, size) for size in ((566, 212), (350, 240)))
+    seen = [f"{name}_mm3_per_s" for name in ("wanted", *drawn)]
+    return Deciding(
+        "Deposition, the part that decides",
+        finding,
+        wide,
+        narrow,
+        "",
+        page.in_viewer("signals", part=[part.part], material=[part.material], y=seen),
+    )
+
+
+def _stretch(table: Table, part: Structure, name: str) -> np.ndarray:
+    """Rows of the part within STRETCH_S about where the composer's flow is furthest from the wanted."""
+    mine = np.flatnonzero((table["part"] == part.part) & (table["material"] == part.material))
+    off = np.abs(table[f"{name}_mm3_per_s"][mine] - table["wanted_mm3_per_s"][mine])
+    if not len(mine) or not np.isfinite(off).any():
+        return mine[:0]
+    time = table["time_s"][mine]
+    middle = time[int(np.nanargmax(off))]
+    start = min(max(middle - STRETCH_S / 2, time.min()), max(time.max() - STRETCH_S, time.min()))
+    return mine[(time >= start) & (time <= start + STRETCH_S)]
+
+
+def _drawn(table: Mapping[str, np.ndarray], names: Sequence[str], alt: str, size: tuple[int, int]) -> Markup:
+    flows = {name: table[f"{name}_mm3_per_s"] for name in ("wanted", *names)}
+    finite = np.concatenate([values[np.isfinite(values)] for values in flows.values()])
+    room = 0.06 * float(np.ptp(finite)) or 1.0
+    time = table["time_s"]
+    frame = charts.Frame(
+        charts.linear(float(time[0]), float(time[-1])),
+        charts.linear(float(finite.min()) - room, float(finite.max()) + room),
+        *size, 40, 34, 22, 14,
+    )  # fmt: skip
+    layers = [charts.line(frame, time, flows["wanted"], "ref", most=120)]
+    for i, name in enumerate(names, 1):
+        y = flows[name]
+        layers.append(charts.line(frame, time, y, STYLES[name], most=120))
+        # a number where the line is furthest from the wanted flow
+        at = int(np.nanargmax(np.abs(y - flows["wanted"])))
+        layers.append(charts.label(frame, time[at], y[at], str(i), dx=5, dy=-4))
+    return charts.panel(
+        frame, layers, alt=alt, css="mb lead-picture", title="flow, mm³/s", across="time, s",
+        units=("s", "mm³/s"),
+    )  # fmt: skip

@@ -1,0 +1,114 @@
+"""A loop on page one: its verdict, the controller that it is about against what stands beside it in three
+figures, the picture of the case that decides, and what to do next."""
+
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from markupsafe import Markup
+
+from pipeline.report.shared.sources import Source
+from pipeline.report.shared.verdict import PASSED, Verdict
+
+# letters of a reason that a card has room for in the widest font
+ROOM = 200
+
+
+class Entrant(NamedTuple):
+    """A controller above its column: its mark, its name, and what it is here (named, runs now, yardstick)."""
+
+    mark: str
+    name: str
+    note: str
+
+
+class Cell(NamedTuple):
+    """A figure with its band in words; `best` of its row, `bad` where it failed."""
+
+    text: str
+    band: str = ""
+    best: bool = False
+    bad: bool = False
+
+
+class Row(NamedTuple):
+    """One figure of every controller of the card, and the rule's limit."""
+
+    title: str
+    limit: str
+    cells: Sequence[Cell]
+
+
+class Step(NamedTuple):
+    """What to do next: a sentence, and the command."""
+
+    sentence: str
+    command: str
+
+
+class Deciding(NamedTuple):
+    """The case that decides a loop as a picture: for a screen, and narrow for a phone. `entrants`
+    are those whose marks it shows; `key` says how to read it; `origin` leads to its data."""
+
+    title: str
+    finding: str
+    wide: Markup
+    narrow: Markup
+    key: str
+    origin: Markup
+    entrants: Sequence[Entrant] = ()
+
+
+class Card(NamedTuple):
+    """One loop. `basis` says what the small figures are; `beside` is a sentence below the table; `missing`
+    says why there are no figures."""
+
+    loop: str
+    moves: str
+    state: str
+    decision: str
+    lead: str
+    reason: str
+    entrants: Sequence[Entrant]
+    rows: Sequence[Row]
+    basis: str
+    beside: str
+    step: Step
+    sources: Sequence[Source]
+    missing: str = ""
+
+
+NEXT = re.compile(r"(?<=[.!?]) (?=[A-Z])")
+
+
+def first_sentence(text: str, room: int = ROOM) -> str:
+    """The first sentence; up to its first semicolon where that is long, and cut where that is too."""
+    sentence = NEXT.split(text, maxsplit=1)[0]
+    if len(sentence) > room:
+        sentence = sentence.split("; ", 1)[0].rstrip(".") + "."
+    return sentence if len(sentence) <= room else sentence[: room - 1].rstrip() + "…"
+
+
+def of_verdict(verdict: Verdict, moves: str, step: Step, **rest: Any) -> Card:
+    """The card of a loop with this verdict."""
+    return Card(
+        verdict.loop,
+        moves,
+        verdict.word,
+        verdict.decision,
+        verdict.lead,
+        first_sentence(verdict.reason),
+        step=step,
+        **rest,
+    )
+
+
+def best_of(values: Sequence[float | None], *, at_least: bool) -> float | None:
+    """The best value that is known; None where fewer than two are."""
+    known = [value for value in values if value is not None]
+    return (max if at_least else min)(known) if len(known) > 1 else None
+
+
+def note_of(verdict: Verdict) -> str:
+    """What the controller is that the verdict is about."""
+    return "named" if verdict.state == PASSED else "closest"

@@ -1,0 +1,124 @@
+"""Every statement of page one, recomputed here from the artifacts themselves, apart from the code that writes
+the page."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.report.test_pages import Page
+
+LOOPS = ("temperature", "deposition", "setpoint")
+
+
+def metrics(reports, stage):
+    return json.loads((reports / f"metrics/{stage}.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def first(reports):
+    return Page(reports / "index.html")
+
+
+@pytest.fixture(scope="module")
+def cards(first):
+    """Text of each loop's card."""
+    starts = [first.text.index(words) for words in ("Heaters and motor", "Plunger command", "Nozzle camera")]
+    ends = [*starts[1:], first.text.index("Next Temperature")]
+    return {loop: first.text[a:b] for loop, a, b in zip(LOOPS, starts, ends, strict=True)}
+
+
+def numbers(text):
+    return [float(found.replace(",", "")) for found in re.findall(r"(?<![\w.])\d[\d,]*\.?\d*", text)]
+
+
+def row(card, title, until):
+    return card[card.index(title) + len(title) : card.index(until, card.index(title))]
+
+
+def test_the_headline_counts_the_verdicts_that_the_metrics_keep(reports, first):
+    verdicts = metrics(reports, "report")["verdicts"]
+    assert {loop: verdicts[loop]["state"] for loop in LOOPS} == dict.fromkeys(LOOPS, "passed")
+    assert "Rehearsal passed: all three loops." in first.text
+    for loop in LOOPS:
+        assert f"{verdicts[loop]['decision']} {verdicts[loop]['lead']}" in first.text
+
+
+def test_temperature_shows_the_quantiles_and_bands_of_the_comparison(reports, cards):
+    contestants = metrics(reports, "evaluate_temperature")["contestants"]
+    card, limits = cards["temperature"], {"Settled error": 0.5, "Overshoot": 5.0}
+    names = ("subspace_lqg", "learned_kernel")
+    for title, key, until in (
+        ("Settled error", "settled_error", "Settling"),
+        ("Overshoot", "overshoot", "90"),
+    ):
+        shown = numbers(row(card, title, until))
+        asked = [limits[title]]
+        for name in names:
+            figure = contestants[name][key]
+            asked += [figure["q90"], figure["low"], figure["high"]]
+        np.testing.assert_allclose(shown[: len(asked)], asked, atol=0.051, err_msg=title)
+
+
+def test_deposition_shows_the_worst_stream_of_each_composer_and_the_range(reports, cards):
+    scores = pd.read_parquet(reports.parent / "datasets/compose_parts/scores.parquet")
+    shown = numbers(row(cards["deposition"], "Flow error", "Line volume"))
+    asked = [6.0]
+    for composer in ("basis", "priority", "on_off"):
+        errors = scores.rms_percent_of_on_off[scores.composer == composer]
+        asked += [errors.max()] + ([errors.min(), errors.max()] if np.ptp(errors) else [])
+    np.testing.assert_allclose(shown, asked, atol=0.51)
+    lines = numbers(row(cards["deposition"], "Line volume", "Above learning"))
+    worst = scores.worst_line_volume_percent[scores.composer == "basis"].max()
+    assert lines[:2] == pytest.approx([3.0, worst], abs=0.051)
+
+
+def test_setpoint_shows_the_worst_case_of_each_controller_with_its_interval(reports, cards):
+    board = pd.read_parquet(reports.parent / "datasets/evaluate_setpoint/scoreboard.parquet")
+    counting = board[board.counts & (board.controller == "our agent")]
+    worst = counting.loc[counting.settled_percent.idxmin()]
+    ends = [worst.settled_percent, worst.settled_low_percent, worst.settled_high_percent]
+    shown = numbers(row(cards["setpoint"], "Settles", "Stays"))
+    np.testing.assert_allclose(shown[1 : 1 + len(ends)], ends, atol=0.051)
+
+
+def test_next_names_each_loop_once_and_its_commands_are_commands(first):
+    from pipeline.cli import EXAMPLES
+
+    place = first.text[first.text.index("Next Temperature") : first.text.index("Since the")]
+    for loop in LOOPS:
+        assert place.count(f"{loop.capitalize()} ") == 1
+    found = re.findall(r"\./run (?:beadline ([\w-]+)|dvc (repro))", place)
+    assert len(found) == 3 and all(name in EXAMPLES or repro for name, repro in found)
+
+
+def test_the_files_and_the_certificate_are_those_of_the_export_with_the_first_digits_of_their_hash(
+    reports, first
+):
+    exported = metrics(reports, "export_controllers")
+    place = first.text[first.text.index("Files and") :]
+    for loop in LOOPS:
+        for path, sha256 in list((exported.get(loop, {}).get("files") or {}).items())[:1]:
+            assert Path(path).name in place or "controller.json" in place
+            assert any(digits[:8] in place for digits in exported[loop]["files"].values()), sha256
+    assert exported["temperature"]["certificate"]["sha256"][:8] in place
+
+
+def test_the_deciding_picture_draws_the_recorded_run_to_its_last_value(reports, first):
+    runs = pd.read_parquet(reports.parent / "datasets/evaluate_temperature/trajectories.parquet")
+    deciding = runs[runs.case_name == "deciding"]
+    told = first.text[first.text.index("ends off its reference") :]
+    listed = dict(re.findall(r"\d ([A-Za-z+, ]+?) (\d[\d.]*)[,.]", told.split("Deciding")[0]))
+    zones = [name for name in runs if f"{name}_reference" in runs]
+    for shown, name in (("subspace + LQG", "subspace_lqg"), ("learned kernel", "learned_kernel")):
+        mine = deciding[deciding.contestant == name].iloc[-1]
+        ends = [abs(mine[zone] - mine[f"{zone}_reference"]) for zone in zones]
+        assert any(float(listed[shown]) == pytest.approx(end, rel=0.06) for end in ends), (listed, ends)
+
+
+def test_what_changed_is_counted_for_every_loop(first):
+    place = first.text[first.text.index("Since the") : first.text.index("Files and")]
+    assert "First run: nothing to compare with." in place
