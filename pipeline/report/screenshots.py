@@ -35,8 +35,11 @@ def take(folder: Path) -> list[Path]:
     with sync_playwright() as driver:
         started = driver.chromium.launch(executable_path=browser, args=["--no-sandbox", "--disable-gpu"])
         for shot in SHOTS:
-            size = {"width": shot.width, "height": shot.height}
-            page = started.new_page(viewport=size, color_scheme="light", reduced_motion="reduce")
+            page = started.new_page(
+                viewport={"width": shot.width, "height": shot.height},
+                color_scheme="light",
+                reduced_motion="reduce",
+            )
             page.goto((folder / f"{shot.page}.html").resolve().as_uri())
             page.wait_for_load_state("networkidle")
             page.screenshot(path=folder / shot.file)
