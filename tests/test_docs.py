@@ -76,6 +76,50 @@ def test_the_version_is_one_and_the_same_wherever_it_stands(root, monkeypatch, c
     assert re.findall(r"^## \[(.*?)\]", changes, re.MULTILINE)[0] == version
 
 
+def told(monkeypatch, capsys, *arguments: str) -> str:
+    """What the command prints with these arguments and --help."""
+    monkeypatch.setattr("sys.argv", ["beadline", *arguments, "--help"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 0
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_the_help_of_every_command_has_a_sentence_an_example_and_the_exit_statuses(monkeypatch, capsys):
+    names = re.findall(r"choose from|'([\w-]+)'", _choices(monkeypatch, capsys))
+    names = [name for name in names if name]
+    assert {"accept", "verify", "nightly", "export"} <= set(names) <= set(cli.EXAMPLES)
+    for name in names:
+        text = told(monkeypatch, capsys, name)
+        assert f"Example: ./run beadline {name} {cli.EXAMPLES[name]}".rstrip() in text, name
+        assert re.search(r"Exit status: 0 .*; 1 ", text), name
+        # its sentence stands between the usage and the options
+        assert re.search(r"\S[.:] (positional arguments|options):", text), (name, text)
+
+
+def _choices(monkeypatch, capsys) -> str:
+    monkeypatch.setattr("sys.argv", ["beadline", "no-such-command"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    return capsys.readouterr().err.split("choose from")[1]
+
+
+def test_the_pictures_of_the_readme_are_those_that_the_command_takes(root):
+    from pipeline.report.screenshots import SHOTS
+
+    shown = re.findall(r"!\[[^\]]+\]\((reports/[^)]+)\)", (root / "README.md").read_text(encoding="utf-8"))
+    assert shown == [f"reports/{shot.file}" for shot in SHOTS]
+    assert all((root / path).read_bytes().startswith(b"\x89PNG") for path in shown)
+
+
+def test_where_there_is_no_page_no_picture_is_taken(tmp_path):
+    from pipeline.report.screenshots import take
+
+    with pytest.raises(ValueError, match="index.html: expected the page, found none; run ./run dvc repro"):
+        take(tmp_path)
+
+
 def readme_of_today(root: Path) -> str:
     """README.md with the temperature loop's figures as reports/metrics has them, and the verdict that the
     pages say of them."""

@@ -29,14 +29,17 @@ def take(folder: Path) -> list[Path]:
     if browser is None:
         raise ValueError(f"expected one of {', '.join(BROWSERS)}, found none; install Chromium")
     # a package of the development group, which only this command needs
-    from playwright.sync_api import ViewportSize, sync_playwright
+    from playwright.sync_api import sync_playwright
 
     taken = []
     with sync_playwright() as driver:
         started = driver.chromium.launch(executable_path=browser, args=["--no-sandbox", "--disable-gpu"])
         for shot in SHOTS:
-            size = ViewportSize(width=shot.width, height=shot.height)
-            page = started.new_page(viewport=size, color_scheme="light", reduced_motion="reduce")
+            page = started.new_page(
+                viewport={"width": shot.width, "height": shot.height},
+                color_scheme="light",
+                reduced_motion="reduce",
+            )
             page.goto((folder / f"{shot.page}.html").resolve().as_uri())
             page.wait_for_load_state("networkidle")
             page.screenshot(path=folder / shot.file)
