@@ -22,8 +22,8 @@ INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT = (
     Path(f"reports/{name}.html")
     for name in ("index", "temperature", "identification", "deposition", "setpoint")
 )
-CERTIFICATE = Path("reports/certificate.html")
-PAGES = (INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT, CERTIFICATE)
+CERTIFICATE, PAPERS = Path("reports/certificate.html"), Path("reports/papers.html")
+PAGES = (INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT, CERTIFICATE, PAPERS)
 
 
 class Page(HTMLParser):
