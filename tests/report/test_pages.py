@@ -22,11 +22,11 @@ INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT = (
     Path(f"reports/{name}.html")
     for name in ("index", "temperature", "identification", "deposition", "setpoint")
 )
-CERTIFICATE = Path("reports/certificate.html")
+CERTIFICATE, PAPERS = Path("reports/certificate.html"), Path("reports/papers.html")
 DIFFERENCE, WORKFLOW, PROVENANCE, WORDS = BESIDE = tuple(
     Path(f"reports/{name}.html") for name in ("difference", "workflow", "provenance", "words")
 )
-PAGES = (INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT, CERTIFICATE, *BESIDE)
+PAGES = (INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT, CERTIFICATE, PAPERS, *BESIDE)
 
 
 class Page(HTMLParser):

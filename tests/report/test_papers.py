@@ -158,7 +158,7 @@ def test_what_the_run_lacks_is_open_and_what_the_results_lack_or_a_wrong_rule_is
 
 # references to places of a paper, and matrices
 REFERENCES = (
-    r"(?:Figures?|Tables?|Sections?|Equations?|Algorithm|phase|trial) [\d.]+(?: (?:to|and) [\d.]+)*",
+    r"(?:Figures?|Tables?|Sections?|Equations?|Algorithm|phase|case|trial) [\d.]+(?: (?:to|and) [\d.]+)*",
     r"\(\d+\)(?: (?:to|and) \(\d+\))*",
     r"\(8/3\) I",
     r"1-norm",
@@ -188,6 +188,8 @@ def test_the_page_shows_every_row_of_every_paper_and_counts_them():
         f"shape, {counts[2]} do not hold, and {counts[3]} cannot be judged."
     )
     assert page.decision(papers) in text
+    labels = re.findall(r'role="img" aria-label="([^"]*)"', text)
+    assert len(labels) > 40 and all(re.search(r"\d", label) for label in labels)
     assert text.count("<article>") > 25 and ">nan" not in text and "None" not in text
 
 

@@ -137,7 +137,7 @@ def _cut(library: Mapping[str, Any]) -> Markup:
     return charts.panel(
         frame,
         layers,
-        alt="The command of A with the stretches of Start, Corner and Stop",
+        alt=f"The command of A, {number(high, 1)} mm at most, with the stretches of Start, Corner and Stop",
         title="plunger in mm, against s",
     )
 
@@ -178,7 +178,10 @@ def _sequenced(part: Mapping[str, Any]) -> Markup:
             layers.append(charts.interval(frame, begin, begin))
             layers.append(charts.label(frame, begin, min(u), SHORT[task], dx=4, dy=-2))
     return charts.panel(
-        frame, layers, alt="The command of figure 9: nine tasks in sequence", title="plunger in mm, against s"
+        frame,
+        layers,
+        alt=f"The command of figure 9: {len(part['tasks'])} tasks in sequence",
+        title="plunger in mm, against s",
     )
 
 
@@ -201,7 +204,10 @@ def _map(path: list[Mapping[str, Any]]) -> Markup:
         for row in path
     ]
     return charts.panel(
-        frame, layers, alt="Four lines, crosses, rings, a square and a triangle", title="mm, against mm"
+        frame,
+        layers,
+        alt=f"{len(path)} printed strokes: lines, crosses, rings, a square and a triangle",
+        title="mm, against mm",
     )
 
 

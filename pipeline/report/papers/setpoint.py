@@ -185,7 +185,8 @@ def _rewards(learning: Mapping[str, Any]) -> Markup:
     return plot(
         [Curve(x, y)],
         title="reward of an episode of 100 steps, against updates",
-        alt="The reward falls where a phase begins and rises within each",
+        alt=f"The reward ends phase 3 at {number(learning['phase_3']['ends'], 0)} and phase 4 at "
+        f"{number(learning['phase_4']['ends'], 0)}",
         texts=[(str(i + 1), float(middle), low) for i, middle in enumerate(middles)],
     )
 
