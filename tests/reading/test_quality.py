@@ -344,4 +344,6 @@ def test_a_signal_that_is_passed_over_as_restless_has_no_stretch_of_that_length(
         first, last = runs(values, segment)
         longest = int((last - first + 1).max())
         assert _may_rest(values, longest)
-    assert not _may_rest(np.arange(100.0), 2)
+    alone = np.array([0.0, 1, 1, 1, 2])
+    assert _may_rest(alone, 3)
+    assert not _may_rest(alone, 4)
