@@ -23,24 +23,21 @@ def mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
     between, and the samples change group again and again. (A step changes it once, a spike twice.)
     """
     finite = np.flatnonzero(np.isfinite(values))
-    y = values[finite]
-    # over one sample and over more: with two devices in turn every change from sample to sample is a jump
-    step = min(COARSEST_STEP, *(_least_change(y, lag) for lag in (1, 2, 3)))
-    # a converter may be coarser: its levels tell, where there are more than the two of two devices at rest
-    if len(np.unique(y)) > 2:
-        step = max(step, quantisation_step(y))
+    y, step = values[finite], 0.0
     suspect, distance = np.zeros(len(y), bool), np.zeros(len(y), np.float32)
     for size in WINDOWS:
         if len(y) < size:
             continue
         starts = np.unique(np.r_[np.arange(0, len(y) - size, size // 2), len(y) - size])
         gap = np.concatenate(
-            [
-                _gaps(y, part, size, step)
-                for part in np.array_split(starts, -(-len(starts) // WINDOWS_AT_ONCE))
-            ]
+            [_gaps(y, part, size) for part in np.array_split(starts, -(-len(starts) // WINDOWS_AT_ONCE))]
         )
         hit = _in_a_row(gap > 0, min(LEAST_WINDOWS, len(gap)))
+        if not hit.any():
+            continue
+        # most records are through by now: the step costs more than the gaps
+        step = step or _coarse_step(y)
+        hit = _in_a_row(gap > GAP * step, min(LEAST_WINDOWS, len(gap)))
         for start, width in zip(starts[hit], gap[hit], strict=True):
             suspect[start : start + size] = True
             distance[start : start + size] = width
@@ -51,6 +48,14 @@ def mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
     ]
 
 
+def _coarse_step(y: np.ndarray) -> float:
+    """The step that a coarse sensor may explain, more than 0."""
+    # over one sample and over more: with two devices in turn every change from sample to sample is a jump
+    step = min(COARSEST_STEP, *(_least_change(y, lag) for lag in (1, 2, 3)))
+    # a converter may be coarser: its levels tell, where there are more than the two of two devices at rest
+    return max(step, quantisation_step(y)) if len(np.unique(y)) > 2 else step
+
+
 def _least_change(y: np.ndarray, lag: int) -> float:
     """The first percentile of the changes: one step of a coarse sensor, next to nothing of a fine one."""
     changes = np.abs(y[lag:] - y[:-lag])
@@ -58,8 +63,9 @@ def _least_change(y: np.ndarray, lag: int) -> float:
     return float(np.percentile(changes, 1)) if len(changes) else np.inf
 
 
-def _gaps(y: np.ndarray, starts: np.ndarray, size: int, step: float) -> np.ndarray:
-    """The gap between the two courses in each window, 0 for a window without two."""
+def _gaps(y: np.ndarray, starts: np.ndarray, size: int) -> np.ndarray:
+    """The gap between the two courses in each window, 0 for a window without two, whatever the sensor's
+    step."""
     windows = np.lib.stride_tricks.sliding_window_view(y, size)[starts]
     parabola = np.linalg.qr(np.vander(np.linspace(-1, 1, size), 3))[0]
     rest = windows - windows @ parabola @ parabola.T
@@ -69,10 +75,12 @@ def _gaps(y: np.ndarray, starts: np.ndarray, size: int, step: float) -> np.ndarr
     at = least - 1 + np.argmax(between[:, least - 1 : size - least], axis=1)
     gap, middle = between[rows, at], (ordered[rows, at] + ordered[rows, at + 1]) / 2
     between[rows, at] = 0
-    crossings = np.count_nonzero(np.diff(rest > middle[:, None], axis=1), axis=1)
-    return np.where(
-        (gap > GAP * between.max(1)) & (gap > GAP * step) & (crossings >= LEAST_CROSSINGS), gap, 0.0
-    )
+    apart = np.flatnonzero(gap > GAP * between.max(1))
+    crossings = np.count_nonzero(np.diff(rest[apart] > middle[apart, None], axis=1), axis=1)
+    two = apart[crossings >= LEAST_CROSSINGS]
+    gaps = np.zeros(len(starts))
+    gaps[two] = gap[two]
+    return gaps
 
 
 def _in_a_row(hit: np.ndarray, least: int) -> np.ndarray:

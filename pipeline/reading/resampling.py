@@ -1,8 +1,8 @@
 """Signals on their own clocks -> one table on one sample time. Inputs are held, outputs interpolated between
 near neighbours; a gap begins a new segment."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -26,6 +26,26 @@ class _Clock(NamedTuple):
     time_s: np.ndarray
     signals: list[str]
     gap_limit_s: float
+    jitter: Jitter | None
+
+
+class _Near(NamedTuple):
+    """The samples of a clock beside each t_k: the indices of the first behind it and of the nearest, and how
+    far that is, each (T,). `off` are the k without a sample on t_k."""
+
+    behind: np.ndarray
+    nearest: np.ndarray | slice
+    distance_s: np.ndarray
+    off: np.ndarray
+
+
+class _Next(NamedTuple):
+    """The t_k from which a command of a clock acts, for each of its n samples: k, how late that is, and
+    whether it counts, as one between two samples of a segment does."""
+
+    k: np.ndarray
+    late_s: np.ndarray
+    counts: np.ndarray
 
 
 def resample(
@@ -66,24 +86,24 @@ def resample(
         )
     time = np.concatenate(segments)
     segment = np.repeat(np.arange(len(segments), dtype=np.int32), [len(grid) for grid in segments])
-    values = {name: _held(*raw.signals[name], time, sample_time_s) for name in inputs}
-    values |= {
-        name: np.concatenate([_interpolated(*raw.signals[name], grid, sample_time_s) for grid in segments])
-        for name in outputs
-    }
+    held = _once_a_clock(clocks, inputs, lambda own: _held(own, time, sample_time_s))
+    near = _once_a_clock(clocks, outputs, lambda own: _near(own, time, sample_time_s))
+    following = _once_a_clock(clocks, inputs, lambda own: _next(own, time, segment, sample_time_s))
+    values = {name: raw.signals[name][1][held[name]] for name in inputs}
+    values |= {name: _interpolated(*raw.signals[name], time, near[name]) for name in outputs}
     masked = {name: ~np.isfinite(column) for name, column in values.items()}
     flags = _gap_flags(clocks) + _jitter_flags(clocks) + _trim_flags(raw, clocks, pieces, grids)
+    jitter = _jitter(clocks)
     for name in outputs:
-        own = raw.signals[name][0]
-        flags += _filled_flags(name, own, time, sample_time_s, masked[name])
-        flags += _rate_flags(name, own, sample_time_s)
+        flags += _filled_flags(name, near[name], time, sample_time_s, masked[name])
+        flags += _rate_flags(name, raw.signals[name][0], jitter[name].interval_s, sample_time_s)
     for name in inputs:
-        flags += _step_flags(name, *raw.signals[name], time, segment, sample_time_s)
+        flags += _step_flags(name, *raw.signals[name], following[name], sample_time_s)
     for name in [*inputs, *outputs]:
         flags += _missing_flags(name, masked[name], time)
     for name in outputs:
         flags += _mixed_flags(name, *raw.signals[name], time, masked[name])
-    return Table(raw.path, segment, time, values, masked, flags, _jitter(clocks))
+    return Table(raw.path, segment, time, values, masked, flags, jitter)
 
 
 def _check(
@@ -136,8 +156,23 @@ def _clocks(
         events = name in inputs and not (
             np.mean(np.diff(time) < 2 * median) >= PERIODIC_SHARE if len(time) > 2 else False
         )
-        clocks.append(_Clock(time, [name], np.inf if events else limit))
+        limit = np.inf if events else limit
+        clocks.append(_Clock(time, [name], limit, intervals(time, limit) if len(time) > 1 else None))
     return clocks
+
+
+_Looked = TypeVar("_Looked")
+
+
+def _once_a_clock(
+    clocks: Sequence[_Clock], names: Sequence[str], look: Callable[[np.ndarray], _Looked]
+) -> dict[str, _Looked]:
+    """{signal: look(its time_s)} for the named signals; those on one clock share it."""
+    found: dict[str, _Looked] = {}
+    for clock in clocks:
+        if here := [name for name in clock.signals if name in names]:
+            found |= dict.fromkeys(here, look(clock.time_s))
+    return found
 
 
 def _pieces(raw: Raw, clocks: Sequence[_Clock], sample_time_s: float) -> list[tuple[float, float]]:
@@ -188,27 +223,47 @@ def _common(
 # ---- values
 
 
-def _held(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndarray:
-    """u(t_k): the last command at or before t_k. There is one, as pieces begin at or behind the first
+def _in_one(indices: np.ndarray) -> np.ndarray | slice:
+    """Indices that run on one by one as a slice, which copies nothing."""
+    first = int(indices[0])
+    end = first + len(indices)
+    return slice(first, end) if np.array_equal(indices, np.arange(first, end)) else indices
+
+
+def _held(time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndarray | slice:
+    """The index of the last command at or before t_k. There is one, as pieces begin at or behind the first
     command."""
-    return values[np.maximum(np.searchsorted(time_s, grid + ON_GRID * sample_time_s, side="right") - 1, 0)]
+    last = np.searchsorted(time_s, grid + ON_GRID * sample_time_s, side="right") - 1
+    return _in_one(np.maximum(last, 0))
 
 
-def _nearest(time_s: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Index of the sample nearest to each t_k."""
-    after = np.clip(np.searchsorted(time_s, grid), 1, len(time_s) - 1)
-    return np.where(grid - time_s[after - 1] <= time_s[after] - grid, after - 1, after)
+def _near(time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> _Near:
+    behind = np.clip(np.searchsorted(time_s, grid), 1, len(time_s) - 1)
+    nearest = behind - (grid - time_s[behind - 1] <= time_s[behind] - grid)
+    distance = np.abs(time_s[nearest] - grid)
+    off = np.flatnonzero(distance > ON_GRID * sample_time_s)
+    return _Near(behind, nearest if len(off) else _in_one(nearest), distance, off)
 
 
-def _interpolated(
-    time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, sample_time_s: float
-) -> np.ndarray:
+def _interpolated(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, near: _Near) -> np.ndarray:
     """y(t_k): the sample on t_k itself, else the line between its neighbours. A NaN neighbour gives NaN."""
-    after = np.clip(np.searchsorted(time_s, grid), 1, len(time_s) - 1)
-    share = (grid - time_s[after - 1]) / (time_s[after] - time_s[after - 1])
-    line = values[after - 1] + np.clip(share, 0.0, 1.0) * (values[after] - values[after - 1])
-    nearest = _nearest(time_s, grid)
-    return np.where(np.abs(time_s[nearest] - grid) <= ON_GRID * sample_time_s, values[nearest], line)
+    y = values[near.nearest].astype(float, copy=False)
+    if not len(near.off):
+        return y
+    behind = near.behind[near.off]
+    share = (grid[near.off] - time_s[behind - 1]) / (time_s[behind] - time_s[behind - 1])
+    y[near.off] = values[behind - 1] + np.clip(share, 0.0, 1.0) * (values[behind] - values[behind - 1])
+    return y
+
+
+def _next(time_s: np.ndarray, grid: np.ndarray, segment: np.ndarray, sample_time_s: float) -> _Next | None:
+    """None where each sample stands on a t_k of its own, so that no command is late or lost."""
+    k = np.searchsorted(grid, time_s - ON_GRID * sample_time_s)
+    within = np.clip(k, 1, len(grid) - 1)
+    late, counts = grid[within] - time_s, (k == within) & (segment[within] == segment[within - 1])
+    if (k[1:] > k[:-1]).all() and not (late[counts] > ON_GRID * sample_time_s).any():
+        return None
+    return _Next(k, late, counts)
 
 
 # ---- flags
@@ -225,7 +280,7 @@ def _flag(signal: str, kind: str, where_s: np.ndarray, message: str) -> list[Fla
 def _gap_flags(clocks: Sequence[_Clock]) -> list[Flag]:
     flags = []
     for clock in clocks:
-        median = float(np.median(np.diff(clock.time_s))) if len(clock.time_s) > 1 else 0.0
+        median = clock.jitter.interval_s if clock.jitter else 0.0
         for i in np.flatnonzero(np.diff(clock.time_s) > clock.gap_limit_s):
             start, end = float(clock.time_s[i]), float(clock.time_s[i + 1])
             summer = " (an hour and an interval: a clock without a zone does so where summer time begins)"
@@ -240,12 +295,7 @@ def _gap_flags(clocks: Sequence[_Clock]) -> list[Flag]:
 
 def _jitter(clocks: Sequence[_Clock]) -> dict[str, Jitter]:
     """{signal: jitter of its clock}."""
-    return {
-        name: intervals(clock.time_s, clock.gap_limit_s)
-        for clock in clocks
-        for name in clock.signals
-        if len(clock.time_s) > 1
-    }
+    return {name: clock.jitter for clock in clocks for name in clock.signals if clock.jitter}
 
 
 def _jitter_flags(clocks: Sequence[_Clock]) -> list[Flag]:
@@ -253,12 +303,14 @@ def _jitter_flags(clocks: Sequence[_Clock]) -> list[Flag]:
     Commands that come as events have no interval."""
     flags = []
     for clock in clocks:
-        if not np.isfinite(clock.gap_limit_s) or len(clock.time_s) < 3:
+        jitter = clock.jitter
+        if jitter is None or not np.isfinite(clock.gap_limit_s) or len(clock.time_s) < 3:
             continue
-        jitter, steps = intervals(clock.time_s, clock.gap_limit_s), np.diff(clock.time_s)
-        inside = np.flatnonzero(steps <= clock.gap_limit_s)
-        off = inside[np.abs(steps[inside] - jitter.interval_s) > JITTER_SHARE * jitter.interval_s]
-        if len(off) < JITTER_OFTEN * len(inside) and jitter.max_s <= 0.5 * jitter.interval_s:
+        steps = np.diff(clock.time_s)
+        inside = steps <= clock.gap_limit_s
+        off = np.flatnonzero(inside & (np.abs(steps - jitter.interval_s) > JITTER_SHARE * jitter.interval_s))
+        count = np.count_nonzero(inside)
+        if len(off) < JITTER_OFTEN * count and jitter.max_s <= 0.5 * jitter.interval_s:
             continue
         pattern = (
             ", by turns longer and shorter: two devices may write under one name"
@@ -268,7 +320,7 @@ def _jitter_flags(clocks: Sequence[_Clock]) -> list[Flag]:
         message = (
             f"the intervals of {', '.join(clock.signals)} differ from {jitter.interval_s:.4g} s by "
             f"{jitter.std_s:.2g} s (standard) and {jitter.max_s:.2g} s (largest), "
-            f"{len(off)} of {len(inside)} by more than a tenth{pattern}"
+            f"{len(off)} of {count} by more than a tenth{pattern}"
         )
         flags.append(
             Flag(
@@ -327,25 +379,22 @@ def _trim_flags(
 
 
 def _filled_flags(
-    name: str, time_s: np.ndarray, grid: np.ndarray, sample_time_s: float, masked: np.ndarray
+    name: str, placed: _Near, grid: np.ndarray, sample_time_s: float, masked: np.ndarray
 ) -> list[Flag]:
     """Flags for samples between two measurements near by, and for those that nothing near by was measured
     for. A masked sample is neither."""
-    distance = np.abs(time_s[_nearest(time_s, grid)] - grid)
-    far = (distance > (0.5 + ON_GRID) * sample_time_s) & ~masked
-    near = (distance > ON_GRID * sample_time_s) & ~far & ~masked
-    between = (
-        f"{near.sum()} of {len(grid)} samples of {name} lie between its own samples and are interpolated"
-    )
+    off = placed.off[~masked[placed.off]]
+    is_far = placed.distance_s[off] > (0.5 + ON_GRID) * sample_time_s
+    near, far = off[~is_far], off[is_far]
+    between = f"{len(near)} of {len(grid)} samples of {name} lie between its own samples and are interpolated"
     invented = (
-        f"{far.sum()} of {len(grid)} samples of {name} have no measurement within half a sample time: "
+        f"{len(far)} of {len(grid)} samples of {name} have no measurement within half a sample time: "
         "the straight line to the next ones fills them"
     )
     return _flag(name, "interpolated", grid[near], between) + _flag(name, "filled", grid[far], invented)
 
 
-def _rate_flags(name: str, time_s: np.ndarray, sample_time_s: float) -> list[Flag]:
-    interval = float(np.median(np.diff(time_s)))
+def _rate_flags(name: str, time_s: np.ndarray, interval: float, sample_time_s: float) -> list[Flag]:
     span = time_s[[0, -1]]
     if interval < sample_time_s / 2:
         message = (
@@ -363,23 +412,14 @@ def _rate_flags(name: str, time_s: np.ndarray, sample_time_s: float) -> list[Fla
 
 
 def _step_flags(
-    name: str,
-    time_s: np.ndarray,
-    values: np.ndarray,
-    grid: np.ndarray,
-    segment: np.ndarray,
-    sample_time_s: float,
+    name: str, time_s: np.ndarray, values: np.ndarray, following: _Next | None, sample_time_s: float
 ) -> list[Flag]:
     """Flags for commands that change between two samples. They act from the next sample on; a command that
     another overtakes before that sample is lost."""
-    changes = np.flatnonzero(values[1:] != values[:-1]) + 1
-    when = time_s[changes]
-    following = np.searchsorted(grid, when - ON_GRID * sample_time_s)
-    inside = (following > 0) & (following < len(grid))
-    when, following = when[inside], following[inside]
-    same = segment[following] == segment[following - 1]
-    when, following = when[same], following[same]
-    late = grid[following] - when
+    if following is None:
+        return []
+    changes = np.flatnonzero((values[1:] != values[:-1]) & following.counts[1:]) + 1
+    when, late, k = time_s[changes], following.late_s[changes], following.k[changes]
     between = late > ON_GRID * sample_time_s
     mean = f"{late[between].mean():.3g} s later on average" if between.any() else ""
     message = (
@@ -387,7 +427,7 @@ def _step_flags(
         f"it is not smeared but acts from the next sample on, {mean}"
     )
     flags = _flag(name, "step_inside", when[between], message)
-    overtaken = np.r_[following[1:] == following[:-1], False] if len(following) else np.zeros(0, bool)
+    overtaken = np.r_[k[1:] == k[:-1], False] if len(k) else np.zeros(0, bool)
     message = (
         f"{overtaken.sum()} commands of {name} were overtaken by another before the next sample and do not"
         f" appear; a smaller sample time shows them"
@@ -396,6 +436,8 @@ def _step_flags(
 
 
 def _missing_flags(name: str, masked: np.ndarray, grid: np.ndarray) -> list[Flag]:
+    if not masked.any():
+        return []
     return _flag(
         name,
         "missing",

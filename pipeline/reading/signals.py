@@ -84,6 +84,12 @@ class Table(NamedTuple):
     jitter: dict[str, Jitter]
 
 
+def measured(table: Table, name: str) -> np.ndarray:
+    """The values (T,) of a signal, NaN where it is masked; no copy where nothing is."""
+    masked = table.masked[name]
+    return np.where(masked, np.nan, table.values[name]) if masked.any() else table.values[name]
+
+
 # comparing names takes 10 us each
 MOST_COMPARED = 50_000
 
@@ -112,6 +118,9 @@ def nearest_names(name: str, names: Iterable[str]) -> str:
 def intervals(time_s: np.ndarray, gap_limit_s: float = np.inf) -> Jitter:
     """Jitter of a clock time_s (n,), n >= 2, from the intervals up to `gap_limit_s`."""
     steps = np.diff(time_s)
-    regular = steps[steps <= gap_limit_s] if (steps <= gap_limit_s).any() else steps
-    deviation = regular - np.median(regular)
-    return Jitter(float(np.median(steps)), float(deviation.std()), float(np.abs(deviation).max()))
+    inside, median = steps <= gap_limit_s, np.median(steps)
+    if inside.all() or not inside.any():
+        deviation = steps - median
+    else:
+        deviation = steps[inside] - np.median(steps[inside])
+    return Jitter(float(median), float(deviation.std()), float(np.abs(deviation).max()))

@@ -6,7 +6,7 @@ stops at once was stopped by its sensor.
 
 import numpy as np
 
-from pipeline.reading.signals import Flag, Table
+from pipeline.reading.signals import Flag, Table, measured
 
 FROZEN_SHORTEST, RAIL_SHORTEST, OVER_USUAL = 30, 10, 5.0
 # samples beside a stretch in which the signal must have been alive
@@ -19,18 +19,24 @@ def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
     Noise ends at once at an end of the stretch, or a movement does although it went on: a jump at the end of
     the stretch shows that, or other signals that move meanwhile.
     """
-    values = np.where(table.masked[name], np.nan, table.values[name])
+    values = measured(table, name)
+    if not _may_rest(values, FROZEN_SHORTEST):
+        return []
     first, last = runs(values, table.segment)
     length = last - first + 1
-    stretches = []
-    for i in np.flatnonzero(length >= FROZEN_SHORTEST):
+    rests = np.flatnonzero(length >= FROZEN_SHORTEST)
+    rests = rests[length[rests] > OVER_USUAL * _usual_of_others(length, length[rests])]
+    rests = rests[~_at_rail(values, table.segment, first[rests])]
+    if not len(rests):
+        return []
+    step, stretches = _step(values), []
+    others = {other: measured(table, other) for other in table.values if other != name}
+    whole = {other: _range(column) for other, column in others.items()}
+    for i in rests:
         a, b = int(first[i]), int(last[i])
-        if length[i] <= OVER_USUAL * _usual(np.delete(length, i)) or _at_rail(values, table.segment, a):
-            continue
         before, after = _before(values, table.segment, a), _after(values, table.segment, b)
-        step = _step(values)
         entry, end = _alive(before, step), _alive(-after[::-1], step)
-        moving = [other for other in table.values if other != name and _moves(table, other, a, b)]
+        moving = [other for other, column in others.items() if _moves(column[a : b + 1], whole[other])]
         released = len(after) > 0 and abs(after[0]) > 3 * max(
             np.abs(before[1:]).max(initial=0.0), np.abs(after[1:]).max(initial=0.0)
         )
@@ -59,7 +65,9 @@ def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
 
 def rails(table: Table, name: str) -> list[Flag]:
     """Flags for a largest or smallest value at which the signal stops at once and stays for long."""
-    values = np.where(table.masked[name], np.nan, table.values[name])
+    values = measured(table, name)
+    if not _may_rest(values, RAIL_SHORTEST + 1):
+        return []
     finite = values[np.isfinite(values)]
     if not len(finite) or np.ptp(finite) == 0:
         return []
@@ -68,15 +76,11 @@ def rails(table: Table, name: str) -> list[Flag]:
     limit = max(RAIL_SHORTEST, OVER_USUAL * float(np.percentile(length, 95)))
     flags = []
     for rail, side in ((finite.max(), "largest"), (finite.min(), "smallest")):
-        there = (values[first] == rail) & (length > limit)
-        long = [
-            (int(a), int(b))
-            for a, b in zip(first[there], last[there], strict=True)
-            if _at_rail(values, table.segment, a)
-        ]
-        if any(
-            _alive(_before(values, table.segment, a), _step(values)) in ("noise", "movement") for a, _ in long
-        ):
+        there = np.flatnonzero((values[first] == rail) & (length > limit))
+        there = there[_at_rail(values, table.segment, first[there])]
+        long = list(zip(first[there].tolist(), last[there].tolist(), strict=True))
+        step = _step(values) if long else 0.0
+        if any(_alive(_before(values, table.segment, a), step) in ("noise", "movement") for a, _ in long):
             count = sum(b - a + 1 for a, b in long)
             message = (
                 f"{name} stays at {rail:g}, its {side} value, for {count} samples in {len(long)} stretches:"
@@ -95,22 +99,35 @@ def rails(table: Table, name: str) -> list[Flag]:
     return flags
 
 
+def _may_rest(values: np.ndarray, least: int) -> bool:
+    """Whether enough samples equal the one before for a stretch of `least`: a quick no for a fine signal."""
+    return bool(np.count_nonzero(values[1:] == values[:-1]) >= least - 1)
+
+
 def runs(values: np.ndarray, segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """First and last index (m,) of stretches of equal values within segments. A NaN ends a stretch and is in
     none."""
-    same = (values[1:] == values[:-1]) & (segment[1:] == segment[:-1])
-    first = np.flatnonzero(np.r_[True, ~same])
+    begins = np.ones(len(values), bool)
+    begins[1:] = (values[1:] != values[:-1]) | (segment[1:] != segment[:-1])
+    first = np.flatnonzero(begins)
     last = np.r_[first[1:], len(values)] - 1
     finite = np.isfinite(values[first])
     return first[finite], last[finite]
 
 
-def _usual(lengths: np.ndarray) -> float:
-    """The length of stretch that holds nine tenths of the samples. A coarse or slow signal rests long, if not
-    often."""
+def _usual_of_others(lengths: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """For stretches of length `own` (k,) among `lengths` (m,): the length that holds nine tenths of the
+    samples of the m - 1 others, infinite without others. A coarse or slow signal rests long, if not often."""
+    if len(lengths) < 2:
+        return np.full(len(own), np.inf)
     ordered = np.sort(lengths)
     held = np.cumsum(ordered)
-    return float(ordered[np.searchsorted(held, 0.9 * held[-1])]) if len(ordered) else np.inf
+    at = np.searchsorted(ordered, own)  # where the stretch itself stands
+    wanted = np.ceil(0.9 * (held[-1] - own)).astype(int)
+    j = np.searchsorted(held, wanted)
+    # behind itself the others hold less by its length
+    behind = np.maximum(np.searchsorted(held, wanted + own), at + 1)
+    return ordered[np.where(j < at, j, behind)].astype(float)
 
 
 def _before(values: np.ndarray, segment: np.ndarray, first: int) -> np.ndarray:
@@ -156,16 +173,21 @@ def _alive(changes: np.ndarray, step: float) -> str:
     )
 
 
-def _moves(table: Table, name: str, first: int, last: int) -> bool:
-    """Whether a signal changes over a stretch by a tenth of its own range."""
-    values = np.where(table.masked[name], np.nan, table.values[name])
-    inside = values[first : last + 1]
-    inside, all_values = inside[np.isfinite(inside)], values[np.isfinite(values)]
-    return len(inside) > 1 and np.ptp(all_values) > 0 and np.ptp(inside) >= 0.1 * np.ptp(all_values)
+def _range(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.ptp(finite)) if len(finite) else 0.0
 
 
-def _at_rail(values: np.ndarray, segment: np.ndarray, first: int) -> bool:
-    """Whether a stretch lies on the largest or smallest value of all, and the signal came there from another
-    value. (A machine at rest begins at its smallest.)"""
-    begins = first == 0 or segment[first] != segment[first - 1]
-    return not begins and bool(values[first] in (np.nanmax(values), np.nanmin(values)))
+def _moves(inside: np.ndarray, whole: float) -> bool:
+    """Whether a signal changes over a stretch by a tenth of its own range, `whole`."""
+    inside = inside[np.isfinite(inside)]
+    return len(inside) > 1 and whole > 0 and bool(np.ptp(inside) >= 0.1 * whole)
+
+
+def _at_rail(values: np.ndarray, segment: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Mask (k,) of the stretches that lie on the largest or smallest value of all, and to which the signal
+    came from another value. (A machine at rest begins at its smallest.)"""
+    if not len(first):
+        return np.zeros(0, bool)
+    came = (first > 0) & (segment[first] == segment[np.maximum(first, 1) - 1])
+    return came & ((values[first] == np.nanmax(values)) | (values[first] == np.nanmin(values)))

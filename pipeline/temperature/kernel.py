@@ -301,9 +301,11 @@ def _refuse(
             f"unknowns, found {samples}; "
             f"record {unknowns - samples} more, or lower the window below {data.N}"
         )
+    if mu:
+        return  # the ridge determines what the record does not
     v = np.hstack([data.s @ W.T, data.u / u_scale])
     _, sv, Vt = np.linalg.svd(np.linalg.qr(v, mode="r"))
-    if sv[-1] < tolerance * sv[0] and mu == 0:
+    if sv[-1] < tolerance * sv[0]:
         worst = int(np.abs(Vt[-1, len(W) :]).argmax())
         raise ValueError(
             f"the kernel cannot be learned: input {worst + 1} of {len(u_scale)} follows from the past of "
@@ -363,13 +365,15 @@ def value_iteration(
     h_0 = data.G_e @ svec(Q) + data.G_u @ svec(R)
     row, column = np.triu_indices(q)
     weight = np.where(row == column, 1.0, ROOT2)
-    # smat once for all iterations: which entry of h each entry of H is, and its weight
+    # svec and smat once for all iterations: which entry of h each entry of H is, and its weight
+    row_v, column_v = np.triu_indices(q + m)
+    weight_v = np.where(row_v == column_v, 1.0, ROOT2)
     place, unweighted = smat(np.arange(len(h_0), dtype=float), q + m), smat(np.ones(len(h_0)), q + m)
     place = np.rint(place / unweighted).astype(int)
     H = smat(h_0, q + m) if H0 is None else H0
     K, P = _greedy(H, q)
     for iteration in range(1, max_iterations + 1):  # noqa: B007 (reported after the loop)
-        h = h_0 + gamma * svec(data.step.T @ P @ data.step)
+        h = h_0 + gamma * ((data.step.T @ P @ data.step)[row_v, column_v] * weight_v)
         if data.G.size:
             h += gamma * (data.G @ (P[row, column] * weight))
         H = h[place] * unweighted

@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
 
+from pipeline.reading.quality import MANY_VALUES, _none_stands_out, quantisation_step
 from pipeline.reading.recordings import Flag, Source, Table, flag, read, resample
+from pipeline.reading.stuck import _may_rest, _usual_of_others, runs
 
 LIMITS = {"u": (0.0, 100.0)}
 UNITS = {"u": "percent", "y": "degC", "z": "degC"}
@@ -285,3 +287,63 @@ def test_a_limit_decides_where_commands_that_move_in_most_samples_are_cut_off_an
     (low, high) = of(flagged(rig() | {"u": noise}), "saturated")
     for finding in (low, high):
         assert finding.message.endswith("samples: there the limit decides, not what commands it")
+
+
+# ---- quick answers, which the checks give before they sort
+
+
+def test_the_step_of_a_long_signal_is_that_of_all_its_values_wherever_its_digits_stand():
+    rng = np.random.default_rng(6)
+    count = 2 * MANY_VALUES
+    fine, coarse = rng.normal(size=count), 0.25 * rng.integers(0, 40, count)
+    share = np.arange(count) / count
+    for digits, step in (
+        (share < 0.3, 0.0),  # levels of both, of which too few are 0.25 apart
+        (share < 0.38, 0.0),  # more levels than a third of the values, seen in the first of them
+        (share > 0.6, 0.0),  # seen in the last of them alone
+        (share < 0.0, 0.25),
+    ):
+        values = np.where(digits, fine, coarse)
+        assert quantisation_step(values) == step
+        # no value stands for itself by its place
+        assert quantisation_step(rng.permutation(values)) == step
+    few = np.repeat(np.round(rng.normal(size=count // 4), 9), 4)
+    assert quantisation_step(few) == quantisation_step(rng.permutation(few))
+
+
+@pytest.mark.parametrize("tails", [1.0, 1.5, 3.0, 30.0])
+def test_no_residual_is_passed_over_that_is_beyond_eight_deviations_of_the_ninetieth_percentile(tails):
+    rng = np.random.default_rng(7)
+    said = []
+    for count in (21, 22, 30, 101, 1000):
+        for _ in range(200):
+            size = np.abs(rng.standard_t(tails, count)) * rng.choice([0.0, 1.0], count, p=[0.2, 0.8])
+            said.append(_none_stands_out(size))
+            if said[-1]:
+                assert size.max() <= 8 * np.percentile(size, 90) / 1.645
+    assert any(said)
+    assert tails == 30.0 or not all(said)
+
+
+def test_the_usual_stretch_of_the_others_is_counted_without_the_one_that_is_judged():
+    rng = np.random.default_rng(8)
+    for count in (1, 2, 3, 10, 60):
+        lengths = rng.integers(1, rng.integers(2, 400), count)
+        for i, quick in enumerate(_usual_of_others(lengths, lengths)):
+            others = np.sort(np.delete(lengths, i))
+            held = np.cumsum(others)
+            usual = others[np.searchsorted(held, 0.9 * held[-1])] if count > 1 else np.inf
+            assert quick == usual
+
+
+def test_a_signal_that_is_passed_over_as_restless_has_no_stretch_of_that_length():
+    rng = np.random.default_rng(9)
+    for _ in range(200):
+        values = np.repeat(rng.integers(0, 3, 8), rng.integers(1, 9, 8)).astype(float)
+        segment = np.sort(rng.integers(0, 2, len(values)))
+        first, last = runs(values, segment)
+        longest = int((last - first + 1).max())
+        assert _may_rest(values, longest)
+    alone = np.array([0.0, 1, 1, 1, 2])
+    assert _may_rest(alone, 3)
+    assert not _may_rest(alone, 4)
