@@ -264,8 +264,8 @@ def _innovation(residual: np.ndarray, size: np.ndarray, tolerance: float) -> tup
 def _solve(
     normal: np.ndarray, right: np.ndarray, limit: float, samples: int, unknowns: int
 ) -> tuple[np.ndarray, float]:
-    """The normal equations by Cholesky after Jacobi scaling, and the condition
-    number of the scaled matrix (LAPACK's estimate)."""
+    """The normal equations by Cholesky after Jacobi scaling, and the condition number of the scaled matrix
+    (LAPACK's estimate, to six digits: the last of sixteen hangs on where in memory the factor lies)."""
     size = np.diag(normal)
     scale = 1 / np.sqrt(np.where(size > 0, size, 1.0))
     scaled = normal * scale * scale[:, None]
@@ -281,7 +281,7 @@ def _solve(
             "probe with more levels or frequencies, or record longer"
         )
     solution, _ = scipy.linalg.lapack.dpotrs(factor, np.asfortranarray(scale[:, None] * right), lower=1)
-    return scale[:, None] * solution, 1 / reciprocal
+    return scale[:, None] * solution, float(f"{1 / reciprocal:.5e}")
 
 
 def _refuse(
