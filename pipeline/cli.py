@@ -313,10 +313,8 @@ def replay(arguments: argparse.Namespace) -> None:
         return
     from pipeline.report.replay import page
     from pipeline.runtime.workflow import replay as replaying
-    from pipeline.setpoint.workflow.training_print import numbers
 
-    reference = numbers(arguments.reference, "--reference") if arguments.reference else ()
-    asked = replaying.Asked(tuple(reference), arguments.out)
+    asked = replaying.Asked(replaying.temperatures(arguments.reference), arguments.out)
     done, made, told = replaying.replay_recording(arguments.controller, arguments.recording, asked)
     inputs, outputs = ([one.name for one in side] for side in (made.machine.inputs, made.machine.outputs))
     shown = page.Shown(
