@@ -1,7 +1,8 @@
 """Does a replay abstain where it should, and only there? And how long do a million rows take?
 
-`./run python -m benchmarks.replay [PART ...]` prints a table by kind of log and writes what was asked for into
-benchmarks/results/replay.json: `study`, `rows` (a million of them), names of small machines; all without PART.
+`./run python -m benchmarks.replay [PART ...]` prints a table by kind of log and writes what was asked for
+into benchmarks/results/replay.json: `study`, `rows` (a million of them), names of small machines; all without
+PART.
 
 The study's machine: the controller and the support of datasets/export_controllers. Its honest logs are of
 plants, noise, ambients and references drawn anew, under the controller. Those that are off support are of

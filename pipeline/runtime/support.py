@@ -319,8 +319,8 @@ STILL_TOLD = (
     "not be told from it."
 )
 SHORT_TOLD = (
-    "The recording is too short for a forecast: swapped sensors or heaters, a wrong unit or another gain could "
-    "not be told from it."
+    "The recording is too short for a forecast: swapped sensors or heaters, a wrong unit or another gain "
+    "could not be told from it."
 )
 
 

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from pipeline import cli
 from pipeline.runtime.export import setpoint
 from pipeline.runtime.workflow import replay_camera
-from pipeline.setpoint import bayes, nozzle_scene
+from pipeline.setpoint import nozzle_scene
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
 from pipeline.setpoint.calibration import Calibration, Familiar
 from pipeline.setpoint.vision_transformer import SMALL, vision_transformer

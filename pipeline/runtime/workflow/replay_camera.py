@@ -20,7 +20,9 @@ def ready(folder: Path) -> deploy.Ready:
     """The loop that evaluate_setpoint judged, without the levels of a camera, which were not exported. Raises
     ValueError where the folder's numbers are others, and where a stage has not run."""
     judged = deploy.ready(None)
-    _check(folder / CLASSIFIER, setpoint.CLASSIFIER_SCHEMA, setpoint.classifier_arrays(deploy.trained().model))
+    _check(
+        folder / CLASSIFIER, setpoint.CLASSIFIER_SCHEMA, setpoint.classifier_arrays(deploy.trained().model)
+    )
     _check(folder / FILTER, setpoint.FILTER_SCHEMA, setpoint.filter_arrays(_filter(judged)))
     return judged
 
@@ -32,8 +34,8 @@ def _filter(judged: deploy.Ready) -> Filter:
         return restore_agents("datasets/train_agent/weights.safetensors").belief.filter
     if not isinstance(parameters, Filter):
         raise ValueError(
-            f"datasets/evaluate_setpoint/choice.json: expected a controller with a filter, found {name!r}, so "
-            "nothing that was exported is what it judged; export again with ./run dvc repro export_controllers"
+            f"datasets/evaluate_setpoint/choice.json: expected a controller with a filter, found {name!r}, "
+            "so what was exported is not what it judged; export again with ./run dvc repro export_controllers"
         )
     return parameters
 
