@@ -39,8 +39,8 @@ def render(sources: Sources, judged: Judgement) -> str:
     loops, accepted = headline.loops(sources, judged), _accepted(sources)
     return page.render(
         "index.html",
-        title=headline.decision(loops).rstrip("."),
-        decision=headline.decision(loops),
+        title=headline.decision(loops, quick=sources.quick).rstrip("."),
+        decision=headline.decision(loops, quick=sources.quick),
         state=headline.state(loops),
         accepted_on=accepted.get("on", ""),
         accepted_at=accepted.get("commit", ""),

@@ -11,7 +11,7 @@ import jinja2
 from markupsafe import Markup, escape
 
 from pipeline.report.shared import digits
-from pipeline.report.shared.sources import Source
+from pipeline.report.shared.sources import QUICK_LOOK, Source
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
@@ -86,7 +86,8 @@ def render(template: str, **values) -> str:
         for name, title in BESIDE
         if name == values["here"] or artifacts.exists(f"reports/{name}.html")
     ]
-    return printable_page(environment().get_template(template).render(beside=beside, **values))
+    quick = artifacts.read_json(QUICK_LOOK) if artifacts.exists(QUICK_LOOK) else None
+    return printable_page(environment().get_template(template).render(beside=beside, quick=quick, **values))
 
 
 def glyph(state: str) -> Markup:
