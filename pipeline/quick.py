@@ -212,7 +212,10 @@ def _furnish(folder: Path, sizes: Sizes, root: Path) -> None:
 def _copy_kept(folder: Path) -> str:
     """The kept artifacts in the places of their stages; the commit that they were made at. Raises ValueError
     where one is missing or not as it was kept."""
-    kept = artifacts.read_json(KEPT / "kept.json")
+    index = KEPT / "kept.json"
+    kept = artifacts.read_json(index) if artifacts.exists(index) else None
+    if not isinstance(kept, dict) or not isinstance(kept.get("files"), dict):
+        raise ValueError(f"{index}: expected commit and files of what is kept; git checkout {KEPT}")
     for name, digest in kept["files"].items():
         if not artifacts.exists(KEPT / name) or artifacts.sha256(KEPT / name) != digest:
             raise ValueError(
@@ -221,7 +224,7 @@ def _copy_kept(folder: Path) -> str:
         target = folder / (name if name.startswith("reports/") else f"datasets/{name}")
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(KEPT / name, target)
-    return str(kept["commit"])
+    return str(kept.get("commit"))
 
 
 def keep() -> str:

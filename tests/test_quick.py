@@ -247,6 +247,11 @@ def test_a_kept_file_that_differs_is_refused_by_name(checkout, beadline):
         file.write(b"!")
     status, _, told = beadline("quick")
     assert status == 1 and "datasets/kept/train_agent/weights.safetensors: expected SHA-256" in told
+    for content in ("[]", "{}", None):
+        index = Path("datasets/kept/kept.json")
+        index.unlink() if content is None else index.write_text(content)
+        status, _, told = beadline("quick")
+        assert status == 1 and "kept.json: expected commit and files" in told and "git checkout" in told
     assert not Path("quick").exists() and not list(Path().glob(".quick.*"))
 
 

@@ -57,7 +57,9 @@ def render(sources: Sources, judged: Judgement) -> str:
         heads=heads(judged),
         pair=judged.pair,
         best=judged.best,
-        change=ChangeSentence(ANOTHER)
+        change=ChangeSentence("A quick look is compared with no run.")
+        if sources.quick
+        else ChangeSentence(ANOTHER)
         if sources.another_machine
         else _change_sentence(
             judged, sources.accepted, _deposition_moves(sources), setpoint_change.moved_cases(sources)
