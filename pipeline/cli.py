@@ -148,6 +148,14 @@ def inspect(arguments: argparse.Namespace) -> None:
     print(printable(isolated(describe, arguments.file, shown=arguments.file, budget=budget)))
 
 
+def quick(arguments: argparse.Namespace) -> None:
+    """A first page in two minutes, in quick/: every loop at the sizes of params.quick.yaml, with a
+    classifier and agents that git keeps. datasets/, reports/ and dvc.lock stay as they are."""
+    from pipeline import quick as looking
+
+    print(printable(looking.keep() if arguments.keep else looking.quick()))
+
+
 def init(arguments: argparse.Namespace) -> None:
     """Recordings of a new machine into params.yaml: mapping, plant, panel and
     rules that fit its pace; and what a person must still decide."""
@@ -501,6 +509,7 @@ EXAMPLES = {
     "history": "--most 100",
     "screenshots": "",
     "inspect": "log.csv",
+    "quick": "",
     "init": "log.csv --copy",
     "first-experiment": "--hold 200",
     "compose": "part.gcode --as csv,gcode --out jobs",
@@ -551,6 +560,13 @@ def main() -> None:
     command = commands.add_parser("inspect", help=inspect.__doc__, description=inspect.__doc__)
     command.add_argument("file", type=Path)
     command.set_defaults(run=inspect)
+    command = commands.add_parser("quick", help=quick.__doc__, description=quick.__doc__)
+    command.add_argument(
+        "--keep",
+        action="store_true",
+        help="keep the classifier and agents of this checkout's full run for it",
+    )
+    command.set_defaults(run=quick)
     command = commands.add_parser("init", help=init.__doc__, description=init.__doc__)
     command.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING")
     command.add_argument("--copy", action="store_true", help="copy them into datasets/raw/temperature")
