@@ -21,8 +21,9 @@ SHORT = {
     "Apache Software License": "Apache-2.0", "BSD License": "BSD", "MIT License": "MIT",
     "ISC License (ISCL)": "ISC", "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
     "Python Software Foundation License": "PSF-2.0", "The Unlicense (Unlicense)": "Unlicense",
-    "Apache 2.0": "Apache-2.0", "Apache License, Version 2.0": "Apache-2.0", "Apache License 2.0": "Apache-2.0",
-    "Apache-2": "Apache-2.0", "Apache 2": "Apache-2.0", "Modified BSD License": "BSD-3-Clause",
+    "Apache 2.0": "Apache-2.0", "Apache License, Version 2.0": "Apache-2.0",
+    "Apache License 2.0": "Apache-2.0", "Apache-2": "Apache-2.0", "Apache 2": "Apache-2.0",
+    "Modified BSD License": "BSD-3-Clause",
 }  # fmt: skip
 UNKNOWN = "not said in its metadata"
 
@@ -103,8 +104,8 @@ def page(packages: list[Package]) -> str:
         "|---|---|---|",
         *(f"| {one.name} | {one.version} | {(one.licence or '').replace('|', '/')} |" for one in here),
         "",
-        f"Locked but not installed by `./run` ({len(apart)}; a GPU, a cluster, S3, peers of the benchmarks, other "
-        "systems): " + ", ".join(f"{one.name} {one.version}" for one in apart) + ".",
+        f"Locked but not installed by `./run` ({len(apart)}; a GPU, a cluster, S3, peers of the benchmarks, "
+        "other systems): " + ", ".join(f"{one.name} {one.version}" for one in apart) + ".",
         "",
     ]
     return "\n".join(lines)

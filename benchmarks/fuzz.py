@@ -73,7 +73,7 @@ def keep(name: str, seed: int, failed: Failed) -> dict[str, Any]:
 
 
 def fuzz(names: list[str], hours: float, seed: int) -> dict[str, Any]:
-    """Files by kind and answer, and all that was found, until the time is over and each kind had one round."""
+    """Files by kind and answer, and what was found, until the time is over; each kind has one round."""
     counts = {name: collections.Counter() for name in names}
     found, began, first = [], time.monotonic(), seed
     while time.monotonic() - began < 3600 * hours or seed == first:

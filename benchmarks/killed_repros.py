@@ -1,11 +1,11 @@
-"""A repro that is killed at random moments: whether the next one gives the bytes of one that nobody disturbed.
+"""A repro that is killed at random moments: whether the next one gives the bytes of one left alone.
 
 `./run python -m benchmarks.killed_repros --kills 50` clones this checkout, takes the small sizes of
-.ci/params.yaml, and makes temperature and deposition once undisturbed. Then, in a second clone with a cache of
-its own, `dvc repro` is killed (SIGKILL, to everything it started or to its process group alone) at moments
+.ci/params.yaml, and makes temperature and deposition once undisturbed. Then, in a second clone with a cache
+of its own, `dvc repro` is killed (SIGKILL, to everything it started or to its process group alone) at moments
 drawn between nothing and all of the undisturbed time, run on and killed again, `--a-repro 6` times, before it
-is let end; then all made files are compared, and a third clone begins. `--stages learn_kernel` plays these and
-what they need. Results: benchmarks/results/killed_repros.json.
+is let end; then all made files are compared, and a third clone begins. `--stages learn_kernel` plays these
+and what they need. Results: benchmarks/results/killed_repros.json.
 """
 
 import argparse
@@ -68,8 +68,8 @@ def ended(child: subprocess.Popen) -> str:
 
 
 def made(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file that stages make: datasets but for raw and memo, reports, and dvc.lock. A left-over
-    of a killed stage is a file too many."""
+    """SHA-256 of every file that stages make: datasets but for raw and memo, reports, and dvc.lock. A
+    left-over of a killed stage is a file too many."""
     kept = (folder / "datasets/raw", folder / "datasets/memo")
     paths = [folder / "dvc.lock"]
     for room in ("datasets", "reports"):
