@@ -33,12 +33,10 @@ LIMIT_S = 7200.0
 
 
 class Kill(NamedTuple):
-    """Seconds into the repro, whether all it had started went too, whether it still ran, and the stages whose
-    results were whole by then."""
+    """Seconds into the repro, whether all it had started went too, and the stages that it had locked."""
 
     after_s: float
     tree: bool
-    ran: bool
     made: int
 
 
@@ -96,17 +94,22 @@ def moments(rng: np.random.Generator, whole_s: float) -> Iterator[tuple[float, b
 def disturbed(
     project: Project, stages: list[str], kills: int, at: Iterator[tuple[float, bool]]
 ) -> list[Kill]:
-    """A repro that is killed so many times, and then ends."""
+    """A repro that is killed so many times at most, and then ends; done before its moment, it counts as
+    no kill."""
     rows = []
     for _ in range(kills):
         after_s, tree = next(at)
         began, child = time.monotonic(), repro(project, stages)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            child.wait(timeout=after_s)
-        ran = child.poll() is None
-        killed_nights.killed(child, tree=tree)
-        child.communicate()
-        rows.append(Kill(round(time.monotonic() - began, 1), tree, ran, finished(project.folder)))
+        try:
+            said, _ = child.communicate(timeout=after_s)
+        except subprocess.TimeoutExpired:
+            killed_nights.killed(child, tree=tree)
+            child.communicate()
+        else:
+            if child.returncode != 0:
+                raise RuntimeError(f"dvc repro after a kill: {' '.join(said[-1500:].split())}")
+            break
+        rows.append(Kill(round(time.monotonic() - began, 1), tree, finished(project.folder)))
         print(f"  {rows[-1]}", flush=True)
     ended(repro(project, stages))
     return rows
@@ -137,9 +140,9 @@ def play(stages: list[str], kills: int, a_repro: int, seed: int) -> dict[str, An
         "files": len(wanted),
         "undisturbed_s": round(whole_s, 1),
         "kills": len(rows),
-        "while_it_ran": sum(row.ran for row in rows),
         "whole_tree": sum(row.tree for row in rows),
-        "stages_whole_at_kill": [row.made for row in rows],
+        "kills_s": [row.after_s for row in rows],
+        "stages_locked_at_kill": [row.made for row in rows],
         "repros": len(differing),
         "repros_with_the_same_bytes": sum(not others for others in differing),
         "files_that_differ": sorted(set().union(*differing)),

@@ -2,8 +2,9 @@
 
 `./run python -m benchmarks.mutants kernel tracking` draws 60 changes of each module by a seed and runs its
 test file against each, the quick tests first, up to the first failure; without names all of `MODULES`.
-`--count 20` draws fewer, `--slowest 2` leaves out tests that take more seconds of CPU. Results go into
-benchmarks/results/mutants.json, by module; a module that is not there was not played.
+`--count 20` draws fewer, `--slowest 2` leaves out tests that take more seconds of CPU, and `--again` then
+plays what survived with all tests. Results go into benchmarks/results/mutants.json, by module; a module that
+is not there was not played.
 
 A mutant is the module's text with one node changed: a comparison, an operator, a number, a condition, a
 statement left out. It stands in a folder of its own and is found before the module; the tests run in a fork
@@ -246,8 +247,9 @@ def in_fork(name: str, path: Path, file: str, order: _QuickFirst, limit_s: float
         return code, used.ru_utime + used.ru_stime, noted.read()
 
 
-def play(name: str, count: int, slowest_s: float) -> dict[str, Any]:
-    """The table of one module: killed, hanging and surviving mutants, and the tests left out."""
+def play(name: str, count: int, slowest_s: float, before: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The table of one module: killed, hanging and surviving mutants, and the tests left out. Where a
+    table `before` is given, those that it says survived are played; the others are taken over as killed."""
     module, file = MODULES[name]
     source = ROOT / (module.replace(".", "/") + ".py")
     text = source.read_text()
@@ -260,7 +262,11 @@ def play(name: str, count: int, slowest_s: float) -> dict[str, Any]:
         known = json.loads(noted)
         order = _QuickFirst(known, slowest_s)
         rows = []
-        for mutant in mutants(text, count, f"{SEED} {name}"):
+        alive = {row["mutant"] for row in before["survivors"]} if before else None
+        for mutant in mutants(text, before["mutants"] if before else count, f"{SEED} {name}"):
+            if alive is not None and f"{mutant.line}: {mutant.change}" not in alive:
+                rows.append((mutant, Played("killed", 0.0)))
+                continue
             path.write_text(mutant.text)
             code, cpu_s, _ = in_fork(module, path, file, order, 4 * whole_s + SPARE_S)
             outcome = "survives" if code == 0 else "killed" if code > 0 else "hangs"
@@ -299,15 +305,19 @@ def main() -> None:
     parser.add_argument(
         "--slowest", type=float, default=1e9, help="CPU seconds of the slowest test that runs"
     )
+    parser.add_argument("--again", action="store_true", help="only what survived before")
     asked = parser.parse_args()
     os.chdir(ROOT)
     for library in LIBRARIES:
         importlib.import_module(library)
     for name in asked.modules or MODULES:
-        result = play(name, asked.count, asked.slowest)
+        known = artifacts.read_json(RESULTS) if RESULTS.exists() else {}
+        if asked.again and name not in known:
+            parser.error(f"{name} is not in {RESULTS.name}; play it without --again first")
+        result = play(name, asked.count, asked.slowest, known[name] if asked.again else None)
         print(f"{name}: {result['killed']} of {result['mutants']} killed, share {result['share_killed']}")
-        before = artifacts.read_json(RESULTS) if RESULTS.exists() else {}
-        artifacts.write_json(RESULTS, dict(sorted((before | {name: result}).items())))
+        known = artifacts.read_json(RESULTS) if RESULTS.exists() else {}
+        artifacts.write_json(RESULTS, dict(sorted((known | {name: result}).items())))
 
 
 if __name__ == "__main__":
