@@ -2,7 +2,7 @@
 
 `./run python -m benchmarks.killed_repros --kills 50` clones this checkout, takes the small sizes of
 .ci/params.yaml, and makes temperature and deposition once undisturbed. Then, in a second clone with a cache
-of its own, `dvc repro` is killed (SIGKILL, to everything it started or to its process group alone) at moments
+of its own, `./run dvc repro` is killed (SIGKILL, to all it started or to its process group alone) at moments
 drawn between nothing and all of the undisturbed time, run on and killed again, `--a-repro 6` times, before it
 is let end; then all made files are compared, and a third clone begins. `--stages learn_kernel` plays these
 and what they need. Results: benchmarks/results/killed_repros.json.
@@ -11,6 +11,7 @@ and what they need. Results: benchmarks/results/killed_repros.json.
 import argparse
 import contextlib
 import hashlib
+import os
 import subprocess
 import sys
 import tempfile
@@ -46,13 +47,16 @@ def clone(folder: Path) -> Project:
     killed_nights._set(folder, params.read(ROOT / ".ci/params.yaml"))
     (folder / "dvc.lock").unlink(missing_ok=True)
     project = Project(folder)
-    project.env |= {"PYTHONPATH": str(folder)}
+    # the environment at hand, by way of the clone's own ./run
+    (folder / ".venv").symlink_to(sys.prefix)
+    path = f"{project.env['PATH']}{os.pathsep}{ROOT / '.uv/bin'}"
+    project.env |= {"PYTHONPATH": str(folder), "UV_NO_SYNC": "1", "PATH": path}
     return project
 
 
 def repro(project: Project, stages: list[str]) -> subprocess.Popen:
     return subprocess.Popen(
-        [sys.executable, "-m", "dvc", "repro", *stages], cwd=project.folder, env=project.env,
+        [str(project.folder / "run"), "dvc", "repro", *stages], cwd=project.folder, env=project.env,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
     )  # fmt: skip
 
