@@ -391,3 +391,19 @@ def test_a_still_law_remembers_nothing_and_asks_for_nothing():
     z = law.A @ z + law.B_u @ u + law.B_y @ y + law.B_r @ y + law.c
     assert z.shape == (0,)
     np.testing.assert_array_equal(-law.K @ z - law.D @ y - law.K_r @ y - law.k, np.zeros(2))
+
+
+def test_an_aimed_law_that_answers_the_measurement_at_once_rests_at_its_target():
+    law = observer_law(SMALL, gains(SMALL, Q2, R2, 0.9), observer_gain(SMALL, 0.5))
+    law = law._replace(D=np.array([[0.3, -0.1], [0.2, 0.4]]))
+    r, u, y = np.array([1.0, 2.0]), np.array([5.0, -3.0]), np.array([1.5, 2.5])
+    rests = aimed(law, r, u, y)
+    z = np.linalg.solve(np.eye(3) - law.A, law.B_u @ u + law.B_y @ y + law.B_r @ r + law.c)
+    np.testing.assert_allclose(-rests.K @ z - rests.D @ y - rests.K_r @ r - rests.k, u, atol=1e-12)
+
+
+def test_the_discount_of_a_policy_is_that_under_which_its_cost_is_finite():
+    """0.95 / 1.1^2 where no input moves the mode of 1.1."""
+    stuck = plant(np.diag([1.1, 0.5]), [[0.0], [1.0]], np.eye(2))
+    with pytest.raises(ValueError, match=r"\(discount 0\.785 of 0\.99\)"):
+        policy_iteration(stuck, np.eye(2), np.eye(1), 0.99, np.zeros((1, 4)), max_iterations=3)
