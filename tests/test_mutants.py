@@ -56,7 +56,8 @@ def test_a_share_counts_neither_the_killed_nor_the_equivalent_as_alive(monkeypat
     rows = [
         (mutants.Mutant(line, change, ""), mutants.Played(outcome, 1.0))
         for line, change, outcome in (
-            (1, "a -> b", "killed"), (2, "a -> c", "hangs"), (3, "1 -> 2", "survives"), (4, "1 -> 2", "survives"),
+            (1, "a -> b", "killed"), (2, "a -> c", "hangs"),
+            (3, "1 -> 2", "survives"), (4, "1 -> 2", "survives"),
         )
     ]  # fmt: skip
     made = mutants.table("m", "test_m.py", rows, [])
