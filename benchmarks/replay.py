@@ -1,6 +1,8 @@
 """Does a replay abstain where it should, and only there? And how long do a million rows take?
 
-`./run python -m benchmarks.replay` prints a table by kind of log and writes benchmarks/results/replay.json.
+`./run python -m benchmarks.replay [PART ...]` prints a table by kind of log and writes what was asked for
+into benchmarks/results/replay.json: `study`, `rows` (a million of them), names of small machines; all without
+PART.
 
 The study's machine: the controller and the support of datasets/export_controllers. Its honest logs are of
 plants, noise, ambients and references drawn anew, under the controller. Those that are off support are of
@@ -14,6 +16,7 @@ among these where the folder is present.
 """
 
 import json
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -38,8 +41,8 @@ from tests.temperature.small_machines import MACHINES, SmallMachine
 RESULTS = Path(__file__).parent / "results" / "replay.json"
 FOLDER = Path("datasets/export_controllers/temperature")
 ROWS = 1_000_000
-SEED, PLANTS = 1203, 20  # of the study's machine, drawn anew
-SEEDS = range(11, 15)  # of the small machines' logs
+SEED, PLANTS = 3307, 20  # of the study's machine, drawn anew
+SEEDS = range(31, 35)  # of the small machines' logs
 
 
 class Counted(NamedTuple):
@@ -189,14 +192,20 @@ def drifted(one: Played, to: float) -> Log:
     return answered(one, one.log.u * share[:, None])
 
 
-def study() -> dict[str, Any]:
-    """By kind of log `Counted`, and what a million rows cost."""
+def deployed() -> tuple[Exported, support.Support]:
+    """The exported controller and its support."""
     made = read(FOLDER)[0]
     within = replaying.read_support(FOLDER, made)
     if within is None:
         raise ValueError(
             f"{FOLDER}: it has no support; make it again with ./run dvc repro export_controllers"
         )
+    return made, within
+
+
+def study() -> dict[str, Any]:
+    """By kind of log `Counted`."""
+    made, within = deployed()
     watch, rng = support.watched_by(within.spread, within.steps), np.random.default_rng(SEED)
     played = honest_logs(made, drawn_anew()[0])
     some, m, p = played[::3], made.controller.limits.low.size, made.model.p
@@ -215,20 +224,18 @@ def study() -> dict[str, Any]:
     for name, logs in kinds.items():
         table[name] = counted(within, watch, logs)
         print("study,", name, table[name], flush=True)
-    return {
-        "kinds": {name: row._asdict() for name, row in table.items()},
-        "rows": ROWS,
-        "cpu_s": million_rows(made, within, played[3].log),
-    }
+    return {"plants": PLANTS, "seed": SEED, "kinds": {name: row._asdict() for name, row in table.items()}}
 
 
-def million_rows(made: Exported, within: support.Support, log: Log) -> float:
+def million_rows() -> dict[str, float]:
     """CPU seconds in one thread of judging and replaying a log, repeated until it has ROWS."""
+    made, within = deployed()
+    log = honest_logs(made, drawn_anew()[0])[3].log
     long = Log(*(np.tile(part, (ROWS // len(part) + 1, 1))[:ROWS] for part in log))
     started = time.process_time()
     support.told(within, long, support.watched_by(within.spread, within.steps))
     replay.replayed(made.controller, made.model, long)
-    return round(time.process_time() - started, 1)
+    return {"rows": ROWS, "cpu_s": round(time.process_time() - started, 1)}
 
 
 # ---- small machines, written apart
@@ -303,11 +310,11 @@ def of_small(
     return table
 
 
-def small() -> dict[str, dict[str, Counted]]:
-    records = {machine.name: of_machine(machine) for machine in MACHINES}
+def small(asked: Sequence[SmallMachine]) -> dict[str, dict[str, Counted]]:
+    records = {machine.name: of_machine(machine) for machine in asked}
     real = {name: Log(r.u, r.y, r.y) for name, r in real_records().items()}
     tables = {}
-    for machine in MACHINES:
+    for machine in asked:
         tables[machine.name] = of_small(machine, records, real)
         print(
             machine.name,
@@ -338,19 +345,29 @@ def shares(kinds: dict[str, dict[str, Any]]) -> dict[str, float]:
 
 
 def main() -> None:
-    own = study()
-    machines = small()
-    kinds = pooled(list(machines.values()))
-    result = {
-        "command": "./run python -m benchmarks.replay",
-        "study": own | shares(own["kinds"]),
-        "small_machines": {"kinds": kinds, **shares(kinds)},
-        "small_machines_own": {name: table["own"].abstains for name, table in machines.items()},
-    }
+    by_name = {machine.name: machine for machine in MACHINES}
+    parts = sys.argv[1:] or ["rows", "study", *by_name]
+    unknown = sorted({*parts} - {"rows", "study", *by_name})
+    if unknown:
+        raise ValueError(f"expected rows, study or {', '.join(by_name)}, found {', '.join(unknown)}")
+    result = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    result["command"] = "./run python -m benchmarks.replay"
+    if "rows" in parts:
+        result["rows"] = million_rows()
+        print(result["rows"])
+    if "study" in parts:
+        own = study()
+        result["study"] = own | shares(own["kinds"])
+    asked = [by_name[name] for name in parts if name in by_name]
+    if asked:
+        tables = small(asked)
+        kinds = pooled(list(tables.values()))
+        own = {name: table["own"].abstains for name, table in tables.items()}
+        result["small_machines"] = {"own": own, "kinds": kinds, **shares(kinds)}
+        for name, row in kinds.items():
+            print(f"{name:24s} {row['logs']:4d} {row['abstains']:.2f} {row['still']:.2f}")
     for name in ("study", "small_machines"):
-        print(name, {key: value for key, value in result[name].items() if "abstains" in key})
-    for name, row in kinds.items():
-        print(f"{name:24s} {row['logs']:4d} {row['abstains']:.2f} {row['still']:.2f}")
+        print(name, {key: value for key, value in result.get(name, {}).items() if "abstains" in key})
     RESULTS.write_text(json.dumps(result, indent=2) + "\n")
 
 

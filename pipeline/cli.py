@@ -7,11 +7,15 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline.nightly import commands as nights
 from pipeline.store import artifacts, params
 from pipeline.store.printable import printable
 from pipeline.temperature.workflow.settings import Ingest, Plant
+
+if TYPE_CHECKING:
+    from pipeline.setpoint.workflow.shadow.deploy import Ready
 
 
 def accept(_: argparse.Namespace) -> None:
@@ -144,6 +148,14 @@ def inspect(arguments: argparse.Namespace) -> None:
     print(printable(isolated(describe, arguments.file, shown=arguments.file, budget=budget)))
 
 
+def quick(arguments: argparse.Namespace) -> None:
+    """A first page in two minutes, in quick/: every loop at the sizes of params.quick.yaml, with a
+    classifier and agents that git keeps. datasets/, reports/ and dvc.lock stay as they are."""
+    from pipeline import quick as looking
+
+    print(printable(looking.keep() if arguments.keep else looking.quick()))
+
+
 def init(arguments: argparse.Namespace) -> None:
     """Recordings of a new machine into params.yaml: mapping, plant, panel and
     rules that fit its pace; and what a person must still decide."""
@@ -236,11 +248,17 @@ def calibrate_camera(arguments: argparse.Namespace) -> None:
 def shadow(arguments: argparse.Namespace) -> None:
     """Watch a printer's camera: what the controller would do in each window and why,
     as MCAP and a local page. Nothing is sent."""
+    from pipeline.setpoint.workflow.shadow import deploy
+
+    _watch(arguments, deploy.ready(str(arguments.levels or "")))
+
+
+def _watch(arguments: argparse.Namespace, ready: "Ready") -> None:
+    """Watches a source of frames with the loop that is ready."""
     from pipeline.setpoint.workflow import shadow as watching
     from pipeline.setpoint.workflow.shadow import deploy
     from pipeline.setpoint.workflow.watch_sources import shown_place, source
 
-    ready = deploy.ready(str(arguments.levels or ""))
     asked = deploy.asked(
         arguments.flow, arguments.temperature, arguments.tip, once=arguments.once, settings=ready
     )
@@ -320,20 +338,18 @@ def export(arguments: argparse.Namespace) -> None:
 
 def replay(arguments: argparse.Namespace) -> None:
     """A recording, and what a certified controller would have asked on it and why not: as MCAP with a layout
-    for Foxglove, and a page. Frames of the nozzle's camera go through the loop of shadow. Nothing is sent."""
+    for Foxglove, and a page. Frames of the nozzle's camera go through the loop of shadow with the classifier
+    and the filter of CONTROLLER. Nothing is sent."""
     if _shows_frames(arguments.controller):
-        place = arguments.recording
-        shadow(argparse.Namespace(
-            source=str(place), out=arguments.out, tip="", flow=100.0, temperature=210.0, levels=None,
-            rate=5.0, once=True,
-        ))  # fmt: skip
+        from pipeline.runtime.workflow import replay_camera
+
+        arguments.source, arguments.rate, arguments.once = str(arguments.recording), 5.0, True
+        _watch(arguments, replay_camera.ready(arguments.controller))
         return
     from pipeline.report.replay import page
     from pipeline.runtime.workflow import replay as replaying
-    from pipeline.setpoint.workflow.training_print import numbers
 
-    reference = numbers(arguments.reference, "--reference") if arguments.reference else ()
-    asked = replaying.Asked(tuple(reference), arguments.out)
+    asked = replaying.Asked(replaying.temperatures(arguments.reference), arguments.out)
     done, made, told = replaying.replay_recording(arguments.controller, arguments.recording, asked)
     inputs, outputs = ([one.name for one in side] for side in (made.machine.inputs, made.machine.outputs))
     shown = page.Shown(
@@ -357,6 +373,17 @@ def version() -> str:
     return importlib.metadata.version("beadline")
 
 
+def _add_print(command: argparse.ArgumentParser) -> None:
+    """What frames may not say of the print."""
+    command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels of the frames")
+    command.add_argument(
+        "--flow", type=float, default=100.0, help="flow setpoint in %% where frames have none (100)"
+    )
+    command.add_argument(
+        "--temperature", type=float, default=210.0, help="of the nozzle in °C where frames have none (210)"
+    )
+
+
 def _add_shadow(commands: argparse._SubParsersAction) -> None:
     command = commands.add_parser("shadow", help=shadow.__doc__, description=shadow.__doc__)
     command.add_argument(
@@ -366,13 +393,7 @@ def _add_shadow(commands: argparse._SubParsersAction) -> None:
     command.add_argument(
         "--out", type=Path, default=Path("shadow"), metavar="DIR", help="for page and decisions (shadow)"
     )
-    command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels")
-    command.add_argument(
-        "--flow", type=float, default=100.0, help="flow setpoint in %% where the source has none (100)"
-    )
-    command.add_argument(
-        "--temperature", type=float, default=210.0, help="of the nozzle in °C where the source has none (210)"
-    )
+    _add_print(command)
     command.add_argument(
         "--levels",
         type=Path,
@@ -466,12 +487,18 @@ def _add_export(commands: argparse._SubParsersAction) -> None:
 
 def _add_replay(commands: argparse._SubParsersAction) -> None:
     command = commands.add_parser("replay", help=replay.__doc__, description=replay.__doc__)
-    command.add_argument("controller", type=Path, metavar="CONTROLLER", help="a folder with controller.json")
-    command.add_argument("recording", type=Path, metavar="RECORDING", help="CSV, Parquet, MCAP, klippy.log")
+    command.add_argument("controller", type=Path, metavar="CONTROLLER", help="a folder of export_controllers")
+    command.add_argument(
+        "recording",
+        type=Path,
+        metavar="RECORDING",
+        help="CSV, Parquet, MCAP, klippy.log; of frames a folder of pictures or an MCAP",
+    )
     command.add_argument("--out", type=Path, default=Path("replay"), metavar="DIR", help="(replay)")
     command.add_argument(
         "--reference", default="", metavar="DEGC,...", help="one an output, where the recording has none"
     )
+    _add_print(command)
     command.set_defaults(run=replay)
 
 
@@ -482,6 +509,7 @@ EXAMPLES = {
     "history": "--most 100",
     "screenshots": "",
     "inspect": "log.csv",
+    "quick": "",
     "init": "log.csv --copy",
     "first-experiment": "--hold 200",
     "compose": "part.gcode --as csv,gcode --out jobs",
@@ -532,6 +560,13 @@ def main() -> None:
     command = commands.add_parser("inspect", help=inspect.__doc__, description=inspect.__doc__)
     command.add_argument("file", type=Path)
     command.set_defaults(run=inspect)
+    command = commands.add_parser("quick", help=quick.__doc__, description=quick.__doc__)
+    command.add_argument(
+        "--keep",
+        action="store_true",
+        help="keep the classifier and agents of this checkout's full run for it",
+    )
+    command.set_defaults(run=quick)
     command = commands.add_parser("init", help=init.__doc__, description=init.__doc__)
     command.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING")
     command.add_argument("--copy", action="store_true", help="copy them into datasets/raw/temperature")

@@ -63,7 +63,7 @@ EDGE_CALLS = {"artifacts", "params", "recordings"}
 HEAVY = {"jax", "equinox", "optax", "cv2", "sklearn", "control", "pandas", "pyarrow", "mcap", "joblib"}
 # all that may lie directly in pipeline/
 ROOMS = {*LOOPS, "store", "reading", "runtime", "report", "nightly"}
-LOOSE = {"__init__", "statistics", "cli"}
+LOOSE = {"__init__", "statistics", "cli", "quick"}
 GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64"}
 
 

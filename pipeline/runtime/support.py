@@ -15,7 +15,8 @@ The most likely c is a ridge regression. `misfit` is the mean square of what it 
 square of c, in units of the spread. Swapped sensors misfit; a gain far from the spread departs.
 
 A steady disagreement is taken for weather (another ambient, more heat lost) by every observer. So a log in
-which nothing moves tells nothing of which sensor is which, or of what a heater's percent is worth."""
+which nothing moves tells nothing of which sensor is which, or of what a heater's percent is worth: it is
+judged by its ranges alone."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -36,7 +37,7 @@ LEAST_SHARE = 0.05  # of a log, beyond whose ranges it is off
 LEAST_FIGURES = (0.05, 1.5, 1.0)  # below which no log is off, whatever the honest ones were
 FEW, FEW_LOGS = 1.5, 30
 ENOUGH = 100
-STILL = 0.3  # of `rest`, by which the plants' forecasts differ where next to nothing moves
+STILL = 3.0  # of `rest`, within which outputs stay, and would by their inputs, where nothing moves
 TAU, DRIFT, LEAK, UNHURRIED = 0.2, 0.06, 1e-4, 16  # of the observers, as of the governor's
 AT_ONCE = 4  # forecasts begin so often within the steps that one goes
 MOST_SAMPLES = 60_000  # of a long log forecasts are judged in stretches, so many samples in all
@@ -201,7 +202,7 @@ def support(
         float(np.quantile(np.concatenate([distances(run, noise) for run in runs]), NEARLY_ALL))
         for runs in groups
     )
-    rest = np.max([_rest(runs, NOISES * noise) for runs in groups], axis=0)
+    rest = np.max([_rest(runs, noise) for runs in groups], axis=0)
     limits = [
         _seldom_above(np.array([figures(run, noise, furthest, rest) for run in runs])) for runs in groups
     ]
@@ -227,9 +228,10 @@ def _pieces(log: Log, steps: int) -> list[Log]:
 PIECES = 8
 
 
-def _rest(runs: Sequence[Forecasts], rest: np.ndarray) -> np.ndarray:
-    """Deviation (p,) in °C of what mixtures leave of honest logs; at least a hundredth of where it began."""
-    least = 0.01 * rest + 1e-9
+def _rest(runs: Sequence[Forecasts], noise: np.ndarray) -> np.ndarray:
+    """Deviation (p,) in °C of what mixtures leave of honest logs; at least the sensors' noise, of which they
+    leave less where forecasts are few."""
+    rest, least = NOISES * noise, noise + 1e-9
     for _ in range(3):
         left = [(explained(run, np.maximum(rest, least)).left ** 2).mean(axis=0) for run in runs]
         rest = np.sqrt(np.mean(left, axis=0))
@@ -249,15 +251,17 @@ def _seldom_above(found: np.ndarray) -> np.ndarray:
 
 class Told(NamedTuple):
     """What is said of a log: by sample (T,) the sum of TEMPERATURE, COMMAND and FORECAST; its `figures` over
-    what they may be (3,), above 1 off support; the share of samples outside the ranges; `abstains`: a replay
-    of it says nothing of this controller; `still`: so little moves that it cannot be told whether signals
-    are wired or scaled as they were."""
+    what they may be (3,), above 1 off support, 0 where it is judged by its ranges alone; the share of samples
+    outside the ranges; `abstains`: a replay of it says nothing of this controller; `still`: so little moves
+    that it cannot be told whether signals are wired or scaled as they were; `short`: too short for a
+    forecast."""
 
     off: np.ndarray
     figures: np.ndarray
     outside: float
     abstains: bool
     still: bool
+    short: bool = False
 
 
 def told(within: Support, log: Log, watch: Watch) -> Told:
@@ -278,17 +282,29 @@ def told(within: Support, log: Log, watch: Watch) -> Told:
     joined = Forecasts(
         *(np.concatenate(part, axis=-2 if part[0].ndim > 1 else 0) for part in zip(*runs, strict=True))
     )
-    over = figures(joined, within.noise, within.furthest, within.rest) / within.allowed
     outside = float((off & (TEMPERATURE | COMMAND) != 0).mean()) if len(off) else 0.0
-    moves = np.sqrt(np.mean((joined.apart / within.rest) ** 2)) if len(joined.start) else 0.0
-    return Told(off, over, outside, bool((over > 1).any()) or outside > LEAST_SHARE, bool(moves < STILL))
+    if still := not any(_moves(within, part) for _, part in _stretches(log)):
+        off &= ~np.int8(FORECAST)
+        return Told(off, np.zeros(3), outside, outside > LEAST_SHARE, still)
+    over = figures(joined, within.noise, within.furthest, within.rest) / within.allowed
+    off_support = bool((over > 1).any()) or outside > LEAST_SHARE
+    return Told(off, over, outside, off_support, still, not len(joined.start))
+
+
+def _moves(within: Support, log: Log) -> bool:
+    """Whether an output moved, or its inputs would have moved it on a plant of the spread."""
+    plant = within.spread[0]
+    drive = (log.u - log.u.mean(axis=0)) @ plant.B.T
+    answer = scanned(plant.A, drive, np.zeros(plant.n)) @ plant.C.T
+    return any(bool((part.std(axis=0) > STILL * within.rest).any()) for part in (log.y, answer))
 
 
 def reasons(said: Told) -> list[str]:
     """Why a log is off support, the strongest reason first; or what could not be told of it."""
     found = [(said.outside / LEAST_SHARE, OUTSIDE)] + list(zip(said.figures, OF_FIGURES, strict=True))
     over = sorted((one for one in found if one[0] > 1), key=lambda one: -one[0])
-    return [sentence.format(times) for times, sentence in over] + ([STILL_TOLD] if said.still else [])
+    untold = [text for so, text in ((said.still, STILL_TOLD), (said.short, SHORT_TOLD)) if so]
+    return [sentence.format(times) for times, sentence in over] + untold
 
 
 OUTSIDE = "Temperatures or commands lie outside what was seen, {:.2g} times as often as they may."
@@ -301,6 +317,10 @@ OF_FIGURES = (
 STILL_TOLD = (
     "Next to nothing moves in the recording: swapped sensors or heaters, a wrong unit or another gain could "
     "not be told from it."
+)
+SHORT_TOLD = (
+    "The recording is too short for a forecast: swapped sensors or heaters, a wrong unit or another gain "
+    "could not be told from it."
 )
 
 

@@ -154,3 +154,39 @@ def test_what_leaves_its_range_is_off_at_that_sample():
     hot[400] += 40.0
     off = told(log()._replace(y=hot)).off
     np.testing.assert_array_equal(np.flatnonzero(off & support.TEMPERATURE), [400])
+
+
+def still(noise_degC: float = 0.1, steps: int = 700) -> Log:
+    """The machine at rest under constant heat, where the other log is in the middle."""
+    rng = np.random.default_rng(7)
+    y = log().y.mean(axis=0) + noise_degC * rng.standard_normal((steps, 5))
+    return Log(np.tile(log().u.mean(axis=0), (steps, 1)), y, np.tile(REFERENCE, (steps, 1)))
+
+
+@pytest.mark.parametrize("noise_degC", [0.0, 0.1, 0.2])
+def test_a_log_in_which_nothing_moves_is_judged_by_its_ranges_alone(noise_degC):
+    said = told(still(noise_degC))
+    assert (said.still, said.abstains) == (True, False)
+    assert not (said.off & support.FORECAST).any()
+    assert support.reasons(said) == [support.STILL_TOLD]
+    hot = told(still(noise_degC)._replace(y=still(noise_degC).y + 100.0))
+    assert hot.still and hot.abstains
+    assert not told(log()).still and support.reasons(told(log())) == []
+
+
+def test_a_log_is_not_still_where_only_its_inputs_move():
+    dead = still()._replace(u=log().u)
+    said = told(dead)
+    assert said.abstains and not said.still
+
+
+def test_a_log_too_short_for_a_forecast_says_so():
+    few = Log(*(part[: 2 * within().steps] for part in log()))
+    said = told(few)
+    assert (said.short, said.still, said.abstains) == (True, False, False)
+    assert support.reasons(said) == [support.SHORT_TOLD]
+
+
+def test_what_honest_logs_leave_is_no_less_than_the_sensors_noise():
+    explained_whole = support.Forecasts(np.arange(4), np.zeros((3, 4, 5)), np.zeros((4, 5)))
+    np.testing.assert_allclose(support._rest([explained_whole], NOISE), NOISE, rtol=1e-6)

@@ -1,6 +1,8 @@
 """What `beadline replay` leaves of a recording: every file opens, and names what is in the others."""
 
 import json
+import re
+import sys
 
 import numpy as np
 import pyarrow as pa
@@ -9,6 +11,7 @@ import pyarrow.parquet
 import pytest
 from mcap.reader import make_reader
 
+from pipeline import cli
 from pipeline.runtime import machine, support
 from pipeline.runtime.replay import Log
 from pipeline.runtime.workflow import replay
@@ -96,3 +99,30 @@ def test_it_says_why_it_abstains(folder, tmp_path):
     recording(tmp_path / "swapped.csv", log._replace(y=log.y[:, ::-1]))
     done, _, told = replayed(folder, tmp_path / "swapped.csv")[0]
     assert done.abstains and any("signals may be swapped" in note for note in told["notes"])
+
+
+def test_a_still_log_is_replayed_and_its_page_says_what_cannot_be_told_and_links_nowhere(
+    folder, tmp_path, monkeypatch
+):
+    moving = rolled(9)
+    noise = 0.1 * np.random.default_rng(3).standard_normal((T, 2))
+    still = Log(np.tile(moving.u.mean(axis=0), (T, 1)), moving.y.mean(axis=0) + noise, moving.r)
+    recording(tmp_path / "still.csv", still)
+    out = tmp_path / "out"
+    argv = ["beadline", "replay", str(folder), str(tmp_path / "still.csv"), "--reference", "150,150"]
+    monkeypatch.setattr(sys, "argv", [*argv, "--out", str(out)])
+    cli.main()
+    told = json.loads((out / "replay.json").read_text())
+    assert (told["abstains"], told["notes"]) == (False, [support.STILL_TOLD])
+    page = (out / "index.html").read_text()
+    assert support.STILL_TOLD in page
+    # it lies in a folder of its own, with no other page beside it
+    assert re.findall(r'href="(?!data:|#)[^"]*"', page) == []
+
+
+def test_references_that_are_no_temperatures_are_refused():
+    assert replay.temperatures("150,160.5") == (150.0, 160.5)
+    assert replay.temperatures("") == ()
+    for words in ("150;160", "150,", "nan,150", "1e9"):
+        with pytest.raises(ValueError, match="--reference: expected temperatures in °C .* found"):
+            replay.temperatures(words)

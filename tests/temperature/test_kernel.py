@@ -388,3 +388,48 @@ def test_value_iteration_that_does_not_settle_is_refused():
         r"record longer, or lower the window",
     ):
         value_iteration(regress(tuples([u], [y], 2)), Q2, R2, 0.9, max_iterations=1)
+
+
+# ---- what no test above would notice
+
+
+def test_policy_iteration_that_does_not_settle_is_refused():
+    _, u, y = small_record(SMALL)
+    with pytest.raises(ValueError, match=r"on the kernel did not settle in 1 policies; start from a gain"):
+        policy_iteration(regress(tuples([u], [y], 2)), Q2, R2, 0.9, np.zeros((2, 7)), max_iterations=1)
+
+
+def test_a_regression_counts_what_it_stands_on():
+    """A window of two holds 2 x 2 inputs and 3 states; the published form has all 8 of it."""
+    _, u, y = small_record(SMALL)
+    data = regress(tuples([u], [y], 2))
+    assert (data.rank, data.unknowns, data.entries) == (9, 9 * 10 // 2, 10 * 11 // 2)
+    assert data.samples == 398
+    np.testing.assert_allclose(data.u_scale, np.sqrt(np.mean(u[2:] ** 2, axis=0)), rtol=1e-12)
+
+
+def test_as_many_samples_as_unknowns_are_enough():
+    _, u, y = small_record(SMALL, samples=400, noise=1.0)
+    unknowns = regress(tuples([u], [y], 2)).unknowns
+    least = tuples([u[: unknowns + 2]], [y[: unknowns + 2]], 2)
+    assert regress(least).samples == unknowns
+    with pytest.raises(ValueError, match=f"expected at least {unknowns} samples"):
+        regress(tuples([u[: unknowns + 1]], [y[: unknowns + 1]], 2))
+
+
+def test_the_innovation_has_unit_variance_and_makes_the_residual():
+    rng = np.random.default_rng(0)
+    residual = rng.normal(size=(500, 2)) @ np.array([[2.0, 1.0, 0.0], [0.0, 0.5, 3.0]])
+    innovation, share = kernels._innovation(residual, np.array([1.0, 5.0, 10.0]), 1e-9)
+    np.testing.assert_allclose(innovation.T @ innovation / 500, np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(innovation @ share.T, residual, atol=1e-12)
+
+
+def test_an_innovation_that_is_rounding_beside_the_largest_target_is_none():
+    residual = 1e-7 * np.random.default_rng(0).normal(size=(500, 2))
+    assert kernels._innovation(residual, np.array([1.0, 1e3]), 1e-9)[0].shape == (500, 0)
+    assert kernels._innovation(residual, np.array([1.0, 1.0]), 1e-9)[0].shape == (500, 2)
+
+
+def test_a_window_law_has_no_integral_action_unless_it_is_asked_for():
+    assert window_law(np.zeros((2, 8)), np.zeros((2, 2)), np.zeros(2), 2).integral == 0

@@ -19,11 +19,13 @@ from pipeline.temperature.tracking import (
     observer_gain,
     observer_law,
     policy_iteration,
+    reached_state,
     riccati,
     robust_observer_gain,
     stabilises,
     started_reached,
     stein,
+    still_law,
 )
 
 I5, I7 = np.eye(5), np.eye(7)
@@ -315,3 +317,93 @@ def test_the_gain_is_control_s_dlqr_of_the_discounted_plant():
     # two ways to one solution, through a condition of 1e4
     np.testing.assert_allclose(optimal.K_x, K, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(optimal.P, P, rtol=1e-8, atol=1e-8)
+
+
+# ---- what no test above would notice
+
+
+def test_a_riccati_solution_scales_with_its_weights():
+    """However small or large the weights are, the tolerance is a share of P."""
+    P = riccati(SMALL.A, SMALL.B, I3 := np.eye(3), R2)
+    for scale in (1e-12, 1e12):
+        np.testing.assert_allclose(riccati(SMALL.A, SMALL.B, scale * I3, scale * R2), scale * P, rtol=1e-10)
+
+
+def test_one_input_that_jumps_through_is_refused_by_design_and_by_observer():
+    jumps = SMALL._replace(D=np.array([[0.0, 0.0], [0.0, 0.5]]))
+    for refused in (
+        lambda: gains(jumps, Q2, R2, 0.9),
+        lambda: observer_law(jumps, gains(SMALL, Q2, R2, 0.9), observer_gain(SMALL, 0.5)),
+    ):
+        with pytest.raises(ValueError, match="the model has feed-through"):
+            refused()
+
+
+def test_a_law_aims_at_targets_unless_it_says_otherwise():
+    assert not observer_law(SMALL, gains(SMALL, Q2, R2, 0.9), observer_gain(SMALL, 0.5)).conditional
+
+
+def test_policies_are_counted_and_limited_as_asked():
+    best = gains(SMALL, Q2, R2, 0.9)
+    optimal = np.hstack([best.K_x, best.K_r])
+    plain = SMALL._replace(b=np.zeros(3), d=np.zeros(2))
+    assert policy_iteration(plain, Q2, R2, 0.9, optimal).iterations == 1
+    needed = policy_iteration(plain, Q2, R2, 0.9, np.zeros((2, 5))).iterations
+    assert policy_iteration(plain, Q2, R2, 0.9, np.zeros((2, 5)), max_iterations=needed).iterations == needed
+    with pytest.raises(ValueError, match=f"did not settle in {needed - 1} policies"):
+        policy_iteration(plain, Q2, R2, 0.9, np.zeros((2, 5)), max_iterations=needed - 1)
+
+
+def test_the_start_of_a_plant_that_runs_away_sums_what_its_inputs_reach():
+    grows = plant([[1.2, 0.1], [0.0, 0.5]], [[1.0], [2.0]], [[1.0, 1.0]])
+    A, W = 0.99 / 1.2 * grows.A, np.zeros((2, 2))
+    for k in range(3000):  # 0.99^6000 is below rounding
+        power = np.linalg.matrix_power(A, k) @ grows.B
+        W += power @ power.T
+    expected = W @ grows.C.T / (grows.C @ W @ grows.C.T)
+    np.testing.assert_allclose(reached_state(grows), expected, rtol=1e-9)
+
+
+def test_a_target_of_a_plant_with_feed_through_is_what_its_output_holds():
+    jumps = plant([[0.5]], [[1.0]], [[1.0]], D=[[3.0]], d=[2.0])
+    # at rest x = 2 u and y = x + 3 u + 2
+    target = feasible_target(jumps, np.array([52.0]), np.zeros(1), np.full(1, 100.0))
+    np.testing.assert_allclose(target.u, 10.0, atol=1e-3)
+    np.testing.assert_allclose(target.y, 5 * target.u + 2, atol=1e-9)
+
+
+def test_a_plant_that_only_integrates_rests_where_its_input_balances_the_loss():
+    tank = plant([[1.0]], [[0.1]], [[1.0]], b=[-1.0])
+    target = feasible_target(tank, np.array([50.0]), np.zeros(1), np.full(1, 100.0))
+    np.testing.assert_allclose(target.u, 10.0, atol=1e-5)  # 0.1 u = 1; a leak of 1e-9 asks for 5e-7 more
+    np.testing.assert_allclose(target.y, 50.0, atol=2e-3)
+
+
+def test_the_observer_gain_by_hand():
+    """0.5 x 2 / (2 x 2 + 3)."""
+    one = plant([[0.5]], [[1.0]], [[2.0]])
+    np.testing.assert_allclose(observer_gain(one, 3.0), [[1 / 7]], rtol=1e-15)
+
+
+def test_a_still_law_remembers_nothing_and_asks_for_nothing():
+    law, u, y = still_law(2, 3), np.ones(2), np.ones(3)
+    z = law.start_u @ u + law.start_y @ y + law.start
+    z = law.A @ z + law.B_u @ u + law.B_y @ y + law.B_r @ y + law.c
+    assert z.shape == (0,)
+    np.testing.assert_array_equal(-law.K @ z - law.D @ y - law.K_r @ y - law.k, np.zeros(2))
+
+
+def test_an_aimed_law_that_answers_the_measurement_at_once_rests_at_its_target():
+    law = observer_law(SMALL, gains(SMALL, Q2, R2, 0.9), observer_gain(SMALL, 0.5))
+    law = law._replace(D=np.array([[0.3, -0.1], [0.2, 0.4]]))
+    r, u, y = np.array([1.0, 2.0]), np.array([5.0, -3.0]), np.array([1.5, 2.5])
+    rests = aimed(law, r, u, y)
+    z = np.linalg.solve(np.eye(3) - law.A, law.B_u @ u + law.B_y @ y + law.B_r @ r + law.c)
+    np.testing.assert_allclose(-rests.K @ z - rests.D @ y - rests.K_r @ r - rests.k, u, atol=1e-12)
+
+
+def test_the_discount_of_a_policy_is_that_under_which_its_cost_is_finite():
+    """0.95 / 1.1^2 where no input moves the mode of 1.1."""
+    stuck = plant(np.diag([1.1, 0.5]), [[0.0], [1.0]], np.eye(2))
+    with pytest.raises(ValueError, match=r"\(discount 0\.785 of 0\.99\)"):
+        policy_iteration(stuck, np.eye(2), np.eye(1), 0.99, np.zeros((1, 4)), max_iterations=3)

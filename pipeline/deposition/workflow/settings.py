@@ -231,7 +231,7 @@ class TrainIlc(Section):
     source: Literal["simulated", "recordings"]
     seed: int = Field(ge=0, le=2**31)
     trials: int = Field(ge=1, le=1000)
-    pixel_trials: int = Field(ge=1, le=1000)
+    pixel_trials: int = Field(ge=0, le=1000)
     family_plants: int = Field(ge=1, le=100_000)
     worst_ratio: float = Field(gt=0, le=1)
     noise: TrialNoise

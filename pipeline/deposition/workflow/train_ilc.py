@@ -58,7 +58,7 @@ def trained(
     calls = [
         delayed(simulate)(out / "recordings", work, i, kind)
         for i in range(len(printer.materials))
-        for kind in ("flow", "pixels")
+        for kind in (("flow", "pixels") if settings.pixel_trials else ("flow",))
     ]
     if settings.source == "recordings":
         calls = [delayed(recordings)(recorded, out / "next", work)]

@@ -60,6 +60,8 @@ class Changes(NamedTuple):
 def changes(sources: Sources, judged: Judgement) -> Changes:
     """What changed since the accepted run, of all loops."""
     accepted = sources.accepted
+    if sources.quick:
+        return Changes("A quick look is compared with no run.")
     if isinstance(accepted, Missing):
         return Changes("The accepted run cannot be read.", accepted.sentence())
     if accepted is None:

@@ -25,14 +25,14 @@ from pipeline.report.shared.verdict import (
     FAILED,
     OPEN,
     PASSED,
-    REHEARSAL,
-    TRIAL,
     UNJUDGED,
     Missing,
     Rule,
     Verdict,
+    Words,
     deciding,
     overall,
+    words_for,
 )
 
 # what the library by its priority rule is not held against: the paper's law is not what it was learned by
@@ -49,7 +49,7 @@ def verdict(sources: Sources) -> Verdict:
         return Verdict(
             loop="deposition",
             state=OPEN,
-            decision=(TRIAL if real(sources) else REHEARSAL).open,
+            decision=words_for(recorded=real(sources), quick=sources.quick).open,
             lead="Nothing was composed.",
             reason=parts.sentence(),
             remedy="",
@@ -76,7 +76,9 @@ def verdict(sources: Sources) -> Verdict:
     return Verdict(
         loop="deposition",
         state=state,
-        decision=_decision(state, use if worst(_known(parts), use) else "", machine),
+        decision=_decision(
+            state, use if worst(_known(parts), use) else "", words_for(recorded=machine, quick=sources.quick)
+        ),
         lead=_lead(state, first, len(judged), condition=bool(unjudged)),
         reason=f"{first.reason} {summary}" if told else summary,
         remedy=first.remedy if first else "",
@@ -92,9 +94,8 @@ def _known(parts: Sequence[Structure]) -> list[Structure]:
     return [part for part in parts if not part.unknown()]
 
 
-def _decision(state: str, use: str, machine: bool) -> str:
+def _decision(state: str, use: str, words: Words) -> str:
     """The decision; which composer comes closest only where that is known of any part."""
-    words = TRIAL if machine else REHEARSAL
     if not use:
         return words.of(state)
     if state == PASSED:

@@ -48,8 +48,8 @@ def render(sources: Sources, judged: Judgement) -> str:
     return page.render(
         "index.html",
         here="index",
-        title=headline.decision(loops).rstrip("."),
-        decision=headline.decision(loops),
+        title=headline.decision(loops, quick=sources.quick).rstrip("."),
+        decision=headline.decision(loops, quick=sources.quick),
         state=headline.state(loops),
         data=data(sources),
         claim=f"{headline.claim(sources)} {drifts(judged)}",

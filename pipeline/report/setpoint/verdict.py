@@ -15,8 +15,6 @@ from pipeline.report.shared.verdict import (
     FAILED,
     OPEN,
     PASSED,
-    REHEARSAL,
-    TRIAL,
     UNDECIDED,
     Figure,
     Missing,
@@ -27,6 +25,7 @@ from pipeline.report.shared.verdict import (
     deciding,
     overall,
     state,
+    words_for,
 )
 from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, harm_bar
 
@@ -481,7 +480,7 @@ def verdict(sources: Sources) -> Verdict:
     anything is claimed."""
     scores = board(sources)
     recorded = sources.declared.everything.get("train_classifier", {}).get("source") == "recordings"
-    claim, words = (CLAIM_RECORDED, TRIAL) if recorded else (CLAIM, REHEARSAL)
+    claim, words = CLAIM_RECORDED if recorded else CLAIM, words_for(recorded=recorded, quick=sources.quick)
     if recorded and lookup(sources.metrics["train_classifier"], "data.windows_apart") is False:
         claim += NOT_APART
     if isinstance(scores, Missing) or not scores.default:

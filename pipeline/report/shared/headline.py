@@ -93,17 +93,24 @@ CLAIMS = (
     (False, ("failed",), "rehearsal failed"),
     (False, ("open",), "rehearsal open"),
 )
+# of a quick look, whatever it was made of
+QUICK_CLAIMS = tuple(
+    (recorded, (state,), f"quick look {state}")
+    for state in ("passed", "failed", "open")
+    for recorded in (True, False)
+)
 
 
-def decision(loops: Sequence[Loop]) -> str:
+def decision(loops: Sequence[Loop], *, quick: bool = False) -> str:
     """ "Rehearsal passed: temperature and deposition; failed: setpoint." """
     parts: list[str] = []
-    for recorded, states, words in CLAIMS:
+    for recorded, states, words in QUICK_CLAIMS if quick else CLAIMS:
         names = [loop.name for loop in loops if loop.recorded == recorded and loop.state in states]
         if names:
-            again = words.startswith("rehearsal") and any("rehearsal" in part for part in parts)
+            kind = next((kind for kind in ("rehearsal", "quick look") if words.startswith(kind)), "")
+            again = bool(kind) and any(kind in part for part in parts)
             listed = "all three loops" if len(names) == len(NAMES) else _listed(names, "and")
-            parts.append(f"{words.removeprefix('rehearsal ') if again else words}: {listed}")
+            parts.append(f"{words.removeprefix(f'{kind} ') if again else words}: {listed}")
     absent = [loop.name for loop in loops if loop.state == ABSENT]
     parts += [f"not measured: {_listed(absent, 'and')}"] if absent else []
     text = "; ".join(parts)

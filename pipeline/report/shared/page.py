@@ -13,7 +13,7 @@ from markupsafe import Markup, escape
 
 from pipeline.report.shared import digits
 from pipeline.report.shared.pictures import Column
-from pipeline.report.shared.sources import Source
+from pipeline.report.shared.sources import QUICK_LOOK, Source
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
@@ -93,7 +93,8 @@ def render(template: str, **values) -> str:
         for name, title in BESIDE
         if name == values["here"] or artifacts.exists(f"reports/{name}.html")
     ]
-    return printable_page(environment().get_template(template).render(beside=beside, **values))
+    quick = artifacts.read_json(QUICK_LOOK) if artifacts.exists(QUICK_LOOK) else None
+    return printable_page(environment().get_template(template).render(beside=beside, quick=quick, **values))
 
 
 def glyph(state: str) -> Markup:

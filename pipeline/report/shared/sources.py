@@ -66,7 +66,7 @@ class Sources(NamedTuple):
     """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what
     was; `absent`: what was not, by path; `accepted`: the last accepted run, or None; `files`: digest of each
     file of code; `nightly`: what the last night measured, None before the first; `relearned`: bands over
-    fresh relearnings of the study's machine, None where nobody made them.
+    fresh relearnings of the study's machine, None where nobody made them; `quick`: the run is a quick look.
     """
 
     declared: Declared
@@ -79,6 +79,7 @@ class Sources(NamedTuple):
     files: Mapping[str, str]
     nightly: dict | Missing | None = None
     relearned: dict | Missing | None = None
+    quick: bool = False
 
     @property
     def recorded(self) -> bool:
@@ -111,6 +112,8 @@ class Sources(NamedTuple):
 # what the nightly job writes after the pages: no dependency of theirs (DVC would ask for it before the first
 # night), they show the night before
 NIGHTLY = "reports/metrics/nightly.json"
+# what `beadline quick` writes before the pages: what is smaller than in a full run, which every page says
+QUICK_LOOK = "reports/quick_look.json"
 
 
 def collect(
@@ -166,8 +169,9 @@ def collect(
     files = code_files(code)
     read = linked(read)
     return Sources(
-        declared, figures, tables, read, absent, before or None, folders_of_code, files, night, relearned
-    )
+        declared, figures, tables, read, absent, before or None, folders_of_code, files, night, relearned,
+        quick=artifacts.exists(QUICK_LOOK),
+    )  # fmt: skip
 
 
 # bytes of a file, and of all files together, that are copied beside the pages

@@ -191,6 +191,13 @@ class Words(NamedTuple):
 
 REHEARSAL = Words("Rehearsal passed: {}.", "Rehearsal failed.", "Rehearsal open.")
 TRIAL = Words("Ready for a supervised trial: {}.", "Not ready.", "Not ready.")
+# few plants, short searches: no rehearsal and no trial is passed by them
+QUICK = Words("Quick look passed: {}.", "Quick look failed.", "Quick look open.")
+
+
+def words_for(*, recorded: bool, quick: bool) -> Words:
+    """The words of a run on recordings or on simulated machines; a quick look says that it is one."""
+    return QUICK if quick else TRIAL if recorded else REHEARSAL
 
 
 class Verdict(NamedTuple):

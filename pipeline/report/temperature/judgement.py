@@ -123,6 +123,7 @@ def judgement(sources: Sources, *, named: str = "") -> Judgement:
         incumbent=incumbent,
         relearned=relearned,
         named=named,
+        quick=sources.quick,
     )
     if sources.recorded:
         verdict = trust_first(verdict, trust(sources))

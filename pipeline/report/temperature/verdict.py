@@ -15,7 +15,6 @@ from pipeline.report.shared.verdict import (
     FAILED_FIRST,
     OPEN,
     PASSED,
-    REHEARSAL,
     TRIAL,
     UNDECIDED,
     UNJUDGED,
@@ -29,6 +28,7 @@ from pipeline.report.shared.verdict import (
     Words,
     deciding,
     share,
+    words_for,
 )
 from pipeline.report.temperature.answers import (
     Metrics,
@@ -245,6 +245,7 @@ def decide(
     incumbent: str = "",
     relearned: Any = None,
     named: str = "",
+    quick: bool = False,
 ) -> Verdict:
     """The verdict on the temperature loop; `undeclared` are outputs without low and high, `relearned` what
     benchmarks/results/temperature_relearned.json has of this machine. Where somebody has `named` the
@@ -252,7 +253,7 @@ def decide(
 
     `rules` of the verdict has a line for each of GROUPS with the contestant that it is about and its rival.
     """
-    words = TRIAL if recorded else REHEARSAL
+    words = words_for(recorded=recorded, quick=quick)
     held = standings(metrics, rules, undeclared=undeclared, drift=drift, relearned=relearned)
     if not held or set(held) <= set(YARDSTICKS) or (named and named not in held):
         return _nothing(metrics, rules, words, drift, named)

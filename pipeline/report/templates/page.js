@@ -258,6 +258,7 @@
     place.hidden = false;
     page.querySelectorAll("[data-alone]").forEach(text => { text.textContent = text.dataset.alone; });
   };
-  page.head.append(make("script", { src: "machine.js", onload: told }));
+  // a page without others beside it has no machine.js either
+  if (page.querySelector(".mast nav")) page.head.append(make("script", { src: "machine.js", onload: told }));
   page.documentElement.classList.add("js");
 })();

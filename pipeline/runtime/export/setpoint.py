@@ -15,6 +15,7 @@ from pipeline.setpoint.vision_transformer import VisionTransformer, named_arrays
 from pipeline.setpoint.window_flow import KNOTS_PERCENT
 from pipeline.store import artifacts
 
+CLASSIFIER_SCHEMA, FILTER_SCHEMA = "flow classifier 1", "flow filter 1"
 READERS = tuple(Path(reader.__file__) for reader in (flow_reader, flow_filter))
 
 
@@ -35,8 +36,8 @@ def write(folder: str | Path, made: Exported) -> None:
     """The four files."""
     folder = Path(folder)
     about = {"reader": "flow_reader.py"}
-    artifacts.write_weights(folder / "classifier.safetensors", "flow classifier 1", made.classifier, about)
-    artifacts.write_weights(folder / "filter.safetensors", "flow filter 1", made.filter, {})
+    artifacts.write_weights(folder / "classifier.safetensors", CLASSIFIER_SCHEMA, made.classifier, about)
+    artifacts.write_weights(folder / "filter.safetensors", FILTER_SCHEMA, made.filter, {})
     for name, text in made.readers.items():
         artifacts.write_text(folder / name, text)
 

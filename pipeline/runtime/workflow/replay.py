@@ -1,6 +1,7 @@
 """`beadline replay`: a recording, and what a certified controller would have asked on it, sample by sample,
 and why not; where the recording is off the support of what was learned, it says nothing."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,6 +47,23 @@ class Replay(NamedTuple):
     cause: np.ndarray
     abstains: bool
     told: tuple[str, ...]
+
+
+def temperatures(text: str) -> tuple[float, ...]:
+    """(150.0, 160.0) of "150,160", the words of --reference; () of "". Raises ValueError."""
+    try:
+        degC = tuple(float(part) for part in text.split(",")) if text else ()
+    except ValueError:
+        degC = (math.nan,)
+    if not all(abs(one) <= HOTTEST_DEGC for one in degC):
+        raise ValueError(
+            f"--reference: expected temperatures in °C of at most {HOTTEST_DEGC:g} such as 150,160, found "
+            f"{text!r}; write one for each output, in order"
+        )
+    return degC
+
+
+HOTTEST_DEGC = 2000.0
 
 
 # ---- support, beside the controller

@@ -22,15 +22,16 @@ from pipeline.setpoint.window_flow import window_flow
 from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
 from pipeline.setpoint.workflow.contestants import THROUGH_PIXELS, ControllerSpec
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
+from pipeline.setpoint.workflow.tables import DECISIONS
 from pipeline.statistics import Mean, Share, shared_variance, wilson
 
 
 class PixelRollouts(NamedTuple):
     """Episodes through pixels: undisturbed ones by controller, two disturbed ones of the default, and these
-    two in words."""
+    two in words; nothing of them where none was asked for."""
 
     calm: dict[str, pixels.Episodes]
-    disturbed: pixels.Episodes
+    disturbed: pixels.Episodes | None
     words: tuple[str, ...]
 
 
@@ -342,7 +343,10 @@ def pixel_rollouts(
     known: Camera | None,
 ) -> PixelRollouts:
     """The default, and our agent or the robust filter beside it, from some starts; and two
-    episodes in which something befalls the default. Windows that are not of the known camera are held."""
+    episodes in which something befalls the default. Windows that are not of the known camera are held.
+    Nothing runs where no start is asked for."""
+    if not settings.pixels.starts:
+        return PixelRollouts({}, None, ())
     names = dict.fromkeys((choice.name, *THROUGH_PIXELS))
     start, disturbances, words = _disturbed(settings)
     at, loop = some_starts(settings), _loop(model, settings, view, known)
@@ -474,6 +478,8 @@ def _disturbed(settings: EvaluateSetpoint) -> tuple[np.ndarray, pixels.Disturban
 def decisions(name: str, rollouts: PixelRollouts) -> dict[str, list]:
     """Columns of schema DECISIONS: the two disturbed episodes."""
     rows, episodes = [], rollouts.disturbed
+    if episodes is None:
+        return {column.name: [] for column in DECISIONS.columns}
     for i, words in enumerate(rollouts.words):
         for d in range(episodes.time_s.shape[1]):
             window = deployment.Window(*(field[:, d] for field in episodes.windows))

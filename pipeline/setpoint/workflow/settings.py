@@ -255,9 +255,9 @@ class Baselines(Section):
 
 
 class Pixels(Section):
-    """The closed loop through rendered frames."""
+    """The closed loop through rendered frames; none with 0 starts."""
 
-    starts: int = Field(ge=1, le=21)
+    starts: int = Field(ge=0, le=21)
     runs: int = Field(ge=1, le=1000)
     decisions: int = Field(ge=20, le=1000)
     frame_rate_hz: float = Field(gt=0, le=1000)

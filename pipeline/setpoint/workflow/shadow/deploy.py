@@ -54,10 +54,10 @@ def trained() -> Trained:
     return Trained(model, artifacts.sha256(WEIGHTS), view)
 
 
-def ready(levels_file: str) -> Ready:
+def ready(levels_file: str | None) -> Ready:
     """The default of evaluate_setpoint with the classifier of train_classifier, and the levels of this
-    camera: of `levels_file`, or where that is empty of LEVELS_FILE, if it is there. Raises ValueError, one
-    sentence, where a stage has not run."""
+    camera: of `levels_file`, or where that is empty of LEVELS_FILE, if it is there; None for those that were
+    judged. Raises ValueError, one sentence, where a stage has not run."""
     settings = params.load(EvaluateSetpoint, "evaluate_setpoint")
     model, digest, view = trained()
     name = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
@@ -66,7 +66,7 @@ def ready(levels_file: str) -> Ready:
     learn = windows["learn"]
     flow = partial(window_flow, fitted=model.calibration.flow)
     looks = Looks(flow, restore_camera(CAMERA), model.calibration.foreign_above)
-    if levels_file or artifacts.exists(LEVELS_FILE):
+    if levels_file is not None and (levels_file or artifacts.exists(LEVELS_FILE)):
         recorded = restore_levels(levels_file or LEVELS_FILE, digest)
         learn = levels.table(recorded.levels, recorded.windows, learn.flow_edges)
         looks = Looks(partial(of_camera, flow, recorded.levels), recorded.camera, recorded.foreign_above)
