@@ -23,7 +23,10 @@ from pipeline.setpoint.workflow.windows import window_tables
 from pipeline.store import artifacts, params
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("certificate", "deposition", "identification", "index", "setpoint", "temperature", "viewer")
+PAGES = (
+    *("certificate", "deposition", "difference", "identification", "index", "papers", "provenance"),
+    *("setpoint", "temperature", "viewer", "words", "workflow"),
+)
 # the first stages and the pages: what is missing between has its place there
 SHORT = ("probe_machine", "ingest", "report")
 

@@ -62,8 +62,8 @@ CONVENTIONS = {
     "data_driven_tuned": (
         "Data-driven, tuned",
         "The same; J weighs u with R = I although the controller was tuned for another R. Here 15,000 rows "
-        "and value iteration to its end: on the 15,084 rows that the script takes, stopped as it stops, every "
-        "printed digit comes out (page Papers).",
+        "and value iteration to its end: on the 15,084 rows that the script takes, stopped as it stops, "
+        "every printed digit comes out (page Papers).",
     ),
 }
 
