@@ -82,9 +82,7 @@ def head(shown: Mapping[str, Any] | Missing, lines: Sequence[exported.Line] | Mi
         )
     limits = "It holds for this plant, these units and this sample time, and nothing else."
     if shown.get("evidence") == "simulated":
-        limits += (
-            " The plant is simulated: not for a real machine. It runs only where a rehearsal is asked for."
-        )
+        limits += " The plant is simulated: a rehearsal, not for a real machine."
     return Head(state, f"{mine.word} {mine.name[:1].upper()}{mine.name[1:]}.", "", limits, "")
 
 
@@ -210,8 +208,8 @@ def judged_margins(sources: Sources) -> str:
         for key, unit in (("disk", ""), ("delay_s", "s"))
     )
     return (
-        f"These plants are drawn around the identified model. On the {plants} plants that the temperature "
-        f"page judges on, wider apart, the disk margin is {disk[0]} of the median and {disk[1]} of the worst, "
+        f"These plants are drawn around the identified model. On the {plants} plants that the "
+        f"temperature page judges on the disk margin is {disk[0]} of the median and {disk[1]} of the worst, "
         f"the delay margin {delay[0] or 'unlimited'} and {delay[1] or 'unlimited'}."
     )
 
