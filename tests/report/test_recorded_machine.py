@@ -44,8 +44,8 @@ def split_off_study(text):
     """(what stands outside of the section of the study's machine, what stands in it); the words that the page
     explains, which is of both, are left out."""
     before, rest = text.split('<section aria-labelledby="study">')
-    inside, words_and_after = rest.split('<section aria-labelledby="words">')
-    return before + words_and_after.split("</dl></section>", 1)[1], inside
+    inside, words_and_after = rest.split('<dl class="meanings" hidden>')
+    return before + words_and_after.split("</dl>", 1)[1], inside
 
 
 def test_the_study_stands_in_a_section_of_its_own_that_says_that_no_recording_touches_it(recorded):

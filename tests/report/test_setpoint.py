@@ -126,8 +126,7 @@ def test_a_share_that_straddles_its_limit_is_undecided_and_says_how_many_runs_wo
     text = page()
     # 98.0 % of 210 runs: 95.1 to 99.2; 1.96^2 x 0.98 x 0.02 / 0.01^2 = 753, rounded up to two digits
     assert (
-        "Rehearsal open. First open rule: settles, worst case. Best, by runs that settle and stay, "
-        "is the agent: in its worst case" in text
+        "Rehearsal open. First open rule: settles, worst case. Judged is the agent: in its worst case" in text
     )
     assert (
         "98.0 % of its runs settle; 97 % are asked for. Its interval, 95.1–99.2, straddles that; "
@@ -246,7 +245,7 @@ def test_a_default_that_spoils_good_prints_fails_by_the_case_most_beyond_its_bar
     rules, text = harm_rules(project)
     assert rules == [("failed", "1.9\u202f%"), ("passed", "0.0\u202f%")]
     assert (
-        "First failed rule: does no harm. Best, by runs that settle and stay, is the agent: from good "
+        "First failed rule: does no harm. Judged is the agent: from good "
         "starts, perfect, 1.9 % of its runs leave ±25 %; at most 1 % may. With doing nothing 0.0 % do."
     ) in text
 

@@ -29,12 +29,11 @@ class Moved(NamedTuple):
 
 
 class LoopChange(NamedTuple):
-    """One loop: the figures that moved, of how many that both runs have, and how many only this one has."""
+    """One loop: the figures that moved, of how many that both runs have"""
 
     loop: str
     moved: Sequence[Moved]
     of: int
-    new: int = 0
 
     def sentence(self) -> str:
         """ "2 of 18 figures moved: settled error +0.39 °C · worse; ..."."""
@@ -72,7 +71,7 @@ def changes(sources: Sources, judged: Judgement) -> Changes:
     if sources.another_machine:
         return Changes(ANOTHER, "Deposition and setpoint are compared.", loops=loops)
     if not moved:
-        nothing = judged.changed is not None and judged.changed.empty and not any(one.new for one in loops)
+        nothing = judged.changed is not None and judged.changed.empty
         strong = "Nothing changed; no figure moved." if nothing else "No figure moved beyond its noise."
         return Changes(strong, "" if nothing else beside, loops=loops)
     figures = f"{moved} of {compared} figures moved"
@@ -95,8 +94,8 @@ def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
     streams = deposition_moves(sources)
     cases = setpoint_change.changes(sources)
     return [
-        LoopChange("temperature", temperature, *_counted([move for _, move in mine])),
-        LoopChange("deposition", [_moved(move) for move in streams if move.moved], *_counted(streams)),
+        LoopChange("temperature", temperature, _both([move for _, move in mine])),
+        LoopChange("deposition", [_moved(move) for move in streams if move.moved], _both(streams)),
         LoopChange(
             "setpoint",
             [Moved(name, change.text, change.worse) for name, change in cases if change.moved],
@@ -105,10 +104,9 @@ def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
     ]
 
 
-def _counted(moves: Sequence[Move]) -> tuple[int, int]:
-    """How many figures both runs have, and how many only this one has."""
-    both = sum(move.before is not None and not isinstance(move.now, Missing) for move in moves)
-    return both, sum(move.word == "new" for move in moves)
+def _both(moves: Sequence[Move]) -> int:
+    """How many figures both runs have."""
+    return sum(move.before is not None and not isinstance(move.now, Missing) for move in moves)
 
 
 def _moved(move: Move, whose: str = "") -> Moved:

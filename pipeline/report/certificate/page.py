@@ -10,7 +10,7 @@ from pipeline.report.certificate import exported
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.digits import number, with_unit
 from pipeline.report.shared.pictures import Column, Picture, placeholder
-from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 from pipeline.report.temperature.contestants import BY_NAME, heading
 
@@ -58,6 +58,7 @@ def render(sources: Sources, verdict: Verdict) -> str:
         about=about(shown) if whole else [],
         poles=poles(sources, shown),
         margins=margins(shown) if whole else [],
+        judged_margins=judged_margins(sources),
         bands=band_rows(shown) if whole else [],
         lines=[] if isinstance(lines, Missing) else lines,
         origin_of=page.origin(sources.source("certificate", "export_controllers")),
@@ -80,6 +81,8 @@ def head(shown: Mapping[str, Any] | Missing, lines: Sequence[exported.Line] | Mi
             state, mine.word, f"First failed rule: {rule}.", mine.why, "Nothing of this loop is exported."
         )
     limits = "It holds for this plant, these units and this sample time, and nothing else."
+    if shown.get("evidence") == "simulated":
+        limits += " The plant is simulated: a rehearsal, not for a real machine."
     return Head(state, f"{mine.word} {mine.name[:1].upper()}{mine.name[1:]}.", "", limits, "")
 
 
@@ -190,6 +193,25 @@ def margins(shown: Mapping[str, Any]) -> list[tuple[str, ...]]:
     if worst:
         rows.append(("Settled error", *(_figure(v, "°C") for v in worst["settled_error_degC"])))
     return rows
+
+
+def judged_margins(sources: Sources) -> str:
+    """The same margins on the plants that page one judges on, which the record did not choose."""
+    metrics = sources.metrics.get(exported.STAGE)
+    name = lookup(metrics, "temperature.contestant") if isinstance(metrics, Mapping) else ""
+    found = lookup(sources.metrics["evaluate_temperature"], f"contestants.{name}.margins")
+    plants = lookup(sources.metrics["evaluate_temperature"], "plants")
+    if isinstance(found, Missing) or isinstance(plants, Missing):
+        return ""
+    disk, delay = (
+        [None if found[key][k] is None else _figure(found[key][k], unit) for k in ("median", "worst")]
+        for key, unit in (("disk", ""), ("delay_s", "s"))
+    )
+    return (
+        f"These plants are drawn around the identified model. On the {plants} plants that the "
+        f"temperature page judges on the disk margin is {disk[0]} of the median and {disk[1]} of the worst, "
+        f"the delay margin {delay[0] or 'unlimited'} and {delay[1] or 'unlimited'}."
+    )
 
 
 def band_rows(shown: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:

@@ -547,7 +547,7 @@ def _closest(name: str, rule: Rule) -> str:
     return (
         f"{rule.reason} By runs that settle and stay {name} comes closest."
         if of_classifier(rule)
-        else f"Best, by runs that settle and stay, is {name}: {rule.reason[:1].lower()}{rule.reason[1:]}"
+        else f"Judged is {name}: {rule.reason[:1].lower()}{rule.reason[1:]}"
     )
 
 
