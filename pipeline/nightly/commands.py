@@ -34,8 +34,7 @@ def rollback(arguments: argparse.Namespace) -> None:
 
 
 def sweep(arguments: argparse.Namespace) -> None:
-    """Experiments over a grid of parameters and seeds, with a table and a picture: sweep -S
-    tune_weights.seed=1,2,3 --target tune_weights --metric tune_weights:contestants.subspace_lqg.cost"""
+    """Experiments over a grid of parameters and seeds, with a table and a picture."""
     from pipeline.nightly import sweeping
 
     print(sweeping.sweep(arguments.set, arguments.target, arguments.metric))
