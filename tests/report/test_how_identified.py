@@ -205,7 +205,8 @@ def test_the_page_of_the_loop_says_whether_the_printers_own_pid_was_judged(proje
     main()
     text = Page(TEMPERATURE).text
     assert "The printer’s own PID is among these contestants, as it is." in text
-    assert "The printer’s own PID. Klipper’s PID with the gains of the printer’s configuration" in text
+    words = Page(Path("reports/words.html")).text
+    assert "The printer’s own PID. Klipper’s PID with the gains of the printer’s configuration" in words
 
 
 def test_a_machine_without_a_printers_log_shows_nothing_of_its_pid(project):

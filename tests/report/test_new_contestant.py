@@ -14,7 +14,7 @@ from tests.report.test_pages import TEMPERATURE, Page
 
 def columns(text: str, section: str) -> list[str]:
     """Marks of a picture's columns, in their order."""
-    part = re.split(rf'<div class="cols c\d {section}">', text)[1].split("</section>")[0]
+    part = re.split(rf'<div class="cols \w+ {section}"[^>]*>', text)[1].split("</section>")[0]
     return re.findall(r'<h4><span class="mk ([a-z ]+)"', part)
 
 

@@ -308,7 +308,8 @@ def test_first_run_equal_runs_and_a_moved_figure(project):
     artifacts.write_json("reports/accepted.json", accepted)
     main()
     page = Page(INDEX).text
-    assert "Nothing changed; no figure moved." in page
+    # deposition has no figures here
+    assert "No figure moved beyond its noise. Nothing else changed." in page
     assert "accepted run of 2026-11-20" in page and "first run" not in page
     assert "accepted on 2026-11-20 at commit 0a1b2c3d" in Page(DIFFERENCE).text
     assert "Since 2026-11-20" in Page(TEMPERATURE).text

@@ -71,7 +71,7 @@ def changes(sources: Sources, judged: Judgement) -> Changes:
     if sources.another_machine:
         return Changes(ANOTHER, "Deposition and setpoint are compared.", loops=loops)
     if not moved:
-        nothing = judged.changed is not None and judged.changed.empty
+        nothing = judged.changed is not None and judged.changed.empty and all(loop.of for loop in loops)
         strong = "Nothing changed; no figure moved." if nothing else "No figure moved beyond its noise."
         return Changes(strong, "" if nothing else beside, loops=loops)
     figures = f"{moved} of {compared} figures moved"

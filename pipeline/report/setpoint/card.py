@@ -1,7 +1,7 @@
 """The setpoint loop on page one: the default, the agent, and doing nothing; and the cases of the rule that
 decides."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from markupsafe import Markup
@@ -57,19 +57,10 @@ def card(sources: Sources, verdict: Verdict) -> Card:
             Row("Harm", f"≤ {ends}{THIN}%", _harm_cells(harms)),
         ],
         basis=f"Worst case of each; small: 95{THIN}% interval{', by segment' if clustered else ''}. Harm: "
-        f"good prints that leave ±{BEYOND[-1]}{THIN}%{_of_starts(limits)}.",
+        f"good prints that leave ±{BEYOND[-1]}{THIN}%.",
         beside=_beside(scores, names),
         sources=sources.source("scoreboard"),
     )
-
-
-def _of_starts(limits: Mapping[Case, float]) -> str:
-    """ "; at most 1 % from a perfect start, 2 % from one in the band" with the limits as declared."""
-    starts = {"perfect": "from a perfect start", "in band": "from one in the band"}
-    told = {starts[c[1].split(",")[0]]: limit for c, limit in limits.items() if c[1].split(",")[0] in starts}
-    if not told:
-        return ""
-    return f"; at most {', '.join(f'{limit:g}{THIN}% {start}' for start, limit in told.items())}"
 
 
 def shown(sources: Sources, scores: Board) -> list[str]:
