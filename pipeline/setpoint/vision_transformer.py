@@ -55,6 +55,19 @@ class Dense(eqx.Module):
         return x @ self.W + self.b
 
 
+@jax.custom_jvp
+def inverse_root(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """1 / sqrt(x), both rounded as IEEE 754 says. XLA would make an rsqrt of them, which begins with an
+    instruction that CPUs of two makers answer differently: the barrier keeps them apart."""
+    return 1.0 / jax.lax.optimization_barrier(jnp.sqrt(x))
+
+
+@inverse_root.defjvp
+def _inverse_root_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    y = inverse_root(*primals)
+    return y, -0.5 * y * y * y * tangents[0]
+
+
 class Norm(eqx.Module):
     """Layer normalisation over the last axis (Ba, Kiros and Hinton 2016)."""
 
@@ -67,7 +80,7 @@ class Norm(eqx.Module):
     def __call__(self, x: Float[Array, "*n width"]) -> Float[Array, "*n width"]:
         centred = x - x.mean(-1, keepdims=True)
         return (
-            centred * jax.lax.rsqrt(jnp.mean(centred**2, -1, keepdims=True) + 1e-5) * self.scale + self.shift
+            centred * inverse_root(jnp.mean(centred**2, -1, keepdims=True) + 1e-5) * self.scale + self.shift
         )
 
 

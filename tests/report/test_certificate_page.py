@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from pipeline.report.certificate import exported
+from pipeline.report.certificate.page import judged_margins
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, ReportRules, Verdict
 from pipeline.report.temperature import judgement
 from pipeline.report.temperature.judgement import trust_first
@@ -53,6 +54,25 @@ def test_a_certificate_of_recordings_says_no_more_than_page_one(project):
     main()
     assert "May run" not in Page(PAGE).text + Page(INDEX).text
     assert "Certificate passed, not ready." in Page(PAGE).text
+    assert "rehearsal, not for a real machine" not in Page(PAGE).text
+
+
+def test_margins_of_the_plants_that_page_one_judges_on_stand_beside_the_certificate_s():
+    def told(margins: object) -> str:
+        judged = {"plants": 60, "contestants": {"pi": {"margins": margins}}}
+        exports = {"temperature": {"contestant": "pi"}}
+        return judged_margins(
+            SimpleNamespace(metrics={"export_controllers": exports, "evaluate_temperature": judged})
+        )
+
+    found = {"disk": {"median": 0.541, "worst": 0.272}, "delay_s": {"median": 1.06, "worst": None}}
+    assert told(found).endswith(
+        "On the 60 plants that the temperature page judges on, the disk margin is 0.541 of the median plant "
+        "and 0.272 of the worst, the delay margin 1.06 s and unlimited."
+    )
+    # nothing is claimed of what was not judged
+    assert (told(None), told({"disk": found["disk"]})) == ("", "")
+    assert judged_margins(SimpleNamespace(metrics={})) == ""
 
 
 def test_a_model_that_nobody_may_trust_exports_nothing(monkeypatch):

@@ -32,6 +32,7 @@ from pipeline.setpoint.vision_transformer import (
     Size,
     convolutional,
     from_named_arrays,
+    inverse_root,
     named_arrays,
     parameters,
     vision_transformer,
@@ -431,3 +432,27 @@ def test_without_averaging_the_weights_themselves_are_judged():
     state = train(untrained(drawn(TINY), epochs=1), *parts(), SETTINGS._replace(averaging=0.0), **DRAW)
     assert same(state.average, state.network)
     assert not same(trained()[0].average, trained()[0].network)
+
+
+def test_an_inverse_root_is_rounded_as_every_cpu_rounds_it():
+    x = np.geomspace(1e-30, 1e30, 10_001).astype(np.float32)
+    np.testing.assert_array_equal(jax.jit(inverse_root)(x), np.float32(1) / np.sqrt(x))
+    np.testing.assert_allclose(jax.jit(jax.grad(inverse_root))(4.0), -0.0625, rtol=1e-7)
+
+
+@pytest.mark.parametrize("network", [drawn(SMALL), convolutional(np.random.default_rng(0))])
+def test_no_program_of_a_classifier_asks_a_cpu_for_its_own_guess_of_a_root(network):
+    """Intel's and AMD's instruction of that kind answer with other digits, and the weights with them."""
+    data = stripes(12, 4, seed=0)
+    rows = [jnp.asarray(a) for a in data[:4]]
+    state = untrained(network, epochs=1)
+    carry, rates = (state.network, state.average, state.opt_state), Rates(1e-3, 1, 2, 0.1, 0.1, 0.9)
+    chosen = KEY, jnp.arange(8)
+    programs = [
+        classifier._predict.lower(network, *rows[:2]),
+        classifier._outputs.lower(network, *rows[:2]),
+        classifier._step.lower(adr, carry, chosen, rows, rates),
+    ]
+    for program in programs:
+        text = program.compile().as_text()
+        assert "rsqrt" not in text and "rcp" not in text

@@ -196,21 +196,23 @@ def margins(shown: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def judged_margins(sources: Sources) -> str:
-    """The same margins on the plants that page one judges on, which the record did not choose."""
-    metrics = sources.metrics.get(exported.STAGE)
-    name = lookup(metrics, "temperature.contestant") if isinstance(metrics, Mapping) else ""
-    found = lookup(sources.metrics["evaluate_temperature"], f"contestants.{name}.margins")
-    plants = lookup(sources.metrics["evaluate_temperature"], "plants")
-    if isinstance(found, Missing) or isinstance(plants, Missing):
+    """The same margins on the plants that page one judges on, which the record did not choose; "" where they
+    were not judged."""
+    name = lookup(sources.metrics.get(exported.STAGE), "temperature.contestant")
+    judged = sources.metrics.get("evaluate_temperature")
+    plants = lookup(judged, "plants")
+    ends = [lookup(judged, f"contestants.{name}.margins.{key}") for key in ("disk", "delay_s")]
+    if any(isinstance(one, Missing) for one in (name, plants, *ends)):
         return ""
+    # null is a margin without end
     disk, delay = (
-        [None if found[key][k] is None else _figure(found[key][k], unit) for k in ("median", "worst")]
-        for key, unit in (("disk", ""), ("delay_s", "s"))
+        ["unlimited" if one.get(of) is None else _figure(one[of], unit) for of in ("median", "worst")]
+        for one, unit in zip(ends, ("", "s"), strict=True)
     )
     return (
-        f"These plants are drawn around the identified model. On the {plants} plants that the "
-        f"temperature page judges on the disk margin is {disk[0]} of the median and {disk[1]} of the worst, "
-        f"the delay margin {delay[0] or 'unlimited'} and {delay[1] or 'unlimited'}."
+        f"These plants are drawn around the identified model. On the {plants} plants that the temperature "
+        f"page judges on, the disk margin is {disk[0]} of the median plant and {disk[1]} of the worst, "
+        f"the delay margin {delay[0]} and {delay[1]}."
     )
 
 

@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from pipeline.report.shared.digits import MINUS, beyond_meaning, short
 from pipeline.report.shared.verdict import Figure, Question, ReportRules
 from pipeline.report.temperature.verdict import questions
 from pipeline.setpoint.workflow.tables import harm_bar
@@ -52,6 +53,30 @@ class Measured(NamedTuple):
     missing: Mapping[str, str]
     controllers: Mapping[str, str]
     verdicts: Mapping[str, str]
+
+
+class Cell(NamedTuple):
+    """A figure in words, the number that its column sorts by, and whether it lies beyond today's limit."""
+
+    text: str
+    number: float | str = ""
+    bad: bool = False
+
+
+def cell(figure: Figure | None, question: Question) -> Cell:
+    """What a table of runs shows of a figure."""
+    if figure is None:
+        return Cell("not measured")
+    beyond = figure.value < question.limit if question.at_least else figure.value > question.limit
+    if not math.isfinite(figure.value):
+        return Cell(question.beyond, "", beyond)
+    text = beyond_meaning(figure.value, question.unit) or short(figure.value, 3).replace("-", MINUS)
+    return Cell(text, rounded(figure.value), beyond and math.isfinite(question.limit))
+
+
+def rounded(value: float) -> float:
+    """Six digits: more would differ between runs without a meaning."""
+    return float(f"{value:.6g}")
 
 
 def parts_questions(rules: ReportRules) -> list[Question]:

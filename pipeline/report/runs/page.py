@@ -16,10 +16,10 @@ from markupsafe import Markup
 
 from pipeline.report.runs import curves, sweep
 from pipeline.report.runs.collected import KINDS, Collected, Run, folders, lock_now, varied
-from pipeline.report.runs.figures import LOOPS, Column
+from pipeline.report.runs.figures import LOOPS, Cell, Column, cell, rounded
 from pipeline.report.runs.sweep import Sweep
 from pipeline.report.shared import page
-from pipeline.report.shared.digits import MINUS, beyond_meaning, count, short, shortened
+from pipeline.report.shared.digits import count, shortened
 from pipeline.report.temperature.contestants import heading
 from pipeline.report.viewer.packed import script_safe
 from pipeline.report.viewer.page import LIBRARY, VENDOR, library
@@ -34,14 +34,6 @@ WORDS = {
     "revision": "committed",
     "files": "not committed",
 }
-
-
-class Cell(NamedTuple):
-    """A figure in words, the number that its column sorts by, and whether it is beyond today's limit."""
-
-    text: str
-    number: float | str = ""
-    bad: bool = False
 
 
 class Row(NamedTuple):
@@ -141,25 +133,10 @@ def _row(run: Run, asked: Sequence[Column], keys: Sequence[str]) -> Row:
         WORDS[run.kind],
         [run.measured.verdicts.get(loop, "none kept") for loop in LOOPS],
         " · ".join(who) or "none kept",
-        [_cell(run, column) for column in asked],
+        [cell(run.measured.figures.get(column.key), column.question) for column in asked],
         [run.parameters.get(key, unset) for key in keys],
         "; ".join(reasons),
     )
-
-
-def _cell(run: Run, column: Column) -> Cell:
-    figure, question = run.measured.figures.get(column.key), column.question
-    if figure is None:
-        return Cell("not measured")
-    beyond = figure.value < question.limit if question.at_least else figure.value > question.limit
-    if not math.isfinite(figure.value):
-        return Cell(question.beyond, "", beyond)
-    text = beyond_meaning(figure.value, question.unit) or short(figure.value, 3).replace("-", MINUS)
-    return Cell(text, _rounded(figure.value), beyond and math.isfinite(question.limit))
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.6g}")
 
 
 # ---- what the script reads
@@ -224,7 +201,7 @@ def data(runs: Sequence[Run], asked: Sequence[Column], packed: curves.Packed) ->
 
 def _triple(figure) -> list[float | str]:
     """[value, low, high], one number where all are equal; JSON knows no infinity."""
-    ends = [_rounded(v) if math.isfinite(v) else "inf" if v > 0 else "-inf" for v in figure[:3]]
+    ends = [rounded(v) if math.isfinite(v) else "inf" if v > 0 else "-inf" for v in figure[:3]]
     return ends[:1] if ends[0] == ends[1] == ends[2] else ends
 
 

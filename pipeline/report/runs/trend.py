@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.runs.figures import parts_questions, setpoint_questions
+from pipeline.report.runs.figures import Cell, cell, parts_questions, setpoint_questions
 from pipeline.report.runs.history import Revision
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import beyond_meaning, count, decimals, quantity, short
+from pipeline.report.shared.digits import count, decimals, quantity
 from pipeline.report.shared.verdict import Figure, Question, ReportRules
 from pipeline.report.temperature.verdict import questions
 
@@ -170,14 +170,6 @@ def _scale(values: np.ndarray) -> charts.Axis:
     return charts.linear(min(float(values.min()), 0.0), 1.1 * float(values.max()))
 
 
-class Cell(NamedTuple):
-    """A figure in words, the number that its column sorts by, and whether it lies beyond today's limit."""
-
-    text: str
-    number: float | str = ""
-    bad: bool = False
-
-
 class Row(NamedTuple):
     """A run in the table."""
 
@@ -195,13 +187,7 @@ def _row(run: Revision, asked: Sequence[Question]) -> Row:
         # margins of earlier runs have today's keys, but are medians on the nominal plant
         names = ("window",) if question in OLD else (run.winner, "subspace_lqg", "deposition", "setpoint")
         figure = next(filter(None, (_figure(run, name, question.key) for name in names)), None)
-        if figure is None:
-            cells.append(Cell("not measured"))
-            continue
-        finite = math.isfinite(figure.value)
-        beyond = figure.value < question.limit if question.at_least else figure.value > question.limit
-        text = beyond_meaning(figure.value, question.unit) or short(figure.value, 3)
-        cells.append(Cell(text if finite else question.beyond, figure.value if finite else "", beyond))
+        cells.append(cell(figure, question))
     return Row(run.commit[:8], run.date[:10], run.date, run.subject, verdict_words(run.verdict), cells)
 
 
