@@ -3,6 +3,7 @@ hostile names, time and size; and in a browser what is chosen, compared and draw
 
 import hashlib
 import json
+import math
 import re
 import shutil
 import sys
@@ -15,7 +16,7 @@ import pytest
 
 from pipeline import cli
 from pipeline.report.runs import collected, curves, figures
-from pipeline.report.shared.verdict import ReportRules
+from pipeline.report.shared.verdict import Figure, Question, ReportRules
 from pipeline.store import artifacts, params
 from pipeline.store.printable import printable
 from tests.report import made
@@ -563,3 +564,18 @@ def test_a_scatter_has_a_point_a_run_at_its_values_and_makes_it_run_b(show):
     place = "e => [e.getBoundingClientRect().x, -e.getBoundingClientRect().y]"
     ninety, most = (cloud.locator(".p").nth(k).evaluate(place) for k in (2, 3))
     assert ninety[0] < most[0] and ninety[1] < most[1]
+
+
+def test_a_cell_is_marked_on_the_side_of_its_limit_on_which_it_fails():
+    def cell(value: float, limit: float, *, at_least: bool) -> figures.Cell:
+        question = Question(0, "disk", "Disk margin", "", limit, at_least, "", beyond="unlimited")
+        return figures.cell(Figure(value, value, value), question)
+
+    assert [cell(v, 0.4, at_least=True).bad for v in (0.39, 0.4, 0.41)] == [True, False, False]
+    assert [cell(v, 0.4, at_least=False).bad for v in (0.39, 0.4, 0.41)] == [False, False, True]
+    assert cell(-0.123456789, 1.0, at_least=False) == figures.Cell("\N{MINUS SIGN}0.123", -0.123457)
+    # a figure without end sorts last and says so; a column without a limit marks nothing
+    assert cell(math.inf, 0.4, at_least=True) == figures.Cell("unlimited")
+    assert cell(math.inf, 0.4, at_least=False) == figures.Cell("unlimited", "", True)
+    assert not cell(1e9, math.inf, at_least=False).bad
+    assert figures.cell(None, Question(0, "k", "t", "", 1.0, False, "")) == figures.Cell("not measured")
