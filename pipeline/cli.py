@@ -330,7 +330,7 @@ def training_print(arguments: argparse.Namespace) -> None:
 
 def export(arguments: argparse.Namespace) -> None:
     """A certified controller as C99 without heap, as one file of Python, or as settings for Klipper and
-    Kalico."""
+    Kalico; what sees and decides in the setpoint loop as weights with readers that need numpy alone."""
     from pipeline.runtime.workflow.exports import export as write
 
     print(write(arguments.controller, arguments.to, arguments.out, arguments.section, arguments.power))
@@ -340,7 +340,9 @@ def replay(arguments: argparse.Namespace) -> None:
     """A recording, and what a certified controller would have asked on it and why not: as MCAP with a layout
     for Foxglove, and a page. Frames of the nozzle's camera go through the loop of shadow with the classifier
     and the filter of CONTROLLER. Nothing is sent."""
-    if _shows_frames(arguments.controller):
+    from pipeline.runtime.workflow import exports
+
+    if exports.shows_frames(arguments.controller):
         from pipeline.runtime.workflow import replay_camera
 
         arguments.source, arguments.rate, arguments.once = str(arguments.recording), 5.0, True
@@ -358,11 +360,6 @@ def replay(arguments: argparse.Namespace) -> None:
     artifacts.write_text(arguments.out / "index.html", page.render(shown))
     print(f"{arguments.recording}: {told['samples']} samples. {page.decision(told)}")
     print(f"written: {arguments.out}/index.html, replay.mcap, layout.json, replay.json")
-
-
-def _shows_frames(folder: Path) -> bool:
-    """Whether a controller's folder is that of the setpoint loop, whose recordings are frames."""
-    return (folder / "classifier.safetensors").exists() and not (folder / "controller.json").exists()
 
 
 def version() -> str:
@@ -475,7 +472,7 @@ def _add_runs(commands: argparse._SubParsersAction) -> None:
 
 def _add_export(commands: argparse._SubParsersAction) -> None:
     command = commands.add_parser("export", help=export.__doc__, description=export.__doc__)
-    command.add_argument("controller", type=Path, metavar="CONTROLLER", help="a folder with controller.json")
+    command.add_argument("controller", type=Path, metavar="CONTROLLER", help="a folder of export_controllers")
     command.add_argument("--to", required=True, choices=("c", "python", "klipper"))
     command.add_argument("--out", type=Path, metavar="DIR", help="(CONTROLLER/c, .../python, .../klipper)")
     command.add_argument(

@@ -84,8 +84,8 @@ def main() -> None:
         baselines = params.load(EvaluateSetpoint, "evaluate_setpoint").baselines
         specs = contestants.controllers(contestants.Problem(baselines, agents, windows["learn"]))
         default = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
-        tables_of = export_setpoint.filter_of(default, specs, agents.belief.filter)
-        setpoint = export_setpoint.write(out / "setpoint", default, model, tables_of, settings.seed)
+        decides = export_setpoint.decider(default, specs, agents)
+        setpoint = export_setpoint.write(out / "setpoint", default, model, decides, settings.seed)
         deposition = export.deposition(
             ("datasets/compose_parts/signals.parquet", "datasets/compose_parts/lines.parquet")
         )

@@ -6,6 +6,8 @@ import json
 import sys
 
 import cv2
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -13,11 +15,12 @@ from mcap.reader import make_reader
 from pipeline import cli
 from pipeline.runtime.export import setpoint
 from pipeline.runtime.workflow import replay_camera
-from pipeline.setpoint import nozzle_scene
+from pipeline.setpoint import bayes, belief_agent, nozzle_scene
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
 from pipeline.setpoint.calibration import Calibration, Familiar
 from pipeline.setpoint.vision_transformer import SMALL, vision_transformer
 from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
+from pipeline.setpoint.workflow.agent_files import Agents
 from pipeline.setpoint.workflow.frame_mcap import Topics
 from pipeline.setpoint.workflow.shadow import deploy
 from pipeline.store import artifacts
@@ -46,7 +49,7 @@ def folder(tmp_path, monkeypatch):
 
     monkeypatch.setattr(deploy, "ready", ready)
     monkeypatch.setattr(deploy, "trained", trained)
-    setpoint.write(tmp_path / "setpoint", setpoint.exported(trained().model, judged.parameters))
+    setpoint.write(tmp_path / "setpoint", setpoint.weights(trained().model, judged.parameters))
     return tmp_path / "setpoint"
 
 
@@ -93,4 +96,19 @@ def test_numbers_that_were_not_judged_are_refused_by_name(folder, file, array):
         replay_camera.ready(folder)
     artifacts.write_weights(folder / file, schema, {k: v for k, v in arrays.items() if k != array}, about)
     with pytest.raises(ValueError, match=f"found others in {array}"):
+        replay_camera.ready(folder)
+
+
+def test_our_agent_is_replayed_with_the_network_that_was_judged(folder, monkeypatch):
+    belief = belief_agent.Belief(deployed().parameters, jnp.zeros((5, len(bayes.GRID))), 0.8)
+    ours, other = (belief_agent.BeliefNetwork(1, jax.random.key(seed)) for seed in (0, 1))
+    judged = deploy.Ready(deployed(name="our agent", parameters=ours), None, None)  # ty: ignore[invalid-argument-type]
+    monkeypatch.setattr(deploy, "ready", lambda levels: judged)
+    monkeypatch.setattr(replay_camera, "restore_agents", lambda path: Agents((), belief, ours))
+    with pytest.raises(ValueError, match="agent.safetensors is missing"):
+        replay_camera.ready(folder)
+    setpoint.write(folder, setpoint.weights(trained().model, setpoint.BeliefAgent(belief, ours)))
+    assert replay_camera.ready(folder) == judged
+    setpoint.write(folder, setpoint.weights(trained().model, setpoint.BeliefAgent(belief, other)))
+    with pytest.raises(ValueError, match="agent.safetensors: expected the numbers .* found others in flow.h"):
         replay_camera.ready(folder)

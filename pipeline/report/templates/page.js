@@ -247,6 +247,7 @@
     if (first) first.textContent = `beadline ${now.version}, ${commit}, ${now.cpu}, pins ${now.pins}, ${day}.`;
     else page.querySelector("main").after(make("footer", { className: "wrap made" }, `Last run on ${now.cpu}, pins ${now.pins}, beadline ${now.version}, ${commit}, ${day}`));
     page.querySelectorAll("[data-made]").forEach(cell => { cell.textContent = day; });
+    page.querySelectorAll("[data-run-column]").forEach(cell => { cell.hidden = false; });
     /* the page carries the accepted run's machine only where inputs, parameters and code are the same */
     const place = page.querySelector("[data-machine]"), then = place && JSON.parse(place.dataset.machine);
     if (!then || then.locked !== now.locked) return;

@@ -49,15 +49,15 @@ def update(f, state, shares, named, flow_seen, flow_move):
     return {"belief": after / after.sum(), "last_code": shown}
 
 
-def move(f, state):
-    """The move of the flow setpoint in percent with the least expected loss."""
+def move(f, state, flow_move):
+    """The move of the flow setpoint in percent with the least expected loss. A correction costs its fixed
+    cost where it begins: what goes on in the direction of flow_move, the last one, has paid it."""
     correction, begins = f["corrections"][:, None, None], f["begins"]
     miss = np.abs(f["grid"] + f["gains"][:, None] * correction - 100.0)
     spread = max(float(f["border_std"]), 1e-4)
     outside = np.vectorize(lambda z: 0.5 * math.erfc(-z / math.sqrt(2)))((miss - 10.0 - 1e-3) / spread)
     loss = ((miss + f["outside_cost"] * outside) * state["belief"]).sum(axis=(1, 2))
     moves = f["flow_moves"]
+    new = (moves != 0) & (moves * flow_move <= 0)
     best = np.array([loss[begins == i].min() for i in range(len(moves))])
-    return float(
-        moves[np.argmin(best + f["move_cost"] * np.abs(moves) + f["move_fixed_cost"] * (moves != 0))]
-    )
+    return float(moves[np.argmin(best + f["move_cost"] * np.abs(moves) + f["move_fixed_cost"] * new)])

@@ -27,11 +27,8 @@ def dense(w, name, x):
 
 
 def norm(w, name, x):
-    centred = x - x.mean(-1, keepdims=True)
-    return (
-        centred / np.sqrt(np.mean(centred**2, -1, keepdims=True) + 1e-5) * w[f"{name}.scale"]
-        + w[f"{name}.shift"]
-    )
+    z = x - x.mean(-1, keepdims=True)
+    return z / np.sqrt(np.mean(z**2, -1, keepdims=True) + 1e-5) * w[f"{name}.scale"] + w[f"{name}.shift"]
 
 
 def block(w, name, x, wanted, heads):
@@ -53,10 +50,8 @@ def image_features(w, x):
     x = x - x.mean(axis=(1, 2), keepdims=True)
     x = x / (np.sqrt(np.mean(x**2, axis=(1, 2), keepdims=True)) + 1)
     (rows, columns), heads, n = w["patch"], int(w["heads"]), len(x)
-    tiles = (
-        x.reshape(n, 16 // rows, rows, 48 // columns, columns).swapaxes(2, 3).reshape(n, -1, rows * columns)
-    )
-    tokens = dense(w, "body.patches", tiles.astype(np.float32))
+    tiles = x.reshape(n, 16 // rows, rows, 48 // columns, columns).swapaxes(2, 3)
+    tokens = dense(w, "body.patches", tiles.reshape(n, -1, rows * columns).astype(np.float32))
     first = np.broadcast_to(w["body.class_token"], (n, 1, tokens.shape[-1]))
     tokens = np.concatenate([first, tokens], axis=1) + w["body.positions"]
     layers = int(w["layers"])
@@ -68,10 +63,8 @@ def image_features(w, x):
 def outputs(w, key_area, temperature_degC):
     """Logits (n, 3), log(flow / 100 %) (n,) and its deviation (n,) of key areas (n, 16, 48) in gray levels at
     nozzle temperatures (n,): the mean over each area's four mirror images."""
-    x = np.asarray(key_area, np.float32)
-    u = np.maximum(
-        dense(w, "head.temperature", (np.asarray(temperature_degC, np.float32)[:, None] - 210) / 20), 0
-    )
+    x, t = np.asarray(key_area, np.float32), np.asarray(temperature_degC, np.float32)[:, None]
+    u = np.maximum(dense(w, "head.temperature", (t - 210) / 20), 0)
     mirrored = (x, x[:, ::-1], x[:, :, ::-1], x[:, ::-1, ::-1])
     seen = sum(np.maximum(dense(w, "head.image", image_features(w, one)), 0) for one in mirrored) / 4
     features = np.concatenate([seen, u], axis=1)
@@ -85,8 +78,7 @@ def window(w, log_flow, deviation):
     weight = np.asarray(deviation, float) ** -2.0
     shown, m = (weight * log_flow).sum() / weight.sum(), len(weight)
     seen = np.interp(shown, w["flow_shown"], w["flow_knots"])
-    spread = np.sqrt((1 + (m - 1) * w["flow_correlation"]) / weight.sum()) * np.interp(
-        seen, w["flow_knots"], w["flow_scale"]
-    )
+    scale = np.interp(seen, w["flow_knots"], w["flow_scale"])
+    spread = scale * np.sqrt((1 + (m - 1) * w["flow_correlation"]) / weight.sum())
     below, above = (0.5 * math.erfc((b - seen) / spread / -math.sqrt(2)) for b in np.log([0.9, 1.1]))
     return 100 * np.exp(seen), spread, np.array([below, above - below, 1 - above])

@@ -1,45 +1,68 @@
-"""The setpoint loop's eyes and its filter for a machine without jax: classifier.safetensors with
-flow_reader.py, filter.safetensors with flow_filter.py. Both readers need numpy only."""
+"""The setpoint loop's eyes and what decides there for a machine without jax: classifier.safetensors with
+flow_reader.py, filter.safetensors with flow_filter.py, and of our agent agent.safetensors with
+agent_reader.py. The readers need numpy only."""
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.runtime.export import flow_filter, flow_reader
-from pipeline.setpoint import bayes
+from pipeline.runtime.export import agent_reader, flow_filter, flow_reader
+from pipeline.setpoint import agent, bayes, belief_agent
+from pipeline.setpoint.belief_agent import Belief, BeliefNetwork
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
-from pipeline.setpoint.published import FLOW_MOVES
-from pipeline.setpoint.simulator import GOOD_BORDERS
+from pipeline.setpoint.published import (
+    BEST_TEMPERATURE,
+    DELTA,
+    FLOW_MOVES,
+    LAMBDA,
+    PHASES,
+    ROTATION,
+    TEMPERATURE_MOVES,
+)
+from pipeline.setpoint.simulator import GOOD_BORDERS, STAND, TEMPERATURE_LIMITS
 from pipeline.setpoint.vision_transformer import VisionTransformer, named_arrays
 from pipeline.setpoint.window_flow import KNOTS_PERCENT
 from pipeline.store import artifacts
 
-CLASSIFIER_SCHEMA, FILTER_SCHEMA = "flow classifier 1", "flow filter 1"
-READERS = tuple(Path(reader.__file__) for reader in (flow_reader, flow_filter))
+CLASSIFIER_SCHEMA, FILTER_SCHEMA, AGENT_SCHEMA = "flow classifier 1", "flow filter 1", "belief agent 1"
+CLASSIFIER, FILTER, AGENT = (f"{name}.safetensors" for name in ("classifier", "filter", "agent"))
+# each file of weights with its schema and its reader
+FILES = {
+    CLASSIFIER: (CLASSIFIER_SCHEMA, flow_reader),
+    FILTER: (FILTER_SCHEMA, flow_filter),
+    AGENT: (AGENT_SCHEMA, agent_reader),
+}
 
 
-class Exported(NamedTuple):
-    """Arrays of classifier.safetensors and of filter.safetensors, and the readers, name to text."""
+class BeliefAgent(NamedTuple):
+    """What our agent decides by: the belief that it sees, and its network."""
 
-    classifier: dict[str, np.ndarray]
-    filter: dict[str, np.ndarray]
-    readers: dict[str, str]
-
-
-def exported(model: CalibratedClassifier, parameters: bayes.Filter) -> Exported:
-    readers = {path.name: path.read_text(encoding="utf-8") for path in READERS}
-    return Exported(classifier_arrays(model), filter_arrays(parameters), readers)
+    belief: Belief
+    network: BeliefNetwork
 
 
-def write(folder: str | Path, made: Exported) -> None:
-    """The four files."""
-    folder = Path(folder)
-    about = {"reader": "flow_reader.py"}
-    artifacts.write_weights(folder / "classifier.safetensors", CLASSIFIER_SCHEMA, made.classifier, about)
-    artifacts.write_weights(folder / "filter.safetensors", FILTER_SCHEMA, made.filter, {})
-    for name, text in made.readers.items():
-        artifacts.write_text(folder / name, text)
+Decider = bayes.Filter | BeliefAgent
+Weights = dict[str, dict[str, np.ndarray]]  # arrays by name, of each file of FILES that there is
+
+
+def weights(model: CalibratedClassifier, decider: Decider) -> Weights:
+    """Arrays of the classifier, of the filter, and of the agent where that decides."""
+    if isinstance(decider, BeliefAgent):
+        more = [filter_arrays(decider.belief.filter), agent_arrays(decider)]
+    else:
+        more = [filter_arrays(decider)]
+    return dict(zip(FILES, [classifier_arrays(model), *more], strict=False))
+
+
+def write(folder: str | Path, made: Weights) -> None:
+    """Each file of weights, and its reader beside it."""
+    for name, arrays in made.items():
+        schema, reader = FILES[name]
+        source = Path(str(reader.__file__))
+        artifacts.write_weights(Path(folder) / name, schema, arrays, {"reader": source.name})
+        artifacts.write_text(Path(folder) / source.name, source.read_text(encoding="utf-8"))
 
 
 def classifier_arrays(model: CalibratedClassifier) -> dict[str, np.ndarray]:
@@ -86,3 +109,32 @@ def filter_arrays(parameters: bayes.Filter) -> dict[str, np.ndarray]:
         "begins": np.asarray(bayes.BEGINS),
         "flow_moves": np.array(FLOW_MOVES),
     }
+
+
+def agent_arrays(of: BeliefAgent) -> dict[str, np.ndarray]:
+    """The network's weights by name, what it starts from, and the moves, clock and scales that it knows."""
+    a, b = PHASES[-1]
+    layers = {
+        f"{head}.layers": np.array(len(getattr(of.network, head).hidden)) for head in ("flow", "temperature")
+    }
+    return (
+        agent.weights(of.network)
+        | layers
+        | {
+            "values": np.asarray(of.belief.values, float),
+            "slow_gamma": np.array(belief_agent.slower(float(of.belief.gamma))),
+            "pooling": belief_agent.POOLING,
+            "at_rest": np.array(belief_agent.AT_REST),
+            "ahead": np.array(belief_agent.AHEAD),
+            # reward (14) at q* is 2 / (1 + |u - u*| / width) - 1
+            "reward_width": np.array(1 / math.hypot(math.sin(ROTATION) / a, math.cos(ROTATION) / b)),
+            "best_temperature": np.array(BEST_TEMPERATURE),
+            "temperature_scale": np.array(agent.TEMPERATURE_SCALE),
+            "temperature_limits": np.array(TEMPERATURE_LIMITS),
+            "temperature_moves": np.array(TEMPERATURE_MOVES),
+            "flow_moves": np.array(FLOW_MOVES),
+            "stand": np.array(STAND),
+            "clock": np.array(LAMBDA),
+            "delta": np.array(DELTA),
+        }
+    )

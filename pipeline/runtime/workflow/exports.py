@@ -1,15 +1,16 @@
-"""`beadline export`: a certified controller in the form that a machine can run. The stage export_controllers
-writes the same files."""
+"""`beadline export`: a certified controller in the form that a machine can run, or what sees and decides in
+the setpoint loop. The stage export_controllers writes the same files."""
 
 from pathlib import Path
 
 from pipeline.runtime import certificate, machine
 from pipeline.runtime.certificate import Certificate
-from pipeline.runtime.export import c, klipper, python, vectors
+from pipeline.runtime.export import c, klipper, python, setpoint, vectors
 from pipeline.runtime.machine import Exported
 from pipeline.store import artifacts
 
 REHEARSAL = "Rehearsal: it was made for a simulated plant, and runs only where it is told so."
+UNCERTIFIED = "It has no certificate: what it does is judged by evaluate_setpoint."
 TRIAL = "May run: its certificate was passed on recordings of the machine."
 
 
@@ -36,6 +37,8 @@ def export(folder: Path, to: str, out: Path | None, section: str, power_W: float
             f"--out {target}: should be a folder but is a file; name a folder, which is made where it is "
             "missing"
         )
+    if shows_frames(folder):
+        return _export_readers(folder, to, target)
     made, shown = machine.read(folder)
     texts = files(made, shown, to, section, power_W)
     for name, text in texts.items():
@@ -44,3 +47,22 @@ def export(folder: Path, to: str, out: Path | None, section: str, power_W: float
     word = REHEARSAL if made.simulated else TRIAL
     digest = certificate.sha256(shown)
     return f"{made.name}, certificate {digest[:12]}. {word}\nwritten: {written}"
+
+
+def shows_frames(folder: Path) -> bool:
+    """Whether a controller's folder is that of the setpoint loop, whose recordings are frames."""
+    return (folder / setpoint.CLASSIFIER).exists() and not (folder / machine.CONTROLLER).exists()
+
+
+def _export_readers(folder: Path, to: str, target: Path) -> str:
+    """Writes classifier, filter and, where it decides, our agent, with their readers in Python."""
+    if to != "python":
+        raise ValueError(
+            f"{folder}: classifier, filter and agent of the setpoint loop run in Python alone, found --to "
+            f"{to}; write --to python"
+        )
+    names = [name for name in setpoint.FILES if name != setpoint.AGENT or (folder / name).exists()]
+    made = {name: artifacts.read_weights(folder / name, setpoint.FILES[name][0])[0] for name in names}
+    setpoint.write(target, made)
+    written = ", ".join(str(path) for path in sorted(target.iterdir()) if path.is_file())
+    return f"{', '.join(name.partition('.')[0] for name in names)}. {UNCERTIFIED}\nwritten: {written}"

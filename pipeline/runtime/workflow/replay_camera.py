@@ -13,25 +13,23 @@ from pipeline.setpoint.workflow.agent_files import restore_agents
 from pipeline.setpoint.workflow.shadow import deploy
 from pipeline.store import artifacts
 
-CLASSIFIER, FILTER = "classifier.safetensors", "filter.safetensors"
-
 
 def ready(folder: Path) -> deploy.Ready:
     """The loop that evaluate_setpoint judged, without the levels of a camera, which were not exported. Raises
     ValueError where the folder's numbers are others, and where a stage has not run."""
     judged = deploy.ready(None)
-    _check(
-        folder / CLASSIFIER, setpoint.CLASSIFIER_SCHEMA, setpoint.classifier_arrays(deploy.trained().model)
-    )
-    _check(folder / FILTER, setpoint.FILTER_SCHEMA, setpoint.filter_arrays(_filter(judged)))
+    for name, arrays in setpoint.weights(deploy.trained().model, _decider(judged)).items():
+        _check(folder / name, setpoint.FILES[name][0], arrays)
     return judged
 
 
-def _filter(judged: deploy.Ready) -> Filter:
-    """The filter of the default, or that by which our agent sees."""
+def _decider(judged: deploy.Ready) -> setpoint.Decider:
+    """The filter of the default, or our agent with that by which it sees."""
     name, parameters = judged.deployed.name, judged.deployed.parameters
     if name == BELIEF:
-        return restore_agents("datasets/train_agent/weights.safetensors").belief.filter
+        return setpoint.BeliefAgent(
+            restore_agents("datasets/train_agent/weights.safetensors").belief, parameters
+        )
     if not isinstance(parameters, Filter):
         raise ValueError(
             f"datasets/evaluate_setpoint/choice.json: expected a controller with a filter, found {name!r}, "
