@@ -73,8 +73,8 @@ def _line(loop: str, metrics: Mapping[str, Any], verdict: Verdict) -> Line:
 def link(sources: Sources, line: Line) -> str:
     """Where a page finds the file: the copy of it in reports/data; "" where it is not there, or too large."""
     source = sources.read.get(line.file)
-    if source is not None and source.link.startswith("data/"):
-        return source.link
+    if source is not None:
+        return source.link if source.link.startswith("data/") else ""
     path = Path(line.file)
     small = bool(line.file) and path.is_file() and path.stat().st_size <= LARGEST_COPY
     return f"data/{line.loop}.{path.name}" if small else ""
