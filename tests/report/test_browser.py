@@ -139,15 +139,17 @@ def test_a_picture_enlarges_zooms_and_closes(open_page, name, figure, picture):
     assert enlarged.get_attribute("aria-label") == (
         small.locator(picture).get_attribute("aria-label") or small.locator(picture).get_attribute("alt")
     )
-    whole = enlarged.get_attribute("viewBox")
+    # x, y, width and height of what is seen of it
+    whole = enlarged.get_attribute("data-view")
     box = box_of(enlarged)
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.mouse.wheel(0, -200)
     page.wait_for_function(
-        "whole => document.querySelector('dialog .stage svg').getAttribute('viewBox') !== whole", arg=whole
+        "whole => document.querySelector('dialog .stage > svg').dataset.view !== whole", arg=whole
     )
+    assert float(enlarged.get_attribute("data-view").split()[2]) < float(whole.split()[2])
     page.keyboard.press("0")
-    assert [float(part) for part in enlarged.get_attribute("viewBox").split()] == [
+    assert [float(part) for part in enlarged.get_attribute("data-view").split()] == [
         float(part) for part in whole.split()
     ]
     page.keyboard.press("Escape")
@@ -255,6 +257,83 @@ def test_text_from_the_data_runs_nothing_even_where_it_were_not_escaped(open_pag
     )
     page.locator("a", has_text="x").first.click()
     assert page.evaluate("window.hit") is None
+
+
+@pytest.mark.parametrize(
+    ("name", "closed"), [("temperature", ("declared", "once")), ("deposition", ("declared", "columns"))]
+)
+def test_a_second_level_of_detail_is_closed_opens_at_its_heading_and_prints(open_page, name, closed):
+    page = open_page(name)
+    inside = {
+        heading: page.locator(f"details:has(> summary > #{heading}) > :not(summary)") for heading in closed
+    }
+    assert not any(found.first.is_visible() for found in inside.values())
+    short = page.evaluate("document.documentElement.scrollHeight")
+    page.locator(f"#{closed[1]}").click()
+    assert inside[closed[1]].first.is_visible() and not inside[closed[0]].first.is_visible()
+    # the page's own list of places leads into it
+    page.locator(f".toc a[href='#{closed[0]}']").click()
+    assert inside[closed[0]].first.is_visible()
+    # a fifth of the page at least, or a reader gains nothing
+    assert page.evaluate("document.documentElement.scrollHeight") > 1.2 * short
+    page.evaluate("document.querySelectorAll('details').forEach(one => { one.open = false; })")
+    page.emulate_media(media="print")
+    assert all(found.first.bounding_box()["height"] > 0 for found in inside.values())
+
+
+def test_a_figure_beyond_its_limit_has_a_cross_and_never_a_colour_alone(reports, page_in_grey):
+    """Of every figure that is vermillion: the cross before it, or a glyph or words in its own cell."""
+    figures = "main td.bad, main td .bad:not(svg, svg *), main .cell-failed .v"
+    alone = """figures => [...document.querySelectorAll(figures)].filter(e => {
+        const { content, clipPath, width } = getComputedStyle(e, "::before");
+        const cross = content !== "none" && clipPath.startsWith("polygon") && parseFloat(width) > 5;
+        return !cross && !e.querySelector(".g") && !/worse|failed|rejected|refused/.test(e.textContent);
+    }).map(e => e.outerHTML.slice(0, 120))"""
+    counted = 0
+    for name in PAGES:
+        page = page_in_grey(name)
+        assert page.evaluate(alone, figures) == [], name
+        counted += page.locator(figures).count()
+    assert counted
+
+
+@pytest.fixture
+def page_in_grey(open_page):
+    """page_in_grey(name): a page as a grey screen or printer shows it."""
+
+    def opened(name):
+        page = open_page(name)
+        page.evaluate("document.documentElement.style.filter = 'grayscale(1)'")
+        return page
+
+    return opened
+
+
+def test_a_map_tells_too_little_from_too_much_by_its_line_and_not_by_colour_alone(open_page):
+    page = open_page("deposition")
+    drawn = """name => {
+        const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
+        path.setAttribute("class", name);
+        document.querySelector(".plot.map").append(path);
+        const style = getComputedStyle(path);
+        return style.strokeWidth + " " + style.strokeDasharray;
+    }"""
+    looks = [page.evaluate(drawn, name) for name in ("lack2", "lack1", "right", "over1", "over2")]
+    assert len(set(looks)) == 5 and all("none" not in look for look in looks[:2])
+
+
+@pytest.mark.parametrize("name", [*PAGES, "viewer"])
+def test_nothing_moves_by_itself_so_that_reduced_motion_has_nothing_left_to_reduce(open_page, name):
+    page = open_page(name)
+    for motion in ("no-preference", "reduce"):
+        page.emulate_media(reduced_motion=motion)
+        moving = """() => [...document.querySelectorAll("*")].filter(e => {
+            const style = getComputedStyle(e);
+            return style.animationName !== "none" || style.scrollBehavior !== "auto" ||
+                style.transitionDuration.split(", ").some(time => parseFloat(time) > 0);
+        }).map(e => e.outerHTML.slice(0, 80))"""
+        assert page.evaluate(moving) == []
+        assert page.evaluate("document.getAnimations().length") == 0
 
 
 def luminance(colour):

@@ -9,6 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipeline.report.certificate import exported
+from pipeline.report.shared import page
+from pipeline.report.shared.sources import LARGEST_COPY
 from tests.report.test_pages import Page
 
 LOOPS = ("temperature", "deposition", "setpoint")
@@ -105,6 +108,44 @@ def test_the_files_and_the_certificate_are_those_of_the_export_with_the_first_di
             assert Path(path).name in place or "controller.json" in place
             assert any(digits[:8] in place for digits in exported[loop]["files"].values()), sha256
     assert exported["temperature"]["certificate"]["sha256"][:8] in place
+
+
+def test_no_link_leads_out_of_the_folder_of_the_pages(reports):
+    leads = {
+        (path.name, link)
+        for path in reports.glob("*.html")
+        for link in re.findall(r'href="([^"#]+)', path.read_text(encoding="utf-8"))
+    }
+    assert len(leads) > 50
+    assert {lead for lead in leads if lead[1].startswith("..") or not (reports / lead[1]).exists()} == set()
+
+
+def test_a_file_too_large_to_lie_beside_the_pages_is_named_and_not_linked():
+    path = "datasets/train_ilc/lessons.parquet"
+    named = page.placed(f"../{path}", path, "lessons")
+    assert "href" not in named and f"<code>{path}</code> of the project" in named
+    assert 'href="data/train_ilc.lessons.parquet"' in page.placed("data/train_ilc.lessons.parquet", path, "x")
+
+
+def test_the_file_to_load_is_copied_beside_the_pages_byte_for_byte_where_it_is_small(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = Path("datasets/export_controllers/temperature/controller.json")
+    line = exported.Line("temperature", "passed", "", "PI", path.as_posix(), "", "1 file", "", "")
+    read = type("Read", (), {"read": {}})()
+    # what was not exported, and what is not there, is no link
+    for absent in (line, line._replace(file="")):
+        assert exported.link(read, absent) == "" and exported.copies(read, [absent]) == {}
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"{}")
+    assert exported.link(read, line) == "data/temperature.controller.json"
+    assert exported.copies(read, [line]) == {"temperature.controller.json": b"{}"}
+    path.write_bytes(bytes(LARGEST_COPY + 1))
+    assert exported.link(read, line) == "" and exported.copies(read, [line]) == {}
+
+
+def test_no_controller_reads_as_approved(first):
+    """The accepted run is what figures are compared with; nobody approved its controller."""
+    assert "as accepted" not in first.text
 
 
 def test_the_deciding_picture_draws_the_recorded_run_to_its_last_value(reports, first):

@@ -258,6 +258,13 @@ def saved(page):
     return rows[0], np.array([[float(cell or "nan") for cell in row] for row in rows[1:]])
 
 
+def test_no_two_lines_of_a_picture_differ_by_their_colour_alone(view):
+    page = view()
+    dashes = page.evaluate("""[...document.querySelectorAll("path[d='M0 5H26']")].map(path =>
+        path.getAttribute("stroke-dasharray"))""")
+    assert len(dashes) >= 3 and len(set(dashes)) == len(dashes)
+
+
 def test_the_csv_is_the_artifact_over_the_time_that_is_seen(view, reports):
     machine = params.load(Plant, "plant", reports.parent / "params.yaml")
     path = reports.parent / "datasets/evaluate_temperature/trajectories.parquet"

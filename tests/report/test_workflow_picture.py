@@ -39,7 +39,7 @@ def test_no_two_stages_share_a_place_and_every_arrow_points_right():
     assert workflow.reduced(workflow.READS)["evaluate_temperature"] == ["tune_weights"]
 
 
-def test_a_stage_is_as_accepted_made_anew_or_not_there(project):
+def test_a_stage_is_unchanged_made_anew_or_not_there(project):
     main()
     assert "No run was accepted yet: nothing says what is new." in Page(WORKFLOW).text
     metrics = {
@@ -58,4 +58,4 @@ def test_a_stage_is_as_accepted_made_anew_or_not_there(project):
     main()
     text = WORKFLOW.read_text()
     assert "New results begin at tune_weights." in text
-    assert "Made anew: tune_weights; not there: segment_library; as accepted: " in text
+    assert "Made anew: tune_weights; not there: segment_library; unchanged: " in text

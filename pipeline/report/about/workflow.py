@@ -40,7 +40,7 @@ READS: dict[str, tuple[str, ...]] = {
         "compose_parts",
     ),
 }
-SAME, CHANGED, GONE, FIRST = "as accepted", "made anew", "not there", "first run"
+SAME, CHANGED, GONE, FIRST = "unchanged", "made anew", "not there", "first run"
 OTHER = "other machine"
 CSS = {SAME: "same", CHANGED: "anew", GONE: "lost", FIRST: "same", OTHER: "anew"}
 # stages of the loop whose machine the accepted run may not share
@@ -77,7 +77,7 @@ def figure(sources: Sources) -> Workflow:
 
 
 def state(sources: Sources, stage: str) -> str:
-    """As accepted: figures and all artifacts that the pages read are the same to
+    """Unchanged: figures and all artifacts that the pages read are the same to
     the byte, whether they were reused or made again."""
     if isinstance(sources.metrics.get(stage), Missing) or any(
         path.startswith(f"datasets/{stage}/") for path in sources.absent

@@ -1,11 +1,12 @@
 """What leaves the house, a line a loop: the file, its certificate and its hash, from the metrics of
 export_controllers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.report.shared.digits import count
-from pipeline.report.shared.sources import Sources, lookup
+from pipeline.report.shared.sources import LARGEST_COPY, Sources, lookup
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 from pipeline.report.temperature.contestants import BY_NAME, in_a_sentence
 
@@ -67,3 +68,19 @@ def _line(loop: str, metrics: Mapping[str, Any], verdict: Verdict) -> Line:
         str(shown.get("sha256") or "") if isinstance(shown, Mapping) else "",
         why,
     )
+
+
+def link(sources: Sources, line: Line) -> str:
+    """Where a page finds the file: the copy of it in reports/data; "" where it is not there, or too large."""
+    source = sources.read.get(line.file)
+    if source is not None:
+        return source.link if source.link.startswith("data/") else ""
+    path = Path(line.file)
+    small = bool(line.file) and path.is_file() and path.stat().st_size <= LARGEST_COPY
+    return f"data/{line.loop}.{path.name}" if small else ""
+
+
+def copies(sources: Sources, lines: Sequence[Line] | Missing) -> dict[str, bytes]:
+    """Name in reports/data -> bytes of each file to load that `link` leads to."""
+    found = {} if isinstance(lines, Missing) else {link(sources, line): line.file for line in lines}
+    return {place.removeprefix("data/"): Path(path).read_bytes() for place, path in found.items() if place}

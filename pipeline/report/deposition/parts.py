@@ -82,8 +82,8 @@ def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Pi
         ""
         if not last
         else "The nozzle’s path from above where it should print, in mm. "
-        "Brown: too little, thin; teal: too much, thick; grey: right. "
-        f"Light beyond ±{100 * RIGHT:g}{THIN}%, dark beyond ±{100 * FAR:g}{THIN}% of a full line’s flow; "
+        "Brown, broken: too little; teal, thick: too much; grey: right. Dashes and light beyond "
+        f"±{100 * RIGHT:g}{THIN}%, dots and dark beyond ±{100 * FAR:g}{THIN}% of a full line’s flow; "
         "of a long part the worst of each stretch. "
         f"{'Forecast.' if real(sources) else 'True flow of the simulated machine.'}",
         page.origin(sources.source("signals"), part=part),
@@ -149,14 +149,12 @@ def _drawn(mine: Table, error: np.ndarray, prints: np.ndarray, alt: str) -> Mark
         if k in paths
     ]
     bar = _round(span / 4)
-    ruler = Markup('<path class="ruler" d="M{} {}h{}"/><text x="{}" y="{}">{} mm</text>').format(
-        f"{room:.0f}",
-        f"{height - 5:.0f}",
-        f"{scale * bar:.1f}",
-        f"{room + scale * bar + 5:.1f}",
-        f"{height - 1:.0f}",
-        short(bar, 2),
-    )
+    start = f"{room:.0f}", f"{height - 5:.0f}", f"{scale * bar:.1f}"
+    # the script draws another round length where a part of the map is seen
+    ruler = Markup(
+        '<path class="ruler" data-at="{} {} {}" data-mm="{:g}" d="M{} {}h{}"/><text x="{}" y="{}">{} mm'
+        "</text>"
+    ).format(*start, bar, *start, f"{room + scale * bar + 5:.1f}", f"{height - 1:.0f}", short(bar, 2))
     size = f"{width:.0f}", f"{height:.0f}"
     return Markup(
         '<svg class="plot map" style="--w:{}px" viewBox="0 0 {} {}" role="img" aria-label="{}">{}{}</svg>'

@@ -19,15 +19,14 @@ from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing, Verdic
 from pipeline.report.temperature import card as temperature_card
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.twelve import drift_state
-from pipeline.store import artifacts
 
 # the gravest first
 GRAVEST = (FAILED, OPEN, PASSED)
 
 
 class File(NamedTuple):
-    """What leaves the house of one loop: the file to load with its digest, and its certificate; whether the
-    file is there to be linked."""
+    """What leaves the house of one loop: the file to load with its digest, and its certificate; `link` leads
+    to a copy beside the pages, "" where there is none."""
 
     loop: str
     name: str
@@ -36,7 +35,7 @@ class File(NamedTuple):
     state: str
     word: str
     certificate: str
-    there: bool
+    link: str
 
 
 def render(sources: Sources, judged: Judgement) -> str:
@@ -140,7 +139,7 @@ def files(sources: Sources, verdict: Verdict) -> list[File] | Missing:
             line.state,
             line.word,
             line.certificate,
-            bool(line.file) and artifacts.exists(line.file),
+            exported.link(sources, line),
         )
         for line in lines
     ]

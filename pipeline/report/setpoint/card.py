@@ -87,7 +87,7 @@ def _notes(sources: Sources, scores: Board, names: Sequence[str]) -> list[tuple[
     return [
         (
             name,
-            "as accepted" if name == before else "closest" if i == 0
+            "as before" if name == before else "closest" if i == 0
             else "yardstick" if name == DOES_NOTHING else kinds.get(scores.kinds[name], "rule"),
         )
         for i, name in enumerate(names)

@@ -224,7 +224,8 @@ def panel(
             frame.width - frame.right, frame.height - 2, across
         )
     return Markup(
-        '<svg class="plot {}" style="--w:{}px" viewBox="0 0 {} {}" role="img" aria-label="{}"{}>{}{}{}</svg>'
+        '<svg class="plot {}" style="--w:{}px" viewBox="0 0 {} {}" role="img" aria-label="{}"{}>'
+        '<g class="axes">{}</g>{}{}</svg>'
     ).format(
         css,
         frame.width,

@@ -63,6 +63,8 @@ def environment() -> jinja2.Environment:
         "bdi": bdi,
         "origin": origin,
         "linked": linked,
+        "placed": placed,
+        "verbatim": verbatim,
         "missing": missing,
         "anchor": anchor,
         "term": term,
@@ -175,16 +177,28 @@ def files(sources: Sequence[Source]) -> Markup:
 
 def linked(sources: Sequence[Source], *, short: bool = False) -> Markup:
     """The links to these files, with commas between them; `short`: without their folder."""
-    parts = [
-        Markup('<a class="from" href="{}" title="{}, SHA-256 {}"><code>{}</code></a>').format(
+    return Markup(", ").join(
+        placed(
             source.link,
             source.path,
-            source.sha256[:8],
-            source.path.rsplit("/", 1)[1] if short else source.path.split("/", 1)[1],
+            verbatim(source.path.rsplit("/", 1)[1] if short else source.path.split("/", 1)[1]),
+            f"{source.path}, SHA-256 {source.sha256[:8]}",
         )
         for source in sources
-    ]
-    return Markup(", ").join(parts)
+    )
+
+
+def verbatim(text: str) -> Markup:
+    return Markup("<code>{}</code>").format(text)
+
+
+def placed(link: str, path: str, text: str, title: str = "") -> Markup:
+    """A file, linked where it lies below reports/; else its path in words, because who has the pages alone
+    cannot follow a link out of their folder."""
+    if link.startswith("../"):
+        return Markup('<span class="outside">{} of the project</span>').format(verbatim(path))
+    shown = Markup(' title="{}"').format(title) if title else Markup("")
+    return Markup('<a class="from" href="{}"{}>{}</a>').format(link, shown, text)
 
 
 def word_id(word: str) -> str:

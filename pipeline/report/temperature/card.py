@@ -52,7 +52,7 @@ def contestants(sources: Sources, judged: Judgement) -> dict[str, str]:
     """Whom the card shows, and what each is here."""
     runs = incumbent_of(sources)
     champion = isinstance(sources.nightly, dict) and runs
-    runs_now = "runs now" if champion else "as accepted"
+    runs_now = "runs now" if champion else "as before"
     names = {judged.subject: runs_now if judged.subject == runs else note_of(judged.verdict)}
     names[judged.rival] = runs_now if judged.rival == runs else kind(judged.rival)
     yardsticks = (IDLE,) if set(names) & set(PI) else (*PI, IDLE)

@@ -218,8 +218,8 @@ def plants(sources: Sources) -> Picture:
         title,
         finding,
         shown,
-        f"Cost as deployed, log scale. Left: ink where model-based costs less, blue where data-driven "
-        "does. Right: bar "
+        f"Cost as deployed, log scale. Left: ink where model-based costs less, blue and dashed where "
+        "data-driven does. Right: bar "
         f"from the 5{THIN}% to the 95{THIN}% quantile, box the middle half, line the median, dot the "
         f"90{THIN}% quantile.",
         page.origin(sources.source("cases")),

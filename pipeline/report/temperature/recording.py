@@ -108,7 +108,7 @@ def record(sources: Sources) -> Picture:
         shown,
         (
             "Against time in s, recordings one after the other; at most 480 points a signal, highest and "
-            "lowest of each stretch kept. Grey: flagged; vermillion: masked."
+            "lowest of each stretch kept. Grey: flagged; vermillion, without a line: masked."
         ),
         page.origin(
             sources.source("record", "quality"), y=[s.name for s in (*machine.acting, *machine.outputs)]

@@ -101,7 +101,7 @@ def _caption(sources: Sources) -> str:
     return (
         f"As deployed on {setting(compared)}. Large: the 90{THIN}% quantile of all cases; small: "
         f"{bands}; the median; the worst case. Bold: best of a row, hold and the exact model left aside. "
-        "Vermillion: beyond the limit. "
+        "A cross, vermillion: beyond the limit. "
         f"Limits: {entry(compared, 'limits', 'source') or 'declared'}."
     )
 

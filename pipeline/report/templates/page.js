@@ -68,7 +68,7 @@
 
   const scale = text => {
     const [low, high, log] = text.split(" ");
-    return log ? [Math.log(low), Math.log(high), Math.exp] : [+low, +high, value => value];
+    return log ? [Math.log(low), Math.log(high), Math.exp, Math.log] : [+low, +high, value => value, value => value];
   };
   const say = value => value === 0 ? "0" : Math.abs(value) >= 1e6 || Math.abs(value) < 1e-4 ? value.toExponential(2) : (+value.toPrecision(Math.abs(value) >= 1000 ? 4 : 3)).toLocaleString("en", { maximumFractionDigits: 9 }).replace("-", "\u2212");
   /* corners of a path of M, L, H and V, in the picture's own units; null starts a new piece */
@@ -111,7 +111,7 @@
     const toY = py => up[2](up[0] + (tall - below - py) / (tall - above - below) * (up[1] - up[0]));
     const points = [...svg.querySelectorAll("circle:not(.hair)")].map(c => [+c.getAttribute("cx"), +c.getAttribute("cy"), c]);
     points.push(...[...svg.querySelectorAll("path.stem")].flatMap(path => corners(path).filter((p, i, all) => p && all[i - 1]).map(p => [p[0], p[1], path])));
-    const point = near(points, x, y, 9), lines = [...svg.querySelectorAll("path.line, path.ref")].map(path => [path, height(path, x)]).filter(pair => pair[1] !== null);
+    const reach = svg === picture ? 9 * view[2] / whole[2] : 9, point = near(points, x, y, reach), lines = [...svg.querySelectorAll("path.line, path.ref")].map(path => [path, height(path, x)]).filter(pair => pair[1] !== null);
     const rows = [], unit = (value, name) => say(value) + (name ? `\u202f${name}` : "");
     if (point) x = point[0];
     if (across) rows.push(make("b", {}, unit(toX(x), unitX)));
@@ -121,11 +121,11 @@
     svg.querySelectorAll(".hair").forEach(hair => hair.remove());
     const hair = page.createElementNS("http://www.w3.org/2000/svg", "path");
     hair.setAttribute("class", "hair");
-    hair.setAttribute("d", `M${x} ${above}V${tall - below}` + (point ? `M${x - 6} ${point[1]}h12` : ""));
-    svg.append(hair);
+    hair.setAttribute("d", `M${x} ${above}V${tall - below}` + (point ? `M${x - reach / 1.5} ${point[1]}h${2 * reach / 1.5}` : ""));
+    (svg.querySelector(".drawn") ?? svg).append(hair);
     put(at[0], at[1], ...rows);
   };
-  const inside = (svg, event) => new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
+  const inside = (svg, event) => new DOMPoint(event.clientX, event.clientY).matrixTransform((svg.querySelector(".drawn") ?? svg).getScreenCTM().inverse());
 
   /* the meaning of a word, or what a strip says */
   const explain = target => {
@@ -152,19 +152,168 @@
   page.addEventListener("keydown", event => event.key === "Escape" && hide());
   page.documentElement.addEventListener("pointerleave", hide);
 
-  /* ---- a picture, large */
+  /* ---- a picture, large: what is drawn zooms, the axes stay beside it with ticks of what is seen */
 
   let dragged = null;
   const stage = make("div", { className: "stage" }), title = make("p", { className: "what" });
   const control = (text, label, act) => make("button", { type: "button", textContent: text, ariaLabel: label, onclick: act });
   const dialog = make("dialog", { className: "big", ariaLabel: "Picture, enlarged" });
-  let picture = null, whole = [0, 0, 1, 1], view = whole, cursor = null;
-  /* letters and dots keep their size on the screen, whatever the zoom */
+  let picture = null, chart = null, whole = [0, 0, 1, 1], view = whole, cursor = null;
+  const vector = (tag, set, text = "") => {
+    const made = page.createElementNS("http://www.w3.org/2000/svg", tag);
+    Object.entries(set).forEach(([key, value]) => made.setAttribute(key, value));
+    made.textContent = text;
+    return made;
+  };
+  const at = (text, key) => +text.getAttribute(key);
+  /* a chart in its parts: what is drawn, the ticks and the names beside it, which keep their size, and what stands over it */
+  const parted = clone => {
+    const [left, right, above, below, width, tall] = clone.dataset.f.split(" ").map(Number);
+    const ends = { left, right: width - right, above, foot: tall - below };
+    const axes = clone.querySelector(":scope > .axes"), heads = [...clone.querySelectorAll(":scope > .yt")];
+    const drawn = vector("g", { class: "drawn" }), names = { x: [], y: [], over: [] }, ticks = { x: [], y: [] };
+    for (const text of axes?.querySelectorAll("text") ?? []) {
+      const line = text.previousElementSibling, key = line.classList.contains("tk") ? "y" : "x";
+      ticks[key].push({ at: at(line, `${key}1`), text: text.textContent });
+    }
+    axes?.remove();
+    heads.forEach(head => head.remove());
+    drawn.append(...clone.childNodes);
+    for (const text of drawn.querySelectorAll("text")) {
+      const [x, y] = [at(text, "x"), at(text, "y")], ofLine = text.previousElementSibling?.tagName === "line";
+      const named = { x, y, text: text.textContent, anchor: text.getAttribute("text-anchor") ?? "start" };
+      const side = y > ends.foot + 2 ? "x" : x < ends.left || (x > ends.right && named.anchor === "start") ? "y" : y < above && !ofLine ? "over" : "";
+      if (!side) continue;
+      names[side].push(named);
+      text.remove();
+    }
+    /* an axis of names has no numbers between them */
+    for (const key of ["x", "y"]) if (ticks[key].some(tick => !/[\dπ]/.test(tick.text))) {
+      names[key].push(...ticks[key].map(tick => key === "x" ? { x: tick.at, y: ends.foot + 14, text: tick.text, anchor: "middle" } : { x: left - 4, y: tick.at + 3.5, text: tick.text, anchor: "end" }));
+      ticks[key] = null;
+    }
+    const units = (clone.dataset.u ?? "|").split("|"), head = foot => heads.find(text => at(text, "y") > above === foot)?.textContent;
+    return { ...ends, drawn, names, ticks, up: head(false) ?? units[1], across: head(true) ?? units[0], scales: { x: clone.dataset.x, y: clone.dataset.y } };
+  };
+  /* (value, label) of at most so many ticks from `low` to `high`: of powers of ten, or of 1, 2, 2.5 and 5 */
+  const round = (low, high, most, log) => {
+    if (log && high >= 30 * low) {
+      const first = Math.ceil(Math.log10(low) - 1e-9), last = Math.floor(Math.log10(high) + 1e-9), every = Math.max(1, Math.ceil((last - first) / most));
+      return Array.from({ length: Math.floor((last - first) / every) + 1 }, (_, i) => 10 ** (first + i * every)).map(value => [value, say(value)]);
+    }
+    const rough = (high - low) / most, power = 10 ** Math.floor(Math.log10(rough)), step = [1, 2, 2.5, 5, 10].map(f => f * power).find(s => s >= rough * 0.999);
+    const digits = Math.min(Math.max(-Math.floor(Math.log10(step) + 1e-9) + (Math.abs(step / power - 2.5) < 1e-9 ? 1 : 0), 0), 9), first = Math.ceil(low / step - 1e-9);
+    return Array.from({ length: Math.max(Math.floor(high / step + 1e-9) - first + 1, 0) }, (_, i) => (first + i) * step)
+      .map(value => [value, value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits }).replace(/^-(?=0[.0]*$)/, "").replace("-", "\u2212")]);
+  };
+  /* draws the axes of what is seen, in px of the screen */
+  const draw = () => {
+    const frame = vector("g", { class: "frame" }), add = (...all) => all.map(made => frame.append(made));
+    picture.querySelector(".frame")?.remove();
+    picture.append(frame);
+    const probe = vector("text", {}), long = text => { probe.textContent = text; return probe.getComputedTextLength(); };
+    add(probe);
+    const { left, right, above, foot, names, ticks, scales } = chart, seen = view[2] < whole[2] * 0.999;
+    const room = [stage.clientWidth, Math.max(innerHeight * 0.96 - dialog.firstElementChild.offsetHeight - 70, 200)];
+    const lines = text => (text ?? "").split(" ").reduce((all, word) => {
+      const longer = `${all.at(-1)} ${word}`.trim();
+      return long(longer) <= room[0] - 12 ? [...all.slice(0, -1), longer] : [...all, word];
+    }, [""]);
+    const span = (key, i) => {
+      const [low, high, back] = scale(scales[key]), from = key === "x" ? left : foot, to = key === "x" ? right : above;
+      return back(low + (view[+(key === "y")] + i * view[2 + (key === "y")] - from) / (to - from) * (high - low));
+    };
+    const place = (key, value) => {
+      const [low, high, , there] = scale(scales[key]), share = (there(value) - low) / (high - low);
+      return key === "x" ? left + share * (right - left) : foot - share * (foot - above);
+    };
+    const labelled = (key, px) => {
+      const own = ticks[key], most = key === "x" ? Math.max(2, Math.floor(px / 80)) : Math.max(2, Math.floor(px / 40));
+      if (!own) return [];
+      const apart = own.slice(1).map((tick, i) => Math.abs(tick.at - own[i].at) * px / view[key === "x" ? 2 : 3]);
+      const fits = apart.every((gap, i) => gap >= (key === "x" ? (long(own[i].text) + long(own[i + 1].text)) / 2 + 4 : 12));
+      if (!scales[key] || (!seen && own.length && fits)) return own;
+      const ends = [span(key, 0), span(key, 1)].sort((p, q) => p - q);
+      /* one tick is no axis */
+      const found = [1, 2, 4].map(more => round(...ends, more * most, scales[key].endsWith("log"))).find((all, i) => all.length > 1 || i === 2);
+      return found.map(([value, text]) => ({ at: place(key, value), text }));
+    };
+    const head = lines(chart.up), beside = names.y.filter(name => name.anchor === "end"), after = names.y.filter(name => name.anchor !== "end");
+    const most = all => Math.max(0, ...all.map(each => long(each.text)));
+    const A = 8 + 16 * head.length + (names.over.length ? 16 : 0), B = 26 + (names.x.length && ticks.x?.length ? 16 : 0) + (chart.across ? 16 : 0), R = Math.max(16, most(after) + 10);
+    let L = Math.max(24, most(beside) + 10), by = 1, up = [];
+    for (let turn = 0; turn < 2; turn++) {
+      by = Math.max(Math.min((room[0] - L - R) / whole[2], (room[1] - A - B) / whole[3]), 0.05);
+      up = labelled("y", by * whole[3]);
+      L = Math.max(L, most(up) + 10);
+    }
+    const wide = by * whole[2], tall = by * whole[3], W = L + wide + R, H = A + tall + B, near = by * whole[2] / view[2];
+    const px = x => L + (x - view[0]) * near, py = y => A + (y - view[1]) * near;
+    const within = (value, low, length) => value >= low - length * 1e-6 && value <= low + length * (1 + 1e-6);
+    picture.setAttribute("viewBox", `0 0 ${W} ${H}`);
+    picture.style.width = `${W}px`;
+    chart.drawn.setAttribute("transform", `matrix(${near} 0 0 ${near} ${px(0)} ${py(0)})`);
+    chart.drawn.style.setProperty("--unit", 1 / near);
+    stage.style.setProperty("--unit", 1);
+    /* whole, what is drawn may reach beyond the axes, as on the page */
+    chart.window.setAttribute("clip-path", seen ? "url(#seen)" : "none");
+    Object.entries({ x: L, y: A, width: wide, height: tall }).forEach(([key, value]) => chart.hole.setAttribute(key, value));
+    const text = (x, y, words, anchor, css = "") => add(vector("text", { x, y, "text-anchor": anchor, class: css }, words));
+    for (const tick of up.filter(one => within(one.at, view[1], view[3]))) {
+      frame.prepend(vector("line", { class: "tk", x1: L, x2: L + wide, y1: py(tick.at), y2: py(tick.at) }));
+      text(L - 6, py(tick.at) + 4.5, tick.text, "end", "ytick");
+    }
+    for (const tick of labelled("x", wide).filter(one => within(one.at, view[0], view[2]))) {
+      const x = px(tick.at), half = long(tick.text) / 2;
+      add(vector("line", { class: "ax", x1: x, x2: x, y1: A + tall, y2: A + tall + 4 }));
+      text(Math.max(half, Math.min(x, W - half)), A + tall + 18, tick.text, "middle", "xtick");
+    }
+    add(vector("line", { class: "ax", x1: L, x2: L + wide, y1: A + tall, y2: A + tall }));
+    /* names that would lie upon one another come back as the picture grows */
+    const lowest = { end: -Infinity, start: -Infinity };
+    for (const name of names.y.filter(one => within(one.y, view[1], view[3])).sort((p, q) => p.y - q.y)) {
+      const side = name.anchor === "end" ? "end" : "start";
+      if (py(name.y) < lowest[side] + 13) continue;
+      lowest[side] = py(name.y);
+      text(side === "end" ? L - 6 : L + wide + 6, py(name.y), name.text, side);
+    }
+    let furthest = -Infinity;
+    for (const name of names.x.filter(one => within(one.x, view[0], view[2])).sort((p, q) => p.x - q.x)) {
+      const length = long(name.text), from = Math.max(0, Math.min(px(name.x) - length * ({ middle: 0.5, end: 1 }[name.anchor] ?? 0), W - length));
+      if (from < furthest + 6) continue;
+      furthest = from + length;
+      text(from, A + tall + (ticks.x?.length ? 34 : 18), name.text, "start");
+    }
+    names.over.forEach(name => text(L + Math.max(0, Math.min((name.x - left) * by, wide)), A - 5, name.text, name.anchor));
+    head.forEach((line, i) => text(0, 13 + 16 * i, line, "start", "yt"));
+    if (chart.across) text(L + wide, H - 5, chart.across, "end", "yt");
+    probe.remove();
+    picture.prepend(frame);
+  };
+  /* a map has a ruler in place of axes: a round length of what is seen */
+  const measure = () => {
+    const ruler = picture.querySelector(".ruler"), text = ruler?.nextElementSibling;
+    if (!ruler) return;
+    const [x, y, length] = ruler.dataset.at.split(" ").map(Number), mm = +ruler.dataset.mm, grown = view[2] / whole[2];
+    const most = mm * grown, power = 10 ** Math.floor(Math.log10(most) + 1e-9), now = [5, 2, 1].map(f => f * power).find(f => f <= most * 1.001);
+    const from = view[0] + x * grown, down = view[1] + y * grown, to = from + length * now / mm;
+    ruler.setAttribute("d", `M${from} ${down}H${to}`);
+    text.setAttribute("x", to + 5 * grown);
+    text.setAttribute("y", down + 4 * grown);
+    text.textContent = `${say(now)} mm`;
+  };
   const look = box => {
     view = box;
+    picture.dataset.view = box.join(" ");
+    if (!dialog.open) return;
+    if (chart) { draw(); return; }
     picture.setAttribute("viewBox", box.join(" "));
-    if (dialog.open) stage.style.setProperty("--unit", box[2] / picture.getBoundingClientRect().width);
+    measure();
+    /* letters shrink with a picture that is wider than the screen, and do not grow beyond their size */
+    stage.style.setProperty("--unit", Math.min(box[2] / picture.getBoundingClientRect().width, 1));
   };
+  /* px of the screen -> units of the picture; its own, or those of what is drawn in a chart */
+  const unit = () => view[2] / (chart ? +chart.hole.getAttribute("width") : picture.getBoundingClientRect().width);
   const zoom = (factor, x = view[0] + view[2] / 2, y = view[1] + view[3] / 2) => {
     const grown = Math.min(Math.max(view[2] / factor, whole[2] / 40), whole[2]) / view[2];
     const size = [view[2] * grown, view[3] * grown];
@@ -177,17 +326,26 @@
   );
   page.body.append(dialog);
   const enlarge = found => {
+    chart = null;
     if (found.tagName === "IMG") {
-      picture = page.createElementNS("http://www.w3.org/2000/svg", "svg");
-      const image = page.createElementNS("http://www.w3.org/2000/svg", "image"), size = [found.naturalWidth || 4, found.naturalHeight || 3];
-      image.setAttribute("href", found.src);
-      ["width", "height"].forEach((key, i) => image.setAttribute(key, size[i]));
-      picture.append(image);
+      const size = [found.naturalWidth || 4, found.naturalHeight || 3];
+      picture = vector("svg", {});
+      picture.append(vector("image", { href: found.src, width: size[0], height: size[1] }));
       whole = [0, 0, ...size];
     } else {
       picture = found.cloneNode(true);
       picture.querySelectorAll(".hair").forEach(hair => hair.remove());
       whole = found.getAttribute("viewBox").split(" ").map(Number);
+      if (picture.dataset.f) {
+        chart = parted(picture);
+        chart.hole = vector("rect", {});
+        chart.window = vector("g", {});
+        chart.window.append(chart.drawn);
+        const clip = vector("clipPath", { id: "seen" });
+        clip.append(chart.hole);
+        picture.append(clip, chart.window);
+        whole = [chart.left, chart.above, chart.right - chart.left, chart.foot - chart.above];
+      }
     }
     title.textContent = found.alt ?? found.getAttribute("aria-label");
     picture.setAttribute("role", "img");
@@ -200,6 +358,7 @@
     look(whole);
     cursor = whole[0] + whole[2] / 2;
   };
+  addEventListener("resize", () => dialog.open && look(view));
   stage.addEventListener("wheel", event => {
     event.preventDefault();
     const { x, y } = inside(picture, event);
@@ -208,8 +367,8 @@
   stage.addEventListener("pointerdown", event => { dragged = [event.clientX, event.clientY, view]; stage.setPointerCapture(event.pointerId); hide(); });
   stage.addEventListener("pointermove", event => {
     if (!dragged) return;
-    const [x, y, from] = dragged, unit = from[2] / picture.getBoundingClientRect().width;
-    look([0, 1].map(i => Math.max(whole[i], Math.min(from[i] - unit * ([event.clientX, event.clientY][i] - [x, y][i]), whole[i] + whole[i + 2] - from[i + 2]))).concat(from.slice(2)));
+    const [x, y, from] = dragged, by = unit();
+    look([0, 1].map(i => Math.max(whole[i], Math.min(from[i] - by * ([event.clientX, event.clientY][i] - [x, y][i]), whole[i] + whole[i + 2] - from[i + 2]))).concat(from.slice(2)));
   });
   for (const end of ["pointerup", "pointercancel"]) stage.addEventListener(end, () => { dragged = null; });
   dialog.addEventListener("click", event => event.target === dialog && dialog.close());
@@ -219,10 +378,10 @@
     if (event.key === "-") zoom(1 / 1.5);
     if (event.key === "0") look(whole);
     const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
-    if (!step || !picture.dataset.f) return;
+    if (!step || !chart) return;
     event.preventDefault();
     cursor = Math.max(view[0], Math.min(cursor + step * view[2] / 100, view[0] + view[2]));
-    const at = new DOMPoint(cursor, view[1] + view[3] / 3).matrixTransform(picture.getScreenCTM());
+    const at = new DOMPoint(cursor, view[1] + view[3] / 3).matrixTransform(chart.drawn.getScreenCTM());
     tip.className = "tip";
     tell(picture, cursor, -99, [at.x, at.y]);
   });
@@ -235,6 +394,16 @@
     found.after(button);
     found.addEventListener("click", () => enlarge(found));
   });
+
+  /* ---- a second level of detail opens where a link leads to its heading, and for print */
+
+  const unfold = () => {
+    const found = location.hash && page.getElementById(decodeURIComponent(location.hash.slice(1)))?.closest("summary");
+    if (found) found.parentElement.open = true;
+  };
+  unfold();
+  addEventListener("hashchange", unfold);
+  addEventListener("beforeprint", () => page.querySelectorAll("details.more").forEach(more => { more.open = true; }));
 
   /* ---- what the run was made on: beside the pages, not in them, so that they are the same on every machine */
 

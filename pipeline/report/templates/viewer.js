@@ -141,20 +141,19 @@
     return { ...a, id: "difference", y, name: `(${a.name}) − (${b.name})${how}`, panel: "difference", column: "difference", beside: "", who: "", owner: "", label: "" };
   };
 
-  /* ---- how a line looks: colour by whose it is, dashes and a number where a colour comes again */
+  /* ---- how a line looks: colour by whose it is; each has dashes of its own and a number, for print and grey screens */
 
-  const DASHES = [[], [7, 3], [2, 3], [10, 3, 2, 3], [14, 4], [5, 2, 1, 2]];
+  const DASHES = [[], [7, 3], [10, 3, 2, 3], [14, 4], [5, 2, 1, 2], [2, 3]];
   const colour = name => getComputedStyle(page.documentElement).getPropertyValue(`--${name}`).trim();
   const dress = lines => {
-    const used = {}, free = ["ink", "over2", "lack2", "muted"], mine = lines.filter(line => !line.beside);
+    const free = ["ink", "over2", "lack2", "muted"], mine = lines.filter(line => !line.beside);
     /* where one controller has several quantities in a picture, colours tell these apart */
     const whose = new Set(mine.map(line => line.owner)).size > 1 || new Set(mine.map(line => line.column)).size === 1;
     for (const line of lines) {
       if (line.beside) { Object.assign(line, { ink: "muted", dash: [3, 3], wide: 1.2 }); continue; }
       const place = mine.indexOf(line);
       line.ink = !whose || !line.who ? free[place % free.length] : { dd: "blue", bl: "grey" }[line.who] ?? "ink";
-      used[line.ink] = (used[line.ink] ?? -1) + 1;
-      line.dash = DASHES[used[line.ink] % DASHES.length];
+      line.dash = DASHES[place % DASHES.length];
       line.wide = 1.6;
     }
   };
@@ -487,8 +486,10 @@
     }
     form.replaceChildren(...parts);
     if (focus >= 0) [...form.querySelectorAll("input, select")][focus]?.focus();
-    parquet.href = table.link;
-    parquet.textContent = `Parquet, ${table.size}`;
+    /* a file that is too large to lie beside the page is named, and not linked: who reads has perhaps the pages alone */
+    const beside = !table.link.startsWith("../");
+    if (beside) parquet.href = table.link; else parquet.removeAttribute("href");
+    parquet.textContent = beside ? `Parquet, ${table.size}` : `Parquet, ${table.size}: ${table.path} of the project`;
   };
   const button = (text, label, act) => { const made = make("button", { type: "button", textContent: text, onclick: act }); if (label) made.setAttribute("aria-label", label); return made; };
   const parquet = make("a", { href: "#" });

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
+from pipeline.report.certificate import exported
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, number, short
 from pipeline.report.shared.sources import Sources, copies
@@ -44,7 +45,11 @@ class Viewer(NamedTuple):
 
 def render(sources: Sources, judged: Judgement) -> Viewer:
     """viewer.html and what it loads."""
-    files: dict[str, str | bytes] = {LIBRARY: library(), **copies(sources)}
+    files: dict[str, str | bytes] = {
+        LIBRARY: library(),
+        **copies(sources),
+        **exported.copies(sources, exported.lines(sources, judged.verdict)),
+    }
     room = packed.LARGEST - sum(map(len, files.values()))
     entries, rows = [], []
     for shown in series.tables(sources):
