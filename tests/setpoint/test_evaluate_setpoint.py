@@ -137,7 +137,7 @@ def test_a_case_that_decides_and_is_kept_of_everybody_is_kept_once_and_to_the_en
     """Runs are made up: every controller rests at 100 %."""
     specs = {name: ControllerSpec("baseline", baselines.nothing(), name) for name in SIMPLE}
     rest = judging.Runs(np.full((21, 201), 100.0), np.full((21, 201), 210.0))
-    kept = {name: {case: rest for case in ("accuracy 0.7", "recorded, fresh")} for name in SIMPLE}
+    kept = {name: dict.fromkeys(("accuracy 0.7", "recorded, fresh"), rest) for name in SIMPLE}
     contest = evaluate_setpoint.Contest({}, {name: judged(0.5) for name in SIMPLE}, {}, kept)
     choice = judging.Choice("do nothing", 0.0, "recorded, fresh", *3 * (0.0,), {}, "")
     columns = evaluate_setpoint.paths(specs, contest, choice, NO_PIXELS)
