@@ -1,7 +1,7 @@
 """Agents and classifier -> who sets flow and temperature: reads datasets/train_classifier
 and datasets/train_agent; writes datasets/evaluate_setpoint: scoreboard.parquet,
-paths.parquet of one run from each start, decisions.parquet of two episodes through pixels,
-and choice.json, the default with its worst case."""
+paths.parquet of one run from each start, in the case that decides too, decisions.parquet of
+two episodes through pixels, and choice.json, the default with its worst case."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -46,7 +46,9 @@ def main() -> None:
             SCOREBOARD,
             evaluate_setpoint.scoreboard(controllers, contest, rollouts),
         )
-        artifacts.write_table(out / "paths.parquet", PATHS, evaluate_setpoint.paths(contest, rollouts))
+        artifacts.write_table(
+            out / "paths.parquet", PATHS, evaluate_setpoint.paths(controllers, contest, choice, rollouts)
+        )
         artifacts.write_table(
             out / "decisions.parquet", DECISIONS, evaluate_setpoint.decisions(choice.name, rollouts)
         )

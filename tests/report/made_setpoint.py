@@ -117,21 +117,44 @@ def _walk(rng, flow, temperature, steps, error):
     return q, u
 
 
-def paths(steps=100):
+STARTS = [(q, u) for q in (30.0, 60.0, 80.0, 120.0, 150.0, 200.0, 300.0) for u in (190.0, 210.0, 230.0)]
+# the worst case of the default, and who is set beside it there
+DECIDES, COMPARED = (
+    ("paper", "accuracy 0.7, clog"),
+    ("do nothing", "sequential test", "Bayes, robust", DEFAULT),
+)
+CLOG_STEP, CLOG = 60, 0.6
+
+
+def paths(steps=100, decides=DECIDES):
+    """Two cases of everybody; and the one that decides of those who are compared, to decision 200."""
     rng, rows = np.random.default_rng(0), []
-    starts = [(q, u) for q in (30.0, 60.0, 80.0, 120.0, 150.0, 200.0, 300.0) for u in (190.0, 210.0, 230.0)]
     for name in KINDS:
         error = 0.05 if name in (DEFAULT, "Bayes, robust") else 0.5
-        for simulator, case in (("paper", "accuracy 0.7"), ("recorded", "recorded, fresh")):
-            for k, start in enumerate(starts):
-                q, u = _walk(rng, *start, steps, error)
-                rows += [
-                    (name, simulator, case, k, step, a, b)
-                    for step, (a, b) in enumerate(zip(q, u, strict=True))
-                ]
+        for case in (("paper", "accuracy 0.7"), ("recorded", "recorded, fresh")):
+            rows += _runs(rng, name, case, steps, error)
+    for name in COMPARED if decides else ():
+        rows += _runs(rng, name, decides, 200, 0.05, clog=CLOG)
     artifacts.write_table(
         "datasets/evaluate_setpoint/paths.parquet", tables.PATHS, columns(tables.PATHS, rows)
     )
+
+
+def _runs(rng, name, case, steps, error, clog=1.0):
+    """Rows of one made-up run from each start; what is left alone stays, and loses what a clog takes."""
+    rows = []
+    for k, start in enumerate(STARTS):
+        if name == "do nothing":
+            gain = np.where(np.arange(steps + 1) < CLOG_STEP, 1.0, clog)
+            q, u = start[0] * gain, np.full(steps + 1, start[1])
+        elif clog < 1:
+            before, warm = _walk(rng, *start, CLOG_STEP - 1, error)
+            after, same = _walk(rng, clog * before[-1], warm[-1], steps - CLOG_STEP, error)
+            q, u = before + after, warm + same
+        else:
+            q, u = _walk(rng, *start, steps, error)
+        rows += [(name, *case, k, step, a, b) for step, (a, b) in enumerate(zip(q, u, strict=True))]
+    return rows
 
 
 def decisions(steps=50, why=""):

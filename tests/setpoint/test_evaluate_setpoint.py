@@ -16,6 +16,7 @@ from pipeline.store import artifacts, params
 from tests.setpoint.synthetic import synthetic_table
 
 NO_PIXELS = evaluate_setpoint.PixelRollouts({}, None, ())
+CLOGGED = "recorded, sticky, half clog"
 SIMPLE = ("do nothing", "filtered proportional", "sequential test")
 
 
@@ -98,9 +99,10 @@ def test_the_number_of_cores_changes_nothing_and_the_runs_drawn_are_among_those_
     assert list(one.scores) == list(three.scores) == list(specs)
     rows = [evaluate_setpoint.scoreboard(specs, contest, NO_PIXELS) for contest in contests]
     np.testing.assert_equal(*rows)
-    columns = evaluate_setpoint.paths(one, NO_PIXELS)
-    np.testing.assert_equal(columns, evaluate_setpoint.paths(three, NO_PIXELS))
-    assert len(columns["flow_percent"]) == len(SIMPLE) * 2 * 21 * 101
+    choice = judging.Choice("sequential test", 0.0, CLOGGED, *3 * (0.0,), {}, "")
+    columns = evaluate_setpoint.paths(specs, one, choice, NO_PIXELS)
+    np.testing.assert_equal(columns, evaluate_setpoint.paths(specs, three, choice, NO_PIXELS))
+    check_the_case_that_decides(columns, one)
     for name in SIMPLE:
         drawn = one.paths[name]["accuracy 0.7"]
         assert set(drawn.flow[:, 0]) == set(judging.START_FLOWS)
@@ -109,6 +111,59 @@ def test_the_number_of_cores_changes_nothing_and_the_runs_drawn_are_among_those_
         np.testing.assert_array_equal(drawn.temperature[:, 0], starts.temperature)
     assert (np.ptp(one.paths["do nothing"]["recorded, fresh"].flow, axis=1) < 1e-3).all()
     assert np.ptp(one.paths["sequential test"]["recorded, fresh"].flow, axis=1).max() > 50
+
+
+def check_the_case_that_decides(columns, contest):
+    """Beside 100 decisions of two cases, all 200 of the choice's: what is left alone shows when it clogs, and
+    how much gets through."""
+    rows = {name: np.asarray(column) for name, column in columns.items()}
+    decides = rows["case"] == CLOGGED
+    assert (~decides).sum() == len(SIMPLE) * 2 * 21 * 101
+    assert set(rows["case"][~decides]) == {"accuracy 0.7", "recorded, fresh"}
+    assert (rows["step"][~decides].max(), rows["step"][decides].max()) == (100, 200)
+    assert set(rows["simulator"][decides]) == {"recorded"}
+    assert list(dict.fromkeys(rows["controller"][decides])) == list(SIMPLE)
+    for name in SIMPLE:
+        drawn = rows["flow_percent"][decides & (rows["controller"] == name)].reshape(21, 201)
+        np.testing.assert_array_equal(drawn, contest.paths[name][CLOGGED].flow.astype(float))
+        if name == "do nothing":
+            np.testing.assert_allclose(drawn[:, :60], np.repeat(drawn[:, :1], 60, axis=1), rtol=1e-5)
+            np.testing.assert_allclose(drawn[:, 60:], np.repeat(0.75 * drawn[:, :1], 141, axis=1), rtol=1e-5)
+        else:
+            assert (np.ptp(drawn[:, 60:], axis=1) > 5).any()
+
+
+def test_a_case_that_decides_and_is_kept_of_everybody_is_kept_once_and_to_the_end(settings):
+    """Runs are made up: every controller rests at 100 %."""
+    specs = {name: ControllerSpec("baseline", baselines.nothing(), name) for name in SIMPLE}
+    rest = judging.Runs(np.full((21, 201), 100.0), np.full((21, 201), 210.0))
+    kept = {name: dict.fromkeys(("accuracy 0.7", "recorded, fresh"), rest) for name in SIMPLE}
+    contest = evaluate_setpoint.Contest({}, {name: judged(0.5) for name in SIMPLE}, {}, kept)
+    choice = judging.Choice("do nothing", 0.0, "recorded, fresh", *3 * (0.0,), {}, "")
+    columns = evaluate_setpoint.paths(specs, contest, choice, NO_PIXELS)
+    assert len(columns["step"]) == len(SIMPLE) * 21 * (101 + 201)
+
+
+def judged(share, worst="clog"):
+    """So much of the runs is kept in the worst case, and all in another."""
+    runs = np.arange(20) < 20 * share
+    return judging.Judged({"other": np.ones((1, 20), bool), worst: runs[None]}, {})
+
+
+def test_beside_the_default_stand_doing_nothing_the_strongest_rule_and_our_strongest_agent():
+    kinds = {
+        "do nothing": "baseline", "slow": "baseline", "quick": "baseline", "harmful": "baseline",
+        "default": "baseline", "paper": "paper", "weak agent": "agent", "agent": "agent",
+    }  # fmt: skip
+    shares = dict(zip(kinds, (0.1, 0.4, 0.6, 0.9, 0.8, 0.7, 0.5, 0.6), strict=True))
+    specs = {name: ControllerSpec(kind, None, None) for name, kind in kinds.items()}
+    contest = evaluate_setpoint.Contest({}, {name: judged(share) for name, share in shares.items()}, {}, {})
+    choice = judging.Choice("default", 80.0, "clog", *3 * (0.0,), {"harmful": "harms"}, "")
+    who = evaluate_setpoint.compared(specs, contest, choice)
+    assert who == ["do nothing", "quick", "default", "agent"]
+    # where no other rule may run, the strongest of those stands there
+    choice = choice._replace(refused={"harmful": "harms", "quick": "harms", "slow": "harms"})
+    assert evaluate_setpoint.compared(specs, contest, choice) == ["do nothing", "harmful", "default", "agent"]
 
 
 def test_who_cannot_win_any_more_runs_in_one_round_only(settings, monkeypatch):

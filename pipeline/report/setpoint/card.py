@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from markupsafe import Markup
 
+from pipeline.report.setpoint import deciding as deciding_case
 from pipeline.report.setpoint.verdict import (
     BASELINE,
     Board,
@@ -26,9 +27,9 @@ from pipeline.report.shared.card import Card, Cell, Deciding, Entrant, Row, Step
 from pipeline.report.shared.digits import THIN, band, count
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import FAILED, PASSED, Figure, Missing, Verdict
-from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING
+from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, FLOW_BAND
 
-MOVES = "Nozzle camera to setpoints"
+MOVES, TITLE = "Nozzle camera to setpoints", "Setpoint, the case that decides"
 # cases that the picture has room for, the worst first
 MOST_CASES = 8
 
@@ -147,8 +148,8 @@ def _step(sources: Sources, verdict: Verdict) -> Step:
 
 
 def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
-    """Runs that settle, or settle and stay, in every case that counts, the worst first: the default, the
-    agent and doing nothing."""
+    """The case that decides, decision by decision; where its runs were not kept, runs that settle, or settle
+    and stay, in every case that counts, the worst first. Of the default, the agent and doing nothing."""
     scores = board(sources)
     if isinstance(scores, Missing):
         return scores
@@ -164,18 +165,30 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
         return Missing("not measured", "no case counts")
     first, more = cases[0], len(cases) - MOST_CASES
     listed = ", ".join(f"{name} {_text(scores, name, first, what)}" for name in names)
+    entrants = [Entrant(role(scores, name), name, "") for name in names]
+    traced = deciding_case.panels(sources, scores, first, names)
+    if not isinstance(traced, Missing):
+        return Deciding(
+            TITLE,
+            f"Runs that {does} in {within(first)}: {listed}; at least {limit:g}{THIN}% are to.",
+            traced.wide,
+            traced.narrow,
+            f"{deciding_case.reading(names)} Dashed: ±{FLOW_BAND:g}{THIN}%.",
+            page.linked(sources.source("paths")),
+            entrants,
+        )
     finding = f"Runs that {does}, by case; the case that decides first, {within(first)}: {listed}."
     sizes = ((566, 212, 190), (350, 250, 150))
     wide, narrow = (_drawn(scores, names, cases[:MOST_CASES], what, limit, finding, size) for size in sizes)
     beyond = f" {count(more, 'better case').capitalize()} on the loop’s page." if more > 0 else ""
     return Deciding(
-        "Setpoint, the case that decides",
+        TITLE,
         finding,
         wide,
         narrow,
         f"Line: the limit, {limit:g}{THIN}%. Bars: 95{THIN}% intervals.{beyond}",
         page.linked(sources.source("scoreboard")),
-        [Entrant(role(scores, name), name, "") for name in names],
+        entrants,
     )
 
 

@@ -10,6 +10,7 @@ from pipeline.report.deposition.page import flat
 from pipeline.report.setpoint import agent as setpoint_agent
 from pipeline.report.setpoint import by_flow as setpoint_by_flow
 from pipeline.report.setpoint import change as setpoint_change
+from pipeline.report.setpoint import deciding as setpoint_deciding
 from pipeline.report.setpoint import harm as setpoint_harm
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
@@ -86,6 +87,8 @@ def render(sources: Sources) -> str:
         no_board=scores if isinstance(scores, Missing) else None,
         heads=heads(judged_scores),
         answers=answers(sources, judged_scores) if judged_scores else [],
+        better=_better(judged_scores) if judged_scores else 0,
+        deciding=setpoint_deciding.picture(sources, scores),
         boards=boards(sources, judged_scores) if judged_scores else [],
         worsts=worsts(judged_scores) if judged_scores else [],
         harms=setpoint_harm.harms(sources, scores),
@@ -165,7 +168,7 @@ class Reading(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """A row of the first screen: one case."""
+    """A row of the first screen: one case; `decides`: the worst of the default."""
 
     simulator: str
     case: str
@@ -175,17 +178,16 @@ class Answer(NamedTuple):
     stay: str
     stay_bad: bool
     change: Change
+    decides: bool
 
 
 def answers(sources: Sources, scores: Board) -> list[Answer]:
-    """Runs that settle and stay of what learned and of a baseline; the strip shows the runs that are
-    lost, as a share of those that may be."""
+    """Runs that settle and stay of what learned and of a baseline, the worst case of the default first; the
+    strip shows the runs that are lost, as a share of those that may be."""
     pair = (scores.learned(), scores.baseline())
-    cases = [
-        case
-        for case in scores.cases
-        if any((cell := scores.cells.get((name, case))) and cell.counts for name in pair)
-    ]
+    mine, cases = scores.default or pair[0] or pair[1], _counting(scores)
+    _, lowest = worst(scores, mine, "lasting")
+    cases.sort(key=lambda case: _share_of(scores.cells.get((mine, case))))
     lost = Question(0, "", "Runs lost", "%", 100 - sources.declared.rules.settled_percent, False, "")
     gone = Question(0, "", "Runs that leave", "%", 100 - sources.declared.rules.stay_percent, False, "")
     rows = []
@@ -196,8 +198,8 @@ def answers(sources: Sources, scores: Board) -> list[Answer]:
             for name, cell in zip(pair, cells, strict=True)
             if name
         ]
-        mine = scores.cells.get((scores.default or pair[0], case))
-        states = [state(lost, _lost(mine)), state(gone, _lost(mine, "stay"))] if mine else [OPEN] * 2
+        own = scores.cells.get((mine, case))
+        states = [state(lost, _lost(own)), state(gone, _lost(own, "stay"))] if own else [OPEN] * 2
         rows.append(
             Answer(
                 SIMULATORS.get(case[0], case[0]),
@@ -208,12 +210,34 @@ def answers(sources: Sources, scores: Board) -> list[Answer]:
                     for name, cell, css in zip(pair, cells, ("dd", "mb"), strict=True)
                 ],
                 strip=charts.strip(lost, shown),
-                stay=_stay(mine),
+                stay=_stay(own),
                 stay_bad=states[1] == FAILED,
-                change=setpoint_change.change(sources, case, mine),
+                change=setpoint_change.change(sources, case, own),
+                decides=case == lowest,
             )
         )
     return rows
+
+
+def _counting(scores: Board) -> list[Case]:
+    """The cases that count for one of the two controllers of the first screen."""
+    pair = (scores.learned(), scores.baseline())
+    return [
+        case
+        for case in scores.cases
+        if any((cell := scores.cells.get((name, case))) and cell.counts for name in pair)
+    ]
+
+
+def _better(scores: Board) -> int:
+    """Cases that the first screen has no room for: those in which the default fares best."""
+    return max(len(_counting(scores)) - MOST, 0)
+
+
+def _share_of(cell: Cell | None) -> float:
+    """The share by which a case is read; 101 where it was not run."""
+    share = Missing("not measured", "") if cell is None else lasting(cell)
+    return share.value if isinstance(share, Figure) else 101.0
 
 
 def _lost(cell: Cell | None, what: str = "settled") -> Figure | Missing:

@@ -2,6 +2,7 @@
 what every other one is. Rows of equal keys are one run; what happens in it are its events.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.report.deposition.learning import LAWS
+from pipeline.report.setpoint.deciding import Clog, clog
 from pipeline.report.shared.charts import stretches
 from pipeline.report.shared.page import MARKS
 from pipeline.report.shared.sources import Sources, Table
@@ -358,10 +360,22 @@ def _decisions(sources: Sources) -> Shown:
 
 
 def _paths(sources: Sources) -> Shown:
+    table = sources.tables["paths"]
+
+    @functools.cache
+    def happens(case: tuple[str, str]) -> Clog | None:
+        return None if isinstance(table, Missing) else clog(table, case)
+
+    def events(rows: Table) -> list[Event]:
+        found = happens((str(rows["simulator"][0]), str(rows["case"][0])))
+        text = "" if found is None else f"a clog leaves {found.left:.0f} % of the flow"
+        return [] if found is None else [Event(found.step, found.step, text, "flow")]
+
     return Shown(
         "paths",
         "Setpoint: runs from every start",
-        "True flow and nozzle temperature, decision by decision, of runs that were judged.",
+        "True flow and nozzle temperature, decision by decision, of runs that were judged; of the case that "
+        "decides to decision 200.",
         ("step", "decision", ""),
         (
             Key("simulator", "Simulator"),
@@ -375,6 +389,7 @@ def _paths(sources: Sources) -> Shown:
         ),
         who="controller",
         marks=_setpoint_marks(sources),
+        events=events,
     )
 
 

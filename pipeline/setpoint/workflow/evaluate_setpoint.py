@@ -16,7 +16,7 @@ from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, read_f
 from pipeline.setpoint.familiar import Camera
 from pipeline.setpoint.judging import Case, Choice, Judged, Runs
 from pipeline.setpoint.recorded import WindowTable
-from pipeline.setpoint.score import BEYOND, Outcomes, Score, harm_bar, summary
+from pipeline.setpoint.score import BEYOND, DOES_NOTHING, STEPS, Outcomes, Score, harm_bar, summary
 from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, Windows
 from pipeline.setpoint.window_flow import window_flow
 from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
@@ -40,7 +40,7 @@ class PixelRollouts(NamedTuple):
 
 class Contest(NamedTuple):
     """Scores of every controller in every case, on segments that are read once; its runs there, and of each
-    how many redraws of them these are on; by controller and case of PATHS_OF the first run from each start.
+    how many redraws of them these are on; by controller and case that counts the first run from each start.
     """
 
     scores: dict[str, dict[str, Score]]
@@ -49,7 +49,7 @@ class Contest(NamedTuple):
     paths: dict[str, Mapping[str, Runs]]
 
 
-# the cases of which the page draws runs, and so many decisions of them
+# the cases of which runs of every controller are kept beside the deciding one, and so many decisions of them
 PATHS_OF, PATH_STEPS = ("accuracy 0.7", "recorded, fresh"), 100
 
 
@@ -174,7 +174,8 @@ def _of_round(recorded: Windows, number: int, redraws: int) -> Windows:
 
 
 class Asked(NamedTuple):
-    """By case what became of one controller's runs; and the first of them from each start, of PATHS_OF."""
+    """By case what became of one controller's runs; and the first of them from each start, of cases that
+    count: which of these decides is known when all are judged."""
 
     outcomes: dict[str, Outcomes]
     paths: dict[str, Runs]
@@ -189,8 +190,9 @@ def _asked(
         keys = jax.random.split(jax.random.fold_in(key, number), redraws)
         of = judging.runs(spec.controller, spec.parameters, case, part, keys)
         found[name] = judging.become(of)
-        if name in PATHS_OF:
-            paths[name] = judging.first_of_each(of)
+        if judging.counts(name):
+            # a copy, so that the other runs can be let go
+            paths[name] = jax.tree.map(np.copy, judging.first_of_each(of))
         bar.update()
     return Asked(found, paths)
 
@@ -305,13 +307,30 @@ def _columns(rows: list[dict[str, Any]]) -> dict[str, list]:
     return {name: [row[name] for row in rows] for name in rows[0]}
 
 
-def paths(contest: Contest, rollouts: PixelRollouts) -> dict[str, Any]:
-    """Columns of schema PATHS: one run from each of the 21 starts, at accuracy 0.7 on the paper's simulator
-    and on fresh recorded windows, of those judged; and those through pixels."""
+def compared(specs: Mapping[str, ControllerSpec], contest: Contest, choice: Choice) -> list[str]:
+    """Who is set beside the default in its worst case, in the contestants' order: doing nothing, the
+    strongest simple rule and the strongest agent of ours. The strongest keeps most in its own worst case;
+    who may not run gives way to who may."""
+    names = {choice.name, DOES_NOTHING}
+    for kind in ("baseline", "agent"):
+        others = [name for name in contest.judged if specs[name].kind == kind and name not in names]
+        others.sort(key=lambda name: (name in choice.refused, -judging.worst_case(contest.judged[name])[0]))
+        names |= {*others[:1]}
+    return [name for name in contest.judged if name in names]
+
+
+def paths(
+    specs: Mapping[str, ControllerSpec], contest: Contest, choice: Choice, rollouts: PixelRollouts
+) -> dict[str, Any]:
+    """Columns of schema PATHS: one run from each of the 21 starts, of those judged. Of every controller
+    PATH_STEPS decisions of the cases PATHS_OF; of those that are compared STEPS of the choice's case, which
+    decides. And the runs through pixels."""
     pieces = []
-    for case in PATHS_OF:
-        for name, of in contest.paths.items():
-            flow, temperature = (np.asarray(a[:, : PATH_STEPS + 1], float) for a in of[case])
+    for case in dict.fromkeys((*PATHS_OF, choice.case)):
+        names = contest.paths if case in PATHS_OF else compared(specs, contest, choice)
+        last = STEPS if case == choice.case else PATH_STEPS
+        for name in names:
+            flow, temperature = (np.asarray(a[:, : last + 1], float) for a in contest.paths[name][case])
             pieces.append(((name, simulator(case), case), flow, temperature))
     for name, episodes in rollouts.calm.items():
         pieces.append(((name, "pixels", "calm"), episodes.flow, episodes.temperature))
