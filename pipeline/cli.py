@@ -653,8 +653,8 @@ def main() -> None:
     arguments = parser.parse_args()
     try:
         arguments.run(arguments)
-    except (ValueError, OSError) as error:
-        print(f"beadline: {printable(' '.join(str(error).split()))}", file=sys.stderr)
+    except (ValueError, OSError, MemoryError) as error:
+        print(f"beadline: {printable(' '.join(artifacts.reason(error).split()))}", file=sys.stderr)
         sys.exit(1)
 
 

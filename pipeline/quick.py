@@ -151,7 +151,11 @@ def _fresh() -> Generator[Path]:
     """An empty folder that becomes FOLDER when the body ends well. What killed calls left is removed."""
     for left in Path().glob(f".{FOLDER}.*.tmp"):
         pid = left.name.split(".")[2]
-        if not pid.isdigit() or int(pid) == os.getpid() or not Path(f"/proc/{pid}").exists():
+        if pid.isdigit() and int(pid) != os.getpid() and Path(f"/proc/{pid}").exists():
+            continue
+        if left.name.endswith(".old.tmp") and not FOLDER.exists():
+            left.rename(FOLDER)
+        else:
             shutil.rmtree(left)
     folder, retired = (Path(f".{FOLDER}.{os.getpid()}{end}.tmp") for end in ("", ".old"))
     folder.mkdir()
@@ -161,6 +165,8 @@ def _fresh() -> Generator[Path]:
             FOLDER.rename(retired)
         folder.rename(FOLDER)
     finally:
+        if retired.exists() and not FOLDER.exists():
+            retired.rename(FOLDER)
         for left in (folder, retired):
             shutil.rmtree(left, ignore_errors=True)
 

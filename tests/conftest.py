@@ -54,6 +54,26 @@ def shared():
     return path
 
 
+@pytest.fixture(scope="session")
+def cluster(tmp_path_factory):
+    """A dask scheduler and two workers on loopback; nobody kills them."""
+    from tests.cluster import Cluster
+
+    made = Cluster(tmp_path_factory.mktemp("cluster"))
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def mortal_cluster(tmp_path):
+    """One of its own for a test that kills."""
+    from tests.cluster import Cluster
+
+    made = Cluster(tmp_path)
+    yield made
+    made.stop()
+
+
 @pytest.fixture
 def beadline(tmp_path, monkeypatch, capfd):
     """beadline("inspect", "a.csv") in an empty folder: status, what was printed, and what was said of

@@ -1,5 +1,6 @@
 """The quick look: its sizes, its folder, what is kept for it, and that its pages say what they are."""
 
+import errno
 import os
 import shutil
 import signal
@@ -149,6 +150,29 @@ def test_a_stage_that_fails_leaves_the_last_quick_look(checkout, capsys):
     assert ended.value.code == 1 and "generate_probing.samples is -1" in capsys.readouterr().err
     assert written(checkout / "quick") == {"page.html": b"of the last quick look"}
     assert not list(checkout.glob(".quick.*")) and Path.cwd() == checkout
+
+
+def test_a_full_disk_at_the_last_step_leaves_the_last_quick_look(checkout, monkeypatch):
+    (checkout / "quick").mkdir()
+    (checkout / "quick/page.html").write_text("of the last quick look")
+    rename = Path.rename
+
+    def full(self, target):
+        if self.name == f".quick.{os.getpid()}.tmp":
+            raise OSError(errno.ENOSPC, "No space left on device", str(self))
+        return rename(self, target)
+
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "rename", full)
+        with pytest.raises(OSError, match="No space left"), quick._fresh():
+            pass
+    assert written(checkout / "quick") == {"page.html": b"of the last quick look"}
+    # killed between its two renames
+    (checkout / "quick").rename(checkout / ".quick.99999999.old.tmp")
+    with pytest.raises(RuntimeError), quick._fresh():
+        raise RuntimeError("the next one fails")
+    assert written(checkout / "quick") == {"page.html": b"of the last quick look"}
+    assert not list(checkout.glob(".quick.*"))
 
 
 def test_a_quick_look_beside_another_leaves_its_folder_alone(checkout):

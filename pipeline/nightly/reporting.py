@@ -21,12 +21,14 @@ from pipeline.store import artifacts, params
 OK, FAILED, DRIFTED, QUARANTINED, BUSY = 0, 1, 3, 4, 75
 PAGE = Path("reports/nightly.html")
 # what ends a night in a sentence; anything else is a mistake of this program, whose traceback is in the log
-REFUSALS = (ValueError, OSError, np.linalg.LinAlgError)
+REFUSALS = (ValueError, OSError, MemoryError, np.linalg.LinAlgError)
 
 
 def told(error: Exception, run: str) -> str:
     """An error in one sentence. The traceback of a mistake of this program goes to the night's log."""
-    said = " ".join((artifacts.reason(error) if isinstance(error, OSError) else str(error)).split())
+    said = " ".join(
+        (artifacts.reason(error) if isinstance(error, OSError | MemoryError) else str(error)).split()
+    )
     if isinstance(error, REFUSALS) and not isinstance(error, UnicodeError):
         return said or type(error).__name__
     log = STATE / "logs" / f"{run}.log"

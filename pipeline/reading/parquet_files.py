@@ -34,6 +34,8 @@ MOST_EXPECTED, MOST_IN_ONE_PIECE = 1 << 26, 1 << 22
 def _parquet(path: Path) -> pq.ParquetFile:
     try:
         return pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False, buffer_size=1 << 16)
+    except MemoryError:
+        raise  # Arrow's is an ArrowException too, and the file may be whole
     except (OSError, pa.ArrowException) as error:
         raise ValueError(
             f"{path} is not a whole Parquet file ({_first_line(error)}); its index is at its end, "
@@ -184,6 +186,8 @@ def _values(path: Path, file: pq.ParquetFile, kinds: dict[str, type], clock: str
         for batch in file.iter_batches(ROWS_AT_ONCE, columns=columns, use_threads=False):
             table = _flat(pa.Table.from_batches([batch]))
             parts.append(*(_array(path, name, table[name], clock) for name in kinds))
+    except MemoryError:
+        raise
     except (OSError, pa.ArrowException) as error:
         raise ValueError(
             f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, "

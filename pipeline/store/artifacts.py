@@ -32,6 +32,9 @@ from pipeline.store.tables import ARRAYS, Column, Schema
 
 DATASETS, REPORTS = Path("datasets"), Path("reports")
 WHOLE = ".whole"  # inside a stage: the folder that it lies in will hold nothing else
+REFUSALS = (ValueError, OSError, MemoryError, np.linalg.LinAlgError, pa.ArrowException)
+# how XLA, OpenCV and C++ say that their memory ran out
+OUT_OF_MEMORY = ("RESOURCE_EXHAUSTED", "Insufficient memory", "bad_alloc")
 CSV_ROWS = 1 << 15  # written at once: text takes ten times the memory of its numbers
 
 # inside a stage: the folder where what goes to reports/ waits until the stage has ended well
@@ -74,6 +77,8 @@ def read_table(path: str | Path, schema: Schema) -> dict[str, np.ndarray]:
             table = file.read()
     except FileNotFoundError:
         raise ValueError(f"{path} is missing; {command}") from None
+    except MemoryError:
+        raise  # Arrow's is an ArrowException too, and says nothing of the file
     except (OSError, pa.ArrowException) as error:
         raise ValueError(f"{path} is not a whole Parquet file ({reason(error)}); {command}") from None
     table = tables.under_new_names(schema, table)
@@ -402,8 +407,8 @@ def stage(name: str) -> Iterator[Path]:
     """The frame around a stage: a fresh folder becomes datasets/<name> when the body ends well, together with
     the files that the body wrote to reports/.
 
-    Bad input (ValueError, LinAlgError, OSError, Arrow's errors) ends the process with status 1 and one line,
-    and changes no file.
+    Bad input (ValueError, LinAlgError, OSError, Arrow's errors) and the end of the memory end the process
+    with status 1 and one line, and change no file.
     """
     folder, retired, waiting = (DATASETS / f".{name}.{os.getpid()}{end}" for end in ("", ".old", ".reports"))
     token = _waiting.set(waiting)
@@ -420,7 +425,9 @@ def stage(name: str) -> Iterator[Path]:
             target = temporary.relative_to(waiting)
             target.parent.mkdir(parents=True, exist_ok=True)
             temporary.replace(target)
-    except (ValueError, OSError, np.linalg.LinAlgError, pa.ArrowException) as error:
+    except (*REFUSALS, RuntimeError, cv2.error) as error:
+        if not isinstance(error, REFUSALS) and not _out_of_memory(error):
+            raise
         # the temporary folder's name means nothing to a reader
         sentence = reason(error).replace(str(folder), str(DATASETS / name))
         print(printable(f"{name}: {sentence}"), file=sys.stderr)
@@ -499,6 +506,26 @@ def beside(path: str | Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def together(folder: Path) -> Iterator[Path]:
+    """A folder inside this one, whose files take their places in it when the body ends well: all or none.
+    What killed calls left is removed."""
+    for left in folder.glob(".together.*"):
+        pid = left.suffix[1:]
+        if pid.isdigit() and not _alive(int(pid)):
+            shutil.rmtree(left, ignore_errors=True)
+    waiting = folder / f".together.{os.getpid()}"
+    try:
+        waiting.mkdir(parents=True, exist_ok=True)
+        yield waiting
+        for file in sorted(waiting.iterdir()):
+            file.replace(folder / file.name)
+    except OSError as error:
+        raise OSError(reason(error).replace(str(waiting), str(folder))) from None
+    finally:
+        shutil.rmtree(waiting, ignore_errors=True)
+
+
 def _on_disk(path: Path) -> None:
     """Waits until a file, or the names in a folder, would outlast a power cut; some 5 ms each."""
     if path.is_dir() and os.name == "nt":
@@ -530,11 +557,21 @@ def remedy(path: str | Path) -> str:
 
 
 def reason(error: Exception) -> str:
-    """The error in one line. An operating system's error becomes file, words and remedy."""
+    """The error in one line. An operating system's error and the end of the memory become words and
+    remedy."""
     text = str(error) or type(error).__name__
+    if isinstance(error, MemoryError) or _out_of_memory(error):
+        text = (
+            f"there is not enough memory ({' '.join(text.split())[:200]}); "
+            f"end other programs, or lower execution.jobs in {params.FILE}, and run it again"
+        )
     if isinstance(error, OSError) and error.filename:
         text = f"{error.filename}: {error.strerror}; {_mend(error, Path(error.filename).parent)}"
     return "; ".join(line.strip() for line in text.splitlines() if line.strip())
+
+
+def _out_of_memory(error: Exception) -> bool:
+    return any(words in str(error) for words in OUT_OF_MEMORY)
 
 
 def write_weights(

@@ -2,13 +2,28 @@
 section `execution` of params.yaml."""
 
 import contextlib
+import functools
+import importlib.metadata
+import os
+import pickle
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
+from pipeline.store import artifacts
 from pipeline.store.params import Execution
+
+CODE = Path(__file__).resolve().parents[1]
+# what `run` exports for the sake of last bits, and the packages whose sums they pin
+PINS = (
+    "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "NPROC",
+    "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "XLA_FLAGS", "ONEDNN_MAX_CPU_ISA",
+    "TENSORFLOW_USE_CUSTOM_CONTRACTION_KERNEL", "ARROW_USER_SIMD_LEVEL", "OPENCV_IPP", "OPENCV_CPU_DISABLE",
+)  # fmt: skip
+PACKAGES = ("numpy", "scipy", "jaxlib", "opencv-python-headless", "pyarrow", "scikit-learn")
 
 
 def run_all(
@@ -17,15 +32,19 @@ def run_all(
     """The results of calls made with joblib.delayed, in their order, as they come. Both back ends give the
     same results.
 
-    The workers of a cluster have the same code and the same file system, under absolute paths. `remains` says
-    what a killed run leaves behind. Raises ValueError if a worker is killed, or if there is no cluster.
+    The workers of a cluster have the same code, packages and pins, and the same file system, under absolute
+    paths. `remains` says what a killed run leaves behind. Raises ValueError if workers are killed over and
+    over, if one differs from this process, or if there is no cluster.
     """
     if execution.backend == "dask" and calls:
-        with _cluster(execution.scheduler, remains):
-            # only a configuration loads joblib's back end for dask
-            with joblib.parallel_config(backend="dask"):
-                parallel = joblib.Parallel(return_as="generator")
-            yield from parallel(calls)
+        with _cluster(execution.scheduler, remains) as client:
+            from distributed.protocol.pickle import dumps  # of local functions too
+
+            # not by joblib: it leaves an array with one worker, and loses it with that
+            futures = client.map(_there, [*map(dumps, calls)], asked=surroundings(), pure=False)
+            futures.reverse()
+            while futures:
+                yield futures.pop().result()
     elif len(calls) <= 1 or execution.jobs == 1:
         yield from (function(*arguments, **settings) for function, arguments, settings in calls)
     else:
@@ -39,9 +58,55 @@ def run_all(
             ) from None
 
 
+# ---- a cluster
+
+
+class Surroundings(NamedTuple):
+    """What the bytes of a result depend on besides its call: SHA-256 of pipeline/, versions of PACKAGES, and
+    PINS, where they are set."""
+
+    code: str
+    packages: dict[str, str]
+    pins: dict[str, str]
+
+
+@functools.cache
+def surroundings() -> Surroundings:
+    """Those of this process when it was first asked: a worker keeps the code that it has once imported."""
+    packages = {name: importlib.metadata.version(name) for name in PACKAGES}
+    pins = {name: os.environ[name] for name in PINS if name in os.environ}
+    return Surroundings(artifacts.sha256(CODE), packages, pins)
+
+
+def _there(call: bytes, asked: Surroundings) -> Any:
+    """What a pickled call gives in a worker. Raises ValueError where that is not as asked."""
+    if others := _differences(asked, surroundings()):
+        import distributed
+
+        raise ValueError(
+            f"params.yaml: execution.scheduler: the worker {distributed.get_worker().address} has "
+            f"{'; '.join(others)}: its results could differ; "
+            "start it anew by `./run dask worker` of this checkout"
+        )
+    function, arguments, settings = pickle.loads(call)
+    return function(*arguments, **settings)
+
+
+def _differences(asked: Surroundings, found: Surroundings) -> list[str]:
+    """What is found in a worker, beside what was asked for."""
+    told = ["another pipeline/, or one of before a change"] if asked.code != found.code else []
+    for wanted, there in ((asked.packages, found.packages), (asked.pins, found.pins)):
+        told += [
+            f"{name} {there.get(name, 'not set')}, expected {wanted.get(name, 'not set')}"
+            for name in sorted(wanted | there)
+            if wanted.get(name) != there.get(name)
+        ]
+    return told
+
+
 @contextlib.contextmanager
-def _cluster(scheduler: str, remains: str) -> Iterator[None]:
-    """joblib's back end `dask` is the cluster of this address. A failure of the cluster is one sentence."""
+def _cluster(scheduler: str, remains: str) -> Iterator[Any]:
+    """A client of the cluster of this address. A failure of the cluster is one sentence."""
     try:
         import distributed
     except ImportError:
@@ -51,9 +116,8 @@ def _cluster(scheduler: str, remains: str) -> Iterator[None]:
         ) from None
     with contextlib.ExitStack() as connected:
         try:
-            connected.enter_context(distributed.Client(scheduler, timeout="20s")).wait_for_workers(
-                1, timeout=20
-            )
+            client = connected.enter_context(distributed.Client(scheduler, timeout="20s"))
+            client.wait_for_workers(1, timeout=20)
         except (OSError, ValueError) as error:
             raise ValueError(
                 f"params.yaml: execution.scheduler: expected a dask scheduler with a worker at {scheduler}, "
@@ -62,10 +126,15 @@ def _cluster(scheduler: str, remains: str) -> Iterator[None]:
                 "or set execution.backend: loky"
             ) from None
         try:
-            yield
+            yield client
         except distributed.KilledWorker as error:
             raise ValueError(
                 f"params.yaml: execution.scheduler: {error.allowed_failures + 1} workers of {scheduler} died "
                 "over the same work; "
                 f"give each worker more memory, and run it again{remains}"
+            ) from None
+        except distributed.CancelledError:
+            raise ValueError(
+                f"params.yaml: execution.scheduler: the scheduler {scheduler} ended, or could no longer be "
+                f"reached; start it and its workers again, and run it again{remains}"
             ) from None

@@ -105,6 +105,12 @@ def refusal(name: str, capsys) -> str:
     return message
 
 
+def test_a_cluster_films_the_same_trials(first_run, project, cluster):
+    declare({"execution.backend": "dask", "execution.scheduler": cluster.address})
+    stage("train_ilc")
+    assert artifacts.sha256("datasets/train_ilc") == artifacts.sha256(first_run / "datasets/train_ilc")
+
+
 def test_the_simulated_loop_learns_composes_and_repeats_to_the_byte(finished, capsys):
     metrics = json.loads(Path("reports/metrics/train_ilc.json").read_text())["A"]
     # the bars of the learning loop at trial 2, on a machine that is not the nominal model

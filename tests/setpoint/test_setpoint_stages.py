@@ -266,8 +266,10 @@ def test_rendered_parts_share_no_segment_and_every_bin_has_a_window_in_every_par
         assert ((recorded.flow >= low) & (recorded.flow <= high)).all()
 
 
-def test_rendering_again_gives_the_same_bytes_whatever_the_workers(simulated, project):
-    declare({"execution.jobs": 2})
+@pytest.mark.parametrize("backend", ["loky", "dask"])
+def test_rendering_again_gives_the_same_bytes_whatever_the_workers(simulated, project, cluster, backend):
+    scheduler = cluster.address if backend == "dask" else ""
+    declare({"execution.jobs": 2, "execution.backend": backend, "execution.scheduler": scheduler})
     stage("render_frames")
     assert artifacts.sha256("datasets/render_frames") == artifacts.sha256(
         simulated / "datasets/render_frames"

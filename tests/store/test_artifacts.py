@@ -578,6 +578,77 @@ def test_a_read_only_folder_is_one_line(root, project, last_good):
     assert everything(project) == last_good
 
 
+LITTLE_MEMORY = """
+import resource, sys
+import numpy as np
+from pipeline.store import artifacts
+from tests.store.test_artifacts import LONG
+pages = int(open("/proc/self/statm").read().split()[0])
+resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 20_000_000,) * 2)
+with artifacts.stage("learn_kernel") as out:
+    {work}
+"""
+LONG = tables.Schema("long", 1, (tables.Column("value", tables.FLOAT, "1", "one after the other"),))
+
+
+@pytest.mark.parametrize("work", ["artifacts.read_table('long.parquet', LONG)", "np.zeros((30_000, 1_000))"])
+def test_memory_that_runs_out_is_one_line_and_blames_no_file(root, project, last_good, work):
+    artifacts.write_table("long.parquet", LONG, {"value": np.zeros(6_000_000)})
+    before = everything(project)
+    end = run(root, LITTLE_MEMORY.format(work=work))
+    assert end.returncode == 1
+    assert re.fullmatch(
+        r"learn_kernel: there is not enough memory \(.+\); end other programs, or lower execution\.jobs in "
+        r"params\.yaml, and run it again\n",
+        end.stderr,
+    )
+    assert everything(project) == before
+
+
+def test_the_memory_of_other_libraries_is_told_from_their_mistakes(project, last_good, capsys):
+    with pytest.raises(SystemExit):
+        learn(RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 80000000000 bytes."))
+    assert "learn_kernel: there is not enough memory (RESOURCE_EXHAUSTED" in capsys.readouterr().err
+    with pytest.raises(RuntimeError, match="a bug"):
+        learn(RuntimeError("a bug"))
+    assert everything(project) == last_good
+
+
+# ---- files that belong together
+
+
+def several(count: int, size: int = 10) -> None:
+    with artifacts.together(Path("jobs")) as place:
+        for k in range(count):
+            artifacts.write_text(place / f"{k}.txt", f"{count}" * size)
+
+
+def test_files_that_belong_together_come_together_or_not_at_all(project, monkeypatch):
+    Path("jobs").mkdir()
+    Path("jobs/of_somebody.txt").write_text("stays")
+    several(2)
+    before = everything(project)
+    assert set(before) == {"jobs/0.txt", "jobs/1.txt", "jobs/of_somebody.txt"}
+    written = artifacts.write_text
+
+    def full(path, text):
+        if path.name == "2.txt":
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        written(path, text)
+
+    with monkeypatch.context() as disk:
+        disk.setattr(artifacts, "write_text", full)
+        with pytest.raises(
+            OSError, match=r"^jobs/2.txt: No space left on device; free some space and run it"
+        ):
+            several(3)
+    assert everything(project) == before
+    killed = Path(f"jobs/.together.{dead_process()}")
+    killed.mkdir()
+    several(3)
+    assert set(everything(project)) == {*before, "jobs/2.txt"} and not killed.exists()
+
+
 def test_a_file_in_the_way_of_a_folder_is_one_line(project, capsys):
     artifacts.write_text("datasets", "a file")
     with pytest.raises(SystemExit):

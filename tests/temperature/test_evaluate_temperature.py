@@ -86,8 +86,10 @@ def small(inputs: int = 7) -> Small:
     return Small(machine, setting, problem)
 
 
-def judged(given: Small, weights=None, *, jobs: int = 1) -> evaluate_temperature.Judged:
-    execution = params.Execution(backend="loky", jobs=jobs, scheduler="")
+def judged(
+    given: Small, weights=None, *, jobs: int = 1, execution: params.Execution | None = None
+) -> evaluate_temperature.Judged:
+    execution = execution or params.Execution(backend="loky", jobs=jobs, scheduler="")
     rules = evaluate_temperature.resolved(
         section(TemperatureRules, "report"), section(Panel, "panel"), given.setting.rehearsal
     )
@@ -291,6 +293,22 @@ def test_one_job_and_two_write_the_same_bytes(given, result, tmp_path):
     one = written(result, given.machine, tmp_path / "one")
     two = written(judged(given, jobs=2), given.machine, tmp_path / "two")
     assert one == two and len(one) == 3
+
+
+def test_two_workers_of_a_cluster_write_the_bytes_of_one_machine(given, result, cluster, tmp_path):
+    one = written(result, given.machine, tmp_path / "one")
+    assert written(judged(given, execution=cluster.execution), given.machine, tmp_path / "two") == one
+
+
+def test_a_killed_worker_of_a_cluster_costs_time_and_no_byte(
+    given, result, mortal_cluster, tmp_path, monkeypatch
+):
+    workers = mortal_cluster.workers
+    monkeypatch.setattr(evaluate_temperature, "run_all", mortal_cluster.killing(workers[1]))
+    made = judged(given, execution=mortal_cluster.execution)
+    assert [worker.is_alive() for worker in workers] == [True, False]
+    one = written(result, given.machine, tmp_path / "one")
+    assert written(made, given.machine, tmp_path / "two") == one and len(one) == 3
 
 
 # ---- tune_weights

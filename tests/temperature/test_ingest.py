@@ -5,17 +5,13 @@ import sys
 import time
 from pathlib import Path
 
-import joblib
 import numpy as np
 import pytest
 
 from pipeline.store import artifacts, params
-from pipeline.store.execution import run_all
-from pipeline.temperature import study
 from pipeline.temperature.workflow import ingest
 from pipeline.temperature.workflow.ingest import Budget, IngestSpec, collect, process, work_done
 from pipeline.temperature.workflow.settings import Plant
-from tests.cluster import Cluster
 from tests.reading.klipper_machine import EXTRUDER, print_log
 from tests.reading.test_bag_folders import bag
 
@@ -301,36 +297,14 @@ def test_two_workers_of_this_machine_give_the_bytes_of_one(tmp_path):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 
 
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory):
-    made = Cluster(tmp_path_factory.mktemp("cluster"))
-    yield made
-    made.stop()
-
-
 def test_a_dask_cluster_of_two_workers_gives_the_bytes_of_one_machine(tmp_path, cluster, monkeypatch):
     raw = folder(tmp_path, 6)
     broken(raw)
     monkeypatch.chdir(tmp_path)  # as the stage names them: relative paths
     ingested(Path("raw"), Path("one"))
-    ingested(
-        Path("raw"), Path("cluster"), params.Execution(backend="dask", jobs=2, scheduler=cluster.address)
-    )
+    ingested(Path("raw"), Path("cluster"), cluster.execution)
     for name in NAMES:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "cluster" / name).read_bytes()
-
-
-def test_what_the_cluster_computes_for_a_stage_is_what_this_machine_computes(cluster):
-    """The judging of learners on noisy data sets, as reproduce_study spreads it."""
-    rng = np.random.default_rng(0)
-    sets_u, sets_y = study.data_sets(rng, 1500, 2)
-    calls = [
-        joblib.delayed(study.under_noise)(sets_u[:, i], sets_y[:, i], noise=0.01, seed=i, longest=6)
-        for i in range(2)
-    ]
-    here = list(run_all(calls, INLINE))
-    assert list(run_all(calls, params.Execution(backend="dask", jobs=2, scheduler=cluster.address))) == here
-    assert len(here) == 2
 
 
 KILLER = """
@@ -343,7 +317,7 @@ print(sum(name.endswith(".json") for name in os.listdir(sys.argv[1])))
 """
 
 
-def test_a_worker_killed_at_its_work_costs_nothing_but_time(tmp_path, cluster):
+def test_a_worker_killed_at_its_work_costs_nothing_but_time(tmp_path, mortal_cluster):
     raw = tmp_path / "raw"
     for k in range(6):
         recording(raw / f"{k:02d}.csv", seed=k, samples=10_000)
@@ -352,16 +326,14 @@ def test_a_worker_killed_at_its_work_costs_nothing_but_time(tmp_path, cluster):
     memo = tmp_path / "cluster/memo"
     memo.mkdir(parents=True)
     killer = subprocess.Popen(
-        [sys.executable, "-c", KILLER, memo, str(cluster.workers[1].pid)], stdout=subprocess.PIPE
+        [sys.executable, "-c", KILLER, memo, str(mortal_cluster.workers[1].pid)], stdout=subprocess.PIPE
     )
-    metrics = ingested(
-        raw, tmp_path / "cluster", params.Execution(backend="dask", jobs=2, scheduler=cluster.address)
-    )
+    metrics = ingested(raw, tmp_path / "cluster", mortal_cluster.execution)
     # entries that were whole when it died: there was work left
     assert int(killer.communicate(timeout=60)[0]) < 6
-    cluster.workers[1].join(timeout=60)
-    assert cluster.workers[1].exitcode == -signal.SIGKILL
-    assert cluster.workers[0].is_alive()
+    mortal_cluster.workers[1].join(timeout=60)
+    assert mortal_cluster.workers[1].exitcode == -signal.SIGKILL
+    assert mortal_cluster.workers[0].is_alive()
     for name in NAMES:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "cluster" / name).read_bytes()
     assert done(metrics) == (6, 0, 0)

@@ -32,15 +32,16 @@ def formats(text: str) -> tuple[str, ...]:
 
 def write(part: Part, folder: Path, formats: Collection[str] = ("csv",)) -> list[Path]:
     """The commands of all tools in each format, tasks and lines as Parquet, and the conformance report as
-    JSON, beside one another in `folder`."""
-    files = _commands(part, folder, formats)
-    # one after the other: a long part's tables are as long as itself
-    for schema, rows in ((TASKS, compose_parts.task_rows), (LINES, compose_parts.line_rows)):
-        files.append(folder / f"{part.name}.{schema.name}.parquet")
-        artifacts.write_table(files[-1], schema, rows(part))
-    files.append(folder / f"{part.name}.conformance.json")
-    artifacts.write_json(files[-1], compose_parts.report(part))
-    return files
+    JSON, beside one another in `folder`: all of them, or none."""
+    with artifacts.together(folder) as place:
+        files = _commands(part, place, formats)
+        # one after the other: a long part's tables are as long as itself
+        for schema, rows in ((TASKS, compose_parts.task_rows), (LINES, compose_parts.line_rows)):
+            files.append(place / f"{part.name}.{schema.name}.parquet")
+            artifacts.write_table(files[-1], schema, rows(part))
+        files.append(place / f"{part.name}.conformance.json")
+        artifacts.write_json(files[-1], compose_parts.report(part))
+    return [folder / file.name for file in files]
 
 
 def _commands(part: Part, folder: Path, formats: Collection[str]) -> list[Path]:

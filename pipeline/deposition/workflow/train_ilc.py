@@ -55,13 +55,15 @@ def trained(
     `recorded`, and in out/next the command of the next one."""
     work = Work(settings, laws.law_settings(settings, printer), laws.noise(settings), printer, camera)
     (out / "recordings").mkdir()
+    if settings.source == "recordings":
+        return recordings(recorded, out / "next", work)
+    # workers of a cluster work in other folders
+    folder = (out / "recordings").resolve()
     calls = [
-        delayed(simulate)(out / "recordings", work, i, kind)
+        delayed(simulate)(folder, work, i, kind)
         for i in range(len(printer.materials))
         for kind in (("flow", "pixels") if settings.pixel_trials else ("flow",))
     ]
-    if settings.source == "recordings":
-        calls = [delayed(recordings)(recorded, out / "next", work)]
     return joined(
         tqdm(
             run_all(calls, execution), total=len(calls), desc="train_ilc: materials, in flow and in pictures"
@@ -77,7 +79,10 @@ def shown(
     camera = trial_video.simulated(camera) if settings.source == "simulated" else camera
     if settings.source == "recordings":
         paths = trial_video.first_and_last(_trials(Path(recorded)), camera)
-    frames = run_all([delayed(trial_video.shown)(path, out / "frames", camera) for path in paths], execution)
+    folder = (out / "frames").resolve()
+    frames = run_all(
+        [delayed(trial_video.shown)(path.resolve(), folder, camera) for path in paths], execution
+    )
     return [row for rows in frames for row in rows]
 
 
