@@ -4,8 +4,9 @@ training beside stable-baselines3's.
 `./run python -m benchmarks.agent 5 100` trains with seeds 0 .. 4 by the numbers of params.expert.yaml, judges
 21 starts x 100 runs in every case, prints every seed and the worst, and writes benchmarks/results/agent.json.
 A third argument is the python of an environment with stable-baselines3 and a CPU build of torch, which then
-trains a DQN of the same sizes in the same run. Recorded windows are synthetic ones: drawn with one generator
-to learn from, with another to judge on.
+trains a DQN of the same sizes in the same run. `... benchmarks.agent speed` measures the speed alone and
+leaves the rest as it was; `... speed PYTHON` beside the peer. Recorded windows are synthetic ones: drawn with
+one generator to learn from, with another to judge on.
 """
 
 import json
@@ -127,6 +128,7 @@ def speeds(settings: Li2025) -> dict[str, Any]:
         "products_alone_per_cpu_s": 1 / cpu["products"],
         "update_by_products_wall": wall["update"] / wall["products"],
         "update_by_products_cpu": cpu["update"] / cpu["products"],
+        "share_of_products": wall["products"] / wall["update"],
         "rollout_steps_per_s": 1 / wall["rollout_step"], "rollout_steps_per_cpu_s": 1 / cpu["rollout_step"],
         "action_ms": 1e3 * wall["action"], "action_cpu_ms": 1e3 * cpu["action"],
     }  # fmt: skip
@@ -191,7 +193,20 @@ def peer(python: str | None, ours: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def fast(python: str | None) -> None:
+    """The speed anew, beside the peer where its python is named."""
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    results["speed"] = speeds(params.load(TrainAgent, "train_agent").li_2025)
+    if python is not None:
+        results["peer"] = peer(python, results["speed"])
+    RESULTS.write_text(json.dumps(results, indent=2, ensure_ascii=False) + "\n")
+    print(json.dumps({name: results.get(name) for name in ("speed", "peer")}, indent=2))
+
+
 if __name__ == "__main__":
+    if sys.argv[1:2] == ["speed"]:
+        fast(sys.argv[2] if len(sys.argv) > 2 else None)
+        sys.exit()
     seeds, runs, python = [*sys.argv[1:], *["5", "100", None][len(sys.argv) - 1 :]]
     settings = params.load(TrainAgent, "train_agent")
     results: dict[str, Any] = {"speed": speeds(settings.li_2025)}

@@ -3,9 +3,9 @@ scenes of its own; what it says by flow; and how fast the paper's size trains.
 
 `./run python -m benchmarks.classifier 5` prints five seeds with their bars and writes
 benchmarks/results/classifier.json; `... 5 others` trains the CNN and the published crop beside them; `...
-classifier speed` measures throughput alone. `... classifier --by-flow` judges the classifier that
-datasets/train_classifier holds on 200 new segments in each bin of 5 % from 70 to 150 %, with windows of 20
-and of 8 frames, and adds `by_flow` to the results.
+classifier speed` measures throughput alone and adds `speed` to the results. `... classifier --by-flow` judges
+the classifier that datasets/train_classifier holds on 200 new segments in each bin of 5 % from 70 to 150 %,
+with windows of 20 and of 8 frames, and adds `by_flow`.
 
 Parts of the seeds are split by segment: 3,000 segments of 6 frames to learn from, 120 of 8 to stop on, 540 of
 20 to calibrate with and 360 of 20 to judge on. Images that the front end rejects are neither learned nor
@@ -268,6 +268,7 @@ def speed(batch: int = 64, repeats: int = 4) -> dict:
         "forward_gflop": flop / 1e9,
         "step_by_products_wall": step[0] / (3 * flop * products[0]),
         "step_by_products_cpu": step[1] / (3 * flop * products[1]),
+        "share_of_products": 3 * flop * products[0] / step[0],
         "forward_by_products_wall": forward_pass[0] / (flop * products[0]),
         "forward_by_products_cpu": forward_pass[1] / (flop * products[1]),
         "products_gflop_per_s_wall": 1e-9 / products[0],
@@ -353,16 +354,23 @@ def by_flow() -> None:
     RESULTS.write_text(json.dumps(results | {"by_flow": figures}, indent=1) + "\n")
 
 
+def fast() -> None:
+    """Prints speed and adds it to the results."""
+    figures = speed()
+    print(json.dumps(figures, indent=1))
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    RESULTS.write_text(json.dumps(results | {"speed": figures}, indent=1) + "\n")
+
+
 def main(seeds: int, others: bool) -> None:
     cv2.setNumThreads(1)
-    kept = json.loads(RESULTS.read_text()).get("by_flow", {}) if RESULTS.exists() else {}
+    kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    kept = {name: kept[name] for name in ("by_flow", "speed") if name in kept}
     rows = []
     for seed in range(seeds):
         rows.append(row(seed, others=others))
         print(json.dumps({k: round(v, 4) for k, v in rows[-1].items()}), flush=True)
-        RESULTS.write_text(
-            json.dumps({"seeds": rows, "worst": worst(rows), "by_flow": kept}, indent=1) + "\n"
-        )
+        RESULTS.write_text(json.dumps({"seeds": rows, "worst": worst(rows), **kept}, indent=1) + "\n")
     for name, figure in worst(rows).items():
         print(
             f"{name:20s} worst {figure['worst']:8.4f}   bar {BARS[name][0]} {figure['bar']}   "
@@ -372,7 +380,7 @@ def main(seeds: int, others: bool) -> None:
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["speed"]:
-        print(json.dumps(speed(), indent=1))
+        fast()
     elif sys.argv[1:] == ["--by-flow"]:
         by_flow()
     else:

@@ -3,7 +3,8 @@ competitors on records that no linear model made.
 
 `./run python -m benchmarks.identification` prints the tables with their bars and writes
 benchmarks/results/identification.json; with `foreign` behind it, only the last table, into
-identification_foreign.json. The peers are nfoursid, sippy_unipi and python-control; one that is not installed
+identification_foreign.json; with `speed`, only how many times faster than nfoursid, into `speed` of the
+results. The peers are nfoursid, sippy_unipi and python-control; one that is not installed
 is left out with a line. Data sets come from BEADLINE_SHARED, by default ../shared. Times are CPU seconds.
 """
 
@@ -359,6 +360,28 @@ def foreign(name: str, seed: int) -> dict:
     return row
 
 
+def speed(rounds: int = 3) -> dict:
+    """CPU seconds on the study's record (10,500 samples, 0.1 °C of noise) as it comes and without refinement,
+    and how many times faster than nfoursid: the median of rounds in which they take turns."""
+    if importlib.util.find_spec("nfoursid") is None:
+        sys.exit("benchmarks.identification: nfoursid is not installed; start with ./run --group peers")
+    u, y = (signal[:10_500] for signal in probed(0, 0.1))
+    order = identify([u], [y], sample_time_s=1.0, settings=Settings(feedthrough=None)).plant.n
+    taken: dict[str, list[float]] = {"validated": [], "none": [], "nfoursid": []}
+    for _ in range(rounds):
+        for refinement in ("validated", "none"):
+            settings = Settings(feedthrough=None, refinement=refinement)
+            taken[refinement].append(timed(identify, [u], [y], sample_time_s=1.0, settings=settings)[1])
+        taken["nfoursid"].append(timed(nfoursid_plant, u - u.mean(axis=0), y - y.mean(axis=0), order)[1])
+    return {
+        **{f"{name}_s": round(float(np.median(seconds)), 3) for name, seconds in taken.items()},
+        **{
+            f"times_faster_{name}": round(float(np.median(np.divide(taken["nfoursid"], taken[name]))), 2)
+            for name in ("validated", "none")
+        },
+    }
+
+
 def main() -> None:
     if "foreign" in sys.argv[1:]:
         result = {f"{name}_{seed}": foreign(name, seed) for name in RECORDS for seed in FOREIGN_SEEDS}
@@ -373,8 +396,16 @@ def main() -> None:
                 ),
             )
         return
+    if sys.argv[1:] == ["speed"]:
+        result = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+        result["speed"] = speed()
+        print(json.dumps(result["speed"], indent=2))
+        RESULTS.write_text(json.dumps(result, indent=2) + "\n")
+        return
     peers, sets = installed_peers(), records()
+    kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     result = {
+        **{name: kept[name] for name in ("speed",) if name in kept},
         "parity": parity(sets),
         "hold_out": {name: hold_out(name, *record, peers) for name, record in sets.items()},
         "baam": study_plant(),

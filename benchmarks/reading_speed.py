@@ -165,6 +165,7 @@ def main() -> None:
             results[kind] = {f"{reader}_s": round(value, 3) for reader, value in seconds.items()}
             least = seconds["ours"] / seconds["arrow"]
             results[kind] |= {"ratio": round(ratio, 2), "ratio_of_least": round(least, 2), "bar": bar}
+            results[kind]["MB"] = round(path.stat().st_size / 1e6, 1)
             print(
                 f"{kind:>18}: {seconds['ours']:.2f} s, Arrow {seconds['arrow']:.2f} s, "
                 f"ratio {ratio:.2f}, of the least {least:.2f} (bar {bar})",

@@ -69,8 +69,8 @@ def _references(pages: Mapping[str, str], read: Mapping[str, str]) -> Check:
     and its hash. provenance.html has a row for each, with the whole hash."""
     link = re.compile(r'<a class="from" href="([^"]+)" title="([^"]+), SHA-256 ([0-9a-f]{8})">')
     row = re.compile(
-        r'<tr id="from-[^"]+"><td><a class="from" href="([^"]+)"><code>([^<]+)</code></a></td><td>[^<]+</td><td>[^<]+</td>'
-        r"<td><code>([0-9a-f]{64})</code></td></tr>"
+        r'<tr id="from-[^"]+"><td><a class="from" href="([^"]+)"><code>([^<]+)</code></a></td>'
+        r"<td>[^<]+</td><td>[^<]+</td><td><code>([0-9a-f]{64})</code></td></tr>"
     )
     count, wrong, held = 0, [], {}
     for page in pages:
