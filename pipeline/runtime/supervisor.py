@@ -73,7 +73,7 @@ LATCHED = ("heater_stuck_on", "heater_stuck_off", "heater_weak", "thermal_runawa
 OF_INPUT = (ON, OFF, WEAK, COMMAND)
 OF_OUTPUT = (RUNAWAY, RANGE, NAN, FROZEN, OFFSET, SLOW, NOISY)
 
-ALARM = 8.0  # of a sum of innovations, in deviations: 7 gave two false ones in 120 h of a room that jumps
+ALARM = 8.5  # of a sum of innovations, in deviations: 7 gave two false ones in 120 h of a room that jumps
 DECIDED_AFTER, DECIDED_BY = 4, 9  # samples from the alarm: where one cause is clear, and at the latest
 TOLD_APART = 8.0  # of -2 log likelihood, by which one cause is clear of another, or of none
 UNEXPLAINED, UNEXPLAINED_SHARE = 12.0, 0.3  # mean square that is left of an output, and its share

@@ -1,6 +1,7 @@
 """What the pages say they were made from: everything matches right after a run,
 and one changed byte anywhere is found and named."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import yaml
 
 from pipeline import cli
 from pipeline.report.shared import provenance
+from pipeline.report.shared.page import placed
 from pipeline.store import artifacts
 from stages.report import main
 
@@ -111,6 +113,19 @@ def test_a_link_to_other_bytes_than_were_read_or_with_another_hash_is_found(chec
         "reports/provenance.html gives another hash of datasets/ingest/record.parquet than was read"
         in wrong()
     )
+
+
+def test_the_hash_of_a_file_without_a_link_is_compared_too(checked):
+    path, page = "datasets/ingest/record.parquet", Path("reports/provenance.html")
+    recorded, text = artifacts.read_metrics("report")["read"][path], page.read_text()
+    linked = re.search(rf'<td>(<a class="from" href="[^"]+"><code>{path}</code></a>)</td>', text)
+    assert linked
+    unlinked = text.replace(linked[1], str(placed("../" + path, path, path)))
+    said = f"reports/provenance.html gives another hash of {path} than was read"
+    page.write_text(unlinked)
+    assert said not in wrong()
+    page.write_text(unlinked.replace(recorded, "1" * 64))
+    assert said in wrong()
 
 
 def test_a_copy_beside_the_pages_that_is_not_what_was_read_is_found(checked):

@@ -72,13 +72,21 @@ def _references(pages: Mapping[str, str], read: Mapping[str, str]) -> Check:
         r'<tr id="from-[^"]+"><td><a class="from" href="([^"]+)"><code>([^<]+)</code></a></td>'
         r"<td>[^<]+</td><td>[^<]+</td><td><code>([0-9a-f]{64})</code></td></tr>"
     )
+    # what is too large to lie beside the pages has its row without a link
+    named = re.compile(
+        r'<tr id="from-[^"]+"><td><span class="outside"><code>([^<]+)</code> of the project</span></td>'
+        r"<td>[^<]+</td><td>[^<]+</td><td><code>([0-9a-f]{64})</code></td></tr>"
+    )
     count, wrong, held = 0, [], {}
     for page in pages:
         text = Path(page).read_text(encoding="utf-8") if Path(page).exists() else ""
-        for href, path, digits in link.findall(text) + row.findall(text):
+        unlinked = [("", *pair) for pair in named.findall(text)]
+        for href, path, digits in link.findall(text) + row.findall(text) + unlinked:
             path, count = html.unescape(path), count + 1
             if not read.get(path, "").startswith(digits):
                 wrong.append(f"{page} gives another hash of {path} than was read")
+            if not href:
+                continue
             place = (Path(page).parent / html.unescape(href)).as_posix()
             if place not in held:
                 held[place] = artifacts.sha256(place) if Path(place).exists() else ""
