@@ -97,6 +97,22 @@ def moments(rng: np.random.Generator, whole_s: float) -> Iterator[tuple[float, b
         yield float(rng.uniform(0.02, 1.0) * whole_s), bool(rng.uniform() < 0.5)
 
 
+def gone(processes: list[int], seconds: float = 20.0) -> None:
+    """Waits while any of them still dies: DVC takes a lock for held as long as its process is there. Workers
+    outside the group may live on."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until and any(_dvc(pid) for pid in processes):
+        time.sleep(0.05)
+
+
+def _dvc(pid: int) -> bool:
+    """Whether a process is there that is DVC itself, or is dead and not yet waited for."""
+    with contextlib.suppress(OSError):
+        command = Path(f"/proc/{pid}/cmdline").read_bytes()
+        return not command or b"/dvc\0" in command
+    return False
+
+
 def disturbed(
     project: Project, stages: list[str], kills: int, at: Iterator[tuple[float, bool]]
 ) -> list[Kill]:
@@ -109,8 +125,10 @@ def disturbed(
         try:
             said, _ = child.communicate(timeout=after_s)
         except subprocess.TimeoutExpired:
+            group = killed_nights._descendants(child.pid)
             killed_nights.killed(child, tree=tree)
             child.communicate()
+            gone(group)
         else:
             if child.returncode != 0:
                 raise RuntimeError(f"dvc repro after a kill: {' '.join(said[-1500:].split())}")

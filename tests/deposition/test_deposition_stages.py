@@ -3,7 +3,10 @@ in a folder; broken input leaves all as it was."""
 
 import importlib
 import json
+import os
+import re
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -424,6 +427,70 @@ def test_a_verification_is_written_composed_and_shown_beside_what_was_measured(f
     sys.argv[2] = "datasets/parts/fig9_verify_A.gcode"
     cli.main()
     assert "learned from its measured print: jobs/fig9_verify_A_A_next.csv" in capsys.readouterr().out
+
+
+# ---- what a machine may run out of
+
+TWICE = """
+import os, resource, sys
+from pathlib import Path
+from pipeline import cli
+sys.argv = ["beadline", "compose", "datasets/parts/fig9.gcode", "--as", "csv,parquet,mcap", "--out", "jobs"]
+cli.main()
+sys.argv += ["--scale", "1.5"]
+{trouble}
+cli.main()
+"""
+TROUBLES = {
+    # the limit of a file's size is the one full disk that a test can have without being root
+    "full": (
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000))",
+        r"beadline: jobs/fig9\.signal\.csv cannot be written \(File too large\); look at jobs",
+    ),
+    "read-only": (
+        "Path('jobs').chmod(0o555); os.geteuid() or os.setuid(65534)",
+        r"beadline: jobs: Permission denied; make jobs writable",
+    ),
+    "memory": (
+        "used = int(Path('/proc/self/statm').read_text().split()[0]) * resource.getpagesize()\n"
+        "resource.setrlimit(resource.RLIMIT_DATA, (used // 100, used // 100))",
+        r"beadline: there is not enough memory \(.*\); end other programs, or lower execution\.jobs .*",
+    ),
+}
+
+
+@pytest.mark.parametrize("trouble", TROUBLES)
+def test_composing_on_a_machine_that_runs_out_is_one_sentence_and_leaves_the_last_files(finished, trouble):
+    spoil, sentence = TROUBLES[trouble]
+    finished.chmod(0o755)
+
+    def composed(trouble: str) -> subprocess.CompletedProcess:
+        return subprocess.run(
+            [sys.executable, "-c", TWICE.format(trouble=trouble)], capture_output=True, text=True,
+            env=os.environ | {"PYTHONPATH": str(ROOT)}, timeout=300, check=False,
+        )  # fmt: skip
+
+    assert composed("sys.exit(0)").returncode == 0
+    before = {path.name: path.read_bytes() for path in Path("jobs").iterdir()}
+    ended = composed(spoil)
+    Path("jobs").chmod(0o755)
+    assert ended.returncode == 1 and re.fullmatch(sentence, ended.stderr.strip().splitlines()[-1])
+    assert "Traceback" not in ended.stderr
+    assert {path.name: path.read_bytes() for path in Path("jobs").iterdir()} == before
+    # and the next call gives what it would have given
+    assert composed("").returncode == 0
+    assert {path.name for path in Path("jobs").iterdir()} == set(before)
+    assert Path("jobs/fig9.signal.csv").read_bytes() != before["fig9.signal.csv"]
+
+
+@pytest.mark.parametrize("year", [1971, 2100])
+def test_a_clock_that_jumped_changes_no_byte_of_what_is_composed(finished, year):
+    before = artifacts.sha256("datasets/compose_parts")
+    stamp = (year - 1970) * 365.25 * 86400
+    for path in Path("datasets").rglob("*"):
+        os.utime(path, (stamp, stamp))
+    stage("compose_parts")
+    assert artifacts.sha256("datasets/compose_parts") == before
 
 
 def test_the_metrics_hold_forecast_truth_and_whether_it_is_judged(finished):
