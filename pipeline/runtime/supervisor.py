@@ -74,7 +74,6 @@ OF_INPUT = (ON, OFF, WEAK, COMMAND)
 OF_OUTPUT = (RUNAWAY, RANGE, NAN, FROZEN, OFFSET, SLOW, NOISY)
 
 ALARM = 8.5  # of a sum of innovations, in deviations: 7 gave two false ones in 120 h of a room that jumps
-LOUD = 14.0  # of a mean square of innovations, which raises the alarm where their signs take turns
 DECIDED_AFTER, DECIDED_BY = 4, 9  # samples from the alarm: where one cause is clear, and at the latest
 TOLD_APART = 8.0  # of -2 log likelihood, by which one cause is clear of another, or of none
 UNEXPLAINED, UNEXPLAINED_SHARE = 12.0, 0.3  # mean square that is left of an output, and its share
@@ -603,7 +602,7 @@ def alarmed(s: Supervision, k: Kept, memory: innovations.Memory, highest: float)
     """The alarm, and its end where it is decided, or where the sensor that raised it is seen to be wrong."""
     c = k.counters
     if c[ALARMED] < 0:
-        if highest > ALARM or max(k.square.tolist()) > LOUD:
+        if highest > ALARM:
             c[ALARMED] = 0
         return
     c[ALARMED] += 1

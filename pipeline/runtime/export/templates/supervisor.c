@@ -594,10 +594,8 @@ static int loudest(const innovation_memory *o)
 static void raise_alarm(supervisor_kept *k, innovation_memory *o, double highest)
 {
     if (k->alarmed < 0) {
-        int j;
-        for (j = 0; j < OUTPUTS; j++)
-            if (highest > ALARM || k->square[j] > LOUD)
-                k->alarmed = 0;
+        if (highest > ALARM)
+            k->alarmed = 0;
         return;
     }
     k->alarmed++;
