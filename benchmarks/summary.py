@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.report.shared.digits import short
+from pipeline.report.temperature.readme import plain, rewritten
 from pipeline.store import artifacts
 
 RESULTS = Path(__file__).parent / "results"
@@ -337,7 +338,7 @@ def block(summary: Mapping[str, Any]) -> str:
         *(f"- {sentence}" for sentence in scale_sentences(summary["scale"])),
         END,
     ]
-    return _plain("\n".join(lines))
+    return plain("\n".join(lines))
 
 
 def growth_lines(growth: Mapping[str, Any]) -> list[str]:
@@ -399,7 +400,4 @@ def _plain(text: str) -> str:
 
 def in_readme(readme: str, text: str) -> str:
     """The README with another block. Raises ValueError where it has no place for one."""
-    if BEGIN not in readme or END not in readme:
-        raise ValueError(f"README.md: expected the lines {BEGIN} and {END}, found none; put them back")
-    before, rest = readme.split(BEGIN, 1)
-    return f"{before}{text}{rest.split(END, 1)[1]}"
+    return rewritten(readme, text, BEGIN, END)

@@ -36,7 +36,7 @@ def block(metrics: Metrics, rules: ReportRules, verdict: Verdict) -> str:
     lines += [
         f"| {heading(name)} | {why} |{' |' * (len(shown) - 1)}" for name, why in refused(metrics).items()
     ]
-    return _plain("\n".join([BEGIN, *lines, END]))
+    return plain("\n".join([BEGIN, *lines, END]))
 
 
 def _head(question: Question) -> str:
@@ -55,14 +55,14 @@ def _cell(question: Question, figure: Figure | Missing) -> str:
     return worded(question, figure.value, places_of(question, [figure]))
 
 
-def _plain(text: str) -> str:
+def plain(text: str) -> str:
     """Spaces that a text file can be searched by."""
     return text.replace("\u202f", " ").replace("\u00a0", " ")
 
 
-def rewritten(readme: str, text: str) -> str:
-    """The README with another block. Raises ValueError where it has none."""
-    if BEGIN not in readme or END not in readme:
-        raise ValueError(f"README.md: expected the lines {BEGIN} and {END}, found none; put them back")
-    before, rest = readme.split(BEGIN, 1)
-    return f"{before}{text}{rest.split(END, 1)[1]}"
+def rewritten(readme: str, text: str, begin: str = BEGIN, end: str = END) -> str:
+    """The README with another block between two lines. Raises ValueError where it has none."""
+    if begin not in readme or end not in readme:
+        raise ValueError(f"README.md: expected the lines {begin} and {end}, found none; put them back")
+    before, rest = readme.split(begin, 1)
+    return f"{before}{text}{rest.split(end, 1)[1]}"

@@ -1,6 +1,9 @@
 """The Bayes filter of the flow with numpy alone: each window moves the belief, and the move of least
 expected loss follows. Reads filter.safetensors with flow_reader.read_safetensors. Letters as in the project's
-bayes.py."""
+bayes.py.
+
+The camera's watch, held windows, waits and limits of what is sent are not in it: where the judged controller
+would hold because the camera is not the one of its table, this one moves."""
 
 import math
 

@@ -23,7 +23,10 @@ from pipeline.setpoint.workflow.contestants import ControllerSpec
 BELIEF = "our agent"  # sees what its own filter believes
 FRAMES = 64  # drawn key areas on which reader and network are compared
 DECISIONS = 200  # drawn windows, one after the other, on which reader and agent are compared
-WHY = "What sees and what decides have no certificate: what they do is judged by evaluate_setpoint."
+WHY = (
+    "What sees and what decides have no certificate: evaluate_setpoint judged them with the camera's watch, "
+    "held windows, waits and limits, which are not in these files."
+)
 
 
 def decider(name: str, specs: dict[str, ControllerSpec], agents: Agents) -> Decider | None:

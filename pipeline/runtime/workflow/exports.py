@@ -10,7 +10,10 @@ from pipeline.runtime.machine import Exported
 from pipeline.store import artifacts
 
 REHEARSAL = "Rehearsal: it was made for a simulated plant, and runs only where it is told so."
-UNCERTIFIED = "It has no certificate: what it does is judged by evaluate_setpoint."
+UNCERTIFIED = (
+    "It has no certificate: evaluate_setpoint judged it with the camera's watch, held windows, waits and "
+    "limits, which are not in these files."
+)
 TRIAL = "May run: its certificate was passed on recordings of the machine."
 
 
