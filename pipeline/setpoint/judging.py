@@ -451,18 +451,21 @@ def _reason(name: str, rival: str, judged: Mapping[str, Judged], margin: Mean) -
         return f"that is {margin.value:.1f} points more than of {other}, {ends}"
     if name == DOES_NOTHING:
         return f"no controller does better beyond noise, the best is {other}, {ends}"
-    near = (
-        "is within noise"
-        if margin.low <= 0 <= margin.high
-        else f"is told from it by no more than {ALIKE_POINTS:g} points"
-    )
+    near = f"is within noise ({ends})"
+    if margin.high < 0:  # how far it is ahead, and that not enough of it is sure
+        near = (
+            f"is ahead by {-margin.high:.1f} to {-margin.low:.1f} points (95 % interval over all cases at "
+            f"once; alike where less than {ALIKE_POINTS:g} are sure)"
+        )
+    elif margin.low > 0:
+        near = f"is behind by no more than {ALIKE_POINTS:g} points for sure ({ends})"
     mean = lead_on_average(judged[name], judged[rival])
     if mean.low > ALIKE_POINTS:
         return (
-            f"{other} {near} ({ends}), but over the cases on average {name} keeps {mean.value:.1f} "
+            f"{other} {near}, but over the cases on average {name} keeps {mean.value:.1f} "
             f"points more ({mean.low:+.1f} to {mean.high:+.1f})"
         )
-    return f"{other} {near} ({ends}), and of two alike the simpler runs"
+    return f"{other} {near}, and of two alike the simpler runs"
 
 
 def _check(judged: Mapping[str, Judged], simplest_first: Sequence[str], bars: Mapping[str, float]) -> None:

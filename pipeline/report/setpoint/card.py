@@ -45,7 +45,7 @@ def card(sources: Sources, verdict: Verdict) -> Card:
     names, asked = shown(sources, scores), sources.declared.rules
     limits = bars(sources, scores)
     harms = [harm_of(scores, name, limits) for name in names]
-    ends = " or ".join(f"{end:g}" for end in sorted(set(limits.values())))
+    limit = next((harm.limit for harm in harms if isinstance(harm, Harm)), None)
     clustered = any(cell.redraws > 1 for cell in scores.cells.values())
     return of_verdict(
         verdict,
@@ -55,7 +55,7 @@ def card(sources: Sources, verdict: Verdict) -> Card:
         rows=[
             _shares("Settles", scores, names, "settled", asked.settled_percent),
             _shares("Stays", scores, names, "stay", asked.stay_percent),
-            Row("Harm", f"≤ {ends}{THIN}%", _harm_cells(harms)),
+            Row("Harm", "" if limit is None else f"≤ {limit:g}{THIN}%", _harm_cells(harms, limit)),
         ],
         basis=f"Worst case of each; small: 95{THIN}% interval{', by segment' if clustered else ''}. Harm: "
         f"good prints that leave ±{BEYOND[-1]}{THIN}%.",
@@ -111,12 +111,18 @@ def _share(figure: Figure | Missing, best: float | None, *, bad: bool) -> Cell:
     return Cell(share_text(figure), band(figure.low, figure.high, 1), figure.value == best, bad)
 
 
-def _harm_cells(harms: Sequence[Harm | Missing]) -> list[Cell]:
+def _harm_cells(harms: Sequence[Harm | Missing], limit: float | None) -> list[Cell]:
+    """The harm of each in the case that decides for it; where another limit holds in that case, with it."""
     best = best_of([h.figure.value if isinstance(h, Harm) else None for h in harms], at_least=False)
-    return [
-        Cell(harm.state) if isinstance(harm, Missing) else _share(harm.figure, best, bad=harm.state == FAILED)
-        for harm in harms
-    ]
+    cells = []
+    for harm in harms:
+        if isinstance(harm, Missing):
+            cells.append(Cell(harm.state))
+            continue
+        cell = _share(harm.figure, best, bad=harm.state == FAILED)
+        own = "" if harm.limit == limit else f"; ≤ {harm.limit:g}{THIN}%"
+        cells.append(cell._replace(band=cell.band + own))
+    return cells
 
 
 def _beside(scores: Board, names: Sequence[str]) -> str:

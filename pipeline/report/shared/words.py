@@ -339,11 +339,13 @@ FIXED = {
     "worst_case": (
         "Worst case",
         "The case in which the fewest runs of a controller settle and stay. "
-        "The controller with the best worst case runs by default.",
+        "By default the simplest controller runs that does no harm and is within noise of the best "
+        "worst case.",
     ),
     "interval": (
         "Interval",
-        "Where the true share lies with 95 % confidence, for as many runs as were made (Wilson). "
+        "Where the true share lies with 95 % confidence, for as many runs as were made: Wilson’s, "
+        "or, where the runs share segments of a print, drawn anew by segment. "
         "A share that straddles its limit is undecided.",
     ),
     "key_area": (
