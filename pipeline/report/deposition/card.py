@@ -47,7 +47,8 @@ def card(sources: Sources, verdict: Verdict) -> Card:
             _row("Line volume", known, names, _volume, asked.line_volume_percent, "±", "%"),
             _row("Above learning it", known, names, _above, asked.above_whole_points, "≤", "pts"),
         ],
-        basis=f"Worst of {count(len(known), 'stream')}, {whose}; small: range. % of on\u2011off’s error, pts: points of it.",
+        basis=f"Worst of {count(len(known), 'stream')}, {whose}; small: range. "
+        "% of on\u2011off’s error, pts: points of it.",
         beside=""
         if other is None
         else f"{NAMES[names[1]]} is worst on {other[1].part}, {other[1].material}: {percent(other[0], 2)}.",
