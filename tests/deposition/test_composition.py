@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.deposition import basis, evaluation, gcode, ilc, training
+from pipeline.deposition import basis, composition, evaluation, gcode, ilc, training
 from pipeline.deposition.composition import (
     BASIS,
     PRIORITY,
@@ -198,6 +198,56 @@ def test_the_wanted_flow_holds_the_volume_of_every_line_and_of_no_travel():
         assert stream.r.sum() * TS == pytest.approx(planned, rel=1e-9)
         assert stream.unshaped.sum() * TS == pytest.approx(planned, rel=1e-9)
     assert not np.any((made.streams[0].r > 0) & (made.streams[1].r > 0))
+
+
+def test_where_nothing_is_wanted_nothing_is_left_of_rounding_and_the_tasks_end_with_the_signal():
+    made = of_part("fig9")
+    for stream in made.streams:
+        assert stream.r[stream.r > 0].min() > 1e-9 * stream.r.max()
+        assert (stream.r == 0).any()
+    assert made.tasks.end_s.max() == pytest.approx(len(made.streams[0].r) * TS)
+
+
+def test_the_learned_percent_is_of_the_steady_flow():
+    of = learned(PLANT).materials[0]
+    errors = []
+    for one in trainings(PLANT):
+        if one.material == of.material:
+            y = learned_command(one)[1]
+            errors.append(np.nanmean(((y - one.r) / one.r.max()) ** 2))
+    raw = 100 * np.sqrt(np.mean(errors))  # without the means over 0.2 s, which take noise off
+    assert 0.3 * raw < of.learned_percent < 1.05 * raw
+
+
+def test_a_long_job_is_judged_on_its_first_minutes_with_the_clock_of_these(monkeypatch):
+    monkeypatch.setattr(composition, "EXCERPT_S", 12.0)
+    lines = "".join(f"G1 X{40 * k + 24} E1 F480\nG0 X{40 * k + 40}\n" for k in range(1, 12))
+    made = composed(f"G21\nG90\nM83\nT0\nG0 X40 Y0 F480\nG4 P30000\n{lines}")
+    share = composition.Share(0, learned(PLANT).materials[0], made.streams[0].r, made.tasks, made.lines)
+    excerpt = composition._excerpt(share, TS)
+    begin = int(np.argmax(share.r > 0)) - round(composition.MARGIN_S / TS)
+    np.testing.assert_array_equal(excerpt.r, share.r[begin : begin + round(12 / TS)])
+    late = made.lines.begin_s > (begin + 12 / TS) * TS + 0.1
+    early = made.lines.begin_s < begin * TS - 0.1
+    assert late.any() and not early.any()
+    np.testing.assert_allclose(excerpt.lines.begin_s, made.lines.begin_s[~late] - begin * TS)
+    np.testing.assert_allclose(excerpt.lines.end_s, made.lines.end_s[~late] - begin * TS)
+    assert excerpt.tasks.begin_s.max() <= 12.1 and (excerpt.tasks.begin_s > -0.1).all()
+    for line_begin in excerpt.lines.begin_s:
+        at = round(line_begin / TS)
+        assert at + 5 >= len(excerpt.r) or excerpt.r[at + 5] > excerpt.r[at - 10]
+
+
+def test_a_command_that_the_drive_cannot_follow_is_sent_ahead_by_delay_and_lag():
+    made = of_part("fig9")
+    material = learned(PLANT).materials[0]
+    chain = material.chain._replace(extruder=material.chain.extruder._replace(delay_s=0.3))
+    r = np.repeat([0.0, 1.0, 0.0], [200, 400, 200])
+    share = composition.Share(0, material._replace(chain=chain), r, made.tasks, made.lines)
+    sent = composition._sent_ahead(share, TS)
+    ahead = 200 - int(np.argmax(sent > 0.5))
+    assert ahead == pytest.approx((0.3 + basis.mean_lag_s(chain.extruder)) / TS, abs=1)
+    assert ahead >= 14
 
 
 def test_a_line_that_begins_at_once_is_given_the_time_for_its_lead():

@@ -11,6 +11,7 @@ from pipeline.deposition import ilc, training
 from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, frequency_response, pressed, routine
 from pipeline.deposition.trial_model import identify
+from pipeline.deposition.unmodelled import SMOOTHED_HZ
 
 TS = 0.02
 MATERIALS = {"A": Extruder(1.08, 2.7), "B": Extruder(0.89, 4.5)}
@@ -396,6 +397,14 @@ def test_no_frequency_of_the_learned_command_has_more_than_three_times_what_the_
     assert not ilc.bounded(np.zeros_like(x), wild, sample_time_s=TS).any()
 
 
+def test_what_is_learned_right_beside_a_frequency_that_is_asked_for_is_kept():
+    t = np.arange(2000) * TS
+    asked, learned = (np.sin(2 * np.pi * f * t) * np.hanning(len(t)) for f in (4.0, 4.0 + SMOOTHED_HZ / 4))
+    np.testing.assert_allclose(ilc.bounded(asked, learned, sample_time_s=TS), learned, atol=0.02)
+    far = np.sin(2 * np.pi * (4.0 + 4 * SMOOTHED_HZ) * t) * np.hanning(len(t))
+    assert np.abs(ilc.bounded(asked, far, sample_time_s=TS)).max() < 0.1
+
+
 def test_what_a_law_learns_of_a_disturbed_trial_is_bounded_by_what_its_model_asks_for():
     t, law = np.arange(len(R)) * TS, model_inverse()
     truth = flow(Extruder(1.2, 3.3, 0.08), R / 1.08, sample_time_s=TS)
@@ -452,6 +461,7 @@ def test_a_command_never_leaves_its_limit_and_ends_nearer_than_one_that_is_cut()
     u = ilc.command(x, R, model, drive=Drive(limit, np.inf, 0.0), sample_time_s=TS)
     cut = np.clip(ilc.inverse(x, model, sample_time_s=TS), -limit, limit)
     assert np.abs(u).max() <= limit
+    assert np.abs(u[: round(1 / TS)]).max() < 1e-3 * STEADY  # at rest, long before the line
     near, far = (ilc.rms(R - flow(model, v, sample_time_s=TS)) for v in (u, cut))
     assert near < 0.5 * far
 
@@ -480,6 +490,29 @@ def test_limits_that_no_law_can_meet_are_refused_with_the_ramp_that_would_do():
     )
     ilc.check_headroom(wide, drive=Drive(100 * STEADY, np.inf, 0.0), worst_ratio=0.2)
     assert wide.ratio < 0.01  # what a Q of 5 Hz takes off these ramps
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "speed"), [(3.0, np.inf), (np.inf, 0.7), (np.inf, 6.0), (1.5, 40.0), (50.0, 0.2)]
+)
+def test_the_ramp_that_would_do_is_the_shortest_whose_peak_and_speed_the_drive_can_follow(amplitude, speed):
+    """In multiples of the steady command: the peak is 1 + tau / ramp, reached over the ramp."""
+    model, steady = Extruder(0.89, 4.5), STEADY / 0.89
+    drive = Drive(amplitude * steady, speed * steady, 0.0)
+    found = ilc.actuator_headroom(
+        R, R / 0.89, model, order=4, cutoff_hz=5.0, drive=drive, sample_time_s=TS
+    ).ramp_s
+    ramps = np.geomspace(1e-2, 1e3, 200_001)
+    peaks = 1 + 4.5 / ramps
+    would_do = (peaks <= amplitude) & (peaks / ramps <= speed)
+    assert found == pytest.approx(ramps[would_do][0], rel=1e-3)
+
+
+def test_a_drive_without_limits_needs_no_ramp():
+    headroom = ilc.actuator_headroom(
+        R, R / 0.89, Extruder(0.89, 4.5), order=4, cutoff_hz=5.0, drive=UNLIMITED, sample_time_s=TS
+    )
+    assert headroom.ramp_s == 0.0
 
 
 # ---- the loop
