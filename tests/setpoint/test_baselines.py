@@ -22,7 +22,7 @@ from pipeline.setpoint.baselines import (
 )
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
 from pipeline.setpoint.recorded import recorded_windows
-from pipeline.setpoint.simulator import STAND, Observation, nominal, paper_windows
+from pipeline.setpoint.simulator import FLOW_LIMITS, STAND, Observation, nominal, paper_windows
 from tests.setpoint.synthetic import synthetic_flow_table, synthetic_table
 
 KEY = jax.random.key(0)
@@ -303,6 +303,43 @@ def test_the_prior_of_the_start_holds_what_is_known_of_the_print():
     good = np.abs(bayes.GRID - 100) <= 10 + 1e-3
     posterior = prior * np.where(good, 0.7, 0.15)
     np.testing.assert_allclose(state.belief[0], posterior / posterior.sum(), atol=1e-6)
+
+
+def test_beliefs_of_the_start_are_densities_of_ratios_with_sum_one():
+    assert bayes.GRID[0] == 20.0 and np.all(np.diff(bayes.GRID) == bayes.SPACING)
+    assert bayes.GRID[-1] == FLOW_LIMITS[1] and FLOW_LIMITS[0] == 20.0
+    assert bayes.PRIOR.sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(bayes.PRIOR * bayes.GRID, bayes.PRIOR[0] * bayes.GRID[0])
+    found = bayes.start_prior(known_start_share=0.7, known_start_std=0.1)
+    near = scipy.stats.lognorm.pdf(bayes.GRID, 0.1, scale=100.0)
+    np.testing.assert_allclose(found, 0.7 * near / near.sum() + 0.3 * bayes.PRIOR, atol=1e-12)
+    sharp = bayes.start_prior(known_start_share=1.0, known_start_std=0.0)  # half a spacing then
+    near = scipy.stats.lognorm.pdf(bayes.GRID, 0.0125, scale=100.0)
+    np.testing.assert_allclose(sharp, near / near.sum(), atol=1e-12)
+
+
+def test_the_robust_filter_begins_with_a_belief_of_sum_one_over_its_ways_of_erring(table):
+    own = bayes.robust_filter(table, ROBUST)
+    assert np.asarray(own.prior).sum() == pytest.approx(1.0, abs=1e-5)
+    ways = np.asarray(own.prior).sum(axis=1).reshape(2, -1)  # by gain
+    np.testing.assert_allclose(ways[0], ways[1], rtol=1e-5)
+    z = np.linspace(-3.0, 3.0, 5)
+    weight = scipy.stats.t.pdf(z, 4) / scipy.stats.t.pdf(z, 4).sum()
+    expected = np.r_[1.0, 1.0, 5 * weight] / 7
+    np.testing.assert_allclose(2 * ways[0], expected, rtol=1e-4)
+
+
+def test_a_jump_of_the_flow_spreads_the_belief_over_every_flow_by_the_hazard():
+    own = bayes.class_filter(accuracy=0.7, hazard=0.2, move_cost=0.0, outside_cost=0.0)
+    at = int(np.argmin(np.abs(bayes.GRID - 100.0)))
+    known = bayes.initial_state(1)._replace(
+        belief=jnp.zeros((1, len(bayes.GRID))).at[0, at].set(1.0), windows=jnp.int32(3)
+    )
+    found = np.asarray(bayes.filter_update(own, known, seen(1)).belief)[0]
+    before = 0.8 * (np.arange(len(bayes.GRID)) == at) + 0.2 * bayes.PRIOR
+    good = (bayes.GRID >= 90.0) & (bayes.GRID <= 110.0)
+    expected = before * np.where(good, 0.7, 0.15)
+    np.testing.assert_allclose(found, expected / expected.sum(), atol=1e-5)
 
 
 def test_a_fixed_cost_leaves_a_print_alone_that_may_well_be_good():
