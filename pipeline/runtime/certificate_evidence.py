@@ -248,7 +248,7 @@ def _of_room(record: Record, sampled: bands.Predictors, outputs: Sequence[str], 
         "room",
         float(off[worst]),
         0.0,
-        "degC beyond a room",
+        "degC outside what a room may be",
         f"{said} what a room may be.",
         f"{said} {low[worst]:.0f} to {high[worst]:.0f} °C on {outputs[worst]}, which is no room: "
         "the sensor is in another unit, or something heats that is not recorded.",
@@ -285,7 +285,7 @@ def _of_newest(
             "unexplained",
             float(missed[worst]),
             rules.unexplained,
-            f"of the movement in {rules.ahead} steps",
+            f"of the movement in {rules.ahead} steps missed",
             "The newest record is explained by the model.",
             f"The model misses {100 * missed[worst]:.0f} % of what {outputs[worst]} did within {rules.ahead} "
             "steps in the newest record: the plant is another one, or a sensor, unit or sample time is.",

@@ -152,7 +152,8 @@ def _of_worst(worst: Worst, crossing: np.ndarray, rules: Rules) -> list[RuleResu
             100 * crossed / worst.plants,
             100 * allowed / worst.plants,
             "% of plants",
-            f"Limits of outputs are kept within {rules.crossing_degC:g} °C, but on {crossed} plants.",
+            f"On {worst.plants - crossed} of {worst.plants} plants no output crosses its limit by more than "
+            f"{rules.crossing_degC:g} °C.",
             f"On {crossed} of {worst.plants} plants an output crosses its limit by more than "
             f"{rules.crossing_degC:g} °C, at most by {crossing.max():.3g} °C.",
         ),

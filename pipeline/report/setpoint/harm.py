@@ -159,10 +159,10 @@ def _chart(board: Board, known: dict[str, Harm]) -> Markup:
     allowed = max(harm.limit for harm in known.values())
     layers: list[Markup] = [charts.interval(frame, 0.0, allowed, "allow")]
     taken: list[tuple[float, float]] = []
-    for name, harm in known.items():
-        share = _recovered(board, name)
-        if isinstance(share, Missing):
-            continue
+    shares = {name: share for name in known if isinstance(share := _recovered(board, name), Figure)}
+    # from the top down: names that give way to one another keep the order of their points
+    for name, share in sorted(shares.items(), key=lambda one: -one[1].value):
+        harm = known[name]
         a, low, high = (float(v) for v in frame.px([harm.figure.value, harm.figure.low, harm.figure.high]))
         b, bottom, top = (float(v) for v in frame.py([share.value, share.low, share.high]))
         if name not in board.refused:
