@@ -243,6 +243,72 @@ def test_a_drift_that_its_observer_has_followed_is_seen_where_surroundings_canno
         assert (innovations.drift(memory, 2)[1, 0] == 0) == bool(kinds)
 
 
+def test_a_drift_that_its_observer_has_followed_stops_the_law_in_the_loop_too():
+    run = Run(seed=4)
+    assert {one.mode for one in run.go(100)} == {"law"}
+    innovations.drift(run.supervised.memory, 2)[1, 0] -= 4 * run.supervised.exported.supervision.heat[1]
+    decisions = run.go(3)
+    assert {(cause.kind, cause.signal) for cause in decisions[-1].causes} == {("sensor_offset", "zone_2")}
+    assert decisions[-1].mode == SAFE["sensor_offset"]
+
+
+def test_what_is_watched_follows_from_noise_and_from_what_a_quarter_of_the_heat_does():
+    """Gain asked for: 2 degC, or six deviations of noise; hysteresis: 5 degC, or six; time: ten times what a
+    quarter of the heat takes for 2 degC, 20 s at least; error: 6 degC for so long."""
+    quick, loud = (supervision(MODEL, [MODEL], WIRED, np.full(2, noise)) for noise in (NOISE, 1.0))
+    for s, gain, hysteresis in ((quick, 2.0, 5.0), (loud, 6.0, 6.0)):
+        np.testing.assert_allclose(s.gain_degC, gain)
+        np.testing.assert_allclose(s.hysteresis_degC, hysteresis)
+        np.testing.assert_allclose(s.check_s, 20.0)
+        np.testing.assert_allclose(s.error_degC_s, 6.0 * s.check_s)
+    # 25 % x 0.004 degC warms to 100 (1 - 0.999^n): 2 degC from the 21st sample on
+    slow = plant(np.diag([0.999, 0.98]), np.diag([0.004, 0.065]), np.eye(2), d=[ROOM, ROOM])
+    s = supervision(slow, [slow], WIRED, np.full(2, NOISE))
+    np.testing.assert_allclose(s.check_s, [210.0, 20.0])
+
+
+def test_what_was_said_first_of_a_cause_stays_and_counts_once():
+    k = supervisor.kept(exported().supervision)
+    supervisor.said(k, supervisor.OFFSET, 1, 2.0, supervisor.ON)
+    supervisor.said(k, supervisor.OFFSET, 1, 7.0)
+    assert k.amount[supervisor.OFFSET, 1] == 2.0 and k.other[supervisor.OFFSET, 1] == supervisor.ON
+    assert k.counters[supervisor.ACTIVE] == 1 and (k.since >= 0).sum() == 1
+
+
+def test_only_a_sensor_that_counts_again_starts_the_observer_anew():
+    s = exported().supervision
+    for kind, starts in ((supervisor.OFFSET, True), (supervisor.DEADLINE, False)):
+        k = supervisor.kept(s)
+        supervisor.said(k, kind, 0, 2.0)
+        k.clock_s[1] = s.back_s[kind]
+        assert not supervisor.gone(s, k) and k.since[kind, 0] == 0
+        k.clock_s[1] += 1.0
+        assert supervisor.gone(s, k) == starts
+        assert (k.since < 0).all() and k.counters[supervisor.ACTIVE] == 0
+
+
+def test_from_the_alarm_on_the_machine_is_held_until_its_cause_is_decided():
+    s = exported().supervision
+    for counter, mode in ((-1, "pi"), (0, "hold"), (3, "hold")):
+        k = supervisor.kept(s)
+        supervisor.said(k, supervisor.REACH, 0, 2.0)
+        k.counters[supervisor.ALARMED] = counter
+        assert supervisor.MODES[supervisor.mode_of(s, k)] == mode
+        k = supervisor.kept(s)
+        k.counters[supervisor.ALARMED] = counter
+        assert supervisor.MODES[supervisor.mode_of(s, k)] == ("law" if counter < 0 else "hold")
+
+
+def test_a_moving_reference_that_is_given_anew_each_sample_goes_on():
+    slow = controller.ramp(R, np.array([0.05, -0.03]))
+    once, anew = Run(seed=6), Run(seed=6)
+    same = once.go(40, r=lambda k: slow)
+    copies = anew.go(40, r=lambda k: controller.Reference(*(part.copy() for part in slow)))
+    for one, other in zip(same, copies, strict=True):
+        np.testing.assert_array_equal(one.u, other.u)
+    assert np.abs(same[-1].u - same[0].u).max() > 0.1
+
+
 BACK = {
     # how the law is left, and for how many samples
     "hold": ({"reading": put(1, lambda y, k: np.nan)}, 25),
@@ -374,6 +440,9 @@ def test_a_simulated_controller_runs_only_in_a_rehearsal():
 def test_bad_input_is_refused_in_a_sentence():
     with pytest.raises(ValueError, match=r"noise in degC above zero, found \[0. 0.\]"):
         supervision(MODEL, [MODEL], WIRED, np.zeros(2))
+    for noise in ([NOISE, np.nan], [NOISE, 0.0], [-NOISE, NOISE], [NOISE, np.inf]):
+        with pytest.raises(ValueError, match="noise in degC above zero"):
+            supervision(MODEL, [MODEL], WIRED, np.array(noise))
     with pytest.raises(ValueError, match="declare the safe mode of every kind"):
         supervision(MODEL, [MODEL], WIRED, np.full(2, NOISE), modes={"sensor_nan": "law"})
     run = Run()
