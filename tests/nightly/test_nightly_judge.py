@@ -319,6 +319,89 @@ def test_the_temperature_loop_allows_its_worst_case_and_its_hold_out_a_percentag
     }
 
 
+def test_every_plant_start_and_reference_is_a_case_and_the_dearest_plant_guards(project):
+    asked = {"starts_degC": [20.0, 60.0], "reference_offsets_degC": [0.0, 7.0], "plants": 3, "steps": 120}
+    settings = project.model_copy(update={"holdout": project.holdout.model_copy(update=asked)})
+    evidence = judge.judge(settings.loops["temperature"], settings).measure(Path("datasets"))
+    reference = judge.frozen_panel(settings.holdout).machine.outputs[0].reference
+    assert set(evidence.cases) == {
+        f"plant {p}, {start:g} °C to {reference + offset:g} °C"
+        for p in range(3) for start in (20.0, 60.0) for offset in (0.0, 7.0)
+    }  # fmt: skip
+    by_plant = [
+        np.mean([cost for block, cost in evidence.cases.values() if block == f"plant {p}"]) for p in range(3)
+    ]
+    assert evidence.guards["worst_case"] == pytest.approx(max(by_plant)) and max(by_plant) > min(by_plant)
+
+
+def test_weights_that_hold_another_versions_too_are_read_as_todays(project):
+    judged = judge.judge(project.loops["temperature"], project)
+    before = judged.measure(Path("datasets"))
+    path = "datasets/tune_weights/weights.json"
+    artifacts.write_json(path, artifacts.read_json(path) | {"practical": {"subspace_lqg": 3.0}})
+    assert judged.measure(Path("datasets")) == before
+
+
+def test_the_hold_out_error_is_the_root_mean_square_of_one_step(project):
+    rng, none = np.random.default_rng(3), np.zeros((400, 7))
+    y = simulate(baam(), none, np.zeros(6))[1]
+    noise = rng.uniform(0.2, 0.6, y.shape)  # of one sign: a cube would be another number
+    predicted = judge._predictor(
+        Path("datasets"), "subspace_lqg", judge.frozen_panel(project.holdout).machine
+    )
+    found = judge._prediction_error(predicted, [(none, y + noise)])
+    assert 0.1 < found < 1.0
+    twice = judge._prediction_error(predicted, [(none, y + noise), (none, y + noise)])
+    assert twice == pytest.approx(found)
+    assert judge._prediction_error(predicted, []) is None
+
+
+def test_hold_out_records_are_cut_at_gaps_segments_and_masked_inputs(project):
+    machine = judge.frozen_panel(project.holdout).machine
+    n = 200
+    record = {"segment": np.repeat([0, 1], [100, 100])}
+    for one in (*machine.inputs, *machine.outputs):
+        record |= {one.name: np.arange(n, dtype=float), f"{one.name}_masked": np.zeros(n, bool)}
+    record[f"{machine.inputs[0].name}_masked"][[30, 60, 130]] = True
+    record[f"{machine.outputs[0].name}_masked"][45] = True  # an output may miss
+    pairs = judge._segments(record, machine)
+    # 30 samples count, 29 do not
+    assert [(int(u[0, 0]), len(u)) for u, _ in pairs] == [(0, 30), (61, 39), (100, 30), (131, 69)]
+    assert all(np.isfinite(u).all() and len(u) == len(y) for u, y in pairs)
+    record[f"{machine.inputs[0].name}_masked"][59] = True
+    record[f"{machine.inputs[0].name}_masked"][31] = True
+    assert (32, 27) not in [(int(u[0, 0]), len(u)) for u, _ in judge._segments(record, machine)]
+
+
+def test_a_hold_out_recording_that_cannot_be_read_ends_the_judging_with_its_reason(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("params.yaml").write_text(yaml.safe_dump(nights.settings()))
+    settings = params.load(Nightly, "nightly")
+    folder = Path(settings.holdout.recordings)
+    with pytest.raises(ValueError, match="expected recordings that nothing is trained on, found none"):
+        judge.frozen_panel(settings.holdout)
+    nights.write(folder / "calm.csv", nights.a_night(1, 0))
+    (folder / "torn.csv").write_text("time_s,heater_1\n0,abc\n")
+    with pytest.raises(ValueError, match="torn.csv"):
+        judge.frozen_panel(settings.holdout)
+
+
+def test_no_case_costs_nothing_and_what_a_champion_did_not_measure_may_not_be_worse(project):
+    columns = {
+        "part": ["a"], "material": ["A"], "composer": ["basis"], "chosen": [True],
+        "rms_percent_of_on_off": [0.0], "predicted_percent": [1.0],
+        "worst_line_volume_percent": [0.2],
+    }  # fmt: skip
+    artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, columns)
+    loop = Loop(artifacts=["x"], judge="deposition", cases="", recordings="")
+    evidence = judge.judge(loop, project).measure(Path("datasets"))
+    assert evidence.cases == {"a, A": ("a, A", 1e-3)}
+    assert evidence.guards == {"worst_line_volume_percent": 0.2}
+    champion = Evidence("a", {}, {"worst_case": 40.0})  # its hold-out was not measured: nothing may be worse
+    allowed = judge.judge(project.loops["temperature"], project).allowed(champion)
+    assert allowed["holdout_error_degC"] == 0.0
+
+
 def test_a_controller_is_designed_for_what_it_was_tuned_for_not_for_the_nights_cases(project, monkeypatch):
     """PI's gains depend on the horizon that its responses are followed over: a night of shorter cases would
     judge another PI than the pages."""
