@@ -250,6 +250,13 @@ def test_a_command_that_the_drive_cannot_follow_is_sent_ahead_by_delay_and_lag()
     assert ahead >= 14
 
 
+def test_lines_shorter_than_a_millimetre_are_wanted_too():
+    steps = "".join(f"G1 X{20 + 0.5 * k:g} E1\n" for k in range(1, 21))
+    made = composed(f"G21\nG90\nM83\nT0\nG0 X20 Y0 F480\nG1 F480\n{steps}G0 X84\nG4 P3000")
+    assert len(made.lines.line) == 20 and made.lines.length.max() < 1.0
+    assert made.streams[0].r.sum() * TS == pytest.approx(AREA * 10.0, rel=1e-9)
+
+
 def test_a_line_that_begins_at_once_is_given_the_time_for_its_lead():
     made = composed("G21\nG90\nM83\nT0\nG1 X20 E1 F480\nG0 X0")
     assert made.lead_in_s == pytest.approx(2.0)

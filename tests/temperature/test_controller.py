@@ -18,6 +18,7 @@ from pipeline.temperature.controller import (
     compact,
     constant,
     deployed,
+    handed_over,
     ramp,
     rest,
     sinusoid,
@@ -183,6 +184,63 @@ def test_a_moving_reference_is_followed_without_lag_on_the_exact_plant(reference
         x = p.A @ x + p.B @ u[0] + p.b
     # the observer's slowest mode is 0.997 a step: of half a degree at the start 1e-4 are left
     assert max(errors[-300:]) < 1e-3
+
+
+def test_references_are_what_their_formulas_say():
+    t = np.arange(50)[:, None]
+    moving = ramp(REFERENCE, np.arange(5) / 10)
+    np.testing.assert_allclose(moving.states(50) @ moving.H.T, REFERENCE + t * np.arange(5) / 10)
+    wave = sinusoid(REFERENCE, np.arange(5.0), 20.0)
+    np.testing.assert_allclose(
+        wave.states(50) @ wave.H.T, REFERENCE + np.arange(5.0) * np.sin(2 * np.pi * t / 20), atol=1e-9
+    )
+
+
+def test_a_limit_binds_from_a_hundredth_of_a_degree_on():
+    one = make_plant([[0.9]], [[1.0]], [[1.0]])  # 10 °C a percent
+    limits = Limits(np.zeros(1), np.full(1, 10.0), np.full(1, np.inf))
+    for beyond, binding in ((0.006, ()), (0.014, ((0, 10.0),))):
+        assert rest(one, constant(np.array([100.0 + beyond])), limits).binding == binding
+
+
+def test_conditional_integration_adds_the_error_where_no_limit_holds_it():
+    law = laws()["pi"][1]._replace(conditional=True)
+    ready = deployed(law, LIMITS, integral_limit=1.0)
+    state = watched(ready, None, np.full((1, 7), 40.0), np.full((1, 5), 150.0), REFERENCE[None])
+    state = handed_over(ready, state, np.full((1, 5), 150.0), [])
+    assert np.any(law.integral)
+    y_star, y = np.full((1, 5), 150.0), np.full((1, 5), 150.0) - 1e-3 * np.arange(5)
+    u, wished, after = batch_step(ready, state, y, y_star, y_star @ law.D.T, y_star)
+    np.testing.assert_array_equal(u, wished)
+    np.testing.assert_allclose(after.xi - state.xi, law.integral * (y_star - y), atol=1e-9)
+
+
+def test_the_compact_law_of_a_window_asks_for_what_the_window_asks_for_case_by_case():
+    u, y = study.data_sets(np.random.default_rng(1), 1500, 1)
+    learned = window.learn([u[:, 0]], [y[:, 0]], longest=4)
+    law = window.controller(learned, 0.99).design(ONE5, ONE7, 0.05)
+    rng = np.random.default_rng(2)
+    readings, target = 150 + rng.standard_normal((12, 3, 5)), np.tile(REFERENCE, (3, 1))
+    inputs = []
+    for form in (law, compact(law, learned.N)):
+        ready = deployed(form, LIMITS, integral_limit=1.0)
+        state = None
+        for row in readings[:6]:
+            state = watched(ready, state, np.full((3, 7), 0.4), row, target)
+        asked = []
+        for row in readings[6:]:
+            applied, _, state = batch_step(ready, state, row, target, np.zeros((3, 7)), target)
+            asked.append(applied)
+        inputs.append(np.array(asked))
+    np.testing.assert_allclose(*inputs, atol=1e-8)
+    assert np.ptp(inputs[0]) > 0
+
+
+def test_aims_of_references_that_came_by_are_kept_in_bounds():
+    controller = in_control()
+    for k in range(controller.AIMS + 3):
+        controller.step(np.full(5, 150.0), REFERENCE + k, 6 + k)
+    assert len(controller._aims) <= controller.AIMS
 
 
 def test_a_sequence_reaches_every_reference():
