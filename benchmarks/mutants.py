@@ -60,6 +60,8 @@ SPARE_S = 5.0  # CPU seconds over four times the tests' own: importing takes a f
 EXACTLY = "differs only where two computed numbers are equal to the last bit"
 RESOLUTION = "the search halves its step until it is below 1e-3 percent, from wherever it starts"
 CLAMPED = "_steady clamps the slack at the same share of the limits, so that wider asks for nothing more"
+DROPPED = "what lies behind the last sample is cut off again"
+RESTS = "a part begins with two seconds of rest: no task reaches its first sample"
 # {(module, "line: before -> after"): why nothing can see it}
 JUDGED = {
     ("kernel", "260: sv > tolerance * size.max() -> sv >= tolerance * size.max()"): EXACTLY,
@@ -76,6 +78,18 @@ JUDGED = {
     ("tracking", "321: high - low -> high + low"): CLAMPED,
     ("tracking", "321: 0.49 -> 0.98"): CLAMPED,
     ("tracking", "321: (high - low).min() -> (high - low).max()"): CLAMPED,
+    ("controller", "93: np.abs(target.miss).max() > tolerance -> "
+     "np.abs(target.miss).max() >= tolerance"): EXACTLY,
+    ("controller", "98: abs(u - limit) < 1e-06 * (limits.high[i] - limits.low[i]) -> "
+     "abs(u - limit) <= 1e-06 * (limits.high[i] - limits.low[i])"): EXACTLY,
+    ("controller", "158: 1e-09 -> 2e-09"): "only keeps a balance that leaks nothing from being singular",
+    ("composition", "210: 0.0 -> 1.0"): DROPPED,
+    ("composition", "183: 1 -> 2"): DROPPED,
+    ("composition", "357: True -> False"): "columns are computed that nobody reads",
+    ("composition", "227: at >= 0 -> at > 0"): RESTS,
+    ("composition", "227: 0 -> 1"): RESTS,
+    ("composition", "213: at < 0 -> at <= 0"): RESTS,
+    ("composition", "213: 0 -> 1"): RESTS,
 }  # fmt: skip
 
 COMPARED = {
