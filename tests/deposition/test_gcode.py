@@ -230,6 +230,47 @@ def test_free_text_is_never_a_move():
     ]  # fmt: skip
 
 
+def test_several_commands_in_every_line_are_all_moves():
+    many = "".join(f"G1 X{k} G1 X{k}.25 G1 X{k}.5 G1 X{k}.75 E1\n" for k in range(1, 30_000))
+    found = parse(f"G21\nG90\nM83\nG1 F600\n{many}").moves  # more than one chunk
+    assert len(found.line) == 4 * 29_999
+    np.testing.assert_allclose(found.end[:, 0], 1 + 0.25 * np.arange(len(found.line)))
+
+
+def test_numbers_of_lines_may_stand_before_some_lines_only():
+    plain = "G21\nG90\nM83\nG1 X10 E1 F600\nG1 Y5 E1\nG1 X0 E1\n"
+    some = "G21\nN7 G90\nM83\nN9 G1 X10 E1 F600\nG1 Y5 E1\nN10 G1 X0 E1\n"
+    for one, other in zip(parse(plain).moves, parse(some).moves, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("radius", "off", "read"), [(20, 0.9, True), (20, 1.1, False), (2, 0.45, True), (2, 0.55, False)]
+)
+def test_an_arc_may_miss_its_circle_by_half_a_millimetre_or_a_twentieth(radius, off, read):
+    """From the right of the circle to its left, the end so far outside."""
+    program = parse(f"G21\nG90\nM83\nG0 X{radius} Y0 F600\nG3 X{-radius - off} Y0 I{-radius} J0 E1\n")
+    assert (len(program.refusals) == 0) == read
+    assert np.any(program.moves.angle > 0) == read
+
+
+def test_more_pins_than_a_board_has_are_refused_by_line():
+    text = "G21\nG90\nG1 F600\n" + "".join(f"M42 P{k} S255\nG1 X{k + 1}\nM42 P{k} S0\n" for k in range(70))
+    program = parse(text, extruder="M42 P3")
+    (refusal,) = program.refusals
+    assert "expected at most 64 pins of M42, found more" in refusal.why
+    assert refusal.line == 4 + 3 * 64
+    assert np.flatnonzero(program.moves.kind == Kind.EXTRUDE).tolist() == [3]
+
+
+@pytest.mark.parametrize("word", ["M200 D1.75", "M204 S500", "M220 S90", "M221 S90"])
+def test_an_e_beside_a_setting_is_refused(word):
+    program = parse(f"G21\nG90\nM83\nG1 X10 E1 F600\n{word} E2\nG1 X20 E1\n")
+    assert [one.line for one in program.refusals] == [5]
+    assert "expected no E beside M200, M204, M220 or M221" in program.refusals[0].why
+    assert not parse(f"G21\nG90\nM83\nG1 X10 E1 F600\n{word}\nG1 X20 E1\n").refusals
+
+
 def test_macros_and_template_rests_are_kept_with_their_lines():
     text = (
         "START_PRINT BED=60 X=5\nEXCLUDE_OBJECT_START NAME=cube_id_0\n{if layer_z > 5}\n_HEAT\nG1 X1\n"
