@@ -45,6 +45,7 @@ WORDS = (
     "forecast",
     "lead",
     "trial",
+    "stream",
     "through_pictures",
     "gamma",
     "saturation",

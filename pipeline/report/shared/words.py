@@ -220,6 +220,7 @@ FIXED = {
         "Our composer: the command for any part is built from a few functions of the wanted flow, "
         "fitted to the trials through an identified chain. It needs no trained task.",
     ),
+    "stream": ("Stream", "What one tool prints of one part, in its material."),
     "library": (
         "Library",
         "The paper’s composer: signals learned once for Start, Stop, Corner and Steady\u2011State, laid one "
@@ -325,6 +326,25 @@ FIXED = {
         "Gain 0.6",
         "The extruder moves only 0.6 of what it is told, as a worn or slipping drive does; "
         "the controller is not told.",
+    ),
+    "segment": (
+        "Segment",
+        "A stretch of one print whose pictures share light, place and bead: intervals draw it anew.",
+    ),
+    "clog": (
+        "Clog, half clog",
+        "From one decision on, which the name beside it tells, less comes out than the extruder moves: the "
+        "share that is left stands there. Half clog: more is left than after a clog.",
+    ),
+    "good_starts": (
+        "Perfect, in band",
+        "Prints that nothing is wrong with: the flow begins at 100 %, or somewhere within the band of good. "
+        "What a controller spoils of them is its harm.",
+    ),
+    "faulty_camera": (
+        "Stuck, blind, another camera, borders",
+        "The camera shows one picture again and again, or no line, for as many decisions as stand there; it "
+        "is of another make than the one learned; or its borders between the classes lie elsewhere.",
     ),
     "sticky": (
         "Sticky",
