@@ -31,14 +31,15 @@ SPARE = 6  # times its minutes, before a benchmark is ended
 QUICK_MINUTES = 1.0
 
 
-def machine() -> dict[str, Any]:
-    """The CPU's name and how many cores this process may use."""
-    names = [
-        line.split(":", 1)[1].strip()
-        for line in Path("/proc/cpuinfo").read_text().splitlines()
-        if line.startswith("model name")
-    ]
-    return {"cpu": names[0] if names else os.uname().machine, "cores": len(os.sched_getaffinity(0))}
+def machine(told: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
+    """The CPU's name, with family and model (makers give several generations one name), and how many cores
+    this process may use."""
+    pairs = (line.partition(":") for line in told.read_text().split("\n\n")[0].splitlines())
+    says = {key.strip(): value.strip() for key, _, value in pairs}
+    name = says.get("model name", os.uname().machine)
+    if {"cpu family", "model"} <= says.keys():
+        name += f" (family {says['cpu family']}, model {says['model']})"
+    return {"cpu": name, "cores": len(os.sched_getaffinity(0))}
 
 
 def lacks(benchmark: Benchmark, peer: str | None) -> str:

@@ -4,8 +4,8 @@
 damages, 50 of one kind after 50 of the next, each round from a seed of its own, until the time is over;
 `--only CSV,G-code` some of them, `--seed 7` other files. A reader may take a file or refuse it by a sentence.
 Anything else is a traceback; more than 20 s of CPU is a hang. The smallest file that shows it is kept as
-benchmarks/results/fuzz/<kind>-<seed><suffix>. Counts go to benchmarks/results/fuzz.json; the exit status is 1
-where anything was found.
+benchmarks/results/fuzz/<kind>-<seed><suffix>. Counts go to benchmarks/results/fuzz.json after every round;
+the exit status is 1 where anything was found.
 """
 
 import argparse
@@ -13,6 +13,7 @@ import collections
 import sys
 import time
 import traceback
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -72,25 +73,26 @@ def keep(name: str, seed: int, failed: Failed) -> dict[str, Any]:
     return {"kind": name, "seed": seed, "said": failed.said[:300], "file": path.name}
 
 
-def fuzz(names: list[str], hours: float, seed: int) -> dict[str, Any]:
-    """Files by kind and answer, and what was found, until the time is over; each kind has one round."""
+def fuzz(names: list[str], hours: float, seed: int) -> Iterator[dict[str, Any]]:
+    """Files by kind and answer, and what was found, after every round of all kinds until the time is over."""
     counts = {name: collections.Counter() for name in names}
-    found, began, first = [], time.monotonic(), seed
-    while time.monotonic() - began < 3600 * hours or seed == first:
+    found, began, first, gone = [], time.monotonic(), seed, 0.0
+    while gone < 3600 * hours:
         for name in names:
             answers, failed = round_of(name, seed)
             counts[name] += answers
             if failed:
                 found.append(keep(name, seed, failed))
+        gone = time.monotonic() - began
+        yield {
+            "hours": round(gone / 3600, 4),
+            "seeds": [first, seed],
+            "files": {name: dict(sorted(counter.items())) for name, counter in counts.items()},
+            "tracebacks": sum(not row["said"].startswith("hang") for row in found),
+            "hangs": sum(row["said"].startswith("hang") for row in found),
+            "found": found,
+        }
         seed += 1
-    return {
-        "hours": hours,
-        "seeds": [first, seed - 1],
-        "files": {name: dict(sorted(counter.items())) for name, counter in counts.items()},
-        "tracebacks": sum(not row["said"].startswith("hang") for row in found),
-        "hangs": sum(row["said"].startswith("hang") for row in found),
-        "found": found,
-    }
 
 
 def main() -> None:
@@ -102,11 +104,12 @@ def main() -> None:
     names = asked.only.split(",")
     if unknown := [name for name in names if name not in fuzzing.TARGETS]:
         parser.error(f"{unknown[0]} is no kind of file; choose among {', '.join(fuzzing.TARGETS)}")
-    result = fuzz(names, asked.hours, asked.seed)
+    result: dict[str, Any] = {"files": {}, "tracebacks": 0, "hangs": 0, "found": []}
+    for result in fuzz(names, asked.hours, asked.seed):
+        artifacts.write_json(RESULTS, result)
     for name, answers in result["files"].items():
         print(f"{name:15} {answers}")
     print(f"{result['tracebacks']} tracebacks, {result['hangs']} hangs")
-    artifacts.write_json(RESULTS, result)
     sys.exit(1 if result["found"] else 0)
 
 

@@ -133,9 +133,17 @@ def _said_mutants(one: Mapping[str, Any]) -> str:
     )
 
 
+def _said_branches(one: Mapping[str, Any]) -> str:
+    return (
+        f"{one['taken']:,} of {one['branches']:,} branches of the methods taken by their tests, "
+        f"{100 * one['share_taken']:.1f} %; at least {100 * one['goal']:g} %"
+    )
+
+
 SAID = {
     "killed_repros": _said_kills,
     "killed_nights": _said_nights,
     "fuzz": _said_fuzz,
     "mutants": _said_mutants,
+    "branches": _said_branches,
 }

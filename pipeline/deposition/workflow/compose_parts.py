@@ -193,10 +193,10 @@ def summary_lines(part: Part) -> str:
             f"of all lines the worst is line {lines.line[worst]}: {lines.error_percent[worst]:+.1f} % of "
             f"{lines.planned_mm3[worst]:.3g} mm^3"
         )
-    if np.any(lines.shorter_than_lead):
+    if short := int(np.sum(lines.shorter_than_lead)):
         text.append(
-            f"{int(np.sum(lines.shorter_than_lead))} lines belong to runs shorter than the lead of Stop: "
-            "the priority rule would not print them"
+            f"{short:,} {'line belongs to a run' if short == 1 else 'lines belong to runs'} shorter than the "
+            f"lead of Stop: the priority rule would not print {'it' if short == 1 else 'them'}"
         )
     text += part_programs.summary(part.program, part.extruded, part.printer)
     text += part_programs.refused(checks, part.program)

@@ -1,0 +1,89 @@
+"""How many branches of the methods their tests take.
+
+`./run --group peers python -m benchmarks.branches` runs the tests of the four folders of `METHODS` under
+coverage, workers and started processes too, and writes benchmarks/results/branches.json: branches and those
+taken by module, and the lines from which an arrow (12->15: from line 12 to 15) was never followed. Methods
+are the modules of these folders themselves; what reads files and parameters for them (`workflow/`) is not
+counted. `--tests tests/runtime` runs fewer tests, and prints only.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.store import artifacts
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks/results/branches.json"
+METHODS = ("temperature", "deposition", "setpoint", "runtime")
+CONFIG = """[run]
+branch = true
+parallel = true
+data_file = {folder}/taken
+source = {source}
+omit = */workflow/*
+patch = subprocess
+disable_warnings = no-data-collected,module-not-measured,module-not-imported
+"""
+
+
+def measured(tests: list[str]) -> dict[str, Any]:
+    """What coverage says, as JSON, of these tests. Raises RuntimeError where one of them fails."""
+    with tempfile.TemporaryDirectory() as folder:
+        config = Path(folder) / "coverage.ini"
+        source = ",".join(str(ROOT / "pipeline" / name) for name in METHODS)
+        config.write_text(CONFIG.format(folder=folder, source=source))
+        told = Path(folder) / "told.json"
+        under = [sys.executable, "-m", "coverage"]
+        with_config = [f"--rcfile={config}"]
+        run = subprocess.run([*under, "run", *with_config, "-m", "pytest", *tests], cwd=ROOT, env=os.environ)
+        if run.returncode:
+            raise RuntimeError(f"the tests ended with {run.returncode}; mend them first")
+        for step in (["combine", "-q"], ["json", "-q", "-o", str(told)]):
+            subprocess.run([*under, step[0], *with_config, *step[1:]], cwd=ROOT, check=True)
+        return json.loads(told.read_text())
+
+
+def table(told: Mapping[str, Any]) -> dict[str, Any]:
+    """Branches, those taken, and the arrows not followed, by module and in all; modules without a branch are
+    left out."""
+    modules = {}
+    for path, one in sorted(told["files"].items()):
+        of = one["summary"]
+        if of["num_branches"]:
+            modules[path.removeprefix("pipeline/").removesuffix(".py")] = {
+                "branches": of["num_branches"],
+                "taken": of["covered_branches"],
+                "not_taken": [f"{a}->{b}" if b > 0 else f"{a}->end" for a, b in one["missing_branches"]],
+            }
+    branches, taken = (sum(one[name] for one in modules.values()) for name in ("branches", "taken"))
+    return {
+        "branches": branches,
+        "taken": taken,
+        "share_taken": round(taken / max(branches, 1), 4),
+        "modules": modules,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--tests", nargs="*", metavar="PATH")
+    asked = parser.parse_args()
+    result = table(measured(asked.tests or [f"tests/{name}" for name in METHODS]))
+    for name, one in sorted(
+        result["modules"].items(), key=lambda item: item[1]["taken"] - item[1]["branches"]
+    ):
+        print(f"{name:45} {one['taken']:4} of {one['branches']:4}  {' '.join(one['not_taken'][:12])}")
+    print(f"{result['taken']} of {result['branches']} branches: {100 * result['share_taken']:.1f} %")
+    if not asked.tests:
+        artifacts.write_json(RESULTS, result)
+
+
+if __name__ == "__main__":
+    main()
