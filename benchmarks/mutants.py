@@ -62,6 +62,7 @@ RESOLUTION = "the search halves its step until it is below 1e-3 percent, from wh
 CLAMPED = "_steady clamps the slack at the same share of the limits, so that wider asks for nothing more"
 DROPPED = "what lies behind the last sample is cut off again"
 RESTS = "a part begins with two seconds of rest: no task reaches its first sample"
+SET_FIRST = "it is read only of causes that are there, and they set it"
 # {(module, "line: before -> after"): why nothing can see it}
 JUDGED = {
     ("kernel", "260: sv > tolerance * size.max() -> sv >= tolerance * size.max()"): EXACTLY,
@@ -83,6 +84,10 @@ JUDGED = {
     ("controller", "98: abs(u - limit) < 1e-06 * (limits.high[i] - limits.low[i]) -> "
      "abs(u - limit) <= 1e-06 * (limits.high[i] - limits.low[i])"): EXACTLY,
     ("controller", "158: 1e-09 -> 2e-09"): "only keeps a balance that leaks nothing from being singular",
+    ("supervisor", "527: 1 -> 2"): SET_FIRST,
+    ("supervisor", "287: 1.0 -> 2.0"): SET_FIRST,
+    ("supervisor", "308: 0 -> 1"): "before a heater is found wrong nothing is lacking: u (1 - 0)",
+    ("supervisor", "691: 0 -> 1"): "what the first target fills is not read before it",
     ("composition", "210: 0.0 -> 1.0"): DROPPED,
     ("composition", "183: 1 -> 2"): DROPPED,
     ("composition", "357: True -> False"): "columns are computed that nobody reads",

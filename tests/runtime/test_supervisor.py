@@ -265,6 +265,9 @@ def test_what_is_watched_follows_from_noise_and_from_what_a_quarter_of_the_heat_
     slow = plant(np.diag([0.999, 0.98]), np.diag([0.004, 0.065]), np.eye(2), d=[ROOM, ROOM])
     s = supervision(slow, [slow], WIRED, np.full(2, NOISE))
     np.testing.assert_allclose(s.check_s, [210.0, 20.0])
+    # 25 % x 0.0004 degC never does: all of 200 samples, and one
+    cold = plant(np.diag([0.999, 0.98]), np.diag([0.0004, 0.065]), np.eye(2), d=[ROOM, ROOM])
+    np.testing.assert_allclose(supervision(cold, [cold], WIRED, np.full(2, NOISE)).check_s, [2010.0, 20.0])
 
 
 def test_what_was_said_first_of_a_cause_stays_and_counts_once():
@@ -307,6 +310,10 @@ def test_a_moving_reference_that_is_given_anew_each_sample_goes_on():
     for one, other in zip(same, copies, strict=True):
         np.testing.assert_array_equal(one.u, other.u)
     assert np.abs(same[-1].u - same[0].u).max() > 0.1
+    # what readings are held against moves with it
+    _, target = once.supervised._target(slow)
+    np.testing.assert_array_equal(target, anew.supervised._target(slow)[1])
+    np.testing.assert_allclose(target - R, 40 * np.array([0.05, -0.03]), atol=0.06)
 
 
 BACK = {
@@ -428,6 +435,125 @@ def test_the_mode_is_safe_for_what_would_show_the_same():
     assert supervisor.MODES[supervisor.mode_of(s, k)] == "off"
     words = supervisor.sentence(WIRED, supervisor.OFFSET, 0, 2.0, supervisor.ON)
     assert "zone_1 is off by +2.0 degC" in words and "heater stuck on would show the same" in words
+
+
+def test_a_sensor_is_frozen_at_the_repeat_that_chance_does_not_allow():
+    s = exported().supervision
+    k = supervisor.kept(s)
+    k.counters[supervisor.SAMPLES] = 21
+    for y in (R, R + 0.1, R + 0.2):
+        supervisor.read(s, k, y)
+    most = int(np.ceil(supervisor.repeats_at_most(k.quantum[0], NOISE)))
+    assert most > 5
+    for repeat in range(1, most + 1):
+        supervisor.read(s, k, R + [0.2, 0.3 + 0.1 * repeat])
+        assert (k.since[supervisor.FROZEN, 0] >= 0) == (repeat == most), repeat
+    assert k.since[supervisor.FROZEN, 1] < 0
+
+
+def verdict_of(s, **costs) -> innovations.Verdict:
+    """A verdict in which the named hypotheses cost so much, all others 1,000; cost and amplitude by
+    "form_signal_number"."""
+    cost, amplitude = np.full(len(s.bank.form), 1000.0), np.full(len(s.bank.form), 0.4)
+    for name, (value, at) in costs.items():
+        form, signal, number = name.rsplit("_", 2)
+        wanted = (s.bank.form == getattr(innovations, form)) & (s.bank.signal == int(signal))
+        k = np.flatnonzero(wanted)[int(number)]
+        cost[k], amplitude[k] = value, at
+    return innovations.Verdict(cost, amplitude, 1000.0, np.ones(2), np.full(2, 9.0))
+
+
+def test_two_begins_of_one_cause_are_no_rivals(monkeypatch):
+    """That a heater is weak from now on, or from a sample before, is the same cause: nothing to wait for."""
+    s = exported().supervision
+    other = {"STEP_1_0": (4.0, 2.0)}
+    same = {"LESS_0_1": (4.0, 0.4)}
+    for beside, decided in ((same, True), (other, False)):
+        k, memory = supervisor.kept(s), innovations.remembered(s.watch, s.bank)
+        k.counters[supervisor.ALARMED], memory.age[0] = supervisor.DECIDED_AFTER, 20
+        told = verdict_of(s, LESS_0_0=(0.0, 0.4), **beside)
+        monkeypatch.setattr(innovations, "judged", lambda bank, memory, told=told: told)
+        assert supervisor.diagnosed(s, k, memory) == decided
+        # at the latest it is said, with what would show the same
+        k.counters[supervisor.ALARMED] = supervisor.DECIDED_BY
+        assert supervisor.diagnosed(s, k, memory)
+        assert k.since[supervisor.WEAK, 0] >= 0
+        assert k.other[supervisor.WEAK, 0] == (-1 if decided else supervisor.OFFSET)
+
+
+def test_a_reading_falls_faster_than_its_own_zone_can_cool():
+    """Out of place is a sensor that falls by twice what its zone loses with the heater off, and ten
+    deviations of its noise; the other zone's heat is none of its matter."""
+    s = exported().supervision
+    k = supervisor.kept(s)
+    k.held[:] = 10.0, 60.0
+    cooling = s.peak @ k.held
+    assert cooling[1] > 2 * cooling[0]
+    for j in (0, 1):
+        limit = 2 * cooling[j] + 10 * NOISE
+        for share, kind in ((1.05, supervisor.RUNAWAY), (0.95, supervisor.OFFSET)):
+            told = verdict_of(s, **{f"RAMP_{j}_0": (0.0, -share * limit)})
+            kinds, signals = supervisor._named(s, k, told)
+            at = int(told.cost.argmin())
+            assert (kinds[at], signals[at]) == (kind, j)
+
+
+def test_what_explains_the_innovation_is_said_with_its_amount():
+    s = exported().supervision
+    k, memory = supervisor.kept(s), innovations.remembered(s.watch, s.bank)
+    memory.f[:] = 4.0
+    supervisor._explained(k, memory, (supervisor.OFFSET, 1, 3), 0.5, -1)
+    assert k.amount[supervisor.OFFSET, 1] == 2.0  # 0.5 of the 4 degC that the hypothesis is off
+    supervisor._explained(k, memory, (supervisor.OFF, 0, 3), 1.5, -1)
+    assert k.amount[supervisor.OFF, 0] == 1.5 and k.lacks[0] == 1.0  # no heater lacks more than all
+    # a reading that left its range in the very first sample has its reason
+    k = supervisor.kept(s)
+    supervisor.said(k, supervisor.RANGE, 1, 400.0)
+    supervisor._explained(k, memory, (supervisor.OFFSET, 1, 3), 0.5, -1)
+    assert k.since[supervisor.OFFSET, 1] < 0 and k.absurd[1] == 1.0
+
+
+def test_a_cause_of_the_first_sample_is_told():
+    supervised = Supervised(exported(), rehearsal=True)
+    decision = supervised.step(np.r_[np.nan, R[1]], R, 0.0)
+    supervised.kept.since[supervisor.NAN, 0] = 0.0
+    assert [cause.kind for cause in supervised._causes(0.0)] == ["sensor_nan"]
+    assert decision.mode == "hold" and decision.causes[0].signal == "zone_1"
+
+
+def test_the_bank_is_followed_from_the_sample_of_the_alarm_on(monkeypatch):
+    run, seen = Run(seed=15), []
+    suspected = innovations.suspected
+    monkeypatch.setattr(
+        innovations, "suspected", lambda *of, alarmed: seen.append(alarmed) or suspected(*of, alarmed=alarmed)
+    )
+    for counter, alarmed in ((-1, False), (0, True), (3, True)):
+        run.supervised.kept.counters[supervisor.ALARMED] = counter
+        run.go(1)
+        assert seen.pop() == alarmed
+
+
+def test_where_a_sensor_counts_again_nothing_of_its_innovation_is_left():
+    run = Run(seed=16)
+    run.go(50)
+    run.go(5, reading=SENSORS["sensor_nan"])
+    active = run.supervised.kept.counters
+    while active[supervisor.ACTIVE]:
+        assert run.t < 120
+        run.go(1)
+    np.testing.assert_array_equal(run.supervised.kept.e, 0.0)
+
+
+def test_a_drift_that_is_small_is_none_whatever_was_learned_of_the_plant():
+    s = exported().supervision
+    s = s._replace(watch=s.watch._replace(unexplained=0.0))
+    for share, kinds in ((0.9, 0), (1.1, 1)):
+        k, memory = supervisor.kept(s), innovations.remembered(s.watch, s.bank)
+        memory.P[:] = 0.0
+        memory.theta[1, 0] = 1.0
+        innovations.drift(memory, 2)[1, :2] = share * s.heat[1], 0.5 * s.heat[1]
+        supervisor.heated(s, k, memory)
+        assert int((k.since >= 0).sum()) == kinds, share
 
 
 def test_a_simulated_controller_runs_only_in_a_rehearsal():
