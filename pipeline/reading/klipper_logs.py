@@ -28,6 +28,7 @@ APART_S = 3600.0
 # Klipper divides its PID parameters by this: they are of a duty of 0 to 255
 PID_BASE = 255.0
 _STATS = (b"Stats", b"INFO:root:Stats")
+LATEST_S = 4e9  # the year 2096: beyond it a system time is none, and no count runs on so long
 _START = re.compile(rb"Start printer at .*\((\d+(?:\.\d+)?) (\d+(?:\.\d+)?)\)")
 # key of a Stats line -> unit and factor
 _KEYS = {
@@ -150,14 +151,17 @@ class _Log:
         self.config: list[str] = []
         self.in_config = False
         self.idle = self.garbled = self.cut = 0
-        self.first_garbled = 0
+        self.first_garbled = self.first_undated = 0
         self.keys: dict[bytes, tuple[str, float]] = {}
 
     def add(self, line: int, text: bytes) -> None:
         if _is_stats(text):
             self._add_stats(line, text)
         elif start := _START.search(text):
-            self.sessions.append(_Session(len(self.times), float(start[1]) - float(start[2])))
+            zero_s = float(start[1]) - float(start[2])
+            if not 0 <= zero_s < LATEST_S:
+                self.first_undated, zero_s = self.first_undated or line, np.nan
+            self.sessions.append(_Session(len(self.times), zero_s))
         else:
             self.add_config(line, text)
 
@@ -189,6 +193,9 @@ class _Log:
             return
         if not np.isfinite(time) or not has_print_time:
             self.idle += 1
+            return
+        if not 0 <= time < LATEST_S:
+            self._count_garbled(line)
             return
         # a count that falls without a start is another run, pasted behind
         if self.times and time < self.times[-1] and self.sessions[-1].first < len(self.times):
@@ -225,11 +232,17 @@ class _Log:
         notes = []
         if self.garbled:
             message = (
-                f"{self.garbled} Stats lines hold text or zero bytes in place of a number and were left out"
+                f"{self.garbled} Stats lines hold text or zero bytes in place of a number, or a count "
+                "that no computer reaches, and were left out"
             )
             notes.append(
                 Note("damage", "", self.garbled, f"{message}, the first is line {self.first_garbled}")
             )
+        if self.first_undated:
+            message = (
+                f"the start in line {self.first_undated} gives no time of day that can be; it is not used"
+            )
+            notes.append(Note("damage", "", 1, message))
         if self.cut:
             notes.append(
                 Note("truncated", "", self.cut, f"{self.cut} Stats lines break off and were left out")

@@ -1,5 +1,7 @@
 """Klipper's log, written by a simulated printer, and what becomes of it."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -119,6 +121,28 @@ def test_a_line_that_breaks_off_or_is_garbled_is_counted_and_left_out(tmp_path, 
     whole = load_klippy(write(tmp_path, log))
     assert len(table.time) == len(whole.time) - 3
     assert set(table.values["extruder.temp"]) <= set(whole.values["extruder.temp"])
+
+
+def test_a_time_that_no_calendar_has_is_told_and_not_used(tmp_path, log):
+    lines = log.splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith("Start printer"))
+    counted = next(i for i, line in enumerate(lines) if line.startswith("Stats")) + 4
+    late = list(lines)
+    late[counted] = re.sub(r"Stats ([0-9.]+):", r"Stats 9\1e17:", lines[counted])
+    table = load_klippy(write(tmp_path, "\n".join(late) + "\n"))
+    whole = load_klippy(write(tmp_path, log))
+    assert (
+        sorted(set(whole.time) - set(table.time)) == [whole.time[4]]
+        and len(table.time) == len(whole.time) - 1
+    )
+    assert f"the first is line {counted + 1}" in next(one.message for one in table.notes)
+    undated = list(lines)
+    undated[start] = re.sub(r"\(([0-9.]+) ", r"(9\g<1>0000000000 ", lines[start])
+    assert undated[start] != lines[start]
+    table = load_klippy(write(tmp_path, "\n".join(undated) + "\n"))
+    assert table.time.dtype == float and table.time[-1] < 1e6  # by the computer's own count
+    message = next(one.message for one in table.notes if one.kind == "damage")
+    assert message.startswith(f"the start in line {start + 1} gives no time of day that can be")
 
 
 def test_a_line_without_an_end_takes_no_memory_of_its_size(tmp_path, log):

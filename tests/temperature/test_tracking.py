@@ -377,6 +377,10 @@ def test_a_plant_that_only_integrates_rests_where_its_input_balances_the_loss():
     target = feasible_target(tank, np.array([50.0]), np.zeros(1), np.full(1, 100.0))
     np.testing.assert_allclose(target.u, 10.0, atol=1e-5)  # 0.1 u = 1; a leak of 1e-9 asks for 5e-7 more
     np.testing.assert_allclose(target.y, 50.0, atol=2e-3)
+    # beside a zone that is at rest by itself: x = 2 u and u as the tank asks
+    beside = plant(np.diag([1.0, 0.5]), [[0.1], [1.0]], [[1.0, 0.0]], b=[-1.0, 0.0])
+    target = feasible_target(beside, np.array([50.0]), np.zeros(1), np.full(1, 100.0))
+    np.testing.assert_allclose(target.x, [50.0, 20.0], atol=2e-3)
 
 
 def test_the_observer_gain_by_hand():
@@ -388,6 +392,7 @@ def test_the_observer_gain_by_hand():
 def test_a_still_law_remembers_nothing_and_asks_for_nothing():
     law, u, y = still_law(2, 3), np.ones(2), np.ones(3)
     z = law.start_u @ u + law.start_y @ y + law.start
+    assert (law.B_u.shape, law.B_y.shape, law.c.shape) == ((0, 2), (0, 3), (0,))
     z = law.A @ z + law.B_u @ u + law.B_y @ y + law.B_r @ y + law.c
     assert z.shape == (0,)
     np.testing.assert_array_equal(-law.K @ z - law.D @ y - law.K_r @ y - law.k, np.zeros(2))
