@@ -1,6 +1,8 @@
 """What is exported is what was judged: commands, files and words of the stage, on six plants of the study's
 machine."""
 
+import errno
+import types
 from functools import cache
 
 import numpy as np
@@ -142,3 +144,28 @@ def test_missing_values_are_held_and_told(tmp_path, monkeypatch):
         for path in panel["paths"]
     }
     assert shown <= set(columns)
+
+
+def test_an_export_that_finds_the_disk_full_leaves_what_was_there(tmp_path, monkeypatch):
+    real = artifacts.write_text
+
+    def full(path, text):
+        if path.name == "b.c":
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        real(path, text)
+
+    made = types.SimpleNamespace(name="law", simulated=False)
+    monkeypatch.setattr(exports.machine, "read", lambda folder: (made, None))
+    monkeypatch.setattr(exports.certificate, "sha256", lambda shown: 64 * "0")
+    for text in ("first", "second"):
+        monkeypatch.setattr(exports, "files", lambda *asked, text=text: {"a.c": text, "b.c": text})
+        if text == "second":
+            monkeypatch.setattr(artifacts, "write_text", full)
+            with pytest.raises(OSError, match=r"c/b\.c.*No space left on device"):
+                exports.export(tmp_path, "c", tmp_path / "c", "", None)
+        else:
+            exports.export(tmp_path, "c", tmp_path / "c", "", None)
+    assert {path.name: path.read_text() for path in (tmp_path / "c").iterdir()} == {
+        "a.c": "first",
+        "b.c": "first",
+    }

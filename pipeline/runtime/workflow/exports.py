@@ -44,8 +44,9 @@ def export(folder: Path, to: str, out: Path | None, section: str, power_W: float
         return _export_readers(folder, to, target)
     made, shown = machine.read(folder)
     texts = files(made, shown, to, section, power_W)
-    for name, text in texts.items():
-        artifacts.write_text(target / name, text)
+    with artifacts.together(target) as place:
+        for name, text in texts.items():
+            artifacts.write_text(place / name, text)
     written = ", ".join(str(target / name) for name in sorted(texts))
     word = REHEARSAL if made.simulated else TRIAL
     digest = certificate.sha256(shown)
@@ -66,6 +67,7 @@ def _export_readers(folder: Path, to: str, target: Path) -> str:
         )
     names = [name for name in setpoint.FILES if name != setpoint.AGENT or (folder / name).exists()]
     made = {name: artifacts.read_weights(folder / name, setpoint.FILES[name][0])[0] for name in names}
-    setpoint.write(target, made)
+    with artifacts.together(target) as place:
+        setpoint.write(place, made)
     written = ", ".join(str(path) for path in sorted(target.iterdir()) if path.is_file())
     return f"{', '.join(name.partition('.')[0] for name in names)}. {UNCERTIFIED}\nwritten: {written}"

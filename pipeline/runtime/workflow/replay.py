@@ -358,7 +358,8 @@ def replay_recording(folder: Path, path: Path, asked: Asked) -> tuple[Replay, Ex
         name: (values[::every], unit, text) for name, (values, unit, text) in signals(done, made).items()
     }
     time = done.time_s[::every] - min(float(done.time_s[0]), 0.0)
-    artifacts.write_recording(asked.out / "replay.mcap", time, thinned, topic="/replay")
-    artifacts.write_json(asked.out / "layout.json", layout(made))
-    artifacts.write_json(asked.out / "replay.json", told)
+    with artifacts.together(asked.out) as place:
+        artifacts.write_recording(place / "replay.mcap", time, thinned, topic="/replay")
+        artifacts.write_json(place / "layout.json", layout(made))
+        artifacts.write_json(place / "replay.json", told)
     return done, made, told
