@@ -92,9 +92,10 @@ def finished(folder: Path) -> int:
     return 0
 
 
-def moments(rng: np.random.Generator, whole_s: float) -> Iterator[tuple[float, bool]]:
+def moments(rng: np.random.Generator, whole_s: list[float]) -> Iterator[tuple[float, bool]]:
+    """Seconds up to the least of `whole_s`, to which the caller may add, and whether all goes."""
     while True:
-        yield float(rng.uniform(0.02, 1.0) * whole_s), bool(rng.uniform() < 0.5)
+        yield float(rng.uniform(0.02, 1.0) * min(whole_s)), bool(rng.uniform() < 0.5)
 
 
 def gone(processes: list[int], seconds: float = 20.0) -> None:
@@ -114,11 +115,11 @@ def _dvc(pid: int) -> bool:
 
 
 def disturbed(
-    project: Project, stages: list[str], kills: int, at: Iterator[tuple[float, bool]]
+    project: Project, stages: list[str], kills: int, at: Iterator[tuple[float, bool]], whole_s: list[float]
 ) -> list[Kill]:
     """A repro that is killed so many times at most, and then ends; done before its moment, it counts as
-    no kill."""
-    rows = []
+    no kill. One that nothing disturbed adds to `whole_s` what it took."""
+    rows: list[Kill] = []
     for _ in range(kills):
         after_s, tree = next(at)
         began, child = time.monotonic(), repro(project, stages)
@@ -132,6 +133,7 @@ def disturbed(
         else:
             if child.returncode != 0:
                 raise RuntimeError(f"dvc repro after a kill: {' '.join(said[-1500:].split())}")
+            whole_s += [] if rows else [time.monotonic() - began]
             break
         rows.append(Kill(round(time.monotonic() - began, 1), tree, finished(project.folder)))
         print(f"  {rows[-1]}", flush=True)
@@ -171,21 +173,20 @@ def play(path: Path, stages: list[str], kills: int, a_repro: int, seed: int) -> 
         whole = clone(Path(place) / "whole")
         began = time.monotonic()
         ended(repro(whole, stages))
-        whole_s, wanted = time.monotonic() - began, made(whole.folder)
-        print(
-            f"undisturbed: {whole_s:.0f} s, {finished(whole.folder)} stages, {len(wanted)} files", flush=True
-        )
+        whole_s, wanted = [time.monotonic() - began], made(whole.folder)
+        what = f"{finished(whole.folder)} stages, {len(wanted)} files"
+        print(f"undisturbed: {whole_s[0]:.0f} s, {what}", flush=True)
         at = moments(rng, whole_s)
         while len(done.kills) < kills:
             project = clone(Path(place) / f"killed_{len(done.kills)}")
-            rows = disturbed(project, stages, min(a_repro, kills - len(done.kills)), at)
+            rows = disturbed(project, stages, min(a_repro, kills - len(done.kills)), at, whole_s)
             found = made(project.folder)
             others = sorted(name for name in wanted | found if wanted.get(name) != found.get(name))
             done.repros.append((rows, others))
-            artifacts.write_json(path, told(done, wanted, whole_s))
+            artifacts.write_json(path, told(done, wanted, min(whole_s)))
             shutil.rmtree(project.folder)
             print(f"after {len(done.kills)} kills: {others or 'the same bytes'}", flush=True)
-        return told(done, wanted, whole_s)
+        return told(done, wanted, min(whole_s))
 
 
 def told(done: Played, wanted: dict[str, str], whole_s: float) -> dict[str, Any]:

@@ -202,7 +202,7 @@ def test_the_wanted_flow_holds_the_volume_of_every_line_and_of_no_travel():
 
 def test_where_nothing_is_wanted_nothing_is_left_of_rounding_and_the_tasks_end_with_the_signal():
     made = of_part("fig9")
-    for stream in made.streams:
+    for stream in (*made.streams, *of_part("tic_tac_toe").streams, *of_part("dashes").streams):
         assert stream.r[stream.r > 0].min() > 1e-9 * stream.r.max()
         assert (stream.r == 0).any()
     assert made.tasks.end_s.max() == pytest.approx(len(made.streams[0].r) * TS)
@@ -317,11 +317,14 @@ def test_a_tool_without_a_material_and_a_material_that_was_not_learned_are_refus
 def test_a_program_that_would_jump_from_steady_state_to_no_flow_is_refused_with_its_line():
     program = gcode.parse("G21\nG90\nM83\nT0\nG0 X10 F480\nG1 X20 E1\nT1\nG1 X30 E1\nG0 X0")
     motion = plan(program.moves, **{**MACHINE, "tool_change_s": 0.0})
+    # the rest of Stop behind the one line, and the lead of Start ahead of the other
+    marks = learned(PLANT).library.marks
+    switch_s = marks["Stop"][1] + marks["Start"][0]
     with pytest.raises(
         ValueError,
         match=(
             "line 7: T1 comes 0.00 s after line 6 still printed with T0, so Steady-State would go to "
-            "No-Flow without a Stop"
+            f"No-Flow without a Stop; expected {switch_s:.2f} s between them: write G4 P{1000 * switch_s:.0f}"
         ),
     ):
         compose(learned(PLANT), program, motion, PART, materials={0: "A", 1: "B"})

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.deposition import gcode
+from pipeline.deposition import gcode, gcode_words
 from pipeline.deposition.gcode import Kind, parse
 
 PARTS = Path(__file__).parents[2] / "datasets" / "parts"
@@ -409,6 +409,7 @@ def test_words_that_change_the_tool(text, tools):
         ("M126", "M127", "M126"),
         ("M101", "M103", "M101"),
         ("M64 P0", "M65 P0", "M64"),
+        ("M62 P0", "M63 P0", "M64"),
         ("M10", "M11", "M10"),
     ],
 )
@@ -417,6 +418,35 @@ def test_paste_printers_that_switch_extrusion(on, off, name):
     assert program.extruder == name and program.other_word.tolist() == []
     assert [Kind(k).name for k in program.moves.kind] == ["TRAVEL", "EXTRUDE", "EXTRUDE", "TRAVEL"]
     np.testing.assert_allclose(program.moves.e, [0, 5, 2 * np.pi, 0], rtol=1e-15)  # mm of path; rounding
+
+
+def test_a_pin_s_mode_beside_it_is_no_foreign_word():
+    assert parse("M42 P4 M1 S255\nG1 X4\nM42 P4 M1 S0\nG1 X9\n").refusals == []
+
+
+def test_settings_at_their_least_are_taken():
+    text = "M82\nM221 S0.5\nM204 P0.5\nG1 X1 E2\nM200 D1.75\nG1 X2 E3\nM200 D0\nG1 X3 E4\n"
+    program = parse(text)
+    assert program.refusals == [] and program.other_word.tolist() == []
+    assert program.flow.tolist() == [0.005] * 3 and program.moves.acceleration.tolist() == [0.5] * 3
+    # a diameter alone makes E count mm^3, none makes it count mm again, and the diameter stays known
+    assert program.volumetric.tolist() == [False, True, False] and program.diameter_mm == {0: 1.75}
+
+
+def test_what_is_pressed_before_anything_was_retracted_primes():
+    assert kinds("M83\nG1 E5 F100\nG1 X10 E1\nG1 E-2\nG1 E2\n") == [
+        "PRIME",
+        "EXTRUDE",
+        "RETRACT",
+        "UNRETRACT",
+    ]
+
+
+def test_e_is_renamed_by_a_piece_of_the_text_in_which_nothing_presses(monkeypatch):
+    text = "G1 X1 E5\n;\nG92 E0\n;\nG1 X2 E1\n"
+    whole = moves(text).e.tolist()
+    monkeypatch.setattr(gcode_words, "CHUNK", 4)  # every line by itself
+    assert moves(text).e.tolist() == whole == [5, 1]
 
 
 def test_a_fan_is_no_switch_where_e_is_driven():

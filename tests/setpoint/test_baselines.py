@@ -687,3 +687,51 @@ def test_the_robust_filter_holds_every_bar_of_the_default(table):
         assert found.settled.percent >= 97, case
         assert found.stay.percent >= 90, case
         assert found.flow_error <= {"recorded, fresh": 2.0, "recorded, sticky": 5.0}.get(case, np.inf), case
+
+
+def test_the_least_flow_that_can_be_has_the_first_code_and_the_largest_the_last():
+    low, high = FLOW_LIMITS
+    bin_wide = float(np.exp(bayes.FLOW_CODE_WIDTH))
+
+    def coded(flow: float) -> int:
+        return int(bayes.code(jnp.ones(3) / 3, jnp.int32(1), jnp.float32(flow))) - bayes.CLASS_CODES
+
+    assert (coded(1.001 * low), coded(0.999 * high)) == (0, bayes.FLOW_CODES - 1)
+    # and a bin further from either end another one
+    assert coded(low * bin_wide * 1.001) == 1 and coded(0.999 * high / bin_wide) == bayes.FLOW_CODES - 2
+
+
+def test_a_segment_without_a_bias_has_one_level_that_is_sure():
+    levels, weights = bayes.bias_levels(1)
+    assert (levels.tolist(), weights.tolist()) == ([0.0], [1.0])
+
+
+def test_the_noise_of_windows_stands_at_the_flow_of_their_segment():
+    table = synthetic_flow_table(np.random.default_rng(4), segments=40, windows=5)
+    flow, within = bayes._window_noise(table)
+    order = np.argsort(table.segment, kind="stable")
+    np.testing.assert_allclose(flow, np.asarray(table.flow)[order][::5].repeat(4), rtol=1e-6)
+    assert abs(np.std(within) / 0.05 - 1) < 0.2  # 160 of them, two of a window each
+
+
+def test_quiet_prints_are_drawn_from_segments_near_100_percent_and_moved_as_often_up_as_down():
+    table = synthetic_flow_table(np.random.default_rng(4), segments=60, windows=5)
+    far = (np.asarray(table.flow) < bayes.QUIET_FLOWS[0]) | (np.asarray(table.flow) > bayes.QUIET_FLOWS[1])
+    assert far.any() and not far.all()
+    # segments far from 100 % show ten times what they are: no quiet print may
+    odd = table._replace(flow_seen=np.where(far, 10.0 * table.flow_seen, table.flow))
+    flow, within = np.array([50.0, 100.0]), np.array([3.0, 1e-6])
+    seen, moves = bayes._quiet_prints(odd, flow, within, np.random.default_rng(0))
+    still = seen[: bayes.QUIET_PRINTS // 2]
+    np.testing.assert_allclose(still, 100.0, rtol=1e-3)
+    stirred = moves[bayes.QUIET_PRINTS // 2 :]
+    # one sets out in five decisions of a hundred, and goes back in the next
+    assert abs((stirred[:, 2:] != 0).mean() - (1 - (1 - bayes.TRIED) ** 2)) < 0.01
+    away = np.cumsum(stirred, axis=1)
+    away = away[np.isin(away, (-10.0, -5.0, 5.0, 10.0))]
+    assert abs(np.mean(away > 0) - 0.5) < 0.05 and abs(np.mean(np.abs(away) > 7) - 0.5) < 0.05
+    # where no segment stands there, all of them are drawn from
+    all_far = odd._replace(flow=np.full(len(far), 300.0), flow_seen=np.full(len(far), 300.0))
+    assert np.isfinite(
+        bayes._quiet_prints(all_far, np.array([300.0]), np.array([1e-6]), np.random.default_rng(0))[0]
+    ).all()
