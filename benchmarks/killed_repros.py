@@ -158,7 +158,7 @@ def played(path: Path, asked: dict[str, Any]) -> Played:
         before = artifacts.read_json(path)
         if {key: before.get(key) for key in asked} == asked:
             rows = before["each_repro"]
-            return Played(asked, [([Kill(*kill) for kill in one["kills"]], one["differ"]) for one in rows])
+            return Played(asked, [([Kill(**kill) for kill in one["kills"]], one["differ"]) for one in rows])
     return Played(asked, [])
 
 

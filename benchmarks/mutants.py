@@ -300,6 +300,13 @@ def play(name: str, count: int, slowest_s: float, before: dict[str, Any] | None 
     module, file = MODULES[name]
     source = ROOT / (module.replace(".", "/") + ".py")
     text = source.read_text()
+    alive = {row["mutant"] for row in before["survivors"]} if before else None
+    drawn = mutants(text, before["mutants"] if before else count, f"{SEED} {name}")
+    if alive and (other := alive - {f"{mutant.line}: {mutant.change}" for mutant in drawn}):
+        raise SystemExit(
+            f"{name}: the module has changed since, {min(other)} is none of its mutants; play it without "
+            "--again"
+        )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / source.name
         path.write_text(ast.unparse(ast.parse(text)))
@@ -309,8 +316,7 @@ def play(name: str, count: int, slowest_s: float, before: dict[str, Any] | None 
         known = json.loads(noted)
         order = _QuickFirst(known, slowest_s)
         rows = []
-        alive = {row["mutant"] for row in before["survivors"]} if before else None
-        for mutant in mutants(text, before["mutants"] if before else count, f"{SEED} {name}"):
+        for mutant in drawn:
             if alive is not None and f"{mutant.line}: {mutant.change}" not in alive:
                 rows.append((mutant, Played("killed", 0.0)))
                 continue

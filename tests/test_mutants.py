@@ -63,3 +63,9 @@ def test_a_share_counts_neither_the_killed_nor_the_equivalent_as_alive(monkeypat
     made = mutants.table("m", "test_m.py", rows, [])
     assert (made["killed"], made["equivalent"], made["share_killed"]) == (2, 1, 0.667)
     assert [row["equivalent"] for row in made["survivors"]] == ["no one can see it", None]
+
+
+def test_survivors_of_another_text_are_not_taken_for_killed():
+    before = {"mutants": 60, "survivors": [{"mutant": "1: never -> there", "equivalent": None}]}
+    with pytest.raises(SystemExit, match="kernel: the module has changed since, 1: never -> there is none"):
+        mutants.play("kernel", 60, 0.0, before)
