@@ -12,8 +12,10 @@ import scipy.optimize
 from pipeline.temperature.plant import baam, hold_state, markov_parameters, plant, simulate
 from pipeline.temperature.published import GAMMA, K_DATA, REFERENCE, TAU
 from pipeline.temperature.tracking import (
+    _steady,
     aimed,
     algorithm_1,
+    bounded_least_squares,
     feasible_target,
     gains,
     observer_gain,
@@ -189,6 +191,32 @@ def test_algorithm_1_says_when_its_iterations_ran_out():
     assert (iterated.iterations, iterated.settled) == (3, False)
 
 
+def test_algorithm_1_takes_as_many_policies_as_it_is_allowed():
+    K0 = np.hstack([K_DATA, np.zeros((7, 5))])
+
+    def after(K: np.ndarray, policies: int) -> np.ndarray:
+        return algorithm_1(baam(), I5, I7, GAMMA, K, tolerance=0.0, max_iterations=policies).K
+
+    one = after(K0, 1)
+    np.testing.assert_allclose(after(one, 1), after(K0, 2), rtol=1e-9, atol=1e-12)
+    assert np.abs(one - K0).max() > 1e-3 and np.abs(after(K0, 2) - one).max() > 1e-3
+    assert algorithm_1(baam(), I5, I7, GAMMA, K0, tolerance=0.0).iterations == 100
+
+
+def test_a_gain_stabilises_only_what_has_no_mode_left_that_grows():
+    two = plant(np.diag([0.5, 1.2]), np.eye(2), np.eye(2))
+    assert not stabilises(two, np.zeros((2, 2))) and stabilises(two, np.diag([0.0, 0.3]))
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_bounded_least_squares_are_scipy_s(seed):
+    rng = np.random.default_rng(seed)
+    A, b = rng.normal(size=(7, 5)), 3 * rng.normal(size=7)
+    low, high = np.full(5, -0.3), np.full(5, 0.2)
+    theirs = scipy.optimize.lsq_linear(A, b, (low, high), method="bvls", tol=1e-15).x
+    np.testing.assert_allclose(bounded_least_squares(A, b, low, high), theirs, atol=1e-9)
+
+
 def test_policy_iteration_says_when_a_mode_obeys_no_input():
     stuck = plant(np.diag([1.1, 0.5]), [[0.0], [1.0]], np.eye(2))
     with pytest.raises(
@@ -280,6 +308,13 @@ def test_an_infeasible_reference_is_missed_by_the_least_that_a_steady_state_allo
     # the y that it names is the y that u holds
     np.testing.assert_allclose(target.y, rest @ target.u, atol=1e-3)
     np.testing.assert_allclose(machine.A @ target.x + machine.B @ target.u, target.x, atol=1e-7)
+
+
+def test_a_thousandth_of_a_degree_is_given_up_for_slack():
+    """At rest y = 0.01 u: 2 degC are missed by 1, and a tenth of a percent of slack costs 0.001 more."""
+    weak = plant([[0.5]], [[0.005]], [[1.0]])
+    target = feasible_target(weak, np.array([2.0]), np.zeros(1), np.full(1, 100.0))
+    assert 0.098 < target.slack <= 0.1 and target.miss[0] == pytest.approx(-1.001, abs=3e-5)
 
 
 def test_an_aimed_law_rests_at_its_target():
@@ -393,6 +428,7 @@ def test_a_still_law_remembers_nothing_and_asks_for_nothing():
     law, u, y = still_law(2, 3), np.ones(2), np.ones(3)
     z = law.start_u @ u + law.start_y @ y + law.start
     assert (law.B_u.shape, law.B_y.shape, law.c.shape) == ((0, 2), (0, 3), (0,))
+    assert (law.start_u.shape, law.start_y.shape, law.start.shape) == ((0, 2), (0, 3), (0,))
     z = law.A @ z + law.B_u @ u + law.B_y @ y + law.B_r @ y + law.c
     assert z.shape == (0,)
     np.testing.assert_array_equal(-law.K @ z - law.D @ y - law.K_r @ y - law.k, np.zeros(2))
