@@ -12,7 +12,6 @@ import scipy.optimize
 from pipeline.temperature.plant import baam, hold_state, markov_parameters, plant, simulate
 from pipeline.temperature.published import GAMMA, K_DATA, REFERENCE, TAU
 from pipeline.temperature.tracking import (
-    _steady,
     aimed,
     algorithm_1,
     bounded_least_squares,
