@@ -191,14 +191,19 @@ def _clock_name(path: Path, columns: Sequence[Column]) -> str:
 
 
 def _unit_note(clock: str, group: Columns) -> list[Note]:
-    """A note on a clock that would have minutes between its samples, as one in ms has without its unit."""
+    """A note on a clock that would have minutes between its samples, as one in ms has without its unit, or
+    more of them a second than a log of temperatures holds, as one in hours has."""
     time = group.time[:CLOCK_SAMPLES]
     if not clock or time.dtype == np.int64 or len(time) < 3:
         return []
     step = float(np.median(np.diff(time)))  # NaN where a time is missing
-    if not step >= 50 or step % 60 == 0 or (time != np.rint(time)).any():
+    of_hours = 3600 * float(time[-1] - time[0]) / (len(time) - 1)  # the mean: digits are few
+    if step >= 50 and step % 60 and (time == np.rint(time)).all():
+        unit = "ms" if step < 2e4 else "us" if step < 2e7 else "ns"
+    elif 0 < step and 0.99 < of_hours < 6.5 and abs(of_hours - round(of_hours)) < 0.01:
+        unit = "h"
+    else:
         return []
-    unit = "ms" if step < 2e4 else "us" if step < 2e7 else "ns"
     message = (
         f"{clock} steps by {step:g}, read as seconds; if it counts {unit}, name the column {clock}_{unit}"
     )

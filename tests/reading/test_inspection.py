@@ -370,6 +370,20 @@ def test_a_clock_in_milliseconds_is_read_by_its_name_or_remarked_by_its_step(tmp
     )
 
 
+def test_a_clock_in_hours_is_read_by_its_name_or_remarked_by_its_step(tmp_path):
+    def told(head: str, per_hour: float, digits: int = 6) -> str:
+        rows = "".join(f"{k / per_hour:.{digits}f},{20 + k % 7},{k % 5 * 20}\n" for k in range(600))
+        (tmp_path / "rig.csv").write_text(f"{head},zone_C,duty\n{rows}")
+        return inspect(tmp_path / "rig.csv")
+
+    assert "sample_time_s: 1.0\n" in told("time_h", 3600.0) and "if it counts" not in told("time_h", 3600.0)
+    for every_s in (1, 2, 5):
+        assert "read as seconds; if it counts h, name the column time_h" in told("time", 3600.0 / every_s)
+    # rates that machines have
+    for rate in (1000.0, 500.0, 100.0, 60.0, 10.0):
+        assert "if it counts" not in told("time", rate, 9)
+
+
 @pytest.mark.parametrize("scale", [("stamp_ms", 1e3), ("stamp_us", 1e6), ("stamp_ns", 1e9)])
 def test_a_field_that_is_the_clock_counts_in_the_unit_of_its_name(tmp_path, scale):
     name, per_second = scale
