@@ -1,7 +1,7 @@
 """How many branches of the methods their tests take.
 
 `./run --group peers python -m benchmarks.branches` runs the tests of the four folders of `METHODS` under
-coverage, workers and started processes too, and writes benchmarks/results/branches.json: branches and those
+coverage, each folder as a process of its own and two at a time, and writes benchmarks/results/branches.json: branches and those
 taken by module, and the lines from which an arrow (12->15: from line 12 to 15) was never followed. Methods
 are the modules of these folders themselves; what reads files and parameters for them (`workflow/`) is not
 counted. `--tests tests/runtime` runs fewer tests, and prints only. Left out are tests that starve a process
@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -29,21 +30,27 @@ parallel = true
 data_file = {folder}/taken
 source = {source}
 omit = */workflow/*
-patch = subprocess
+sigterm = true
 disable_warnings = no-data-collected,module-not-measured,module-not-imported
 """
 
 
 def measured(tests: list[str]) -> tuple[dict[str, Any], int]:
-    """What coverage says of these tests, as JSON, and how they ended."""
+    """What coverage says of these tests, as JSON, and the worst status of those that ran them."""
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder) / "coverage.ini"
         source = ",".join(str(ROOT / "pipeline" / name) for name in METHODS)
         config.write_text(CONFIG.format(folder=folder, source=source))
         told, rc = Path(folder) / "told.json", f"--rcfile={config}"
         under = [sys.executable, "-m", "coverage"]
-        tested = [*under, "run", rc, "-m", "pytest", "-k", f"not {STARVED}", *tests]
-        ended = subprocess.run(tested, cwd=ROOT).returncode
+
+        def tested(one: str) -> int:
+            # no workers: what one of them had taken was once lost with its end
+            asked = ["pytest", "-n", "0", "-k", f"not {STARVED}", one]
+            return subprocess.run([*under, "run", rc, "-m", *asked], cwd=ROOT).returncode
+
+        with ThreadPoolExecutor(2) as pool:
+            ended = max(map(abs, pool.map(tested, tests)))
         for step in (["combine", "-q", rc], ["json", "-q", rc, "-o", str(told)]):
             subprocess.run([*under, *step], cwd=ROOT, check=True)
         return json.loads(told.read_text()), ended
