@@ -1,11 +1,11 @@
 """How many branches of the methods their tests take.
 
 `./run --group peers python -m benchmarks.branches` runs the tests of the four folders of `METHODS` under
-coverage, each folder as a process of its own and two at a time, and writes benchmarks/results/branches.json: branches and those
-taken by module, and the lines from which an arrow (12->15: from line 12 to 15) was never followed. Methods
-are the modules of these folders themselves; what reads files and parameters for them (`workflow/`) is not
-counted. `--tests tests/runtime` runs fewer tests, and prints only. Left out are tests that starve a process
-they start of disk or rights: coverage's own notes would be what fails there.
+coverage, each folder as a process of its own and two at a time, and writes benchmarks/results/branches.json:
+branches and those taken by module, and the lines from which an arrow (12->15: from line 12 to 15) was never
+followed. Methods are the modules of these folders themselves; what reads files and parameters for them
+(`workflow/`) is not counted. `--tests tests/runtime` runs fewer tests, and prints only. Left out are tests
+that starve a process they start of disk or rights: coverage's own notes would be what fails there.
 """
 
 import argparse
