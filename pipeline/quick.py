@@ -41,8 +41,8 @@ SECTIONS: Mapping[str, type[params.Section]] = {
 KEPT, TRAINED = Path("datasets/kept"), ("train_classifier", "train_agent")
 # and what leaves the house only from a full run
 LEFT_OUT = ("render_frames", *TRAINED, "export_controllers")
-# read where it lies; relearnings are in benchmarks, and of the code pages show the digest
-LINKED = ("datasets/raw", "datasets/parts", "datasets/published", "benchmarks", "pipeline", "stages")
+# read where it lies; of the code the pages show the digest
+LINKED = ("datasets/raw", "datasets/parts", "datasets/papers", "pipeline", "stages")
 
 
 class Took(NamedTuple):
@@ -76,7 +76,7 @@ def quick() -> str:
         with contextlib.chdir(folder):
             took = [_timed(name) for name in order]
             report = artifacts.read_metrics("report")
-        for name in ("benchmarks", "pipeline", "stages"):
+        for name in ("pipeline", "stages"):
             (folder / name).unlink()
     return summary(report["verdicts"], took, time.perf_counter() - begun)
 

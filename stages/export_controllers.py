@@ -4,7 +4,6 @@ datasets/export_controllers: temperature/ (controller.json, arrays.safetensors, 
 setpoint/, and exported.json, which says what there is and why not. Where the certificate is refused it is all
 that is written of that loop."""
 
-from pipeline.report.shared.sources import read_relearned
 from pipeline.report.shared.verdict import ReportRules
 from pipeline.report.temperature.judgement import winner
 from pipeline.runtime.workflow import export_controllers as export
@@ -19,9 +18,6 @@ from pipeline.setpoint.workflow.windows import window_tables
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import evaluate_temperature, learned, tables
 from pipeline.temperature.workflow.settings import Panel, Plant, TemperatureRules, Tracking, TuneWeights
-
-# the relearnings of the study's machine: part of the verdict that names the controller
-RELEARNED = "benchmarks/results/temperature_relearned.json"
 
 
 def main() -> None:
@@ -53,7 +49,6 @@ def main() -> None:
             },
             params.load(ReportRules, "report"),
             machine,
-            read_relearned(RELEARNED) if artifacts.exists(RELEARNED) else None,
             recorded=not simulated,
             model={
                 "residuals": artifacts.read_table(

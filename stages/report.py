@@ -58,9 +58,6 @@ FOLDERS = {
     "evaluate_setpoint": "datasets/evaluate_setpoint",
     "export_controllers": "datasets/export_controllers",
 }
-# the relearnings of the study's machine, an accepted result of `./run python -m benchmarks.temperature`
-RELEARNED = "benchmarks/results/temperature_relearned.json"
-
 # what the papers print, and ours beside it, accepted results of `./run python -m benchmarks.papers_NAME`
 PAPERS = {
     "temperature": ("datasets/papers/temperature.toml", "benchmarks/results/papers/temperature.json"),
@@ -72,9 +69,7 @@ PAPERS = {
 def main() -> None:
     with artifacts.stage("report"):
         declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
-        sources = collect(
-            declared, METRICS, FOLDERS, "reports/accepted.json", ("pipeline", "stages"), RELEARNED
-        )
+        sources = collect(declared, METRICS, FOLDERS, "reports/accepted.json", ("pipeline", "stages"))
         judged = judgement(sources)
         viewer = viewer_page.render(sources, judged)
         pages = {

@@ -136,7 +136,6 @@ def readme_of_today(root: Path) -> str:
         recorded=False,
         undeclared=[output.name for output in machine.outputs if output.low is None or output.high is None],
         incumbent=str(accepted.get("winner") or ""),
-        relearned=artifacts.read_json(root / "benchmarks/results/temperature_relearned.json"),
     )
     text = readme.block(metrics, rules, verdict)
     return readme.rewritten((root / "README.md").read_text(encoding="utf-8"), text)

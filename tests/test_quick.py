@@ -47,7 +47,7 @@ def lay_out(folder: Path, stages: tuple[str, ...] = SHORT) -> Path:
         (folder / name).write_text("of the full run\n")
     for name in ("raw", "parts", "published", "kept"):
         (folder / "datasets" / name).symlink_to(ROOT / "datasets" / name)
-    for name in ("benchmarks", "pipeline", "stages"):
+    for name in ("pipeline", "stages"):
         (folder / name).symlink_to(ROOT / name)
     return folder
 

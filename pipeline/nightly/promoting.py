@@ -30,7 +30,7 @@ MEASURED = (
     "train_classifier", "train_agent", "evaluate_setpoint", "export_controllers",
 )  # fmt: skip
 REPORT = "reports/metrics/report.json"
-ACCEPTED, RELEARNED = "reports/accepted.json", "benchmarks/results/temperature_relearned.json"
+ACCEPTED = "reports/accepted.json"
 # artifacts that only some contestants are designed from, and that a record may not determine
 OPTIONAL = {f"datasets/{path}" for path in judge.DESIGNED_FROM.values()}
 # the certified controller of the temperature loop, installed beside what it was designed from
@@ -111,7 +111,6 @@ def page_sources() -> Sources:
         {stage: f"datasets/{stage}" for stage in MEASURED},
         ACCEPTED,
         (),
-        RELEARNED,
     )
 
 

@@ -11,7 +11,6 @@ import pytest
 from pipeline.report.deposition.verdict import verdict as deposition
 from pipeline.report.identification.model import trust
 from pipeline.report.setpoint.verdict import verdict as setpoint
-from pipeline.report.shared.sources import read_relearned
 from pipeline.report.shared.verdict import (
     FAILED,
     OPEN,
@@ -29,10 +28,9 @@ from pipeline.report.shared.verdict import (
     state,
 )
 from pipeline.report.temperature import readme
-from pipeline.report.temperature.answers import relearned_band
 from pipeline.report.temperature.contestants import in_a_sentence
 from pipeline.report.temperature.judgement import judgement
-from pipeline.report.temperature.pairs import deciding_sentence, pair_sentence, prior_sentence
+from pipeline.report.temperature.pairs import deciding_sentence, pair_sentence
 from pipeline.report.temperature.verdict import best_sentence, decide, questions, standings
 from pipeline.store import artifacts, params
 from stages import report
@@ -258,56 +256,6 @@ def test_who_runs_today_stays_where_nobody_is_better_beyond_the_bands():
     assert judge(stages, incumbent="window").winner == "subspace_lqg"
 
 
-@pytest.mark.parametrize(
-    ("counts", "named", "said"),
-    [
-        ({"subspace_lqg": 9, "pi": 1}, "subspace_lqg", ""),
-        (
-            {"pi": 9, "subspace_lqg": 1},
-            "pi",
-            "Of 10 relearnings from fresh records PI, tuned was the best in 9; of this one subspace + LQG "
-            "is.",
-        ),
-        (
-            {"subspace_lqg": 6, "pi": 4},
-            "pi",
-            "Which is best turns with the record: of 10 relearnings from fresh records subspace + LQG in 6 "
-            "and PI, tuned in 4, so that the simplest of them that passes is named.",
-        ),
-    ],
-)
-def test_of_relearnings_the_one_that_is_best_in_most_is_named_else_the_simplest(counts, named, said):
-    stages = metrics()
-    stages["evaluate_temperature"]["best"] = "subspace_lqg"
-    relearned = {"answers": {"best": counts}}
-    verdict = judge(stages, relearned=relearned, incumbent="hold")
-    assert verdict.winner == named
-    assert said in verdict.reason
-    assert ("relearnings" in verdict.reason) == bool(said)
-    # whose cost lies within the bands of the one that would be named, and was named before, stays
-    if named == "subspace_lqg":
-        return
-    stayed = judge(stages, relearned=relearned, incumbent="subspace_lqg")
-    assert stayed.winner == "subspace_lqg"
-    assert "the one that was named before stays" in stayed.reason and "the simplest" not in stayed.reason
-
-
-def test_what_relearnings_may_break_does_not_pass_and_another_is_named():
-    """One relearning in which it never settles leaves the rule undecided, whatever this record came to."""
-    never = {"contestants": {"subspace_lqg": {"settling": {"q90": {"low": 20.0, "high": None}}}}}
-    stages = metrics()
-    assert judge(stages).winner == "subspace_lqg"
-    verdict = judge(stages, relearned=never)
-    assert verdict.winner not in (None, "subspace_lqg")
-    held = standings(stages, RULES, relearned=never)
-    assert (
-        "Subspace + LQG is the best of this record and does not pass: settling is undecided."
-        in verdict.reason
-    )
-    settling = next(rule for rule in held["subspace_lqg"].rules if rule.name == "settling")
-    assert settling.state == UNDECIDED and not held["subspace_lqg"].passes
-
-
 def test_limits_are_those_that_the_comparison_resolved_for_the_machine():
     stages = metrics(settling=made.figure(120.0, 110.0, 130.0))
     assert judge(stages).state == FAILED
@@ -343,43 +291,6 @@ def test_the_deciding_case_is_told_and_the_verdict_without_it():
         "Deciding case: plant 3, a ramp. Without plant 3 the best would be PI, tuned and the pair would be "
         "undecided."
     )
-
-
-FRESH = {
-    "date": "2026-11-23",
-    "machine": {"outputs": ["zone_1", "zone_2"], "sample_time_s": 1.0},
-    "relearnings": 24,
-    "contestants": {"pi": {"settling": {"q90": {"low": 5.0, "median": 6.0, "high": 900.0}}}},
-    "answers": {"pair_winner": {"subspace_lqg": 20, "None": 4}},
-    "prior": {
-        "removed": {"pair_winner": {"learned_kernel": 3, "subspace_lqg": 1}},
-        "added": {"pair_winner": {"subspace_lqg": 4}},
-    },
-}
-
-
-def test_bands_over_relearnings_stand_in_where_they_were_made_and_a_turning_prior_is_said():
-    assert relearned_band(FRESH, "pi", "settling") == (5.0, 900.0)
-    assert relearned_band(FRESH, "pi", "overshoot") is None
-    assert relearned_band(None, "pi", "settling") is None
-    assert prior_sentence(FRESH, "subspace_lqg") == (
-        "Over 24 relearnings the pair went to subspace + LQG in 20, to nobody in 4. With the prior of plant "
-        "uncertainty removed it turns: to the learned kernel in 3 of 4."
-    )
-    assert prior_sentence(None, "subspace_lqg") == ""
-
-
-def test_the_page_takes_bands_of_relearnings_of_this_machine_with_their_date_and_of_no_other(project):
-    path = "benchmarks/results/temperature_relearned.json"
-    artifacts.write_json(path, FRESH)
-    report.main()
-    text = Page(TEMPERATURE).text
-    assert "its band is the range over 24 fresh relearnings of 2026-11-23" in text
-    assert "5–900" in text and "Over 24 relearnings the pair went to" in text
-    artifacts.write_json(path, FRESH | {"machine": {"outputs": ["bed"]}})
-    report.main()
-    text = Page(TEMPERATURE).text
-    assert "its band is of this one learned controller, plants resampled" in text and "5–900" not in text
 
 
 def test_without_any_figures_the_verdict_is_open_and_says_what_to_run():
@@ -534,12 +445,3 @@ def test_an_old_params_file_is_told_in_one_sentence_that_a_rule_was_retired(tmp_
     with pytest.raises(ValueError, match=rf"report.{key} was retired: .*; remove the line") as refused:
         params.load(ReportRules, "report", tmp_path / "params.yaml")
     assert len(str(refused.value).splitlines()) == 1
-
-
-@pytest.mark.parametrize("text", ["not json", "[1]", '{"machine": 3, "contestants": {}, "answers": {}}'])
-def test_relearnings_that_cannot_be_read_are_refused_not_left_out(tmp_path, text):
-    """Without them the bands would be narrower, and no place on the page would say so."""
-    path = tmp_path / "relearned.json"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=r"relearned\.json.*(whole JSON|expected an object)"):
-        read_relearned(str(path))

@@ -65,8 +65,8 @@ class Source(NamedTuple):
 class Sources(NamedTuple):
     """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what
     was; `absent`: what was not, by path; `accepted`: the last accepted run, or None; `files`: digest of each
-    file of code; `nightly`: what the last night measured, None before the first; `relearned`: bands over
-    fresh relearnings of the study's machine, None where nobody made them; `quick`: the run is a quick look.
+    file of code; `nightly`: what the last night measured, None before the first; `quick`: the run is
+    a quick look.
     """
 
     declared: Declared
@@ -78,7 +78,6 @@ class Sources(NamedTuple):
     code: str
     files: Mapping[str, str]
     nightly: dict | Missing | None = None
-    relearned: dict | Missing | None = None
     quick: bool = False
 
     @property
@@ -122,12 +121,9 @@ def collect(
     folders: Mapping[str, str],
     accepted: str,
     code: tuple[str, ...],
-    relearnings: str = "",
 ) -> Sources:
     """Reads the metrics files and the folders of stages, {stage: path} each. What is missing or broken is no
-    error here: its place on the page says so. Only relearnings that cannot be read raise ValueError: without
-    them every band would be narrower than it is, in a place that shows none.
-    """
+    error here: its place on the page says so."""
     read: dict[str, Source] = {}
     absent: dict[str, Missing] = {}
     figures: dict[str, Any] = {}
@@ -159,17 +155,11 @@ def collect(
         if artifacts.exists(NIGHTLY)
         else None
     )
-    relearned = None
-    if relearnings and artifacts.exists(relearnings):
-        relearned = read_relearned(relearnings)
-        read[relearnings] = Source(
-            "relearned", relearnings, "benchmark", "relearned", artifacts.sha256(relearnings)
-        )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
     files = code_files(code)
     read = linked(read)
     return Sources(
-        declared, figures, tables, read, absent, before or None, folders_of_code, files, night, relearned,
+        declared, figures, tables, read, absent, before or None, folders_of_code, files, night,
         quick=artifacts.exists(QUICK_LOOK),
     )  # fmt: skip
 
@@ -347,17 +337,6 @@ def _read(
         return Missing("failed", str(error))
     read[path] = Source(name, path, stage, schema, artifacts.sha256(path))
     return content
-
-
-def read_relearned(path: str) -> dict:
-    """What benchmarks.temperature --relearnings wrote. Raises ValueError where it is not whole."""
-    found, needed = artifacts.read_json(path), ("machine", "contestants", "answers")
-    if not isinstance(found, Mapping) or not all(isinstance(found.get(key), Mapping) for key in needed):
-        raise ValueError(
-            f"{path}: expected an object with {', '.join(needed)}, each an object itself; bring it back with "
-            f"git checkout {path}, or delete it: bands then hold this record alone"
-        )
-    return dict(found)
 
 
 def lookup(data: Any, dotted: str, *, what: str = "") -> Any:

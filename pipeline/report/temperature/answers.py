@@ -61,39 +61,16 @@ def quantile(figures: Any) -> Figure | None:
     return Figure(value, min(low, value), max(high, value))
 
 
-def relearned_band(relearned: Any, name: str, key: str) -> tuple[float, float] | None:
-    """Low and high of a figure's 90 % quantile over fresh relearnings
-    (benchmarks/results/temperature_relearned.json); None where none were made."""
-    ends = entry(relearned, "contestants", name, key, "q90")
-    if not isinstance(ends, Mapping) or not {"low", "high"} <= ends.keys():
-        return None
-    return finite(ends["low"]), finite(ends["high"])
-
-
-def _widened(figure: Figure, band: tuple[float, float] | None) -> Figure:
-    """The figure with a band that holds the plants of this record, and what other records taught."""
-    if band is None:
-        return figure
-    return figure._replace(low=min(figure.low, band[0]), high=max(figure.high, band[1]))
-
-
-def of_contestant(
-    metrics: Metrics, name: str, undeclared: Sequence[str] = (), relearned: Any = None
-) -> dict[str, Figure | Missing]:
-    """{key: figure} of one contestant; `undeclared` are outputs without low and high, and `relearned` widens
-    the bands by what relearnings from fresh records came to."""
+def of_contestant(metrics: Metrics, name: str, undeclared: Sequence[str] = ()) -> dict[str, Figure | Missing]:
+    """{key: figure} of one contestant; `undeclared` are outputs without low and high."""
     figures = entry(comparison(metrics), "contestants", name)
     if figures is None:
         gap = _without(metrics, name)
         keys = (*QUANTILES, "disk", "delay_s", "crossings")
         return dict.fromkeys(keys, gap) | {"data": data(metrics, name)}
     gap = Missing(OPEN, "This figure is not in the scorecard", REPEAT)
-    own = {key: quantile(entry(figures, key)) for key in QUANTILES}
     return {
-        **{
-            key: _widened(figure, relearned_band(relearned, name, key)) if figure else gap
-            for key, figure in own.items()
-        },
+        **{key: quantile(entry(figures, key)) or gap for key in QUANTILES},
         **{key: _margin(figures, key) or _without_margin(figures, gap) for key in ("disk", "delay_s")},
         "crossings": crossings(figures, undeclared),
         "data": data(metrics, name),

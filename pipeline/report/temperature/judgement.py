@@ -3,7 +3,7 @@ moved since the accepted run."""
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from pipeline.report.identification.model import UNTRUSTED, trust
 from pipeline.report.shared.difference import Difference, Move, difference, moves
@@ -59,38 +59,17 @@ class Judgement(NamedTuple):
     drifted: Drift
 
 
-def relearned_date(sources: Sources) -> str:
-    """The date of the relearnings, where they are of this machine; else ""."""
-    relearned = of_this_machine(sources.relearned, sources.declared.machine, recorded=sources.recorded)
-    return str(relearned.get("date") or "") if relearned else ""
-
-
-def of_this_machine(relearned: Any, machine: Plant, *, recorded: bool) -> Mapping[str, Any] | None:
-    """The relearnings, where they are of this simulated machine."""
-    if recorded or not isinstance(relearned, dict):
-        return None
-    outputs = [output.name for output in machine.outputs]
-    return relearned if entry(relearned, "machine", "outputs") == outputs else None
-
-
 def winner(
     metrics: Metrics,
     rules: ReportRules,
     machine: Plant,
-    relearned: Any,
     *,
     recorded: bool,
     model: Mapping[str, Table | Missing],
 ) -> Verdict:
     """The verdict that the run gives by itself: without a night's drift, and without who runs today; `model`
     are the tables by which page one trusts a recorded machine's model, "residuals" and "dynamics"."""
-    verdict = decide(
-        metrics,
-        rules,
-        recorded=recorded,
-        undeclared=undeclared_outputs(machine),
-        relearned=of_this_machine(relearned, machine, recorded=recorded),
-    )
+    verdict = decide(metrics, rules, recorded=recorded, undeclared=undeclared_outputs(machine))
     if not recorded:
         return verdict
     return trust_first(
@@ -104,14 +83,13 @@ def judgement(sources: Sources, *, named: str = "") -> Judgement:
     drifted = drift(sources)
     undeclared = undeclared_outputs(sources.declared.machine)
     asked = questions(rules, comparison(metrics))
-    relearned = sources.relearned if relearned_date(sources) else None
-    held = standings(metrics, rules, undeclared=undeclared, drift=drifted.answer, relearned=relearned)
+    held = standings(metrics, rules, undeclared=undeclared, drift=drifted.answer)
     incumbent = incumbent_of(sources)
-    best = choose(metrics, held, incumbent, relearned)
+    best = choose(metrics, held, incumbent)
     competing = [name for name in held if name not in YARDSTICKS]
     subject = best or (closest(held) if competing else pair_names(metrics)[0])
     beside = rival(metrics, subject)
-    answers = {name: of_contestant(metrics, name, undeclared, relearned) for name in (*held, subject, beside)}
+    answers = {name: of_contestant(metrics, name, undeclared) for name in (*held, subject, beside)}
     changed = None if sources.another_machine else difference(sources)
     moved = moves(sources, asked, answers) if changed else {}
     verdict = decide(
@@ -121,7 +99,6 @@ def judgement(sources: Sources, *, named: str = "") -> Judgement:
         undeclared=undeclared,
         drift=drifted.answer,
         incumbent=incumbent,
-        relearned=relearned,
         named=named,
         quick=sources.quick,
     )

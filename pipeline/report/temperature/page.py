@@ -9,8 +9,7 @@ from pipeline.report.temperature import findings, pictures, recording, scorecard
 from pipeline.report.temperature.answers import comparison, refused
 from pipeline.report.temperature.answers import judged as names_judged
 from pipeline.report.temperature.contestants import BY_NAME
-from pipeline.report.temperature.judgement import Judgement, heads, relearned_date, verdict_parts
-from pipeline.report.temperature.pairs import prior_sentence
+from pipeline.report.temperature.judgement import Judgement, heads, verdict_parts
 
 WORDS = (
     "rehearsal",
@@ -38,7 +37,6 @@ def render(sources: Sources, judged: Judgement) -> str:
     contestants = [
         name for name in (*names_judged(sources.metrics), *refused(sources.metrics)) if name in BY_NAME
     ]
-    relearned = sources.relearned if relearned_date(sources) else None
     return page.render(
         "temperature.html",
         here="temperature",
@@ -53,7 +51,6 @@ def render(sources: Sources, judged: Judgement) -> str:
         pair=judged.pair,
         best=judged.best,
         deciding=judged.deciding,
-        prior=prior_sentence(relearned, judged.pair.winner),
         scorecard=scorecard.scorecard(sources, judged, words.ANSWERS_WORDS),
         infeasible=scorecard.infeasible(sources),
         at_work=[
@@ -69,7 +66,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         weights=scorecard.weights(sources),
         trusted=trust(sources),
         words=words.chosen(sources, (*dict.fromkeys(contestants), *WORDS)),
-        from_scorecard=sources.source("evaluate_temperature", "cases", "relearned"),
+        from_scorecard=sources.source("evaluate_temperature", "cases"),
         from_quality=sources.source("quality"),
         from_weights=sources.source("weights"),
         from_model=sources.source("identify_plant", "plant"),

@@ -96,39 +96,3 @@ def reference_of(case: Mapping[str, Any]) -> str:
     """ "a constant reference", "a ramp"."""
     kind = str(case.get("kind") or "")
     return f"a {kind}{' reference' if kind == 'constant' else ''}" if kind else ""
-
-
-# ---- over relearnings
-
-
-def prior_sentence(relearned: Any, winner: str | None) -> str:
-    """How the pair ended over the relearnings, and where the prior of plant uncertainty, removed or added for
-    all, turns its winner; "" without relearnings."""
-    sentences = []
-    counts = _winners(entry(relearned, "answers", "pair_winner"))
-    if counts:
-        shares = [f"{_who(name)} in {number(times, 0)}" for name, times in counts.items()]
-        runs = sum(counts.values())
-        sentences.append(f"Over {number(runs, 0)} relearnings the pair went to {', to '.join(shares)}.")
-    for change in ("removed", "added"):
-        counts = _winners(entry(relearned, "prior", change, "pair_winner"))
-        mine = winner or str(None)
-        turned = {name: times for name, times in counts.items() if name != mine}
-        if turned and sum(turned.values()) > counts.get(mine, 0):
-            shares = [f"{_who(name)} in {number(times, 0)}" for name, times in turned.items()]
-            sentences.append(
-                f"With the prior of plant uncertainty {change} it turns: to {', to '.join(shares)} of "
-                f"{number(sum(counts.values()), 0)}."
-            )
-    return " ".join(sentences)
-
-
-def _winners(counts: Any) -> dict[str, int]:
-    """{winner: times}; "None" stands for no difference."""
-    if not isinstance(counts, Mapping):
-        return {}
-    return {str(name): times for name, times in counts.items() if isinstance(times, int)}
-
-
-def _who(name: str) -> str:
-    return "nobody" if name == str(None) else in_a_sentence(name)

@@ -10,7 +10,7 @@ from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
 from pipeline.report.temperature.answers import comparison, entry, finite, judged, refused, unstable
 from pipeline.report.temperature.contestants import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
-from pipeline.report.temperature.judgement import Judgement, relearned_date
+from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.wording import banded, places_of, worded
 
 # figures without a rule
@@ -92,16 +92,10 @@ def scorecard(sources: Sources, judgement: Judgement, words: Mapping[str, str]) 
 
 def _caption(sources: Sources) -> str:
     compared = comparison(sources.metrics)
-    date = relearned_date(sources)
-    bands = (
-        f"its band is the range over {entry(sources.relearned, 'relearnings')} fresh relearnings of {date}"
-        if date and entry(sources.relearned, "contestants")
-        else "its band is of this one learned controller, plants resampled"
-    )
     return (
         f"As deployed on {setting(compared)}. Large: the 90{THIN}% quantile of all cases; small: "
-        f"{bands}; the median; the worst case. Bold: best of a row, hold and the exact model left aside. "
-        "A cross, vermillion: beyond the limit. "
+        "its band is of this one learned controller, plants resampled; the median; the worst case. "
+        "Bold: best of a row, hold and the exact model left aside. A cross, vermillion: beyond the limit. "
         f"Limits: {entry(compared, 'limits', 'source') or 'declared'}."
     )
 

@@ -143,18 +143,13 @@ class Standing(NamedTuple):
 
 
 def standings(
-    metrics: Metrics,
-    rules: ReportRules,
-    *,
-    undeclared: Sequence[str] = (),
-    drift: Figure | Missing = NEVER,
-    relearned: Any = None,
+    metrics: Metrics, rules: ReportRules, *, undeclared: Sequence[str] = (), drift: Figure | Missing = NEVER
 ) -> dict[str, Standing]:
     """Every contestant that was judged, in the order of simplicity, the yardstick last."""
     asked = questions(rules, comparison(metrics))
     held = {}
     for name in judged(metrics):
-        answers = of_contestant(metrics, name, undeclared, relearned)
+        answers = of_contestant(metrics, name, undeclared)
         own = [
             rule._replace(reason=_unstable_sentence(metrics, name) or rule.reason)
             if rule.state == FAILED and rule.name in ("settled error", "disk margin", "delay margin")
@@ -170,24 +165,9 @@ def _unstable_sentence(metrics: Metrics, name: str) -> str:
     return f"{name_first(name)} is unstable on {lost} of {of} plants." if lost else ""
 
 
-# of the relearnings in which a contestant is to be the best before it is named for that
-STEADY = 0.8
-
-
-def best_in(relearned: Any) -> dict[str, int]:
-    """How many relearnings from fresh records each contestant was the best of; empty without relearnings."""
-    counts = entry(relearned, "answers", "best")
-    if not isinstance(counts, Mapping):
-        return {}
-    return {str(name): times for name, times in counts.items() if isinstance(times, int) and name != "None"}
-
-
-def choose(
-    metrics: Metrics, held: Mapping[str, Standing], incumbent: str = "", relearned: Any = None
-) -> str | None:
-    """Who should run: the best that passes, ties to the simpler; the incumbent where none is better beyond
-    the bands of the cost. Where fresh records make others the best as well, the simplest of those is named.
-    None where nobody passes."""
+def choose(metrics: Metrics, held: Mapping[str, Standing], incumbent: str = "") -> str | None:
+    """Who should run: the best that passes, ties to the simpler; the incumbent if none is better beyond the
+    bands of the cost. None if nobody passes."""
     fit = [name for name, standing in held.items() if standing.passes and name not in YARDSTICKS]
     if not fit:
         return None
@@ -195,18 +175,9 @@ def choose(
     if best not in fit:
         cheapest = min(fit, key=lambda name: _cost(held[name]).value)
         best = next(name for name in fit if _cost(held[name]).low <= _cost(held[cheapest]).high)
-    counts = best_in(relearned)
-    if counts:
-        steady = [name for name in fit if _steady(counts, name)]
-        best = next(iter(steady or [name for name in fit if name in counts]), best)
     if incumbent in fit and _cost(held[incumbent]).low <= _cost(held[best]).high:
         return incumbent
     return best
-
-
-def _steady(counts: Mapping[str, int], name: str) -> bool:
-    """Whether a contestant was the best of enough relearnings to be named for that."""
-    return counts.get(name, 0) >= STEADY * sum(counts.values())
 
 
 def _cost(standing: Standing) -> Figure:
@@ -243,41 +214,35 @@ def decide(
     undeclared: Sequence[str] = (),
     drift: Figure | Missing = NEVER,
     incumbent: str = "",
-    relearned: Any = None,
     named: str = "",
     quick: bool = False,
 ) -> Verdict:
-    """The verdict on the temperature loop; `undeclared` are outputs without low and high, `relearned` what
-    benchmarks/results/temperature_relearned.json has of this machine. Where somebody has `named` the
-    contestant that runs, the verdict is about that one alone.
+    """The verdict on the temperature loop; `undeclared` are outputs without low and high. If somebody has
+    `named` the contestant that runs, the verdict is about that one alone.
 
     `rules` of the verdict has a line for each of GROUPS with the contestant that it is about and its rival.
     """
     words = words_for(recorded=recorded, quick=quick)
-    held = standings(metrics, rules, undeclared=undeclared, drift=drift, relearned=relearned)
+    held = standings(metrics, rules, undeclared=undeclared, drift=drift)
     if not held or set(held) <= set(YARDSTICKS) or (named and named not in held):
         return _nothing(metrics, rules, words, drift, named)
     if named:
         best = named if held[named].passes else None
     else:
-        best = choose(metrics, held, incumbent, relearned)
+        best = choose(metrics, held, incumbent)
     subject = best or named or closest(held)
     beside = rival(metrics, subject)
     asked = questions(rules, comparison(metrics))
     theirs = (
         held[beside].rules
         if beside in held
-        else rules_of(asked, of_contestant(metrics, beside, undeclared, relearned), drift, beside)
+        else rules_of(asked, of_contestant(metrics, beside, undeclared), drift, beside)
     )
     lines = tuple(zip(grouped(held[subject].rules), grouped(theirs), strict=True))
     if best:
-        without = choose(metrics, held, "", relearned)
-        turns = "" if named else turning(metrics, held, best, relearned, stays=best == incumbent != without)
         lost = "" if named else _beaten(metrics, held)
-        verdict = _passed(
-            metrics, held[best], words, lines, "" if turns or lost else incumbent, recorded=recorded
-        )
-        return verdict._replace(reason=" ".join(filter(None, [lost, turns, verdict.reason])))
+        verdict = _passed(metrics, held[best], words, lines, "" if lost else incumbent, recorded=recorded)
+        return verdict._replace(reason=" ".join(filter(None, [lost, verdict.reason])))
     return _not_passed(metrics, held[subject], words, lines, named=bool(named))
 
 
@@ -288,33 +253,6 @@ def _beaten(metrics: Metrics, held: Mapping[str, Standing]) -> str:
     if first is None:
         return ""
     return f"{name_first(best)} is the best of this record and does not pass: {first.name} is {first.state}."
-
-
-def turning(
-    metrics: Metrics, held: Mapping[str, Standing], winner: str, relearned: Any, *, stays: bool
-) -> str:
-    """How often which contestant was the best of a relearning, where that turns with the record or is not the
-    best of this one; else "". Who was named before may be the one that `stays`."""
-    counts = dict(sorted(best_in(relearned).items(), key=lambda one: -one[1]))
-    runs, of_record = sum(counts.values()), entry(comparison(metrics), "best")
-    steady = next((name for name in counts if _steady(counts, name)), "")
-    if not counts or (steady and of_record in (steady, None)):
-        return ""
-    if steady:
-        return (
-            f"Of {runs} relearnings from fresh records {in_a_sentence(steady)} was the best in "
-            f"{counts[steady]}; of this one {in_a_sentence(of_record)} is{_STAYS if stays else '.'}"
-        )
-    listed = _listed([f"{in_a_sentence(name)} in {times}" for name, times in counts.items()])
-    simplest = next((name for name, standing in held.items() if standing.passes and name in counts), "")
-    tail = ", so that the simplest of them that passes is named." if winner == simplest else "."
-    return (
-        f"Which is best turns with the record: of {runs} relearnings from fresh records {listed}"
-        f"{_STAYS if stays else tail}"
-    )
-
-
-_STAYS = "; the one that was named before stays, as nobody is better beyond the bands."
 
 
 def _nothing(
