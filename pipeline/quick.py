@@ -18,13 +18,7 @@ from pipeline.deposition.workflow.settings import TrainIlc
 from pipeline.report.shared.sources import QUICK_LOOK
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import (
-    EvaluateTemperature,
-    IdentifyPlant,
-    Panel,
-    ReproduceStudy,
-    TuneWeights,
-)
+from pipeline.temperature.workflow.settings import EvaluateTemperature, IdentifyPlant, Panel, TuneWeights
 
 SIZES, FOLDER = Path("params.quick.yaml"), Path("quick")
 # the sections whose sizes a quick look may set; what a machine is and what is good enough stay as they are
@@ -33,7 +27,6 @@ SECTIONS: Mapping[str, type[params.Section]] = {
     "evaluate_temperature": EvaluateTemperature,
     "identify_plant": IdentifyPlant,
     "panel": Panel,
-    "reproduce_study": ReproduceStudy,
     "train_ilc": TrainIlc,
     "tune_weights": TuneWeights,
 }

@@ -35,7 +35,6 @@ METRICS = {
     "learn_kernel": "reports/metrics/learn_kernel.json",
     "tune_weights": "reports/metrics/tune_weights.json",
     "evaluate_temperature": "reports/metrics/evaluate_temperature.json",
-    "reproduce_study": "reports/metrics/reproduce_study.json",
     "train_ilc": "reports/metrics/train_ilc.json",
     "segment_library": "reports/metrics/segment_library.json",
     "compose_parts": "reports/metrics/compose_parts.json",
@@ -49,7 +48,6 @@ FOLDERS = {
     "identify_plant": "datasets/identify_plant",
     "tune_weights": "datasets/tune_weights",
     "evaluate_temperature": "datasets/evaluate_temperature",
-    "reproduce_study": "datasets/reproduce_study",
     "train_ilc": "datasets/train_ilc",
     "segment_library": "datasets/segment_library",
     "compose_parts": "datasets/compose_parts",
@@ -58,12 +56,19 @@ FOLDERS = {
     "evaluate_setpoint": "datasets/evaluate_setpoint",
     "export_controllers": "datasets/export_controllers",
 }
-# what the papers print, and ours beside it, accepted results of `./run python -m benchmarks.papers_NAME`
+# what the papers print, and ours beside it, which the second pipeline makes
 PAPERS = {
-    "temperature": ("datasets/papers/temperature.toml", "benchmarks/results/papers/temperature.json"),
-    "setpoint": ("datasets/papers/setpoint.toml", "benchmarks/results/papers/setpoint.json"),
-    "deposition": ("datasets/papers/deposition.toml", "benchmarks/results/papers/deposition.json"),
+    "temperature": ("datasets/papers/temperature.toml", "datasets/papers/temperature.json"),
+    "setpoint": ("datasets/papers/setpoint.toml", "datasets/papers/setpoint.json"),
+    "deposition": ("datasets/papers/deposition.toml", "datasets/papers/deposition.json"),
 }
+# and what else it makes of the papers' methods; the page says which of its files are older than their method
+OTHERS = {
+    "reproduce_study": "datasets/papers/reproduce_study.json",
+    "relearned": "datasets/papers/relearned.json",
+}
+# what made.sentence reads
+MADE = ("datasets/papers/dvc.yaml", "datasets/papers/made.json", "datasets/papers/params.yaml")
 
 
 def main() -> None:
@@ -79,7 +84,7 @@ def main() -> None:
             "deposition": deposition_page.render(sources),
             "setpoint": setpoint_page.render(sources),
             "certificate": certificate_page.render(sources, judged.verdict),
-            "papers": papers_page.render(sources, PAPERS),
+            "papers": papers_page.render(sources, PAPERS, OTHERS),
             "viewer": viewer.text,
             "difference": difference_page.render(sources, judged),
             "workflow": about_page.render_workflow(sources),

@@ -62,9 +62,10 @@ EDGE_CALLS = {"artifacts", "params", "recordings"}
 # what takes a second to import, or needs a device
 HEAVY = {"jax", "equinox", "optax", "cv2", "sklearn", "control", "pandas", "pyarrow", "mcap", "joblib"}
 # all that may lie directly in pipeline/
-ROOMS = {*LOOPS, "store", "reading", "runtime", "report", "nightly"}
+ROOMS = {*LOOPS, "store", "reading", "runtime", "report", "nightly", "papers"}
 LOOSE = {"__init__", "statistics", "cli", "quick"}
-GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64"}
+# MT19937: R's generator, with which the script of a paper draws
+GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64", "MT19937"}
 
 
 # ---- the syntax tree
@@ -160,6 +161,8 @@ def may_know(room: str, target: str) -> bool:
         return target in ("store", "runtime/settings")
     if room == "runtime/workflow":  # what is exported and replayed is read as the loops' stages left it
         return target.split("/")[0] in (*LOOPS, "store", "reading", "statistics", "runtime")
+    if room == "papers":  # the second pipeline plays the methods, and the root's stages on fresh records
+        return target.split("/")[0] in (*LOOPS, "store", "statistics", "papers", "stages")
     if room in ("store", "reading"):  # 5: below the loops
         return target in ("store", "reading", "statistics")
     return True  # nightly, cli and stages
@@ -175,7 +178,7 @@ def forbidden_imports(root: Path) -> list[str]:
             reason = ""
             if name.startswith("."):
                 reason = "write the whole name"
-            elif room == "stages" or name.split(".")[0] == "tests":
+            elif (room == "stages" and file.room != "papers") or name.split(".")[0] == "tests":
                 reason = "nothing imports a stage or a test"
             elif room and not may_know(file.room, room):
                 reason = f"{file.room} must not know {room}"
@@ -305,21 +308,17 @@ def loads(name: str, tree: ast.AST) -> Iterator[tuple[str, str]]:
 
 
 def paths(stage: str, name: str, tree: ast.Module) -> tuple[set[str], set[str]]:
-    """Literal paths in datasets/, reports/ and benchmarks/results/ that are read; those that are written."""
+    """Literal paths in datasets/ and reports/ that are read; those that are written."""
     written, read = set(), set()
     targets = {
         id(call.args[0]) for call, _, function in calls(tree) if function.startswith("write_") and call.args
     }
     for node in ast.walk(tree):
-        if isinstance(node, ast.JoinedStr) and re.match(
-            r"f['\"](datasets|reports|benchmarks/results)/", ast.unparse(node)
-        ):
+        if isinstance(node, ast.JoinedStr) and re.match(r"f['\"](datasets|reports)/", ast.unparse(node)):
             raise AssertionError(
                 f"{name}:{node.lineno} {ast.unparse(node)}: write the path out, so that one can grep for it"
             )
-        if isinstance(node, ast.Constant) and re.fullmatch(
-            r"(datasets|reports|benchmarks/results)/[\w./-]+", str(node.value)
-        ):
+        if isinstance(node, ast.Constant) and re.fullmatch(r"(datasets|reports)/[\w./-]+", str(node.value)):
             (written if id(node) in targets else read).add(node.value.rstrip("/"))
     read |= {
         f"reports/metrics/{literal(name, call, 0)}.json"
@@ -408,6 +407,39 @@ def expected(root: Path, stage: str) -> dict[str, Any]:
         "metrics": [{path: {"cache": False, "persist": True}} for path in metrics],
     }
     return {key: value for key, value in entry.items() if value}
+
+
+# the second pipeline: results that no recording changes, and no stage of the root asks for
+PAPERS = "datasets/papers/dvc.yaml"
+
+
+def expected_of_paper(root: Path, stage: str) -> dict[str, Any]:
+    """The entry of datasets/papers/dvc.yaml: deps and params are what pipeline/papers/<stage>.py imports and
+    opens, files and no folder of code. It has no outs: DVC joins pipelines by their outs, and the root's
+    `dvc repro` would start it."""
+    name = f"pipeline/papers/{stage}.py"
+    code = modules(root, name)
+    keys = {key for module in code for _, key in loads(module, parsed(root / module)) if key != "execution"}
+    own = {key for key in keys if key in params.PAPERS_SECTIONS}
+    read, _ = paths(stage, name, parsed(root / name))
+    read -= {f"datasets/papers/{stage}.json", params.PAPERS}
+    entry = {
+        "cmd": f"python -m pipeline.papers.{stage}",
+        "wdir": "../..",
+        "deps": [name, *sorted(code - {name}), *sorted(path for path in read if "/memo" not in path)],
+        "params": tracked(root, keys - own) + ([{params.PAPERS: sorted(own)}] if own else []),
+    }
+    return {key: value for key, value in entry.items() if value}
+
+
+def second_pipeline(root: Path) -> dict[str, Any]:
+    """The stages of the papers: the modules with a `main`."""
+    names = sorted(
+        path.stem
+        for path in (root / "pipeline/papers").glob("*.py")
+        if any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in parsed(path).body)
+    )
+    return {"stages": {stage: expected_of_paper(root, stage) for stage in names}}
 
 
 def stages(root: Path) -> list[str]:

@@ -129,13 +129,11 @@ def readme_of_today(root: Path) -> str:
     }
     rules = params.load(ReportRules, "report", root / params.FILE)
     machine = params.load(Plant, "plant", root / params.FILE)
-    accepted = artifacts.read_json(root / "reports/accepted.json")
     verdict = decide(
         metrics,
         rules,
         recorded=False,
         undeclared=[output.name for output in machine.outputs if output.low is None or output.high is None],
-        incumbent=str(accepted.get("winner") or ""),
     )
     text = readme.block(metrics, rules, verdict)
     return readme.rewritten((root / "README.md").read_text(encoding="utf-8"), text)

@@ -1,5 +1,5 @@
 """Who may know whom, and dvc.yaml: both read off the syntax tree. `./run python -m tests.test_house` prints
-the dvc.yaml that the stages ask for."""
+the dvc.yaml that the stages ask for, `... test_house papers` that of datasets/papers."""
 
 import ast
 import importlib
@@ -14,6 +14,7 @@ from pydantic import Field
 
 from pipeline.store import params
 from tests.house import (
+    PAPERS,
     differences,
     expected,
     forbidden_files,
@@ -22,6 +23,7 @@ from tests.house import (
     loads,
     misplaced,
     pipeline,
+    second_pipeline,
     stages,
     unbounded,
     unframed,
@@ -47,6 +49,14 @@ def test_dvc_yaml_is_what_the_stages_import_and_open():
     assert differences(entries["stages"], wanted["stages"]) == [], (
         "paste the output of ./run python -m tests.test_house into dvc.yaml"
     )
+
+
+def test_the_second_pipeline_is_what_its_modules_import_and_declares_no_outs():
+    entries = yaml.safe_load((ROOT / PAPERS).read_text(encoding="utf-8"))["stages"]
+    assert differences(entries, second_pipeline(ROOT)["stages"]) == [], (
+        f"paste the output of ./run python -m tests.test_house papers into {PAPERS}"
+    )
+    assert not any(kind in entry for entry in entries.values() for kind in ("outs", "metrics", "plots"))
 
 
 @pytest.mark.parametrize("stage", stages(ROOT))
@@ -333,4 +343,5 @@ def test_a_number_without_bounds_and_a_default_are_seen():
 
 
 if __name__ == "__main__":
-    yaml.safe_dump(pipeline(ROOT), sys.stdout, sort_keys=False, width=200)
+    wanted = second_pipeline(ROOT) if sys.argv[1:] == ["papers"] else pipeline(ROOT)
+    yaml.safe_dump(wanted, sys.stdout, sort_keys=False, width=200)

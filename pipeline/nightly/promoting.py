@@ -26,7 +26,7 @@ from pipeline.temperature.workflow.settings import Plant
 # stages whose metrics the pages show; those before `learn_kernel` have no tables there
 MEASURED = (
     "probe_machine", "generate_probing", "learn_kernel", "ingest", "identify_plant", "tune_weights",
-    "evaluate_temperature", "reproduce_study", "train_ilc", "segment_library", "compose_parts",
+    "evaluate_temperature", "train_ilc", "segment_library", "compose_parts",
     "train_classifier", "train_agent", "evaluate_setpoint", "export_controllers",
 )  # fmt: skip
 REPORT = "reports/metrics/report.json"

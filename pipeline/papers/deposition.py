@@ -1,47 +1,84 @@
 """Hoelzle, Alleyne and Wagoner Johnson 2009 beside us: every figure of the paper on its own nominal machine,
 and the same law on a machine that is not its model.
 
-`./run python -m benchmarks.papers_deposition` writes benchmarks/results/papers/deposition.json, which
+`./run dvc repro datasets/papers/dvc.yaml:deposition` writes datasets/papers/deposition.json, which
 reports/papers.html shows; seconds. The paper prints neither lengths nor speeds of its training routine: ours
-is that of benchmarks.ilc, a pulse of two plateaus with a pause of 0.6 s between them, at 50 Hz.
+is that of tests/deposition, a pulse of two plateaus with a pause of 0.6 s between them, at 50 Hz.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.signal
 
-from benchmarks import papers
-from benchmarks.composition import FIG_9, MACHINE, NOZZLE, PART, PARTS, forbidden, percent
-from benchmarks.ilc import (
-    AREA,
-    HOELZLE,
-    HOELZLE_Q,
-    MATERIALS,
-    NO_ROLL_BACK,
-    NOISE,
-    SPEED,
-    STEADY,
-    TS,
-    causal_q,
-)
 from pipeline.deposition import ilc
-from pipeline.deposition.composition import Learned, compose, learn, priority
+from pipeline.deposition.composition import Learned, PartSettings, compose, learn, priority
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, Routine, disturb, flow, frequency_response, routine
 from pipeline.deposition.gcode import Kind, Program, parse
-from pipeline.deposition.library import CORNER, START, STOP, TASKS, Training
+from pipeline.deposition.library import CORNER, NO_FLOW, START, STEADY, STOP, TASKS, Training
 from pipeline.deposition.motion import plan
+from pipeline.deposition.tasks import DWELL
+from pipeline.papers import files
 
-FIVE = Path(__file__).parents[1] / "datasets" / "papers" / "tic_tac_toe_five_tasks.gcode"
-COMMAND = "./run python -m benchmarks.papers_deposition"
+COMMAND = "./run dvc repro datasets/papers/dvc.yaml:deposition"
 TRIALS, SHOWN = 31, (0, 15, 30)  # figure 3 shows these, figure 5 the command of the last
 PAUSE_S = 0.6
 DELAYS_S = (0.0, 0.1, 0.15)
-ON_S, LIBRARY_ON_S = (
-    6.0,
-    14.0,
-)  # plateaus of three time constants of B: those of 6 s are too short to cut a library from
+# plateaus of 14 s are three time constants of B: those of 6 s are too short to cut a library from
+ON_S, LIBRARY_ON_S = 6.0, 14.0
+# the paper's machines A and B, its law (2), and the noise of a measured trial
+TS, AREA, SPEED, NOZZLE = 0.02, 0.304, 8.0, 0.6
+STEADY_FLOW = AREA * SPEED
+MATERIALS = {"A": Extruder(1.08, 2.7), "B": Extruder(0.89, 4.5)}
+NOISE = {"white": 0.03, "drift": 0.01, "gain": 0.01}
+HOELZLE = ilc.HoelzleSettings(learning_gain=0.25, fast_zero_s=0.03, order=2, cutoff_hz=3.0)
+HOELZLE_Q = {"order": 2, "cutoff_hz": 3.0}
+NO_ROLL_BACK = np.inf
+MACHINE = {
+    "acceleration": 1000.0,
+    "junction_deviation_mm": 0.05,
+    "speed_limit": 100.0,
+    "unset_feed": 8.0,
+    "tool_change_s": 2.0,
+}
+PART = PartSettings(NOZZLE, AREA, 0.15, corner_deg=30.0, longest_pause_s=1.0, drive=UNLIMITED)
+FIG_9 = [NO_FLOW, START, STEADY, CORNER, STEADY, CORNER, STEADY, STOP, NO_FLOW]
+# figure 8 within a material; Dwell stands for the switch of the system
+ALLOWED = {
+    NO_FLOW: (START, DWELL),
+    START: (STEADY, STOP),
+    STEADY: (CORNER, STOP),
+    CORNER: (STEADY, STOP),
+    STOP: (NO_FLOW, START, DWELL),
+    DWELL: (START,),
+}
+
+
+def forbidden(tasks: Sequence[str], tools: Sequence[int]) -> np.ndarray:
+    """The indices (F,) of tasks that may not follow the one before them (figure 8): another tool comes only
+    by Dwell, Steady-State never goes to No-Flow."""
+    tasks, tools = np.asarray(tasks), np.asarray(tools)
+    names = np.array(list(ALLOWED))
+    table = np.array([[after in ALLOWED[before] for after in names] for before in names])
+    order = np.argsort(names)
+    code = order[np.searchsorted(names, tasks, sorter=order)]
+    fine = table[code[:-1], code[1:]] & ((tools[1:] == tools[:-1]) | (tasks[:-1] == DWELL))
+    return np.flatnonzero(~fine) + 1
+
+
+def percent(plant: Extruder, nominal: Extruder, u: np.ndarray, r: np.ndarray) -> float:
+    """R.m.s. error of the true flow under u in percent of on-off control's."""
+    on_off = flow(plant, r / nominal.gain, sample_time_s=TS) - r
+    return 100 * float(np.linalg.norm(flow(plant, u, sample_time_s=TS) - r) / np.linalg.norm(on_off))
+
+
+def causal_q(x: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
+    """Q x (T,) run forward only: the other reading of the paper's Q, which delays the command and never gets
+    below a third of the error."""
+    return scipy.signal.sosfilt(scipy.signal.butter(order, cutoff_hz, fs=1 / sample_time_s, output="sos"), x)
 
 
 def trained(on_s: float) -> Routine:
@@ -59,7 +96,7 @@ def learned(plant: Extruder, nominal: Extruder, r: np.ndarray, q=ilc.zero_phase)
 
     def measure(u: np.ndarray) -> ilc.Trial:
         y = flow(plant, u, sample_time_s=TS)
-        return ilc.Trial(u, disturb(y, rng, steady_flow=STEADY, **NOISE), y)
+        return ilc.Trial(u, disturb(y, rng, steady_flow=STEADY_FLOW, **NOISE), y)
 
     return ilc.learn(law, measure, r / nominal.gain, r, trials=TRIALS, rise=NO_ROLL_BACK)
 
@@ -78,20 +115,20 @@ def thinned(x: np.ndarray, every: int = 5, digits: int = 4) -> list[float]:
 def learning(task: Routine) -> dict[str, Any]:
     """Figures 3 to 5: A and B on their nominal machines, A with delays that the model lacks, and with a Q
     that runs forward only."""
-    out: dict[str, Any] = {"time_s": thinned(task.time_s, digits=2), "wanted": thinned(task.r / STEADY)}
+    out: dict[str, Any] = {"time_s": thinned(task.time_s, digits=2), "wanted": thinned(task.r / STEADY_FLOW)}
     printing, commands = task.r > 0, {}
     for name, nominal in MATERIALS.items():
         trials = learned(nominal, nominal, task.r)
         ratio, u = ratios(trials, task.r), trials[TRIALS].u
         commands[name] = u
         out[name] = {
-            "flow": {f"trial_{j}": thinned(trials[j].truth / STEADY) for j in SHOWN},
+            "flow": {f"trial_{j}": thinned(trials[j].truth / STEADY_FLOW) for j in SHOWN},
             "ratio": [round(value, 3) for value in ratio],
             "ratio_30": ratio[30],
             "best": min(ratio),
             "first_below_20": next(j for j, value in enumerate(ratio) if value < 20),
             "command": thinned(u),
-            "steady_mm": STEADY / nominal.gain,
+            "steady_mm": STEADY_FLOW / nominal.gain,
             "peak_mm": float(np.abs(u).max()),
             "rms_mm": float(np.sqrt(np.mean(u[printing] ** 2))),
         }
@@ -145,7 +182,7 @@ def library(task: Routine) -> tuple[Learned, dict[str, Any]]:
     events = {START: [task.start_s] * 2, CORNER: list(task.pause_s), STOP: [task.stop_s] * 2}
     in_first = known.library.columns[0].material
     tasks = {row["task"] for row in rows if row["material"] == in_first}
-    steady, peak = STEADY / MATERIALS["A"].gain, float(np.abs(trainings[0].u[-1]).max())
+    steady, peak = STEADY_FLOW / MATERIALS["A"].gain, float(np.abs(trainings[0].u[-1]).max())
     jump = max(one.percent for one in known.checks if one.assumption == 4) * steady / peak
     return known, {
         "columns": rows,
@@ -183,8 +220,8 @@ def composed(known: Learned, path: Path, tools: dict[int, str], *, curves: bool)
             y = flow(plant, u, sample_time_s=TS)
             out |= {
                 "command": thinned(u),
-                "flow": thinned(y / STEADY),
-                "wanted": thinned(stream.r / STEADY),
+                "flow": thinned(y / STEADY_FLOW),
+                "wanted": thinned(stream.r / STEADY_FLOW),
                 "time_s": thinned(np.arange(len(u)) * TS, digits=2),
             }
         else:
@@ -233,11 +270,12 @@ def table_1() -> dict[str, Any]:
 def main() -> None:
     task = trained(LIBRARY_ON_S)
     known, cut = library(task)
-    figure_9 = composed(known, PARTS / "fig9.gcode", {0: "A"}, curves=True)
+    figure_9 = composed(known, Path("datasets/parts/fig9.gcode"), {0: "A"}, curves=True)
     parts = {
-        name: composed(known, path, {0: "A", 1: "B"}, curves=False)
-        for name, path in (("tic_tac_toe", PARTS / "tic_tac_toe.gcode"), ("five_tasks", FIVE))
+        "tic_tac_toe": Path("datasets/parts/tic_tac_toe.gcode"),
+        "five_tasks": Path("datasets/papers/tic_tac_toe_five_tasks.gcode"),
     }
+    parts = {name: composed(known, path, {0: "A", 1: "B"}, curves=False) for name, path in parts.items()}
     result = {
         "command": COMMAND,
         "learning": learning(trained(ON_S)),
@@ -248,7 +286,7 @@ def main() -> None:
         "part_over_routine": parts["five_tasks"]["duration_s"] / float(task.time_s[-1] + TS),
         "settings": table_1(),
     }
-    papers.write("deposition", result)
+    files.write("deposition", result)
 
 
 if __name__ == "__main__":

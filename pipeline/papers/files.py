@@ -1,16 +1,17 @@
-"""What the three benchmarks of the papers share: how their results are written."""
+"""The files of datasets/papers that the second pipeline writes: results, a list of numbers on one line, and
+made.json, which says of which code and parameters each of them was made."""
 
 import json
 import re
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
-FOLDER = Path(__file__).parent / "results" / "papers"
+from pipeline.store import artifacts, made
 
 
-def write(name: str, result: dict[str, Any]) -> None:
-    """benchmarks/results/papers/NAME.json, a list of numbers on one line."""
+def write(name: str, result: Mapping[str, Any]) -> None:
+    """datasets/papers/NAME.json, and its entry in made.json."""
     text = json.dumps(result, indent=1, allow_nan=False)
     text = re.sub(r"\[[^\[\]{}]*\]", lambda match: " ".join(match[0].split()).replace("[ ", "["), text)
-    FOLDER.mkdir(parents=True, exist_ok=True)
-    (FOLDER / f"{name}.json").write_text(text.replace(" ]", "]") + "\n")
+    artifacts.write_text(made.FOLDER / f"{name}.json", text.replace(" ]", "]") + "\n")
+    made.record(name)

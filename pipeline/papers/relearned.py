@@ -1,22 +1,19 @@
 """The temperature comparison done again: would its sentences stay true on another record, with other tuning
 seeds, on other plants, and with less or more prior knowledge of how far plants differ?
 
-`./run python -m benchmarks.temperature` relearns everything from fresh records (probing, identification,
-kernel, tuning of every contestant, judging; each with seeds of its own, the panel's plants too), tunes five
-times on one record, and removes and adds the prior for all contestants alike. It writes
-benchmarks/results/temperature_relearned.json, from which the pages take the bands of the figures: the
-interval of the relearnings, smallest to largest, which a further one falls into with probability (n - 1) /
-(n + 1). `--relearnings 8 --jobs 2` makes fewer. `--fresh 8` only counts how many figures of 8 further
-relearnings the bands on file hold.
+`./run dvc repro datasets/papers/dvc.yaml:relearned` relearns everything from fresh records (probing,
+identification, kernel, tuning of every controller, judging; each with seeds of its own, the plants too),
+tunes five times on one record, and removes and adds the prior for all controllers alike. It takes hours and
+writes datasets/papers/relearned.json, which papers.html shows: the interval of the relearnings, smallest to
+largest, into which a further one falls with probability (n - 1) / (n + 1). No verdict, choice or export reads
+it. `./run python -m pipeline.papers.relearned --fresh 8` only counts how many figures of 8 further
+relearnings lie in the intervals on file.
 """
 
 import argparse
 import contextlib
-import datetime
 import io
 import json
-import os
-import shutil
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,11 +21,13 @@ from typing import Any
 
 import joblib
 import numpy as np
-import yaml
 
-RESULTS = Path(__file__).parent / "results" / "temperature_relearned.json"
-ROOT = Path(__file__).parent.parent
-STAGES = ("probe_machine", "ingest", "identify_plant", "learn_kernel", "tune_weights", "evaluate_temperature")
+from pipeline.papers import files
+from pipeline.store import artifacts, params
+from stages import evaluate_temperature, identify_plant, ingest, learn_kernel, probe_machine, tune_weights
+
+COMMAND = "./run dvc repro datasets/papers/dvc.yaml:relearned"
+STAGES = (probe_machine, ingest, identify_plant, learn_kernel, tune_weights, evaluate_temperature)
 FIGURES = ("settled_error", "settling", "overshoot", "at_limits", "energy", "cost", "rms")
 ENDS = ("median", "q90")
 # what a relearning changes: everything that is drawn
@@ -42,44 +41,33 @@ PRIORS: dict[str, dict[str, Any]] = {
 }
 
 
-def relearned(seeds: Mapping[str, int], changes: Mapping[str, Any], stages=STAGES, start: str = "") -> dict:
-    """evaluate_temperature.json of one run of the stages in a folder of its own; `start` is a folder whose
-    datasets it goes on from."""
+def relearn(seeds: Mapping[str, int], changes: Mapping[str, Any]) -> dict:
+    """The metrics of evaluate_temperature, and the cost of each tuned controller, of one run of the stages in
+    a folder of its own, with other seeds and other parameters."""
+    root = Path.cwd()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for file in ("params.yaml", "params.expert.yaml"):
-            values = yaml.safe_load((ROOT / file).read_text())
+        for path, values in params.files(root / params.FILE).items():
+            file = Path(path).name
             for dotted, value in {**seeds, **changes, "execution.jobs": 1}.items():
                 *parents, key = dotted.split(".")
                 place = values
                 for parent in parents:
                     place = place.get(parent, {}) if isinstance(place, dict) else {}
-                if isinstance(place, dict) and key in place:
+                new = dotted in changes and parents[0] in values and file == params.EXPERT
+                if isinstance(place, dict) and (key in place or new):
                     place[key] = value
-                elif dotted in changes and parents[0] in values and file == "params.expert.yaml":
-                    place[key] = value
-            (folder / file).write_text(yaml.safe_dump(values))
-        (folder / "datasets/raw/temperature").mkdir(parents=True)
-        if start:
-            for done in STAGES[: STAGES.index(stages[0])]:
-                shutil.copytree(Path(start) / done, folder / "datasets" / done)
-        before = os.getcwd()
-        os.chdir(folder)
-        try:
-            for stage in stages:
-                module = __import__(f"stages.{stage}", fromlist=["main"])
+            artifacts.write_json(folder / file, values)  # JSON is YAML too
+        (folder / "datasets" / "raw" / "temperature").mkdir(parents=True)
+        with contextlib.chdir(folder):
+            for stage in STAGES:
                 with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-                    module.main()
-            return json.loads(Path("reports/metrics/evaluate_temperature.json").read_text()) | {
-                "tuned_cost": {
-                    key: one["cost"]
-                    for key, one in json.loads(Path("reports/metrics/tune_weights.json").read_text())[
-                        "contestants"
-                    ].items()
-                }
-            }
-        finally:
-            os.chdir(before)
+                    stage.main()
+        metrics = folder / "reports" / "metrics"
+        judged, tuned = (
+            artifacts.read_json(metrics / f"{name}.json") for name in ("evaluate_temperature", "tune_weights")
+        )
+        return judged | {"tuned_cost": {key: one["cost"] for key, one in tuned["contestants"].items()}}
 
 
 def figures(runs: list[dict]) -> dict[str, Any]:
@@ -160,23 +148,21 @@ def many(count: int, first: int, changes: Mapping[str, Any], jobs: int) -> list[
     work = [dict.fromkeys(SEEDS, first + k) | {"panel.training.seed": 5000 + first + k} for k in range(count)]
     return list(
         joblib.Parallel(n_jobs=jobs, return_as="generator")(
-            joblib.delayed(relearned)(seeds, changes) for seeds in work
+            joblib.delayed(relearn)(seeds, changes) for seeds in work
         )
     )
 
 
-def tuned_again(jobs: int) -> list[dict]:
-    """Five tuning seeds on the record of the accepted run (datasets/ of this checkout)."""
-    after = STAGES[STAGES.index("tune_weights") :]
+def tune_again(jobs: int) -> list[dict]:
+    """Five tuning seeds on the record that the parameters draw."""
     return joblib.Parallel(n_jobs=jobs)(
-        joblib.delayed(relearned)({"tune_weights.seed": seed}, {}, after, str(ROOT / "datasets"))
-        for seed in range(1, 6)
+        joblib.delayed(relearn)({"tune_weights.seed": seed}, {}) for seed in range(1, 6)
     )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--relearnings", type=int, default=24)
+    parser.add_argument("--relearnings", type=int, default=16)
     parser.add_argument("--priors", type=int, default=4, help="relearnings without, and with more, prior")
     parser.add_argument(
         "--fresh", type=int, default=0, help="only: further relearnings against the file's bands"
@@ -184,17 +170,14 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     chosen = parser.parse_args()
     if chosen.fresh:
-        on_file = json.loads(RESULTS.read_text())
+        on_file = artifacts.read_json("datasets/papers/relearned.json")
         runs = many(chosen.fresh, 9000, {}, chosen.jobs)
-        on_file["cover"] = cover(on_file["contestants"], runs) | {"answers": answers(runs)}
-        RESULTS.write_text(json.dumps(on_file, indent=1) + "\n")
-        print(json.dumps(on_file["cover"], indent=1))
+        print(json.dumps(cover(on_file["contestants"], runs) | {"answers": answers(runs)}, indent=1))
         return
     runs = many(chosen.relearnings, 1000, {}, chosen.jobs)
-    machine = yaml.safe_load((ROOT / "params.yaml").read_text())["plant"]
+    machine = params.read()["plant"]
     result: dict[str, Any] = {
-        "command": f"./run python -m benchmarks.temperature --relearnings {chosen.relearnings}",
-        "date": datetime.date.today().isoformat(),
+        "command": COMMAND,
         "machine": {
             "outputs": [o["name"] for o in machine["outputs"]],
             "sample_time_s": machine["sample_time_s"],
@@ -204,16 +187,13 @@ def main() -> None:
         "contestants": figures(runs),
         "answers": answers(runs),
     }
-    # each part is on file before the next begins
-    RESULTS.write_text(json.dumps(result, indent=1) + "\n")
-    again = tuned_again(chosen.jobs)
+    again = tune_again(chosen.jobs)
     result["five_tuning_seeds"] = answers(again) | {"spread_percent": spread_percent(again)}
-    RESULTS.write_text(json.dumps(result, indent=1) + "\n")
     if chosen.priors:
         result["prior"] = {
             name: answers(many(chosen.priors, 1000, changes, chosen.jobs)) for name, changes in PRIORS.items()
         }
-        RESULTS.write_text(json.dumps(result, indent=1) + "\n")
+    files.write("relearned", result)
     print(json.dumps({key: result.get(key) for key in ("answers", "five_tuning_seeds", "prior")}, indent=1))
 
 

@@ -1,13 +1,20 @@
-"""What reproduce_study does: the study's own part, on its simulated machine, which no recording touches. Its
-figures as published; its learners on noise-free and on many noisy data sets; the starts of its Algorithm 1;
-and the parity search, Q and R by Bayesian optimisation of its fitness (37), whose optimum is known."""
+"""The study's own part, on its simulated machine, which no recording touches: datasets/published ->
+datasets/papers/reproduce_study.json.
 
+Its figures as published; its learners on noise-free and on many noisy data sets; the starts of its Algorithm
+1; and the parity search, Q and R by Bayesian optimisation of its fitness (37), whose optimum is known.
+"""
+
+import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from joblib import delayed
 from tqdm import tqdm
 
+from pipeline.papers import files
+from pipeline.store import params
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
 from pipeline.temperature import published, study, tuning
@@ -33,12 +40,12 @@ def check(settings: ReproduceStudy) -> None:
         low, high = getattr(settings, f"{name}_low"), getattr(settings, f"{name}_high")
         if low >= high:
             raise ValueError(
-                f"params.expert.yaml: reproduce_study.{name}_low is {low:g} but must be less than "
+                f"{params.PAPERS}: reproduce_study.{name}_low is {low:g} but must be less than "
                 f"reproduce_study.{name}_high, {high:g}; change one of the two"
             )
     if settings.initial > settings.evaluations:
         raise ValueError(
-            f"params.expert.yaml: reproduce_study.initial is {settings.initial} but must be at most "
+            f"{params.PAPERS}: reproduce_study.initial is {settings.initial} but must be at most "
             f"reproduce_study.evaluations, {settings.evaluations}; change one of the two"
         )
 
@@ -83,3 +90,37 @@ def _parity(settings: ReproduceStudy) -> tuning.Result:
             rng=np.random.default_rng(settings.seed),
             on_step=lambda _: bar.update(),
         )
+
+
+def result(reproduced: Reproduced) -> dict[str, Any]:
+    """What the file holds: the figures, and the tables as lists, eight digits a number."""
+    tables = {"study": reproduced.study, "parity": reproduced.parity}
+    return {"figures": plain(reproduced.metrics)} | {
+        name: plain({key: list(values) for key, values in table.items()}, digits=8)
+        for name, table in tables.items()
+    }
+
+
+def plain(value: Any, digits: int = 17) -> Any:
+    """A value as JSON has it, a number with so many digits; None for a number without end or that is none."""
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    if isinstance(value, Mapping):
+        return {key: plain(one, digits) for key, one in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [plain(one, digits) for one in value]
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+    return value
+
+
+def main() -> None:
+    settings = params.load(ReproduceStudy, "reproduce_study", "datasets/papers/params.yaml")
+    check(settings)
+    execution = params.load(Execution, "execution")
+    files.write("reproduce_study", result(reproduced(settings, execution, "datasets/published")))
+
+
+if __name__ == "__main__":
+    main()

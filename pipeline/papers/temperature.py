@@ -1,7 +1,7 @@
 """Zavrakli, Parnell and Dey 2023 beside us: every figure of the paper in its own count, digit for digit, and
 what stands behind the numbers.
 
-`./run python -m benchmarks.papers_temperature` writes benchmarks/results/papers/temperature.json, which
+`./run dvc repro datasets/papers/dvc.yaml:temperature` writes datasets/papers/temperature.json, which
 reports/papers.html shows; some minutes. The paper's scripts (it prints their address) draw with R's generator
 after set.seed, which is emulated here, so that their data are the same to rounding. Written apart from
 pipeline/temperature/published.py and kernel.py: the tests hold the two against each other.
@@ -19,14 +19,14 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
-from benchmarks import papers
+from pipeline.papers import files
 from pipeline.temperature import study
 from pipeline.temperature.plant import baam
 from pipeline.temperature.published import GAMMA, IDENTITY, K_DATA, REFERENCE, TAU, TUNED_DATA, TUNED_MODEL
 from pipeline.temperature.tracking import algorithm_1, gains, observer_gain, stabilises
 from pipeline.temperature.workflow.record import read_published
 
-COMMAND = "./run python -m benchmarks.papers_temperature"
+COMMAND = "./run dvc repro datasets/papers/dvc.yaml:temperature"
 N, SAMPLES, LENGTH, SCALE, MU, STOP = 6, 15_000, 84, 1000.0, 1e-4, 1e-3
 AMPLITUDES, BANDWIDTH, VARIANCE = np.arange(100.0, 0.0, -10.0), 1.65, 1.5
 MISPRINTED_Q5 = {"model_based": 0.514, "data_driven": 0.010}  # (46) and (53) as the text has them
@@ -413,7 +413,7 @@ def main() -> None:
         "settings": settings(),
         "enough": enough(u, y),
     }
-    papers.write("temperature", result)
+    files.write("temperature", result)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,6 @@ SECTIONS = (
     "plant",
     "printer",
     "report",
-    "reproduce_study",
     "segment_library",
     "setpoint_material",
     "tracking",
@@ -52,6 +51,8 @@ SECTIONS = (
     "train_ilc",
     "tune_weights",
 )
+# the second pipeline has a file of its own, which no owner of a machine needs to know
+PAPERS, PAPERS_SECTIONS = "datasets/papers/params.yaml", ("reproduce_study",)
 # the project's own files have some 600 values, 6 levels deep
 MOST_VALUES, DEEPEST, LONGEST_NUMBER = 100_000, 50, 30
 _TAGS = [
@@ -337,7 +338,8 @@ def _check_names(by_file: dict[str, dict]) -> None:
         f"{file}: {_no_section(str(name))}"
         for file, sections in by_file.items()
         for name in sections
-        if name not in SECTIONS and not str(name).startswith("x_")
+        if name not in (PAPERS_SECTIONS if file.endswith(PAPERS) else SECTIONS)
+        and not str(name).startswith("x_")
     ]
     if problems:
         raise ValueError("\n".join(problems))

@@ -20,7 +20,6 @@ READS: dict[str, tuple[str, ...]] = {
     "learn_kernel": ("ingest",),
     "tune_weights": ("identify_plant", "ingest", "learn_kernel"),
     "evaluate_temperature": ("ingest", "identify_plant", "learn_kernel", "tune_weights"),
-    "reproduce_study": (),
     "train_ilc": (),
     "segment_library": ("train_ilc",),
     "compose_parts": ("segment_library", "train_ilc"),

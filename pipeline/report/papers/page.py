@@ -1,15 +1,22 @@
 """papers.html: for each paper every table, every figure and every number that is a result, printed beside
-ours with its verdict; then our data in the papers' axes."""
+ours with its verdict; then our data in the papers' axes; the machine of Zavrakli 2023 counted in each way;
+and the temperature loop learned again from fresh records.
+
+All of ours is from files of the second pipeline, datasets/papers/dvc.yaml. Each says at which commit it was
+made and whether its method has changed since. No verdict, choice or export reads them.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from pipeline.report.papers import deposition, setpoint, temperature
+from pipeline.report.papers import deposition, setpoint, study, temperature
 from pipeline.report.papers.figures import Drawn
+from pipeline.report.papers.relearned import sentences
 from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS, Paper, Row, read
 from pipeline.report.shared import page
 from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import Missing
+from pipeline.store import artifacts, made
 
 # glyph of a verdict, by the states that the pages know
 GLYPHS = {HOLDS: "passed", SHAPE: "passed", FAILS: "failed", OPEN: "open"}
@@ -22,7 +29,7 @@ PICTURES = {
 
 class Shown(NamedTuple):
     """A paper as the page shows it: its anchor, the places that do not hold or cannot be judged, rows,
-    pictures, and the files that they are from."""
+    pictures, the files that they are from, and when ours were made."""
 
     key: str
     paper: Paper
@@ -30,6 +37,7 @@ class Shown(NamedTuple):
     rows: list[Row]
     pictures: list[Drawn]
     files: Sequence[str]
+    made: str
 
 
 class Count(NamedTuple):
@@ -41,8 +49,9 @@ class Count(NamedTuple):
     counts: list[int]
 
 
-def render(sources: Sources, files: Mapping[str, tuple[str, str]]) -> str:
-    """The page of the papers in `files`, {key: (printed, results)}."""
+def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mapping[str, str]) -> str:
+    """The page of the papers in `files`, {key: (printed, results)}; `others` are the files of the stages
+    reproduce_study and relearned."""
     shown, gaps = [], []
     for key, (printed, results) in files.items():
         paper = read(printed, results, sources.metrics)
@@ -50,7 +59,9 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]]) -> str:
             gaps.append((key, paper))
             continue
         pictures = PICTURES[key](paper.results, sources)
-        shown.append(Shown(key, paper, brief(paper), paper.rows, pictures, (printed, results)))
+        shown.append(
+            Shown(key, paper, brief(paper), paper.rows, pictures, (printed, results), made.sentence(key))
+        )
     counts = [
         Count(one.key, one.paper.title, len(one.rows), [one.paper.count(verdict) for verdict in VERDICTS])
         for one in shown
@@ -66,7 +77,16 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]]) -> str:
         gaps=gaps,
         state=GLYPHS,
         fails=FAILS,
+        study=study.part(_results(others["reproduce_study"], "reproduce_study")),
+        relearned=sentences(_results(others["relearned"], "relearned")),
+        made={name: made.sentence(name) for name in others},
     )
+
+
+def _results(path: str, stage: str) -> Mapping | Missing:
+    if not artifacts.exists(path):
+        return Missing("not measured", f"{path} is not there", f"Run {made.command(stage)}")
+    return artifacts.read_json(path)
 
 
 def decision(papers: Sequence[Paper]) -> str:

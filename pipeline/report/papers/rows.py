@@ -1,5 +1,5 @@
 """What the papers print, row by row, beside ours: the verdict of each row by its rule, and its words with
-the figures put in. Printed values stand in datasets/papers/*.toml, ours in benchmarks/results/papers/*.json
+the figures put in. Printed values stand in datasets/papers/*.toml, ours in datasets/papers/*.json
 and in the metrics of the run."""
 
 import math
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from pipeline.report.shared.digits import number
 from pipeline.report.shared.verdict import Missing
-from pipeline.store import artifacts
+from pipeline.store import artifacts, made
 
 HOLDS, SHAPE, FAILS, OPEN = "holds", "holds in shape", "does not hold", "cannot be judged"
 VERDICTS = (HOLDS, SHAPE, FAILS, OPEN)
@@ -75,7 +75,7 @@ def read(printed: str, results: str, metrics: Mapping[str, Any]) -> "Paper | Mis
     Raises ValueError, naming file and row, where a row has an unknown rule or asks for a figure that the
     results do not hold.
     """
-    for path, remedy in ((printed, f"git checkout {printed}"), (results, _command(results))):
+    for path, remedy in ((printed, f"git checkout {printed}"), (results, made.command(Path(results).stem))):
         if not artifacts.exists(path):
             return Missing("not measured", f"{path} is not there", f"Run {remedy}")
     try:
@@ -94,10 +94,6 @@ def read(printed: str, results: str, metrics: Mapping[str, Any]) -> "Paper | Mis
         found,
         found["command"],
     )
-
-
-def _command(results: str) -> str:
-    return f"./run python -m benchmarks.papers_{Path(results).stem}"
 
 
 # ---- a row

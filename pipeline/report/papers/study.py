@@ -1,16 +1,17 @@
-"""The study's machine on the temperature page, simulated and apart from the machine that the page is about:
-its figures as published, what they say, its learners under noise, and the parity search."""
+"""The machine of Zavrakli 2023, simulated: its figures as published, what they say, its learners under noise,
+and the parity search."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.shared import charts, page
+from pipeline.report.shared import charts
 from pipeline.report.shared.digits import number, percent, short
 from pipeline.report.shared.pictures import Column, Picture, placeholder
-from pipeline.report.shared.sources import Sources, Table, lookup
+from pipeline.report.shared.sources import Table, lookup
 from pipeline.report.shared.verdict import Missing
 from pipeline.report.temperature import evidence, trades
 
@@ -23,20 +24,29 @@ class StudyPart(NamedTuple):
     findings: list[tuple[str, str]]
     pictures: list[Picture]
     weights: list[tuple[str, str]]
-    origin: Markup
 
 
-def part(sources: Sources) -> StudyPart:
-    """What reproduce_study wrote, whatever the record is of."""
-    study = sources.metrics["reproduce_study"]
+def part(results: Mapping[str, Any] | Missing) -> StudyPart:
+    """The study's part from the results of the stage reproduce_study."""
+    if isinstance(results, Missing):
+        study, noisy, searched = results, results, results
+    else:
+        study, noisy, searched = results["figures"], _table(results["study"]), _table(results["parity"])
     return StudyPart(
         _published(study),
         _honest(study),
         [_claim(study), _scaled(study), _algorithm_1(study), _start(study)],
-        [_noise(sources), _parity(sources)],
+        [_noise(noisy), _parity(searched, study)],
         _weights(study),
-        page.origin(sources.source("reproduce_study")),
     )
+
+
+def _table(columns: Mapping[str, list]) -> Table:
+    """Columns as arrays; None, a number without end or that is none, as NaN."""
+    gaps = {
+        name: [np.nan if value is None else value for value in values] for name, values in columns.items()
+    }
+    return {name: np.array(values) for name, values in gaps.items()}
 
 
 # ---- as published
@@ -63,7 +73,7 @@ CONVENTIONS = {
         "Data-driven, tuned",
         "The same; J weighs u with R = I although the controller was tuned for another R. Here 15,000 rows "
         "and value iteration to its end: on the 15,084 rows that the script takes, stopped as it stops, "
-        "every printed digit comes out (page Papers).",
+        "every printed digit comes out (the rows above).",
     ),
 }
 
@@ -202,9 +212,9 @@ ROUTES = {
 }
 
 
-def _noise(sources: Sources) -> Picture:
+def _noise(table: Table | Missing) -> Picture:
     """Gap and error of each route, a dot a data set."""
-    table, title = sources.tables["study"], "What noise costs the learners"
+    title = "What noise costs the learners"
     if isinstance(table, Missing):
         return placeholder("noise", title, table)
     shown = [
@@ -229,7 +239,7 @@ def _noise(sources: Sources) -> Picture:
             "study’s probing; the bar is their median. Learned from noisy data, judged on the true plant "
             "under the same noise."
         ),
-        page.origin(sources.source("study")),
+        Markup(""),
     )
 
 
@@ -285,9 +295,9 @@ def _ranking(table: Table) -> str:
 # ---- the parity search
 
 
-def _parity(sources: Sources) -> Picture:
+def _parity(table: Table | Missing, study: Any) -> Picture:
     """The best cost so far above the optimum that is known, and what the candidates trade."""
-    table, study, title = sources.tables["parity"], sources.metrics["reproduce_study"], "The search for (37)"
+    title = "The search for (37)"
     if isinstance(table, Missing):
         return placeholder("parity", title, table)
     best, optimum = lookup(study, "parity.best_cost_perfect_state"), lookup(study, "parity.optimum")
@@ -308,7 +318,7 @@ def _parity(sources: Sources) -> Picture:
         ],
         f"{evidence.dots_and_line(table)} Beside it: r.m.s. tracking error in °C, up, against r.m.s. "
         "effort in per cent, across; line: the front; filled square: chosen; cross: the optimum, Q = R = I.",
-        page.origin(sources.source("parity", "reproduce_study")),
+        Markup(""),
     )
 
 

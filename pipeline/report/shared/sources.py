@@ -257,8 +257,6 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
             "trajectories.parquet",
             *table(schemas.trajectories(machine.inputs, machine.outputs)),
         ),
-        ("study", "reproduce_study", "study.parquet", *table(schemas.STUDY)),
-        ("parity", "reproduce_study", "parity.parquet", *table(schemas.PARITY)),
         ("trials", "train_ilc", "trials.parquet", *table(TRIALS)),
         ("lessons", "train_ilc", "lessons.parquet", *table(LESSONS)),
         ("filmed", "train_ilc", "filmed.parquet", *table(FILMED)),

@@ -14,7 +14,7 @@ from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Figure, Missing
 from pipeline.report.temperature.answers import comparison
 from pipeline.report.temperature.contestants import heading, kind
 from pipeline.report.temperature.deciding import degrees, runs_of, until_settled
-from pipeline.report.temperature.judgement import Judgement, incumbent_of
+from pipeline.report.temperature.judgement import Judgement, named_before
 from pipeline.report.temperature.scorecard import setting
 from pipeline.report.temperature.wording import OFF_THE_SCALE, banded, places_of, worded
 
@@ -50,7 +50,7 @@ def card(sources: Sources, judged: Judgement, verdict: Verdict) -> Card:
 
 def contestants(sources: Sources, judged: Judgement) -> dict[str, str]:
     """Whom the card shows, and what each is here."""
-    runs = incumbent_of(sources)
+    runs = named_before(sources)
     champion = isinstance(sources.nightly, dict) and runs
     runs_now = "runs now" if champion else "as before"
     names = {judged.subject: runs_now if judged.subject == runs else note_of(judged.verdict)}

@@ -84,7 +84,7 @@ def judgement(sources: Sources, *, named: str = "") -> Judgement:
     undeclared = undeclared_outputs(sources.declared.machine)
     asked = questions(rules, comparison(metrics))
     held = standings(metrics, rules, undeclared=undeclared, drift=drifted.answer)
-    incumbent = incumbent_of(sources)
+    incumbent = in_production(sources)
     best = choose(metrics, held, incumbent)
     competing = [name for name in held if name not in YARDSTICKS]
     subject = best or (closest(held) if competing else pair_names(metrics)[0])
@@ -125,13 +125,18 @@ def undeclared_outputs(machine: Plant) -> list[str]:
     return [output.name for output in machine.outputs if output.low is None or output.high is None]
 
 
-def incumbent_of(sources: Sources) -> str:
-    """The contestant in production, as the nightly job wrote it, else the one that the accepted run of this
-    machine chose; "" where there is neither."""
-    if isinstance(sources.nightly, dict):
-        runs = entry(sources.nightly, "champion", "temperature", "contestant")
-        if runs and isinstance(runs, str):
-            return runs
+def in_production(sources: Sources) -> str:
+    """The contestant that runs, as the nightly job wrote it; "" if no night has promoted one."""
+    runs = entry(sources.nightly, "champion", "temperature", "contestant")
+    return runs if isinstance(runs, str) else ""
+
+
+def named_before(sources: Sources) -> str:
+    """The contestant in production, else the one that the accepted run of this machine named; "" if there is
+    neither. A page shows the accepted one beside the others; it decides nothing, because `export_controllers`
+    does not read it and the two would name different controllers."""
+    if runs := in_production(sources):
+        return runs
     if not isinstance(sources.accepted, dict) or sources.another_machine:
         return ""
     return str(sources.accepted.get("winner") or "")

@@ -1,11 +1,11 @@
 """The page of the temperature loop: verdict, the pair, the scorecard, three pictures, findings, the record,
-the study, words, provenance."""
+words, provenance."""
 
 from pipeline.report.identification.model import trust
 from pipeline.report.shared import headline, page, words
 from pipeline.report.shared.difference import accepted_on
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature import findings, pictures, recording, scorecard, study, twelve
+from pipeline.report.temperature import findings, pictures, recording, scorecard, twelve
 from pipeline.report.temperature.answers import comparison, refused
 from pipeline.report.temperature.answers import judged as names_judged
 from pipeline.report.temperature.contestants import BY_NAME
@@ -13,7 +13,6 @@ from pipeline.report.temperature.judgement import Judgement, heads, verdict_part
 
 WORDS = (
     "rehearsal",
-    "study",
     "pair",
     "quantile",
     "settled",
@@ -59,7 +58,6 @@ def render(sources: Sources, judged: Judgement) -> str:
             pictures.plants(sources),
         ],
         findings=findings.findings(sources),
-        study=study.part(sources),
         record=[recording.excitation(sources), recording.record(sources)],
         flaws=recording.flaws(sources),
         panel=scorecard.declared_panel(sources),

@@ -125,46 +125,6 @@ CASES = Schema(
     ),
 )
 
-STUDY = Schema(
-    "study",
-    1,
-    (
-        Column("route", TEXT, NONE, "window, kernel or kernel_predicted_state"),
-        Column("noise_degC", FLOAT, "degC", "noise in the data and under the controller", low=0),
-        Column("data_set", COUNT, NONE, "which data set of 15,000 samples", low=0),
-        Column("gap", FLOAT, NONE, "J / J* - 1 over 1,000 steps", nullable=True),
-        Column("error_degC", FLOAT, "degC", "root mean square error over steps 500-1000", nullable=True),
-    ),
-)
-
-PARITY = Schema(
-    "parity",
-    1,
-    (
-        Column("evaluation", COUNT, NONE, "counted from 1", low=1),
-        Column("cost", FLOAT, NONE, "the paper's (37); missing where this candidate failed", nullable=True),
-        Column(
-            "incumbent", FLOAT, NONE, "lowest cost so far; missing before the first success", nullable=True
-        ),
-        Column(
-            "tracking_degC",
-            FLOAT,
-            "degC",
-            "discounted r.m.s. tracking error of this candidate; missing where it failed",
-            nullable=True,
-        ),
-        Column(
-            "effort_percent",
-            FLOAT,
-            "percent",
-            "discounted r.m.s. effort of this candidate; missing where it failed",
-            nullable=True,
-        ),
-        Column("chosen", BOOL, NONE, "whether the search recommends this candidate"),
-        Column("failure", TEXT, NONE, "why the candidate failed; empty where it did not"),
-    ),
-)
-
 TUNING = Schema(
     "tuning",
     3,
