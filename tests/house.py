@@ -411,6 +411,7 @@ def expected(root: Path, stage: str) -> dict[str, Any]:
 
 # the second pipeline: results that no recording changes, and no stage of the root asks for
 PAPERS = "datasets/papers/dvc.yaml"
+METHODS = {*LOOPS, "statistics", "papers", "stages"}
 
 
 def expected_of_paper(root: Path, stage: str) -> dict[str, Any]:
@@ -418,7 +419,9 @@ def expected_of_paper(root: Path, stage: str) -> dict[str, Any]:
     opens, files and no folder of code. It has no outs: DVC joins pipelines by their outs, and the root's
     `dvc repro` would start it."""
     name = f"pipeline/papers/{stage}.py"
+    # how a file is read and a figure written is no method
     code = modules(root, name)
+    methods = {path for path in code if File(path, parsed(root / path)).room.split("/")[0] in METHODS}
     keys = {key for module in code for _, key in loads(module, parsed(root / module)) if key != "execution"}
     own = {key for key in keys if key in params.PAPERS_SECTIONS}
     read, _ = paths(stage, name, parsed(root / name))
@@ -426,7 +429,7 @@ def expected_of_paper(root: Path, stage: str) -> dict[str, Any]:
     entry = {
         "cmd": f"python -m pipeline.papers.{stage}",
         "wdir": "../..",
-        "deps": [name, *sorted(code - {name}), *sorted(path for path in read if "/memo" not in path)],
+        "deps": [name, *sorted(methods - {name}), *sorted(read)],
         "params": tracked(root, keys - own) + ([{params.PAPERS: sorted(own)}] if own else []),
     }
     return {key: value for key, value in entry.items() if value}
