@@ -94,7 +94,7 @@ def winner(
     if not recorded:
         return verdict
     return trust_first(
-        verdict, trust(Sources(Declared(rules, machine, {}), metrics, model, {}, {}, None, "", {}))
+        verdict, trust(Sources(Declared(rules, machine, {}), metrics, model, {}, {}, None, ""))
     )
 
 

@@ -42,6 +42,7 @@ def render(sources: Sources, judged: Judgement) -> str:
     return page.render(
         "temperature.html",
         here="temperature",
+        sources=sources,
         title=f"Temperature: {judged.verdict.decision.rstrip('.')}",
         verdict=verdict_parts(judged, claim=headline.claim(sources, ("temperature",))),
         answers=twelve.rows(sources, judged),
