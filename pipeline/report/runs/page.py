@@ -11,7 +11,7 @@ from pipeline.report.runs.curves import Curve, curves, restored
 from pipeline.report.runs.figures import LOOPS, Measured, asked, measured
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.difference import accepted_on, changed_parameters, move
-from pipeline.report.shared.digits import MINUS, THIN, band, count, decimals, number, quantity, with_unit
+from pipeline.report.shared.digits import MINUS, THIN, band, count, declared, quantity, short, with_unit
 from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import FAILED, Figure, Missing, Question, ReportRules, row_places, state
 from pipeline.report.temperature.contestants import heading
@@ -154,44 +154,37 @@ def _head(loop: str, before: Measured, now: Measured) -> dict[str, Any]:
 
 
 def _row(question: Question, before: Figure | None, now: Figure | None) -> Row:
-    both = [figure for figure in (before, now) if figure]
-    places = row_places(question, both)
     bound = "at least" if question.at_least else "at most"
-    limit = with_unit(question.limit, question.unit, decimals(0, 0, value=question.limit))
-    text, moved = _change(question, before, now, places)
+    limit = with_unit(question.limit, question.unit, declared(question.limit))
+    text, moved = _change(question, before, now)
     return Row(
         question.title,
         f"{bound} {limit}" if np.isfinite(question.limit) else "none",
-        (_cell(question, before, places), _cell(question, now, places)),
+        (_cell(question, before), _cell(question, now)),
         text,
         moved,
     )
 
 
-def _cell(question: Question, figure: Figure | None, places: int) -> Cell:
+def _cell(question: Question, figure: Figure | None) -> Cell:
     if figure is None:
         return Cell("not measured")
+    places = row_places(question, [figure])
     text = quantity(figure.value, question.unit, places, beyond=question.beyond)
     ends = band(figure.low, figure.high, places, beyond=question.beyond)
     return Cell(text, ends or "no band", bad=state(question, figure) == FAILED)
 
 
-def _change(question: Question, before: Figure | None, now: Figure | None, places: int) -> tuple[str, bool]:
+def _change(question: Question, before: Figure | None, now: Figure | None) -> tuple[str, bool]:
     """How a figure moved, and whether beyond its noise; only a figure with a band can be better or worse."""
     if before is None or now is None:
         return "nothing to compare", False
-    if before[:3] == now[:3]:
-        return "unchanged", False
-    if before.low == before.high or now.low == now.high:
+    if before[:3] != now[:3] and (before.low == before.high or now.low == now.high):
         size = now.value - before.value
+        if not np.isfinite(size):
+            return "changed, noise unknown", False
         unit = "points" if question.unit == "%" else question.unit
-        places = max(places, 0 if abs(size) >= 1 else decimals(0, 0, value=size)) if np.isfinite(size) else 0
-        sign = "+" if size > 0 else MINUS
-        by = (
-            f"{sign}{number(abs(size), places)}{THIN + unit if unit else ''}"
-            if np.isfinite(size)
-            else "changed"
-        )
+        by = f"{'+' if size > 0 else MINUS}{short(abs(size))}{THIN + unit if unit else ''}"
         return f"{by}, noise unknown", False
     moved = move(question, before, now)
     return moved.text(), moved.moved

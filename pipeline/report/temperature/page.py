@@ -1,5 +1,5 @@
 """The page of the temperature loop: verdict, the pair, the scorecard, three pictures, findings, the record,
-the study, words, provenance."""
+the study, words."""
 
 from pipeline.report.identification.model import trust
 from pipeline.report.shared import headline, page, words
