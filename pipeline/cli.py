@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def accept(_: argparse.Namespace) -> None:
     """Mark the figures of this run as good: later reports show their differences against them."""
-    from pipeline.report.shared.sources import code_files, machine
+    from pipeline.report.shared.sources import machine
 
     metrics = {
         path.stem: artifacts.read_json(path)
@@ -43,7 +43,6 @@ def accept(_: argparse.Namespace) -> None:
         "metrics": metrics,
         "params": params.read(),
         "hashes": hashes,
-        "code": code_files(("pipeline", "stages")),
     }
     artifacts.write_json("reports/accepted.json", run | _shown())
     print(
@@ -64,10 +63,11 @@ def _today() -> dict[str, str]:
 
 
 def _shown() -> dict:
-    """What the pages show: figures with their bands, and which contestant of the temperature loop the verdict
-    chose; nothing where no page was made. Raises ValueError where the pages are of another run."""
+    """What the pages show: figures with their bands, which contestant of the temperature loop the verdict
+    chose, the verdicts, the curves; nothing if no page was made. Raises ValueError if the pages are of
+    another run."""
     if not artifacts.exists("reports/metrics/report.json"):
-        return {"figures": {}, "winner": None}
+        return {"figures": {}, "winner": None, "verdicts": {}, "curves": {}}
     report = artifacts.read_metrics("report")
     stale = [
         path
@@ -79,15 +79,12 @@ def _shown() -> dict:
             f"reports: the pages are of another run than {stale[0]}; run ./run dvc repro, "
             "look at them, and accept then"
         )
-    return {"figures": report["figures"], "winner": report["verdict"]["winner"]}
-
-
-def verify(_: argparse.Namespace) -> None:
-    """Hold what the pages say they were made from against dvc.lock and the files as they are now; what no
-    longer matches is named, with exit status 1."""
-    from pipeline.report.shared import provenance
-
-    print(provenance.summary(provenance.checks()))
+    return {
+        "figures": report["figures"],
+        "winner": report["verdict"]["winner"],
+        "verdicts": {loop: {"decision": verdict["decision"]} for loop, verdict in report["verdicts"].items()},
+        "curves": artifacts.read_json("reports/data/curves.json"),
+    }
 
 
 def screenshots(arguments: argparse.Namespace) -> None:
@@ -97,41 +94,20 @@ def screenshots(arguments: argparse.Namespace) -> None:
     print(f"written: {', '.join(path.as_posix() for path in pictures.take(arguments.folder))}")
 
 
-def history(arguments: argparse.Namespace) -> None:
-    """Write reports/history.html: the figures of every run that git holds, as trends and as a table."""
-    from tqdm import tqdm
-
-    from pipeline.report.runs import history as past
-    from pipeline.report.runs import trend
-    from pipeline.report.shared.verdict import ReportRules
-
-    found = list(tqdm(past.revisions(arguments.most), desc="history", unit=" runs", file=sys.stderr))
-    pages = [
-        (path.stem, path.name) for path in sorted(Path("reports").glob("*.html")) if path.stem != "history"
-    ]
-    rules = params.load(ReportRules, "report")
-    artifacts.write_text("reports/history.html", trend.render(found, rules, pages=pages))
-    print(f"reports/history.html: {len(found)} runs, the last {found[-1].commit[:8] or 'not committed'}")
-
-
 def runs(arguments: argparse.Namespace) -> None:
-    """Write reports/runs.html: accepted runs, nights and DVC experiments in one table, with parameters and
-    figures of all three loops; two of them side by side; one column against another; the sweeps."""
-    from pipeline.report.runs import collected, figures, sweep
+    """Write a page of two runs side by side: figures with bands, and parameters that differ. A and B are
+    commits, tags, branches or DVC experiments whose metrics git has."""
+    from pipeline.report.runs import commits
     from pipeline.report.runs import page as runs_page
     from pipeline.report.shared.verdict import ReportRules
 
-    sweeps, troubles = sweep.remembered()
-    names = dict.fromkeys([*arguments.also, *(swept.metric for swept in sweeps[-runs_page.MOST_SWEEPS :])])
-    asked = [*figures.columns(params.load(ReportRules, "report")), *map(figures.named, names)]
-    found = collected.collected(arguments.most, asked)
-    found = found._replace(troubles=[*found.troubles, *troubles])
-    made = runs_page.render(found, asked, sweeps)
-    artifacts.write_text("reports/runs.html", made.text)
-    artifacts.write_folder(runs_page.FOLDER, made.files)
-    print(f"reports/runs.html: {len(found.runs)} runs, the last {runs_page.name_of(found.runs[-1])}")
-    for trouble in found.troubles:
-        print(printable(trouble))
+    a, b = (commits.run_of(name) for name in (arguments.a, arguments.b))
+    path = (
+        "-".join(["reports/runs", *(commits.commit_of(name)[:8] for name in (arguments.a, arguments.b))])
+        + ".html"
+    )
+    artifacts.write_text(path, runs_page.render_two(a, b, params.load(ReportRules, "report")))
+    print(path)
 
 
 def inspect(arguments: argparse.Namespace) -> None:
@@ -462,11 +438,8 @@ def _add_training_print(commands: argparse._SubParsersAction) -> None:
 
 def _add_runs(commands: argparse._SubParsersAction) -> None:
     command = commands.add_parser("runs", help=runs.__doc__, description=runs.__doc__)
-    command.add_argument("--most", type=int, default=1000, help="runs at most, the newest first (1000)")
-    command.add_argument(
-        "--also", action="append", default=[], metavar="STAGE:KEY",
-        help="a column more: a figure below reports/metrics, such as tune_weights:contestants.pi.cost",
-    )  # fmt: skip
+    command.add_argument("a", metavar="A", help="the run before")
+    command.add_argument("b", metavar="B", help="the run after")
     command.set_defaults(run=runs)
 
 
@@ -502,8 +475,6 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
 # what stands behind ./run beadline COMMAND in the example of its --help
 EXAMPLES = {
     "accept": "",
-    "verify": "",
-    "history": "--most 100",
     "screenshots": "",
     "inspect": "log.csv",
     "quick": "",
@@ -519,15 +490,12 @@ EXAMPLES = {
     "replay": "datasets/export_controllers/temperature log.csv",
     "nightly": "",
     "rollback": "night-0042",
-    "sweep": "-S tune_weights.seed=1,2,3 --target tune_weights "
-    "--metric tune_weights:contestants.subspace_lqg.cost",
-    "runs": "",
+    "runs": "HEAD~1 HEAD",
 }
 STATUSES = "0 done; 1 refused, and one sentence says why; 2 a wrong option"
 OTHER_STATUSES = {
     "nightly": "0 promoted, kept or nothing new; 1 failed; 3 drift alarm; 4 recordings set aside; "
-    "75 another night is at work",
-    "verify": "0 all match; 1 something does not, and is named; 2 a wrong option",
+    "75 another night is at work"
 }
 
 
@@ -544,12 +512,6 @@ def main() -> None:
     parser.add_argument("--version", action="version", version=f"beadline {version()}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     commands.add_parser("accept", help=accept.__doc__, description=accept.__doc__).set_defaults(run=accept)
-    commands.add_parser("verify", help=verify.__doc__, description=verify.__doc__).set_defaults(run=verify)
-    command = commands.add_parser("history", help=history.__doc__, description=history.__doc__)
-    command.add_argument(
-        "--most", type=int, default=500, help="revisions to read at most, the newest first (500)"
-    )
-    command.set_defaults(run=history)
     _add_runs(commands)
     command = commands.add_parser("screenshots", help=screenshots.__doc__, description=screenshots.__doc__)
     command.add_argument("--folder", type=Path, default=Path("reports"), metavar="DIR", help="(reports)")

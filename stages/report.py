@@ -1,6 +1,6 @@
 """Artifacts -> pages: reports/index.html, a page a loop (temperature.html, identification.html,
 deposition.html, setpoint.html), certificate.html, papers.html, viewer.html with its columns in reports/data,
-and beside them difference.html, workflow.html, provenance.html, words.html.
+runs.html (this run beside the accepted one) and words.html.
 
 It reads the metrics and tables of every stage and reports/accepted.json. A missing file is shown as missing.
 Every file read is hashed, and the pages carry the hashes. The drift on page one is that of the last night
@@ -8,14 +8,16 @@ Every file read is hashed, and the pages carry the hashes. The drift on page one
 """
 
 import hashlib
+import json
 
-from pipeline.report.about import difference as difference_page
 from pipeline.report.about import page as about_page
 from pipeline.report.certificate import page as certificate_page
 from pipeline.report.deposition import page as deposition_page
 from pipeline.report.identification import page as identification_page
 from pipeline.report.index import page as index_page
 from pipeline.report.papers import page as papers_page
+from pipeline.report.runs import curves
+from pipeline.report.runs import page as runs_page
 from pipeline.report.setpoint import page as setpoint_page
 from pipeline.report.shared import headline
 from pipeline.report.shared.sources import Declared, collect, digest
@@ -76,6 +78,13 @@ def main() -> None:
         declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
         sources = collect(declared, METRICS, FOLDERS, "reports/accepted.json", ("pipeline", "stages"))
         judged = judgement(sources)
+        told = {
+            "verdict": judged.verdict.metrics(),
+            "verdicts": {
+                loop: verdict.metrics() for loop, verdict in headline.verdicts(sources, judged).items()
+            },
+            "figures": shown(judged),
+        }
         viewer = viewer_page.render(sources, judged)
         pages = {
             "index": index_page.render(sources, judged),
@@ -86,9 +95,7 @@ def main() -> None:
             "certificate": certificate_page.render(sources, judged.verdict),
             "papers": papers_page.render(sources, PAPERS, OTHERS),
             "viewer": viewer.text,
-            "difference": difference_page.render(sources, judged),
-            "workflow": about_page.render_workflow(sources),
-            "provenance": about_page.render_provenance(sources),
+            "runs": runs_page.render(sources, judged, told),
             "words": about_page.render_words(sources),
         }
         artifacts.write_text("reports/index.html", pages["index"])
@@ -99,19 +106,15 @@ def main() -> None:
         artifacts.write_text("reports/certificate.html", pages["certificate"])
         artifacts.write_text("reports/papers.html", pages["papers"])
         artifacts.write_text("reports/viewer.html", pages["viewer"])
-        artifacts.write_text("reports/difference.html", pages["difference"])
-        artifacts.write_text("reports/workflow.html", pages["workflow"])
-        artifacts.write_text("reports/provenance.html", pages["provenance"])
+        artifacts.write_text("reports/runs.html", pages["runs"])
         artifacts.write_text("reports/words.html", pages["words"])
-        artifacts.write_folder("reports/data", viewer.files)
+        # `accept` keeps these
+        drawn = json.dumps(curves.stored(curves.curves(sources.tables)), ensure_ascii=False)
+        artifacts.write_folder("reports/data", {**viewer.files, "curves.json": drawn})
         artifacts.write_metrics(
             "report",
             {
-                "verdict": judged.verdict.metrics(),
-                "verdicts": {
-                    loop: verdict.metrics() for loop, verdict in headline.verdicts(sources, judged).items()
-                },
-                "figures": shown(judged),
+                **told,
                 "bytes": {name: len(text.encode()) for name, text in pages.items()},
                 "pictures": {name: text.count('role="img"') for name, text in pages.items()},
                 "pages": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in pages.items()},

@@ -88,7 +88,7 @@ def told(monkeypatch, capsys, *arguments: str) -> str:
 def test_the_help_of_every_command_has_a_sentence_an_example_and_the_exit_statuses(monkeypatch, capsys):
     names = re.findall(r"choose from|'([\w-]+)'", _choices(monkeypatch, capsys))
     names = [name for name in names if name]
-    assert {"accept", "verify", "nightly", "export"} <= set(names) <= set(cli.EXAMPLES)
+    assert {"accept", "runs", "nightly", "export"} <= set(names) <= set(cli.EXAMPLES)
     for name in names:
         text = told(monkeypatch, capsys, name)
         assert f"Example: ./run beadline {name} {cli.EXAMPLES[name]}".rstrip() in text, name

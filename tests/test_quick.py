@@ -25,8 +25,8 @@ from pipeline.store import artifacts, params
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
-    *("certificate", "deposition", "difference", "identification", "index", "papers", "provenance"),
-    *("setpoint", "temperature", "viewer", "words", "workflow"),
+    *("certificate", "deposition", "identification", "index", "papers", "runs"),
+    *("setpoint", "temperature", "viewer", "words"),
 )
 # the first stages and the pages: what is missing between has its place there
 SHORT = ("probe_machine", "ingest", "report")

@@ -33,13 +33,6 @@ def rollback(arguments: argparse.Namespace) -> None:
     print(printable(night.rollback(arguments.of, arguments.loop)))
 
 
-def sweep(arguments: argparse.Namespace) -> None:
-    """Experiments over a grid of parameters and seeds, with a table and a picture."""
-    from pipeline.nightly import sweeping
-
-    print(sweeping.sweep(arguments.set, arguments.target, arguments.metric))
-
-
 def add(commands) -> None:
     command = commands.add_parser("nightly", help=nightly.__doc__, description=nightly.__doc__)
     command.add_argument(
@@ -70,22 +63,3 @@ def add(commands) -> None:
     )
     command.add_argument("--loop", default="", help="only this loop")
     command.set_defaults(run=rollback)
-    command = commands.add_parser("sweep", help=sweep.__doc__, description=sweep.__doc__)
-    command.add_argument(
-        "-S",
-        "--set",
-        action="append",
-        required=True,
-        metavar="KEY=A,B,C",
-        help="a key of params.yaml or params.expert.yaml and its values",
-    )
-    command.add_argument(
-        "--target", required=True, metavar="STAGE", help="the stage up to which each experiment runs"
-    )
-    command.add_argument(
-        "--metric",
-        required=True,
-        metavar="STAGE:KEY",
-        help="the figure that is told of each, below reports/metrics",
-    )
-    command.set_defaults(run=sweep)

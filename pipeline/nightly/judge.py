@@ -13,8 +13,7 @@ from pipeline.nightly.decision import Evidence
 from pipeline.nightly.settings import HoldOut, Loop, Nightly, Rule
 from pipeline.setpoint.workflow import tables
 from pipeline.store import artifacts, params
-from pipeline.temperature import controller, panel, plant, window
-from pipeline.temperature import tracking as temperature_tracking
+from pipeline.temperature import panel, plant, window
 from pipeline.temperature.workflow import cases, contestants, evaluate_temperature, ingest, learned
 from pipeline.temperature.workflow.settings import Panel, Tracking, TuneWeights
 from pipeline.temperature.workflow.settings import Plant as Machine
@@ -258,8 +257,6 @@ def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[contestants
     )
     path = folder / "tune_weights/weights.json"
     stored = artifacts.read_json(path)
-    if "contestants" not in stored and "practical" in stored:
-        return _of_version_0_1(path, name, stored["practical"], made, tracking), setting
     contestant = contestants.BY_NAME[name]
     mine = evaluate_temperature.read_weights(str(path), machine).get(name, {})
     values = {one.name: mine.get(one.name) for one in contestant.parameters}
@@ -296,31 +293,6 @@ def _learned(folder: Path, name: str, machine: Machine) -> learned.Learned:
         folder / "learn_kernel",
         pid if pid.exists() else None,
         machine,
-    )
-
-
-def _of_version_0_1(
-    path: Path, name: str, practical: Mapping[str, Any], made: learned.Learned, tracking: Tracking
-) -> contestants.Design:
-    """The law of weights q (p,), r (m,) and observer_tau, which one search tuned for all controllers, with
-    the declared integral."""
-    expected = {"q": made.model.p, "r": made.model.m}
-    for key, count in expected.items():
-        if np.shape(practical.get(key, ())) != (count,):
-            raise ValueError(
-                f"{path}: expected practical.{key} with {count} weights, as its plant has them, found "
-                f"{practical.get(key)}; it cannot be compared"
-            )
-    weights = np.array(practical["q"], float), np.array(practical["r"], float), tracking.integral
-    if name == "subspace_lqg" and "observer_tau" in practical:
-        own = temperature_tracking.model_based(made.model, tracking.gamma, tau=practical["observer_tau"])
-        return contestants.Design(own.design(*weights), own.model)
-    if name == "varx_riccati":
-        own = window.controller(made.window, tracking.gamma)
-        return contestants.Design(controller.compact(own.design(*weights), made.window.N), own.model)
-    raise ValueError(
-        f"{path}: expected parameters of {name}, found those of an earlier version, which had none; name "
-        "subspace_lqg or varx_riccati in nightly.holdout.controller"
     )
 
 

@@ -26,7 +26,7 @@ import pyarrow.parquet as pq
 import safetensors
 from safetensors.numpy import load_file, save_file
 
-from pipeline.store import params, renamed, tables
+from pipeline.store import params, tables
 from pipeline.store.printable import printable
 from pipeline.store.tables import ARRAYS, Column, Schema
 
@@ -68,8 +68,7 @@ def write_table(
 def read_table(path: str | Path, schema: Schema) -> dict[str, np.ndarray]:
     """Columns by name: text as objects, missing floats as NaN, lists as objects.
 
-    A table of an earlier version is read under today's names if only names have changed. Raises ValueError
-    for a table of another schema.
+    Raises ValueError for a table of another schema.
     """
     command = remedy(path)
     try:
@@ -81,7 +80,6 @@ def read_table(path: str | Path, schema: Schema) -> dict[str, np.ndarray]:
         raise  # Arrow's is an ArrowException too, and says nothing of the file
     except (OSError, pa.ArrowException) as error:
         raise ValueError(f"{path} is not a whole Parquet file ({reason(error)}); {command}") from None
-    table = tables.under_new_names(schema, table)
     tables.check(path, schema, table, command)
     return {
         column.name: np.array(table[column.name].to_numpy(zero_copy_only=False)) for column in schema.columns
@@ -205,17 +203,6 @@ def write_metrics(stage: str, data: Mapping) -> None:
 def read_metrics(stage: str) -> dict:
     """The data that the stage wrote with `write_metrics`."""
     return read_json(REPORTS / "metrics" / f"{stage}.json")
-
-
-def read_old_metrics(path: str | Path) -> dict:
-    """A file of reports/metrics that may be of an earlier version, under today's names."""
-    return renamed.metrics({Path(path).stem: read_json(path)})[Path(path).stem]
-
-
-def read_accepted(path: str | Path):
-    """reports/accepted.json, which may be of an earlier version, under today's names."""
-    run = read_json(path)
-    return renamed.accepted(run) if isinstance(run, dict) else run
 
 
 def write_learning_curve(

@@ -22,8 +22,6 @@ import pydantic
 import yaml
 from pydantic import Field
 
-from pipeline.store import renamed
-
 FILE, EXPERT = "params.yaml", "params.expert.yaml"
 # every section that code reads
 SECTIONS = (
@@ -53,6 +51,8 @@ SECTIONS = (
 )
 # the second pipeline has a file of its own, which no owner of a machine needs to know
 PAPERS, PAPERS_SECTIONS = "datasets/papers/params.yaml", ("reproduce_study",)
+# old dotted key or section -> new one, for one version; none since 0.2
+RENAMED: dict[str, str] = {}
 # the project's own files have some 600 values, 6 levels deep
 MOST_VALUES, DEEPEST, LONGEST_NUMBER = 100_000, 50, 30
 _TAGS = [
@@ -139,12 +139,9 @@ def value(dotted: str, path: str | Path = FILE, *, one_of: tuple) -> Any:
     section, *keys = dotted.split(".")
     choice: Any = _section(section, path)
     place = _files_of(files(path), section, keys)
-    for depth, key in enumerate(keys):
+    for key in keys:
         if not isinstance(choice, dict) or key not in choice:
             names = choice if isinstance(choice, dict) else ()
-            above = ".".join([section, *keys[:depth]])
-            if old := _old_name(above, key, names):
-                raise ValueError(f"{place}: {_renamed(f'{above}.{old}')}")
             near = _nearest(key, names)
             remedy = f"is {near} meant?" if near else f"add it (one of {_listed(one_of)})"
             raise ValueError(f"{place}: {dotted} is missing; {remedy}")
@@ -152,7 +149,7 @@ def value(dotted: str, path: str | Path = FILE, *, one_of: tuple) -> Any:
     if not any(type(choice) is type(allowed) and choice == allowed for allowed in one_of):
         raise ValueError(
             f"{place}: {dotted} is {_shown(choice)} but must be one of "
-            f"{_listed(one_of)}{_choice_remedy(dotted, choice, one_of)}"
+            f"{_listed(one_of)}{_choice_remedy(choice, one_of)}"
         )
     return choice
 
@@ -382,12 +379,9 @@ def _sentences(model: type[Section], section: str, errors: list) -> Iterator[tup
         if error["type"] == "extra_forbidden":
             *above, name = error["loc"]
             old = _dotted(section, error["loc"])
-            if renamed.new_name(old, renamed.PARAMETERS) != old:
-                explained.add(renamed.new_name(old, renamed.PARAMETERS))
-                yield error["loc"], _renamed(old)
-                continue
-            if old in renamed.RETIRED:
-                yield error["loc"], f"{old} was retired: {renamed.RETIRED[old]}; remove the line"
+            if old in RENAMED:
+                explained.add(RENAMED[old])
+                yield error["loc"], f"{old} was renamed to {RENAMED[old]}"
                 continue
             parent = _at(model, tuple(above))
             is_section = isinstance(parent, type) and issubclass(parent, Section)
@@ -408,24 +402,14 @@ def _dotted(section: str, location: Sequence) -> str:
     return ".".join(map(str, (section, *location)))
 
 
-def _renamed(old: str) -> str:
-    return f"{old} was renamed to {renamed.new_name(old, renamed.PARAMETERS)}"
-
-
 def _no_section(name: str) -> str:
-    if renamed.new_name(name, renamed.PARAMETERS) != name:
-        return _renamed(name)
+    if name in RENAMED:
+        return f"{name} was renamed to {RENAMED[name]}"
+    if name in PAPERS_SECTIONS:
+        return f"{name} has moved to {PAPERS}; delete it here"
     near = _nearest(name, SECTIONS)
     remedy = f"did you mean {near}?" if near else "remove it, or begin its name with x_ if it is yours"
     return f"{name} is no section; {remedy}"
-
-
-def _old_name(section: str, name: str, names) -> str:
-    """Which of the section's names is the old one of `name`; "" where none is."""
-    today = f"{section}.{name}"
-    return next(
-        (old for old in names if renamed.new_name(f"{section}.{old}", renamed.PARAMETERS) == today), ""
-    )
 
 
 def _complaint(section: str, error: dict) -> str:
@@ -437,7 +421,7 @@ def _complaint(section: str, error: dict) -> str:
         return f"is {shown} but must be {_TYPES[kind]}"
     if kind == "literal_error":
         choices = context["expected"]
-        remedy = _choice_remedy(_dotted(section, error["loc"]), error["input"], choices)
+        remedy = _choice_remedy(error["input"], choices)
         return f"is {shown} but must be one of {choices.replace(chr(39), '')}{remedy}"
     if kind in ("too_short", "string_too_short"):
         counted = "entries" if kind == "too_short" else "characters"
@@ -467,10 +451,8 @@ def _nearest(name: Any, names) -> str:
     return next(iter(matches), "")
 
 
-def _choice_remedy(dotted: str, value: Any, choices) -> str:
-    """How a value that is none of the choices is mended: its new name, or the choice most like it."""
-    if isinstance(value, str) and (dotted, value) in renamed.CHOICES:
-        return f"; {value} was renamed to {renamed.CHOICES[dotted, value]}"
+def _choice_remedy(value: Any, choices) -> str:
+    """The choice that is most like a value that is none of them."""
     words = re.findall(r"'([^']*)'", choices) if isinstance(choices, str) else choices
     near = _nearest(value, words)
     return f"; did you mean {near}?" if near else ""

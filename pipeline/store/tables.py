@@ -10,8 +10,6 @@ from typing import NamedTuple
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline.store import renamed
-
 
 class Column(NamedTuple):
     """`low` and `high` are checked whenever the column is written or read.
@@ -47,23 +45,6 @@ def arrow(schema: Schema) -> pa.Schema:
         for name, kind, unit, meaning, _, _, nullable in schema.columns
     ]
     return pa.schema(fields, {"schema": schema.name, "schema_version": str(schema.version)})
-
-
-def under_new_names(schema: Schema, table: pa.Table) -> pa.Table:
-    """A table of an earlier version with today's names, if its columns were renamed since and nothing else
-    changed; any other table as it is."""
-    metadata = table.schema.metadata or {}
-    version = metadata.get(b"schema_version", b"").decode()
-    if metadata.get(b"schema", b"").decode() != schema.name or not version.isdigit():
-        return table
-    old = renamed.columns(schema.name)
-    names = [old.get(name, name) for name in table.column_names]
-    changed = names != table.column_names
-    same_columns = sorted(names) == sorted(column.name for column in schema.columns)
-    if int(version) >= schema.version or not changed or not same_columns:
-        return table
-    today = metadata | {b"schema_version": str(schema.version).encode()}
-    return table.rename_columns(names).replace_schema_metadata(today)
 
 
 def check(path: str | Path, schema: Schema, table: pa.Table, remedy: str) -> None:

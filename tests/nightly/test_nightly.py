@@ -24,11 +24,9 @@ from pipeline.nightly import (
     remembered,
     reporting,
     screening,
-    sweeping,
     watch,
 )
 from pipeline.report.nightly.production import Champion
-from pipeline.store import artifacts
 from tests.nightly.toy_nights import Project, entered
 
 TOMORROW = datetime.timedelta(days=1)
@@ -492,59 +490,6 @@ def test_killed_at_twenty_random_moments_the_champion_is_whole_and_the_next_nigh
 
 
 @pytest.mark.slow
-def test_a_sweep_runs_every_point_beside_the_working_tree_and_tabulates_it(project):
-    text = (project.folder / "learn.py").read_text()
-    (project.folder / "learn.py").write_text(
-        text.replace(
-            "sum(values) / len(values)",
-            "sum(values) / len(values) + "
-            "__import__('yaml').safe_load(pathlib.Path('params.yaml').read_text())['shift']",
-        )
-    )
-    parameters = json.loads((project.folder / "params.yaml").read_text()) | {"shift": 0}
-    (project.folder / "params.yaml").write_text(json.dumps(parameters, indent=1))
-    (project.folder / "dvc.yaml").write_text(
-        (project.folder / "dvc.yaml")
-        .read_text()
-        .replace("deps: [learn.py,", "params: [shift]\n    deps: [learn.py,")
-    )
-    project.run("git", "commit", "-qam", "a parameter")
-    before = (project.folder / "datasets/learn/model.json").read_bytes()
-    swept = project.beadline("sweep", "-S", "shift=1,2", "--target", "learn", "--metric", "learn:mean")
-    assert swept.returncode == 0, swept
-    table = (project.folder / "reports/sweep.csv").read_text().splitlines()
-    assert table == ["experiment,shift,learn:mean", "sweep-shift-1,1,12.0", "sweep-shift-2,2,13.0"]
-    assert (
-        project.folder / "datasets/learn/model.json"
-    ).read_bytes() == before and "lowest at shift 1, 12" in (
-        project.folder / "reports/sweep.html"
-    ).read_text()
-    assert project.run("git", "diff", "--stat").stdout == ""
-
-
-def test_a_sweep_finds_the_file_of_each_key(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("params.yaml").write_text("learn: {window: null}")
-    Path("params.expert.yaml").write_text("learn: {seed: 1}")
-    Path("dvc.yaml").write_text("stages: {learn: {cmd: learn}}")
-    artifacts.write_metrics("learn", {"cost": 1.0})
-    asked = []
-    monkeypatch.setattr(
-        sweeping, "dvc", lambda *words, log: asked.append(words[words.index("--set-param") : -1])
-    )
-    monkeypatch.setattr(sweeping, "git", lambda *words: '{"cost": 1}')
-    table = sweeping.sweep(["params.expert.yaml:learn.seed=1,2", "learn.window=3"], "learn", "learn:cost")
-    assert asked == [
-        ("--set-param", f"params.expert.yaml:learn.seed={seed}", "--set-param", "params.yaml:learn.window=3")
-        for seed in (1, 2)
-    ]
-    assert table.splitlines()[0].split() == ["experiment", "learn.seed", "learn.window", "learn:cost"]
-    with pytest.raises(
-        ValueError, match=r"with a key of params.yaml or params.expert.yaml, found params.yaml:learn.seed=1; "
-    ):
-        sweeping.grid(["params.yaml:learn.seed=1"])
-
-
 @pytest.mark.parametrize("file", ["params.yaml", "params.expert.yaml"])
 def test_a_change_of_either_file_of_parameters_is_something_new(tmp_path, monkeypatch, file):
     monkeypatch.chdir(tmp_path)
@@ -559,11 +504,3 @@ def test_a_change_of_either_file_of_parameters_is_something_new(tmp_path, monkey
     assert depended_on() == before
     Path(file).write_text("learn: {other: 2}")
     assert depended_on() != before
-
-
-def test_a_sweep_over_a_key_that_is_not_there_is_refused(project):
-    refused = project.beadline("sweep", "-S", "colour=1,2", "--target", "learn", "--metric", "learn:mean")
-    assert (
-        refused.returncode == 1
-        and "expected KEY=VALUE,VALUE with a key of params.yaml, found colour=1,2" in refused.stderr
-    )

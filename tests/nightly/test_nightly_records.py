@@ -1,7 +1,6 @@
-"""Files that nights of version 0.1 wrote are read as today's records, and written again byte for byte."""
+"""Files that nights wrote are read as records, and written again byte for byte."""
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -9,39 +8,35 @@ from pipeline.nightly.remembered import DriftMemory, Remembered
 from pipeline.report.nightly.production import ChampionState
 from pipeline.report.nightly.record import Night
 from pipeline.report.shared.night import Alarm
+from tests.report.test_nightly_page import ALARM, FIRST, STATE
 
-# written by version 0.1 on the toy project: a first champion, one promoted, rolled back, its drift accepted
-OLD = Path(__file__).parent / "version_0_1"
-
-
-def text(data) -> str:
-    return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
-
-
-def test_a_champion_file_of_version_0_1_is_read_and_written_byte_for_byte():
-    before = (OLD / "champion.json").read_text(encoding="utf-8")
-    state = ChampionState.read(json.loads(before))
-    assert text(state.written()) == before
-    events = [line.event for line in state.history]
-    assert events == ["first champion", "promoted", "rolled back", "drift accepted"]
-    assert state.history[2].replaced == state.history[1].champion.installed.files
-
-
-def test_nights_of_version_0_1_are_read_and_written_byte_for_byte():
-    before = (OLD / "nights.json").read_text(encoding="utf-8")
-    nights = [Night.read(row) for row in json.loads(before)]
-    rows = [night.written() for night in nights]
-    # the figures of a machine belong to the temperature loop, whichever loop raised the alarm
-    assert text(rows) == before
-    outcomes = [night.outcome for night in nights]
-    assert outcomes == ["promoted", "nothing new", "kept", "failed", "promoted", "kept"]
-    assert [alarm.cause for alarm in nights[-1].drift.of("toy").alarms] == ["the gain has changed"]
+CAUSE = {"cause": "the gain has changed", "sigmas": 9.0, "consequences": ["it settles elsewhere"]}
+LAST = {
+    "night": 14,
+    "success": "2030-01-03T21:00:00+00:00",
+    "inputs": "a92d03c9",
+    "unpushed": False,
+    "recordings": {"toy": {"datasets/raw/toy/fifth.csv": "e0b04046"}},
+    "drift": {
+        "pending": ["toy: k"],
+        "alarms": [{"loop": "toy", "key": "toy: k", "recording": "datasets/raw/toy/fifth.csv"} | CAUSE],
+        "drifted": {"toy": ["datasets/raw/toy/fifth.csv"]},
+        "night": 3,
+    },
+    "hashes": {"dvc.yaml": [123, 1700000000000000000, 42, "0" * 64]},
+}
 
 
-def test_what_version_0_1_remembered_is_read_and_written_byte_for_byte():
-    before = (OLD / "last.json").read_text(encoding="utf-8")
-    last = Remembered.read(json.loads(before))
-    assert text(last.written()) == before
+@pytest.mark.parametrize(("record", "fields"), [(ChampionState, STATE), (Night, FIRST), (Night, ALARM)])
+def test_what_a_record_writes_is_read_and_written_byte_for_byte(record, fields):
+    written = json.dumps(record.read(fields).written())
+    assert json.dumps(record.read(json.loads(written)).written()) == written
+    assert record.read(json.loads(written)) == record.read(fields)
+
+
+def test_what_a_night_remembers_is_read_and_written_byte_for_byte():
+    last = Remembered.read(json.loads(json.dumps(LAST)))
+    assert json.dumps(last.written()) == json.dumps(LAST)
     assert last.drift.drifted == {"toy": ["datasets/raw/toy/fifth.csv"]}
 
 

@@ -48,7 +48,7 @@ def commissioned(folder, loop):
         artifacts.write_arrays(champion / "identify_plant/plant.parquet", "plant", 1, plant.stored([model]))
         artifacts.write_json(
             champion / "tune_weights/weights.json",
-            {"practical": {"q": [1.0, 1.0], "r": [1.0, 1.0], "observer_tau": 1.0}},
+            {"contestants": {"subspace_lqg": {"effort_weight": 1.0, "observer_tau": 1.0, "integral": 0.02}}},
         )
         artifacts.write_json(
             champion / screening.REFERENCE,

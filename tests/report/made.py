@@ -389,6 +389,12 @@ def model(machine):
     }
 
 
+def accepted(**fields):
+    """What `accept` keeps, without figures; `fields` take the place of its own."""
+    run = {"accepted": {"on": "2026-11-20", "commit": "0a1b2c3d"}, "machine": {}, "winner": None}
+    return run | {"metrics": {}, "params": {}, "hashes": {}, "figures": {}} | fields
+
+
 def write(root, *, samples=400, recording="good.mcap"):
     """Every artifact below `root`, which is the working directory."""
     machine = declared(root)
@@ -436,6 +442,16 @@ def write(root, *, samples=400, recording="good.mcap"):
         data / "tune_weights/weights.json",
         {"contestants": {"subspace_lqg": {"q": [1.0, 2.0], "r": [0.1, 0.2], "cost": 2.0, "at_bound": []}}},
     )
+    search = {
+        "contestant": ["subspace_lqg"] * 3,
+        "evaluation": [1, 2, 3],
+        "cost": [None, 3.0, 2.0],
+        "incumbent": [None, 3.0, 2.0],
+        "values": ["{}"] * 3,
+        "chosen": [False, False, True],
+        "failure": ["unstable", "", ""],
+    }
+    artifacts.write_table(data / "tune_weights/history.parquet", tables.TUNING, search)
     artifacts.write_json(data / "ingest/printer_pid.json", {"heaters": [PRINTER_PID]})
     folder = data / "evaluate_temperature"
     artifacts.write_table(folder / "cases.parquet", tables.CASES, cases())

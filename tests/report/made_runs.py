@@ -89,15 +89,3 @@ def parameters(**tune):
         "params.yaml": "# what the owner sets\n" + yaml.safe_dump({"plant": {"sample_time_s": 1.0}}),
         "params.expert.yaml": yaml.safe_dump(expert),
     }
-
-
-def lock(**stages):
-    """A dvc.lock: {stage: ({path that it reads: md5}, {path that it makes: md5})}."""
-    text = "schema: '2.0'\nstages:\n"
-    for stage, (reads, makes) in stages.items():
-        text += f"  {stage}:\n    cmd: python -m stages.{stage}\n"
-        for kind, paths in (("deps", reads), ("outs", makes)):
-            text += f"    {kind}:\n" + "".join(
-                f"    - path: {path}\n      hash: md5\n      md5: {md5}\n" for path, md5 in paths.items()
-            )
-    return text

@@ -8,7 +8,7 @@ import pytest
 from tests.report.conftest import MACHINE
 
 PAGES = ("index", "temperature", "identification", "deposition", "setpoint", "certificate")
-BESIDE = ("difference", "workflow", "provenance", "words")
+BESIDE = ("runs", "words")
 # name, width and theme of the pages that are loaded once for all tests that look at them
 WIDE = [(name, 1280, "light") for name in (*PAGES, *BESIDE)]
 DARK = [(name, 1024, "dark") for name in PAGES]
@@ -93,10 +93,11 @@ def test_a_table_sorts_by_number_both_ways_and_back_and_what_has_no_value_stands
     assert head.get_attribute("aria-sort") is None and cells.all_inner_texts() == before
 
 
-def test_a_table_sorts_by_text_and_the_deposition_scores_by_their_error(open_page):
-    page = open_page("provenance")
+def test_a_table_sorts_by_text_in_the_list_of_files_at_the_foot_of_a_page(open_page):
+    page = open_page("words")
+    page.locator(".prov summary").click()
     paths = page.locator(".prov tbody td:first-child")
-    page.locator(".prov th button", has_text="Artifact").click()
+    page.locator(".prov th button", has_text="File").click()
     assert paths.all_inner_texts() == sorted(paths.all_inner_texts(), key=str.lower)
 
 

@@ -4,7 +4,6 @@ that its figures are no dependency of the pages."""
 import re
 from pathlib import Path
 
-from pipeline.report.shared import provenance
 from pipeline.report.shared.verdict import FAILED, PASSED, Missing, ReportRules
 from pipeline.report.temperature.verdict import NEVER, decide
 from pipeline.store import artifacts, params
@@ -96,12 +95,6 @@ def test_a_broken_file_of_the_night_is_said_so(project):
 def test_text_of_the_night_is_escaped(project):
     night(alarms=[{"loop": "temperature", "cause": "<script>alert(1)</script>"}])
     assert "<script>alert" not in INDEX.read_text() + TEMPERATURE.read_text()
-
-
-def test_a_later_night_is_no_change_of_what_the_pages_were_made_from(project):
-    night(figures=FIGURES)
-    artifacts.write_json(NIGHT, {"run": "night-0004"})
-    assert not any("nightly.json" in sentence for check in provenance.checks() for sentence in check.wrong)
 
 
 def test_drift_is_judged_by_the_night_alone_and_a_drifted_machine_fails(project):

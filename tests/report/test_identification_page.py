@@ -174,11 +174,7 @@ def test_nothing_identified_reads_as_open_never_as_passed(project):
 def test_every_output_stands_beside_what_it_must_beat_and_the_accepted_run(project):
     artifacts.write_json(
         "reports/accepted.json",
-        {
-            "metrics": {"identify_plant": {"fit_holdout": {"zone_1": 90.0, "zone_2": 70.0}}},
-            "hashes": {},
-            "params": {},
-        },
+        made.accepted(metrics={"identify_plant": {"fit_holdout": {"zone_1": 90.0, "zone_2": 70.0}}}),
     )
     text = page()
     # 95 and 91 % ahead against 20 and -10 % of holding the last value

@@ -23,24 +23,23 @@ INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT = (
     for name in ("index", "temperature", "identification", "deposition", "setpoint")
 )
 CERTIFICATE, PAPERS = Path("reports/certificate.html"), Path("reports/papers.html")
-DIFFERENCE, WORKFLOW, PROVENANCE, WORDS = BESIDE = tuple(
-    Path(f"reports/{name}.html") for name in ("difference", "workflow", "provenance", "words")
-)
+RUNS, WORDS = BESIDE = Path("reports/runs.html"), Path("reports/words.html")
 PAGES = (INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT, CERTIFICATE, PAPERS, *BESIDE)
 
 
 class Page(HTMLParser):
-    """Tags with attributes, ids, text, and the addresses that a page points
-    to; every white space in the text is a plain one."""
+    """Tags with attributes, ids, text above the list of files at the foot, and the addresses that a page
+    points to; every white space in the text is a plain one."""
 
     def __init__(self, path):
         super().__init__()
         self.tags, self.ids, self.links, self.words = [], [], [], []
-        self.style = self.hidden = False  # or script
+        self.style = self.hidden = self.foot = False  # or script
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag, attributes):
         found, self.style = dict(attributes), tag in ("style", "script")
+        self.foot |= found.get("class") == "prov"
         # what only a script shows, beside its word
         self.hidden = found.get("class") == "meanings" or (self.hidden and tag in ("div", "dt", "dd"))
         self.tags.append((tag, found))
@@ -52,7 +51,7 @@ class Page(HTMLParser):
         ]
 
     def handle_data(self, data):
-        self.words += [] if self.style or self.hidden else [data]
+        self.words += [] if self.style or self.hidden or self.foot else [data]
 
     @property
     def text(self):
@@ -139,13 +138,13 @@ def test_a_failed_rule_fails_the_verdict_and_its_row_only(project):
 @pytest.mark.parametrize("how", ["missing", "broken"])
 def test_an_artifact_that_is_missing_or_broken_is_said_so_in_its_place(project, path, how):
     main()
-    whole = "".join(page.read_text() for page in (INDEX, TEMPERATURE, PROVENANCE))
+    whole = "".join(page.read_text() for page in (INDEX, TEMPERATURE))
     if how == "missing":
         Path(path).unlink()
     else:
         Path(path).write_bytes(b"{")
     main()
-    text = "".join(page.read_text() for page in (INDEX, TEMPERATURE, PROVENANCE))
+    text = "".join(page.read_text() for page in (INDEX, TEMPERATURE))
     assert f"<tr><td><code>{path}</code></td>" in text
     assert f"<tr><td><code>{path}</code></td>" not in whole
     assert path not in figures()["read"]
@@ -297,21 +296,21 @@ def test_a_hundred_recordings_with_their_findings_stay_within_the_sizes(project)
 def test_first_run_equal_runs_and_a_moved_figure(project):
     main()
     assert "First run: nothing to compare with." in Page(INDEX).text
-    accepted = {
-        "figures": figures()["figures"],
-        "accepted": {"on": "2026-11-20", "commit": "0a1b2c3d"},
-        "metrics": {path.stem: artifacts.read_json(path) for path in Path("reports/metrics").glob("*.json")},
-        "params": made.params.read("params.yaml"),
-        "hashes": {str(p): artifacts.sha256(p) for p in Path("datasets").rglob("*") if p.is_file()}
+    accepted = made.accepted(
+        figures=figures()["figures"],
+        winner="subspace_lqg",
+        metrics={path.stem: artifacts.read_json(path) for path in Path("reports/metrics").glob("*.json")},
+        params=made.params.read("params.yaml"),
+        hashes={str(p): artifacts.sha256(p) for p in Path("datasets").rglob("*") if p.is_file()}
         | {f: artifacts.sha256(f) for f in ("pipeline", "stages")},
-    }
+    )
     artifacts.write_json("reports/accepted.json", accepted)
     main()
     page = Page(INDEX).text
     # deposition has no figures here
     assert "No figure moved beyond its noise. Nothing else changed." in page
     assert "accepted run of 2026-11-20" in page and "first run" not in page
-    assert "accepted on 2026-11-20 at commit 0a1b2c3d" in Page(DIFFERENCE).text
+    assert "This run beside the accepted one of 2026-11-20" in Page(RUNS).text
     assert "Since 2026-11-20" in Page(TEMPERATURE).text
 
     change(
@@ -329,9 +328,9 @@ def test_first_run_equal_runs_and_a_moved_figure(project):
     moved = "settled error, worst zone +0.35 °C · worse; settling"
     assert re.search(r"2 of \d+ figures moved beyond their noise. Changed: .*one parameter, code", page)
     assert re.search(f"Temperature 2 of \\d+ figures moved: {re.escape(moved)} ", page)
-    page = Page(DIFFERENCE).text
-    assert "report.disk_margin 0.4 → 0.41" in page and re.search("Code changed", page)
-    assert "Within noise: overshoot" in page
+    page = Page(RUNS).text
+    assert "report.disk_margin 0.4 0.41" in page
+    assert re.search("Overshoot at most .* within noise", page)
     page = Page(TEMPERATURE).text
     assert "+0.35 °C · worse" in page and "within noise" in page
 
@@ -340,9 +339,18 @@ def test_a_broken_accepted_run_is_said_so(project):
     Path("reports/accepted.json").write_text("{")
     main()
     assert "The accepted run cannot be read." in Page(INDEX).text
-    Path("reports/accepted.json").write_text("{}")
+
+
+def test_an_accepted_run_of_another_version_is_refused_in_one_sentence_with_the_remedy(project):
+    run = made.accepted()
+    del run["winner"]
+    artifacts.write_json("reports/accepted.json", run)
     main()
-    assert "First run: nothing to compare with." in Page(INDEX).text
+    sentence = (
+        "The accepted run cannot be read. reports/accepted.json was written by another version of beadline; "
+        "accept a run of this version with ./run beadline accept."
+    )
+    assert sentence in Page(INDEX).text and sentence in Page(RUNS).text
 
 
 def test_a_signal_of_another_schema_is_shown_as_failed_not_read(project):
@@ -359,7 +367,7 @@ def test_a_signal_of_another_schema_is_shown_as_failed_not_read(project):
 def test_a_page_needs_no_simulator_and_starts_fast():
     heavy = ("jax", "equinox", "scipy.stats", "pipeline.setpoint.simulator", "pipeline.temperature.plant")
     said = (
-        "import sys, stages.report, pipeline.report.nightly.page, pipeline.report.runs.trend; "
+        "import sys, stages.report, pipeline.report.nightly.page, pipeline.report.runs.commits; "
         f"print([name for name in {heavy!r} if name in sys.modules])"
     )
     done = subprocess.run(

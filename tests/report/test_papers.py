@@ -48,7 +48,7 @@ def results(name):
 
 def sources(metrics=METRICS):
     gap = Missing("not measured", "nothing ran")
-    return Sources(None, metrics, {"course": gap, "classified": gap}, {}, {}, None, "", {})
+    return Sources(None, metrics, {"course": gap, "classified": gap}, {}, {}, None, "")
 
 
 # ---- nothing of a paper is left out

@@ -17,7 +17,7 @@ from pipeline.setpoint.simulator import reward
 from pipeline.setpoint.workflow.tables import PATHS, harm_bar
 from pipeline.store import artifacts, params
 from stages.report import main
-from tests.report import made_setpoint
+from tests.report import made, made_setpoint
 from tests.report.test_pages import Page, change, figures
 
 PAGE, INDEX = Path("reports/setpoint.html"), Path("reports/index.html")
@@ -150,7 +150,6 @@ def test_what_is_missing_or_broken_is_said_in_its_place(project, paths, how):
         broken = (
             f"{path} is not whole JSON" if name.endswith("json") else f"{path} is not a whole Parquet file"
         )
-        # the provenance has a page of its own
         assert (
             text.count(
                 broken if how == "broken" else f"{name} of {stage} is not there. Run ./run dvc repro {stage}."
@@ -212,11 +211,7 @@ def test_the_card_sets_the_default_beside_another_and_doing_nothing_where_each_f
 
 
 def test_how_a_figure_moved_since_the_accepted_run_is_said(project):
-    accepted = {
-        "metrics": {"evaluate_setpoint": artifacts.read_metrics("evaluate_setpoint")},
-        "params": {},
-        "hashes": {},
-    }
+    accepted = made.accepted(metrics={"evaluate_setpoint": artifacts.read_metrics("evaluate_setpoint")})
     cases = accepted["metrics"]["evaluate_setpoint"]["our agent"]["paper"]
     cases["accuracy 0.7"]["settled"] = 97.0
     cases["accuracy 0.9"] = {

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import pytest
 from pydantic import Field
 
-from pipeline.store import params, renamed
+from pipeline.store import params
 from pipeline.store.params import Execution, Section
 from pipeline.temperature.workflow.settings import Plant
 
@@ -407,6 +407,11 @@ def test_the_digest_is_the_same_wherever_a_key_stands_and_another_with_another_v
         ),
         ("", "trackng: {}", "params.expert.yaml: trackng is no section; did you mean tracking?"),
         (
+            "",
+            "reproduce_study: {}",
+            "params.expert.yaml: reproduce_study has moved to datasets/papers/params.yaml; delete it here",
+        ),
+        (
             "learn: {}",
             "panl: {}",
             "params.yaml: learn was renamed to learn_kernel\n"
@@ -417,12 +422,26 @@ def test_the_digest_is_the_same_wherever_a_key_stands_and_another_with_another_v
 def test_a_section_that_nothing_reads_is_refused_whatever_section_is_loaded(
     load, monkeypatch, owner, expert, sentence
 ):
-    monkeypatch.setattr(renamed, "PARAMETERS", {"learn": "learn_kernel"})
+    monkeypatch.setattr(params, "RENAMED", {"learn": "learn_kernel"})
     texts = f"{OWNER}{owner}\n", f"{EXPERT}{expert}\n"
     with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
         load(texts[0], expert=texts[1])
     with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
         params.value("learn_kernel.method", one_of=("window",))
+
+
+def test_a_renamed_key_is_refused_with_its_new_name_alone(load, monkeypatch):
+    monkeypatch.setattr(params, "RENAMED", {"learn_kernel.steps": "learn_kernel.horizon"})
+    assert "horizon: " in GOOD
+    with pytest.raises(
+        ValueError, match=r"^params.yaml: learn_kernel.steps was renamed to learn_kernel.horizon$"
+    ):
+        load(GOOD.replace("horizon: ", "steps: "))
+
+
+def test_every_new_name_is_a_key_of_today_and_no_old_one_is(root):
+    for old, new in params.RENAMED.items():
+        assert params.home(new, root / params.FILE) and not params.home(old, root / params.FILE)
 
 
 def test_a_users_own_section_begins_with_x(load):

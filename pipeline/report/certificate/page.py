@@ -51,6 +51,7 @@ def render(sources: Sources, verdict: Verdict) -> str:
     return page.render(
         "certificate.html",
         here="certificate",
+        sources=sources,
         title="Certificate",
         head=head(shown, lines),
         missing_certificate=None if whole else shown,

@@ -74,6 +74,7 @@ def render(sources: Sources) -> str:
     return page.render(
         "deposition.html",
         here="deposition",
+        sources=sources,
         title=f"Deposition: {judged.decision.rstrip('.')}",
         verdict=judged,
         heads_of_rules=HEADS,

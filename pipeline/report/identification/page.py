@@ -56,6 +56,7 @@ def render(sources: Sources) -> str:
     return page.render(
         "identification.html",
         here="identification",
+        sources=sources,
         title=f"Identification: {judged.decision.rstrip('.')}",
         trust=judged,
         ahead=ahead[:1].upper() + ahead[1:],

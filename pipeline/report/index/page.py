@@ -47,6 +47,7 @@ def render(sources: Sources, judged: Judgement) -> str:
     return page.render(
         "index.html",
         here="index",
+        sources=sources,
         title=headline.decision(loops, quick=sources.quick).rstrip("."),
         decision=headline.decision(loops, quick=sources.quick),
         state=headline.state(loops),

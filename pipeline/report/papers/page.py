@@ -69,6 +69,7 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
     return page.render(
         "papers.html",
         here="papers",
+        sources=sources,
         title="Three papers beside us",
         decision=decision([one.paper for one in shown]),
         verdicts=VERDICTS,

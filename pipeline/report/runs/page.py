@@ -1,213 +1,224 @@
-"""The page of the runs: one table that sorts, a scatter of two columns, two runs side by side, the sweeps.
+"""Two runs side by side: figures of the three loops with their bands, parameters that differ, curves."""
 
-The table and the sweeps need no script. What the script needs of a run (figures with their bands, parameters,
-reasons) stands in the page once; curves lie in files beside it and are loaded when two runs are compared.
-"""
-
-import base64
-import hashlib
-import math
-from collections import Counter
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.runs import curves, sweep
-from pipeline.report.runs.collected import KINDS, Collected, Run, folders, lock_now, varied
-from pipeline.report.runs.figures import LOOPS, Cell, Column, cell, rounded
-from pipeline.report.runs.sweep import Sweep
-from pipeline.report.shared import page
-from pipeline.report.shared.digits import count, shortened
+from pipeline.report.about.changes import ANOTHER, changes
+from pipeline.report.runs.curves import Curve, curves, restored
+from pipeline.report.runs.figures import LOOPS, Measured, asked, measured
+from pipeline.report.shared import charts, page
+from pipeline.report.shared.difference import accepted_on, changed_parameters, move
+from pipeline.report.shared.digits import MINUS, THIN, band, count, declared, quantity, short, with_unit
+from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.verdict import FAILED, Figure, Missing, Question, ReportRules, row_places, state
 from pipeline.report.temperature.contestants import heading
-from pipeline.report.viewer.packed import script_safe
-from pipeline.report.viewer.page import LIBRARY, VENDOR, library
+from pipeline.report.temperature.judgement import Judgement
 
-FOLDER = Path("reports/runs")
-# columns of parameters that the table has room for, sweeps that are drawn, and letters of a subject
-MOST_PARAMETERS, MOST_SWEEPS, SUBJECT = 6, 12, 120
-WORDS = {
-    "accepted": "accepted",
-    "night": "night",
-    "experiment": "experiment",
-    "revision": "committed",
-    "files": "not committed",
-}
+# parameters that the page lists
+MOST_PARAMETERS = 200
+
+
+class Run(NamedTuple):
+    """A run: its name, {stage: metrics}, the sections of its parameters, its curves."""
+
+    name: str
+    metrics: Mapping[str, Any]
+    parameters: Mapping[str, Any]
+    curves: Mapping[str, Curve] = {}
+
+
+class Cell(NamedTuple):
+    """A figure of one run: value, band, whether it is beyond its limit."""
+
+    text: str
+    band: str = ""
+    bad: bool = False
 
 
 class Row(NamedTuple):
-    """A run in the table. `missing`: why figures are not there, each reason once."""
+    """A figure of both runs."""
 
-    run: Run
-    name: str
-    kind: str
-    verdicts: list[str]
-    controllers: str
-    cells: list[Cell]
-    parameters: list[str]
-    missing: str
+    title: str
+    limit: str
+    cells: tuple[Cell, Cell]
+    change: str
+    moved: bool = False
 
 
-class Drawn(NamedTuple):
-    """A sweep in words and as a picture."""
+class Panel(NamedTuple):
+    """A curve of both runs."""
 
-    metric: str
-    over: str
-    picture: Markup
-    finding: str
-    caption: str
+    title: str
+    svg: Markup
 
 
-class Pages(NamedTuple):
-    """The text of runs.html, and the files of the folder runs/ beside it."""
-
-    text: str
-    files: dict[str, str]
-
-
-def render(found: Collected, asked: Sequence[Column], sweeps: Sequence[Sweep]) -> Pages:
-    """runs.html and what it loads."""
-    runs = found.runs
-    packed = curves.packed(runs, folders(lock_now()))
-    keys = _parameter_columns(runs)
-    script = page.environment().get_template("runs.js").render().strip()
-    text = page.render(
+def render(sources: Sources, judged: Judgement, metrics: Mapping[str, Any]) -> str:
+    """The text of runs.html: this run beside the accepted one. `metrics` are those of the report itself."""
+    now = {stage: found for stage, found in sources.metrics.items() if not isinstance(found, Missing)}
+    this = Run("This run", {**now, "report": metrics}, sources.declared.everything, curves(sources.tables))
+    told = changes(sources, judged)
+    day = accepted_on(sources)
+    return page.render(
         "runs.html",
         here="runs",
-        title=f"Runs: {count(len(runs), 'run')}",
-        kinds=_kinds(runs),
-        asked=asked,
-        keys=keys,
-        loops=LOOPS,
-        rows=[_row(run, asked, keys) for run in reversed(runs)],
-        troubles=found.troubles,
-        sweeps=[_drawn(each) for each in reversed(sweeps[-MOST_SWEEPS:])],
-        more_sweeps=max(len(sweeps) - MOST_SWEEPS, 0),
-        data=Markup(script_safe(data(runs, asked, packed))),
-        own=Markup(script),
-        own_digest=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-        library_style=Markup((VENDOR / "uPlot.min.css").read_text(encoding="utf-8").strip()),
-    )
-    return Pages(text, {LIBRARY: library(), **packed.files})
-
-
-def name_of(run: Run) -> str:
-    """What a run is called: a night's or an experiment's name, else its commit."""
-    return run.name or run.commit[:8] or "files"
-
-
-def _kinds(runs: Sequence[Run]) -> str:
-    counted = Counter(run.kind for run in runs)
-    words = {"accepted": "accepted run", "night": "night", "experiment": "experiment"}
-    parts = [count(counted[kind], word) for kind, word in words.items() if counted[kind]]
-    rest = counted["revision"] + counted["files"]
-    return ", ".join([*parts, *([f"{count(rest, 'run')} that nobody accepted"] if rest else [])])
-
-
-def _parameter_columns(runs: Sequence[Run]) -> list[str]:
-    """Parameters that the table shows: those in which experiments differ from where they began, the most
-    frequent first."""
-    by_commit = {run.commit: run for run in runs if run.commit}
-    changed: Counter[str] = Counter()
-    tried = [run for run in runs if run.kind == "experiment"]
-    for run in tried:
-        base = by_commit.get(run.base)
-        changed.update(varied([run, base] if base else tried))
-    keys = [key for key, _ in sorted(changed.items(), key=lambda pair: (-pair[1], pair[0]))]
-    return keys[:MOST_PARAMETERS]
-
-
-# ---- the table
-
-
-def _row(run: Run, asked: Sequence[Column], keys: Sequence[str]) -> Row:
-    reasons = dict.fromkeys(run.measured.missing.values())
-    if run.no_parameters and keys:
-        reasons |= {run.no_parameters: None}
-    who = [heading(name) for name in run.measured.controllers.values() if name]
-    unset = "not measured" if run.no_parameters else "not set"
-    return Row(
-        run,
-        name_of(run),
-        WORDS[run.kind],
-        [run.measured.verdicts.get(loop, "none kept") for loop in LOOPS],
-        " · ".join(who) or "none kept",
-        [cell(run.measured.figures.get(column.key), column.question) for column in asked],
-        [run.parameters.get(key, unset) for key in keys],
-        "; ".join(reasons),
+        sources=sources,
+        title="This run beside the accepted one",
+        heading=f"This run beside the accepted one{f' of {day}' if day else ''}",
+        lead=f"{told.strong} {told.text}".strip(),
+        remedy="",
+        **_parts(accepted(sources), this, sources.declared.rules),
     )
 
 
-# ---- what the script reads
+def accepted(sources: Sources) -> Run | None:
+    """The accepted run; None without one that can be read."""
+    run = sources.accepted
+    if not isinstance(run, dict):
+        return None
+    report = {
+        "figures": run["figures"],
+        "verdict": {"winner": run["winner"]},
+        "verdicts": run.get("verdicts"),
+    }
+    return Run(
+        "Accepted run", {**run["metrics"], "report": report}, run["params"], restored(run.get("curves"))
+    )
 
 
-def data(runs: Sequence[Run], asked: Sequence[Column], packed: curves.Packed) -> dict[str, Any]:
-    """Columns, and of each run its figures, its parameters as changes to the run before it, and its reasons;
-    texts that come often stand once, and are numbered."""
-    texts: dict[str, int] = {}
+def render_two(a: Run, b: Run, rules: ReportRules) -> str:
+    """The page of any two runs."""
+    parts = _parts(a, b, rules)
+    rows = [row for _, rows in parts["loops"] for row in rows]
+    moved = sum(row.moved for row in rows)
+    figures = count(moved, "figure")
+    return page.render(
+        "runs.html",
+        here="",
+        title=f"{a.name} beside {b.name}",
+        heading=f"{a.name} beside {b.name}",
+        lead=f"{figures[:1].upper()}{figures[1:]} of {len(rows)} moved beyond their noise.",
+        remedy=f"./run dvc plots diff {a.name.split(' ')[0]} {b.name.split(' ')[0]}",
+        **parts,
+    )
 
-    def numbered(text: str) -> int:
-        return texts.setdefault(text, len(texts))
 
-    entries: list[dict[str, Any]] = []
-    before: dict[str, str] = {}
-    for run, (file, drawn), why in zip(runs, packed.places, packed.why, strict=True):
-        own = dict(run.parameters)
-        changes = [
-            number
-            for key in (*before, *(key for key in own if key not in before))
-            if before.get(key) != own.get(key)
-            for number in (numbered(key), numbered(own[key]) if key in own else -1)
+def _parts(a: Run | None, b: Run, rules: ReportRules) -> dict[str, Any]:
+    """What the template shows of two runs."""
+    questions = asked(rules, b.metrics)
+    before, now = measured(a.metrics) if a else Measured({}, {}, {}), measured(b.metrics)
+    another = a is not None and _signals(a) != _signals(b)
+    loops = []
+    for loop in LOOPS:
+        rows = [
+            _row(one, before.figures.get(loop, {}).get(one.key), now.figures.get(loop, {}).get(one.key))
+            for one in questions[loop]
         ]
-        before = own
-        figures = run.measured.figures
-        entry = {
-            "name": shortened(name_of(run)),
-            "id": run.name or run.commit[:10] or "files",
-            "kind": KINDS.index(run.kind),
-            "date": run.date[:16].replace("T", " "),
-            "subject": shortened(run.subject, SUBJECT),
-            "figures": [_triple(figures[c.key]) if c.key in figures else None for c in asked],
-            "missing": [numbered(run.measured.missing.get(c.key, "")) for c in asked],
-            "verdicts": [run.measured.verdicts.get(loop, "") for loop in LOOPS],
-            "who": [heading(run.measured.controllers.get(loop, "")) for loop in LOOPS],
-            "changes": changes,
-            "none": run.no_parameters,
-            "file": file,
-            "curves": [numbered("\n".join(curve)) for curve in drawn],
-            "why": numbered(why),
-        }
-        entries.append(entry)
+        if another and loop == "temperature":
+            rows = [row._replace(change="another machine", moved=False) for row in rows]
+        loops.append((_head(loop, before, now), rows))
+    differing = list(changed_parameters(a.parameters, b.parameters)) if a else []
     return {
-        "runs": entries,
-        "texts": list(texts),
-        "kinds": [WORDS[kind] for kind in KINDS],
-        "columns": [
-            {
-                "key": column.key,
-                "loop": column.loop,
-                "title": column.question.title,
-                "unit": column.question.unit,
-                "limit": column.question.limit if math.isfinite(column.question.limit) else None,
-                "more": column.question.at_least,
-                "beyond": column.question.beyond,
-            }
-            for column in asked
-        ],
-        "loops": LOOPS,
+        "names": (a.name if a else "Accepted run", b.name),
+        "loops": loops,
+        "another": ANOTHER if another else "",
+        "compared": a is not None,
+        "parameters": differing[:MOST_PARAMETERS],
+        "more": max(len(differing) - MOST_PARAMETERS, 0),
+        "panels": _panels(a.curves if a else {}, b.curves),
+        "kept": bool(a and a.curves),
     }
 
 
-def _triple(figure) -> list[float | str]:
-    """[value, low, high], one number where all are equal; JSON knows no infinity."""
-    ends = [rounded(v) if math.isfinite(v) else "inf" if v > 0 else "-inf" for v in figure[:3]]
-    return ends[:1] if ends[0] == ends[1] == ends[2] else ends
+def _signals(run: Run) -> list[set]:
+    """The names of the machine's inputs and of its outputs."""
+    plant = run.parameters.get("plant")
+    return [
+        {signal.get("name") for signal in (plant or {}).get(kind) or [] if isinstance(signal, dict)}
+        for kind in ("inputs", "outputs")
+    ]
 
 
-# ---- sweeps
+# ---- figures
 
 
-def _drawn(swept: Sweep) -> Drawn:
-    keys = ", ".join(swept.keys)
-    return Drawn(swept.metric, keys, sweep.picture(swept), sweep.finding(swept), sweep.caption(swept))
+def _head(loop: str, before: Measured, now: Measured) -> dict[str, Any]:
+    """A loop, and by run whose figures they are with the verdict."""
+    return {
+        "loop": loop,
+        "who": [heading(run.controllers[loop]) if run.controllers.get(loop) else "" for run in (before, now)],
+        "verdicts": [run.verdicts.get(loop, "") for run in (before, now)],
+    }
+
+
+def _row(question: Question, before: Figure | None, now: Figure | None) -> Row:
+    bound = "at least" if question.at_least else "at most"
+    limit = with_unit(question.limit, question.unit, declared(question.limit))
+    text, moved = _change(question, before, now)
+    return Row(
+        question.title,
+        f"{bound} {limit}" if np.isfinite(question.limit) else "none",
+        (_cell(question, before), _cell(question, now)),
+        text,
+        moved,
+    )
+
+
+def _cell(question: Question, figure: Figure | None) -> Cell:
+    if figure is None:
+        return Cell("not measured")
+    places = row_places(question, [figure])
+    text = quantity(figure.value, question.unit, places, beyond=question.beyond)
+    ends = band(figure.low, figure.high, places, beyond=question.beyond)
+    return Cell(text, ends or "no band", bad=state(question, figure) == FAILED)
+
+
+def _change(question: Question, before: Figure | None, now: Figure | None) -> tuple[str, bool]:
+    """How a figure moved, and whether beyond its noise; only a figure with a band can be better or worse."""
+    if before is None or now is None:
+        return "nothing to compare", False
+    if before[:3] != now[:3] and (before.low == before.high or now.low == now.high):
+        size = now.value - before.value
+        if not np.isfinite(size):
+            return "changed, noise unknown", False
+        unit = "points" if question.unit == "%" else question.unit
+        by = f"{'+' if size > 0 else MINUS}{short(abs(size))}{THIN + unit if unit else ''}"
+        return f"{by}, noise unknown", False
+    moved = move(question, before, now)
+    return moved.text(), moved.moved
+
+
+# ---- curves
+
+
+def _panels(before: Mapping[str, Curve], now: Mapping[str, Curve]) -> list[Panel]:
+    return [_panel(name, before.get(name), now.get(name)) for name in dict.fromkeys([*now, *before])]
+
+
+def _panel(name: str, before: Curve | None, now: Curve | None) -> Panel:
+    """This run's curve is solid, the accepted run's grey and dashed."""
+    drawn = [(curve, css) for curve, css in ((before, "line thin dash"), (now, "line")) if curve]
+    x, y = (np.concatenate([curve[end] for curve, _ in drawn]) for end in (2, 3))
+    frame = charts.Frame(charts.linear(float(x.min()), float(x.max())), _scale(y), 368, 150, 44, 30)
+    across, up = drawn[-1][0][:2]
+    ends = [f"{'accepted run' if 'dash' in css else 'this run'} {curve.y[-1]:g}" for curve, css in drawn]
+    svg = charts.panel(
+        frame,
+        [charts.line(frame, curve.x, curve.y, css) for curve, css in drawn],
+        alt=f"{name}, last value: {', '.join(ends)}",
+        css="mb wide",
+        title=f"{up}{', log' if frame.y.log else ''}",
+        across=across,
+    )
+    return Panel(name, svg)
+
+
+def _scale(values: np.ndarray) -> charts.Axis:
+    """Decades if the values span more than fifty to one, else linear."""
+    low, high = float(values.min()), float(values.max())
+    if low > 0 and high > 50 * low:
+        return charts.logarithmic(low, high)
+    room = 0.06 * (high - low)
+    return charts.linear(low - room, high + room)

@@ -76,6 +76,7 @@ def render(sources: Sources) -> str:
     return page.render(
         "setpoint.html",
         here="setpoint",
+        sources=sources,
         title=f"Setpoint: {judged.decision.rstrip('.')}",
         verdict=judged,
         heads_of_rules=HEADS

@@ -87,21 +87,6 @@ def mark(css: str, x: str, y: float) -> Markup:
     )
 
 
-def before_and_now(question: Question, css: str, before: Figure, now: Figure, limit: str) -> Markup:
-    """The accepted run (ring) above this one (filled), the limit at half width."""
-    old, new = _lane(question, "acc", before, 30), _lane(question, css, now, 50)
-    frame = Markup(
-        '<rect class="beyond" x="50%" width="50%" y="20" height="40"/><line class="limit" x1="50%" '
-        'x2="50%" y1="20" y2="60"/>'
-        '<text x="50%" y="14" text-anchor="middle">limit {}</text>'
-    ).format(limit)
-    alt = (
-        f"{question.title} was {number(100 * min(share(question, before.value), 99), 0)} % of its limit "
-        f"and is {number(100 * min(share(question, now.value), 99), 0)} %"
-    )
-    return Markup('<svg role="img" aria-label="{}">{}{}{}</svg>').format(alt, frame, old, new)
-
-
 # ---- axes
 
 

@@ -1,4 +1,4 @@
-"""This run against the last accepted one: what changed, and which figures moved beyond their noise."""
+"""This run against the accepted one: what changed, and which figures moved beyond their noise."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -47,18 +47,15 @@ class Change(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """`inputs`, `parameters` (name, before, now), `code` with its `files`, and `artifacts` (path, new |
-    changed | gone) that changed; `same`: how many artifacts did not; `machine`: the accepted run's, where
-    nothing but the machine can differ from it, else {}.
+    """Recordings (`inputs`), `parameters` (name, before, now), `code` (changed, unchanged, not recorded) and
+    `artifacts` that are not those of the accepted run. `machine`: the accepted run's, if nothing but the
+    machine can differ from it, else {}.
     """
 
     inputs: list[str]
     parameters: list[tuple[str, str, str]]
     code: str
-    files: list[tuple[str, str]]
-    artifacts: list[tuple[str, str]]
-    same: int
-    accepted: str
+    artifacts: list[str]
     machine: Mapping[str, Any]
 
     @property
@@ -66,18 +63,10 @@ class Difference(NamedTuple):
         return not (self.inputs or self.parameters or self.artifacts or self.code == "changed")
 
 
-def accepted(sources: Sources) -> dict[str, str]:
-    """The day on which the run was accepted, and the commit that was checked out; older files do not say."""
-    run = sources.accepted if isinstance(sources.accepted, dict) else {}
-    told = run.get("accepted")
-    if not isinstance(told, dict):
-        return {}
-    return {key: str(told[key])[:40] for key in ("on", "commit") if key in told}
-
-
 def accepted_on(sources: Sources) -> str:
-    """The day of the accepted run; "" where nothing tells it."""
-    return accepted(sources).get("on", "")
+    """The day of the accepted run; "" without one."""
+    run = sources.accepted if isinstance(sources.accepted, dict) else {}
+    return str((run.get("accepted") or {}).get("on", ""))[:40]
 
 
 def difference(sources: Sources) -> Difference | None:
@@ -99,28 +88,26 @@ def difference(sources: Sources) -> Difference | None:
     }
     recorded = {path.split("/", 1)[0] for path in then}
     now = {path: value for path, value in now.items() if path.split("/", 1)[0] in recorded}
-    changes = [
-        (path, "changed" if path in then else "new") for path in sorted(now) if then.get(path) != now[path]
-    ]
-    # what no page reads is not hashed again; that it is not there any more is seen
+    changed = [path for path in sorted(now) if then.get(path) != now[path]]
+    # no page reads the other files, so that they are not hashed again; whether they exist is known
     folders_read = {path.rsplit("/", 1)[0] for path in now}
-    changes += [
-        (path, "gone")
+    changed += [
+        path
         for path in sorted(then)
         if path not in now and path.rsplit("/", 1)[0] in folders_read and not Path(path).exists()
     ]
     inputs = [
         path
-        for path, _ in changes
+        for path in changed
         if path.split("/")[1] == "raw" or path.split("/")[1:] == ["ingest", "record.parquet"]
     ]
     # the accepted run may know the code by its folders, as it knows artifacts
     folders = {path: value for path, value in hashes.items() if path in ("pipeline", "stages")}
     code = digest(folders) if folders else None
-    parameters = list(_parameters(before.get("params") or {}, sources.declared.everything))
+    everything = sources.declared.everything
+    parameters = list(changed_parameters(before.get("params") or {}, everything))
     alike = code == sources.code and not inputs and not parameters
     # recordings of these loops are read into no table that is compared: they may have changed unseen
-    everything = sources.declared.everything
     sections = [everything.get(stage) or {} for stage in ("train_ilc", "train_classifier")]
     alike = alike and not any(section.get("source") == "recordings" for section in sections)
     machine = before.get("machine")
@@ -128,25 +115,13 @@ def difference(sources: Sources) -> Difference | None:
         inputs,
         parameters,
         "not recorded" if code is None else "unchanged" if code == sources.code else "changed",
-        _changed(before["code"], sources.files) if before.get("code") else [],
-        [change for change in changes if change[0] not in inputs],
-        sum(then.get(path) == now[path] for path in now),
-        digest(before)[:8],
+        [path for path in changed if path not in inputs],
         machine if alike and isinstance(machine, dict) else {},
     )
 
 
-def _changed(before: Mapping[str, str], now: Mapping[str, str]) -> list[tuple[str, str]]:
-    """(path, new | changed | gone) of every file whose digest is another."""
-    words = {(True, True): "changed", (False, True): "new", (True, False): "gone"}
-    return [
-        (path, words[path in before, path in now])
-        for path in sorted(before.keys() | now.keys())
-        if before.get(path) != now.get(path)
-    ]
-
-
-def _parameters(before: Mapping, now: Mapping) -> Iterator[tuple[str, str, str]]:
+def changed_parameters(before: Mapping, now: Mapping) -> Iterator[tuple[str, str, str]]:
+    """(dotted key, value before, value now) of each parameter that differs."""
     # a section that is new or gone is one change
     for name in sorted(before.keys() ^ now.keys()):
         values = count(len(list(_flat("", before.get(name, now.get(name))))), "value")
@@ -193,7 +168,7 @@ def moves(
     before = _recorded(sources.accepted.get("figures") or {})
     return {
         name: [
-            _move(question, before.get(name, {}).get(question.key), mine[question.key]) for question in asked
+            move(question, before.get(name, {}).get(question.key), mine[question.key]) for question in asked
         ]
         for name, mine in answers.items()
     }
@@ -210,7 +185,8 @@ def _recorded(figures: Mapping[str, Any]) -> dict[str, dict[str, Figure | Missin
     }
 
 
-def _move(question: Question, before: Figure | None, now: Figure | Missing) -> Move:
+def move(question: Question, before: Figure | None, now: Figure | Missing) -> Move:
+    """A figure moves if its band and the earlier one do not overlap."""
     if isinstance(now, Missing):
         return Move(question, None, now, False, now.state)
     if before is None:

@@ -13,7 +13,7 @@ from markupsafe import Markup, escape
 
 from pipeline.report.shared import digits
 from pipeline.report.shared.pictures import Column
-from pipeline.report.shared.sources import QUICK_LOOK, Source
+from pipeline.report.shared.sources import QUICK_LOOK, Source, Sources
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
@@ -66,7 +66,6 @@ def environment() -> jinja2.Environment:
         "placed": placed,
         "verbatim": verbatim,
         "missing": missing,
-        "anchor": anchor,
         "term": term,
         "word_id": word_id,
     }
@@ -84,19 +83,13 @@ def environment() -> jinja2.Environment:
     return templates
 
 
-# pages that the command line writes, linked where they are
-BESIDE = (("nightly", "Nightly"), ("runs", "Runs"), ("history", "History"))
-
-
-def render(template: str, **values) -> str:
-    """A whole page."""
-    beside = [
-        (name, title)
-        for name, title in BESIDE
-        if name == values["here"] or artifacts.exists(f"reports/{name}.html")
-    ]
+def render(template: str, *, sources: Sources | None = None, **values) -> str:
+    """A whole page; at its foot the table of the files that the pages of this run are made from."""
+    # the nightly job writes its page after the others
+    nightly = values["here"] == "nightly" or artifacts.exists("reports/nightly.html")
     quick = artifacts.read_json(QUICK_LOOK) if artifacts.exists(QUICK_LOOK) else None
-    return printable_page(environment().get_template(template).render(beside=beside, quick=quick, **values))
+    frame = {"beside": [("nightly", "Nightly")] if nightly else [], "quick": quick, "sources": sources}
+    return printable_page(environment().get_template(template).render(**frame, **values))
 
 
 def glyph(state: str) -> Markup:
@@ -160,8 +153,8 @@ def in_viewer(table: str, **place: str | Sequence[str]) -> Markup:
 
 
 def origin(sources: list[Source], **place: str | Sequence[str]) -> Markup:
-    """Where the figures beside it are from: stage, artifact, schema, hash; the whole hash is in the
-    provenance. A time series is linked to its place in the viewer, which `place` tells."""
+    """Where the figures beside it are from: artifact and hash; the whole hash stands at the foot of the page.
+    A time series is linked to its place in the viewer, which `place` tells."""
     if not sources:
         return Markup("")
     series = next((source.name for source in sources if source.name in IN_VIEWER), None)
@@ -213,7 +206,3 @@ def term(word: str, text: str = "") -> Markup:
         if word
         else escape(text)
     )
-
-
-def anchor(path: str) -> str:
-    return "from-" + "".join(letter if letter.isalnum() else "-" for letter in path)

@@ -64,9 +64,8 @@ class Source(NamedTuple):
 
 class Sources(NamedTuple):
     """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what
-    was; `absent`: what was not, by path; `accepted`: the last accepted run, or None; `files`: digest of each
-    file of code; `nightly`: what the last night measured, None before the first; `quick`: the run is
-    a quick look.
+    was; `absent`: what was not, by path; `accepted`: the accepted run, or None; `nightly`: what the last
+    night measured, None before the first; `quick`: the run is a quick look.
     """
 
     declared: Declared
@@ -76,7 +75,6 @@ class Sources(NamedTuple):
     absent: Mapping[str, Missing]
     accepted: dict | Missing | None
     code: str
-    files: Mapping[str, str]
     nightly: dict | Missing | None = None
     quick: bool = False
 
@@ -129,7 +127,7 @@ def collect(
     figures: dict[str, Any] = {}
     tables: dict[str, Any] = {}
     for stage, path in metrics.items():
-        figures[stage] = _read(read, path, stage, stage, "metrics", artifacts.read_old_metrics)
+        figures[stage] = _read(read, path, stage, stage, "metrics", artifacts.read_json)
         if isinstance(figures[stage], Missing):
             absent[path] = figures[stage]
     for name, stage, file, kind, reader in _tables(declared.machine):
@@ -146,20 +144,19 @@ def collect(
             path = frame["path"]
             read[path] = Source("frame", path, stage, "JPEG", artifacts.sha256(path))
     before = (
-        _read(read, accepted, "accepted", "accept", "accepted", artifacts.read_accepted)
+        _read(read, accepted, "accepted", "accept", "accepted", read_accepted)
         if artifacts.exists(accepted)
         else None
     )
     night = (
-        _read(read, NIGHTLY, "nightly", "nightly", "nightly", artifacts.read_old_metrics)
+        _read(read, NIGHTLY, "nightly", "nightly", "nightly", artifacts.read_json)
         if artifacts.exists(NIGHTLY)
         else None
     )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
-    files = code_files(code)
     read = linked(read)
     return Sources(
-        declared, figures, tables, read, absent, before or None, folders_of_code, files, night,
+        declared, figures, tables, read, absent, before, folders_of_code, night,
         quick=artifacts.exists(QUICK_LOOK),
     )  # fmt: skip
 
@@ -191,16 +188,6 @@ def copies(sources: Sources) -> dict[str, bytes]:
         source.link.removeprefix("data/"): Path(path).read_bytes()
         for path, source in sources.read.items()
         if source.link.startswith("data/")
-    }
-
-
-def code_files(folders: tuple[str, ...]) -> dict[str, str]:
-    """Digest of each file of code, so that a difference can name the ones that changed."""
-    files = [file for folder in folders for file in sorted(Path(folder).rglob("*")) if file.is_file()]
-    return {
-        file.as_posix(): artifacts.sha256(file)
-        for file in files
-        if not any(p.startswith(".") or p == "__pycache__" for p in file.parts)
     }
 
 
@@ -249,6 +236,7 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("poles", "identify_plant", "poles.parquet", *table(schemas.POLES)),
         ("levels", "identify_plant", "levels.parquet", *table(schemas.LEVELS)),
         ("weights", "tune_weights", "weights.json", "weights", artifacts.read_json),
+        ("tuning", "tune_weights", "history.parquet", *table(schemas.TUNING)),
         ("summary", "evaluate_temperature", "summary.json", "summary", artifacts.read_json),
         ("cases", "evaluate_temperature", "cases.parquet", *table(schemas.CASES)),
         (
@@ -335,6 +323,21 @@ def _read(
         return Missing("failed", str(error))
     read[path] = Source(name, path, stage, schema, artifacts.sha256(path))
     return content
+
+
+# what `./run beadline accept` writes
+OF_ACCEPTED = ("accepted", "machine", "metrics", "params", "hashes", "figures", "winner")
+
+
+def read_accepted(path: str) -> dict:
+    """The accepted run. Raises ValueError if another version of beadline wrote it."""
+    run = artifacts.read_json(path)
+    if not isinstance(run, dict) or not run.keys() >= set(OF_ACCEPTED):
+        raise ValueError(
+            f"{path} was written by another version of beadline; "
+            "accept a run of this version with ./run beadline accept"
+        )
+    return run
 
 
 def lookup(data: Any, dotted: str, *, what: str = "") -> Any:

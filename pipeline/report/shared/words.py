@@ -127,7 +127,7 @@ FIXED = {
     "hash": (
         "Hash",
         "The first digits of a fingerprint (SHA-256) of a file: equal hashes, equal bytes. "
-        "./run beadline verify holds all of them against the files.",
+        "The foot of each page has all of them; ./run dvc status checks the files.",
     ),
     "accepted": ("Accepted run", "The last run that a person marked as good with ./run beadline accept."),
     "at_limits": (

@@ -73,7 +73,7 @@ def winner(
     if not recorded:
         return verdict
     return trust_first(
-        verdict, trust(Sources(Declared(rules, machine, {}), metrics, model, {}, {}, None, "", {}))
+        verdict, trust(Sources(Declared(rules, machine, {}), metrics, model, {}, {}, None, ""))
     )
 
 

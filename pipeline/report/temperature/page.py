@@ -1,5 +1,5 @@
 """The page of the temperature loop: verdict, the pair, the scorecard, three pictures, findings, the record,
-words, provenance."""
+words."""
 
 from pipeline.report.identification.model import trust
 from pipeline.report.shared import headline, page, words
@@ -39,6 +39,7 @@ def render(sources: Sources, judged: Judgement) -> str:
     return page.render(
         "temperature.html",
         here="temperature",
+        sources=sources,
         title=f"Temperature: {judged.verdict.decision.rstrip('.')}",
         verdict=verdict_parts(judged, claim=headline.claim(sources, ("temperature",))),
         answers=twelve.rows(sources, judged),

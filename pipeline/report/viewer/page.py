@@ -71,6 +71,7 @@ def render(sources: Sources, judged: Judgement) -> Viewer:
     text = page.render(
         "viewer.html",
         here="viewer",
+        sources=sources,
         title="Viewer",
         rows=rows,
         still=still(sources, judged),
