@@ -38,7 +38,7 @@ def of_today(settling):
     ends = {"median": settling, "low": 0.9 * settling, "high": 1.1 * settling}
     names = ("subspace_lqg", "learned_kernel", "pi")
     return {
-        "verdict": {"decision": "Rehearsal passed: subspace + LQG.", "winner": "subspace_lqg"},
+        "verdict": {"decision": "Pass (simulation): subspace + LQG.", "winner": "subspace_lqg"},
         "figures": {name: {"settling": ends} for name in names},
     }
 
@@ -166,7 +166,7 @@ def test_runs_before_and_after_the_comparison_as_deployed_stand_on_one_page_and_
     command(monkeypatch)
     page = Page(PAGE).text
     assert "Temperature, earlier runs" in page and "Gap to the optimum" in page
-    assert "Rehearsal passed: subspace + LQG." in page and "Passed the rules of its day." in page
+    assert "Pass (simulation): subspace + LQG." in page and "Passed the rules of its day." in page
     assert "deploy " not in page.lower() and "deploy," not in page.lower()
     assert "Settling now 26 s" in page
     # a figure of the one never stands in the line or column of the other

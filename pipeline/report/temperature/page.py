@@ -13,7 +13,7 @@ from pipeline.report.temperature.judgement import Judgement, heads, relearned_da
 from pipeline.report.temperature.pairs import prior_sentence
 
 WORDS = (
-    "rehearsal",
+    "verdict",
     "study",
     "pair",
     "quantile",
