@@ -64,10 +64,11 @@ def _today() -> dict[str, str]:
 
 
 def _shown() -> dict:
-    """What the pages show: figures with their bands, and which contestant of the temperature loop the verdict
-    chose; nothing where no page was made. Raises ValueError where the pages are of another run."""
+    """What the pages show: figures with their bands, the verdict of each loop, and which contestant of the
+    temperature loop the verdict chose; nothing if no page was made. Raises ValueError if the pages are of
+    another run."""
     if not artifacts.exists("reports/metrics/report.json"):
-        return {"figures": {}, "winner": None}
+        return {"figures": {}, "winner": None, "verdicts": {}}
     report = artifacts.read_metrics("report")
     stale = [
         path
@@ -79,7 +80,11 @@ def _shown() -> dict:
             f"reports: the pages are of another run than {stale[0]}; run ./run dvc repro, "
             "look at them, and accept then"
         )
-    return {"figures": report["figures"], "winner": report["verdict"]["winner"]}
+    return {
+        "figures": report["figures"],
+        "winner": report["verdict"]["winner"],
+        "verdicts": report["verdicts"],
+    }
 
 
 def verify(_: argparse.Namespace) -> None:
