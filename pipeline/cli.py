@@ -154,8 +154,8 @@ def inspect(arguments: argparse.Namespace) -> None:
 
 
 def quick(arguments: argparse.Namespace) -> None:
-    """A first page in two minutes, in quick/: every loop at the sizes of params.quick.yaml, with a
-    classifier and agents that git keeps. datasets/, reports/ and dvc.lock stay as they are."""
+    """Write a first page to quick/: every loop at the sizes of params.quick.yaml,
+    with a classifier and agents that git keeps. datasets/, reports/ and dvc.lock stay as they are."""
     from pipeline import quick as looking
 
     print(printable(looking.keep() if arguments.keep else looking.quick()))
@@ -530,7 +530,7 @@ EXAMPLES = {
 }
 STATUSES = "0 done; 1 refused, and one sentence says why; 2 a wrong option"
 OTHER_STATUSES = {
-    "nightly": "0 promoted, kept or nothing new; 1 failed; 3 drift alarm; 4 recordings set aside; "
+    "nightly": "0 promoted, kept or nothing new; 1 the night or one loop failed; 3 drift alarm; 4 recordings set aside; "
     "75 another night is at work",
     "verify": "0 all match; 1 something does not, and is named; 2 a wrong option",
 }

@@ -379,8 +379,8 @@ FIXED = {
     ),
     "held_window": (
         "Held",
-        "Nothing is sent: too few frames show a line, they are foreign, the tip moved, "
-        "or two classes remain possible.",
+        "Nothing is sent: too few frames show a line, they are foreign, or the tip moved. "
+        "A window in which two classes remain possible is weighed by its flow, and may move the controller.",
     ),
     "foreign": (
         "Foreign",
