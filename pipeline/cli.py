@@ -530,8 +530,8 @@ EXAMPLES = {
 }
 STATUSES = "0 done; 1 refused, and one sentence says why; 2 a wrong option"
 OTHER_STATUSES = {
-    "nightly": "0 promoted, kept or nothing new; 1 the night or one loop failed; 3 drift alarm; 4 recordings set aside; "
-    "75 another night is at work",
+    "nightly": "0 promoted, kept or nothing new; 1 the night or one loop failed; 3 drift alarm; "
+    "4 recordings set aside; 75 another night is at work",
     "verify": "0 all match; 1 something does not, and is named; 2 a wrong option",
 }
 
