@@ -31,13 +31,13 @@ LOOPS = {
     "temperature": (
         "**[Temperature](docs/explanation/temperature.md)**: barrel zones or one heater",
         "heater power and temperatures",
-        "a controller with a certificate: C99, Python, or a Klipper module",
-        "PI, subspace + LQG, VARX + Riccati, learned kernel",
+        "a certified controller: C99, Python or Klipper module",
+        "PI, LQG, VARX + Riccati, learned kernel",
     ),
     "deposition": (
         "**[Deposition](docs/how-to/deposition.md)**: flow of a plunger extruder",
         "camera video, gantry and plunger position",
-        "a plunger command for any G-code part, with a forecast of its flow error",
+        "a plunger command for any G-code part, with a forecast",
         "on-off control, learned signal library, basis functions",
     ),
     "setpoint": (
@@ -85,7 +85,7 @@ def _loops(accepted: Mapping[str, Any]) -> str:
         "setpoint": _reached(accepted),
     }
     lines = [
-        "| Control loop | You record | You get | Controllers compared | Result on the bundled simulations |",
+        "| Loop | You record | You get | Compared | Result (bundled simulations) |",
         "|---|---|---|---|---|",
     ]
     for loop, cells in LOOPS.items():

@@ -28,7 +28,6 @@ from pipeline.report.shared.verdict import (
     share,
     state,
 )
-from pipeline.report.temperature import readme
 from pipeline.report.temperature.answers import relearned_band
 from pipeline.report.temperature.contestants import in_a_sentence
 from pipeline.report.temperature.judgement import judgement
@@ -388,19 +387,6 @@ def test_without_any_figures_the_verdict_is_open_and_says_what_to_run():
     verdict = judge(made.metrics() | {"evaluate_temperature": gone})
     assert (verdict.state, verdict.decision) == (OPEN, "Undecided (simulation).")
     assert verdict.reason == "evaluate_temperature.json is not there. Run it."
-
-
-def test_the_readme_shows_every_contestant_with_its_quantiles_and_the_verdict_of_the_pages():
-    stages = metrics()
-    text = readme.block(stages, RULES, judge(stages))
-    assert "**Pass (simulation): subspace + LQG.** Every rule measured so far passed on 6 simulated" in text
-    assert "| settled error, worst zone, at most 0.5 °C | settling, at most 60 s |" in text
-    assert "| subspace + LQG (model-based) | 0.10 °C | 6 s | 0.5 °C | 1.0 % | 2.00 | 0 |" in text
-    assert "| Hold (do nothing) | 80 °C | never settles |" in text
-    whole = readme.rewritten(f"a\n{readme.BEGIN}\nold\n{readme.END}\nb\n", text)
-    assert whole == f"a\n{text}\nb\n"
-    with pytest.raises(ValueError, match="README.md: expected the lines"):
-        readme.rewritten("no block", text)
 
 
 # ---- over many comparisons
