@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.report.shared.digits import short
-from pipeline.report.temperature.readme import plain, rewritten
 from pipeline.store import artifacts
 
 RESULTS = Path(__file__).parent / "results"
@@ -347,7 +346,7 @@ def block(summary: Mapping[str, Any]) -> str:
         *(f"- {sentence}" for sentence in scale_sentences(summary["scale"])),
         END,
     ]
-    return plain("\n".join(lines))
+    return "\n".join(lines).replace("\u202f", " ").replace("\u00a0", " ")
 
 
 def growth_lines(growth: Mapping[str, Any]) -> list[str]:
@@ -409,4 +408,7 @@ def _plain(text: str) -> str:
 
 def in_readme(readme: str, text: str) -> str:
     """The README with another block. Raises ValueError where it has no place for one."""
-    return rewritten(readme, text, BEGIN, END)
+    if BEGIN not in readme or END not in readme:
+        raise ValueError(f"README.md: expected the lines {BEGIN} and {END}, found none; put them back")
+    before, rest = readme.split(BEGIN, 1)
+    return f"{before}{text}{rest.split(END, 1)[1]}"

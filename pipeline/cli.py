@@ -63,9 +63,9 @@ def _today() -> dict[str, str]:
 
 
 def _shown() -> dict:
-    """What the pages show: figures with their bands, which contestant of the temperature loop the verdict
-    chose, the verdicts, the curves; nothing if no page was made. Raises ValueError if the pages are of
-    another run."""
+    """What the pages show: figures with their bands, the verdict of each loop, which controller of the
+    temperature loop the verdict names, and the curves; nothing if no page was made. Raises ValueError if the
+    pages are of another run."""
     if not artifacts.exists("reports/metrics/report.json"):
         return {"figures": {}, "winner": None, "verdicts": {}, "curves": {}}
     report = artifacts.read_metrics("report")
@@ -82,7 +82,7 @@ def _shown() -> dict:
     return {
         "figures": report["figures"],
         "winner": report["verdict"]["winner"],
-        "verdicts": {loop: {"decision": verdict["decision"]} for loop, verdict in report["verdicts"].items()},
+        "verdicts": report["verdicts"],
         "curves": artifacts.read_json("reports/data/curves.json"),
     }
 
@@ -125,8 +125,8 @@ def inspect(arguments: argparse.Namespace) -> None:
 
 
 def quick(arguments: argparse.Namespace) -> None:
-    """A first page in two minutes, in quick/: every loop at the sizes of params.quick.yaml, with a
-    classifier and agents that git keeps. datasets/, reports/ and dvc.lock stay as they are."""
+    """Write a first page to quick/: every loop at the sizes of params.quick.yaml,
+    with a classifier and agents that git keeps. datasets/, reports/ and dvc.lock stay as they are."""
     from pipeline import quick as looking
 
     print(printable(looking.keep() if arguments.keep else looking.quick()))
@@ -494,8 +494,8 @@ EXAMPLES = {
 }
 STATUSES = "0 done; 1 refused, and one sentence says why; 2 a wrong option"
 OTHER_STATUSES = {
-    "nightly": "0 promoted, kept or nothing new; 1 failed; 3 drift alarm; 4 recordings set aside; "
-    "75 another night is at work"
+    "nightly": "0 promoted, kept or nothing new; 1 the night or one loop failed; 3 drift alarm; "
+    "4 recordings set aside; 75 another night is at work"
 }
 
 

@@ -1,4 +1,4 @@
-"""`./run beadline quick`: a first page in two minutes. The stages run as under DVC, in one process and a
+"""`./run beadline quick`: a first page at small sizes. The stages run as under DVC, in one process and a
 folder of its own, at the sizes of params.quick.yaml. No network is trained, and nothing is exported."""
 
 import contextlib

@@ -1,19 +1,20 @@
-"""The walk-throughs in docs/ run as they stand, what they print holds, and the version is one."""
+"""The walk-throughs in docs/ run as they stand, and the version is one. README is short, its figures are
+those of the accepted run, and its commands exist."""
 
+import argparse
+import copy
 import re
 import runpy
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline import cli
-from pipeline.report.shared.verdict import ReportRules
-from pipeline.report.temperature import readme
-from pipeline.report.temperature.verdict import decide
 from pipeline.setpoint import score
-from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.store import artifacts
+from tests import readme
 
 LOOPS = ("temperature", "deposition", "setpoint")
 
@@ -73,7 +74,7 @@ def test_the_version_is_one_and_the_same_wherever_it_stands(root, monkeypatch, c
     assert f"\nversion: {version}\n" in (root / "CITATION.cff").read_text(encoding="utf-8")
     assert f'name = "beadline"\nversion = "{version}"\n' in (root / "uv.lock").read_text(encoding="utf-8")
     changes = (root / "CHANGELOG.md").read_text(encoding="utf-8")
-    assert re.findall(r"^## \[(.*?)\]", changes, re.MULTILINE)[0] == version
+    assert re.findall(r"^## \[(.*?)\]", changes, re.MULTILINE)[:2] == ["Unreleased", version]
 
 
 def told(monkeypatch, capsys, *arguments: str) -> str:
@@ -120,39 +121,141 @@ def test_where_there_is_no_page_no_picture_is_taken(tmp_path):
         take(tmp_path)
 
 
-def readme_of_today(root: Path) -> str:
-    """README.md with the temperature loop's figures as reports/metrics has them, and the verdict that the
-    pages say of them."""
-    metrics = {
-        stage: artifacts.read_json(root / f"reports/metrics/{stage}.json")
-        for stage in ("evaluate_temperature", "identify_plant", "learn_kernel")
-    }
-    rules = params.load(ReportRules, "report", root / params.FILE)
-    machine = params.load(Plant, "plant", root / params.FILE)
-    verdict = decide(
-        metrics,
-        rules,
-        recorded=False,
-        undeclared=[output.name for output in machine.outputs if output.low is None or output.high is None],
-    )
-    text = readme.block(metrics, rules, verdict)
-    return readme.rewritten((root / "README.md").read_text(encoding="utf-8"), text)
+# ---- README
 
 
-def test_the_temperature_figures_of_the_readme_are_those_of_the_last_run(root):
-    assert (root / "README.md").read_text(encoding="utf-8") == readme_of_today(root), (
-        "run ./run python -m tests.test_docs, which writes them"
+@pytest.fixture
+def text(root) -> str:
+    return (root / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def accepted(root) -> dict:
+    return artifacts.read_json(root / readme.ACCEPTED)
+
+
+def check_readme(text: str, accepted: dict, papers: Path) -> None:
+    """Raises AssertionError, naming the block, if README does not hold what the accepted run gives."""
+    for name, block in readme.blocks(accepted, papers).items():
+        assert block in text, f"README.md, block {name}: run {readme.COMMAND}, which writes it"
+
+
+def test_the_figures_and_verdicts_of_the_readme_are_those_of_the_accepted_run(root, text, accepted):
+    check_readme(text, accepted, root / readme.PAPERS)
+    assert readme.rewritten(text, readme.blocks(accepted, root / readme.PAPERS)) == text
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_one_changed_figure_of_a_loop_makes_the_readme_wrong(root, text, accepted, loop):
+    metrics = copy.deepcopy(accepted["metrics"])
+    if loop == "temperature":
+        subject = metrics["evaluate_temperature"]["contestants"][accepted["verdicts"][loop]["subject"]]
+        subject["settling"]["q90"] += 1.0
+    elif loop == "deposition":
+        metrics["compose_parts"]["dashes"]["A"][accepted["verdicts"][loop]["winner"]][
+            "rms_percent_of_on_off"
+        ] += 0.1
+    else:
+        metrics["evaluate_setpoint"]["cases"]["recorded, sticky, half clog"]["settled"] += 0.1
+    with pytest.raises(AssertionError, match="README.md, block loops"):
+        check_readme(text, accepted | {"metrics": metrics}, root / readme.PAPERS)
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_another_verdict_of_a_loop_makes_the_readme_wrong(root, text, accepted, loop):
+    verdicts = copy.deepcopy(accepted["verdicts"])
+    verdicts[loop]["decision"] = "Quick look failed."
+    with pytest.raises(AssertionError, match="README.md, block loops"):
+        check_readme(text, accepted | {"verdicts": verdicts}, root / readme.PAPERS)
+
+
+def test_another_count_of_the_papers_makes_the_readme_wrong(root, text, accepted, tmp_path):
+    for key in readme.KEYS:
+        for suffix in ("json", "toml"):
+            name = f"{key}.{suffix}"
+            (tmp_path / name).write_bytes((root / readme.PAPERS / name).read_bytes())
+    figures = artifacts.read_json(tmp_path / "temperature.json")
+    figures["model_based"]["identity"]["J100"] += 100.0
+    artifacts.write_json(tmp_path / "temperature.json", figures)
+    with pytest.raises(AssertionError, match="README.md, block papers"):
+        check_readme(text, accepted, tmp_path)
+
+
+def test_the_figures_of_the_readme_are_those_that_the_verdicts_name(root, accepted):
+    table = readme.blocks(accepted, root / readme.PAPERS)["loops"]
+    for loop, figure in (
+        ("deposition", r"Largest flow error ([\d.]+ %)"),
+        ("setpoint", r"worst test case ([\d.]+ %)"),
+    ):
+        reason = accepted["verdicts"][loop]["reason"].replace("\u202f", " ").replace("\u00a0", " ")
+        assert re.search(figure, table)[1] in reason, loop
+
+
+def test_a_readme_without_the_place_of_a_block_is_refused(text, root, accepted):
+    with pytest.raises(ValueError, match="README.md: expected the lines <!-- papers"):
+        readme.rewritten(text.replace("<!-- /papers -->", ""), readme.blocks(accepted, root / readme.PAPERS))
+
+
+def test_outside_its_blocks_the_readme_states_no_measured_figure(text):
+    """Times, sizes and versions alone may stand there."""
+    units = (
+        r"°C|%|percent|points?|mm\b|mm/s|mm³|µm|Hz|kHz|W\b|V\b|Pa\b|px|frames?|images?|times faster|x faster"
     )
+    assert re.findall(rf"\d[\d,.]*\s?(?:{units})", readme.without_blocks(text)) == []
+    assert re.findall(rf"\d[\d,.]*\s?(?:{units})", text)
+
+
+def test_the_readme_is_short_and_plain(text):
+    assert len(text.splitlines()) <= 150 and len(text.split()) <= 1300
+    first_screen = text.split("## Quick start")[0]
+    for words in ("research software", "simulated data", "No controller has run on a real printer",
+                  "No licence chosen yet", "reports/papers.html"):  # fmt: skip
+        assert words in first_screen, words
+
+
+def test_every_link_of_the_readme_and_the_documents_leads_to_a_file(root):
+    for path in [root / "README.md", *sorted((root / "docs").rglob("*.md"))]:
+        for link in re.findall(r"\]\((?!https?:)([^)#]+)", path.read_text(encoding="utf-8")):
+            assert (path.parent / link).exists(), f"{path.name}: {link}"
+
+
+def commands(root: Path) -> list[tuple[str, str]]:
+    """The commands of beadline that README and the documents name, each with its file."""
+    paths = [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
+    return [
+        (path.name, command.split("  #")[0].strip())
+        for path in paths
+        for command in re.findall(r"\./run beadline ([a-z][^`\n]*)", path.read_text(encoding="utf-8"))
+    ]
+
+
+class Parsed(Exception):
+    """The arguments were read; the command does not run."""
+
+
+def test_every_command_of_the_readme_and_the_documents_exists_with_its_options(root, monkeypatch):
+    parse = argparse.ArgumentParser.parse_args
+
+    def stop(parser: argparse.ArgumentParser) -> None:
+        parse(parser)
+        raise Parsed
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", stop)
+    named = commands(root)
+    assert {"init", "inspect", "quick", "export", "replay"} <= {command.split()[0] for _, command in named}
+    for name, command in named:
+        monkeypatch.setattr("sys.argv", ["beadline", *shlex.split(command)])
+        try:
+            cli.main()
+        except Parsed:
+            continue
+        except SystemExit:
+            pytest.fail(f"{name}: ./run beadline {command} is refused")
 
 
 def test_no_page_and_no_document_advises_to_deploy(root):
-    pages = [*(root / "pipeline/report/templates").glob("*"), *(root / "docs").glob("*"), root / "README.md"]
+    pages = [*(root / "pipeline/report/templates").glob("*"), *(root / "docs").rglob("*"), root / "README.md"]
     advice = re.compile(r"\bdeploy\b", re.IGNORECASE)
     assert not [
         path.name for path in pages if path.is_file() and advice.search(path.read_text(encoding="utf-8"))
     ]
-
-
-if __name__ == "__main__":
-    here = Path(__file__).resolve().parents[1]
-    (here / "README.md").write_text(readme_of_today(here), encoding="utf-8")

@@ -91,7 +91,7 @@ def test_a_quick_look_writes_its_own_folder_and_nothing_else(looked):
         and not (folder / "quick/datasets/export_controllers").exists()
     )
     assert told.splitlines()[-1].startswith("quick/reports/index.html")
-    assert all(f"\n{name}" in f"\n{told}" for name in (*SHORT, "whole", "temperature: Quick look open."))
+    assert all(f"\n{name}" in f"\n{told}" for name in (*SHORT, "whole", "temperature: Quick look undecided."))
 
 
 def test_every_page_of_a_quick_look_says_so(looked):
@@ -99,7 +99,7 @@ def test_every_page_of_a_quick_look_says_so(looked):
         text = (looked[0] / f"quick/reports/{name}.html").read_text()
         assert text.count('role="note"><strong>Quick look.</strong>') == 1
         assert "panel.judging.plants" in text and "those of a full run, of commit" in text
-        assert not any(f"Rehearsal {state}" in text for state in ("passed", "failed", "open"))
+        assert not any(f"{word} (simulation)" in text for word in ("Pass", "Fail", "Undecided"))
 
 
 def test_the_same_inputs_give_the_same_bytes_and_take_the_place_of_the_last(looked, monkeypatch):
@@ -285,10 +285,10 @@ def test_a_kept_file_that_differs_is_refused_by_name(checkout, beadline):
 # ---- words
 
 
-def test_no_quick_look_is_a_rehearsal_passed_or_ready_for_a_trial():
+def test_no_quick_look_passes_a_simulation_or_is_ready_for_a_trial():
     for recorded in (True, False):
         assert words_for(recorded=recorded, quick=True).passed.startswith("Quick look passed")
-    assert words_for(recorded=False, quick=False).passed.startswith("Rehearsal passed")
+    assert words_for(recorded=False, quick=False).passed.startswith("Pass (simulation)")
     states = ("passed", "failed", "passed")
     loops = [
         Loop(name, "", state, "", "", "", "", recorded)

@@ -8,8 +8,8 @@ from pipeline.store.printable import printable
 
 def nightly(arguments: argparse.Namespace) -> None:
     """The nightly job: new recordings, dvc repro, judge, promote or keep. Exit status 0: promoted, kept, or
-    nothing new; 1: failed, nothing in production has changed; 3: drift alarm; 4: done, but recordings were
-    set aside; 75: refused, another night is at work."""
+    nothing new; 1: the night or one loop failed; a loop that failed keeps its controller, the others are
+    judged; 3: drift alarm; 4: done, but recordings were set aside; 75: refused, another night is at work."""
     from pipeline.nightly import accepting, merging, night, reporting
 
     if arguments.accept_drift:

@@ -157,7 +157,8 @@ class Growing:
 
 
 def file_format(path: Path) -> str:
-    """ "mcap", "parquet", "csv", "bag" or a name of `LOADERS`, by the first bytes and not by the name.
+    """ "mcap", "parquet", "csv", "bag" or a name of `LOADERS`, by the first bytes.
+    Text is "csv", but text named .mcap or .parquet is refused.
 
     Raises ValueError for any other format.
     """
@@ -193,7 +194,8 @@ def file_format(path: Path) -> str:
     if path.suffix in (".mcap", ".parquet"):
         raise ValueError(
             f"{path}: the bytes at offset 0 are {start[:8].hex(' ')}, "
-            f"which begin no {path.suffix[1:]} file; copy the recording again as binary"
+            f"which begin no {path.suffix[1:]} file; copy the recording again as binary, "
+            "or, if it is text such as CSV, give it the suffix .csv"
         )
     return "csv"
 

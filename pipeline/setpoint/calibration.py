@@ -315,7 +315,7 @@ def holds_true_class(p: np.ndarray, label: np.ndarray, level: float) -> np.ndarr
 
 class Sets(NamedTuple):
     """Share of sets {c: p_c >= level} that hold the true class, and share that does not
-    name one class alone: there the controller holds."""
+    name one class alone."""
 
     coverage: float
     held: float

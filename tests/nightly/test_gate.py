@@ -284,7 +284,6 @@ def test_page_and_night_never_disagree(project, seed):
     index = words(index_page.render(sources, judgement(sources)))
     page = nightly_page.render([tonight], after, asked)
     summary = reporting.summary(tonight, [])
-    one_line = index.split(" Rehearsal", 1)[0] + index  # the head is the title too
     assert {loop: tonight.decisions[loop].verdict.state for loop in LOOPS} == expected
     for loop, decision in tonight.decisions.items():
         verdict, passed = decision.verdict, expected[loop] == PASSED
@@ -298,9 +297,9 @@ def test_page_and_night_never_disagree(project, seed):
         mine = section(page, loop)
         assert said(verdict.sentence) in mine
         # and none that contradicts it
-        assert verdict.decision.startswith("Rehearsal passed") == passed
+        assert verdict.decision.startswith("Pass (simulation)") == passed
         assert (f"candidate {loop}: {verdict.sentence}" in summary) == (not passed)
-        assert ("Rehearsal passed" in mine) == passed and ("Rehearsal failed" in mine) == (
+        assert ("Pass (simulation)" in mine) == passed and ("Fail (simulation)" in mine) == (
             expected[loop] == FAILED
         )
         assert (f"candidate of {loop}, not run" in words(page)) == (not passed)
@@ -310,10 +309,10 @@ def test_page_and_night_never_disagree(project, seed):
         mine_in_production = after.champions[loop] if passed else after.candidates[loop]
         assert mine_in_production.rehearsal and mine_in_production.contestant == verdict.subject
         assert mine_in_production.verdict == verdict.sentence
-    head = re.search(r"Rehearsal (?:passed|failed|open): .*?\.", one_line)
+    head = re.search(r"(?:Pass|Fail|Undecided) \(simulation\): .*?\.", index)
     passed = sorted(loop for loop, state in expected.items() if state == PASSED)
     first = head[0] if head else ""
-    named = re.search(r"Rehearsal passed: (.*?)[;.]", first)
+    named = re.search(r"Pass \(simulation\): (.*?)[;.]", first)
     listed = (
         list(LOOPS)
         if named and "all three loops" in named[1]
@@ -417,7 +416,7 @@ def test_a_contestant_that_is_named_to_run_must_pass_itself(project):
     )
     assert (by_page.state, by_page.winner) == (PASSED, "subspace_lqg")
     assert named.state == FAILED and named.subject == "varx_riccati" and named.winner is None
-    assert named.sentence == "Rehearsal failed. First failed rule: overshoot."
+    assert named.sentence == "Fail (simulation). First failed rule: overshoot."
     assert "VARX + Riccati is named to run, and does not pass." in named.reason
     tonight, after = promoting.judged(
         settings(controller="varx_riccati"), TONIGHT, ChampionState(), lineage=Lineage
@@ -477,7 +476,7 @@ def test_the_same_files_as_another_contestant_are_another_challenger(project):
             ("pi_simc", verdict),
             (
                 "pi",
-                verdict._replace(state=FAILED, decision="Rehearsal failed.", lead="First failed rule: x."),
+                verdict._replace(state=FAILED, decision="Fail (simulation).", lead="First failed rule: x."),
             ),
         )
     }
@@ -485,7 +484,7 @@ def test_the_same_files_as_another_contestant_are_another_challenger(project):
     assert decisions["subspace_lqg"].reasons == ["the challenger is the champion, byte for byte"]
     assert decisions["pi"].reasons == [
         "the challenger is the champion, byte for byte, which does not pass: "
-        "Rehearsal failed. First failed rule: x."
+        "Fail (simulation). First failed rule: x."
     ]
 
 
@@ -528,8 +527,8 @@ def played(tmp_path, monkeypatch):
 
 def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(played, monkeypatch):
     words_of = {
-        FAILED: ("Rehearsal failed.", "First failed rule: flow error."),
-        PASSED: ("Rehearsal passed: the basis functions.", "All six rules passed."),
+        FAILED: ("Fail (simulation).", "First failed rule: flow error."),
+        PASSED: ("Pass (simulation): the basis functions.", "All six rules passed."),
     }
 
     def a_night(number, files, state):
@@ -554,13 +553,13 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
         return summary, json.loads(played.run("git", "show", "HEAD:champion.json").stdout)
 
     summary, state = a_night(1, "one", FAILED)
-    assert "candidate deposition: Rehearsal failed. First failed rule: flow error." in summary
+    assert "candidate deposition: Fail (simulation). First failed rule: flow error." in summary
     assert "promoted" not in summary
     candidate = state["candidates"]["deposition"]
     assert not state["champions"] and not state["history"]
     assert candidate["run"] == "night-0001" and candidate["files"] and candidate["lineage"]["commit"]
     assert (candidate["contestant"], candidate["rehearsal"]) == ("basis", True)
-    assert candidate["why"] == candidate["verdict"] == "Rehearsal failed. First failed rule: flow error."
+    assert candidate["why"] == candidate["verdict"] == "Fail (simulation). First failed rule: flow error."
     assert candidate["metrics"]["mean_cost"] == 1.0
     assert played.production_of("deposition.candidate") == {"compose_parts/x": b"one"}
     # the same challenger again stays the candidate of the night that made it, and its files are as they were
@@ -590,6 +589,6 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
     assert state["candidates"]["deposition"]["run"] == "night-0005"
     assert played.production_of("deposition") == {"compose_parts/x": b"two"}
     page = words(Path("reports/nightly.html").read_text())
-    assert "Nothing is promoted: deposition does not pass." in page and "Rehearsal failed." in page
+    assert "Nothing is promoted: deposition does not pass." in page and "Fail (simulation)." in page
     assert champion.as_committed() == []
     assert not [line for line in played.dirty() if "champion" in line]

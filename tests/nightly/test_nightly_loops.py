@@ -53,7 +53,7 @@ def project(empty, tmp_path, monkeypatch):
 
 
 def passing(loop: str) -> tuple[str, Verdict]:
-    said = "Rehearsal passed: ours.", "All six rules passed.", "", "", ""
+    said = "Pass (simulation): ours.", "All six rules passed.", "", "", ""
     return loop, Verdict(loop, PASSED, *said, winner="ours", subject="ours", rehearsal=True)
 
 

@@ -65,7 +65,7 @@ def metrics(settling=26.0, stay=71.0, flow=2.5, winner="pi_simc"):
     }
     verdicts = {"temperature": "passed", "deposition": "not measured", "setpoint": "failed"}
     report = {
-        "verdict": {"state": "passed", "decision": "Rehearsal passed.", "winner": winner},
+        "verdict": {"state": "passed", "decision": "Pass (simulation).", "winner": winner},
         "verdicts": {loop: {"state": state} for loop, state in verdicts.items()},
         "figures": {winner: figures},
     }

@@ -20,11 +20,11 @@ from tests.report.test_pages import Page
 PAGE, INDEX = Path("reports/certificate.html"), Path("reports/index.html")
 
 
-def test_a_passed_certificate_of_a_simulated_plant_is_a_rehearsal(project):
+def test_a_passed_certificate_of_a_simulated_plant_is_a_simulation(project):
     made_certificate.write()
     main()
     page, first = Page(PAGE).text, Page(INDEX).text
-    assert "Rehearsal: certificate passed." in page and "May run" not in page + first
+    assert "Certificate passed (simulation)." in page and "May run" not in page + first
     digest = artifacts.sha256(made_certificate.PATH)
     for text in (page, first):
         whole = " ".join(text.split())
@@ -54,7 +54,7 @@ def test_a_certificate_of_recordings_says_no_more_than_page_one(project):
     main()
     assert "May run" not in Page(PAGE).text + Page(INDEX).text
     assert "Certificate passed, not ready." in Page(PAGE).text
-    assert "rehearsal, not for a real machine" not in Page(PAGE).text
+    assert "simulated: not for a real machine" not in Page(PAGE).text
 
 
 def test_margins_of_the_plants_that_page_one_judges_on_stand_beside_the_certificate_s():

@@ -53,7 +53,7 @@ def conformance(**values):
 
 def test_the_composer_with_the_least_worst_error_is_named_with_its_figure_yardsticks_and_price(project):
     text = page()
-    assert "Rehearsal passed: the basis functions. All eight rules passed." in text
+    assert "Pass (simulation): the basis functions. All eight rules passed." in text
     assert (
         "Basis functions leave at most 2.0 % of on‑off control’s flow error (square, A); "
         "library by its priority rule 12 %" in text
@@ -69,7 +69,7 @@ def test_the_composer_with_the_least_worst_error_is_named_with_its_figure_yardst
     )
     assert (
         re.search(r"<title>(.*?) ·", PAGE.read_text())[1]
-        == "Deposition: Rehearsal passed: the basis functions"
+        == "Deposition: Pass (simulation): the basis functions"
     )
 
 
@@ -98,7 +98,7 @@ def test_where_the_simple_rule_is_as_good_it_wins(project):
     )
     conformance(shorter_than_lead=0)
     # 2.4 % is within half a point of 2.0 %: the simpler one is taken
-    assert "Rehearsal passed: the library by its priority rule. All six rules passed." in page()
+    assert "Pass (simulation): the library by its priority rule. All six rules passed." in page()
 
 
 def test_on_off_control_may_win_and_then_nothing_is_to_be_printed_by_this_loop(project):
@@ -106,7 +106,7 @@ def test_on_off_control_may_win_and_then_nothing_is_to_be_printed_by_this_loop(p
         {"on_off": (100.0, None, 60.0), "priority": (120.0, 80.0, 90.0), "basis": (130.0, 60.0, 90.0)}
     )
     text = page()
-    assert "Rehearsal failed" in text and "on‑off control comes closest" in text
+    assert "Fail (simulation)" in text and "on‑off control comes closest" in text
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_the_first_failed_rule_is_said_in_words(project, basis, rule, sentence):
     )
     text = page()
     assert (
-        f"Rehearsal failed: the basis functions come closest. First failed rule: {rule}. {sentence}" in text
+        f"Fail (simulation): the basis functions come closest. First failed rule: {rule}. {sentence}" in text
     )
     assert PAGE.read_text().count('<tr class="fail"><th scope="row"><a') == 1
 
@@ -203,7 +203,7 @@ def test_without_a_declared_drive_the_verdict_is_open_and_says_what_to_declare(p
     undeclared = DRIVEN | {"amplitude_mm": None, "speed_mm_per_s": None, "share_percent": 0.0, "enough": True}
     conformance(saturation={"A": undeclared})
     text = page()
-    assert "First open rule: the drive follows." in text
+    assert "First undecided rule: the drive follows." in text
     assert "goes to 45 mm, 900 mm/s, and no drive is declared." in text
     assert "Declare the drive (printer.drive)." in text
 
@@ -262,19 +262,19 @@ def recordings():
 
 
 def test_a_forecast_that_is_not_judged_leaves_its_rule_open_with_its_reason_and_trial(project):
-    """In a rehearsal too, though the true flow of the simulated machine is known and below what is allowed;
+    """In a simulation too, though the true flow of the simulated machine is known and below what is allowed;
     on every page the same, and in what the night reads."""
     unjudged()
     text = page()
     assert "forecast not judged" in text and "forecast 0.40" not in text
     assert "the part prints at 100 mm/s; to judge it, add a training routine" in text
-    lead = "First open rule: every forecast judged."
+    lead = "First undecided rule: every forecast judged."
     reason = "The forecast of square, material A, is not judged: the part prints at 100 mm/s."
-    assert f"Rehearsal open: the basis functions come closest. {lead} {reason}" in text
+    assert f"Undecided (simulation): the basis functions come closest. {lead} {reason}" in text
     assert "To judge it, add a training routine." in text and "rules passed" not in text
     assert "at most 2.0 % of on‑off control’s flow error" in text
     index = Page(Path("reports/index.html")).text
-    assert "Rehearsal passed: temperature and setpoint; open: deposition." in index
+    assert "Pass (simulation): temperature and setpoint; undecided: deposition." in index
     assert f"{lead} {reason}" in index
     written = figures()["verdicts"]["deposition"]
     assert (written["state"], written["lead"], written["rule"]) == (OPEN, lead, "Every forecast judged")
@@ -286,7 +286,7 @@ def test_the_library_too_waits_for_the_trial_that_judges_its_forecast(project):
     conformance(shorter_than_lead=0)
     unjudged()
     text = page()
-    assert "Rehearsal open: the library by its priority rule comes closest." in text
+    assert "Undecided (simulation): the library by its priority rule comes closest." in text
     assert "is not judged: the part prints at 100 mm/s. Library by its priority rule leaves" in text
 
 
@@ -318,7 +318,7 @@ def test_on_a_real_machine_a_part_that_is_not_judged_has_no_figure_anywhere(proj
     unjudged()
     text, index = page(), Page(Path("reports/index.html")).text
     assert "Ready for a supervised trial" not in text
-    assert "Not ready. First open rule: every forecast judged." in text
+    assert "Not ready for a supervised trial. First undecided rule: every forecast judged." in text
     assert "is not judged: the part prints at 100 mm/s. What the parts come to is not known." in text
     card = index[index.index("Plunger command to flow at the nozzle") : index.index("Nozzle camera to")]
     board = text.split("Share of the printing time")[0]
@@ -350,7 +350,10 @@ def test_before_the_stages_ran_the_page_and_the_card_say_so(project):
     for path in [*ARTIFACTS, *(f"reports/metrics/{stage}.json" for stage in made.deposition_metrics())]:
         Path(path).unlink()
     text = page()
-    assert "Rehearsal open. Nothing was composed." in text and "Run ./run dvc repro compose_parts." in text
+    assert (
+        "Undecided (simulation). Nothing was composed." in text
+        and "Run ./run dvc repro compose_parts." in text
+    )
     assert "This machine" not in Page(Path("reports/index.html")).text
 
 
@@ -365,11 +368,11 @@ def test_a_frame_is_in_the_page_itself_with_its_recording_time_and_the_reason_of
 def test_page_one_has_the_card_with_the_winner_in_words_and_the_worst_loop_as_its_headline(project):
     main()
     first = Page(Path("reports/index.html"))
-    assert "Rehearsal passed: the basis functions." in first.text
+    assert "Pass (simulation): the basis functions." in first.text
     card = first.text[first.text.index("Plunger command to flow") : first.text.index("Nozzle camera to")]
     assert re.search(r"Flow error ≤ 6 % 2(\.0)? % 12(\.0)? % 100", card), card
     assert first.links.count("deposition.html") >= 2
-    assert "Rehearsal passed: subspace + LQG." in first.text
+    assert "Pass (simulation): subspace + LQG." in first.text
     made.deposition(
         {
             "on_off": (100.0, None, 60.0),
@@ -382,9 +385,9 @@ def test_page_one_has_the_card_with_the_winner_in_words_and_the_worst_loop_as_it
     text = Path("reports/index.html").read_text()
     assert (
         re.search(r"<h1.*?>(.*?)</h1>", text)[1]
-        == "Rehearsal passed: temperature and setpoint; failed: deposition."
+        == "Pass (simulation): temperature and setpoint; fail: deposition."
     )
-    assert "Rehearsal failed: the basis functions come closest." in text
+    assert "Fail (simulation): the basis functions come closest." in text
 
 
 def test_two_loops_that_fail_are_both_named_in_the_headline(project):
@@ -400,8 +403,8 @@ def test_two_loops_that_fail_are_both_named_in_the_headline(project):
     main()
     head, rest = Path("reports/index.html").read_text().split("</h1>")
     assert (
-        head.endswith("Rehearsal passed: setpoint; failed: temperature and deposition.")
-        and '<strong class="bad">Rehearsal failed.</strong>' in rest
+        head.endswith("Pass (simulation): setpoint; fail: temperature and deposition.")
+        and '<strong class="bad">Fail (simulation).</strong>' in rest
     )
 
 

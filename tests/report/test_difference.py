@@ -55,7 +55,7 @@ def test_who_was_chosen_is_accepted_and_stays_where_nobody_is_better_beyond_the_
     artifacts.write_json("reports/accepted.json", run | {"winner": "varx_riccati"})
     main()
     text = Page(TEMPERATURE).text
-    assert "Rehearsal passed: VARX + Riccati." in text
+    assert "Pass (simulation): VARX + Riccati." in text
     assert "It was named before, and subspace + LQG is not better beyond the bands." in text
 
 

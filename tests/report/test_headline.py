@@ -14,19 +14,19 @@ def three(*states):
 
 
 def test_the_sentence_names_every_loop_once_by_what_may_be_done_with_it():
-    assert decision(three("passed", "passed", "passed")) == "Rehearsal passed: all three loops."
+    assert decision(three("passed", "passed", "passed")) == "Pass (simulation): all three loops."
     assert (
         decision(three("passed", "passed", "failed"))
-        == "Rehearsal passed: temperature and deposition; failed: setpoint."
+        == "Pass (simulation): temperature and deposition; fail: setpoint."
     )
     assert (
         decision(three("failed", "open", "not measured"))
-        == "Rehearsal failed: temperature; open: deposition; not measured: setpoint."
+        == "Fail (simulation): temperature; undecided: deposition; not measured: setpoint."
     )
-    assert decision(three("failed", "failed", "failed")) == "Rehearsal failed: all three loops."
+    assert decision(three("failed", "failed", "failed")) == "Fail (simulation): all three loops."
     assert (
         decision(three("open", "not measured", "not measured"))
-        == "Rehearsal open: temperature; not measured: deposition and setpoint."
+        == "Undecided (simulation): temperature; not measured: deposition and setpoint."
     )
 
 
@@ -35,7 +35,7 @@ def test_of_a_recorded_machine_a_loop_is_ready_for_a_trial_or_not():
     loops = [ready._replace(recorded=True), not_ready._replace(recorded=True), rehearsed]
     assert (
         decision(loops)
-        == "Ready for a supervised trial: temperature; not ready: deposition; rehearsal passed: setpoint."
+        == "Ready for a supervised trial: temperature; not ready: deposition; pass (simulation): setpoint."
     )
 
 

@@ -152,7 +152,8 @@ def test_a_hold_out_too_short_to_predict_over_leaves_that_open_and_keeps_the_res
     text = page()
     assert "Trust this model to simulate, not yet to design controllers and to predict 10 s ahead." in text
     assert (
-        "First open rule: 10 s ahead. no stretch of the hold-out outlasts the start-up of the prediction. "
+        "First undecided rule: 10 s ahead. "
+        "no stretch of the hold-out outlasts the start-up of the prediction. "
         "Record longer, or lower ahead_steps." in text
     )
 

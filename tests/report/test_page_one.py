@@ -45,7 +45,7 @@ def row(card, title, until):
 def test_the_headline_counts_the_verdicts_that_the_metrics_keep(reports, first):
     verdicts = metrics(reports, "report")["verdicts"]
     assert {loop: verdicts[loop]["state"] for loop in LOOPS} == dict.fromkeys(LOOPS, "passed")
-    assert "Rehearsal passed: all three loops." in first.text
+    assert "Pass (simulation): all three loops." in first.text
     for loop in LOOPS:
         assert f"{verdicts[loop]['decision']} {verdicts[loop]['lead']}" in first.text
 

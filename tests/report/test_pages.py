@@ -100,7 +100,7 @@ def test_a_failed_rule_fails_the_verdict_and_its_row_only(project):
     change_all(settled_error=made.figure(0.72, 0.61, 0.84))
     main()
     page = Page(INDEX).text
-    assert "Rehearsal passed: deposition and setpoint; failed: temperature." in page
+    assert "Pass (simulation): deposition and setpoint; fail: temperature." in page
     assert (
         "First failed rule: settled error. Subspace + LQG settles 0.72 °C from its reference at the "
         "90 % quantile of all cases; the rule allows 0.50 °C." in page
@@ -162,7 +162,7 @@ def test_with_nothing_at_all_the_pages_are_there_and_every_place_says_not_measur
         path.unlink()
     main()
     page = Page(INDEX).text
-    assert "Rehearsal open." in page
+    assert "Undecided (simulation)." in page
     assert figures()["verdict"]["winner"] is None
     assert Page(TEMPERATURE).text.lower().count("not measured") > 10
 

@@ -71,14 +71,16 @@ def test_zones_of_a_users_machine_have_its_names(recorded):
     assert not re.search(r"zone 1\b", TEMPERATURE.read_text())
 
 
-def test_words_of_a_recorded_machine_speak_of_a_trial_and_of_a_simulated_one_of_a_rehearsal(project):
+def test_words_of_a_recorded_machine_speak_of_a_trial_and_of_a_simulated_one_of_a_simulation(project):
     main()
-    assert "Rehearsal passed: subspace + LQG." in Page(INDEX).text
+    assert "Pass (simulation): subspace + LQG." in Page(INDEX).text
     declare("generate_probing", source="recordings")
     main()
     text = Page(TEMPERATURE).text
-    assert "Rehearsal" not in text
-    assert "Not ready." in text or "Ready for a supervised trial: subspace + LQG." in text
+    assert "(simulation)" not in text
+    assert (
+        "Not ready for a supervised trial." in text or "Ready for a supervised trial: subspace + LQG." in text
+    )
 
 
 def test_outputs_without_low_and_high_leave_the_rule_open_and_it_does_not_pass(recorded):
@@ -88,7 +90,7 @@ def test_outputs_without_low_and_high_leave_the_rule_open_and_it_does_not_pass(r
     declare("plant", **machine)
     main()
     text = Page(TEMPERATURE).text
-    assert "First open rule: crossings." in text or "Do not trust this model." in text
+    assert "First undecided rule: crossings." in text or "Do not trust this model." in text
     assert "low and high of zone_1, zone_2 are not declared" in text or "trust" in text
     assert figures()["verdict"]["winner"] is None
 

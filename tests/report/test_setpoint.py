@@ -44,12 +44,12 @@ def lost(**percent):
 def test_the_default_is_named_with_its_worst_case_and_its_lead_over_the_next(project):
     text = page()
     # by hand: 100 - 1.5 (0.2 + 5 x 0.1) = 98.95, and 97.6 for the next
-    assert "Rehearsal passed: the agent. All seven rules passed." in text
+    assert "Pass (simulation): the agent. All seven rules passed." in text
     assert (
         "In its worst case (the paper’s simulator, accuracy 70 %, clog) 99.0 % of 2,100 runs settle "
         "and stay, 1.1 points more than of the next, the baseline “Bayes, robust”" in text
     )
-    assert re.search(r"<title>(.*?) ·", PAGE.read_text())[1] == "Setpoint: Rehearsal passed: the agent"
+    assert re.search(r"<title>(.*?) ·", PAGE.read_text())[1] == "Setpoint: Pass (simulation): the agent"
 
 
 def test_who_may_not_run_is_no_next(project):
@@ -89,11 +89,11 @@ def test_a_baseline_may_win_and_then_the_page_says_how_far_the_agent_came(projec
     made_setpoint.scoreboard(lost(our_agent=(1.0, 2.0)))
     made_setpoint.choice("Bayes, robust", margin=9.0)
     text = page()
-    assert "Rehearsal passed: the baseline “Bayes, robust”. All seven rules passed." in text
+    assert "Pass (simulation): the baseline “Bayes, robust”. All seven rules passed." in text
     # 100 - 1.5 (1 + 10) = 83.5, behind the sequential test's 88.6
     assert "9.0 points more than of the next, the baseline “sequential test”" in text
     assert "The agent did not earn it: 83.5 % (the paper’s simulator, accuracy 70 %, clog)." in text
-    assert "Rehearsal passed: the baseline “Bayes, robust”. All seven rules" in Page(INDEX).text
+    assert "Pass (simulation): the baseline “Bayes, robust”. All seven rules" in Page(INDEX).text
 
 
 @pytest.mark.parametrize(
@@ -109,14 +109,14 @@ def test_the_first_failed_rule_is_said_in_words(project, metric, value, rule, se
     change("train_classifier", **{metric: value})
     text = page()
     assert (
-        f"Rehearsal failed. First failed rule: {rule}. "
+        f"Fail (simulation). First failed rule: {rule}. "
         f"{sentence} By runs that settle and stay the agent comes closest." in text
     )
     assert PAGE.read_text().count('<tr class="fail"><th scope="row"><a') == 1
     # page one says which loops passed, and of this one why not
     assert (
         re.search(r"<h1.*?>(.*?)</h1>", INDEX.read_text())[1]
-        == "Rehearsal passed: temperature and deposition; failed: setpoint."
+        == "Pass (simulation): temperature and deposition; fail: setpoint."
     )
     assert f"First failed rule: {rule}. {sentence}" in Page(INDEX).text
 
@@ -126,7 +126,8 @@ def test_a_share_that_straddles_its_limit_is_undecided_and_says_how_many_runs_wo
     text = page()
     # 98.0 % of 210 runs: 95.1 to 99.2; 1.96^2 x 0.98 x 0.02 / 0.01^2 = 753, rounded up to two digits
     assert (
-        "Rehearsal open. First open rule: settles, worst case. Judged is the agent: in its worst case" in text
+        "Undecided (simulation). First undecided rule: settles, worst case. "
+        "Judged is the agent: in its worst case" in text
     )
     assert (
         "98.0 % of its runs settle; 97 % are asked for. Its interval, 95.1–99.2, straddles that; "
@@ -162,14 +163,14 @@ def test_before_the_stages_ran_the_page_and_the_card_say_so(project):
     for path in [*ARTIFACTS, *(f"reports/metrics/{stage}.json" for stage in made_setpoint.metrics())]:
         Path(path).unlink()
     text = page()
-    assert "Rehearsal open. No controller was chosen." in text
+    assert "Undecided (simulation). No controller was chosen." in text
     assert (
         "Run ./run dvc repro evaluate_setpoint." in text
-        and "Rehearsal passed: the agent" not in Page(INDEX).text
+        and "Pass (simulation): the agent" not in Page(INDEX).text
     )
     # what was not measured takes no headline from a loop that was
     assert (
-        "Rehearsal passed: temperature and deposition; not measured: setpoint."
+        "Pass (simulation): temperature and deposition; not measured: setpoint."
         in INDEX.read_text().split("</h1>")[0]
     )
 
@@ -205,7 +206,7 @@ def test_the_card_sets_the_default_beside_another_and_doing_nothing_where_each_f
     page()
     first = Page(INDEX)
     card = first.text[first.text.index("Nozzle camera to") :]
-    assert "Rehearsal passed: the agent." in card and "99.0 %" in card.split("Settles")[1]
+    assert "Pass (simulation): the agent." in card and "99.0 %" in card.split("Settles")[1]
     assert "Worst case of our agent: the paper’s simulator, accuracy 70 %, clog." in card
     assert first.links.count("setpoint.html") >= 2
 
@@ -270,7 +271,7 @@ def test_harm_without_a_declared_bar_is_not_measured_and_does_not_pass(project):
     del sections["evaluate_setpoint"]["most_harmed"]
     Path("params.yaml").write_text(yaml.safe_dump(sections))
     rules, text = harm_rules(project)
-    assert rules == [("not measured", "not measured")] * 2 and "First open rule: does no harm." in text
+    assert rules == [("not measured", "not measured")] * 2 and "First undecided rule: does no harm." in text
 
 
 def test_harm_stands_beside_recovery_with_doing_nothing_and_who_may_not_run_last(project):
@@ -352,7 +353,7 @@ def test_the_ideal_reader_is_named_of_rendered_beads_only(project):
 def test_without_figures_by_flow_the_page_says_so_and_the_rule_is_open(project):
     change("train_classifier", by_flow=None, right_70_150=None)
     text = page()
-    assert "First open rule: right, 70–150 % of flow." in text
+    assert "First undecided rule: right, 70–150 % of flow." in text
     section = PAGE.read_text().split('aria-labelledby="by-flow"')[1].split("</section>")[0]
     assert "Not measured" in section and '<svg class="plot' not in section
 

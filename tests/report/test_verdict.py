@@ -27,7 +27,6 @@ from pipeline.report.shared.verdict import (
     share,
     state,
 )
-from pipeline.report.temperature import readme
 from pipeline.report.temperature.contestants import in_a_sentence
 from pipeline.report.temperature.judgement import judgement
 from pipeline.report.temperature.pairs import deciding_sentence, pair_sentence
@@ -142,7 +141,7 @@ def test_share_of_the_allowance_is_inverted_where_more_is_better():
 def test_passed_says_what_is_closest_to_its_limit_and_never_counts_drift_as_passed():
     verdict = judge(metrics())
     assert (verdict.state, verdict.winner) == (PASSED, "subspace_lqg")
-    assert verdict.decision == "Rehearsal passed: subspace + LQG."
+    assert verdict.decision == "Pass (simulation): subspace + LQG."
     assert verdict.lead == "Every rule measured so far passed on 6 simulated plants."
     assert verdict.reason == "Closest to its limit: disk margin of the median plant, 0.70 of at least 0.40."
     assert verdict.remedy.startswith("Drift is not measured. The nightly job measures it and has not run.")
@@ -176,7 +175,8 @@ def test_of_recordings_a_pass_is_ready_for_a_supervised_trial_and_nothing_more()
     verdict = judge(metrics(), recorded=True)
     assert verdict.decision == "Ready for a supervised trial: subspace + LQG."
     assert verdict.remedy.endswith("Next: a supervised trial, somebody at the machine throughout.")
-    assert judge(metrics(overshoot=made.figure(9.0, 8.0, 10.0)), recorded=True).decision == "Not ready."
+    failed = judge(metrics(overshoot=made.figure(9.0, 8.0, 10.0)), recorded=True)
+    assert failed.decision == "Not ready for a supervised trial."
 
 
 @pytest.mark.parametrize(
@@ -212,7 +212,7 @@ def test_of_recordings_a_pass_is_ready_for_a_supervised_trial_and_nothing_more()
 )
 def test_failed_names_the_first_failed_rule_with_figure_and_limit(figure, rule, sentence):
     verdict = judge(metrics(**figure))
-    assert (verdict.state, verdict.decision) == (FAILED, "Rehearsal failed.")
+    assert (verdict.state, verdict.decision) == (FAILED, "Fail (simulation).")
     assert verdict.lead == f"First failed rule: {rule}."
     reason = verdict.reason.replace("\u202f", " ")
     assert reason == f"Subspace + LQG {sentence} No contestant passes; subspace + LQG comes closest."
@@ -222,8 +222,8 @@ def test_failed_names_the_first_failed_rule_with_figure_and_limit(figure, rule, 
 def test_an_undeclared_limit_leaves_the_rule_open_and_an_open_rule_does_not_pass():
     verdict = judge(metrics(), undeclared=("zone_1", "zone_2"))
     assert (verdict.state, verdict.winner) == (OPEN, None)
-    assert verdict.decision == "Rehearsal open."
-    assert verdict.lead == "First open rule: crossings."
+    assert verdict.decision == "Undecided (simulation)."
+    assert verdict.lead == "First undecided rule: crossings."
     assert verdict.reason.startswith(
         "low and high of zone_1, zone_2 are not declared. "
         "Declare low and high below plant.outputs in params.yaml."
@@ -232,7 +232,7 @@ def test_an_undeclared_limit_leaves_the_rule_open_and_an_open_rule_does_not_pass
 
 def test_a_band_that_straddles_its_limit_does_not_pass():
     verdict = judge(metrics(overshoot=made.figure(4.9, 4.5, 5.6)))
-    assert verdict.state == OPEN and verdict.lead == "First open rule: overshoot."
+    assert verdict.state == OPEN and verdict.lead == "First undecided rule: overshoot."
     assert "The band of that quantile, 4.5–5.6, straddles the limit." in verdict.reason
 
 
@@ -296,21 +296,8 @@ def test_the_deciding_case_is_told_and_the_verdict_without_it():
 def test_without_any_figures_the_verdict_is_open_and_says_what_to_run():
     gone = Missing("not measured", "evaluate_temperature.json is not there", "Run it")
     verdict = judge(made.metrics() | {"evaluate_temperature": gone})
-    assert (verdict.state, verdict.decision) == (OPEN, "Rehearsal open.")
+    assert (verdict.state, verdict.decision) == (OPEN, "Undecided (simulation).")
     assert verdict.reason == "evaluate_temperature.json is not there. Run it."
-
-
-def test_the_readme_shows_every_contestant_with_its_quantiles_and_the_verdict_of_the_pages():
-    stages = metrics()
-    text = readme.block(stages, RULES, judge(stages))
-    assert "**Rehearsal passed: subspace + LQG.** Every rule measured so far passed on 6 simulated" in text
-    assert "| settled error, worst zone, at most 0.5 °C | settling, at most 60 s |" in text
-    assert "| subspace + LQG (model-based) | 0.10 °C | 6 s | 0.5 °C | 1.0 % | 2.00 | 0 |" in text
-    assert "| Hold (do nothing) | 80 °C | never settles |" in text
-    whole = readme.rewritten(f"a\n{readme.BEGIN}\nold\n{readme.END}\nb\n", text)
-    assert whole == f"a\n{text}\nb\n"
-    with pytest.raises(ValueError, match="README.md: expected the lines"):
-        readme.rewritten("no block", text)
 
 
 # ---- over many comparisons

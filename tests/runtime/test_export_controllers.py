@@ -64,12 +64,12 @@ def test_an_exported_machine_is_the_declared_one():
     ("best", "name", "why"),
     [
         ("pi", "pi", ""),
-        (None, "", "The verdict names no controller to run: Rehearsal failed."),
+        (None, "", "The verdict names no controller to run: Fail (simulation)."),
         ("hold", "", "Doing nothing is recommended"),
     ],
 )
 def test_nothing_is_exported_where_the_verdict_recommends_no_controller(best, name, why):
-    found, reason = export.chosen(best, "Rehearsal failed.")
+    found, reason = export.chosen(best, "Fail (simulation).")
     assert found == name and reason.startswith(why)
     assert export.nothing(reason).files == {}
 

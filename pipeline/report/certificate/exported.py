@@ -12,7 +12,7 @@ from pipeline.report.temperature.contestants import BY_NAME, in_a_sentence
 
 STAGE, LOOPS = "export_controllers", ("temperature", "deposition", "setpoint")
 FOLDER = "datasets/export_controllers"
-REHEARSAL, MAY_RUN = "Rehearsal: certificate passed.", "May run."
+SIMULATED, MAY_RUN = "Certificate passed (simulation).", "May run."
 NOT_READY = "Certificate passed, not ready."
 REFUSED, NONE = "Certificate refused.", "No certificate."
 
@@ -53,7 +53,7 @@ def _line(loop: str, metrics: Mapping[str, Any], verdict: Verdict) -> Line:
     if isinstance(shown, Mapping):
         passed = shown.get("verdict") == "passed"
         state = PASSED if passed else FAILED
-        word = (REHEARSAL if shown.get("evidence") == "simulated" else MAY_RUN) if passed else REFUSED
+        word = (SIMULATED if shown.get("evidence") == "simulated" else MAY_RUN) if passed else REFUSED
     if word == MAY_RUN and not (verdict.state == PASSED and verdict.winner == name):
         state, word = OPEN, NOT_READY
         why = f"Page one says: {verdict.decision} {verdict.lead}".strip()

@@ -14,7 +14,7 @@ from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 from pipeline.report.temperature.contestants import BY_NAME, heading
 
-WORDS = ("rehearsal", "margin_disk", "margin_delay", "spread", "step", "hash")
+WORDS = ("verdict", "margin_disk", "margin_delay", "spread", "step", "hash")
 MOST_BANDS = 40  # gains that are listed, those that are surest of all inputs first
 CIRCLE = np.linspace(0, 2 * np.pi, 181)
 
@@ -83,7 +83,7 @@ def head(shown: Mapping[str, Any] | Missing, lines: Sequence[exported.Line] | Mi
         )
     limits = "It holds for this plant, these units and this sample time, and nothing else."
     if shown.get("evidence") == "simulated":
-        limits += " The plant is simulated: a rehearsal, not for a real machine."
+        limits += " The plant is simulated: not for a real machine."
     return Head(state, f"{mine.word} {mine.name[:1].upper()}{mine.name[1:]}.", "", limits, "")
 
 

@@ -259,7 +259,7 @@ def _flow(parts: Sequence[Structure], limit: float) -> Pair:
 
 
 def _forecast(parts: Sequence[Structure]) -> Pair:
-    """Whether every forecast may be believed; open where one is not judged, simulated or not: a rehearsal
+    """Whether every forecast may be believed; open where one is not judged, simulated or not: a simulation
     does not pass what would not be printed on a machine without another trial."""
     rule = _at_most(FORECAST, 0, limit="all", place="saturation")
     left = [part for part in parts if not part.judged()]

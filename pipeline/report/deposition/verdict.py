@@ -49,7 +49,7 @@ def verdict(sources: Sources) -> Verdict:
         return Verdict(
             loop="deposition",
             state=OPEN,
-            decision=words_for(recorded=real(sources), quick=sources.quick).open,
+            decision=words_for(recorded=real(sources), quick=sources.quick).undecided,
             lead="Nothing was composed.",
             reason=parts.sentence(),
             remedy="",
@@ -108,7 +108,7 @@ def _lead(state: str, first: Rule | None, judged: int, *, condition: bool) -> st
     if state != PASSED:
         if first is None:
             return "Nothing beats on\u2011off control."
-        word = "failed" if state == FAILED else "open"
+        word = "failed" if state == FAILED else "undecided"
         return f"First {word} rule: {first.name[:1].lower()}{first.name[1:]}."
     return f"All {count(judged, 'rule')} {'that can be judged ' if condition else ''}passed."
 

@@ -84,7 +84,7 @@ def trust(sources: Sources) -> Verdict:
         )
         remedy = "Valid for the range of inputs and temperatures that the record covers."
     else:
-        word = {FAILED: "failed", UNDECIDED: "undecided", OPEN: "open"}[first.state]
+        word = "failed" if first.state == FAILED else "undecided"
         place = "First" if ended != PASSED else "One reservation, the first"
         lead = f"{place} {word} rule: {first.name[:1].lower()}{first.name[1:]}."
         reason, remedy = first.reason, first.remedy

@@ -175,7 +175,7 @@ def _champions(champions: Mapping[str, Champion]) -> list[dict[str, str]]:
             "run": champion.run,
             "since": _when(champion.since or champion.when),
             "contestant": heading(champion.contestant),
-            "rehearsal": "rehearsal" if champion.rehearsal else "",
+            "simulation": "simulation" if champion.rehearsal else "",
             "verdict": champion.verdict,
             "exported": _exported(champion),
         }

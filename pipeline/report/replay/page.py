@@ -37,7 +37,7 @@ def render(shown: Shown) -> str:
         title=f"Replay of {told['recording']}",
         state="open" if told["abstains"] else "passed",
         decision=decision(told),
-        word="Rehearsal: the controller was made for a simulated plant." if told["simulated"] else "",
+        word="Simulation: the controller was made for a simulated plant." if told["simulated"] else "",
         told=told,
         rows=rows(told),
         temperatures=[

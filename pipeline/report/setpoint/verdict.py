@@ -488,7 +488,7 @@ def verdict(sources: Sources) -> Verdict:
         return Verdict(
             loop="setpoint",
             state=OPEN,
-            decision=words.open,
+            decision=words.undecided,
             lead="No controller was chosen.",
             reason=gap.sentence()
             if isinstance(gap, Missing)
@@ -521,7 +521,7 @@ def verdict(sources: Sources) -> Verdict:
     return settled._replace(
         state=ended,
         decision=words.of(ended),
-        lead=f"First {'failed' if failed else 'open'} rule: {first.name[:1].lower()}{first.name[1:]}.",
+        lead=f"First {'failed' if failed else 'undecided'} rule: {first.name[:1].lower()}{first.name[1:]}.",
         reason=_closest(name, first),
         remedy=_conditions(asked, claim == CLAIM),
         rule=first.name,

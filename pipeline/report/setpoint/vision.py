@@ -411,7 +411,8 @@ def _conformal(sets: Any) -> str:
     return (
         f"Sets of classes hold the true one in {percent(100 * sets['coverage'], 3)} of "
         f"{sets['windows']:,} windows{asked}; "
-        f"in {percent(100 * sets['held'], 2)} the set is no single class, and nothing is sent."
+        f"in {percent(100 * sets['held'], 2)} the set is no single class. "
+        "The controller weighs the flow that such a window shows, and may still move."
     )
 
 

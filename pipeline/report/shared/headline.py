@@ -85,32 +85,34 @@ def claim(sources: Sources, names: Sequence[str] = NAMES) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-# what is claimed of loops, by whether their machine was recorded and by state
+# the claim about loops, by whether their machine was recorded and by state
 CLAIMS = (
     (True, ("passed",), "ready for a supervised trial"),
-    (True, ("failed", "open"), "not ready"),
-    (False, ("passed",), "rehearsal passed"),
-    (False, ("failed",), "rehearsal failed"),
-    (False, ("open",), "rehearsal open"),
+    (True, ("failed", "open"), "not ready for a supervised trial"),
+    (False, ("passed",), "pass (simulation)"),
+    (False, ("failed",), "fail (simulation)"),
+    (False, ("open",), "undecided (simulation)"),
 )
-# of a quick look, whatever it was made of
+# the claim of a quick look, whether its machine was recorded or not
 QUICK_CLAIMS = tuple(
-    (recorded, (state,), f"quick look {state}")
-    for state in ("passed", "failed", "open")
+    (recorded, (state,), f"quick look {word}")
+    for state, word in (("passed", "passed"), ("failed", "failed"), ("open", "undecided"))
     for recorded in (True, False)
 )
+# the part of a claim that stands once in a sentence
+KINDS = (" for a supervised trial", " (simulation)", "quick look ")
 
 
 def decision(loops: Sequence[Loop], *, quick: bool = False) -> str:
-    """ "Rehearsal passed: temperature and deposition; failed: setpoint." """
+    """ "Pass (simulation): temperature and deposition; fail: setpoint." """
     parts: list[str] = []
     for recorded, states, words in QUICK_CLAIMS if quick else CLAIMS:
         names = [loop.name for loop in loops if loop.recorded == recorded and loop.state in states]
         if names:
-            kind = next((kind for kind in ("rehearsal", "quick look") if words.startswith(kind)), "")
-            again = bool(kind) and any(kind in part for part in parts)
+            kind = next(kind for kind in KINDS if kind in words)
+            again = any(kind in part for part in parts)
             listed = "all three loops" if len(names) == len(NAMES) else _listed(names, "and")
-            parts.append(f"{words.removeprefix(f'{kind} ') if again else words}: {listed}")
+            parts.append(f"{words.replace(kind, '') if again else words}: {listed}")
     absent = [loop.name for loop in loops if loop.state == ABSENT]
     parts += [f"not measured: {_listed(absent, 'and')}"] if absent else []
     text = "; ".join(parts)

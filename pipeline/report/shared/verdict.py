@@ -178,26 +178,27 @@ def overall(states: Sequence[str]) -> str:
 
 
 class Words(NamedTuple):
-    """What a verdict may say: of simulated machines never more than that a rehearsal passed."""
+    """What a verdict may say. A verdict on simulated machines says that it is one."""
 
     passed: str
     failed: str
-    open: str
+    undecided: str
 
     def of(self, state: str) -> str:
         """The word for a verdict in this state, `passed` with a place for the controller."""
-        return {PASSED: self.passed, FAILED: self.failed}.get(state, self.open)
+        return {PASSED: self.passed, FAILED: self.failed}.get(state, self.undecided)
 
 
-REHEARSAL = Words("Rehearsal passed: {}.", "Rehearsal failed.", "Rehearsal open.")
-TRIAL = Words("Ready for a supervised trial: {}.", "Not ready.", "Not ready.")
-# few plants, short searches: no rehearsal and no trial is passed by them
-QUICK = Words("Quick look passed: {}.", "Quick look failed.", "Quick look open.")
+SIMULATION = Words("Pass (simulation): {}.", "Fail (simulation).", "Undecided (simulation).")
+NOT_READY = "Not ready for a supervised trial."
+TRIAL = Words("Ready for a supervised trial: {}.", NOT_READY, NOT_READY)
+# few plants, short searches: neither a simulation nor a trial is passed by them
+QUICK = Words("Quick look passed: {}.", "Quick look failed.", "Quick look undecided.")
 
 
 def words_for(*, recorded: bool, quick: bool) -> Words:
     """The words of a run on recordings or on simulated machines; a quick look says that it is one."""
-    return QUICK if quick else TRIAL if recorded else REHEARSAL
+    return QUICK if quick else TRIAL if recorded else SIMULATION
 
 
 class Verdict(NamedTuple):
@@ -229,7 +230,7 @@ class Verdict(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """The decision, and the rule that decided it: "Rehearsal failed. First failed rule: settling." """
+        """The decision, and the rule that decided it: "Fail (simulation). First failed rule: settling." """
         return f"{self.decision} {self.lead}".strip()
 
     def metrics(self) -> dict[str, str | bool | None]:

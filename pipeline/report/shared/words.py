@@ -8,7 +8,7 @@ from pipeline.report.shared.sources import Sources
 from pipeline.temperature.workflow.contestants import CONTESTANTS
 
 INDEX = (
-    "rehearsal",
+    "verdict",
     "columns",
     "pair",
     "quantile",
@@ -100,11 +100,11 @@ FIXED = {
         "Delay margin",
         "Extra delay of all sensors, in seconds, that the loop bears before it oscillates.",
     ),
-    "rehearsal": (
-        "Rehearsal, trial",
-        "Rehearsal: judged on simulated machines, no claim about a real one. Ready for a supervised "
-        "trial: judged "
-        "on models of the recorded machine; somebody stays at it throughout.",
+    "verdict": (
+        "Verdict",
+        "Pass, fail or undecided (simulation): judged on simulated machines, no claim about a real one. "
+        "Undecided: no rule failed, but a rule is undecided or not measured. Ready for a supervised trial: "
+        "judged on models of the recorded machine; somebody stays at it throughout.",
     ),
     "columns": (
         "Data\u2011driven, model\u2011based",
@@ -379,8 +379,8 @@ FIXED = {
     ),
     "held_window": (
         "Held",
-        "Nothing is sent: too few frames show a line, they are foreign, the tip moved, "
-        "or two classes remain possible.",
+        "Nothing is sent: too few frames show a line, they are foreign, or the tip moved. "
+        "A window in which two classes remain possible is weighed by its flow, and may move the controller.",
     ),
     "foreign": (
         "Foreign",

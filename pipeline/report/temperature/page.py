@@ -12,7 +12,7 @@ from pipeline.report.temperature.contestants import BY_NAME
 from pipeline.report.temperature.judgement import Judgement, heads, verdict_parts
 
 WORDS = (
-    "rehearsal",
+    "verdict",
     "pair",
     "quantile",
     "settled",

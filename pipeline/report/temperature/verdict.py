@@ -266,7 +266,15 @@ def _nothing(
     why = gap if isinstance(gap, Missing) else Missing(OPEN, nobody)
     first = GROUPS_FIRST
     verdict = Verdict(
-        LOOP, OPEN, words.open, f"First open rule: {first}.", why.sentence(), "", first, None, rules=lines
+        LOOP,
+        OPEN,
+        words.undecided,
+        f"First undecided rule: {first}.",
+        why.sentence(),
+        "",
+        first,
+        None,
+        rules=lines,
     )
     return verdict._replace(subject=named or a)
 
@@ -329,13 +337,13 @@ def _not_passed(
     who = "" if first.name == "drift" else comes
     why = first.reason or _drift_sentence(first)
     open_too = [rule.name for rule in subject.rules if rule.state == OPEN and rule.name not in LATER]
-    also = f"Open too: {', '.join(open_too)}." if failed and open_too else ""
+    also = f"Undecided too: {', '.join(open_too)}." if failed and open_too else ""
     where = _worst_case(metrics, subject.name, first) if failed else ""
     return Verdict(
         LOOP,
         FAILED if failed else OPEN,
-        words.failed if failed else words.open,
-        f"First {'failed' if failed else 'open'} rule: {first.name}.",
+        words.failed if failed else words.undecided,
+        f"First {'failed' if failed else 'undecided'} rule: {first.name}.",
         " ".join(filter(None, [why, who])),
         " ".join(filter(None, [where, also, "Keep what runs on the machine now." if words is TRIAL else ""])),
         group_of(first.name),

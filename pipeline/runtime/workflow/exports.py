@@ -9,7 +9,7 @@ from pipeline.runtime.export import c, klipper, python, setpoint, vectors
 from pipeline.runtime.machine import Exported
 from pipeline.store import artifacts
 
-REHEARSAL = "Rehearsal: it was made for a simulated plant, and runs only where it is told so."
+SIMULATED = "Pass (simulation): it was made for a simulated plant, and runs only if `rehearsal` is set."
 UNCERTIFIED = (
     "It has no certificate: evaluate_setpoint judged it with the camera's watch, held windows, waits and "
     "limits, which are not in these files."
@@ -48,7 +48,7 @@ def export(folder: Path, to: str, out: Path | None, section: str, power_W: float
         for name, text in texts.items():
             artifacts.write_text(place / name, text)
     written = ", ".join(str(target / name) for name in sorted(texts))
-    word = REHEARSAL if made.simulated else TRIAL
+    word = SIMULATED if made.simulated else TRIAL
     digest = certificate.sha256(shown)
     return f"{made.name}, certificate {digest[:12]}. {word}\nwritten: {written}"
 
