@@ -1,19 +1,12 @@
 """The agents over training seeds, each judged on windows that nothing was fitted to, and the speed of
-training beside stable-baselines3's.
+training.
 
-`./run python -m benchmarks.agent 5 100` trains with seeds 0 .. 4 by the numbers of params.expert.yaml, judges
-21 starts x 100 runs in every case, prints every seed and the worst, and writes benchmarks/results/agent.json.
-A third argument is the python of an environment with stable-baselines3 and a CPU build of torch, which then
-trains a DQN of the same sizes in the same run. `... benchmarks.agent speed` measures the speed alone and
-leaves the rest as it was; `... speed PYTHON` beside the peer. Recorded windows are synthetic ones: drawn with
-one generator to learn from, with another to judge on.
+`./run python -m benchmarks.agent` trains with seeds 0 .. 4 by the numbers of params.expert.yaml, judges 21
+starts x 100 runs in every case, and writes its part of benchmarks/results.json. Recorded windows are
+synthetic ones: drawn with one generator to learn from, with another to judge on.
 """
 
-import json
-import subprocess
-import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -21,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from benchmarks import results
+from benchmarks.results import Row
 from pipeline.setpoint import agent, belief_agent, judging
 from pipeline.setpoint.recorded import recorded_windows
 from pipeline.setpoint.score import Score
@@ -30,7 +25,6 @@ from pipeline.setpoint.workflow.settings import Li2025, TrainAgent
 from pipeline.store import params
 from tests.setpoint.synthetic import synthetic_table
 
-RESULTS, PEER = Path(__file__).parent / "results" / "agent.json", Path(__file__).parent / "agent_peer.py"
 UPDATES = 500  # of each timing
 
 
@@ -169,52 +163,43 @@ def seconds(work) -> np.ndarray:
     return np.median(taken[1:], axis=0)
 
 
-def peer(python: str | None, ours: dict[str, Any]) -> dict[str, Any]:
-    """stable-baselines3's updates a second and a CPU second, of its whole loop and of its
-    updates alone, and how often ours fit into them."""
-    if python is None or not Path(python).exists():
-        return {
-            "skipped": "no python of an environment with stable-baselines3 and a CPU build of torch was named"
-        }
-    done = subprocess.run([python, str(PEER), str(UPDATES)], capture_output=True, text=True, check=True)
-    rates = {
-        name: [float(x) for x in np.median(values, axis=0)]
-        for name, values in json.loads(done.stdout.splitlines()[-1]).items()
-    }
-    rates = {
-        f"{name}_per_{unit}": value
-        for name, pair in rates.items()
-        for unit, value in zip(("s", "cpu_s"), pair, strict=True)
-    }
-    return rates | {
-        f"ratio_{name}_{unit}": ours[f"updates_per_{unit}"] / rates[f"{name}_per_{unit}"]
-        for name in ("whole_loop", "updates_alone")
-        for unit in ("s", "cpu_s")
-    }
+SEEDS, RUNS = 5, 100
+CASES = ("accuracy 0.7", "recorded, fresh", "recorded, sticky")
+# its program needs torch: git show 23e84ac:benchmarks/agent_peer.py
+BASELINES3 = "2.85 times stable-baselines3's whole loop on another day, commit 23e84ac"
 
 
-def fast(python: str | None) -> None:
-    """The speed anew, beside the peer where its python is named."""
-    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    results["speed"] = speeds(params.load(TrainAgent, "train_agent").li_2025)
-    if python is not None:
-        results["peer"] = peer(python, results["speed"])
-    RESULTS.write_text(json.dumps(results, indent=2, ensure_ascii=False) + "\n")
-    print(json.dumps({name: results.get(name) for name in ("speed", "peer")}, indent=2))
+def rows(speed: dict[str, Any], seeds: list[dict[str, Any]]) -> list[Row]:
+    """Updates a second, and what each agent settles and keeps over the training seeds."""
+    out = [
+        Row(
+            "updates of the DQN, whole loop",
+            f"{speed['updates_per_s']:,.0f} updates/s",
+            f"{speed['products_alone_per_s']:,.0f} updates/s (its bare matrix products)",
+            BASELINES3,
+        ),
+        Row("one action", f"{speed['action_ms']:.3f} ms"),
+    ]
+    for name in ("four phases", "ours"):
+        title = "the paper's agent, four phases" if name == "four phases" else "our agent on a belief"
+        for case in (case for case in CASES if all(case in seed[name] for seed in seeds)):
+            settled, stay = ([seed[name][case][key] for seed in seeds] for key in ("settled", "stay"))
+            out.append(
+                Row(
+                    f"{title}, {case}: runs that reach the target",
+                    f"{min(settled):g} to {max(settled):g} %",
+                    "",
+                    f"{len(seeds)} training seeds; keep it: {min(stay):g} to {max(stay):g} %",
+                )
+            )
+    return out
+
+
+def main() -> None:
+    settings = params.load(TrainAgent, "train_agent")
+    seeds = [one_seed(settings.model_copy(update={"seed": seed}), RUNS, 10.0) for seed in range(SEEDS)]
+    results.write("agent", rows(speeds(settings.li_2025), seeds))
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["speed"]:
-        fast(sys.argv[2] if len(sys.argv) > 2 else None)
-        sys.exit()
-    seeds, runs, python = [*sys.argv[1:], *["5", "100", None][len(sys.argv) - 1 :]]
-    settings = params.load(TrainAgent, "train_agent")
-    results: dict[str, Any] = {"speed": speeds(settings.li_2025)}
-    print(json.dumps(results, indent=2), flush=True)
-    results["peer"] = peer(python, results["speed"])
-    print(json.dumps(results["peer"], indent=2), flush=True)
-    RESULTS.write_text(json.dumps(results, indent=2, ensure_ascii=False) + "\n")
-    for seed in range(int(seeds)):
-        results[f"seed {seed}"] = one_seed(settings.model_copy(update={"seed": seed}), int(runs), 10.0)
-        print(seed, json.dumps(results[f"seed {seed}"], indent=2, ensure_ascii=False), flush=True)
-        RESULTS.write_text(json.dumps(results, indent=2, ensure_ascii=False) + "\n")
+    main()

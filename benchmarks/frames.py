@@ -1,32 +1,31 @@
 """From frames to flow: bead width, empty frames, Q(t), learning through
 pixels, and the time a frame takes, each beside its bar.
 
-`./run python -m benchmarks.frames` prints the tables and writes benchmarks/results/frames.json; `./run python
--m benchmarks.frames width empty` runs only the parts named (width, empty, flow, pixels, speed) and leaves the
-others as they were. Figures are the worst over seeds that nothing was tuned on; the scenes nominal and hard,
-and some like the others, were looked at while the edge finder was made. Times are CPU milliseconds of one
-core, the quickest of several rounds.
+`./run python -m benchmarks.frames` writes its part of benchmarks/results.json. Figures are the worst over
+seeds that nothing was tuned on; the scenes nominal and hard, and some like the others, were looked at while
+the edge finder was made. Times are CPU milliseconds of one core, the quickest of several rounds.
 """
 
 import itertools
-import json
-import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from benchmarks import results
+from benchmarks.results import Row
 from pipeline.deposition import ilc
 from pipeline.deposition.bead import Calibration, area, calibrate, measure, measure_all
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, routine
 from pipeline.deposition.flow import Flow, View, estimate, sections
 from pipeline.deposition.rendering import HARD, NOMINAL, Camera, Scene
+from pipeline.deposition.workflow.trial_files import Conditions, Signals, read_trial, write_trial
 
-RESULTS = Path(__file__).parent / "results" / "frames.json"
 TS, SPEED, ANGLE_DEG, PX_PER_MM = 0.02, 8.0, 90.0, 125.0
 AREA = float(area(0.88, ANGLE_DEG))
 NOMINAL_FLOW = AREA * SPEED
@@ -263,65 +262,115 @@ def pixel_figures(trials: int = 15) -> dict[str, Any]:
     return out
 
 
-def quickest_ms(function: Callable[[], Any], rounds: int = 15, each: int = 20) -> float:
-    times_ms = []
-    for _ in range(rounds):
-        start = time.process_time()
-        for _ in range(each):
-            function()
-        times_ms.append(1e3 * (time.process_time() - start) / each)
-    return round(min(times_ms), 3)
+# ---- recorded trials
+
+RECORDED, ROUNDS = 450, 5
+CONDITIONS = Conditions("A", "0.6 mm", 0, "on-off", 8.0, 0.6, 0.304, 125.0, 0.0, 90.0, -0.008, 60.0)
 
 
-def speed_figures() -> dict[str, Any]:
-    camera = Camera(NOMINAL, np.random.default_rng(600))
-    frame, bare = camera.frame(110.0, stage_px=0), camera.empty(stage_px=0)
-    many = [camera.frame(110.0, stage_px=97 * i) for i in range(16)]
-    jpeg = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
-    rng = np.random.default_rng(601)
-    calibration = gauged(camera, rng)
-    start = time.process_time()
-    flow_through_camera(camera, R.r, calibration)
-    trial_s = time.process_time() - start
-    return {
-        "bars": "render <= 1.5 ms a frame, measure about 0.25 ms, raw >= 2,500 frames/s for frame -> area",
-        "render_ms": quickest_ms(lambda: camera.frame(110.0, stage_px=0)),
-        "measure_ms": quickest_ms(lambda: measure(frame, columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX)),
-        "measure_all_ms_a_frame": (
-            ms := round(
-                quickest_ms(
-                    lambda: measure_all(many, columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX), each=3
-                )
-                / 16,
-                3,
+def rendered(count: int) -> list[np.ndarray]:
+    """Frames of the nominal scene, the bead at 80 to 120 px."""
+    camera = Camera(NOMINAL, np.random.default_rng(0))
+    return [camera.frame(100.0 + 20 * np.sin(k), stage_px=33 * k) for k in range(count)]
+
+
+def record(path: Path, frames: list[np.ndarray], encoding: str) -> None:
+    t = np.arange(RECORDED // 30 * 50) / 50
+    stream: Iterator = ((k / 30, frames[k % len(frames)]) for k in range(RECORDED))
+    signals = Signals(t, 8 * t, np.full(t.size, 8.0), np.sin(t), np.cos(t))
+    write_trial(path, CONDITIONS, stream, signals, encoding=encoding)
+
+
+def only_read(path: Path) -> int:
+    """From the closed file on: signals read, everything checked, every frame decoded."""
+    return sum(frame.shape[0] == 480 for _, frame in read_trial(path, unreadable_share=0.0).frames)
+
+
+def read_and_measured(path: Path) -> int:
+    frames = (frame for _, frame in read_trial(path, unreadable_share=0.0).frames)
+    widths = []
+    while batch := list(itertools.islice(frames, 16)):
+        widths += [bead.width for bead in measure_all(batch, columns=(120, 640), longest_blur_px=3.5)]
+    return int(np.isfinite(area(np.array(widths) / CONDITIONS.px_per_mm, CONDITIONS.contact_angle_deg)).sum())
+
+
+def recorded_figures() -> dict[str, dict[str, float]]:
+    """Frames a CPU second from a closed MCAP file, raw and as the recorder writes it by default, JPEG."""
+    frames, out = rendered(60), {}
+    with tempfile.TemporaryDirectory() as folder:
+        for encoding in ("raw", "jpeg"):
+            path = Path(folder) / f"{encoding}.mcap"
+            record(path, frames, encoding)
+            seconds = {
+                way.__name__: min(_taken(way, path) for _ in range(ROUNDS))
+                for way in (only_read, read_and_measured)
+            }
+            out[encoding] = {
+                "decoded_per_s": RECORDED / seconds["only_read"],
+                "measured_per_s": RECORDED / seconds["read_and_measured"],
+            }
+    return out
+
+
+def _taken(way: Callable[[Path], int], path: Path) -> float:
+    begun = time.process_time()
+    if way(path) != RECORDED:
+        raise ValueError(f"{path.name}: expected {RECORDED} frames")
+    return time.process_time() - begun
+
+
+# ---- the rows
+
+
+def rows(found: dict[str, Any]) -> list[Row]:
+    """Errors of widths, of empty frames and of Q(t); learning through pixels; frames a second."""
+    out = []
+    for level, deviation in (("nominal", 0.12), ("hard", 0.3)):
+        one = found["width"][level]
+        out.append(
+            Row(
+                f"bead width, {level} scene: worst deviation",
+                f"{one['worst_deviation_px']:g} px",
+                f"at most {deviation:g} px",
+                f"worst bias {one['worst_bias_px']:g} px, {one['worst_bias_calibrated_px']:g} px calibrated",
             )
-        ),
-        "measure_empty_ms": quickest_ms(
-            lambda: measure(bare, columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX)
-        ),
-        "raw_frames_per_s": round(1e3 / ms),
-        "jpeg_decode_ms": quickest_ms(lambda: cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)),
-        "trial_of_738_frames_s": round(trial_s, 2),
-    }
-
-
-PARTS = {
-    "width": width_figures,
-    "empty": empty_figures,
-    "flow": flow_figures,
-    "pixels": pixel_figures,
-    "speed": speed_figures,
-}
+        )
+        empty = found["empty"][level]
+        out.append(Row(f"{empty['frames']} empty frames, {level}: beads found", f"{empty['beads']}", "0"))
+        first = found["flow"][level]["on_off"]
+        out.append(
+            Row(
+                f"Q(t) of an on-off trial, {level}: r.m.s. error",
+                f"{first['worst_rms_percent']:g} %",
+                "at most 2.5 %",
+                f"near the pause {first['worst_corner_percent']:g} %, lag {first['worst_lag_ms']:g} ms",
+            )
+        )
+        learned = found["pixels"][level]
+        out.append(
+            Row(
+                f"learning through pixels, {level}, {learned['runs']} runs: true error after 15 updates",
+                f"{learned['worst_at_15']:g} %",
+                "at most 5 % of trial 0",
+                f"after 2 updates {learned['worst_at_2']:g} %",
+            )
+        )
+    for encoding, one in found["recorded"].items():
+        out.append(
+            Row(
+                f"frames of a recorded trial, {encoding}, to the bead's area",
+                f"{one['measured_per_s']:,.0f} frames/s",
+                "at least 2,500 frames/s" if encoding == "raw" else "",
+                f"only read and checked: {one['decoded_per_s']:,.0f} frames/s",
+            )
+        )
+    return out
 
 
 def main() -> None:
     cv2.setNumThreads(1)
-    result = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    for part in sys.argv[1:] or PARTS:
-        result[part] = PARTS[part]()
-        print(part, json.dumps(result[part], indent=2), flush=True)
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps({part: result[part] for part in PARTS if part in result}, indent=2) + "\n")
+    figures = {"width": width_figures(), "empty": empty_figures(), "flow": flow_figures()}
+    results.write("frames", rows(figures | {"pixels": pixel_figures(), "recorded": recorded_figures()}))
 
 
 if __name__ == "__main__":

@@ -1,11 +1,10 @@
 """Identification held against published figures, against peers on the same hold-outs, and against simple
 competitors on records that no linear model made.
 
-`./run python -m benchmarks.identification` prints the tables with their bars and writes
-benchmarks/results/identification.json; with `foreign` behind it, only the last table, into
-identification_foreign.json; with `speed`, only how many times faster than nfoursid, into `speed` of the
-results. The peers are nfoursid, sippy_unipi and python-control; one that is not installed
-is left out with a line. Data sets come from BEADLINE_SHARED, by default ../shared. Times are CPU seconds.
+`./run --group peers python -m benchmarks.identification` writes its part of benchmarks/results.json; with
+`foreign` behind it, it prints the records of tests/foreign. The peers are nfoursid, sippy_unipi and
+python-control; one that is not installed is left out with a line. Data sets come from BEADLINE_SHARED, by
+default ../shared. Times are CPU seconds.
 """
 
 import importlib.util
@@ -19,79 +18,25 @@ from pathlib import Path
 import control
 import numpy as np
 
-from benchmarks.foreign_records import RECORDS
-from benchmarks.moesp import moesp, moesp_singular_values, varx
+from benchmarks import results
+from benchmarks.results import Row
 from pipeline.temperature.identification import Settings, identify
 from pipeline.temperature.order import LARGEST_RADIUS, stabilised
-from pipeline.temperature.plant import Plant, baam, markov_parameters, simulate
+from pipeline.temperature.plant import Plant, baam, markov_parameters
 from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.probing import study_probe, study_signal
 from pipeline.temperature.published import K_DATA
-from pipeline.temperature.subspace import Segments, lagged, realise, subspace
-from pipeline.temperature.validation import predicted_ahead, simulated
+from pipeline.temperature.subspace import lagged, realise, subspace
+from tests.foreign.records import RECORDS
+from tests.temperature.fits import predict_fit, resampled, simulate_fit
+from tests.temperature.moesp import moesp, varx
 
 SHARED = Path(os.environ.get("BEADLINE_SHARED", "../shared")) / "data"
-RESULTS = Path(__file__).parent / "results" / "identification.json"
-FOREIGN_RESULTS = RESULTS.with_name("identification_foreign.json")
 FOREIGN_SEEDS = (20, 21, 22)
 LOWEST = -100.0  # a fit below this is a failure, however far below
 AMPLITUDES = np.arange(100.0, 0.0, -10.0)
-PRINTED_SINGULAR_VALUES = np.array([69.8841, 14.9963, 3.6675, 1.9677, 0.3000, 0.2078])
-PRINTED_POLES = np.sort_complex(np.array([0.961, 0.7455, 0.4758 + 0.200j, 0.4758 - 0.200j]))
-ERR1 = {"dryer": (15, 4, 0.0150), "evaporator": (10, 4, 0.489), "glass_furnace": (10, 5, 0.496)}
 HOLD_OUT_BARS = {"dryer": 8.0, "evaporator": 38.0, "glass_furnace": 36.0}
 MARKOV_BARS = {0.1: 2e-3, 0.5: 1.5e-2}
-
-
-def nrmse(y: np.ndarray, predicted: np.ndarray, *, means_removed: bool = False) -> np.ndarray:
-    """Fit of each output in percent, 100 (1 - |y - ŷ| / |y - mean y|); NaN in y is left out. With
-    `means_removed` the mean of the error is taken off first."""
-    mask = np.isfinite(y)
-    error = np.where(mask, y - predicted, np.nan)
-    error = error - np.nanmean(error, axis=0) if means_removed else error
-    spread = np.where(mask, y, np.nan) - np.nanmean(np.where(mask, y, np.nan), axis=0)
-    return 100.0 * (
-        1.0
-        - np.sqrt(
-            np.nansum(error**2, axis=0) / np.maximum(np.nansum(spread**2, axis=0), np.finfo(float).tiny)
-        )
-    )
-
-
-def simulate_fit(plant: Plant, u: Segments, y: Segments, *, means_removed: bool = False) -> np.ndarray:
-    """NRMSE (p,) in percent of free simulation over the segments, the
-    initial state of each fitted as in `simulated`."""
-    predicted = [simulated(plant, a, b, means_removed=means_removed) for a, b in zip(u, y, strict=True)]
-    return nrmse(np.vstack(y), np.vstack(predicted), means_removed=means_removed)
-
-
-def predict_fit(plant: Plant, u: Segments, y: Segments, steps: int) -> np.ndarray:
-    """NRMSE (p,) in percent `steps` samples ahead, over the samples
-    after the start-up of `predicted_ahead`."""
-    skip = max(3 * plant.n, 30) + steps
-    if all(len(a) <= skip for a in u):
-        raise ValueError(
-            f"predict_fit: expected a segment longer than {skip} samples for {steps} steps ahead; "
-            "hold out a longer part, or fewer steps"
-        )
-    pairs = [
-        (b[skip:], predicted_ahead(plant, a, b, steps)[skip:])
-        for a, b in zip(u, y, strict=True)
-        if len(a) > skip
-    ]
-    return nrmse(np.vstack([b for b, _ in pairs]), np.vstack([e for _, e in pairs]))
-
-
-def resampled(
-    path: Path, sample_time_s: float, columns: tuple[list[int], list[int]]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Inputs held and outputs interpolated on a clock of `sample_time_s`: the makers' stamps are jittered."""
-    record = np.genfromtxt(path, delimiter=",", skip_header=1)
-    t = np.arange(0.0, record[-1, 0], sample_time_s)
-    held = np.maximum(np.searchsorted(record[:, 0], t, side="right") - 1, 0)
-    return record[held][:, columns[0]], np.column_stack(
-        [np.interp(t, record[:, 0], record[:, k]) for k in columns[1]]
-    )
 
 
 def probed(seed: int, noise: float, samples: int = 15_000) -> tuple[np.ndarray, np.ndarray]:
@@ -213,23 +158,6 @@ def hold_out(name: str, u: np.ndarray, y: np.ndarray, cut: int, peers: dict[str,
         ) as failure:
             row[peer] = {"failed": str(failure)[:120]}
     return row
-
-
-def parity(sets) -> dict:
-    u, y, _ = sets["dryer"]
-    poles = np.sort_complex(np.linalg.eigvals(moesp([u], [y], 15, 4)[0].A))
-    out = {
-        "singular_values_relative": float(
-            np.abs(moesp_singular_values([u], [y], 15)[:6] / PRINTED_SINGULAR_VALUES - 1).max()
-        ),
-        "pole_error": float(np.abs(poles - PRINTED_POLES).max()),
-    }
-    for name, (block_rows, order, published) in ERR1.items():
-        u, y, _ = sets[name]
-        model, x0 = moesp([u], [y], block_rows, order)
-        err1 = np.linalg.norm(y - simulate(model, u, x0[0])[1], 1) / np.linalg.norm(y, 1)
-        out[f"err1_{name}"] = {"ours": round(float(err1), 5), "published": published}
-    return out
 
 
 def markov_error(plant: Plant) -> float:
@@ -360,61 +288,46 @@ def foreign(name: str, seed: int) -> dict:
     return row
 
 
-def speed(rounds: int = 3) -> dict:
-    """CPU seconds on the study's record (10,500 samples, 0.1 °C of noise) as it comes and without refinement,
-    and how many times faster than nfoursid: the median of rounds in which they take turns."""
-    if importlib.util.find_spec("nfoursid") is None:
-        sys.exit("benchmarks.identification: nfoursid is not installed; start with ./run --group peers")
-    u, y = (signal[:10_500] for signal in probed(0, 0.1))
-    order = identify([u], [y], sample_time_s=1.0, settings=Settings(feedthrough=None)).plant.n
-    taken: dict[str, list[float]] = {"validated": [], "none": [], "nfoursid": []}
-    for _ in range(rounds):
-        for refinement in ("validated", "none"):
-            settings = Settings(feedthrough=None, refinement=refinement)
-            taken[refinement].append(timed(identify, [u], [y], sample_time_s=1.0, settings=settings)[1])
-        taken["nfoursid"].append(timed(nfoursid_plant, u - u.mean(axis=0), y - y.mean(axis=0), order)[1])
-    return {
-        **{f"{name}_s": round(float(np.median(seconds)), 3) for name, seconds in taken.items()},
-        **{
-            f"times_faster_{name}": round(float(np.median(np.divide(taken["nfoursid"], taken[name]))), 2)
-            for name in ("validated", "none")
-        },
-    }
+def rows(hold_outs: dict[str, dict], study: dict[str, dict]) -> list[Row]:
+    """Ours beside each peer on records that nothing was fitted to, error and seconds; then the study's
+    plant."""
+    out = []
+    for name, one in hold_outs.items():
+        peers = [
+            f"{peer} failed"
+            if "failed" in one[peer]
+            else f"{peer} {one[peer]['error_percent']:g} % in {one[peer]['s']:g} s"
+            for peer in PEERS
+            if peer in one
+        ]
+        bar = f"limit {one['bar']:g} %" if "bar" in one else ""
+        measured = f"{one['error_percent']:g} % in {one['ours_s']:g} s"
+        out.append(Row(f"error on the hold-out of `{name}`", measured, "; ".join(peers), bar))
+    for name, one in study.items():
+        if isinstance(one, dict) and "worst_error" in one:
+            order = f"order six found in {one['order_six']} of {one['of']}"
+            out.append(
+                Row(
+                    f"the study's plant, {name.replace('_', ' ')}: worst error of the Markov parameters",
+                    f"{one['worst_error']:.2g} in {one['median_s']:g} s",
+                    f"at most {one['bar']:g}",
+                    order,
+                )
+            )
+    return out
 
 
 def main() -> None:
-    if "foreign" in sys.argv[1:]:
-        result = {f"{name}_{seed}": foreign(name, seed) for name in RECORDS for seed in FOREIGN_SEEDS}
-        FOREIGN_RESULTS.write_text(json.dumps(result, indent=1) + "\n")
-        for name, row in result.items():
-            print(
-                f"{name:20s}",
-                *(
-                    f"{key} {row[key]}"
-                    for key in ("ours", "arx_akaike", "arx_schwarz", "best_n4sid", "best_moesp")
-                    if key in row
-                ),
-            )
+    if sys.argv[1:] == ["foreign"]:
+        for name in RECORDS:
+            for seed in FOREIGN_SEEDS:
+                print(f"{name}_{seed}", json.dumps(foreign(name, seed)), flush=True)
         return
-    if sys.argv[1:] == ["speed"]:
-        result = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-        result["speed"] = speed()
-        print(json.dumps(result["speed"], indent=2))
-        RESULTS.write_text(json.dumps(result, indent=2) + "\n")
-        return
-    peers, sets = installed_peers(), records()
-    kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    result = {
-        **{name: kept[name] for name in ("speed",) if name in kept},
-        "parity": parity(sets),
-        "hold_out": {name: hold_out(name, *record, peers) for name, record in sets.items()},
-        "baam": study_plant(),
-    }
+    peers = installed_peers()
+    hold_outs = {name: hold_out(name, *record, peers) for name, record in records().items()}
     for name, bar in HOLD_OUT_BARS.items():
-        result["hold_out"][name]["bar"] = bar
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps(result, indent=2) + "\n")
-    print(json.dumps(result, indent=2))
+        hold_outs[name]["bar"] = bar
+    results.write("identification", rows(hold_outs, study_plant()))
 
 
 if __name__ == "__main__":

@@ -1,17 +1,15 @@
 """CPU time of reading tables of a million rows and 12 columns beside Arrow's own readers on one thread,
 and of protobuf messages beside the official package.
 
-`./run python -m benchmarks.reading_speed` prints every ratio beside its bar and writes
-benchmarks/results/reading_speed.json; with names of rows behind it, only those are measured again. The two
-readers take turns: a row has the median of the ratios of neighbours, and the ratio of the least times, which
-other work on the machine moves less.
+`./run python -m benchmarks.reading_speed` prints every ratio beside its bar and writes its part
+of benchmarks/results.json. The two readers take turns; the ratio is that of the least times, which other work
+on the machine moves least.
 
 Rows "checked" hold all that ingest does before it writes. Their limit is the checks: each output takes two
 sorts of its windows (two devices under one name), a median of seven (spikes) and the sort of two fifths of
 its values (steps of a converter), of a coarse signal of all of them three times.
 """
 
-import json
 import operator
 import subprocess
 import sys
@@ -24,6 +22,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
+
+from benchmarks import results
+from benchmarks.results import Row
 
 ROWS, COLUMNS, REPEATS = 1_000_000, 12, 5
 INPUTS = 5
@@ -41,7 +42,6 @@ BARS = {
 # the fields are named by the recording and not by hand
 PROTOBUF_BAR = 1.5
 NAMES = [f"signal_{i}" for i in range(1, COLUMNS)]
-RESULTS = Path(__file__).parent / "results" / "reading_speed.json"
 
 
 def write(path: Path, kind: str, count: int) -> None:
@@ -148,44 +148,51 @@ def apart(reader: str, path: Path, warm: Path) -> float:
     return float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout)
 
 
-def main() -> None:
-    results: dict[str, dict[str, float]] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    rows = sys.argv[1:] or [*BARS, "protobuf"]
+TITLES = {
+    "csv": "CSV of a million rows and 12 columns, only read",
+    "csv_iso": "the same with ISO stamps",
+    "csv_comma": "the same with decimal commas",
+    "csv_some_empty": "the same with some empty cells",
+    "csv_checked": "CSV, checked as ingest does it",
+    "csv_checked_coarse": "CSV of coarse sensors, checked",
+    "parquet": "Parquet of the same size",
+    "parquet_stamps": "Parquet with stamps",
+    "protobuf": "200,000 protobuf messages",
+}
+
+
+def measured() -> dict[str, dict[str, float]]:
+    found: dict[str, dict[str, float]] = {}
     with tempfile.TemporaryDirectory() as folder:
         for kind, bar in BARS.items():
-            if kind not in rows:
-                continue
             path, warm = Path(folder) / kind, Path(folder) / f"{kind}_warm"
             write(path, kind, ROWS)
             write(warm, kind, 2000)
             own = "checked" if "checked" in kind else "ours"
             pairs = [(apart("arrow", path, warm), apart(own, path, warm)) for _ in range(REPEATS)]
-            ratio = float(np.median([ours / theirs for theirs, ours in pairs]))
-            seconds = {"arrow": min(pair[0] for pair in pairs), "ours": min(pair[1] for pair in pairs)}
-            results[kind] = {f"{reader}_s": round(value, 3) for reader, value in seconds.items()}
-            least = seconds["ours"] / seconds["arrow"]
-            results[kind] |= {"ratio": round(ratio, 2), "ratio_of_least": round(least, 2), "bar": bar}
-            results[kind]["MB"] = round(path.stat().st_size / 1e6, 1)
-            print(
-                f"{kind:>18}: {seconds['ours']:.2f} s, Arrow {seconds['arrow']:.2f} s, "
-                f"ratio {ratio:.2f}, of the least {least:.2f} (bar {bar})",
-                flush=True,
-            )
+            arrow_s, ours_s = (min(column) for column in zip(*pairs, strict=True))
+            found[kind] = {"arrow_s": arrow_s, "ours_s": ours_s, "bar": bar}
             path.unlink()
-    if "protobuf" in rows:
-        results["protobuf"] = protobuf()
-    RESULTS.write_text(json.dumps(results, indent=2) + "\n")
-
-
-def protobuf() -> dict[str, float]:
     seconds = protobuf_s()
-    ratio = seconds["ours"] / seconds["package"]
-    print(
-        f"       protobuf: {seconds['ours']:.2f} s, package {seconds['package']:.2f} s, ratio {ratio:.2f} "
-        f"(bar {PROTOBUF_BAR})"
-    )
-    figures = {f"{reader}_s": round(value, 3) for reader, value in seconds.items()}
-    return figures | {"ratio": round(ratio, 2), "bar": PROTOBUF_BAR}
+    found["protobuf"] = {"package_s": seconds["package"], "ours_s": seconds["ours"], "bar": PROTOBUF_BAR}
+    return found
+
+
+def rows(found: dict[str, dict[str, float]]) -> list[Row]:
+    """Our seconds beside the peer's on one thread."""
+    out = []
+    for kind, title in TITLES.items():
+        one = found[kind]
+        theirs = one.get("arrow_s", one.get("package_s", float("nan")))
+        peer = "pyarrow" if "arrow_s" in one else "the protobuf package"
+        ratio = one["ours_s"] / theirs
+        note = f"limit {one['bar']:g} times: {'met' if ratio <= one['bar'] else 'missed'}"
+        out.append(Row(title, f"{one['ours_s']:.3f} s, {ratio:.2f} times", f"{theirs:.3f} s ({peer})", note))
+    return out
+
+
+def main() -> None:
+    results.write("reading_speed", rows(measured()))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 nothing to do, one more recording, and the quick look.
 
 `./run python -m benchmarks.stages` clones this checkout at HEAD, makes everything at full size with nothing
-kept from before (compiled code among it), and writes benchmarks/results/stages.json; `--small` takes the
+kept from before (compiled code among it), and writes its part of benchmarks/results.json; `--small` takes the
 sizes of .ci/params.yaml and prints only. Where dvc.yaml says `python`, DVC finds a watcher that starts the
 real one and notes what the stage took: seconds on the clock and of CPU with its children, the largest process
 and the most memory of all at once (shared pages counted once, looked at five times a second). Imports are
@@ -22,12 +22,13 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from benchmarks import growth, killed_nights
+from benchmarks import growth, results
+from benchmarks.results import Row
 from pipeline.store import artifacts, params
 
 ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "benchmarks/results/stages.json"
 LOOPS = ("temperature", "deposition", "setpoint")
+LOOP_BARS = {"temperature": 80, "deposition": 60, "setpoint": 130}
 LIMIT_S = 3600.0
 # what stands in for `python` in a stage's command: light, so that what it costs is not the stage's
 WATCHER = """#!{python} -I
@@ -93,12 +94,25 @@ def watcher(place: Path, notes: Path) -> Path:
     return place
 
 
+def set_parameters(folder: Path, changes: dict[str, Any]) -> None:
+    """These keys of params.yaml and params.expert.yaml, each where it lives."""
+    by_file = params.files(folder / "params.yaml")
+    for dotted, value in changes.items():
+        *parents, key = dotted.split(".")
+        inner = by_file[params.home(dotted, folder / "params.yaml")]
+        for parent in parents:
+            inner = inner[parent]
+        inner[key] = value
+    for name, sections in by_file.items():
+        artifacts.write_text(Path(name), yaml.safe_dump(sections, sort_keys=False, allow_unicode=True))
+
+
 def cloned(place: Path, *, small: bool) -> Clone:
     """This checkout at HEAD with nothing made: no outputs, no lock, no compiled code of an earlier run."""
     folder, notes = place / "clone", place / "notes.jsonl"
     subprocess.run(["git", "clone", "-q", "--no-hardlinks", str(ROOT), str(folder)], check=True)
     if small:
-        killed_nights._set(folder, params.read(ROOT / ".ci/params.yaml"))
+        set_parameters(folder, params.read(ROOT / ".ci/params.yaml"))
     (folder / "dvc.lock").unlink(missing_ok=True)
     path = f"{watcher(place / 'bin', notes)}{os.pathsep}{os.environ['PATH']}"
     return Clone(folder, os.environ | {"PATH": path, "PYTHONPATH": str(folder)}, notes)
@@ -174,13 +188,40 @@ def measured(place: Path, *, small: bool) -> dict[str, Any]:
     }
 
 
+def rows(found: dict[str, Any]) -> list[Row]:
+    """Seconds on the clock; each stage with its CPU seconds and memory."""
+    figures = [
+        ("the whole of the first `dvc repro`", found["whole_s"], 300),
+        *((f"stages of the {loop} loop", found["loops_s"][loop], bar) for loop, bar in LOOP_BARS.items()),
+        ("export, pages and DVC", found["loops_s"]["pages_and_dvc"], 30),
+        ("`beadline quick`, to its first page", found["quick_s"], 120),
+        ("`dvc repro` with nothing to do", found["nothing_to_do_s"], 3.5),
+        ("one more recording read", found["one_more_recording_s"], 8),
+    ]
+    out = [
+        Row(what, f"{value:g} s", f"at most {bar:g} s", "met" if value <= bar else "missed")
+        for what, value, bar in figures
+    ]
+    out += [
+        Row(
+            f"`{one['stage']}`",
+            f"{one['wall_s']:g} s",
+            "",
+            f"{one['cpu_s']:g} CPU s, {one['together_MB']:,} MB",
+        )
+        for one in sorted(found["stages"], key=lambda one: -one["wall_s"])
+    ]
+    return out
+
+
 def main() -> None:
     small = sys.argv[1:] == ["--small"]
     with tempfile.TemporaryDirectory(prefix="stages-") as place:
-        result = measured(Path(place), small=small)
-    if not small:
-        artifacts.write_json(RESULTS, result)
-    print(json.dumps(result, indent=1))
+        found = measured(Path(place), small=small)
+    if small:
+        print(json.dumps(found, indent=1))
+    else:
+        results.write("stages", rows(found))
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ KEPT, TRAINED = Path("datasets/kept"), ("train_classifier", "train_agent")
 # and what leaves the house only from a full run
 LEFT_OUT = ("render_frames", *TRAINED, "export_controllers")
 # read where it lies; of the code the pages show the digest
-LINKED = ("datasets/raw", "datasets/parts", "datasets/papers", "pipeline", "stages")
+LINKED = ("datasets/raw", "datasets/parts", "datasets/papers", "datasets/published", "pipeline", "stages")
 
 
 class Took(NamedTuple):

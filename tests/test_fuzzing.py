@@ -1,5 +1,4 @@
-"""Whatever a file holds, what reads it takes it or refuses it by a sentence: no traceback, no hang. A few
-seconds of `./run python -m benchmarks.fuzz`, which goes on for hours."""
+"""Whatever a file holds, what reads it takes it or refuses it by a sentence: no traceback, no hang."""
 
 import pytest
 from hypothesis import given, settings

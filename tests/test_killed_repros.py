@@ -1,14 +1,10 @@
-"""`./run dvc` after a DVC that was killed while it wrote: what benchmarks.killed_repros found."""
+"""`./run dvc` after a DVC that was killed while it wrote."""
 
 import os
 import shutil
 import subprocess
 
-import numpy as np
 import pytest
-
-from benchmarks.killed_repros import Kill, Played, moments, played, told
-from pipeline.store import artifacts
 
 
 @pytest.fixture
@@ -45,21 +41,3 @@ def test_a_table_that_holds_locks_stays_and_other_commands_touch_none(dvc):
     held = '{"read": {}, "write": {"/a": {"pid": 1, "cmd": "dvc repro"}}}'
     assert dvc(held) == ("", held)
     assert dvc("", "python") == ("", "")
-
-
-def test_a_call_goes_on_behind_what_an_earlier_one_wrote(tmp_path):
-    asked = {"commit": "abc", "stages": ["ingest"], "seed": 1}
-    done = Played(asked, [([Kill(3.0, True, 2), Kill(9.5, False, 4)], []), ([], ["dvc.lock"])])
-    path = tmp_path / "killed.json"
-    artifacts.write_json(path, told(done, {"datasets/ingest/a": "0"}, 12.0))
-    again = played(path, asked)
-    assert again == done and told(again, {}, 12.0)["kills"] == 2
-    assert played(path, asked | {"commit": "other"}).repros == []
-
-
-def test_moments_lie_within_the_quickest_repro_seen():
-    whole_s = [100.0]
-    at = moments(np.random.default_rng(0), whole_s)
-    assert max(next(at)[0] for _ in range(200)) > 90
-    whole_s.append(20.0)
-    assert 15 < max(next(at)[0] for _ in range(200)) <= 20

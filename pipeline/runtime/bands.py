@@ -171,7 +171,7 @@ def bands(
 
     2 K - mean +- z s of the resamples: bias-corrected, as the regression's bias shows in them once more
     (Efron and Tibshirani 1993, 10.6), and by their deviation. Quantiles of the resamples held some gains in
-    54 % of records where 90 % were wanted, these in 82 % (benchmarks/certificates.py). Resamples that give no
+    54 % of records where 90 % were wanted, these in 82 %. Resamples that give no
     gain are left out. Raises ValueError where fewer than half of them give one.
     """
     data = rows(u, y, learning.N)

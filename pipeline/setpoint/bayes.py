@@ -17,7 +17,7 @@ gains alike: what clogs a nozzle changes how its flow follows, too. Windows of a
 where the flow setpoint stood, one shows with window_repeat_probability what the one before did,
 whatever the flow, so that ten alike are not ten witnesses.
 
-What holds it below its bars (benchmarks.setpoint_limits, segments that it was not made from): of clogs by a
+What holds it below its bars (measured on segments that it was not made from): of clogs by a
 quarter 74 % settle, and 90 % were it told when they come: until the segment ends, a clog looks like a segment
 whose beads look thin. Where each window is a segment of its own and the nozzle clogs, 85 % settle, 93 without
 the watch, to which such a camera is another, and 96 if told as well. Prints in the band leave 15 % in 5.2 %

@@ -9,7 +9,6 @@ the same.
 import hashlib
 import json
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,26 +28,36 @@ def stages() -> list[str]:
 def record(stage: str) -> None:
     """Writes the entry of a stage that has just ended."""
     entries = artifacts.read_json(MADE) if MADE.exists() else {}
-    entries[stage] = {"commit": _commit(), "of": dict(_hashes(stage))}
+    entries[stage] = {"commit": _commit(), "of": {name: _sha256(name) for name in names(stage)}}
     artifacts.write_json(MADE, dict(sorted(entries.items())))
 
 
+def names(stage: str) -> list[str]:
+    """What its entry in dvc.yaml names: files, and sections of parameters as "file: section"."""
+    entry = params.files(PIPELINE)[str(PIPELINE)]["stages"][stage]
+    sections = []
+    for item in entry.get("params", []):
+        for file, keys in item.items() if isinstance(item, dict) else [(params.FILE, [item])]:
+            sections += [f"{file}: {key}" for key in keys]
+    return [*entry["deps"], *sections]
+
+
 def changed(stage: str) -> list[str]:
-    """Dependencies and parameters of a stage that are not what its file was made of."""
-    then, now = _entry(stage).get("of", {}), dict(_hashes(stage))
-    return sorted(name for name in then.keys() | now.keys() if then.get(name) != now.get(name))
+    """Files and parameters that are not what the stage's file was made of. It reads no dvc.yaml, which DVC
+    allows no stage to depend on."""
+    return sorted(name for name, then in _entry(stage).get("of", {}).items() if _sha256(name) != then)
 
 
 def sentence(stage: str) -> str:
     """When the file of a stage was made, and whether its method has changed since."""
-    entry, names = _entry(stage), changed(stage)
+    entry = _entry(stage)
     if not entry:
         return f"Nothing says of which method it was made; run {command(stage)}."
-    if not names:
+    if not (others := changed(stage)):
         return f"Made at commit {entry['commit']}; the method has not changed since."
-    listed = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
+    more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
     begun = f"Made at commit {entry['commit']}; the method has changed since"
-    return f"{begun}: {listed}. {command(stage)} makes it anew."
+    return f"{begun}: {', '.join(others[:NAMED])}{more}. {command(stage)} makes it anew."
 
 
 def command(stage: str) -> str:
@@ -60,27 +69,20 @@ def _entry(stage: str) -> dict[str, Any]:
     return artifacts.read_json(MADE).get(stage, {}) if MADE.exists() else {}
 
 
-def _hashes(stage: str) -> Iterator[tuple[str, str]]:
-    """(name, SHA-256) of each dependency and each section of parameters; "" for a file that is not there."""
-    entry = params.files(PIPELINE)[str(PIPELINE)]["stages"][stage]
-    for path in entry["deps"]:
-        yield path, artifacts.sha256(path) if Path(path).exists() else ""
-    for item in entry.get("params", []):
-        for file, keys in item.items() if isinstance(item, dict) else [(params.FILE, [item])]:
-            sections = params.files(file)[str(file)]
-            for key in keys:
-                text = json.dumps(_value(sections, key), sort_keys=True)
-                yield f"{file}: {key}", hashlib.sha256(text.encode()).hexdigest()
-
-
-def _value(sections: Any, dotted: str) -> Any:
-    for key in dotted.split("."):
-        sections = sections.get(key) if isinstance(sections, dict) else None
-    return sections
+def _sha256(name: str) -> str:
+    """Of a file, or of a section of parameters as JSON; "" for what is not there."""
+    path, _, key = name.partition(": ")
+    if not Path(path).exists():
+        return ""
+    if not key:
+        return artifacts.sha256(path)
+    value: Any = params.files(path)[path]
+    for part in key.split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
 def _commit() -> str:
-    ended = subprocess.run(
-        ["git", "rev-parse", "--short=7", "HEAD"], capture_output=True, text=True, check=False
-    )
+    command = ["git", "rev-parse", "--short=7", "HEAD"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
     return ended.stdout.strip() or "unknown"

@@ -441,7 +441,7 @@ def simplest(table: list[Candidate], worth: float = WORTH_A_STATE) -> Candidate:
 
     Not within one standard error: five blocks of which one holds a disturbance have so wide a one that models
     much too small pass, and these cost more on new data than models somewhat too large (measured on the
-    records of benchmarks/foreign_records.py).
+    records of tests/foreign/records.py).
     """
     best = min(row.error for row in table)
     return min(

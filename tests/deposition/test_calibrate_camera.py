@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.foreign_camera import Eye, Stage, tip_of
 from pipeline.deposition.workflow import trial_files
 from pipeline.deposition.workflow.settings import Camera
 from pipeline.store import params
+from tests.foreign.camera import Eye, Stage, tip_of
 
 ROOT = Path(__file__).resolve().parents[2]
 WIDTHS = (0.5, 0.9, 1.2)

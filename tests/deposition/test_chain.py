@@ -4,11 +4,11 @@ walk, parameters found, creep where there is creep."""
 import numpy as np
 import pytest
 
-from benchmarks import foreign_extruders
 from pipeline.deposition import extruder
 from pipeline.deposition.chain import Identified, backlash, forecast, identify, simulate
 from pipeline.deposition.extruder import Extruder
 from tests.deposition.trained import CREEPING, PLANT, TS, learned, trainings
+from tests.foreign import extruders as foreign_extruders
 
 
 @pytest.mark.parametrize("length", [1, 2, 7, 100, 1001])

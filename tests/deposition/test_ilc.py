@@ -4,14 +4,13 @@ of the drive, and the loop with roll-back."""
 import numpy as np
 import pytest
 
-from benchmarks import foreign_deposition, foreign_extruders
-from benchmarks.ilc import causal_q
-from benchmarks.norm_optimal import norm_optimal_law
 from pipeline.deposition import ilc, training
 from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, frequency_response, pressed, routine
-from pipeline.deposition.trial_model import identify
 from pipeline.deposition.unmodelled import SMOOTHED_HZ
+from pipeline.papers.deposition import causal_q
+from tests.foreign import deposition as foreign_deposition
+from tests.foreign import extruders as foreign_extruders
 
 TS = 0.02
 MATERIALS = {"A": Extruder(1.08, 2.7), "B": Extruder(0.89, 4.5)}
@@ -300,18 +299,9 @@ def test_a_pause_that_no_camera_sees_does_not_disturb_what_is_learned():
     assert ratios(model_inverse(), blind, MATERIALS[name], 15)[15] < 4  # 1 where the pause is seen
 
 
-def test_the_norm_optimal_law_learns_too():
-    name, plant = next(family(15, 1))
-    u0 = R / MATERIALS[name].gain
-    model = identify([u0], [machine(plant)(u0).y], sample_time_s=TS).extruder
-    law = norm_optimal_law(R, model, R_u=1e-5, R_d=1e-3, drive=UNLIMITED, sample_time_s=TS)
-    percent = ratios(law, machine(plant), MATERIALS[name], 15)
-    assert percent[2] < 20 and percent[15] < 6
-
-
 def test_a_machine_of_third_order_is_learned_because_its_lag_is_identified():
     plant = foreign_deposition.plant("third_order", "B", 1)
-    percent = foreign_deposition.learned(plant, "B", 1, "model_inverse").percent
+    percent = foreign_deposition.learned_percent(plant, "B", 1)
     # 6 and still falling slowly where all that is late is taken for delay
     assert percent[5] < 4 and percent[15:].max() < 3
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from benchmarks.foreign_camera import Eye, Stage, tip_of
 from pipeline.deposition import ladder
+from tests.foreign.camera import Eye, Stage, tip_of
 
 WIDTHS = (0.5, 0.8, 1.1)
 

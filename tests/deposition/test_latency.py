@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.foreign_camera import GROUNDS, Eye, trial
 from pipeline.deposition import latency
 from pipeline.deposition.extruder import Extruder, flow, routine
 from pipeline.deposition.latency import Gantry, Latency
+from tests.foreign.camera import GROUNDS, Eye, trial
 
 EYE = Eye(height=120, width=240, mm_per_px=0.02)
 ROUTINE = routine(

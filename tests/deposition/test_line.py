@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.foreign_camera import GROUNDS, Eye, Stage, tip_of
 from pipeline.deposition import bead, line
+from tests.foreign.camera import GROUNDS, Eye, Stage, tip_of
 
 EYE = Eye(height=240, width=320, mm_per_px=0.016)
 

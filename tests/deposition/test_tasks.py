@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.composition import ALLOWED, forbidden
 from pipeline.deposition import gcode
 from pipeline.deposition.motion import plan
 from pipeline.deposition.tasks import DWELL, halting, printed_lines, refuse, sequence
+from pipeline.papers.deposition import ALLOWED, forbidden
 
 PARTS = Path(__file__).parents[2] / "datasets" / "parts"
 MACHINE = {
@@ -68,7 +68,7 @@ def random_tasks(rng):
 
 def test_no_random_program_has_a_forbidden_transition():
     rng, refused = np.random.default_rng(0), 0
-    for _ in range(200):  # 10,000 in benchmarks.composition
+    for _ in range(200):
         tasks = random_tasks(rng)
         refused += tasks is None
         if tasks is not None:

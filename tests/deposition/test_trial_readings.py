@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.foreign_camera import Eye, tip_of, trial
 from pipeline.deposition import bead
 from pipeline.deposition.extruder import Extruder, flow, routine
 from pipeline.deposition.workflow import trial_files, trial_readings, trial_video
 from pipeline.deposition.workflow.settings import Camera, Printer
 from pipeline.store import params
+from tests.foreign.camera import Eye, tip_of, trial
 
 ROOT = Path(__file__).resolve().parents[2]
 CAMERA, PRINTER = (

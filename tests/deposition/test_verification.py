@@ -6,8 +6,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from benchmarks import foreign_parts
-from benchmarks.foreign_extruders import seen
 from pipeline.deposition import basis, forecast, gcode, verification
 from pipeline.deposition.composition import learn
 from pipeline.deposition.drive import UNLIMITED, Drive, follows
@@ -18,6 +16,8 @@ from pipeline.deposition.tasks import printed_lines
 from pipeline.deposition.workflow import verify_part
 from tests.deposition.test_composition import MACHINE, composed, of_part
 from tests.deposition.trained import AREA, NOMINAL, PLANT, TS, learned, percent_of_on_off
+from tests.foreign import parts as foreign_parts
+from tests.foreign.extruders import seen
 from tests.mcap_writing import Written
 
 LONG = "G21\nG90\nM83\nT0\nG0 X0 Y0 F480\n" + "".join(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks import nights
 from pipeline.deposition.workflow.tables import SCORES
 from pipeline.nightly import judge, promoting
 from pipeline.nightly.decision import FIRST, KEPT, PROMOTED, Evidence, decide
@@ -19,6 +18,8 @@ from pipeline.store import artifacts, params
 from pipeline.temperature import plant, window
 from pipeline.temperature.plant import baam, simulate
 from pipeline.temperature.workflow.contestants import CONTESTANTS
+from pipeline.temperature.workflow.settings import Tracking
+from tests.nightly import shifts_recorded as nights
 from tests.nightly.toy_nights import SETTINGS
 
 TEMPERATURE = {

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks import nights
 from pipeline.nightly import drift, inputs, screening, temperature_drift
 from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly
@@ -17,6 +16,7 @@ from pipeline.report.shared.night import Alarm
 from pipeline.store import artifacts, params
 from pipeline.temperature import identification, plant
 from tests.mcap_writing import Written
+from tests.nightly import shifts_recorded as nights
 
 CHAMPIONS = {"temperature"}
 NOTHING = DriftMemory()

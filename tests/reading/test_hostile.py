@@ -22,7 +22,7 @@ from tests.reading import damaging, hostile
 from tests.temperature.test_ingest import INLINE, JOB, LOKY, MACHINE
 
 BUDGET = Budget(60.0, 2000.0)
-# they take seconds to minutes, up to their budget: with -m slow, and in benchmarks/damaged_recordings.py
+# they take seconds to minutes, up to their budget: with -m slow
 SLOW = {
     "rows_1e9.parquet",
     "channels_1e6.mcap",

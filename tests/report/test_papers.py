@@ -1,5 +1,5 @@
 """papers.html: each table and figure of the papers has its row, a verdict is what its rule says, figures come
-from the results and never from prose, and the results are what their benchmarks make."""
+from the results and never from prose, and the results are what the second pipeline makes."""
 
 import json
 import re
@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import papers_deposition, papers_setpoint, papers_temperature
+from pipeline.papers import deposition as papers_deposition
+from pipeline.papers import setpoint as papers_setpoint
+from pipeline.papers import temperature as papers_temperature
 from pipeline.report.papers import page, rows, setpoint
 from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS
 from pipeline.report.shared.sources import Sources
@@ -30,9 +32,10 @@ SEEDS = {
     "deposition": "seeds/seed3_hoelzle_ilc_basis_library.txt",
 }
 PAPERS = {
-    name: (str(ROOT / f"datasets/papers/{name}.toml"), str(ROOT / f"benchmarks/results/papers/{name}.json"))
+    name: (str(ROOT / f"datasets/papers/{name}.toml"), str(ROOT / f"datasets/papers/{name}.json"))
     for name in SEEDS
 }
+OTHERS = {name: str(ROOT / f"datasets/papers/{name}.json") for name in ("reproduce_study", "relearned")}
 METRICS = {
     "train_classifier": {"image_accuracy": 0.75, "window_accuracy": 0.9, "data": {"valid_share": 0.94}}
 }
@@ -179,7 +182,7 @@ def test_no_number_is_typed_in_what_is_said_of_ours(name):
 
 
 def test_the_page_shows_every_row_of_every_paper_and_counts_them():
-    text = page.render(sources(), PAPERS)
+    text = page.render(sources(), PAPERS, OTHERS)
     papers = [rows.read(*files, METRICS) for files in PAPERS.values()]
     assert text.count('<td class="at" role="cell">') == sum(len(paper.rows) for paper in papers)
     counts = [sum(paper.count(verdict) for paper in papers) for verdict in VERDICTS]
@@ -195,8 +198,10 @@ def test_the_page_shows_every_row_of_every_paper_and_counts_them():
 
 def test_a_paper_whose_files_are_not_there_is_a_hole_that_says_how_to_make_them(tmp_path):
     gone = {"temperature": (PAPERS["temperature"][0], str(tmp_path / "temperature.json"))}
-    text = page.render(sources(), gone)
-    assert "./run python -m benchmarks.papers_temperature" in text and "No paper is set beside us" in text
+    text = page.render(sources(), gone, OTHERS)
+    assert (
+        "./run dvc repro datasets/papers/dvc.yaml:temperature" in text and "No paper is set beside us" in text
+    )
 
 
 def test_the_confusion_of_the_classes_is_counted_in_percent_of_the_true_class():
@@ -218,7 +223,7 @@ def test_the_confusion_of_the_classes_is_counted_in_percent_of_the_true_class():
 
 
 def test_two_renderings_are_the_same_bytes():
-    assert page.render(sources(), PAPERS) == page.render(sources(), PAPERS)
+    assert page.render(sources(), PAPERS, OTHERS) == page.render(sources(), PAPERS, OTHERS)
 
 
 @pytest.mark.parametrize(
@@ -232,7 +237,7 @@ def test_two_renderings_are_the_same_bytes():
     ],
 )
 def test_nothing_overflows_texts_can_be_read_and_axe_finds_nothing(browser, tmp_path, width, theme, rules):
-    (tmp_path / "papers.html").write_text(page.render(sources(), PAPERS), encoding="utf-8")
+    (tmp_path / "papers.html").write_text(page.render(sources(), PAPERS, OTHERS), encoding="utf-8")
     context = browser.new_context(viewport={"width": width, "height": 800}, color_scheme=theme)
     shown = context.new_page()
     shown.goto(f"file://{tmp_path}/papers.html")
@@ -250,7 +255,7 @@ def test_nothing_overflows_texts_can_be_read_and_axe_finds_nothing(browser, tmp_
     assert [(one["id"], one["nodes"][0]["html"][:120]) for one in violations] == []
 
 
-# ---- the results are what the benchmarks make
+# ---- the results are what the second pipeline makes: a cheap row of each paper
 
 
 def test_r_s_generator_draws_the_studys_record():
@@ -319,7 +324,6 @@ def test_the_setpoint_results_are_of_the_settings_in_force():
     assert found["table_2"] == pytest.approx(papers_setpoint.table_2(settings))
     assert found["arithmetic"] == json.loads(json.dumps(papers_setpoint.arithmetic()))
     assert found["reward"] == pytest.approx(papers_setpoint.reward_figures(), rel=1e-5)
-    assert found["seeds"] == papers_setpoint.seeds()
 
 
 def test_a_single_start_is_told_by_its_own_runs():

@@ -125,7 +125,7 @@ def test_a_faulty_sensor_is_named_and_its_safe_mode_asked_for(kind):
     decisions = run.go(60, reading=SENSORS[kind])
     at, cause = first(decisions)
     assert (cause.kind, cause.signal) == (kind, "zone_2")
-    # the sums of a noise whose signs take turns rise late: benchmarks/results/faults.json counts how often
+    # the sums of a noise whose signs take turns rise late
     assert at <= (12 if kind == "sensor_noisy" else 10) and decisions[at + 10].mode == SAFE[kind]
     assert abs(cause.since_s - 200) <= 20
 

@@ -1,4 +1,4 @@
-"""Windows of a classifier that nobody trained, for tests and benchmarks of the controllers."""
+"""Windows of a classifier that nobody trained, to try the controllers on."""
 
 import numpy as np
 

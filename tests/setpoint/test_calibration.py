@@ -2,13 +2,14 @@
 and the foreign is told from the familiar."""
 
 import re
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import pytest
 import scipy.special
 
-from benchmarks.classifier import judge
+from pipeline.setpoint import calibrated_classifier, calibration
 from pipeline.setpoint.calibration import (
     ClassifierOutputs,
     Familiar,
@@ -377,6 +378,34 @@ def frames(segments: int, *, seed: int) -> ClassifierOutputs:
 
 SEGMENT, FRAME = 0.12, 0.15
 PROMISE = Promise(coverage=0.95, confidence=0.8, by_flow=0.9)
+
+
+class Judgement(NamedTuple):
+    """Images that are valid, and windows: share right, reliability; windows by the paper's hard counts beside
+    them; the sets; and the share of images taken for foreign."""
+
+    image_accuracy: float
+    window_accuracy: float
+    image: calibration.Reliability
+    window: calibration.Reliability
+    hard_window: calibration.Reliability
+    sets: calibration.Sets
+    false_alarms: float
+
+
+def judge(fitted, test, *, length, bins):
+    """How a calibrated classifier does on segments that neither learning nor calibration saw."""
+    v, log_p = test.valid, calibration.log_probabilities(test.logits, fitted.temperature)
+    windows = calibrated_classifier.window_predictions(fitted, test, length=length)
+    label, p = windows.truth.label, windows.seen.prob
+    image, window, hard = (
+        calibration.reliability(shares, truth, bins=bins)
+        for shares, truth in ((np.exp(log_p[v]), test.label[v]), (p, label), (windows.hard, label))
+    )
+    right = [float(np.mean(a.argmax(axis=1) == b)) for a, b in ((log_p[v], test.label[v]), (p, label))]
+    foreign = calibration.mahalanobis(fitted.familiar, test.features[v]) > fitted.foreign_above
+    sets = calibration.sets(p, label, fitted.level)
+    return Judgement(*right, image, window, hard, sets, float(foreign.mean()))
 
 
 def test_frames_that_share_an_error_are_calibrated_alone_and_in_windows_on_segments_never_seen():

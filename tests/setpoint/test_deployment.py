@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from benchmarks.waits import autocorrelation, derived_waits, effective_frames, settling_s, window_frames
 from pipeline.setpoint.actuation import (
     ACTS,
     AMBIGUOUS,
@@ -226,89 +225,6 @@ def test_the_wait_is_the_longest_that_any_move_asks_for():
     change = np.array([[0.0, 0.0], [5.0, 0.0], [0.0, -10.0], [-5.0, 20.0]])
     np.testing.assert_array_equal(wait_after(change, Waits(3.0, 8.0, 0.5)), [0.5, 3.0, 8.0, 8.0])
     np.testing.assert_array_equal(wait_after(change, Waits(6.0, 6.0, 6.0)), 6.0)  # as published
-    assert derived_waits(3.0, 20.0, transport_s=0.5) == Waits(3.5, 20.5, 3.5)
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_first_order_response_settles_when_its_exponential_says(sign):
-    t = np.arange(-2, 20, 0.05)
-    tau, delay = 1.5, 0.6
-    y = 100 + sign * 10 * (1 - np.exp(-np.maximum(t - delay, 0) / tau))
-    got = settling_s(y, at=40, band=0.5, window=20, sample_time_s=0.05)
-    # the mean of a second of exp(-t/tau) is exp(-t/tau) tau (1 - exp(-1/tau)); it crosses 0.5 of 10 at
-    expected = delay + tau * np.log(10 / 0.5 * tau * (1 - np.exp(-1 / tau)))
-    assert got == pytest.approx(expected, abs=0.1)  # two samples
-
-
-def test_noise_lengthens_the_wait_by_little_and_a_record_that_still_moves_is_refused():
-    t, rng = np.arange(-2, 20, 0.05), np.random.default_rng(1)
-    clean = 10 * (1 - np.exp(-np.maximum(t, 0) / 1.5))
-    waits = [
-        settling_s(clean + rng.normal(0, 1.0, len(t)), at=40, band=1.0, window=20, sample_time_s=0.05)
-        for _ in range(50)
-    ]
-    clean_wait = settling_s(clean, at=40, band=1.0, window=20, sample_time_s=0.05)
-    # a mean of 20 has 0.22 of noise: 1.0 is passed for some half a time constant longer or shorter
-    assert abs(np.median(waits) - clean_wait) < 0.75
-    with pytest.raises(
-        ValueError, match=r"not come to rest within 0.1 in 20 s; record for longer, or widen the band"
-    ):
-        settling_s(t, at=40, band=0.1, window=20, sample_time_s=0.05)
-    with pytest.raises(
-        ValueError, match="at least 80 finite samples after the step, found 60; record for longer"
-    ):
-        settling_s(clean[:100], at=40, band=1.0, window=20, sample_time_s=0.05)
-
-
-def test_effective_frames_of_equal_correlation_are_the_design_effect():
-    rho = np.r_[1.0, np.full(59, 0.45)]
-    n = np.arange(1, 61)
-    np.testing.assert_allclose(effective_frames(rho), n / (1 + (n - 1) * 0.45), rtol=1e-12)
-    np.testing.assert_allclose(effective_frames(np.eye(1, 60)[0]), n, rtol=1e-12)
-
-
-def test_effective_frames_are_what_the_variance_of_a_mean_says():
-    rng, phi = np.random.default_rng(2), 0.8
-    e = np.zeros((4000, 60))
-    e[:, 0] = rng.normal(size=4000)
-    for t in range(1, 60):
-        e[:, t] = phi * e[:, t - 1] + np.sqrt(1 - phi**2) * rng.normal(size=4000)
-    measured = 1 / e[:, :20].mean(axis=1).var()
-    assert effective_frames(autocorrelation(e, longest=20))[-1] == pytest.approx(
-        measured, rel=0.1
-    )  # 4,000 rows: 2 % on a variance, and the lags' own noise
-
-
-def test_autocorrelation_reads_past_rejected_frames():
-    rng = np.random.default_rng(3)
-    e = (rng.random((3000, 1)) < 0.5) * 0.6 + (rng.random((3000, 40)) < 0.2)
-    rho = autocorrelation(e, longest=20)
-    e[rng.random(e.shape) < 0.2] = np.nan
-    np.testing.assert_allclose(
-        autocorrelation(e, longest=20), rho, atol=0.02
-    )  # a fifth fewer of 60,000 pairs
-    assert rho[1:] == pytest.approx(
-        0.36 / 4 / (0.36 / 4 + 0.16), abs=0.03
-    )  # between / (between + within) variance; 3,000 segments
-    with pytest.raises(
-        ValueError,
-        match=(
-            "expected errors .* that are not all alike, found .*; take longer segments, and flows near "
-            "the class borders"
-        ),
-    ):
-        autocorrelation(np.zeros((5, 40)), longest=20)
-
-
-def test_the_window_grows_with_the_wait_and_shrinks_with_correlation():
-    def best(rho, wait):
-        return window_frames(np.r_[1.0, np.full(99, rho)], wait_s=wait, frame_rate_hz=20)
-
-    assert (
-        best(0.45, 6.0) == 12
-    )  # maximum of n / ((1 + 0.45 (n - 1)) (6 + n/20)) is at n^2 = 120 * 0.55 / 0.45: 12.1
-    assert best(0.45, 2.0) < best(0.45, 6.0) < best(0.1, 6.0)
-    assert best(0.0, 6.0) == 100
 
 
 # ---- why it acted

@@ -5,8 +5,8 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks import foreign_pictures
 from pipeline.setpoint import familiar, key_area, nozzle_scene
+from tests.foreign import pictures as foreign_pictures
 
 ALARMS = 0.02
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from benchmarks.waits import settling_s, step_response
 from pipeline.setpoint import actuation, deployment, familiar, pixels
 from pipeline.setpoint.actuation import ACTS, Limits, Waits
 from pipeline.setpoint.pixels import Loop, Machine, at_rest, calm, run, tick
 from pipeline.setpoint.simulator import Action, Controller
 from pipeline.setpoint.workflow import camera_files, known_camera, settings
 from pipeline.store import params
+from tests.setpoint.step_response import settling_s, step_response
 
 MACHINE = Machine(heater_s=15.0, heater_delay_s=2.0, melt_s=1.2, softening_per_degC=0.02)
 LIMITS = Limits(

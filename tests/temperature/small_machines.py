@@ -2,7 +2,7 @@
 fan, dead time of transport, a sensor that lags and a converter with coarse steps. Their records are what an
 owner would have: steps, staircases, walks.
 
-Shared by tests and benchmarks. None is linear, and none has the structure of an identified model.
+None is linear, and none has the structure of an identified model.
 """
 
 from functools import cache

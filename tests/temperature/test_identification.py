@@ -3,7 +3,6 @@ import re
 import numpy as np
 import pytest
 
-from benchmarks.moesp import moesp, moesp_singular_values, varx
 from pipeline.temperature.identification import Settings, identify, refit, within_limits
 from pipeline.temperature.order import (
     Candidate,
@@ -27,6 +26,7 @@ from pipeline.temperature.refinement import (
 )
 from pipeline.temperature.subspace import lagged
 from pipeline.temperature.validation import simulated
+from tests.temperature.moesp import moesp, moesp_singular_values, varx
 
 
 def markov_error(model, true):

@@ -4,13 +4,13 @@ and records of real ones."""
 import numpy as np
 import pytest
 
-from benchmarks.identification import resampled
 from pipeline.temperature import baseline
 from pipeline.temperature.identification import identify
 from pipeline.temperature.plant import strictly_proper
 from pipeline.temperature.scorecard import closed_loop
 from pipeline.temperature.tracking import aimed, feasible_target
 from tests.temperature import small_machines
+from tests.temperature.fits import resampled
 from tests.temperature.small_machines import HOT_END, KIT, MACHINES
 
 each_machine = pytest.mark.parametrize("machine", MACHINES, ids=lambda machine: machine.name)

@@ -1,21 +1,18 @@
-"""What the learners reach on the study's machine, each beside its bar; and the stage that no recording
-touches."""
+"""What the learners reach on the study's machine, each beside its bar; and the stage of the second pipeline
+that writes it down."""
 
-import os
-import subprocess
-import sys
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
-from pipeline.store import artifacts, params
+from pipeline.papers import files, reproduce_study
+from pipeline.store import made, params
 from pipeline.temperature import study, tuning
 from pipeline.temperature.published import GAMMA, REFERENCE
-from pipeline.temperature.workflow import reproduce_study, tables
 from pipeline.temperature.workflow.settings import ReproduceStudy
-from tests.house import expected
+from tests.house import expected_of_paper
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -143,11 +140,10 @@ def test_each_candidate_has_the_error_and_the_effort_that_make_its_cost_and_a_fa
     )
     np.testing.assert_allclose(total, cost, rtol=1e-9)  # by steps instead of by products; NaN where it failed
     assert table["chosen"].tolist() == [True, False, False] and table["failure"] == ["", "no gain", ""]
-    assert list(table) == [column.name for column in tables.PARITY.columns]
 
 
 def test_the_parity_search_ends_near_the_known_optimum_with_weights_whose_cost_it_states():
-    search = reproduce_study._parity(params.load(ReproduceStudy, "reproduce_study", ROOT / "params.yaml"))
+    search = reproduce_study._parity(params.load(ReproduceStudy, "reproduce_study", ROOT / params.PAPERS))
     figures = study.parity_metrics(search)
     theta = np.concatenate([figures["q"], figures["r"]])
     assert (len(figures["q"]), len(figures["r"])) == (5, 7)
@@ -159,12 +155,13 @@ def test_the_parity_search_ends_near_the_known_optimum_with_weights_whose_cost_i
 # ---- the stage
 
 
-def test_the_stage_reads_the_studys_draws_and_its_own_section_and_nothing_else():
-    entry = expected(ROOT, "reproduce_study")
+def test_the_stage_reads_the_studys_draws_and_its_own_section_and_declares_no_outs():
+    entry = expected_of_paper(ROOT, "reproduce_study")
     assert [path for path in entry["deps"] if path.startswith(("datasets", "reports"))] == [
         "datasets/published"
     ]
-    assert entry["params"] == [{"params.expert.yaml": ["reproduce_study"]}]
+    assert entry["params"] == [{params.PAPERS: ["reproduce_study"]}]
+    assert "outs" not in entry and "metrics" not in entry
 
 
 @pytest.mark.parametrize(
@@ -175,37 +172,30 @@ def test_the_stage_reads_the_studys_draws_and_its_own_section_and_nothing_else()
     ],
 )
 def test_a_search_without_room_is_refused_in_one_sentence(change, sentence):
-    settings = params.load(ReproduceStudy, "reproduce_study", ROOT / "params.yaml").model_copy(update=change)
+    settings = params.load(ReproduceStudy, "reproduce_study", ROOT / params.PAPERS).model_copy(update=change)
     with pytest.raises(ValueError, match=f"{sentence}; change one of the two"):
         reproduce_study.check(settings)
 
 
-def test_the_stage_runs_where_nobody_has_a_machine_or_a_recording(tmp_path):
-    """Without `plant`, `panel`, `tracking` and any artifact: the optimum is the known one all the same."""
-    (tmp_path / "datasets").mkdir()
-    for name in ("pipeline", "stages", "datasets/published"):
-        (tmp_path / name).symlink_to(ROOT / name)
-    owner, expert = params.files(ROOT / "params.yaml").values()
-    for section in ("plant", "panel", "tracking"):
-        owner.pop(section, None)
-        expert.pop(section, None)
-    expert["reproduce_study"] |= {"data_sets": 1, "initial": 4, "evaluations": 8}
-    (tmp_path / "params.yaml").write_text(yaml.safe_dump(owner))
-    (tmp_path / "params.expert.yaml").write_text(yaml.safe_dump(expert))
-    ended = subprocess.run(
-        [sys.executable, "-m", "stages.reproduce_study"],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert ended.returncode == 0, ended.stderr
-    figures = artifacts.read_json(tmp_path / "reports/metrics/reproduce_study.json")
+def test_the_file_holds_what_a_small_run_of_the_stage_comes_to(tmp_path, monkeypatch):
+    """The optimum and Algorithm 1's starts are the known ones at any size; what has no end is null."""
+    settings = params.load(ReproduceStudy, "reproduce_study", ROOT / params.PAPERS)
+    small = settings.model_copy(update={"data_sets": 1, "initial": 4, "evaluations": 8})
+    execution = params.load(params.Execution, "execution", ROOT / "params.yaml")
+    found = reproduce_study.reproduced(small, execution, str(ROOT / "datasets/published"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(made, "record", lambda stage: None)
+    (tmp_path / "datasets/papers").mkdir(parents=True)
+    files.write("reproduce_study", reproduce_study.result(found))
+    written = json.loads((tmp_path / "datasets/papers/reproduce_study.json").read_text())
+    accepted = json.loads((ROOT / "datasets/papers/reproduce_study.json").read_text())
+    figures = written["figures"]
     assert figures["optimal"]["J1000"] == pytest.approx(151_875.28, abs=0.01)  # printed digits
-    assert figures["algorithm_1"] == {"failures": 106, "of": 300}
+    for key in ("optimal", "observer", "algorithm_1", "takeover"):
+        assert figures[key] == pytest.approx(accepted["figures"][key], rel=1e-6), key
+    for key, column in accepted["figures"]["as_published"].items():
+        assert figures["as_published"][key] == pytest.approx(column, rel=1e-6), key
     assert figures["window"]["noise_0_1"]["of"] == 1
-    folder = tmp_path / "datasets/reproduce_study"
-    assert len(artifacts.read_table(folder / "parity.parquet", tables.PARITY)["cost"]) == 8
-    assert len(artifacts.read_table(folder / "study.parquet", tables.STUDY)["gap"]) == 2 * len(study.ROUTES)
+    assert len(written["parity"]["cost"]) == 8
+    assert len(written["study"]["gap"]) == 2 * len(study.ROUTES)
+    assert reproduce_study.plain({"a": np.inf, "b": np.array([1.0, np.nan])}) == {"a": None, "b": [1.0, None]}

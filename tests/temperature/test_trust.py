@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from benchmarks.identification import nrmse, predict_fit, simulate_fit
 from pipeline.temperature.plant import plant, simulate
 from pipeline.temperature.trust import (
     dynamics_rows,
@@ -23,6 +22,7 @@ from pipeline.temperature.trust import (
     two_points,
 )
 from pipeline.temperature.validation import excitation, residual_tests, step_response
+from tests.temperature.fits import nrmse, predict_fit, simulate_fit
 from tests.temperature.test_validation import HEATER, innovations_record
 
 

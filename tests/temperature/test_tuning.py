@@ -133,7 +133,7 @@ def test_the_search_finds_the_optimum_of_37():
     result = tuning.minimise(
         fitness_of_baam, LOWER, UPPER, tuning.SearchSettings(50, 150), rng=np.random.default_rng(2)
     )
-    # the worst that is allowed of any seed; benchmarks/tuning.py has the distribution
+    # the worst that is allowed of any seed
     assert result.cost <= 151_880
     assert result.cost == fitness_of_baam(result.theta) == result.history.cost.min()
 

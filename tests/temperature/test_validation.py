@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from benchmarks.identification import nrmse, predict_fit, simulate_fit
 from pipeline.temperature.identification import Settings, identify
 from pipeline.temperature.plant import plant, simulate
 from pipeline.temperature.validation import (
@@ -15,6 +14,7 @@ from pipeline.temperature.validation import (
     spread_bands,
     step_response,
 )
+from tests.temperature.fits import nrmse, predict_fit, simulate_fit
 
 
 def innovations_record(true, T, noise, seed):
