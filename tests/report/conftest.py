@@ -1,7 +1,9 @@
 """The small project as the working directory, its pages built once, and the browser."""
 
 import contextlib
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -20,22 +22,55 @@ def populate(folder):
     made.write(folder)
 
 
+@pytest.fixture(scope="session")
+def populated(tmp_path_factory):
+    """The folder with every artifact in it, which nobody changes."""
+    folder = tmp_path_factory.mktemp("populated")
+    with contextlib.chdir(folder):
+        populate(folder)
+    return folder
+
+
 @pytest.fixture
-def project(tmp_path, monkeypatch):
+def project(populated, tmp_path, monkeypatch):
     """The working directory with every artifact in it."""
     monkeypatch.chdir(tmp_path)
-    populate(tmp_path)
+    shutil.copytree(populated, tmp_path, dirs_exist_ok=True)
     return tmp_path
 
 
+@pytest.fixture
+def render_only(monkeypatch):
+    """render_only("deposition"): the stage report renders the pages of these modules alone, and leaves the
+    others empty. Its verdicts and its figures are those of a whole run."""
+    from stages import report
+
+    empty = SimpleNamespace(text="", files={})
+
+    def render(*names):
+        modules = {
+            name.removesuffix("_page"): getattr(report, name)
+            for name in vars(report)
+            if name.endswith("_page")
+        }
+        assert set(names) <= set(modules)
+        for other in set(modules) - set(names):
+            for function in [name for name in vars(modules[other]) if name.startswith("render")]:
+                blank = empty if other == "viewer" else ""
+                monkeypatch.setattr(modules[other], function, lambda *_, blank=blank: blank)
+        report.main()
+
+    return render
+
+
 @pytest.fixture(scope="session")
-def reports(tmp_path_factory):
+def reports(populated, tmp_path_factory):
     """The folder of the small project's pages, which nobody changes."""
     from stages.report import main
 
     folder = tmp_path_factory.mktemp("built")
+    shutil.copytree(populated, folder, dirs_exist_ok=True)
     with contextlib.chdir(folder):
-        populate(folder)
         main()
         Path("reports/machine.js").write_text(MACHINE)  # as ./run does
     return folder / "reports"
