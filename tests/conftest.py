@@ -1,7 +1,9 @@
 """What every test may ask for: the repository's root, other people's data (or the reason why not), and slow
 tests only when they are asked for."""
 
+import hashlib
 import os
+import platform
 import shutil
 import sys
 from pathlib import Path
@@ -10,9 +12,28 @@ import hypothesis
 import pytest
 
 from pipeline import cli
+from pipeline.store.execution import PINS
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT / os.environ.get("BEADLINE_SHARED", "../shared")
+
+
+def compiled_for(cpuinfo: str) -> str:
+    """A name for what XLA's programs depend on beside their source, its version and its flags, which JAX's
+    own key holds: the CPU, its number of cores, and the pins that `run` exports."""
+    cpu = sorted(
+        {line for line in cpuinfo.splitlines() if line.startswith(("model name", "flags", "Features"))}
+    )
+    told = [platform.machine(), str(os.cpu_count()), *cpu, *(os.environ.get(pin, "") for pin in PINS)]
+    return hashlib.sha256("\n".join(told).encode()).hexdigest()[:16]
+
+
+# Programs that XLA compiled are kept from one process and one run to the next, in pytest's own cache
+# (--cache-clear removes them). Set before anything imports jax, and for the processes that tests start.
+cpuinfo = Path("/proc/cpuinfo")
+kept = ROOT / ".pytest_cache/d" / f"jax-{compiled_for(cpuinfo.read_text() if cpuinfo.exists() else '')}"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(kept))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 # the same examples in every run, and no folder of remembered ones
 hypothesis.settings.register_profile("repeatable", derandomize=True, database=None, deadline=None)
