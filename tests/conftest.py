@@ -5,7 +5,10 @@ import hashlib
 import os
 import platform
 import shutil
+import signal
+import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import hypothesis
@@ -93,6 +96,51 @@ def mortal_cluster(tmp_path):
     made = Cluster(tmp_path)
     yield made
     made.stop()
+
+
+@pytest.fixture
+def must_end():
+    """Ends a test that waits for ever or works without an end: five minutes are no measure of a machine."""
+
+    def end(*_):
+        raise AssertionError("this test had not ended after 300 s")
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.alarm(300)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """The command of each process that this one starts from now on."""
+    commands: list[str] = []
+    start = subprocess.Popen.__init__
+
+    def told(process, command, *arguments, **settings):
+        commands.append(command if isinstance(command, str) else " ".join(map(os.fsdecode, command)))
+        start(process, command, *arguments, **settings)
+
+    monkeypatch.setattr(subprocess.Popen, "__init__", told)
+    return commands
+
+
+def count_calls(work: Callable[[], object]) -> int:
+    """How many functions `work` calls: its cost in a unit that no machine changes."""
+    calls = 0
+
+    def count(frame, event, argument):
+        nonlocal calls
+        calls += event in ("call", "c_call")
+
+    before = sys.getprofile()
+    sys.setprofile(count)
+    try:
+        work()
+    finally:
+        sys.setprofile(before)
+    return calls
 
 
 @pytest.fixture
