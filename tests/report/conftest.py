@@ -76,6 +76,21 @@ def reports(populated, tmp_path_factory):
     return folder / "reports"
 
 
+def expect(shown):
+    """Playwright's assertions about a locator or a page, which wait until they hold: a page's script works
+    beside the test."""
+    from playwright import sync_api
+
+    sync_api.expect.set_options(timeout=30_000)
+    return sync_api.expect(shown)
+
+
+def timers_fired(page):
+    """Waits until timers of less than 0.2 s that the page has set have fired: those of one page fire in the
+    order of their times, however slow the machine is."""
+    page.evaluate("() => new Promise(done => setTimeout(done, 200))")
+
+
 def loaded(browser, folder, name, *, width=1280, height=800, theme="light", script=True):
     """A page in a browser context of its own; the addresses that it asked for in .asked, the messages of its
     console in .console."""

@@ -5,7 +5,6 @@ import json
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -75,14 +74,14 @@ def empty(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_two_hundred_revisions_are_drawn_within_ten_seconds_with_their_own_figures(
-    empty, monkeypatch, capsys
+def test_two_hundred_revisions_are_drawn_with_their_own_figures_by_a_few_processes(
+    empty, monkeypatch, capsys, started
 ):
     commits([(f"run {k}", {"report.json": report(1 + k / 100)}) for k in range(200)])
-    started = time.perf_counter()
+    started.clear()
     command(monkeypatch)
-    # the bar; a quiet machine takes under one
-    assert time.perf_counter() - started < 10
+    # no git for each revision
+    assert 0 < len(started) < 20
     runs = list(history.revisions(500))
     np.testing.assert_allclose(
         [run.figures["window"]["gap_percent"].value for run in runs],

@@ -7,7 +7,6 @@ import math
 import re
 import shutil
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ from pipeline.report.shared.verdict import Figure, Question, ReportRules
 from pipeline.store import artifacts, params
 from pipeline.store.printable import printable
 from tests.report import made
-from tests.report.conftest import MACHINE, loaded
+from tests.report.conftest import MACHINE, expect, loaded
 from tests.report.made_runs import Made, lock, make, metrics, parameters
 from tests.report.test_pages import Page
 
@@ -376,16 +375,16 @@ def test_the_same_runs_give_the_same_bytes(empty):
     assert set(first) > {"runs.html", "uPlot.js"}
 
 
-def test_a_thousand_runs_take_seconds_and_the_page_stays_bounded(empty, capsys):
+def test_a_thousand_runs_take_a_few_processes_and_the_page_stays_bounded(empty, capsys, started):
     runs = [Made("base", {**metrics(), **parameters()})]
     for k in range(1100):
         own = {**metrics(20 + k / 100, stay=50 + k / 50), **parameters(seed=k, budget=k % 7)}
         runs.append(Made(f"tried {k}", own, f"sweep-{k}"))
     make(runs)
-    began = time.perf_counter()
+    started.clear()
     command()
-    # a quiet core takes 3 s; the bar leaves room for the work of others beside it
-    assert time.perf_counter() - began < 30
+    # no git for each run
+    assert 0 < len(started) < 20
     assert "1000 runs" in capsys.readouterr().out
     told = data()
     assert len(told["runs"]) == 1000 and PAGE.stat().st_size < 4_000_000
@@ -429,7 +428,6 @@ def folder(tmp_path_factory):
 
 def opened(browser, folder, where="", **view):
     page = loaded(browser, folder, "runs", **view)
-    page.set_default_timeout(5000)
     if where:
         page.goto(f"file://{folder}/runs.html{where}")
         page.reload()
@@ -480,7 +478,7 @@ def test_without_a_script_the_table_reads_and_says_what_it_cannot_do(show):
     said = " ".join(rows.last.inner_text().split())
     assert "not measured" in said and "report.json" not in said and "there is no evaluate_setpoint" in said
     assert "Without a script the table does not sort" in page.locator("main").inner_text()
-    assert not page.locator("#two").is_visible()
+    expect(page.locator("#two")).not_to_be_visible()
 
 
 def column(page, title):
@@ -495,8 +493,8 @@ def test_the_table_sorts_and_the_filters_leave_kinds_and_words(show):
     assert column(page, "Settling") == ["26.0", "30.0", "40.0", "50.0", "not measured"]
     page.get_by_label("accepted").uncheck()
     page.get_by_label("Only rows with").fill("tried 120")
+    expect(page.get_by_text("1 of 5 runs", exact=True)).to_be_visible()
     assert column(page, "Settling") == ["50.0"]
-    assert page.get_by_text("1 of 5 runs", exact=True).is_visible()
     page.wait_for_function("location.hash.includes('find=tried+120')")
 
 
@@ -545,7 +543,7 @@ def test_curves_of_both_runs_are_drawn_with_the_values_of_the_artifact(show):
     assert words == ["47.51 at 4"] * 2
     page.get_by_label("Curve", exact=True).select_option("Flow error left by trial, material A")
     page.wait_for_selector("html[data-curve='Flow error left by trial, material A']")
-    assert "curve=Flow" in page.evaluate("location.hash")
+    page.wait_for_function("location.hash.includes('curve=Flow')")
 
 
 def test_a_scatter_has_a_point_a_run_at_its_values_and_makes_it_run_b(show):
