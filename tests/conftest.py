@@ -1,18 +1,42 @@
 """What every test may ask for: the repository's root, other people's data (or the reason why not), and slow
 tests only when they are asked for."""
 
+import hashlib
 import os
+import platform
 import shutil
+import signal
+import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import hypothesis
 import pytest
 
 from pipeline import cli
+from pipeline.store.execution import PINS
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT / os.environ.get("BEADLINE_SHARED", "../shared")
+
+
+def compiled_for(cpuinfo: str) -> str:
+    """A name for what XLA's programs depend on beside their source, its version and its flags, which JAX's
+    own key holds: the CPU, its number of cores, and the pins that `run` exports."""
+    cpu = sorted(
+        {line for line in cpuinfo.splitlines() if line.startswith(("model name", "flags", "Features"))}
+    )
+    told = [platform.machine(), str(os.cpu_count()), *cpu, *(os.environ.get(pin, "") for pin in PINS)]
+    return hashlib.sha256("\n".join(told).encode()).hexdigest()[:16]
+
+
+# Programs that XLA compiled are kept from one process and one run to the next, in pytest's own cache
+# (--cache-clear removes them). Set before anything imports jax, and for the processes that tests start.
+cpuinfo = Path("/proc/cpuinfo")
+kept = ROOT / ".pytest_cache/d" / f"jax-{compiled_for(cpuinfo.read_text() if cpuinfo.exists() else '')}"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(kept))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 # the same examples in every run, and no folder of remembered ones
 hypothesis.settings.register_profile("repeatable", derandomize=True, database=None, deadline=None)
@@ -72,6 +96,51 @@ def mortal_cluster(tmp_path):
     made = Cluster(tmp_path)
     yield made
     made.stop()
+
+
+@pytest.fixture
+def must_end():
+    """Ends a test that waits for ever or works without an end: five minutes are no measure of a machine."""
+
+    def end(*_):
+        raise AssertionError("this test had not ended after 300 s")
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.alarm(300)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """The command of each process that this one starts from now on."""
+    commands: list[str] = []
+    start = subprocess.Popen.__init__
+
+    def told(process, command, *arguments, **settings):
+        commands.append(command if isinstance(command, str) else " ".join(map(os.fsdecode, command)))
+        start(process, command, *arguments, **settings)
+
+    monkeypatch.setattr(subprocess.Popen, "__init__", told)
+    return commands
+
+
+def count_calls(work: Callable[[], object]) -> int:
+    """How many functions `work` calls: its cost in a unit that no machine changes."""
+    calls = 0
+
+    def count(frame, event, argument):
+        nonlocal calls
+        calls += event in ("call", "c_call")
+
+    before = sys.getprofile()
+    sys.setprofile(count)
+    try:
+        work()
+    finally:
+        sys.setprofile(before)
+    return calls
 
 
 @pytest.fixture

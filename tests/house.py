@@ -105,16 +105,19 @@ def files(root: Path, *folders: str) -> Iterator[File]:
             yield File(path.relative_to(root).as_posix(), parsed(path))
 
 
-def imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
+@functools.cache
+def imports(tree: ast.AST) -> list[tuple[int, str]]:
     """(line, dotted name) of each import; `from a import b` is a.b. A relative import begins with a dot."""
+    found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            yield from ((node.lineno, alias.name) for alias in node.names)
+            found += [(node.lineno, alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            yield from (
+            found += [
                 (node.lineno, "." * node.level + f"{node.module or ''}.{alias.name}".strip("."))
                 for alias in node.names
-            )
+            ]
+    return found
 
 
 def project_file(root: Path, name: str) -> str | None:
@@ -127,13 +130,16 @@ def project_file(root: Path, name: str) -> str | None:
     return None
 
 
-def calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str, str]]:
+@functools.cache
+def calls(tree: ast.AST) -> list[tuple[ast.Call, str, str]]:
     """(call, receiver, function) of each call: artifacts.write_text(...) is ("artifacts", "write_text"),
     open(...) ("", "open")."""
+    found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
             *receiver, function = ast.unparse(node.func).rsplit(".", 1)
-            yield node, "".join(receiver), function
+            found.append((node, "".join(receiver), function))
+    return found
 
 
 # ---- who may know whom
@@ -329,11 +335,18 @@ def paths(stage: str, name: str, tree: ast.Module) -> tuple[set[str], set[str]]:
     return {path for path in read if not path.startswith(("datasets/memo", f"datasets/{stage}/"))}, written
 
 
+@functools.cache
+def _sections(owner: Path, *contents: bytes) -> dict[str, Any]:
+    """The sections by file of params.yaml and params.expert.yaml, which hold `contents`."""
+    return params.files(owner)
+
+
 def tracked(root: Path, keys: set[str]) -> list[Any]:
     """Keys as DVC lists them, each under the files in which it stands: those of params.yaml bare, those of
     params.expert.yaml below its name."""
     owner, expert = root / params.FILE, root / params.EXPERT
-    by_file = params.files(owner) if owner.exists() else {}
+    contents = [path.read_bytes() for path in (owner, expert) if path.exists()]
+    by_file = _sections(owner, *contents) if owner.exists() else {}
     present = {
         name: sorted(key for key in keys if key in _flattened(sections)) for name, sections in by_file.items()
     }

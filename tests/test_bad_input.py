@@ -361,7 +361,7 @@ def test_the_command_ends_with_status_1_and_one_sentence_without_a_traceback(tre
         env=environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         check=False,
     )
     assert ended.returncode == 1

@@ -431,13 +431,15 @@ def test_a_verification_is_written_composed_and_shown_beside_what_was_measured(f
 
 # ---- what a machine may run out of
 
+COMPOSE = ["beadline", "compose", "datasets/parts/fig9.gcode", "--as", "csv,parquet,mcap", "--out", "jobs"]
+LARGER = [*COMPOSE, "--scale", "1.5"]
 TWICE = """
 import os, resource, sys
 from pathlib import Path
 from pipeline import cli
-sys.argv = ["beadline", "compose", "datasets/parts/fig9.gcode", "--as", "csv,parquet,mcap", "--out", "jobs"]
+sys.argv = {compose}
 cli.main()
-sys.argv += ["--scale", "1.5"]
+sys.argv = {larger}
 {trouble}
 cli.main()
 """
@@ -460,25 +462,25 @@ TROUBLES = {
 
 
 @pytest.mark.parametrize("trouble", TROUBLES)
-def test_composing_on_a_machine_that_runs_out_is_one_sentence_and_leaves_the_last_files(finished, trouble):
+def test_composing_on_a_machine_that_runs_out_is_one_sentence_and_leaves_the_last_files(
+    finished, monkeypatch, trouble
+):
     spoil, sentence = TROUBLES[trouble]
     finished.chmod(0o755)
-
-    def composed(trouble: str) -> subprocess.CompletedProcess:
-        return subprocess.run(
-            [sys.executable, "-c", TWICE.format(trouble=trouble)], capture_output=True, text=True,
-            env=os.environ | {"PYTHONPATH": str(ROOT)}, timeout=300, check=False,
-        )  # fmt: skip
-
-    assert composed("sys.exit(0)").returncode == 0
+    monkeypatch.setattr(sys, "argv", COMPOSE)
+    cli.main()
     before = {path.name: path.read_bytes() for path in Path("jobs").iterdir()}
-    ended = composed(spoil)
+    ended = subprocess.run(
+        [sys.executable, "-c", TWICE.format(compose=COMPOSE, larger=LARGER, trouble=spoil)],
+        capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)}, timeout=300, check=False,
+    )  # fmt: skip
     Path("jobs").chmod(0o755)
     assert ended.returncode == 1 and re.fullmatch(sentence, ended.stderr.strip().splitlines()[-1])
     assert "Traceback" not in ended.stderr
     assert {path.name: path.read_bytes() for path in Path("jobs").iterdir()} == before
     # and the next call gives what it would have given
-    assert composed("").returncode == 0
+    monkeypatch.setattr(sys, "argv", LARGER)
+    cli.main()
     assert {path.name for path in Path("jobs").iterdir()} == set(before)
     assert Path("jobs/fig9.signal.csv").read_bytes() != before["fig9.signal.csv"]
 

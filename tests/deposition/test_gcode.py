@@ -2,7 +2,6 @@
 each dialect's traps by hand, and what is refused."""
 
 import re
-import time
 from pathlib import Path
 
 import numpy as np
@@ -667,13 +666,12 @@ GOOD = "G21\nM83\n" + "G1 X1 Y1 E.1\nG1 X2 Y2 E.1\n" * 9
         ("M83\nG1 X1 E1\n".encode("utf-16-le") * 9, "binary"),
     ],
 )
+@pytest.mark.usefixtures("must_end")
 def test_what_cannot_be_a_program_is_refused_in_bounded_time(data, why):
-    start = time.process_time()
+    """A second a hundred MB on the slowest machine seen; what is quadratic takes hours."""
     with pytest.raises(ValueError, match=why) as refused:
         parse(data)
     assert "\n" not in str(refused.value)
-    # a second a hundred MB on the slowest machine seen; what is quadratic takes minutes
-    assert time.process_time() - start < 10
 
 
 @pytest.mark.parametrize(

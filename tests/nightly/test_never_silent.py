@@ -302,14 +302,13 @@ def test_a_commit_that_fails_leaves_the_champion_of_the_commit_before(project, m
 # ---- loops
 
 
+@pytest.mark.usefixtures("must_end")
 def test_stages_that_take_too_long_are_ended_and_that_is_said(project):
     alarm = json.loads(Path("params.yaml").read_text())["nightly"]["alarm"]
     project.set(longest_h=0.001, alarm=alarm)
-    Path("slow.txt").write_text("60")
+    Path("slow.txt").write_text("3600")
     project.record("second", [9.5])
-    began = time.monotonic()
     told(project, "dvc repro --keep-going was ended after 0.001 h (nightly.longest_h)")
-    assert time.monotonic() - began < 50
     Path("slow.txt").unlink()
     project.set(alarm=alarm)
     works_again(project, "night-0003")
@@ -454,7 +453,6 @@ class Server:
 @pytest.fixture
 def quick(monkeypatch):
     monkeypatch.setattr(watch, "PAUSE_S", 0.01)
-    monkeypatch.setattr(watch, "ASKED_S", 0.5)
 
 
 def test_the_webhook_gets_a_text_and_is_tried_once_more(tmp_path, monkeypatch, quick):
@@ -468,6 +466,7 @@ def test_the_webhook_gets_a_text_and_is_tried_once_more(tmp_path, monkeypatch, q
     assert json.loads(body) == json.loads(watch.ALARM.read_text())
 
 
+@pytest.mark.usefixtures("must_end")
 @pytest.mark.parametrize("kind", ["hangs", "refuses", "fails", "no URL", "no server", "file"])
 def test_a_server_that_does_not_answer_takes_a_bounded_time_and_its_url_is_not_told(
     tmp_path, monkeypatch, quick, kind
@@ -481,11 +480,11 @@ def test_a_server_that_does_not_answer_takes_a_bounded_time_and_its_url_is_not_t
         "no server": lambda: "http://user:t0ken@s3cret:nan/",
         "file": lambda: Path("t0ken").absolute().as_uri() if Path("t0ken").write_text("s3cret") else "",
     }[kind]()
-    began = time.monotonic()
+    if kind == "hangs":
+        monkeypatch.setattr(watch, "ASKED_S", 0.5)
     troubles = watch.wake("failed", ["no room"], {}, watch.Routes(webhook=url, heartbeat=url)) + watch.beat(
         watch.Routes(heartbeat=url)
     )
-    assert time.monotonic() - began < 4 * 0.5 + 2
     assert len(troubles) == 2 and "nightly.webhook" in troubles[0] and "nightly.heartbeat" in troubles[1]
     assert "s3cret" not in str(troubles).replace("http://s3cret", "") and "t0ken" not in str(troubles)
 
@@ -569,15 +568,15 @@ def test_a_loop_whose_name_is_no_folder_in_champion_is_refused(name):
         Nightly.model_validate(SETTINGS | {"loops": {name: SETTINGS["loops"]["toy"]}})
 
 
+@pytest.mark.usefixtures("must_end")
 def test_an_alarm_command_that_hangs_is_ended_and_does_not_tell_its_arguments(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(watch, "COMMAND_S", 0.5)
     # a child of its own keeps the error output open beyond the command's end
-    code = "import time,subprocess; subprocess.Popen(['sleep','30']); time.sleep(30)"
+    code = "import time,subprocess; subprocess.Popen(['sleep','3600']); time.sleep(3600)"
     command = f'{sys.executable} -c "{code}" t0ken'
-    began = time.monotonic()
     (trouble,) = watch.wake("failed", ["no room"], {}, watch.Routes(alarm=command))
-    assert time.monotonic() - began < 10 and "was ended after 0.5 s" in trouble and "t0ken" not in trouble
+    assert "was ended after 0.5 s" in trouble and "t0ken" not in trouble
 
 
 def test_the_heartbeat_beats_after_a_good_night_and_not_after_a_failed_one(project, monkeypatch, quick):

@@ -18,7 +18,6 @@ from pipeline.store import artifacts, params
 from pipeline.temperature import plant, window
 from pipeline.temperature.plant import baam, simulate
 from pipeline.temperature.workflow.contestants import CONTESTANTS
-from pipeline.temperature.workflow.settings import Tracking
 from tests.nightly import shifts_recorded as nights
 from tests.nightly.toy_nights import SETTINGS
 

@@ -3,7 +3,6 @@
 import os
 import socket
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
@@ -70,30 +69,33 @@ def test_links_inside_and_a_folder_of_recordings_on_another_disk_are_taken(raw, 
         check_plain_files(raw)
 
 
-def test_a_thousand_files_are_looked_through_in_milliseconds(raw):
+def test_a_thousand_files_are_listed_and_none_is_asked_for_by_its_path(raw, monkeypatch):
+    """The list of a folder tells what each file is; a question a file would be a thousand."""
     for k in range(1000):
         (raw / f"temperature/{k}.csv").touch()
-    start = time.perf_counter()
+    asked = []
+    for name in ("stat", "lstat", "resolve"):
+        ask = getattr(Path, name)
+        monkeypatch.setattr(
+            Path, name, lambda path, *rest, ask=ask, **how: asked.append(path) or ask(path, *rest, **how)
+        )
     check_plain_files(raw)
-    # some 10 ms; ten times that on a busy machine
-    assert time.perf_counter() - start < 0.2
+    assert 0 < len(asked) < 20
 
 
 def test_run_refuses_a_pipe_by_name_before_dvc_can_hang_on_it(root, raw, tmp_path):
-    """DVC would open the pipe and wait for ever; the refusal comes in the time of a start of Python."""
+    """DVC would open the pipe and wait for ever; the refusal comes before it starts."""
     os.mkfifo(raw / "temperature/pi\x1b[31mpe.csv")
     environment = os.environ | {"BEADLINE_CPUINFO": "/dev/null"}
-    start = time.perf_counter()
     ended = subprocess.run(
         [root / "run", "dvc", "status"],
         cwd=tmp_path,
         env=environment,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
         check=False,
     )
     assert ended.returncode == 1
     assert "run: datasets/raw/temperature/pi\\x1b[31mpe.csv is a named pipe (FIFO)" in ended.stderr
     assert "\x1b" not in ended.stderr
-    assert time.perf_counter() - start < 30

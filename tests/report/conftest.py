@@ -1,7 +1,9 @@
 """The small project as the working directory, its pages built once, and the browser."""
 
 import contextlib
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -20,25 +22,73 @@ def populate(folder):
     made.write(folder)
 
 
+@pytest.fixture(scope="session")
+def populated(tmp_path_factory):
+    """The folder with every artifact in it, which nobody changes."""
+    folder = tmp_path_factory.mktemp("populated")
+    with contextlib.chdir(folder):
+        populate(folder)
+    return folder
+
+
 @pytest.fixture
-def project(tmp_path, monkeypatch):
+def project(populated, tmp_path, monkeypatch):
     """The working directory with every artifact in it."""
     monkeypatch.chdir(tmp_path)
-    populate(tmp_path)
+    shutil.copytree(populated, tmp_path, dirs_exist_ok=True)
     return tmp_path
 
 
+@pytest.fixture
+def render_only(monkeypatch):
+    """render_only("deposition"): the stage report renders the pages of these modules alone, and leaves the
+    others empty. Its verdicts and its figures are those of a whole run."""
+    from stages import report
+
+    empty = SimpleNamespace(text="", files={})
+
+    def render(*names):
+        modules = {
+            name.removesuffix("_page"): getattr(report, name)
+            for name in vars(report)
+            if name.endswith("_page")
+        }
+        assert set(names) <= set(modules)
+        for other in set(modules) - set(names):
+            for function in [name for name in vars(modules[other]) if name.startswith("render")]:
+                blank = empty if other == "viewer" else ""
+                monkeypatch.setattr(modules[other], function, lambda *_, blank=blank: blank)
+        report.main()
+
+    return render
+
+
 @pytest.fixture(scope="session")
-def reports(tmp_path_factory):
+def reports(populated, tmp_path_factory):
     """The folder of the small project's pages, which nobody changes."""
     from stages.report import main
 
     folder = tmp_path_factory.mktemp("built")
+    shutil.copytree(populated, folder, dirs_exist_ok=True)
     with contextlib.chdir(folder):
-        populate(folder)
         main()
         Path("reports/machine.js").write_text(MACHINE)  # as ./run does
     return folder / "reports"
+
+
+def expect(shown):
+    """Playwright's assertions about a locator or a page, which wait until they hold: a page's script works
+    beside the test."""
+    from playwright import sync_api
+
+    sync_api.expect.set_options(timeout=30_000)
+    return sync_api.expect(shown)
+
+
+def timers_fired(page):
+    """Waits until timers of less than 0.2 s that the page has set have fired: those of one page fire in the
+    order of their times, however slow the machine is."""
+    page.evaluate("() => new Promise(done => setTimeout(done, 200))")
 
 
 def loaded(browser, folder, name, *, width=1280, height=800, theme="light", script=True):

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from tests.report.conftest import MACHINE
+from tests.report.conftest import MACHINE, expect
 
 PAGES = ("index", "temperature", "identification", "deposition", "setpoint", "certificate")
 BESIDE = ("runs", "words")
@@ -84,13 +84,14 @@ def test_a_table_sorts_by_number_both_ways_and_back_and_what_has_no_value_stands
     # 50 %, 10 % and an order that was not tried
     assert [text.split("\u202f")[0] for text in before] == ["50.00", "10.00", "within noise"]
     head.locator("button").click()
-    assert head.get_attribute("aria-sort") == "ascending"
+    expect(head).to_have_attribute("aria-sort", "ascending")
     assert [text[:2] for text in cells.all_inner_texts()] == ["10", "50", "wi"]
     head.locator("button").press("Enter")
-    assert head.get_attribute("aria-sort") == "descending"
+    expect(head).to_have_attribute("aria-sort", "descending")
     assert [text[:2] for text in cells.all_inner_texts()] == ["50", "10", "wi"]
     head.locator("button").press("Enter")
-    assert head.get_attribute("aria-sort") is None and cells.all_inner_texts() == before
+    expect(head).not_to_have_attribute("aria-sort", re.compile(""))
+    assert cells.all_inner_texts() == before
 
 
 def test_a_table_sorts_by_text_in_the_list_of_files_at_the_foot_of_a_page(open_page):
@@ -98,6 +99,7 @@ def test_a_table_sorts_by_text_in_the_list_of_files_at_the_foot_of_a_page(open_p
     page.locator(".prov summary").click()
     paths = page.locator(".prov tbody td:first-child")
     page.locator(".prov th button", has_text="File").click()
+    expect(page.locator(".prov th", has_text="File")).to_have_attribute("aria-sort", "ascending")
     assert paths.all_inner_texts() == sorted(paths.all_inner_texts(), key=str.lower)
 
 
@@ -107,6 +109,7 @@ def pointed(page, section, picture, share):
     svg.scroll_into_view_if_needed()
     box = box_of(svg)
     page.mouse.move(box["x"] + share * box["width"], box["y"] + box["height"] / 2)
+    expect(page.locator(".tip")).to_be_visible()
     return page.locator(".tip").inner_text().replace(",", "")
 
 
@@ -131,12 +134,12 @@ def test_the_pointer_tells_time_and_value_as_they_are_in_the_artifact(open_page)
 )
 def test_a_picture_enlarges_zooms_and_closes(open_page, name, figure, picture):
     page = open_page(name)
-    page.set_default_timeout(5000)
     small = page.locator(figure).first
     small.locator("button.zoom").focus()
     page.keyboard.press("Enter")
     dialog, enlarged = page.locator("dialog"), page.locator("dialog .stage svg")
-    assert dialog.is_visible() and box_of(enlarged)["width"] > 1.5 * box_of(small)["width"]
+    expect(dialog).to_be_visible()
+    assert box_of(enlarged)["width"] > 1.5 * box_of(small)["width"]
     assert enlarged.get_attribute("aria-label") == (
         small.locator(picture).get_attribute("aria-label") or small.locator(picture).get_attribute("alt")
     )
@@ -150,17 +153,21 @@ def test_a_picture_enlarges_zooms_and_closes(open_page, name, figure, picture):
     )
     assert float(enlarged.get_attribute("data-view").split()[2]) < float(whole.split()[2])
     page.keyboard.press("0")
-    assert [float(part) for part in enlarged.get_attribute("data-view").split()] == [
-        float(part) for part in whole.split()
-    ]
+    page.wait_for_function(
+        """whole => document.querySelector('dialog .stage > svg').dataset.view.split(" ").map(Number).join()
+            === whole.split(" ").map(Number).join()""",
+        arg=whole,
+    )
     page.keyboard.press("Escape")
-    assert not dialog.is_visible() and page.console == []
+    expect(dialog).not_to_be_visible()
+    assert page.console == []
 
 
 def test_the_keys_read_values_off_an_enlarged_picture(open_page):
     page = open_page("temperature")
     page.locator("section:has(> #typical) button.zoom").first.click()
     page.keyboard.press("ArrowLeft")
+    expect(page.locator(".tip")).to_be_visible()
     assert re.fullmatch(r"[\d.]+\u202fs(\n[\d.]+\u202f°C)+", page.locator(".tip").inner_text())
 
 
@@ -168,14 +175,14 @@ def test_a_word_explains_itself_to_pointer_and_keys_and_stands_in_the_list(open_
     page = open_page("temperature")
     word, tip = page.locator("#answer-disk a.term"), page.locator(".tip")
     word.hover()
-    assert "before it oscillates" in tip.inner_text()
+    expect(tip).to_contain_text("before it oscillates", use_inner_text=True)
     page.keyboard.press("Escape")
-    assert not tip.is_visible()
+    expect(tip).not_to_be_visible()
     page.mouse.move(5, 5)
     page.locator("#answer-overshoot a.term").focus()
-    assert "past its reference" in tip.inner_text()
+    expect(tip).to_contain_text("past its reference", use_inner_text=True)
     word.click()
-    assert "words.html#" in page.url
+    expect(page).to_have_url(re.compile(r"words\.html#"))
     assert page.locator(":target dd").inner_text().endswith("from 2/3 to 3/2.")
 
 
@@ -268,13 +275,15 @@ def test_a_second_level_of_detail_is_closed_opens_at_its_heading_and_prints(open
     inside = {
         heading: page.locator(f"details:has(> summary > #{heading}) > :not(summary)") for heading in closed
     }
-    assert not any(found.first.is_visible() for found in inside.values())
+    for found in inside.values():
+        expect(found.first).not_to_be_visible()
     short = page.evaluate("document.documentElement.scrollHeight")
     page.locator(f"#{closed[1]}").click()
-    assert inside[closed[1]].first.is_visible() and not inside[closed[0]].first.is_visible()
+    expect(inside[closed[1]].first).to_be_visible()
+    expect(inside[closed[0]].first).not_to_be_visible()
     # the page's own list of places leads into it
     page.locator(f".toc a[href='#{closed[0]}']").click()
-    assert inside[closed[0]].first.is_visible()
+    expect(inside[closed[0]].first).to_be_visible()
     # a fifth of the page at least, or a reader gains nothing
     assert page.evaluate("document.documentElement.scrollHeight") > 1.2 * short
     page.evaluate("document.querySelectorAll('details').forEach(one => { one.open = false; })")

@@ -335,12 +335,13 @@ def test_what_was_measured_of_a_print_stands_beside_its_forecast(project):
 
 @pytest.mark.parametrize("path", ARTIFACTS)
 @pytest.mark.parametrize("how", ["missing", "broken"])
-def test_what_is_missing_or_broken_is_said_in_its_place(project, path, how):
+def test_what_is_missing_or_broken_is_said_in_its_place(project, render_only, path, how):
     if how == "missing":
         Path(path).unlink()
     else:
         Path(path).write_bytes(b"{")
-    text, name = page(), Path(path).name
+    render_only("deposition")
+    text, name = Page(PAGE).text, Path(path).name
     broken = "is not whole JSON" if name.endswith("json") else "is not a whole Parquet file"
     sentence = f"{name} of {path.split('/')[1]} is not there. Run ./run dvc repro {path.split('/')[1]}."
     assert (broken if how == "broken" else sentence) in text

@@ -35,7 +35,6 @@ TICKS = """key => {
 
 def enlarged(page, section, number=0):
     """The enlarged picture of a section."""
-    page.set_default_timeout(5000)
     page.locator(f"section[aria-labelledby={section}] figure:visible button.zoom").nth(number).press("Enter")
     return page.locator("dialog .stage > svg")
 

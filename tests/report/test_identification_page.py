@@ -261,13 +261,14 @@ def test_what_was_masked_is_counted_by_signal(project):
     "name", ["holdout", "residuals", "steps", "dynamics", "first_order", "poles", "levels", "order"]
 )
 @pytest.mark.parametrize("how", ["missing", "broken"])
-def test_a_table_that_is_missing_or_broken_is_said_so_in_its_place(project, name, how):
+def test_a_table_that_is_missing_or_broken_is_said_so_in_its_place(project, render_only, name, how):
     path = FOLDER / f"{name}.parquet"
     if how == "missing":
         path.unlink()
     else:
         path.write_bytes(b"{")
-    text = page()
+    render_only("identification")
+    text = Page(IDENTIFICATION).text
     sentence = (
         f"{name}.parquet of identify_plant is not there. Run ./run dvc repro identify_plant."
         if how == "missing"

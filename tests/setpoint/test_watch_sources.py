@@ -326,6 +326,7 @@ def test_a_camera_that_fails_in_the_middle_is_asked_again_and_nobody_else_is(cam
     ("at_once", "drop"),
     [(b"", b"H"), (b"HTTP/1.1 200 OK\r\nX-A: ", b"a"), (b"HTTP/1.1 200 OK\r\n\r\n", b"x")],
 )
+@pytest.mark.usefixtures("must_end")
 def test_a_camera_that_drips_is_given_up(monkeypatch, at_once, drop):
     """In the line of its status, in its headers, or in its picture."""
     monkeypatch.setattr(watch_sources, "TIMEOUT_S", 0.3)
@@ -342,9 +343,7 @@ def test_a_camera_that_drips_is_given_up(monkeypatch, at_once, drop):
         server.daemon_threads = True
         threading.Thread(target=server.serve_forever, daemon=True).start()
         here = Snapshots(f"http://127.0.0.1:{server.server_address[1]}/", 5.0)
-        began = time.monotonic()
         assert list(here.frames()) == []
-        assert time.monotonic() - began < 2.0
         ended.set()
         server.shutdown()
     assert "took more than 0.3 s" in here.waits_for

@@ -2,7 +2,6 @@
 whatever is wrong with them is said in one sentence."""
 
 import re
-import time
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -487,14 +486,12 @@ LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("a: \x1b[31m", "unacceptable character"),
     ],
 )
+@pytest.mark.usefixtures("must_end")
 def test_a_hostile_file_is_one_sentence_at_once(load, text, sentence):
-    start = time.perf_counter()
     with pytest.raises(ValueError, match=re.escape(sentence)) as refused:
         load(text)
     assert str(refused.value).startswith("params.yaml: ")
     assert "\n" not in str(refused.value)
-    # milliseconds; the bound leaves room for a busy machine
-    assert time.perf_counter() - start < 5
 
 
 def test_an_alias_of_a_few_values_is_what_it_stands_for(load):
