@@ -1,0 +1,102 @@
+"""A small project of an owner of a deposition machine: short routines, one material, own topics and a turned
+camera. Its stages run as `./run dvc repro STAGE` runs them."""
+
+import importlib
+import re
+import shutil
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from tests.foreign.bead_camera import BeadCamera
+from tests.foreign.deposition_machine import TOPICS, DepositionMachine, Printed
+from tests.foreign.syringe import PneumaticSyringe
+
+ROOT = Path(__file__).resolve().parents[2]
+RECORDED, NEXT = Path("datasets/raw/deposition"), Path("datasets/train_ilc/next")
+AREA_MM2, RAMP_S = 0.304, 0.15
+SHORT = {"off_s": 1.0, "on_s": 2.5, "tail_s": 2.0}
+REFERENCE = {"speed_mm_per_s": 8.0, "pause_s": 0.6, **SHORT}
+# as the shipped ones: the first shares speed and pause with the reference, and prints longer
+LIKE_THE_SHIPPED = [
+    {"speed_mm_per_s": 8.0, "pause_s": 0.6, **SHORT, "on_s": 4.0},
+    {"speed_mm_per_s": 5.0, "pause_s": 0.6, **SHORT, "on_s": 4.0},
+]
+CAMERA = BeadCamera()
+SMALL = {
+    "printer.drive": {"amplitude_mm": 1e3, "speed_mm_per_s": 1e5, "backlash_mm": 0.0},
+    "printer.reference": REFERENCE,
+    "printer.routines": [],
+    "printer.materials": [{"name": "A", "tool": 0, "gain_mm3_per_s_per_mm": 1.08, "time_constant_s": 0.8}],
+    "train_ilc.source": "simulated",
+    "train_ilc.trials": 6,
+    "train_ilc.pixel_trials": 2,
+    "train_ilc.family_plants": 10,
+    "compose_parts.full_part_updates": 4,
+    "execution.jobs": 1,
+}
+# the owner's camera, turned, with the tip where it is in the picture
+OWN = SMALL | {
+    "train_ilc.source": "recordings",
+    "segment_library.law": "pixels",
+    "camera.mm_per_px": -CAMERA.mm_per_px,
+    "camera.rotation_deg": None,
+    "camera.tip_px": list(CAMERA.tip),
+    "camera.nozzle_column": 20,
+    "camera.columns": [90, 280],
+    "camera.topics": TOPICS,
+}
+
+
+class Refused(Exception):
+    """A stage ended with status 1; its one sentence."""
+
+
+class Played(NamedTuple):
+    """A command of next/ that was played: its name, the number of its routine, and what was printed."""
+
+    name: str
+    routine: int
+    printed: Printed
+
+
+def lay_out(changes: dict[str, Any], parts: tuple[str, ...] = ("fig9",)) -> None:
+    """Parts, an empty folder of recordings and the two files of parameters in the working folder."""
+    Path("datasets/parts").mkdir(parents=True)
+    RECORDED.mkdir(parents=True)
+    for name in parts:
+        shutil.copy(ROOT / f"datasets/parts/{name}.gcode", "datasets/parts")
+    files = {name: yaml.safe_load((ROOT / name).read_text()) for name in ("params.yaml", "params.expert.yaml")}
+    for dotted, value in changes.items():
+        section, key = dotted.split(".")
+        places = [sections for sections in files.values() if key in sections.get(section, {})]
+        places[0][section][key] = value
+    for name, sections in files.items():
+        Path(name).write_text(yaml.safe_dump(sections, sort_keys=False))
+
+
+def run_stage(name: str, capsys) -> None:
+    """What `./run dvc repro` runs. Raises Refused with the last line that the stage printed."""
+    capsys.readouterr()
+    try:
+        importlib.import_module(f"stages.{name}").main()
+    except SystemExit:
+        raise Refused(capsys.readouterr().err.strip().splitlines()[-1]) from None
+
+
+def machine(**changes: float) -> DepositionMachine:
+    return DepositionMachine(PneumaticSyringe(**changes), CAMERA, AREA_MM2, RAMP_S)
+
+
+def play_all(foreign: DepositionMachine, routines: list[dict[str, float]], seed: int) -> list[Played]:
+    """Every command of next/ played and recorded, as README.md of datasets/raw/deposition says."""
+    played = []
+    for command in sorted(NEXT.glob("*.csv")):
+        number = int(re.fullmatch(r"A_routine_(\d+)_trial_\d+", command.stem).group(1))
+        path = RECORDED / f"print_of_{command.stem}.mcap"
+        rng = np.random.default_rng([seed, number])
+        printed = foreign.record(path, command.with_suffix(""), routines[number], rng)
+        played.append(Played(command.stem, number, printed))
+    return played
