@@ -1,15 +1,21 @@
 """A small project of an owner of a deposition machine: short routines, one material, own topics and a turned
 camera. Its stages run as `./run dvc repro STAGE` runs them."""
 
+import contextlib
+import html
 import importlib
+import io
 import re
 import shutil
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytest
 import yaml
 
+from pipeline import cli
 from tests.foreign.bead_camera import BeadCamera
 from tests.foreign.deposition_machine import TOPICS, DepositionMachine, Printed
 from tests.foreign.syringe import PneumaticSyringe
@@ -63,7 +69,9 @@ class Played(NamedTuple):
 
 
 def lay_out(changes: dict[str, Any], parts: tuple[str, ...] = ("fig9",)) -> None:
-    """Parts, an empty folder of recordings and the two files of parameters in the working folder."""
+    """The code, parts, an empty folder of recordings and the two files of parameters in the working folder."""
+    for name in ("pipeline", "stages"):
+        Path(name).symlink_to(ROOT / name)
     Path("datasets/parts").mkdir(parents=True)
     RECORDED.mkdir(parents=True)
     for name in parts:
@@ -77,13 +85,37 @@ def lay_out(changes: dict[str, Any], parts: tuple[str, ...] = ("fig9",)) -> None
         Path(name).write_text(yaml.safe_dump(sections, sort_keys=False))
 
 
-def run_stage(name: str, capsys) -> None:
+def run_stage(name: str) -> None:
     """What `./run dvc repro` runs. Raises Refused with the last line that the stage printed."""
-    capsys.readouterr()
-    try:
+    with _one_sentence():
         importlib.import_module(f"stages.{name}").main()
+
+
+def beadline(*arguments: object) -> str:
+    """What `./run beadline ...` prints. Raises Refused with its last line."""
+    with pytest.MonkeyPatch.context() as patch, _one_sentence() as printed:
+        patch.setattr(sys, "argv", ["beadline", *map(str, arguments)])
+        cli.main()
+    return printed.getvalue()
+
+
+@contextlib.contextmanager
+def _one_sentence():
+    """What is printed; an exit of the command becomes Refused."""
+    printed, refused = io.StringIO(), io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(refused):
+            yield printed
     except SystemExit:
-        raise Refused(capsys.readouterr().err.strip().splitlines()[-1]) from None
+        raise Refused(refused.getvalue().strip().splitlines()[-1]) from None
+
+
+def page_text(path: Path) -> str:
+    """The words and figures of a page, without its pictures; every kind of space is one space."""
+    text = path.read_text(encoding="utf-8")
+    for element in ("style", "script", "svg"):
+        text = re.sub(rf"<{element}\b.*?</{element}>", " ", text, flags=re.DOTALL)
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", text)).split())
 
 
 def machine(**changes: float) -> DepositionMachine:
@@ -92,11 +124,15 @@ def machine(**changes: float) -> DepositionMachine:
 
 def play_all(foreign: DepositionMachine, routines: list[dict[str, float]], seed: int) -> list[Played]:
     """Every command of next/ played and recorded, as README.md of datasets/raw/deposition says."""
-    played = []
-    for command in sorted(NEXT.glob("*.csv")):
-        number = int(re.fullmatch(r"A_routine_(\d+)_trial_\d+", command.stem).group(1))
-        path = RECORDED / f"print_of_{command.stem}.mcap"
-        rng = np.random.default_rng([seed, number])
-        printed = foreign.record(path, command.with_suffix(""), routines[number], rng)
-        played.append(Played(command.stem, number, printed))
-    return played
+    return [play(foreign, command, routines, seed) for command in sorted(NEXT.glob("*.csv"))]
+
+
+def play(
+    foreign: DepositionMachine, command: Path, routines: list[dict[str, float]], seed: int
+) -> Played:
+    """One command of next/ played and recorded."""
+    number = int(re.fullmatch(r"A_routine_(\d+)_trial_\d+", command.stem).group(1))
+    path = RECORDED / f"print_of_{command.stem}.mcap"
+    rng = np.random.default_rng([seed, number])
+    printed = foreign.record(path, command.with_suffix(""), routines[number], rng)
+    return Played(command.stem, number, printed)
