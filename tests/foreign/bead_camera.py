@@ -1,5 +1,6 @@
-"""A camera that rides with the nozzle, drawn with numpy and OpenCV alone: the line on the stage is drawn once,
-and each frame is one turned and late view of it."""
+"""A camera that rides with the nozzle, drawn with numpy and OpenCV alone.
+
+The line on the stage is drawn once, and each frame is one turned and late view of it."""
 
 import math
 from collections.abc import Iterator

@@ -56,7 +56,7 @@ class Printed(NamedTuple):
 
 
 class DepositionMachine(NamedTuple):
-    """Extruder and camera on a gantry that plays `off_s`, `on_s`, `pause_s`, `on_s`, `tail_s` at one speed."""
+    """Extruder and camera on a gantry. It plays off_s, on_s, pause_s, on_s and tail_s at one speed."""
 
     extruder: PneumaticSyringe
     camera: BeadCamera
@@ -92,7 +92,9 @@ class DepositionMachine(NamedTuple):
         messages = []
         for t in np.arange(time_s[0] - EARLY_S, time_s[-1] + 0.2, 1 / SIGNALS_HZ):
             place, pace = np.interp(t, time_s, x) / 1000, np.interp(t, time_s, speed) / 1000
-            held = float(u[min(int(np.searchsorted(time_s, t + 1e-9)), len(u)) - 1]) if t >= time_s[0] else 0.0
+            held = (
+                float(u[min(int(np.searchsorted(time_s, t + 1e-9)), len(u)) - 1]) if t >= time_s[0] else 0.0
+            )
             messages.append((t, axes, {"x_m": place, "v_m_per_s": pace}))
             messages.append((t, regulator, {"set_um": 1000 * held}))
         for t, picture in self.camera.frames(time_s, printed.true, x, hz=self.frames_hz, rng=rng):

@@ -1,5 +1,6 @@
-"""Seed figures of Hoelzle, Alleyne and Wagoner Johnson 2009 from the methods' public functions: what the paper
-prints, and to the digit what our page of the papers prints beside it."""
+"""Seed figures of Hoelzle, Alleyne and Wagoner Johnson 2009 from the methods' public functions.
+
+The bounds are the paper's. The digits are those that our page of the papers prints beside them."""
 
 from pathlib import Path
 
@@ -94,7 +95,9 @@ def composed_by_priority(known: Learned, path: Path) -> tuple[list[str], float]:
 
 
 def test_the_shipped_machine_is_that_of_table_1_and_the_law_that_of_equation_2():
-    owner, expert = (yaml.safe_load((ROOT / name).read_text()) for name in ("params.yaml", "params.expert.yaml"))
+    owner, expert = (
+        yaml.safe_load((ROOT / name).read_text()) for name in ("params.yaml", "params.expert.yaml")
+    )
     shipped = [
         (row["name"], row["gain_mm3_per_s_per_mm"], row["time_constant_s"])
         for row in owner["printer"]["materials"]

@@ -30,7 +30,7 @@ LIKE_THE_SHIPPED = [
     {"speed_mm_per_s": 8.0, "pause_s": 0.6, **SHORT, "on_s": 4.0},
     {"speed_mm_per_s": 5.0, "pause_s": 0.6, **SHORT, "on_s": 4.0},
 ]
-CAMERA = BeadCamera()
+CAMERA, SYRINGE = BeadCamera(), PneumaticSyringe()
 SMALL = {
     "printer.drive": {"amplitude_mm": 1e3, "speed_mm_per_s": 1e5, "backlash_mm": 0.0},
     "printer.reference": REFERENCE,
@@ -69,14 +69,16 @@ class Played(NamedTuple):
 
 
 def lay_out(changes: dict[str, Any], parts: tuple[str, ...] = ("fig9",)) -> None:
-    """The code, parts, an empty folder of recordings and the two files of parameters in the working folder."""
+    """Code, parts, an empty folder of recordings and both files of parameters in the working folder."""
     for name in ("pipeline", "stages"):
         Path(name).symlink_to(ROOT / name)
     Path("datasets/parts").mkdir(parents=True)
     RECORDED.mkdir(parents=True)
     for name in parts:
         shutil.copy(ROOT / f"datasets/parts/{name}.gcode", "datasets/parts")
-    files = {name: yaml.safe_load((ROOT / name).read_text()) for name in ("params.yaml", "params.expert.yaml")}
+    files = {
+        name: yaml.safe_load((ROOT / name).read_text()) for name in ("params.yaml", "params.expert.yaml")
+    }
     for dotted, value in changes.items():
         section, key = dotted.split(".")
         places = [sections for sections in files.values() if key in sections.get(section, {})]
@@ -87,21 +89,21 @@ def lay_out(changes: dict[str, Any], parts: tuple[str, ...] = ("fig9",)) -> None
 
 def run_stage(name: str) -> None:
     """What `./run dvc repro` runs. Raises Refused with the last line that the stage printed."""
-    with _one_sentence():
+    with _quiet():
         importlib.import_module(f"stages.{name}").main()
 
 
 def beadline(*arguments: object) -> str:
     """What `./run beadline ...` prints. Raises Refused with its last line."""
-    with pytest.MonkeyPatch.context() as patch, _one_sentence() as printed:
+    with pytest.MonkeyPatch.context() as patch, _quiet() as printed:
         patch.setattr(sys, "argv", ["beadline", *map(str, arguments)])
         cli.main()
     return printed.getvalue()
 
 
 @contextlib.contextmanager
-def _one_sentence():
-    """What is printed; an exit of the command becomes Refused."""
+def _quiet():
+    """What is printed, kept; an exit of the command becomes Refused."""
     printed, refused = io.StringIO(), io.StringIO()
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(refused):
@@ -118,8 +120,9 @@ def page_text(path: Path) -> str:
     return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", text)).split())
 
 
-def machine(**changes: float) -> DepositionMachine:
-    return DepositionMachine(PneumaticSyringe(**changes), CAMERA, AREA_MM2, RAMP_S)
+def machine(extruder: PneumaticSyringe = SYRINGE, frames_hz: float = 20.0) -> DepositionMachine:
+    """The owner's machine."""
+    return DepositionMachine(extruder, CAMERA, AREA_MM2, RAMP_S, frames_hz)
 
 
 def play_all(foreign: DepositionMachine, routines: list[dict[str, float]], seed: int) -> list[Played]:
@@ -127,9 +130,7 @@ def play_all(foreign: DepositionMachine, routines: list[dict[str, float]], seed:
     return [play(foreign, command, routines, seed) for command in sorted(NEXT.glob("*.csv"))]
 
 
-def play(
-    foreign: DepositionMachine, command: Path, routines: list[dict[str, float]], seed: int
-) -> Played:
+def play(foreign: DepositionMachine, command: Path, routines: list[dict[str, float]], seed: int) -> Played:
     """One command of next/ played and recorded."""
     number = int(re.fullmatch(r"A_routine_(\d+)_trial_\d+", command.stem).group(1))
     path = RECORDED / f"print_of_{command.stem}.mcap"
