@@ -121,6 +121,18 @@ def test_the_next_command_is_written_as_csv_and_mcap_with_its_record(walk):
         assert records["beadline.trial"]["trial"] == "3" and records["beadline.trial"]["material"] == "A"
 
 
+@pytest.mark.xfail(
+    strict=True,
+    raises=pytest.RaisesExc(AssertionError, match="the record lacks"),
+    reason="a command is recorded with the speed and the pause of its routine alone",
+)
+def test_the_record_of_a_command_holds_the_whole_plan_of_its_routine(walk):
+    plan = {"off_s", "on_s", "pause_s", "tail_s", "speed_mm_per_s"}
+    for path in sorted((walk.folder / "datasets/train_ilc/next").glob("*.mcap")):
+        record = plunger(path)[2]["beadline.trial"]
+        assert plan <= record.keys(), f"{path.name}: the record lacks {sorted(plan - record.keys())}"
+
+
 def plunger(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, dict[str, str]]]:
     """Stamps in s and values of the plunger's topic, and the metadata records, by the mcap package: the value
     is the last number of a message in CDR."""
