@@ -101,7 +101,7 @@ def test_all_commands_of_the_shipped_routines_are_played_for_three_rounds(shippe
     slow = PneumaticSyringe(fill_s=2.9, vent_s=2.4)
     errors = walk(machine(slow, frames_hz=10.0), shipped)
     for of_routine in errors.values():
-        assert of_routine[2] <= 0.1 * of_routine[0]
+        assert of_routine[2] <= 0.2 * of_routine[0]
 
 
 @pytest.mark.xfail(
