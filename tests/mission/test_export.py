@@ -68,7 +68,9 @@ def close_loop(module: ModuleType, machine: HotEnd, *, fan: bool) -> Played:
         decision = controller.step(measured[k : k + 1], set_point[t : t + 1], float(t))
         duty[k], mode = decision.u[0], [*mode, decision.mode]
         machine.advance(duty[k], 100.0 if fan and t >= FAN_S else 0.0, STEP_S)
-    return Played(np.arange(-COLD_S, END_S), np.append(np.full(COLD_S, 200.0), set_point), measured, duty, mode)
+    return Played(
+        np.arange(-COLD_S, END_S), np.append(np.full(COLD_S, 200.0), set_point), measured, duty, mode
+    )
 
 
 def safe_seconds(played: Played) -> float:
