@@ -11,6 +11,7 @@ temperature difference to the power 5/4 and with the part fan, by radiation, and
 s(t) is 0 or 1: the heater is switched by pulse width. The thermistor T_s lags, and its converter has steps.
 """
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -38,10 +39,13 @@ class Parts(NamedTuple):
     duty_steps: int = 255
 
 
+PARTS = Parts()
+
+
 class HotEnd:
     """The machine at work: `read` gives the thermistor in °C, `advance` applies a duty in percent."""
 
-    def __init__(self, rng: np.random.Generator, parts: Parts = Parts()):
+    def __init__(self, rng: np.random.Generator, parts: Parts = PARTS):
         self.parts, self.rng = parts, rng
         self.cartridge = self.block = self.thermistor = parts.room_degC
         self.substeps = 0
@@ -74,39 +78,52 @@ class HotEnd:
 
 class Record(NamedTuple):
     """One recording, a row a sample: time (T,) in s, duty (T,) and part fan (T,) in percent, temperature (T,)
-    in °C. The duty of a row acts until the next one."""
+    and the firmware's target (T,) in °C. The duty of a row acts until the next one."""
 
     time_s: np.ndarray
     duty_percent: np.ndarray
     fan_percent: np.ndarray
     temperature_degC: np.ndarray
+    target_degC: np.ndarray
 
 
 def record(
-    rng: np.random.Generator,
-    *,
-    minutes: float = 50.0,
-    every_s: float = 1.0,
-    fan: bool = False,
-    parts: Parts = Parts(),
+    rng: np.random.Generator, *, minutes: float = 50.0, fan: bool = False, parts: Parts = PARTS
 ) -> Record:
     """A heater stepped by hand about what holds printing temperatures, from cold: levels of some minutes, and
-    on each of them switches of a few percent. With `fan` the part fan goes on and off too."""
-    count = round(minutes * 60 / every_s)
-    levels = np.array([36.0, 40.0, 34.0, 42.0, 37.0, 32.0])
-    time_s = every_s * np.arange(count)
-    level = levels[np.minimum((time_s / (minutes * 60) * len(levels)).astype(int), len(levels) - 1)]
+    on each of them switches of a few percent, a sample a second. With `fan` the part fan goes on and off
+    too."""
+    count = round(minutes * 60)
+    time_s, levels = np.arange(float(count)), np.array([36.0, 40.0, 34.0, 42.0, 37.0, 32.0])
+    level = levels[np.minimum((time_s / count * len(levels)).astype(int), len(levels) - 1)]
     switched = np.repeat(rng.choice([-6.0, 6.0], count // 30 + 1), 30)[:count]
     duty = np.where(time_s < 60, 0.0, level + switched)
     blown = 100.0 * np.repeat(rng.integers(0, 2, count // 120 + 1), 120)[:count] * fan
     machine, read = HotEnd(rng, parts), np.empty(count)
     for k in range(count):
         read[k] = machine.read()
-        machine.advance(duty[k], blown[k], every_s)
-    return Record(time_s, duty, blown, read)
+        machine.advance(duty[k], blown[k], 1.0)
+    return Record(time_s, duty, blown, read, np.full(count, 210.0))
 
 
-def write_csv(path, recorded: Record, *, fan: bool = False) -> None:
+def record_print(rng: np.random.Generator, *, minutes: float = 60.0, parts: Parts = PARTS) -> Record:
+    """A printer's evening: the firmware's PI controller heats from cold and follows a target that changes
+    every four minutes, a sample a second."""
+    count = round(minutes * 60)
+    target = np.repeat(rng.choice(np.arange(185.0, 236.0, 5.0), count // 240 + 1), 240)[:count]
+    machine, read, duty, integral = HotEnd(rng, parts), np.empty(count), np.empty(count), 0.0
+    for k in range(count):
+        read[k] = machine.read()
+        error = target[k] - read[k]
+        wanted = 4.0 * error + integral
+        duty[k] = min(max(wanted, 0.0), 100.0)
+        if duty[k] == wanted:
+            integral += 0.03 * error
+        machine.advance(duty[k], 0.0, 1.0)
+    return Record(np.arange(float(count)), duty, np.zeros(count), read, target)
+
+
+def write_csv(path: Path, recorded: Record, *, fan: bool = False) -> None:
     """The recording as a logger writes it."""
     columns = {
         "time_s": recorded.time_s,

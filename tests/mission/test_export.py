@@ -12,11 +12,7 @@ import numpy as np
 import pytest
 
 from tests.foreign.hot_end import HotEnd
-from tests.mission.toy_temperature import (  # noqa: F401  fixtures
-    exported_project,
-    hot_end_project,
-    hot_end_record,
-)
+from tests.mission.toy_temperature import beadline, exported_project, hot_end_project, hot_end_record  # noqa: F401  three of them are fixtures
 
 pytestmark = pytest.mark.xdist_group("toy_temperature")
 STEP_S = 1.0
@@ -30,8 +26,8 @@ needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on th
 
 
 class Played(NamedTuple):
-    """A closed loop, a row a sample: time in s, set-point and measured temperature in °C, duty in percent, and
-    the mode that the supervisor was in."""
+    """A closed loop, a row a sample: time in s, set-point and measured temperature in °C, duty in percent,
+    and the mode that the supervisor was in."""
 
     time_s: np.ndarray
     set_point: np.ndarray
@@ -84,8 +80,12 @@ def farthest_from_set_point(played: Played, start_s: float, end_s: float) -> flo
 
 
 @pytest.fixture(scope="module")
-def exported(exported_project) -> Path:  # noqa: F811
-    return exported_project / "datasets/export_controllers/temperature"
+def exported(exported_project, tmp_path_factory) -> Path:  # noqa: F811
+    """Both files, written by `./run beadline export`."""
+    controller, out = "datasets/export_controllers/temperature", tmp_path_factory.mktemp("exported")
+    for form in ("c", "python"):
+        beadline(exported_project, "export", controller, "--to", form, "--out", str(out / form))
+    return out
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def test_the_exported_controller_keeps_a_foreign_hot_end_at_its_set_point_when_t
 # ---- the files are the judged controller
 
 
-def test_the_exported_python_gives_the_judged_commands(exported_project, exported):  # noqa: F811
+def test_the_exported_python_gives_the_judged_commands(exported_project):  # noqa: F811
     """What the stage measured: the law in the case that decided, and the file beside the law."""
     told = json.loads((exported_project / "datasets/export_controllers/exported.json").read_text())
     differences = told["temperature"]["largest_difference"]
@@ -147,7 +147,7 @@ def make(folder: Path, *flags: str) -> subprocess.CompletedProcess:
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="gcc warns of array bounds in least_squares if the machine has one output, and warnings are errors",
+    reason="if a machine has one output gcc warns of array bounds in least_squares; warnings are errors",
 )
 def test_the_exported_c_compiles_by_its_own_makefile(exported, tmp_path):
     done = make(shutil.copytree(exported / "c", tmp_path / "c"))

@@ -1,7 +1,6 @@
 """One hot end behind every format: each recording is inspected, begun with `init`, ingested and identified;
 what is damaged is set aside, and what is no recording is refused."""
 
-import io
 import json
 import os
 import resource
@@ -13,13 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
-import scipy.io
 
 from tests.foreign.hot_end import Record
-from tests.mcap_writing import Written, cdr
+from tests.foreign.hot_end_files import FORMATS, write_csv, write_parquet
 from tests.mission.toy_temperature import (  # noqa: F401  hot_end_project and hot_end_record are fixtures
     ROOT,
     Refused,
@@ -32,73 +28,8 @@ from tests.mission.toy_temperature import (  # noqa: F401  hot_end_project and h
     hot_end_record,
     play,
 )
-from tests.reading.klipper_machine import EXTRUDER, config_lines
-from tests.reading.test_spreadsheets import sheet, workbook
 
 pytestmark = pytest.mark.xdist_group("toy_temperature")
-NAMES = ("time_s", "heater_pct", "hotend_C")
-STATE = "float64 heater_pct\nfloat64 hotend_C\n"
-
-
-def columns(record: Record) -> dict[str, np.ndarray]:
-    return dict(zip(NAMES, (record.time_s, record.duty_percent, record.temperature_degC), strict=True))
-
-
-# ---- the same record in every format
-
-
-def write_parquet(record: Record) -> bytes:
-    stream = io.BytesIO()
-    pq.write_table(pa.table(columns(record)), stream)
-    return stream.getvalue()
-
-
-def write_mcap(record: Record) -> bytes:
-    """ROS 2: CDR messages of a type whose definition stands in the file."""
-    made = Written()
-    topic = made.topic("/hot_end", "cdr", "machine/msg/State", "ros2msg", STATE.encode())
-    for time_s, duty, degC in zip(*columns(record).values(), strict=True):
-        made.message(topic, 1_700_000_000.0 + time_s, cdr(("d", [duty, degC])))
-    return made.bytes()
-
-
-def write_klippy_log(record: Record) -> bytes:
-    """Stats lines have a tenth of a second, a tenth of a degree and a thousandth of the duty."""
-    lines = ["Starting Klippy...", "Start printer at Sat Jul 12 10:00:00 2025 (1752314400.0 100.0)"]
-    lines += config_lines([EXTRUDER])
-    for time_s, duty, degC in zip(*columns(record).values(), strict=True):
-        lines.append(
-            f"Stats {100 + time_s:.1f}: gcodein=0 mcu: mcu_awake=0.014 mcu_task_avg=0.000022 "
-            f"bytes_write={900 + int(time_s)} send_seq=1 freq=180003476 sysload=1.40 "
-            f"print_time={93 + time_s:.3f} buffer_time=2.417 print_stall=0 "
-            f"extruder: target=210 temp={degC:.1f} pwm={duty / 100:.3f}"
-        )
-    return ("\n".join(lines) + "\n").encode()
-
-
-def write_xlsx(record: Record) -> bytes:
-    rows = zip(*(column.tolist() for column in columns(record).values()), strict=True)
-    return workbook(sheet([NAMES, *rows]))
-
-
-def write_mat(record: Record) -> bytes:
-    stream = io.BytesIO()
-    scipy.io.savemat(stream, columns(record))
-    return stream.getvalue()
-
-
-def write_csv(record: Record) -> bytes:
-    return pandas.DataFrame(columns(record)).to_csv(index=False).encode()
-
-
-FORMATS: dict[str, Callable[[Record], bytes]] = {
-    "log.csv": write_csv,
-    "log.parquet": write_parquet,
-    "log.mcap": write_mcap,
-    "klippy.log": write_klippy_log,
-    "log.xlsx": write_xlsx,
-    "log.mat": write_mat,
-}
 # °C and percent that the format itself rounds away
 ROUNDING = {"klippy.log": (0.0501, 0.0501)}
 

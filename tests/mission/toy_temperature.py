@@ -72,8 +72,10 @@ def declare(folder: Path, changes: Mapping[str, Any]) -> None:
     for dotted, value in changes.items():
         *parents, key = dotted.split(".")
         sections = [_descend(sections, parents) for sections in files.values()]
-        (home,) = [section for section in sections if key in section]
-        home[key] = value
+        homes = [section for section in sections if key in section]
+        if len(homes) != 1:
+            raise KeyError(f"{dotted} should stand in one of {PARAMS}, and stands in {len(homes)}")
+        homes[0][key] = value
     for name, sections in files.items():
         text = yaml.safe_dump(sections, sort_keys=False, allow_unicode=True)
         (folder / name).write_text(text, encoding="utf-8")
