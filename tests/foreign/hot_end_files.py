@@ -1,4 +1,4 @@
-"""A recording of the foreign hot end in every format that the product reads; no line of its readers is used."""
+"""A recording of the foreign hot end in each format that the product reads, without a line of its readers."""
 
 import io
 from collections.abc import Callable
