@@ -125,6 +125,7 @@ REMEDIES: list[tuple[str, Callable[..., None]]] = [
     (r"([\w.]+) is missing; add it", add),
     (r"([\w.]+) is unknown; remove it", remove),
     (r"(\w+) is no section; remove it", remove),
+    (r"(\w+) has moved to \S+; delete it here", remove),
 ]
 
 
