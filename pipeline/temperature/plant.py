@@ -44,7 +44,7 @@ class Plant(NamedTuple):
         """The plant as a control.StateSpace with named signals and its sample time, for a notebook to go on.
 
         python-control knows linear systems only: b, d and K stay behind. Its y is then the distance from the
-        outputs at rest, and `from_control` takes b, d and K back.
+        outputs at rest, and `from_control` takes b, d and K back. `./run --extra control` installs it.
         """
         import control
 
