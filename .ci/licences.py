@@ -94,7 +94,7 @@ def page(packages: list[Package]) -> str:
         "# Licences of the packages",
         "",
         f"Written by `./run python .ci/licences.py --record` from uv.lock and the packages' metadata: "
-        f"{len(here)} that `./run` installs.",
+        f"{len(here)} that `./run` installs, and for `./run pytest` the group dev.",
         "",
         "To be read by whoever passes them on (GPL, EPL, MPL, or not said): "
         + "; ".join(f"{one.name} ({one.licence})" for one in here if _asks(one.licence or ""))

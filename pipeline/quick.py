@@ -12,12 +12,12 @@ from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
+from ruamel.yaml import YAML
 
 from pipeline.deposition.workflow.settings import TrainIlc
 from pipeline.report.shared.sources import QUICK_LOOK
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint
-from pipeline.store import artifacts, params
+from pipeline.store import artifacts, params, params_text
 from pipeline.temperature.workflow.settings import EvaluateTemperature, IdentifyPlant, Panel, TuneWeights
 
 SIZES, FOLDER = Path("params.quick.yaml"), Path("quick")
@@ -122,7 +122,7 @@ def _put(sections: dict[str, Any], keys: Sequence[str], value: Any) -> Any:
 
 
 def _shown(value: Any) -> str:
-    return yaml.safe_dump(value, default_flow_style=True, width=200).removesuffix("...\n").strip()
+    return params_text.written(value, flow=True).removesuffix("...\n").strip()
 
 
 def _check(folder: Path) -> None:
@@ -167,7 +167,7 @@ def _fresh() -> Generator[Path]:
 def stages(sizes: Sizes) -> list[str]:
     """The stages of dvc.yaml in its order, each after those whose results it reads, without LEFT_OUT. A
     classifier of somebody's own frames cannot be kept here: their setpoint loop is left out."""
-    names = yaml.safe_load(Path("dvc.yaml").read_text(encoding="utf-8"))["stages"]
+    names = YAML(typ="safe").load(Path("dvc.yaml").read_text(encoding="utf-8"))["stages"]
     skipped = {*LEFT_OUT, *(() if _rendered(sizes) else ("evaluate_setpoint",))}
     return [name for name in names if name not in skipped]
 
@@ -185,7 +185,7 @@ def _rendered(sizes: Sizes) -> bool:
 def _furnish(folder: Path, sizes: Sizes, root: Path) -> None:
     """Params, links to what is only read, the kept artifacts, and what every page says of a quick look."""
     for name, sections in sizes.files.items():
-        artifacts.write_text(folder / name, yaml.safe_dump(sections, sort_keys=False, allow_unicode=True))
+        artifacts.write_text(folder / name, params_text.written(sections))
     _check(folder)
     (folder / "datasets").mkdir()
     for name in LINKED:

@@ -162,10 +162,10 @@ def beadline(tmp_path, monkeypatch, capfd):
 
 
 def pytest_collection_modifyitems(config, items):
-    """Slow tests run with -m slow, or when they are named by ::."""
+    """Tests marked slow or full run with -m slow or -m full, or when they are named by ::."""
     if config.option.markexpr or any("::" in argument for argument in config.args):
         return
-    slow = [item for item in items if item.get_closest_marker("slow")]
-    if slow:
-        config.hook.pytest_deselected(items=slow)
-        items[:] = [item for item in items if item not in slow]
+    longer = [item for item in items if item.get_closest_marker("slow") or item.get_closest_marker("full")]
+    if longer:
+        config.hook.pytest_deselected(items=longer)
+        items[:] = [item for item in items if item not in longer]

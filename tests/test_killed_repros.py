@@ -1,31 +1,22 @@
 """`./run dvc` after a DVC that was killed while it wrote."""
 
-import os
-import shutil
-import subprocess
-
 import pytest
+
+from tests import fake_uv
 
 
 @pytest.fixture
 def dvc(root, tmp_path):
-    """dvc(table of locks) runs `./run dvc status` of a copy with a uv that does nothing: what was said, and
+    """dvc(table of locks) runs `./run dvc status` of a copy with a DVC that does nothing: what was said, and
     the table afterwards, None where it is gone."""
-    shutil.copy(root / "run", tmp_path / "run")
-    uv = tmp_path / "bin/uv"
-    uv.parent.mkdir()
-    uv.write_text("#!/bin/sh\nexit 0\n")
-    uv.chmod(0o755)
+    fake_uv.furnish(tmp_path, root)
     rwlock = tmp_path / ".dvc/tmp/rwlock"
     rwlock.parent.mkdir(parents=True)
 
     def run(content: str, command: str = "dvc") -> tuple[str, str | None]:
         rwlock.write_text(content)
-        ended = subprocess.run(
-            ["./run", command, "status"], cwd=tmp_path, capture_output=True, text=True,
-            env=os.environ | {"PATH": f"{uv.parent}{os.pathsep}{os.environ['PATH']}"},
-        )  # fmt: skip
-        assert ended.returncode == 0
+        ended = fake_uv.run(tmp_path, command, "status")
+        assert ended.returncode == 0, ended.stderr
         return ended.stderr, rwlock.read_text() if rwlock.exists() else None
 
     return run
@@ -40,4 +31,4 @@ def test_an_empty_table_of_locks_is_removed_and_said(dvc):
 def test_a_table_that_holds_locks_stays_and_other_commands_touch_none(dvc):
     held = '{"read": {}, "write": {"/a": {"pid": 1, "cmd": "dvc repro"}}}'
     assert dvc(held) == ("", held)
-    assert dvc("", "python") == ("", "")
+    assert dvc("", "beadline") == ("", "")

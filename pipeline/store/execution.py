@@ -86,7 +86,7 @@ def _there(call: bytes, asked: Surroundings) -> Any:
         raise ValueError(
             f"params.yaml: execution.scheduler: the worker {distributed.get_worker().address} has "
             f"{'; '.join(others)}: its results could differ; "
-            "start it anew by `./run dask worker` of this checkout"
+            "start it anew by `./run --group cluster dask worker` of this checkout"
         )
     function, arguments, settings = pickle.loads(call)
     return function(*arguments, **settings)
@@ -112,7 +112,8 @@ def _cluster(scheduler: str, remains: str) -> Iterator[Any]:
     except ImportError:
         raise ValueError(
             "params.yaml: execution.backend is dask but dask is not installed; "
-            "run with ./run --group cluster, or set execution.backend: loky"
+            "write ./run --group cluster before the command, as in ./run --group cluster dvc repro, or set "
+            "execution.backend: loky"
         ) from None
     with contextlib.ExitStack() as connected:
         try:
@@ -122,7 +123,8 @@ def _cluster(scheduler: str, remains: str) -> Iterator[Any]:
             raise ValueError(
                 f"params.yaml: execution.scheduler: expected a dask scheduler with a worker at {scheduler}, "
                 "found none within 20 s "
-                f"({' '.join(str(error).split())}); start `dask scheduler` and `dask worker {scheduler}`, "
+                f"({' '.join(str(error).split())}); start `./run --group cluster dask scheduler` and "
+                f"`./run --group cluster dask worker {scheduler}`, "
                 "or set execution.backend: loky"
             ) from None
         try:

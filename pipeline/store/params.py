@@ -16,11 +16,14 @@ import types
 import typing
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import pydantic
-import yaml
 from pydantic import Field
+from ruamel.yaml import YAML
+from ruamel.yaml.composer import MaxDepthExceededError
+from ruamel.yaml.error import MarkedYAMLError, StreamMark, YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 FILE, EXPERT = "params.yaml", "params.expert.yaml"
 # every section that code reads
@@ -53,11 +56,9 @@ SECTIONS = (
 PAPERS, PAPERS_SECTIONS = "datasets/papers/params.yaml", ("reproduce_study",)
 # old dotted key or section -> new one, for one version; none since 0.2
 RENAMED: dict[str, str] = {}
-# the project's own files have some 600 values, 6 levels deep
-MOST_VALUES, DEEPEST, LONGEST_NUMBER = 100_000, 50, 30
-_TAGS = [
-    f"tag:yaml.org,2002:{kind}" for kind in ("bool", "null", "int", "float", "str", "map", "seq", "merge")
-]
+# the project's own files are 6 levels deep
+DEEPEST, LONGEST_NUMBER = 50, 30
+_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("bool", "null", "int", "float", "str", "map", "seq")}
 
 
 class Section(pydantic.BaseModel):
@@ -173,85 +174,59 @@ def digest(model: Section) -> str:
     return hashlib.sha256(canonical.encode()).hexdigest()
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML 1.2 as DVC reads it: 1e-6 is a number, `no` and `on` are words, 12:30 is no number.
-
-    Refused are a key given twice, tags that JSON has no type for, and a file that grows beyond MOST_VALUES
-    once its aliases are written out, or is nested deeper than DEEPEST.
-    """
-
-    yaml_implicit_resolvers: ClassVar[dict] = {}
-
-    def __init__(self, stream):
-        super().__init__(stream)
-        self.depth = self.values = 0
-        self.sizes: dict[int, int] = {}  # values in a composed node, its aliases written out
-
-    def compose_node(self, parent, index):
-        event = self.peek_event()
-        if isinstance(event, yaml.AliasEvent):
-            node = super().compose_node(parent, index)
-            if id(node) not in self.sizes:
-                raise _refused(f"the alias *{event.anchor} stands inside of what it names", event.start_mark)
-            self.values += self.sizes[id(node)]
-        else:
-            self.depth, before = self.depth + 1, self.values
-            if self.depth > DEEPEST:
-                raise _refused(f"it is nested deeper than {DEEPEST} levels", event.start_mark)
-            if getattr(event, "tag", None) not in (None, "!", *_TAGS):
-                raise _refused(f"the tag {event.tag} names no type of parameters", event.start_mark)
-            node = super().compose_node(parent, index)
-            self.depth -= 1
-            self.values += 1
-            self.sizes[id(node)] = self.values - before
-        if self.values > MOST_VALUES:
-            raise _refused(
-                f"with its aliases written out the file has more than {MOST_VALUES} values", event.start_mark
-            )
-        return node
-
-    def construct_mapping(self, node, deep=False):
-        lines: dict[str, int] = {}
-        for key_node, _ in node.value:
-            key = key_node.value
-            if not isinstance(key_node, yaml.ScalarNode):
-                raise _refused("a key is no word", key_node.start_mark)
-            if key in lines:
-                raise _refused(f"{key} is given twice, first in line {lines[key]}", key_node.start_mark)
-            lines[key] = key_node.start_mark.line + 1
-        return super().construct_mapping(node, deep)
-
-
-def _refused(problem: str, mark: yaml.Mark | None) -> yaml.MarkedYAMLError:
-    return yaml.constructor.ConstructorError(None, None, problem, mark)
-
-
-def _whole(_: _Loader, node: yaml.ScalarNode) -> int:
-    if len(node.value) > LONGEST_NUMBER:
-        raise _refused(f"a number has {len(node.value)} digits", node.start_mark)
-    return int(node.value)
-
-
-for _tag, _pattern, _first in [
-    ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
-    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
-    ("int", r"[-+]?[0-9]+", "-+0123456789"),
-    (
-        "float",
-        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
-        "-+.0123456789",
-    ),
-]:
-    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(rf"^(?:{_pattern})$"), list(_first))
-_Loader.add_constructor("tag:yaml.org,2002:int", _whole)
-_Loader.add_constructor(
-    "tag:yaml.org,2002:float", lambda loader, node: float(re.sub(r"\.(inf|nan)", r"\1", node.value.lower()))
-)
-
-
 @functools.lru_cache(maxsize=8)
 def _parsed(text: str) -> Any:
-    return yaml.load(text, _Loader)
+    """YAML 1.2 as DVC reads it, by the same parser: 1e-6 is a number, `no` and `on` are words."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.max_depth = DEEPEST
+    try:
+        node = yaml.compose(text)
+    except MaxDepthExceededError as error:
+        error.problem = f"it is nested deeper than {DEEPEST} levels; put fewer into each other"
+        raise
+    if node is None:
+        return None
+    _check(node)
+    try:
+        return yaml.constructor.construct_document(node)
+    except (KeyError, ValueError) as error:
+        raise MarkedYAMLError(problem=f"{error} does not fit its tag; take the tag out") from None
+
+
+def _check(node: Node) -> None:
+    """Raises MarkedYAMLError for what a reader of the file would take for something else, and for what JSON
+    has no type for. An alias is its anchor's node, so that it is not reached."""
+    if node.anchor:
+        raise _refused(node, f"the anchor &{node.anchor} is refused; write the values out at each place")
+    tag = str(node.tag)
+    if tag.endswith(":timestamp") and isinstance(node, ScalarNode):
+        raise _refused(node, f'{node.value} is a date; write it in quotes: "{node.value}"')
+    if tag not in _TAGS:
+        raise _refused(node, f"the tag {tag} names no type of parameters; take it out")
+    if isinstance(node, ScalarNode) and tag.endswith((":int", ":float")):
+        if len(node.value) > LONGEST_NUMBER:
+            raise _refused(node, f"a number has {len(node.value)} digits; write at most {LONGEST_NUMBER}")
+        if "_" in node.value:
+            raise _refused(node, f"{node.value} has underscores; write {node.value.replace('_', '')}")
+    if isinstance(node, SequenceNode):
+        for inner in node.value:
+            _check(inner)
+    if isinstance(node, MappingNode):
+        lines: dict[str, int] = {}
+        for key, inner in node.value:
+            if not isinstance(key, ScalarNode):
+                raise _refused(key, "a key is no word; write a name before the colon")
+            _check(key)
+            if key.value in lines:
+                raise _refused(
+                    key, f"{key.value} is given twice, first in line {lines[key.value]}; keep one of the two"
+                )
+            lines[key.value] = key.start_mark.line + 1
+            _check(inner)
+
+
+def _refused(node: Node, problem: str) -> MarkedYAMLError:
+    return MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
 
 
 def read(path: str | Path = FILE) -> dict:
@@ -293,15 +268,14 @@ def _sections(path: str | Path) -> dict:
         raise ValueError(f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8") from None
     try:
         sections = copy.deepcopy(_parsed(text))
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        remedy = (
-            "keep one of the two"
-            if "twice" in (error.problem or "")
-            else "mend the line: key: value, indented by spaces"
-        )
-        raise ValueError(f"{path}: line {line}: {error.problem}; {remedy}") from None
-    except yaml.YAMLError as error:
+    except MarkedYAMLError as error:
+        line = f"line {error.problem_mark.line + 1}: " if isinstance(error.problem_mark, StreamMark) else ""
+        # "expected one document", "but found another"
+        context = f"{error.context}, " if str(error.problem).startswith("but") else ""
+        problem = " ".join(f"{context}{error.problem}".split())
+        remedy = "" if ";" in problem else "; mend the line: key: value, indented by spaces"
+        raise ValueError(f"{path}: {line}{problem}{remedy}") from None
+    except YAMLError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}; remove that character") from None
     if type(sections) is not dict:
         raise ValueError(

@@ -1,8 +1,29 @@
-"""A value of a params file written into its text: comments, order and all other lines stay as they are."""
+"""Params as text: a value written into a file whose comments, order and other lines stay as they are, and
+whole sections.
 
+(The round trip of ruamel.yaml moves the entries of lists and writes null as nothing: 64 lines of the two
+files as shipped would change.)
+"""
+
+import io
 from collections.abc import Sequence
+from typing import Any
 
-import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.nodes import CollectionNode, MappingNode, Node
+
+
+def written(value: Any, *, flow: bool = False) -> str:
+    """The value as YAML, in the order of its keys; `flow`: on one line."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = flow
+    yaml.sort_base_mapping_type_on_output = False
+    # an object that stands twice is written out twice
+    yaml.representer.ignore_aliases = lambda _: True
+    yaml.width = 1000
+    stream = io.StringIO()
+    yaml.dump(value, stream)
+    return stream.getvalue()
 
 
 def replaced(text: str, dotted: str, lines: Sequence[str]) -> str:
@@ -15,7 +36,7 @@ def replaced(text: str, dotted: str, lines: Sequence[str]) -> str:
     start, end = value.start_mark.index, _end(value)
     line_end = text.find("\n", key.end_mark.index)
     line_end = len(text) if line_end < 0 else line_end
-    is_entry = lines[0].startswith("- ") or isinstance(yaml.safe_load(lines[0]), dict)
+    is_entry = lines[0].startswith("- ") or isinstance(YAML(typ="safe", pure=True).load(lines[0]), dict)
     if len(lines) == 1 and not is_entry:
         if value.start_mark.line != key.start_mark.line:  # a block below the key
             return text[: key.end_mark.index] + f": {lines[0]}{_comment(text, key, line_end)}" + text[end:]
@@ -29,17 +50,17 @@ def replaced(text: str, dotted: str, lines: Sequence[str]) -> str:
     return text[: key.end_mark.index] + ":" + _comment(text, key, line_end) + block + text[end:]
 
 
-def _comment(text: str, key: yaml.Node, line_end: int) -> str:
+def _comment(text: str, key: Node, line_end: int) -> str:
     """The comment behind the colon of a key whose value stands below it."""
     rest = text[key.end_mark.index : line_end].lstrip().removeprefix(":").strip()
     return f"  {rest}" if rest else ""
 
 
-def _nodes(text: str, dotted: str) -> tuple[yaml.Node, yaml.Node]:
-    node = yaml.compose(text, yaml.SafeLoader)
+def _nodes(text: str, dotted: str) -> tuple[Node, Node]:
+    node = YAML(typ="safe", pure=True).compose(text)
     key = None
     for name in dotted.split("."):
-        pairs = node.value if isinstance(node, yaml.MappingNode) else []
+        pairs = node.value if isinstance(node, MappingNode) else []
         key, node = next(((k, v) for k, v in pairs if k.value == name), (None, None))
         if key is None or node is None:
             raise ValueError(f"{dotted} is not in the file; restore its sections with git checkout")
@@ -47,9 +68,9 @@ def _nodes(text: str, dotted: str) -> tuple[yaml.Node, yaml.Node]:
     return key, node
 
 
-def _end(node: yaml.Node) -> int:
+def _end(node: Node) -> int:
     """Where the node's last character stands; the end that YAML gives a block lies behind its comments."""
-    if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
+    if isinstance(node, CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)
     return node.end_mark.index

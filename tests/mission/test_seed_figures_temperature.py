@@ -4,8 +4,8 @@ import csv
 
 import numpy as np
 import pytest
-from pipeline.papers import temperature as paper
 
+from pipeline.papers import temperature as paper
 from pipeline.temperature import published
 from pipeline.temperature.published import IDENTITY, TUNED_DATA, TUNED_MODEL
 

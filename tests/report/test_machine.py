@@ -15,6 +15,7 @@ from pipeline import cli
 from pipeline.report.shared.sources import machine
 from pipeline.store import artifacts, params
 from stages.report import main
+from tests import fake_uv
 from tests.report import made
 from tests.report.test_pages import change
 
@@ -39,29 +40,22 @@ def write(facts):
 
 @pytest.fixture
 def house(tmp_path, root):
-    """house(*command, cpuinfo): ./run of a copy in which uv only says what it
-    was asked; the facts that were written, or None."""
-    for name in ("run", "pyproject.toml", "uv.lock", ".python-version"):
-        shutil.copy(root / name, tmp_path)
-    uv = tmp_path / "bin/uv"
-    uv.parent.mkdir()
-    uv.write_text('#!/bin/sh\necho "$@"\n')
-    uv.chmod(0o755)
+    """house(*command, cpuinfo): ./run of a copy in which DVC only prints its command; the facts that were
+    written, or None."""
+    fake_uv.furnish(tmp_path, root)
 
     def run(*command, cpuinfo=None):
-        env = {"PATH": f"{tmp_path}/bin:/usr/bin:/bin"}
+        outside = {}
         if cpuinfo is not None:
             (tmp_path / "cpuinfo").write_text(cpuinfo)
-            env["BEADLINE_CPUINFO"] = str(tmp_path / "cpuinfo")
+            outside["BEADLINE_CPUINFO"] = str(tmp_path / "cpuinfo")
         path = tmp_path / JS
         if path.is_file():
             path.unlink()
-        done = subprocess.run(
-            ["sh", tmp_path / "run", *command], capture_output=True, text=True, env=env, check=False
-        )
-        assert (
-            done.returncode == 0 and done.stdout == f"run --frozen --project {tmp_path} {' '.join(command)}\n"
-        )
+        done = fake_uv.run(tmp_path, *command, **outside)
+        assert done.returncode == 0, done.stderr
+        assert fake_uv.asked(tmp_path).startswith(f"uv run --frozen --project {tmp_path} ")
+        assert fake_uv.asked(tmp_path).endswith(" ".join(command))
         assert not list(tmp_path.rglob("*.tmp"))
         return machine(path) or None
 
@@ -112,7 +106,6 @@ def test_another_environment_is_told_from_another_cpu(house, tmp_path):
 
 
 def test_the_commit_and_what_is_changed_on_it_are_said(house, tmp_path):
-    (tmp_path / "pipeline").mkdir()
     (tmp_path / "pipeline/code.py").write_text("1\n")
     git(tmp_path, "init", "-q")
     git(tmp_path, "add", ".")
@@ -121,6 +114,8 @@ def test_the_commit_and_what_is_changed_on_it_are_said(house, tmp_path):
     assert re.fullmatch("[0-9a-f]{8}", found["commit"]) and found["changed"] is False
     (tmp_path / "pipeline/code.py").write_text("2\n")
     assert house("dvc", "repro") | {"date": ""} == found | {"changed": True, "date": ""}
+    git(tmp_path, "checkout", "-q", "pipeline")
+    assert house("dvc", "repro")["changed"] is False
 
 
 @pytest.mark.parametrize(

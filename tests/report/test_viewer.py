@@ -478,7 +478,7 @@ def million(tmp_path_factory):
 
 STROKES = """window.strokes = 0;
 for (const drawn of [Path2D, CanvasRenderingContext2D])
-    for (const name of ["lineTo", "moveTo", "rect", "arc", "fillRect"].filter(name => drawn.prototype[name])) {
+    for (const name of ["lineTo", "moveTo", "rect", "arc", "fillRect"].filter(n => drawn.prototype[n])) {
         const draw = drawn.prototype[name];
         drawn.prototype[name] = function (...given) { window.strokes += 1; return draw.apply(this, given); };
     }"""

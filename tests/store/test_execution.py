@@ -47,7 +47,7 @@ def test_a_scheduler_that_ends_is_one_sentence(mortal_cluster):
 
 def test_without_dask_the_sentence_names_the_group_that_has_it(cluster, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ValueError, match=r"dask is not installed; run with \./run --group cluster, or set"):
+    with pytest.raises(ValueError, match=r"dask is not installed; write \./run --group cluster before the"):
         list(run_all(noisy(2), cluster.execution))
 
 

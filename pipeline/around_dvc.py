@@ -1,0 +1,151 @@
+"""What `run` does around DVC: python -P pipeline/around_dvc.py OPTIONS COMMAND...
+
+OPTIONS are those of uv, in one word; COMMAND begins with dvc or beadline. Before it, recordings that are none
+are refused, a table of locks that a killed DVC left empty is removed, and reports/machine.js says where the
+pages are made. After `dvc repro` the last line is the verdict. DVC runs in this process: a signal reaches it,
+and its exit status is the one of `run`. Only the standard library is imported: DVC itself takes most of a
+repro with nothing to do.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+
+from pipeline.reading.plain_files import check_plain_files
+from pipeline.store.printable import printable
+
+# a link to this folder stays in the project that has the link
+ROOT = Path(__file__).absolute().parents[1]
+RAW = Path("datasets/raw")
+# the code, as git is asked whether it has changed
+CODE = "pipeline stages run pyproject.toml uv.lock dvc.yaml params.yaml params.expert.yaml".split()
+MAKES_PAGES = ("dvc repro ", "dvc exp run ", "beadline nightly ")
+
+
+def main() -> None:
+    options, *command = sys.argv[1:]
+    words = " ".join(command) + " "
+    shows_only = {"--help", "-h", "--dry"}.intersection(command)
+    elsewhere = {"--queue", "--temp", "--watch"}.intersection(command)
+    if words.startswith(MAKES_PAGES) and not shows_only and not elsewhere:
+        write_machine(options)
+    if words.startswith("dvc "):
+        remove_empty_locks(ROOT / ".dvc/tmp/rwlock")
+    if words.startswith(("dvc ", "beadline nightly ")):
+        try:
+            check_plain_files(RAW)
+        except ValueError as error:
+            sys.exit(f"run: {' '.join(printable(str(error)).split())}")
+    if command[0] != "dvc":
+        os.execvp(command[0], command)
+    status = run_dvc(command)
+    verdict = first_title(ROOT / "reports/index.html")
+    if status == 0 and verdict and words.startswith("dvc repro ") and not shows_only:
+        print(f"{verdict}. Open {ROOT}/reports/index.html")
+    sys.exit(status)
+
+
+def run_dvc(command: list[str]) -> int:
+    """The exit status of `dvc ...`, as its own script calls it."""
+    from dvc.cli import main as dvc
+
+    sys.argv = command
+    return dvc(command[1:])
+
+
+def remove_empty_locks(rwlock: Path) -> None:
+    """A DVC that was killed while it wrote its table of locks leaves it empty, and no later one starts. A DVC
+    at work has it empty for less than a blink."""
+    for wait_s in (1, 0):
+        if not rwlock.is_file() or rwlock.stat().st_size:
+            return
+        time.sleep(wait_s)
+    print("run: .dvc/tmp/rwlock was left half written by a killed DVC and is removed", file=sys.stderr)
+    rwlock.unlink(missing_ok=True)
+
+
+def first_title(page: Path) -> str:
+    """The verdict, which is the title of page one; "" without a page."""
+    if not page.is_file():
+        return ""
+    found = re.search(r"<title>(.*) · beadline</title>", page.read_text(encoding="utf-8", errors="replace"))
+    return found[1] if found else ""
+
+
+# ---- reports/machine.js
+
+
+def write_machine(options: str) -> None:
+    """Writes what this run is made on. The pages read it by script. It is no out of DVC, as outs are equal on
+    every machine. A folder that cannot be written stops no run."""
+    path = ROOT / "reports/machine.js"
+    beside = path.with_name(f".machine.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(exist_ok=True)
+        beside.write_text(f"window.beadline = {json.dumps({'machine': machine(options)})};\n")
+        beside.replace(path)
+    except OSError:
+        return
+
+
+def machine(options: str) -> dict[str, str | int | bool]:
+    """CPU, cores and pins, the version and commit of the code, and the packages: a page can tell another CPU
+    from another environment."""
+    version = re.search(r'^version *= *"(.*)"', read(ROOT / "pyproject.toml").decode(), re.MULTILINE)
+    packages = b"".join(read(ROOT / name) for name in ("uv.lock", "run", ".python-version"))
+    commit = git("rev-parse", "--short=8", "HEAD") if (ROOT / ".git").exists() else ""
+    return {
+        "cpu": cpu(),
+        "cores": os.cpu_count() or 0,
+        "pins": "avx2" if os.environ.get("OPENBLAS_CORETYPE") else "none",
+        "version": plain(version[1] if version else ""),
+        "commit": commit or "none",
+        "changed": bool(commit) and git("status", "--porcelain", "--", *CODE) != "",
+        "locked": str(zlib.crc32(packages + options.encode())),
+        "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+
+
+def cpu() -> str:
+    """The name of the CPU, as Linux or macOS says it, else the architecture."""
+    about = read(Path(os.environ.get("BEADLINE_CPUINFO", "/proc/cpuinfo"))).decode(errors="replace")
+    named = re.search(r"^model name[^:\n]*: *(.*)", about, re.MULTILINE)
+    name = plain(named[1]) if named else ""
+    return (
+        name or plain(output("sysctl", "-n", "machdep.cpu.brand_string") or "") or plain(os.uname().machine)
+    )
+
+
+def git(*arguments: str) -> str | None:
+    return output("git", "--no-optional-locks", "-C", str(ROOT), *arguments)
+
+
+def output(*command: str) -> str | None:
+    """What a command prints, None if it fails."""
+    try:
+        ended = subprocess.run(command, capture_output=True, text=True, errors="replace", check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return ended.stdout.strip()
+
+
+def read(path: Path) -> bytes:
+    """The content of a file, b"" for one that cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError:
+        return b""
+
+
+def plain(text: str) -> str:
+    """Text that breaks out of no string of a script."""
+    return re.sub(r"[^A-Za-z0-9 ()@.,:/_+-]", "", text)[:80]
+
+
+if __name__ == "__main__":
+    main()

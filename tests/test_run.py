@@ -1,0 +1,94 @@
+"""./run: the command that uv gets, and what goes before and after DVC."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from tests import fake_uv
+
+
+@pytest.fixture
+def copy(root, tmp_path):
+    fake_uv.furnish(tmp_path, root)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("command", "asked"),
+    [
+        ("true", "true"),
+        ("pytest -k x", "--group dev pytest -k x"),
+        ("ruff check", "--group dev ruff check"),
+        ("ty check", "--group dev ty check"),
+        ("--group peers pytest", "--group peers --group dev pytest"),
+        ("cat pytest ruff", "cat pytest ruff"),
+        ("--group pytest true", "--group pytest true"),
+        ("dvc status", "python -P {folder}/pipeline/around_dvc.py  dvc status"),
+        (
+            "--group cluster --quiet dvc pull -q",
+            "--group cluster --quiet python -P {folder}/pipeline/around_dvc.py  --group cluster --quiet "
+            "dvc pull -q",
+        ),
+        ("beadline quick", "python -P {folder}/pipeline/around_dvc.py  beadline quick"),
+    ],
+)
+def test_uv_gets_the_command_behind_its_options_and_the_group_that_the_command_needs(copy, command, asked):
+    ended = fake_uv.run(copy, *command.split())
+    assert ended.returncode == 0, ended.stderr
+    assert fake_uv.asked(copy) == f"uv run --frozen --project {copy} {asked.format(folder=copy)}"
+
+
+def test_words_of_a_command_stay_as_they_are(copy):
+    code = "import sys; print(sys.argv[1:])"
+    ended = fake_uv.run(copy, "python", "-c", code, "a  b", "", "*", "--group")
+    assert ended.stdout == "['a  b', '', '*', '--group']\n"
+
+
+def test_the_last_line_is_the_verdict_of_page_one(copy):
+    page = copy / "reports/index.html"
+    fake_uv.write(page, "<html><title>3 of 3 pass (simulation) · beadline</title>")
+    last = f"3 of 3 pass (simulation). Open {page}\n"
+    assert fake_uv.run(copy, "dvc", "repro").stdout == f"dvc repro\n{last}"
+    for others in (["repro", "--dry"], ["repro", "-h"], ["status"], ["exp", "run"]):
+        assert fake_uv.run(copy, "dvc", *others).stdout == f"dvc {' '.join(others)}\n"
+    page.unlink()
+    assert fake_uv.run(copy, "dvc", "repro").stdout == "dvc repro\n"
+
+
+def test_the_exit_status_of_dvc_is_handed_on_without_a_last_line(root, tmp_path):
+    fake_uv.furnish(tmp_path, root, status=7)
+    fake_uv.write(tmp_path / "reports/index.html", "<title>pass · beadline</title>")
+    ended = fake_uv.run(tmp_path, "dvc", "repro")
+    assert (ended.returncode, ended.stdout) == (7, "dvc repro\n")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_run_reaches_dvc(copy, number):
+    """The process that was started is DVC in the end: nothing between the two can be killed alone."""
+    slow = "import os, time\ndef main(arguments):\n    print(os.getpid(), flush=True)\n    time.sleep(600)\n"
+    fake_uv.write(copy / "fake/dvc/cli.py", slow)
+    with subprocess.Popen(
+        ["./run", "dvc", "repro"],
+        cwd=copy,
+        env=fake_uv.environment(copy),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as started:
+        assert started.stdout is not None
+        # the process of the shell became the one of uv, and that, here, the one of DVC
+        assert int(started.stdout.readline()) == started.pid
+        started.send_signal(number)
+        # as Python ends by that signal
+        assert started.wait(timeout=60) == -number
+
+
+def test_what_goes_around_dvc_imports_the_standard_library_alone(root):
+    """Every `./run dvc` pays for it."""
+    code = "import sys; import pipeline.around_dvc; print(*{name.partition('.')[0] for name in sys.modules})"
+    ended = subprocess.run(
+        [sys.executable, "-S", "-c", code], cwd=root, capture_output=True, text=True, check=True
+    )
+    assert set(ended.stdout.split()) <= sys.stdlib_module_names | {"pipeline", "__main__"}
