@@ -25,7 +25,7 @@ def lock():
     ]
     outs += [Path("datasets") / name for name in ("segment_library", "train_ilc", "tune_weights")]
     outs += [Path("datasets") / name for name in ("train_classifier", "train_agent", "evaluate_setpoint")]
-    outs += [Path("datasets/reproduce_study"), Path("datasets/export_controllers")]
+    outs += [Path("datasets/export_controllers")]
     stages = {path.name: {"outs": [{"path": str(path), "md5": provenance.md5(path)}]} for path in outs}
     written = [*Path("reports").glob("*.html"), *Path("reports/metrics").glob("*.json"), Path("reports/data")]
     stages["report"] = {
