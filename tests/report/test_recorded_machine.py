@@ -1,5 +1,5 @@
-"""The pages of a user's machine, taken from recordings: nothing is of the study, which papers.html shows,
-its own, and what is the machine's own is there."""
+"""The pages of a user's machine, taken from recordings: nothing is of the study, which papers.html
+shows, and what is the machine's own is there."""
 
 import re
 import sys
