@@ -91,7 +91,7 @@ def test_one_relearning_at_toy_size_is_of_the_shape_that_is_on_file(monkeypatch)
         "tune_weights.practical_evaluations": 8,
     }
     kept = (ROOT / "reports/metrics/evaluate_temperature.json").read_bytes()
-    run = relearned.relearn(dict.fromkeys(relearned.SEEDS, 1000), sizes)
+    run = relearned.relearn(relearned.seeds(1000), sizes)
     assert (ROOT / "reports/metrics/evaluate_temperature.json").read_bytes() == kept
     on_file = json.loads((ROOT / "datasets/papers/relearned.json").read_text())
     figures = relearned.figures([run])
