@@ -216,29 +216,6 @@ def deviations(
     return tuple(float(v) for v in np.sqrt(variance))
 
 
-def directions(
-    u: np.ndarray,
-    y: np.ndarray,
-    *,
-    start_s: float,
-    stop_s: float,
-    window_s: float,
-    yield_: float,
-    sample_time_s: float,
-) -> tuple[TrialModel, TrialModel]:
-    """The models of the upward and of the downward step alone (Hoelzle 2009, table I is downward): only the
-    flow within `window_s` of start or stop counts.
-
-    The yield (mm^3/s) is that of the whole trial: in one step it cannot be told from delay. Where
-    the two differ by more than their deviations, the extruder fills and relaxes at different
-    speeds, and one first-order model is a compromise.
-    """
-    t = np.arange(len(y)) * sample_time_s
-    near = [np.where((t >= at - window_s / 10) & (t < at + window_s), y, np.nan) for at in (start_s, stop_s)]
-    up, down = (identify([u], [part], sample_time_s=sample_time_s, yield_=yield_) for part in near)
-    return up, down
-
-
 def _check(u: list[np.ndarray], y: list[np.ndarray]) -> None:
     if not u or len(u) != len(y) or any(a.shape != b.shape or a.ndim != 1 for a, b in zip(u, y, strict=True)):
         raise ValueError(

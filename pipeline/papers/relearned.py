@@ -41,7 +41,7 @@ PRIORS: dict[str, dict[str, Any]] = {
 }
 
 
-def relearn(seeds: Mapping[str, int], changes: Mapping[str, Any]) -> dict:
+def relearn(drawn: Mapping[str, int], changes: Mapping[str, Any]) -> dict:
     """The metrics of evaluate_temperature, and the cost of each tuned controller, of one run of the stages in
     a folder of its own, with other seeds and other parameters."""
     root = Path.cwd()
@@ -49,7 +49,7 @@ def relearn(seeds: Mapping[str, int], changes: Mapping[str, Any]) -> dict:
         folder = Path(name)
         for path, values in params.files(root / params.FILE).items():
             file = Path(path).name
-            for dotted, value in {**seeds, **changes, "execution.jobs": 1}.items():
+            for dotted, value in {**drawn, **changes, "execution.jobs": 1}.items():
                 *parents, key = dotted.split(".")
                 place = values
                 for parent in parents:
@@ -61,8 +61,12 @@ def relearn(seeds: Mapping[str, int], changes: Mapping[str, Any]) -> dict:
         (folder / "datasets" / "raw" / "temperature").mkdir(parents=True)
         with contextlib.chdir(folder):
             for stage in STAGES:
-                with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-                    stage.main()
+                said = io.StringIO()
+                try:
+                    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(said):
+                        stage.main()
+                except SystemExit:
+                    raise ValueError(f"a relearning failed: {said.getvalue().strip()}") from None
         metrics = folder / "reports" / "metrics"
         judged, tuned = (
             artifacts.read_json(metrics / f"{name}.json") for name in ("evaluate_temperature", "tune_weights")
@@ -143,12 +147,17 @@ def cover(bands: Mapping[str, Any], runs: list[dict]) -> dict[str, Any]:
     }
 
 
+def seeds(number: int) -> dict[str, int]:
+    """The seeds of one relearning; the plants to tune on are other plants than those to judge on."""
+    return dict.fromkeys(SEEDS, number) | {"panel.training.seed": 5000 + number}
+
+
 def many(count: int, first: int, changes: Mapping[str, Any], jobs: int) -> list[dict]:
     """`count` relearnings, everything drawn anew from seeds that begin with `first`."""
-    work = [dict.fromkeys(SEEDS, first + k) | {"panel.training.seed": 5000 + first + k} for k in range(count)]
+    work = [seeds(first + k) for k in range(count)]
     return list(
         joblib.Parallel(n_jobs=jobs, return_as="generator")(
-            joblib.delayed(relearn)(seeds, changes) for seeds in work
+            joblib.delayed(relearn)(drawn, changes) for drawn in work
         )
     )
 

@@ -391,38 +391,6 @@ def value_iteration(
     return _kernel(data, H, K, Q, gamma, np.eye(data.output.shape[0]) if F is None else F, iteration, change)
 
 
-def policy_iteration(
-    data: Regression,
-    Q: np.ndarray,
-    R: np.ndarray,
-    gamma: float,
-    K0: np.ndarray,
-    *,
-    F=None,
-    tolerance: float = 1e-9,
-    max_iterations: int = 50,
-) -> Kernel:
-    """The same kernel by policies: each is evaluated exactly, (I - gamma G [I -K']-congruence) h = h_0, then
-    improved; K0 (m, q) must stabilise (whitened state)."""
-    q, m = len(data.W), len(data.u_scale)
-    h_0, K = data.G_e @ svec(Q) + data.G_u @ svec(R), K0
-    successor = skron(data.step).T + (data.G if data.G.size else 0.0)
-    for iteration in range(1, max_iterations + 1):
-        value_of = skron(np.vstack([np.eye(q), -K])).T
-        h = np.linalg.solve(np.eye(len(h_0)) - gamma * successor @ value_of, h_0)
-        H = smat(h, q + m)
-        previous, K = K, _greedy(H, q)[0]
-        change = float(np.abs(K - previous).max() / np.abs(K).max())
-        if change < tolerance:
-            return _kernel(
-                data, H, K, Q, gamma, np.eye(data.output.shape[0]) if F is None else F, iteration, change
-            )
-    raise ValueError(
-        f"policy iteration on the kernel did not settle in {max_iterations} policies; "
-        "start from a gain that stabilises"
-    )
-
-
 def _kernel(
     data: Regression,
     H: np.ndarray,

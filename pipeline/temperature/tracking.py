@@ -164,31 +164,6 @@ def algorithm_1(plant: Plant, Q, R, gamma, K0, *, tolerance: float, max_iteratio
     return Iterated(K, max_iterations, False)
 
 
-def policy_iteration(
-    plant: Plant, Q, R, gamma, K0, *, tolerance: float = 1e-9, max_iterations: int = 200
-) -> Iterated:
-    """Algorithm 1 made safe: a policy is evaluated only under a discount for which its cost is finite, and
-    the discount rises to gamma as the policy improves.
-
-    With rho the spectral radius of A - B K_x, the cost of K is finite for every
-    discount below 1 / rho^2, so that P of (ii) is a cost, and the improvement (iii)
-    improves. Raises ValueError where no policy reaches gamma.
-    """
-    T, B_1, Q_1 = augmented(plant, Q, np.eye(plant.p))
-    K = K0
-    for j in range(1, max_iterations + 1):
-        rho = np.abs(np.linalg.eigvals(plant.A - plant.B @ K[:, : plant.n])).max()
-        discount = gamma if gamma * rho**2 < 0.999 else 0.95 / rho**2
-        P = scipy.linalg.solve_discrete_lyapunov(np.sqrt(discount) * (T - B_1 @ K).T, Q_1 + K.T @ R @ K)
-        K, previous = np.linalg.solve(R + discount * B_1.T @ P @ B_1, discount * B_1.T @ P @ T), K
-        if discount == gamma and np.linalg.norm(K - previous, 1) < tolerance:
-            return Iterated(K, j, True)
-    raise ValueError(
-        f"policy iteration did not settle in {max_iterations} policies (discount {discount:.3g} of "
-        f"{gamma:g}); is every slow mode moved by an input?"
-    )
-
-
 def still_law(m: int, p: int) -> Law:
     """A law that asks for nothing and remembers nothing: what doing nothing is judged as."""
     none = np.zeros((0, 0))

@@ -4,8 +4,8 @@ deviations with it; up and down apart."""
 import numpy as np
 import pytest
 
-from pipeline.deposition.extruder import Extruder, disturb, draw, flow, lagged, routine
-from pipeline.deposition.trial_model import deviations, directions, identify, identify_with_lag, lag_delay_s
+from pipeline.deposition.extruder import Extruder, disturb, draw, flow, routine
+from pipeline.deposition.trial_model import deviations, identify, identify_with_lag, lag_delay_s
 
 TS = 0.02
 R = routine(
@@ -24,14 +24,6 @@ def total(plant):
     """The parameters that a model without lag should find: below its
     corner a lag of damping 0.7 delays by 1.4 / w."""
     return parameters(plant._replace(delay_s=plant.delay_s + 1.4 / (2 * np.pi * plant.lag_hz)))
-
-
-def asymmetric(u, slower):
-    """First order that relaxes `slower` times more slowly than it fills."""
-    y, x = np.empty(len(u)), 0.0
-    for t, v in enumerate(lagged(u, 0.1, 4.0, TS)):
-        y[t], x = x, x + (1 - np.exp(-TS / (2.0 if v > x else 2.0 * slower))) * (v - x)
-    return y
 
 
 def test_without_noise_the_four_parameters_are_found():
@@ -122,21 +114,6 @@ def test_a_spiky_learned_command_does_not_hide_the_yield():
         [U, u], [flow(TRUE, U, sample_time_s=TS), flow(TRUE, u, sample_time_s=TS)], sample_time_s=TS
     )
     np.testing.assert_allclose(parameters(model.extruder), parameters(TRUE), rtol=1e-4)  # the solver's stop
-
-
-def test_an_extruder_that_relaxes_slowly_shows_in_the_downward_step():
-    settings = {"start_s": 4.0, "stop_s": 16.6, "window_s": 6.0, "yield_": 0.0, "sample_time_s": TS}
-    up, down = directions(U, asymmetric(U, 1.5), **settings)
-    assert up.extruder.time_constant_s == pytest.approx(
-        2.0, rel=0.05
-    )  # the pause's dip lies outside the window, the lag inside
-    assert down.extruder.time_constant_s == pytest.approx(
-        3.0, rel=0.15
-    )  # the level it falls from came up at 2 s
-    up, down = directions(U, asymmetric(U, 1.0), **settings)
-    assert up.extruder.time_constant_s == pytest.approx(
-        down.extruder.time_constant_s, rel=0.02
-    )  # the lag taken as delay
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """What no recording changes is a pipeline of its own: a method that is edited starts none of its stages from
 the root, and each of them is run by its name."""
 
+import json
 import shutil
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from pipeline.papers import relearned
 from tests.house import PAPERS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -70,3 +72,31 @@ def test_a_declared_out_would_start_it_from_the_root(clone):
         assert f"Running stage '{PAPERS}:deposition'" in dvc(clone, "repro", "--dry", "--keep-going")
     finally:
         path.write_text(kept)
+
+
+def test_one_relearning_at_toy_size_is_of_the_shape_that_is_on_file(monkeypatch):
+    """The stages themselves, in a folder of their own: nothing of this checkout is written."""
+    monkeypatch.chdir(ROOT)
+    sizes = {
+        "generate_probing.samples": 1500,
+        "panel.steps": 150,
+        "panel.settled_steps": 40,
+        "panel.judging.plants": 4,
+        "panel.judging.starts_degC": [20],
+        "panel.judging.sequence_offsets_degC": [],
+        "panel.training.plants": 3,
+        "panel.training.starts_degC": [20],
+        "panel.training.sequence_offsets_degC": [],
+        "tune_weights.practical_initial": 4,
+        "tune_weights.practical_evaluations": 8,
+    }
+    kept = (ROOT / "reports/metrics/evaluate_temperature.json").read_bytes()
+    run = relearned.relearn(relearned.seeds(1000), sizes)
+    assert (ROOT / "reports/metrics/evaluate_temperature.json").read_bytes() == kept
+    on_file = json.loads((ROOT / "datasets/papers/relearned.json").read_text())
+    figures = relearned.figures([run])
+    assert set(figures) <= set(on_file["contestants"]) and "subspace_lqg" in figures
+    assert set(relearned.answers([run])) == set(on_file["answers"])
+    band = figures["subspace_lqg"]["cost"]["q90"]
+    assert band["low"] == band["median"] == band["high"] > 0
+    assert set(run["tuned_cost"]) <= set(run["contestants"])

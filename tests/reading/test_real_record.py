@@ -28,7 +28,6 @@ STAGES = (
     "learn_kernel",
     "tune_weights",
     "evaluate_temperature",
-    "reproduce_study",
     "report",
 )
 
@@ -59,9 +58,6 @@ SMALL = {
     "panel.training.plants": 4,
     "tune_weights.practical_initial": 6,
     "tune_weights.practical_evaluations": 10,
-    "reproduce_study.initial": 6,
-    "reproduce_study.evaluations": 12,
-    "reproduce_study.data_sets": 1,
 }
 
 

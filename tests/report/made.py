@@ -145,10 +145,6 @@ def comparison():
 
 
 def metrics():
-    both = {
-        name: {"J100": 100.0, "J1000": 110.0, "error": 0.04}
-        for name in ("model_based", "model_based_tuned", "data_driven", "data_driven_tuned")
-    }
     return {
         "probe_machine": {
             "source": "simulated",
@@ -224,23 +220,6 @@ def metrics():
         },
         "tune_weights": {"evaluations": 60},
         "evaluate_temperature": comparison(),
-        "reproduce_study": {
-            "as_published": both,
-            "printed": both,
-            "algorithm_1": {"failures": 106, "of": 300},
-            "optimal": {"J1000": 100.0},
-            "observer": {"J1000": 100.1, "J1000_from_50_degC": 105.0},
-            "takeover": {"zero_history_gap": 1e-6},
-            "kernel": {"gap": 1e-8, "gap_window_6": 1e-8, "any_reference_gap": 1e-8},
-            "parity": {
-                "best_cost_perfect_state": 101.0,
-                "optimum": 100.0,
-                "scaled_weights": SCALED,
-                "trade": {"optimum": {"tracking_degC": 4.0, "effort_percent": 30.0}},
-                "q": [0.5, 0.25, 0.5, 0.5, 0.5],
-                "r": [0.5] * 7,
-            },
-        },
     }
 
 
@@ -461,36 +440,8 @@ def write(root, *, samples=400, recording="good.mcap"):
         trajectories(machine),
     )
     artifacts.write_json(folder / "summary.json", comparison())
-    study()
     deposition()
     made_setpoint.write()
-
-
-def study():
-    """The tables of the study's machine: four noisy data sets, and three candidates of the parity search."""
-    folder = Path("datasets/reproduce_study")
-    routes = [
-        (route, noise, i)
-        for route in ("window", "kernel", "kernel_predicted_state")
-        for noise in (0.1, 0.5)
-        for i in range(4)
-    ]
-    table = dict(zip(("route", "noise_degC", "data_set"), map(list, zip(*routes, strict=True)), strict=True))
-    table |= {
-        "gap": [1e-5 * (1 + i) for i in range(len(routes))],
-        "error_degC": [0.01 * (1 + i) for i in range(len(routes))],
-    }
-    artifacts.write_table(folder / "study.parquet", tables.STUDY, table)
-    parity = {
-        "evaluation": [1, 2, 3],
-        "cost": [120.0, 101.0, 103.0],
-        "incumbent": [120.0, 101.0, 101.0],
-        "tracking_degC": [8.0, 6.0, 6.5],
-        "effort_percent": [20.0, 24.0, 26.0],
-        "chosen": [False, True, False],
-        "failure": [""] * 3,
-    }
-    artifacts.write_table(folder / "parity.parquet", tables.PARITY, parity)
 
 
 # ---- the deposition loop: one material, one part of one line, three trials of three laws

@@ -118,8 +118,6 @@ def test_a_failed_rule_fails_the_verdict_and_its_row_only(project):
         "datasets/evaluate_temperature/cases.parquet",
         "datasets/evaluate_temperature/trajectories.parquet",
         "datasets/evaluate_temperature/summary.json",
-        "datasets/reproduce_study/parity.parquet",
-        "datasets/reproduce_study/study.parquet",
         "datasets/identify_plant/plant.parquet",
         "datasets/identify_plant/order.parquet",
         "datasets/identify_plant/holdout.parquet",
@@ -132,7 +130,6 @@ def test_a_failed_rule_fails_the_verdict_and_its_row_only(project):
         "reports/metrics/learn_kernel.json",
         "reports/metrics/tune_weights.json",
         "reports/metrics/evaluate_temperature.json",
-        "reports/metrics/reproduce_study.json",
     ],
 )
 @pytest.mark.parametrize("how", ["missing", "broken"])

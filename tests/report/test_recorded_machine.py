@@ -1,5 +1,5 @@
-"""The pages of a user's machine, taken from recordings: what is of the study stands apart under a heading of
-its own, and what is the machine's own is there."""
+"""The pages of a user's machine, taken from recordings: nothing is of the study, which papers.html
+shows, and what is the machine's own is there."""
 
 import re
 import sys
@@ -40,29 +40,10 @@ def recorded(project):
     return project
 
 
-def split_off_study(text):
-    """(what stands outside of the section of the study's machine, what stands in it); the words that the page
-    explains, which is of both, are left out."""
-    before, rest = text.split('<section aria-labelledby="study">')
-    inside, words_and_after = rest.split('<dl class="meanings" hidden>')
-    return before + words_and_after.split("</dl>", 1)[1], inside
-
-
-def test_the_study_stands_in_a_section_of_its_own_that_says_that_no_recording_touches_it(recorded):
+def test_nothing_of_the_study_stands_on_the_page_of_a_users_machine(recorded):
     main()
-    outside, inside = split_off_study(TEMPERATURE.read_text())
-    assert "The study’s machine (simulated; no recording touches this)" in inside
-    assert [text for text in OF_THE_STUDY if text not in inside] == ["read seconds as steps"]
-    assert [text for text in OF_THE_STUDY if text.lower() in outside.lower()] == []
-
-
-def test_the_section_of_the_study_is_the_same_whatever_the_record_is_of(project):
-    main()
-    simulated = split_off_study(TEMPERATURE.read_text())
-    declare("generate_probing", source="recordings")
-    main()
-    assert split_off_study(TEMPERATURE.read_text())[1] == simulated[1]
-    assert "read seconds as steps" in simulated[0]
+    text = TEMPERATURE.read_text()
+    assert [said for said in OF_THE_STUDY if said.lower() in text.lower()] == []
 
 
 def test_zones_of_a_users_machine_have_its_names(recorded):

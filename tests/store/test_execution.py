@@ -16,7 +16,7 @@ from tests.temperature.test_ingest import INLINE
 
 
 def noisy(count: int) -> list:
-    """The judging of learners on noisy data sets, as reproduce_study spreads it: arrays are its arguments."""
+    """The judging of learners on noisy data sets, as the second pipeline spreads it: arrays are arguments."""
     u, y = study.data_sets(np.random.default_rng(0), 1500, count)
     return [
         joblib.delayed(study.under_noise)(u[:, i], y[:, i], noise=0.01, seed=i, longest=6)

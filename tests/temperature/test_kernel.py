@@ -9,7 +9,6 @@ import pytest
 from pipeline.temperature import kernel as kernels
 from pipeline.temperature.kernel import (
     exact_gains,
-    policy_iteration,
     quadratic_gram,
     reconstruction,
     regress,
@@ -239,28 +238,12 @@ def test_the_learned_law_is_the_optimal_one_for_any_generator_and_offset(machine
     np.testing.assert_allclose(solution.K_r, best.K_r, atol=1e-8)
 
 
-def test_policies_and_values_lead_to_one_kernel():
-    _, u, y = small_record(OFFSET)
-    data = regress(tuples([u], [y], 2, offset=True))
-    by_value = value_iteration(data, Q2, R2, 0.9, tolerance=1e-13)
-    by_policy = policy_iteration(data, Q2, R2, 0.9, np.zeros((2, len(data.W))))
-    assert by_policy.iterations < 10 < by_value.iterations
-    # H creeps at 0.9^k after the gain has settled
-    np.testing.assert_allclose(by_policy.H, by_value.H, rtol=1e-8, atol=1e-8 * np.abs(by_value.H).max())
-    np.testing.assert_allclose(by_policy.K, by_value.K, atol=1e-9)
-    np.testing.assert_allclose(by_policy.k, by_value.k, atol=1e-9)
-
-
 def test_the_kernel_solves_the_bellman_equation_on_every_sample():
     """v'H v = e'Qe + u'Ru + gamma s+'P s+ with P the Schur complement of H: no noise, so sample by sample."""
     _, u, y = small_record(SMALL)
     data = tuples([u], [y], 2)
-    solution = (
-        policy_iteration(regress(data), Q2, R2, 0.9, np.zeros((2, 7)), tolerance=1e-12)
-        if len(regress(data).W) == 7
-        else None
-    )
-    assert solution is not None, "the window of two holds 2 x 2 inputs and 3 states"
+    assert len(regress(data).W) == 7, "the window of two holds 2 x 2 inputs and 3 states"
+    solution = value_iteration(regress(data), Q2, R2, 0.9, tolerance=1e-14)
     W, _ = whitening(data.s, data.s_next, tolerance=1e-9)
     v, s_next = np.hstack([data.s @ W.T, data.u / np.sqrt((data.u**2).mean(axis=0))]), data.s_next @ W.T
     P = solution.H[:7, :7] - solution.H[:7, 7:] @ np.linalg.solve(solution.H[7:, 7:], solution.H[7:, :7])
@@ -391,12 +374,6 @@ def test_value_iteration_that_does_not_settle_is_refused():
 
 
 # ---- what no test above would notice
-
-
-def test_policy_iteration_that_does_not_settle_is_refused():
-    _, u, y = small_record(SMALL)
-    with pytest.raises(ValueError, match=r"on the kernel did not settle in 1 policies; start from a gain"):
-        policy_iteration(regress(tuples([u], [y], 2)), Q2, R2, 0.9, np.zeros((2, 7)), max_iterations=1)
 
 
 def test_a_regression_counts_what_it_stands_on():

@@ -19,7 +19,6 @@ from pipeline.temperature.tracking import (
     gains,
     observer_gain,
     observer_law,
-    policy_iteration,
     reached_state,
     riccati,
     robust_observer_gain,
@@ -164,18 +163,6 @@ def test_the_design_refuses_a_plant_that_jumps_with_its_input():
 # ---- Algorithm 1
 
 
-def test_policy_iteration_reaches_the_stabilising_gain_from_300_of_300():
-    machine = baam()
-    best = gains(machine, I5, I7, GAMMA)
-    expected = np.hstack([best.K_x, best.K_r])
-    for seed in range(300):
-        K0 = np.random.default_rng(seed).normal(0.0, 10.0, (7, 11))
-        iterated = policy_iteration(machine, I5, I7, GAMMA, K0)
-        # its own tolerance of 1e-9, converging quadratically
-        np.testing.assert_allclose(iterated.K, expected, atol=1e-11, err_msg=f"seed {seed}")
-        assert iterated.settled
-
-
 def test_algorithm_1_from_the_probing_gain_takes_five_to_eight_policies():
     iterated = algorithm_1(baam(), I5, I7, GAMMA, np.hstack([K_DATA, np.zeros((7, 5))]), tolerance=0.1)
     assert iterated.settled
@@ -214,16 +201,6 @@ def test_bounded_least_squares_are_scipy_s(seed):
     low, high = np.full(5, -0.3), np.full(5, 0.2)
     theirs = scipy.optimize.lsq_linear(A, b, (low, high), method="bvls", tol=1e-15).x
     np.testing.assert_allclose(bounded_least_squares(A, b, low, high), theirs, atol=1e-9)
-
-
-def test_policy_iteration_says_when_a_mode_obeys_no_input():
-    stuck = plant(np.diag([1.1, 0.5]), [[0.0], [1.0]], np.eye(2))
-    with pytest.raises(
-        ValueError,
-        match=r"policy iteration did not settle in 200 policies \(discount 0\.\d+ of 0.99\); is every slow "
-        r"mode moved by an input\?",
-    ):
-        policy_iteration(stuck, np.eye(2), np.eye(1), 0.99, np.zeros((1, 4)))
 
 
 # ---- observer and targets
@@ -377,17 +354,6 @@ def test_a_law_aims_at_targets_unless_it_says_otherwise():
     assert not observer_law(SMALL, gains(SMALL, Q2, R2, 0.9), observer_gain(SMALL, 0.5)).conditional
 
 
-def test_policies_are_counted_and_limited_as_asked():
-    best = gains(SMALL, Q2, R2, 0.9)
-    optimal = np.hstack([best.K_x, best.K_r])
-    plain = SMALL._replace(b=np.zeros(3), d=np.zeros(2))
-    assert policy_iteration(plain, Q2, R2, 0.9, optimal).iterations == 1
-    needed = policy_iteration(plain, Q2, R2, 0.9, np.zeros((2, 5))).iterations
-    assert policy_iteration(plain, Q2, R2, 0.9, np.zeros((2, 5)), max_iterations=needed).iterations == needed
-    with pytest.raises(ValueError, match=f"did not settle in {needed - 1} policies"):
-        policy_iteration(plain, Q2, R2, 0.9, np.zeros((2, 5)), max_iterations=needed - 1)
-
-
 def test_the_start_of_a_plant_that_runs_away_sums_what_its_inputs_reach():
     grows = plant([[1.2, 0.1], [0.0, 0.5]], [[1.0], [2.0]], [[1.0, 1.0]])
     A, W = 0.99 / 1.2 * grows.A, np.zeros((2, 2))
@@ -440,10 +406,3 @@ def test_an_aimed_law_that_answers_the_measurement_at_once_rests_at_its_target()
     rests = aimed(law, r, u, y)
     z = np.linalg.solve(np.eye(3) - law.A, law.B_u @ u + law.B_y @ y + law.B_r @ r + law.c)
     np.testing.assert_allclose(-rests.K @ z - rests.D @ y - rests.K_r @ r - rests.k, u, atol=1e-12)
-
-
-def test_the_discount_of_a_policy_is_that_under_which_its_cost_is_finite():
-    """0.95 / 1.1^2 where no input moves the mode of 1.1."""
-    stuck = plant(np.diag([1.1, 0.5]), [[0.0], [1.0]], np.eye(2))
-    with pytest.raises(ValueError, match=r"\(discount 0\.785 of 0\.99\)"):
-        policy_iteration(stuck, np.eye(2), np.eye(1), 0.99, np.zeros((1, 4)), max_iterations=3)

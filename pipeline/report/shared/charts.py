@@ -358,26 +358,3 @@ def label(
     return Markup('<text x="{}" y="{}" text-anchor="{}">{}</text>').format(
         _n(float(frame.px(x)) + dx), _n(float(frame.py(y)) + dy), anchor, text
     )
-
-
-def spark(
-    x: np.ndarray,
-    y: np.ndarray,
-    axis: Axis,
-    *,
-    css: str,
-    limit: float,
-    alt: str,
-    limit_label: str = "",
-    units: tuple[str, str] = ("", ""),
-) -> Markup:
-    """A panel of a loop's card: no ticks, the allowed region grey, the last
-    point marked, vermillion where it lies outside."""
-    frame = Frame(linear(float(x[0]), float(x[-1])), axis, 104, 88, 1, 4, 4, 4)
-    end = Markup('<circle class="end{}" cx="{}" cy="{}" r="3"/>').format(
-        " bad" if y[-1] > limit else "", _n(float(frame.px(x[-1]))), _n(float(frame.py(y[-1])))
-    )
-    layers = [tint(frame, axis.low, limit), line(frame, x, y), level(frame, limit, "lim", limit_label), end]
-    return Markup('<svg class="spark {}" viewBox="0 0 104 88" role="img" aria-label="{}"{}>{}</svg>').format(
-        css, alt, readable(frame, units), Markup("").join(layers)
-    )

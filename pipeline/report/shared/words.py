@@ -1,8 +1,5 @@
 """The words of the pages, each explained once, as a process engineer would."""
 
-from markupsafe import Markup, escape
-
-from pipeline.report.shared import page
 from pipeline.report.shared.digits import THIN
 from pipeline.report.shared.sources import Sources
 from pipeline.temperature.workflow.contestants import CONTESTANTS
@@ -32,17 +29,6 @@ INDEX = (
     "settles",
     "stays",
 )
-# as a sentence has them -> key of the word that explains them
-INLINE = {
-    "basis functions": "basis",
-    "on\u2011off control": "on_off",
-    "disk margin": "margin_disk",
-    "recorded windows": "recorded_windows",
-    "sticky": "sticky",
-    "gain 0.6": "weak_actuator",
-    "settled error": "settled",
-    "90 % quantile": "quantile",
-}
 # key of an answer -> the word that explains it
 ANSWERS = {
     "settled_error": "settled",
@@ -434,18 +420,6 @@ def glossary(sources: Sources) -> dict[str, tuple[str, str]]:
         ),
         "step": ("Step", f"One sample of the controller, {machine.sample_time_s:g} s here."),
     }
-
-
-def explained(sources: Sources, text: str) -> Markup:
-    """A sentence whose words of the page's list lead there, each where it stands first."""
-    sentence = escape(text)
-    meanings, listed = glossary(sources), set(INDEX)
-    for phrase, key in INLINE.items():
-        if key in listed and key in meanings and phrase in sentence:
-            before, after = sentence.split(phrase, 1)
-            linked = page.term(meanings[key][0], phrase)
-            sentence = Markup("{}{}{}").format(Markup(before), linked, Markup(after))
-    return sentence
 
 
 def chosen(sources: Sources, keys: tuple[str, ...]) -> list[tuple[str, str]]:
