@@ -61,7 +61,7 @@ def test_a_worker_without_our_pins_is_refused_with_what_differs(tmp_path):
             ValueError, match=r"the worker tcp://\S+ has OPENBLAS_NUM_THREADS 7, expected "
         ) as e:
             list(run_all(noisy(2), made.execution))
-        assert "start it anew by `./run dask worker`" in str(e.value)
+        assert "start it anew by `./run --group cluster dask worker`" in str(e.value)
     finally:
         made.stop()
 
