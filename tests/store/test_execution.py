@@ -81,5 +81,7 @@ def test_the_pins_are_all_that_run_exports_for_last_bits(root):
     )))  # fmt: skip
     assert set(execution.PINS) == exported - {
         # of no arithmetic
-        "OPENCV_IO_MAX_IMAGE_PIXELS", "PYTHONHASHSEED", "DVC_NO_ANALYTICS", "UV_COMPILE_BYTECODE"
+        "OPENCV_IO_MAX_IMAGE_PIXELS", "PYTHONHASHSEED", "DVC_NO_ANALYTICS", "UV_COMPILE_BYTECODE",
+        "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES",
     }  # fmt: skip
