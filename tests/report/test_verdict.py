@@ -422,13 +422,3 @@ def test_the_rules_are_read_from_params_with_bounds(tmp_path):
     (tmp_path / "params.yaml").write_text("report: {disk_margin: -1}\n")
     with pytest.raises(ValueError, match=r"report.disk_margin is -1 but must be more than 0"):
         params.load(ReportRules, "report", tmp_path / "params.yaml")
-
-
-@pytest.mark.parametrize("key", ["gap_percent", "worst_case_gap_percent", "window_accuracy"])
-def test_an_old_params_file_is_told_in_one_sentence_that_a_rule_was_retired(tmp_path, key):
-    rules = RULES.model_dump() | {key: 5.0}
-    lines = "".join(f"  {name}: {value}\n" for name, value in rules.items())
-    (tmp_path / "params.yaml").write_text(f"report:\n{lines}")
-    with pytest.raises(ValueError, match=rf"report.{key} was retired: .*; remove the line") as refused:
-        params.load(ReportRules, "report", tmp_path / "params.yaml")
-    assert len(str(refused.value).splitlines()) == 1

@@ -61,7 +61,7 @@ def test_a_worker_without_our_pins_is_refused_with_what_differs(tmp_path):
             ValueError, match=r"the worker tcp://\S+ has OPENBLAS_NUM_THREADS 7, expected "
         ) as e:
             list(run_all(noisy(2), made.execution))
-        assert "start it anew by `./run dask worker`" in str(e.value)
+        assert "start it anew by `./run --group cluster dask worker`" in str(e.value)
     finally:
         made.stop()
 
@@ -81,5 +81,7 @@ def test_the_pins_are_all_that_run_exports_for_last_bits(root):
     )))  # fmt: skip
     assert set(execution.PINS) == exported - {
         # of no arithmetic
-        "OPENCV_IO_MAX_IMAGE_PIXELS", "PYTHONHASHSEED", "DVC_NO_ANALYTICS", "UV_COMPILE_BYTECODE"
+        "OPENCV_IO_MAX_IMAGE_PIXELS", "PYTHONHASHSEED", "DVC_NO_ANALYTICS", "UV_COMPILE_BYTECODE",
+        "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES",
     }  # fmt: skip
