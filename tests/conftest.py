@@ -93,10 +93,10 @@ def beadline(tmp_path, monkeypatch, capfd):
 
 
 def pytest_collection_modifyitems(config, items):
-    """Slow tests run with -m slow, or when they are named by ::."""
+    """Slow tests run with -m slow, those of the full mission with -m full, or when they are named by ::."""
     if config.option.markexpr or any("::" in argument for argument in config.args):
         return
-    slow = [item for item in items if item.get_closest_marker("slow")]
+    slow = [item for item in items if item.get_closest_marker("slow") or item.get_closest_marker("full")]
     if slow:
         config.hook.pytest_deselected(items=slow)
         items[:] = [item for item in items if item not in slow]
