@@ -1,5 +1,5 @@
-"""Pictures of a nozzle camera that shares no code with pipeline/setpoint/nozzle_scene.py: a colour camera looks
-at a metal nozzle, its fresh bead drawn as shaded pieces that wobble, and a ground of older lines.
+"""Pictures of a nozzle camera that shares no code with pipeline/setpoint/nozzle_scene.py: a colour camera
+looks at a metal nozzle, its fresh bead drawn as shaded pieces that wobble, and a ground of older lines.
 
 A folder of them with its CSV is what an owner has, in the columns of the public CAXTON data.
 """
@@ -46,8 +46,9 @@ def film(camera: Camera, flow_percent: float, frames: int, rng: np.random.Genera
     power 0.8, and wobbles along the bead."""
     half = HALF_WIDTH_PX * (flow_percent / 100) ** 0.8
     phase, spread = rng.uniform(0, 2 * math.pi, 3), 0.03 * half
-    ground = _ground(camera, rng)
-    return [_frame(camera, half, ground, phase, spread, k, rng) for k in range(frames)]
+    axes = _axes(camera)
+    ground = _ground(camera, *axes, rng)
+    return [_frame(camera, half, ground, axes, phase, spread, k, rng) for k in range(frames)]
 
 
 def _axes(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -58,9 +59,8 @@ def _axes(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return dx * math.cos(a) + dy * math.sin(a), dy * math.cos(a) - dx * math.sin(a)
 
 
-def _ground(camera: Camera, rng: np.random.Generator) -> np.ndarray:
+def _ground(camera: Camera, along: np.ndarray, across: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Older lines side by side, each of a gray of its own, with grain."""
-    along, across = _axes(camera)
     lines = rng.normal(0, 9, 64)
     number = np.floor(across / 26 + 32).astype(int).clip(0, 63)
     gloss = 10 * np.cos(2 * math.pi * across / 26)
@@ -70,10 +70,11 @@ def _ground(camera: Camera, rng: np.random.Generator) -> np.ndarray:
 
 
 def _frame(
-    camera: Camera, half: float, ground: np.ndarray, phase: np.ndarray, spread: float, k: int,
+    camera: Camera, half: float, ground: np.ndarray,
+    axes: tuple[np.ndarray, np.ndarray], phase: np.ndarray, spread: float, k: int,
     rng: np.random.Generator,
 ) -> np.ndarray:  # fmt: skip
-    along, across = _axes(camera)
+    along, across = axes
     # what is laid moves away from the tip, frame by frame
     place = along + 23.0 * k
     wobble = sum(np.sin(place / length + p) for length, p in zip((19.0, 41.0, 87.0), phase, strict=True))
