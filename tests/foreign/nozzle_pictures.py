@@ -16,7 +16,7 @@ import numpy as np
 
 HEIGHT, WIDTH = 360, 480
 # of a bead at 100 % of flow
-HALF_WIDTH_PX = 17.0
+HALF_WIDTH_PX = 11.0
 
 
 class Camera(NamedTuple):

@@ -130,7 +130,7 @@ def own_pictures(made_once) -> Project:
     def make(folder: Path) -> None:
         project = Project(folder).make().keep_stages(*STAGES)
         raw, flows = folder / "datasets/raw/setpoint", (60.0, 100.0, 160.0)
-        nozzle_pictures.write_prints(raw, 6, flows, 2 * SHOTS, np.random.default_rng(3))
+        nozzle_pictures.write_prints(raw, 12, flows, 2 * SHOTS, np.random.default_rng(3))
         project.declare(SMALL | {"train_classifier.source": "recordings"}).commit()
         project.run("dvc", "repro")
 
@@ -140,7 +140,7 @@ def own_pictures(made_once) -> Project:
 @pytest.mark.full
 @pytest.mark.xfail(
     strict=True, raises=AssertionError,
-    reason="a classifier that learned from 144 own pictures is not proven right, and shadow acts on it",
+    reason="a classifier that learned from 288 own pictures is not proven right, and shadow acts on it",
 )  # fmt: skip
 def test_a_classifier_of_few_own_pictures_holds_everything_and_says_so(own_pictures, tmp_path):
     project = own_pictures.copy(tmp_path / "project")
