@@ -71,7 +71,8 @@ class Project:
             capture_output=True,
             text=True,
         )
-        assert not check or ended.returncode == 0, f"{command}: {ended.stdout}{ended.stderr}"
+        if check and ended.returncode:  # no AssertionError: a set-up that fails is no expected failure
+            raise RuntimeError(f"{command}: {ended.stdout}{ended.stderr}")
         return ended
 
     def run(self, *command: str, check: bool = True, **outside: str) -> subprocess.CompletedProcess:
