@@ -8,7 +8,6 @@ Every file read is hashed, and the pages carry the hashes. The drift on page one
 """
 
 import hashlib
-import json
 
 from pipeline.report.about import page as about_page
 from pipeline.report.certificate import page as certificate_page
@@ -109,8 +108,8 @@ def main() -> None:
         artifacts.write_text("reports/runs.html", pages["runs"])
         artifacts.write_text("reports/words.html", pages["words"])
         # `accept` keeps these
-        drawn = json.dumps(curves.stored(curves.curves(sources.tables)), ensure_ascii=False)
-        artifacts.write_folder("reports/data", {**viewer.files, "curves.json": drawn})
+        drawn = {"curves.json": curves.stored(curves.curves(sources.tables))}
+        artifacts.write_folder("reports/data", viewer.files | drawn)
         artifacts.write_metrics(
             "report",
             {

@@ -1,5 +1,6 @@
 """The curves of a run's searches and trainings. `accept` keeps them; runs.html draws them."""
 
+import json
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -39,9 +40,9 @@ def restored(stored: Any) -> dict[str, Curve]:
     return {name: Curve(**fields) for name, fields in (stored or {}).items()}
 
 
-def stored(drawn: Mapping[str, Curve]) -> dict[str, dict]:
-    """The curves as JSON keeps them."""
-    return {name: curve._asdict() for name, curve in drawn.items()}
+def stored(drawn: Mapping[str, Curve]) -> str:
+    """The curves as JSON."""
+    return json.dumps({name: curve._asdict() for name, curve in drawn.items()}, ensure_ascii=False)
 
 
 def _search(table: Table) -> Iterator[tuple[str, Curve]]:
