@@ -421,16 +421,7 @@ def write(root, *, samples=400, recording="good.mcap"):
         data / "tune_weights/weights.json",
         {"contestants": {"subspace_lqg": {"q": [1.0, 2.0], "r": [0.1, 0.2], "cost": 2.0, "at_bound": []}}},
     )
-    search = {
-        "contestant": ["subspace_lqg"] * 3,
-        "evaluation": [1, 2, 3],
-        "cost": [None, 3.0, 2.0],
-        "incumbent": [None, 3.0, 2.0],
-        "values": ["{}"] * 3,
-        "chosen": [False, False, True],
-        "failure": ["unstable", "", ""],
-    }
-    artifacts.write_table(data / "tune_weights/history.parquet", tables.TUNING, search)
+    search()
     artifacts.write_json(data / "ingest/printer_pid.json", {"heaters": [PRINTER_PID]})
     folder = data / "evaluate_temperature"
     artifacts.write_table(folder / "cases.parquet", tables.CASES, cases())
@@ -442,6 +433,20 @@ def write(root, *, samples=400, recording="good.mcap"):
     artifacts.write_json(folder / "summary.json", comparison())
     deposition()
     made_setpoint.write()
+
+
+def search():
+    """The search of one contestant, whose first candidate failed."""
+    table = {
+        "contestant": ["subspace_lqg"] * 3,
+        "evaluation": [1, 2, 3],
+        "cost": [None, 3.0, 2.0],
+        "incumbent": [None, 3.0, 2.0],
+        "values": ["{}"] * 3,
+        "chosen": [False, False, True],
+        "failure": ["unstable", "", ""],
+    }
+    artifacts.write_table("datasets/tune_weights/history.parquet", tables.TUNING, table)
 
 
 # ---- the deposition loop: one material, one part of one line, three trials of three laws

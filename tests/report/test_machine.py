@@ -231,7 +231,7 @@ def test_pins_alone_and_both_are_said_too(open_page, accepted):
     write(HERE | {"pins": "none"})
     assert (
         "Nothing but CPU and pins differ from the accepted run: There 3000, pins avx2 then, "
-        "Here 9000, pins none now." in first_page(open_page, accepted)[0]
+        "Here 9000, pins none now." in first_page(open_page, accepted)
     )
 
 

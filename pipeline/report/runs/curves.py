@@ -25,10 +25,9 @@ class Curve(NamedTuple):
 
 def curves(tables: Mapping[str, Table | Missing]) -> dict[str, Curve]:
     """{name: curve} of the tables that exist."""
-    readers = {"tuning": _search, "trials": _trials, "course": _classifier, "agents": _agent}
     return {
         name: curve
-        for table, read in readers.items()
+        for table, read in READERS.items()
         if not isinstance(rows := tables[table], Missing)
         for name, curve in read(rows)
         if curve.x
@@ -86,3 +85,7 @@ def _curve(across: str, up: str, x: np.ndarray, y: np.ndarray) -> Curve:
         known[np.unique(np.linspace(0, len(known) - 1, SAMPLES).round().astype(int))] if len(known) else known
     )
     return Curve(across, up, [float(x[i]) for i in kept], [float(f"{y[i]:.4g}") for i in kept])
+
+
+# table -> what reads its curves
+READERS = {"tuning": _search, "trials": _trials, "course": _classifier, "agents": _agent}

@@ -7,7 +7,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.about.changes import ANOTHER, changes
-from pipeline.report.runs.curves import Curve, curves, restored
+from pipeline.report.runs.curves import READERS, Curve, curves, restored
 from pipeline.report.runs.figures import LOOPS, Measured, asked, measured
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.difference import accepted_on, changed_parameters, move
@@ -69,6 +69,7 @@ def render(sources: Sources, judged: Judgement, metrics: Mapping[str, Any]) -> s
         heading=f"This run beside the accepted one{f' of {day}' if day else ''}",
         lead=f"{told.strong} {told.text}".strip(),
         remedy="",
+        tables=page.files(sources.source(*READERS)),
         **_parts(accepted(sources), this, sources.declared.rules),
     )
 
@@ -100,6 +101,7 @@ def render_two(a: Run, b: Run, rules: ReportRules) -> str:
         title=f"{a.name} beside {b.name}",
         heading=f"{a.name} beside {b.name}",
         lead=f"{figures[:1].upper()}{figures[1:]} of {len(rows)} moved beyond their noise.",
+        tables="",
         remedy=f"./run dvc plots diff {a.name.split(' ')[0]} {b.name.split(' ')[0]}",
         **parts,
     )
