@@ -17,6 +17,8 @@ from pipeline.report.shared.verdict import FAILED, Figure, Missing, Question, Re
 from pipeline.report.temperature.contestants import heading
 from pipeline.report.temperature.judgement import Judgement
 
+# the stages that give the figures
+MEASURED_BY = ("evaluate_temperature", "compose_parts", "train_ilc", "evaluate_setpoint", "train_classifier")
 # parameters that the page lists
 MOST_PARAMETERS = 200
 
@@ -70,6 +72,8 @@ def render(sources: Sources, judged: Judgement, metrics: Mapping[str, Any]) -> s
         lead=f"{told.strong} {told.text}".strip(),
         remedy="",
         tables=page.files(sources.source(*READERS)),
+        measured=page.files(sources.source(*MEASURED_BY, "accepted")),
+        declared=page.files(sources.source("accepted")),
         **_parts(accepted(sources), this, sources.declared.rules),
     )
 
@@ -102,6 +106,8 @@ def render_two(a: Run, b: Run, rules: ReportRules) -> str:
         heading=f"{a.name} beside {b.name}",
         lead=f"{figures[:1].upper()}{figures[1:]} of {len(rows)} moved beyond their noise.",
         tables="",
+        measured="",
+        declared="",
         remedy=f"./run dvc plots diff {a.name.split(' ')[0]} {b.name.split(' ')[0]}",
         **parts,
     )
