@@ -263,7 +263,8 @@ def main() -> None:
     conditions = conditions._replace(
         flow_actions=settings.li_2025.flow_actions * jnp.ones_like(conditions.flow)
     )
-    key, result = jax.random.key(settings.seed + 2), {"command": COMMAND, "agents": {}}
+    key = jax.random.key(settings.seed + 2)
+    result: dict[str, Any] = {"command": COMMAND, "agents": {}}
     for name, network in agents.by_name.items():
         path = rollout(controller, network, paper_windows(), conditions, key, steps=STEPS)
         row = {place: starts(path, where) for place, where in places.items() if place.startswith("starts")}
