@@ -64,7 +64,7 @@ HEAVY = {"jax", "equinox", "optax", "cv2", "sklearn", "control", "pandas", "pyar
 # all that may lie directly in pipeline/
 ROOMS = {*LOOPS, "store", "reading", "runtime", "report", "nightly"}
 LOOSE = {"__init__", "around_dvc", "statistics", "cli", "quick"}
-# around_dvc imports the standard library alone: artifacts takes longer than it may; params_text dumps to a text
+# around_dvc imports the standard library alone: artifacts takes longer than it may; params_text dumps to text
 WRITERS = {"pipeline/store/artifacts.py", "pipeline/around_dvc.py", "pipeline/store/params_text.py"}
 GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64"}
 
