@@ -35,7 +35,7 @@ STEADY_FLOW = AREA * SPEED
 MATERIALS = {"A": Extruder(1.08, 2.7), "B": Extruder(0.89, 4.5)}
 NOISE = {"white": 0.03, "drift": 0.01, "gain": 0.01}
 HOELZLE = ilc.HoelzleSettings(learning_gain=0.25, fast_zero_s=0.03, order=2, cutoff_hz=3.0)
-HOELZLE_Q = {"order": 2, "cutoff_hz": 3.0}
+HOELZLE_Q: dict[str, Any] = {"order": 2, "cutoff_hz": 3.0}
 NO_ROLL_BACK = np.inf
 MACHINE = {
     "acceleration": 1000.0,
@@ -57,15 +57,15 @@ ALLOWED = {
 }
 
 
-def forbidden(tasks: Sequence[str], tools: Sequence[int]) -> np.ndarray:
+def forbidden(tasks: Sequence[str] | np.ndarray, tools: Sequence[int] | np.ndarray) -> np.ndarray:
     """The indices (F,) of tasks that may not follow the one before them (figure 8): another tool comes only
     by Dwell, Steady-State never goes to No-Flow."""
-    tasks, tools = np.asarray(tasks), np.asarray(tools)
+    task, tool = np.asarray(tasks), np.asarray(tools)
     names = np.array(list(ALLOWED))
     table = np.array([[after in ALLOWED[before] for after in names] for before in names])
     order = np.argsort(names)
-    code = order[np.searchsorted(names, tasks, sorter=order)]
-    fine = table[code[:-1], code[1:]] & ((tools[1:] == tools[:-1]) | (tasks[:-1] == DWELL))
+    code = order[np.searchsorted(names, task, sorter=order)]
+    fine = table[code[:-1], code[1:]] & ((tool[1:] == tool[:-1]) | (task[:-1] == DWELL))
     return np.flatnonzero(~fine) + 1
 
 

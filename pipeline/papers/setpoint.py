@@ -156,7 +156,7 @@ APPENDIX = {
 
 def waits(path: Trajectory, places: dict[str, slice]) -> dict[str, Any]:
     """Steps from (30 %, 190 °C) until a run is in the band for good, and how many get there."""
-    out = {}
+    out: dict[str, dict[str, Any]] = {}
     for name, place in places.items():
         if name.startswith("wait"):
             of = score.outcomes(np.asarray(path.flow)[place], np.asarray(path.temperature)[place])

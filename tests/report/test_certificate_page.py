@@ -82,9 +82,7 @@ def test_a_model_that_nobody_may_trust_exports_nothing(monkeypatch):
     monkeypatch.setattr(judgement, "trust", lambda _: doubted)
     machine = params.load(Plant, "plant")
     for recorded, winner in ((True, None), (False, "pi")):
-        found = judgement.winner(
-            {}, params.load(ReportRules, "report"), machine, None, recorded=recorded, model={}
-        )
+        found = judgement.winner({}, params.load(ReportRules, "report"), machine, recorded=recorded, model={})
         assert found.winner == winner
 
 
