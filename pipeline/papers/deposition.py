@@ -122,7 +122,7 @@ def learning(task: Routine) -> dict[str, Any]:
         ratio, u = ratios(trials, task.r), trials[TRIALS].u
         commands[name] = u
         out[name] = {
-            "flow": {f"trial_{j}": thinned(trials[j].truth / STEADY_FLOW) for j in SHOWN},
+            "flow": {f"trial_{j}": thinned(np.asarray(trials[j].truth) / STEADY_FLOW) for j in SHOWN},
             "ratio": [round(value, 3) for value in ratio],
             "ratio_30": ratio[30],
             "best": min(ratio),

@@ -303,8 +303,8 @@ def test_a_machine_of_32_inputs_and_outputs_and_a_long_hold_out_stay_within_the_
         artifacts.write_table(FOLDER / f"{name}.parquet", schema, columns)
     change("identify_plant", fit_holdout=dict.fromkeys(names, 90.0), fit_holdout_band=None)
     main()
-    # the limit of a page: 1.5 MB
-    assert figures()["bytes"]["identification"] <= 1_500_000
+    # the limit of a page: 1.5 MB, and 20 kB for the files at its foot
+    assert figures()["bytes"]["identification"] <= 1_520_000
 
 
 # ---- the primitives
