@@ -19,7 +19,7 @@ from pipeline.store import artifacts, params
 from tests.foreign import two_zones
 
 ROOT = Path(__file__).resolve().parents[2]
-# what an owner's project is made of; tests, documents and benchmarks are no part of it
+# what an owner's project is made of; tests and documents are no part of it
 PARTS = (
     "run", "pyproject.toml", "uv.lock", ".python-version", "README.md", ".dvcignore", ".gitignore",
     "dvc.yaml", "params.yaml", "params.expert.yaml", "pipeline", "stages", "datasets",

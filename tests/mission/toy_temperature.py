@@ -27,7 +27,7 @@ OTHERS = {
     "evaluate_setpoint", "reproduce_study",
 }  # fmt: skip
 # read where they lie
-LINKED = ("datasets/published", "datasets/papers", "datasets/parts", "benchmarks", "pipeline", "stages")
+LINKED = ("datasets/published", "datasets/papers", "datasets/parts", "pipeline", "stages")
 TOY: dict[str, Any] = {
     "execution.jobs": 1,
     "panel.steps": 300,
