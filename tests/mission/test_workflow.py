@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 import subprocess
+import time
 import tomllib
 
 import numpy as np
@@ -82,6 +83,18 @@ def test_one_more_recording_runs_only_what_follows_from_it(project):
     assert re.search(r"\b1 recordings? read, 2\b", ended.stdout + ended.stderr)
 
 
+def wait_for_end(group: int) -> None:
+    """Returns when no process of the group is left: who is killed is not gone at once, and DVC takes its lock
+    for held as long as its number is in use."""
+    for _ in range(3000):
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    raise RuntimeError(f"a process of group {group} outlives its kill")
+
+
 def test_a_repro_that_is_killed_leaves_what_the_next_one_needs(owner, fresh):
     for stage in ("ingest", "learn_kernel"):
         with subprocess.Popen(
@@ -91,6 +104,7 @@ def test_a_repro_that_is_killed_leaves_what_the_next_one_needs(owner, fresh):
             reached = any(f"Running stage '{stage}'" in line for line in child.stdout)
             os.killpg(child.pid, signal.SIGKILL)
         assert reached and child.returncode == -signal.SIGKILL
+        wait_for_end(child.pid)
     fresh.run("dvc", "repro")
     assert fresh.made() == owner.made()
 
