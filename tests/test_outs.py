@@ -15,6 +15,10 @@ stages:
     outs:
     - {path: datasets/ingest, md5: bb.dir, size: 2, nfiles: 1}
     - {path: reports/metrics/ingest.json, md5: cc, size: 3}
+  report:
+    cmd: python -m stages.report
+    outs:
+    - {path: reports/index.html, md5: dd, size: 4}
   nothing:
     cmd: 'true'
 """
@@ -44,7 +48,7 @@ def test_outs_that_differ_are_named_and_code_may_change(compare, tmp_path):
     assert compare(LOCK, "--record") == (0, "")
     assert "deps" not in (tmp_path / "dvc.lock").read_text()
     assert compare(LOCK) == (0, "")
-    assert compare(LOCK.replace("aa", "a2")) == (0, "")
+    assert compare(LOCK.replace("aa", "a2").replace("dd", "d2")) == (0, "")
     status, said = compare(LOCK.replace("cc", "c2").replace("datasets/ingest,", "datasets/other,"))
     assert status == 1
     assert said.splitlines() == [
