@@ -15,7 +15,7 @@ from pipeline.report.shared.verdict import FAILED, UNDECIDED, Figure, Missing, Q
 from pipeline.report.temperature.answers import comparison, judged, of_contestant
 from pipeline.report.temperature.contestants import heading, kind
 from pipeline.report.temperature.pairs import pair_sentence
-from pipeline.report.temperature.scorecard import UNRULED, setting
+from pipeline.report.temperature.scorecard import setting
 from pipeline.report.temperature.verdict import questions
 from pipeline.report.temperature.wording import places_of, worded
 from pipeline.store import artifacts
@@ -23,15 +23,15 @@ from pipeline.store import artifacts
 ACCEPTED, PAPERS = "reports/accepted.json", "datasets/papers"
 KEYS = ("temperature", "setpoint", "deposition")
 COMMAND = "./run python -m tests.readme"
-SHOWN = ("settled_error", "settling", "overshoot", "cost")
+SHOWN = ("settled_error", "settling", "overshoot")
 STATES = {FAILED: ", fail", UNDECIDED: ", undecided"}
 # sentences of the temperature verdict's reason that README repeats, by how they begin
 MARGINS = ("Closest to its limit", "Below the limit on the worst plant")
 LOOPS = {
     "temperature": (
-        "**[Temperature](docs/explanation/temperature.md)**: barrel zones or one heater",
+        "**[Temperature](docs/explanation/temperature.md)**: one hot end, or the zones of a barrel",
         "heater power and temperatures",
-        "a certified controller: C99, Python or Klipper module",
+        "a controller with a robustness certificate: C99, Python or Klipper module",
         "PI, LQG, VARX + Riccati, learned kernel",
     ),
     "deposition": (
@@ -97,7 +97,7 @@ def _loops(accepted: Mapping[str, Any]) -> str:
 def _settling(accepted: Mapping[str, Any]) -> str:
     asked = {question.key: question for question in _questions(accepted)}["settling"]
     figure = of_contestant(accepted["metrics"], accepted["verdicts"]["temperature"]["subject"])["settling"]
-    return f"Settling time {_cell(asked, figure)} (limit {asked.limit:g} s)."
+    return f"Settling time {_cell(asked, figure)} (at most {asked.limit:g} s)."
 
 
 def _flow_error(accepted: Mapping[str, Any]) -> str:
@@ -111,7 +111,7 @@ def _flow_error(accepted: Mapping[str, Any]) -> str:
     error = max(part[composer]["rms_percent_of_on_off"] for part in parts)
     missing = sum(not part["judged"]["judged"] for part in parts)
     limit = accepted["params"]["report"]["flow_error_percent"]
-    text = f"Largest flow error {error:.1f} % of on-off control's (limit {limit:g} %)."
+    text = f"Largest flow error: {error:.1f} % of that of on-off control (at most {limit:g} %)."
     return f"{text} No valid forecast for {missing} of {len(parts)} parts." if missing else text
 
 
@@ -120,7 +120,8 @@ def _reached(accepted: Mapping[str, Any]) -> str:
     limit = accepted["params"]["report"]["settled_percent"]
     subject = accepted["verdicts"]["setpoint"]["subject"]
     return (
-        f"In the worst test case {reached:.1f} % of runs of {subject} reach the target (limit {limit:g} %)."
+        f"In the worst test case {reached:.1f} % of runs reach the target (at least {limit:g} %). "
+        f'Default controller: "{subject}".'
     )
 
 
@@ -129,7 +130,7 @@ def _reached(accepted: Mapping[str, Any]) -> str:
 
 def _questions(accepted: Mapping[str, Any]) -> list[Question]:
     rules = ReportRules.model_validate(accepted["params"]["report"])
-    return [*questions(rules, comparison(accepted["metrics"])), *UNRULED]
+    return questions(rules, comparison(accepted["metrics"]))
 
 
 def _temperature(accepted: Mapping[str, Any]) -> str:
@@ -144,32 +145,30 @@ def _temperature(accepted: Mapping[str, Any]) -> str:
         "",
         pair_sentence(metrics).text,
         "",
-        f"Test set: {setting(comparison(metrics))}. Nine in ten cases are better than the figure shown.",
+        f"Test set: {setting(comparison(metrics))}. Nine in ten cases are better than the figure shown. "
+        "Lower cost is better.",
         "",
-        f"| Controller | {' | '.join(map(_head, shown))} |",
-        f"|---|{'---|' * len(shown)}",
+        f"| Controller | {' | '.join(map(_head, shown))} | Cost, median case |",
+        f"|---|{'---|' * (len(shown) + 1)}",
     ]
     for name in judged(metrics):
         figures = of_contestant(metrics, name)
         cells = " | ".join(_cell(question, figures[question.key]) for question in shown)
-        lines.append(f"| {heading(name)} ({kind(name)}) | {cells} |")
+        cost = comparison(metrics)["contestants"][name]["cost"]["median"]
+        lines.append(f"| {heading(name)} ({kind(name)}) | {cells} | {cost:.3g} |")
     return _plain("\n".join(lines))
 
 
 def _head(question: Question) -> str:
     limit = f"{question.limit:g} {question.unit}".strip()
-    return f"{question.title} (limit {limit})" if _has_limit(question) else question.title
-
-
-def _has_limit(question: Question) -> bool:
-    return question.key not in [one.key for one in UNRULED]
+    return f"{question.title} (at {'least' if question.at_least else 'most'} {limit})"
 
 
 def _cell(question: Question, figure: Figure | Missing) -> str:
     if isinstance(figure, Missing):
         return figure.state
     text = worded(question, figure.value, places_of(question, [figure]))
-    return text + (STATES.get(state(question, figure), "") if _has_limit(question) else "")
+    return text + STATES.get(state(question, figure), "")
 
 
 # ---- the papers

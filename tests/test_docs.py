@@ -184,7 +184,7 @@ def test_another_count_of_the_papers_makes_the_readme_wrong(root, text, accepted
 def test_the_figures_of_the_readme_are_those_that_the_verdicts_name(root, accepted):
     table = readme.blocks(accepted, root / readme.PAPERS)["loops"]
     for loop, figure in (
-        ("deposition", r"Largest flow error ([\d.]+ %)"),
+        ("deposition", r"Largest flow error: ([\d.]+ %)"),
         ("setpoint", r"worst test case ([\d.]+ %)"),
     ):
         reason = accepted["verdicts"][loop]["reason"].replace("\u202f", " ").replace("\u00a0", " ")
