@@ -7,9 +7,11 @@ and its exit status is the one of `run`. Only the standard library is imported: 
 repro with nothing to do.
 """
 
+import contextlib
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -38,7 +40,9 @@ def main() -> None:
         remove_empty_locks(ROOT / ".dvc/tmp/rwlock")
     if words.startswith(("dvc ", "beadline nightly ")):
         try:
-            check_plain_files(RAW)
+            for folder in dict.fromkeys([RAW, Path(os.path.relpath(ROOT / RAW))]):
+                check_plain_files(folder)
+            check_params()
         except ValueError as error:
             sys.exit(f"run: {' '.join(printable(str(error)).split())}")
     if command[0] != "dvc":
@@ -50,12 +54,43 @@ def main() -> None:
     sys.exit(status)
 
 
+def check_params() -> None:
+    """Raises ValueError, in one sentence, for parameters that cannot be read. DVC would read them first, by a
+    parser in C that crashes on hostile text. A content that was read once is not read again."""
+    paths = [ROOT / name for name in ("params.yaml", "params.expert.yaml")]
+    remembered, digest = ROOT / ".dvc/tmp/params_read", b""
+    if all(path.is_file() for path in paths):
+        digest = str(zlib.crc32(b"".join(map(read, paths)))).encode()
+    if digest and read(remembered) == digest:
+        return
+    from pipeline.store import params
+
+    params.files(os.path.relpath(paths[0]))
+    with contextlib.suppress(OSError):
+        remembered.parent.mkdir(exist_ok=True)
+        remembered.write_bytes(digest)
+
+
 def run_dvc(command: list[str]) -> int:
     """The exit status of `dvc ...`, as its own script calls it."""
     from dvc.cli import main as dvc
 
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, end_with_children)
     sys.argv = command
     return dvc(command[1:])
+
+
+def end_with_children(number: int, _frame: object) -> None:
+    """Hands a signal that reached DVC alone to the stage and its workers, and ends by it."""
+    pids = [os.getpid()]
+    for pid in pids:
+        for children in Path(f"/proc/{pid}/task").glob("*/children"):
+            pids += map(int, read(children).split())
+    signal.signal(number, signal.SIG_DFL)
+    for pid in reversed(pids):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, number)
 
 
 def remove_empty_locks(rwlock: Path) -> None:
@@ -90,7 +125,8 @@ def write_machine(options: str) -> None:
         beside.write_text(f"window.beadline = {json.dumps({'machine': machine(options)})};\n")
         beside.replace(path)
     except OSError:
-        return
+        with contextlib.suppress(OSError):
+            beside.unlink()
 
 
 def machine(options: str) -> dict[str, str | int | bool]:

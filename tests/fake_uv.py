@@ -5,7 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-COPIED = ("run", "pyproject.toml", "uv.lock", ".python-version", "pipeline/around_dvc.py")
+COPIED = (
+    "run", "pyproject.toml", "uv.lock", ".python-version", "pipeline/around_dvc.py", "params.yaml",
+    "params.expert.yaml", "datasets/papers/params.yaml",
+)  # fmt: skip
 # the whole command is kept beside; of commands only python is run, which is ours
 UV = """\
 #!/bin/sh
@@ -23,7 +26,7 @@ DVC = 'def main(arguments):\n    print("dvc", *arguments)\n    return {status}\n
 def furnish(folder: Path, root: Path, *, status: int = 0) -> None:
     """Copies `run` and its neighbours from `root`. The DVC of the copy ends with `status`."""
     for name in COPIED:
-        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(root / name, folder / name)
     write(folder / "bin/uv", UV.format(python=sys.executable, folder=folder))
     write(folder / "bin/beadline", '#!/bin/sh\necho beadline "$@"\n')

@@ -1,5 +1,6 @@
 """./run: the command that uv gets, and what goes before and after DVC."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -83,6 +84,61 @@ def test_a_signal_to_run_reaches_dvc(copy, number):
         started.send_signal(number)
         # as Python ends by that signal
         assert started.wait(timeout=60) == -number
+
+
+STAGE = "import subprocess; worker = subprocess.Popen(['sleep', '600']); print(1, flush=True); worker.wait()"
+
+
+def test_a_signal_to_run_alone_ends_the_stage_and_its_workers(copy):
+    slow = "import subprocess, sys\ndef main(arguments):\n    subprocess.run([sys.executable, '-c', {!r}])\n"
+    fake_uv.write(copy / "fake/dvc/cli.py", slow.format(STAGE))
+    with subprocess.Popen(
+        ["./run", "dvc", "repro"], cwd=copy, env=fake_uv.environment(copy), stdout=subprocess.PIPE, text=True
+    ) as started:
+        assert started.stdout is not None
+        assert started.stdout.readline() == "1\n"
+        started.send_signal(signal.SIGTERM)
+        # stage and worker hold the other end of the pipe: it ends when both have ended
+        assert started.stdout.read() == ""
+        assert started.wait(timeout=60) == -signal.SIGTERM
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("x: " + "[" * 100_000, "run: params.yaml: line 1: "),
+        ("a: &a [*a]\n", "run: params.yaml: line 1: "),
+        ("x: 1\nx: 2\n", "run: params.yaml: line 2: "),
+        ("x: " + "1 " * 200_000, "run: params.yaml has 400003 bytes but may have 200000; "),
+    ],
+)
+def test_parameters_that_nobody_can_read_are_refused_before_dvc_reads_them(copy, text, sentence):
+    (copy / "params.yaml").write_text(text)
+    for folder in (copy, copy / "pipeline"):
+        ended = subprocess.run(
+            [copy / "run", "dvc", "repro"],
+            cwd=folder,
+            env=fake_uv.environment(copy),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert (ended.returncode, ended.stdout) == (1, "")
+        assert (
+            sentence.replace("params.yaml", str(os.path.relpath(copy / "params.yaml", folder)))
+            in ended.stderr
+        )
+        assert ended.stderr.count("\n") == 1
+
+
+def test_parameters_that_were_read_once_are_not_read_again_until_they_change(copy):
+    (copy / ".dvc/tmp").mkdir(parents=True)
+    assert fake_uv.run(copy, "dvc", "status").returncode == 0
+    remembered = (copy / ".dvc/tmp/params_read").read_bytes()
+    assert fake_uv.run(copy, "dvc", "status").returncode == 0
+    (copy / "params.yaml").write_text("x: [")
+    assert fake_uv.run(copy, "dvc", "status").returncode == 1
+    assert (copy / ".dvc/tmp/params_read").read_bytes() == remembered
 
 
 def test_what_goes_around_dvc_imports_the_standard_library_alone(root):

@@ -8,11 +8,8 @@ directly below datasets/raw/setpoint may be links.
 
 import os
 import stat
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-
-from pipeline.store.printable import printable
 
 _KINDS = (
     (stat.S_ISFIFO, "a named pipe (FIFO)"),
@@ -80,18 +77,5 @@ def _special(path: Path, mode: int) -> Iterator[str]:
         if is_kind(mode):
             yield (
                 f"{path} is {kind}, which is no recording and stops whoever reads it; "
-                f"remove it (rm {path.name}) and copy the recording itself there"
+                f"remove it (rm {path}) and copy the recording itself there"
             )
-
-
-def main() -> None:
-    """python -m pipeline.reading.plain_files FOLDER: exit status 1 and one sentence if not all is plain."""
-    try:
-        check_plain_files(sys.argv[1])
-    except ValueError as error:
-        print(f"run: {' '.join(printable(str(error)).split())}", file=sys.stderr)
-        sys.exit(1)
-
-
-if __name__ == "__main__":
-    main()

@@ -57,7 +57,7 @@ PAPERS, PAPERS_SECTIONS = "datasets/papers/params.yaml", ("reproduce_study",)
 # old dotted key or section -> new one, for one version; none since 0.2
 RENAMED: dict[str, str] = {}
 # the project's own files are 6 levels deep
-DEEPEST, LONGEST_NUMBER = 50, 30
+DEEPEST, LONGEST_NUMBER, LARGEST = 50, 30, 200_000
 _TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("bool", "null", "int", "float", "str", "map", "seq")}
 
 
@@ -189,7 +189,7 @@ def _parsed(text: str) -> Any:
     _check(node)
     try:
         return yaml.constructor.construct_document(node)
-    except (KeyError, ValueError) as error:
+    except (KeyError, IndexError, ValueError) as error:
         raise MarkedYAMLError(problem=f"{error} does not fit its tag; take the tag out") from None
 
 
@@ -261,6 +261,13 @@ def files(path: str | Path = FILE) -> dict[str, dict]:
 
 def _sections(path: str | Path) -> dict:
     try:
+        size = Path(path).stat().st_size
+        if not Path(path).is_file():
+            raise ValueError(f"{path} is no file; {_RESTORE.format(path)}")
+        if size > LARGEST:
+            raise ValueError(
+                f"{path} has {size} bytes but may have {LARGEST}; restore it with git checkout {path}"
+            )
         text = Path(path).read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ValueError(f"{path} is missing; {_RESTORE.format(path)}") from None
@@ -275,6 +282,8 @@ def _sections(path: str | Path) -> dict:
         problem = " ".join(f"{context}{error.problem}".split())
         remedy = "" if ";" in problem else "; mend the line: key: value, indented by spaces"
         raise ValueError(f"{path}: {line}{problem}{remedy}") from None
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f"{path}: {error}; take that out") from None
     except YAMLError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}; remove that character") from None
     if type(sections) is not dict:

@@ -443,6 +443,30 @@ def test_every_new_name_is_a_key_of_today_and_no_old_one_is(root):
         assert params.home(new, root / params.FILE) and not params.home(old, root / params.FILE)
 
 
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ('learn_kernel: {horizon: !!int ""}\n', "params.yaml: "),
+        ('learn_kernel: {method: "\\U00110000"}\n', "params.yaml: "),
+        ("x_large: " + "1 " * 200_000, "params.yaml has 400009 bytes but may have 200000; "),
+    ],
+)
+def test_hostile_values_and_sizes_are_refused_with_the_name_of_the_file(load, text, sentence):
+    load(GOOD)
+    Path("params.yaml").write_text(text)
+    with pytest.raises(ValueError, match=f"^{re.escape(sentence)}") as refused:
+        params.read("params.yaml")
+    assert str(refused.value).count("\n") == 0 and ";" in str(refused.value)
+
+
+def test_a_folder_in_the_place_of_the_parameters_is_refused(load):
+    load(GOOD)
+    Path("params.yaml").unlink()
+    Path("params.yaml").mkdir()
+    with pytest.raises(ValueError, match="^params.yaml is no file; "):
+        params.read("params.yaml")
+
+
 def test_a_users_own_section_begins_with_x(load):
     assert load(f"x_colours: {{red: 1}}\n{OWNER}", expert=f"{EXPERT}x_rig: {{}}\n") == load(GOOD)
 
@@ -478,7 +502,7 @@ LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("a: " + "[" * 3000 + "]" * 3000, "it is nested deeper than 50 levels"),
         ("a: " + "{b: " * 3000 + "}" * 3000, "it is nested deeper than 50 levels"),
         ("\n".join(" " * depth + "a:" for depth in range(90)), "line 50: it is nested deeper than 50 levels"),
-        ("\n".join(" " * depth + "a:" for depth in range(3000)), "it is nested deeper than 50 levels"),
+        ("\n".join(" " * depth + "a:" for depth in range(600)), "it is nested deeper than 50 levels"),
         ("a: &a [*a]", "line 1: the anchor &a is refused"),
         (
             "x: 1\na: {<<: 3}",
