@@ -16,10 +16,10 @@ import optax
 
 from benchmarks import results
 from benchmarks.results import Row
-from pipeline.setpoint import agent, belief_agent, judging
-from pipeline.setpoint.recorded import recorded_windows
+from pipeline.setpoint.agents import agent, belief_agent, judging
 from pipeline.setpoint.score import Score
-from pipeline.setpoint.simulator import paper_windows, rollout
+from pipeline.setpoint.simulation.recorded import recorded_windows
+from pipeline.setpoint.simulation.simulator import paper_windows, rollout
 from pipeline.setpoint.workflow import train_agent
 from pipeline.setpoint.workflow.settings import Li2025, TrainAgent
 from pipeline.store import params

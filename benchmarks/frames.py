@@ -18,12 +18,12 @@ import numpy as np
 
 from benchmarks import results
 from benchmarks.results import Row
-from pipeline.deposition import ilc
-from pipeline.deposition.bead import Calibration, area, calibrate, measure, measure_all
+from pipeline.deposition.camera.bead import Calibration, area, calibrate, measure, measure_all
+from pipeline.deposition.camera.flow import Flow, View, estimate, sections
+from pipeline.deposition.camera.rendering import HARD, NOMINAL, Camera, Scene
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, routine
-from pipeline.deposition.flow import Flow, View, estimate, sections
-from pipeline.deposition.rendering import HARD, NOMINAL, Camera, Scene
+from pipeline.deposition.learning import ilc
 from pipeline.deposition.workflow.trial_files import Conditions, Signals, read_trial, write_trial
 
 TS, SPEED, ANGLE_DEG, PX_PER_MM = 0.02, 8.0, 90.0, 125.0

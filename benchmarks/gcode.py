@@ -23,8 +23,9 @@ import yaml
 
 from benchmarks import results
 from benchmarks.results import Row
-from pipeline.deposition import extrusion, gcode, motion
-from pipeline.deposition.gcode import Kind
+from pipeline.deposition.parts import extrusion
+from pipeline.deposition.toolpath import gcode, motion
+from pipeline.deposition.toolpath.gcode import Kind
 from tests.deposition.dialects import DIALECTS, Dialect, Made, made
 from tests.deposition.reprap_reader import Reader
 
@@ -38,7 +39,7 @@ WATCHED = """
 import re, sys, time
 from pathlib import Path
 from pipeline import cli
-from pipeline.deposition import gcode, motion
+from pipeline.deposition.toolpath import gcode, motion
 from pipeline.deposition.workflow import compose_parts, exports
 # of this process alone: the peak that getrusage tells began in its parent
 peak = lambda: int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 1024

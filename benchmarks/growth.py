@@ -33,8 +33,8 @@ import scipy.signal
 from benchmarks import results
 from benchmarks.results import Row
 from pipeline.store import artifacts, params
-from pipeline.temperature.half_vector import quadratic_gram
-from pipeline.temperature.kernel import Tuples, regress, tuples_with_reference, value_iteration
+from pipeline.temperature.controllers.half_vector import quadratic_gram
+from pipeline.temperature.controllers.kernel import Tuples, regress, tuples_with_reference, value_iteration
 from pipeline.temperature.published import GAMMA, REFERENCE
 from pipeline.temperature.study import data_sets
 from tests.temperature import naive
@@ -78,14 +78,14 @@ def two_heaters(samples: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def kernel(samples: int, folder: Path) -> Work:
-    from pipeline.temperature.kernel import tuples
+    from pipeline.temperature.controllers.kernel import tuples
 
     u, y = two_heaters(samples)
     return lambda: value_iteration(regress(tuples([u], [y], 2, offset=True)), np.eye(2), np.eye(2), 0.9)
 
 
 def identification(samples: int, folder: Path) -> Work:
-    from pipeline.temperature.identification import Settings, identify
+    from pipeline.temperature.identification.model_choice import Settings, identify
 
     u, y = two_heaters(samples)
     settings = Settings(feedthrough=None, refinement="validated")
@@ -136,8 +136,8 @@ def recordings(count: int, folder: Path) -> Work:
 
 def trial(samples: int, folder: Path) -> Work:
     """The command of the next trial after three of so many samples at 50 Hz, the model identified anew."""
-    from pipeline.deposition import ilc
     from pipeline.deposition.extruder import Extruder, flow, routine
+    from pipeline.deposition.learning import ilc
     from pipeline.deposition.workflow.settings import Printer
 
     printer = params.load(Printer, "printer")
@@ -159,7 +159,7 @@ def trial(samples: int, folder: Path) -> Work:
 
 def materials(count: int, folder: Path) -> Work:
     """The library of so many materials, each with all trials of one of the two that were trained on."""
-    from pipeline.deposition import composition
+    from pipeline.deposition.parts import composition
     from pipeline.deposition.workflow import segment_library
     from pipeline.deposition.workflow.settings import Printer, SegmentLibrary
     from pipeline.deposition.workflow.tables import LESSONS
@@ -179,7 +179,7 @@ def materials(count: int, folder: Path) -> Work:
 
 def plants(count: int, folder: Path) -> Work:
     """Subspace + LQG as deployed on so many plants of the judging half, with its figures."""
-    from pipeline.temperature import panel
+    from pipeline.temperature.test_set import panel
     from pipeline.temperature.workflow import cases, evaluate_temperature, learned
     from pipeline.temperature.workflow.settings import Panel, Plant, Tracking, TuneWeights
 

@@ -14,9 +14,9 @@ import numpy as np
 
 from benchmarks import results
 from benchmarks.results import Row
-from pipeline.deposition import ilc
 from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, frequency_response, routine
+from pipeline.deposition.learning import ilc
 from pipeline.papers.deposition import causal_q
 
 TS, AREA, SPEED = 0.02, 0.304, 8.0

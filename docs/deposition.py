@@ -8,9 +8,9 @@ The deposition stages do the same with camera frames, a library of learned signa
 import matplotlib
 import numpy as np
 
-from pipeline.deposition import ilc
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, disturb, flow, frequency_response, routine
+from pipeline.deposition.learning import ilc
 
 matplotlib.use("Agg")
 from matplotlib import pyplot  # noqa: E402  a figure without a screen

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 
-from pipeline.setpoint import bayes, judging, score
-from pipeline.setpoint.baselines import Proportional, proportional
-from pipeline.setpoint.simulator import paper_windows, rollout
+from pipeline.setpoint import score
+from pipeline.setpoint.agents import bayes, judging
+from pipeline.setpoint.agents.baselines import Proportional, proportional
+from pipeline.setpoint.simulation.simulator import paper_windows, rollout
 
 matplotlib.use("Agg")
 from matplotlib import pyplot  # noqa: E402  a figure without a screen

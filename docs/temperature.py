@@ -8,10 +8,12 @@ The temperature stages do the same with recordings, tuned weights and a panel of
 import matplotlib
 import numpy as np
 
-from pipeline.temperature import controller, kernel, panel, plant, probing, study, tracking, window
-from pipeline.temperature.baseline import pairing, pi_law
-from pipeline.temperature.identification import Settings, identify
+from pipeline.temperature import plant, probing, study, tracking
+from pipeline.temperature.controllers import controller, kernel, window
+from pipeline.temperature.controllers.baseline import pairing, pi_law
+from pipeline.temperature.identification.model_choice import Settings, identify
 from pipeline.temperature.published import K_DATA
+from pipeline.temperature.test_set import panel
 
 matplotlib.use("Agg")
 from matplotlib import pyplot  # noqa: E402  a figure without a screen

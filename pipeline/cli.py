@@ -251,8 +251,8 @@ def record_levels(arguments: argparse.Namespace) -> None:
     and a page."""
     from functools import partial
 
-    from pipeline.setpoint.calibrated_classifier import read_frames
-    from pipeline.setpoint.window_flow import window_flow
+    from pipeline.setpoint.vision.calibrated_classifier import read_frames
+    from pipeline.setpoint.vision.window_flow import window_flow
     from pipeline.setpoint.workflow import record_levels as levels
     from pipeline.setpoint.workflow.frame_folder import read_options
     from pipeline.setpoint.workflow.settings import SetpointMaterial

@@ -5,7 +5,7 @@ two episodes through pixels, and choice.json, the default with its worst case.""
 
 from concurrent.futures import ThreadPoolExecutor
 
-from pipeline.setpoint import judging
+from pipeline.setpoint.agents import judging
 from pipeline.setpoint.workflow import contestants, evaluate_setpoint
 from pipeline.setpoint.workflow.agent_files import restore_agents
 from pipeline.setpoint.workflow.camera_files import restore_camera

@@ -3,7 +3,7 @@ datasets/learn_kernel/window.parquet and, where the record determines it, kernel
 whatever the weights, so that new weights need no pass over the data."""
 
 from pipeline.store import artifacts, params
-from pipeline.temperature import window
+from pipeline.temperature.controllers import window
 from pipeline.temperature.workflow import learn_kernel
 from pipeline.temperature.workflow.settings import LearnKernel, Panel, Plant, Tracking
 

@@ -3,7 +3,7 @@ writes datasets/train_ilc: trials.parquet, lessons.parquet, filmed.parquet, mode
 recordings of the first and the last trial, frames of these with the measured edges, and, for a
 real machine, the command of the next one in next/."""
 
-from pipeline.deposition import training
+from pipeline.deposition.learning import training
 from pipeline.deposition.workflow import train_ilc, trial_video
 from pipeline.deposition.workflow.settings import Camera, Printer, TrainIlc
 from pipeline.deposition.workflow.tables import FILMED, LESSONS, TRIALS

@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 from hypothesis import strategies as st
 
-from pipeline.deposition import gcode
+from pipeline.deposition.toolpath import gcode
 from pipeline.reading import recordings
 from pipeline.reading.inspection import inspect
 from pipeline.store import artifacts, params, tables

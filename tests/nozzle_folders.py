@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.setpoint import key_area, nozzle_scene
+from pipeline.setpoint.frames import key_area, nozzle_scene
 from pipeline.setpoint.workflow import frame_folder
 from pipeline.setpoint.workflow.frame_mcap import Topics
 from pipeline.store.params import Execution

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from pipeline.store import artifacts, params
-from pipeline.temperature import identification
+from pipeline.temperature.identification import model_choice as identification
 from pipeline.temperature.plant import plant, simulate
 
 SAMPLES = 600

@@ -24,8 +24,8 @@ import numpy as np
 import scipy.linalg
 import scipy.stats
 
+from pipeline.temperature.identification.refinement import Predictor, free_response, linear_recurrence
 from pipeline.temperature.plant import Plant, clip_spectral_radius
-from pipeline.temperature.refinement import Predictor, free_response, linear_recurrence
 
 BLOCKS = 12  # into which a record is cut for the variance of an estimate
 SHORTEST = 96  # samples of a record that is asked

@@ -13,7 +13,9 @@ from pipeline.nightly.decision import Evidence
 from pipeline.nightly.settings import HoldOut, Loop, Nightly, Rule
 from pipeline.setpoint.workflow import tables
 from pipeline.store import artifacts, params
-from pipeline.temperature import panel, plant, window
+from pipeline.temperature import plant
+from pipeline.temperature.controllers import window
+from pipeline.temperature.test_set import panel
 from pipeline.temperature.workflow import cases, contestants, evaluate_temperature, ingest, learned
 from pipeline.temperature.workflow.settings import Panel, Tracking, TuneWeights
 from pipeline.temperature.workflow.settings import Plant as Machine
@@ -370,7 +372,8 @@ def _segments(record: dict[str, np.ndarray], machine: Machine) -> list[tuple[np.
 def _panel_plants(records: list[tuple[np.ndarray, np.ndarray]], machine: Machine):
     """The plants of the hold-out recordings: identified from them alone, and a bootstrap family around; kept,
     since neither recordings nor method change from night to night."""
-    from pipeline.temperature import identification, validation
+    from pipeline.temperature.identification import model_choice as identification
+    from pipeline.temperature.identification import validation
 
     p = params.read()["identify_plant"]
     key = joblib.hash((records, p["max_order"], p["offset"], p["spread_plants"], p["seed"]))
@@ -396,7 +399,7 @@ def _prediction_error(model, records: list[tuple[np.ndarray, np.ndarray]]) -> fl
     """Root mean square one-step error in °C on the hold-out recordings, None where there are none."""
     if not records:
         return None
-    from pipeline.temperature import validation
+    from pipeline.temperature.identification import validation
 
     errors = np.vstack(validation.one_step_errors(model, [u for u, _ in records], [y for _, y in records]))
     return float(np.sqrt(np.nanmean(errors**2)))

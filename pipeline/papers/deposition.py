@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import scipy.signal
 
-from pipeline.deposition import ilc
-from pipeline.deposition.composition import Learned, PartSettings, compose, learn, priority
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, Routine, disturb, flow, frequency_response, routine
-from pipeline.deposition.gcode import Kind, Program, parse
-from pipeline.deposition.library import CORNER, NO_FLOW, START, STEADY, STOP, TASKS, Training
-from pipeline.deposition.motion import plan
-from pipeline.deposition.tasks import DWELL
+from pipeline.deposition.learning import ilc
+from pipeline.deposition.parts.composition import Learned, PartSettings, compose, learn, priority
+from pipeline.deposition.parts.library import CORNER, NO_FLOW, START, STEADY, STOP, TASKS, Training
+from pipeline.deposition.toolpath.gcode import Kind, Program, parse
+from pipeline.deposition.toolpath.motion import plan
+from pipeline.deposition.toolpath.tasks import DWELL
 from pipeline.papers import files
 
 COMMAND = "./run dvc repro datasets/papers/dvc.yaml:deposition"

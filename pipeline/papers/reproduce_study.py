@@ -17,7 +17,8 @@ from pipeline.papers import files
 from pipeline.store import params
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
-from pipeline.temperature import published, study, tuning
+from pipeline.temperature import published, study
+from pipeline.temperature.test_set import tuning
 from pipeline.temperature.workflow.record import read_published
 from pipeline.temperature.workflow.settings import ReproduceStudy
 

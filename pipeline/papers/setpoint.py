@@ -17,10 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from pipeline.papers import files
-from pipeline.setpoint import agent, judging, score
+from pipeline.setpoint import score
+from pipeline.setpoint.agents import agent, judging
 from pipeline.setpoint.published import PHASES, ROTATION
-from pipeline.setpoint.simulator import Conditions, Trajectory, nominal, paper_windows, reward, rollout
-from pipeline.setpoint.vision_transformer import PAPER, parameters, vision_transformer
+from pipeline.setpoint.simulation.simulator import (
+    Conditions,
+    Trajectory,
+    nominal,
+    paper_windows,
+    reward,
+    rollout,
+)
+from pipeline.setpoint.vision.vision_transformer import PAPER, parameters, vision_transformer
 from pipeline.setpoint.workflow import train_agent
 from pipeline.setpoint.workflow.settings import TrainAgent
 from pipeline.store import params

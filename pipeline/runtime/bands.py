@@ -14,12 +14,20 @@ import numpy as np
 import scipy.linalg
 import scipy.stats
 
-from pipeline.temperature.controller import Deployed, aim, batch_step, constant, handed_over, rest, watched
-from pipeline.temperature.kernel import Tuples, regress, value_iteration, window_shift, windows
-from pipeline.temperature.panel import padded
+from pipeline.temperature.controllers.controller import (
+    Deployed,
+    aim,
+    batch_step,
+    constant,
+    handed_over,
+    rest,
+    watched,
+)
+from pipeline.temperature.controllers.kernel import Tuples, regress, value_iteration, window_shift, windows
+from pipeline.temperature.controllers.window import Window, observer_form, predictor
 from pipeline.temperature.plant import Plant, hold_output, observability_matrix
+from pipeline.temperature.test_set.panel import padded
 from pipeline.temperature.tracking import gains
-from pipeline.temperature.window import Window, observer_form, predictor
 
 Segments = Sequence[np.ndarray]
 LEAST_BLOCKS = 20  # fewer blocks than this say little of how far a resample may lie

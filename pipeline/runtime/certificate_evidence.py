@@ -13,10 +13,10 @@ import numpy as np
 from pipeline.runtime import bands
 from pipeline.runtime.certificate import Record, RuleResult, Rules, Segments, at_least, at_most, result
 from pipeline.runtime.machine import Exported
+from pipeline.temperature.controllers.window import learn, predictor
+from pipeline.temperature.identification.validation import one_step_errors, predicted_ahead
 from pipeline.temperature.plant import Plant, strictly_proper
 from pipeline.temperature.tracking import robust_observer_gain
-from pipeline.temperature.validation import one_step_errors, predicted_ahead
-from pipeline.temperature.window import learn, predictor
 
 LAGS = 5  # of errors and inputs from which a coloured error could have been foretold
 # share of the largest command that is allowed: a record that never leaves it is in another unit (0..1)

@@ -26,10 +26,10 @@ from pipeline.runtime.certificate import (
 )
 from pipeline.runtime.certificate_evidence import Sampled, asked
 from pipeline.runtime.machine import Exported
-from pipeline.temperature import scorecard
-from pipeline.temperature.controller import Deployed
+from pipeline.temperature.controllers.controller import Deployed
+from pipeline.temperature.controllers.window import observer_form
 from pipeline.temperature.plant import Plant, strictly_proper
-from pipeline.temperature.window import observer_form
+from pipeline.temperature.test_set import scorecard
 
 POLES_SHOWN = 12  # of each plant, the largest
 

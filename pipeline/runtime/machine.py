@@ -24,7 +24,7 @@ import numpy as np
 from safetensors.numpy import save as as_bytes
 
 from pipeline.store import artifacts
-from pipeline.temperature.controller import Deployed
+from pipeline.temperature.controllers.controller import Deployed
 from pipeline.temperature.plant import Plant
 
 if TYPE_CHECKING:

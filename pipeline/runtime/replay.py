@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.controller import Aim, Deployed, Reference, aim, constant, rest
-from pipeline.temperature.governor import Governor, corrected, governed, predicted, started
+from pipeline.temperature.controllers.controller import Aim, Deployed, Reference, aim, constant, rest
+from pipeline.temperature.controllers.governor import Governor, corrected, governed, predicted, started
 from pipeline.temperature.plant import Plant
 
 # ---- in chunks

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.runtime import innovations
-from pipeline.temperature.controller import Reference, RunningController, constant, rest
+from pipeline.temperature.controllers.controller import Reference, RunningController, constant, rest
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
 
 if TYPE_CHECKING:

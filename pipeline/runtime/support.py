@@ -25,7 +25,7 @@ import numpy as np
 import scipy.linalg
 
 from pipeline.runtime.replay import BLOCK, Log, scanned
-from pipeline.temperature.governor import instants
+from pipeline.temperature.controllers.governor import instants
 from pipeline.temperature.plant import Plant, markov_parameters
 from pipeline.temperature.tracking import reached_state, riccati
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.setpoint.recorded import WindowTable
-from pipeline.setpoint.window_flow import class_probabilities
+from pipeline.setpoint.simulation.recorded import WindowTable
+from pipeline.setpoint.vision.window_flow import class_probabilities
 
 # fewer windows say nothing of a level, fewer levels nothing of a curve
 LEAST_LEVELS, LEAST_WINDOWS = 3, 5

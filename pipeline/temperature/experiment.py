@@ -19,7 +19,6 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
-from pipeline.temperature.first_order import response
 from pipeline.temperature.forecast import (
     SIGMAS,
     Answers,
@@ -37,12 +36,13 @@ from pipeline.temperature.forecast import (
     start,
     truncated,
 )
-from pipeline.temperature.order import LARGEST_RADIUS, stabilised
+from pipeline.temperature.identification.first_order import response
+from pipeline.temperature.identification.order import LARGEST_RADIUS, stabilised
+from pipeline.temperature.identification.subspace import Segments
+from pipeline.temperature.identification.trust import horizon, two_points
+from pipeline.temperature.identification.validation import step_response
 from pipeline.temperature.plant import Plant, strictly_proper
-from pipeline.temperature.subspace import Segments
 from pipeline.temperature.tracking import Law, aimed, feasible_target, gains
-from pipeline.temperature.trust import horizon, two_points
-from pipeline.temperature.validation import step_response
 
 ENOUGH = 0.5  # of the largest safe amplitude: the rest is given up to come nearer to the references
 SEEN = 0.05  # of an output's largest effect: pairs below it teach and are asked nothing

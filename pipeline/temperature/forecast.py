@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.temperature.identification.refinement import Predictor, estimate_state, respond, simulation_form
+from pipeline.temperature.identification.subspace import Segments, gapless
+from pipeline.temperature.identification.validation import one_step_errors, simulated
 from pipeline.temperature.plant import Plant
-from pipeline.temperature.refinement import Predictor, estimate_state, respond, simulation_form
-from pipeline.temperature.subspace import Segments, gapless
 from pipeline.temperature.tracking import Law
-from pipeline.temperature.validation import one_step_errors, simulated
 
 TAIL = 3000  # samples at the end of the record that the present state is taken from
 LATEST = 20  # samples at its very end by which each member is set right

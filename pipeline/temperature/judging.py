@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.temperature import kernel
-from pipeline.temperature import window as window_route
+from pipeline.temperature.controllers import kernel
+from pipeline.temperature.controllers import window as window_route
 from pipeline.temperature.plant import Plant
-from pipeline.temperature.scorecard import Panel, Yardstick, cost, optimum, panel, regret, simulate
+from pipeline.temperature.test_set.scorecard import Panel, Yardstick, cost, optimum, panel, regret, simulate
 
 
 class Sufficiency(NamedTuple):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.kernel import regress, tuples_with_reference, value_iteration
+from pipeline.temperature.controllers.kernel import regress, tuples_with_reference, value_iteration
 from pipeline.temperature.plant import baam
 from pipeline.temperature.tracking import algorithm_1, observer_gain, stabilises
 

@@ -6,14 +6,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.temperature import window as window_route
-from pipeline.temperature.kernel import Kernel, exact_gains, regress, tuples, value_iteration, window_law
+from pipeline.temperature.controllers import window as window_route
+from pipeline.temperature.controllers.kernel import (
+    Kernel,
+    exact_gains,
+    regress,
+    tuples,
+    value_iteration,
+    window_law,
+)
 from pipeline.temperature.plant import baam
 from pipeline.temperature.probing import study_probe, study_signal
 from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, Figures
-from pipeline.temperature.scorecard import Panel, Yardstick, cost, optimum, panel, regret, simulate
+from pipeline.temperature.test_set.scorecard import Panel, Yardstick, cost, optimum, panel, regret, simulate
+from pipeline.temperature.test_set.tuning import Result, fitness
 from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
-from pipeline.temperature.tuning import Result, fitness
 
 OUTPUTS, INPUTS = 5, 7
 YARDSTICK = Yardstick(np.ones(OUTPUTS), np.ones(INPUTS), GAMMA)

@@ -4,10 +4,10 @@ is wanted; the weights of its docstring; limits."""
 import numpy as np
 import pytest
 
-from pipeline.deposition import basis
-from pipeline.deposition.chain import Identified
 from pipeline.deposition.drive import Drive, at_limit, follows
 from pipeline.deposition.extruder import Extruder, draw, lagged, ramp
+from pipeline.deposition.parts import basis
+from pipeline.deposition.parts.chain import Identified
 from tests.deposition.trained import TS, percent_of_on_off, protocol
 
 STEADY = 2.432

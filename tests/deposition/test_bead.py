@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.deposition.bead import area, calibrate, drawn, gray, measure, measure_all
-from pipeline.deposition.rendering import HARD, NOMINAL, Camera
+from pipeline.deposition.camera.bead import area, calibrate, drawn, gray, measure, measure_all
+from pipeline.deposition.camera.rendering import HARD, NOMINAL, Camera
 
 VIEW = {"columns": (0, 600), "longest_blur_px": 6.0}
 WIDTHS = (60.0, 85.0, 110.0, 135.0, 160.0)

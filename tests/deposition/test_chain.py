@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from pipeline.deposition import extruder
-from pipeline.deposition.chain import Identified, backlash, forecast, identify, simulate
 from pipeline.deposition.extruder import Extruder
+from pipeline.deposition.parts.chain import Identified, backlash, forecast, identify, simulate
 from tests.deposition.trained import CREEPING, PLANT, TS, learned, trainings
 from tests.foreign import extruders as foreign_extruders
 

@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.deposition import basis, composition, evaluation, gcode, ilc, training
-from pipeline.deposition.composition import (
+from pipeline.deposition.drive import UNLIMITED, Drive, follows, obeyed
+from pipeline.deposition.learning import ilc, training
+from pipeline.deposition.parts import basis, composition, evaluation
+from pipeline.deposition.parts.composition import (
     BASIS,
     PRIORITY,
     PartSettings,
@@ -17,11 +19,11 @@ from pipeline.deposition.composition import (
     priority,
     superposition,
 )
-from pipeline.deposition.conformance import conform
-from pipeline.deposition.drive import UNLIMITED, Drive, follows, obeyed
-from pipeline.deposition.library import Basis, Library
-from pipeline.deposition.library import learned as learned_command
-from pipeline.deposition.motion import plan
+from pipeline.deposition.parts.conformance import conform
+from pipeline.deposition.parts.library import Basis, Library
+from pipeline.deposition.parts.library import learned as learned_command
+from pipeline.deposition.toolpath import gcode
+from pipeline.deposition.toolpath.motion import plan
 from pipeline.deposition.workflow import compose_parts
 from tests.deposition.trained import (
     AREA,

@@ -4,18 +4,18 @@ ramp that would do, and what was refused."""
 import numpy as np
 import pytest
 
-from pipeline.deposition import basis
-from pipeline.deposition.conformance import (
+from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
+from pipeline.deposition.extruder import Extruder, flow
+from pipeline.deposition.parts import basis
+from pipeline.deposition.parts.conformance import (
     conform,
     line_volumes,
     ramp_that_would_do,
     saturation,
     volume_between,
 )
-from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
-from pipeline.deposition.extruder import Extruder, flow
-from pipeline.deposition.gcode import Refusal
 from pipeline.deposition.reachable import LOSS, lost
+from pipeline.deposition.toolpath.gcode import Refusal
 from tests.deposition.test_composition import composed, of_part
 from tests.deposition.trained import AREA, NOMINAL, PLANT, RAMP, TS, learned, protocol
 

@@ -15,10 +15,10 @@ import pytest
 import yaml
 
 from pipeline import cli
-from pipeline.deposition.bead import Calibration
+from pipeline.deposition.camera.bead import Calibration
 from pipeline.deposition.drive import Drive, asked, follows
 from pipeline.deposition.extruder import draw, flow
-from pipeline.deposition.training import Noise
+from pipeline.deposition.learning.training import Noise
 from pipeline.deposition.workflow import train_ilc, trial_files, trial_video
 from pipeline.deposition.workflow.settings import Camera, Printer
 from pipeline.deposition.workflow.tables import LESSONS, TASKS

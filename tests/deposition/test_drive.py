@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeline.deposition import basis, ilc
 from pipeline.deposition.drive import UNLIMITED, Drive, asked, at_limit, follows, obeyed
 from pipeline.deposition.extruder import Extruder, backlash, flow
+from pipeline.deposition.learning import ilc
+from pipeline.deposition.parts import basis
 from tests.deposition.trained import AREA, TS
 
 DRIVE = Drive(10.0, 20.0, 0.05)

@@ -10,9 +10,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.deposition import extrusion, gcode, leads, motion
-from pipeline.deposition.conformance import Refused
-from pipeline.deposition.gcode import Kind
+from pipeline.deposition.parts import extrusion, leads
+from pipeline.deposition.parts.conformance import Refused
+from pipeline.deposition.toolpath import gcode, motion
+from pipeline.deposition.toolpath.gcode import Kind
 from pipeline.deposition.workflow import compose_parts, exports, part_motion, part_programs
 from pipeline.deposition.workflow.settings import ComposeParts, Printer
 from pipeline.store import params

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.deposition.bead import area, measure
-from pipeline.deposition.edges import BLOCK
+from pipeline.deposition.camera.bead import area, measure
+from pipeline.deposition.camera.edges import BLOCK
+from pipeline.deposition.camera.flow import Sections, View, deposit_share, estimate, sections
+from pipeline.deposition.camera.rendering import HARD, NOMINAL, Camera
 from pipeline.deposition.extruder import draw, flow, routine
-from pipeline.deposition.flow import Sections, View, deposit_share, estimate, sections
-from pipeline.deposition.rendering import HARD, NOMINAL, Camera
 
 AREA, SPEED = float(area(0.88, 90.0)), 8.0
 NOMINAL_FLOW = AREA * SPEED

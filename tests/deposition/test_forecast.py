@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter1d
 
-from pipeline.deposition import forecast
-from pipeline.deposition.composition import learn
 from pipeline.deposition.extruder import flow
-from pipeline.deposition.forecast import BINS, CORNER, OFF, START, STEADY, STOP
+from pipeline.deposition.parts import forecast
+from pipeline.deposition.parts.composition import learn
+from pipeline.deposition.parts.forecast import BINS, CORNER, OFF, START, STEADY, STOP
 from tests.deposition.trained import PLANT, TS, learned, protocol, trainings
 from tests.foreign import parts as foreign_parts
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.deposition import gcode, gcode_words
-from pipeline.deposition.gcode import Kind, parse
+from pipeline.deposition.toolpath import gcode, gcode_words
+from pipeline.deposition.toolpath.gcode import Kind, parse
 
 PARTS = Path(__file__).parents[2] / "datasets" / "parts"
 

@@ -4,8 +4,9 @@ accounted for, lengths to 1e-6, volumes by E to 1e-3."""
 import numpy as np
 import pytest
 
-from pipeline.deposition import extrusion, gcode_words
-from pipeline.deposition.gcode import Kind, parse
+from pipeline.deposition.parts import extrusion
+from pipeline.deposition.toolpath import gcode_words
+from pipeline.deposition.toolpath.gcode import Kind, parse
 from tests.deposition.dialects import DIALECTS, made
 from tests.deposition.reprap_reader import Reader
 

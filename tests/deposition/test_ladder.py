@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.deposition import ladder
+from pipeline.deposition.camera import ladder
 from tests.foreign.camera import Eye, Stage, tip_of
 
 WIDTHS = (0.5, 0.8, 1.1)

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.deposition import latency
+from pipeline.deposition.camera import latency
+from pipeline.deposition.camera.latency import Gantry, Latency
 from pipeline.deposition.extruder import Extruder, flow, routine
-from pipeline.deposition.latency import Gantry, Latency
 from tests.foreign.camera import GROUNDS, Eye, trial
 
 EYE = Eye(height=120, width=240, mm_per_px=0.02)

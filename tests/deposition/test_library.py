@@ -4,8 +4,8 @@ changes, the nearest of what is lacking, and refusals."""
 import numpy as np
 import pytest
 
-from pipeline.deposition.basis import compose
-from pipeline.deposition.library import Training, build, check, demarcate, learned, nearest, segment
+from pipeline.deposition.parts.basis import compose
+from pipeline.deposition.parts.library import Training, build, check, demarcate, learned, nearest, segment
 from tests.deposition.trained import AREA, NOZZLE, PLANT, TS, protocol, trainings
 
 

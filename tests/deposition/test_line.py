@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.deposition import bead, line
+from pipeline.deposition.camera import bead, line
 from tests.foreign.camera import GROUNDS, Eye, Stage, tip_of
 
 EYE = Eye(height=240, width=320, mm_per_px=0.016)

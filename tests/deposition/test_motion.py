@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.deposition import motion
-from pipeline.deposition.gcode import Kind, parse
+from pipeline.deposition.toolpath import motion
+from pipeline.deposition.toolpath.gcode import Kind, parse
 
 LIMITS = {
     "acceleration": 500.0,

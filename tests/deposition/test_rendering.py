@@ -4,9 +4,9 @@ conserved, and the same seed gives the same bytes."""
 import numpy as np
 import pytest
 
-from pipeline.deposition.bead import area
-from pipeline.deposition.flow import View
-from pipeline.deposition.rendering import HARD, NOMINAL, Camera
+from pipeline.deposition.camera.bead import area
+from pipeline.deposition.camera.flow import View
+from pipeline.deposition.camera.rendering import HARD, NOMINAL, Camera
 
 CLEAN = NOMINAL._replace(
     shading=0.0,

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.deposition import gcode
-from pipeline.deposition.motion import plan
-from pipeline.deposition.tasks import DWELL, halting, printed_lines, refuse, sequence
+from pipeline.deposition.toolpath import gcode
+from pipeline.deposition.toolpath.motion import plan
+from pipeline.deposition.toolpath.tasks import DWELL, halting, printed_lines, refuse, sequence
 from pipeline.papers.deposition import ALLOWED, forbidden
 
 PARTS = Path(__file__).parents[2] / "datasets" / "parts"

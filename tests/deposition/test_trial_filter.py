@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from pipeline.deposition.extruder import Extruder, flow, routine
-from pipeline.deposition.ilc import zero_phase
-from pipeline.deposition.trial_filter import FIRST, WEIGHTS, gain_forecasts, repeating
-from pipeline.deposition.trial_model import TrialModel
+from pipeline.deposition.learning.ilc import zero_phase
+from pipeline.deposition.learning.trial_filter import FIRST, WEIGHTS, gain_forecasts, repeating
+from pipeline.deposition.learning.trial_model import TrialModel
 
 TS = 0.02
 R = routine(

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, routine
-from pipeline.deposition.trial_model import deviations, identify, identify_with_lag, lag_delay_s
+from pipeline.deposition.learning.trial_model import deviations, identify, identify_with_lag, lag_delay_s
 
 TS = 0.02
 R = routine(

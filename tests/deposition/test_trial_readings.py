@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.deposition import bead
+from pipeline.deposition.camera import bead
 from pipeline.deposition.extruder import Extruder, flow, routine
 from pipeline.deposition.workflow import trial_files, trial_readings, trial_video
 from pipeline.deposition.workflow.settings import Camera, Printer

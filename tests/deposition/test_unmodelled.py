@@ -4,10 +4,10 @@ what it adds to the convergence test."""
 import numpy as np
 import pytest
 
-from pipeline.deposition import ilc
 from pipeline.deposition.extruder import Extruder, flow, frequency_response, routine
-from pipeline.deposition.trial_model import TrialModel
-from pipeline.deposition.unmodelled import unmodelled
+from pipeline.deposition.learning import ilc
+from pipeline.deposition.learning.trial_model import TrialModel
+from pipeline.deposition.learning.unmodelled import unmodelled
 
 TS = 0.02
 R = routine(

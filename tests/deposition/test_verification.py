@@ -6,13 +6,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.deposition import basis, forecast, gcode, verification
-from pipeline.deposition.composition import learn
 from pipeline.deposition.drive import UNLIMITED, Drive, follows
 from pipeline.deposition.extruder import flow
-from pipeline.deposition.forecast import NAMES
-from pipeline.deposition.motion import plan
-from pipeline.deposition.tasks import printed_lines
+from pipeline.deposition.parts import basis, forecast, verification
+from pipeline.deposition.parts.composition import learn
+from pipeline.deposition.parts.forecast import NAMES
+from pipeline.deposition.toolpath import gcode
+from pipeline.deposition.toolpath.motion import plan
+from pipeline.deposition.toolpath.tasks import printed_lines
 from pipeline.deposition.workflow import verify_part
 from tests.deposition.test_composition import MACHINE, composed, of_part
 from tests.deposition.trained import AREA, NOMINAL, PLANT, TS, learned, percent_of_on_off

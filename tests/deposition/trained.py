@@ -5,11 +5,11 @@ import functools
 
 import numpy as np
 
-from pipeline.deposition import ilc
-from pipeline.deposition.composition import Learned, learn
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, disturb, flow, routine
-from pipeline.deposition.library import Training
+from pipeline.deposition.learning import ilc
+from pipeline.deposition.parts.composition import Learned, learn
+from pipeline.deposition.parts.library import Training
 
 TS, AREA, NOZZLE, RAMP = 0.02, 0.304, 0.6, 0.15
 NOMINAL = Extruder(1.08, 2.7)

@@ -1,5 +1,5 @@
-"""A camera beside the nozzle that shares no code with pipeline/deposition/rendering.py: a printed stage,
-drawn once, of which each frame is one affine view, turned, mirrored and late as the camera is.
+"""A camera beside the nozzle that shares no code with pipeline/deposition/camera/rendering.py: a printed
+stage, drawn once, of which each frame is one affine view, turned, mirrored and late as the camera is.
 
 Beads are dark or light, with a specular line and a shadow at one edge that makes them look wider; the ground
 is plain, striped, grained, or lit from one side.

@@ -3,9 +3,9 @@
 import numpy as np
 import scipy.optimize
 
-from pipeline.deposition import ilc
 from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
 from pipeline.deposition.extruder import Extruder, routine
+from pipeline.deposition.learning import ilc
 from tests.foreign.extruders import CHANGING, STATIC, ForeignExtruder, drawn, flow, seen
 
 TS, AREA, SPEED, TRIALS, RISE = 0.02, 0.304, 8.0, 30, 0.1

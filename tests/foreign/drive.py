@@ -13,7 +13,7 @@ import scipy.signal
 
 from pipeline.deposition import reachable
 from pipeline.deposition.drive import Drive, obeyed
-from pipeline.deposition.ilc import rms
+from pipeline.deposition.learning.ilc import rms
 from tests.foreign.extruders import STEP_S, ForeignExtruder, flow
 
 # Gauss-Newton steps of a plant that is not linear

@@ -1,5 +1,6 @@
-"""Pictures of a nozzle camera that shares no code with pipeline/setpoint/nozzle_scene.py: a colour camera
-looks at a metal nozzle, its fresh bead drawn as shaded pieces that wobble, and a ground of older lines.
+"""Pictures of a nozzle camera that shares no code with pipeline/setpoint/frames/nozzle_scene.py: a colour
+camera looks at a metal nozzle, its fresh bead drawn as shaded pieces that wobble, and a ground of older
+lines.
 
 A folder of them with its CSV is what an owner has, in the columns of the public CAXTON data.
 """

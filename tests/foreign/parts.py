@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.deposition import ilc
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, routine
-from pipeline.deposition.library import Training
+from pipeline.deposition.learning import ilc
+from pipeline.deposition.parts.library import Training
 from tests.foreign import extruders
 from tests.foreign.extruders import STEP_S, ForeignExtruder
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.setpoint import familiar, key_area, nozzle_scene
+from pipeline.setpoint.frames import familiar, key_area, nozzle_scene
 
 DATA = Path(__file__).parents[2] / os.environ.get("BEADLINE_SHARED", "../shared") / "data"
 LEAST = 10.0

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
-from pipeline.setpoint import actuation
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
-from pipeline.setpoint.recorded import WindowTable
-from pipeline.setpoint.simulator import Controller, Observation
+from pipeline.setpoint.simulation import actuation
+from pipeline.setpoint.simulation.recorded import WindowTable
+from pipeline.setpoint.simulation.simulator import Controller, Observation
 
 DECISIONS, WINDOW_S, HEATER_S = 200, 1.0, 15.0
 LIMITS = actuation.Limits(

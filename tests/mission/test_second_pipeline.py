@@ -51,7 +51,7 @@ def stale(folder, stage):
 def test_an_edited_method_starts_no_stage_of_the_papers_from_the_root(clone):
     assert not dvc(clone, "commit", "-q", "-f", f"{PAPERS}:deposition")
     assert not stale(clone, "deposition")
-    method = clone / "pipeline/deposition/ilc.py"
+    method = clone / "pipeline/deposition/learning/ilc.py"
     method.write_text(method.read_text() + "\n# another method\n")
     assert stale(clone, "deposition")
     planned = dvc(clone, "repro", "--dry", "--keep-going")

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.deposition import ilc
-from pipeline.deposition.composition import Learned, PartSettings, compose, learn, priority
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, Routine, disturb, flow, frequency_response, routine
-from pipeline.deposition.gcode import parse
-from pipeline.deposition.library import TASKS, Training
-from pipeline.deposition.motion import plan
+from pipeline.deposition.learning import ilc
+from pipeline.deposition.parts.composition import Learned, PartSettings, compose, learn, priority
+from pipeline.deposition.parts.library import TASKS, Training
+from pipeline.deposition.toolpath.gcode import parse
+from pipeline.deposition.toolpath.motion import plan
 
 ROOT = Path(__file__).resolve().parents[2]
 # table I and equation (2) of the paper

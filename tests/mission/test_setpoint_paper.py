@@ -8,9 +8,9 @@ import jax
 import numpy as np
 import pytest
 
-from pipeline.setpoint.agent import QNetwork
+from pipeline.setpoint.agents.agent import QNetwork
 from pipeline.setpoint.published import PHASES, ROTATION
-from pipeline.setpoint.vision_transformer import PAPER, parameters, vision_transformer
+from pipeline.setpoint.vision.vision_transformer import PAPER, parameters, vision_transformer
 from pipeline.setpoint.workflow.settings import TrainAgent
 from pipeline.store import params
 

@@ -4,7 +4,7 @@ out of focus; and nothing where nothing changed."""
 import numpy as np
 import pytest
 
-from pipeline.deposition import rendering
+from pipeline.deposition.camera import rendering
 from pipeline.nightly import camera_drift
 
 LIMITS = {"moved_px": 2.0, "contrast_percent": 15.0}

@@ -15,7 +15,8 @@ from pipeline.report.nightly.production import Champion, ChampionState, Installe
 from pipeline.report.nightly.record import Night
 from pipeline.setpoint.workflow import tables
 from pipeline.store import artifacts, params
-from pipeline.temperature import plant, window
+from pipeline.temperature import plant
+from pipeline.temperature.controllers import window
 from pipeline.temperature.plant import baam, simulate
 from pipeline.temperature.workflow.contestants import CONTESTANTS
 from tests.nightly import shifts_recorded as nights

@@ -14,7 +14,8 @@ from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly
 from pipeline.report.shared.night import Alarm
 from pipeline.store import artifacts, params
-from pipeline.temperature import identification, plant
+from pipeline.temperature import plant
+from pipeline.temperature.identification import model_choice as identification
 from tests.mcap_writing import Written
 from tests.nightly import shifts_recorded as nights
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.deposition import extrusion, gcode
+from pipeline.deposition.parts import extrusion
+from pipeline.deposition.toolpath import gcode
 from pipeline.deposition.workflow import part_programs, tables
 from pipeline.deposition.workflow.settings import Printer
 from pipeline.deposition.workflow.tables import SIGNALS

@@ -363,7 +363,13 @@ def test_a_signal_of_another_schema_is_shown_as_failed_not_read(project):
 
 
 def test_a_page_needs_no_simulator_and_starts_fast():
-    heavy = ("jax", "equinox", "scipy.stats", "pipeline.setpoint.simulator", "pipeline.temperature.plant")
+    heavy = (
+        "jax",
+        "equinox",
+        "scipy.stats",
+        "pipeline.setpoint.simulation.simulator",
+        "pipeline.temperature.plant",
+    )
     said = (
         "import sys, stages.report, pipeline.report.nightly.page, pipeline.report.runs.commits; "
         f"print([name for name in {heavy!r} if name in sys.modules])"

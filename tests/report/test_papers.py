@@ -20,7 +20,7 @@ from pipeline.setpoint.workflow import train_agent
 from pipeline.setpoint.workflow.settings import TrainAgent
 from pipeline.store import params
 from pipeline.temperature import published
-from pipeline.temperature.kernel import exact_gains
+from pipeline.temperature.controllers.kernel import exact_gains
 from pipeline.temperature.plant import baam
 from pipeline.temperature.tracking import gains
 from pipeline.temperature.workflow.record import read_published

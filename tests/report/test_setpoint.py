@@ -13,7 +13,7 @@ from pipeline.report.setpoint import verdict as setpoint_verdict
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.shared.verdict import Figure, Question
-from pipeline.setpoint.simulator import reward
+from pipeline.setpoint.simulation.simulator import reward
 from pipeline.setpoint.workflow.tables import PATHS, harm_bar
 from pipeline.store import artifacts, params
 from stages.report import main

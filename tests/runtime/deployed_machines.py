@@ -8,12 +8,13 @@ import scipy.linalg
 from pipeline.runtime import supervisor
 from pipeline.runtime.certificate import RULES, VERSION, Certificate, RuleResult
 from pipeline.runtime.machine import Exported, Machine, Signal, controller_sha256, plants_sha256
-from pipeline.temperature import baseline, printer_pid, tracking
-from pipeline.temperature.controller import Deployed, compact, deployed
-from pipeline.temperature.governor import Governor, Limits, OutputLimits, Strength, governor
+from pipeline.temperature import tracking
+from pipeline.temperature.controllers import baseline, printer_pid
+from pipeline.temperature.controllers.controller import Deployed, compact, deployed
+from pipeline.temperature.controllers.governor import Governor, Limits, OutputLimits, Strength, governor
+from pipeline.temperature.controllers.window import controller, learn
 from pipeline.temperature.plant import Plant, baam, plant
 from pipeline.temperature.tracking import Law, still_law
-from pipeline.temperature.window import controller, learn
 
 INTEGRAL_LIMIT = 1.0
 NOISE = 0.1

@@ -9,8 +9,9 @@ from pipeline.runtime import bands, certificate, machine
 from pipeline.runtime.certificate import Record, Rules, from_json, sha256, to_json
 from pipeline.runtime.certify import certify
 from pipeline.runtime.machine import Exported, Machine, Signal, plants_sha256
-from pipeline.temperature import controller, kernel, plant, tracking, window
-from pipeline.temperature.governor import Limits
+from pipeline.temperature import plant, tracking
+from pipeline.temperature.controllers import controller, kernel, window
+from pipeline.temperature.controllers.governor import Limits
 from pipeline.temperature.plant import Plant, hold_output, simulate
 
 REFERENCE = np.array([180.0, 170.0])

@@ -23,7 +23,7 @@ from pipeline.runtime.export.vectors import TOLERANCE
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.supervisor import KINDS, MODES, Supervised
 from pipeline.temperature import tracking
-from pipeline.temperature.controller import ramp
+from pipeline.temperature.controllers.controller import ramp
 from pipeline.temperature.plant import Plant, hold_output
 from tests.runtime.deployed_machines import LAWS, block_and_sensor, exported, limits_of, passed, refused
 

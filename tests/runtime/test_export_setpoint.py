@@ -10,13 +10,14 @@ import pytest
 
 from pipeline.runtime.export import agent_reader, flow_filter, flow_reader, setpoint
 from pipeline.runtime.workflow import export_setpoint, exports
-from pipeline.setpoint import agent, bayes, belief_agent, classifier, window_flow
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
-from pipeline.setpoint.calibration import Calibration, Familiar
+from pipeline.setpoint.agents import agent, bayes, belief_agent
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
-from pipeline.setpoint.simulator import TEMPERATURE_LIMITS, Observation
-from pipeline.setpoint.vision_transformer import SMALL, convolutional, vision_transformer
-from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
+from pipeline.setpoint.simulation.simulator import TEMPERATURE_LIMITS, Observation
+from pipeline.setpoint.vision import classifier, window_flow
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
+from pipeline.setpoint.vision.calibration import Calibration, Familiar
+from pipeline.setpoint.vision.vision_transformer import SMALL, convolutional, vision_transformer
+from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.setpoint.workflow.agent_files import Agents
 from pipeline.setpoint.workflow.contestants import ControllerSpec
 from pipeline.store import artifacts

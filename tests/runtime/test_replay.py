@@ -7,11 +7,13 @@ import pytest
 
 from pipeline.runtime import replay, support
 from pipeline.runtime.replay import Log
-from pipeline.temperature import baseline, controller, governor, panel, tracking, window
-from pipeline.temperature.controller import Deployed, RunningController, compact, deployed
-from pipeline.temperature.governor import Limits
+from pipeline.temperature import tracking
+from pipeline.temperature.controllers import baseline, controller, governor, window
+from pipeline.temperature.controllers.controller import Deployed, RunningController, compact, deployed
+from pipeline.temperature.controllers.governor import Limits
 from pipeline.temperature.plant import Plant, baam
 from pipeline.temperature.study import data_sets
+from pipeline.temperature.test_set import panel
 
 LIMITS = Limits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
 SLOW = LIMITS._replace(rate=np.full(7, 4.0))

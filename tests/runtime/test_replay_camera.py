@@ -15,11 +15,12 @@ from mcap.reader import make_reader
 from pipeline import cli
 from pipeline.runtime.export import setpoint
 from pipeline.runtime.workflow import replay_camera
-from pipeline.setpoint import bayes, belief_agent, nozzle_scene
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
-from pipeline.setpoint.calibration import Calibration, Familiar
-from pipeline.setpoint.vision_transformer import SMALL, vision_transformer
-from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
+from pipeline.setpoint.agents import bayes, belief_agent
+from pipeline.setpoint.frames import nozzle_scene
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
+from pipeline.setpoint.vision.calibration import Calibration, Familiar
+from pipeline.setpoint.vision.vision_transformer import SMALL, vision_transformer
+from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.setpoint.workflow.agent_files import Agents
 from pipeline.setpoint.workflow.frame_mcap import Topics
 from pipeline.setpoint.workflow.shadow import deploy

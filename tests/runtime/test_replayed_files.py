@@ -16,7 +16,7 @@ from pipeline.runtime import machine, support
 from pipeline.runtime.replay import Log
 from pipeline.runtime.workflow import replay
 from pipeline.store import artifacts
-from pipeline.temperature import panel
+from pipeline.temperature.test_set import panel
 from tests.runtime.deployed_machines import block_and_sensor, exported, passed
 
 T = 400

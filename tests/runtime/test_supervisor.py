@@ -7,10 +7,10 @@ import pytest
 from pipeline.runtime import innovations, supervisor
 from pipeline.runtime.machine import Exported, Machine, Signal
 from pipeline.runtime.supervisor import SAFE, Supervised, supervision
-from pipeline.temperature import baseline, controller
-from pipeline.temperature.governor import Limits
-from pipeline.temperature.panel import delayed
+from pipeline.temperature.controllers import baseline, controller
+from pipeline.temperature.controllers.governor import Limits
 from pipeline.temperature.plant import plant
+from pipeline.temperature.test_set.panel import delayed
 
 LOW, HIGH = np.zeros(2), np.full(2, 100.0)
 NOISE, ROOM, R = 0.1, 20.0, np.array([150.0, 180.0])

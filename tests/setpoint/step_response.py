@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pipeline.setpoint import pixels
-from pipeline.setpoint.pixels import Machine
+from pipeline.setpoint.deployment import pixels
+from pipeline.setpoint.deployment.pixels import Machine
 
 
 def step_response(

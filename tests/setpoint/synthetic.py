@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.setpoint.recorded import WindowTable, class_shares
+from pipeline.setpoint.simulation.recorded import WindowTable, class_shares
 
 
 def synthetic_table(rng: np.random.Generator, *, segments: int, windows: int) -> WindowTable:

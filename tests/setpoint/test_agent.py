@@ -7,8 +7,8 @@ import optax
 import pytest
 from jax.tree_util import Partial
 
-from pipeline.setpoint import bayes, belief_agent, simulator
-from pipeline.setpoint.agent import (
+from pipeline.setpoint.agents import bayes, belief_agent
+from pipeline.setpoint.agents.agent import (
     DqnProblem,
     DqnSettings,
     EnvSpec,
@@ -32,8 +32,9 @@ from pipeline.setpoint.agent import (
     weights,
     with_weights,
 )
-from pipeline.setpoint.judging import evaluate, starts
-from pipeline.setpoint.simulator import STAND, Observation, begin, nominal, paper_windows
+from pipeline.setpoint.agents.judging import evaluate, starts
+from pipeline.setpoint.simulation import simulator
+from pipeline.setpoint.simulation.simulator import STAND, Observation, begin, nominal, paper_windows
 from tests.setpoint.synthetic import synthetic_table
 
 SMALL = DqnSettings(gamma=0.99, tau=0.005, batch=64, capacity=512, environments=8, episode=100)

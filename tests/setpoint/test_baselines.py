@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from pipeline.setpoint import agent, bayes, camera_watch, judging
-from pipeline.setpoint.baselines import (
+from pipeline.setpoint.agents import agent, bayes, camera_watch, judging
+from pipeline.setpoint.agents.baselines import (
     Proportional,
     SequentialTest,
     nearest,
@@ -21,8 +21,8 @@ from pipeline.setpoint.baselines import (
     temperature_move,
 )
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
-from pipeline.setpoint.recorded import recorded_windows
-from pipeline.setpoint.simulator import FLOW_LIMITS, STAND, Observation, nominal, paper_windows
+from pipeline.setpoint.simulation.recorded import recorded_windows
+from pipeline.setpoint.simulation.simulator import FLOW_LIMITS, STAND, Observation, nominal, paper_windows
 from tests.setpoint.synthetic import synthetic_flow_table, synthetic_table
 
 KEY = jax.random.key(0)

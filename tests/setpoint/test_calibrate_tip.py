@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.setpoint import key_area
+from pipeline.setpoint.frames import key_area
 from tests.nozzle_folders import LEAST, expected, scenes
 from tests.report.conftest import expect
 from tests.setpoint.test_frame_mcap import film, foreign

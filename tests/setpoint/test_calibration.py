@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import scipy.special
 
-from pipeline.setpoint import calibrated_classifier, calibration
-from pipeline.setpoint.calibration import (
+from pipeline.setpoint.vision import calibrated_classifier, calibration
+from pipeline.setpoint.vision.calibration import (
     ClassifierOutputs,
     Familiar,
     Promise,
@@ -38,7 +38,7 @@ from pipeline.setpoint.calibration import (
     window_probabilities,
     windows,
 )
-from pipeline.setpoint.window_flow import KNOTS_PERCENT, WindowFlow, class_probabilities
+from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, WindowFlow, class_probabilities
 from pipeline.statistics import wilson
 
 

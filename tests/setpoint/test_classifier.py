@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pipeline.setpoint import classifier
-from pipeline.setpoint.classifier import (
+from pipeline.setpoint.vision import classifier
+from pipeline.setpoint.vision.classifier import (
     Labelled,
     Rates,
     TrainingSettings,
@@ -24,7 +24,7 @@ from pipeline.setpoint.classifier import (
     train,
     untrained,
 )
-from pipeline.setpoint.vision_transformer import (
+from pipeline.setpoint.vision.vision_transformer import (
     PAPER,
     SMALL,
     Block,

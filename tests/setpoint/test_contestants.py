@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint import baselines, judging
-from pipeline.setpoint.agent import QNetwork
-from pipeline.setpoint.simulator import paper_windows
+from pipeline.setpoint.agents import baselines, judging
+from pipeline.setpoint.agents.agent import QNetwork
+from pipeline.setpoint.simulation.simulator import paper_windows
 from pipeline.setpoint.workflow.agent_files import Agents
 from pipeline.setpoint.workflow.contestants import (
     CONTESTANTS,

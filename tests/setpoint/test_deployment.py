@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from pipeline.setpoint.actuation import (
+from pipeline.setpoint.deployment.deployment import camera_seen, judge_window, why
+from pipeline.setpoint.simulation.actuation import (
     ACTS,
     AMBIGUOUS,
     FEW,
@@ -27,8 +28,7 @@ from pipeline.setpoint.actuation import (
     still,
     wait_after,
 )
-from pipeline.setpoint.deployment import camera_seen, judge_window, why
-from pipeline.setpoint.simulator import Action, Controller
+from pipeline.setpoint.simulation.simulator import Action, Controller
 
 RULES = {"least_frames": 8, "correlation": 0.45, "foreign_above": 5.0, "conformal_level": 0.2}
 LIMITS = Limits(

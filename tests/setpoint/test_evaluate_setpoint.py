@@ -5,8 +5,8 @@ import collections
 import numpy as np
 import pytest
 
-from pipeline.setpoint import baselines, judging
-from pipeline.setpoint.judging import Choice
+from pipeline.setpoint.agents import baselines, judging
+from pipeline.setpoint.agents.judging import Choice
 from pipeline.setpoint.score import Outcomes
 from pipeline.setpoint.workflow import evaluate_setpoint
 from pipeline.setpoint.workflow.contestants import CONTESTANTS, ControllerSpec, Problem, controllers

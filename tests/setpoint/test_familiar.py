@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.setpoint import familiar, key_area, nozzle_scene
+from pipeline.setpoint.frames import familiar, key_area, nozzle_scene
 from tests.foreign import pictures as foreign_pictures
 
 ALARMS = 0.02

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.setpoint import key_area
+from pipeline.setpoint.frames import key_area
 from pipeline.setpoint.workflow import frame_images
 from pipeline.setpoint.workflow.frame_csv import read_log, stretches
 from pipeline.setpoint.workflow.frame_folder import figures

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.reading.recordings import inspect
 from pipeline.reading.signals import Source
-from pipeline.setpoint import key_area
+from pipeline.setpoint.frames import key_area
 from pipeline.setpoint.workflow.frame_folder import figures
 from pipeline.setpoint.workflow.frame_mcap import UNITS, Topics, middle_frame, open_film
 from pipeline.store.mcap_frames import tables_of, write_frames

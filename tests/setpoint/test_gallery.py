@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.setpoint import calibrated_classifier, familiar
+from pipeline.setpoint.frames import familiar
+from pipeline.setpoint.vision import calibrated_classifier
 from pipeline.setpoint.workflow import camera_files, frame_folder, gallery, known_camera
 from tests.nozzle_folders import ANY, FLOWS, LEAST, SHOTS, folder, read, rows, scenes
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pipeline.setpoint import baselines, judging
-from pipeline.setpoint.judging import (
+from pipeline.setpoint.agents import baselines, judging
+from pipeline.setpoint.agents.judging import (
     DOES_NOTHING,
     START_FLOWS,
     START_TEMPERATURES,
@@ -19,9 +19,9 @@ from pipeline.setpoint.judging import (
     starts,
     still_in,
 )
-from pipeline.setpoint.recorded import recorded_windows
 from pipeline.setpoint.score import judge, outcomes, summary
-from pipeline.setpoint.simulator import STAND, Action, Controller, nominal
+from pipeline.setpoint.simulation.recorded import recorded_windows
+from pipeline.setpoint.simulation.simulator import STAND, Action, Controller, nominal
 from pipeline.statistics import effective_runs, redrawn_mean, redrawn_share, shared_variance, wilson
 from tests.setpoint.synthetic import synthetic_flow_table, synthetic_table
 

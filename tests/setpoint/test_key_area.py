@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.setpoint import key_area, nozzle_scene
+from pipeline.setpoint.frames import key_area, nozzle_scene
 
 LEAST = 10.0
 # tips (x, y) of the real full frames, clicked by hand

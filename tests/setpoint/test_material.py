@@ -4,8 +4,10 @@ import numpy as np
 import pydantic
 import pytest
 
-from pipeline.setpoint import nozzle_scene, published, simulator
+from pipeline.setpoint import published
+from pipeline.setpoint.frames import nozzle_scene
 from pipeline.setpoint.material import PLA, Material
+from pipeline.setpoint.simulation import simulator
 from pipeline.setpoint.workflow import frame_folder
 from pipeline.setpoint.workflow.settings import SetpointMaterial
 from pipeline.store.params import Execution

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.setpoint import nozzle_scene, yardsticks
-from pipeline.setpoint.key_area import find
+from pipeline.setpoint.frames import nozzle_scene
+from pipeline.setpoint.frames.key_area import find
+from pipeline.setpoint.vision import yardsticks
 
 LEAST = 10.0
 

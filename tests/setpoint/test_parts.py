@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.setpoint import nozzle_scene
+from pipeline.setpoint.frames import nozzle_scene
 from pipeline.setpoint.workflow import parts
 from pipeline.setpoint.workflow.render_frames import PARTS, LabelledFrames
 from pipeline.setpoint.workflow.settings import TrainClassifier

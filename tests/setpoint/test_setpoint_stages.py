@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.setpoint import nozzle_scene
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, classify
-from pipeline.setpoint.calibration import Calibration, Familiar
-from pipeline.setpoint.recorded import WindowTable
-from pipeline.setpoint.vision_transformer import SMALL as SMALL_SIZE
-from pipeline.setpoint.vision_transformer import named_arrays, vision_transformer
-from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
+from pipeline.setpoint.frames import nozzle_scene
+from pipeline.setpoint.simulation.recorded import WindowTable
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, classify
+from pipeline.setpoint.vision.calibration import Calibration, Familiar
+from pipeline.setpoint.vision.vision_transformer import SMALL as SMALL_SIZE
+from pipeline.setpoint.vision.vision_transformer import named_arrays, vision_transformer
+from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.setpoint.workflow import camera_files, parts, render_frames, train_agent, train_classifier
 from pipeline.setpoint.workflow.agent_files import AGENTS_SCHEMA, Agents, restore_agents, store_agents
 from pipeline.setpoint.workflow.classifier_files import (
@@ -353,8 +353,8 @@ def test_bins_of_the_flow_by_hand():
 def test_agents_survive_being_stored(project, tmp_path):
     import jax
 
-    from pipeline.setpoint.agent import QNetwork
-    from pipeline.setpoint.belief_agent import BeliefNetwork
+    from pipeline.setpoint.agents.agent import QNetwork
+    from pipeline.setpoint.agents.belief_agent import BeliefNetwork
 
     settings = params.load(TrainAgent, "train_agent").belief_dqn
     belief = train_agent.belief(settings, synthetic_table(np.random.default_rng(0), segments=3, windows=2))

@@ -20,10 +20,12 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from pipeline.setpoint import actuation, bayes, deployment
-from pipeline.setpoint.calibrated_classifier import FrameReadings
+from pipeline.setpoint.agents import bayes
+from pipeline.setpoint.deployment import deployment
 from pipeline.setpoint.material import PLA, Material
-from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration, window_flow
+from pipeline.setpoint.simulation import actuation
+from pipeline.setpoint.vision.calibrated_classifier import FrameReadings
+from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration, window_flow
 from pipeline.setpoint.workflow import decision_log, shadow, watch_sources
 from pipeline.setpoint.workflow.shadow.decide import Asked, Deployed
 from pipeline.setpoint.workflow.shadow.windows import Windows

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from pipeline.setpoint.actuation import ACTS, FEW, STILL
-from pipeline.setpoint.recorded import WindowTable, recorded_windows
-from pipeline.setpoint.simulator import (
+from pipeline.setpoint.simulation.actuation import ACTS, FEW, STILL
+from pipeline.setpoint.simulation.recorded import WindowTable, recorded_windows
+from pipeline.setpoint.simulation.simulator import (
     CHANCES,
     FLOW_MOVES,
     TEMPERATURE_MOVES,

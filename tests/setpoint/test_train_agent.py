@@ -5,9 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pipeline.setpoint import agent
-from pipeline.setpoint.agent import Published, QNetwork
-from pipeline.setpoint.simulator import Action, Controller, Trajectory, nominal, paper_windows, rollout
+from pipeline.setpoint.agents import agent
+from pipeline.setpoint.agents.agent import Published, QNetwork
+from pipeline.setpoint.simulation.simulator import (
+    Action,
+    Controller,
+    Trajectory,
+    nominal,
+    paper_windows,
+    rollout,
+)
 from pipeline.setpoint.workflow import train_agent
 from pipeline.setpoint.workflow.settings import TrainAgent
 from pipeline.store import params

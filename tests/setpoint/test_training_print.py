@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pipeline import cli
-from pipeline.deposition import gcode
-from pipeline.deposition.gcode import Kind
+from pipeline.deposition.toolpath import gcode
+from pipeline.deposition.toolpath.gcode import Kind
 from pipeline.setpoint.workflow.frame_csv import read_log
 
 

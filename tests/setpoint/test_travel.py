@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.setpoint import key_area, nozzle_scene, travel
+from pipeline.setpoint.frames import key_area, nozzle_scene, travel
 from pipeline.setpoint.workflow.frame_images import find_key_areas
 
 N = 12

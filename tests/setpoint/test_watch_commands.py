@@ -13,14 +13,14 @@ import pytest
 from mcap.reader import make_reader
 
 from pipeline import cli
-from pipeline.setpoint import calibration
-from pipeline.setpoint.agent import QNetwork
-from pipeline.setpoint.belief_agent import BeliefNetwork
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
-from pipeline.setpoint.calibration import Calibration, Familiar
+from pipeline.setpoint.agents.agent import QNetwork
+from pipeline.setpoint.agents.belief_agent import BeliefNetwork
 from pipeline.setpoint.levels import Levels, LevelWindows
-from pipeline.setpoint.vision_transformer import SMALL, vision_transformer
-from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
+from pipeline.setpoint.vision import calibration
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
+from pipeline.setpoint.vision.calibration import Calibration, Familiar
+from pipeline.setpoint.vision.vision_transformer import SMALL, vision_transformer
+from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.setpoint.workflow import train_agent
 from pipeline.setpoint.workflow.agent_files import Agents, store_agents
 from pipeline.setpoint.workflow.camera_files import FILE, store_camera

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.setpoint.window_flow import (
+from pipeline.setpoint.vision.window_flow import (
     KNOTS_PERCENT,
     FlowCalibration,
     class_probabilities,

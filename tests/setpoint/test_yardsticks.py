@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from pipeline.setpoint import yardsticks
+from pipeline.setpoint.vision import yardsticks
 
 
 def bars(rows, rng, noise=8.0):

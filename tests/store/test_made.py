@@ -36,12 +36,12 @@ def test_a_method_that_changes_makes_its_file_old_and_no_other(copy):
     made.record("temperature")
     assert made.changed("deposition") == made.changed("temperature") == []
     assert made.sentence("deposition").endswith("the method has not changed since.")
-    method = copy / "pipeline/deposition/ilc.py"
+    method = copy / "pipeline/deposition/learning/ilc.py"
     method.write_text(method.read_text() + "\n# another method\n")
-    assert made.changed("deposition") == ["pipeline/deposition/ilc.py"]
+    assert made.changed("deposition") == ["pipeline/deposition/learning/ilc.py"]
     assert made.changed("temperature") == []
     assert (
-        "the method has changed since: pipeline/deposition/ilc.py. "
+        "the method has changed since: pipeline/deposition/learning/ilc.py. "
         "./run dvc repro datasets/papers/dvc.yaml:deposition makes it anew." in made.sentence("deposition")
     )
 
@@ -68,9 +68,11 @@ def test_the_release_check_names_what_is_older_than_its_method(copy):
         made.record(stage)
     command = ["python", ".ci/release.py"]
     assert subprocess.run(command, cwd=copy, capture_output=True).returncode == 0
-    method = copy / "pipeline/setpoint/agent.py"
+    method = copy / "pipeline/setpoint/agents/agent.py"
     method.write_text(method.read_text() + "\n")
     ended = subprocess.run(command, cwd=copy, capture_output=True, text=True)
     assert (
-        ended.returncode == 1 and "setpoint" in ended.stdout and "pipeline/setpoint/agent.py" in ended.stdout
+        ended.returncode == 1
+        and "setpoint" in ended.stdout
+        and "pipeline/setpoint/agents/agent.py" in ended.stdout
     )

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.temperature.identification.subspace import Segments
+from pipeline.temperature.identification.validation import predicted_ahead, simulated
 from pipeline.temperature.plant import Plant
-from pipeline.temperature.subspace import Segments
-from pipeline.temperature.validation import predicted_ahead, simulated
 
 
 def nrmse(y: np.ndarray, predicted: np.ndarray, *, means_removed: bool = False) -> np.ndarray:

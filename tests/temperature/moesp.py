@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.temperature.identification.refinement import fit_inputs
+from pipeline.temperature.identification.subspace import Segments, complete_runs, lagged, one_step
 from pipeline.temperature.plant import Plant, clip_spectral_radius
 from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.refinement import fit_inputs
-from pipeline.temperature.subspace import Segments, complete_runs, lagged, one_step
 
 GROWTH = (
     1e6  # a mode that grows more than this over a segment has lost the digits by which it could be fitted

@@ -1,6 +1,6 @@
 """Algorithm 2 in its published form, vectorised: Kronecker products z (x) z with every entry twice, and every
 iteration through all samples. Nothing is whitened, nothing is projected; it shares no line with
-pipeline/temperature/kernel.py, which is held against it."""
+pipeline/temperature/controllers/kernel.py, which is held against it."""
 
 import numpy as np
 import scipy.linalg

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.identification import Settings, identify
+from pipeline.temperature.identification.model_choice import Settings, identify
+from pipeline.temperature.identification.validation import bootstrap_spread, one_step_errors
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.tracking import Law
-from pipeline.temperature.validation import bootstrap_spread, one_step_errors
 
 KELVIN = 273.15
 FAMILY = 20  # plants around an identified one, as identify_plant.spread_plants

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.temperature.baseline import NOISE_SHARE, Tuning, pairing, pi_law
+from pipeline.temperature.controllers.baseline import NOISE_SHARE, Tuning, pairing, pi_law
 from pipeline.temperature.plant import baam, plant
 from pipeline.temperature.published import REFERENCE
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.temperature.closed_loop import closed_loop
-from pipeline.temperature.identification import Settings, identify
+from pipeline.temperature.identification.closed_loop import closed_loop
+from pipeline.temperature.identification.model_choice import Settings, identify
 
 
 def heater(kind, seed, T=1500):

@@ -4,7 +4,14 @@ known distributions."""
 import numpy as np
 import pytest
 
-from pipeline.temperature.comparison import banded, between, chosen, deciding_plant, mean_and_worst, pair
+from pipeline.temperature.test_set.comparison import (
+    banded,
+    between,
+    chosen,
+    deciding_plant,
+    mean_and_worst,
+    pair,
+)
 
 PLANTS, EACH = 30, 4
 PLANT = np.repeat(np.arange(PLANTS), EACH)

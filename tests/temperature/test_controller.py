@@ -8,8 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipeline.temperature import baseline, panel, study, tracking, window
-from pipeline.temperature.controller import (
+from pipeline.temperature import study, tracking
+from pipeline.temperature.controllers import baseline, window
+from pipeline.temperature.controllers.controller import (
     Deployed,
     RunningController,
     State,
@@ -24,10 +25,11 @@ from pipeline.temperature.controller import (
     sinusoid,
     watched,
 )
-from pipeline.temperature.governor import Governor, Limits, OutputLimits, governor
+from pipeline.temperature.controllers.governor import Governor, Limits, OutputLimits, governor
 from pipeline.temperature.plant import Plant, baam, hold_state
 from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.published import REFERENCE
+from pipeline.temperature.test_set import panel
 from pipeline.temperature.tracking import Law
 
 LIMITS = Limits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))

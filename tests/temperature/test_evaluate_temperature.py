@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from pipeline.store import artifacts, params
-from pipeline.temperature import comparison, window
-from pipeline.temperature.kernel import regress
+from pipeline.temperature.controllers import window
+from pipeline.temperature.controllers.kernel import regress
 from pipeline.temperature.plant import baam
 from pipeline.temperature.study import data_sets
+from pipeline.temperature.test_set import comparison
 from pipeline.temperature.workflow import cases, evaluate_temperature, learned, tables, tune_weights
 from pipeline.temperature.workflow.contestants import BY_NAME, CONTESTANTS, PAIR, Problem
 from pipeline.temperature.workflow.settings import (

@@ -9,7 +9,8 @@ import yaml
 
 from pipeline import cli
 from pipeline.store import artifacts, params
-from pipeline.temperature import baseline, experiment, forecast, tracking
+from pipeline.temperature import experiment, forecast, tracking
+from pipeline.temperature.controllers import baseline
 from pipeline.temperature.experiment import Limits, Names, Wish
 from pipeline.temperature.plant import hold_output, plant, simulate
 from pipeline.temperature.workflow import generate_probing, tables

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipeline.temperature.first_order import of_step_responses, response, simc_pid
+from pipeline.temperature.identification.first_order import of_step_responses, response, simc_pid
 
 
 def test_response_to_a_step_is_the_textbook_one_also_for_a_fraction_of_a_sample_of_delay():

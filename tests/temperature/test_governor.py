@@ -6,9 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipeline.temperature import baseline, panel, tracking
-from pipeline.temperature.controller import Deployed, deployed
-from pipeline.temperature.governor import (
+from pipeline.temperature import tracking
+from pipeline.temperature.controllers import baseline
+from pipeline.temperature.controllers.controller import Deployed, deployed
+from pipeline.temperature.controllers.governor import (
     Governor,
     Limits,
     OutputLimits,
@@ -25,6 +26,7 @@ from pipeline.temperature.governor import (
 from pipeline.temperature.plant import Plant, baam
 from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.published import REFERENCE
+from pipeline.temperature.test_set import panel
 
 LIMITS = Limits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
 SPREAD = panel.Spread(input_gain=0.15, slower=0.2, extra_heat_loss=0.005, delayed=0.5, ambient_degC=8.0)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from pipeline.temperature import governor as governing
 from pipeline.temperature import tracking
-from pipeline.temperature.controller import RunningController, deployed
-from pipeline.temperature.governor import (
+from pipeline.temperature.controllers import governor as governing
+from pipeline.temperature.controllers.controller import RunningController, deployed
+from pipeline.temperature.controllers.governor import (
     Governor,
     Limits,
     OutputLimits,

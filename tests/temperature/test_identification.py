@@ -3,8 +3,8 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.temperature.identification import Settings, identify, refit, within_limits
-from pipeline.temperature.order import (
+from pipeline.temperature.identification.model_choice import Settings, identify, refit, within_limits
+from pipeline.temperature.identification.order import (
     Candidate,
     Structure,
     dead_time,
@@ -13,10 +13,7 @@ from pipeline.temperature.order import (
     with_delays,
     worth_refining,
 )
-from pipeline.temperature.plant import baam, markov_parameters, plant, simulate
-from pipeline.temperature.probing import study_probe, study_signal
-from pipeline.temperature.published import K_DATA
-from pipeline.temperature.refinement import (
+from pipeline.temperature.identification.refinement import (
     FitSettings,
     estimate_state,
     kalman_gain,
@@ -24,8 +21,11 @@ from pipeline.temperature.refinement import (
     refine,
     simulation_form,
 )
-from pipeline.temperature.subspace import lagged
-from pipeline.temperature.validation import simulated
+from pipeline.temperature.identification.subspace import lagged
+from pipeline.temperature.identification.validation import simulated
+from pipeline.temperature.plant import baam, markov_parameters, plant, simulate
+from pipeline.temperature.probing import study_probe, study_signal
+from pipeline.temperature.published import K_DATA
 from tests.temperature.moesp import moesp, moesp_singular_values, varx
 
 

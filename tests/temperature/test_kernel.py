@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.temperature import kernel as kernels
-from pipeline.temperature.kernel import (
+from pipeline.temperature.controllers import kernel as kernels
+from pipeline.temperature.controllers.kernel import (
     exact_gains,
     quadratic_gram,
     reconstruction,

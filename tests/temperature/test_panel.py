@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.temperature import panel
-from pipeline.temperature.controller import Limits, constant, deployed, ramp, sinusoid
-from pipeline.temperature.panel import Allowance, Cases, Figures, Questions, Rollout, Spread
+from pipeline.temperature.controllers.controller import Limits, constant, deployed, ramp, sinusoid
 from pipeline.temperature.plant import baam, plant, simulate
 from pipeline.temperature.published import GAMMA, REFERENCE, TAU
-from pipeline.temperature.scorecard import closed_loop
+from pipeline.temperature.test_set import panel
+from pipeline.temperature.test_set.panel import Allowance, Cases, Figures, Questions, Rollout, Spread
+from pipeline.temperature.test_set.scorecard import closed_loop
 from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law, still_law
 
 SPREAD = Spread(input_gain=0.15, slower=0.2, extra_heat_loss=0.005, delayed=0.5, ambient_degC=8.0)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from pipeline.temperature import panel
-from pipeline.temperature.controller import Limits, Rest, aim, constant, deployed
+from pipeline.temperature.controllers.controller import Limits, Rest, aim, constant, deployed
+from pipeline.temperature.controllers.printer_pid import HeaterPid, controller, law
 from pipeline.temperature.plant import Plant
-from pipeline.temperature.printer_pid import HeaterPid, controller, law
-from pipeline.temperature.scorecard import closed_loop, law_response
+from pipeline.temperature.test_set import panel
+from pipeline.temperature.test_set.scorecard import closed_loop, law_response
 
 BED = HeaterPid(input=1, output=0, Kp=21.2, Ki=0.30, Kd=372.0, most_percent=100.0, smooth_s=1.0)
 HOT = HeaterPid(input=0, output=1, Kp=8.7, Ki=0.42, Kd=44.7, most_percent=100.0, smooth_s=1.0)

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.temperature import window as window_route
+from pipeline.temperature.controllers import window as window_route
 from pipeline.temperature.plant import baam, simulate
 from pipeline.temperature.probing import (
     InputLimits,

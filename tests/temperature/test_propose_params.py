@@ -11,7 +11,7 @@ import yaml
 from pipeline import cli
 from pipeline.store import artifacts, params
 from pipeline.store.params_text import replaced
-from pipeline.temperature.time_scale import time_constant
+from pipeline.temperature.test_set.time_scale import time_constant
 from pipeline.temperature.workflow import probe_machine, propose_params, tables
 from pipeline.temperature.workflow.settings import (
     GenerateProbing,

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.store import params
-from pipeline.temperature import baseline, controller, governor, panel
+from pipeline.temperature.controllers import baseline, controller, governor
 from pipeline.temperature.plant import strictly_proper
-from pipeline.temperature.scenario_defaults import steady_map
+from pipeline.temperature.test_set import panel
+from pipeline.temperature.test_set.scenario_defaults import steady_map
 from pipeline.temperature.workflow import cases
 from pipeline.temperature.workflow.settings import Panel, Tracking, TuneWeights
 from pipeline.temperature.workflow.settings import Plant as Machine

@@ -6,10 +6,10 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.temperature import baseline
-from pipeline.temperature.identification import Settings, identify
+from pipeline.temperature.controllers import baseline
+from pipeline.temperature.identification.model_choice import Settings, identify
 from pipeline.temperature.plant import plant
-from pipeline.temperature.scenario_defaults import (
+from pipeline.temperature.test_set.scenario_defaults import (
     STEPS,
     CaseDefaults,
     MachineScale,

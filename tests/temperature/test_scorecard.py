@@ -8,11 +8,12 @@ import scipy.linalg
 import scipy.signal
 
 from pipeline.temperature import judging
-from pipeline.temperature import window as window_route
-from pipeline.temperature.kernel import window_law
+from pipeline.temperature.controllers import window as window_route
+from pipeline.temperature.controllers.kernel import window_law
 from pipeline.temperature.plant import Plant, baam, plant
 from pipeline.temperature.published import GAMMA, REFERENCE, TAU
-from pipeline.temperature.scorecard import (
+from pipeline.temperature.study import data_sets
+from pipeline.temperature.test_set.scorecard import (
     Cost,
     PanelRun,
     Yardstick,
@@ -26,7 +27,6 @@ from pipeline.temperature.scorecard import (
     regret,
     simulate,
 )
-from pipeline.temperature.study import data_sets
 from pipeline.temperature.tracking import Law, aimed, gains, observer_gain, observer_law
 
 I5, I7 = np.eye(5), np.eye(7)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.temperature.drift import simulated_with_drift, tracked
-from pipeline.temperature.identification import Settings, identify
-from pipeline.temperature.validation import simulated
+from pipeline.temperature.identification.drift import simulated_with_drift, tracked
+from pipeline.temperature.identification.model_choice import Settings, identify
+from pipeline.temperature.identification.validation import simulated
 
 
 def test_the_drift_is_the_mean_over_its_warm_up_and_then_exponential_smoothing():

@@ -4,10 +4,10 @@ and records of real ones."""
 import numpy as np
 import pytest
 
-from pipeline.temperature import baseline
-from pipeline.temperature.identification import identify
+from pipeline.temperature.controllers import baseline
+from pipeline.temperature.identification.model_choice import identify
 from pipeline.temperature.plant import strictly_proper
-from pipeline.temperature.scorecard import closed_loop
+from pipeline.temperature.test_set.scorecard import closed_loop
 from pipeline.temperature.tracking import aimed, feasible_target
 from tests.temperature import small_machines
 from tests.temperature.fits import resampled

@@ -9,8 +9,9 @@ import pytest
 
 from pipeline.papers import files, reproduce_study
 from pipeline.store import made, params
-from pipeline.temperature import study, tuning
+from pipeline.temperature import study
 from pipeline.temperature.published import GAMMA, REFERENCE
+from pipeline.temperature.test_set import tuning
 from pipeline.temperature.workflow.settings import ReproduceStudy
 from tests.house import expected_of_paper
 

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from pipeline.temperature.plant import plant, simulate
-from pipeline.temperature.trust import (
+from pipeline.temperature.identification.trust import (
     dynamics_rows,
     fit_figures,
     fit_of_held_inputs,
@@ -21,7 +20,8 @@ from pipeline.temperature.trust import (
     steps,
     two_points,
 )
-from pipeline.temperature.validation import excitation, residual_tests, step_response
+from pipeline.temperature.identification.validation import excitation, residual_tests, step_response
+from pipeline.temperature.plant import plant, simulate
 from tests.temperature.fits import nrmse, predict_fit, simulate_fit
 from tests.temperature.test_validation import HEATER, innovations_record
 

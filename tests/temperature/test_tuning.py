@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime
 
-from pipeline.temperature import tuning
 from pipeline.temperature.plant import baam, plant
+from pipeline.temperature.test_set import tuning
 from pipeline.temperature.tracking import gains
 
 BAAM = baam()

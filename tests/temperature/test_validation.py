@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from pipeline.temperature.identification import Settings, identify
-from pipeline.temperature.plant import plant, simulate
-from pipeline.temperature.validation import (
+from pipeline.temperature.identification.model_choice import Settings, identify
+from pipeline.temperature.identification.validation import (
     advice,
     bootstrap_spread,
     excitation,
@@ -14,6 +13,7 @@ from pipeline.temperature.validation import (
     spread_bands,
     step_response,
 )
+from pipeline.temperature.plant import plant, simulate
 from tests.temperature.fits import nrmse, predict_fit, simulate_fit
 
 

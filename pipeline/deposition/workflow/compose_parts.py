@@ -9,10 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.deposition import composition, conformance, drive, evaluation, extrusion, gcode, motion
-from pipeline.deposition.composition import Composed, Learned, PartSettings, Stream
-from pipeline.deposition.conformance import Conformance
-from pipeline.deposition.evaluation import Judging, Score
+from pipeline.deposition import drive
+from pipeline.deposition.parts import composition, conformance, evaluation, extrusion
+from pipeline.deposition.parts.composition import Composed, Learned, PartSettings, Stream
+from pipeline.deposition.parts.conformance import Conformance
+from pipeline.deposition.parts.evaluation import Judging, Score
+from pipeline.deposition.toolpath import gcode, motion
 from pipeline.deposition.workflow import laws, part_motion, part_programs
 from pipeline.deposition.workflow.segment_library import finite_or_none
 from pipeline.deposition.workflow.settings import ComposeParts, Printer, TrainIlc

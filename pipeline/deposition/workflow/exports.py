@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.deposition import leads
-from pipeline.deposition.composition import Composed
+from pipeline.deposition.parts import leads
+from pipeline.deposition.parts.composition import Composed
 from pipeline.deposition.workflow import compose_parts
 from pipeline.deposition.workflow.compose_parts import Part
 from pipeline.deposition.workflow.tables import LINES, TASKS

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.deposition.extruder import Extruder
-from pipeline.deposition.ilc import HoelzleSettings, InverseSettings
-from pipeline.deposition.training import LawSettings, Noise
+from pipeline.deposition.learning.ilc import HoelzleSettings, InverseSettings
+from pipeline.deposition.learning.training import LawSettings, Noise
 from pipeline.deposition.workflow.settings import Printer, TrainIlc
 
 

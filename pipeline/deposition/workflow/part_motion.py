@@ -5,13 +5,15 @@ import math
 
 import numpy as np
 
-from pipeline.deposition import basis, motion, reachable
-from pipeline.deposition.composition import MARGIN_S, Learned
-from pipeline.deposition.conformance import LONGEST_RAMP_S
+from pipeline.deposition import reachable
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder
-from pipeline.deposition.gcode import Kind, Moves
+from pipeline.deposition.parts import basis
+from pipeline.deposition.parts.composition import MARGIN_S, Learned
+from pipeline.deposition.parts.conformance import LONGEST_RAMP_S
 from pipeline.deposition.reachable import LOSS
+from pipeline.deposition.toolpath import motion
+from pipeline.deposition.toolpath.gcode import Kind, Moves
 from pipeline.deposition.workflow import part_programs
 from pipeline.deposition.workflow.settings import Printer
 

@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deposition import extrusion, gcode
-from pipeline.deposition.composition import Composed
-from pipeline.deposition.conformance import Conformance
-from pipeline.deposition.extrusion import Extruded
-from pipeline.deposition.gcode_words import Refusals
-from pipeline.deposition.motion import Motion
+from pipeline.deposition.parts import extrusion
+from pipeline.deposition.parts.composition import Composed
+from pipeline.deposition.parts.conformance import Conformance
+from pipeline.deposition.parts.extrusion import Extruded
+from pipeline.deposition.toolpath import gcode
+from pipeline.deposition.toolpath.gcode_words import Refusals
+from pipeline.deposition.toolpath.motion import Motion
 from pipeline.deposition.workflow.settings import Printer
 from pipeline.reading.plain_files import check_plain_file
 from pipeline.store import artifacts

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.deposition import composition
-from pipeline.deposition.chain import Chain, Identified
-from pipeline.deposition.composition import Learned
 from pipeline.deposition.extruder import Routine
-from pipeline.deposition.forecast import Covered, Missed
-from pipeline.deposition.library import Basis, Check, Library, Training
+from pipeline.deposition.parts import composition
+from pipeline.deposition.parts.chain import Chain, Identified
+from pipeline.deposition.parts.composition import Learned
+from pipeline.deposition.parts.forecast import Covered, Missed
+from pipeline.deposition.parts.library import Basis, Check, Library, Training
 from pipeline.deposition.workflow.settings import Printer, SegmentLibrary
 from pipeline.deposition.workflow.tables import LESSONS, LIBRARY
 from pipeline.store import artifacts

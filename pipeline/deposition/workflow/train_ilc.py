@@ -9,11 +9,12 @@ import numpy as np
 from joblib import delayed
 from tqdm import tqdm
 
-from pipeline.deposition import bead, ilc, training
+from pipeline.deposition.camera import bead
 from pipeline.deposition.drive import obeyed
 from pipeline.deposition.extruder import Extruder, Routine, draw
-from pipeline.deposition.ilc import Trial
-from pipeline.deposition.training import LawSettings, Noise, TrainingCase, TrialSequence, on_off
+from pipeline.deposition.learning import ilc, training
+from pipeline.deposition.learning.ilc import Trial
+from pipeline.deposition.learning.training import LawSettings, Noise, TrainingCase, TrialSequence, on_off
 from pipeline.deposition.workflow import laws, trial_files, trial_readings, trial_video
 from pipeline.deposition.workflow.settings import Camera, Material, Printer, TrainIlc
 from pipeline.deposition.workflow.trial_video import MeasuredTrial, SimulatedMachine

@@ -13,8 +13,8 @@ import joblib
 import numpy as np
 import pyarrow as pa
 
-from pipeline.deposition import bead, latency, line
-from pipeline.deposition.latency import Gantry, Latency
+from pipeline.deposition.camera import bead, latency, line
+from pipeline.deposition.camera.latency import Gantry, Latency
 from pipeline.deposition.workflow import trial_files
 from pipeline.deposition.workflow.settings import Camera
 from pipeline.reading import image_messages

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import scipy.signal
 
-from pipeline.deposition import bead, flow, latency, rendering
+from pipeline.deposition.camera import bead, flow, latency, rendering
+from pipeline.deposition.camera.latency import Latency
 from pipeline.deposition.drive import obeyed
 from pipeline.deposition.extruder import Extruder, Routine, disturb
 from pipeline.deposition.extruder import flow as true_flow
-from pipeline.deposition.ilc import Trial
-from pipeline.deposition.latency import Latency
-from pipeline.deposition.training import Noise
+from pipeline.deposition.learning.ilc import Trial
+from pipeline.deposition.learning.training import Noise
 from pipeline.deposition.workflow import trial_files, trial_readings
 from pipeline.deposition.workflow.settings import Camera, Material, Printer, TrialTopics
 from pipeline.deposition.workflow.trial_readings import Readings

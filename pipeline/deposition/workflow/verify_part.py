@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deposition import forecast, verification
-from pipeline.deposition.composition import Composed, Learned, Material, Stream
+from pipeline.deposition.parts import forecast, verification
+from pipeline.deposition.parts.composition import Composed, Learned, Material, Stream
 from pipeline.deposition.workflow import compose_parts, exports
 from pipeline.deposition.workflow.compose_parts import Part
 from pipeline.deposition.workflow.settings import ComposeParts, Printer

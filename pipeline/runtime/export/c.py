@@ -16,10 +16,10 @@ from pipeline.runtime import innovations, supervisor
 from pipeline.runtime.certificate import Certificate, sha256
 from pipeline.runtime.export.names import identifier
 from pipeline.runtime.machine import Exported, check, check_certificate
-from pipeline.temperature import governor as governing
 from pipeline.temperature import tracking
-from pipeline.temperature.controller import Deployed, Rest, aim, constant
-from pipeline.temperature.governor import Governor
+from pipeline.temperature.controllers import governor as governing
+from pipeline.temperature.controllers.controller import Deployed, Rest, aim, constant
+from pipeline.temperature.controllers.governor import Governor
 from pipeline.temperature.plant import Plant, strictly_proper
 from pipeline.temperature.tracking import Law
 
@@ -321,7 +321,7 @@ def member_halves(family: Governor) -> dict[str, np.ndarray]:
     if not _same_form(family, halves, n, p):
         raise ValueError(
             "the governor's members should hold a state and what it lacks in equal blocks, but these do not; "
-            "make it with pipeline.temperature.governor.governor"
+            "make it with pipeline.temperature.controllers.governor.governor"
         )
     return halves
 

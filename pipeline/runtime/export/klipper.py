@@ -25,7 +25,7 @@ import scipy.optimize
 from pipeline.runtime.certificate import Certificate, sha256
 from pipeline.runtime.export import python
 from pipeline.runtime.machine import Exported, check, check_certificate
-from pipeline.temperature import baseline
+from pipeline.temperature.controllers import baseline
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
 
 MODULE = Path(__file__).parent / "templates" / "beadline.py.txt"  # for klippy/extras/

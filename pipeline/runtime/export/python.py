@@ -17,13 +17,15 @@ from pipeline.runtime.machine import Exported, check, check_certificate
 
 HOME = standalone.__name__
 ENTRIES: list[Place] = [("pipeline.runtime.supervisor", "Supervised")]
-REPLACED: dict[Place, Place] = {("pipeline.temperature.controller", "_triangular"): (HOME, "_triangular")}
+REPLACED: dict[Place, Place] = {
+    ("pipeline.temperature.controllers.controller", "_triangular"): (HOME, "_triangular")
+}
 ORDER = [
     "pipeline.temperature.plant",
     "pipeline.temperature.tracking",
     HOME,
-    "pipeline.temperature.governor",
-    "pipeline.temperature.controller",
+    "pipeline.temperature.controllers.governor",
+    "pipeline.temperature.controllers.controller",
     "pipeline.runtime.innovations",
     "pipeline.runtime.supervisor",
     "pipeline.runtime.machine",

@@ -9,9 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.runtime.export import agent_reader, flow_filter, flow_reader
-from pipeline.setpoint import agent, bayes, belief_agent
-from pipeline.setpoint.belief_agent import Belief, BeliefNetwork
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
+from pipeline.setpoint.agents import agent, bayes, belief_agent
+from pipeline.setpoint.agents.belief_agent import Belief, BeliefNetwork
 from pipeline.setpoint.published import (
     BEST_TEMPERATURE,
     DELTA,
@@ -21,9 +20,10 @@ from pipeline.setpoint.published import (
     ROTATION,
     TEMPERATURE_MOVES,
 )
-from pipeline.setpoint.simulator import GOOD_BORDERS, STAND, TEMPERATURE_LIMITS
-from pipeline.setpoint.vision_transformer import VisionTransformer, named_arrays
-from pipeline.setpoint.window_flow import KNOTS_PERCENT
+from pipeline.setpoint.simulation.simulator import GOOD_BORDERS, STAND, TEMPERATURE_LIMITS
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
+from pipeline.setpoint.vision.vision_transformer import VisionTransformer, named_arrays
+from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT
 from pipeline.store import artifacts
 
 CLASSIFIER_SCHEMA, FILTER_SCHEMA, AGENT_SCHEMA = "flow classifier 1", "flow filter 1", "belief agent 1"

@@ -18,8 +18,9 @@ from pipeline.runtime.replay import Log
 from pipeline.runtime.workflow import exports, replay
 from pipeline.runtime.workflow.settings import ExportControllers
 from pipeline.store import artifacts
-from pipeline.temperature import controller, panel
-from pipeline.temperature.identification import gapless
+from pipeline.temperature.controllers import controller
+from pipeline.temperature.identification.model_choice import gapless
+from pipeline.temperature.test_set import panel
 from pipeline.temperature.workflow import cases, evaluate_temperature, record
 from pipeline.temperature.workflow.contestants import BY_NAME, Problem
 from pipeline.temperature.workflow.learned import Learned

@@ -12,11 +12,11 @@ import numpy as np
 from pipeline.runtime.export import setpoint
 from pipeline.runtime.export.setpoint import BeliefAgent, Decider
 from pipeline.runtime.workflow.export_controllers import Written, hashes
-from pipeline.setpoint.bayes import Filter
-from pipeline.setpoint.belief_agent import belief_encoder
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, read_frames
+from pipeline.setpoint.agents.bayes import Filter
+from pipeline.setpoint.agents.belief_agent import belief_encoder
 from pipeline.setpoint.published import FLOW_MOVES
-from pipeline.setpoint.simulator import TEMPERATURE_LIMITS, Observation
+from pipeline.setpoint.simulation.simulator import TEMPERATURE_LIMITS, Observation
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, read_frames
 from pipeline.setpoint.workflow.agent_files import Agents
 from pipeline.setpoint.workflow.contestants import ControllerSpec
 

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint import agent, bayes
-from pipeline.setpoint.agent import QNetwork
-from pipeline.setpoint.belief_agent import Belief, BeliefNetwork
-from pipeline.setpoint.simulator import CLASSES, HISTORY
+from pipeline.setpoint.agents import agent, bayes
+from pipeline.setpoint.agents.agent import QNetwork
+from pipeline.setpoint.agents.belief_agent import Belief, BeliefNetwork
+from pipeline.setpoint.simulation.simulator import CLASSES, HISTORY
 from pipeline.store import artifacts
 from pipeline.store.artifacts import read_weights, write_weights
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.setpoint import familiar
-from pipeline.setpoint.familiar import Camera
+from pipeline.setpoint.frames import familiar
+from pipeline.setpoint.frames.familiar import Camera
 from pipeline.store import artifacts
 
 FILE, KNOWN_CAMERA = "known_camera.parquet", ("known_camera", 1)

@@ -4,17 +4,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.setpoint import calibration
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
-from pipeline.setpoint.calibration import Calibration
-from pipeline.setpoint.vision_transformer import (
+from pipeline.setpoint.vision import calibration
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
+from pipeline.setpoint.vision.calibration import Calibration
+from pipeline.setpoint.vision.vision_transformer import (
     PAPER,
     SMALL,
     from_named_arrays,
     named_arrays,
     vision_transformer,
 )
-from pipeline.setpoint.window_flow import KNOTS_PERCENT, FlowCalibration
+from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.setpoint.workflow.settings import TrainClassifier
 from pipeline.store import artifacts
 from pipeline.store.artifacts import read_weights, write_weights

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
-from pipeline.setpoint import agent, baselines, bayes, belief_agent, judging
-from pipeline.setpoint.recorded import WindowTable
-from pipeline.setpoint.simulator import Controller
+from pipeline.setpoint.agents import agent, baselines, bayes, belief_agent, judging
+from pipeline.setpoint.simulation.recorded import WindowTable
+from pipeline.setpoint.simulation.simulator import Controller
 from pipeline.setpoint.workflow.agent_files import Agents
 from pipeline.setpoint.workflow.settings import Baselines
 

@@ -11,14 +11,17 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.setpoint import actuation, deployment, familiar, judging, pixels
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, read_frames
-from pipeline.setpoint.familiar import Camera
-from pipeline.setpoint.judging import Case, Choice, Judged, Runs
-from pipeline.setpoint.recorded import WindowTable
+from pipeline.setpoint.agents import judging
+from pipeline.setpoint.agents.judging import Case, Choice, Judged, Runs
+from pipeline.setpoint.deployment import deployment, pixels
+from pipeline.setpoint.frames import familiar
+from pipeline.setpoint.frames.familiar import Camera
 from pipeline.setpoint.score import BEYOND, DOES_NOTHING, STEPS, Outcomes, Score, harm_bar, summary
-from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, Windows
-from pipeline.setpoint.window_flow import window_flow
+from pipeline.setpoint.simulation import actuation
+from pipeline.setpoint.simulation.recorded import WindowTable
+from pipeline.setpoint.simulation.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, Windows
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, read_frames
+from pipeline.setpoint.vision.window_flow import window_flow
 from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
 from pipeline.setpoint.workflow.contestants import THROUGH_PIXELS, ControllerSpec
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier

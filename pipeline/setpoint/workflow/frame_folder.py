@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from pipeline.reading.excluded import readable
 from pipeline.reading.signals import Note
-from pipeline.setpoint.key_area import SHAPE
+from pipeline.setpoint.frames.key_area import SHAPE
 from pipeline.setpoint.material import PLA, Material
 from pipeline.setpoint.workflow.frame_csv import Log, read_log
 from pipeline.setpoint.workflow.frame_images import (

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.reading.image_messages import check_size
-from pipeline.setpoint import familiar, key_area, travel
+from pipeline.setpoint.frames import familiar, key_area, travel
 from pipeline.store import artifacts
 from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema
 

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.setpoint import calibrated_classifier, key_area
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
+from pipeline.setpoint.frames import key_area
 from pipeline.setpoint.material import Material
+from pipeline.setpoint.vision import calibrated_classifier
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
 from pipeline.setpoint.workflow import frame_images, frame_mcap
 from pipeline.setpoint.workflow.frame_folder import NozzleFrames, ReadOptions, read_options
 from pipeline.setpoint.workflow.settings import TrainClassifier

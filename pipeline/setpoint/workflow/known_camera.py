@@ -8,8 +8,8 @@ import numpy as np
 from joblib import delayed
 from tqdm import tqdm
 
-from pipeline.setpoint import familiar, nozzle_scene
-from pipeline.setpoint.familiar import Camera
+from pipeline.setpoint.frames import familiar, nozzle_scene
+from pipeline.setpoint.frames.familiar import Camera
 from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS, FILE, restore_camera
 from pipeline.setpoint.workflow.frame_folder import NozzleFrames
 from pipeline.setpoint.workflow.settings import RenderFrames

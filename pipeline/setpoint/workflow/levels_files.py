@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.setpoint.familiar import Camera
+from pipeline.setpoint.frames.familiar import Camera
 from pipeline.setpoint.levels import Levels, LevelWindows
 from pipeline.store import artifacts
 

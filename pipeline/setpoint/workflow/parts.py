@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.setpoint import calibration
-from pipeline.setpoint.classifier import CLASS_NAMES, Labelled, split_by_segment
 from pipeline.setpoint.material import PLA, Material
+from pipeline.setpoint.vision import calibration
+from pipeline.setpoint.vision.classifier import CLASS_NAMES, Labelled, split_by_segment
 from pipeline.setpoint.workflow import frame_folder
 from pipeline.setpoint.workflow.frame_folder import NozzleFrames
 from pipeline.setpoint.workflow.render_frames import PARTS, LabelledFrames, restore_frames, standing_out

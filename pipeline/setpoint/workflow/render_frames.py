@@ -10,7 +10,7 @@ import numpy as np
 from joblib import delayed
 from tqdm import tqdm
 
-from pipeline.setpoint import nozzle_scene
+from pipeline.setpoint.frames import nozzle_scene
 from pipeline.setpoint.workflow.settings import RenderFrames
 from pipeline.setpoint.workflow.tables import FLOW_EDGES, WINDOW_PARTS
 from pipeline.store.artifacts import read_weights, write_weights

@@ -13,12 +13,18 @@ import joblib
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.setpoint import agent, bayes, belief_agent, judging
-from pipeline.setpoint.belief_agent import Belief
+from pipeline.setpoint.agents import agent, bayes, belief_agent, judging
+from pipeline.setpoint.agents.belief_agent import Belief
 from pipeline.setpoint.published import ALPHA, DELTA, SIGMA
-from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.score import Score
-from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, nominal, paper_windows, rollout
+from pipeline.setpoint.simulation.recorded import WindowTable
+from pipeline.setpoint.simulation.simulator import (
+    FLOW_LIMITS,
+    TEMPERATURE_LIMITS,
+    nominal,
+    paper_windows,
+    rollout,
+)
 from pipeline.setpoint.workflow.agent_files import Agents, restore_published, store_published
 from pipeline.setpoint.workflow.settings import BeliefDqn, Learning, Li2025, RobustFilter, TrainAgent
 from pipeline.store import artifacts

@@ -15,12 +15,17 @@ import joblib
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.setpoint import calibrated_classifier, calibration, classifier, key_area, nozzle_scene
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, WindowPredictions, YardstickClasses
-from pipeline.setpoint.calibration import ClassifierOutputs, Promise, WindowTruth
-from pipeline.setpoint.classifier import Labelled, TrainingSettings, TrainState
-from pipeline.setpoint.recorded import WindowTable
-from pipeline.setpoint.vision_transformer import (
+from pipeline.setpoint.frames import key_area, nozzle_scene
+from pipeline.setpoint.simulation.recorded import WindowTable
+from pipeline.setpoint.vision import calibrated_classifier, calibration, classifier
+from pipeline.setpoint.vision.calibrated_classifier import (
+    CalibratedClassifier,
+    WindowPredictions,
+    YardstickClasses,
+)
+from pipeline.setpoint.vision.calibration import ClassifierOutputs, Promise, WindowTruth
+from pipeline.setpoint.vision.classifier import Labelled, TrainingSettings, TrainState
+from pipeline.setpoint.vision.vision_transformer import (
     Classifier,
     convolutional,
     from_named_arrays,

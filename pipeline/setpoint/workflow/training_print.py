@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.setpoint.simulator import FLOW_LIMITS
+from pipeline.setpoint.simulation.simulator import FLOW_LIMITS
 from pipeline.store import artifacts
 
 # least and largest of each flag, with its unit

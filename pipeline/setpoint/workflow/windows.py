@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.setpoint.recorded import WindowTable
+from pipeline.setpoint.simulation.recorded import WindowTable
 from pipeline.setpoint.workflow.tables import FLOW_EDGES, WINDOW_PARTS
 
 

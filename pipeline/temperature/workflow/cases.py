@@ -6,15 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.temperature import (
-    controller,
-    governor,
-    identification,
-    panel,
-    plant,
-    scenario_defaults,
-    tracking,
-)
+from pipeline.temperature import plant, tracking
+from pipeline.temperature.controllers import controller, governor
+from pipeline.temperature.identification import model_choice as identification
+from pipeline.temperature.test_set import panel, scenario_defaults
 from pipeline.temperature.workflow import record
 from pipeline.temperature.workflow.contestants import Design
 from pipeline.temperature.workflow.settings import Half, Panel, Tracking, TuneWeights

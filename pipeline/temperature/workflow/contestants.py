@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 if TYPE_CHECKING:
-    from pipeline.temperature.governor import Limits
-    from pipeline.temperature.kernel import Regression
+    from pipeline.temperature.controllers.governor import Limits
+    from pipeline.temperature.controllers.kernel import Regression
+    from pipeline.temperature.controllers.printer_pid import HeaterPid
+    from pipeline.temperature.controllers.window import Window
     from pipeline.temperature.plant import Plant
-    from pipeline.temperature.printer_pid import HeaterPid
     from pipeline.temperature.tracking import Law
-    from pipeline.temperature.window import Window
 
 
 class Problem(NamedTuple):
@@ -96,7 +96,7 @@ def _hold(problem: Problem, values: Values) -> Design:
 
 
 def _printer_pid(problem: Problem, values: Values) -> Design | None:
-    from pipeline.temperature import printer_pid
+    from pipeline.temperature.controllers import printer_pid
 
     if not problem.printer_pid:
         return None
@@ -106,7 +106,7 @@ def _printer_pid(problem: Problem, values: Values) -> Design | None:
 
 
 def _pi(problem: Problem, values: Values) -> Design:
-    from pipeline.temperature import baseline
+    from pipeline.temperature.controllers import baseline
 
     made = baseline.controller(
         problem.plant,
@@ -128,7 +128,7 @@ def _subspace_lqg(problem: Problem, values: Values) -> Design:
 
 
 def _varx_riccati(problem: Problem, values: Values) -> Design:
-    from pipeline.temperature import controller, window
+    from pipeline.temperature.controllers import controller, window
 
     made, N = window.controller(problem.window, problem.gamma), problem.window.N
     law = controller.compact(made.design(*weights(problem, values), values["integral"]), N)
@@ -137,7 +137,7 @@ def _varx_riccati(problem: Problem, values: Values) -> Design:
 
 def _learned_kernel(problem: Problem, values: Values) -> Design | None:
     """Its steady inputs come from the window that was learned from the same record."""
-    from pipeline.temperature import controller, kernel, window
+    from pipeline.temperature.controllers import controller, kernel, window
 
     if problem.kernel is None:
         return None

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from pipeline.store import artifacts
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
-from pipeline.temperature import comparison, panel, scorecard
+from pipeline.temperature.test_set import comparison, panel, scorecard
 from pipeline.temperature.workflow import contestants, tune_weights
 from pipeline.temperature.workflow.cases import Rehearsal, Setting, faster, played
 from pipeline.temperature.workflow.settings import EvaluateTemperature, Panel, TemperatureRules

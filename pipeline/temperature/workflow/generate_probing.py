@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.temperature import baseline, experiment, forecast
+from pipeline.temperature import experiment, forecast
+from pipeline.temperature.controllers import baseline
 from pipeline.temperature.experiment import Dither, Experiment, Family, Limits, Wish
+from pipeline.temperature.identification.subspace import Segments
+from pipeline.temperature.identification.trust import horizon
 from pipeline.temperature.plant import Plant as Model
 from pipeline.temperature.probing import excitation
-from pipeline.temperature.subspace import Segments
-from pipeline.temperature.trust import horizon
 from pipeline.temperature.workflow.probe_machine import given_centre, input_limits
 from pipeline.temperature.workflow.record import read_record
 from pipeline.temperature.workflow.settings import GenerateProbing, Plant, Tracking

@@ -7,8 +7,10 @@ import numpy as np
 
 from pipeline.store import artifacts
 from pipeline.store.tables import Schema
-from pipeline.temperature import identification, order, plant, trust, validation
-from pipeline.temperature.closed_loop import LEVEL_CLOSED
+from pipeline.temperature import plant
+from pipeline.temperature.identification import model_choice as identification
+from pipeline.temperature.identification import order, trust, validation
+from pipeline.temperature.identification.closed_loop import LEVEL_CLOSED
 from pipeline.temperature.workflow import tables
 from pipeline.temperature.workflow.record import read_recordings
 from pipeline.temperature.workflow.settings import IdentifyPlant

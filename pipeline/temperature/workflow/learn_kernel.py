@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.store import artifacts
-from pipeline.temperature import identification, window
+from pipeline.temperature.controllers import window
+from pipeline.temperature.identification import model_choice as identification
 from pipeline.temperature.judging import Candidate, CheckRun, Sufficiency, kernel_candidates, sufficiency
-from pipeline.temperature.scorecard import Yardstick
+from pipeline.temperature.test_set.scorecard import Yardstick
 from pipeline.temperature.workflow.record import read_record
 from pipeline.temperature.workflow.settings import LearnKernel, Panel, Plant, Tracking
 

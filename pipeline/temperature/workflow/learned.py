@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.store import artifacts
-from pipeline.temperature import kernel, plant, window
-from pipeline.temperature.printer_pid import HeaterPid
+from pipeline.temperature import plant
+from pipeline.temperature.controllers import kernel, window
+from pipeline.temperature.controllers.printer_pid import HeaterPid
 from pipeline.temperature.workflow import cases, contestants
 from pipeline.temperature.workflow.cases import Setting
 from pipeline.temperature.workflow.settings import Panel, Tracking, TuneWeights

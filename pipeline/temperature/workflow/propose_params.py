@@ -20,7 +20,7 @@ from pipeline.reading.recordings import Source, read
 from pipeline.reading.resampling import resample
 from pipeline.store import artifacts, params
 from pipeline.store.params_text import replaced
-from pipeline.temperature.time_scale import time_constant
+from pipeline.temperature.test_set.time_scale import time_constant
 
 RAW = Path("datasets/raw/temperature")
 # what the files hold before anybody has touched them: the study's machine

@@ -10,7 +10,8 @@ from tqdm import tqdm
 
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
-from pipeline.temperature import comparison, controller, panel, scorecard, tuning
+from pipeline.temperature.controllers import controller
+from pipeline.temperature.test_set import comparison, panel, scorecard, tuning
 from pipeline.temperature.workflow import contestants
 from pipeline.temperature.workflow.cases import Setting, played
 from pipeline.temperature.workflow.settings import TuneWeights

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from pipeline.deposition import bead, ladder, line
-from pipeline.deposition.edges import BLOCK, FEWEST_BLOCKS
-from pipeline.deposition.ladder import Ladder, Rung
+from pipeline.deposition.camera import bead, ladder, line
+from pipeline.deposition.camera.edges import BLOCK, FEWEST_BLOCKS
+from pipeline.deposition.camera.ladder import Ladder, Rung
 from pipeline.deposition.workflow import trial_readings
 from pipeline.deposition.workflow.settings import Camera, Printer
 from pipeline.store import artifacts, params

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.setpoint import key_area
+from pipeline.setpoint.frames import key_area
 from pipeline.setpoint.workflow.frame_images import read_image
 from pipeline.setpoint.workflow.frame_mcap import middle_frame
 from pipeline.store import artifacts

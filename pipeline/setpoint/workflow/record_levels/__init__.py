@@ -9,13 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.setpoint import familiar, levels
-from pipeline.setpoint.calibrated_classifier import FrameReadings
-from pipeline.setpoint.calibration import foreign_above
-from pipeline.setpoint.familiar import Camera
+from pipeline.setpoint import levels
+from pipeline.setpoint.frames import familiar
+from pipeline.setpoint.frames.familiar import Camera
 from pipeline.setpoint.levels import Levels, LevelWindows
 from pipeline.setpoint.material import PLA, Material
-from pipeline.setpoint.window_flow import WindowFlow
+from pipeline.setpoint.vision.calibrated_classifier import FrameReadings
+from pipeline.setpoint.vision.calibration import foreign_above
+from pipeline.setpoint.vision.window_flow import WindowFlow
 from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
 from pipeline.setpoint.workflow.frame_images import find_key_areas
 from pipeline.setpoint.workflow.levels_files import RecordedLevels, store_levels

@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.setpoint.actuation import ACTS
+from pipeline.setpoint.simulation.actuation import ACTS
 from pipeline.setpoint.workflow.decision_log import DecisionLog
 from pipeline.setpoint.workflow.shadow.decide import Asked, Decision, Deployed, Mind
 from pipeline.setpoint.workflow.shadow.page import ENDED, render

@@ -9,15 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint import actuation, bayes, deployment, familiar, key_area
-from pipeline.setpoint.actuation import ACTS, FOREIGN, Limits, is_evidence
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, FrameReadings, read_frames
-from pipeline.setpoint.deployment import Window, camera_seen
-from pipeline.setpoint.familiar import Camera
+from pipeline.setpoint.agents import bayes
+from pipeline.setpoint.deployment import deployment
+from pipeline.setpoint.deployment.deployment import Window, camera_seen
+from pipeline.setpoint.deployment.pixels import ADVANTAGE, LIKENESS, LOOKS, REACH_PX, TEMPLATE_PX
+from pipeline.setpoint.frames import familiar, key_area
+from pipeline.setpoint.frames.familiar import Camera
 from pipeline.setpoint.material import PLA, Material
-from pipeline.setpoint.pixels import ADVANTAGE, LIKENESS, LOOKS, REACH_PX, TEMPLATE_PX
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
-from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, Observation
+from pipeline.setpoint.simulation import actuation
+from pipeline.setpoint.simulation.actuation import ACTS, FOREIGN, Limits, is_evidence
+from pipeline.setpoint.simulation.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, Observation
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, FrameReadings, read_frames
 from pipeline.setpoint.workflow.camera_files import FALSE_ALARMS
 from pipeline.setpoint.workflow.frame_images import FrameKeyAreas, find_key_areas
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier

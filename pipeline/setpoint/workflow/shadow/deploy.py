@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.setpoint import levels
-from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
-from pipeline.setpoint.window_flow import WindowFlow, window_flow
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
+from pipeline.setpoint.vision.window_flow import WindowFlow, window_flow
 from pipeline.setpoint.workflow import contestants
 from pipeline.setpoint.workflow.agent_files import restore_agents
 from pipeline.setpoint.workflow.camera_files import restore_camera

@@ -10,9 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.setpoint import actuation, bayes, deployment
-from pipeline.setpoint.actuation import ACTS
+from pipeline.setpoint.agents import bayes
+from pipeline.setpoint.deployment import deployment
 from pipeline.setpoint.material import GOOD, Material
+from pipeline.setpoint.simulation import actuation
+from pipeline.setpoint.simulation.actuation import ACTS
 from pipeline.setpoint.workflow.shadow.decide import Decision, Deployed, Drawn
 from pipeline.store.printable import counted, printable, printable_page
 

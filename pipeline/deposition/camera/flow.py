@@ -1,0 +1,454 @@
+"""Widths of many frames -> cross-section along the line -> flow Q(t) by regularised inversion, with its
+uncertainty and what the frames cannot tell.
+
+Width belongs to a place, not to a moment: the nozzle at x(t) lays Q(t) dt over its footprint f, so that A(s)
+= integral of Q(t) f(s - x(t)) dt, and each place is seen in many frames. Q comes back from A by least squares
+against a smoothness prior whose strength the data choose.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+import scipy.sparse
+
+from pipeline.deposition.camera.bead import area
+from pipeline.deposition.camera.edges import BLOCK
+
+# instants a sample at which the nozzle is placed: at 8 mm/s and 50 Hz every 20 um, a third of a place
+INSTANTS = 8
+# a bead lower than this is not seen, px: its section is the least that a place without a bead may hide
+BLIND_PX = 8.0
+# below this share of the highest speed the flow at a moment is not
+# observable, only the volume of the whole pause
+SLOW = 0.05
+# readings of one place this many deviations from their median are specks, not scatter
+GATE = 5.0
+# residuals of A(s) beyond this many deviations get less weight (Huber 1964: 95 % efficient for normal errors)
+HUBER = 1.345
+# weights and scatter settle in so many rounds
+ROUNDS = 3
+# log of the strengths that are tried: from no smoothing at all to a straight line
+STRENGTHS = (-8.0, 24.0)
+# prior weight of the amplitudes, far below anything that the data say: one that nobody sees stays 0
+RIDGE = 1e-6
+
+
+class View(NamedTuple):
+    """Where the camera looks: a column shows the stage at s = x + (column -
+    nozzle_column) mm_per_px, x the gantry's position.
+
+    mm_per_px is negative where the line trails towards higher columns."""
+
+    mm_per_px: float
+    nozzle_column: float
+
+
+class Sections(NamedTuple):
+    """Cross-section along the stage: centres s (n,) in mm of places 8 px long, area (n,) in
+    mm^2 and its standard deviation as the frames scatter, and the number of frames (n,) that
+    saw each; `dropped` of all readings were outliers."""
+
+    s: np.ndarray
+    area: np.ndarray
+    deviation: np.ndarray
+    frames: np.ndarray
+    length: float
+    dropped: int
+
+
+class Pause(NamedTuple):
+    """A stretch in which the gantry stood: begin and end in s; the
+    volume laid there in mm^3 and its standard deviation."""
+
+    begin_s: float
+    end_s: float
+    volume: float
+    deviation: float
+
+
+class Flow(NamedTuple):
+    """Q (T,) in mm^3/s at the gantry's samples and its standard
+    deviation, given the smoothness that the data chose.
+
+    observable (T,) is False where the gantry stood or the camera never saw what was laid: there only
+    the volume of the whole pause is measured, and Q is its likeliest spread over time. per_travel (T,)
+    is Q / v in mm^3/mm, NaN where v is below 5 % of its maximum. `amplitudes` (k,) belong to the
+    shapes, `strength` is the weight of smoothness, `noise` the scatter of A(s) about the fit in
+    multiples of what the frames' scatter lets expect (more where the bead itself is rough), `outliers`
+    the places that were given less than half their weight.
+    """
+
+    flow: np.ndarray
+    deviation: np.ndarray
+    observable: np.ndarray
+    per_travel: np.ndarray
+    pauses: tuple[Pause, ...]
+    amplitudes: np.ndarray
+    strength: float
+    noise: float
+    outliers: int
+
+
+def deposit_share(distance: np.ndarray, radius: float) -> np.ndarray:
+    """Share of what leaves a round nozzle that falls behind `distance` ahead of its middle: 1/2 + (z sqrt(1 -
+    z^2) + arcsin z) / pi, z = distance / radius in -1..1.
+
+    Its derivative is the footprint f: the chord of the nozzle at that distance, over its area.
+    """
+    z = np.clip(distance / radius, -1.0, 1.0)
+    return 0.5 + (z * np.sqrt(1 - z * z) + np.arcsin(z)) / np.pi
+
+
+def sections(
+    position: np.ndarray,
+    columns: np.ndarray,
+    widths: np.ndarray,
+    *,
+    view: View,
+    nozzle_radius_mm: float,
+    contact_angle_deg: float,
+) -> Sections:
+    """A(s) from widths (F, m) in mm at the `columns` (m,) of F frames taken with the gantry at `position`
+    (F,); NaN is unread, 0 is bare substrate.
+
+    Readings are gathered by place. Those closer to the nozzle than its radius, where the bead still grows,
+    are left out; so are those beyond five robust deviations from the median of their place. Raises ValueError
+    where nothing is left, or where the gantry does not move away from what the camera sees.
+    """
+    position, columns, widths = (
+        np.asarray(position, float),
+        np.asarray(columns, float),
+        np.asarray(widths, float),
+    )
+    if widths.shape != (len(position), len(columns)):
+        raise ValueError(
+            f"sections: expected widths of {len(position)} frames x {len(columns)} columns but found "
+            f"{widths.shape}; give one row a frame"
+        )
+    s, w = _readings(position, columns, widths, view, nozzle_radius_mm)
+    px = abs(view.mm_per_px)
+    length = BLOCK * px
+    place = np.floor((s - s.min()) / length).astype(int)
+    order = np.lexsort((w, place))
+    place, s, w = place[order], s[order], w[order]
+    of, keep, scatter = _without_specks(place, w, px)
+    count = np.bincount(of, keep)
+    A, where = np.bincount(of, area(w, contact_angle_deg) * keep) / count, np.bincount(of, s * keep) / count
+    slope, blind = np.sqrt(4 * area(1.0, contact_angle_deg) * A), area(BLIND_PX * px, contact_angle_deg)
+    # a place averages over its length: where A bends within it, the mean is not the value in the middle
+    bend = np.convolve(np.pad(A, 1, "edge"), [1.0, -2.0, 1.0], "valid") / 12
+    deviation = np.sqrt(slope**2 * scatter**2 / count + blind**2 / 12 + bend**2)
+    return Sections(where, A, deviation, count.astype(int), length, int(np.sum(~keep)))
+
+
+def _readings(
+    position: np.ndarray, columns: np.ndarray, widths: np.ndarray, view: View, nozzle_radius_mm: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places (N,) in mm and widths (N,) in mm of the readings that count. Raises ValueError where there is
+    none, or where the gantry goes back."""
+    behind = (columns - view.nozzle_column) * view.mm_per_px
+    used = np.isfinite(widths) & (np.abs(behind) >= nozzle_radius_mm) & np.isfinite(position)[:, None]
+    if not used.any():
+        raise ValueError(
+            f"sections: none of {widths.size} readings is usable; look at why the frames were rejected, "
+            "and at the nozzle's column in the view"
+        )
+    travel = -np.sign(np.median(behind)) * position[np.isfinite(position)]
+    retreat = float(np.max(np.maximum.accumulate(travel) - travel))
+    if retreat > nozzle_radius_mm:
+        raise ValueError(
+            f"sections: the gantry goes back by {retreat:.3g} mm, towards where the camera looks, "
+            "so a place is seen before it is printed; "
+            "cut the record to one pass along the line, or turn the sign of the view's mm per px"
+        )
+    return (position[:, None] + behind)[used], widths[used]
+
+
+def _without_specks(place: np.ndarray, w: np.ndarray, px: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """For readings w (N,) sorted by place and width: the index of their place (N,), whether they count (N,),
+    and the robust scatter of one reading in mm."""
+    first = np.flatnonzero(np.diff(place, prepend=-1))
+    count = np.diff(np.append(first, len(place)))
+    of = np.repeat(np.arange(len(first)), count)
+    median = w[first + (count - 1) // 2]
+    miss = np.abs(w - median[of])
+    # one scatter for all places, a dozen readings each do not tell it;
+    # beside it the width may change along a place
+    scatter = max(1.4826 * float(np.median(miss[w > 0])) if (w > 0).any() else 0.0, 0.02 * px)
+    keep = miss <= (GATE * scatter + np.abs(np.gradient(np.pad(median, 1, "edge"))[1:-1]))[of]
+    return of, keep, scatter
+
+
+def estimate(
+    time_s: np.ndarray,
+    position: np.ndarray,
+    sections: Sections,
+    *,
+    nozzle_radius_mm: float,
+    shapes: np.ndarray,
+    contact_angle_deg: float,
+    width_deviation_mm: float,
+) -> Flow:
+    """Q(t) = z + shapes' a at the samples time_s (T,), evenly spaced, of the gantry's position (T,), from
+
+    min |W (A - K Q)|^2 + strength |D2 z|^2, K[i, k] = mean over place
+    i of integral of hat_k(t) f(s - x(t)) dt,
+
+    D2 the second difference: z is an integrated random walk, and the shapes (k, T) are where the flow may
+    turn sharply, each by an amplitude that the data choose (the wanted flow r as one row; a model's answer to
+    the command; none, as zeros (0, T)). The strength maximises the likelihood of A with all Q integrated out
+    (generalised maximum likelihood, Wahba 1985). W carries the deviations of A, scaled to its scatter about
+    the fit, and Huber's weights. `width_deviation_mm` is what a calibration leaves: it moves all widths
+    alike, so that Q is uncertain by Q 2 dw / w on top. Raises ValueError where the record is too short,
+    unevenly sampled, or where no place is reached by the nozzle.
+    """
+    time_s, position, shapes = (
+        np.asarray(time_s, float),
+        np.asarray(position, float),
+        np.asarray(shapes, float),
+    )
+    _check(time_s, position, shapes)
+    dt = float(np.mean(np.diff(time_s)))
+    K = _laid(position, dt, sections, nozzle_radius_mm)
+    reached = np.asarray(K.sum(axis=1)).ravel() > 0
+    if not reached.any():
+        raise ValueError(
+            "estimate: the nozzle reached no place of A(s) in this record; "
+            "do frames and gantry overlap in time, and has the view the right direction?"
+        )
+    K, A = K[reached], sections.area[reached]
+    bead = A > 0
+    fit, deviation, spread, strength, noise, outliers = _robust_fit(
+        K, A, sections.deviation[reached], bead, shapes.T
+    )
+    Q = fit.z + shapes.T @ fit.a
+    share = (
+        2 * width_deviation_mm / np.sqrt(np.median(A[bead]) / area(1.0, contact_angle_deg))
+        if bead.any()
+        else 0.0
+    )
+    deviation = np.hypot(deviation, share * Q)
+    speed = np.abs(np.gradient(position, dt))
+    moving = speed > SLOW * speed.max()
+    lit = np.asarray(K.sum(axis=0)).ravel() * sections.length > 0.4 * dt
+    per_travel = np.where(moving, Q / np.where(moving, speed, 1.0), np.nan)
+    pauses = tuple(_pause(a, b, time_s, Q, fit.factor, spread) for a, b in _runs(~moving))
+    return Flow(Q, deviation, moving & lit, per_travel, pauses, fit.a, strength, noise, outliers)
+
+
+class _RobustFit(NamedTuple):
+    """The solution, the deviation (T,) of its flow, the part (T, k) of the latter that the amplitudes
+    spread, the strength of the prior, the noise of A(s), and how many places are outliers."""
+
+    fit: "_Fit"
+    deviation: np.ndarray
+    spread: np.ndarray
+    strength: float
+    noise: float
+    outliers: int
+
+
+def _robust_fit(
+    K: scipy.sparse.csr_matrix, A: np.ndarray, expected: np.ndarray, bead: np.ndarray, shapes: np.ndarray
+) -> _RobustFit:
+    """Least squares with Huber's weights, reweighted ROUNDS times; each time the likeliest strength."""
+    steps = K.shape[1]
+    noise = _roughness(A, expected, bead)
+    P, robust = _penalty(steps), np.ones(len(A))
+    deviation = np.where(bead, noise * expected, expected)
+    for _ in range(ROUNDS):
+        weight = np.sqrt(robust) / deviation
+        H = scipy.sparse.diags(weight) @ K
+        data = _Data(
+            _banded((H.T @ H).tocoo(), steps),
+            P,
+            H.T @ (H @ shapes),
+            shapes,
+            H.T @ (weight * A),
+            float(np.sum((weight * A) ** 2)),
+        )
+        best = scipy.optimize.minimize_scalar(
+            _unlikely, args=(data,), bounds=STRENGTHS, method="bounded", options={"xatol": 0.1}
+        )
+        fit = _solve(best.x, data)
+        Q = fit.z + shapes @ fit.a
+        robust = np.minimum(1.0, HUBER * deviation / np.maximum(np.abs(A - K @ Q), 1e-12))
+    U = shapes - scipy.linalg.cho_solve_banded((fit.factor, True), data.C)
+    spread = U @ np.linalg.inv(np.linalg.cholesky(fit.S)).T
+    deviation = np.sqrt(_inverse_diagonal(_sum(data.M, P, np.exp(best.x))) + np.sum(spread**2, axis=1))
+    return _RobustFit(fit, deviation, spread, float(np.exp(best.x)), noise, int(np.sum(robust < 0.5)))
+
+
+def _roughness(A: np.ndarray, expected: np.ndarray, bead: np.ndarray) -> float:
+    """Scatter of A along the stage over what the frames' scatter lets expect, at least 1: robust deviation of
+    the second differences of means over three places, which flow hardly moves. What lies on the stage errs
+    alike in every frame, so only this shows it; neighbours share readings, hence the means."""
+    n = len(A) // 3
+    mean, variance = (
+        A[: 3 * n].reshape(n, 3).mean(axis=1),
+        np.square(expected[: 3 * n]).reshape(n, 3).sum(axis=1) / 9,
+    )
+    covered = bead[: 3 * n].reshape(n, 3).all(axis=1)
+    inside = covered[:-2] & covered[1:-1] & covered[2:]
+    if not inside.any():
+        return 1.0
+    spread = np.sqrt(variance[:-2] + 4 * variance[1:-1] + variance[2:])
+    return max(1.4826 * float(np.median(np.abs(np.diff(mean, 2) / spread)[inside])), 1.0)
+
+
+def _check(time_s: np.ndarray, position: np.ndarray, shapes: np.ndarray) -> None:
+    if (
+        len(time_s) < 10
+        or position.shape != time_s.shape
+        or shapes.ndim != 2
+        or shapes.shape[1] != len(time_s)
+    ):
+        raise ValueError(
+            "estimate: expected time and position (T,) and shapes (k, T) with T at least 10, "
+            f"but found {time_s.shape}, {position.shape} and {shapes.shape}; "
+            "resample them on one clock"
+        )
+    gaps = np.diff(time_s)
+    if gaps.min() <= 0 or np.ptp(gaps) > 0.01 * gaps.mean():
+        raise ValueError(
+            f"estimate: expected evenly spaced samples but found steps of {gaps.min():.4g} to "
+            f"{gaps.max():.4g} s; resample the gantry's record"
+        )
+    if not np.isfinite(position).all() or not np.isfinite(shapes).all():
+        raise ValueError(
+            "estimate: expected finite positions and shapes but found gaps; cut the record there, "
+            "or fill the gantry's position first"
+        )
+
+
+def _laid(position: np.ndarray, dt: float, sections: Sections, radius: float) -> scipy.sparse.csr_matrix:
+    """K (n, T) in s/mm: section at place i from unit flow at sample k;
+    positions straight between samples, flow too."""
+    share = (np.arange(INSTANTS) + 0.5) / INSTANTS
+    x = (position[:-1, None] + np.diff(position)[:, None] * share).ravel()
+    begin = np.searchsorted(sections.s, x - radius - sections.length / 2)
+    many = int(2 * radius / sections.length) + 3
+    place = begin[:, None] + np.arange(many)
+    s = sections.s[np.minimum(place, len(sections.s) - 1)] - x[:, None]
+    half = sections.length / 2
+    f = (
+        (deposit_share(s + half, radius) - deposit_share(s - half, radius))
+        * (place < len(sections.s))
+        / sections.length
+    )
+    f *= dt / INSTANTS
+    late = np.tile(share, len(position) - 1)[:, None]
+    sample = np.repeat(np.arange(len(position) - 1), INSTANTS)[:, None]
+    on = f > 0
+    rows = np.concatenate([place[on]] * 2)
+    columns = np.concatenate([np.broadcast_to(sample, f.shape)[on], np.broadcast_to(sample + 1, f.shape)[on]])
+    values = np.concatenate([(f * (1 - late))[on], (f * late)[on]])
+    return scipy.sparse.coo_matrix((values, (rows, columns)), shape=(len(sections.s), len(position))).tocsr()
+
+
+def _penalty(steps: int) -> np.ndarray:
+    """D2'D2 in lower banded form (3, T)."""
+    D = scipy.sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(steps - 2, steps))
+    return _banded((D.T @ D).tocoo(), steps)
+
+
+def _banded(M: scipy.sparse.coo_matrix, steps: int) -> np.ndarray:
+    below = M.row - M.col
+    band = np.zeros((max(int(below.max()), 2) + 1, steps))
+    low = below >= 0
+    band[below[low], M.col[low]] = M.data[low]
+    return band
+
+
+def _sum(M: np.ndarray, P: np.ndarray, strength: float) -> np.ndarray:
+    total = M.copy()
+    total[:3] += strength * P
+    return total
+
+
+class _Data(NamedTuple):
+    """Normal equations: M = H'H banded, P = D2'D2 banded, shapes (T, k)
+    and C = H'H shapes, right side H'y, energy y'y."""
+
+    M: np.ndarray
+    P: np.ndarray
+    C: np.ndarray
+    shapes: np.ndarray
+    right: np.ndarray
+    energy: float
+
+
+class _Fit(NamedTuple):
+    """Cholesky factor of M + strength P, Schur complement S (k, k) of the amplitudes, z (T,), a (k,), and -2
+    log likelihood up to a constant."""
+
+    factor: np.ndarray
+    S: np.ndarray
+    z: np.ndarray
+    a: np.ndarray
+    unlikely: float
+
+
+def _solve(log_strength: float, data: _Data) -> _Fit:
+    """Minimum over z and a by elimination of z; -2 log likelihood = minimum + log det (M +
+    strength P) + log det S - (T - 2) log strength."""
+    M, P, C, shapes, right, energy = data
+    factor = scipy.linalg.cholesky_banded(_sum(M, P, np.exp(log_strength)), lower=True)
+    solved = scipy.linalg.cho_solve_banded((factor, True), np.column_stack([right, C]))
+    S = shapes.T @ C - C.T @ solved[:, 1:] + RIDGE * np.eye(C.shape[1])
+    a = np.linalg.solve(S, shapes.T @ right - C.T @ solved[:, 0])
+    z = solved[:, 0] - solved[:, 1:] @ a
+    minimum = energy - right @ z - a @ (shapes.T @ right)
+    unlikely = (
+        minimum + 2 * np.log(factor[0]).sum() + np.linalg.slogdet(S)[1] - (M.shape[1] - 2) * log_strength
+    )
+    return _Fit(factor, S, z, a, float(unlikely))
+
+
+def _unlikely(log_strength: float, data: _Data) -> float:
+    return _solve(log_strength, data).unlikely
+
+
+def _inverse_diagonal(band: np.ndarray) -> np.ndarray:
+    """Diagonal of the inverse of a symmetric banded matrix: blocks as wide as the band make it block
+    tridiagonal; Schur complements down, inverses up (Takahashi 1973)."""
+    b, steps = len(band) - 1, band.shape[1]
+    blocks = -(-steps // b)
+    full = np.zeros((b + 1, blocks * b + b))
+    full[:, :steps] = band
+    full[0, steps:] = 1.0
+    i = np.arange(b)
+    down = i[:, None] - i
+    inverses, lower = [], []
+    for k in range(blocks):
+        column = k * b + i
+        D = np.where(down >= 0, full[np.abs(down), column[None, :]], 0.0)
+        D = D + np.tril(D, -1).T
+        if k:
+            D = D - lower[-1] @ inverses[-1] @ lower[-1].T
+        inverses.append(np.linalg.inv(D))
+        reach = down + b
+        lower.append(np.where(reach <= b, full[np.minimum(reach, b), column[None, :]], 0.0))
+    G = inverses[-1]
+    out = [np.diag(G)]
+    for S, E in zip(inverses[-2::-1], lower[-2::-1], strict=True):
+        G = S + S @ E.T @ G @ E @ S
+        out.append(np.diag(G))
+    return np.concatenate(out[::-1])[:steps]
+
+
+def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """(first, one past the last) of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _pause(a: int, b: int, time_s, Q, factor, spread) -> Pause:
+    """Volume w'Q of the samples a to b - 1, each dt long, and its standard deviation: both parts of the
+    covariance, of z and of the amplitudes."""
+    w = np.zeros(len(Q))
+    w[a:b] = time_s[1] - time_s[0]
+    variance = w @ scipy.linalg.cho_solve_banded((factor, True), w) + np.sum((w @ spread) ** 2)
+    return Pause(float(time_s[a]), float(time_s[b - 1]), float(w @ Q), float(np.sqrt(variance)))

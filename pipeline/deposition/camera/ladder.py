@@ -1,0 +1,161 @@
+"""A printed ladder, lines of known widths, into what a camera needs: the size of a pixel, the direction of
+the line, and by how much beads of each width look wider than they are.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from pipeline.deposition.camera import bead, line
+
+
+class Rung(NamedTuple):
+    """One line of the ladder as it is seen: where, how wide across it in px with its standard deviation, and
+    why it could not be measured (empty where it could). `pose` is how it was turned."""
+
+    found: line.Line
+    pose: line.Pose
+    bead: bead.Bead
+    angle_deg: float
+    width_px: float
+    deviation_px: float
+    reason: str
+
+
+class Ladder(NamedTuple):
+    """mm_per_px > 0; rotation_deg of the lines; known (n,) in mm and measured (n,) in px, growing; edge_bias
+    (n,) in px by which each looks wider than it is; deviation_px, the scatter of repeated pictures."""
+
+    mm_per_px: float
+    rotation_deg: float
+    known_mm: np.ndarray
+    measured_px: np.ndarray
+    edge_bias_px: np.ndarray
+    deviation_px: float
+
+
+def rungs(
+    frame: np.ndarray,
+    count: int,
+    *,
+    tip: tuple[float, float] | None,
+    hidden_px: float,
+    longest_blur_px: float,
+) -> list[Rung]:
+    """The `count` lines of one picture that stand out most, measured; fewer where it shows fewer. One line is
+    sought at the nozzle's tip where that is given. Several are all light or all dark: what lies between them
+    is one fewer."""
+    if count == 1:
+        return _of_sign(frame, 1, tip=tip, hidden_px=hidden_px, sign=0, longest_blur_px=longest_blur_px)
+    both = [
+        _of_sign(frame, count, tip=tip, hidden_px=hidden_px, sign=sign, longest_blur_px=longest_blur_px)
+        for sign in (1, -1)
+    ]
+    return max(both, key=lambda found: sum(not rung.reason for rung in found))
+
+
+def _of_sign(
+    frame: np.ndarray,
+    count: int,
+    *,
+    tip: tuple[float, float] | None,
+    hidden_px: float,
+    sign: int,
+    longest_blur_px: float,
+) -> list[Rung]:
+    """The lines of one colour: 1 light, -1 dark, 0 either."""
+    mask = np.zeros(frame.shape[:2], bool)
+    if tip is not None and count > 1:
+        cv2.circle(hidden := mask.astype(np.uint8), (round(tip[0]), round(tip[1])), round(hidden_px), 1, -1)
+        mask = hidden.astype(bool)
+    out = []
+    for _ in range(count):
+        found = line.find(frame, tip=tip if count == 1 else None, hidden_px=hidden_px, mask=mask, sign=sign)
+        if found is None:
+            break
+        behind = math.inf
+        if tip is not None and count == 1:
+            behind = max(math.dist(tip, (found.x, found.y)) - hidden_px, 0.0)
+        out.append(_measured(frame, found, behind, longest_blur_px))
+        mask |= _covered(frame.shape[:2], found)
+    return out
+
+
+def _measured(frame: np.ndarray, found: line.Line, behind_px: float, longest_blur_px: float) -> Rung:
+    """The line of a picture, turned a second time where the first measurement shows that it lies askew."""
+    for _ in range(2):
+        pose = line.pose_on(found, (frame.shape[0], frame.shape[1]), behind_px=behind_px)
+        one = bead.measure(
+            line.turned(frame, pose),
+            columns=(0, pose.columns),
+            longest_blur_px=longest_blur_px * pose.scale,
+            sign=1 if found.contrast > 0 else -1,
+        )
+        if one.reason:
+            break
+        middle = float(np.nanmean(one.top + one.bottom) / 2)
+        x, y = line.matrix(pose) @ np.array([pose.column, middle, 1.0])
+        found = found._replace(
+            angle_deg=found.angle_deg + one.angle_deg,
+            x=float(x),
+            y=float(y),
+            width_px=max(one.width / pose.scale, 2.0),
+        )
+    return Rung(
+        found, pose, one, found.angle_deg, one.width / pose.scale, one.deviation / pose.scale, one.reason
+    )
+
+
+def _covered(shape: tuple[int, int], found: line.Line) -> np.ndarray:
+    """(h, w) bool: what a line and its edges cover of a picture."""
+    a = math.radians(found.angle_deg)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    across = (y - found.y) * math.cos(a) - (x - found.x) * math.sin(a)
+    return np.abs(across) < 0.6 * found.width_px + 4
+
+
+def calibrated(
+    known_mm: np.ndarray,
+    measured_px: np.ndarray,
+    angles_deg: np.ndarray,
+    *,
+    mm_per_px: float | None,
+    from_tip: bool,
+) -> Ladder:
+    """From pictures (N,) of lines of known widths: scale, direction and edge bias by width.
+
+    mm_per_px is the size of a pixel where something that has no edges tells it, such as the pitch of the
+    ladder; else it is the slope of known over measured widths, so that the mean bias is the same at all of
+    them. Directions `from_tip` count over the whole circle, others to half of it. Raises ValueError for fewer
+    than three different widths, for a measurement that failed and for widths that do not grow with the known
+    ones.
+    """
+    known, px = np.asarray(known_mm, float), np.asarray(measured_px, float)
+    fit = bead.calibrate(px, known)
+    scale = fit.gain if mm_per_px is None else abs(mm_per_px)
+    widths = np.unique(known)
+    means = np.array([px[known == width].mean() for width in widths])
+    spread = np.concatenate([px[known == width] - px[known == width].mean() for width in widths])
+    free = max(len(px) - len(widths), 1)
+    folds = 1 if from_tip else 2
+    turn = folds * np.radians(np.asarray(angles_deg, float))
+    rotation = math.degrees(math.atan2(np.sin(turn).mean(), np.cos(turn).mean())) / folds
+    return Ladder(
+        scale, rotation, widths, means, means - widths / scale, float(np.sqrt(spread @ spread / free))
+    )
+
+
+def pitch_px(found: Sequence[line.Line]) -> float:
+    """Mean distance in px of the middles of neighbouring parallel lines: no edge enters. Raises ValueError
+    for fewer than two lines."""
+    if len(found) < 2:
+        raise ValueError(
+            f"ladder: expected two lines or more to measure their pitch but found {len(found)}; "
+            "take a picture that shows all of them"
+        )
+    a = math.radians(float(np.median([one.angle_deg for one in found])))
+    across = np.sort([one.y * math.cos(a) - one.x * math.sin(a) for one in found])
+    return float((across[-1] - across[0]) / (len(found) - 1))

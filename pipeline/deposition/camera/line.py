@@ -1,0 +1,261 @@
+"""Where a printed line lies in a picture as it comes, and the picture turned so that it lies along the rows.
+
+A line is a band that is brighter or darker than the ground on both of its sides, along its whole length. Its
+specular line, a stripe of the ground or a speck is that too, but narrower, fainter or shorter: what counts is
+the square of the contrast that lasts along the band, times the root of its width.
+"""
+
+import functools
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from pipeline.deposition.camera.bead import gray
+
+# longest side in px at which a line is sought, and the step of its direction in degrees
+COARSE_PX, STEP_DEG = 200, 5.0
+# from a tip on it is followed so far, px of the small picture
+REACH_PX, SIDE_PX = 64, 3
+# parts of the line's length in which its contrast must hold, and how many must be in the picture
+PARTS, FEWEST_PARTS = 10, 4
+# widths of the bands that are tried, in px of the small picture
+BANDS = (3, 4, 5, *range(6, 78, 3))
+# a band is a line where its contrast is so many levels and so many deviations of its parts
+LEAST_CONTRAST, LEAST_SCORE = 6.0, 4.0
+# what is no part of the picture
+OUTSIDE = -1e6
+# widths from which a bead has a plateau of its own, and the least picture that is cut out
+WIDE_PX, LEAST_PX = 64, 96
+
+
+class Line(NamedTuple):
+    """A line in a picture: its direction (0 right, 90 down), within 180 degrees where no tip says from where
+    it comes; a point in its middle and its width in px of the picture; `contrast`, bead less ground in
+    levels, and `score`, that contrast over its deviation along the line."""
+
+    angle_deg: float
+    x: float
+    y: float
+    width_px: float
+    contrast: float
+    score: float
+
+
+class Pose(NamedTuple):
+    """How a picture is turned before it is measured: by -angle_deg about (x, y), which comes to lie at
+    (column, row) of the turned picture of shape (rows, columns), enlarged by `scale`."""
+
+    angle_deg: float
+    x: float
+    y: float
+    column: float
+    row: float
+    rows: int
+    columns: int
+    scale: float = 1.0
+
+
+def find(
+    frame: np.ndarray,
+    *,
+    tip: tuple[float, float] | None = None,
+    hidden_px: float = 0.0,
+    mask: np.ndarray | None = None,
+    sign: int = 0,
+) -> Line | None:
+    """The line with the most energy in the picture (h, w), or the one that comes out beside the nozzle's tip
+    (x, y) in px, seen from `hidden_px` on; None where there is none. What `mask` (h, w) marks is not looked
+    at. `sign` is 1 for a bead brighter than its ground, -1 for a darker one, 0 for either."""
+    picture = gray(frame).astype(np.float32)
+    h, w = picture.shape
+    shrunk = max(h, w) / COARSE_PX
+    small = cv2.resize(picture, (round(w / shrunk), round(h / shrunk)), interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), 0.8)
+    if mask is not None:
+        hidden = cv2.resize(mask.astype(np.float32), small.shape[::-1], interpolation=cv2.INTER_AREA) > 0
+        small[hidden] = OUTSIDE
+    middle = (small.shape[1] / 2 - 0.5, small.shape[0] / 2 - 0.5)
+    centre = middle if tip is None else ((tip[0] + 0.5) / shrunk - 0.5, (tip[1] + 0.5) / shrunk - 0.5)
+    span = (0.0, hidden_px / shrunk)[tip is not None]
+    turns = np.arange(0.0, 180.0 if tip is None else 360.0, STEP_DEG).tolist()
+    search = functools.partial(_band, small, centre, hidden=span, from_tip=tip is not None, sign=sign)
+    best = max((search(turn) for turn in turns), key=lambda band: band.energy)
+    near = (best.turn + STEP_DEG / 5 * np.arange(-4, 5)).tolist()
+    best = max((search(turn) for turn in near), key=lambda band: band.energy)
+    level = 1 if frame.dtype == np.uint8 else 257
+    if best.energy <= 0 or abs(best.contrast) < LEAST_CONTRAST * level or best.score < LEAST_SCORE:
+        return None
+    a, across = math.radians(best.turn), (best.offset + 0.5) * shrunk - 0.5
+    x0, y0 = ((at + 0.5) * shrunk - 0.5 for at in centre)
+    along = best.along * shrunk
+    x, y = x0 - math.sin(a) * across + math.cos(a) * along, y0 + math.cos(a) * across + math.sin(a) * along
+    return Line(best.turn % (180 if tip is None else 360), x, y, best.width * shrunk, best.contrast / level,
+                best.score)  # fmt: skip
+
+
+class _Band(NamedTuple):
+    energy: float
+    turn: float
+    offset: float
+    along: float
+    width: float
+    contrast: float
+    score: float
+
+
+def _band(small: np.ndarray, centre, turn: float, *, hidden: float, from_tip: bool, sign: int) -> _Band:
+    """The band of most energy along direction `turn` of a small picture."""
+    h, w = small.shape
+    reach = math.ceil(math.hypot(h, w) / 2)
+    half, first, columns = (REACH_PX, hidden, REACH_PX) if from_tip else (reach, -reach, 2 * reach)
+    a = math.radians(turn)
+    c, s = math.cos(a), math.sin(a)
+    # turned (column, row) -> small picture
+    M = np.array([
+        [c, -s, centre[0] + c * first + s * half],
+        [s, c, centre[1] + s * first - c * half],
+    ])  # fmt: skip
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    turned = cv2.warpAffine(small, M, (columns, 2 * half), flags=flags, borderValue=OUTSIDE)
+    inside = turned > -1.0
+    length = max(columns // PARTS, 4)
+    n = columns // length
+    value = np.where(inside, turned, 0.0)[:, : n * length].reshape(2 * half, n, length).sum(axis=2)
+    count = inside[:, : n * length].reshape(2 * half, n, length).sum(axis=2)
+    sums, counts = (np.cumsum(np.pad(part, ((1, 0), (0, 0))), axis=0) for part in (value, count))
+    best = _Band(0.0, turn, 0.0, 0.0, 0.0, 0.0, 0.0)
+    edges = {inner: _steps(sums, counts, inner, length) for inner in (2, SIDE_PX)}
+    for width in BANDS:
+        inner = 2 if width < 2 * SIDE_PX else SIDE_PX
+        one = _best_of_width(*edges[inner], width, half if from_tip else -1, sign)
+        if one is not None and one[0] > best.energy:
+            energy, row, along, contrast, score = one
+            offset = row + width / 2 - half - 0.5
+            best = _Band(energy, turn, offset, first + length * along, width, contrast, score)
+    return best
+
+
+def _steps(sums: np.ndarray, counts: np.ndarray, inner: int, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """(rows + 1, parts) each: by how much the rows after a boundary are above those before it, and those
+    before it above those after it; `inner` rows on the bead's side, SIDE_PX beyond a row's gap on the
+    ground's. NaN where not all of them are in the picture."""
+    size = len(sums) - 1
+
+    def mean(shift: int, rows: int) -> np.ndarray:
+        out = np.full(sums.shape, np.nan)
+        first = np.arange(max(-shift, 0), min(size - rows - shift, size) + 1)
+        low, high = first + shift, first + shift + rows
+        some = counts[high] - counts[low]
+        whole = some >= 0.9 * rows * length
+        out[first] = np.where(whole, (sums[high] - sums[low]) / np.maximum(some, 1), np.nan)
+        return out
+
+    before = mean(0, inner) - mean(-1 - SIDE_PX, SIDE_PX)
+    after = mean(-inner, inner) - mean(1, SIDE_PX)
+    return before, after
+
+
+def _best_of_width(before, after, width: int, through: int, sign: int):
+    """(energy, first row, middle in parts of the length, contrast, score) of the best band of one width,
+    through the row `through` where that is not negative."""
+    if width >= len(before):
+        return None
+    up, down = before[:-width], after[width:]
+    both = np.minimum(np.abs(up), np.abs(down))
+    contrast = np.where(np.isnan(both), np.nan, np.where(up * down > 0, np.copysign(both, up), 0.0))
+    seen = ~np.isnan(contrast)
+    parts, filled = seen.sum(axis=1), np.where(seen, contrast, 0.0)
+    some = np.maximum(parts, 1)
+    average = filled.sum(axis=1) / some
+    spread = np.sqrt(np.maximum(np.square(filled).sum(axis=1) / some - average**2, 0.0))
+    lasting = np.maximum(np.abs(average) - spread, 0.0)
+    energy = np.where(parts >= FEWEST_PARTS, lasting**2 * math.sqrt(width), 0.0)
+    if sign:
+        energy = np.where(sign * average > 0, energy, 0.0)
+    if through >= 0:
+        beside = np.abs(np.arange(len(energy)) + width / 2 - through)
+        energy = np.where(beside <= np.clip(width / 4, 1.5, 4.0), energy, 0.0)
+    k = int(np.argmax(energy))
+    if energy[k] <= 0:
+        return None
+    weight = np.abs(filled[k])
+    along = float(weight @ (np.arange(len(weight)) + 0.5) / max(weight.sum(), 1e-9))
+    score = abs(average[k]) * math.sqrt(parts[k]) / max(spread[k], 0.5)
+    return float(energy[k]), float(k), along, float(average[k]), float(score)
+
+
+@functools.lru_cache(maxsize=64)
+def matrix(pose: Pose) -> np.ndarray:
+    """(2, 3) that takes (column, row) of the turned picture to (x, y) of the picture as it came."""
+    a = math.radians(pose.angle_deg)
+    c, s = math.cos(a) / pose.scale, math.sin(a) / pose.scale
+    return np.array([
+        [c, -s, pose.x - c * pose.column + s * pose.row],
+        [s, c, pose.y - s * pose.column - c * pose.row],
+    ])  # fmt: skip
+
+
+def turned(frame: np.ndarray, pose: Pose) -> np.ndarray:
+    """The picture (rows, columns) in gray with the line along its rows; what lies outside of the frame
+    repeats its border."""
+    return cv2.warpAffine(
+        gray(frame),
+        matrix(pose),
+        (pose.columns, pose.rows),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+
+
+def pose_on(
+    line: Line, shape: tuple[int, int], *, ahead_px: float = math.inf, behind_px: float = math.inf
+) -> Pose:
+    """The pose in which only the line and its surroundings are left: half its width again on both sides, and
+    as much of its length, up to `longest_px`, as lies with them inside of the frame (rows, columns). A line
+    narrower than the windows of an edge is enlarged."""
+    scale = max(1.0, round(WIDE_PX / line.width_px))
+    half = math.ceil(max(line.width_px * scale, LEAST_PX / 2) * 0.9) + 8
+    pose = Pose(line.angle_deg, line.x, line.y, 0.0, half - 0.5, 2 * half, LEAST_PX, scale)
+    most = [math.floor(min(math.hypot(*shape), limit) * scale) for limit in (ahead_px, behind_px)]
+    ahead = span(pose, shape, (0, most[0]), half)[1]
+    back = pose._replace(angle_deg=line.angle_deg + 180)
+    behind = span(back, shape, (0, most[1]), half)[1]
+    return pose._replace(column=float(behind), columns=max(ahead + behind, LEAST_PX))
+
+
+def span(pose: Pose, shape: tuple[int, int], columns: tuple[int, int], half: float) -> tuple[int, int]:
+    """The first and one past the last of the first run of `columns`, counted from the pose's point, that lie
+    inside of the frame (rows, columns) over `half` rows on both sides; twice the same where none does."""
+    M = matrix(pose._replace(column=0.0, row=0.0))
+    steps = np.arange(*columns)
+    ones = np.ones(len(steps))
+    corners = [np.column_stack([steps, r * ones, ones]) @ M.T for r in (-half, half)]
+    h, w = shape
+    inside = np.all([np.all((at > -1) & (at < (w, h)), axis=1) for at in corners], axis=0)
+    first = int(np.argmax(np.append(inside, True)))
+    return columns[0] + first, columns[0] + first + int(np.argmin(np.append(inside[first:], False)))
+
+
+def foot(line: Line, x: float, y: float) -> tuple[float, float]:
+    """The point of the line that is nearest to (x, y)."""
+    a = math.radians(line.angle_deg)
+    along = (x - line.x) * math.cos(a) + (y - line.y) * math.sin(a)
+    return line.x + along * math.cos(a), line.y + along * math.sin(a)
+
+
+def with_room(pose: Pose, shape: tuple[int, int], columns: tuple[int, int]) -> Pose:
+    """The pose with its line in the middle of as many rows as lie inside of the frame (rows, columns) over
+    `columns`, at least LEAST_PX and at most the frame's diagonal."""
+    h, w = shape
+    M = matrix(pose._replace(row=0.0))
+    first, last = columns[0], columns[1] - 1
+
+    def inside(half: float) -> bool:
+        corners = np.array([[c, r, 1.0] for c in (first, last) for r in (-half, half)]) @ M.T
+        return bool(np.all((corners > -1) & (corners < (w, h))))
+
+    most = math.floor(math.hypot(h, w) / 2)
+    half = next((r for r in range(most, LEAST_PX // 2 - 1, -1) if inside(r)), LEAST_PX // 2)
+    return pose._replace(row=half - 0.5, rows=2 * half)

@@ -1,0 +1,534 @@
+"""Iterative learning control of the flow: the paper's law (Hoelzle 2009, eq. 2), the inverse of the
+identified model averaged over trials, the convergence test before anything runs, what the limits of the drive
+allow, and the learning loop, which rolls back, and restarts on a machine that changed."""
+
+import functools
+import math
+import operator
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.fft
+import scipy.signal
+
+from pipeline.deposition import reachable
+from pipeline.deposition.drive import Drive, asked, at_limit, follows, obeyed
+from pipeline.deposition.extruder import Extruder, flow, frequency_response
+from pipeline.deposition.learning.trial_filter import Repeating, repeating
+from pipeline.deposition.learning.trial_model import TrialModel, identify_with_lag, lag_delay_s
+from pipeline.deposition.learning.unmodelled import SMOOTHED_HZ
+
+# of the steady gain squared: only keeps the inverse finite where half
+# a sample of delay makes a zero, far above any Q
+EPSILON = 1e-9
+# where the inverse of the model's lag amplifies by so much, half of Q is kept: there the lag of a machine of
+# another order is off by a factor of 3 and a quarter of a turn (lags of 0.06 and 0.17 s, taken for 0.84 Hz)
+LAG_INVERSE = 10.0
+# no frequency of the learned command has more than this times what the model alone asks for: a machine whose
+# response there is a third of the model's is still learned
+MOST = 3.0
+# a trial that lies within so many standard deviations of the last ones, of so many, has not risen
+SCATTER, SCATTER_TRIALS = 3.0, 10
+# but beyond so many times the best error it has, however the last ones scatter: a scatter that grows would
+# let the next one grow more
+FAR = 3.0
+# the ink is brought to its yield over this time before flow is wanted, and let down over it afterwards
+YIELD_LEAD_S = 0.4
+
+
+class Trial(NamedTuple):
+    """Command u (T,) in mm as the drive applied it, measured flow y (T,) in mm^3/s with NaN where it was not
+    observable, true flow where simulated."""
+
+    u: np.ndarray
+    y: np.ndarray
+    truth: np.ndarray | None = None
+
+
+Law = Callable[[Sequence[Trial]], np.ndarray]
+
+
+class HoelzleSettings(NamedTuple):
+    """Settings of Hoelzle's law: learning gain k_p, fast zero in s, order and cut-off (Hz) of Q."""
+
+    learning_gain: float
+    fast_zero_s: float
+    order: int
+    cutoff_hz: float
+
+
+class InverseSettings(NamedTuple):
+    """Settings of the model inverse: the trials that identify the model, the least weight of a new trial,
+    order and cut-off (Hz) of Q."""
+
+    identify_trials: int
+    floor: float
+    order: int
+    cutoff_hz: float
+
+
+# ---- Q
+
+
+@functools.cache
+def _butterworth(order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
+    if not 0 < cutoff_hz < 0.5 / sample_time_s:
+        raise ValueError(
+            f"Q filter: expected a cut-off between 0 and half the sampling rate, {0.5 / sample_time_s:g} Hz, "
+            f"but found {cutoff_hz:g} Hz; lower the cut-off or sample faster"
+        )
+    return scipy.signal.butter(order, cutoff_hz, fs=1 / sample_time_s, output="sos")
+
+
+def zero_phase(x: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
+    """Q x (..., T): Butterworth low-pass of `order` run forward and backward, |Q|^2 without phase; x is zero
+    before and after, as no-flow is."""
+    sos, pad = _butterworth(order, cutoff_hz, sample_time_s), round(order / cutoff_hz / sample_time_s)
+    padded = np.zeros((*x.shape[:-1], x.shape[-1] + 2 * pad))
+    padded[..., pad : padded.shape[-1] - pad] = x
+    return scipy.signal.sosfilt(sos, scipy.signal.sosfilt(sos, padded)[..., ::-1])[..., ::-1][
+        ..., pad : padded.shape[-1] - pad
+    ]
+
+
+def magnitude(frequency_hz: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
+    """|Q(f)| (F,) of one run of the Butterworth filter; squared it is the response of `zero_phase`."""
+    sos = _butterworth(order, cutoff_hz, sample_time_s)
+    return np.abs(scipy.signal.sosfreqz(sos, frequency_hz, fs=1 / sample_time_s)[1])
+
+
+# ---- L
+
+
+def _slow_inverse(
+    model: Extruder, settings: HoelzleSettings, sample_time_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    scale = settings.learning_gain / model.gain
+    return scipy.signal.bilinear(
+        [scale * model.time_constant_s, scale], [settings.fast_zero_s, 1.0], 1 / sample_time_s
+    )
+
+
+def hoelzle_filter(
+    frequency_hz: np.ndarray, model: Extruder, settings: HoelzleSettings, *, sample_time_s: float
+) -> np.ndarray:
+    """L(f) = k_p / P̂ (F,), P̂ = K (fast_zero s + 1) / (tau s + 1): the fast zero makes the inverse proper
+    (Hoelzle 2009, eq. 2); bilinear."""
+    return scipy.signal.freqz(
+        *_slow_inverse(model, settings, sample_time_s), frequency_hz, fs=1 / sample_time_s
+    )[1]
+
+
+def hoelzle_law(
+    r: np.ndarray,
+    model: Extruder,
+    q: Callable[..., np.ndarray],
+    settings: HoelzleSettings,
+    *,
+    drive: Drive,
+    sample_time_s: float,
+) -> Law:
+    """u_{j+1} = Q (u_j + L e_j) of the last trial (Hoelzle 2009, eq. 2); q is
+    `zero_phase` or takes the same, the model the nominal (1).
+
+    u_j is what the drive applied, so that nothing winds up at its
+    limits; e_j = 0 where the flow was not observable.
+    """
+    b, a = _slow_inverse(model, settings, sample_time_s)
+
+    def law(trials: Sequence[Trial]) -> np.ndarray:
+        u, y, _ = trials[-1]
+        e = np.where(np.isfinite(y), r - y, 0.0)
+        following = q(
+            u + scipy.signal.lfilter(b, a, e),
+            order=settings.order,
+            cutoff_hz=settings.cutoff_hz,
+            sample_time_s=sample_time_s,
+        )
+        return obeyed(following, drive, sample_time_s=sample_time_s)
+
+    return law
+
+
+def inverse_filter(frequency_hz: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarray:
+    """L(f) = conj(H) / (|H|^2 + eps) (F,), H the response of the identified model with its delay."""
+    H = frequency_response(model, frequency_hz, sample_time_s=sample_time_s)
+    return np.conj(H) / (np.abs(H) ** 2 + EPSILON * model.gain**2)
+
+
+def inverse(x: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarray:
+    """L x (T,) by FFT, with zeros for as long as the model's delay and
+    a second more, so that nothing comes round."""
+    n = scipy.fft.next_fast_len(len(x) + round((model.delay_s + 1.0) / sample_time_s), real=True)
+    f = np.fft.rfftfreq(n, sample_time_s)
+    return np.fft.irfft(np.fft.rfft(x, n) * inverse_filter(f, model, sample_time_s=sample_time_s), n)[
+        : len(x)
+    ]
+
+
+def known_share(frequency_hz: np.ndarray, model: Extruder) -> np.ndarray:
+    """T(f) (F,) = 1 / (1 + (|lag|^-4 - 1) / LAG_INVERSE^4), |lag(f)|^2 = 1 / (1 + (f / lag_hz)^4): what is
+    kept of Q where the inverse of the model's lag amplifies. One half where it does so by LAG_INVERSE; 1 of a
+    model without a lag.
+
+    A lag of few Hz is hardly identified beyond its own frequency, and stands for lags of another order; its
+    inverse would amplify noise without end, and diverge where |Q (1 - L P)| > 1.
+    """
+    return 1 / (1 + ((1 + (frequency_hz / model.lag_hz) ** 4) ** 2 - 1) / LAG_INVERSE**4)
+
+
+def known(x: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarray:
+    """T x (..., T) without phase (`known_share`)."""
+    if math.isinf(model.lag_hz):
+        return x
+    n = scipy.fft.next_fast_len(x.shape[-1] + round(1 / sample_time_s), real=True)
+    share = known_share(np.fft.rfftfreq(n, sample_time_s), model)
+    return np.fft.irfft(share * np.fft.rfft(x, n), n)[..., : x.shape[-1]]
+
+
+def bounded(x: np.ndarray, learned: np.ndarray, *, sample_time_s: float) -> np.ndarray:
+    """`learned` (T,) with at no frequency more than MOST times the amplitude of x (T,), both summed over the
+    SMOOTHED_HZ around it; as it is where it has nowhere more.
+
+    So no command grows without bound, whatever the machine is: |u| <= MOST |L Q x|, and L Q is known.
+    """
+    n = scipy.fft.next_fast_len(len(x) + round(1 / sample_time_s), real=True)
+    spectra = np.fft.rfft([x, learned], n)
+    near = np.ones(max(round(SMOOTHED_HZ * n * sample_time_s), 1))
+    # summed one by one: a running sum loses what is small beside the lowest frequencies
+    asked, given = (np.sqrt(np.convolve(np.abs(one) ** 2, near, "same")) for one in spectra)
+    kept = np.minimum(MOST * asked, given) / np.maximum(given, np.finfo(float).tiny)
+    return np.fft.irfft(spectra[1] * kept, n)[: len(x)]
+
+
+def wanted(r: np.ndarray, yield_: float, *, sample_time_s: float) -> np.ndarray:
+    """x (T,) in mm^3/s that gives the flow r: r + yield while ink is wanted, brought up to the yield just
+    before and let down just after; r, yield in mm^3/s."""
+    half = round(YIELD_LEAD_S / sample_time_s)
+    near = np.convolve(r > 0, np.ones(2 * half + 1), "full")[half : half + len(r)] / (half + 1)
+    return r + yield_ * np.where(r > 0, 1.0, np.minimum(near, 1.0))
+
+
+def command(
+    x: np.ndarray, r: np.ndarray, model: Extruder, *, drive: Drive, sample_time_s: float
+) -> np.ndarray:
+    """u (T,) in mm that presses x (T,) out of the model; where the drive cannot follow that, the u whose flow
+    comes nearest (`reachable.nearest`)."""
+    u = inverse(x, model, sample_time_s=sample_time_s)
+    if follows(u, drive, sample_time_s=sample_time_s):
+        return u
+    a = math.exp(-sample_time_s / model.time_constant_s)
+    scale, t = model.gain * (1 - a), np.arange(len(x)) * sample_time_s
+    # u(t) shows in the flow one sample and the delay later; what is reached at a limit is slow, and a lag
+    # makes that late
+    later = t + sample_time_s + model.delay_s + lag_delay_s(model.lag_hz)
+    free = np.interp(later, t, r) <= 0
+    v = reachable.nearest(
+        np.interp(later, t, x),
+        free,
+        pole=a,
+        bound=scale * drive.amplitude_mm,
+        step=scale * drive.speed_mm_per_s * sample_time_s,
+    )
+    u = np.diff(v, prepend=0.0) / scale + np.concatenate([[0.0], v[:-1]]) / model.gain
+    return obeyed(u, drive, sample_time_s=sample_time_s)
+
+
+class InverseLaw:
+    """The model inverse, u_{j+1} = Q sum_i w_i (u_i + L e_i) over the trials i <= j that it is given, L the
+    inverse of the model identified from the first of them; it remembers that model.
+
+    Written with the average d of what the model misses: u_{j+1} = L Q ((r + yield) / g - d), the same thing
+    where the gain g of the next trial is 1, and for one trial Q (u + L e). The weights w_i average what does
+    not repeat, and follow what changes (`trial_filter.repeating`); Q stays outside, so that it erodes nothing
+    as they fall, and |1 - k + k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k. Q ends earlier where
+    the model's lag would have to be inverted far above its frequency (`known_share`), and what is learned is
+    bounded by what the model alone asks for (`bounded`).
+
+    `identify_trials` trials are identified together: beyond the on-off trial 0 the first
+    learned commands show the extruder as it will be driven.
+    """
+
+    def __init__(self, r: np.ndarray, settings: InverseSettings, *, drive: Drive, sample_time_s: float):
+        self.r, self.settings, self.drive, self.sample_time_s = r, settings, drive, sample_time_s
+        self.q = {"order": settings.order, "cutoff_hz": settings.cutoff_hz, "sample_time_s": sample_time_s}
+        self._first: list[Trial] = []
+        self.model: TrialModel | None = None
+        self.repeating: Repeating | None = None
+
+    def __call__(self, trials: Sequence[Trial]) -> np.ndarray:
+        model = self._identified(list(trials[: self.settings.identify_trials]))
+        self.repeating = repeating(
+            np.array([trial.u for trial in trials]),
+            np.array([trial.y for trial in trials]),
+            self.r,
+            model,
+            floor=self.settings.floor,
+            smooth=lambda x: self._smooth(x, model.extruder),
+            sample_time_s=self.sample_time_s,
+        )
+        d, gain, extruder = self.repeating.disturbance, self.repeating.gain, model.extruder
+        x = self._smooth(wanted(self.r, extruder.yield_, sample_time_s=self.sample_time_s) / gain, extruder)
+        x = bounded(x, x - self._smooth(d, extruder), sample_time_s=self.sample_time_s)
+        return command(x, self.r, extruder, drive=self.drive, sample_time_s=self.sample_time_s)
+
+    def _smooth(self, x: np.ndarray, model: Extruder) -> np.ndarray:
+        """T Q x (..., T): below the law's cut-off, and where the model's lag is known (`known_share`)."""
+        return known(zero_phase(x, **self.q), model, sample_time_s=self.sample_time_s)
+
+    def _identified(self, first: list[Trial]) -> TrialModel:
+        """The model of the trials `first`, identified once."""
+        same = len(first) == len(self._first) and all(map(operator.is_, first, self._first))
+        if self.model is None or not same:
+            u, y = [trial.u for trial in first], [trial.y for trial in first]
+            self._first = first
+            self.model = identify_with_lag(u, y, sample_time_s=self.sample_time_s)
+        return self.model
+
+
+# ---- before anything runs
+
+
+def gamma(Q: np.ndarray, L: np.ndarray, P: np.ndarray, delta: np.ndarray | float = 0.0) -> np.ndarray:
+    """max over frequency and over all |Delta'(f)| <= delta(f) of |Q (1 - L P (1 + Delta'))|, which is |Q| (|1
+    - L P| + |L P| delta): below 1 the error shrinks monotonically, above 1 it grows in the end (Bristow,
+    Tharayil and Alleyne 2006; with the multiplicative uncertainty delta, de Roover and Bosgra 2000).
+
+    Q (F,) is |Q|^2 where Q runs both ways; L (F,); delta (F,); P (F,) or (plants, F), with all
+    the delay there is: the result is one number a plant.
+    """
+    return np.max(np.abs(Q) * (np.abs(1 - L * P) + np.abs(L * P) * delta), axis=-1)
+
+
+class ActuatorHeadroom(NamedTuple):
+    """What the drive leaves: peak (mm) and speed (mm/s) of the command that r needs, its steady command (mm),
+    the least error as a share of trial 0's, and the ramp that would do."""
+
+    peak: float
+    steady: float
+    ratio: float
+    ramp_s: float
+    speed: float
+
+
+def actuator_headroom(
+    r: np.ndarray,
+    u0: np.ndarray,
+    model: Extruder,
+    *,
+    order: int,
+    cutoff_hz: float,
+    drive: Drive,
+    sample_time_s: float,
+) -> ActuatorHeadroom:
+    """Headroom of the drive over the model for r (T,): the least error is that of the nearest flow that the
+    drive can follow, as a share of what u0 (T,) leaves. Its backlash, which is learned, is left out.
+
+    ramp_s is the longer of what solves (1 + tau / t_ramp) steady = amplitude and (1 + tau / t_ramp) steady /
+    t_ramp = speed; it is infinite where the amplitude does not even hold the steady flow.
+    """
+    x = zero_phase(
+        wanted(r, model.yield_, sample_time_s=sample_time_s),
+        order=order,
+        cutoff_hz=cutoff_hz,
+        sample_time_s=sample_time_s,
+    )
+    needed = asked(inverse(x, model, sample_time_s=sample_time_s), sample_time_s=sample_time_s)
+    steady = float((r.max() + model.yield_) / model.gain)
+    best, first = (
+        rms(r - flow(model, u, sample_time_s=sample_time_s))
+        for u in (
+            command(x, r, model, drive=drive, sample_time_s=sample_time_s),
+            obeyed(u0, drive, sample_time_s=sample_time_s),
+        )
+    )
+    ramp_s = max(_ramp_of_amplitude(drive, steady, model), _ramp_of_speed(drive, steady, model))
+    return ActuatorHeadroom(needed.command_mm, steady, best / first, ramp_s, needed.speed_mm_per_s)
+
+
+def _ramp_of_amplitude(drive: Drive, steady: float, model: Extruder) -> float:
+    """The ramp in s whose peak command is the amplitude, (1 + tau / ramp) steady; 0 without a limit."""
+    over = drive.amplitude_mm / steady
+    return model.time_constant_s / (over - 1) if over > 1 else math.inf
+
+
+def _ramp_of_speed(drive: Drive, steady: float, model: Extruder) -> float:
+    """The ramp in s over which the command goes to (1 + tau / ramp) steady at the speed; 0 without a
+    limit."""
+    rate = drive.speed_mm_per_s / steady
+    if math.isinf(rate):
+        return 0.0
+    return (1 + math.sqrt(1 + 4 * model.time_constant_s * rate)) / (2 * rate)
+
+
+def check_headroom(headroom: ActuatorHeadroom, *, drive: Drive, worst_ratio: float) -> None:
+    """Raises ValueError where no law can come below `worst_ratio` of trial 0's
+    error: the sentence names the ramp that would do."""
+    if headroom.ratio <= worst_ratio:
+        return
+    needs = (
+        f"these ramps need a peak command of {headroom.peak / headroom.steady:.1f} x steady "
+        f"and the limit is {drive.amplitude_mm / headroom.steady:.1f} x"
+    )
+    if headroom.speed > drive.speed_mm_per_s:
+        needs += f", and {headroom.speed:.0f} mm/s where the drive has {drive.speed_mm_per_s:g} mm/s"
+    do = (
+        f"ramps of {headroom.ramp_s:.2f} s would do"
+        if math.isfinite(headroom.ramp_s)
+        else "no ramp would do: print slower, or raise the limit above the steady command"
+    )
+    raise ValueError(
+        f"actuator headroom: {needs}, so no law comes below {headroom.ratio:.0%} of the error of trial 0; "
+        f"{do}"
+    )
+
+
+# ---- the learning loop
+
+
+class Step(NamedTuple):
+    """Next command u (T,) in mm; the best trial of the machine as it is now; whether the last trial rose, so
+    that u goes back to the best; and the trials at which the machine was found changed."""
+
+    u: np.ndarray
+    best: int
+    rolled_back: bool
+    restarts: list[int]
+
+
+def rms(e: np.ndarray) -> float:
+    """Root mean square over what was observable."""
+    observable = e[np.isfinite(e)]
+    return float(np.sqrt(observable @ observable / len(observable)))
+
+
+class LearningState(NamedTuple):
+    """The trials to learn from, those of the machine as it is now without those that rose; the one of them
+    with the least error; whether each trial has risen; the first trial after each change of the machine;
+    whether the next trial repeats the best command; and how often the law's step is halved."""
+
+    keep: list[int]
+    best: int
+    risen: list[bool]
+    restarts: list[int]
+    repeat: bool
+    halvings: int
+
+
+def judge(errors: Sequence[float], *, rise: float) -> LearningState:
+    """What the trials so far say of machine and law: a trial has risen whose error exceeds the best by more
+    than `rise` of trial 0's, and what the trials before it scatter or FAR times the best.
+
+    The trial after a rise repeats the best command, and this tells a law from a machine. Where the error of
+    old comes back, the law went too far, or that trial was spoilt: the trial is left out, and the law's steps
+    are halved until as many trials did not rise. Where the repeat rises too, the machine changed: what was
+    learned before the first of the two is left.
+    """
+    keep, best, risen, restarts = [0], 0, [False], []
+    repeat, halvings = False, 0
+    for j in range(1, len(errors)):
+        usual = _scattered([errors[i] for i in keep[2:]][-SCATTER_TRIALS:])
+        risen.append(errors[j] > max(errors[best] + rise * errors[0], min(usual, FAR * errors[best])))
+        if repeat and risen[j]:
+            restarts.append(j - 1)
+            keep, best = [j - 1, j], min(j - 1, j, key=errors.__getitem__)
+            repeat, halvings = False, 0
+        elif risen[j]:
+            repeat = True
+        else:
+            keep.append(j)
+            best = min(best, j, key=errors.__getitem__)
+            repeat, halvings = False, halvings + 1 if repeat else max(halvings - 1, 0)
+    return LearningState(keep, best, risen, restarts, repeat, halvings)
+
+
+def _scattered(errors: list[float]) -> float:
+    """The largest error that the scatter of these explains: their median and SCATTER standard deviations,
+    told from the changes between them, which are small where an error creeps up; 0 of fewer than four."""
+    if len(errors) < 4:
+        return 0.0
+    deviation = 1.4826 * float(np.median(np.abs(np.diff(errors)))) / math.sqrt(2)
+    return float(np.median(errors)) + SCATTER * deviation
+
+
+def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) -> Step:
+    """What follows from the trials so far; nothing else is remembered,
+    so that a folder of recordings can be continued.
+
+    After a trial that has risen (`judge`) the best command is repeated. If the machine changed, the law is
+    given the trials since alone, and so identifies its model anew; otherwise it goes on, at first with half
+    its step from the best. Learning never stops.
+    """
+    for j, (u, y, _) in enumerate(trials):
+        if u.shape != r.shape or y.shape != r.shape or not np.isfinite(y).any():
+            raise ValueError(
+                f"trial {j}: expected command and flow of {len(r)} samples, as the reference has, "
+                f"some of it observable, but found {u.shape} and {y.shape} "
+                f"with {np.isfinite(y).sum()} observable; leave the trial out or record it again"
+            )
+    state = judge([rms(r - trial.y) for trial in trials], rise=rise)
+    best = trials[state.best].u
+    u = law([trials[i] for i in state.keep])
+    if state.repeat:
+        u = best
+    elif state.halvings:
+        u = best + (u - best) / 2**state.halvings
+    return Step(u, state.best, state.risen[-1], state.restarts)
+
+
+def learn(
+    law: Law,
+    measure: Callable[[np.ndarray], Trial],
+    u0: np.ndarray,
+    r: np.ndarray,
+    *,
+    trials: int,
+    rise: float,
+    on_step: Callable[[Trial], None] = lambda trial: None,
+) -> list[Trial]:
+    """Trial 0 with u0 and `trials` updates. `measure` runs one command on a plant."""
+    done = [measure(u0)]
+    on_step(done[0])
+    while len(done) <= trials:
+        done.append(measure(next_step(done, r, law, rise=rise).u))
+        on_step(done[-1])
+    return done
+
+
+class Row(NamedTuple):
+    """One trial: errors in mm^3/s (true is NaN where nothing was simulated), ratio to trial 0 of the true
+    error where known, else of the measured one."""
+
+    trial: int
+    rms_true: float
+    rms_measured: float
+    ratio: float
+    peak_over_steady: float
+    saturated: float
+    rolled_back: bool
+
+
+def table(
+    trials: Sequence[Trial], r: np.ndarray, *, steady: float, drive: Drive, sample_time_s: float, rise: float
+) -> list[Row]:
+    """A row a trial; `steady` is the steady command in mm, saturated the share of time at a limit of the
+    drive, rolled_back whether the trial was left for a better one."""
+    measured = [rms(r - trial.y) for trial in trials]
+    true = [np.nan if trial.truth is None else rms(r - trial.truth) for trial in trials]
+    risen = judge(measured, rise=rise).risen
+    rows = []
+    for j, (u, _, truth) in enumerate(trials):
+        ratio = measured[j] / measured[0] if truth is None else true[j] / true[0]
+        rows.append(
+            Row(
+                j,
+                true[j],
+                measured[j],
+                ratio,
+                float(np.abs(u).max() / steady),
+                float(np.mean(at_limit(u, drive, sample_time_s=sample_time_s))),
+                risen[j],
+            )
+        )
+    return rows

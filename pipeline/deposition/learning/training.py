@@ -1,0 +1,314 @@
+"""A machine learns its routines: on-off first, then the paper's law or the model inverse, trial after trial;
+and the convergence of both over a family of plants before anything runs."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.deposition.drive import Drive, obeyed
+from pipeline.deposition.extruder import Extruder, Routine, disturb, draw, flow, frequency_response
+from pipeline.deposition.learning import ilc
+from pipeline.deposition.learning.ilc import Law, Trial
+from pipeline.deposition.learning.trial_model import deviations
+from pipeline.deposition.learning.unmodelled import unmodelled
+
+# the frequencies of the convergence test reach to half the sampling rate
+FREQUENCIES = 2000
+
+
+class LawSettings(NamedTuple):
+    """What both laws are built from: sample time in s; the drive; the settings of each law; `rise` of the
+    error, as share of trial 0's, that counts as one."""
+
+    sample_time_s: float
+    drive: Drive
+    hoelzle_2009: ilc.HoelzleSettings
+    model_inverse: ilc.InverseSettings
+    rise: float
+
+
+class Noise(NamedTuple):
+    """What does not repeat from trial to trial, as shares of the steady flow (`extruder.disturb`)."""
+
+    white: float
+    drift: float
+    gain: float
+
+
+class TrialSequence(NamedTuple):
+    """What one law did with one routine: every trial, a row of figures for each (`ilc.Row`), and the model
+    that it identified where it did."""
+
+    law: str
+    routine: Routine
+    trials: list[Trial]
+    rows: list[ilc.Row]
+    model: ilc.TrialModel | None
+
+
+class TrainingCase(NamedTuple):
+    """What a material is trained on: nominal model, the machine that it
+    runs on, and its routines, the reference first."""
+
+    nominal: Extruder
+    plant: Extruder
+    routines: list[Routine]
+
+
+class Convergence(NamedTuple):
+    """gamma of the nominal plant and of each plant of the family (N,); below 1 the error shrinks at every
+    trial."""
+
+    nominal: float
+    family: np.ndarray
+
+
+def on_off(r: np.ndarray, model: Extruder) -> np.ndarray:
+    """u_0 = r / K (T,) in mm: what a machine does that knows only the gain of its nominal model."""
+    return r / model.gain
+
+
+def hoelzle_2009(routine: Routine, nominal: Extruder, settings: LawSettings) -> Law:
+    """The paper's law (2) with Q both ways."""
+    return ilc.hoelzle_law(
+        routine.r,
+        nominal,
+        ilc.zero_phase,
+        settings.hoelzle_2009,
+        drive=settings.drive,
+        sample_time_s=settings.sample_time_s,
+    )
+
+
+def model_inverse(routine: Routine, settings: LawSettings) -> ilc.InverseLaw:
+    """The inverse of the model identified from the first trials."""
+    return ilc.InverseLaw(
+        routine.r, settings.model_inverse, drive=settings.drive, sample_time_s=settings.sample_time_s
+    )
+
+
+def simulated(
+    plant: Extruder, rng: np.random.Generator, noise: Noise, *, steady_flow: float, settings: LawSettings
+) -> Callable[[np.ndarray], Trial]:
+    """A machine that runs a command u (T,) in mm: the true flow, and
+    the measured one with what does not repeat."""
+
+    def measure(u: np.ndarray) -> Trial:
+        truth = flow(plant, u, sample_time_s=settings.sample_time_s, drive=settings.drive)
+        y = disturb(
+            truth, rng, steady_flow=steady_flow, white=noise.white, drift=noise.drift, gain=noise.gain
+        )
+        return Trial(obeyed(u, settings.drive, sample_time_s=settings.sample_time_s), y, truth)
+
+    return measure
+
+
+def run_trials(
+    name: str,
+    law: Law,
+    measure: Callable[[np.ndarray], Trial],
+    routine: Routine,
+    nominal: Extruder,
+    *,
+    trials: int,
+    settings: LawSettings,
+    on_step: Callable[[Trial], None],
+) -> TrialSequence:
+    """`trials` updates from on-off control, with roll-back (`ilc.learn`)."""
+    u0 = on_off(routine.r, nominal)
+    done = ilc.learn(law, measure, u0, routine.r, trials=trials, rise=settings.rise, on_step=on_step)
+    rows = ilc.table(
+        done,
+        routine.r,
+        steady=float(u0.max()),
+        drive=settings.drive,
+        sample_time_s=settings.sample_time_s,
+        rise=settings.rise,
+    )
+    return TrialSequence(name, routine, done, rows, getattr(law, "model", None))
+
+
+def train(
+    case: TrainingCase,
+    rng: np.random.Generator,
+    noise: Noise,
+    *,
+    trials: int,
+    settings: LawSettings,
+    on_step: Callable[[Trial], None],
+) -> list[TrialSequence]:
+    """The paper's law on the reference routine and the model inverse on every routine, on the simulated
+    machine; last the paper's law on its own nominal model, as the paper ran it."""
+    first, sequences = case.routines[0], []
+    work = [
+        ("hoelzle_2009", first, case.plant),
+        *(("model_inverse", routine, case.plant) for routine in case.routines),
+        ("hoelzle_2009_nominal", first, case.nominal),
+    ]
+    for name, routine, plant in work:
+        measure = simulated(plant, rng, noise, steady_flow=float(routine.r.max()), settings=settings)
+        law = (
+            model_inverse(routine, settings)
+            if name == "model_inverse"
+            else hoelzle_2009(routine, case.nominal, settings)
+        )
+        sequences.append(
+            run_trials(
+                name, law, measure, routine, case.nominal, trials=trials, settings=settings, on_step=on_step
+            )
+        )
+    return sequences
+
+
+def figures(sequence: TrialSequence, *, rise: float) -> dict[str, float | list[int]]:
+    """The ratios that the loop is judged by: at some trials, of the last, and the least of the machine as it
+    is now; the trials at which it was found changed, and what the command needs."""
+    rows = sequence.rows
+    restarts = ilc.judge([row.rms_measured for row in rows], rise=rise).restarts
+    now = rows[restarts[-1] if restarts else 0 :]
+    best = min(now, key=lambda row: row.ratio)
+    return {f"ratio_trial_{j}": rows[j].ratio for j in (2, 3, 4, 8, 15, 30) if j < len(rows)} | {
+        "last_ratio": rows[-1].ratio,
+        "best_ratio": best.ratio,
+        "best_trial": best.trial,
+        "restarts": restarts,
+        "trials": len(rows) - 1,
+        "peak_over_steady": max(row.peak_over_steady for row in rows),
+        "saturated": rows[-1].saturated,
+    }
+
+
+def convergence(
+    nominal: Extruder, rng: np.random.Generator, *, plants: int, steady_flow: float, settings: LawSettings
+) -> Convergence:
+    """gamma = max |Q (1 - L P)| of the paper's law over `plants` draws
+    around the nominal model, before anything runs."""
+    f = np.linspace(0.0, 0.5 / settings.sample_time_s, FREQUENCIES)
+    law, Ts = settings.hoelzle_2009, settings.sample_time_s
+    Q = ilc.magnitude(f, order=law.order, cutoff_hz=law.cutoff_hz, sample_time_s=Ts) ** 2
+    L = ilc.hoelzle_filter(f, nominal, law, sample_time_s=Ts)
+    family = [
+        draw(rng, gain=nominal.gain, time_constant_s=nominal.time_constant_s, steady_flow=steady_flow)
+        for _ in range(plants)
+    ]
+    P = np.stack(
+        [frequency_response(plant, f, sample_time_s=settings.sample_time_s) for plant in [nominal, *family]]
+    )
+    gammas = ilc.gamma(Q, L, P)
+    return Convergence(float(gammas[0]), gammas[1:])
+
+
+def convergence_of_model_inverse(
+    sequence: TrialSequence, rng: np.random.Generator, noise: Noise, *, plants: int, settings: LawSettings
+) -> Convergence:
+    """gamma = max |Q| (|1 - L P| + |L P Delta|) of the model inverse once its model is identified: of that
+    model, and over plants that the first trials cannot tell from it.
+
+    That is the largest |Q (1 - L P (1 + Delta'))| of all |Delta'(f)| <= |Delta(f)|, and Delta is what the
+    model leaves of the trials that identified it and of the next one, which it has not seen
+    (`unmodelled.unmodelled`).
+    """
+    e, law, Ts = sequence.model.extruder, settings.model_inverse, settings.sample_time_s
+    first = _first_trials(sequence, law.identify_trials + 1, settings)
+    u, y = [t.u for t in first], [t.y for t in first]
+    n = law.identify_trials
+    spread = deviations(
+        sequence.model, u[:n], y[:n], drift=noise.drift, trial_gain=noise.gain, sample_time_s=Ts
+    )
+    near = np.array([e.gain, e.time_constant_s, e.delay_s]) + np.array(spread[:3]) * rng.standard_normal(
+        (plants, 3)
+    )
+    f = np.linspace(0.0, 0.5 / Ts, FREQUENCIES)
+    Q = ilc.magnitude(f, order=law.order, cutoff_hz=law.cutoff_hz, sample_time_s=Ts) ** 2
+    Q = Q * ilc.known_share(f, e)
+    L = ilc.inverse_filter(f, e, sample_time_s=Ts)
+    family = [
+        Extruder(K, tau, max(delay, 0.0), e.lag_hz) for K, tau, delay in np.maximum(near, 1e-6).tolist()
+    ]
+    P = np.stack([frequency_response(plant, f, sample_time_s=Ts) for plant in [e, *family]])
+    gammas = ilc.gamma(Q, L, P, unmodelled(sequence.model, u, y, f, sample_time_s=Ts))
+    return Convergence(float(gammas[0]), gammas[1:])
+
+
+def _first_trials(sequence: TrialSequence, count: int, settings: LawSettings) -> list[Trial]:
+    """The first trials of the machine as it is now: of them the model was identified."""
+    state = ilc.judge([row.rms_measured for row in sequence.rows], rise=settings.rise)
+    return [sequence.trials[j] for j in state.keep[:count]]
+
+
+def actuator_headroom(
+    routine: Routine, nominal: Extruder, *, worst_ratio: float, settings: LawSettings
+) -> ilc.ActuatorHeadroom:
+    """What the drive leaves of the routine, on the nominal model, before anything
+    runs. Raises ValueError where no law can come below worst_ratio of the error of on-off
+    control; the sentence names the ramp that would do."""
+    headroom = ilc.actuator_headroom(
+        routine.r,
+        on_off(routine.r, nominal),
+        nominal,
+        order=settings.model_inverse.order,
+        cutoff_hz=settings.model_inverse.cutoff_hz,
+        drive=settings.drive,
+        sample_time_s=settings.sample_time_s,
+    )
+    ilc.check_headroom(headroom, drive=settings.drive, worst_ratio=worst_ratio)
+    return headroom
+
+
+# ---- as tables
+
+
+def trial_rows(sequences: dict[tuple[str, int], list[TrialSequence]]) -> dict[str, np.ndarray]:
+    """One row a trial of every sequence, by (material, number of the routine)."""
+    columns: dict[str, list] = {
+        name: [] for name in ("material", "law", "routine", "speed_mm_per_s", "pause_s", *ilc.Row._fields)
+    }
+    for (material, index), of_routine in sequences.items():
+        for sequence in of_routine:
+            routine, law = sequence.routine, sequence.law
+            speed = float(routine.speed.max())
+            pause = round(routine.pause_s[1] - routine.pause_s[0], 9)
+            for row in sequence.rows:
+                for name, value in zip(columns, (material, law, index, speed, pause, *row), strict=True):
+                    columns[name].append(value)
+    return {
+        name: np.array(values, object if name in ("material", "law") else None)
+        for name, values in columns.items()
+    }
+
+
+def sample_rows(sequences: dict[tuple[str, int], list[TrialSequence]]) -> dict[str, np.ndarray]:
+    """Every sample of every trial of every sequence: what a library is cut from."""
+    parts: dict[str, list[np.ndarray]] = {
+        name: []
+        for name in (
+            "material",
+            "law",
+            "routine",
+            "trial",
+            "time_s",
+            "wanted_mm3_per_s",
+            "command_mm",
+            "measured_mm3_per_s",
+            "true_mm3_per_s",
+        )
+    }
+    for (material, index), of_routine in sequences.items():
+        for sequence in of_routine:
+            for j, (u, y, truth) in enumerate(sequence.trials):
+                n, r = len(u), sequence.routine
+                names = [np.full(n, text, object) for text in (material, sequence.law)]
+                values = (
+                    *names,
+                    np.full(n, index),
+                    np.full(n, j),
+                    r.time_s,
+                    r.r,
+                    u,
+                    y,
+                    np.full(n, np.nan) if truth is None else truth,
+                )
+                for name, value in zip(parts, values, strict=True):
+                    parts[name].append(value)
+    return {name: np.concatenate(values) if values else np.array([]) for name, values in parts.items()}

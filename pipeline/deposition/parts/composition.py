@@ -1,0 +1,407 @@
+"""Part program -> plunger command without learning again: the paper's priority rule, superposition, and basis
+functions; the one whose forecast is least at its upper end is taken."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.deposition.drive import Drive, at_limit, follows, obeyed
+from pipeline.deposition.parts import basis, forecast
+from pipeline.deposition.parts.chain import Chain, averaged, identify, simulate
+from pipeline.deposition.parts.forecast import Covered, Judged, Missed
+from pipeline.deposition.parts.library import (
+    CORNER,
+    START,
+    STEADY,
+    STOP,
+    Check,
+    Library,
+    Training,
+    background,
+    build,
+    check,
+    learned,
+    nearest,
+    of_task,
+)
+from pipeline.deposition.toolpath.gcode import Kind, Moves, Program
+from pipeline.deposition.toolpath.motion import Motion, rate, sampled
+from pipeline.deposition.toolpath.tasks import Lines, Tasks, halting, printed_lines, refuse, sequence
+
+COMPOSERS = PRIORITY, SUPERPOSITION, BASIS = "priority", "superposition", "basis"
+# rest before the first line and after the last: longer than any lead
+MARGIN_S = 2.0
+# a long job is judged by its first minutes of each material
+EXCERPT_S = 600.0
+
+
+class Material(NamedTuple):
+    """What was learned of one material and nozzle: its chain, the gain (mm^3/s per mm) by
+    which on-off control set out in the first trial, and the error of the learned trials
+    themselves in % of the steady flow (means over 0.2 s); what fits without a routine missed on it, and what
+    the routines covered."""
+
+    material: str
+    nozzle_mm: float
+    chain: Chain
+    on_off_gain: float
+    learned_percent: float
+    missed: Missed
+    covered: Covered
+
+
+class Learned(NamedTuple):
+    """The library of all materials, what the composers know of each, and the assumptions in figures."""
+
+    library: Library
+    materials: tuple[Material, ...]
+    checks: list[Check]
+
+
+class PartSettings(NamedTuple):
+    """How a part is printed: nozzle in mm; the wanted flow is bead area x printing speed, its steps shaped by
+    two boxes of ramp_s; a junction is a Corner from corner_deg on; a longer halt than longest_pause_s ends a
+    run; and the drive."""
+
+    nozzle_mm: float
+    bead_area_mm2: float
+    ramp_s: float
+    corner_deg: float
+    longest_pause_s: float
+    drive: Drive
+
+
+class Prediction(NamedTuple):
+    """Forecast r.m.s. error of one composer on one tool's share of a part, in % of that of on-off control:
+    90 % of what may come out lies between low and high. `chosen` is the composer with the least `high`."""
+
+    tool: int
+    material: str
+    composer: str
+    low: float
+    median: float
+    high: float
+    chosen: bool
+
+
+class Stream(NamedTuple):
+    """One tool's share of a part, all (T,): wanted flow r (mm^3/s), the same before its steps were shaped,
+    command u (mm), predicted flow y and that of on-off control; the composer that u is from, whether its
+    forecast may be believed, and the share of
+    the time that u is at a limit of the drive."""
+
+    tool: int
+    material: str
+    nozzle_mm: float
+    composer: str
+    r: np.ndarray
+    unshaped: np.ndarray
+    u: np.ndarray
+    y: np.ndarray
+    on_off: np.ndarray
+    saturated: float
+    judged: Judged
+
+
+class Share(NamedTuple):
+    """One tool's share of a part before it is composed: the tool, its material, the wanted flow r (T,) in
+    mm^3/s, and the tasks and lines of the whole part."""
+
+    tool: int
+    material: Material
+    r: np.ndarray
+    tasks: Tasks
+    lines: Lines
+
+
+class Composed(NamedTuple):
+    """A part: its streams on one clock (sample k at k Ts; the gantry sets out lead_in_s later, which the
+    times of lines and tasks contain), and how each composer would do. error_percent (N,) is the predicted
+    error of the library's signal for each task, 0 for what was trained."""
+
+    streams: tuple[Stream, ...]
+    tasks: Tasks
+    lines: Lines
+    error_percent: np.ndarray
+    predictions: list[Prediction]
+    lead_in_s: float
+    sample_time_s: float
+
+
+def learn(trainings: Sequence[Training], *, sample_time_s: float) -> Learned:
+    """Library, chains and checks from all learned trials: what segment_library stores.
+
+    Of each material and nozzle at least one routine; two speeds and two pauses make it hold for others.
+    """
+    library, materials = build(trainings, sample_time_s=sample_time_s), []
+    for key in sorted({(t.material, t.nozzle_mm) for t in trainings}):
+        mine = [t for t in trainings if (t.material, t.nozzle_mm) == key]
+        left = []
+        for t in mine:
+            y = learned(t)[1]
+            left.append(averaged(np.nan_to_num(y - t.r), np.isfinite(y), sample_time_s) / t.r.max())
+        gain = float(
+            np.median(
+                np.concatenate(
+                    [t.r[t.r >= t.r.max() / 2] / np.maximum(t.u[0][t.r >= t.r.max() / 2], 1e-9) for t in mine]
+                )
+            )
+        )
+        chain = identify(mine, sample_time_s=sample_time_s)
+        materials.append(
+            Material(
+                *key,
+                chain,
+                gain,
+                100 * math.sqrt(np.mean(np.square(left))),
+                forecast.missed(mine, chain, sample_time_s=sample_time_s),
+                forecast.covered(mine, sample_time_s=sample_time_s),
+            )
+        )
+    return Learned(library, tuple(materials), check(trainings, library))
+
+
+def _of(tasks: Tasks, tool: int, name: str) -> np.ndarray:
+    return np.flatnonzero((tasks.task == name) & (tasks.tool == tool))
+
+
+def _steady(
+    library: Library, material: str, nozzle_mm: float, lines: Lines, tool: int, samples: int
+) -> np.ndarray:
+    """Steady-State (T,) from each printed line's begin to the next
+    one's in its run, at the level of its speed."""
+    mine = np.flatnonzero(lines.tool == tool)
+    columns, column, factor, _ = nearest(
+        library, STEADY, material, nozzle_mm, lines.speed[mine], np.zeros(len(mine))
+    )
+    level = np.array([still.signal[0] for still in columns])[column] * factor
+    until = np.where(lines.last[mine], lines.end_s[mine], np.append(lines.begin_s[1:], lines.end_s[-1])[mine])
+    at = np.round(np.concatenate([lines.begin_s[mine], until]) / library.sample_time_s).astype(int)
+    step = np.bincount(
+        np.minimum(at, samples), weights=np.concatenate([level, -level]), minlength=samples + 1
+    )
+    return np.cumsum(step)[:samples]
+
+
+def _placed(library: Library, name: str, material: str, nozzle_mm: float, tasks: Tasks, tool: int):
+    """For each column of a finite task: (signal, samples (E, K) that
+    it takes at its E events, factors (E, 1))."""
+    mine = _of(tasks, tool, name)
+    columns, column, factor, _ = nearest(
+        library, name, material, nozzle_mm, tasks.speed[mine], tasks.pause_s[mine]
+    )
+    event = np.round(tasks.begin_s[mine] / library.sample_time_s).astype(int)
+    for k in np.unique(column):
+        chosen, taken = columns[k], column == k
+        yield (
+            chosen,
+            (event[taken] - chosen.lead)[:, None] + np.arange(len(chosen.signal)),
+            factor[taken][:, None],
+        )
+
+
+def priority(
+    library: Library, material: str, nozzle_mm: float, tasks: Tasks, lines: Lines, tool: int, *, samples: int
+) -> np.ndarray:
+    """u (T,) by the paper's hierarchy (fig. 7): at each sample the highest of Stop, Start, Corner,
+    Steady-State, No-Flow that is active; each sent ahead by its lead."""
+    u = np.append(_steady(library, material, nozzle_mm, lines, tool, samples), 0.0)
+    for name in (CORNER, START, STOP):
+        for chosen, at, factor in _placed(library, name, material, nozzle_mm, tasks, tool):
+            u[np.where((at < 0) | (at > samples), samples, at)] = factor * chosen.signal
+    return u[:samples]
+
+
+def superposition(
+    library: Library, material: str, nozzle_mm: float, tasks: Tasks, lines: Lines, tool: int, *, samples: int
+) -> np.ndarray:
+    """u (T,) as the steady level with every task's deviation from it added, so that tasks which overlap both
+    count (the extruder is nearly linear)."""
+    u = _steady(library, material, nozzle_mm, lines, tool, samples)
+    levels = {still.speed: float(still.signal[0]) for still in of_task(library, STEADY, material, nozzle_mm)}
+    for name in (CORNER, START, STOP):
+        for chosen, at, factor in _placed(library, name, material, nozzle_mm, tasks, tool):
+            added = factor * (chosen.signal - background(chosen, levels[chosen.speed]))
+            inside = (at >= 0) & (at < samples)
+            u += np.bincount(at[inside], weights=np.broadcast_to(added, at.shape)[inside], minlength=samples)
+    return u
+
+
+def _command(composer: str, library: Library, share: Share, drive: Drive) -> np.ndarray:
+    """u (T,) in mm of one composer for one tool's share of a part, which the drive can follow."""
+    material, Ts = share.material, library.sample_time_s
+    if composer == BASIS:
+        return basis.compose(material.chain.extruder, share.r, sample_time_s=Ts, drive=drive)
+    by = priority if composer == PRIORITY else superposition
+    u = by(
+        library,
+        material.material,
+        material.nozzle_mm,
+        share.tasks,
+        share.lines,
+        share.tool,
+        samples=len(share.r),
+    )
+    if follows(u, drive, sample_time_s=Ts):
+        return u
+    return basis.reached(material.chain.extruder, u, _sent_ahead(share, Ts), drive, Ts)
+
+
+def _sent_ahead(share: Share, Ts: float) -> np.ndarray:
+    """The wanted flow (T,) at the time when a command for it is sent: earlier by delay and lag of the
+    chain."""
+    extruder, t = share.material.chain.extruder, np.arange(len(share.r)) * Ts
+    return np.interp(t + extruder.delay_s + basis.mean_lag_s(extruder), t, share.r, right=0.0)
+
+
+def commands(learned: Learned, composed: Composed, stream: Stream, *, drive: Drive) -> dict[str, np.ndarray]:
+    """The command (T,) of every composer for one stream of a part, to set beside the chosen one."""
+    material = next(
+        one
+        for one in learned.materials
+        if (one.material, one.nozzle_mm) == (stream.material, stream.nozzle_mm)
+    )
+    share = Share(stream.tool, material, stream.r, composed.tasks, composed.lines)
+    return {name: _command(name, learned.library, share, drive) for name in COMPOSERS}
+
+
+def _judge(library: Library, share: Share, drive: Drive) -> dict[str, forecast.Interval]:
+    """Forecast error of each composer in % of on-off control's, over the first EXCERPT_S from where this tool
+    begins to print: all by the same members and residuals."""
+    Ts, material = library.sample_time_s, share.material
+    excerpt = _excerpt(share, Ts)
+
+    def flows(u):
+        return forecast.flows(material.chain, material.missed, u, excerpt.r, sample_time_s=Ts)
+
+    on_off = flows(_on_off(excerpt, drive, Ts))
+    return {
+        name: forecast.error_percent(flows(_command(name, library, excerpt, drive)), on_off, excerpt.r)
+        for name in COMPOSERS
+    }
+
+
+def _excerpt(share: Share, Ts: float) -> Share:
+    """The first EXCERPT_S of a share with its own tasks and lines, its clock from MARGIN_S before the tool
+    begins to print."""
+    r, tasks, lines = share.r, share.tasks, share.lines
+    begin = max(0, int(np.argmax(r > 0)) - round(MARGIN_S / Ts))
+    upto = min(len(r), begin + round(EXCERPT_S / Ts))
+    near = (tasks.begin_s < (upto + 1) * Ts) & (tasks.begin_s >= (begin - 1) * Ts)
+    tasks = Tasks(*(np.asarray(column)[near] for column in tasks))
+    tasks = tasks._replace(begin_s=tasks.begin_s - begin * Ts)
+    near = (lines.begin_s < (upto + 1) * Ts) & (lines.begin_s >= (begin - 1) * Ts)
+    lines = Lines(*(np.asarray(column)[near] for column in lines))
+    lines = lines._replace(begin_s=lines.begin_s - begin * Ts, end_s=lines.end_s - begin * Ts)
+    return share._replace(r=r[begin:upto], tasks=tasks, lines=lines)
+
+
+def _on_off(share: Share, drive: Drive, Ts: float) -> np.ndarray:
+    """u (T,) in mm of on-off control, as the first trial set out: r over the gain known then."""
+    return obeyed(share.r / share.material.on_off_gain, drive, sample_time_s=Ts)
+
+
+def compose(
+    learned: Learned, program: Program, motion: Motion, settings: PartSettings, *, materials: dict[int, str]
+) -> Composed:
+    """Commands for all tools of a part, each by the composer that is predicted to do best for its material.
+
+    `materials` names the material of each tool. Raises ValueError for a tool without a material, a
+    material or nozzle that was not learned, where nothing is printed, and, with its line number, where the
+    program would go from Steady-State to No-Flow without a Stop.
+    """
+    library, drive, moves = learned.library, settings.drive, program.moves
+    Ts, marks = library.sample_time_s, library.marks
+    lines = printed_lines(
+        moves, motion, corner_deg=settings.corner_deg, longest_pause_s=settings.longest_pause_s
+    )
+    refuse(
+        lines,
+        moves,
+        halts=halting(program.other_line, program.other_word),
+        switch_s=marks[STOP][1] + marks[START][0],
+    )
+    ahead = math.ceil(max(0.0, MARGIN_S - lines.begin_s[0]) / Ts)
+    wanted = _wanted(moves, motion, settings, ahead, Ts)
+    lines = lines._replace(begin_s=lines.begin_s + ahead * Ts, end_s=lines.end_s + ahead * Ts)
+    samples = len(next(iter(wanted.values())))
+    tasks = sequence(lines, end_s=samples * Ts)
+    error, streams, predictions = np.zeros(len(tasks.task)), [], []
+    for tool, unshaped in wanted.items():
+        material = _material(learned, materials, tool, settings.nozzle_mm, lines)
+        r = basis.boxed(unshaped, settings.ramp_s, Ts)
+        r[r < 1e-9 * r.max()] = 0.0  # rounding of the sums behind the rate
+        share = Share(tool, material, r, tasks, lines)
+        percents = _judge(library, share, drive)
+        best = min(percents, key=lambda name: percents[name].high)
+        predictions += [
+            Prediction(tool, material.material, name, *percent, name == best)
+            for name, percent in percents.items()
+        ]
+        streams.append(_stream(library, share, unshaped, best, drive))
+        for name in (START, STOP, CORNER, STEADY):
+            at = _of(tasks, tool, name)
+            error[at] = nearest(
+                library, name, material.material, settings.nozzle_mm, tasks.speed[at], tasks.pause_s[at]
+            ).error_percent
+    return Composed(tuple(streams), tasks, lines, error, predictions, ahead * Ts, Ts)
+
+
+def _wanted(
+    moves: Moves, motion: Motion, settings: PartSettings, ahead: int, Ts: float
+) -> dict[int, np.ndarray]:
+    """Wanted flow (T,) in mm^3/s of each tool that prints, before its steps are shaped, with `ahead` samples
+    of rest before the gantry sets out and MARGIN_S after the end."""
+    signal = sampled(motion, moves, sample_time_s=Ts, rates_only=True)
+    prints, around = (moves.kind == Kind.EXTRUDE) & (moves.length > 0), (ahead, math.ceil(MARGIN_S / Ts))
+    return {
+        tool: settings.bead_area_mm2
+        * np.pad(
+            rate(signal, np.where(prints & (moves.tool == tool), moves.length, 0.0), sample_time_s=Ts), around
+        )
+        for tool in np.unique(moves.tool[prints]).tolist()
+    }
+
+
+def _material(
+    learned: Learned, materials: dict[int, str], tool: int, nozzle_mm: float, lines: Lines
+) -> Material:
+    """What was learned of the tool's material with this nozzle."""
+    first = lines.line[lines.tool == tool][0]
+    if tool not in materials:
+        raise ValueError(
+            f"line {first}: T{tool} prints but has no material; expected one of tools {sorted(materials)}, "
+            "or name its material"
+        )
+    for material in learned.materials:
+        if (material.material, material.nozzle_mm) == (materials[tool], nozzle_mm):
+            return material
+    trained = ", ".join(f"{one.material} with {one.nozzle_mm:g} mm" for one in learned.materials)
+    raise ValueError(
+        f"line {first}: T{tool} prints {materials[tool]} with a nozzle of {nozzle_mm:g} mm, "
+        f"but what was learned is {trained}; train it first"
+    )
+
+
+def _stream(library: Library, share: Share, unshaped: np.ndarray, composer: str, drive: Drive) -> Stream:
+    """The share by one composer: its command, and the flows that the chain predicts for it and for on-off."""
+    material, u, Ts = share.material, _command(composer, library, share, drive), library.sample_time_s
+    y, on_off = (
+        simulate([material.chain.extruder], command[None], sample_time_s=Ts)[0, 0]
+        for command in (u, _on_off(share, drive, Ts))
+    )
+    return Stream(
+        share.tool,
+        material.material,
+        material.nozzle_mm,
+        composer,
+        share.r,
+        unshaped,
+        u,
+        y,
+        on_off,
+        float(np.mean(at_limit(u, drive, sample_time_s=Ts))),
+        forecast.judged(material.missed, material.covered, share.r, sample_time_s=Ts),
+    )

@@ -1,0 +1,276 @@
+"""Will this part print? Predicted volume of every printed line, runs shorter than the Stop lead, what the
+drive's limit costs, and what was refused, by line number."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.deposition import reachable
+from pipeline.deposition.drive import Drive, asked, at_limit, obeyed
+from pipeline.deposition.extruder import Extruder
+from pipeline.deposition.parts import basis, forecast
+from pipeline.deposition.parts.chain import Identified
+from pipeline.deposition.parts.chain import forecast as predicted_flow
+from pipeline.deposition.parts.composition import (
+    BASIS,
+    EXCERPT_S,
+    MARGIN_S,
+    Composed,
+    Learned,
+    Material,
+    Stream,
+)
+from pipeline.deposition.parts.library import STOP, Library
+from pipeline.deposition.toolpath.gcode import Refusal
+
+# flow this long before a line begins and after it ends is its own, unless a neighbour is nearer
+REACH_S = 1.0
+# ramps longer than this are no ramps of a printed line
+LONGEST_RAMP_S = 10.0
+
+
+class LineVolumes(NamedTuple):
+    """Every printed line, all (L,): number in the program, tool, begin and duration in s, length in mm,
+    planned volume (bead area x length), predicted volume and that of on-off control in mm^3, error in % of
+    the plan, whether its whole run is shorter than the Stop lead, and the 90 % interval of its error in % of
+    the plan."""
+
+    line: np.ndarray
+    tool: np.ndarray
+    begin_s: np.ndarray
+    duration_s: np.ndarray
+    length_mm: np.ndarray
+    planned_mm3: np.ndarray
+    predicted_mm3: np.ndarray
+    on_off_mm3: np.ndarray
+    error_percent: np.ndarray
+    shorter_than_lead: np.ndarray
+    low_percent: np.ndarray
+    high_percent: np.ndarray
+
+
+class Saturation(NamedTuple):
+    """What a drive does to one flow with one ramp: its limits (inf where there is none) and beside them the
+    largest unlimited command (mm) and its speed (mm/s); peak of that command over the steady one, share of
+    the printing time at a limit, and r.m.s. error of the composed command within them in % of that of on-off
+    control r / on_off_gain; least_percent is that of the nearest flow that the drive can reach, and enough
+    whether the drive adds at most `reachable.LOSS` of on-off's to the error of the unlimited command."""
+
+    ramp_s: float
+    amplitude_mm: float
+    speed_mm_per_s: float
+    largest_command_mm: float
+    largest_speed_mm_per_s: float
+    peak_over_steady: float
+    share_percent: float
+    rms_percent_of_on_off: float
+    least_percent: float
+    enough: bool
+
+
+class Refused(NamedTuple):
+    """What was not composed as it stands: line number and one sentence."""
+
+    line: int
+    why: str
+
+
+class Conformance(NamedTuple):
+    """The report on a part: its lines, the worst error in % among the `judged` lines of at least shortest_s,
+    for each tool the saturation with the ramp as it is and the ramp of the gantry in s with which the drive
+    would follow a line (inf where none does), and what was refused."""
+
+    lines: LineVolumes
+    worst_line_volume_percent: float
+    judged: int
+    saturation: dict[int, Saturation]
+    ramp_that_would_do_s: dict[int, float]
+    refused: list[Refused]
+
+
+def conform(
+    composed: Composed,
+    learned: Learned,
+    *,
+    bead_area_mm2: float,
+    ramp_s: float,
+    drive: Drive,
+    shortest_s: float,
+    largest_error_percent: float,
+    refusals: Sequence[Refusal] = (),
+) -> Conformance:
+    """Whether the part will print: line volumes, saturation, refusals of the program's reader, and
+    tasks whose signal the library only guesses (predicted error above largest_error_percent, or
+    unknown), where the library's signals are used."""
+    lines = line_volumes(composed, learned.library, bead_area_mm2=bead_area_mm2)
+    lines = _intervals(lines, composed, learned)
+    judged = lines.duration_s >= shortest_s - 1e-9
+    Ts = composed.sample_time_s
+    saturations, ramps = {}, {}
+    for stream in composed.streams:
+        material = _material(learned, stream)
+        first = int(np.argmax(stream.unshaped > 0))
+        some = stream.unshaped[max(0, first - round(MARGIN_S / Ts)) : first + round(EXCERPT_S / Ts)]
+        settings = {"ramp_s": ramp_s, "drive": drive, "sample_time_s": Ts}
+        saturations[stream.tool] = saturation(
+            material.chain.extruder, some, on_off_gain=material.on_off_gain, **settings
+        )
+        ramps[stream.tool] = ramp_that_would_do(material.chain.extruder, some, **settings)
+    refused = [Refused(refusal.line, refusal.why) for refusal in refusals]
+    by_library = np.isin(
+        composed.tasks.tool, [stream.tool for stream in composed.streams if stream.composer != BASIS]
+    )
+    for k in np.flatnonzero(by_library & ~(composed.error_percent <= largest_error_percent)):
+        speed, pause = composed.tasks.speed[k], composed.tasks.pause_s[k]
+        asked = f"{composed.tasks.task[k]} at {speed:g} mm/s with a pause of {pause:.2f} s"
+        refused.append(
+            Refused(
+                int(composed.tasks.line[k]),
+                f"the library lacks {asked}; the nearest signal has a predicted error of "
+                f"{composed.error_percent[k]:.0f} %",
+            )
+        )
+    worst = float(np.abs(lines.error_percent[judged]).max()) if judged.any() else math.nan
+    return Conformance(lines, worst, int(judged.sum()), saturations, ramps, sorted(refused))
+
+
+def _intervals(lines: LineVolumes, composed: Composed, learned: Learned) -> LineVolumes:
+    """The lines with the 90 % interval of each one's volume, of what the streams' forecasts may come to."""
+    low, high = lines.low_percent.copy(), lines.high_percent.copy()
+    for stream in composed.streams:
+        material = _material(learned, stream)
+        mine, start, stop = _reaches(composed, stream.tool)
+        planned = lines.planned_mm3[mine]
+        made = forecast.each_flow(
+            material.chain, material.missed, stream.u, stream.r, sample_time_s=composed.sample_time_s
+        )
+        low[mine], high[mine] = forecast.ends(
+            100 * (volume_between(y, start, stop, sample_time_s=composed.sample_time_s) / planned - 1)
+            for y in made
+        )
+    return lines._replace(low_percent=low, high_percent=high)
+
+
+def _material(learned: Learned, stream: Stream) -> Material:
+    """What was learned of the stream's material with its nozzle."""
+    return next(
+        material
+        for material in learned.materials
+        if (material.material, material.nozzle_mm) == (stream.material, stream.nozzle_mm)
+    )
+
+
+def _reaches(composed: Composed, tool: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The lines of a tool, and from when to when in s the flow is theirs: to the middles of the gaps to
+    their neighbours, at most REACH_S from their ends."""
+    mine = np.flatnonzero(composed.lines.tool == tool)
+    a, b = composed.lines.begin_s[mine], composed.lines.end_s[mine]
+    middle = (b[:-1] + a[1:]) / 2
+    start = np.maximum(a - composed.lines.early_s[mine] - REACH_S, np.append(-np.inf, middle))
+    stop = np.minimum(b + composed.lines.late_s[mine] + REACH_S, np.append(middle, np.inf))
+    return mine, start, stop
+
+
+def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) -> LineVolumes:
+    """A row for each printed line, in their order: the flow between the middles of the gaps to its neighbours
+    of the same tool, at most REACH_S from its ends."""
+    lines, Ts = composed.lines, composed.sample_time_s
+    begin = np.bincount(lines.run, weights=np.where(lines.first, lines.begin_s, 0.0))
+    run_s = np.bincount(lines.run, weights=np.where(lines.last, lines.end_s, 0.0)) - begin
+    predicted, on_off = np.zeros(len(lines.line)), np.zeros(len(lines.line))
+    for stream in composed.streams:
+        mine, start, stop = _reaches(composed, stream.tool)
+        predicted[mine] = volume_between(stream.y, start, stop, sample_time_s=Ts)
+        on_off[mine] = volume_between(stream.on_off, start, stop, sample_time_s=Ts)
+    planned = bead_area_mm2 * lines.length
+    error, short = 100 * (predicted / planned - 1), run_s[lines.run] < library.marks[STOP][0]
+    return LineVolumes(
+        lines.line,
+        lines.tool,
+        lines.begin_s,
+        lines.end_s - lines.begin_s,
+        lines.length,
+        planned,
+        predicted,
+        on_off,
+        error,
+        short,
+        np.full(len(error), np.nan),
+        np.full(len(error), np.nan),
+    )
+
+
+def volume_between(
+    flow: np.ndarray, start: np.ndarray, stop: np.ndarray, *, sample_time_s: float
+) -> np.ndarray:
+    """Volume (L,) in mm^3 that a flow (T,), linear between its samples, presses out from start (L,) to stop
+    (L,), in s; none before the first and after the last."""
+    t = np.arange(len(flow)) * sample_time_s
+    total = np.append(0.0, np.cumsum((flow[1:] + flow[:-1]) / 2)) * sample_time_s
+    return np.interp(stop, t, total) - np.interp(start, t, total)
+
+
+def saturation(
+    extruder: Extruder | Identified,
+    unshaped: np.ndarray,
+    *,
+    on_off_gain: float,
+    ramp_s: float,
+    drive: Drive,
+    sample_time_s: float,
+) -> Saturation:
+    """What the drive does to the wanted flow (T,) with its steps
+    shaped by two boxes of ramp_s: forecast by the chain."""
+    r = basis.boxed(unshaped, ramp_s, sample_time_s)
+    r[r < 1e-9 * r.max(initial=0.0)] = 0.0  # rounding of the sums behind the rate
+    free = basis.compose(extruder, r, sample_time_s=sample_time_s)
+    u = basis.compose(extruder, r, sample_time_s=sample_time_s, drive=drive)
+    steady, most = (r.max() + extruder.yield_) / extruder.gain, asked(free, sample_time_s=sample_time_s)
+    first = obeyed(r / on_off_gain, drive, sample_time_s=sample_time_s)
+    on_off, limited, unlimited = (
+        float(np.linalg.norm(predicted_flow(extruder, command, sample_time_s=sample_time_s) - r))
+        for command in (first, u, free)
+    )
+    least = float(np.linalg.norm(reachable.flow(_plain(extruder), r, drive, sample_time_s) - r))
+    share = np.mean(at_limit(u, drive, sample_time_s=sample_time_s)[r > 0])
+    on_off = max(on_off, 1e-300)
+    return Saturation(
+        ramp_s,
+        drive.amplitude_mm,
+        drive.speed_mm_per_s,
+        most.command_mm,
+        most.speed_mm_per_s,
+        most.command_mm / steady,
+        100 * float(share),
+        100 * limited / on_off,
+        100 * least / on_off,
+        limited - unlimited <= reachable.LOSS * on_off,
+    )
+
+
+def ramp_that_would_do(
+    extruder: Extruder | Identified,
+    unshaped: np.ndarray,
+    *,
+    ramp_s: float,
+    drive: Drive,
+    sample_time_s: float,
+) -> float:
+    """The shortest time in s in which the gantry comes to the highest speed of the wanted flow (T,), its
+    steps shaped by two boxes of ramp_s, such that the drive follows a line
+    (`reachable.ramp_that_loses_little`); inf where none up to LONGEST_RAMP_S does."""
+    return reachable.ramp_that_loses_little(
+        _plain(extruder),
+        drive,
+        steady_flow=float(unshaped.max()),
+        ramp_s=ramp_s,
+        longest_s=LONGEST_RAMP_S,
+        sample_time_s=sample_time_s,
+    )
+
+
+def _plain(extruder: Extruder | Identified) -> Extruder:
+    """Its gain, time constant and yield: what a drive's limits stand against."""
+    return Extruder(extruder.gain, extruder.time_constant_s, yield_=extruder.yield_)

@@ -1,0 +1,103 @@
+"""Every composer on one part, beside on-off control and full-part ILC; judged by the true flow of the
+machine, on a real one by the forecast."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.deposition.drive import obeyed
+from pipeline.deposition.extruder import Extruder, Routine, flow
+from pipeline.deposition.learning import ilc, training
+from pipeline.deposition.learning.training import LawSettings, Noise
+from pipeline.deposition.parts.chain import forecast
+from pipeline.deposition.parts.composition import Composed, Learned, Stream, commands
+from pipeline.deposition.parts.conformance import line_volumes
+
+ON_OFF, FULL_PART_ILC = "on_off", "ilc"
+
+
+class Score(NamedTuple):
+    """One composer on one stream: r.m.s. error of its flow y (T,) in % of on-off control's, as judged and as
+    predicted beforehand (NaN where nothing predicts it), and the largest error of a printed line's volume in
+    % (NaN where no line is long enough)."""
+
+    stream: int
+    composer: str
+    chosen: bool
+    rms_percent_of_on_off: float
+    predicted_percent: float
+    worst_line_volume_percent: float
+    y: np.ndarray
+
+
+class Judging(NamedTuple):
+    """What composers are judged by: the nominal and the true extruders by material, the latter empty where
+    there is only a real machine; the laws' settings and the noise; the updates of full-part ILC; the bead's
+    area, and the shortest line whose volume counts."""
+
+    nominals: dict[str, Extruder]
+    plants: dict[str, Extruder]
+    laws: LawSettings
+    noise: Noise
+    updates: int
+    bead_area_mm2: float
+    shortest_s: float
+
+
+def evaluate(learned: Learned, composed: Composed, judging: Judging, rng: np.random.Generator) -> list[Score]:
+    """Scores of all composers on all streams.
+
+    On a real machine nobody knows the true flow: a composer scores the upper end of its forecast, its flow is
+    the chain's, and full-part ILC is left out.
+    """
+    scores, Ts, drive = [], judging.laws.sample_time_s, judging.laws.drive
+    for i, stream in enumerate(composed.streams):
+        nominal, plant = judging.nominals[stream.material], judging.plants.get(stream.material)
+        chain = next(one.chain.extruder for one in learned.materials if one.material == stream.material)
+        by_composer = {ON_OFF: obeyed(stream.r / nominal.gain, drive, sample_time_s=Ts)} | commands(
+            learned, composed, stream, drive=drive
+        )
+        if plant:
+            by_composer[FULL_PART_ILC] = _full_part_ilc(plant, nominal, stream, judging, rng)
+        predicted = {p.composer: p for p in composed.predictions if p.tool == stream.tool}
+        yardstick = np.nan
+        for name, u in by_composer.items():
+            y = (
+                flow(plant, u, sample_time_s=Ts, drive=drive)
+                if plant
+                else forecast(chain, u, sample_time_s=Ts)
+            )
+            error = float(np.linalg.norm(y - stream.r))
+            yardstick = error if name == ON_OFF else yardstick
+            worst = _worst_line(learned, composed, i, y, judging)
+            told = predicted.get(name)
+            percent = told.high if told and not plant else 100 * error / max(yardstick, 1e-12)
+            middle = told.median if told else np.nan
+            scores.append(Score(i, name, name == stream.composer, percent, middle, worst, y))
+    return scores
+
+
+def _full_part_ilc(
+    plant: Extruder, nominal: Extruder, stream: Stream, judging: Judging, rng: np.random.Generator
+) -> np.ndarray:
+    """The command after `updates` trials of the full part by the inverse of the identified model."""
+    laws = judging.laws
+    t = np.arange(len(stream.r)) * laws.sample_time_s
+    part = Routine(t, stream.r, np.zeros(len(t)), np.zeros(len(t)), stream.r > 0, 0.0, (0.0, 0.0), 0.0)
+    measure = training.simulated(plant, rng, judging.noise, steady_flow=float(stream.r.max()), settings=laws)
+    law = training.model_inverse(part, laws)
+    u0 = training.on_off(stream.r, nominal)
+    trials = ilc.learn(law, measure, u0, stream.r, trials=judging.updates, rise=laws.rise)
+    return ilc.next_step(trials, stream.r, law, rise=laws.rise).u
+
+
+def _worst_line(learned: Learned, composed: Composed, i: int, y: np.ndarray, judging: Judging) -> float:
+    """Largest error in % of the volume of a line of stream i under the flow y."""
+    with_flow = composed._replace(
+        streams=(*composed.streams[:i], composed.streams[i]._replace(y=y), *composed.streams[i + 1 :])
+    )
+    volumes = line_volumes(with_flow, learned.library, bead_area_mm2=judging.bead_area_mm2)
+    long_enough = (volumes.tool == composed.streams[i].tool) & (
+        volumes.duration_s >= judging.shortest_s - 1e-9
+    )
+    return float(np.abs(volumes.error_percent[long_enough]).max()) if long_enough.any() else float("nan")

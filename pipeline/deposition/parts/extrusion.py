@@ -1,0 +1,116 @@
+"""What E presses out: mm^3 of every move by RepRap's arithmetic, the diameter of what E pushes, and the
+declared bead beside it."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.deposition.toolpath.gcode import Kind, Moves, Program
+
+
+class Extruded(NamedTuple):
+    """What is wanted of every printed move: volume_mm3 (N,), by E where the diameter of what it pushes is
+    known, else bead area x length, NaN for moves that do not print; by_e (N,) tells which. source: in words
+    by tool where the diameter is from, or why E does not count."""
+
+    volume_mm3: np.ndarray
+    by_e: np.ndarray
+    source: dict[int, str]
+
+
+class Difference(NamedTuple):
+    """E of one tool beside the declared bead: volumes in mm^3 of the lines that E counts for, and the 5 %,
+    50 % and 95 % quantiles of their bead area in mm^2, weighted by length."""
+
+    tool: int
+    by_e_mm3: float
+    declared_mm3: float
+    area_mm2: tuple[float, float, float]
+
+
+def volumes(program: Program, diameter_mm: Mapping[int, float]) -> np.ndarray:
+    """mm^3 (N,) that E of every move presses out: e x flow x pi d^2 / 4, and e x flow where M200 makes E
+    count mm^3; NaN where neither is known, and where no letter drives the extrusion."""
+    moves = program.moves
+    if not _lettered(program):
+        return np.full(len(moves.line), np.nan)
+    area = np.full(len(moves.line), np.nan)
+    for tool, d in diameter_mm.items():
+        area[moves.tool == tool] = np.pi * d**2 / 4
+    return moves.e * program.flow * np.where(program.volumetric, 1.0, area)
+
+
+def wanted(
+    program: Program,
+    *,
+    bead_area_mm2: float,
+    asked_mm: float | None = None,
+    declared_mm: Mapping[int, float] | None = None,
+    scale: float = 1.0,
+) -> Extruded:
+    """The volume of every printed move. A tool's diameter is what was asked for, else what the program says
+    (a slicer's comment, M200), else what the machine declares; without one its lines are declared beads. A
+    part made `scale` times as large asks for scale^3 of E's volume."""
+    moves, said = program.moves, program.diameter_mm
+    printed = (moves.kind == Kind.EXTRUDE) & (moves.length > 0)
+    diameter, source = {}, {}
+    for tool in np.unique(moves.tool[printed]).tolist():
+        choices = (
+            (asked_mm, "as asked"), (said.get(tool), "as the program says"),
+            ((declared_mm or {}).get(tool), "as declared"),
+        )  # fmt: skip
+        d, where = next(((d, where) for d, where in choices if d), (None, ""))
+        if not _lettered(program):
+            source[tool] = f"{program.extruder or 'nothing'} drives the extrusion, which tells no volume"
+        elif np.all(program.volumetric[printed & (moves.tool == tool)]):
+            source[tool] = "E counts mm^3 (M200)"
+        elif d is None:
+            source[tool] = f"the diameter of what {program.extruder} pushes is not known"
+        else:
+            diameter[tool], source[tool] = d, f"diameter {d:g} mm, {where}"
+    e = volumes(program, diameter) * scale**3
+    by_e = printed & np.isfinite(e)
+    volume = np.where(by_e, e, np.where(printed, bead_area_mm2 * moves.length, np.nan))
+    return Extruded(volume, by_e, source)
+
+
+def _lettered(program: Program) -> bool:
+    """Whether letters drive the extrusion, not a switch."""
+    return bool(program.extruder) and program.extruder.isalpha()
+
+
+def differences(moves: Moves, extruded: Extruded, *, bead_area_mm2: float) -> list[Difference]:
+    """E beside the declared bead, of each tool whose lines E counts for."""
+    found = []
+    for tool in np.unique(moves.tool[extruded.by_e]).tolist():
+        at = extruded.by_e & (moves.tool == tool)
+        length, volume = moves.length[at], extruded.volume_mm3[at]
+        order = np.argsort(volume / length, kind="stable")
+        share = np.cumsum(length[order]) / length.sum()
+        low, middle, high = ((volume / length)[order][np.searchsorted(share, q)] for q in (0.05, 0.5, 0.95))
+        declared = bead_area_mm2 * float(length.sum())
+        found.append(
+            Difference(tool, float(volume.sum()), declared, (float(low), float(middle), float(high)))
+        )
+    return found
+
+
+def resized(program: Program, *, scale: float = 1.0, speed: float = 1.0) -> Program:
+    """The program with X, Y and Z `scale` times as large and every feed `speed` times as fast."""
+    moves = program.moves
+    if scale == speed == 1.0:
+        return program
+    moves = moves._replace(
+        start=moves.start * scale, end=moves.end * scale, length=moves.length * scale,
+        centre=moves.centre * scale, feed=moves.feed * speed,
+    )  # fmt: skip
+    return program._replace(moves=moves)
+
+
+def as_lengths(program: Program, extruded: Extruded, *, bead_area_mm2: float) -> Program:
+    """The program with every printed move as long as the declared bead would be of its volume: what a
+    composer, which wants bead area x length, then presses out is what E asks for."""
+    moves = program.moves
+    length = np.where(extruded.by_e, extruded.volume_mm3 / bead_area_mm2, moves.length)
+    return program._replace(moves=moves._replace(length=length))

@@ -1,0 +1,132 @@
+"""Plunger commands -> G-code with leads: the plunger's place written along the gantry's way, so that it is
+primed ahead of each line and let back ahead of its end, by a machine that plays no signal."""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.deposition.toolpath.gcode import Kind, Moves
+from pipeline.deposition.toolpath.motion import Motion, sampled
+
+# how near the gantry is to its planned place at any time, mm: a sixteenth of a nozzle
+WAY_MM = 0.05
+
+
+class Legs(NamedTuple):
+    """K legs in their order: the tool in use, where the gantry ends (K, 3) in mm, the plunger's place at
+    that end in mm, the seconds that the leg takes, and whether it is a change to its tool, which takes the
+    machine's own time. lost_mm is the largest command of a tool while another one is in use."""
+
+    tool: np.ndarray
+    position: np.ndarray
+    u: np.ndarray
+    duration_s: np.ndarray
+    change: np.ndarray
+    lost_mm: float
+
+
+def legs(
+    moves: Moves,
+    motion: Motion,
+    commands: Mapping[int, np.ndarray],
+    *,
+    lead_in_s: float,
+    sample_time_s: float,
+    tolerance_mm: float,
+) -> Legs:
+    """Legs that follow the commands u (T,) of each tool, linear between their samples, within tolerance_mm,
+    and the gantry's path exactly but for arcs, which get a leg a sample; along it the gantry is within WAY_MM
+    of where it is planned at that time, so that a long ramp is several legs of rising feed. The gantry sets
+    out lead_in_s behind the first sample."""
+    Ts, n = sample_time_s, max(len(u) for u in commands.values())
+    changes = np.flatnonzero(moves.kind == Kind.TOOL)
+    begins, ends = lead_in_s + motion.begin_s, lead_in_s + motion.begin_s + motion.duration_s
+    bounds = np.concatenate([[0.0], begins[changes], [max(n * Ts, ends[-1])]])
+    first = next((int(t) for t, k in zip(moves.tool, moves.kind, strict=True) if k == Kind.EXTRUDE), 0)
+    tools = [int(moves.tool[changes[0] - 1]) if len(changes) and changes[0] else first]
+    tools += moves.tool[changes].tolist()
+    u, lost = np.zeros(n), 0.0
+    at = np.searchsorted(bounds, np.arange(n) * Ts, side="right") - 1
+    for tool, command in commands.items():
+        mine = np.isin(at, [k for k, each in enumerate(tools) if each == tool])
+        u[mine[: len(command)].nonzero()[0]] = command[mine[: len(command)]]
+        lost = max(lost, float(np.abs(command[~mine[: len(command)]]).max(initial=0.0)))
+    signal = sampled(motion, moves, sample_time_s=Ts)
+    ahead = round(lead_in_s / Ts)
+    curved = np.flatnonzero(moves.angle[signal.move] != 0) + ahead
+    nodes = np.unique(np.concatenate([bends(u, tolerance_mm), bends(_way(signal.position, ahead, n), WAY_MM),
+                                      curved[curved < n]]))  # fmt: skip
+    time_s = np.unique(np.concatenate([nodes * Ts, ends, begins, bounds]))
+    time_s = time_s[np.append(True, np.diff(time_s) > 1e-9)]
+    place = _places(moves, time_s, begins, ends, signal, ahead, Ts)
+    value = np.interp(time_s, np.arange(n) * Ts, u)
+    tool = np.array(tools)[np.searchsorted(bounds, time_s[:-1] + 1e-9, side="right") - 1]
+    in_change = np.searchsorted(begins[changes], time_s[:-1] + 1e-9, side="right") - 1
+    change = (in_change >= 0) & (time_s[:-1] + 1e-9 < np.append(ends[changes], -np.inf)[in_change])
+    return Legs(tool, place[1:], value[1:], np.diff(time_s), change, lost)
+
+
+def _way(position: np.ndarray, ahead: int, n: int) -> np.ndarray:
+    """The way (n,) in mm that the gantry has gone, place by place (P, 3), at the samples of the commands."""
+    gone = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1)))
+    return gone[np.clip(np.arange(n) - ahead, 0, len(gone) - 1)]
+
+
+def _places(moves: Moves, time_s, begins, ends, signal, ahead: int, Ts: float) -> np.ndarray:
+    """The gantry's place (K, 3) at times that are samples of its signal or ends of its moves."""
+    k = np.clip(np.rint(time_s / Ts).astype(int) - ahead, 0, len(signal.time_s) - 1)
+    place = signal.position[k]
+    done = np.searchsorted(ends, time_s + 1e-9, side="right") - 1  # the last move that is over
+    at_end = (done >= 0) & (np.abs(ends[done] - time_s) < 1e-9) | (done == len(ends) - 1)
+    place[at_end] = moves.end[done[at_end]]
+    place[time_s <= begins[0] + 1e-9] = moves.start[0]
+    return place
+
+
+def bends(u: np.ndarray, tolerance: float) -> np.ndarray:
+    """Indices (K,) of samples, the first and the last among them, between which straight lines stay within
+    `tolerance` of u (T,): each line as long as the cone of slopes from its start allows."""
+    kept, start, last, low, high = [0], 0, 0, -np.inf, np.inf
+    flat = np.flatnonzero(np.append(True, np.abs(np.diff(u)) > 0))  # runs of equal values have two ends
+    inner = np.union1d(flat, [*np.maximum(flat - 1, 0), len(u) - 1])
+    for k, value in zip(inner.tolist(), u[inner].tolist(), strict=True):
+        if k == 0:
+            continue
+        slope = (value - u[start]) / (k - start)
+        if not low <= slope <= high:
+            kept.append(last)
+            start, low, high = last, -np.inf, np.inf
+            slope = (value - u[start]) / (k - start)
+        wide = tolerance / (k - start)
+        low, high, last = max(low, slope - wide), min(high, slope + wide), k
+    return np.unique(np.append(kept, len(u) - 1))
+
+
+def program(found: Legs, *, letter: str = "E") -> list[str]:
+    """The legs as lines of G-code in mm, absolute: G1 with the plunger's place behind `letter`, the feed that
+    makes the leg last as long as planned; G4 where nothing moves."""
+    lines, held, wait, tool = ["G21", "G90", "M82"], [0.0] * 4, 0.0, None
+    columns = zip(*(np.asarray(column).tolist() for column in found[:5]), strict=True)
+    for each, position, u, seconds, change in columns:
+        if each != tool:
+            lines += [*_waited(wait), f"T{each}", f"G92 {letter}0"]
+            tool, wait, held[3] = each, 0.0, 0.0
+        if change:
+            continue
+        to = [*(round(x, 3) for x in position), round(u, 5)]
+        step = [b - a for a, b in zip(held, to, strict=True)]
+        if not any(step):
+            wait += seconds
+            continue
+        # with X, Y or Z the feed is that of the path, else that of the plunger
+        way = math.hypot(*step[:3]) or abs(step[3])
+        words = [f"{c}{x:.9g}" for c, x, d in zip(("X", "Y", "Z", letter), to, step, strict=True) if d]
+        lines += [*_waited(wait), f"G1 {' '.join(words)} F{60 * way / seconds:.6g}"]
+        held, wait = to, 0.0
+    return [*lines, *_waited(wait)]
+
+
+def _waited(seconds: float) -> list[str]:
+    return [f"G4 P{1000 * seconds:.1f}"] if seconds > 5e-5 else []

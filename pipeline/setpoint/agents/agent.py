@@ -1,0 +1,429 @@
+"""Deep Q-learning of setpoints as published (Li and Pattinson 2025, eqs. 10-13, tables 1 and 2): network,
+replay, one phase as one program, and the four phases.
+
+An `ObservationEncoder` makes the network's input, so that the paper's 35 numbers and the belief
+(belief_agent.py) train by the same lines. Two heads, one for the flow and one for the temperature, each with
+one maximum and a one-step target of its own; step 100 ends an episode without ending the task, so its target
+still looks ahead.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.tree_util import Partial
+
+from pipeline.setpoint.published import BEST_TEMPERATURE, LAMBDA, PHASES
+from pipeline.setpoint.simulation.simulator import (
+    CHANCES,
+    CLASSES,
+    FLOW_LIMITS,
+    HISTORY,
+    STAND,
+    TEMPERATURE_LIMITS,
+    Action,
+    Conditions,
+    Controller,
+    Observation,
+    State,
+    Windows,
+    begin,
+    first_history,
+    nominal,
+    paper_state,
+    paper_windows,
+    remembered,
+    reward,
+    stepped,
+)
+
+ACTIONS = 5  # of each head
+# rows that one product sums: the linear algebra under XLA cuts longer sums by the size of the CPU's first
+# cache (288 numbers in 32 kB)
+SHORT = 256
+TEMPERATURE_SCALE = 30.0  # °C, half the range of the targets: degrees as they come drown the camera's numbers
+
+
+class QNetwork(eqx.Module):
+    """The paper's network, 47,082 parameters: camera 33 -> 256 and temperatures 2 -> 32,
+    together 288 -> 128 -> 5 + 5, rectified linear. The camera's numbers are a history of classes and (4)."""
+
+    vision: eqx.nn.Linear
+    temperature: eqx.nn.Linear
+    joint: eqx.nn.Linear
+    heads: eqx.nn.Linear
+
+    def __init__(self, key: jax.Array, history: int = HISTORY):
+        keys = jax.random.split(key, 4)
+        self.vision = eqx.nn.Linear(history + CLASSES, 256, key=keys[0])
+        self.temperature = eqx.nn.Linear(2, 32, key=keys[1])
+        self.joint = eqx.nn.Linear(288, 128, key=keys[2])
+        self.heads = eqx.nn.Linear(128, 2 * ACTIONS, key=keys[3])
+
+    def __call__(self, state: jax.Array) -> jax.Array:
+        """Q (2, 5) of the flow's and the temperature's actions at a
+        state (history + 5,) of (9), temperatures already scaled."""
+        # both first layers as one product, zeros where one does not see the other's numbers: for a batch that
+        # is dearer in sums and cheaper in moving them
+        both = jax.scipy.linalg.block_diag(self.vision.weight, self.temperature.weight)
+        hidden = jax.nn.relu(both @ state + jnp.concatenate([self.vision.bias, self.temperature.bias]))
+        return self.heads(jax.nn.relu(self.joint(hidden))).reshape(2, ACTIONS)
+
+
+def history_of(network: QNetwork) -> int:
+    """How many former classes it sees."""
+    return network.vision.weight.shape[1] - CLASSES
+
+
+class ObservationEncoder(NamedTuple):
+    """Observations -> the network's input: start() -> memory; encode(parameters, memory, observation) ->
+    (memory, x (d,)). Pure, for one episode."""
+
+    start: Callable[[], Any]
+    encode: Callable[[Any, Any, Observation], tuple[Any, jax.Array]]
+
+
+@cache
+def paper_encoder(history: int = HISTORY) -> ObservationEncoder:
+    """The state (9): so many former classes, the scaled distribution, and both temperatures as
+    (u - 210) / 30."""
+
+    def encode(network, classes, observation):
+        state, camera = paper_state(classes, observation), history + CLASSES
+        temperatures = state.at[camera:].add(-BEST_TEMPERATURE).at[camera:].divide(TEMPERATURE_SCALE)
+        return remembered(classes, observation.named), temperatures
+
+    return ObservationEncoder(Partial(first_history, history), Partial(encode))
+
+
+def greedy(encoder: ObservationEncoder) -> Controller:
+    """The controller that takes the best action of each head; its parameters are the network. The simulator
+    heeds the temperature's every 10th step."""
+    return Controller(encoder.start, Partial(_best_action, encoder.encode))
+
+
+def _best_action(encode, network, memory, observation, key):
+    memory, x = encode(network, memory, observation)
+    best = network(x).argmax(axis=1)
+    return memory, Action(best[0], best[1])
+
+
+# ---- learning
+
+
+class TrainState(NamedTuple):
+    """Network, its target network (13), and the optimiser's state: all that goes from one phase to the next.
+    The replay buffer does not: its rewards are of the old phase."""
+
+    network: eqx.Module
+    target_network: eqx.Module
+    opt_state: Any
+
+
+class DqnSettings(NamedTuple):
+    """Numbers of table 2 and those it leaves open. Each update comes after one step of `environments`
+    episodes at once. gamma is of both heads, or (2,) of each."""
+
+    gamma: float | jax.Array
+    tau: float
+    batch: int
+    capacity: int
+    environments: int
+    episode: int
+
+
+class Replay(NamedTuple):
+    """Transitions: x and what followed (n, d), action and reward of both heads (n, 2), and
+    temperature_action_masked (n,): lambda's clock heeds no temperature action next.
+
+    Where it is masked, the temperature stands, and the target says so; a maximum there would make waiting
+    free. The replay buffer keeps them as rows of 2 d + 5 numbers: one place to look up each.
+    """
+
+    x: jax.Array
+    after: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    temperature_action_masked: jax.Array
+
+
+def _packed(rows: Replay) -> jax.Array:
+    masked = rows.temperature_action_masked
+    return jnp.concatenate([rows.x, rows.after, rows.action, rows.reward, masked[:, None]], axis=1)
+
+
+def _unpacked(table: jax.Array) -> Replay:
+    d = (table.shape[1] - 5) // 2
+    x, after, action, reward, masked = jnp.split(table, (d, 2 * d, 2 * d + 2, 2 * d + 4), axis=1)
+    return Replay(x, after, action.astype(jnp.int8), reward, masked[:, 0] > 0)
+
+
+class EnvSpec(NamedTuple):
+    """Where experience comes from: windows, conditions(key) of a new
+    episode, and rewards(state) -> (2,) of both heads."""
+
+    windows: Windows
+    conditions: Callable[[jax.Array], Conditions]
+    rewards: Callable[[State], jax.Array]
+
+
+class DqnProblem(NamedTuple):
+    """What a phase trains on: encoder of the network's input, environment, optimiser,
+    bootstrap(network, target_network, x (d,)) -> values (2,), and the settings."""
+
+    encoder: ObservationEncoder
+    env: EnvSpec
+    optimiser: optax.GradientTransformation
+    bootstrap: Callable
+    settings: DqnSettings
+
+
+def dqn_target(network, target_network, after: jax.Array) -> jax.Array:
+    """max_a Q(s', a; target network) of each head (11)."""
+    return target_network(after).max(axis=1)
+
+
+def double_dqn_target(network, target_network, after: jax.Array) -> jax.Array:
+    """Q(s', argmax_a Q(s', a); target network): the network chooses, the target network values
+    (van Hasselt, Guez and Silver 2016)."""
+    return jnp.take_along_axis(target_network(after), network(after).argmax(axis=1)[:, None], axis=1)[:, 0]
+
+
+def _fresh(problem: DqnProblem, network, keys):
+    """New episodes, one a key: conditions, state, memory and the network's input."""
+    env, encoder = problem.env, problem.encoder
+
+    def one(key):
+        conditions = env.conditions(key)
+        state, observation = begin(env.windows, conditions, key)
+        return conditions, state, *encoder.encode(network, encoder.start(), observation)
+
+    return jax.vmap(one)(keys)
+
+
+def _stepped(problem: DqnProblem, network, episodes, epsilon, u: jax.Array, key):
+    """One step of all episodes under the epsilon-greedy policy, by u (n, 4 + CHANCES) uniform in [0, 1) ->
+    (episodes, their transitions); those that are over start anew, from the key."""
+    env = problem.env
+    conditions, state, memory, x = episodes
+    explores, at_random, befalls = u[:, :2] < epsilon, (ACTIONS * u[:, 2:4]).astype(jnp.int32), u[:, 4:]
+    action = jnp.where(explores, at_random, jax.vmap(network)(x).argmax(axis=2))
+    action = action.at[:, 1].set(
+        jnp.where(state.step % conditions.flow_actions == 0, action[:, 1], STAND)
+    )  # what is not heeded is standing
+    state, observation = jax.vmap(Partial(stepped, env.windows))(
+        conditions, state, Action(action[:, 0], action[:, 1]), befalls
+    )
+    memory, after = jax.vmap(Partial(problem.encoder.encode, network))(memory, observation)
+    rewards = jax.vmap(env.rewards)(state)
+    over, masked = state.step >= problem.settings.episode, state.step % conditions.flow_actions != 0
+
+    def renewed(going):
+        again = _fresh(problem, network, jax.random.split(key, len(x)))
+        return jax.tree.map(
+            lambda new, old: jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old), again, going
+        )
+
+    episodes = jax.lax.cond(over.any(), renewed, lambda going: going, (conditions, state, memory, after))
+    return episodes, Replay(x, after, action.astype(jnp.int8), rewards, masked)
+
+
+def _updated(train_state: TrainState, rows: Replay, problem: DqnProblem) -> TrainState:
+    """One step on (12) for a batch, then (13)."""
+    network, target_network = train_state.network, train_state.target_network
+    gamma, tau = problem.settings.gamma, problem.settings.tau
+    ahead = jax.vmap(Partial(problem.bootstrap, network, target_network))(rows.after)
+    standing = jax.vmap(target_network)(rows.after)[:, 1, STAND]
+    masked = rows.temperature_action_masked
+    y = rows.reward + gamma * ahead.at[:, 1].set(jnp.where(masked, standing, ahead[:, 1]))
+    taken = jax.nn.one_hot(rows.action, ACTIONS)
+
+    def loss(network, x, taken, y):
+        return ((y - (jax.vmap(network)(x) * taken).sum(axis=2)) ** 2).mean()
+
+    gradient = _mean_gradient(loss, network, rows.x, taken, y)
+    change, opt_state = problem.optimiser.update(gradient, train_state.opt_state)
+    network = optax.apply_updates(network, change)
+    target_network = jax.tree.map(lambda old, new: tau * new + (1 - tau) * old, target_network, network)
+    return TrainState(network, target_network, opt_state)
+
+
+def _mean_gradient(loss: Callable, network, *batch: jax.Array):
+    """Gradient of the mean of `loss` over the rows of `batch`, as the mean over slices of at most SHORT rows:
+    sums of the same order on every CPU."""
+    parts = next(
+        n for n in range(1, len(batch[0]) + 1) if len(batch[0]) % n == 0 and len(batch[0]) <= n * SHORT
+    )
+    slices = zip(*(jnp.split(a, parts) for a in batch), strict=True)
+    return jax.tree.map(lambda *g: sum(g) / parts, *(jax.grad(loss)(network, *rows) for rows in slices))
+
+
+def phase(
+    train_state: TrainState,
+    key: jax.Array,
+    problem: DqnProblem,
+    *,
+    updates: int,
+    longest: int,
+    epsilon: tuple[float, float],
+) -> tuple[TrainState, jax.Array]:
+    """A whole phase as one program -> the train state after it and the mean reward of each step (updates,);
+    epsilon falls in a line over the first third.
+
+    A step of all episodes, one batch from an empty replay buffer, one update, `updates` times. Episodes start
+    at different steps, so that they do not end together. Phases with the same `longest`, the updates of the
+    longest of them, are one program compiled once.
+    """
+    train_state, rewards = _phase(
+        train_state, key, problem, jnp.asarray(updates), jnp.asarray(epsilon), longest=longest
+    )
+    return train_state, rewards[:updates]
+
+
+@eqx.filter_jit
+def _phase(train_state: TrainState, key, problem: DqnProblem, updates, epsilon, *, longest: int):
+    settings = problem.settings
+    k_start, k_clock, key = jax.random.split(key, 3)
+    n, capacity = settings.environments, settings.capacity
+    conditions, state, memory, x = _fresh(problem, train_state.network, jax.random.split(k_start, n))
+    actions = conditions.flow_actions.astype(jnp.int32)
+    state = state._replace(step=actions * jax.random.randint(k_clock, (n,), 0, settings.episode // actions))
+    # a step draws some thousand numbers: by XLA's own generator
+    # (Philox), which costs a tenth of jax's default there
+    fast = jax.random.wrap_key_data(jnp.tile(jax.random.key_data(key), 2), impl="rbg")
+
+    def one(i, carry):
+        train_state, episodes, replay_buffer, rewards = carry
+        k_step, k_batch = (jax.random.fold_in(fast, 2 * i + j) for j in (0, 1))
+        now = epsilon[0] + (epsilon[1] - epsilon[0]) * jnp.minimum(3.0 * i / updates, 1.0)
+        u = jax.random.uniform(k_step, (n, 4 + CHANCES))
+        episodes, new = _stepped(problem, train_state.network, episodes, now, u, jax.random.fold_in(key, i))
+        replay_buffer = jax.lax.dynamic_update_slice_in_dim(replay_buffer, _packed(new), i * n % capacity, 0)
+        filled = jnp.minimum((i + 1) * n, capacity).astype(jnp.uint32)
+        chosen = (jax.random.bits(k_batch, (settings.batch,)) % filled).astype(jnp.int32)
+        train_state = _updated(train_state, _unpacked(replay_buffer[chosen]), problem)
+        return train_state, episodes, replay_buffer, rewards.at[i].set(new.reward.mean())
+
+    replay_buffer = jnp.zeros((capacity, 2 * x.shape[1] + 5))
+    train_state, _, _, rewards = jax.lax.fori_loop(
+        0, updates, one, (train_state, (conditions, state, memory, x), replay_buffer, jnp.zeros(longest))
+    )
+    return train_state, rewards
+
+
+# ---- the paper's four phases
+
+
+class Published(NamedTuple):
+    """Networks after phases 1 to 4, and the mean reward of each step of each phase."""
+
+    networks: tuple[QNetwork, ...]
+    rewards: tuple[jax.Array, ...]
+
+
+def ellipse(a, b, state: State) -> jax.Array:
+    """(2,): the reward (14) of the state, the same for both heads."""
+    return jnp.tile(reward(state.flow, state.temperature, a=a, b=b), 2)
+
+
+def anywhere(accuracy, key: jax.Array, *, flow_actions=LAMBDA) -> Conditions:
+    """A machine that does as it is told, from a flow and temperature uniform within the limits; flow_actions
+    to one temperature action."""
+    u = jax.random.uniform(key, (2,))
+    low, high = jnp.array([FLOW_LIMITS, TEMPERATURE_LIMITS]).T
+    flow, temperature = low + (high - low) * u
+    conditions = nominal(flow, temperature, accuracy=accuracy)
+    return conditions._replace(flow_actions=flow_actions * jnp.ones_like(flow))
+
+
+class PublishedTraining(NamedTuple):
+    """`updates` of each phase, as many phases as there are numbers; accuracy of the windows in the last one.
+
+    Epsilon falls to `least`: from `explore` in phase 1, from `explore_again` in the later ones. history is
+    eta of (8), flow_actions is lambda, table 2.
+    """
+
+    dqn: DqnSettings
+    learning_rate: float
+    updates: tuple[int, ...]
+    accuracy: float
+    explore: float
+    explore_again: float
+    least: float
+    history: int = HISTORY
+    flow_actions: int = LAMBDA
+
+
+def train_published(key: jax.Array, settings: PublishedTraining, *, on_step=None) -> Published:
+    """The four phases: reward shapes (40, 20), (40, 10), (20, 10) on windows that are always right, then the
+    last shape with `accuracy`; Adam at one rate throughout.
+
+    on_step(phase, network, rewards) is called after each phase.
+    """
+    k_network, key = jax.random.split(key)
+    network, optimiser = QNetwork(k_network, settings.history), optax.adam(settings.learning_rate)
+    encoder, windows = paper_encoder(settings.history), paper_windows()
+    clock = jnp.float32(settings.flow_actions)
+    train_state = TrainState(network, network, optimiser.init(eqx.filter(network, eqx.is_array)))
+    networks, all_rewards = [], []
+    for i, count in enumerate(settings.updates):
+        a, b = PHASES[min(i, len(PHASES) - 1)]
+        right = 1.0 if i < len(PHASES) else settings.accuracy
+        start = Partial(anywhere, jnp.asarray(right), flow_actions=clock)
+        env = EnvSpec(windows, start, Partial(ellipse, jnp.asarray(a), jnp.asarray(b)))
+        train_state, rewards = phase(
+            train_state,
+            jax.random.fold_in(key, i),
+            DqnProblem(encoder, env, optimiser, dqn_target, settings.dqn),
+            updates=count,
+            longest=max(settings.updates),
+            epsilon=(settings.explore if i == 0 else settings.explore_again, settings.least),
+        )
+        networks.append(train_state.network)
+        all_rewards.append(rewards)
+        if on_step is not None:
+            on_step(i + 1, train_state.network, rewards)
+    return Published(tuple(networks), tuple(all_rewards))
+
+
+# ---- weights by name
+
+
+def weights(network: eqx.Module) -> dict[str, np.ndarray]:
+    """The network's arrays by their place in it, for the edge to write."""
+    return {_place(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(network)}
+
+
+def _place(path) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".")
+
+
+def untrained(make: Callable[..., eqx.Module], *sizes: int) -> eqx.Module:
+    """make(key, *sizes) with the shapes of its arrays only, for `with_weights`: what draws weights takes long
+    to compile, and these would be thrown away."""
+    return eqx.filter_eval_shape(lambda key: make(key, *sizes), jax.random.key(0))
+
+
+def with_weights(network: eqx.Module, arrays: dict[str, np.ndarray]) -> eqx.Module:
+    """The network with these arrays in the places of its own, of which the shapes suffice (`untrained`).
+
+    Raises ValueError where names or shapes are those of another architecture.
+    """
+    own = {_place(path): np.shape(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(network)}
+    wrong = sorted(own.keys() ^ arrays.keys()) or [
+        name for name in own if own[name] != np.shape(arrays[name])
+    ]
+    if wrong:
+        shape = f"shape {np.shape(arrays[wrong[0]])}" if wrong[0] in arrays else "none"
+        raise ValueError(
+            f"weights of another architecture: {wrong[0]!r} is "
+            f"{f'of shape {own[wrong[0]]}' if wrong[0] in own else 'unknown'} in this "
+            f"network and {shape} in "
+            "the file; train again, or load them into the network that they were trained in"
+        )
+    return jax.tree.unflatten(jax.tree.structure(network), [jnp.asarray(arrays[name]) for name in own])

@@ -1,0 +1,108 @@
+"""Controllers without learning, behind the interface of the agent: nothing, proportional, filtered
+proportional, and a sequential test (CUSUM) of the window's class.
+
+The class depends on the flow alone, so nothing that the camera sees bears on the temperature: every
+controller here moves the target to 210 °C in the largest steps that lambda's clock allows, which the lag (6)
+then follows. The Bayes filters are in bayes.py.
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from pipeline.setpoint.published import BEST_TEMPERATURE, FLOW_MOVES, TEMPERATURE_MOVES
+from pipeline.setpoint.simulation.simulator import (
+    CLASSES,
+    GOOD,
+    OVER,
+    STAND,
+    UNDER,
+    Action,
+    Controller,
+    Observation,
+)
+
+
+def nearest(moves: tuple[float, ...], wanted: jax.Array) -> jax.Array:
+    """The index of the move nearest to the wanted one; of two as near, the smaller."""
+    distance = jnp.abs(jnp.asarray(moves) - wanted) + 1e-4 * jnp.abs(jnp.asarray(moves))
+    return jnp.argmin(distance).astype(jnp.int32)
+
+
+def temperature_move(observation: Observation) -> jax.Array:
+    """Straight to 210 °C: the move nearest to u* - u_bar. It says so
+    at every step; lambda's clock takes every tenth."""
+    return nearest(TEMPERATURE_MOVES, BEST_TEMPERATURE - observation.target)
+
+
+@cache
+def nothing() -> Controller:
+    """Never moves the flow, whatever it sees: what any other controller must be better than. Its parameters
+    are ()."""
+
+    def act(parameters, memory: tuple, observation: Observation, key: jax.Array) -> tuple[tuple, Action]:
+        return memory, Action(jnp.int32(STAND), temperature_move(observation))
+
+    return Controller(lambda: (), act)
+
+
+class Proportional(NamedTuple):
+    """gain: percent of flow by unit of p_0 - p_2; time_constant of the
+    filter in decisions, 1 is no memory."""
+
+    gain: float
+    time_constant: float
+
+
+@cache  # one pair of functions, so that what was compiled for it is found again
+def proportional() -> Controller:
+    """a_q nearest to gain y, y += (p_0 - p_2 - y) / time_constant: Proportional parameters. After a move the
+    filter forgets: what it saw was another flow."""
+
+    def act(
+        parameters: Proportional, y: jax.Array, observation: Observation, key: jax.Array
+    ) -> tuple[jax.Array, Action]:
+        y = y + (observation.shares[UNDER] - observation.shares[OVER] - y) / parameters.time_constant
+        move = nearest(FLOW_MOVES, parameters.gain * y)
+        remembered = jnp.where(move == STAND, y, y * (1.0 - 1.0 / parameters.time_constant))
+        return remembered, Action(move, temperature_move(observation))
+
+    return Controller(lambda: jnp.zeros(()), act)
+
+
+class SequentialTest(NamedTuple):
+    """accuracy: of the class, as the test assumes it; threshold and cap in units of log likelihood ratio, the
+    cap the most that a class may fall behind."""
+
+    accuracy: float
+    threshold: float
+    cap: float
+
+
+@cache
+def sequential_test() -> Controller:
+    """A running test of the three classes, 10 % against under or over where it leads good by the threshold
+    (Wald 1945; capped as in Page's CUSUM, 1954).
+
+    S_i <- max(S_i + log P(x | i) - max_j (S_j + log P(x | j)), -cap): the cap is what lets a class come back,
+    once a move or a clog has made it true.
+    """
+
+    def act(
+        parameters: SequentialTest, S: jax.Array, observation: Observation, key: jax.Array
+    ) -> tuple[jax.Array, Action]:
+        S = S + jnp.log(
+            jnp.where(
+                jnp.arange(CLASSES) == observation.named, parameters.accuracy, (1.0 - parameters.accuracy) / 2
+            )
+        )
+        S = jnp.maximum(S - S.max(), -parameters.cap)
+        leads = S - S[GOOD] >= parameters.threshold
+        move = STAND + 2 * jnp.where(
+            S[UNDER] > S[OVER], leads[UNDER].astype(jnp.int32), -leads[OVER].astype(jnp.int32)
+        )
+        return S, Action(move, temperature_move(observation))
+
+    return Controller(lambda: jnp.zeros(CLASSES), act)

@@ -1,0 +1,161 @@
+"""From the frames of a window to a setpoint that may be sent: what the frames say together, and why it acted.
+When to hold, limits and waits are `actuation`'s."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.setpoint.simulation.actuation import (
+    ACTS,
+    AMBIGUOUS,
+    FEW,
+    FOREIGN,
+    REASONS,
+    TIP,
+    is_evidence,
+    still,
+)
+from pipeline.setpoint.vision.calibration import hard_shares, window_probabilities
+
+CLASSES = ("under", "good", "over")
+
+
+class Window(NamedTuple):
+    """What E windows of frames say. `reason` indexes REASONS: 0 acts, all else holds.
+
+    p (E, 3) soft shares, counts of which the paper makes its shares: shares (E, 3) and scaled (E, 3) of (4),
+    label (E,) the class of p, members (E, 3) the conformal set, score (E,) the median out-of-distribution
+    score, valid (E,) and used (E,) the frames that were valid and the frames that count, reason (E,). Where
+    no frame counts, p and shares are 1/3 each and the score is NaN. flow_seen (E,) in percent of nominal and
+    spread (E,), the deviation of its logarithm, NaN where the classifier names classes only.
+    """
+
+    p: np.ndarray
+    shares: np.ndarray
+    scaled: np.ndarray
+    label: np.ndarray
+    members: np.ndarray
+    score: np.ndarray
+    valid: np.ndarray
+    used: np.ndarray
+    reason: np.ndarray
+    flow_seen: np.ndarray
+    spread: np.ndarray
+
+
+def judge_window(
+    probabilities: np.ndarray,
+    valid: np.ndarray,
+    scores: np.ndarray,
+    tip_moved: np.ndarray,
+    *,
+    flows: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]] | None = None,
+    least_frames: int,
+    correlation: float,
+    foreign_above: float,
+    conformal_level: float,
+) -> Window:
+    """E windows of W frames each: class probabilities (E, W, 3), valid (E, W), out-of-distribution scores (E,
+    W), tip moved (E,) -> what they say together.
+
+    A frame counts when its key area is valid, its probabilities are a distribution and its score is at most
+    `foreign_above`. Of the m that count p = softmax( sum_i log p_i / (1 + (m - 1) correlation) ) frames of
+    one segment repeat each other (design effect; Kish 1965) w_c = #{i: argmax p_i = c}, p = w / m, p-hat = p
+    / max p Li and Pattinson 2025, eq. 1-4 members = {c: p_c >= conformal_level} split conformal set (Sadinle,
+    Lei, Wasserman 2019) Held: fewer than `least_frames` count (by what cost the most of them), the tip has
+    moved, or the set is no single class.
+
+    flows(frames that count (E, W)) -> flow_seen (E,), spread (E,), class probabilities (E, 3) is of a
+    classifier that shows flows (`calibration.window_flow`). Its windows have those probabilities, and are not
+    held for two classes: how sure the flow is, is for the controller to weigh.
+    """
+    P, valid, scores = np.asarray(probabilities, float), np.asarray(valid, bool), np.asarray(scores, float)
+    if (
+        P.ndim != 3
+        or P.shape[2] != 3
+        or valid.shape != P.shape[:2]
+        or scores.shape != P.shape[:2]
+        or np.shape(tip_moved) != P.shape[:1]
+    ):
+        raise ValueError(
+            "judge_window: expected probabilities (E, W, 3), valid and scores (E, W), tip_moved (E,), found "
+            f"{P.shape}, {valid.shape}, {scores.shape}, {np.shape(tip_moved)}; give one row a window"
+        )
+    if least_frames < 1:
+        raise ValueError(
+            f"judge_window: expected least_frames of at least 1, found {least_frames}; "
+            "an empty window says nothing"
+        )
+    P = np.where(np.isfinite(P) & (np.abs(P) <= 2), P, -1.0)
+    sound = valid & (P >= 0).all(axis=2) & (np.abs(P.sum(axis=2) - 1) < 1e-3)
+    familiar = sound & (scores <= foreign_above)
+    m = familiar.sum(axis=1)
+    logs = np.log(np.clip(P, 1e-6, 1.0))
+    p, shares = window_probabilities(logs, familiar, correlation), hard_shares(logs, familiar)
+    flow_seen, spread = np.full((2, len(P)), np.nan)
+    if flows is not None:
+        flow_seen, spread, p = flows(familiar)
+    members = p >= conformal_level
+    few = np.where(sound.sum(axis=1) >= least_frames, FOREIGN, FEW)
+    reason = np.where((members.sum(axis=1) != 1) & np.isnan(flow_seen), AMBIGUOUS, ACTS)
+    reason = np.where(tip_moved, TIP, np.where(m < least_frames, few, reason))
+    return Window(
+        p,
+        shares,
+        shares / shares.max(axis=1, keepdims=True),
+        p.argmax(axis=1),
+        members,
+        _median(scores, sound),
+        valid.sum(axis=1),
+        m,
+        reason,
+        flow_seen,
+        spread,
+    )
+
+
+def _median(scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The median (the upper one of two) of each row over what was seen, NaN where nothing was. A missing
+    score is infinite: nothing vouches for that frame."""
+    ordered = np.sort(np.where(mask & ~np.isnan(scores), scores, np.inf), axis=1)
+    n = mask.sum(axis=1)
+    ordered = np.concatenate([ordered, np.full((len(n), 1), np.nan)], axis=1)
+    return ordered[np.arange(len(n)), np.where(n > 0, n // 2, -1)]
+
+
+def camera_seen(
+    window: Window,
+    last_seen: np.ndarray,
+    looks: np.ndarray,
+    foreign: Callable[[np.ndarray], np.ndarray] | None,
+) -> Window:
+    """E windows, held too where the picture stands still or is of no camera that is known.
+
+    last_seen (E,) is the flow that the window before showed, NaN where there was none; looks (E, measures)
+    how the windows look (`familiar`), NaN where no frame was measured; foreign(looks) -> (E,) bool, None
+    where no camera is known.
+    """
+    reason = np.where(window.reason == ACTS, still(window.flow_seen, last_seen), window.reason)
+    if foreign is not None:
+        reason = np.where(is_evidence(reason) & foreign(looks), FOREIGN, reason)
+    return window._replace(reason=reason)
+
+
+def why(time_s: float, window: Window, i: int, change: np.ndarray) -> str:
+    """One line of the strip "why it acted" for window i: time, what
+    was seen, what was sent or why it was held."""
+    frames = f"{time_s:6.1f} s: {window.valid[i]} frames valid, {window.used[i]} count"
+    if window.reason[i] == ACTS:
+        moves = (
+            ", ".join(
+                f"{name} {c:+g} {unit}"
+                for name, c, unit in zip(("flow", "temperature"), change, ("%", "°C"), strict=True)
+                if c
+            )
+            or "no change"
+        )
+        seen = "" if np.isnan(window.flow_seen[i]) else f", flow {window.flow_seen[i]:.0f} %"
+        return f"{frames}{seen}, {CLASSES[window.label[i]]} {window.p[i, window.label[i]]:.2f}; {moves}"
+    shares = " ".join(f"{name} {p:.2f}" for name, p in zip(CLASSES, window.p[i], strict=True))
+    return f"{frames}, {shares}, score {window.score[i]:.3g}; held: {REASONS[window.reason[i]]}"

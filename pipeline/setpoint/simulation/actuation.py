@@ -1,0 +1,156 @@
+"""What is sent to the machine: when to hold and why, how far setpoints may move, and how long to wait.
+
+The loop through pixels (`pixels`) and the simulators (`simulator`) call the same functions: what is judged is
+what would run. Limits and holds take numpy arrays or jax's, with any leading axes.
+"""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+if TYPE_CHECKING:
+    from pipeline.setpoint.simulation.simulator import Action, Controller, Observation
+
+REASONS = (
+    "acts",
+    "too few valid frames",
+    "out of distribution",
+    "tip moved",
+    "the classes cannot be told apart",
+    "the action is not a number",
+    "the camera is not the one of the table: record levels",
+    "the picture stands still",
+)
+ACTS, FEW, FOREIGN, TIP, AMBIGUOUS, NO_NUMBER, TABLE, STILL = range(8)
+REMEMBERED = 64  # actions that the travel of 60 s is summed over: a window takes about a second
+
+
+# ---- when to hold
+
+
+def is_evidence(reason):
+    """Whether the controller is shown a window: those acted on, those that cannot tell the classes apart, and
+    those of a camera that is not the table's, so that it may be found to be after all."""
+    return (reason == ACTS) | (reason == AMBIGUOUS) | (reason == TABLE)
+
+
+def still(flow_seen, last_seen):
+    """STILL where a window shows to the last bit the flow that the one before did, as no camera that looks
+    does; else ACTS. NaN, of a camera that shows classes only, is never still."""
+    return STILL * (flow_seen == last_seen)
+
+
+def decide(
+    controller: "Controller",
+    parameters: Any,
+    memory: Any,
+    observation: "Observation",
+    reason: jax.Array,
+    key: jax.Array,
+) -> tuple[Any, "Action", jax.Array]:
+    """Memory, action and reason of one episode. Memory stays as it was where the window is no evidence, and
+    where the controller takes the camera for another than its table's the reason is TABLE. The action counts
+    where the reason is ACTS; whoever sends it looks."""
+    after, action = controller.act(parameters, memory, observation, key)
+    seen = is_evidence(reason)
+    memory = jax.tree.map(lambda new, old: jnp.where(seen, new, old), after, memory)
+    strange = controller.strange(parameters, memory) & (reason == ACTS)
+    return memory, action, jnp.where(strange, TABLE, reason)
+
+
+# ---- what may be sent
+
+
+class Limits(NamedTuple):
+    """Of (flow in percent, target temperature in °C), each (2,): the box, the largest change of one action
+    and the travel allowed in any 60 s."""
+
+    low: np.ndarray
+    high: np.ndarray
+    per_action: np.ndarray
+    per_minute: np.ndarray
+
+
+class Setpoints(NamedTuple):
+    """Setpoints as sent, value (..., 2); the last H moves, times (..., H) in s and moves (..., H, 2), oldest
+    first; `clipped` (..., 4) counts how often the size of one action, the travel of a minute or the box cut a
+    change, and how often it was no number."""
+
+    value: Any
+    times: Any
+    moves: Any
+    clipped: Any
+
+
+def setpoints(start: np.ndarray, limits: Limits) -> Setpoints:
+    """Setpoints at rest at start (E, 2). Raises ValueError where a start lies outside the box."""
+    start = np.asarray(start, float)
+    outside = ~((start >= limits.low) & (start <= limits.high)).all(axis=1)
+    if outside.any():
+        raise ValueError(
+            f"setpoints: expected a start within {np.asarray(limits.low)} to {np.asarray(limits.high)} (flow "
+            "in percent, target in °C), "
+            f"found {start[outside][0]}; bring the machine there by hand first"
+        )
+    return at_rest(start, remembered=REMEMBERED)
+
+
+def at_rest(value, *, remembered: int) -> Setpoints:
+    """Setpoints value (..., 2) that did not move in the last minute, with room for so many moves."""
+    xp, lead = value.__array_namespace__(), value.shape[:-1]
+    return Setpoints(
+        value,
+        xp.full((*lead, remembered), -xp.inf),
+        xp.zeros((*lead, remembered, 2)),
+        xp.zeros((*lead, 4), dtype=int),
+    )
+
+
+def moved(state: Setpoints, change, time_s, limits: Limits) -> Setpoints:
+    """The setpoints after the wanted change (..., 2) at time_s (...,), cut to the size of one action, to what
+    is left of the last 60 s' travel, and to the box.
+
+    A change that is no number moves nothing, and neither does one while more moves than are remembered lie
+    within 60 s. Every cut is counted.
+    """
+    xp = state.value.__array_namespace__()
+    number = xp.isfinite(change).all(axis=-1)
+    wanted = xp.where(number[..., None], change, 0.0)
+    recent = (time_s[..., None] - state.times < 60.0)[..., None] * xp.abs(state.moves)
+    left = xp.maximum(limits.per_minute - recent.sum(axis=-2), 0.0)
+    left = xp.where((recent[..., 0, :] > 0).any(axis=-1)[..., None], 0.0, left)
+    small = xp.clip(wanted, -limits.per_action, limits.per_action)
+    allowed = xp.clip(small, -left, left)
+    value = xp.clip(state.value + allowed, limits.low, limits.high)
+    cuts = xp.stack(
+        [
+            (small != wanted).any(axis=-1),
+            (allowed != small).any(axis=-1),
+            (value != state.value + allowed).any(axis=-1),
+            ~number,
+        ],
+        axis=-1,
+    )
+    times = xp.concatenate([state.times[..., 1:], time_s[..., None]], axis=-1)
+    moves = xp.concatenate([state.moves[..., 1:, :], (value - state.value)[..., None, :]], axis=-2)
+    return Setpoints(value, times, moves, state.clipped + cuts)
+
+
+class Waits(NamedTuple):
+    """Seconds to the next window after an action that moved the flow,
+    that moved the temperature, that moved nothing."""
+
+    flow_s: float | jax.Array
+    temperature_s: float | jax.Array
+    idle_s: float | jax.Array
+
+
+def wait_after(change, waits: Waits):
+    """Seconds (...,) to wait after the changes (..., 2) that were really
+    sent: the longest that any of them asks for."""
+    xp = change.__array_namespace__()
+    moves = change != 0
+    asked = xp.maximum(moves[..., 0] * waits.flow_s, moves[..., 1] * waits.temperature_s)
+    return xp.maximum(asked, waits.idle_s)

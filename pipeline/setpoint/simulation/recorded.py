@@ -1,0 +1,229 @@
+"""Windows recorded from a trained classifier as a source for the simulator: whole windows are drawn again, so
+errors sit, stick and mislead as the classifier's do.
+
+Of a table of classes only: given a true flow, a segment of its flow bin is taken, and of that segment any
+window. Conditions persist: within a bin the segments are ranked by how much they look over-extruded (mean
+p_2 - p_0), and an episode keeps its rank for a while, also when the flow moves to another bin, so that what
+looks thin here looks thin there. Of a table with flows an error is drawn: that of a segment, which persists
+in the same way, and about it that of any of the NEAREST windows recorded at flows like this one.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pipeline.setpoint.simulation.simulator import GOOD_BORDERS, Conditions, Windows
+
+UNSEEN = np.array(np.nan)  # of a table of classes only
+DITHER = 1e-3  # of log flow_seen: a window drawn twice is not a picture that stands still
+
+
+class WindowTable(NamedTuple):
+    """n windows of a classifier: shares p (n, 3) of under, good, over, sum 1; named class (n,) 0, 1, 2;
+    flow_bin (n,) 0 .. bins - 1; segment (n,) any integers.
+
+    flow_edges (bins + 1,) in percent, rising; flows outside take the outermost bin. Every bin needs a window;
+    a segment may occur in one bin or in many. Bins of 2.5 % from 70 to 130 % and wider ones beyond let a
+    controller find 100 % within the good class. flow_seen (n,) is the flow that a window shows, spread (n,)
+    the deviation of its logarithm, flow (n,) the true one, both in percent of nominal: all three NaN where
+    the classifier names classes only.
+    """
+
+    shares: np.ndarray
+    named: np.ndarray
+    flow_bin: np.ndarray
+    segment: np.ndarray
+    flow_edges: np.ndarray
+    flow_seen: np.ndarray = UNSEEN
+    spread: np.ndarray = UNSEEN
+    flow: np.ndarray = UNSEEN
+
+
+def with_flows(table: WindowTable) -> bool:
+    """Whether the windows show flows, not classes only."""
+    return bool(np.isfinite(table.flow_seen).all())
+
+
+NEAREST = 40  # windows that an error is drawn from, or all where there are fewer
+
+
+class _Ranked(NamedTuple):
+    """Windows sorted by bin, then by the rank of their segment: segments of bin b are first_segment[b] + 0 ..
+    segments[b] - 1, their windows likewise. Of those that show flows, sorted by log_flow (n,): their errors
+    about their segments (n,) and spread (n,); and bias (segments,) of the segments, rising. seen: how many of
+    these windows and biases there are, as what a redraw is filled up with behind them is none."""
+
+    shares: jax.Array
+    named: jax.Array
+    log_flow: jax.Array
+    error: jax.Array
+    spread: jax.Array
+    bias: jax.Array
+    first_segment: jax.Array
+    segments: jax.Array
+    first_window: jax.Array
+    windows: jax.Array
+    flow_edges: jax.Array
+    seen: jax.Array
+
+
+class SegmentErrors(NamedTuple):
+    """Errors log flow_seen / flow of a table's windows, in two parts: within (n,), of each window about its
+    segment, with the camera's mean error at its flow; bias (segments,) of the segments, their number of
+    windows shrunk away, and its deviation bias_std."""
+
+    within: np.ndarray
+    bias: np.ndarray
+    bias_std: float
+
+
+# segments that the declared deviation counts for, beside the table's own
+DECLARED_SEGMENTS = 5
+
+
+def segment_errors(table: WindowTable, *, width_bias_std: float) -> SegmentErrors:
+    """The errors of a table that shows flows, by a one-way analysis of variance: s_b^2 = var(segment means) -
+    s_w^2 mean(1 / n_s), pooled with the declared width_bias_std^2. A segment that stands at one flow only
+    cannot tell its bias from what the camera does at that flow: errors are taken about the smoothed mean."""
+    log_flow = np.log(table.flow)
+    error = np.log(table.flow_seen) - log_flow
+    mean = smooth_mean(log_flow, error)
+    _, place, counts = np.unique(table.segment, return_inverse=True, return_counts=True)
+    about = error - mean
+    segment_mean = np.bincount(place, about) / counts
+    within = about - segment_mean[place]
+    free = len(error) - len(counts)
+    if free <= 0:  # one window a segment: nothing parts the two
+        return SegmentErrors(error, np.zeros(1), width_bias_std)
+    variance = (within**2).sum() / free
+    between = max(0.0, float((segment_mean**2).mean() - variance * (1 / counts).mean()))
+    n = len(counts)
+    bias_std = np.sqrt((n * between + DECLARED_SEGMENTS * width_bias_std**2) / (n + DECLARED_SEGMENTS))
+    inflate = np.sqrt(variance / max(float((within**2).mean()), 1e-12))
+    own = segment_mean * np.sqrt(between / max(between + variance * (1 / counts).mean(), 1e-12))
+    return SegmentErrors(mean + within * inflate, own, float(bias_std))
+
+
+MEAN_BANDWIDTH = 0.08  # of log flow, one deviation: over which a camera's mean error is smooth
+
+
+def smooth_mean(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The kernel mean (n,) of y over x, read at every x."""
+    at = np.linspace(x.min(), x.max(), 200)
+    weight = np.exp(-0.5 * ((at[:, None] - x) / MEAN_BANDWIDTH) ** 2)
+    return np.interp(x, at, (weight @ y) / np.maximum(weight.sum(axis=1), 1e-12))
+
+
+def recorded_windows(table: WindowTable) -> Windows:
+    """The table as a source of windows: fresh where conditions.persistence is 1, sticky above."""
+    _check(table)
+    shares, bins = np.asarray(table.shares, np.float32), len(table.flow_edges) - 1
+    pairs, place = np.unique(np.stack([table.flow_bin, table.segment], axis=1), axis=0, return_inverse=True)
+    place = place.ravel()
+    counts = np.bincount(place)
+    thickness = np.bincount(place, weights=shares[:, 2] - shares[:, 0]) / counts
+    order = np.lexsort([thickness, pairs[:, 0]])  # by bin, then by thickness
+    position = np.empty_like(order)
+    position[order] = np.arange(len(order))
+    rows = np.argsort(position[place], kind="stable")
+    windows, segments = counts[order], np.bincount(pairs[:, 0], minlength=bins)
+    log_flow, error, spread, bias = _errors(table)
+    ranked = _Ranked(
+        shares=jnp.asarray(shares[rows]),
+        named=jnp.asarray(np.asarray(table.named, np.int32)[rows]),
+        log_flow=jnp.asarray(log_flow, jnp.float32),
+        error=jnp.asarray(error, jnp.float32),
+        spread=jnp.asarray(spread, jnp.float32),
+        bias=jnp.asarray(bias, jnp.float32),
+        first_segment=jnp.asarray(np.cumsum(segments) - segments),
+        segments=jnp.asarray(segments),
+        first_window=jnp.asarray(np.cumsum(windows) - windows),
+        windows=jnp.asarray(windows),
+        flow_edges=jnp.asarray(table.flow_edges, jnp.float32),
+        seen=jnp.asarray([len(log_flow), len(bias)], jnp.int32),
+    )
+    return Windows(_recorded_draw, ranked)
+
+
+def _errors(table: WindowTable) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """log_flow, error, spread and bias as _Ranked has them; NaN of a table of classes only."""
+    if not with_flows(table):
+        none = np.full(1, np.nan)
+        return none, none, none, none
+    errors = segment_errors(table, width_bias_std=0.0)
+    order = np.argsort(table.flow, kind="stable")
+    return np.log(table.flow)[order], errors.within[order], table.spread[order], np.sort(errors.bias)
+
+
+def _recorded_draw(
+    ranked: _Ranked, conditions: Conditions, flow, segment, u
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    flow_bin = (flow >= ranked.flow_edges[1:-1]).sum()
+    s = ranked.first_segment[flow_bin] + jnp.floor(segment * ranked.segments[flow_bin]).astype(jnp.int32)
+    w = ranked.first_window[s] + jnp.floor(u[0] * ranked.windows[s]).astype(jnp.int32)
+    q = jnp.clip(flow, ranked.flow_edges[0], ranked.flow_edges[-1])
+    n, biases = ranked.seen
+    some = jnp.minimum(NEAREST, n)
+    first = jnp.clip(jnp.searchsorted(ranked.log_flow, jnp.log(q)) - some // 2, 0, n - some)
+    near = first + jnp.floor(u[0] * some).astype(jnp.int32)
+    bias = ranked.bias[jnp.floor(segment * biases).astype(jnp.int32)]
+    seen = q * jnp.exp(bias + ranked.error[near] + DITHER * u[1])
+    by_flow = class_shares(seen, ranked.spread[near])
+    known = jnp.isfinite(seen)
+    shares = jnp.where(known, by_flow, ranked.shares[w])
+    return shares, jnp.where(known, by_flow.argmax().astype(jnp.int32), ranked.named[w]), seen
+
+
+def class_shares(flow_seen: jax.Array, spread: jax.Array) -> jax.Array:
+    """(..., 3): P(flow < 90 %), P(90 to 110 %), P(> 110 %) where log flow ~ N(log flow_seen, spread^2);
+    flow_seen in percent, both (...)."""
+    low, high = (
+        jax.scipy.special.ndtr((jnp.log(border) - jnp.log(flow_seen)) / spread) for border in GOOD_BORDERS
+    )
+    return jnp.stack([low, high - low, 1.0 - high], axis=-1)
+
+
+def _check(table: WindowTable) -> None:
+    shares, n, bins = np.asarray(table.shares), len(table.shares), len(table.flow_edges) - 1
+    if shares.shape != (n, 3) or not all(
+        len(column) == n for column in (table.named, table.flow_bin, table.segment)
+    ):
+        raise ValueError(
+            "recorded windows: expected shares (n, 3) and as many classes, flow bins and segments, "
+            f"found {shares.shape}, "
+            f"{len(table.named)}, {len(table.flow_bin)}, {len(table.segment)}; record them in one go"
+        )
+    if (
+        n == 0
+        or not np.isfinite(shares).all()
+        or (shares < 0).any()
+        or np.abs(shares.sum(axis=1) - 1).max() > 1e-3
+    ):
+        raise ValueError(
+            "recorded windows: expected shares from 0 to 1 with sum 1, found others; "
+            "normalise each window's shares over its classes"
+        )
+    flows = [np.asarray(column, float) for column in (table.flow_seen, table.spread, table.flow)]
+    if np.isfinite(flows[0]).any() and not all(
+        column.shape == (n,) and (np.isfinite(column) & (column > 0)).all() for column in flows
+    ):
+        raise ValueError(
+            f"recorded windows: expected flow_seen, spread and flow of all {n} windows, positive numbers, or "
+            f"of none, found {', '.join(str((column > 0).sum()) for column in flows)}; record them in one go"
+        )
+    if (np.diff(table.flow_edges) <= 0).any():
+        raise ValueError("recorded windows: expected rising flow edges, found some that fall; sort the bins")
+    empty = np.setdiff1d(np.arange(bins), table.flow_bin)
+    if len(empty):
+        low, high = table.flow_edges[empty[0]], table.flow_edges[empty[0] + 1]
+        raise ValueError(
+            f"recorded windows: no window for flows from {low:g} to {high:g} % ({len(empty)} empty bins); "
+            "record them, or widen the bins"
+        )
+    if np.min(table.flow_bin) < 0 or np.max(table.flow_bin) >= bins:
+        raise ValueError(
+            f"recorded windows: expected flow bins 0 to {bins - 1}, "
+            f"found {np.min(table.flow_bin)} to {np.max(table.flow_bin)}"
+        )

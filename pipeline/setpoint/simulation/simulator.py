@@ -1,0 +1,451 @@
+"""The printer as a controller of setpoints meets it: the paper's simulator (Li and Pattinson 2025, eqs. 5-9),
+disturbances in mid-episode, and rollouts.
+
+One decision is one window of frames. At step t the controller sees an
+`Observation` and answers with an `Action`; then
+
+q_bar <- clip(q_bar + gain a_q, 20, 310), q = blockage q_bar, u_bar <- clip(u_bar + a_u, 180, 240) where t mod
+lambda = 0, u_hat += (u_bar - u_hat) / delta
+
+What may be sent, how long to wait and when to hold is `actuation`'s, as in the loop through pixels. The
+commanded flow acts at once, or as fast as the melt lets it, and the class depends on the true flow q alone.
+What a window shows for a flow comes from a `Windows`: `paper_windows()` here, or windows recorded from a
+trained classifier (`recorded.recorded_windows`). Flow is in percent of nominal, temperature in °C.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pipeline.setpoint.published import (
+    ALPHA,
+    BEST_FLOW,
+    BEST_TEMPERATURE,
+    DELTA,
+    FLOW_MOVES,
+    LAMBDA,
+    ROTATION,
+    SIGMA,
+    TEMPERATURE_MOVES,
+)
+from pipeline.setpoint.simulation import actuation
+from pipeline.setpoint.simulation.actuation import ACTS, FEW, Limits, Setpoints
+
+STAND = 2  # the index of no move
+FLOW_LIMITS, TEMPERATURE_LIMITS = (20.0, 310.0), (180.0, 240.0)
+BLOCKAGE_LIMITS = (1 / 3, 3.0)  # beyond, no setpoint within its limits would bring the flow to 100 %
+GAIN_LIMITS = (0.5, 1.2)  # that a drifting gain keeps to
+LIMITS = Limits(  # of what is sent: the largest change of one action, and of 60 s
+    *(np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True)),
+    np.array([10.0, 20.0]),
+    np.array([100.0, 60.0]),
+)
+REMEMBERED = 16  # actions of the last 60 s that limits are of: one takes at least 4 s
+WINDOW_S = 1.0
+CLOG_GOES = 1 / 30  # probability a decision, of clogs that come and go
+HISTORY, CLASSES = 30, 3  # eta and n_c of (8)
+UNDER, GOOD, OVER = 0, 1, 2
+GOOD_BORDERS = (90.0, 110.0)  # percent
+CHANCES = 8  # uniform numbers that a decision takes: three for its window, five for what befalls the machine
+
+
+class Observation(NamedTuple):
+    """What the machine shows at a decision. The true flow is not among it, nor a setpoint that would give it
+    away: only moves of the flow setpoint mean something.
+
+    shares (3,) of under, good, over in the window, sum 1; named is the window's class 0, 1, 2; flow_seen the
+    flow that it shows, percent of nominal, NaN of a camera that shows classes only; flow_move
+    (percent) is how far the flow setpoint moved since the controller's last observation, as executed after
+    limits (0 after a hold); temperature u_hat and target u_bar in °C; step t counts decisions, held ones too.
+    """
+
+    shares: jax.Array
+    named: jax.Array
+    flow_seen: jax.Array
+    flow_move: jax.Array
+    temperature: jax.Array
+    target: jax.Array
+    step: jax.Array
+
+
+class Action(NamedTuple):
+    """Indices 0..4 into FLOW_MOVES and TEMPERATURE_MOVES; the
+    temperature's counts only where step mod LAMBDA = 0."""
+
+    flow: jax.Array
+    temperature: jax.Array
+
+
+def _never(parameters, memory) -> jax.Array:
+    return jnp.zeros((), bool)
+
+
+class Controller(NamedTuple):
+    """start() -> memory; act(parameters, memory, observation, key) -> (memory, action); strange(parameters,
+    memory) -> whether the camera is none that the controller knows, so that it should hold. All pure, for one
+    episode: vmap over episodes, scan over steps."""
+
+    start: Callable[[], Any]
+    act: Callable[[Any, Any, Observation, jax.Array], tuple[Any, Action]]
+    strange: Callable[[Any, Any], jax.Array] = _never
+
+
+class Conditions(NamedTuple):
+    """One episode's start and machine: scalars, or arrays (n,) with one entry an episode.
+
+    flow (percent) and temperature (°C) at the start; accuracy rho of the paper's windows; persistence:
+    decisions that a recorded segment lasts on average, 1 is fresh; gain: true move by commanded move; clog:
+    factor on the flow from clog_step on, 1 is none; drift: relative change of the flow at each step;
+    jump_rate: probability a step that the flow is multiplied by exp(jump_size N(0, 1)).
+
+    As deployed: wait_s after every action; melt_s: time constant with which the flow follows, 0 is at once;
+    gain_drift: relative change of the gain at each step, within GAIN_LIMITS; clog_rate: probability a step
+    that a clog comes, and goes again with CLOG_GOES; seen: factor on the flow that the camera reads, against
+    its record; the camera repeats its window for stuck_for decisions from stuck_from on, and shows nothing
+    for blind_for from blind_from on. flow_actions: lambda, of flow to one of temperature.
+    """
+
+    flow: jax.Array
+    temperature: jax.Array
+    accuracy: jax.Array
+    persistence: jax.Array
+    gain: jax.Array
+    clog: jax.Array
+    clog_step: jax.Array
+    drift: jax.Array
+    jump_rate: jax.Array
+    jump_size: jax.Array
+    wait_s: jax.Array
+    melt_s: jax.Array
+    gain_drift: jax.Array
+    clog_rate: jax.Array
+    seen: jax.Array
+    stuck_from: jax.Array
+    stuck_for: jax.Array
+    blind_from: jax.Array
+    blind_for: jax.Array
+    flow_actions: jax.Array
+
+
+class State(NamedTuple):
+    """sent: what the moves reach, (q_bar before blockage, u_bar), and the moves of the last minute; gain and
+    blockage now, clogged by what comes and goes; flow: the true q; flow_move: percent that was sent since the
+    controller last saw a window; segment in [0, 1): the recorded conditions that persist, as a rank among
+    segments; shown: the last window; reason: why it holds, actuation.REASONS; step counts decisions, acted
+    those that were not held."""
+
+    sent: Setpoints
+    gain: jax.Array
+    blockage: jax.Array
+    clogged: jax.Array
+    flow: jax.Array
+    flow_move: jax.Array
+    temperature: jax.Array
+    segment: jax.Array
+    shown: tuple[jax.Array, jax.Array, jax.Array]
+    reason: jax.Array
+    time_s: jax.Array
+    step: jax.Array
+    acted: jax.Array
+
+    @property
+    def target(self) -> jax.Array:
+        return self.sent.value[..., 1]
+
+
+class Windows(NamedTuple):
+    """draw(table, conditions, flow, segment, u) -> shares (3,), named, flow_seen (percent; NaN where the
+    camera shows classes only): a window at the true flow, from uniform numbers u (3,) and the arrays of
+    `table`."""
+
+    draw: Callable[[Any, Conditions, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]
+    table: Any = ()
+
+
+class Trajectory(NamedTuple):
+    """n episodes of T decisions: true flow, temperature and target (n, T + 1) with the start first; named (n,
+    T), shares (n, T, 3), action (n, T) as asked where it was sent, and reason (n, T), actuation.REASONS, of
+    each decision."""
+
+    flow: jax.Array
+    temperature: jax.Array
+    target: jax.Array
+    named: jax.Array
+    shares: jax.Array
+    action: Action
+    reason: jax.Array
+
+
+def flow_class(flow: jax.Array) -> jax.Array:
+    """0 under 90 %, 1 from 90 to 110 %, 2 above."""
+    return jnp.where(flow < GOOD_BORDERS[0], UNDER, jnp.where(flow > GOOD_BORDERS[1], OVER, GOOD))
+
+
+def nominal(flow, temperature, *, accuracy: float) -> Conditions:
+    """Conditions of a machine that does as it is told, from starts flow (n,) and
+    temperature (n,); `_replace` what an episode is to meet."""
+    flow = jnp.asarray(flow, float)
+    one, zero = jnp.ones_like(flow), jnp.zeros_like(flow)
+    ones = dict.fromkeys(("persistence", "gain", "clog", "seen"), one)
+    values = dict.fromkeys(Conditions._fields, zero) | ones
+    return Conditions(
+        **values
+        | {
+            "flow": flow,
+            "temperature": jnp.asarray(temperature, float) * one,
+            "accuracy": accuracy * one,
+            "wait_s": 6.0 * one,
+            "flow_actions": LAMBDA * one,
+        }
+    )
+
+
+def paper_windows() -> Windows:
+    """(7): the class is right with probability rho, else one of the others; p_i = clip(exp(-alpha |i - x0|) +
+    N(0, sigma^2), 0, 1) for i != x0, 1 at x0; over their sum. It shows classes only."""
+    return Windows(_paper_draw)
+
+
+def _paper_draw(table, conditions: Conditions, flow, segment, u) -> tuple[jax.Array, jax.Array, jax.Array]:
+    wrong = u[0] >= conditions.accuracy
+    shift = 1 + (u[0] - conditions.accuracy >= (1.0 - conditions.accuracy) / 2)
+    x0 = jnp.where(wrong, (flow_class(flow) + shift) % CLASSES, flow_class(flow))
+    distance = jnp.abs(jnp.arange(CLASSES) - x0)
+    z = _normal(u[1:])
+    noise = SIGMA * jnp.stack(
+        [z[0], jnp.where(x0 == 0, z[0], z[1]), z[1]]
+    )  # two numbers serve, as x0 itself takes none
+    prob = jnp.where(distance == 0, 1.0, jnp.clip(jnp.exp(-ALPHA * distance) + noise, 0.0, 1.0))
+    return prob / prob.sum(), x0, jnp.full_like(u[0], jnp.nan)
+
+
+def _normal(u: jax.Array) -> jax.Array:
+    """N(0, 1) from numbers uniform in [0, 1)."""
+    return jnp.sqrt(2.0) * jax.lax.erf_inv(jnp.clip(2.0 * u - 1.0, -1.0 + 1e-6, 1.0 - 1e-6))
+
+
+def begin(windows: Windows, conditions: Conditions, key: jax.Array) -> tuple[State, Observation]:
+    """The state and first observation of one episode (scalar conditions)."""
+    return _begun(windows, conditions, jax.random.uniform(key, (CHANCES,)))
+
+
+def _begun(windows: Windows, conditions: Conditions, u: jax.Array) -> tuple[State, Observation]:
+    flow, temperature = (
+        jnp.clip(conditions.flow, *FLOW_LIMITS),
+        jnp.clip(conditions.temperature, *TEMPERATURE_LIMITS),
+    )
+    zero, none = jnp.zeros_like(flow), jnp.zeros_like(flow, jnp.int32)
+    state = State(
+        sent=actuation.at_rest(jnp.stack([flow, temperature]), remembered=REMEMBERED),
+        gain=conditions.gain,
+        blockage=zero + 1.0,
+        clogged=zero > 0,
+        flow=flow,
+        flow_move=zero,
+        temperature=temperature,
+        segment=u[6],
+        shown=(jnp.full(CLASSES, 1.0 / CLASSES), none + GOOD, zero + jnp.nan),
+        reason=none + ACTS,
+        time_s=zero,
+        step=none,
+        acted=none,
+    )
+    state = _watched(windows, conditions, state, u[:3])
+    return state, _observation(state)
+
+
+def stepped(
+    windows: Windows, conditions: Conditions, state: State, action: Action, u: jax.Array
+) -> tuple[State, Observation]:
+    """One decision of one episode: the action, the limits and lags, whatever befalls the machine, and the
+    next window. The reward is `reward(state.flow, state.temperature, ...)`.
+
+    u (CHANCES,) are the chances, uniform in [0, 1), which the caller draws for many at once. An action that
+    answers a window that holds is not sent.
+    """
+    sent, wait_s, executed = _sent(conditions, state, action)
+    t = state.step + 1
+    blockage, clogged = _blocked(conditions, state, t, u)
+    reached = blockage * sent.value[0]
+    # the window's middle is what it shows of a melt on its way
+    late = jnp.exp(-(wait_s + WINDOW_S / 2) / jnp.maximum(conditions.melt_s, 1e-3))
+    saw = actuation.is_evidence(state.reason)
+    state = state._replace(
+        sent=sent,
+        gain=jnp.clip(
+            state.gain * (1.0 + conditions.gain_drift),
+            jnp.minimum(conditions.gain, GAIN_LIMITS[0]),
+            jnp.maximum(conditions.gain, GAIN_LIMITS[1]),
+        ),
+        blockage=blockage,
+        clogged=clogged,
+        flow=reached + (state.flow - reached) * late,
+        flow_move=executed + jnp.where(saw, 0.0, state.flow_move),
+        temperature=state.temperature + (sent.value[1] - state.temperature) / DELTA,  # (6)
+        segment=jnp.where(u[5] * conditions.persistence < 1.0, u[6], state.segment),
+        time_s=state.time_s + wait_s + WINDOW_S,
+        step=t,
+        acted=state.acted + (state.reason == ACTS),
+    )
+    state = _watched(windows, conditions, state, u[:3])
+    return state, _observation(state)
+
+
+def _sent(conditions: Conditions, state: State, action: Action) -> tuple[Setpoints, jax.Array, jax.Array]:
+    """What is sent of an action, the wait after it in s, and the flow's executed move in percent as
+    commanded. The flow is limited where it arrives: a move of a reaches gain a."""
+    acts = state.reason == ACTS
+    heeded = acts & (state.acted % conditions.flow_actions == 0)
+    asked = jnp.stack(
+        [
+            jnp.where(acts, jnp.asarray(FLOW_MOVES)[action.flow], 0.0),
+            jnp.where(heeded, jnp.asarray(TEMPERATURE_MOVES)[action.temperature], 0.0),
+        ]
+    )
+    scale = jnp.stack([state.gain, jnp.ones_like(state.gain)])
+    limits = LIMITS._replace(per_action=LIMITS.per_action * scale, per_minute=LIMITS.per_minute * scale)
+    sent = actuation.moved(state.sent, asked * scale, state.time_s, limits)
+    change = sent.value - state.sent.value
+    return (
+        sent,
+        actuation.wait_after(change, actuation.Waits(*3 * (conditions.wait_s,))),
+        change[0] / state.gain,
+    )
+
+
+def _blocked(conditions: Conditions, state: State, t: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Blockage, and whether a clog that comes and goes is there."""
+    jump = jnp.where(u[3] < conditions.jump_rate, conditions.jump_size * _normal(u[4]), 0.0)
+    comes = ~state.clogged & (u[7] < conditions.clog_rate)
+    goes = state.clogged & (u[7] > 1.0 - CLOG_GOES)
+    blockage = (
+        state.blockage
+        * jnp.where((t == conditions.clog_step) | comes, conditions.clog, 1.0)
+        / jnp.where(goes, conditions.clog, 1.0)
+        * (1.0 + conditions.drift)
+        * jnp.exp(jump)
+    )
+    return jnp.clip(blockage, *BLOCKAGE_LIMITS), (state.clogged | comes) & ~goes
+
+
+def _watched(windows: Windows, conditions: Conditions, state: State, u: jax.Array) -> State:
+    """The state with the window that the camera shows now, and whether that holds."""
+    fresh = windows.draw(windows.table, conditions, conditions.seen * state.flow, state.segment, u)
+    stuck = _lasts(state.step, conditions.stuck_from, conditions.stuck_for)
+    shown = jax.tree.map(lambda new, old: jnp.where(stuck, old, new), fresh, state.shown)
+    blind = _lasts(state.step, conditions.blind_from, conditions.blind_for)
+    reason = jnp.where(blind, FEW, actuation.still(shown[2], state.shown[2]))
+    return state._replace(shown=shown, reason=reason.astype(jnp.int32))
+
+
+def _lasts(step: jax.Array, begins: jax.Array, decisions: jax.Array) -> jax.Array:
+    return (step >= begins) & (step < begins + decisions)
+
+
+def _observation(state: State) -> Observation:
+    return Observation(*state.shown, state.flow_move, state.temperature, state.sent.value[1], state.acted)
+
+
+def first_history(length: int = HISTORY) -> jax.Array:
+    """(8) at the start: eta classes as if all had been good, 1 / n_c each; oldest first."""
+    return jnp.full(length, 1.0 / CLASSES)
+
+
+def remembered(history: jax.Array, named: jax.Array) -> jax.Array:
+    """The history (30,) with the newest class x as x / n_c at its end (8)."""
+    return jnp.append(history[1:], named / CLASSES)
+
+
+def paper_state(history: jax.Array, observation: Observation) -> jax.Array:
+    """The state (35,) of (9): 30 former classes by n_c, oldest first,
+    p_hat with its largest at 1, u_hat, u_bar (°C)."""
+    p_hat = observation.shares / observation.shares.max()
+    return jnp.concatenate([history, p_hat, jnp.stack([observation.temperature, observation.target])])
+
+
+def rollout(
+    controller: Controller,
+    parameters: Any,
+    windows: Windows,
+    conditions: Conditions,
+    key: jax.Array,
+    *,
+    steps: int,
+) -> Trajectory:
+    """Every episode of `conditions` (n,) for `steps` decisions: one
+    compiled program, the same key the same bytes."""
+    n = conditions.flow.shape[0]
+    own, world = jax.random.split(key)  # the controller's chance is not the world's
+    # chance is drawn outside of the program, as its generator takes longer to compile than the rest; so are
+    # the first windows, which are the same program for every controller
+    u = jax.random.uniform(world, (steps + 1, n, CHANCES))
+    first = _first(windows, conditions, u)
+    return _rolled(controller, parameters, windows, conditions, jax.random.split(own, n), first, u)
+
+
+@eqx.filter_jit
+def _first(windows: Windows, conditions: Conditions, u: jax.Array) -> tuple[State, Observation]:
+    return jax.vmap(_begun, (None, 0, 0))(windows, conditions, u[0])
+
+
+@eqx.filter_jit
+def _rolled(
+    controller: Controller,
+    parameters: Any,
+    windows: Windows,
+    conditions: Conditions,
+    keys: jax.Array,
+    first: tuple[State, Observation],
+    u: jax.Array,
+) -> Trajectory:
+    def decide(carry, chance):
+        state, observation, memory = carry
+        u, t = chance
+        now = jax.vmap(jax.random.fold_in, (0, None))(keys, t)
+        decide = jax.vmap(actuation.decide, (None, None, 0, 0, 0, 0))
+        memory, action, reason = decide(controller, parameters, memory, observation, state.reason, now)
+        state = state._replace(reason=reason)
+        after, next_observation = jax.vmap(stepped, (None, 0, 0, 0, 0))(windows, conditions, state, action, u)
+        return (after, next_observation, memory), (
+            after.flow,
+            after.temperature,
+            after.target,
+            observation.named,
+            observation.shares,
+            action,
+            reason,
+        )
+
+    state, observation = first
+    memory = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (len(keys), *jnp.shape(leaf))), controller.start()
+    )
+    _, (flow, temperature, target, *per_decision) = jax.lax.scan(
+        decide, (state, observation, memory), (u[1:], jnp.arange(len(u) - 1))
+    )
+    flow, temperature, target = (
+        jnp.concatenate([first[None], then])
+        for first, then in zip(
+            (state.flow, state.temperature, state.target), (flow, temperature, target), strict=True
+        )
+    )
+    return Trajectory(
+        *jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), (flow, temperature, target, *per_decision))
+    )
+
+
+def reward(flow: jax.Array, temperature: jax.Array, *, a: float, b: float) -> jax.Array:
+    """The paper's elliptical reward (Li and Pattinson 2025, eqs. 14-16):
+    r = 2 / (1 + sqrt(q_r^2 / a^2 + u_r^2 / b^2)) - 1 in (-1, 1], 1 at (q*, u*) = (100 %, 210 °C); flow in
+    percent, temperature in °C, any one shape.
+
+    q_r = (q - q*) cos theta - (u - u*) sin theta,   u_r = (q - q*) sin theta + (u - u*) cos theta
+    """
+    dq, du = flow - BEST_FLOW, temperature - BEST_TEMPERATURE
+    q_r = dq * jnp.cos(ROTATION) - du * jnp.sin(ROTATION)
+    u_r = dq * jnp.sin(ROTATION) + du * jnp.cos(ROTATION)
+    return 2.0 / (1.0 + jnp.sqrt(q_r**2 / a**2 + u_r**2 / b**2)) - 1.0

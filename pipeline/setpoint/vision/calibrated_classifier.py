@@ -1,0 +1,193 @@
+"""A classifier with its calibration: class probabilities of key areas and of windows, and how far a key area
+is from what was learned."""
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import scipy.special
+
+from pipeline.setpoint.vision import calibration
+from pipeline.setpoint.vision.calibration import (
+    Calibration,
+    ClassifierOutputs,
+    Reliability,
+    WindowFlow,
+    WindowTruth,
+)
+from pipeline.setpoint.vision.classifier import Labelled, predict
+from pipeline.setpoint.vision.vision_transformer import Classifier
+
+BINS = 10  # of reliability diagrams
+
+
+class CalibratedClassifier(NamedTuple):
+    network: Classifier
+    calibration: Calibration
+
+
+class FrameReadings(NamedTuple):
+    """Of n key areas: class probabilities (n, 3), how foreign each is (n,), log(flow / 100 %) (n,) and its
+    deviation (n,) as the network gives them; calibration.window_flow makes a window's flow of them."""
+
+    prob: np.ndarray
+    distance: np.ndarray
+    log_flow: np.ndarray
+    deviation: np.ndarray
+
+
+def read_frames(
+    model: CalibratedClassifier, images: np.ndarray, temperature_degC: np.ndarray
+) -> FrameReadings:
+    """What key areas (n, 16, 48) at temperatures (n,) show; the distance is the squared Mahalanobis distance
+    of features and appearance from those learned."""
+    prediction = predict(model.network, images, temperature_degC)
+    prob = np.exp(calibration.log_probabilities(prediction.logits, model.calibration.temperature))
+    features = np.hstack([prediction.features, calibration.appearance(images)])
+    return FrameReadings(
+        prob / prob.sum(axis=1, keepdims=True),
+        calibration.mahalanobis(model.calibration.familiar, features),
+        prediction.log_flow.astype(float),
+        prediction.deviation.astype(float),
+    )
+
+
+def classify(
+    model: CalibratedClassifier, images: np.ndarray, temperature_degC: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Class probabilities (n, 3) of key areas (n, 16, 48) at temperatures (n,), and how foreign each is
+    (n,), as `read_frames` says."""
+    return read_frames(model, images, temperature_degC)[:2]
+
+
+def outputs(network: Classifier, data: Labelled, valid: np.ndarray) -> ClassifierOutputs:
+    """The network's outputs on n frames, valid (n,) or not."""
+    prediction = predict(network, data.key_area, data.temperature_degC)
+    return calibration.classifier_outputs(prediction, data, valid)
+
+
+class WindowPredictions(NamedTuple):
+    """Of w windows: the flow seen and the probabilities of the classes that follow from it; those by summed
+    logarithms (w, 3), by hard counts and by the mean; the truth, rows (w, length) of the frames, whether any
+    is valid (w,)."""
+
+    seen: WindowFlow
+    log_sum: np.ndarray
+    hard: np.ndarray
+    mean: np.ndarray
+    truth: WindowTruth
+    rows: np.ndarray
+    any_valid: np.ndarray
+
+
+def window_predictions(fitted: Calibration, frames: ClassifierOutputs, *, length: int) -> WindowPredictions:
+    """Predictions of the windows of `length` frames of one segment and class; 1/3 each for those without a
+    valid frame."""
+    rows = calibration.windows(frames.segment, frames.label, length=length).rows
+    log_p, valid = calibration.log_probabilities(frames.logits, fitted.temperature)[rows], frames.valid[rows]
+    total = np.where(valid[:, :, None], np.exp(log_p), 0).sum(axis=1)
+    m = valid.sum(axis=1)[:, None]
+    first = rows[:, 0]
+    truth = frames.label, frames.flow_percent, frames.temperature_degC, frames.segment
+    return WindowPredictions(
+        seen=calibration.window_flow(frames.log_flow[rows], frames.deviation[rows], valid, fitted.flow),
+        log_sum=calibration.window_probabilities(log_p, valid, fitted.correlation),
+        hard=calibration.hard_shares(log_p, valid),
+        mean=np.where(m > 0, total / np.maximum(m, 1), 1 / 3),
+        truth=WindowTruth(*(column[first] for column in truth)),
+        rows=rows,
+        any_valid=valid.any(axis=1),
+    )
+
+
+def reliabilities(
+    fitted: Calibration, frames: ClassifierOutputs, *, length: int
+) -> dict[tuple[str, str], Reliability]:
+    """By (image or window, method): before and after calibration; of windows the paper's hard counts, the
+    mean, summed logarithms, and what follows from the flow seen."""
+    v, windows = frames.valid, window_predictions(fitted, frames, length=length)
+    images = {
+        "raw": scipy.special.softmax(frames.logits[v], axis=1),
+        "calibrated": np.exp(calibration.log_probabilities(frames.logits[v], fitted.temperature)),
+    }
+    methods = {"hard_counts": windows.hard, "mean": windows.mean, "log_sum": windows.log_sum}
+    methods["flow"] = windows.seen.prob
+    some = windows.any_valid
+    return {
+        ("image", name): calibration.reliability(prob, frames.label[v], bins=BINS)
+        for name, prob in images.items()
+    } | {
+        ("window", name): calibration.reliability(prob[some], windows.truth.label[some], bins=BINS)
+        for name, prob in methods.items()
+    }
+
+
+def foreign_images(key_area: np.ndarray) -> dict[str, np.ndarray]:
+    """Key areas (n, 16, 48) as no bead looks: a lens out of focus, little and
+    much, and a rectangle that lies across the line."""
+    blurred = {
+        name: np.stack([cv2.GaussianBlur(a, (0, 0), sigma) for a in key_area])
+        for name, sigma in (("slight_blur", 1.5), ("blur", 2.5))
+    }
+    return blurred | {
+        "transposed": np.stack(
+            [
+                cv2.resize(np.ascontiguousarray(a.T), a.shape[::-1], interpolation=cv2.INTER_AREA)
+                for a in key_area
+            ]
+        )
+    }
+
+
+def foreign_detection(
+    model: CalibratedClassifier, frames: ClassifierOutputs, data: Labelled
+) -> dict[str, Any]:
+    """By kind of foreign picture the AUROC of the distance, beside those of the energy and of 1 - max p, and
+    the share found; and the share of familiar ones called foreign."""
+    v, fitted = frames.valid, model.calibration
+    familiar = calibration.mahalanobis(fitted.familiar, frames.features[v])
+    plain = -scipy.special.softmax(frames.logits[v], axis=1).max(axis=1)
+    figures: dict[str, Any] = {"false_alarms": float(np.mean(familiar > fitted.foreign_above))}
+    for name, images in foreign_images(data.key_area[v]).items():
+        shown = predict(model.network, images, data.temperature_degC[v])
+        scores = calibration.mahalanobis(
+            fitted.familiar, np.hstack([shown.features, calibration.appearance(images)])
+        )
+        energies = calibration.energy(frames.logits[v]), calibration.energy(shown.logits)
+        figures[name] = {
+            "auroc": calibration.auroc(familiar, scores),
+            "found": float(np.mean(scores > fitted.foreign_above)),
+            "energy_auroc": calibration.auroc(*energies),
+            "max_p_auroc": calibration.auroc(plain, -scipy.special.softmax(shown.logits, axis=1).max(axis=1)),
+        }
+    return figures
+
+
+class YardstickClasses(NamedTuple):
+    """The yardsticks' classes of n frames (n,): support vector machine on the profile, width; and the share
+    of windows that the machine's counts name rightly."""
+
+    svc: np.ndarray
+    width: np.ndarray
+    svc_window_accuracy: float
+
+
+def yardstick_classes(
+    learned: Labelled, data: Labelled, windows: WindowPredictions, valid: np.ndarray
+) -> YardstickClasses:
+    """Both yardsticks, fitted on the valid frames that the network
+    learned, on the frames `data` and their windows."""
+    from pipeline.setpoint import yardsticks  # here, as who only classifies needs none
+
+    machine = yardsticks.fit_profile_machine(
+        learned.key_area, learned.temperature_degC, learned.label, learned.segment
+    )
+    rule = yardsticks.fit_width_rule(learned.key_area, learned.label)
+    prob = yardsticks.profile_probabilities(machine, data.key_area, data.temperature_degC)
+    log_p = np.log(prob + 1e-12)[windows.rows]
+    counts = calibration.hard_shares(log_p, valid[windows.rows]).argmax(axis=1)
+    return YardstickClasses(
+        prob.argmax(axis=1),
+        yardsticks.width_class(rule, data.key_area),
+        float(np.mean((counts == windows.truth.label)[windows.any_valid])),
+    )

@@ -1,0 +1,484 @@
+"""What a classifier's probabilities are worth: temperature for one image, a fitted log-sum for a window,
+conformal sets by segment, distance from what was learned.
+
+All of it is fitted on segments that the classifier never saw, and judged on yet others.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+import scipy.fft
+import scipy.linalg
+import scipy.optimize
+import scipy.special
+import scipy.stats
+
+from pipeline.setpoint.simulation.recorded import WindowTable
+from pipeline.setpoint.vision.classifier import Labelled, Prediction
+from pipeline.setpoint.vision.window_flow import FlowCalibration, WindowFlow, fit_flow, window_flow
+from pipeline.statistics import Share
+
+CLASSES = 3
+
+
+# ---- one image
+
+
+def log_probabilities(logits: np.ndarray, temperature: float) -> np.ndarray:
+    """log softmax(logits / T) (n, 3): the higher T, the less sure (Guo, Pleiss, Sun, Weinberger 2017)."""
+    return scipy.special.log_softmax(np.asarray(logits, float) / temperature, axis=1)
+
+
+def fit_temperature(logits: np.ndarray, label: np.ndarray) -> float:
+    """The T that makes the labels (n,) most likely, between 1/20 and 20."""
+    label = np.asarray(label)
+    fit = scipy.optimize.minimize_scalar(
+        lambda log_t: -log_probabilities(logits, np.exp(log_t))[np.arange(len(label)), label].mean(),
+        bounds=(-3.0, 3.0),
+        method="bounded",
+    )
+    return float(np.exp(fit.x))
+
+
+# ---- a window of images
+
+
+class WindowRows(NamedTuple):
+    """Rows (w, length) of the frames of each window, and how many frames fill no window."""
+
+    rows: np.ndarray
+    left_over: int
+
+
+def windows(segment: np.ndarray, label: np.ndarray, *, length: int) -> WindowRows:
+    """Every `length` frames of one segment and one class in the order in which they come,
+    none used twice; a change of class starts anew."""
+    segment, label = np.asarray(segment), np.asarray(label)
+    order = np.argsort(segment, kind="stable")
+    change = (
+        (np.diff(segment[order]) != 0) | (np.diff(label[order]) != 0) if len(order) else np.zeros(0, bool)
+    )
+    rows = [
+        run[i : i + length]
+        for run in np.split(order, np.flatnonzero(change) + 1)
+        for i in range(0, len(run) - length + 1, length)
+    ]
+    return WindowRows(np.array(rows, int).reshape(-1, length), len(order) - length * len(rows))
+
+
+def window_probabilities(log_p: np.ndarray, valid: np.ndarray, correlation: float) -> np.ndarray:
+    """p (w, 3) = softmax( sum_i log p_i / (1 + (m - 1) correlation) ) over the m valid of a window's frames;
+    log_p (w, length, 3), valid (w, length).
+
+    Frames of one segment repeat each other: the divisor is Kish's design effect (1965), 1 for independent
+    frames and m where each says the same. No valid frame: 1/3 each.
+    """
+    m = valid.sum(axis=1)
+    total = np.where(valid[:, :, None], log_p, 0.0).sum(axis=1)
+    return scipy.special.softmax(total / (1 + np.maximum(m - 1, 0) * correlation)[:, None], axis=1)
+
+
+def fit_correlation(log_p: np.ndarray, valid: np.ndarray, label: np.ndarray) -> float:
+    """The correlation in 0 .. 3 that makes the labels (w,) of the windows most likely
+    (above 1: images are surer than they should be)."""
+    label = np.asarray(label)
+
+    def loss(correlation):
+        p = window_probabilities(log_p, valid, correlation)
+        return -np.log(np.maximum(p[np.arange(len(label)), label], 1e-300)).mean()
+
+    return float(scipy.optimize.minimize_scalar(loss, bounds=(0.0, 3.0), method="bounded").x)
+
+
+def hard_shares(log_p: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """p_c = w_c / w, the shares of the valid frames' most likely classes (w, 3) (Li and Pattinson 2025, eq.
+    4; scaled: p / max p). No valid frame: 1/3 each."""
+    named = np.where(valid, log_p.argmax(axis=2), -1)
+    counts = (named[:, :, None] == np.arange(CLASSES)).sum(axis=1)
+    m = valid.sum(axis=1)[:, None]
+    return np.where(m > 0, counts / np.maximum(m, 1), 1 / CLASSES)
+
+
+def recorded(
+    seen: WindowFlow, flow: np.ndarray, segment: np.ndarray, *, flow_edges: np.ndarray
+) -> WindowTable:
+    """What was seen in w windows of segments (w,) printed at flow (w,) percent, as the simulator draws it
+    again; windows without a valid frame are left out.
+
+    flow_edges (bins + 1,) in percent; raises ValueError where a flow lies outside them.
+    """
+    flow, flow_edges = np.asarray(flow, float), np.asarray(flow_edges, float)
+    outside = ~((flow >= flow_edges[0]) & (flow <= flow_edges[-1]))
+    if outside.any():
+        raise ValueError(
+            f"flows are expected within {flow_edges[0]:g} .. {flow_edges[-1]:g} % but {outside.sum()} are "
+            f"not, the first {flow[outside][0]:g}; widen the bins"
+        )
+    some = np.isfinite(seen.flow_seen)
+    seen, flow = WindowFlow(*(values[some] for values in seen)), flow[some]
+    flow_bin = np.clip(np.searchsorted(flow_edges, flow, side="right") - 1, 0, len(flow_edges) - 2)
+    named = seen.prob.argmax(axis=1)
+    bins = flow_bin, np.asarray(segment)[some], flow_edges
+    return WindowTable(seen.prob, named, *bins, seen.flow_seen, seen.spread, flow)
+
+
+# ---- how true the probabilities are
+
+
+class Reliability(NamedTuple):
+    """By bin of the highest probability: mean confidence, share right (NaN where empty), count, lower edges;
+    `error` is the expected calibration error, and `floor` what a perfectly calibrated classifier with these
+    probabilities would show on as many."""
+
+    confidence: np.ndarray
+    accuracy: np.ndarray
+    count: np.ndarray
+    edges: np.ndarray
+    error: float
+    floor: float
+
+
+def reliability(p: np.ndarray, label: np.ndarray, *, bins: int) -> Reliability:
+    """ECE = sum_b n_b / n |accuracy_b - confidence_b| over `bins` bins of equal width between 1/3 and 1,
+    where the highest of three probabilities lies (Guo et al. 2017).
+
+    p (n, 3). Were p true, a bin's hits would scatter by sqrt(sum c (1 - c)): the floor is
+    the mean of that, sqrt(2 / pi) of it, over all bins.
+    """
+    p, label = np.asarray(p, float), np.asarray(label)
+    edges = np.linspace(1 / CLASSES, 1.0, bins + 1)
+    confidence, right = p.max(axis=1), p.argmax(axis=1) == label
+    place = np.clip(np.searchsorted(edges, confidence, side="right") - 1, 0, bins - 1)
+    count = np.bincount(place, minlength=bins)
+
+    error = np.abs(np.bincount(place, right - confidence, bins)).sum() / max(len(label), 1)
+    floor = np.sqrt(2 / np.pi * np.bincount(place, confidence * (1 - confidence), bins)).sum() / max(
+        len(label), 1
+    )
+    with np.errstate(invalid="ignore"):
+        means = [np.bincount(place, values, bins) / count for values in (confidence, right)]
+    return Reliability(*means, count, edges[:-1], float(error), float(floor))
+
+
+def share_by_segment(happened: np.ndarray, segment: np.ndarray) -> Share:
+    """The share of True among n images or windows, in percent, with its 95 % interval: what is of one segment
+    (n,) errs together, so the segments are what was drawn.
+
+    Wilson's interval of n_eff = p (1 - p) / V images, with V the variance of a ratio of sums over segments
+    and a factor for Student's t of few of them (Korn and Graubard 1998); n_eff is at most n, and the number
+    of segments where all or none happened. No image: NaN.
+    """
+    happened, n = np.asarray(happened, float), len(happened)
+    if n == 0:
+        return Share(np.nan, np.nan, np.nan)
+    _, place = np.unique(segment, return_inverse=True)
+    clusters = int(place.max()) + 1
+    p, z = float(happened.mean()), float(scipy.special.ndtri(0.975))
+    residual = np.bincount(place, happened - p)
+    variance = (residual**2).sum() / n**2 * clusters / max(clusters - 1, 1)
+    effective = float(clusters)
+    if variance > 0 and clusters > 1:
+        student = float(scipy.special.stdtrit(clusters - 1, 0.975))
+        effective = min(p * (1 - p) / variance, n) * (z / student) ** 2
+    centre = (p + z**2 / (2 * effective)) / (1 + z**2 / effective)
+    half = z * np.sqrt(p * (1 - p) / effective + z**2 / (4 * effective**2)) / (1 + z**2 / effective)
+    return Share(100 * p, float(100 * max(centre - half, 0.0)), float(100 * min(centre + half, 1.0)))
+
+
+# ---- by flow
+
+
+class WindowTruth(NamedTuple):
+    """Of w windows: true class (w,), flow in percent (w,), temperature in °C (w,) and segment (w,)."""
+
+    label: np.ndarray
+    flow_percent: np.ndarray
+    temperature_degC: np.ndarray
+    segment: np.ndarray
+
+
+# bins of the true flow in percent by which a classifier is judged
+JUDGED_PERCENT = tuple(np.arange(70.0, 151.0, 5.0))
+
+
+class ByFlow(NamedTuple):
+    """Of windows with a true flow from `flow_low` to `flow_high` percent: how many, and the share for which
+    something holds, in percent, with its 95 % interval by segment; NaN where there is none."""
+
+    flow_low: float
+    flow_high: float
+    windows: int
+    percent: float
+    low: float
+    high: float
+
+
+def by_flow(happened: np.ndarray, truth: WindowTruth) -> list[ByFlow]:
+    """The share of True (w,) in each bin of JUDGED_PERCENT."""
+    rows = []
+    for low, high in itertools.pairwise(JUDGED_PERCENT):
+        here = (truth.flow_percent >= low) & (truth.flow_percent < high)
+        share = share_by_segment(happened[here], truth.segment[here])
+        rows.append(ByFlow(low, high, int(here.sum()), *share))
+    return rows
+
+
+def uniform_share(happened: np.ndarray, truth: WindowTruth) -> Share:
+    """The share of True (w,) as if the flows were uniform over JUDGED_PERCENT, in percent: the mean over its
+    bins, each with the variance of its share by segment. NaN where a bin has no window."""
+    rows = by_flow(happened, truth)
+    z = scipy.special.ndtri(0.975)
+    mean = float(np.mean([row.percent for row in rows]))
+    half = z * np.sqrt(np.sum([((row.high - row.low) / (2 * z)) ** 2 for row in rows])) / len(rows)
+    return Share(mean, float(max(mean - half, 0.0)), float(min(mean + half, 100.0)))
+
+
+# ---- sets that hold the true class
+
+
+def conformal_level(
+    p: np.ndarray, label: np.ndarray, segment: np.ndarray, *, coverage: float, confidence: float
+) -> float:
+    """The level of the sets {c: p_c >= level}: they hold the true class of a new segment's window with
+    probability `coverage` (Sadinle, Lei and Wasserman 2019).
+
+    Calibrated by segment: each counts once, however many windows (w,) it has, for its windows err together.
+    The coverage that n segments promise varies with their draw; with the k-th smallest p_label of n, the
+    share missed is Beta(k, n + 1 - k) (Vovk 2012), and k is the largest for which it is at most 1 - coverage
+    with probability `confidence`. Raises ValueError where even k = 1 does not promise that.
+    """
+    _, place, windows_of = np.unique(segment, return_inverse=True, return_counts=True)
+    n = len(windows_of)
+    k = 0
+    while k < n and scipy.stats.beta.cdf(1 - coverage, k + 1, n - k) >= confidence:
+        k += 1
+    if k == 0:
+        needed = int(np.ceil(np.log(1 - confidence) / np.log(coverage)))
+        raise ValueError(
+            f"sets that cover {coverage:.0%} with confidence {confidence:.0%} need at least {needed} "
+            f"calibration segments but found {n}; film more, or ask for less"
+        )
+    true = p[np.arange(len(label)), label]
+    order = np.argsort(true, kind="stable")
+    below = np.cumsum(1 / windows_of[place[order]])  # segments at or below each window
+    return float(true[order][np.searchsorted(below, k - 1e-9)])
+
+
+class Promise(NamedTuple):
+    """What the conformal sets promise: `coverage` of all windows with this confidence, and `by_flow` of those
+    at any one flow."""
+
+    coverage: float
+    confidence: float
+    by_flow: float
+
+
+# bins of flow in percent, where controllers work, in each of which sets must cover
+COVERED_PERCENT = (70.0, 80.0, 90.0, 100.0, 110.0, 120.0, 150.0)
+
+
+def conditional_level(p: np.ndarray, truth: WindowTruth, promise: Promise) -> float:
+    """One level whose sets cover at every flow and temperature: the lowest of 1 - by_flow, the conformal
+    level of all windows (w,), and those of the windows in each bin of COVERED_PERCENT and at each
+    temperature.
+
+    Sets that cover on average do so where nothing is in doubt, and miss beside the borders. Under the normal
+    law a flow at the border of its class has p < a with probability a, so that 1 - by_flow is enough where
+    that law holds. The groups hold it against what was measured (label-conditional prediction, Vovk 2012),
+    each at even odds; one with too few segments for that is left to the others.
+    """
+    every = conformal_level(
+        p, truth.label, truth.segment, coverage=promise.coverage, confidence=promise.confidence
+    )
+    levels = [every, 1 - promise.by_flow]
+    near = (truth.flow_percent >= COVERED_PERCENT[0]) & (truth.flow_percent < COVERED_PERCENT[-1])
+    flow_bin = np.searchsorted(COVERED_PERCENT, truth.flow_percent, side="right")
+    groups = [near & (flow_bin == k) for k in range(1, len(COVERED_PERCENT))]
+    groups += [near & (truth.temperature_degC == degrees) for degrees in np.unique(truth.temperature_degC)]
+    needed = np.log(0.5) / np.log(promise.by_flow)
+    for group in groups:
+        segment = truth.segment[group]
+        if len(np.unique(segment)) >= needed:
+            levels.append(
+                conformal_level(
+                    p[group], truth.label[group], segment, coverage=promise.by_flow, confidence=0.5
+                )
+            )
+    return min(levels)
+
+
+def holds_true_class(p: np.ndarray, label: np.ndarray, level: float) -> np.ndarray:
+    """(w,) whether the set {c: p_c >= level} holds the true class (w,)."""
+    return p[np.arange(len(label)), label] >= level
+
+
+class Sets(NamedTuple):
+    """Share of sets {c: p_c >= level} that hold the true class, and share that does not
+    name one class alone."""
+
+    coverage: float
+    held: float
+
+
+def sets(p: np.ndarray, label: np.ndarray, level: float) -> Sets:
+    members = p >= level
+    return Sets(float(members[np.arange(len(label)), label].mean()), float((members.sum(axis=1) != 1).mean()))
+
+
+# ---- distance from what was learned
+
+
+class Familiar(NamedTuple):
+    """Means of the three classes' features (3, f) and the whitening
+    L^-1 (f, f) of their common covariance L L'."""
+
+    means: np.ndarray
+    whitening: np.ndarray
+
+
+def fit_familiar(features: np.ndarray, label: np.ndarray) -> Familiar:
+    """Gaussians of one covariance round each class's features (n, f) (Lee, Lee, Lee and Shin 2018), the
+    covariance shrunk (Ledoit and Wolf 2004)."""
+    features, label = np.asarray(features, float), np.asarray(label)
+    means = np.array([features[label == c].mean(axis=0) for c in range(CLASSES)])
+    from sklearn.covariance import LedoitWolf  # here, as who only classifies fits none
+
+    covariance = LedoitWolf(assume_centered=True).fit(features - means[label]).covariance_
+    covariance += 1e-9 * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
+    L = np.linalg.cholesky(covariance)
+    return Familiar(means, scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True))
+
+
+BAND_ROWS, BAND_COLUMNS = (
+    (0, 1, 2, 4, 8),
+    (0, 1, 2, 4, 8, 16, 32),
+)  # where octaves of spatial frequency begin in the cosine transform of a key area
+
+
+def appearance(key_area: np.ndarray) -> np.ndarray:
+    """log energy of key areas (n, 16, 48) in octaves of spatial frequency, across and along the bead (n, 34),
+    each area scaled to mean 0 and deviation 1.
+
+    A network trained for width is made blind to much else: its features hardly move under blur or a wrong
+    angle, which empty and fill these bands.
+    """
+    x = np.asarray(key_area, np.float32)
+    x = x - x.mean(axis=(1, 2), keepdims=True)
+    x /= np.sqrt((x**2).mean(axis=(1, 2), keepdims=True)) + 1
+    energy = scipy.fft.dctn(x, axes=(1, 2), norm="ortho") ** 2
+    bands = np.add.reduceat(np.add.reduceat(energy, BAND_ROWS, axis=1), BAND_COLUMNS, axis=2)
+    return (
+        np.log(bands + 0.01).reshape(len(x), -1)[:, 1:].astype(float)
+    )  # 0.01 of 768: rounding to gray levels; the mean is left out
+
+
+def mahalanobis(familiar: Familiar, features: np.ndarray) -> np.ndarray:
+    """min_c (f - mu_c)' Sigma^-1 (f - mu_c) (n,): how foreign each image is."""
+    white = np.asarray(features, float) @ familiar.whitening.T
+    return np.min(
+        [((white - mean) ** 2).sum(axis=1) for mean in familiar.means @ familiar.whitening.T], axis=0
+    )
+
+
+def energy(logits: np.ndarray) -> np.ndarray:
+    """-log sum_c exp logit_c (n,), higher for the foreign (Liu, Wang, Owens and Li 2020); the yardstick."""
+    return -scipy.special.logsumexp(np.asarray(logits, float), axis=1)
+
+
+def foreign_above(scores: np.ndarray, *, false_alarms: float) -> float:
+    """The score that a share `false_alarms` of familiar images exceeds at most."""
+    scores = np.sort(np.asarray(scores, float))
+    return float(scores[int(np.ceil((1 - false_alarms) * len(scores))) - 1])
+
+
+def auroc(familiar: np.ndarray, foreign: np.ndarray) -> float:
+    """The probability that a foreign score exceeds a familiar one,
+    ties for a half (Mann and Whitney 1947)."""
+    return float(scipy.stats.mannwhitneyu(foreign, familiar).statistic / (len(familiar) * len(foreign)))
+
+
+# ---- all of it together
+
+
+class ClassifierOutputs(NamedTuple):
+    """A network's outputs on n frames: logits (n, 3), features with appearance (n, f), log(flow / 100 %) (n,)
+    with its deviation (n,); and the frames' label, flow in percent, temperature in °C, segment and valid
+    (n,)."""
+
+    logits: np.ndarray
+    features: np.ndarray
+    log_flow: np.ndarray
+    deviation: np.ndarray
+    label: np.ndarray
+    flow_percent: np.ndarray
+    temperature_degC: np.ndarray
+    segment: np.ndarray
+    valid: np.ndarray
+
+
+def classifier_outputs(prediction: Prediction, data: Labelled, valid: np.ndarray) -> ClassifierOutputs:
+    """The head's features with the appearance of the key areas beside them;
+    frames that the front end rejected are not valid."""
+    return ClassifierOutputs(
+        prediction.logits,
+        np.hstack([prediction.features, appearance(data.key_area)]),
+        np.asarray(prediction.log_flow, float),
+        np.asarray(prediction.deviation, float),
+        data.label,
+        np.asarray(data.flow_percent, float),
+        np.asarray(data.temperature_degC, float),
+        data.segment,
+        np.asarray(valid, bool),
+    )
+
+
+class Calibration(NamedTuple):
+    """What turns outputs into decisions: temperature of images, correlation of the classes of a window's
+    frames (for summed logarithms), level of a window's conformal set, the distance that is foreign, and what
+    turns the flows of frames into that of a window."""
+
+    temperature: float
+    correlation: float
+    level: float
+    familiar: Familiar
+    foreign_above: float
+    flow: FlowCalibration
+
+
+def calibrate(
+    learned: ClassifierOutputs,
+    unseen: ClassifierOutputs,
+    *,
+    length: int,
+    promise: Promise,
+    false_alarms: float,
+) -> Calibration:
+    """Everything fitted on segments `unseen` in training, but for the familiar features, which are those
+    `learned`; windows have `length` frames."""
+    v = unseen.valid
+    T = fit_temperature(unseen.logits[v], unseen.label[v])
+    rows = _rows(unseen, length)
+    first = rows[:, 0]
+    correlation = fit_correlation(log_probabilities(unseen.logits, T)[rows], v[rows], unseen.label[first])
+    of_frames = unseen.log_flow[rows], unseen.deviation[rows], v[rows]
+    flow = fit_flow(*of_frames, unseen.flow_percent[first])
+    truth = WindowTruth(
+        unseen.label[first], unseen.flow_percent[first], unseen.temperature_degC[first], unseen.segment[first]
+    )
+    level = conditional_level(window_flow(*of_frames, flow).prob, truth, promise)
+    familiar = fit_familiar(learned.features[learned.valid], learned.label[learned.valid])
+    distance = mahalanobis(familiar, unseen.features[v])
+    return Calibration(
+        T, correlation, level, familiar, foreign_above(distance, false_alarms=false_alarms), flow
+    )
+
+
+def _rows(frames: ClassifierOutputs, length: int) -> np.ndarray:
+    rows = windows(frames.segment, frames.label, length=length).rows
+    if not len(rows):
+        raise ValueError(
+            f"expected a segment with {length} frames in a row of one class but found none among "
+            f"{len(frames.label)} frames; film longer ones, or take shorter windows"
+        )
+    return rows

@@ -1,0 +1,160 @@
+"""The flow that a window of frames shows, with its spread, and the classes that follow from it.
+
+Each frame says a log flow with a deviation of its own. What they say is fitted to true flows on segments that
+the network never saw.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.special
+
+from pipeline.setpoint.frames.nozzle_scene import BORDERS
+
+CLASSES = 3
+# where the map from what frames show to the flow has its knots, in percent; between them it is linear
+KNOTS_PERCENT = (
+    10.0,
+    20.0,
+    35.0,
+    50.0,
+    65.0,
+    80.0,
+    90.0,
+    100.0,
+    110.0,
+    120.0,
+    140.0,
+    170.0,
+    220.0,
+    310.0,
+    620.0,
+)
+# windows that weigh as much as the wish for a straight map, and the flattest slope that is believed
+STRAIGHT, LEAST_SLOPE = 3.0, 0.1
+
+
+class FlowCalibration(NamedTuple):
+    """What turns the log flows of frames into that of a window: `shown` (k,) is what frames show on average
+    at the flows KNOTS_PERCENT, rising; `scale` (k,) multiplies their deviation there; `correlation` is that
+    of the errors of one segment's frames.
+
+    A network that is sure of little says a flow nearer to those that it learned than the true one: the map
+    undoes that, so that a window at any flow shows that flow on average.
+    """
+
+    shown: np.ndarray
+    scale: np.ndarray
+    correlation: float
+
+
+class WindowFlow(NamedTuple):
+    """Of w windows: flow_seen (w,) in percent of nominal, its relative standard deviation spread (w,), and
+    the probabilities prob (w, 3) of under, good, over. Without a valid frame: NaN, NaN and 1/3 each."""
+
+    flow_seen: np.ndarray
+    spread: np.ndarray
+    prob: np.ndarray
+
+
+def window_flow(
+    log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, fitted: FlowCalibration
+) -> WindowFlow:
+    """The flow of w windows from log(flow / 100 %) of their frames with its deviation, and valid (w, length).
+
+    What is shown is the mean of the m valid frames weighted by v_i = deviation_i^-2, and flow_seen the flow
+    at which frames show that on average. Frames of one segment repeat each other: spread^2 =
+    scale^2 (1 + (m - 1) correlation) / sum_i v_i (design effect; Kish 1965).
+    """
+    shown, unscaled = _shown(log_flow, deviation, valid, fitted.correlation)
+    seen = np.interp(shown, fitted.shown, _knots())
+    some = np.isfinite(seen)
+    spread = unscaled * np.interp(seen, _knots(), fitted.scale)
+    prob = np.full((len(seen), CLASSES), 1 / CLASSES)
+    prob[some] = class_probabilities(seen[some], spread[some])
+    return WindowFlow(100 * np.exp(seen), spread, prob)
+
+
+def _shown(
+    log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, correlation: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted mean of each window's frames, and its deviation before any scale (w,); NaN without a valid
+    frame."""
+    m = valid.sum(axis=1)
+    weight = np.where(valid, deviation, np.inf) ** -2.0
+    total = np.where(m > 0, weight.sum(axis=1), np.nan)
+    mean = (weight * np.where(valid, log_flow, 0.0)).sum(axis=1) / total
+    return mean, np.sqrt((1 + np.maximum(m - 1, 0) * correlation) / total)
+
+
+def _knots() -> np.ndarray:
+    return np.log(np.array(KNOTS_PERCENT) / 100)
+
+
+def _hats(log_flow: np.ndarray) -> np.ndarray:
+    """(n, k) weights of the knots in linear interpolation at log_flow (n,)."""
+    return np.stack([np.interp(log_flow, _knots(), one) for one in np.eye(len(KNOTS_PERCENT))], axis=1)
+
+
+def _straight() -> np.ndarray:
+    """(k - 2, k): changes of slope at the inner knots, per unit of log flow."""
+    slopes = np.diff(np.eye(len(KNOTS_PERCENT)), axis=0) / np.diff(_knots())[:, None]
+    return np.diff(slopes, axis=0)
+
+
+def fit_flow(
+    log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, flow: np.ndarray
+) -> FlowCalibration:
+    """Map, scale and correlation from windows (w, length) at flows (w,) in percent, all of segments that were
+    not learned from.
+
+    The map is least squares with its changes of slope weighed as STRAIGHT windows; the correlation that of
+    the standardised residuals of two frames of a window (analysis of variance); the scale what makes the
+    windows' squared errors as large as they are, smoothed in the same way.
+    """
+    some = valid.any(axis=1)
+    log_flow, deviation, valid, truth = (a[some] for a in (log_flow, deviation, valid, np.log(flow / 100)))
+    hats, straight = _hats(truth), STRAIGHT * _straight().T @ _straight()
+    slopes = np.eye(len(KNOTS_PERCENT))[[0, -1]] * 1e-6  # keeps ends that nobody saw finite
+    shown, _ = _shown(log_flow, deviation, valid, 0.0)
+    knots = _knots()
+    fitted = np.linalg.solve(
+        hats.T @ hats + straight + slopes.T @ slopes, hats.T @ shown + slopes.T @ slopes @ knots
+    )
+    steps = np.maximum(np.diff(fitted), LEAST_SLOPE * np.diff(knots))
+    middle = KNOTS_PERCENT.index(100.0)
+    rising = np.concatenate([[0.0], np.cumsum(steps)])
+    fitted = rising + fitted[middle] - rising[middle]
+    correlation = _correlation((log_flow - (hats @ fitted)[:, None]) / deviation, valid)
+    shown, unscaled = _shown(log_flow, deviation, valid, correlation)
+    seen = np.interp(shown, fitted, knots)
+    squared = ((seen - truth) / unscaled) ** 2
+    hats = _hats(seen)
+    level = squared.mean()
+    scale2 = np.linalg.solve(hats.T @ hats + straight + 1e-6 * np.eye(len(knots)), hats.T @ squared)
+    return FlowCalibration(fitted, np.sqrt(np.clip(scale2, 0.25 * level, 16 * level)), correlation)
+
+
+def _correlation(residual: np.ndarray, valid: np.ndarray) -> float:
+    """Mean product of two valid frames of a window over the mean square of one, within 0 .. 1."""
+    r = np.where(valid, residual, 0.0)
+    m = valid.sum(axis=1)
+    pairs = (m * (m - 1)).sum()
+    if pairs == 0:
+        return 1.0  # windows of one frame: nothing says that more would tell more
+    products = (r.sum(axis=1) ** 2 - (r**2).sum(axis=1)).sum() / pairs
+    return float(np.clip(products / ((r**2).sum() / m.sum()), 0.0, 1.0))
+
+
+def class_probabilities(log_flow: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """(n, 3) P(flow below 90 %, 90 to 110 %, above) under Normal(log_flow, spread) of log(flow / 100 %)."""
+    low, high = (np.log(border / 100) for border in BORDERS)
+    under = scipy.special.ndtr((low - log_flow) / spread)
+    over = scipy.special.ndtr((log_flow - high) / spread)
+    # as the difference of the nearer tails: 1 - under - over loses its digits far from 100 %
+    good = np.where(
+        log_flow > 0,
+        scipy.special.ndtr((high - log_flow) / spread) - under,
+        scipy.special.ndtr((log_flow - low) / spread) - over,
+    )
+    return np.stack([under, np.maximum(good, 0.0), over], axis=1)

@@ -1,0 +1,117 @@
+"""Feedback in a record: whether its inputs answer what its outputs did."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.stats
+
+from pipeline.temperature.identification.subspace import Segments, complete_runs, lagged, one_step
+
+LEVEL_CLOSED = 0.001  # of the test for feedback: far below 5 %, as records are less ideal than the test
+
+
+class ClosedLoop(NamedTuple):
+    """Whether the inputs answer what the outputs did: p_value (m,) of each input, and `closed` where one of
+    them is below `LEVEL_CLOSED` shared among the inputs."""
+
+    p_value: np.ndarray
+    closed: bool
+
+
+class _Answers(NamedTuple):
+    """What the past of the inputs does not foretell of them (N, m), beside one-step errors of the outputs at
+    lags 1..k (N, k p), of a predictor told u(t), and at lag 0 (N, p), of one that is not."""
+
+    moved: np.ndarray
+    errors_before: np.ndarray
+    errors_now: np.ndarray
+
+
+def closed_loop(
+    u: Segments, y: Segments, past: int, *, offset: bool = True, lags: int = 5, inputs: int | None = None
+) -> ClosedLoop:
+    """Whether inputs follow innovations (Granger 1969): what the past of u does not foretell of u(t) is
+    regressed on one-step errors of VARX models, which are consistent with and without feedback.
+
+    Errors before t speak of feedback alone. The error at t correlates with u(t) under feed-through too, and
+    then by as much where an input jumps: a jump of a set-point moves u, and y only later. Of inputs set by a
+    plan the statistics are chi-squared, whatever the plan, as errors are white. Jumps are clipped: they would
+    drown the small answers to noise, by which feedback is recognised. Only the first `inputs` columns are
+    tested.
+    """
+    answers = _answers(u, y, past, offset=offset, lags=lags)
+    m = inputs or u[0].shape[1]
+    p_value = np.ones(m)
+    if answers is None:
+        return ClosedLoop(p_value, False)
+    for j in range(m):
+        moved = answers.moved[:, j]
+        clipped = _clipped(moved)
+        if not np.any(clipped):
+            continue
+        p_value[j] = _p_value(clipped, answers.errors_before)
+        at_once = _p_value(clipped, answers.errors_now)
+        if at_once < p_value[j] and not _jumps_with(answers.errors_now, moved - clipped):
+            p_value[j] = at_once
+    return ClosedLoop(p_value, bool((p_value < LEVEL_CLOSED / (2 * m)).any()))
+
+
+def _answers(u: Segments, y: Segments, past: int, *, offset: bool, lags: int) -> _Answers | None:
+    """None where no stretch is long enough to tell."""
+    m, runs = u[0].shape[1], [w for w in complete_runs(u, y) if len(w) > past + lags + 1]
+    # the predictor that is told u(t) has m unknowns more
+    if sum(len(w) - past for w in runs) < (past + 1) * sum(part[0].shape[1] for part in (u, y)) + m + 1:
+        return None
+    data, untold = (lagged(u, y, past, feedthrough=told, offset=offset) for told in (True, False))
+    of_told, of_untold = (one_step(part, past)[0] for part in (data, untold))
+    parts = [[], [], [], []]
+    for w in runs:
+        z = np.hstack([w[past - lag : len(w) - lag] - data.means[lag] for lag in range(1, past + 1)])
+        now_u, now_y = w[past:, :m] - data.means[0, :m], w[past:, m:] - data.means[0, m:]
+        told = now_y - np.hstack([now_u, z]) @ of_told
+        parts[0].append(w[past + lags :, :m])
+        # as recorded: an input that is held has moved by nothing, to the last bit
+        late = [w[past + lags - lag : len(w) - lag, :m] for lag in range(1, min(past, 20) + 1)]
+        parts[1].append(np.stack(late, axis=1))
+        parts[2].append(np.hstack([told[lags - k : len(told) - k] for k in range(1, lags + 1)]))
+        parts[3].append((now_y - z @ of_untold)[lags:])
+    now, history, before, at_once = (np.concatenate(part) for part in parts)
+    return _Answers(_unforeseen(now, history), before, at_once)
+
+
+def _unforeseen(now: np.ndarray, history: np.ndarray) -> np.ndarray:
+    """What the past of all inputs (N, past, m) does not foretell of each (N, m): by regression, or by its
+    last value where that is nearer in the median."""
+    centred = history.reshape(len(now), -1) - history.reshape(len(now), -1).mean(axis=0)
+    design = np.hstack([np.ones((len(now), 1)), centred])
+    by_regression = now - design @ np.linalg.lstsq(design, now, rcond=1e-10)[0]
+    by_holding = now - history[:, 0]
+    nearer = np.median(np.abs(by_holding), axis=0) < np.median(np.abs(by_regression), axis=0)
+    left = np.where(nearer, by_holding, by_regression)
+    return np.where(np.abs(left) > 1e-9 * np.maximum(np.ptp(now, axis=0), np.finfo(float).tiny), left, 0.0)
+
+
+def _clipped(moved: np.ndarray) -> np.ndarray:
+    """At three robust deviations of its usual size; of an input that is held, of the sizes of its moves."""
+    size = np.abs(moved)
+    scale = np.median(size) or (np.median(size[size > 0]) if size.any() else 0.0)
+    return np.clip(moved, -4.5 * scale, 4.5 * scale)
+
+
+def _p_value(moved: np.ndarray, errors: np.ndarray) -> float:
+    """Of no correlation of moved (N,) with any column of errors (N, k)."""
+    design = np.hstack([np.ones((len(errors), 1)), errors])
+    answered = design @ np.linalg.lstsq(design, moved, rcond=1e-10)[0]
+    share = np.var(answered) / max(np.var(moved), np.finfo(float).tiny)
+    return float(scipy.stats.chi2.sf(len(errors) * share, errors.shape[1]))
+
+
+def _jumps_with(errors: np.ndarray, excess: np.ndarray) -> bool:
+    """Whether outputs answer the large moves of an input at once, or it makes none that could tell:
+    feed-through then explains what a correlation at lag 0 shows."""
+    if np.count_nonzero(excess) < 4:
+        return True
+    about_mean = excess - excess.mean()
+    sizes = np.linalg.norm(about_mean) * np.linalg.norm(errors, axis=0)
+    share = about_mean @ errors / np.maximum(sizes, np.finfo(float).tiny)
+    return bool((np.abs(share) * np.sqrt(len(excess)) > 4).any())  # far beyond what p outputs show by chance

@@ -1,0 +1,119 @@
+"""Slow drift: what is not recorded (ambient, operating point) as a random walk beside each output.
+
+y(t) = ŷ(t) + w(t) + e(t), w(t+1) = w(t) + v(t), with ŷ the simulation of the plant under its inputs alone:
+the disturbance model of output steps (Cutler and Ramaker 1980; Muske and Badgwell 2002, section 3.1). The
+Kalman filter of a random walk in white noise is exponential smoothing (Muth 1960), w(t+1) = w(t) + k(t) (y(t)
+- ŷ(t) - w(t)), where k(t) = 1/(t+1) until it reaches the `rate`: the mean over a warm-up of 1/rate samples,
+then slow tracking. Stable for every rate in (0, 1], whatever the plant.
+
+It is for forecasts and hold-outs at another ambient. Controllers do not get this state: theirs are free of
+offset by their integrator.
+"""
+
+import numpy as np
+
+from pipeline.temperature.identification.order import (
+    VALIDATED_STEPS,
+    WORTH_REFINING,
+    Fit,
+    Structure,
+    Validation,
+    beyond_chance,
+    fit,
+    folds,
+    shifted,
+)
+from pipeline.temperature.identification.refinement import (
+    FitSettings,
+    drives,
+    estimate_state,
+    respond,
+    simulation_form,
+)
+from pipeline.temperature.identification.subspace import Segments, lagged, realise, subspace
+from pipeline.temperature.plant import Plant
+
+SLOWER = (1, 4, 16)  # time constants of a drift that are tried, in windows
+# a mode so near an integrator moves the level itself: beside it a drift is not observable
+INTEGRATES = 1e-4
+
+
+def tracked(error: np.ndarray, rate: float, ahead: int = 1) -> np.ndarray:
+    """w(t | errors up to t - ahead) (T, p) of simulation errors (T, p); NaN before the first and where none
+    has been seen, and a masked error leaves w as it is."""
+    level, count = np.full(error.shape[1], np.nan), np.zeros(error.shape[1])
+    drift = np.full(error.shape, np.nan)
+    for t in range(len(error) - ahead):
+        seen = np.isfinite(error[t])
+        count += seen
+        gain = np.maximum(rate, 1.0 / np.maximum(count, 1.0))
+        before = np.where(np.isfinite(level), level, 0.0)
+        level = np.where(seen, before + gain * (np.where(seen, error[t], 0.0) - before), level)
+        drift[t + ahead] = level
+    return drift
+
+
+def chosen_rate(
+    u: Segments, y: Segments, structure: Structure, order: int, kind: Fit, validation: Validation
+) -> float:
+    """The rate of the drift, 0 for none: of `SLOWER` the one with the least error a window ahead on the
+    left-out blocks or recordings, where it takes `WORTH_REFINING` off the error without it, beyond chance.
+
+    None of a plant with an integrator, and where blocks are shorter than four windows or leave too little.
+    """
+    u, y = shifted(u, y, structure.delays)
+    direct, settings = (
+        any(structure.feedthrough),
+        FitSettings(structure.feedthrough, structure.offset, validation.max_radius, VALIDATED_STEPS),
+    )
+    errors = []
+    for train_u, train_y, test_u, test_y in folds(u, y, validation.blocks, validation.recordings):
+        if max(map(len, test_u)) < 4 * structure.past:
+            return 0.0
+        try:
+            data = lagged(train_u, train_y, structure.past, feedthrough=direct, offset=structure.offset)
+        except ValueError:  # what is left of the record is too short
+            return 0.0
+        start = realise(data, subspace(data, structure.past).basis[:order], 1.0, structure.feedthrough)
+        plant = fit(kind, start, train_u, train_y, settings, gain=False)
+        if np.abs(np.linalg.eigvals(plant.A)).max() > 1 - INTEGRATES:
+            return 0.0
+        errors.append(_errors_ahead(plant, test_u, test_y, structure.past))
+    if not errors:
+        return 0.0
+    gains = np.log(np.array(errors)[:, :1] / np.array(errors)[:, 1:])
+    best = int(gains.mean(axis=0).argmax())
+    worth = gains[:, best].mean() > -np.log(1 - WORTH_REFINING) and beyond_chance(gains[:, best])
+    return 1.0 / (SLOWER[best] * structure.past) if worth else 0.0
+
+
+def _errors_ahead(plant: Plant, u: Segments, y: Segments, past: int) -> list[float]:
+    """Size of the error a window ahead as a share of the outputs' variation, without drift and with each of
+    `SLOWER`, after two windows of warm-up."""
+    left, spread = [[] for _ in range(1 + len(SLOWER))], np.nanstd(np.vstack(y), axis=0)
+    for a, b in zip(u, y, strict=True):
+        if len(a) < 4 * past:
+            continue
+        error = simulation_error(plant, a, b)
+        left[0].append(error[2 * past :])
+        for k, times in enumerate(SLOWER, 1):
+            left[k].append((error - tracked(error, 1.0 / (times * past), past))[2 * past :])
+    return [
+        float(np.sqrt(np.nanmean((np.vstack(part) / np.maximum(spread, np.finfo(float).tiny)) ** 2)))
+        for part in left
+    ]
+
+
+def simulation_error(plant: Plant, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """y - ŷ (T, p) of free simulation, its initial state fitted with a free mean: the drift has the mean."""
+    model, v = simulation_form(plant, []), drives("simulation", u, y)
+    return y - respond(model, v, estimate_state(model, v, y, free_mean=True))[1]
+
+
+def simulated_with_drift(plant: Plant, u: np.ndarray, y: np.ndarray, rate: float, ahead: int) -> np.ndarray:
+    """ŷ(t) + w(t | y up to t - ahead) (T, p); NaN over the warm-up of 1/rate samples, or a third of the
+    segment where that is shorter, and `ahead` more."""
+    error = simulation_error(plant, u, y)
+    predicted = y - error + tracked(error, rate, ahead)
+    predicted[: min(int(np.ceil(1.0 / rate)), len(y) // 3) + ahead] = np.nan
+    return predicted

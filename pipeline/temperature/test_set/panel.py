@@ -1,0 +1,455 @@
+"""The panel: the plants that nobody learned or tuned on, what they are asked, and what comes out, with every
+controller as it runs (controller.py).
+
+Plants, drawn uniformly around a nominal one: each input's gain, the speed of the whole plant, more heat lost,
+a sample of delay on every input in a part of them, another ambient. Cases of each: constant references from
+several starts, a ramp, a sinusoid, a sequence of references; sensor noise.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from pipeline.temperature.controllers.controller import (
+    Aim,
+    Deployed,
+    Limits,
+    Reference,
+    Rest,
+    aim,
+    batch_step,
+    constant,
+    handed_over,
+    ramp,
+    rest,
+    sinusoid,
+    watched,
+)
+from pipeline.temperature.controllers.governor import Strength
+from pipeline.temperature.plant import Plant, hold_output, hold_state
+from pipeline.temperature.tracking import Law, reached_state
+
+RESTLESS = 1e-8  # reciprocal condition of I - A below which a plant has no rest of its own
+
+
+class Spread(NamedTuple):
+    """How far plants lie from the nominal one: input gains 1 +- input_gain each; A' = I + (A - I) / (1 + d),
+    B' = B / (1 + d), d within +- slower, in the modes of heat; A - l I, l from 0 to extra_heat_loss a step;
+    all inputs one step late in a share `delayed`; the ambient +- ambient_degC."""
+
+    input_gain: float
+    slower: float
+    extra_heat_loss: float
+    delayed: float
+    ambient_degC: float
+
+
+def delayed(plant: Plant, late: bool) -> Plant:
+    """The plant with m more states, the input before: it acts a sample late, or is carried along unused, so
+    that both kinds have one order. Feed-through must be a delay already (plant.strictly_proper)."""
+    n, m = plant.n, plant.m
+    A, B = np.zeros((n + m, n + m)), np.zeros((n + m, m))
+    A[:n, :n], B[n:] = plant.A, np.eye(m)
+    if late:
+        A[:n, n:] = plant.B
+    else:
+        B[:n] = plant.B
+    return plant._replace(
+        A=A,
+        B=B,
+        C=np.hstack([plant.C, np.zeros((plant.p, m))]),
+        b=np.r_[plant.b, np.zeros(m)],
+        K=np.vstack([plant.K, np.zeros((m, plant.p))]),
+    )
+
+
+def varied(
+    plant: Plant, *, gains: np.ndarray, slower: float, loss: float, ambient: float, late: bool, cells: bool
+) -> Plant:
+    """One plant of the spread. An ambient warmer by `ambient` °C warms every cell by as much in the end,
+    where the states are `cells`, and every output otherwise. Of an identified plant only the modes of heat
+    slow down (`paced`)."""
+    identity = np.eye(plant.n)
+    pace = identity / (1 + slower) if cells else paced(plant.A, slower)
+    A = identity + pace @ (plant.A - identity)
+    warmer = np.ones(plant.n) if cells else reached_state(plant) @ np.ones(plant.p)
+    b = pace @ plant.b + (identity - A) @ warmer * ambient
+    changed = plant._replace(A=A - loss * identity, B=pace @ plant.B * gains, b=b)
+    return delayed(changed, late)
+
+
+def paced(A: np.ndarray, slower: float) -> np.ndarray:
+    """The pace P (n, n) by which A' = I + P (A - I), B' = P B, b' = P b have the steady state of A, B, b and
+    heat up 1 + slower times as slowly.
+
+    A mode of heat is one whose eigenvalue l has Re l > 0.3 and |Im l| <= |1 - Re l|: overdamped, or hardly
+    less. P is 1 / (1 + slower) on their invariant subspace and 1 on that of the others: delays, sensors'
+    noise and what rings stand for no heat, and I + (A - I) / (1 + slower) would make them unstable.
+    """
+    n = len(A)
+    T, Z, slow = scipy.linalg.schur(A, output="complex", sort=_of_heat)
+    # A = Z [T1 X; 0 T2] Z*: with T1 S - S T2 = -X the columns Z [I S; 0 I] span both subspaces
+    decoupled = np.eye(n, dtype=complex)
+    if 0 < slow < n:
+        decoupled[:slow, slow:] = scipy.linalg.solve_sylvester(
+            T[:slow, :slow], -T[slow:, slow:], -T[:slow, slow:]
+        )
+    basis = Z @ decoupled
+    share = np.where(np.arange(n) < slow, 1 / (1 + slower), 1.0)
+    return (basis * share @ np.linalg.inv(basis)).real
+
+
+def _of_heat(eigenvalue: complex) -> bool:
+    return bool(eigenvalue.real > 0.3 and abs(eigenvalue.imag) <= abs(1 - eigenvalue.real))
+
+
+def drawn(
+    nominal: Sequence[Plant], count: int, spread: Spread, *, cells: bool, rng: np.random.Generator
+) -> list[Plant]:
+    """`count` plants around the nominal ones in turn."""
+    plants = []
+    for k in range(count):
+        plant = nominal[k % len(nominal)]
+        gains = 1 + spread.input_gain * rng.uniform(-1, 1, plant.m)
+        slower, loss, ambient, late = rng.uniform(-1, 1), rng.uniform(), rng.uniform(-1, 1), rng.uniform()
+        plants.append(
+            varied(
+                plant,
+                gains=gains,
+                slower=spread.slower * slower,
+                loss=spread.extra_heat_loss * loss,
+                ambient=spread.ambient_degC * ambient,
+                late=late < spread.delayed,
+                cells=cells,
+            )
+        )
+    return plants
+
+
+def corners(nominal: Sequence[Plant], spread: Spread) -> tuple[list[Plant], Strength]:
+    """The family that the governor guards: each plant in time and a sample late, and within what range its
+    inputs act."""
+    family = [delayed(plant, late) for plant in nominal for late in (False, True)]
+    weakest = (1 - spread.input_gain) / (1 + spread.slower)
+    strongest = (1 + spread.input_gain) / (1 - spread.slower)
+    return padded(family), Strength(weakest, strongest, spread.input_gain)
+
+
+def padded(plants: Sequence[Plant]) -> list[Plant]:
+    """The plants with one order: states that nothing moves and nobody sees fill up the smaller ones."""
+    most = max(plant.n for plant in plants)
+    return [
+        plant._replace(
+            A=np.pad(plant.A, (0, most - plant.n)),
+            B=np.pad(plant.B, ((0, most - plant.n), (0, 0))),
+            C=np.pad(plant.C, ((0, 0), (0, most - plant.n))),
+            b=np.pad(plant.b, (0, most - plant.n)),
+            K=np.pad(plant.K, ((0, most - plant.n), (0, 0))),
+        )
+        for plant in plants
+    ]
+
+
+# ---- what they are asked
+
+
+class Questions(NamedTuple):
+    """What every plant is asked, by zone: starts (a, p) and constant references (j, p) in °C, each start with
+    each; from the middle start a ramp (r (p,), slope (p,) in °C a step), a sinusoid (mean (p,), amplitude
+    (p,), period in steps) and a sequence (g, p) of references for equal times."""
+
+    starts: np.ndarray
+    constants: np.ndarray
+    ramp: tuple[np.ndarray, np.ndarray] | None
+    sinusoid: tuple[np.ndarray, np.ndarray, float] | None
+    sequence: np.ndarray | None
+
+
+class Cases(NamedTuple):
+    """`each` cases of every plant, plant by plant: s in all. Held at y0 by u0 from state x0, `hold` samples,
+    then `steps` under the controller.
+
+    `references` and of each case `begin` (s, g), the step at which its g-th reference begins, and `asked`
+    (s, g), which one; noise (s,) in °C drawn from `seed` (s,); `start` (s,) which start.
+    """
+
+    plants: list[Plant]
+    plant: np.ndarray
+    each: int
+    kind: np.ndarray
+    start: np.ndarray
+    starts: np.ndarray
+    x0: np.ndarray
+    u0: np.ndarray
+    references: list[Reference]
+    begin: np.ndarray
+    asked: np.ndarray
+    noise: np.ndarray
+    seed: int
+    steps: int
+    hold: int
+
+
+def asked(
+    plants: Sequence[Plant],
+    questions: Questions,
+    *,
+    noise: np.ndarray,
+    seed: int,
+    steps: int,
+    hold: int,
+    cells: bool,
+    limits: Limits | None = None,
+) -> Cases:
+    """The questions put to every plant. Where states are `cells`, a start holds every cell at one
+    temperature, otherwise every output, or what comes nearest within `limits`; noise (p,) in °C."""
+    references = [constant(r) for r in questions.constants]
+    rows = [("constant", a, [j]) for a in range(len(questions.starts)) for j in range(len(references))]
+    middle = len(questions.starts) // 2
+    if questions.ramp is not None:
+        rows.append(("ramp", middle, [len(references)]))
+        references.append(ramp(*questions.ramp))
+    if questions.sinusoid is not None:
+        rows.append(("sinusoid", middle, [len(references)]))
+        references.append(sinusoid(*questions.sinusoid))
+    if questions.sequence is not None:
+        rows.append(("sequence", middle, [len(references) + g for g in range(len(questions.sequence))]))
+        references += [constant(r) for r in questions.sequence]
+    most = max(len(row[2]) for row in rows)
+    begin = np.array(
+        [[g * steps // len(row[2]) if g < len(row[2]) else steps for g in range(most)] for row in rows]
+    )
+    which = np.array([[row[2][min(g, len(row[2]) - 1)] for g in range(most)] for row in rows])
+    x0, u0 = [], []
+    for plant in plants:
+        for _, a, _ in rows:
+            state, held = _held(plant, questions.starts[a], cells, limits)
+            x0.append(state)
+            u0.append(held)
+    count = len(plants)
+    return Cases(
+        list(plants),
+        np.repeat(np.arange(count), len(rows)),
+        len(rows),
+        np.tile([row[0] for row in rows], count),
+        np.tile([row[1] for row in rows], count),
+        questions.starts,
+        np.array(x0),
+        np.array(u0),
+        references,
+        np.tile(begin, (count, 1)),
+        np.tile(which, (count, 1)),
+        np.asarray(noise, float),
+        seed,
+        steps,
+        hold,
+    )
+
+
+def _held(plant: Plant, y: np.ndarray, cells: bool, limits: Limits | None) -> tuple[np.ndarray, np.ndarray]:
+    """State and input of a plant of `delayed` held at outputs y (p,), or at cells of y[0] °C; where inputs
+    would have to leave `limits`, at rest under the nearest within."""
+    n = plant.n - plant.m
+    late = bool(np.any(plant.A[:n, n:]))
+    inner = plant._replace(
+        A=plant.A[:n, :n],
+        B=plant.A[:n, n:] if late else plant.B[:n],
+        C=plant.C[:, :n],
+        b=plant.b[:n],
+        K=plant.K[:n],
+    )
+    if cells:
+        x = np.full(n, y[0])
+        u = hold_state(inner, x)
+    else:
+        x, u = hold_output(inner, y)
+    if limits is None:
+        return np.r_[x, u], u
+    within, balance = np.clip(u, limits.low, limits.high), np.eye(n) - inner.A
+    # a plant that nearly integrates drifts slowly from where it is, and has no rest worth a start
+    if np.any(within != u) and np.linalg.cond(balance) < 1 / RESTLESS:
+        x = np.linalg.solve(balance, inner.B @ within + inner.b)
+    return np.r_[x, within], within
+
+
+# ---- what comes out
+
+
+class Rollout(NamedTuple):
+    """(steps, s, .): true outputs y, the reference r and the target y_star, inputs wished and applied; and
+    what the controller measured."""
+
+    y: np.ndarray
+    r: np.ndarray
+    target: np.ndarray
+    wished: np.ndarray
+    u: np.ndarray
+    measured: np.ndarray
+
+
+def rests(model: Plant, cases: Cases, limits: Limits) -> list[Rest]:
+    """Where a plant rests under each reference of the cases, then at each start."""
+    return [rest(model, reference, limits) for reference in _wanted(cases)]
+
+
+def aims(law: Law, at: Sequence[Rest], cases: Cases) -> list[Aim]:
+    """What a law adds to rest there, one by one."""
+    return [aim(law, one, reference) for one, reference in zip(at, _wanted(cases), strict=True)]
+
+
+def _wanted(cases: Cases) -> list[Reference]:
+    return [*cases.references, *(constant(y) for y in cases.starts)]
+
+
+def noise_of(cases: Cases) -> np.ndarray:
+    """(hold + steps, s, p): the same for every controller."""
+    shape = (cases.hold + cases.steps, len(cases.plant), len(cases.noise))
+    return cases.noise * np.random.default_rng(cases.seed).standard_normal(shape)
+
+
+def schedule(cases: Cases, aimed: Sequence[Aim]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """r, y* (steps, s, p) and feed (steps, s, m) of every case."""
+    steps, s = cases.steps, len(cases.plant)
+    p, m = aimed[0].Y.shape[0], aimed[0].feed.shape[0]
+    r, target, feed = np.empty((steps, s, p)), np.empty((steps, s, p)), np.empty((steps, s, m))
+    for index, reference in enumerate(cases.references):
+        w = reference.states(steps)
+        parts = w @ reference.H.T, w @ aimed[index].Y.T, w @ aimed[index].feed.T
+        for g in range(cases.begin.shape[1]):
+            mine = np.flatnonzero((cases.asked[:, g] == index) & (cases.begin[:, g] < steps))
+            for first in np.unique(cases.begin[mine, g]):
+                rows = mine[cases.begin[mine, g] == first]
+                for array, part in zip((r, target, feed), parts, strict=True):
+                    array[first:, rows] = part[: steps - first, None]
+    return r, target, feed
+
+
+def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Rollout:
+    """Every case at once under one controller; `aimed` from `aims`."""
+    count, each = len(cases.plants), cases.each
+    A, B, C = (
+        np.stack([getattr(plant, name) for plant in cases.plants]).transpose(0, 2, 1) for name in "ABC"
+    )
+    b, d = (np.stack([getattr(plant, name) for plant in cases.plants])[:, None] for name in "bd")
+    r, target, feed = schedule(cases, aimed)
+    noise = noise_of(cases)
+    x, u = cases.x0, cases.u0
+    p, m = r.shape[2], u.shape[1]
+
+    def outputs(x):
+        return (np.matmul(x.reshape(count, each, -1), C) + d).reshape(-1, p)
+
+    held = outputs(x)
+    state = watched(controller, None, u, held + noise[0], r[0])
+    for t in range(1, cases.hold):
+        state = watched(controller, state, u, held + noise[t], r[0])
+    here = [aimed[len(cases.references) + a] for a in cases.start]
+    state = handed_over(controller, state, held + noise[cases.hold], here)
+    y, wished, applied = np.empty_like(r), np.empty_like(feed), np.empty_like(feed)
+    noise = noise[cases.hold :]
+    for t in range(cases.steps):
+        y[t] = outputs(x)
+        applied[t], wished[t], state = batch_step(
+            controller, state, y[t] + noise[t], r[t], feed[t], target[t]
+        )
+        x = np.matmul(x.reshape(count, each, -1), A) + np.matmul(applied[t].reshape(count, each, m), B) + b
+        x = x.reshape(len(cases.plant), -1)
+        if not np.abs(x).max() < 1e9:
+            x = np.clip(np.nan_to_num(x), -1e9, 1e9)
+            state = state._replace(z=np.clip(np.nan_to_num(state.z), -1e9, 1e9))
+    return Rollout(y, r, target, wished, applied, y + noise)
+
+
+class Figures(NamedTuple):
+    """An engineer's figures of each case (s,), of true outputs, worst zone: °C, steps, percent. Settling is
+    inf where the outputs are outside at the end, NaN where the reference moves; so is overshoot there."""
+
+    settled_error: np.ndarray
+    settled_zone: np.ndarray
+    settling: np.ndarray
+    overshoot: np.ndarray
+    at_limits: np.ndarray
+    energy: np.ndarray
+    rms: np.ndarray
+    crossing: np.ndarray
+    outside: np.ndarray
+
+
+def figures(
+    rollout: Rollout,
+    cases: Cases,
+    *,
+    limits: Limits,
+    low: np.ndarray,
+    high: np.ndarray,
+    band: float,
+    settled: int = 100,
+) -> Figures:
+    """Settled error: |mean of the last `settled` steps - r|. Settling: the last step outside `band` °C of the
+    target, counted from each new reference, the longest of them. Overshoot: past the target in the direction
+    of the step. At limits: share of (input, step) wished outside. Energy: mean input. Crossing: how far y
+    lies beyond low, high (p,). Outside: steps outside the band, an edge of a fifth of it counted in part:
+    smooth."""
+    error = rollout.y - rollout.r
+    late = np.abs((rollout.y - rollout.r)[-settled:].mean(axis=0))
+    off = rollout.y - rollout.target
+    beyond = np.abs(off).max(axis=2)
+    moving = np.isin(cases.kind, ("ramp", "sinusoid"))
+    settling, overshoot = np.zeros(len(cases.plant)), np.zeros(len(cases.plant))
+    ends = np.column_stack([cases.begin[:, 1:], np.full(len(cases.plant), cases.steps)])
+    for first, after in {
+        (int(a), int(b)) for a, b in zip(cases.begin.ravel(), ends.ravel(), strict=True) if a < b
+    }:
+        rows = np.flatnonzero(((cases.begin == first) & (ends == after)).any(axis=1))
+        outside = beyond[first:after, rows] > band
+        last = np.where(outside.any(axis=0), len(outside) - outside[::-1].argmax(axis=0), 0).astype(float)
+        last[outside[-1]] = np.inf
+        settling[rows] = np.maximum(settling[rows], last)
+        way = np.where(off[first, rows] <= 0, 1.0, -1.0)
+        past = (way * off[first:after, rows]).max(axis=(0, 2))
+        overshoot[rows] = np.maximum(overshoot[rows], past)
+    settling[moving], overshoot[moving] = np.nan, np.nan
+    wished = (rollout.wished < limits.low - 1e-9) | (rollout.wished > limits.high + 1e-9)
+    return Figures(
+        late.max(axis=1),
+        late.argmax(axis=1),
+        settling,
+        overshoot,
+        100.0 * wished.mean(axis=(0, 2)),
+        rollout.u.mean(axis=(0, 2)),
+        np.sqrt((error**2).mean(axis=(0, 2))),
+        np.maximum((rollout.y - high).max(axis=(0, 2)), (low - rollout.y).max(axis=(0, 2))),
+        np.clip((beyond - band) / (0.2 * band) + 0.5, 0.0, 1.0).sum(axis=0),
+    )
+
+
+class Allowance(NamedTuple):
+    """What the cost counts as one: steps outside the band, °C of overshoot and of settled error, percent of
+    commands outside the limits, percent of mean input, °C of r.m.s. error where the reference moves."""
+
+    outside: float
+    overshoot: float
+    settled_error: float
+    at_limits: float
+    energy: float
+    rms: float
+
+
+def costs(results: Figures, allowance: Allowance) -> np.ndarray:
+    """The declared cost of each case (s,): the sum of figure / allowance of what applies to it; 1e4 at
+    most."""
+    moving = np.isnan(results.overshoot)
+    response = np.where(
+        moving,
+        results.rms / allowance.rms,
+        results.outside / allowance.outside + np.nan_to_num(results.overshoot) / allowance.overshoot,
+    )
+    total = (
+        response
+        + results.settled_error / allowance.settled_error
+        + results.at_limits / allowance.at_limits
+        + results.energy / allowance.energy
+    )
+    return np.minimum(np.nan_to_num(total, nan=1e4, posinf=1e4), 1e4)

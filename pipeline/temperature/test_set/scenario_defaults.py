@@ -1,0 +1,334 @@
+"""What a rehearsal on somebody's record asks of the controllers, by stated defaults: from how fast the
+machine is, where it was recorded, and what its inputs can hold.
+
+A bed that needs 230 s for one time constant cannot be judged by the 60 s of another machine, nor started at
+15 °C in a room of 22. Each default has its reason beside its name; none is a setting.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.optimize
+
+from pipeline.temperature.controllers.baseline import rises
+from pipeline.temperature.identification.validation import one_step_errors, simulated
+from pipeline.temperature.plant import Plant, strictly_proper
+from pipeline.temperature.test_set.time_scale import time_constant
+
+RANGE = (0.01, 0.99)  # quantiles that count as recorded: a spike, or one sample of a start, is none
+ONE_DEVIATION = (0.1587, 0.8413)  # quantiles of a normal one standard deviation either side of its median
+# near the bottom, where a machine is switched on, and the middle, where a reference is changed
+START_SHARES = (0.1, 0.5)
+LOWER_SHARE = 0.15  # of the recorded span, by which the second reference lies below the first
+# as an open loop needs to come within 5 % of its end; the delay counts as the step and its answer are late
+SETTLING = (3.0, 2.0)  # time constants, delays
+BAND_NOISE = 3.0  # standard deviations: a sensor's noise alone leaves it once in 370 samples
+BAND_SHARE = 0.01  # of the recorded span, where a sensor is better than the machine needs
+WIDEST_BAND_DEGC = (
+    1.0  # no print tells less; where noise asks for more the true outputs are judged all the same
+)
+TIME_CONSTANTS = 8.0  # in a case: 3 to settle, 3 to settle again, and the last sixth of what is then left
+STEPS = (600, 3000)
+PERIOD = (
+    4.0  # time constants of a sinusoid: two periods fit, and its heat flow is twice that of holding still
+)
+REACHED_DEGC = 0.1  # a reference that is missed by less is reached: no sensor here shows it
+# of an input's limit, in a reference that is not the owner's: with 15 % less gain it can still be held
+HEADROOM = 0.15
+FLOOR_SHARE = (
+    0.05  # of an input's range above its lowest: in a room that is a little warmer it can still be held
+)
+BEYOND = 1e3  # times as dear as missing a reference: crossing a declared limit of an output
+LEAK = 1e-9  # a step, by which a plant that only integrates is taken to leak, so that it has a steady state
+
+
+class MachineScale(NamedTuple):
+    """How fast, how warm and how noisy a machine is, by its outputs (p,).
+
+    time_constant_s: the first-order lag that explains the record; delay_s: effective dead time of the
+    strongest input, lags of sensors in it. low_degC..high_degC: recorded range. noise_degC: standard
+    deviation of what one step cannot foretell. ambient_degC_spread: the largest difference of the mean error
+    of simulation between recordings, 0 with one: another room, another day.
+    """
+
+    time_constant_s: np.ndarray
+    delay_s: np.ndarray
+    low_degC: np.ndarray
+    high_degC: np.ndarray
+    noise_degC: np.ndarray
+    ambient_degC_spread: np.ndarray
+
+
+class Infeasible(NamedTuple):
+    """A reference of output `output` that cannot be held, or not beside the others: `reachable_degC` is the
+    nearest within limits, `judged_degC` the reference in its place, with headroom.
+
+    `input` is the one at its `limit` "low" or "high" that would move it most; None where the limit is not of
+    an input: "output low" or "output high" of the machine's own limits, or "inputs", fewer than the
+    references need.
+    """
+
+    output: int
+    asked_degC: float
+    reachable_degC: float
+    judged_degC: float
+    input: int | None
+    limit: str
+
+
+class Sinusoid(NamedTuple):
+    """About the middle of the two references: amplitude (p,) in °C, period in steps."""
+
+    amplitude_degC: np.ndarray
+    period_steps: int
+
+
+class CaseDefaults(NamedTuple):
+    """What the cases of a rehearsal are: starts (k, p) at which the plant is held, references (j, p), both
+    steady states within the limits of inputs and outputs by the model; settling_s the rule's limit, band_degC
+    the band of settling; ramp_degC_per_step (p,) from the lower reference, one ramp a run; `sequence` (3, p).
+    notes: sentences where a default could not be had.
+    """
+
+    starts: np.ndarray
+    references: np.ndarray
+    infeasible: list[Infeasible]
+    settling_s: float
+    band_degC: float
+    steps: int
+    ramp_degC_per_step: np.ndarray
+    sinusoid: Sinusoid
+    sequence: np.ndarray
+    notes: tuple[str, ...]
+
+
+# ---- the machine, from its record
+
+
+def machine_scale(
+    u: Sequence[np.ndarray],
+    y: Sequence[np.ndarray],
+    model: Plant,
+    sample_time_s: float,
+    recording_of_segment: Sequence[int],
+) -> MachineScale:
+    """Scale of a machine from segments u (T, m), y (T, p), the model of them, and the recording of each.
+
+    Time constants come from the record: a model's slowest pole may be a drift. None is longer than the
+    longest segment, which could not show it. Raises ValueError where no input moves.
+    """
+    p = model.p
+    longest = max(map(len, y)) * sample_time_s
+    taus = [time_constant(u, [b[:, o] for b in y], sample_time_s=sample_time_s) for o in range(p)]
+    rows = np.vstack(y)
+    low, high = np.nanquantile(rows, RANGE, axis=0)
+    below, above = np.nanquantile(np.vstack(one_step_errors(model, u, y)), ONE_DEVIATION, axis=0)
+    return MachineScale(
+        np.minimum(taus, longest),
+        sample_time_s * _delays(model, np.ptp(np.vstack(u), axis=0), max(map(len, y))),
+        low,
+        high,
+        (above - below) / 2,
+        _ambient_spread(u, y, model, recording_of_segment),
+    )
+
+
+def _delays(model: Plant, moved: np.ndarray, horizon: int) -> np.ndarray:
+    """Dead time (p,) in samples of the input whose recorded range `moved` (m,) acts most on each output."""
+    strongest = [
+        row[int(np.argmax([abs(rise.slope) * d for rise, d in zip(row, moved, strict=True)]))]
+        for row in rises(model, horizon)
+    ]
+    return np.array([rise.delay for rise in strongest])
+
+
+def _ambient_spread(u, y, model: Plant, recording_of_segment: Sequence[int]) -> np.ndarray:
+    """Largest less smallest mean error of simulation (p,) of the recordings, the start of each segment fitted
+    together with its mean: alone, the start would hide a part of another room."""
+    errors: dict[int, list[np.ndarray]] = {}
+    for a, b, recording in zip(u, y, recording_of_segment, strict=True):
+        errors.setdefault(int(recording), []).append(b - simulated(model, a, b, means_removed=True))
+    means = [np.nanmean(np.vstack(parts), axis=0) for parts in errors.values()]
+    return np.ptp(np.stack(means), axis=0)
+
+
+# ---- the cases, from the machine
+
+
+def defaults(
+    scale: MachineScale,
+    model: Plant,
+    limits: tuple[np.ndarray, np.ndarray],
+    asked_reference: np.ndarray,
+    output_low: np.ndarray,
+    output_high: np.ndarray,
+    sample_time_s: float,
+) -> CaseDefaults:
+    """Starts, references and rules for one machine; `limits` low and high (m,) of the inputs in percent,
+    output_low and output_high (p,) in °C, NaN where the owner declares none.
+
+    starts: START_SHARES of the recorded range; what the inputs cannot hold, a temperature below the room's
+    above all, becomes the nearest that they can. references: the declared one where it can be held; in its
+    place otherwise the nearest that leaves HEADROOM to inputs and the band to declared limits of outputs;
+    and one LOWER_SHARE of the recorded span below. ramp: from the lower to the higher in one run. sinusoid:
+    about their middle, so small that its heat is no more than the way between them needs. sequence: lower,
+    higher, middle. All these lie between two states that can be held, so that they can be held too.
+    """
+    band, span = _band(scale), scale.high_degC - scale.low_degC
+    outputs = _declared(output_low, -np.inf), _declared(output_high, np.inf)
+    bounds, careful = Bounds(*limits, *outputs), _drawn_in(Bounds(*limits, *outputs), band)
+    starts = [_nearest(model, scale.low_degC + share * span, careful)[0] for share in START_SHARES]
+    asked = np.asarray(asked_reference, float)
+    reached, u = _nearest(model, asked, bounds)
+    first, entries = asked, []
+    if (missed := np.abs(reached - asked) > REACHED_DEGC).any():
+        held_back = np.where(missed, _nearest(model, asked, careful)[0], asked)
+        first, u_first = _nearest(model, held_back, bounds)
+        # a zone within reach may need the heat of one that is held back
+        entries = [
+            _missed(model, int(o), asked, (reached, first), (u if missed[o] else u_first), bounds)
+            for o in np.flatnonzero(missed | (np.abs(first - asked) > REACHED_DEGC))
+        ]
+    lower = _nearest(model, first - LOWER_SHARE * span, careful)[0]
+    slowest, delay = float(scale.time_constant_s.max()), float(scale.delay_s.max())
+    steps, notes = _steps(slowest, delay, sample_time_s)
+    return CaseDefaults(
+        starts=np.stack(starts),
+        references=np.stack([first, lower]),
+        infeasible=entries,
+        settling_s=SETTLING[0] * slowest + SETTLING[1] * delay,
+        band_degC=band,
+        steps=steps,
+        ramp_degC_per_step=(first - lower) / steps,
+        sinusoid=Sinusoid(
+            np.abs(first - lower) / 2 / np.hypot(1, 2 * np.pi / PERIOD),
+            max(round(PERIOD * slowest / sample_time_s), 4),
+        ),
+        sequence=np.stack([lower, first, (first + lower) / 2]),
+        notes=notes,
+    )
+
+
+def unreachable(
+    model: Plant,
+    limits: tuple[np.ndarray, np.ndarray],
+    asked_reference: np.ndarray,
+    output_low: np.ndarray,
+    output_high: np.ndarray,
+) -> list[Infeasible]:
+    """References that a machine cannot hold where they are judged as they were asked; arguments as
+    `defaults`."""
+    bounds = Bounds(*limits, _declared(output_low, -np.inf), _declared(output_high, np.inf))
+    asked = np.asarray(asked_reference, float)
+    reached, u = _nearest(model, asked, bounds)
+    missed = np.flatnonzero(np.abs(reached - asked) > REACHED_DEGC)
+    return [_missed(model, int(o), asked, (reached, reached), u, bounds) for o in missed]
+
+
+class Bounds(NamedTuple):
+    """Limits of inputs (m,) in percent and of outputs (p,) in °C, infinite where none is declared."""
+
+    low: np.ndarray
+    high: np.ndarray
+    output_low: np.ndarray
+    output_high: np.ndarray
+
+
+def _drawn_in(bounds: Bounds, band: float) -> Bounds:
+    """Limits with HEADROOM of the inputs towards zero, FLOOR_SHARE above a lowest of zero or more, and
+    outputs the band within theirs, or in the middle where that is less than the band away."""
+    raised = bounds.low + FLOOR_SHARE * (bounds.high - bounds.low)
+    low = np.where(bounds.low < 0, (1 - HEADROOM) * bounds.low, raised)
+    high = np.where(bounds.high > 0, np.maximum((1 - HEADROOM) * bounds.high, low), bounds.high)
+    room = np.minimum(band, (bounds.output_high - bounds.output_low) / 2)
+    return Bounds(low, high, bounds.output_low + room, bounds.output_high - room)
+
+
+def _declared(limit: np.ndarray, otherwise: float) -> np.ndarray:
+    limit = np.asarray(limit, float)
+    return np.where(np.isfinite(limit), limit, otherwise)
+
+
+def _band(scale: MachineScale) -> float:
+    """BAND_NOISE deviations of the noise or BAND_SHARE of the span, of the zone that needs most, but at most
+    WIDEST_BAND_DEGC."""
+    span = scale.high_degC - scale.low_degC
+    return float(min(np.maximum(BAND_NOISE * scale.noise_degC, BAND_SHARE * span).max(), WIDEST_BAND_DEGC))
+
+
+def _steps(slowest_s: float, delay_s: float, sample_time_s: float) -> tuple[int, tuple[str, ...]]:
+    """Steps of a case, TIME_CONSTANTS of them and two delays, within STEPS; a sentence where they do not
+    fit."""
+    needed = int(np.ceil((TIME_CONSTANTS * slowest_s + 2 * delay_s) / sample_time_s))
+    if needed <= STEPS[1]:
+        return max(needed, STEPS[0]), ()
+    return STEPS[1], (
+        f"{TIME_CONSTANTS:g} time constants of {slowest_s:.0f} s are {needed} steps, and a case has at most "
+        f"{STEPS[1]}; set plant.sample_time_s to {sample_time_s * needed / STEPS[1]:.1f} or more",
+    )
+
+
+def steady_map(model: Plant) -> tuple[np.ndarray, np.ndarray]:
+    """G (p, m) and g (p,) of the steady outputs y = G u + g; a plant that only integrates leaks LEAK a
+    step."""
+    model = strictly_proper(model)
+    balance = np.eye(model.n) - model.A
+    if np.linalg.cond(balance) > 1e13:
+        balance = balance + LEAK * np.eye(model.n)
+    return (
+        model.C @ np.linalg.solve(balance, model.B),
+        model.C @ np.linalg.solve(balance, model.b) + model.d,
+    )
+
+
+def _nearest(model: Plant, r: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
+    """Steady outputs (p,) nearest r by the sum of misses, and inputs (m,) for them, within limits: a linear
+    programme over [u; miss; beyond], limits of outputs crossed only where no input keeps them.
+
+    The sum of misses, not of their squares: a zone that cannot be reached pulls no other off its reference.
+    """
+    G, g = steady_map(model)
+    p, m, one = model.p, model.m, np.eye(model.p)
+    none, size = np.zeros((p, p)), 1 / np.maximum(np.abs(G).max(axis=0), np.finfo(float).tiny)
+    G = G * size  # inputs in units of the °C that they make
+    rows = np.vstack([np.hstack([G, -one, none]), np.hstack([-G, -one, none])])
+    right = np.r_[r - g, g - r]
+    for sign, limit in ((1.0, bounds.output_high), (-1.0, bounds.output_low)):
+        some = np.isfinite(limit)
+        rows = np.vstack([rows, np.hstack([sign * G, none, -one])[some]])
+        right = np.r_[right, (sign * (limit - g))[some]]
+    free = [(0.0, None)] * (2 * p)
+    inputs = list(zip(bounds.low / size, bounds.high / size, strict=True))
+    price = np.r_[np.zeros(m), np.ones(p), np.full(p, BEYOND)]
+    solved = scipy.optimize.linprog(price, A_ub=rows, b_ub=right, bounds=inputs + free, method="highs-ds")
+    if solved.x is None:
+        raise ValueError(
+            f"no steady input of the identified model could be found for references {r.tolist()} °C "
+            f"({solved.message}); identify the plant on a longer record"
+        )
+    return G @ solved.x[:m] + g, solved.x[:m] * size
+
+
+def _missed(
+    model: Plant,
+    o: int,
+    asked: np.ndarray,
+    reached_and_judged: tuple[np.ndarray, np.ndarray],
+    u: np.ndarray,
+    bounds: Bounds,
+) -> Infeasible:
+    """What keeps output o from its reference: a declared limit of its own, or the input of u at its limit, in
+    the direction that would help, whose range moves it most."""
+    reached, judged = reached_and_judged
+    figures = o, float(asked[o]), float(reached[o]), float(judged[o])
+    if asked[o] > bounds.output_high[o]:
+        return Infeasible(*figures, None, "output high")
+    if asked[o] < bounds.output_low[o]:
+        return Infeasible(*figures, None, "output low")
+    helps, slack = (asked[o] - judged[o]) * steady_map(model)[0][o], 1e-6 * (bounds.high - bounds.low)
+    stuck = np.where(helps > 0, u >= bounds.high - slack, u <= bounds.low + slack) & (helps != 0)
+    if not stuck.any():
+        return Infeasible(*figures, None, "inputs")
+    i = int(np.where(stuck, np.abs(helps) * (bounds.high - bounds.low), 0.0).argmax())
+    return Infeasible(*figures, i, "high" if helps[i] > 0 else "low")
