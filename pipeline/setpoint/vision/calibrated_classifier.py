@@ -177,7 +177,7 @@ def yardstick_classes(
 ) -> YardstickClasses:
     """Both yardsticks, fitted on the valid frames that the network
     learned, on the frames `data` and their windows."""
-    from pipeline.setpoint import yardsticks  # here, as who only classifies needs none
+    from pipeline.setpoint.vision import yardsticks  # here, as who only classifies needs none
 
     machine = yardsticks.fit_profile_machine(
         learned.key_area, learned.temperature_degC, learned.label, learned.segment
