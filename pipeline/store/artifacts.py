@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fnmatch
 import hashlib
 import json
 import math
@@ -39,6 +40,8 @@ CSV_ROWS = 1 << 15  # written at once: text takes ten times the memory of its nu
 
 # inside a stage: the folder where what goes to reports/ waits until the stage has ended well
 _waiting: ContextVar[Path | None] = ContextVar("_waiting", default=None)
+# and the fresh folder that becomes datasets/<stage> then
+_fresh: ContextVar[Path | None] = ContextVar("_fresh", default=None)
 
 
 # ---- tables
@@ -211,15 +214,39 @@ def read_json(path: str | Path):
         raise ValueError(f"{path} is not whole JSON ({reason(error)}); {remedy(path)}") from None
 
 
-def write_metrics(stage: str, data: Mapping) -> None:
-    """Writes reports/metrics/<stage>.json. Inside the frame of a stage the file is put in place when the
-    stage has ended well."""
-    write_json(REPORTS / "metrics" / f"{stage}.json", data)
+def write_metrics(stage: str, figures: Mapping, metrics: Sequence[str] = ("*",)) -> None:
+    """Writes all figures to datasets/<stage>/figures.json, which pages and later stages read, and those that
+    match `metrics` to reports/metrics/<stage>.json, which git keeps and DVC compares.
+
+    A pattern is a dotted path whose keys may hold * for any text. It takes a figure, or all figures below a
+    section.
+    """
+    fresh = _fresh.get()
+    write_json((fresh if fresh else DATASETS / stage) / "figures.json", figures)
+    patterns = [tuple(pattern.split(".")) for pattern in metrics]
+    write_json(REPORTS / "metrics" / f"{stage}.json", _matching(_plain(stage, "", figures), patterns))
+
+
+def _matching(figures: Mapping, patterns: Sequence[Sequence[str]]) -> dict:
+    """The figures and sections that a pattern takes, in their order."""
+    chosen = {}
+    for key, value in figures.items():
+        rests = [rest for first, *rest in patterns if fnmatch.fnmatchcase(key, first)]
+        if not all(rests):
+            chosen[key] = value
+        elif isinstance(value, Mapping) and (inner := _matching(value, rests)):
+            chosen[key] = inner
+    return chosen
 
 
 def read_metrics(stage: str) -> dict:
-    """The data that the stage wrote with `write_metrics`."""
+    """The metrics that the stage wrote with `write_metrics`."""
     return read_json(REPORTS / "metrics" / f"{stage}.json")
+
+
+def read_figures(stage: str) -> dict:
+    """All figures that the stage wrote with `write_metrics`."""
+    return read_json(DATASETS / stage / "figures.json")
 
 
 def write_learning_curve(
@@ -422,7 +449,7 @@ def stage(name: str) -> Iterator[Path]:
     with status 1 and one line, and change no file.
     """
     folder, retired, waiting = (DATASETS / f".{name}.{os.getpid()}{end}" for end in ("", ".old", ".reports"))
-    token = _waiting.set(waiting)
+    tokens = _waiting.set(waiting), _fresh.set(folder)
     try:
         _tidy(name)
         folder.mkdir(parents=True)
@@ -444,7 +471,8 @@ def stage(name: str) -> Iterator[Path]:
         print(printable(f"{name}: {sentence}"), file=sys.stderr)
         raise SystemExit(1) from None
     finally:
-        _waiting.reset(token)
+        _waiting.reset(tokens[0])
+        _fresh.reset(tokens[1])
         for left in (folder, waiting):
             shutil.rmtree(left, ignore_errors=True)
 
