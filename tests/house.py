@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LOOPS = ("temperature", "deposition", "setpoint")
 # what other rooms may read of a loop, of runtime and of nightly: settings, schemas, tables of controllers
 PLAIN = {"settings", "tables", "controllers", "controllers/table", "agents/criteria", "published", "records"}
-# room -> rooms that it may know beside itself. `own`: the methods of its own loop; `files`: what saves networks
+# room -> rooms that it may know beside itself; own: the methods of its loop, files: what saves networks
 MAY_KNOW: dict[str, set[str]] = {
     "statistics": set(),
     "store": set(),
@@ -193,7 +193,7 @@ def doubles(root: Path) -> dict[str, list[str]]:
 
 
 def forbidden_files(root: Path) -> list[str]:
-    """Files that methods and stages open by themselves, and files that other rooms write without artifacts."""
+    """Files that methods and stages open by themselves, and those that others write without artifacts."""
     sentences = []
     for file in files(root, "pipeline", "stages"):
         forbidden = WRITES | READS if file.room in (*LOOPS, "statistics", "stages") else WRITES
@@ -275,8 +275,8 @@ def literal(file: str, call: ast.Call, position: int) -> str:
 def keys(root: Path, code: Iterable[str]) -> set[str]:
     """The parameters that change what modules write, as dvc.yaml has them: "key" or "FILE: key".
 
-    How work is spread over processes changes nothing, and the frame of a stage refuses sections that it does not
-    use. What stands in no file is asked for where a person looks first.
+    How work is spread over processes changes nothing, and the frame of a stage refuses sections that it does
+    not use. What stands in no file is asked for where a person looks first.
     """
     asked = set()
     for name in [name for name in code if name != FRAME]:
@@ -360,8 +360,10 @@ def expected_of_paper(root: Path, stage: str) -> dict[str, set[str]]:
     wanted = expected(root, f"pipeline/papers/{stage}.py")
     methods = {*LOOPS, "statistics", "papers", "stages"}
     code = {path for path in wanted["code"] if File(path, ast.Module([], [])).room.split("/")[0] in methods}
-    own = {f"datasets/papers/{stage}.json", params.PAPERS}
-    return wanted | {"code": code, "deps": wanted["deps"] - own, "outs": set(), "metrics": set()}
+    # `relearned` plays the root's stages with parameters of its own
+    own = {f"datasets/papers/{stage}.json", params.PAPERS, params.FILE, params.EXPERT}
+    keys = {key for key in wanted["params"] if not key.startswith("loops.")}
+    return {"code": code, "deps": wanted["deps"] - own, "params": keys, "outs": set(), "metrics": set()}
 
 
 def differences(stage: str, entry: dict[str, Any], wanted: dict[str, set[str]]) -> list[str]:
@@ -399,7 +401,9 @@ def coarse(stage: str, deps: Iterable[str]) -> list[str]:
     ]
     for loop in LOOPS:
         methods = [
-            part for part in parts if part[1] == loop and part[2:] not in (["settings.py"], ["tables.py"])
+            part
+            for part in parts
+            if part[1] == loop and part[2:] not in (["settings.py"], ["tables.py"], ["workflow"])
         ]
         if ["pipeline", loop] in methods or len(methods) > MOST_METHODS:
             sentences.append(f"{stage}: name at most {MOST_METHODS} files or folders of pipeline/{loop}")

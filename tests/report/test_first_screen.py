@@ -59,7 +59,6 @@ def nothing():
     for path in [
         *Path("datasets").rglob("*.parquet"),
         *Path("datasets").rglob("*.json"),
-        *Path("reports/metrics").glob("*.json"),
     ]:
         path.unlink()
 
@@ -75,7 +74,7 @@ def long_sentences():
             "drift": {"alarms": [{"loop": "temperature", "cause": LONG}]},
         },
     )
-    Path("reports/metrics/evaluate_temperature.json").write_text("{")
+    Path("datasets/evaluate_temperature/figures.json").write_text("{")
 
 
 STATES = (
