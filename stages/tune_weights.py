@@ -77,7 +77,7 @@ def load_design_problem(
 ) -> tuple[CaseConditions, DesignProblem]:
     """What controllers are tuned and judged on, and what they are designed from. A simulated machine is the
     study's; otherwise cases follow from the record of ingest."""
-    from pipeline.temperature.identification.segments import segments
+    from pipeline.temperature.identification.segments import segments, without_gaps
     from pipeline.temperature.plant import baam
     from pipeline.temperature.test_set import cases
 
@@ -98,7 +98,7 @@ def load_design_problem(
         u, y, recordings = segments(
             record, [s.name for s in machine.acting], [o.name for o in machine.outputs]
         )
-        rehearsal = cases.from_record(panel, machine, family, *cases.without_gaps(u, y, recordings))
+        rehearsal = cases.from_record(panel, machine, family, *without_gaps(u, y, recordings))
     setting = cases.conditions(tuning, machine, tracking, panel, rehearsal, family)
     return setting, cases.design_problem(models, tracking, setting, truth)
 
