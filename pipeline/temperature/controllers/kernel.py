@@ -39,8 +39,8 @@ class Tuples(NamedTuple):
 
 
 def window_shift(m: int, p: int, N: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, B_u, B_y with w(t+1) = A w + B_u u + B_y y for the window w =
-    [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)]."""
+    """A, B_u, B_y with w(t+1) = A w + B_u u + B_y y
+    for the window w = [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)]."""
     A = scipy.linalg.block_diag(np.eye(N * m, k=-m), np.eye(N * p, k=-p))
     B_u, B_y = np.zeros((N * (m + p), m)), np.zeros((N * (m + p), p))
     B_u[:m], B_y[N * m : N * m + p] = np.eye(m), np.eye(p)
