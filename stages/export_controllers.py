@@ -17,8 +17,9 @@ from pipeline.setpoint.workflow.settings import EvaluateSetpoint
 from pipeline.setpoint.workflow.tables import WINDOWS
 from pipeline.setpoint.workflow.windows import window_tables
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import evaluate_temperature, learned, tables
-from pipeline.temperature.workflow.settings import Panel, Plant, TemperatureRules, Tracking, TuneWeights
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Plant
+from stages.evaluate_temperature import load_problem
 
 # figures of control that git keeps and that runs are compared by
 METRICS = ("*.contestant", "*.certificate.verdict", "*.largest_difference")
@@ -30,21 +31,12 @@ def main() -> None:
             params.load(ExportControllers, "export_controllers"),
             params.load(Plant, "plant"),
         )
-        tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
-        tuning, rules = params.load(TuneWeights, "tune_weights"), params.load(TemperatureRules, "report")
-        simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
-        made = learned.read_learned(
-            "datasets/identify_plant/plant.parquet",
-            "datasets/identify_plant/spread.parquet",
-            "datasets/learn_kernel",
-            "datasets/ingest/printer_pid.json",
-            machine,
-        )
-        weights = evaluate_temperature.read_weights("datasets/tune_weights/weights.json", machine)
-        record = "datasets/ingest/record.parquet"
-        posed = learned.posed(made, machine, panel, tracking, tuning, record, simulated=simulated)
+        loaded, record = load_problem(), "datasets/ingest/record.parquet"
+        simulated, panel = loaded.simulated, loaded.panel
         summary = artifacts.read_json("datasets/evaluate_temperature/summary.json")
-        judged = export.Judged(machine, made, posed.setting, posed.problem, weights, summary, simulated)
+        judged = export.Judged(
+            machine, loaded.setting, loaded.problem, loaded.weights, summary, loaded.simulated
+        )
         verdict = winner(
             {
                 "identify_plant": artifacts.read_figures("identify_plant"),
@@ -69,8 +61,7 @@ def main() -> None:
             played = artifacts.read_table("datasets/evaluate_temperature/trajectories.parquet", shown)
             difference = export.replayed(one, judged, played)
             export.check_same(one, difference)
-            resolved = evaluate_temperature.resolved(rules, panel, posed.rehearsal)
-            certificate = export.certified(one, judged, resolved, settings, record)
+            certificate = export.certified(one, judged, loaded.rules, settings, record)
             within = export.supported(one, judged, panel, settings.seed, record)
             temperature = export.write_temperature(
                 out / "temperature", one, certificate, within, {"judged": difference}

@@ -18,13 +18,13 @@ from pipeline.runtime.replay import Log
 from pipeline.runtime.workflow import exports, replay
 from pipeline.runtime.workflow.settings import ExportControllers
 from pipeline.store import artifacts
+from pipeline.temperature import tables
 from pipeline.temperature.controllers import controller
-from pipeline.temperature.identification.model_choice import gapless
-from pipeline.temperature.test_set import panel
-from pipeline.temperature.workflow import cases, evaluate_temperature, record
-from pipeline.temperature.workflow.contestants import BY_NAME, Problem
-from pipeline.temperature.workflow.learned import Learned
-from pipeline.temperature.workflow.settings import Panel, Plant, TemperatureRules
+from pipeline.temperature.controllers.problem import DesignProblem
+from pipeline.temperature.controllers.table import BY_NAME, design_controllers
+from pipeline.temperature.identification.segments import segments, without_gaps
+from pipeline.temperature.settings import Panel, Plant, TemperatureRules
+from pipeline.temperature.test_set import cases, panel
 
 FALLBACK = "pi_simc"  # the safe mode "pi"; where the machine allows none, inputs are held
 NEWEST = 0.25  # of a single recording, its end, stands for the machine as it is now
@@ -34,9 +34,8 @@ class Judged(NamedTuple):
     """What evaluate_temperature read, and its summary: what a controller is rebuilt from."""
 
     machine: Plant
-    learned: Learned
-    setting: cases.Setting
-    problem: Problem
+    setting: cases.CaseConditions
+    problem: DesignProblem
     weights: Mapping[str, Mapping[str, Any]]
     summary: Mapping[str, Any]
     simulated: bool
@@ -54,28 +53,28 @@ def chosen(winner: str | None, said: str) -> tuple[str, str]:
 
 def exported(judged: Judged, name: str) -> Exported:
     """The contestant as it was judged, with its safe mode, its supervisor and the machine it is for."""
-    designs, refused = evaluate_temperature.designed(judged.problem, judged.weights)
+    designs, refused = design_controllers(judged.problem, judged.weights)
     if name not in designs:
         raise ValueError(
             f"datasets/evaluate_temperature/summary.json: {name} is recommended but cannot be designed "
             f"({refused.get(name, 'it is none of this version')}); make it again with ./run dvc repro "
             "evaluate_temperature"
         )
-    made, design = judged.learned, designs[name]
+    problem, design = judged.problem, designs[name]
     wired = wired_to(judged.machine)
     noise = judged.setting.rehearsal.noise
-    safe = cases.as_deployed(designs[FALLBACK], judged.setting) if FALLBACK in designs else None
-    watched = supervisor.supervision(design.model, [made.model, *made.spread], wired, noise)
+    safe = cases.deploy(designs[FALLBACK], judged.setting) if FALLBACK in designs else None
+    watched = supervisor.supervision(design.model, problem.family, wired, noise)
     return Exported(
         name,
         wired,
-        cases.as_deployed(design, judged.setting),
+        cases.deploy(design, judged.setting),
         design.model,
         safe,
         watched,
         judged.simulated,
-        machine.plants_sha256([made.model]),
-        machine.plants_sha256(made.spread),
+        machine.plants_sha256([problem.plant]),
+        machine.plants_sha256(problem.family[1:]),
     )
 
 
@@ -98,13 +97,11 @@ def wired_to(declared: Plant) -> machine.Machine:
 def evidence(path: str, declared: Plant) -> certificate.Record:
     """The record of ingest in pieces without a missing sample; the newest are those of the last recording,
     of a single one its last quarter."""
-    u, y, names = record.read_recordings(path, declared.inputs, declared.outputs)
-    pieces = [
-        (a, b, name)
-        for one, other, name in zip(u, y, names, strict=True)
-        for a, b in zip(*gapless([one], [other]), strict=True)
-    ]
-    last = [piece[2] == names[-1] for piece in pieces]
+    table = artifacts.read_table(path, tables.record(declared.acting, declared.outputs))
+    inputs, outputs = ([one.name for one in signals] for signals in (declared.inputs, declared.outputs))
+    u, y, names = segments(table, inputs, outputs)
+    pieces = list(zip(*without_gaps(u, y, names), strict=True))
+    last = [piece[2] == pieces[-1][2] for piece in pieces]
     if all(last):
         longest = max(range(len(pieces)), key=lambda i: len(pieces[i][0]))
         a, b, name = pieces[longest]
@@ -162,7 +159,7 @@ def certified(
     """The certificate on the record at `path`."""
     seen, rng = evidence(path, judged.machine), np.random.default_rng(settings.seed)
     asks, how = asked(judged, rules, settings, seen), learning(made.name, judged)
-    return certify.certify(made, judged.learned.spread, seen, asks, rng, learning=how)
+    return certify.certify(made, judged.problem.family[1:], seen, asks, rng, learning=how)
 
 
 def learning(name: str, judged: Judged) -> bands.Learning | None:
@@ -185,10 +182,10 @@ def learning(name: str, judged: Judged) -> bands.Learning | None:
 def supported(made: Exported, judged: Judged, declared: Panel, seed: int, path: str) -> support.Support:
     """What a replay holds a recording against: plants drawn anew from the spread forecast; honest logs are
     those of the judging half under this controller."""
-    learned, half = judged.learned, judged.setting.rehearsal.judging
-    around, rng = [learned.model, *learned.spread], np.random.default_rng(seed)
-    spread = cases.spread_of(declared) if judged.simulated else cases.spread_around(declared, learned.model)
-    plants = panel.padded(panel.drawn(around, FORECASTING, spread, cells=False, rng=rng))
+    family, half = judged.problem.family, judged.setting.rehearsal.judging
+    rng = np.random.default_rng(seed)
+    spread = cases.spread_of(declared) if judged.simulated else cases.spread_around(declared, family[0])
+    plants = panel.padded(panel.drawn(family, FORECASTING, spread, cells=False, rng=rng))
     aimed = panel.aims(made.controller.law, panel.rests(made.model, half, judged.setting.limits), half)
     run, noise = panel.rolled_out(made.controller, half, aimed), panel.noise_of(half)[: half.hold]
     honest = []

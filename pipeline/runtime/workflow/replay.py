@@ -14,7 +14,8 @@ from pipeline.runtime import machine, replay, supervisor, support
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.replay import Log
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Ingest, Plant
+from pipeline.temperature.settings import Plant
+from stages.ingest import Ingest
 
 HOLD = 30  # samples that the law watches first
 MESSAGES = 50_000  # of replay.mcap at most: a longer recording is thinned evenly
