@@ -4,7 +4,6 @@ datasets/export_controllers: temperature/ (controller.json, arrays.safetensors, 
 setpoint/, and exported.json, which says what there is and why not. Where the certificate is refused it is all
 that is written of that loop."""
 
-from pipeline.report.shared.verdict import ReportRules
 from pipeline.report.temperature.judgement import winner
 from pipeline.runtime.workflow import export_controllers as export
 from pipeline.runtime.workflow import export_setpoint
@@ -18,6 +17,7 @@ from pipeline.setpoint.workflow.windows import window_tables
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import evaluate_temperature, learned, tables
 from pipeline.temperature.workflow.settings import Panel, Plant, TemperatureRules, Tracking, TuneWeights
+from pipeline.verdict.settings import ReportRules
 
 
 def main() -> None:

@@ -20,12 +20,12 @@ from pipeline.report.runs import page as runs_page
 from pipeline.report.setpoint import page as setpoint_page
 from pipeline.report.shared import headline
 from pipeline.report.shared.sources import Declared, collect, digest
-from pipeline.report.shared.verdict import ReportRules
 from pipeline.report.temperature import page as temperature_page
 from pipeline.report.temperature.judgement import judgement, shown
 from pipeline.report.viewer import page as viewer_page
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow.settings import Plant
+from pipeline.verdict.settings import ReportRules
 
 # what the pages show of each stage: its figures, and its folder of tables
 METRICS = {

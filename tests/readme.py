@@ -11,7 +11,6 @@ from typing import Any
 
 from pipeline.report.papers import page as papers_page
 from pipeline.report.papers import rows
-from pipeline.report.shared.verdict import FAILED, UNDECIDED, Figure, Missing, Question, ReportRules, state
 from pipeline.report.temperature.answers import comparison, judged, of_contestant
 from pipeline.report.temperature.contestants import heading, kind
 from pipeline.report.temperature.pairs import pair_sentence
@@ -19,6 +18,8 @@ from pipeline.report.temperature.scorecard import setting
 from pipeline.report.temperature.verdict import questions
 from pipeline.report.temperature.wording import places_of, worded
 from pipeline.store import artifacts
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
 
 ACCEPTED, PAPERS = "reports/accepted.json", "datasets/papers"
 KEYS = ("temperature", "setpoint", "deposition")

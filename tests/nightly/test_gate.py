@@ -19,10 +19,11 @@ from pipeline.report.index import page as index_page
 from pipeline.report.nightly import page as nightly_page
 from pipeline.report.nightly.production import Champion, ChampionState, Installed, Lineage
 from pipeline.report.nightly.record import CANDIDATE, FIRST, KEPT, PROMOTED, Night
-from pipeline.report.shared.digits import typeset
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, ReportRules, Verdict
 from pipeline.report.temperature.judgement import judgement
 from pipeline.store import artifacts, params
+from pipeline.verdict.digits import typeset
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Verdict
 from stages import report
 from tests.conftest import ROOT
 from tests.nightly.toy_nights import Project, entered

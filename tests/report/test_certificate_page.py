@@ -8,11 +8,12 @@ import pytest
 
 from pipeline.report.certificate import exported
 from pipeline.report.certificate.page import judged_margins
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, ReportRules, Verdict
 from pipeline.report.temperature import judgement
 from pipeline.report.temperature.judgement import trust_first
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow.settings import Plant
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Verdict
 from stages.report import main
 from tests.report import made_certificate
 from tests.report.test_pages import Page

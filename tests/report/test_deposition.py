@@ -14,8 +14,8 @@ from pipeline.deposition.workflow import part_programs, tables
 from pipeline.deposition.workflow.settings import Printer
 from pipeline.deposition.workflow.tables import SIGNALS
 from pipeline.report.deposition import rules
-from pipeline.report.shared.verdict import OPEN
 from pipeline.store import artifacts, params
+from pipeline.verdict.verdict import OPEN
 from stages.report import main
 from tests.conftest import ROOT
 from tests.report import made

@@ -4,9 +4,10 @@ that its figures are no dependency of the pages."""
 import re
 from pathlib import Path
 
-from pipeline.report.shared.verdict import FAILED, PASSED, Missing, ReportRules
 from pipeline.report.temperature.verdict import NEVER, decide
 from pipeline.store import artifacts, params
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import FAILED, PASSED, Missing
 from stages.report import main
 from tests.report import made
 from tests.report.test_pages import DEPOSITION, INDEX, TEMPERATURE, Page, figures

@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from pipeline import cli
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Verdict
 from pipeline.report.temperature.judgement import trust_first
 from pipeline.store import artifacts
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Verdict
 from stages.report import main
 from tests.report.test_pages import IDENTIFICATION, INDEX, TEMPERATURE, Page, change, figures
 

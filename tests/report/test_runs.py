@@ -11,8 +11,9 @@ import pytest
 from pipeline import cli
 from pipeline.report.runs import curves, figures
 from pipeline.report.runs.page import Run, render_two
-from pipeline.report.shared.verdict import Figure, ReportRules
 from pipeline.store import artifacts, params
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import Figure
 from stages.report import main
 from tests.report import made
 from tests.report.conftest import loaded

@@ -12,10 +12,10 @@ from pipeline.report.setpoint import agent as setpoint_agent
 from pipeline.report.setpoint import verdict as setpoint_verdict
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
-from pipeline.report.shared.verdict import Figure, Question
 from pipeline.setpoint.simulation.simulator import reward
 from pipeline.setpoint.workflow.tables import PATHS, harm_bar
 from pipeline.store import artifacts, params
+from pipeline.verdict.verdict import Figure, Question
 from stages.report import main
 from tests.report import made, made_setpoint
 from tests.report.test_pages import Page, change, figures

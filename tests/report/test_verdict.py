@@ -11,7 +11,13 @@ import pytest
 from pipeline.report.deposition.verdict import verdict as deposition
 from pipeline.report.identification.model import trust
 from pipeline.report.setpoint.verdict import verdict as setpoint
-from pipeline.report.shared.verdict import (
+from pipeline.report.temperature.contestants import in_a_sentence
+from pipeline.report.temperature.judgement import judgement
+from pipeline.report.temperature.pairs import deciding_sentence, pair_sentence
+from pipeline.report.temperature.verdict import best_sentence, decide, questions, standings
+from pipeline.store import artifacts, params
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import (
     FAILED,
     OPEN,
     PASSED,
@@ -19,7 +25,6 @@ from pipeline.report.shared.verdict import (
     Figure,
     Missing,
     Question,
-    ReportRules,
     Rule,
     Verdict,
     deciding,
@@ -27,11 +32,6 @@ from pipeline.report.shared.verdict import (
     share,
     state,
 )
-from pipeline.report.temperature.contestants import in_a_sentence
-from pipeline.report.temperature.judgement import judgement
-from pipeline.report.temperature.pairs import deciding_sentence, pair_sentence
-from pipeline.report.temperature.verdict import best_sentence, decide, questions, standings
-from pipeline.store import artifacts, params
 from stages import report
 from tests.report import made
 from tests.report.test_pages import INDEX, TEMPERATURE, Page

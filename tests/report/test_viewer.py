@@ -16,7 +16,6 @@ import pytest
 
 from pipeline.report.shared import page as shared_page
 from pipeline.report.shared.sources import Declared, Source, collect, linked
-from pipeline.report.shared.verdict import ReportRules
 from pipeline.report.temperature.judgement import judgement
 from pipeline.report.viewer import packed
 from pipeline.report.viewer import page as viewer_page
@@ -24,6 +23,7 @@ from pipeline.report.viewer.series import Event, Key, Line, Shown
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import tables
 from pipeline.temperature.workflow.settings import Plant
+from pipeline.verdict.settings import ReportRules
 from tests.report.conftest import expect, loaded, timers_fired
 
 

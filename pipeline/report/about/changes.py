@@ -8,11 +8,11 @@ from pipeline.report.deposition import change as deposition_change
 from pipeline.report.deposition import rules as deposition_rules
 from pipeline.report.setpoint import change as setpoint_change
 from pipeline.report.shared.difference import Difference, Move
-from pipeline.report.shared.digits import count
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import Missing
 from pipeline.report.temperature.contestants import in_a_sentence
 from pipeline.report.temperature.judgement import Judgement
+from pipeline.verdict.digits import count
+from pipeline.verdict.verdict import Missing
 
 ANOTHER = "The accepted run is of another machine: nothing to compare."
 # figures of a loop that page one names

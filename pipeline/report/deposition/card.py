@@ -9,9 +9,9 @@ from markupsafe import Markup
 from pipeline.report.deposition.rules import LIBRARY, MARK, NAMES, OURS, Structure, real, structures, worst
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.card import Card, Cell, Deciding, Entrant, Row, Step, best_of, note_of, of_verdict
-from pipeline.report.shared.digits import THIN, band, count, decimals, number, percent
 from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import PASSED, Missing, Verdict
+from pipeline.verdict.digits import THIN, band, count, decimals, number, percent
+from pipeline.verdict.verdict import PASSED, Missing, Verdict
 
 MOVES = "Plunger command to flow at the nozzle"
 # how long a stretch of a part is drawn, s

@@ -11,10 +11,10 @@ from markupsafe import Markup
 
 from pipeline.report.deposition.rules import real
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, count, number, percent, short
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import Missing
+from pipeline.verdict.digits import THIN, count, number, percent, short
+from pipeline.verdict.verdict import Missing
 
 # law -> head, what it is, class of its line; the order of every row of panels
 LAWS = {

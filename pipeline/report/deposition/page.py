@@ -30,10 +30,11 @@ from pipeline.report.deposition.rules import (
 from pipeline.report.deposition.verdict import verdict
 from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Change, Move
-from pipeline.report.shared.digits import THIN, number, percent, short
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import Figure, Missing, Question, ReportRules
+from pipeline.verdict.digits import THIN, number, percent, short
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import Figure, Missing, Question
 
 WORDS = (
     "on_off",

@@ -10,10 +10,10 @@ from markupsafe import Markup
 
 from pipeline.report.deposition.rules import MARK, NAMES, PAPER, asked_of_the_drive, real
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import MINUS, THIN, count, number, percent, short, shortened
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import Missing
+from pipeline.verdict.digits import MINUS, THIN, count, number, percent, short, shortened
+from pipeline.verdict.verdict import Missing
 
 # parts and streams that are drawn; the others stand in the tables
 PARTS, STREAMS = 4, 8

@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from pipeline.report.shared.digits import THIN, count, number, percent, short
 from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import (
+from pipeline.verdict.digits import THIN, count, number, percent, short
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import (
     BELOW_ONE,
     FAILED,
     OPEN,
@@ -18,7 +19,6 @@ from pipeline.report.shared.verdict import (
     Figure,
     Missing,
     Question,
-    ReportRules,
     Rule,
     count_of,
 )

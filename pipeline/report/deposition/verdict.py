@@ -19,9 +19,9 @@ from pipeline.report.deposition.rules import (
     winner,
     worst,
 )
-from pipeline.report.shared.digits import THIN, count, number, percent
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import (
+from pipeline.verdict.digits import THIN, count, number, percent
+from pipeline.verdict.verdict import (
     FAILED,
     OPEN,
     PASSED,

@@ -12,9 +12,9 @@ from pipeline.report.identification.model import (
     flagged_sentence,
     percent_of,
 )
-from pipeline.report.shared.digits import THIN, band, count, decimals, number, short
 from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import Figure, Missing
+from pipeline.verdict.digits import THIN, band, count, decimals, number, short
+from pipeline.verdict.verdict import Figure, Missing
 
 LEAST_P = 1e-6  # smaller ones are all the same to a reader
 

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.report.shared.digits import THIN, band, count, decimals, number, quantity, short
 from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import (
+from pipeline.verdict.digits import THIN, band, count, decimals, number, quantity, short
+from pipeline.verdict.verdict import (
     BELOW_ONE,
     FAILED,
     OPEN,

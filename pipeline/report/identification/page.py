@@ -16,18 +16,9 @@ from pipeline.report.identification import (
 )
 from pipeline.report.identification.model import LEAST_FIT, Fit, ahead_words, fits, trust
 from pipeline.report.shared import charts, page, words
-from pipeline.report.shared.digits import MINUS, THIN, band, count, decimals, number, percent, quantity, short
 from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import (
-    FAILED,
-    PASSED,
-    UNDECIDED,
-    Figure,
-    Missing,
-    Question,
-    Verdict,
-    state,
-)
+from pipeline.verdict.digits import MINUS, THIN, band, count, decimals, number, percent, quantity, short
+from pipeline.verdict.verdict import FAILED, PASSED, UNDECIDED, Figure, Missing, Question, Verdict, state
 
 WORDS = (
     "trusted",

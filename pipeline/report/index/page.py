@@ -13,12 +13,12 @@ from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.shared import headline, page, words
 from pipeline.report.shared.card import Card, Deciding, Step
 from pipeline.report.shared.difference import accepted_on
-from pipeline.report.shared.digits import count, shortened
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 from pipeline.report.temperature import card as temperature_card
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.twelve import drift_state
+from pipeline.verdict.digits import count, shortened
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 
 # the gravest first
 GRAVEST = (FAILED, OPEN, PASSED)

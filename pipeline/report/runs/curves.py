@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.report.shared.sources import Table
-from pipeline.report.shared.verdict import Missing
 from pipeline.report.temperature.contestants import heading
+from pipeline.verdict.verdict import Missing
 
 # of one curve at most
 SAMPLES = 40

@@ -24,10 +24,10 @@ from pipeline.report.setpoint.verdict import (
 )
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.card import Card, Cell, Deciding, Entrant, Row, Step, best_of, of_verdict
-from pipeline.report.shared.digits import THIN, band, count
 from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import FAILED, PASSED, Figure, Missing, Verdict
 from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, FLOW_BAND
+from pipeline.verdict.digits import THIN, band, count
+from pipeline.verdict.verdict import FAILED, PASSED, Figure, Missing, Verdict
 
 MOVES, TITLE = "Nozzle camera to setpoints", "Setpoint, the case that decides"
 # cases that the picture has room for, the worst first

@@ -2,9 +2,9 @@
 
 from pipeline.report.setpoint.verdict import Case, Cell, board, within
 from pipeline.report.shared.difference import Change
-from pipeline.report.shared.digits import MINUS, THIN, number
 from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import FAILED, Missing, Question, state
+from pipeline.verdict.digits import MINUS, THIN, number
+from pipeline.verdict.verdict import FAILED, Missing, Question, state
 
 # points closer than this are one: the accepted figures are kept rounded
 SAME = 0.05

@@ -9,10 +9,8 @@ from markupsafe import Markup
 
 from pipeline.report.setpoint.verdict import Board, Case, case_text, role, worst
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, count, number, shortened
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import Missing
 from pipeline.setpoint.workflow.tables import (
     BEST_FLOW,
     BEST_TEMPERATURE,
@@ -21,6 +19,8 @@ from pipeline.setpoint.workflow.tables import (
     SETTLED_BY,
     TEMPERATURE_BAND,
 )
+from pipeline.verdict.digits import THIN, count, number, shortened
+from pipeline.verdict.verdict import Missing
 
 TITLE = "Flow, decision by decision"
 # percent of flow that the picture shows

@@ -9,11 +9,11 @@ from markupsafe import Markup
 
 from pipeline.report.setpoint.verdict import Board, Case, Harm, bars, case_text, harm_of, role, share_text
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, band, number
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import Figure, Missing
 from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING
+from pipeline.verdict.digits import THIN, band, number
+from pipeline.verdict.verdict import Figure, Missing
 
 TITLE = "Harm against recovery"
 # a clog that halves the evidence: to 0.6 of the flow, and to 0.75

@@ -32,10 +32,10 @@ from pipeline.report.setpoint.verdict import (
 )
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.difference import Change
-from pipeline.report.shared.digits import THIN, band, count, number, percent, quantity
 from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, state
 from pipeline.setpoint.workflow.tables import BEYOND
+from pipeline.verdict.digits import THIN, band, count, number, percent, quantity
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, state
 
 WORDS = (
     "window_of_frames",

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.report.shared.digits import THIN, band, count, number, quantity
 from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import (
+from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, harm_bar
+from pipeline.verdict.digits import THIN, band, count, number, quantity
+from pipeline.verdict.verdict import (
     FAILED,
     OPEN,
     PASSED,
@@ -27,7 +28,6 @@ from pipeline.report.shared.verdict import (
     state,
     words_for,
 )
-from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, harm_bar
 
 AGENT, PAPER, BASELINE = "agent", "paper", "baseline"
 SIMULATORS = {

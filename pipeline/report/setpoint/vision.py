@@ -11,11 +11,11 @@ from markupsafe import Markup
 
 from pipeline.report.setpoint.verdict import CLASS_BORDERS, NAMES, accuracy, share_text
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, band, number, percent, quantity, short
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import Figure, Missing
 from pipeline.setpoint.workflow.tables import ALPHA
+from pipeline.verdict.digits import THIN, band, number, percent, quantity, short
+from pipeline.verdict.verdict import Figure, Missing
 
 CLASSES = ("under", "good", "over")
 # characters of a frame's place in its recording that are shown, its end

@@ -7,8 +7,8 @@ from typing import NamedTuple
 from pipeline.report.deposition import verdict as deposition_verdict
 from pipeline.report.setpoint import verdict as setpoint_verdict
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import Verdict
 from pipeline.report.temperature.judgement import Judgement
+from pipeline.verdict.verdict import Verdict
 
 NAMES = ("temperature", "deposition", "setpoint")
 MOVES = ("heaters to barrel", "plunger to flow", "camera to setpoints")

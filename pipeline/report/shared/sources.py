@@ -21,7 +21,6 @@ from pipeline.deposition.workflow.tables import (
     TASKS,
     TRIALS,
 )
-from pipeline.report.shared.verdict import Missing, ReportRules
 from pipeline.setpoint.workflow.tables import (
     AGENT_CURVE,
     CLASSIFIED,
@@ -35,6 +34,8 @@ from pipeline.setpoint.workflow.tables import (
 from pipeline.store import artifacts
 from pipeline.temperature.workflow import tables as schemas
 from pipeline.temperature.workflow.settings import Plant
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import Missing
 
 Table = dict[str, np.ndarray]
 

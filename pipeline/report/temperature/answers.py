@@ -5,9 +5,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.report.shared.digits import number
-from pipeline.report.shared.verdict import OPEN, Figure, Missing
 from pipeline.report.temperature.contestants import BY_NAME, YARDSTICKS, heading
+from pipeline.verdict.digits import number
+from pipeline.verdict.verdict import OPEN, Figure, Missing
 
 Metrics = Mapping[str, Any]  # {stage: its metrics, or why there are none}
 REPEAT = "Run ./run dvc repro evaluate_temperature"

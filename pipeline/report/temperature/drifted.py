@@ -5,10 +5,10 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from pipeline.report.shared import night
-from pipeline.report.shared.digits import beyond_meaning, number
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import FAILED, OPEN, UNDECIDED, Figure, Missing
 from pipeline.report.temperature.verdict import NEVER
+from pipeline.verdict.digits import beyond_meaning, number
+from pipeline.verdict.verdict import FAILED, OPEN, UNDECIDED, Figure, Missing
 
 LOOP = "temperature"  # whose alarms are read: those of another loop's camera say nothing of this machine
 AGAIN = "Look at the machine; where the change is meant to stay, record it anew and learn again"

@@ -3,9 +3,9 @@
 from typing import Any
 
 from pipeline.report.identification.model import flagged_sentence
-from pipeline.report.shared.digits import THIN, short
 from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import Missing
+from pipeline.verdict.digits import THIN, short
+from pipeline.verdict.verdict import Missing
 
 
 def findings(sources: Sources) -> list[tuple[str, str]]:

@@ -7,18 +7,7 @@ from typing import NamedTuple
 
 from pipeline.report.identification.model import UNTRUSTED, trust
 from pipeline.report.shared.difference import Difference, Move, difference, moves
-from pipeline.report.shared.digits import count
 from pipeline.report.shared.sources import Declared, Sources, Table
-from pipeline.report.shared.verdict import (
-    OPEN,
-    PASSED,
-    Answers,
-    Figure,
-    Missing,
-    Question,
-    ReportRules,
-    Verdict,
-)
 from pipeline.report.temperature.answers import Metrics, comparison, entry, of_contestant
 from pipeline.report.temperature.contestants import YARDSTICKS, heading, kind
 from pipeline.report.temperature.drifted import Drift, drift
@@ -35,6 +24,9 @@ from pipeline.report.temperature.verdict import (
     standings,
 )
 from pipeline.temperature.workflow.settings import Plant
+from pipeline.verdict.digits import count
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import OPEN, PASSED, Answers, Figure, Missing, Question, Verdict
 
 
 class Judgement(NamedTuple):

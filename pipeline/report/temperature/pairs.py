@@ -4,9 +4,9 @@ relearnings. Metrics of the comparison -> words, no page, no file."""
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import band, number
 from pipeline.report.temperature.answers import Metrics, comparison, entry, finite, judged, refused
 from pipeline.report.temperature.contestants import DATA_DRIVEN, INDIRECT, MODEL_BASED, in_a_sentence
+from pipeline.verdict.digits import band, number
 
 
 class PairSentence(NamedTuple):

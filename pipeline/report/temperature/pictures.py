@@ -8,14 +8,14 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, count, number, short
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import Missing
 from pipeline.report.temperature.answers import comparison, entry, judged, refused
 from pipeline.report.temperature.contestants import YARDSTICKS, heading, in_a_sentence, kind
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.pairs import pair_names, reference_of
+from pipeline.verdict.digits import THIN, count, number, short
+from pipeline.verdict.verdict import Missing
 
 CASES = {"typical": "A typical case", "deciding": "The case that decides"}
 # a cost or temperature beyond it is of a loop that is lost; it is drawn at the edge

@@ -5,13 +5,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import THIN, count, declared, number, short, with_unit
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
 from pipeline.report.temperature.answers import comparison, entry, finite, judged, refused, unstable
 from pipeline.report.temperature.contestants import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.wording import banded, places_of, worded
+from pipeline.verdict.digits import THIN, count, declared, number, short, with_unit
+from pipeline.verdict.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
 
 # figures without a rule
 UNRULED = (

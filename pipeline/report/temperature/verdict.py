@@ -9,27 +9,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import short, with_unit
-from pipeline.report.shared.verdict import (
-    FAILED,
-    FAILED_FIRST,
-    OPEN,
-    PASSED,
-    TRIAL,
-    UNDECIDED,
-    UNJUDGED,
-    Answers,
-    Figure,
-    Missing,
-    Question,
-    ReportRules,
-    Rule,
-    Verdict,
-    Words,
-    deciding,
-    share,
-    words_for,
-)
 from pipeline.report.temperature.answers import (
     Metrics,
     comparison,
@@ -42,6 +21,27 @@ from pipeline.report.temperature.answers import (
 from pipeline.report.temperature.contestants import YARDSTICKS, heading, in_a_sentence
 from pipeline.report.temperature.pairs import pair_names, pair_sentence, reference_of
 from pipeline.report.temperature.wording import name_first, places_of, reason, worded
+from pipeline.verdict.digits import short, with_unit
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import (
+    FAILED,
+    FAILED_FIRST,
+    OPEN,
+    PASSED,
+    TRIAL,
+    UNDECIDED,
+    UNJUDGED,
+    Answers,
+    Figure,
+    Missing,
+    Question,
+    Rule,
+    Verdict,
+    Words,
+    deciding,
+    share,
+    words_for,
+)
 
 LOOP = "temperature"
 NEVER = Missing(OPEN, "The nightly job measures it and has not run")

@@ -4,9 +4,9 @@ rule does not pass."""
 import math
 from collections.abc import Sequence
 
-from pipeline.report.shared.digits import band, beyond_meaning, quantity, with_unit
-from pipeline.report.shared.verdict import FAILED, Figure, Missing, Question, Rule, row_places
 from pipeline.report.temperature.contestants import in_a_sentence
+from pipeline.verdict.digits import band, beyond_meaning, quantity, with_unit
+from pipeline.verdict.verdict import FAILED, Figure, Missing, Question, Rule, row_places
 
 OFF_THE_SCALE = "off the scale"
 # what an infinite figure is called
