@@ -18,7 +18,6 @@ from pipeline.report.papers import page as papers_page
 from pipeline.report.runs import curves
 from pipeline.report.runs import page as runs_page
 from pipeline.report.setpoint import page as setpoint_page
-from pipeline.report.shared import headline
 from pipeline.report.shared.sources import Declared, collect, digest
 from pipeline.report.temperature import page as temperature_page
 from pipeline.report.temperature.judgement import judgement, shown
@@ -86,9 +85,7 @@ def main() -> None:
         judged = judgement(sources)
         told = {
             "verdict": judged.verdict.metrics(),
-            "verdicts": {
-                loop: verdict.metrics() for loop, verdict in headline.verdicts(sources, judged).items()
-            },
+            "verdicts": {loop: verdict.metrics() for loop, verdict in sources.verdicts.items()},
             "figures": shown(judged),
         }
         viewer = viewer_page.render(sources, judged)

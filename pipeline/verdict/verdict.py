@@ -244,9 +244,9 @@ def write(verdicts: Mapping[str, Verdict], folder: str | Path) -> None:
         artifacts.write_json(Path(folder) / f"{loop}.json", verdict._asdict() | {"rules": lines})
 
 
-def read(folder: str | Path) -> dict[str, Verdict]:
+def read(folder: str | Path, names: Sequence[str] = LOOPS) -> dict[str, Verdict]:
     """The verdicts that `write` wrote, by loop. A loop that is switched off has no file and is left out."""
-    files = {loop: Path(folder) / f"{loop}.json" for loop in LOOPS}
+    files = {loop: Path(folder) / f"{loop}.json" for loop in names}
     return {
         loop: _decode(artifacts.read_json(path)) for loop, path in files.items() if artifacts.exists(path)
     }

@@ -9,7 +9,7 @@ import pytest
 from pipeline.report.certificate import exported
 from pipeline.report.certificate.page import judged_margins
 from pipeline.report.temperature import judgement
-from pipeline.report.temperature.judgement import trust_first
+from pipeline.verdict.decide import trust_first
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow.settings import Plant
 from pipeline.verdict.settings import ReportRules

@@ -4,7 +4,7 @@ that its figures are no dependency of the pages."""
 import re
 from pathlib import Path
 
-from pipeline.report.temperature.verdict import NEVER, decide
+from pipeline.verdict.decide import (NEVER, decide)
 from pipeline.store import artifacts, params
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import FAILED, PASSED, Missing

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from pipeline import cli
-from pipeline.report.temperature.judgement import trust_first
+from pipeline.verdict.decide import trust_first
 from pipeline.store import artifacts
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Verdict
 from stages.report import main

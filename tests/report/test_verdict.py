@@ -8,13 +8,15 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.report.deposition.verdict import verdict as deposition
-from pipeline.report.identification.model import trust
-from pipeline.report.setpoint.verdict import verdict as setpoint
-from pipeline.report.temperature.contestants import in_a_sentence
+from pipeline.verdict.deposition import verdict as deposition
+from pipeline.verdict.identification import trust
+from pipeline.verdict.setpoint import verdict as setpoint
+from pipeline.verdict.controllers import in_a_sentence
 from pipeline.report.temperature.judgement import judgement
-from pipeline.report.temperature.pairs import deciding_sentence, pair_sentence
-from pipeline.report.temperature.verdict import best_sentence, decide, questions, standings
+from pipeline.report.temperature.beside import deciding_sentence
+from pipeline.verdict.pairs import pair_sentence
+from pipeline.report.temperature.beside import best_sentence
+from pipeline.verdict.decide import (decide, questions, standings)
 from pipeline.store import artifacts, params
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import (

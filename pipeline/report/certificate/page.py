@@ -9,8 +9,9 @@ import numpy as np
 from pipeline.report.certificate import exported
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.pictures import Column, Picture, placeholder
-from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.temperature.contestants import BY_NAME, heading
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.controllers import (BY_NAME, heading)
 from pipeline.verdict.digits import number, with_unit
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 

@@ -9,10 +9,11 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.deposition.rules import real
+from pipeline.report.deposition.marks import real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column, Picture, placeholder
-from pipeline.report.shared.sources import Sources, Table, lookup
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.evidence import (Table, lookup)
 from pipeline.verdict.digits import THIN, count, number, percent, short
 from pipeline.verdict.verdict import Missing
 

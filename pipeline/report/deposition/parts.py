@@ -8,10 +8,12 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.deposition.rules import MARK, NAMES, PAPER, asked_of_the_drive, real
+from pipeline.report.deposition.marks import (MARK, PAPER, real)
+from pipeline.verdict.deposition import (NAMES, asked_of_the_drive)
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column, Picture, placeholder
-from pipeline.report.shared.sources import Sources, Table
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.evidence import Table
 from pipeline.verdict.digits import MINUS, THIN, count, number, percent, short, shortened
 from pipeline.verdict.verdict import Missing
 

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.report.identification.model_errors import MOST_INPUTS
-from pipeline.report.shared.sources import Sources, Table, lookup
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.evidence import (Table, lookup)
 from pipeline.verdict.digits import THIN, band, count, decimals, number, short
 from pipeline.verdict.verdict import Missing
 

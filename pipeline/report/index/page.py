@@ -40,7 +40,7 @@ class File(NamedTuple):
 
 def render(sources: Sources, judged: Judgement) -> str:
     """The text of index.html."""
-    loops, verdicts = headline.loops(sources, judged), headline.verdicts(sources, judged)
+    loops, verdicts = headline.loops(sources), sources.verdicts
     first, picture = deciding(sources, judged, verdicts)
     shown = cards(sources, judged, verdicts)
     told = changes.changes(sources, judged)

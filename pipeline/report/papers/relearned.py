@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.report.temperature.contestants import in_a_sentence
+from pipeline.verdict.controllers import in_a_sentence
 from pipeline.verdict.digits import count, number
 from pipeline.verdict.verdict import Missing
 

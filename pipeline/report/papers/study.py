@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts
 from pipeline.report.shared.pictures import Column, Picture, placeholder
-from pipeline.report.shared.sources import Table, lookup
+from pipeline.verdict.evidence import (Table, lookup)
 from pipeline.report.temperature import evidence, trades
 from pipeline.verdict.digits import number, percent, short
 from pipeline.verdict.verdict import Missing

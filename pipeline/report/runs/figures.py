@@ -4,8 +4,8 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from pipeline.report.temperature.answers import comparison
-from pipeline.report.temperature.verdict import questions
+from pipeline.verdict.temperature import comparison
+from pipeline.verdict.decide import questions
 from pipeline.setpoint.workflow.tables import harm_bar
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import Figure, Question

@@ -10,10 +10,11 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.setpoint.verdict import AGENT, BASELINE, PAPER, Board, Case, case_text, role
+from pipeline.verdict.setpoint import (AGENT, BASELINE, PAPER, Board, Case, case_text, role)
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column, Picture, placeholder
-from pipeline.report.shared.sources import Sources, Table, lookup
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.evidence import (Table, lookup)
 from pipeline.setpoint.workflow.tables import (
     BEST_FLOW,
     BEST_TEMPERATURE,

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.setpoint.verdict import Board, Case, case_text, role, worst
+from pipeline.verdict.setpoint import (Board, Case, case_text, role, worst)
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column, Picture, placeholder
-from pipeline.report.shared.sources import Sources, Table
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.evidence import Table
 from pipeline.setpoint.workflow.tables import (
     BEST_FLOW,
     BEST_TEMPERATURE,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.setpoint.verdict import Board, Case, Harm, bars, case_text, harm_of, role, share_text
+from pipeline.verdict.setpoint import (Board, Case, Harm, bars, case_text, harm_of, role, share_text)
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources
@@ -50,7 +50,7 @@ def harms(sources: Sources, board: Board | Missing) -> Harms:
     """The chart, and the contestants as a table: those that may run first."""
     if isinstance(board, Missing):
         return Harms(placeholder("harm", TITLE, board))
-    limits = bars(sources, board)
+    limits = bars(sources.evidence, board)
     found = {name: harm_of(board, name, limits) for name in board.names}
     known = {name: harm for name, harm in found.items() if isinstance(harm, Harm)}
     if not known:

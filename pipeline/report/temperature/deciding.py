@@ -3,8 +3,10 @@
 import numpy as np
 
 from pipeline.report.shared import charts
-from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.temperature.answers import comparison, entry
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.evidence import Table
+from pipeline.verdict.temperature import comparison
+from pipeline.verdict.evidence import entry
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.pictures import drawn
 

@@ -9,11 +9,13 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column, Picture, placeholder
-from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.temperature.answers import comparison, entry, judged, refused
-from pipeline.report.temperature.contestants import YARDSTICKS, heading, in_a_sentence, kind
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.evidence import Table
+from pipeline.verdict.temperature import (comparison, names, refused)
+from pipeline.verdict.evidence import entry
+from pipeline.verdict.controllers import (YARDSTICKS, heading, in_a_sentence, kind)
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.report.temperature.pairs import pair_names, reference_of
+from pipeline.verdict.pairs import (pair_names, reference_of)
 from pipeline.verdict.digits import THIN, count, number, short
 from pipeline.verdict.verdict import Missing
 
@@ -25,7 +27,7 @@ LARGEST = 1e4
 def drawn(sources: Sources, judgement: Judgement) -> list[str]:
     """Who is drawn: the pair, the best, and PI, in the order of simplicity."""
     wanted = {*pair_names(sources.metrics), judgement.subject, "pi"}
-    return [name for name in (*judged(sources.metrics), *refused(sources.metrics)) if name in wanted]
+    return [name for name in (*names(sources.metrics), *refused(sources.metrics)) if name in wanted]
 
 
 def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
@@ -207,7 +209,7 @@ def plants(sources: Sources) -> Picture:
         )
     names = [
         name
-        for name in judged(sources.metrics)
+        for name in names(sources.metrics)
         if name in set(cases["contestant"]) and name not in YARDSTICKS
     ]
     if not names:

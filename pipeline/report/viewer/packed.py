@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.report.shared.sources import Source, Table
+from pipeline.report.shared.sources import Source
+from pipeline.verdict.evidence import Table
 from pipeline.report.viewer.series import UNITS, Shown, runs
 from pipeline.verdict.digits import number
 

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from pipeline.report.certificate import exported
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.sources import Sources, copies
-from pipeline.report.temperature.contestants import heading
+from pipeline.verdict.controllers import heading
 from pipeline.report.temperature.deciding import degrees, runs_of, until_settled
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.viewer import packed, series
