@@ -1,8 +1,8 @@
-"""Figures, a few tables, certificates and the rules -> the verdict of each loop: datasets/verdict/temperature.json,
-deposition.json, setpoint.json, and identification.json on the model.
+"""Figures, a few tables, certificates and the rules -> datasets/verdict: temperature.json, deposition.json,
+setpoint.json, and identification.json on the model of the temperature loop.
 
-It decides who should run, the first rule that failed or is undecided, and what to do (pipeline/verdict, rules.toml).
-Pages, export, README and the nightly job read these files. A loop that is switched off has none.
+A verdict says who should run, the first rule that failed or is undecided, and what to do (pipeline/verdict,
+rules.toml). Pages, export, README and the nightly job read it. A loop that is switched off has none.
 """
 
 import stages
@@ -23,7 +23,9 @@ def main() -> None:
         evidence = read_evidence(certified)
         verdicts = loops.verdicts(evidence)
         write(loops.with_model(evidence, verdicts), out)
-        artifacts.write_metrics("verdict", {loop: verdict.metrics() for loop, verdict in verdicts.items()}, METRICS)
+        artifacts.write_metrics(
+            "verdict", {loop: verdict.metrics() for loop, verdict in verdicts.items()}, METRICS
+        )
 
 
 if __name__ == "__main__":

@@ -11,15 +11,15 @@ from typing import Any
 
 from pipeline.report.papers import page as papers_page
 from pipeline.report.papers import rows
-from pipeline.verdict.temperature import (comparison, names, of_controller)
-from pipeline.verdict.controllers import (heading, kind)
-from pipeline.verdict.pairs import pair_sentence
 from pipeline.report.temperature.scorecard import setting
-from pipeline.verdict.decide import questions
-from pipeline.verdict.wording import (places_of, worded)
 from pipeline.store import artifacts
+from pipeline.verdict.controllers import heading, kind
+from pipeline.verdict.decide import questions
+from pipeline.verdict.pairs import pair_sentence
 from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.temperature import comparison, names, of_controller
 from pipeline.verdict.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
+from pipeline.verdict.wording import places_of, worded
 
 ACCEPTED, PAPERS = "reports/accepted.json", "datasets/papers"
 KEYS = ("temperature", "setpoint", "deposition")

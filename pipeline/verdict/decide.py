@@ -221,7 +221,9 @@ def verdict(
     return trust_first(judged, identification.trust(evidence))
 
 
-def decide(evidence: Evidence, drift: Figure | Missing, incumbent: str, named: str) -> Verdict:
+def decide(
+    evidence: Evidence, drift: Figure | Missing = NEVER, incumbent: str = "", named: str = ""
+) -> Verdict:
     """The verdict before anybody asks whether the model can be trusted."""
     figures, recorded = evidence.figures, evidence.recorded("generate_probing")
     words = words_for(recorded=recorded, quick=evidence.quick)

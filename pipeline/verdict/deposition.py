@@ -195,9 +195,13 @@ class Parts(NamedTuple):
 
 
 def rules(evidence: Evidence, parts: Sequence[Structure]) -> tuple[Pair, ...]:
+    """The rules of a run, of the model-based composer and of the library."""
+    return rules_of(Parts(evidence, parts, _bound(evidence)))
+
+
+def rules_of(case: Parts) -> tuple[Pair, ...]:
     """The drive first, then what may be believed. If the drive cannot follow, a signal is held against the
     best that any command could reach within it, else against the flow that is wanted."""
-    case = Parts(evidence, parts, _bound(evidence))
     asked = {key: row for key, row in rows(LOOP).items() if key != "near" or case.bound}
     return tuple((_rule(case, key, row, OURS), _rule(case, key, row, LIBRARY)) for key, row in asked.items())
 

@@ -42,10 +42,7 @@ def read_evidence(certified: Mapping[str, Mapping[str, Any]]) -> Evidence:
     """What the stages that ran wrote; a Missing in the place of each file that is not there."""
     return Evidence(
         {stage: _read(f"datasets/{stage}/figures.json", stage, artifacts.read_json) for stage in STAGES},
-        {
-            name: _read(path, path.split("/")[1], _reader(schema))
-            for name, (path, schema) in TABLES.items()
-        },
+        {name: _read(path, path.split("/")[1], _reader(schema)) for name, (path, schema) in TABLES.items()},
         params.load(Plant, "plant"),
         params.load(ReportRules, "report"),
         params.read(),

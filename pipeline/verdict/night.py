@@ -1,5 +1,5 @@
-"""What a night adds to the verdicts of a run: the drift of the machine, the controller that runs today, and the
-one that somebody named to run."""
+"""What a night adds to the verdicts of a run: the drift of the machine, the controller that runs today, and
+the one that somebody named to run."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple

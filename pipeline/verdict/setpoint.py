@@ -1,4 +1,4 @@
-"""Scoreboard and classifier's figures -> who sets flow and temperature by default, and whether it may steer."""
+"""Scoreboard and classifier's figures -> who sets flow and temperature, and whether it may steer."""
 
 import math
 import re
@@ -398,6 +398,8 @@ SEEING = {
 def undecided(question: Question, figure: Figure, words: Mapping[str, Any]) -> str:
     """What would tell, where the interval straddles the limit: of runs that share nothing
     z^2 p (1 - p) / (p - limit)^2 at 95 %; of clustered ones the segments by which the interval shrinks."""
+    if state(question, figure) != UNDECIDED:
+        return ""
     p, off = figure.value / 100, abs(figure.value - question.limit) / 100
     if words.get("clustered"):
         times = ((figure.high - figure.low) / 200 / off) ** 2 if off else math.inf

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.temperature.workflow.settings import Plant
 from pipeline.verdict import loops
 from pipeline.verdict.evidence import Evidence
-from pipeline.temperature.workflow.settings import Plant
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import Missing, Verdict
 

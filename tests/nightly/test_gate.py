@@ -372,7 +372,7 @@ def test_the_night_reads_what_the_pages_are_made_of():
 
 
 def test_the_report_keeps_the_verdict_of_each_loop_as_the_night_reads_it(project, monkeypatch):
-    report.main()
+    made.main()
     made_anew = []
     monkeypatch.setattr(promoting, "dvc", lambda *command, **_: made_anew.append(command))
     verdicts, tonight = promoting.verdicts_of(settings(), TONIGHT)
@@ -389,7 +389,7 @@ def test_the_report_keeps_the_verdict_of_each_loop_as_the_night_reads_it(project
 
 
 def test_pages_that_cannot_be_made_anew_are_told_and_the_night_goes_on(project, monkeypatch):
-    report.main()
+    made.main()
     drift("alarms")(None)
 
     def refused(*_, **__):

@@ -14,8 +14,8 @@ from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import tables
 from pipeline.temperature.workflow.settings import Plant
 from pipeline.verdict.verdict import Figure
-from stages.report import main
 from tests.report import made
+from tests.report.made import main
 from tests.report.test_pages import IDENTIFICATION, TEMPERATURE, Page, change, figures
 
 FOLDER = Path("datasets/identify_plant")

@@ -9,10 +9,10 @@ import pytest
 import yaml
 
 from pipeline import cli
-from pipeline.verdict.decide import trust_first
 from pipeline.store import artifacts
+from pipeline.verdict.decide import trust_first
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Verdict
-from stages.report import main
+from tests.report.made import main
 from tests.report.test_pages import IDENTIFICATION, INDEX, TEMPERATURE, Page, change, figures
 
 OF_THE_STUDY = (

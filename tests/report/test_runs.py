@@ -14,9 +14,9 @@ from pipeline.report.runs.page import Run, render_two
 from pipeline.store import artifacts, params
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import Figure
-from stages.report import main
 from tests.report import made
 from tests.report.conftest import loaded
+from tests.report.made import main
 from tests.report.made_runs import Made, ends, make, metrics, parameters
 from tests.report.test_pages import RUNS, Page, change
 

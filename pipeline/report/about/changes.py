@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from pipeline.report.deposition import change as deposition_change
-from pipeline.verdict.deposition import structures
 from pipeline.report.setpoint import change as setpoint_change
 from pipeline.report.shared.difference import Difference, Move
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.controllers import in_a_sentence
 from pipeline.report.temperature.judgement import Judgement
+from pipeline.verdict.controllers import in_a_sentence
+from pipeline.verdict.deposition import structures
 from pipeline.verdict.digits import count
 from pipeline.verdict.verdict import Missing
 

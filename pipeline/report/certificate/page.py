@@ -10,9 +10,9 @@ from pipeline.report.certificate import exported
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import lookup
-from pipeline.verdict.controllers import (BY_NAME, heading)
+from pipeline.verdict.controllers import BY_NAME, heading
 from pipeline.verdict.digits import number, with_unit
+from pipeline.verdict.evidence import lookup
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 
 WORDS = ("verdict", "margin_disk", "margin_delay", "spread", "step", "hash")

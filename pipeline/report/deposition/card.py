@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.verdict.deposition import (LIBRARY, NAMES, OURS, Structure, structures, worst)
-from pipeline.report.deposition.marks import (MARK, real)
+from pipeline.report.deposition.marks import MARK, real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.card import Card, Cell, Deciding, Entrant, Row, Step, best_of, note_of, of_verdict
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import Table
+from pipeline.verdict.deposition import LIBRARY, NAMES, OURS, Structure, structures, worst
 from pipeline.verdict.digits import THIN, band, count, decimals, number, percent
+from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import PASSED, Missing, Verdict
 
 MOVES = "Plunger command to flow at the nozzle"

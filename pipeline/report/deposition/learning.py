@@ -13,8 +13,8 @@ from pipeline.report.deposition.marks import real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import (Table, lookup)
 from pipeline.verdict.digits import THIN, count, number, percent, short
+from pipeline.verdict.evidence import Table, lookup
 from pipeline.verdict.verdict import Missing
 
 # law -> head, what it is, class of its line; the order of every row of panels

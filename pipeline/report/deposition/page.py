@@ -13,15 +13,14 @@ from markupsafe import Markup
 from pipeline.report.deposition import change as deposition_change
 from pipeline.report.deposition import learning as deposition_learning
 from pipeline.report.deposition import parts as deposition_parts
-from pipeline.report.deposition.marks import (HEADS, MARK, PAPER, real)
-from pipeline.verdict.deposition import (LIBRARY, NAMES, NOT_JUDGED, OURS, Score, Structure, gamma, structures)
-from pipeline.verdict.deposition import verdict
+from pipeline.report.deposition.marks import HEADS, MARK, PAPER, real
 from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Change, Move
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import (Table, lookup)
+from pipeline.verdict.deposition import LIBRARY, NAMES, NOT_JUDGED, OURS, Score, Structure, gamma, structures
 from pipeline.verdict.digits import THIN, number, percent, short
+from pipeline.verdict.evidence import Table, lookup
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import Figure, Missing, Question
 

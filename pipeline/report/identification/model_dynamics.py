@@ -12,9 +12,9 @@ from pipeline.report.identification.model_errors import Cell, Matrix, Room, blan
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import (Table, lookup)
 from pipeline.report.temperature import evidence
 from pipeline.verdict.digits import DASH, THIN, band, count, decimals, number, short
+from pipeline.verdict.evidence import Table, lookup
 from pipeline.verdict.verdict import Missing
 
 MOST_DOTS = 600  # of the cloud of poles

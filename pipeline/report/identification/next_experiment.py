@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import lookup
 from pipeline.verdict.digits import THIN, number, short
+from pipeline.verdict.evidence import lookup
 from pipeline.verdict.verdict import Missing
 
 

@@ -14,11 +14,11 @@ from pipeline.report.identification import (
     model_errors,
     next_experiment,
 )
-from pipeline.verdict.identification import (Fit, ahead_words, fits, least_fit)
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import lookup
 from pipeline.verdict.digits import MINUS, THIN, band, count, decimals, number, percent, quantity, short
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.identification import Fit, ahead_words, fits, least_fit
 from pipeline.verdict.verdict import FAILED, PASSED, UNDECIDED, Figure, Missing, Question, Verdict, state
 
 WORDS = (

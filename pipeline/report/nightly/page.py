@@ -13,8 +13,8 @@ from pipeline.report.nightly.production import Champion, ChampionState, HistoryL
 from pipeline.report.nightly.record import Guard, LoopDecision, Night
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.night import PLANT
-from pipeline.verdict.controllers import heading
 from pipeline.statistics import Paired
+from pipeline.verdict.controllers import heading
 from pipeline.verdict.digits import beyond_meaning, count, number, quantity, short
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED
 

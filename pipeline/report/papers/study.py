@@ -10,9 +10,9 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts
 from pipeline.report.shared.pictures import Column, Picture, placeholder
-from pipeline.verdict.evidence import (Table, lookup)
 from pipeline.report.temperature import evidence, trades
 from pipeline.verdict.digits import number, percent, short
+from pipeline.verdict.evidence import Table, lookup
 from pipeline.verdict.verdict import Missing
 
 

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.verdict.evidence import Table
 from pipeline.verdict.controllers import heading
+from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import Missing
 
 # of one curve at most

@@ -4,10 +4,10 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from pipeline.verdict.temperature import comparison
-from pipeline.verdict.decide import questions
 from pipeline.setpoint.workflow.tables import harm_bar
+from pipeline.verdict.decide import questions
 from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.temperature import comparison
 from pipeline.verdict.verdict import Figure, Question
 
 LOOPS = ("temperature", "deposition", "setpoint")

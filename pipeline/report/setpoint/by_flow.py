@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.verdict.setpoint import (CLASS_BORDERS, share_in)
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import lookup
 from pipeline.verdict.digits import THIN, band, number, percent, quantity
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.setpoint import CLASS_BORDERS, share_in
 from pipeline.verdict.verdict import Figure, Missing
 
 TITLE = "Right and covered, by flow"

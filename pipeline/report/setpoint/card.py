@@ -7,13 +7,27 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.setpoint import deciding as deciding_case
-from pipeline.verdict.setpoint import (BASELINE, Board, Case, Harm, bars, board, case_text, harm_of, lasting, role, share_text, within, worst)
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.card import Card, Cell, Deciding, Entrant, Row, Step, best_of, of_verdict
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import lookup
 from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, FLOW_BAND
 from pipeline.verdict.digits import THIN, band, count
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.setpoint import (
+    BASELINE,
+    Board,
+    Case,
+    Harm,
+    bars,
+    board,
+    case_text,
+    harm_of,
+    lasting,
+    role,
+    share_text,
+    within,
+    worst,
+)
 from pipeline.verdict.verdict import FAILED, PASSED, Figure, Missing, Verdict
 
 MOVES, TITLE = "Nozzle camera to setpoints", "Setpoint, the case that decides"

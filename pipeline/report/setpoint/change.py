@@ -1,10 +1,10 @@
 """How the settled runs of the setpoint loop's default moved since the accepted run."""
 
-from pipeline.verdict.setpoint import (Case, Cell, board, within)
 from pipeline.report.shared.difference import Change
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import lookup
 from pipeline.verdict.digits import MINUS, THIN, number
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.setpoint import Case, Cell, board, within
 from pipeline.verdict.verdict import FAILED, Missing, Question, state
 
 # points closer than this are one: the accepted figures are kept rounded

@@ -7,11 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.verdict.setpoint import (Board, Case, case_text, role, worst)
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import Table
 from pipeline.setpoint.workflow.tables import (
     BEST_FLOW,
     BEST_TEMPERATURE,
@@ -21,6 +19,8 @@ from pipeline.setpoint.workflow.tables import (
     TEMPERATURE_BAND,
 )
 from pipeline.verdict.digits import THIN, count, number, shortened
+from pipeline.verdict.evidence import Table
+from pipeline.verdict.setpoint import Board, Case, case_text, role, worst
 from pipeline.verdict.verdict import Missing
 
 TITLE = "Flow, decision by decision"

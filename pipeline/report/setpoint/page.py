@@ -14,13 +14,26 @@ from pipeline.report.setpoint import deciding as setpoint_deciding
 from pipeline.report.setpoint import harm as setpoint_harm
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
-from pipeline.verdict.setpoint import (BASELINE, SIMULATORS, Board, Case, Cell, board, case_text, lasting, role, share_text, summary, worst)
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.difference import Change
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import lookup
 from pipeline.setpoint.workflow.tables import BEYOND
 from pipeline.verdict.digits import THIN, band, count, number, percent, quantity
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.setpoint import (
+    BASELINE,
+    SIMULATORS,
+    Board,
+    Case,
+    Cell,
+    board,
+    case_text,
+    lasting,
+    role,
+    share_text,
+    summary,
+    worst,
+)
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, state
 
 # what the two columns of its rules are, and the mark of the second

@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.verdict.setpoint import (CLASS_BORDERS, accuracy, share_text)
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import (Table, lookup)
 from pipeline.setpoint.workflow.tables import ALPHA
 from pipeline.verdict.digits import THIN, band, number, percent, quantity, short
+from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.setpoint import CLASS_BORDERS, accuracy, share_text
 from pipeline.verdict.verdict import Figure, Missing
 
 CLASSES = ("under", "good", "over")

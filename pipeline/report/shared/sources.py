@@ -9,8 +9,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from pipeline.deposition.workflow.tables import (
     FILMED,
     LESSONS,
@@ -34,13 +32,12 @@ from pipeline.setpoint.workflow.tables import (
 from pipeline.store import artifacts
 from pipeline.temperature.workflow import tables as schemas
 from pipeline.temperature.workflow.settings import Plant
-from pipeline.verdict.settings import ReportRules
 from pipeline.verdict import night
 from pipeline.verdict.evidence import Evidence, Table
 from pipeline.verdict.files import QUICK_LOOK
+from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import LOOPS, Missing, Verdict
 from pipeline.verdict.verdict import read as read_verdicts
-
 
 
 class Declared(NamedTuple):
@@ -69,7 +66,7 @@ class Source(NamedTuple):
 class Sources(NamedTuple):
     """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what
     was; `absent`: what was not, by path; `accepted`: the accepted run, or None; `nightly`: what the last
-    night measured, None before the first; `quick`: the run is a quick look; `stored`: the verdicts of the run.
+    night measured, None before the first; `quick`: the run is a quick look; `stored`: its verdicts.
     """
 
     declared: Declared
@@ -182,9 +179,10 @@ def collect(
     )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
     read = linked(read)
+    stored = read_verdicts("datasets/verdict", (*LOOPS, "identification"))
     return Sources(
         declared, figures, tables, read, absent, before, folders_of_code, night,
-        quick=artifacts.exists(QUICK_LOOK), stored=read_verdicts("datasets/verdict", (*LOOPS, "identification")),
+        quick=artifacts.exists(QUICK_LOOK), stored=stored,
     )  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """Sentences beside the temperature loop's verdict: the case that decides, and the best of all controllers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from pipeline.verdict.controllers import YARDSTICKS, in_a_sentence
 from pipeline.verdict.decide import Standing

@@ -4,11 +4,10 @@ import numpy as np
 
 from pipeline.report.shared import charts
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import Table
-from pipeline.verdict.temperature import comparison
-from pipeline.verdict.evidence import entry
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.pictures import drawn
+from pipeline.verdict.evidence import Table, entry
+from pipeline.verdict.temperature import comparison
 
 
 def runs_of(sources: Sources, judged: Judgement, table: Table) -> tuple[dict[str, np.ndarray], str]:

@@ -2,10 +2,10 @@
 
 from typing import Any
 
-from pipeline.verdict.identification import flagged_sentence
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import lookup
 from pipeline.verdict.digits import THIN, short
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.identification import flagged_sentence
 from pipeline.verdict.verdict import Missing
 
 

@@ -58,7 +58,9 @@ def judgement(sources: Sources) -> Judgement:
     undeclared = undeclared_outputs(evidence)
     answers = {name: of_controller(figures, name, undeclared) for name in (*held, subject, beside)}
     changed = None if sources.another_machine else difference(sources)
-    best = verdict.winner if verdict.rule != "trust" else choose(figures, held, in_production(sources.nightly))
+    best = (
+        verdict.winner if verdict.rule != "trust" else choose(figures, held, in_production(sources.nightly))
+    )
     return Judgement(
         asked,
         held,
@@ -127,7 +129,7 @@ def verdict_parts(judged: Judgement, *, claim: str = "") -> VerdictParts:
     rules = [
         RuleLine(
             line[0].name[:1].upper() + line[0].name[1:],
-            groups[line[0].name][1],
+            groups()[line[0].name][1],
             tuple(rule.state for rule in line),
             first=line[0].name == verdict.rule,
         )

@@ -1,15 +1,14 @@
 """The page of the temperature loop: verdict, the pair, the scorecard, three pictures, findings, the record,
 words."""
 
-from pipeline.verdict.identification import trust
 from pipeline.report.shared import headline, page, words
 from pipeline.report.shared.difference import accepted_on
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import findings, pictures, recording, scorecard, twelve
-from pipeline.verdict.temperature import (comparison, refused)
-from pipeline.verdict.temperature import names as names_judged
-from pipeline.verdict.controllers import BY_NAME
 from pipeline.report.temperature.judgement import Judgement, heads, verdict_parts
+from pipeline.verdict.controllers import BY_NAME
+from pipeline.verdict.temperature import comparison, refused
+from pipeline.verdict.temperature import names as names_judged
 
 WORDS = (
     "verdict",

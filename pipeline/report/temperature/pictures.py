@@ -10,13 +10,12 @@ from markupsafe import Markup
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import Table
-from pipeline.verdict.temperature import (comparison, names, refused)
-from pipeline.verdict.evidence import entry
-from pipeline.verdict.controllers import (YARDSTICKS, heading, in_a_sentence, kind)
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.verdict.pairs import (pair_names, reference_of)
+from pipeline.verdict.controllers import YARDSTICKS, heading, in_a_sentence, kind
 from pipeline.verdict.digits import THIN, count, number, short
+from pipeline.verdict.evidence import Table, entry
+from pipeline.verdict.pairs import pair_names, reference_of
+from pipeline.verdict.temperature import comparison, names, refused
 from pipeline.verdict.verdict import Missing
 
 CASES = {"typical": "A typical case", "deciding": "The case that decides"}
@@ -207,14 +206,12 @@ def plants(sources: Sources) -> Picture:
         shown.append(
             Column("The pair", "mean cost on each plant, a line a plant", "", [_slopes(both, a, b, finding)])
         )
-    names = [
-        name
-        for name in names(sources.metrics)
-        if name in set(cases["contestant"]) and name not in YARDSTICKS
+    drawn_names = [
+        name for name in names(sources.metrics) if name in set(cases["contestant"]) and name not in YARDSTICKS
     ]
-    if not names:
+    if not drawn_names:
         return placeholder("plants", title, Missing("not measured", "no case has a cost"))
-    shown.append(Column("All contestants", "cost of every case", "", [_boxes(cases, names)]))
+    shown.append(Column("All contestants", "cost of every case", "", [_boxes(cases, drawn_names)]))
     return Picture(
         "plants",
         title,

@@ -10,8 +10,8 @@ from markupsafe import Markup
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.evidence import (Table, lookup)
 from pipeline.verdict.digits import THIN, count, number, short
+from pipeline.verdict.evidence import Table, lookup
 from pipeline.verdict.verdict import UNJUDGED, Missing
 
 

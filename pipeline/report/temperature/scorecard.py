@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.temperature import (comparison, finite, names, refused, unstable)
-from pipeline.verdict.evidence import entry
-from pipeline.verdict.controllers import (BY_NAME, YARDSTICKS, heading, in_a_sentence, kind)
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.verdict.wording import (banded, places_of, worded)
+from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
 from pipeline.verdict.digits import THIN, count, declared, number, short, with_unit
+from pipeline.verdict.evidence import entry
+from pipeline.verdict.temperature import comparison, finite, names, refused, unstable
 from pipeline.verdict.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
+from pipeline.verdict.wording import banded, places_of, worded
 
 # figures without a rule
 UNRULED = (

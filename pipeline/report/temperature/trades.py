@@ -7,8 +7,8 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Column
-from pipeline.verdict.evidence import Table
 from pipeline.verdict.digits import THIN, count, short
+from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import Missing
 
 

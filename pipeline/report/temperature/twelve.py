@@ -8,11 +8,11 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.controllers import heading
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.verdict.wording import (banded, places_of, worded)
+from pipeline.verdict.controllers import heading
 from pipeline.verdict.digits import declared, with_unit
 from pipeline.verdict.verdict import PASSED, UNJUDGED, Figure, Missing, Question, state
+from pipeline.verdict.wording import banded, places_of, worded
 
 
 class Cell(NamedTuple):

@@ -12,10 +12,10 @@ from markupsafe import Markup
 from pipeline.report.certificate import exported
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.sources import Sources, copies
-from pipeline.verdict.controllers import heading
 from pipeline.report.temperature.deciding import degrees, runs_of, until_settled
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.viewer import packed, series
+from pipeline.verdict.controllers import heading
 from pipeline.verdict.digits import THIN, number, short
 from pipeline.verdict.verdict import Missing
 
