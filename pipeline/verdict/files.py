@@ -39,7 +39,7 @@ TABLES = {
 
 
 def read_evidence(certified: Mapping[str, Mapping[str, Any]]) -> Evidence:
-    """What the stages that ran wrote; a Missing in the place of each file that is not there."""
+    """What the stages that ran wrote; a Missing in the place of each file that is not there, or broken."""
     return Evidence(
         {stage: _read(f"datasets/{stage}/figures.json", stage, artifacts.read_json) for stage in STAGES},
         {name: _read(path, path.split("/")[1], _reader(schema)) for name, (path, schema) in TABLES.items()},
@@ -59,4 +59,7 @@ def _read(path: str, stage: str, reader: Callable[[str], Any]) -> Any:
     if not artifacts.exists(path):
         name = path.rsplit("/", 1)[-1]
         return Missing("not measured", f"{name} of {stage} is not there", f"Run ./run dvc repro {stage}")
-    return reader(path)
+    try:
+        return reader(path)
+    except ValueError as error:
+        return Missing("failed", str(error))
