@@ -11,6 +11,7 @@ from pipeline.verdict.verdict import Missing
 
 Table = dict[str, np.ndarray]
 Figures = Mapping[str, Any]  # {stage: its figures, or why there are none}
+OFF = Missing("not applicable", "this loop is switched off (loops in params.yaml)")
 
 
 class Evidence(NamedTuple):
@@ -32,6 +33,11 @@ class Evidence(NamedTuple):
         """Why the stage `certify` refuses a controller; "" if it passed it, and if nothing is known."""
         known = self.certified.get(loop, {}).get(controller)
         return str(known["why"]) if known and not known["passed"] else ""
+
+
+def switched_off(figures: Any) -> bool:
+    """Whether a stage wrote that it was not asked, because its loop is switched off."""
+    return isinstance(figures, Mapping) and figures.get("asked") is False
 
 
 class Absent(Exception):

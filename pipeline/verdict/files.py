@@ -8,7 +8,7 @@ from pipeline.setpoint.workflow.tables import SCOREBOARD
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow.settings import Plant
 from pipeline.temperature.workflow.tables import DYNAMICS, RESIDUALS
-from pipeline.verdict.evidence import Evidence
+from pipeline.verdict.evidence import OFF, Evidence, switched_off
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import Missing
 
@@ -40,9 +40,12 @@ TABLES = {
 
 def read_evidence(certified: Mapping[str, Mapping[str, Any]]) -> Evidence:
     """What the stages that ran wrote; a Missing in the place of each file that is not there, or broken."""
+    figures = {stage: _read(f"datasets/{stage}/figures.json", stage, artifacts.read_json) for stage in STAGES}
+    off = {stage for stage in STAGES if switched_off(figures[stage])}
+    places = {name: (path, path.split("/")[1], _reader(schema)) for name, (path, schema) in TABLES.items()}
     return Evidence(
-        {stage: _read(f"datasets/{stage}/figures.json", stage, artifacts.read_json) for stage in STAGES},
-        {name: _read(path, path.split("/")[1], _reader(schema)) for name, (path, schema) in TABLES.items()},
+        {**figures, **dict.fromkeys(off, OFF)},
+        {name: OFF if place[1] in off else _read(*place) for name, place in places.items()},
         params.load(Plant, "plant"),
         params.load(ReportRules, "report"),
         params.read(),
