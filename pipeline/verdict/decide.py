@@ -326,7 +326,7 @@ def _passed(
 def _not_passed(
     figures: Figures, subject: Standing, words: Words, lines: tuple[tuple[Rule, ...], ...], *, named: bool
 ) -> Verdict:
-    first = first_in(subject.rules)
+    first = first_in(subject.rules) or subject.rules[-1]
     failed = first.state == FAILED
     comes = (
         f"{name_first(subject.name)} is named to run, and does not pass."

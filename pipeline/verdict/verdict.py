@@ -270,7 +270,8 @@ def _text(value: Any) -> Any:
 
 def _decode(fields: Mapping[str, Any]) -> Verdict:
     rules = tuple(tuple(_rule(rule) for rule in line) for line in fields["rules"])
-    return Verdict(**{**fields, "rules": rules})
+    values: dict[str, Any] = {**fields, "rules": rules}
+    return Verdict(**values)
 
 
 def _rule(fields: Mapping[str, Any]) -> Rule:
@@ -284,5 +285,5 @@ def _rule(fields: Mapping[str, Any]) -> Rule:
             runs=tuple(map(float, figure["runs"])),
             note=figure["note"],
         ),
-        question=question and Question(**{**question, "limit": float(question["limit"])}),
+        question=question and Question(**question)._replace(limit=float(question["limit"])),
     )
