@@ -307,7 +307,7 @@ def training_print(arguments: argparse.Namespace) -> None:
 def export(arguments: argparse.Namespace) -> None:
     """A certified controller as C99 without heap, as one file of Python, or as settings for Klipper and
     Kalico; what sees and decides in the setpoint loop as weights with readers that need numpy alone."""
-    from pipeline.runtime.workflow.exports import export as write
+    from pipeline.commands.export import export as write
 
     print(write(arguments.controller, arguments.to, arguments.out, arguments.section, arguments.power))
 
@@ -316,16 +316,16 @@ def replay(arguments: argparse.Namespace) -> None:
     """A recording, and what a certified controller would have asked on it and why not: as MCAP with a layout
     for Foxglove, and a page. Frames of the nozzle's camera go through the loop of shadow with the classifier
     and the filter of CONTROLLER. Nothing is sent."""
-    from pipeline.runtime.workflow import exports
+    from pipeline.commands import export as exports
 
     if exports.shows_frames(arguments.controller):
-        from pipeline.runtime.workflow import replay_camera
+        from pipeline.commands import replay_camera
 
         arguments.source, arguments.rate, arguments.once = str(arguments.recording), 5.0, True
         _watch(arguments, replay_camera.ready(arguments.controller))
         return
+    from pipeline.commands import replay as replaying
     from pipeline.report.replay import page
-    from pipeline.runtime.workflow import replay as replaying
 
     asked = replaying.Asked(replaying.temperatures(arguments.reference), arguments.out)
     done, made, told = replaying.replay_recording(arguments.controller, arguments.recording, asked)

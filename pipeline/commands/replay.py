@@ -13,6 +13,8 @@ from pipeline.reading.resampling import resample
 from pipeline.runtime import machine, replay, supervisor, support
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.replay import Log
+from pipeline.runtime.supervised import Supervised
+from pipeline.runtime.support_file import read_support
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow.settings import Ingest, Plant
 
@@ -20,7 +22,6 @@ HOLD = 30  # samples that the law watches first
 MESSAGES = 50_000  # of replay.mcap at most: a longer recording is thinned evenly
 WATCHED = 10_000  # samples that the supervisor watches, in stretches of a long recording
 STRETCH = 1_000
-SUPPORT = "support.safetensors"
 
 
 class Asked(NamedTuple):
@@ -64,48 +65,6 @@ def temperatures(text: str) -> tuple[float, ...]:
 
 
 HOTTEST_DEGC = 2000.0
-
-
-# ---- support, beside the controller
-
-
-def write_support(folder: Path, within: support.Support, controller_sha256: str) -> None:
-    """support.safetensors of a controller's folder."""
-    plants = {
-        f"spread.{name}": np.stack([np.asarray(getattr(one, name), float) for one in within.spread])
-        for name in within.spread[0]._fields
-    }
-    numbers = {k: np.asarray(v, float) for k, v in within._asdict().items() if k != "spread"}
-    artifacts.write_weights(
-        folder / SUPPORT, "support 2", plants | numbers, {"controller": controller_sha256}
-    )
-
-
-def read_support(folder: Path, made: Exported) -> support.Support | None:
-    """What `write_support` wrote; None where there is none. Raises ValueError where it is of another
-    controller."""
-    if not artifacts.exists(folder / SUPPORT):
-        return None
-    arrays, about = artifacts.read_weights(folder / SUPPORT, "support 2")
-    if about.get("controller") != machine.controller_sha256(made):
-        raise ValueError(f"{folder / SUPPORT}: it is of another controller than the folder; export it again")
-    names = type(made.model)._fields
-    plants = tuple(
-        type(made.model)(*(arrays[f"spread.{name}"][i] for name in names))
-        for i in range(len(arrays["spread.A"]))
-    )
-    return support.Support(
-        arrays["temperature_low"],
-        arrays["temperature_high"],
-        arrays["command_low"],
-        arrays["command_high"],
-        plants,
-        arrays["noise"],
-        int(arrays["steps"]),
-        float(arrays["furthest"]),
-        arrays["rest"],
-        arrays["allowed"],
-    )
 
 
 # ---- the recording
@@ -242,10 +201,10 @@ def _causes(made: Exported, log: Log, cuts: np.ndarray) -> np.ndarray:
     starts = [0] if T <= WATCHED else np.linspace(0, T - STRETCH, WATCHED // STRETCH).astype(int)
     length = T if T <= WATCHED else STRETCH
     for start in starts:
-        watching = supervisor.Supervised(made, rehearsal=True)
+        watching = Supervised(made, rehearsal=True)
         for t in range(int(start), int(start) + length):
             if t in cuts:
-                watching = supervisor.Supervised(made, rehearsal=True)
+                watching = Supervised(made, rehearsal=True)
             watching.watch(log.u[t], log.y[t], log.r[t])
             active = np.flatnonzero((watching.kept.since >= 0).any(axis=1))
             cause[t] = active[0] if len(active) else -1
