@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pydantic import Field
 
+import stages
 from pipeline.store import artifacts, params
 from pipeline.store.params import Section
 
@@ -41,6 +42,7 @@ NO_FEED_FORWARD = (
     "The machine declares disturbances ({names}), which an exported controller cannot read yet: none is "
     "certified. Remove plant.disturbances to certify controllers that do without them."
 )
+NO_SETPOINT = "Not asked: loops.setpoint is false."
 
 
 class Certify(Section):
@@ -77,12 +79,13 @@ class Common(NamedTuple):
 
 def main() -> None:
     with artifacts.stage("certify") as out:
-        settings = params.load(Certify, "certify")
-        found = {
-            "temperature": certify_temperature(out / "temperature", settings),
-            "setpoint": certify_setpoint(out / "setpoint", settings.seed),
-        }
-        artifacts.write_json(out / "certified.json", found)
+        settings, loops = params.load(Certify, "certify"), params.load(params.Loops, "loops")
+        temperature, setpoint = {}, {"controller": "", "why": NO_SETPOINT, "largest_difference": {}}
+        if loops.temperature:
+            temperature = certify_temperature(out / "temperature", settings)
+        if loops.setpoint:
+            setpoint = certify_setpoint(out / "setpoint", settings.seed)
+        artifacts.write_json(out / "certified.json", {"temperature": temperature, "setpoint": setpoint})
 
 
 # ---- temperature
@@ -350,4 +353,4 @@ def certify_setpoint(folder: Path, seed: int) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "certify")

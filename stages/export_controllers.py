@@ -8,13 +8,15 @@ certificate.json, c/, python/), setpoint/, and exported.json, which says what th
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pipeline.runtime import certificate, certified
-from pipeline.runtime.certificate import Certificate
+import stages
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow.settings import TemperatureRules
 from stages.certify import PLACE
+
+if TYPE_CHECKING:
+    from pipeline.runtime.certificate import Certificate
 
 MARKED = ("c/machine.h", "c/README.txt", "python/controller.py")  # which hold the certificate's SHA-256
 VERDICT, CERTIFY = Path("datasets/verdict/temperature.json"), Path("datasets/certify")
@@ -23,7 +25,7 @@ COMPOSED = ("datasets/compose_parts/signals.parquet", "datasets/compose_parts/li
 
 def main() -> None:
     with artifacts.stage("export_controllers") as out:
-        found = artifacts.read_json(CERTIFY / certified.CERTIFIED)
+        found = artifacts.read_json(CERTIFY / "certified.json")
         loops = {
             "temperature": export_temperature(out / "temperature", found["temperature"]),
             "setpoint": export_setpoint(out / "setpoint", found["setpoint"]),
@@ -36,6 +38,8 @@ def main() -> None:
 def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
     """Files of the controller that the verdict names. If the verdict names none because the certificate of
     its controller is refused, that certificate alone."""
+    from pipeline.runtime import certificate, certified
+
     verdict = artifacts.read_json(VERDICT)
     name = verdict["winner"] or verdict.get("refused")
     if name is None or name == "hold":
@@ -107,7 +111,9 @@ def describe(
     }
 
 
-def summarise(decided: Certificate) -> dict[str, Any]:
+def summarise(decided: "Certificate") -> dict[str, Any]:
+    from pipeline.runtime import certificate
+
     return {
         "sha256": certificate.sha256(decided),
         "verdict": decided.verdict,
@@ -131,7 +137,7 @@ def copy(source: Path, folder: Path, certificate_sha256: str) -> None:
         if name in MARKED:
             text = path.read_text(encoding="utf-8").replace(PLACE, certificate_sha256)
             artifacts.write_text(folder / name, text)
-        elif name != certified.MEASURED:
+        elif name != "measured.json":
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, folder / name)
 
@@ -148,4 +154,4 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "export_controllers")

@@ -161,7 +161,7 @@ def with_column(number, **changed):
         (pa.table({"a": [1]}), " holds no schema but scores version 1 is expected"),
         (table().drop_columns("share"), ": table scores version 1 lacks share"),
         (table(with_column(1, unit="1")), ": column share is in 1 but should be in percent"),
-        (table(with_column(2, type=pa.int32())), ": column steps is int32 but should be int64"),
+        (table(with_column(2, type="int32")), ": column steps is int32 but should be int64"),
         (table(share=[3.0, 200.0]), ": column share is 200 percent in row 1 but must be at most 100 percent"),
     ],
 )
