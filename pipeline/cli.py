@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 from pipeline.nightly import commands as nights
 from pipeline.store import artifacts, params
 from pipeline.store.printable import printable
-from pipeline.temperature.workflow.settings import Ingest, Plant
+from pipeline.temperature.settings import Plant
+from stages.ingest import Ingest
 
 if TYPE_CHECKING:
     from pipeline.setpoint.workflow.shadow.deploy import Ready
@@ -135,7 +136,7 @@ def quick(arguments: argparse.Namespace) -> None:
 def init(arguments: argparse.Namespace) -> None:
     """Recordings of a new machine into params.yaml: mapping, plant, panel and
     rules that fit its pace; and what a person must still decide."""
-    from pipeline.temperature.workflow import propose_params
+    from pipeline.commands import propose_params
 
     initialised = propose_params.proposed(arguments.recordings, sample_time=arguments.time)
     changed = propose_params.write(initialised.values, force=arguments.force)
@@ -147,7 +148,7 @@ def init(arguments: argparse.Namespace) -> None:
 def first_experiment(arguments: argparse.Namespace) -> None:
     """A staircase for a machine of which there is no record yet: which input, which level, for how long, and
     at which temperature to stop. No model is behind it."""
-    from pipeline.temperature.workflow import first_experiment as first
+    from pipeline.commands import first_experiment as first
 
     plan = first.staircase(params.load(Plant, "plant"), arguments.hold)
     artifacts.write_csv(arguments.out, first.columns(plan))

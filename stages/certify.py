@@ -17,32 +17,28 @@ from pydantic import Field
 import stages
 from pipeline.store import artifacts, params
 from pipeline.store.params import Section
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Plant
+from stages.evaluate_temperature import EvaluationInputs, load_problem
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from pipeline.runtime.bands import GainRoute
     from pipeline.runtime.certificate import EvidenceRecord, Rules
     from pipeline.runtime.certificate_evidence import WindowModels
-    from pipeline.runtime.machine import Exported
     from pipeline.runtime.signals import Machine
-    from pipeline.runtime.support import Support
+    from pipeline.temperature.controllers.problem import Design
     from pipeline.temperature.plant import Plant as PlantModel
-    from pipeline.temperature.workflow import cases
-    from pipeline.temperature.workflow.contestants import Design, Problem
-    from pipeline.temperature.workflow.settings import Panel, Plant
 
 RECORD = "datasets/ingest/record.parquet"
 FALLBACK = "pi_simc"  # the safe mode "pi"; if the machine allows none, the inputs are held
-REACH = 0.25  # of the recorded span, beyond which no reference is certified
-COOLEST = 0.05  # quantile of the recorded temperatures
 # stands in the exported files for the SHA-256 of the certificate, which depends on the limits
 PLACE = "@certificate@"
 NO_FEED_FORWARD = (
     "The machine declares disturbances ({names}), which an exported controller cannot read yet: none is "
     "certified. Remove plant.disturbances to certify controllers that do without them."
 )
-NO_SETPOINT = "Not asked: loops.setpoint is false."
+NOT_ASKED = "Not asked: loops.{} is false."
 
 
 class Certify(Section):
@@ -52,17 +48,6 @@ class Certify(Section):
     seed: int = Field(ge=0, le=2**31)
     plants: int = Field(ge=20, le=100_000)
     resamples: int = Field(ge=20, le=10_000)
-
-
-class Evaluated(NamedTuple):
-    """What the controllers were designed from and judged on, the same for all of them."""
-
-    declared: Plant
-    panel: Panel
-    setting: cases.Setting
-    problem: Problem
-    weights: dict[str, Any]
-    simulated: bool
 
 
 class Common(NamedTuple):
@@ -80,7 +65,10 @@ class Common(NamedTuple):
 def main() -> None:
     with artifacts.stage("certify") as out:
         settings, loops = params.load(Certify, "certify"), params.load(params.Loops, "loops")
-        temperature, setpoint = {}, {"controller": "", "why": NO_SETPOINT, "largest_difference": {}}
+        temperature, setpoint = (
+            {},
+            {"controller": "", "why": NOT_ASKED.format("setpoint"), "largest_difference": {}},
+        )
         if loops.temperature:
             temperature = certify_temperature(out / "temperature", settings)
         if loops.setpoint:
@@ -98,71 +86,46 @@ def certify_temperature(folder: Path, settings: Certify) -> dict[str, dict[str, 
     from tqdm import tqdm
 
     from pipeline.store.execution import run_all
-    from pipeline.temperature.workflow.contestants import CONTESTANTS
-    from pipeline.temperature.workflow.evaluate_temperature import designed
+    from pipeline.temperature.controllers.table import CONTROLLERS, design_controllers
 
-    evaluated = load()
-    designs, refused = designed(evaluated.problem, evaluated.weights)
-    names = [one.name for one in CONTESTANTS if one.role != "yardstick" and one.name != "hold"]
+    loaded = load_problem()  # whose rules are not used here
+    designs, refused = design_controllers(loaded.problem, loaded.weights)
+    names = [one.name for one in CONTROLLERS if one.kind != "reference"]
     found = {name: _not_measured(refused[name]) for name in names if name in refused}
-    names = [name for name in names if name in designs]
-    if disturbances := [one.name for one in evaluated.declared.disturbances]:
+    names = [name for name in names if name in designs and not designs[name].holds]
+    if disturbances := [one.name for one in loaded.machine.disturbances]:
         why = NO_FEED_FORWARD.format(names=", ".join(disturbances))
         return found | {name: _not_measured(why) for name in names}
-    common = prepare(evaluated, settings)
-    calls = [
-        delayed(certify_controller)(folder / name, name, designs, evaluated, common, settings)
-        for name in names
-    ]
+    common = prepare(loaded, settings)
+    certify = delayed(certify_controller)
+    calls = [certify(folder / name, name, designs, loaded, common) for name in names]
     results = run_all(calls, params.load(params.Execution, "execution"))
     return found | dict(tqdm(results, total=len(calls), desc="certify: controllers", mininterval=2))
 
 
-def load() -> Evaluated:
-    """Parameters, and what the stages before wrote."""
-    from pipeline.temperature.workflow import evaluate_temperature, learned
-    from pipeline.temperature.workflow.settings import Panel, Plant, Tracking, TuneWeights
-
-    machine, panel = params.load(Plant, "plant"), params.load(Panel, "panel")
-    simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
-    made = learned.read_learned(
-        "datasets/identify_plant/plant.parquet",
-        "datasets/identify_plant/spread.parquet",
-        "datasets/learn_kernel",
-        "datasets/ingest/printer_pid.json",
-        machine,
-    )
-    posed = learned.posed(
-        made,
-        machine,
-        panel,
-        params.load(Tracking, "tracking"),
-        params.load(TuneWeights, "tune_weights"),
-        RECORD,
-        simulated=simulated,
-    )
-    weights = evaluate_temperature.read_weights("datasets/tune_weights/weights.json", machine)
-    return Evaluated(machine, panel, posed.setting, posed.problem, weights, simulated)
-
-
-def prepare(evaluated: Evaluated, settings: Certify) -> Common:
+def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
+    """What no controller changes."""
     import numpy as np
 
     from pipeline.runtime import certificate_evidence, certify, support_logs
     from pipeline.runtime.certificate import EvidenceRecord
-    from pipeline.temperature.workflow import cases
-    from pipeline.temperature.workflow.record import read_recordings
+    from pipeline.temperature.identification.segments import segments, without_gaps
+    from pipeline.temperature.test_set import cases
 
-    declared, family = evaluated.declared, evaluated.problem.family
-    machine = wire(declared)
-    segments = certify.split_newest(*read_recordings(RECORD, declared.inputs, declared.outputs))
-    record = EvidenceRecord(machine.inputs, machine.outputs, machine.sample_time_s, *segments)
-    rules, rng = require(evaluated, settings, record), np.random.default_rng(settings.seed)
+    declared, family = loaded.machine, loaded.problem.family
+    machine, schema = wire(declared), tables.record(declared.acting, declared.outputs)
+    names = ([signal.name for signal in side] for side in (declared.inputs, declared.outputs))
+    pieces = without_gaps(*segments(artifacts.read_table(RECORD, schema), *names))
+    parts = certify.split_newest(*pieces)
+    record = EvidenceRecord(machine.inputs, machine.outputs, machine.sample_time_s, *parts)
+    setting, rng = loaded.setting, np.random.default_rng(settings.seed)
+    half = setting.rehearsal.judging
+    rules = certify.require(half, record, setting.settled, settings.plants, settings.resamples)
     models = certificate_evidence.window_models(machine, record, rules, rng)
-    if evaluated.simulated:
-        spread = cases.spread_of(evaluated.panel)
+    if loaded.simulated:
+        spread = cases.spread_of(loaded.panel)
     else:
-        spread = cases.spread_around(evaluated.panel, evaluated.problem.plant)
+        spread = cases.spread_around(loaded.panel, loaded.problem.plant)
     plants = support_logs.forecasting_plants(family, spread, np.random.default_rng(settings.seed))
     return Common(machine, record, rules, models, rng, plants)
 
@@ -170,7 +133,7 @@ def prepare(evaluated: Evaluated, settings: Certify) -> Common:
 def wire(declared: Plant) -> Machine:
     """Section `plant` as a controller knows it."""
     from pipeline.runtime.signals import Machine, Signal
-    from pipeline.temperature.workflow import cases
+    from pipeline.temperature.test_set import cases
 
     low, high = cases.output_limits(declared)
     return Machine(
@@ -183,72 +146,50 @@ def wire(declared: Plant) -> Machine:
     )
 
 
-def require(evaluated: Evaluated, settings: Certify, record: EvidenceRecord) -> Rules:
-    """How each controller is measured: on the constant references of the judging half that the record
-    reaches, from where the record is coolest. References further off were simulated only. If the record
-    reaches none, all are taken, and the certificate is refused."""
-    import numpy as np
-
-    from pipeline.runtime.certificate import Rules
-
-    setting, half = evaluated.setting, evaluated.setting.rehearsal.judging
-    constants = sorted({int(half.asked[row, 0]) for row in np.flatnonzero(half.kind == "constant")})
-    references = np.array([half.references[index].H[:, 0] for index in constants])
-    y = np.concatenate([*record.y, *record.newest_y])
-    low, high = y.min(axis=0), y.max(axis=0)
-    near = (references >= low - REACH * (high - low)) & (references <= high + REACH * (high - low))
-    return Rules(
-        references=references[near.all(axis=1)] if near.all(axis=1).any() else references,
-        start=np.quantile(y, COOLEST, axis=0),
-        steps=half.steps // 2,
-        settled=min(setting.settled, half.steps // 4),
-        plants=settings.plants,
-        resamples=settings.resamples,
-    )
-
-
 def certify_controller(
-    folder: Path,
-    name: str,
-    designs: dict[str, Design],
-    evaluated: Evaluated,
-    common: Common,
-    settings: Certify,
+    folder: Path, name: str, designs: dict[str, Design], loaded: EvaluationInputs, common: Common
 ) -> tuple[str, dict[str, Any]]:
     """Measures one controller and writes its folder; its name, and what certified.json says of it."""
-    from pipeline.runtime import certified, certify, checks, machine, support_file
+    from pipeline.runtime import assembly, certified, certify, checks, machine, support, support_logs
     from pipeline.runtime.export import c, python, vectors
+    from pipeline.runtime.support_file import write_support
+    from pipeline.temperature.controllers.table import BY_NAME
 
-    setting, half = evaluated.setting, evaluated.setting.rehearsal.judging
+    setting, problem, half = loaded.setting, loaded.problem, loaded.setting.rehearsal.judging
+    design, fallback, family = designs[name], designs.get(FALLBACK), problem.family
+    route = assembly.gain_route(problem, BY_NAME[name].learned_from, loaded.weights.get(name, {}))
     try:
-        made = rebuild(name, designs, evaluated, common.machine)
+        made = assembly.assemble(
+            name, design, fallback, common.machine, setting, family, simulated=loaded.simulated
+        )
         machine.check(made)
-        difference = checks.judged_difference(made, half, *judged_trajectory(name, evaluated.declared))
+        difference = checks.judged_difference(made, half, *judged_trajectory(name, loaded.machine))
         checks.check_same(made, difference)
         measured = certify.measure(
             made,
-            evaluated.problem.family[1:],
+            family[1:],
             common.record,
             common.rules,
             common.models,
             common.generator,
-            learning=gain_route(name, evaluated),
+            learning=route,
             delay_share=setting.faster,
         )
-        within = supported(made, evaluated, common)
-        code = c.code(made, PLACE) | {"golden.csv": vectors.golden(made)}
-        checks.check_compiled(made, code)
-        text = python.code(made, PLACE)
-        differences = {"judged": difference, "python": checks.python_difference(made, text)}
+        honest = support_logs.honest_logs(made, half, setting.limits)
+        recorded = support_logs.recorded_logs(common.record)
+        within = support.support(common.plants, honest, setting.rehearsal.noise, recorded)
+        sources = c.code(made, PLACE) | {"golden.csv": vectors.golden(made)}
+        checks.check_compiled(made, sources)
+        code = python.code(made, PLACE)
+        differences = {"judged": difference, "python": checks.python_difference(made, code)}
     except ValueError as reason:
         return name, _not_measured(str(reason))
     certified.write(folder, measured)
     machine.write_controller(folder, made)
-    support_file.write_support(folder, within, measured.draft.controller_sha256)
-    for file, part in (
-        {f"c/{file}": part for file, part in code.items()} | {"python/controller.py": text}
-    ).items():
-        artifacts.write_text(folder / file, part)
+    write_support(folder, within, measured.draft.controller_sha256)
+    for file, text in sources.items():
+        artifacts.write_text(folder / "c" / file, text)
+    artifacts.write_text(folder / "python" / "controller.py", code)
     return name, {"measured": True, "why": "", "largest_difference": differences}
 
 
@@ -256,32 +197,10 @@ def _not_measured(why: str) -> dict[str, Any]:
     return {"measured": False, "why": why, "largest_difference": {}}
 
 
-def rebuild(name: str, designs: dict[str, Design], evaluated: Evaluated, wired: Machine) -> Exported:
-    """The controller as it was judged, with its safe mode, its supervisor and the machine it is for."""
-    from pipeline.runtime import machine, supervisor
-    from pipeline.temperature.workflow import cases
-
-    setting, family, design = evaluated.setting, evaluated.problem.family, designs[name]
-    safe = cases.as_deployed(designs[FALLBACK], setting) if FALLBACK in designs else None
-    return machine.Exported(
-        name,
-        wired,
-        cases.as_deployed(design, setting),
-        design.model,
-        safe,
-        supervisor.supervision(design.model, family, wired, setting.rehearsal.noise),
-        evaluated.simulated,
-        machine.plants_sha256(family[:1]),
-        machine.plants_sha256(family[1:]),
-    )
-
-
 def judged_trajectory(name: str, declared: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Outputs and references (steps, p) in °C, and applied inputs (steps, m) in percent, of the case that
     decided the comparison."""
     import numpy as np
-
-    from pipeline.temperature.workflow import tables
 
     schema = tables.trajectories(declared.inputs, declared.outputs)
     played = artifacts.read_table("datasets/evaluate_temperature/trajectories.parquet", schema)
@@ -292,38 +211,6 @@ def judged_trajectory(name: str, declared: Plant) -> tuple[np.ndarray, np.ndarra
         for columns in (outputs, [f"{o}_reference" for o in outputs], [f"{i}_applied" for i in inputs])
     )
     return y, r, u
-
-
-def gain_route(name: str, evaluated: Evaluated) -> GainRoute | None:
-    """How the gains of a controller were learned from the record; None if they are those of a model."""
-    import numpy as np
-
-    from pipeline.runtime.bands import GainRoute
-    from pipeline.temperature.workflow.contestants import BY_NAME
-
-    problem, route = evaluated.problem, BY_NAME[name].learned_from
-    if route != "window" and route != "kernel":
-        return None
-    learned = problem.window if route == "window" else problem.kernel
-    if learned is None:
-        return None
-    effort = float(evaluated.weights[name]["effort_weight"])
-    p, m = problem.plant.p, problem.plant.m
-    return GainRoute(route, learned.N, np.ones(p), np.full(m, effort), problem.gamma)
-
-
-def supported(made: Exported, evaluated: Evaluated, common: Common) -> Support:
-    """Where a recording is like those that this controller was learned from and judged on."""
-    from pipeline.runtime import support, support_logs
-    from pipeline.runtime.replay import Log
-
-    setting, record = evaluated.setting, common.record
-    recorded = [
-        Log(u, y, y)
-        for u, y in zip([*record.u, *record.newest_u], [*record.y, *record.newest_y], strict=True)
-    ]
-    honest = support_logs.honest_logs(made, setting.rehearsal.judging, setting.limits)
-    return support.support(common.plants, honest, setting.rehearsal.noise, recorded)
 
 
 # ---- setpoint

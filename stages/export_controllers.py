@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import stages
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import TemperatureRules
-from stages.certify import PLACE
+from pipeline.temperature.settings import TemperatureRules
+from stages.certify import NOT_ASKED, PLACE
 
 if TYPE_CHECKING:
     from pipeline.runtime.certificate import Certificate
@@ -25,14 +25,18 @@ COMPOSED = ("datasets/compose_parts/signals.parquet", "datasets/compose_parts/li
 
 def main() -> None:
     with artifacts.stage("export_controllers") as out:
-        found = artifacts.read_json(CERTIFY / "certified.json")
-        loops = {
-            "temperature": export_temperature(out / "temperature", found["temperature"]),
+        found, loops = artifacts.read_json(CERTIFY / "certified.json"), params.load(params.Loops, "loops")
+        exported = {
+            "temperature": describe(why=NOT_ASKED.format("temperature"), unit="percent"),
             "setpoint": export_setpoint(out / "setpoint", found["setpoint"]),
-            "deposition": name_composed(),
+            "deposition": describe(why=NOT_ASKED.format("deposition"), unit="mm"),
         }
-        artifacts.write_json(out / "exported.json", loops)
-        artifacts.write_metrics("export_controllers", loops)
+        if loops.temperature:
+            exported["temperature"] = export_temperature(out / "temperature", found["temperature"])
+        if loops.deposition:
+            exported["deposition"] = name_composed()
+        artifacts.write_json(out / "exported.json", exported)
+        artifacts.write_metrics("export_controllers", exported)
 
 
 def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,8 @@ from pipeline.runtime.replay import Log
 from pipeline.runtime.supervised import Supervised
 from pipeline.runtime.support_file import read_support
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Ingest, Plant
+from pipeline.temperature.settings import Plant
+from stages.ingest import Ingest
 
 HOLD = 30  # samples that the law watches first
 MESSAGES = 50_000  # of replay.mcap at most: a longer recording is thinned evenly

@@ -21,7 +21,7 @@ from pipeline.report.shared.sources import Declared, Sources, collect
 from pipeline.report.shared.verdict import PASSED, ReportRules, Verdict
 from pipeline.report.temperature.judgement import judgement
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 
 # stages whose metrics the pages show; those before `learn_kernel` have no tables there
 MEASURED = (

@@ -13,39 +13,49 @@ from pipeline.runtime.certificate import LOOP, VERSION, Certificate, EvidenceRec
 from pipeline.runtime.certificate_evidence import WindowModels
 from pipeline.runtime.certified import Measured
 from pipeline.runtime.machine import Exported, controller_sha256
-from pipeline.temperature.identification.model_choice import gapless
 from pipeline.temperature.plant import Plant
+from pipeline.temperature.test_set import panel
 
 NEWEST = 0.25  # of a single recording: its end stands for the machine as it is today
+REACH = 0.25  # of the recorded span, beyond which no reference is certified
+COOLEST = 0.05  # quantile of the recorded temperatures
 
 
 def split_newest(
-    u: Sequence[np.ndarray], y: Sequence[np.ndarray], recordings: Sequence[str]
+    u: Sequence[np.ndarray], y: Sequence[np.ndarray], recordings: Sequence[int]
 ) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-    """u, y, newest u, newest y in pieces without a missing sample, of segments (T, m), (T, p) and the
-    recording of each. The newest are the pieces of the last recording, or the last quarter of a single
+    """u, y, newest u, newest y of pieces (T, m), (T, p) without a missing sample and the recording of each.
+    The newest are the pieces of the last recording, or the last quarter of the longest piece of a single
     one."""
-    pieces = [
-        (a, b, name)
-        for one, other, name in zip(u, y, recordings, strict=True)
-        for a, b in zip(*gapless([one], [other]), strict=True)
-    ]
-    last = [piece[2] == recordings[-1] for piece in pieces]
-    if all(last):
+    pieces, new = list(zip(u, y, strict=True)), [number == recordings[-1] for number in recordings]
+    if all(new):
         longest = max(range(len(pieces)), key=lambda i: len(pieces[i][0]))
-        a, b, name = pieces[longest]
+        a, b = pieces[longest]
         cut = round((1 - NEWEST) * len(a))
-        pieces[longest : longest + 1] = [(a[:cut], b[:cut], name), (a[cut:], b[cut:], name)]
-        last = [i == longest + 1 for i in range(len(pieces))]
-    parts = [
-        [piece for piece, flag in zip(pieces, last, strict=True) if flag == new] for new in (False, True)
-    ]
-    learned, newest = parts
-    return (
-        [a for a, *_ in learned],
-        [b for _, b, _ in learned],
-        [a for a, *_ in newest],
-        [b for _, b, _ in newest],
+        pieces[longest : longest + 1] = [(a[:cut], b[:cut]), (a[cut:], b[cut:])]
+        new = [i == longest + 1 for i in range(len(pieces))]
+    learned, newest = (
+        [piece for piece, flag in zip(pieces, new, strict=True) if flag == wanted] for wanted in (False, True)
+    )
+    return [a for a, _ in learned], [b for _, b in learned], [a for a, _ in newest], [b for _, b in newest]
+
+
+def require(half: panel.Cases, record: EvidenceRecord, settled: int, plants: int, resamples: int) -> Rules:
+    """How each controller is measured: on the constant references of the judging half that the record
+    reaches, from where the record is coolest. References further off were simulated only. If the record
+    reaches none, all are taken, and the certificate is refused."""
+    constants = sorted({int(half.asked[row, 0]) for row in np.flatnonzero(half.kind == "constant")})
+    references = np.array([half.references[index].H[:, 0] for index in constants])
+    y = np.concatenate([*record.y, *record.newest_y])
+    low, high = y.min(axis=0), y.max(axis=0)
+    near = (references >= low - REACH * (high - low)) & (references <= high + REACH * (high - low))
+    return Rules(
+        references=references[near.all(axis=1)] if near.all(axis=1).any() else references,
+        start=np.quantile(y, COOLEST, axis=0),
+        steps=half.steps // 2,
+        settled=min(settled, half.steps // 4),
+        plants=plants,
+        resamples=resamples,
     )
 
 

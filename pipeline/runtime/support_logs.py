@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.runtime.certificate import EvidenceRecord
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.replay import Log
 from pipeline.temperature.controllers.governor import Limits
@@ -33,3 +34,9 @@ def honest_logs(made: Exported, half: panel.Cases, limits: Limits) -> list[Log]:
         )  # fmt: skip
         logs.append(Log(*(np.concatenate(part) for part in parts)))
     return logs
+
+
+def recorded_logs(record: EvidenceRecord) -> list[Log]:
+    """The pieces of the machine's own record, which are on support whatever the plants say."""
+    pieces = zip([*record.u, *record.newest_u], [*record.y, *record.newest_y], strict=True)
+    return [Log(u, y, y) for u, y in pieces]

@@ -21,7 +21,7 @@ from pipeline.report.shared import headline
 from pipeline.report.shared.sources import Declared, Sources
 from pipeline.report.shared.verdict import Missing, ReportRules, Verdict
 from pipeline.report.temperature.judgement import judgement
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 
 HERE = Path(__file__).parent
 INPUTS, ANSWERS = HERE / "frozen_metrics.json", HERE / "frozen_verdicts.json"

@@ -12,7 +12,7 @@ from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, ReportRules, Ve
 from pipeline.report.temperature import judgement
 from pipeline.report.temperature.judgement import trust_first
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 from stages.report import main
 from tests.report import made_certificate
 from tests.report.test_pages import Page

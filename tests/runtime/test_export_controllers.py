@@ -7,12 +7,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-
-from pipeline.runtime import machine
 from pipeline.runtime.workflow import export_controllers as export
 from pipeline.runtime.workflow import exports, replay
+
+from pipeline.runtime import machine
 from pipeline.store import artifacts
-from pipeline.temperature.workflow import learned
 from tests.temperature.test_evaluate_temperature import judged, small
 
 
@@ -21,10 +20,7 @@ def given() -> tuple[export.Judged, dict[str, np.ndarray]]:
     """What evaluate_temperature read and wrote."""
     of = small()
     result = judged(of)
-    made = learned.Learned(
-        of.problem.plant, of.problem.window, of.problem.kernel, list(of.problem.family[1:])
-    )
-    told = export.Judged(of.machine, made, of.setting, of.problem, of.weights, result.summary, True)
+    told = export.Judged(of.machine, of.setting, of.problem, of.weights, result.summary, True)
     return told, {name: np.asarray(values) for name, values in result.trajectories.items()}
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from pipeline.papers import files, reproduce_study
+from pipeline.papers.reproduce_study import ReproduceStudy
 from pipeline.store import made, params
 from pipeline.temperature import study
 from pipeline.temperature.published import GAMMA, REFERENCE
 from pipeline.temperature.test_set import tuning
-from pipeline.temperature.workflow.settings import ReproduceStudy
 from tests.house import expected_of_paper
 
 ROOT = Path(__file__).resolve().parents[2]

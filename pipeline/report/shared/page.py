@@ -17,7 +17,7 @@ from pipeline.report.shared.sources import QUICK_LOOK, Source, Sources
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
-from pipeline.temperature.workflow.contestants import CONTESTANTS
+from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 
 GLYPHS = {
     PASSED: "tick",

@@ -33,8 +33,8 @@ from pipeline.setpoint.workflow.tables import (
     WINDOWS,
 )
 from pipeline.store import artifacts
-from pipeline.temperature.workflow import tables as schemas
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature import tables as schemas
+from pipeline.temperature.settings import Plant
 
 Table = dict[str, np.ndarray]
 

@@ -2,7 +2,7 @@
 
 from pipeline.report.shared.digits import THIN
 from pipeline.report.shared.sources import Sources
-from pipeline.temperature.workflow.contestants import CONTESTANTS
+from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 
 INDEX = (
     "verdict",

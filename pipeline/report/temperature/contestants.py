@@ -1,7 +1,7 @@
 """What the pages say of a contestant of the temperature loop, from the table of contestants: heading, kind,
 and how it reads in a sentence. One that the table does not know goes by its own name."""
 
-from pipeline.temperature.workflow.contestants import CONTESTANTS
+from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 
 BY_NAME = {contestant.name: contestant for contestant in CONTESTANTS}
 # shown beside the others, never the best of them

@@ -34,7 +34,7 @@ from pipeline.report.temperature.verdict import (
     rival,
     standings,
 )
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 
 
 class Judgement(NamedTuple):

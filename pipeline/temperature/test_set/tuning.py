@@ -60,7 +60,7 @@ class SearchSettings(NamedTuple):
     exploration: float = 2.0
 
 
-class Result(NamedTuple):
+class SearchResult(NamedTuple):
     """The weights theta (d,) that the search recommends, their cost as it
     was evaluated, and everything that was evaluated."""
 
@@ -393,7 +393,7 @@ def _extended(history: History, theta: np.ndarray, value: float, reason: str) ->
     )
 
 
-def _recommended(search: _Search, history: History, kernel) -> Result:
+def _recommended(search: _Search, history: History, kernel) -> SearchResult:
     """The candidate of least cost; as published the one of least posterior mean (43).
 
     (43) is taken over the candidates: over the whole box the mean is least where no data hold it up (BAAM: F
@@ -411,7 +411,7 @@ def _recommended(search: _Search, history: History, kernel) -> Result:
         points = search.points(history.theta[worked])
         merit = _posterior(_surrogate(points, _standardised(merit), kernel), points)[0]
     best = worked[np.argmin(merit)]
-    return Result(history.theta[best], float(history.cost[best]), history)
+    return SearchResult(history.theta[best], float(history.cost[best]), history)
 
 
 def _checked(
@@ -459,7 +459,7 @@ def minimise(
     rng: np.random.Generator,
     on_step: Callable[[History], None] | None = None,
     start: History | None = None,
-) -> Result:
+) -> SearchResult:
     """The weights of least cost among the candidates evaluated between lower (d,) and upper (d,).
 
     `cost(theta)` takes weights (d,); a ValueError from it, or a number that is not finite, is a failure of
@@ -500,13 +500,13 @@ def minimise(
 
 def polished(
     cost: Callable[[np.ndarray], float],
-    found: Result,
+    found: SearchResult,
     lower: np.ndarray,
     upper: np.ndarray,
     *,
     evaluations: int,
     side: float = 1 / 8,
-) -> Result:
+) -> SearchResult:
     """The best of `found` after a pattern search of so many `evaluations` more (Hooke and Jeeves 1961): one
     log-weight after the other a step up and down, the step first `side` of its range and halved where none of
     them is better.
@@ -530,4 +530,4 @@ def polished(
             point, best = there, value
             left = [way, *(other for other in ways if other is not way)]
     theta = history.theta[np.nanargmin(history.cost)]
-    return Result(theta, best, history)
+    return SearchResult(theta, best, history)
