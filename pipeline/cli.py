@@ -328,8 +328,9 @@ def replay(arguments: argparse.Namespace) -> None:
     from pipeline.commands import replay as replaying
     from pipeline.report.replay import page
 
-    asked = replaying.Asked(replaying.temperatures(arguments.reference), arguments.out)
-    done, made, told = replaying.replay_recording(arguments.controller, arguments.recording, asked)
+    done, made, told = replaying.replay_recording(
+        arguments.controller, arguments.recording, arguments.out, replaying.temperatures(arguments.reference)
+    )
     inputs, outputs = ([one.name for one in side] for side in (made.machine.inputs, made.machine.outputs))
     shown = page.Shown(
         done.time_s, done.applied, done.asked, done.measured, done.reference, done.off, inputs, outputs, told

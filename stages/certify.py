@@ -65,10 +65,8 @@ class Common(NamedTuple):
 def main() -> None:
     with artifacts.stage("certify") as out:
         settings, loops = params.load(Certify, "certify"), params.load(params.Loops, "loops")
-        temperature, setpoint = (
-            {},
-            {"controller": "", "why": NOT_ASKED.format("setpoint"), "largest_difference": {}},
-        )
+        temperature: dict[str, Any] = {}
+        setpoint = {"controller": "", "why": NOT_ASKED.format("setpoint"), "largest_difference": {}}
         if loops.temperature:
             temperature = certify_temperature(out / "temperature", settings)
         if loops.setpoint:

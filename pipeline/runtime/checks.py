@@ -93,11 +93,16 @@ def python_difference(made: Exported, code: str) -> float:
     return float(np.abs(one.u - other.u).max())
 
 
+def find_compiler() -> str | None:
+    """The name of a C compiler of this machine, if it has make too."""
+    return next((name for name in COMPILERS if shutil.which(name) and shutil.which("make")), None)
+
+
 def check_compiled(made: Exported, files: Mapping[str, str]) -> None:
     """Compiles the exported C and plays golden.csv, if this machine has a compiler and make. Raises
     ValueError if it does not compile, or gives other commands."""
-    compiler = next((name for name in COMPILERS if shutil.which(name)), None)
-    if compiler is None or shutil.which("make") is None:
+    compiler = find_compiler()
+    if compiler is None:
         return
     with tempfile.TemporaryDirectory() as folder:
         for name, text in files.items():

@@ -127,7 +127,7 @@ def supervision(
     machine: Machine,
     noise_degC: np.ndarray,
     *,
-    spread: innovations.Spread | None = None,
+    spread: innovations.PlantDeviations | None = None,
     modes: Mapping[str, str] = SAFE,
     back_s: float | None = None,
 ) -> Supervision:
@@ -187,7 +187,7 @@ def _check_s(model: Plant, limits: tuple[np.ndarray, np.ndarray], sample_time_s:
     return np.maximum(10 * takes * sample_time_s, 20.0)
 
 
-def spread_of(model: Plant, family: Sequence[Plant]) -> innovations.Spread:
+def spread_of(model: Plant, family: Sequence[Plant]) -> innovations.PlantDeviations:
     """How far the plants of a family are from the model, a deviation each: gain by the rise over MOST_LATE
     samples of each output's strongest input; no less than what records leave open anyway."""
     lags = innovations.MOST_LATE
@@ -199,7 +199,7 @@ def spread_of(model: Plant, family: Sequence[Plant]) -> innovations.Spread:
         for one in family
     ]
     gain = float(np.sqrt(np.mean(np.square(ratios)))) if ratios else 0.0
-    return innovations.Spread(gain=max(gain, 0.15), pace=0.15, loss=0.003, late=0.7)
+    return innovations.PlantDeviations(gain=max(gain, 0.15), pace=0.15, loss=0.003, late=0.7)
 
 
 class Cause(NamedTuple):

@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.runtime.certificate import EvidenceRecord
 from pipeline.runtime.machine import Exported
-from pipeline.runtime.replay import Log
+from pipeline.runtime.replay import GaplessLog
 from pipeline.temperature.controllers.governor import Limits
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.test_set import panel
@@ -21,7 +21,7 @@ def forecasting_plants(
     return panel.padded(panel.drawn(family, FORECASTING, spread, cells=False, rng=rng))
 
 
-def honest_logs(made: Exported, half: panel.Cases, limits: Limits) -> list[Log]:
+def honest_logs(made: Exported, half: panel.Cases, limits: Limits) -> list[GaplessLog]:
     """Logs of cases of the judging half under the controller as deployed, from the hold on."""
     aims = panel.aims(made.controller.law, panel.rests(made.model, half, limits), half)
     run, noise = panel.rolled_out(made.controller, half, aims), panel.noise_of(half)[: half.hold]
@@ -32,11 +32,11 @@ def honest_logs(made: Exported, half: panel.Cases, limits: Limits) -> list[Log]:
         parts = (still * half.u0[case], run.u[:, case]), (held, run.measured[:, case]), (
             still * run.r[0, case], run.r[:, case],
         )  # fmt: skip
-        logs.append(Log(*(np.concatenate(part) for part in parts)))
+        logs.append(GaplessLog(*(np.concatenate(part) for part in parts)))
     return logs
 
 
-def recorded_logs(record: EvidenceRecord) -> list[Log]:
+def recorded_logs(record: EvidenceRecord) -> list[GaplessLog]:
     """The pieces of the machine's own record, which are on support whatever the plants say."""
     pieces = zip([*record.u, *record.newest_u], [*record.y, *record.newest_y], strict=True)
-    return [Log(u, y, y) for u, y in pieces]
+    return [GaplessLog(u, y, y) for u, y in pieces]
