@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import os
 import re
 import sys
 import zlib
@@ -9,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+ROOT = Path(__file__).absolute().parents[1]
 # for each section of params.yaml and params.expert.yaml the class that knows all its keys
 SECTIONS = {
     "camera": "pipeline.deposition.workflow.settings:Camera",
@@ -38,7 +40,7 @@ SECTIONS = {
 }
 # what a stage writes instead of its results if its loop is switched off
 NOT_ASKED = {"asked": False}
-# beside params.yaml: digests of the files that were checked last, and the loops
+# beside params.yaml: the digest of the files that were checked last, and their loops
 CHECKED = ".dvc/tmp/params_checked.json"
 
 
@@ -82,23 +84,31 @@ def check_parameters(path: str | Path = "params.yaml") -> dict[str, bool]:
 
     Raises ValueError with a line for each problem. Files that were checked once are not checked again.
     """
-    memory = Path(path).parent / CHECKED
-    try:
-        checked = json.loads(memory.read_bytes())
-        if all(_digest(file) == digest for file, digest in checked["files"].items()):
-            return checked["loops"]
-    except (OSError, ValueError, KeyError, AttributeError, TypeError):
-        pass  # no memory, or not a whole one
+    if loops := checked_loops(path):
+        return loops
     from pipeline.store import params
 
     params.check({section: model(section) for section in SECTIONS}, path)
     loops = params.load(params.Loops, "loops", path).model_dump()
-    files = [str(Path(path).absolute()), str(Path(path).with_name(params.EXPERT).absolute())]
-    for name, module in list(sys.modules.items()):
-        if name.partition(".")[0] in ("pipeline", "stages") and module.__file__:
-            files.append(module.__file__)
-    _remember(memory, {"files": {file: _digest(file) for file in files}, "loops": loops})
+    _remember(Path(path).parent / CHECKED, {"digest": _digest(path), "loops": loops})
     return loops
+
+
+def checked_loops(path: str | Path = "params.yaml") -> dict[str, bool]:
+    """Section `loops` of files that have not changed since they were checked; {} of others."""
+    try:
+        checked = json.loads((Path(path).parent / CHECKED).read_bytes())
+        return checked["loops"] if checked["digest"] == _digest(path) else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}  # no memory, or not a whole one
+
+
+def _digest(path: str | Path) -> int:
+    """Of both files, and of the code that checks them."""
+    modules = sorted({module.partition(":")[0] for module in SECTIONS.values()})
+    code = [Path(__file__), *(ROOT / f"{module.replace('.', '/')}.py" for module in modules)]
+    files = [Path(path), Path(path).with_name("params.expert.yaml"), *code]
+    return zlib.crc32(b"\0".join(file.read_bytes() for file in files))
 
 
 def model(section: str) -> Any:
@@ -107,14 +117,8 @@ def model(section: str) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
-def _digest(file: str) -> int:
-    return zlib.crc32(Path(file).read_bytes())
-
-
 def _remember(memory: Path, checked: dict[str, Any]) -> None:
     """Keeps what was checked, if this is a project of DVC that can be written."""
-    import os
-
     beside = memory.with_name(f".{memory.name}.{os.getpid()}")
     try:
         if memory.parents[1].is_dir():

@@ -89,7 +89,7 @@ def _noisy(settings: ReproduceStudy, execution: Execution) -> dict[str, list]:
     return study.rows(work, list(results))
 
 
-def _parity(settings: ReproduceStudy) -> tuning.Result:
+def _parity(settings: ReproduceStudy) -> tuning.SearchResult:
     low, high = (
         np.repeat(ends, (study.OUTPUTS, study.INPUTS))
         for ends in ((settings.q_low, settings.r_low), (settings.q_high, settings.r_high))

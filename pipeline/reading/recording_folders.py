@@ -28,7 +28,7 @@ from pipeline.store.tables import Schema
 
 CODE = Path(__file__).parents[1]
 # what decides what an entry of the memo holds: changed code reads everything again
-READING = ("store/*.py", "reading/*.py")
+READING = ("store/artifacts.py", "store/params.py", "store/tables.py", "reading/*.py")
 
 
 class RecordingWish(NamedTuple):

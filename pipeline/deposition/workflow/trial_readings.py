@@ -29,7 +29,7 @@ HERE = Path(__file__).resolve().parents[2]
 CODE = (
     "deposition/workflow/trial_readings.py", "deposition/workflow/trial_files.py",
     "deposition/bead.py", "deposition/edges.py", "deposition/line.py", "deposition/latency.py",
-    "store/mcap_frames.py", "reading/image_messages.py", "reading/image_topics.py",
+    "reading/mcap_frames.py", "reading/image_messages.py", "reading/image_topics.py",
 )  # fmt: skip
 READINGS = Schema(
     "trial_readings",

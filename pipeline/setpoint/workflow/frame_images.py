@@ -24,7 +24,7 @@ HERE = Path(__file__).parents[2]
 CODE = (
     "setpoint/workflow/frame_images.py", "setpoint/workflow/frame_mcap.py", "setpoint/key_area.py",
     "setpoint/travel.py", "setpoint/familiar.py",
-    "store/mcap_frames.py",
+    "reading/mcap_frames.py",
     "reading/image_messages.py", "reading/image_topics.py",
 )  # fmt: skip
 DIGEST_BYTES = 16

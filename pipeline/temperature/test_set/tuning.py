@@ -80,11 +80,12 @@ def fitness(
     x0: np.ndarray,
     k=0.0,
 ) -> float:
-    """F = sum_{t=0..l} gamma^t (|y(t) - r|^2 + |u(t)|^2) of u = -K_x x -
-    K_r r - k with the state known and r constant (37).
+    """F = sum_{t=0..l} gamma^t (|y(t) - r|^2 + |u(t)|^2)
 
-    K_x (m, n), K_r (m, p), k (m,), reference r (p,) in °C, x0 (n,), steps = l >= 0: l + 1 terms. With z = [x;
-    1] the loop is z(t+1) = M z(t), so that all z come from log2(l) products, Z <- [Z, M^i Z]. Raises
+    of u = -K_x x - K_r r - k with the state known and r constant (37).
+
+    K_x (m, n), K_r (m, p), k (m,), reference r (p,) in °C, x0 (n,), steps = l >= 0: l + 1 terms. With
+    z = [x; 1] the loop is z(t+1) = M z(t), so that all z come from log2(l) products, Z <- [Z, M^i Z]. Raises
     ValueError where the closed loop is unstable.
     """
     A_cl = plant.A - plant.B @ K_x
@@ -106,8 +107,10 @@ def fitness(
 
 
 class _Surrogate(NamedTuple):
-    """A Gaussian process and its data: k(x, x') = variance kappa(s), s = sum_j ((x_j -
-    x'_j) / length_j)^2; kappa(s) -> kappa, kappa'."""
+    """A Gaussian process and its data; kappa(s) -> kappa, kappa'.
+
+    k(x, x') = variance kappa(s)
+    s = sum_j ((x_j - x'_j) / length_j)^2"""
 
     points: np.ndarray  # (k, d)
     weights: np.ndarray  # (k,)  K^-1 y
@@ -209,8 +212,9 @@ def _log_improvement(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _expected_improvement(mean, std, *, best: float):
-    """a = -log E[max(best - f, 0)] = -log(std h(z)), z = (best - mean) / std; the
-    logarithm keeps a slope where the improvement is flat."""
+    """a = -log E[max(best - f, 0)] = -log(std h(z)), z = (best - mean) / std
+
+    The logarithm keeps a slope where the improvement is flat."""
     z = (best - mean) / std
     log_h, ratio = _log_improvement(z)
     return -(np.log(std) + log_h), ratio / std, (ratio * z - 1) / std
@@ -396,8 +400,8 @@ def _extended(history: History, theta: np.ndarray, value: float, reason: str) ->
 def _recommended(search: _Search, history: History, kernel) -> SearchResult:
     """The candidate of least cost; as published the one of least posterior mean (43).
 
-    (43) is taken over the candidates: over the whole box the mean is least where no data hold it up (BAAM: F
-    = 155,000-208,000 there, 153,000-154,000 so).
+    (43) is taken over the candidates: over the whole box the mean is least where no data hold it up
+    (BAAM: F = 155,000-208,000 there, 153,000-154,000 so).
     """
     worked = np.flatnonzero(np.isfinite(history.cost))
     if not worked.size:
