@@ -25,7 +25,7 @@ from pipeline.report.temperature import page as temperature_page
 from pipeline.report.temperature.judgement import Judgement, judgement, shown
 from pipeline.report.viewer import page as viewer_page
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.settings import ReportRules
 
 # what the pages show of each stage: its figures, and its folder of tables

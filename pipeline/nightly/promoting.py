@@ -18,7 +18,7 @@ from pipeline.report.nightly.production import Champion, ChampionMetrics, Champi
 from pipeline.report.nightly.record import CANDIDATE, KEPT, LoopDecision, Night
 from pipeline.report.shared.sources import Declared, Sources, collect
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.night import verdicts as verdicts_of_night
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import PASSED, Verdict

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import Missing
 

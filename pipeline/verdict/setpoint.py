@@ -14,6 +14,7 @@ from pipeline.verdict.digits import THIN, band, count, number, quantity
 from pipeline.verdict.evidence import Evidence, lookup
 from pipeline.verdict.rules import Reading, Row, at_path, judge, rows
 from pipeline.verdict.verdict import (
+    CERTIFICATE,
     FAILED,
     OPEN,
     PASSED,
@@ -459,7 +460,7 @@ def verdict(evidence: Evidence) -> Verdict:
     asked = _asked(lines, scores)
     if refusal:
         gap = Missing(UNDECIDED, refusal)
-        asked.append(Rule("certificate", None, gap, text="refused", limit="passed", reason=refusal))
+        asked.append(Rule(CERTIFICATE, None, gap, text="refused", limit="passed", reason=refusal))
     name = named(scores, scores.default)
     ended, first = (
         overall([rule.state for rule in asked if _binding(rule)]),

@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.deposition.workflow import train_ilc
-from pipeline.reading import excluded
-from pipeline.temperature.workflow import ingest
+from pipeline.reading import excluded, recording_folders
 from tests import nozzle_folders
 from tests.temperature.test_ingest import BUDGET, INLINE, JOB, folder
 
@@ -42,7 +41,7 @@ def test_temperatures_are_ingested_without_an_excluded_recording_until_it_is_men
     raw = folder(tmp_path, 3)
 
     def read() -> list[str]:
-        results = ingest.process(raw, JOB, INLINE, memo=tmp_path / "memo", budget=BUDGET)
+        results = recording_folders.read_folder(raw, JOB, INLINE, memo=tmp_path / "memo", budget=BUDGET)
         assert not [result.reason for result in results if result.reason]
         return [result.name for result in results]
 

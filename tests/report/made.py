@@ -17,8 +17,8 @@ from pipeline.deposition.workflow.tables import (
     TRIALS,
 )
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import tables
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Plant
 from tests.report import made_certificate, made_setpoint
 
 ROOT = Path(__file__).resolve().parents[2]

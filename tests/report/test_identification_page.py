@@ -11,8 +11,8 @@ import yaml
 from pipeline.report.identification.page import since
 from pipeline.report.shared import charts
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import tables
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.verdict import Figure
 from tests.report import made
 from tests.report.made import main

@@ -30,8 +30,8 @@ from pipeline.setpoint.workflow.tables import (
     WINDOWS,
 )
 from pipeline.store import artifacts
-from pipeline.temperature.workflow import tables as schemas
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature import tables as schemas
+from pipeline.temperature.settings import Plant
 from pipeline.verdict import night
 from pipeline.verdict.evidence import OFF, Evidence, Table, switched_off
 from pipeline.verdict.files import QUICK_LOOK

@@ -1,9 +1,10 @@
-"""The setpoint loop's part of export_controllers: its classifier and what decides there, written for a
-machine without jax."""
+"""The setpoint loop's classifier and the controller that decides there, written for a machine without jax,
+and how far the exported readers are from the networks."""
 
 import importlib.util
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,6 @@ import numpy as np
 
 from pipeline.runtime.export import setpoint
 from pipeline.runtime.export.setpoint import BeliefAgent, Decider
-from pipeline.runtime.workflow.export_controllers import Written, hashes
 from pipeline.setpoint.agents.bayes import Filter
 from pipeline.setpoint.agents.belief_agent import belief_encoder
 from pipeline.setpoint.published import FLOW_MOVES
@@ -30,7 +30,7 @@ WHY = (
 
 
 def decider(name: str, specs: dict[str, ControllerSpec], agents: Agents) -> Decider | None:
-    """What the controller that is the default decides by; None where it has no filter."""
+    """What the default controller decides by; None if it has no filter."""
     if name == BELIEF:
         return BeliefAgent(agents.belief, agents.belief_dqn)
     parameters = specs[name].parameters if name in specs else None
@@ -39,15 +39,17 @@ def decider(name: str, specs: dict[str, ControllerSpec], agents: Agents) -> Deci
 
 def write(
     folder: Path, name: str, model: CalibratedClassifier, decides: Decider | None, seed: int
-) -> Written:
-    """The files of setpoint.write, and how far the readers are from the networks."""
+) -> dict[str, Any]:
+    """Writes the files of setpoint.write. Returns why there is no certificate, and how far the readers are
+    from the networks."""
     if decides is None:
-        return Written(name, None, f"{name} has no filter whose tables could be exported.", {}, {}, "1")
+        why = f"{name} has no filter whose tables could be exported."
+        return {"controller": name, "why": why, "largest_difference": {}}
     setpoint.write(folder, setpoint.weights(model, decides))
     difference = {"log_flow": of_reader(folder, model, np.random.default_rng(seed))}
     if isinstance(decides, BeliefAgent):
         difference["values"] = of_agent(folder, decides, np.random.default_rng(seed))
-    return Written(name, None, WHY, hashes(folder), difference, "1")
+    return {"controller": name, "why": WHY, "largest_difference": difference}
 
 
 def of_reader(folder: Path, model: CalibratedClassifier, rng: np.random.Generator) -> float:

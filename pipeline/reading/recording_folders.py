@@ -1,12 +1,11 @@
-"""What ingest does: it makes one record of a folder of recordings. It decides which files are read, which
-were read before and which are broken; `pipeline.reading` reads, resamples and flags a file.
+"""A folder of recordings -> the table of each: which files are read, which were read before and which are
+broken.
 
-The memo is content-addressed. The hash of the recording, of the parameters and of the code that reads names
-the entry, so that one more recording costs one reading. An entry counts where its files have the digests that
-were written last; otherwise the recording is read again.
-"""
+The memo is content-addressed. The hash of the recording, of the wish and of the code that reads names the
+entry, so that one more recording costs one reading. An entry counts if its files have the digests that were
+written last; otherwise the recording is read again."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,74 +18,38 @@ from pipeline.reading.isolated import Budget, isolated
 from pipeline.reading.klipper_logs import printer_heaters
 from pipeline.reading.plain_files import check_plain_files
 from pipeline.reading.quality import flag
-from pipeline.reading.recordings import Source, Table, nearest_names, read
+from pipeline.reading.recordings import Source, Table, read
 from pipeline.reading.resampling import resample
 from pipeline.reading.signatures import is_bag
 from pipeline.store import artifacts
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
-from pipeline.temperature.workflow import tables
-from pipeline.temperature.workflow.settings import Ingest, Plant
+from pipeline.store.tables import Schema
 
-CODE = Path(__file__).parents[2]
+CODE = Path(__file__).parents[1]
 # what decides what an entry of the memo holds: changed code reads everything again
-READING = (
-    "store/artifacts.py",
-    "reading/csv_rows.py",
-    "store/params.py",
-    "store/tables.py",
-    "temperature/workflow/ingest.py",
-    "temperature/workflow/tables.py",
-    "reading/*.py",
-)
+READING = ("store/artifacts.py", "store/params.py", "store/tables.py", "reading/*.py")
 
 
-class IngestSpec(NamedTuple):
-    """What to take from every recording: the machine's signals, mapping {signal: (source, unit, scale,
-    offset)} (empty: our own names), the clock, the gap limit, the decimal mark of text ("": found)."""
+class RecordingWish(NamedTuple):
+    """What to take from every recording: the sources of all signals, which of them are inputs and within
+    which limits, the sample time, the clock, the gap limit, the decimal mark of text ("": found), and the
+    schemas of the record and of its findings."""
 
-    machine: Plant
-    mapping: dict[str, tuple[str, str, float, float]]
+    sources: tuple[Source, ...]
+    limits: dict[str, tuple[float, float]]
+    held: tuple[str, ...]  # inputs and disturbances: between two samples they keep their value
+    sample_time_s: float
     time: str
     max_gap_s: float
-    decimal: str = ""
-
-    def sources(self) -> list[Source]:
-        signals = [*self.machine.acting, *self.machine.outputs]
-        unknown = sorted(set(self.mapping) - {signal.name for signal in signals})
-        if unknown:
-            raise ValueError(
-                f"params.yaml: ingest.mapping.{unknown[0]} is no signal of the plant; "
-                f"{nearest_names(unknown[0], [s.name for s in signals])}"
-            )
-        sources = []
-        for signal in signals:
-            source, unit, scale, offset = self.mapping.get(signal.name, (signal.name, signal.unit, 1.0, 0.0))
-            if unit != signal.unit:
-                raise ValueError(
-                    f"params.yaml: ingest.mapping.{signal.name}.unit is {unit} but the plant's {signal.name} "
-                    f"is in {signal.unit}; "
-                    f"convert with scale and offset, and write unit: {signal.unit}"
-                )
-            sources.append(Source(signal.name, source, unit, scale, offset))
-        return sources
+    decimal: str
+    record: Schema
+    quality: Schema
 
 
-def spec_of(settings: Ingest, machine: Plant, source: str) -> IngestSpec:
-    """What section `ingest` asks for; what probe_machine wrote has our own names."""
-    mapping = settings.mapping if source == "recordings" else {}
-    return IngestSpec(
-        machine,
-        {name: (m.source, m.unit, m.scale, m.offset) for name, m in mapping.items()},
-        settings.time,
-        settings.max_gap_s,
-        settings.decimal,
-    )
-
-
-class Result(NamedTuple):
-    """One recording's share of the record and of its findings; `reason` is
-    why it was quarantined, empty where it was not."""
+class RecordingTable(NamedTuple):
+    """One recording's share of the record and of its findings; `reason` is why it was quarantined, "" if it
+    was not."""
 
     name: str
     record: dict[str, np.ndarray]
@@ -95,17 +58,11 @@ class Result(NamedTuple):
     reused: bool
 
 
-class Columns(NamedTuple):
-    schema: tables.Schema
-    columns: dict[str, np.ndarray]
-
-
-def process(
-    folder: Path, spec: IngestSpec, execution: Execution, *, memo: Path, budget: Budget
-) -> list[Result]:
-    """Every recording below `folder`, in the order of names, on as many workers as
-    `execution` says. A recording that needs more than its budget is quarantined. Raises
-    ValueError where there is none."""
+def read_folder(
+    folder: Path, wish: RecordingWish, execution: Execution, *, memo: Path, budget: Budget
+) -> list[RecordingTable]:
+    """Every recording below `folder`, in the order of names, on as many workers as `execution` says. A
+    recording that needs more than its budget is quarantined. Raises ValueError if there is none."""
     check_plain_files(folder)
     bags = {path.parent for path in folder.rglob("metadata.yaml") if is_bag(path.parent)} - {folder}
     files = sorted(
@@ -122,39 +79,30 @@ def process(
             f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none; copy one there, "
             "or set generate_probing.source: simulated"
         )
-    spec.sources()
     code = "".join(artifacts.sha256(path) for pattern in READING for path in sorted(CODE.glob(pattern)))
     hashes = [artifacts.sha256(path) for path in files]
     names = [_utf8(path.relative_to(folder).as_posix()) for path in files]
-    keys = [
-        joblib.hash((content, name, spec.machine.model_dump(), spec[1:], code))
-        for content, name in zip(hashes, names, strict=True)
-    ]
-    twice = _twice(files, hashes) | _without_text(files)
+    keys = [joblib.hash((content, name, wish, code)) for content, name in zip(hashes, names, strict=True)]
+    left_out = _copies(files, hashes) | _without_text(files)
     remembered = [
-        None if path in twice else _remembered(memo, key, spec.machine)
+        None if path in left_out else _remembered(memo, key, wish)
         for path, key in zip(files, keys, strict=True)
     ]
     todo = [
         (path, key)
         for path, key, entry in zip(files, keys, remembered, strict=True)
-        if entry is None and path not in twice
+        if entry is None and path not in left_out
     ]
-    reasons = twice | dict(
-        zip([path for path, _ in todo], _run(todo, folder, spec, execution, (memo, budget)), strict=True)
+    reasons = left_out | dict(
+        zip([path for path, _ in todo], _run(todo, folder, wish, execution, (memo, budget)), strict=True)
     )
     return [
-        _result(
-            name,
-            entry or _remembered(memo, key, spec.machine),
-            _utf8(reasons.get(path, "")),
-            entry is not None,
-        )
+        _result(name, entry or _remembered(memo, key, wish), _utf8(reasons.get(path, "")), entry is not None)
         for path, name, key, entry in zip(files, names, keys, remembered, strict=True)
     ]
 
 
-def _twice(files: Sequence[Path], hashes: Sequence[str]) -> dict[Path, str]:
+def _copies(files: Sequence[Path], hashes: Sequence[str]) -> dict[Path, str]:
     """Why a file is left out that is a copy of another: what is learned from twice is
     trusted twice, and judged by what it was learned from."""
     first: dict[str, Path] = {}
@@ -184,7 +132,7 @@ def _utf8(name: str) -> str:
 def _run(
     todo: Sequence[tuple[Path, str]],
     folder: Path,
-    spec: IngestSpec,
+    wish: RecordingWish,
     execution: Execution,
     where: tuple[Path, Budget],
 ) -> list[str]:
@@ -192,7 +140,7 @@ def _run(
     system under absolute paths. On one machine threads wait for children that do the work."""
     memo, budget = where
     calls = [
-        joblib.delayed(_within)(budget, path.resolve(), path, folder, key, spec, memo.resolve())
+        joblib.delayed(_within)(budget, path.resolve(), path, folder, key, wish, memo.resolve())
         for path, key in todo
     ]
     if execution.backend == "loky":
@@ -208,25 +156,21 @@ def _within(budget: Budget, path: Path, shown: Path, *arguments) -> str:
         return str(reason)
 
 
-def _one(path: Path, shown: Path, folder: Path, key: str, spec: IngestSpec, memo: Path) -> str:
+def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, memo: Path) -> str:
     """Read, resample and flag one recording into the memo, under the path that is
     `shown`; the reason why it cannot be, or an empty text."""
     name = shown.relative_to(folder).as_posix()
-    inputs, outputs = [s.name for s in spec.machine.acting], [s.name for s in spec.machine.outputs]
-    units, limits = (
-        {s.name: s.unit for s in [*spec.machine.acting, *spec.machine.outputs]},
-        {s.name: (s.low, s.high) for s in spec.machine.inputs},
-    )
+    units = {source.signal: source.unit for source in wish.sources}
     try:
-        raw = read(path, spec.sources(), time=spec.time, decimal=spec.decimal)
+        raw = read(path, wish.sources, time=wish.time, decimal=wish.decimal)
         table = resample(
             raw,
-            sample_time_s=spec.machine.sample_time_s,
-            inputs=inputs,
-            outputs=outputs,
-            max_gap_s=spec.max_gap_s,
+            sample_time_s=wish.sample_time_s,
+            inputs=list(wish.held),
+            outputs=[name for name in units if name not in wish.held],
+            max_gap_s=wish.max_gap_s,
         )
-        table = flag(table, units=units, limits=limits)
+        table = flag(table, units=units, limits=wish.limits)
         for flagged in table.flags:
             if flagged.kind == "mixed" and table.masked[flagged.signal].mean() > 0.5:
                 raise ValueError(f"{path}: {flagged.message}")
@@ -250,12 +194,8 @@ def _one(path: Path, shown: Path, folder: Path, key: str, spec: IngestSpec, memo
         "count": counts,
         "message": messages,
     }
-    artifacts.write_table(
-        memo / f"{key}.record.parquet",
-        tables.record(spec.machine.acting, spec.machine.outputs),
-        _columns(name, table),
-    )
-    artifacts.write_table(memo / f"{key}.quality.parquet", tables.QUALITY, quality)
+    artifacts.write_table(memo / f"{key}.record.parquet", wish.record, _columns(name, table))
+    artifacts.write_table(memo / f"{key}.quality.parquet", wish.quality, quality)
     artifacts.write_json(memo / f"{key}.json", _digests(memo, key))
     return ""
 
@@ -265,17 +205,15 @@ def _digests(memo: Path, key: str) -> dict[str, str]:
 
 
 def _remembered(
-    memo: Path, key: str, machine: Plant
+    memo: Path, key: str, wish: RecordingWish
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]] | None:
     """Record and quality of an entry whose digests, written last, are those of its files;
     None where it is absent, half written or damaged."""
     try:
         if artifacts.read_json(memo / f"{key}.json") != _digests(memo, key):
             return None
-        record = artifacts.read_table(
-            memo / f"{key}.record.parquet", tables.record(machine.acting, machine.outputs)
-        )
-        return record, artifacts.read_table(memo / f"{key}.quality.parquet", tables.QUALITY)
+        record = artifacts.read_table(memo / f"{key}.record.parquet", wish.record)
+        return record, artifacts.read_table(memo / f"{key}.quality.parquet", wish.quality)
     except (OSError, ValueError):
         return None
 
@@ -287,21 +225,23 @@ def _columns(name: str, table: Table) -> dict[str, np.ndarray | list[str]]:
     return columns
 
 
-def _result(name: str, entry: tuple[dict, dict] | None, reason: str, reused: bool) -> Result:
+def _result(name: str, entry: tuple[dict, dict] | None, reason: str, reused: bool) -> RecordingTable:
     if reason:
-        return Result(name, {}, {}, reason, False)
+        return RecordingTable(name, {}, {}, reason, False)
     if entry is None:
         raise ValueError(
             f"{name} was read by a worker but its entry is not in datasets/memo/ingest; "
             "let the workers share this folder, "
             "or set execution.backend: loky"
         )
-    return Result(name, *entry, "", reused)
+    return RecordingTable(name, *entry, "", reused)
 
 
-def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple[Columns, Columns, dict]:
-    """One record and one table of findings in the order of names, and the metrics. Raises ValueError where no
-    recording is left, or `strict` and one is broken."""
+def join(
+    results: Sequence[RecordingTable], wish: RecordingWish, *, strict: bool
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict]:
+    """The columns of one record and of one table of findings, in the order of names, and figures. Raises
+    ValueError if no recording is left, or if `strict` and one is broken."""
     broken = [result for result in results if result.reason]
     if broken and (strict or len(broken) == len(results)):
         raise ValueError(
@@ -309,14 +249,13 @@ def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple
             + (f" ({len(broken)} of {len(results)} recordings are broken)" if len(results) > 1 else "")
         )
     good = [result for result in results if not result.reason]
-    schema = tables.record(machine.acting, machine.outputs)
     record = {
         column.name: np.concatenate([result.record[column.name] for result in good])
-        for column in schema.columns
+        for column in wish.record.columns
     }
     quality = {
         column.name: np.concatenate([result.quality[column.name] for result in good])
-        for column in tables.QUALITY.columns
+        for column in wish.quality.columns
     }
     for result in broken:
         row = {
@@ -335,17 +274,17 @@ def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple
     for signal, kind, count in zip(quality["signal"], quality["kind"], quality["count"], strict=True):
         of = counts.setdefault(str(signal) or "recording", {})
         of[str(kind)] = of.get(str(kind), 0) + int(count)
-    metrics = {
+    figures = {
         "recordings": len(results),
         "quarantined": len(broken),
         "samples": len(record["time_s"]),
         "segments": int(_segments(record)),
         "findings": counts,
     }
-    return Columns(schema, record), Columns(tables.QUALITY, quality), metrics
+    return record, quality, figures
 
 
-def work_done(results: Sequence[Result]) -> dict[str, int]:
+def count_work(results: Sequence[RecordingTable]) -> dict[str, int]:
     """How many recordings were processed and how many the memo gave: of this run alone, so no metric."""
     return {
         "processed": sum(not r.reused and not r.reason for r in results),
@@ -353,11 +292,12 @@ def work_done(results: Sequence[Result]) -> dict[str, int]:
     }
 
 
-def printer_pids(folder: Path, results: Sequence[Result], spec: IngestSpec) -> dict[str, list[dict]]:
-    """{"heaters": [...]}: by which PID a printer held the heaters whose duty and temperature are signals of
-    ours, in our units; {} where no good recording is a klippy.log. The last log's values count."""
-    inputs = {signal.name for signal in spec.machine.inputs}
-    of = {source.source: source for source in spec.sources()}
+def printer_pids(
+    folder: Path, results: Sequence[RecordingTable], sources: Sequence[Source], inputs: Collection[str]
+) -> dict[str, list[dict]]:
+    """{"heaters": [...]}: the PIDs by which a printer held the heaters whose duty and temperature are signals
+    of ours, in our units; {} if no good recording is a klippy.log. The last log's values count."""
+    of = {source.source: source for source in sources}
     pids: dict[str, dict] = {}
     logs = [r.name for r in results if not r.reason and file_format(folder / r.name) == "klippy.log"]
     for name in logs:

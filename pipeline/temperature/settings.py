@@ -1,5 +1,5 @@
-"""Sections of the params files that the temperature loop's stages read: the machine, what
-controllers share, the panel, and a section a stage."""
+"""Sections of the params files that several stages of the temperature loop read. A section of one stage
+stands in the file of that stage."""
 
 import re
 from typing import Annotated, Literal
@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import pydantic
 from pydantic import AfterValidator, Field
 
-from pipeline.store.params import Mapped, Section
+from pipeline.store.params import Section
 
 _TABLE_COLUMNS = ("recording", "segment", "time_s")
 
@@ -23,14 +23,14 @@ def _signal_name(name: str) -> str:
     return name
 
 
-class Signal(Section):
+class PlantSignal(Section):
     """A signal of the machine; figures label their axes with its name and unit."""
 
     name: Annotated[str, AfterValidator(_signal_name)]
     unit: str = Field(min_length=1, max_length=20)
 
 
-class Input(Signal):
+class Input(PlantSignal):
     """A heater or the motor; low and high are the limits of what the machine can give, in percent, and
     rate_percent_per_s how fast it may change; none: as fast as it is asked. `heats`: no output can fall for
     good when it is raised."""
@@ -47,7 +47,7 @@ class Input(Signal):
         return self
 
 
-class Output(Signal):
+class Output(PlantSignal):
     """A barrel temperature, the reference that it should settle at, and between which temperatures the
     machine must stay, in °C; a simulated machine needs no limits."""
 
@@ -72,7 +72,7 @@ class Plant(Section):
     act on the outputs and that no controller moves: fan, feed, a sensor of the room."""
 
     inputs: list[Input] = Field(min_length=1, max_length=32)
-    disturbances: list[Signal] = Field(default=[], max_length=16)
+    disturbances: list[PlantSignal] = Field(default=[], max_length=16)
     outputs: list[Output] = Field(min_length=1, max_length=32)
     sample_time_s: float = Field(gt=0, le=3600)
 
@@ -87,7 +87,7 @@ class Plant(Section):
         return self
 
     @property
-    def acting(self) -> list[Signal]:
+    def acting(self) -> list[PlantSignal]:
         """What acts on the outputs: inputs, then disturbances."""
         return [*self.inputs, *self.disturbances]
 
@@ -169,7 +169,7 @@ class Panel(Section):
         return self
 
 
-# ---- a section a stage
+# ---- sections of more than one stage
 
 
 class GenerateProbing(Section):
@@ -195,40 +195,19 @@ class GenerateProbing(Section):
     doubt_delay_steps: int = Field(ge=0, le=1000)
 
 
-class Ingest(Section):
-    """Section `ingest`."""
-
-    mapping: dict[str, Mapped]
-    time: str = Field(max_length=300)
-    decimal: Literal["", ".", ","]
-    max_gap_s: float = Field(gt=0, le=86400)
-    longest_s: float = Field(ge=1, le=86400)
-    largest_mb: int = Field(ge=100, le=1_000_000)
-    strict: bool
-
-
-class IdentifyPlant(Section):
-    """Section `identify_plant`."""
-
-    seed: int = Field(ge=0, le=2**31)
-    order: int = Field(ge=0, le=60)
-    max_order: int = Field(ge=1, le=60)
-    offset: bool
-    feedthrough: Literal["chosen", "none"]
-    refinement: Literal["none", "prediction", "simulation", "validated"]
-    holdout_share: float = Field(gt=0, lt=0.9)
-    ahead_steps: int = Field(ge=1, le=10_000)
-    spread_plants: int = Field(ge=20, le=1000)
-
-
-class LearnKernel(Section):
-    """Section `learn_kernel`."""
-
-    longest_window: int = Field(ge=1, le=200)
-    largest_kernel_window: int = Field(ge=1, le=10)
-    offset: bool
-    gain_spread: float = Field(ge=0, le=1)
-    allowed_gap_percent: float = Field(gt=0, le=100)
+def given_centre(settings: GenerateProbing, machine: Plant) -> list[float] | None:
+    """The operating point (m,) that the user gives, one number for all inputs or one each; None if it is left
+    to the model."""
+    given, count = settings.centre_percent, len(machine.inputs)
+    if given is None:
+        return None
+    values = [float(value) for value in (given if isinstance(given, list) else [given])]
+    if len(values) not in (1, count):
+        raise ValueError(
+            f"generate_probing.centre_percent has {len(values)} values, but plant has {count} "
+            "inputs; give one for each, or one number for all"
+        )
+    return values if len(values) == count else values * count
 
 
 class TuneWeights(Section):
@@ -247,14 +226,6 @@ class TuneWeights(Section):
     least_delay_margin_s: float = Field(ge=0, le=1e6)
 
 
-class EvaluateTemperature(Section):
-    """Section `evaluate_temperature`: the seed of its tests, and how often the plants are resampled for a
-    band."""
-
-    seed: int = Field(ge=0, le=2**31)
-    resamples: int = Field(ge=20, le=100_000)
-
-
 class TemperatureRules(Section, extra="ignore"):
     """Of section `report` what a rehearsal of the temperature loop is held against; settling_s null: as
     panel.settling_s says on the study's machine, as the record says on another."""
@@ -265,17 +236,3 @@ class TemperatureRules(Section, extra="ignore"):
     at_limits_percent: float = Field(gt=0, le=100)
     disk_margin: float = Field(gt=0, le=2)
     delay_margin_s: float = Field(gt=0, le=1e6)
-
-
-class ReproduceStudy(Section):
-    """Section `reproduce_study`: the study's own part; the bounds are those of its search for Q and R."""
-
-    seed: int = Field(ge=0, le=2**31)
-    data_sets: int = Field(ge=1, le=1000)
-    initial: int = Field(ge=4, le=5000)
-    evaluations: int = Field(ge=8, le=5000)
-    acquisition: Literal["expected_improvement", "upper_confidence_bound"]
-    q_low: float = Field(gt=0, le=1e6)
-    q_high: float = Field(gt=0, le=1e6)
-    r_low: float = Field(gt=0, le=1e6)
-    r_high: float = Field(gt=0, le=1e6)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.workflow.settings import Plant, check_output_limits
+from pipeline.temperature.settings import Plant, check_output_limits
 
 # of an input's range, one level after another: small enough to watch, down again so that cooling is seen too
 LEVELS = (0.05, 0.10, 0.15, 0.20, 0.10)

@@ -1,19 +1,17 @@
-"""What a rehearsal asks, on whose plants: the declared panel on the study's machine; on somebody's records
-what follows from them by stated defaults (scenario_defaults.py)."""
+"""The cases on which controllers are tuned and compared: the declared panel on the study's machine; on
+somebody's records what follows from them by stated defaults (scenario_defaults.py)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pipeline.temperature import plant, tracking
 from pipeline.temperature.controllers import controller, governor
-from pipeline.temperature.identification import model_choice as identification
+from pipeline.temperature.controllers.problem import Design, DesignProblem
+from pipeline.temperature.settings import Half, Panel, Tracking, TuneWeights
+from pipeline.temperature.settings import Plant as Machine
 from pipeline.temperature.test_set import panel, scenario_defaults
-from pipeline.temperature.workflow import record
-from pipeline.temperature.workflow.contestants import Design
-from pipeline.temperature.workflow.settings import Half, Panel, Tracking, TuneWeights
-from pipeline.temperature.workflow.settings import Plant as Machine
 
 
 class Rehearsal(NamedTuple):
@@ -30,8 +28,8 @@ class Rehearsal(NamedTuple):
     source: str
 
 
-class Setting(NamedTuple):
-    """What all contestants share, tuned and judged: the rehearsal, the identified plant with all inputs a
+class CaseConditions(NamedTuple):
+    """What all controllers share, tuned and judged: the rehearsal, the identified plant with all inputs a
     sample late, limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in
     °C, the settled window in steps, what the cost counts as one, the discount, the sample time, and the share
     of the declared delay margins that is asked here (`faster`)."""
@@ -55,14 +53,14 @@ def faster(settings: Panel, rehearsal: Rehearsal) -> float:
     return min((rehearsal.settling_s or settings.settling_s) / settings.settling_s, 1.0)
 
 
-def shared(
+def conditions(
     tuning: TuneWeights,
     machine: Machine,
     tracking: Tracking,
     settings: Panel,
     rehearsal: Rehearsal,
     family: Sequence[plant.Plant],
-) -> Setting:
+) -> CaseConditions:
     """`family`: the identified plant first, then its spread."""
     band = rehearsal.band_degC / settings.band_degC
     late = (rehearsal.settling_s or settings.settling_s) / settings.settling_s
@@ -77,7 +75,7 @@ def shared(
     )
     # nearer to a reference than its noise no forecast can tell an overshoot
     overshoot = max(tracking.governor_overshoot_degC * band, 3 * float(rehearsal.noise.max()))
-    return Setting(
+    return CaseConditions(
         rehearsal,
         panel.delayed(family[0], late=True),
         input_limits(machine),
@@ -92,8 +90,24 @@ def shared(
     )
 
 
-def as_deployed(design: Design, setting: Setting) -> controller.Deployed:
-    """A contestant with what all of them run under."""
+def design_problem(
+    models: Mapping[str, Any], tracking: Tracking, setting: CaseConditions, truth: plant.Plant | None
+) -> DesignProblem:
+    """What controllers are designed from: the same for tuning and for judging, whatever the length of their
+    cases. `models` has plant, family, window, kernel and printer_pid."""
+    return DesignProblem(
+        **models,
+        truth=truth,
+        limits=setting.limits,
+        gamma=tracking.gamma,
+        exact_tau=tracking.observer_tau,
+        horizon=setting.rehearsal.judging.steps,
+        noise=setting.rehearsal.noise,
+    )
+
+
+def deploy(design: Design, setting: CaseConditions) -> controller.Deployed:
+    """A controller with what all of them run under."""
     return controller.deployed(
         design.law,
         setting.limits,
@@ -103,15 +117,15 @@ def as_deployed(design: Design, setting: Setting) -> controller.Deployed:
     )
 
 
-def played(
-    design: Design, rests: Sequence[controller.Rest], asked: panel.Cases, setting: Setting
+def play(
+    design: Design, rests: Sequence[controller.Rest], half: panel.Cases, setting: CaseConditions
 ) -> tuple[panel.Rollout, panel.Figures]:
-    """A contestant over one half of the panel, as deployed; `rests` from panel.rests of its model."""
-    rollout = panel.rolled_out(as_deployed(design, setting), asked, panel.aims(design.law, rests, asked))
+    """A controller over one half of the panel, as deployed; `rests` from panel.rests of its model."""
+    rollout = panel.rolled_out(deploy(design, setting), half, panel.aims(design.law, rests, half))
     low, high = setting.output_limits
     figures = panel.figures(
         rollout,
-        asked,
+        half,
         limits=setting.limits,
         low=low,
         high=high,
@@ -119,19 +133,6 @@ def played(
         settled=setting.settled,
     )
     return rollout, figures
-
-
-def rehearsed(
-    settings: Panel,
-    machine: Machine,
-    truth: plant.Plant | None,
-    family: Sequence[plant.Plant],
-    record_path: str,
-) -> Rehearsal:
-    """The declared panel where the true plant is known, otherwise what follows from the record."""
-    if truth is not None:
-        return declared(settings, machine, truth, family)
-    return from_record(settings, machine, family, read_recorded(record_path, machine))
 
 
 def input_limits(machine: Machine) -> governor.Limits:
@@ -150,7 +151,7 @@ def output_limits(machine: Machine) -> tuple[np.ndarray, np.ndarray]:
 def watchdog(
     machine: Machine, settings: Panel, family: Sequence[plant.Plant], noise: np.ndarray, overshoot: float
 ) -> governor.Governor:
-    """The governor of all contestants: the identified plant, in time and a sample late, with inputs that act
+    """The governor of all controllers: the identified plant, in time and a sample late, with inputs that act
     as the panel's spread has them; what it keeps from a limit is three deviations of the sensors' noise."""
     low, high = output_limits(machine)
     guarded, strength = panel.corners(family[:1], spread_of(settings))
@@ -174,7 +175,7 @@ def spread_around(settings: Panel, identified: plant.Plant) -> panel.Spread:
     return spread._replace(extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)))
 
 
-def declared(
+def from_declaration(
     settings: Panel, machine: Machine, truth: plant.Plant, family: Sequence[plant.Plant]
 ) -> Rehearsal:
     """The study's machine: judged around the truth, tuned around the identified family, so that no controller
@@ -182,7 +183,16 @@ def declared(
     reference = np.array([o.reference for o in machine.outputs])
     noise = np.full(len(reference), settings.noise_degC)
     judging, training = (
-        _half(settings, half, around, _questions(half, reference, settings.steps), noise, cells=cells)
+        _half(
+            settings,
+            half,
+            around,
+            _questions(half, reference, settings.steps),
+            noise,
+            cells=cells,
+            steps=settings.steps,
+            declared=spread_of(settings),
+        )
         for half, around, cells in ((settings.judging, [truth], True), (settings.training, family, False))
     )
     limits = input_limits(machine)
@@ -210,15 +220,6 @@ def _questions(half: Half, reference: np.ndarray, steps: int) -> panel.Questions
     )
 
 
-class Own(NamedTuple):
-    """What follows from a record in place of the panel's: steps of a case, how far plants lie from the
-    nominal one, and limits of the inputs, within which starts are held."""
-
-    steps: int
-    spread: panel.Spread
-    limits: governor.Limits
-
-
 def _half(
     settings: Panel,
     half: Half,
@@ -227,10 +228,13 @@ def _half(
     noise: np.ndarray,
     *,
     cells: bool,
-    own: Own | None = None,
+    steps: int,
+    declared: panel.Spread,
+    limits: governor.Limits | None = None,
 ) -> panel.Cases:
+    """One half of the panel: cases of `steps` at most, on plants that lie around those of `around` as
+    `declared` says; starts are held within `limits`."""
     rng = np.random.default_rng(half.seed)
-    declared = own.spread if own else spread_of(settings)
     scaled = panel.Spread(*(half.spread * value for value in declared))._replace(
         delayed=min(half.spread * declared.delayed, 1.0)
     )
@@ -240,10 +244,10 @@ def _half(
         questions,
         noise=noise,
         seed=half.seed,
-        steps=round(half.length * (own.steps if own else settings.steps)),
+        steps=round(half.length * steps),
         hold=settings.hold_steps,
         cells=cells,
-        limits=own.limits if own else None,
+        limits=limits,
     )
 
 
@@ -277,42 +281,26 @@ def _ambient(
     return max(max(held, default=0.0), float(np.max(scale.ambient_degC_spread)))
 
 
-class Recorded(NamedTuple):
-    """Segments u (T, m and more: disturbances follow the inputs) in percent and y (T, p) in °C, and the
-    number of the recording of each."""
-
-    u: list[np.ndarray]
-    y: list[np.ndarray]
-    recordings: list[int]
-
-
-def read_recorded(path: str, machine: Machine) -> Recorded:
-    """The record of ingest, in pieces without a missing input."""
-    segments = record.read_recordings(path, machine.acting, machine.outputs)
-    pieces = [
-        (u, y, number)
-        for a, b, number in zip(*segments[:2], _numbered(segments[2]), strict=True)
-        for u, y in zip(*identification.gapless([a], [b]), strict=True)
-    ]
-    return Recorded(*(list(part) for part in zip(*pieces, strict=True)))
-
-
 def from_record(
-    settings: Panel, machine: Machine, family: Sequence[plant.Plant], recorded: Recorded
+    settings: Panel,
+    machine: Machine,
+    family: Sequence[plant.Plant],
+    u: Sequence[np.ndarray],
+    y: Sequence[np.ndarray],
+    recordings: Sequence[int],
 ) -> Rehearsal:
     """Somebody's machine: both halves are drawn around plants of the identified family, and starts,
-    references, band, settling limit and length follow from the record.
+    references, band, settling limit and length follow from the record: segments u (T, m and more:
+    disturbances follow the inputs) in percent and y (T, p) in °C, as segments.without_gaps returns them.
 
     What a plant may differ by: the spread is a bootstrap of the record, every second member for each half,
     and around each the panel's input gains, pace and delay. The ambient differs by `_ambient`. More heat is
     lost by a fifth of what the slowest mode loses at most.
     """
     identified = family[0]
-    u = [a[:, : len(machine.inputs)] for a in recorded.u]
+    u = [a[:, : len(machine.inputs)] for a in u]
     (low, high), limits = output_limits(machine), input_limits(machine)
-    scale = scenario_defaults.machine_scale(
-        u, recorded.y, identified, machine.sample_time_s, recorded.recordings
-    )
+    scale = scenario_defaults.machine_scale(u, y, identified, machine.sample_time_s, recordings)
     asked = scenario_defaults.defaults(
         scale,
         identified,
@@ -341,7 +329,9 @@ def from_record(
             question,
             scale.noise_degC,
             cells=False,
-            own=Own(asked.steps, spread, limits),
+            steps=asked.steps,
+            declared=spread,
+            limits=limits,
         )
         for half, around, question in (
             (settings.judging, family[1::2], questions),
@@ -357,11 +347,6 @@ def from_record(
         _infeasible(machine, asked.infeasible),
         "from the record",
     )
-
-
-def _numbered(names: Sequence[str]) -> list[int]:
-    first = list(dict.fromkeys(names))
-    return [first.index(name) for name in names]
 
 
 def _infeasible(machine: Machine, missed: list[scenario_defaults.Infeasible]) -> list[dict[str, Any]]:

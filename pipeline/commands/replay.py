@@ -12,25 +12,20 @@ from pipeline.reading.recordings import Source, Table, read
 from pipeline.reading.resampling import resample
 from pipeline.runtime import machine, replay, supervisor, support
 from pipeline.runtime.machine import Exported
-from pipeline.runtime.replay import Log
+from pipeline.runtime.replay import GaplessLog
+from pipeline.runtime.supervised import Supervised
+from pipeline.runtime.support_file import read_support
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Ingest, Plant
+from pipeline.temperature.settings import Plant
+from stages.ingest import Ingest
 
 HOLD = 30  # samples that the law watches first
 MESSAGES = 50_000  # of replay.mcap at most: a longer recording is thinned evenly
 WATCHED = 10_000  # samples that the supervisor watches, in stretches of a long recording
 STRETCH = 1_000
-SUPPORT = "support.safetensors"
 
 
-class Asked(NamedTuple):
-    """What a person says: references (p,) in °C where the recording has none, and where files go."""
-
-    reference: tuple[float, ...]
-    out: Path
-
-
-class Replay(NamedTuple):
+class ReplayedRecording(NamedTuple):
     """One recording replayed. By sample: time_s (T,), applied, wished, asked (T, m), why (T, m) of
     replay.WHY, measured, reference, target (T, p), off (T,) of support, cause (T,) of supervisor.KINDS or -1.
     `abstains` where the recording is off support; `told` are sentences."""
@@ -64,48 +59,6 @@ def temperatures(text: str) -> tuple[float, ...]:
 
 
 HOTTEST_DEGC = 2000.0
-
-
-# ---- support, beside the controller
-
-
-def write_support(folder: Path, within: support.Support, controller_sha256: str) -> None:
-    """support.safetensors of a controller's folder."""
-    plants = {
-        f"spread.{name}": np.stack([np.asarray(getattr(one, name), float) for one in within.spread])
-        for name in within.spread[0]._fields
-    }
-    numbers = {k: np.asarray(v, float) for k, v in within._asdict().items() if k != "spread"}
-    artifacts.write_weights(
-        folder / SUPPORT, "support 2", plants | numbers, {"controller": controller_sha256}
-    )
-
-
-def read_support(folder: Path, made: Exported) -> support.Support | None:
-    """What `write_support` wrote; None where there is none. Raises ValueError where it is of another
-    controller."""
-    if not artifacts.exists(folder / SUPPORT):
-        return None
-    arrays, about = artifacts.read_weights(folder / SUPPORT, "support 2")
-    if about.get("controller") != machine.controller_sha256(made):
-        raise ValueError(f"{folder / SUPPORT}: it is of another controller than the folder; export it again")
-    names = type(made.model)._fields
-    plants = tuple(
-        type(made.model)(*(arrays[f"spread.{name}"][i] for name in names))
-        for i in range(len(arrays["spread.A"]))
-    )
-    return support.Support(
-        arrays["temperature_low"],
-        arrays["temperature_high"],
-        arrays["command_low"],
-        arrays["command_high"],
-        plants,
-        arrays["noise"],
-        int(arrays["steps"]),
-        float(arrays["furthest"]),
-        arrays["rest"],
-        arrays["allowed"],
-    )
 
 
 # ---- the recording
@@ -157,16 +110,17 @@ def _of(mapped: Any) -> tuple[str, str, float, float]:
     return mapped.source, mapped.unit, mapped.scale, mapped.offset
 
 
-def references(table: Table, named: str, made: Exported, asked: Asked) -> np.ndarray:
-    """References (T, p) in °C: those of --reference, else the recording's, else those of params.yaml."""
+def references(table: Table, named: str, made: Exported, reference: tuple[float, ...]) -> np.ndarray:
+    """References (T, p) in °C: `reference` (p,) of --reference, else the recording's, else those of
+    params.yaml."""
     outputs, T = [one.name for one in made.machine.outputs], len(table.time_s)
-    if asked.reference:
-        if len(asked.reference) != len(outputs):
+    if reference:
+        if len(reference) != len(outputs):
             raise ValueError(
                 f"--reference: expected {len(outputs)} temperatures in °C ({', '.join(outputs)}), found "
-                f"{len(asked.reference)}; write one for each output, in order"
+                f"{len(reference)}; write one for each output, in order"
             )
-        return np.tile(asked.reference, (T, 1))
+        return np.tile(reference, (T, 1))
     if named:
         return np.stack([table.values[f"{name} reference"] for name in outputs], axis=1)
     declared = params.load(Plant, "plant").outputs if Path(params.FILE).exists() else []
@@ -181,7 +135,9 @@ def references(table: Table, named: str, made: Exported, asked: Asked) -> np.nda
 # ---- the replay
 
 
-def replayed(made: Exported, within: support.Support | None, table: Table, r: np.ndarray) -> Replay:
+def replayed(
+    made: Exported, within: support.Support | None, table: Table, r: np.ndarray
+) -> ReplayedRecording:
     """Every segment by itself, from its first sample on in manual."""
     wired = made.machine
     u, y = (
@@ -190,10 +146,10 @@ def replayed(made: Exported, within: support.Support | None, table: Table, r: np
     masked = np.stack([table.masked[one.name] for one in (*wired.inputs, *wired.outputs)], axis=1).any(axis=1)
     u, y, r = (_filled(part) for part in (u, y, r))
     runs, offs, told = [], [], []
-    watch = support.watched_by(within.spread, within.steps) if within else None
+    observers = support.design_observers(within.spread, within.steps) if within else None
     cuts = np.flatnonzero(np.diff(table.segment)) + 1
-    for log in map(Log, np.split(u, cuts), np.split(y, cuts), np.split(r, cuts)):
-        offs.append(_told(within, log, watch))
+    for log in map(GaplessLog, np.split(u, cuts), np.split(y, cuts), np.split(r, cuts)):
+        offs.append(_check_log(within, log, observers))
         if offs[-1].abstains:
             runs.append((replay.Replayed(log.u, log.u, log.u, log.r), np.zeros(log.u.shape, int)))
             continue
@@ -202,7 +158,7 @@ def replayed(made: Exported, within: support.Support | None, table: Table, r: np
     joined = replay.Replayed(*(np.concatenate(part) for part in zip(*(run for run, _ in runs), strict=True)))
     length = np.array([len(one.off) for one in offs])
     abstains = bool(length[[one.abstains for one in offs]].sum() > 0.5 * length.sum())
-    cause = _causes(made, Log(u, y, r), cuts)
+    cause = _causes(made, GaplessLog(u, y, r), cuts)
     # of several segments the longest that is off speaks; of none the longest
     spoken = max(offs, key=lambda one: (one.abstains == abstains, len(one.off)))
     told += support.reasons(spoken)
@@ -210,16 +166,18 @@ def replayed(made: Exported, within: support.Support | None, table: Table, r: np
         told.append("The folder holds no support: whether the recording is off it is not known.")
     if masked.any():
         told.append(f"{int(masked.sum())} samples lack a signal; the last value stands for it.")
-    return Replay(
+    return ReplayedRecording(
         table.time_s, u, joined.wished, joined.asked, np.concatenate([why for _, why in runs]), y, r,
         joined.target, np.concatenate([one.off for one in offs]), cause, abstains, tuple(told),
     )  # fmt: skip
 
 
-def _told(within: support.Support | None, log: Log, watch: support.Watch | None) -> support.Told:
-    if within is None or watch is None:
-        return support.Told(np.zeros(len(log.u), np.int8), np.zeros(3), 0.0, False, False)
-    return support.told(within, log, watch)
+def _check_log(
+    within: support.Support | None, log: GaplessLog, observers: support.Observers | None
+) -> support.SupportCheck:
+    if within is None or observers is None:
+        return support.SupportCheck(np.zeros(len(log.u), np.int8), np.zeros(3), 0.0, False, False)
+    return support.check_log(within, log, observers)
 
 
 def _filled(values: np.ndarray) -> np.ndarray:
@@ -235,17 +193,17 @@ def _filled(values: np.ndarray) -> np.ndarray:
     return np.take_along_axis(values, rows, axis=0)
 
 
-def _causes(made: Exported, log: Log, cuts: np.ndarray) -> np.ndarray:
+def _causes(made: Exported, log: GaplessLog, cuts: np.ndarray) -> np.ndarray:
     """The first cause (T,) that the supervisor has while it watches, as an index of supervisor.KINDS; -1
     where it has none, and where it did not watch."""
     T, cause = len(log.u), np.full(len(log.u), -1, np.int8)
     starts = [0] if T <= WATCHED else np.linspace(0, T - STRETCH, WATCHED // STRETCH).astype(int)
     length = T if T <= WATCHED else STRETCH
     for start in starts:
-        watching = supervisor.Supervised(made, rehearsal=True)
+        watching = Supervised(made, rehearsal=True)
         for t in range(int(start), int(start) + length):
             if t in cuts:
-                watching = supervisor.Supervised(made, rehearsal=True)
+                watching = Supervised(made, rehearsal=True)
             watching.watch(log.u[t], log.y[t], log.r[t])
             active = np.flatnonzero((watching.kept.since >= 0).any(axis=1))
             cause[t] = active[0] if len(active) else -1
@@ -255,7 +213,7 @@ def _causes(made: Exported, log: Log, cuts: np.ndarray) -> np.ndarray:
 # ---- what is written
 
 
-def summary(done: Replay, made: Exported, path: Path) -> dict[str, Any]:
+def summary(done: ReplayedRecording, made: Exported, path: Path) -> dict[str, Any]:
     """replay.json: shares of samples by what kept the law from its wish, off support, and causes."""
     T = len(done.time_s)
     difference = np.abs(done.asked - done.applied)[HOLD:]
@@ -292,7 +250,7 @@ def summary(done: Replay, made: Exported, path: Path) -> dict[str, Any]:
     }
 
 
-def signals(done: Replay, made: Exported) -> dict[str, tuple[np.ndarray, str, str]]:
+def signals(done: ReplayedRecording, made: Exported) -> dict[str, tuple[np.ndarray, str, str]]:
     """The columns of replay.mcap; where the replay abstains, what was asked is what was applied."""
     columns: dict[str, tuple[np.ndarray, str, str]] = {}
     asked = done.applied if done.abstains else done.asked
@@ -346,19 +304,21 @@ def layout(made: Exported) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def replay_recording(folder: Path, path: Path, asked: Asked) -> tuple[Replay, Exported, dict[str, Any]]:
-    """Reads, replays and writes replay.mcap, layout.json and replay.json below asked.out."""
+def replay_recording(
+    folder: Path, path: Path, out: Path, reference: tuple[float, ...] = ()
+) -> tuple[ReplayedRecording, Exported, dict[str, Any]]:
+    """Reads, replays and writes replay.mcap, layout.json and replay.json below `out`."""
     made = machine.read(folder)[0]
     within = read_support(folder, made)
     table, named = recorded(path, made)
-    done = replayed(made, within, table, references(table, named, made, asked))
+    done = replayed(made, within, table, references(table, named, made, reference))
     told = summary(done, made, path)
     every = max(-(-len(done.time_s) // MESSAGES), 1)
     thinned = {
         name: (values[::every], unit, text) for name, (values, unit, text) in signals(done, made).items()
     }
     time = done.time_s[::every] - min(float(done.time_s[0]), 0.0)
-    with artifacts.together(asked.out) as place:
+    with artifacts.together(out) as place:
         artifacts.write_recording(place / "replay.mcap", time, thinned, topic="/replay")
         artifacts.write_json(place / "layout.json", layout(made))
         artifacts.write_json(place / "replay.json", told)
