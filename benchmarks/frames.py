@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from pipeline.deposition.workflow.trial_files import Conditions, Signals, read_trial, write_trial
 
 from benchmarks import results
 from benchmarks.results import Row
@@ -24,7 +25,6 @@ from pipeline.deposition.camera.rendering import HARD, NOMINAL, Camera, Scene
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, routine
 from pipeline.deposition.learning import ilc
-from pipeline.deposition.workflow.trial_files import Conditions, Signals, read_trial, write_trial
 
 TS, SPEED, ANGLE_DEG, PX_PER_MM = 0.02, 8.0, 90.0, 125.0
 AREA = float(area(0.88, ANGLE_DEG))

@@ -136,9 +136,10 @@ def recordings(count: int, folder: Path) -> Work:
 
 def trial(samples: int, folder: Path) -> Work:
     """The command of the next trial after three of so many samples at 50 Hz, the model identified anew."""
+    from pipeline.deposition.workflow.settings import Printer
+
     from pipeline.deposition.extruder import Extruder, flow, routine
     from pipeline.deposition.learning import ilc
-    from pipeline.deposition.workflow.settings import Printer
 
     printer = params.load(Printer, "printer")
     step, fixed_s = printer.sample_time_s, 8.0
@@ -159,10 +160,11 @@ def trial(samples: int, folder: Path) -> Work:
 
 def materials(count: int, folder: Path) -> Work:
     """The library of so many materials, each with all trials of one of the two that were trained on."""
-    from pipeline.deposition.parts import composition
-    from pipeline.deposition.workflow import segment_library
     from pipeline.deposition.workflow.settings import Printer, SegmentLibrary
     from pipeline.deposition.workflow.tables import LESSONS
+
+    from pipeline.deposition.parts import composition
+    from pipeline.deposition.workflow import segment_library
 
     printer, settings = params.load(Printer, "printer"), params.load(SegmentLibrary, "segment_library")
     samples = artifacts.read_table("datasets/train_ilc/lessons.parquet", LESSONS)

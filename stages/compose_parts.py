@@ -4,10 +4,11 @@ tasks.parquet, lines.parquet, scores.parquet and conformance.json."""
 
 from pathlib import Path
 
-from pipeline.deposition.workflow import compose_parts, verify_part
-from pipeline.deposition.workflow.segment_library import read_learned
 from pipeline.deposition.workflow.settings import ComposeParts, Printer, TrainIlc
 from pipeline.deposition.workflow.tables import LINES, SCORES, SIGNALS, TASKS
+
+from pipeline.deposition.workflow import compose_parts, verify_part
+from pipeline.deposition.workflow.segment_library import read_learned
 from pipeline.store import artifacts, params
 
 

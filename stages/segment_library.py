@@ -2,9 +2,10 @@
 library.parquet, the columns of the paper's matrix (3), and learned.json, the identified chain of each
 material, the demarcation and the paper's four assumptions in figures."""
 
-from pipeline.deposition.workflow import segment_library
 from pipeline.deposition.workflow.settings import Printer, SegmentLibrary
 from pipeline.deposition.workflow.tables import LIBRARY
+
+from pipeline.deposition.workflow import segment_library
 from pipeline.store import artifacts, params
 
 

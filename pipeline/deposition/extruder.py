@@ -2,6 +2,7 @@
 chain that trials run on, its draws, and the training routine."""
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +38,16 @@ class Extruder(NamedTuple):
     yield_: float = 0.0
     creep_share: float = 0.0
     creep_time_s: float = 20.0
+
+
+def to_json(extruder: Extruder) -> dict[str, float | None]:
+    """An extruder as JSON: no lag is null."""
+    return {name: float(value) if np.isfinite(value) else None for name, value in extruder._asdict().items()}
+
+
+def from_json(values: Mapping[str, float | None]) -> Extruder:
+    """What `to_json` made."""
+    return Extruder(**{name: np.inf if value is None else value for name, value in values.items()})
 
 
 class Routine(NamedTuple):

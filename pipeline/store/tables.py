@@ -33,6 +33,7 @@ class Schema(NamedTuple):
 
 
 TEXT, FLOAT, BOOL, COUNT, INDEX = pa.string(), pa.float64(), pa.bool_(), pa.int64(), pa.int32()
+BYTES = pa.binary()
 
 # the unit of what has none
 NONE = "1"

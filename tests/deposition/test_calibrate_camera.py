@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from pipeline.deposition.workflow.settings import Camera
 
 from pipeline.deposition.workflow import trial_files
-from pipeline.deposition.workflow.settings import Camera
 from pipeline.store import params
 from tests.foreign.camera import Eye, Stage, tip_of
 

@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from pipeline.deposition.workflow.settings import Camera, Printer
+from pipeline.deposition.workflow.tables import LESSONS, TASKS
 
 from pipeline import cli
 from pipeline.deposition.camera.bead import Calibration
@@ -20,8 +22,6 @@ from pipeline.deposition.drive import Drive, asked, follows
 from pipeline.deposition.extruder import draw, flow
 from pipeline.deposition.learning.training import Noise
 from pipeline.deposition.workflow import train_ilc, trial_files, trial_video
-from pipeline.deposition.workflow.settings import Camera, Printer
-from pipeline.deposition.workflow.tables import LESSONS, TASKS
 from pipeline.store import artifacts, params
 
 ROOT = Path(__file__).parents[2]

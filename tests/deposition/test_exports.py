@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from pipeline.deposition.workflow.settings import ComposeParts, Printer
 
 from pipeline.deposition.parts import extrusion, leads
 from pipeline.deposition.parts.conformance import Refused
 from pipeline.deposition.toolpath import gcode, motion
 from pipeline.deposition.toolpath.gcode import Kind
 from pipeline.deposition.workflow import compose_parts, exports, part_motion, part_programs
-from pipeline.deposition.workflow.settings import ComposeParts, Printer
 from pipeline.store import params
 from tests.deposition.trained import NOZZLE, PLANT, TS, learned
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pipeline.deposition.workflow.settings import Drive, Printer
 
 from pipeline.deposition.toolpath import gcode
 from pipeline.deposition.workflow import part_motion
-from pipeline.deposition.workflow.settings import Drive, Printer
 from pipeline.store import params
 from tests.deposition.trained import NOZZLE, PLANT, learned
 

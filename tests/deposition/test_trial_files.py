@@ -13,8 +13,6 @@ from mcap.reader import make_reader
 from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
-
-from pipeline.deposition.workflow import trial_files
 from pipeline.deposition.workflow.trial_files import (
     COMMAND,
     FLOW,
@@ -27,6 +25,8 @@ from pipeline.deposition.workflow.trial_files import (
     write_command,
     write_trial,
 )
+
+from pipeline.deposition.workflow import trial_files
 from pipeline.reading import image_messages
 from pipeline.reading.recordings import read
 from pipeline.store.mcap_frames import ENCODERS

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pipeline.deposition.workflow.settings import Camera, Printer
 
 from pipeline.deposition.camera import bead
 from pipeline.deposition.extruder import Extruder, flow, routine
 from pipeline.deposition.workflow import trial_files, trial_readings, trial_video
-from pipeline.deposition.workflow.settings import Camera, Printer
 from pipeline.store import params
 from tests.foreign.camera import Eye, tip_of, trial
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-
 from pipeline.deposition.workflow.tables import (
     FILMED,
     LESSONS,
@@ -16,6 +15,7 @@ from pipeline.deposition.workflow.tables import (
     TASKS,
     TRIALS,
 )
+
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import tables
 from pipeline.temperature.workflow.settings import Plant

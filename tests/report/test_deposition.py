@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from pipeline.deposition.workflow.settings import Printer
+from pipeline.deposition.workflow.tables import SIGNALS
 
 from pipeline.deposition.parts import extrusion
 from pipeline.deposition.toolpath import gcode
 from pipeline.deposition.workflow import part_programs, tables
-from pipeline.deposition.workflow.settings import Printer
-from pipeline.deposition.workflow.tables import SIGNALS
 from pipeline.report.deposition import rules
 from pipeline.report.shared.verdict import OPEN
 from pipeline.store import artifacts, params

@@ -50,7 +50,7 @@ def area(width: np.ndarray | float, contact_angle_deg: float) -> np.ndarray | fl
     return (theta - math.sin(theta) * math.cos(theta)) / (4 * math.sin(theta) ** 2) * width**2
 
 
-class Calibration(NamedTuple):
+class WidthCalibration(NamedTuple):
     """Width in mm = gain px + offset. deviation is the r.m.s. of the residuals (mm, two parameters taken
     off), residuals (n,) known less fitted in mm."""
 
@@ -60,7 +60,7 @@ class Calibration(NamedTuple):
     residuals: np.ndarray
 
 
-def calibrate(widths_px: np.ndarray, known_mm: np.ndarray) -> Calibration:
+def calibrate(widths_px: np.ndarray, known_mm: np.ndarray) -> WidthCalibration:
     """Gain (mm/px) and offset (mm) by least squares from measured widths (n,)
     in px of beads or gauges of known widths (n,) in mm.
 
@@ -87,7 +87,7 @@ def calibrate(widths_px: np.ndarray, known_mm: np.ndarray) -> Calibration:
             "calibration: expected widths in px that grow with the known widths but found a gain of "
             f"{gain:.3g} mm/px; check which frame shows which width"
         )
-    return Calibration(
+    return WidthCalibration(
         float(gain), float(offset), float(np.sqrt(residuals @ residuals / (len(px) - 2))), residuals
     )
 

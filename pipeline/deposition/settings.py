@@ -1,19 +1,30 @@
-"""Sections `printer` and `camera` of the parameters: the deposition loop's
-machine, its materials, and what looks at the bead."""
+"""Sections of the parameters that several stages of the deposition loop read: its machine with materials, its
+camera, the laws that learn from trials, and how a part is composed.
 
-import math
-from collections.abc import Sequence
-from typing import Annotated, Literal
+Methods take values, no sections: the properties here make what a method takes, and import it only then.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import pydantic
 from pydantic import Field
 
-from pipeline.deposition import drive, reachable
-from pipeline.deposition.extruder import Extruder, Routine, routine
 from pipeline.store.params import Mapped, Section
 
+if TYPE_CHECKING:
+    import numpy as np
 
-class Material(Section):
+    from pipeline.deposition.camera.pose import Mounting
+    from pipeline.deposition.drive import Drive
+    from pipeline.deposition.extruder import Extruder, Routine
+    from pipeline.deposition.learning.training import LawSettings, Noise
+    from pipeline.deposition.parts.composition import PartSettings
+    from pipeline.deposition.parts.part_motion import GantryLimits
+
+
+class PrinterMaterial(Section):
     """What is known of a material before anything is learned: K / (tau s + 1) from
     plunger displacement to flow, on the printer's nozzle."""
 
@@ -22,8 +33,15 @@ class Material(Section):
     gain_mm3_per_s_per_mm: float = Field(gt=0, le=1e6)
     time_constant_s: float = Field(gt=0, le=1000)
 
+    @property
+    def nominal(self) -> Extruder:
+        """The extruder as known beforehand."""
+        from pipeline.deposition.extruder import Extruder
 
-class Training(Section):
+        return Extruder(self.gain_mm3_per_s_per_mm, self.time_constant_s)
+
+
+class TrainingRoutine(Section):
     """A training routine: off, on, a pause of the gantry, on, off."""
 
     speed_mm_per_s: float = Field(gt=0, le=1000)
@@ -33,7 +51,7 @@ class Training(Section):
     tail_s: float = Field(gt=0, le=600)
 
 
-class Drive(Section):
+class PlungerDrive(Section):
     """What the plunger's drive can do: largest |command|, largest speed, and backlash."""
 
     amplitude_mm: float = Field(gt=0, le=1e6)
@@ -52,15 +70,15 @@ class Printer(Section):
     speed_mm_per_s: float = Field(gt=0, le=1000)
     ramp_s: float = Field(gt=0, le=60)
     longest_ramp_s: float | None = Field(default=None, gt=0, le=60)
-    drive: Drive | None
+    drive: PlungerDrive | None
     acceleration_mm_per_s2: float = Field(gt=0, le=1e6)
     junction_deviation_mm: float = Field(ge=0, le=10)
     gantry_speed_limit_mm_per_s: float = Field(gt=0, le=10_000)
     tool_change_s: float = Field(ge=0, le=3600)
     filament_mm: float | None = Field(gt=0, le=200)
-    materials: list[Material] = Field(min_length=1, max_length=20)
-    reference: Training
-    routines: list[Training] = Field(max_length=20)
+    materials: list[PrinterMaterial] = Field(min_length=1, max_length=20)
+    reference: TrainingRoutine
+    routines: list[TrainingRoutine] = Field(max_length=20)
 
     @pydantic.model_validator(mode="after")
     def _distinct(self):
@@ -75,11 +93,11 @@ class Printer(Section):
         return self
 
     @property
-    def limits(self) -> drive.Drive:
-        """The drive that commands obey; unlimited where none is declared."""
-        if self.drive is None:
-            return drive.UNLIMITED
-        return drive.Drive(self.drive.amplitude_mm, self.drive.speed_mm_per_s, self.drive.backlash_mm)
+    def limits(self) -> Drive:
+        """The drive that commands obey; unlimited if none is declared."""
+        from pipeline.deposition import drive
+
+        return drive.UNLIMITED if self.drive is None else drive.Drive(**self.drive.model_dump())
 
     @property
     def steady_flow(self) -> float:
@@ -87,40 +105,39 @@ class Printer(Section):
         return self.bead_area_mm2 * self.speed_mm_per_s
 
     @property
-    def nominals(self) -> list[Extruder]:
-        """The materials' extruders as known beforehand."""
-        return [Extruder(one.gain_mm3_per_s_per_mm, one.time_constant_s) for one in self.materials]
+    def gantry(self) -> GantryLimits:
+        """How the gantry moves."""
+        from pipeline.deposition.parts.part_motion import GantryLimits
 
-    def slow_s(self, extruders: Sequence[Extruder], speed_mm_per_s: float, longest_s: float) -> float:
-        """Seconds in which the gantry may reach a printing speed such that the drive follows the flow of each
-        of the extruders (`reachable.ramp_that_loses_little`), in whole hundredths; at most longest_s."""
-        ramps = [
-            reachable.ramp_that_loses_little(
-                extruder, self.limits, steady_flow=self.bead_area_mm2 * speed_mm_per_s, ramp_s=self.ramp_s,
-                longest_s=longest_s, sample_time_s=self.sample_time_s,
-            )
-            for extruder in extruders
-        ]  # fmt: skip
-        longest = min(max(ramps), longest_s)
-        return min(math.ceil(100 * longest) / 100, longest_s)
+        return GantryLimits(
+            self.acceleration_mm_per_s2, self.junction_deviation_mm, self.gantry_speed_limit_mm_per_s,
+            self.speed_mm_per_s, self.tool_change_s, self.longest_ramp_s,
+        )  # fmt: skip
 
-    def trained(self) -> list[Routine]:
-        """The training routines: the reference, on which laws are compared, and those of the library. Where
-        the drive asks for longer ramps of the gantry, it rests as long in the pause, between them."""
+    def training_routines(self) -> list[Routine]:
+        """The training routines: the reference, on which laws are compared, and those of the library. If the
+        drive needs longer ramps of the gantry, it rests as long in the pause, between them."""
+        from pipeline.deposition import reachable
+        from pipeline.deposition.extruder import routine
+
         trainings = [self.reference, *self.routines]
         fastest = max(t.speed_mm_per_s for t in trainings)
         # the pause is longer by this at all speeds, so that these are compared at one pause
-        longer_s = (
-            0.0 if self.longest_ramp_s is None else self.slow_s(self.nominals, fastest, self.longest_ramp_s)
-        )
-        slow_s = [round(longer_s * t.speed_mm_per_s / fastest, 9) for t in trainings]
+        longer_s = 0.0
+        if self.longest_ramp_s is not None:
+            longer_s = reachable.ramp_of_all(
+                [material.nominal for material in self.materials], self.limits,
+                steady_flow=self.bead_area_mm2 * fastest, ramp_s=self.ramp_s,
+                longest_s=self.longest_ramp_s, sample_time_s=self.sample_time_s,
+            )  # fmt: skip
         return [
             routine(
                 off_s=t.off_s, on_s=t.on_s, pause_s=round(t.pause_s + longer_s, 9), tail_s=t.tail_s,
-                speed=t.speed_mm_per_s, bead_area_mm2=self.bead_area_mm2,
-                ramp_s=self.ramp_s, gantry_ramp_s=slow, sample_time_s=self.sample_time_s,
+                speed=t.speed_mm_per_s, bead_area_mm2=self.bead_area_mm2, ramp_s=self.ramp_s,
+                gantry_ramp_s=round(longer_s * t.speed_mm_per_s / fastest, 9),
+                sample_time_s=self.sample_time_s,
             )
-            for t, slow in zip(trainings, slow_s, strict=True)
+            for t in trainings
         ]  # fmt: skip
 
 
@@ -189,12 +206,55 @@ class Camera(Section):
         return self
 
     @property
-    def nozzle_radius_px(self) -> float:
-        """From the tip on so much of the line is hidden, px: measured columns begin there."""
-        return max(abs(self.columns[0] - self.nozzle_column), 0.0)
+    def mounting(self) -> Mounting:
+        """How the camera hangs, and what of its pictures is measured."""
+        from pipeline.deposition.camera.pose import Mounting
+
+        return Mounting(
+            self.mm_per_px, self.nozzle_column, (self.columns[0], self.columns[1]), self.longest_blur_px,
+            {"light": 1, "dark": -1, "": 0}[self.bead], self.rotation_deg,
+            None if self.tip_px is None else (self.tip_px[0], self.tip_px[1]), self.mask_px,
+        )  # fmt: skip
+
+    def true_px(self, measured_px: np.ndarray) -> np.ndarray:
+        """Widths in px without the edge bias that calibration found."""
+        import numpy as np
+
+        from pipeline.deposition.camera.trial_flow import width_px
+
+        known_px = np.array(self.known_widths_mm) / abs(self.mm_per_px)
+        return width_px(measured_px, known_px, np.array(self.edge_bias_px))
+
+    @property
+    def recording(self) -> dict[str, Any]:
+        """How a recording of a trial is opened: keywords of `trial_files.open_trial`."""
+        return {**dict(self.topics), "unreadable_share": self.unreadable_share}
+
+    def straight(self) -> Camera:
+        """The camera of a simulated machine, which stands straight and errs as its calibration finds."""
+        return self.model_copy(
+            update={
+                "rotation_deg": 0.0, "tip_px": None, "mask_px": [], "bead": "", "edge_bias_px": [],
+                "topics": TrialTopics(image="", time="", mapping={}),
+            }
+        )  # fmt: skip
 
 
-# ---- a section a stage
+def trial_conditions(
+    printer: Printer, camera: Camera, material: PrinterMaterial, routine: Routine
+) -> dict[str, Any]:
+    """What the recording of a trial says of itself, but for its number, its law and the scale of its widths:
+    fields of `trial_files.TrialConditions`."""
+    return {
+        "material": material.name,
+        "nozzle": f"{printer.nozzle_mm:g}",
+        "speed_mm_per_s": float(routine.speed.max()),
+        "pause_s": round(routine.pause_s[1] - routine.pause_s[0], 9),
+        "bead_area_mm2": printer.bead_area_mm2,
+        "contact_angle_deg": camera.contact_angle_deg,
+        "mm_per_px": camera.mm_per_px,
+        "nozzle_column": camera.nozzle_column,
+    }
 
 
 class TrialNoise(Section):
@@ -238,11 +298,23 @@ class TrainIlc(Section):
     hoelzle_2009: Hoelzle2009
     model_inverse: ModelInverse
 
+    def laws(self, printer: Printer) -> LawSettings:
+        """Settings of both laws on this printer."""
+        from pipeline.deposition.learning.ilc import HoelzleSettings, InverseSettings
+        from pipeline.deposition.learning.training import LawSettings
 
-class SegmentLibrary(Section):
-    """Section `segment_library`."""
+        inverse = self.model_inverse.model_dump()
+        rise = inverse.pop("rise")
+        hoelzle = HoelzleSettings(**self.hoelzle_2009.model_dump())
+        return LawSettings(printer.sample_time_s, printer.limits, hoelzle, InverseSettings(**inverse), rise)
 
-    law: Literal["model_inverse", "pixels"]
+    @property
+    def shares(self) -> Noise:
+        """What does not repeat from trial to trial, as shares of the steady flow."""
+        from pipeline.deposition.learning.training import Noise
+
+        noise = self.noise
+        return Noise(noise.white_percent / 100, noise.drift_percent / 100, noise.gain_percent / 100)
 
 
 class ComposeParts(Section):
@@ -254,3 +326,12 @@ class ComposeParts(Section):
     shortest_s: float = Field(ge=0, le=600)
     largest_error_percent: float = Field(gt=0, le=1000)
     full_part_updates: int = Field(ge=1, le=1000)
+
+    def of_part(self, printer: Printer) -> PartSettings:
+        """How a part is printed on this printer."""
+        from pipeline.deposition.parts.composition import PartSettings
+
+        return PartSettings(
+            printer.nozzle_mm, printer.bead_area_mm2, printer.ramp_s, self.corner_deg,
+            self.longest_pause_s, printer.limits,
+        )  # fmt: skip
