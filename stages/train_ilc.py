@@ -119,15 +119,10 @@ def simulate(folder: Path, sections: Sections, index: int, kind: str) -> Results
     with tqdm(total=updates, desc=title, position=place, mininterval=2, leave=False) as bar:
         if kind == "pixels":
             return learn_in_pictures(folder, sections, material, case, rngs[:2], bar)
-        by_routine, figures, identified = training.learn_in_flow(
+        by_routine, figures, models = training.learn_in_flow(
             case, rngs[2:], settings.shares, trials=settings.trials, plants=settings.family_plants,
             settings=settings.laws(printer), on_step=lambda _: bar.update(),
         )  # fmt: skip
-    models = {
-        "nominal": extruder.to_json(nominal),
-        "plant": extruder.to_json(plant),
-        "identified": identified,
-    }
     sequences = {(material.name, number): of_routine for number, of_routine in by_routine.items()}
     return sequences, {}, {material.name: models}, {material.name: figures}
 
@@ -137,39 +132,31 @@ def learn_in_pictures(
     rngs: Sequence[np.random.Generator], bar: Any,
 ) -> Results:  # fmt: skip
     """The model inverse on the reference routine of a simulated machine, the flow measured from pictures.
-
-    Every trial is one recording in `folder`, written and read back; those of the first and the last trial are
-    kept. `rngs` draw what the camera sees, and what does not repeat.
-    """
-    from pipeline.deposition.camera import flow, rendering, simulated_trial, trial_flow
+    Every trial is one recording in `folder`, written and read back; the first and the last are kept. `rngs`
+    draw what the camera sees, and what does not repeat."""
+    from pipeline.deposition.camera import rendering, simulated_trial, trial_flow
     from pipeline.deposition.learning import training
     from pipeline.reading import trial_files
 
     (settings, printer, camera), routine, measured = sections, case.routines[0], []
     laws, name = settings.laws(printer), material.name
     film = rendering.SimulatedCamera(rendering.SCENES[camera.scene], rngs[0])
-    calibration = rendering.calibrate(
-        film, camera.known_widths_mm, rngs[0], mm_per_px=camera.mm_per_px,
-        columns=camera.mounting.columns, longest_blur_px=camera.longest_blur_px,
-    )  # fmt: skip
-    known = trial_conditions(printer, camera, material, routine)
-    known |= {"px_per_mm": 1 / calibration.gain, "offset_px": -calibration.offset / calibration.gain}
+    calibration = rendering.calibrate(film, camera.known_widths_mm, rngs[0], camera.mounting)
 
     def measure(u: np.ndarray) -> ilc.Trial:
         number, law = len(measured), "pixels" if measured else "on_off"
-        path, said = folder / f"{name}_{number:02d}.mcap", known | {"trial": number, "law": law}
+        path = folder / f"{name}_{number:02d}.mcap"
+        known = trial_conditions(printer, camera, material, routine, number, law, calibration[:2])
         pictures, applied, truth = simulated_trial.simulate_trial(
             case.plant, film, routine, u, rngs[1], noise=settings.shares._asdict(), drive=laws.drive,
-            sample_time_s=laws.sample_time_s, view=flow.View(camera.mm_per_px, camera.nozzle_column),
-            frame_rate_hz=camera.frames_per_s, contact_angle_deg=camera.contact_angle_deg,
-            nozzle_mm=(printer.nozzle_mm / 2, printer.nozzle_outer_mm / 2),
+            sample_time_s=laws.sample_time_s, **camera.film(printer),
         )  # fmt: skip
         signals = trial_files.TrialSignals(routine.time_s, routine.position, routine.speed, applied, truth)
-        conditions = trial_files.TrialConditions(**said)
+        conditions = trial_files.TrialConditions(**known)
         trial_files.write_trial(path, conditions, pictures, signals, encoding=camera.encoding)
         recording = trial_files.open_trial(path, **camera.recording)
-        earlier = [trial.latency for trial in measured]
-        measured.append(measure_trial(recording, routine, printer, camera, earlier))
+        earlier, values = [trial.latency for trial in measured], read(recording, camera)
+        measured.append(measure_trial(recording, values, earlier, routine, printer, camera))
         if number > 1:
             (folder / f"{name}_{number - 1:02d}.mcap").unlink()
         return measured[-1].trial
@@ -198,34 +185,26 @@ def learn_from_recordings(
 
     settings, printer, camera = sections
     routines, laws, results = printer.training_routines(), settings.laws(printer), ({}, {}, {}, {})
-    groups = trial_files.group_trials(
-        recordings, folder, materials=[material.name for material in printer.materials],
-        nozzle=f"{printer.nozzle_mm:g}",
-        routines=[(float(r.speed.max()), r.pause_s[1] - r.pause_s[0]) for r in routines],
-    )  # fmt: skip
-    values = {recording.path: read(recording, camera, MEMO) for recording in recordings}
+    groups = trial_files.group_trials(recordings, folder, **printer.expected_trials(routines))
+    values = {one.path: read(one, camera, MEMO) for one in recordings}
     following.mkdir()
     for material in printer.materials:
         figures, models = {}, {"nominal": extruder.to_json(material.nominal)}
         for index, routine in enumerate(routines):
             key, end, measured = (material.name, index), f"_{index}" if index else "", []
-            for recording in groups.get(key, []):
-                earlier = [values[path].latency for path in values if path != recording.path]
-                own = values[recording.path]
-                measured.append(measure_trial(recording, routine, printer, camera, earlier, own))
+            for one in groups.get(key, []):
+                earlier = [other.latency for path, other in values.items() if path != one.path]
+                measured.append(measure_trial(one, values[one.path], earlier, routine, printer, camera))
+            number, law = len(measured), "model_inverse" if measured else "on_off"
             with artifacts.about(f"{folder}: material {material.name}, routine {index}"):
                 trials = [one.trial for one in measured]
-                sequence, step = training.resume(trials, routine, material.nominal, laws)
-            name = f"{material.name}_routine_{index}_trial_{len(trials):02d}"
-            said = {"trial": len(trials), "law": "model_inverse" if trials else "on_off"}
-            said |= {"px_per_mm": 1 / abs(camera.mm_per_px), "offset_px": -0.0}
-            said |= trial_conditions(printer, camera, material, routine)
-            conditions = trial_files.TrialConditions(**said)
-            trial_files.write_command(following / name, conditions, time_s=routine.time_s, command_mm=step.u)
-            _, best, rolled_back, restarts = step
-            figures[f"routine_{index}"] = {
-                "next": name, "best_trial": best, "rolled_back": rolled_back, "restarts": restarts,
-            }  # fmt: skip
+                sequence, u, of_step = training.resume(trials, routine, material.nominal, laws)
+            name = f"{material.name}_routine_{index}_trial_{number:02d}"
+            scale = (abs(camera.mm_per_px), 0.0)
+            known = trial_conditions(printer, camera, material, routine, number, law, scale)
+            conditions, time_s = trial_files.TrialConditions(**known), routine.time_s
+            trial_files.write_command(following / name, conditions, time_s=time_s, command_mm=u)
+            figures[f"routine_{index}"] = {"next": name} | of_step
             if sequence:
                 results[0][key], results[1][key] = [sequence], measured
                 of_sequence = training.figures(sequence, rise=laws.rise)
@@ -239,43 +218,36 @@ def learn_from_recordings(
 
 
 def read(recording: TrialRecording, camera: Camera, memo: Path | None = None) -> readings.Readings:
-    """The readings of a recording, out of the memo if it holds them."""
+    """The readings of a recording's frames, out of the memo if it holds them."""
     from pipeline.deposition.camera import latency, readings
     from pipeline.reading import trial_memo
 
-    def measure() -> tuple:
-        gantry = latency.Gantry(*recording.signals["position_mm"])
+    def measure() -> readings.Readings:
         with artifacts.about(recording.path):
-            return tuple(readings.read(recording.frames, gantry, camera.mounting))
+            gantry = latency.Gantry(*recording.signals["position_mm"])
+            return readings.read(recording.frames, gantry, camera.mounting)
 
     if memo is None:
-        return readings.Readings(*measure())
-    looks = camera.mounting._asdict() | {"recording": camera.recording}
+        return measure()
     code = [PIPELINE / name for name in READERS]
-    *values, late = trial_memo.recall(memo, recording.path, looks, code, measure)
-    return readings.Readings(*values, latency.Latency(*late))
+    values = trial_memo.recall(memo, recording.path, camera.looks, code, measure)
+    return readings.Readings.from_values(values)
 
 
 def measure_trial(
-    recording: TrialRecording, routine: Routine, printer: Printer, camera: Camera,
-    earlier: Sequence[latency.Latency] = (), values: readings.Readings | None = None,
+    recording: TrialRecording, values: readings.Readings, earlier: Sequence[latency.Latency],
+    routine: Routine, printer: Printer, camera: Camera,
 ) -> trial_flow.MeasuredTrial:  # fmt: skip
-    """The trial of a recording on the clock of its routine, from the readings of its frames.
-
-    The camera's latency is that of section `camera`; without one, what the motion in the pictures of this
-    recording and of `earlier` ones tells, none if they do not tell it. Raises ValueError, naming the file, if
-    it says nothing of its conditions or shows no bead.
-    """
-    import numpy as np
-
+    """The trial of a recording on the clock of its routine, from the readings of its frames; the camera's
+    latency from section `camera`, or from this recording and `earlier` ones. Raises ValueError, naming the
+    file, if it says nothing of its conditions or shows no bead."""
     from pipeline.deposition.camera import flow, latency, trial_flow
     from pipeline.reading import trial_files
 
-    known, values = trial_files.checked_conditions(recording), values or read(recording, camera)
-    widths_mm = (camera.true_px(values.widths) - known.offset_px) / known.px_per_mm
+    known = trial_files.checked_conditions(recording)
     with artifacts.about(recording.path):
         return trial_flow.measure_trial(
-            values, np.where(values.widths == 0, 0.0, widths_mm), recording.signals, routine,
+            values, recording.signals, routine, camera.mounting, scale=(known.px_per_mm, known.offset_px),
             view=flow.View(known.mm_per_px, known.nozzle_column), nozzle_mm=printer.nozzle_mm,
             latency=latency.of_camera(camera.latency_s, [*earlier, values.latency]),
             contact_angle_deg=known.contact_angle_deg, width_deviation_mm=camera.width_deviation_mm,
@@ -285,25 +257,19 @@ def measure_trial(
 def show_frames(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]]:
     """Writes a few frames of a recording with the measured edges drawn in as JPEG to `folder`, and returns a
     row for each: where it is from, what was measured, and why it was rejected."""
-    import numpy as np
-
-    from pipeline.deposition.camera import excerpts
+    from pipeline.deposition.camera.excerpts import excerpts
     from pipeline.reading import trial_files
 
     recording, rows = trial_files.open_trial(path, **camera.recording), []
-    known, frames = recording.conditions, recording.frames
+    frames, signals, known = recording.frames, recording.signals, recording.conditions
     if known is None:
         return rows
-    for number, place, time, picture, one in excerpts.excerpts(frames, recording.signals, camera.mounting):
+    scale = (known.px_per_mm, known.offset_px)
+    for number, picture, row in excerpts(frames, signals, camera.mounting, scale=scale):
         name = f"{path.stem}_{number:05d}.jpg"
         artifacts.write_jpeg(folder / name, picture)
-        width_mm = float(camera.true_px(np.array(one.width)) - known.offset_px) / known.px_per_mm
-        figures = {"blur_px": one.blur_px, "width_mm": width_mm, "deviation_px": one.deviation}
-        rows.append({
-            "file": name, "place": place, "material": known.material, "trial": known.trial,
-            "recording": path.name, "topic": frames.topic, "time_s": round(time, 6), "reason": one.reason,
-            **{key: value if np.isfinite(value) else None for key, value in figures.items()},
-        })  # fmt: skip
+        head = {"file": name, "place": row["place"], "material": known.material, "trial": known.trial}
+        rows.append(head | {"recording": path.name, "topic": frames.topic} | row)
     return rows
 
 

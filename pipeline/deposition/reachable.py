@@ -102,8 +102,8 @@ def ramp_of_all(
     longest_s: float,
     sample_time_s: float,
 ) -> float:
-    """The time in s in which the gantry may reach a printing speed such that the drive follows the flow of each
-    of the extruders (`ramp_that_loses_little`), in whole hundredths; at most longest_s."""
+    """The time in s in which the gantry may reach a printing speed such that the drive follows the flow of
+    each of the extruders (`ramp_that_loses_little`), in whole hundredths; at most longest_s."""
     ramps = [
         ramp_that_loses_little(
             extruder, drive, steady_flow=steady_flow, ramp_s=ramp_s, longest_s=longest_s,

@@ -6,6 +6,7 @@ Methods take values, no sections: the properties here make what a method takes, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import pydantic
@@ -14,8 +15,6 @@ from pydantic import Field
 from pipeline.store.params import Mapped, Section
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from pipeline.deposition.camera.pose import Mounting
     from pipeline.deposition.drive import Drive
     from pipeline.deposition.extruder import Extruder, Routine
@@ -140,6 +139,14 @@ class Printer(Section):
             for t in trainings
         ]  # fmt: skip
 
+    def expected_trials(self, routines: Sequence[Routine]) -> dict[str, Any]:
+        """The trials that a folder may hold: keywords of `trial_files.group_trials`."""
+        return {
+            "materials": [material.name for material in self.materials],
+            "nozzle": f"{self.nozzle_mm:g}",
+            "routines": [(float(r.speed.max()), r.pause_s[1] - r.pause_s[0]) for r in routines],
+        }
+
 
 class TrialTopics(Section):
     """Topics of a machine's own recordings of trials: the camera's (empty: the only one), the clock
@@ -210,25 +217,38 @@ class Camera(Section):
         """How the camera hangs, and what of its pictures is measured."""
         from pipeline.deposition.camera.pose import Mounting
 
+        known_px = [known / abs(self.mm_per_px) for known in self.known_widths_mm]
         return Mounting(
             self.mm_per_px, self.nozzle_column, (self.columns[0], self.columns[1]), self.longest_blur_px,
             {"light": 1, "dark": -1, "": 0}[self.bead], self.rotation_deg,
             None if self.tip_px is None else (self.tip_px[0], self.tip_px[1]), self.mask_px,
+            list(zip(known_px, self.edge_bias_px, strict=False)),
         )  # fmt: skip
 
-    def true_px(self, measured_px: np.ndarray) -> np.ndarray:
-        """Widths in px without the edge bias that calibration found."""
-        import numpy as np
+    def film(self, printer: Printer) -> dict[str, Any]:
+        """How a simulated trial is filmed: keywords of `simulated_trial.simulate_trial`."""
+        from pipeline.deposition.camera.flow import View
 
-        from pipeline.deposition.camera.trial_flow import width_px
-
-        known_px = np.array(self.known_widths_mm) / abs(self.mm_per_px)
-        return width_px(measured_px, known_px, np.array(self.edge_bias_px))
+        return {
+            "view": View(self.mm_per_px, self.nozzle_column),
+            "frame_rate_hz": self.frames_per_s,
+            "nozzle_mm": (printer.nozzle_mm / 2, printer.nozzle_outer_mm / 2),
+            "contact_angle_deg": self.contact_angle_deg,
+        }
 
     @property
     def recording(self) -> dict[str, Any]:
         """How a recording of a trial is opened: keywords of `trial_files.open_trial`."""
         return {**dict(self.topics), "unreadable_share": self.unreadable_share}
+
+    @property
+    def looks(self) -> dict[str, Any]:
+        """The settings that decide what is read from a recording."""
+        names = {
+            "mm_per_px", "nozzle_column", "columns", "rotation_deg", "tip_px", "mask_px", "bead", "topics",
+            "longest_blur_px", "unreadable_share",
+        }  # fmt: skip
+        return self.model_dump(include=names)
 
     def straight(self) -> Camera:
         """The camera of a simulated machine, which stands straight and errs as its calibration finds."""
@@ -241,16 +261,22 @@ class Camera(Section):
 
 
 def trial_conditions(
-    printer: Printer, camera: Camera, material: PrinterMaterial, routine: Routine
-) -> dict[str, Any]:
-    """What the recording of a trial says of itself, but for its number, its law and the scale of its widths:
-    fields of `trial_files.TrialConditions`."""
+    printer: Printer, camera: Camera, material: PrinterMaterial, routine: Routine, trial: int, law: str,
+    calibration: tuple[float, float],
+) -> dict[str, Any]:  # fmt: skip
+    """What the recording of a trial says of itself: fields of `trial_files.TrialConditions`. calibration is
+    (gain, offset) of widths in mm against px."""
+    gain, offset = calibration
     return {
         "material": material.name,
         "nozzle": f"{printer.nozzle_mm:g}",
+        "trial": trial,
+        "law": law,
         "speed_mm_per_s": float(routine.speed.max()),
         "pause_s": round(routine.pause_s[1] - routine.pause_s[0], 9),
         "bead_area_mm2": printer.bead_area_mm2,
+        "px_per_mm": 1 / gain,
+        "offset_px": -offset / gain,
         "contact_angle_deg": camera.contact_angle_deg,
         "mm_per_px": camera.mm_per_px,
         "nozzle_column": camera.nozzle_column,

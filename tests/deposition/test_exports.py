@@ -12,7 +12,7 @@ import pytest
 from pipeline.deposition.workflow.settings import ComposeParts, Printer
 
 from pipeline.deposition.parts import extrusion, leads
-from pipeline.deposition.parts.conformance import Refused
+from pipeline.deposition.parts.conformance import LineRefusal
 from pipeline.deposition.toolpath import gcode, motion
 from pipeline.deposition.toolpath.gcode import Kind
 from pipeline.deposition.workflow import compose_parts, exports, part_motion, part_programs
@@ -303,8 +303,8 @@ def test_pipes_and_large_files_are_refused_without_being_read(tmp_path, monkeypa
 
 def test_what_the_library_lacks_is_told_once_a_task_with_the_number_of_its_lines(tmp_path, machine):
     done = part(tmp_path, machine, TWO)
-    many = [Refused(k, f"the library lacks Corner at {k} mm/s; an error of {k} %") for k in range(40, 90)]
-    many += [Refused(7, "the library lacks Stop at 8 mm/s")]
+    many = [LineRefusal(k, f"the library lacks Corner at {k} mm/s; an error of {k} %") for k in range(40, 90)]
+    many += [LineRefusal(7, "the library lacks Stop at 8 mm/s")]
     program = gcode.parse("G1 X1\n" + "G1 X Y\n" * 3)
     kinds = part_programs.grouped(done.conformance._replace(refused=many), program.refusals)
     assert [(one.line, one.count) for one in kinds] == [(2, 3), (7, 1), (40, 50)]

@@ -1,6 +1,7 @@
 """A few frames of a trial for the page, with the measured edges drawn in."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,11 +14,15 @@ from pipeline.deposition.camera.readings import TrialFrames, measure_beads
 
 
 def excerpts(
-    frames: TrialFrames, signals: Mapping[str, tuple[np.ndarray, np.ndarray]], mounting: Mounting
-) -> Iterator[tuple[int, str, float, np.ndarray, Bead]]:
-    """(number, what it shows, time, picture (h, w, 3) in RGB, bead) of the frames to show; signals {name:
-    (time_s (n,), values (n,))} have the gantry's place and speed."""
-    gantry = Gantry(*signals["position_mm"])
+    frames: TrialFrames,
+    signals: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    mounting: Mounting,
+    *,
+    scale: tuple[float, float],
+) -> Iterator[tuple[int, np.ndarray, dict[str, Any]]]:
+    """(number, picture (h, w, 3) in RGB, figures) of the frames to show; signals {name: (time_s (n,), values
+    (n,))} have the gantry's place and speed, scale is (px_per_mm, offset_px) of the widths."""
+    gantry, (px_per_mm, offset_px) = Gantry(*signals["position_mm"]), scale
     beads = [(time, one) for time, _, one in measure_beads(frames, gantry, mounting)]
     if not beads:
         return
@@ -25,7 +30,11 @@ def excerpts(
     places = places_to_show(beads, *signals["speed_mm_per_s"], travel_mm=float(travel_mm))
     for number, (time, picture, one) in enumerate(measure_beads(frames, gantry, mounting)):
         if number in places:
-            yield number, places[number], time, cut(bead.drawn(picture, one), one), one
+            width_mm = float(mounting.true_px(np.array(one.width)) - offset_px) / px_per_mm
+            figures = {"blur_px": one.blur_px, "width_mm": width_mm, "deviation_px": one.deviation}
+            figures = {name: value if np.isfinite(value) else None for name, value in figures.items()}
+            row = {"place": places[number], "time_s": round(time, 6), "reason": one.reason} | figures
+            yield number, cut(bead.drawn(picture, one), one), row
 
 
 def places_to_show(

@@ -1,5 +1,5 @@
-"""How the pictures of a trial are turned before they are measured: as the camera's calibration says, or as the
-line in the pictures themselves shows."""
+"""How the pictures of a trial are turned before they are measured: as the camera's calibration says, or as
+the line in the pictures themselves shows."""
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import NamedTuple
@@ -20,7 +20,7 @@ class Mounting(NamedTuple):
     """How a camera hangs: the size of a pixel in mm, negative if the line trails to higher columns; the
     nozzle's column and the columns that are measured; `sign` 1 for a bead brighter than its ground, -1 for a
     darker one, 0 if nobody said; the direction of the line and the tip (x, y) in px, None if unknown; the
-    polygon that the nozzle hides."""
+    polygon that the nozzle hides; and pairs in px: a width, and by how much wider it looks."""
 
     mm_per_px: float
     nozzle_column: float
@@ -30,6 +30,15 @@ class Mounting(NamedTuple):
     rotation_deg: float | None
     tip_px: tuple[float, float] | None
     mask_px: Sequence[Sequence[float]]
+    edge_bias: Sequence[tuple[float, float]]
+
+    def true_px(self, measured_px: np.ndarray) -> np.ndarray:
+        """Widths in px without the edge bias, straight between the known widths; as measured if calibration
+        found none."""
+        if not self.edge_bias:
+            return measured_px
+        known_px, bias_px = np.array(self.edge_bias).T
+        return measured_px - np.interp(measured_px, known_px + bias_px, bias_px)
 
     @property
     def hidden_px(self) -> float:
@@ -43,9 +52,9 @@ def pose(
     gantry: Gantry,
     frames: Callable[[Collection[int]], Iterable[tuple[int, np.ndarray]]],
 ) -> line.Pose | None:
-    """How pictures taken at time_s (F,) are turned: as the mounting says, else as the frames with a bead, less
-    those without, show it. `frames` gives (number, picture) for some numbers. None: they are measured as they
-    lie."""
+    """How pictures taken at time_s (F,) are turned: as the mounting says, else as the frames with a bead,
+    less those without, show it. `frames` gives (number, picture) for some numbers. None: they are measured as
+    they lie."""
     if mounting.rotation_deg is not None and not mounting.rotation_deg and mounting.tip_px is None:
         return None
     shape, picture = bead_alone(time_s, gantry, frames)
@@ -62,7 +71,7 @@ def pose(
     return None if mounting.tip_px is None else placed(mounting, shape, 0.0, None)
 
 
-def pose_of_line(mounting: Mounting, shape: tuple[int, int], found: line.Line) -> line.Pose | None:
+def pose_of_line(mounting: Mounting, shape: tuple[int, int], found: line.ImageLine) -> line.Pose | None:
     """The pose for a line found in pictures of this shape (rows, columns)."""
     if mounting.tip_px is not None:
         # the line comes out of the tip and trails to the side that mm_per_px says
@@ -72,7 +81,7 @@ def pose_of_line(mounting: Mounting, shape: tuple[int, int], found: line.Line) -
 
 
 def placed(
-    mounting: Mounting, shape: tuple[int, int], angle_deg: float, found: line.Line | None
+    mounting: Mounting, shape: tuple[int, int], angle_deg: float, found: line.ImageLine | None
 ) -> line.Pose:
     """The tip comes to lie at the nozzle's column, without a tip the picture's middle stays where it is; the
     line in the middle row. As many rows as the frame has on both sides of the line over the measured

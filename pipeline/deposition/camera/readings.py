@@ -32,15 +32,21 @@ class TrialFrames(Protocol):
 
 
 class Readings(NamedTuple):
-    """The readings of F frames: time_s (F,) as stamped, columns (m,), widths (F, m) in px of the picture as it
-    is measured (0 bare, NaN unread), reasons (F,) why a frame has no usable bead, and the camera's latency as
-    this recording tells it."""
+    """The readings of F frames: time_s (F,) as stamped, columns (m,), widths (F, m) in px of the picture as
+    it is measured (0 bare, NaN unread), reasons (F,) why a frame has no usable bead, and the camera's latency
+    as this recording tells it."""
 
     time_s: np.ndarray
     columns: np.ndarray
     widths: np.ndarray
     reasons: list[str]
     latency: Latency
+
+    @classmethod
+    def from_values(cls, values: tuple) -> "Readings":
+        """Of five plain values, the latency as (latency_s, deviation_s)."""
+        *rest, late = values
+        return cls(*rest, Latency(*late))
 
 
 def measure_beads(

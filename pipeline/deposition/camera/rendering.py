@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.deposition.camera import bead
 from pipeline.deposition.camera.bead import area
 from pipeline.deposition.camera.flow import View, deposit_share
+from pipeline.deposition.camera.pose import Mounting
 
 # frames of each known width, spread over the stage
 CALIBRATION_FRAMES = 12
@@ -167,20 +168,13 @@ class SimulatedCamera:
 
 
 def calibrate(
-    camera: SimulatedCamera,
-    known_widths_mm: Sequence[float],
-    rng: np.random.Generator,
-    *,
-    mm_per_px: float,
-    columns: tuple[int, int],
-    longest_blur_px: float,
+    camera: SimulatedCamera, known_widths_mm: Sequence[float], rng: np.random.Generator, mounting: Mounting
 ) -> bead.WidthCalibration:
     """Pixels to mm on pictures of beads of known widths. Raises ValueError if one cannot be measured."""
     widths_mm = np.repeat(known_widths_mm, CALIBRATION_FRAMES)
-    frames = [
-        camera.frame(width / abs(mm_per_px), stage_px=int(rng.integers(0, 10_000))) for width in widths_mm
-    ]
-    beads = [bead.measure(frame, columns=columns, longest_blur_px=longest_blur_px) for frame in frames]
+    px, columns, blur_px = abs(mounting.mm_per_px), mounting.columns, mounting.longest_blur_px
+    frames = [camera.frame(width / px, stage_px=int(rng.integers(0, 10_000))) for width in widths_mm]
+    beads = [bead.measure(frame, columns=columns, longest_blur_px=blur_px) for frame in frames]
     bad = [f"{width:g} mm: {one.reason}" for width, one in zip(widths_mm, beads, strict=True) if one.reason]
     if bad:
         reasons = ", ".join(
@@ -188,7 +182,7 @@ def calibrate(
         )
         raise ValueError(
             f"camera: known widths should be seen in every picture but are not ({reasons}); "
-            f"fit camera.known_widths_mm to what is seen at {abs(mm_per_px):g} mm per px, "
+            f"fit camera.known_widths_mm to what is seen at {px:g} mm per px, "
             "or raise camera.longest_blur_px"
         )
     return bead.calibrate(np.array([one.width for one in beads]), widths_mm)

@@ -1,5 +1,5 @@
-"""A trial measured from its pictures: readings of its frames and signals of its recording -> the flow that a law
-learns from, on the clock of its routine."""
+"""A trial measured from its pictures: readings of its frames and signals of its recording -> the flow that a
+law learns from, on the clock of its routine."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -9,6 +9,7 @@ import scipy.signal
 
 from pipeline.deposition.camera import flow
 from pipeline.deposition.camera.latency import Latency
+from pipeline.deposition.camera.pose import Mounting
 from pipeline.deposition.camera.readings import Readings
 from pipeline.deposition.extruder import Routine
 from pipeline.deposition.learning.ilc import Trial
@@ -32,19 +33,23 @@ class MeasuredTrial(NamedTuple):
 
 def measure_trial(
     readings: Readings,
-    widths_mm: np.ndarray,
     signals: Mapping[str, tuple[np.ndarray, np.ndarray]],
     routine: Routine,
+    mounting: Mounting,
     *,
+    scale: tuple[float, float],
     view: flow.View,
     latency: Latency,
     nozzle_mm: float,
     contact_angle_deg: float,
     width_deviation_mm: float,
 ) -> MeasuredTrial:
-    """The trial of one recording: readings with widths_mm (F, m) in mm, and signals {name: (time_s (n,), values
-    (n,))} on clocks of their own. Raises ValueError if no frame shows a bead, and for signals that do not
-    cover the routine."""
+    """The trial of one recording: readings of its frames, and signals {name: (time_s (n,), values (n,))} on
+    clocks of their own. scale is (px_per_mm, offset_px) of the widths. Raises ValueError if no frame shows a
+    bead, and for signals that do not cover the routine."""
+    px_per_mm, offset_px = scale
+    widths_mm = (mounting.true_px(readings.widths) - offset_px) / px_per_mm
+    widths_mm = np.where(readings.widths == 0, 0.0, widths_mm)
     late = clock_shift(*signals["position_mm"], routine)
     shifted = {name: (time_s - late, values) for name, (time_s, values) in signals.items()}
     at = on_routine_clock(shifted, routine)
@@ -85,8 +90,8 @@ def _check_beads(readings: Readings) -> None:
 def on_routine_clock(
     signals: Mapping[str, tuple[np.ndarray, np.ndarray]], routine: Routine
 ) -> dict[str, np.ndarray]:
-    """The signals (T,) of a recording at the samples of its routine. Raises ValueError if the recording is too
-    short, has gaps, or shows another travel."""
+    """The signals (T,) of a recording at the samples of its routine. Raises ValueError if the recording is
+    too short, has gaps, or shows another travel."""
     for name, (time_s, _) in signals.items():
         if len(time_s) == 0 or time_s[0] > SLACK_S or time_s[-1] < routine.time_s[-1] - SLACK_S:
             span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s" if len(time_s) else "nothing"
@@ -127,14 +132,6 @@ def clock_shift(time_s: np.ndarray, position: np.ndarray, routine: Routine) -> f
     both = scipy.signal.correlate(speed, routine.speed, "valid", method="fft")
     own = np.convolve(speed**2, np.ones(len(routine.speed)), "valid")
     return float(time_s[0]) + (int(np.argmin(own - 2 * both)) - spare) * Ts
-
-
-def width_px(measured_px: np.ndarray, known_px: np.ndarray, bias_px: np.ndarray) -> np.ndarray:
-    """Widths in px without the edge bias (k,) that calibration found on known widths (k,) in px, straight
-    between them; as measured if it found none."""
-    if not len(bias_px):
-        return measured_px
-    return measured_px - np.interp(measured_px, known_px + bias_px, bias_px)
 
 
 # ---- figures

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.deposition.drive import Drive, obeyed
-from pipeline.deposition.extruder import Extruder, Routine, disturb, draw, flow, frequency_response
+from pipeline.deposition.extruder import Extruder, Routine, disturb, draw, flow, frequency_response, to_json
 from pipeline.deposition.learning import ilc
 from pipeline.deposition.learning.ilc import Law, Trial
 from pipeline.deposition.learning.trial_model import deviations
@@ -15,8 +15,8 @@ from pipeline.deposition.learning.unmodelled import unmodelled
 
 # the frequencies of the convergence test reach to half the sampling rate
 FREQUENCIES = 2000
-# an extruder is known to 30 %: what is off by this factor is a unit, a scale or a picture of another size, and
-# the next command would be off as much
+# an extruder is known to 30 %: what is off by this factor is a unit, a scale or a picture of another size,
+# and the next command would be off as much
 WRONG_GAIN = 3.0
 
 
@@ -46,7 +46,7 @@ class TrialSequence(NamedTuple):
     law: str
     routine: Routine
     trials: list[Trial]
-    rows: list[ilc.Row]
+    rows: list[ilc.TrialRow]
     model: ilc.TrialModel | None
 
 
@@ -296,10 +296,10 @@ def learn_in_flow(
     plants: int,
     settings: LawSettings,
     on_step: Callable[[Trial], None],
-) -> tuple[dict[int, list[TrialSequence]], dict[str, Any], dict[str, float] | None]:
-    """Both laws on the measured flow of a simulated machine: their sequences by number of the routine, figures,
-    and the model identified on the reference. `rngs` draw what does not repeat, and the plants of the
-    convergence test."""
+) -> tuple[dict[int, list[TrialSequence]], dict[str, Any], dict[str, Any]]:
+    """Both laws on the measured flow of a simulated machine: their sequences by number of the routine,
+    figures, and the models as JSON. `rngs` draw what does not repeat, and the plants of the convergence
+    test."""
     sequences = train(case, rngs[0], noise, trials=trials, settings=settings, on_step=on_step)
     hoelzle, reference, *others, hoelzle_nominal = sequences
     gamma = convergence_of_model_inverse(reference, rngs[1], noise, plants=plants, settings=settings)
@@ -313,20 +313,22 @@ def learn_in_flow(
     }
     by_routine = {0: [hoelzle_nominal, hoelzle, reference]}
     by_routine |= {index: [sequence] for index, sequence in enumerate(others, 1)}
-    return by_routine, rows, model_figures(reference.model)
+    models = {"nominal": to_json(case.nominal), "plant": to_json(case.plant)}
+    return by_routine, rows, models | {"identified": model_figures(reference.model)}
 
 
 def resume(
     trials: Sequence[Trial], routine: Routine, nominal: Extruder, settings: LawSettings
-) -> tuple[TrialSequence | None, ilc.Step]:
-    """What was learned in the trials so far, and what follows: trial 0 is on-off control. Raises ValueError if
-    they show another gain than the nominal one by more than WRONG_GAIN."""
+) -> tuple[TrialSequence | None, np.ndarray, dict[str, Any]]:
+    """What was learned in the trials so far, the next command u (T,) in mm, and its figures: trial 0 is
+    on-off control. Raises ValueError if they show another gain than the nominal one by more than
+    WRONG_GAIN."""
     u0 = on_off(routine.r, nominal)
     if not trials:
         first = obeyed(u0, settings.drive, sample_time_s=settings.sample_time_s)
-        return None, ilc.Step(first, 0, False, [])
+        return None, first, {"best_trial": 0, "rolled_back": False, "restarts": []}
     law = model_inverse(routine, settings)
-    step = ilc.next_step(trials, routine.r, law, rise=settings.rise)
+    u, best, rolled_back, restarts = ilc.next_step(trials, routine.r, law, rise=settings.rise)
     gain_ratio = law.model.extruder.gain / nominal.gain if law.model else 1.0
     if not 1 / WRONG_GAIN < gain_ratio < WRONG_GAIN:
         raise ValueError(
@@ -337,7 +339,8 @@ def resume(
         trials, routine.r, steady=float(u0.max()), drive=settings.drive,
         sample_time_s=settings.sample_time_s, rise=settings.rise,
     )  # fmt: skip
-    return TrialSequence("pixels", routine, list(trials), rows, law.model), step
+    sequence = TrialSequence("pixels", routine, list(trials), rows, law.model)
+    return sequence, u, {"best_trial": best, "rolled_back": rolled_back, "restarts": restarts}
 
 
 def model_figures(model: ilc.TrialModel | None) -> dict[str, float] | None:
@@ -358,7 +361,8 @@ def model_figures(model: ilc.TrialModel | None) -> dict[str, float] | None:
 def trial_rows(sequences: dict[tuple[str, int], list[TrialSequence]]) -> dict[str, np.ndarray]:
     """One row a trial of every sequence, by (material, number of the routine)."""
     columns: dict[str, list] = {
-        name: [] for name in ("material", "law", "routine", "speed_mm_per_s", "pause_s", *ilc.Row._fields)
+        name: []
+        for name in ("material", "law", "routine", "speed_mm_per_s", "pause_s", *ilc.TrialRow._fields)
     }
     for (material, index), of_routine in sequences.items():
         for sequence in of_routine:
