@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # the readings of a recording are remembered; this code decides what they are
 MEMO, PIPELINE = Path("datasets/memo/train_ilc"), Path(__file__).resolve().parents[1] / "pipeline"
 READERS = ("deposition/camera", "reading/image_messages.py", "reading/image_topics.py")
-READERS += ("reading/trial_files.py", "store/mcap_frames.py")
+READERS += ("reading/trial_files.py", "reading/mcap_frames.py")
 Sections = tuple[TrainIlc, Printer, Camera]
 # trial sequences and measured trials by (material, number of the routine), models and figures by material
 Results = tuple[dict[tuple[str, int], list], dict[tuple[str, int], list], dict[str, dict], dict[str, dict]]

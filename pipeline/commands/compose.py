@@ -14,7 +14,7 @@ from pipeline.deposition.tables import LIBRARY, LINES, TASKS
 from pipeline.reading.signals import Source
 from pipeline.reading.trial_files import COMMAND, TYPES
 from pipeline.store import artifacts
-from pipeline.store.mcap_frames import tables_of, write_frames
+from pipeline.reading.mcap_frames import tables_of, write_frames
 from pipeline.store.tables import FLOAT, Column, Schema
 
 FORMATS = ("csv", "parquet", "mcap", "gcode")
