@@ -11,10 +11,10 @@ from pipeline.deposition.parts import leads, part_report, stored
 from pipeline.deposition.parts.composition import Composed, LearnedLibrary
 from pipeline.deposition.parts.part import ComposedPart
 from pipeline.deposition.tables import LIBRARY, LINES, TASKS
+from pipeline.reading.mcap_frames import tables_of, write_frames
 from pipeline.reading.signals import Source
 from pipeline.reading.trial_files import COMMAND, TYPES
 from pipeline.store import artifacts
-from pipeline.reading.mcap_frames import tables_of, write_frames
 from pipeline.store.tables import FLOAT, Column, Schema
 
 FORMATS = ("csv", "parquet", "mcap", "gcode")

@@ -24,7 +24,6 @@ from pipeline.deposition.parts.library import Basis, Library
 from pipeline.deposition.parts.library import learned as learned_command
 from pipeline.deposition.toolpath import gcode
 from pipeline.deposition.toolpath.motion import plan
-from pipeline.deposition.workflow import compose_parts
 from tests.deposition.trained import (
     AREA,
     CREEPING,
@@ -347,8 +346,7 @@ def test_on_a_machine_whose_flow_nobody_knows_a_composer_scores_the_upper_end_of
     )  # fmt: skip
     ends = np.abs([checks.lines.low_percent, checks.lines.high_percent]).max()
     assert np.all(checks.lines.low_percent <= checks.lines.high_percent)
-    part = compose_parts.Part("dashes", None, None, made, checks, None, None)
-    chosen = next(score for score in compose_parts.upper_ends(part, scores, plain) if score.chosen)
+    chosen = next(score for score in evaluation.upper_ends(made, checks.lines, scores, plain) if score.chosen)
     assert chosen.worst_line_volume_percent == ends > checks.worst_line_volume_percent
 
 

@@ -12,9 +12,11 @@ from pipeline.deposition.parts import extrusion, part_motion
 from pipeline.deposition.parts.composition import Composed, Stream
 from pipeline.deposition.parts.conformance import Conformance
 from pipeline.deposition.parts.evaluation import FULL_PART_ILC, ComposerScore
+from pipeline.deposition.parts.extrusion import Extruded
 from pipeline.deposition.parts.part import ComposedPart
 from pipeline.deposition.parts.stored import finite_or_none
 from pipeline.deposition.toolpath import motion
+from pipeline.deposition.toolpath.gcode import PartProgram
 from pipeline.deposition.toolpath.gcode_words import LineRefusal, Refusals
 
 LONGEST_LIST = 12  # refusals and words in the summary
@@ -82,12 +84,13 @@ def _program_lines(part: ComposedPart) -> list[str]:
         f"hold other words, {by.blank:,} are empty or comment, {by.refused:,} were refused"
     ]
     text += [f"T{tool}: {_volume_source(why)}" for tool, why in part.extruded.source.items()]
-    for one in _differences(part):
+    area = part.bead_area_mm2
+    for one in extrusion.differences(program.moves, part.extruded, bead_area_mm2=area):
         low, middle, high = one.area_mm2
         text.append(
             f"T{one.tool}: E asks for {one.by_e_mm3:.4g} mm^3, {one.by_e_mm3 / one.declared_mm3:.2f} of the "
             f"declared bead's {one.declared_mm3:.4g} mm^3; its lines have {low:.3g} to {high:.3g} mm^2, half "
-            f"of the length below {middle:.3g}, declared {part.bead_area_mm2:g}"
+            f"of the length below {middle:.3g}, declared {area:g}"
         )
     text += [
         f"{one.word}, {one.count:,} x, first in line {one.line}: {one.what or 'unknown; left out'}"
@@ -100,10 +103,6 @@ def _program_lines(part: ComposedPart) -> list[str]:
 
 def _volume_source(why: str) -> str:
     return f"volumes by E, {why}" if why.startswith(("diameter", "E counts")) else f"declared bead: {why}"
-
-
-def _differences(part: ComposedPart) -> list[extrusion.VolumeDifference]:
-    return extrusion.differences(part.program.moves, part.extruded, bead_area_mm2=part.bead_area_mm2)
 
 
 def grouped(report: Conformance, refusals: Sequence[LineRefusal]) -> list[LineRefusal]:
@@ -221,14 +220,20 @@ def report(part: ComposedPart) -> dict[str, Any]:
         },
         "refused": [one._asdict() for one in grouped(checks, part.program.refusals)],
         "unknown_words": sum(one.count for one in part.program.told if not one.what),
-        "program": {
-            "lines": part.program.accounted._asdict(),
-            "extruder": part.program.extruder,
-            "volumes": {f"T{tool}": _volume_source(why) for tool, why in part.extruded.source.items()},
-            "e_beside_declared_bead": [one._asdict() for one in _differences(part)],
-            "words": [one._asdict() for one in part.program.told],
-            "refused": [one._asdict() for one in part.program.refusals],
-        },
+        "program": program_report(part.program, part.extruded, bead_area_mm2=part.bead_area_mm2),
+    }
+
+
+def program_report(program: PartProgram, extruded: Extruded, *, bead_area_mm2: float) -> dict[str, Any]:
+    """What the program holds and what E asks for beside the declared bead, as JSON."""
+    differences = extrusion.differences(program.moves, extruded, bead_area_mm2=bead_area_mm2)
+    return {
+        "lines": program.accounted._asdict(),
+        "extruder": program.extruder,
+        "volumes": {f"T{tool}": _volume_source(why) for tool, why in extruded.source.items()},
+        "e_beside_declared_bead": [one._asdict() for one in differences],
+        "words": [one._asdict() for one in program.told],
+        "refused": [one._asdict() for one in program.refusals],
     }
 
 
