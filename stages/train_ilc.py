@@ -60,7 +60,7 @@ def main() -> None:
             paths = trial_files.trial_paths(folder)
             recordings = [trial_files.open_trial(path, **camera.recording) for path in paths]
             results = [learn_from_recordings(recordings, folder, out / "next", (settings, printer, camera))]
-            paths = [Path(recording.path) for recording in trial_files.first_and_last(recordings)]
+            paths = trial_files.first_and_last(recordings)
         else:
             camera, kinds = camera.straight(), ("flow", "pixels") if settings.pixel_trials else ("flow",)
             # workers of a cluster work in other folders
@@ -189,7 +189,8 @@ def learn_from_recordings(
     values = {one.path: read(one, camera, MEMO) for one in recordings}
     following.mkdir()
     for material in printer.materials:
-        figures, models = {}, {"nominal": extruder.to_json(material.nominal)}
+        figures: dict[str, Any] = {}
+        models: dict[str, Any] = {"nominal": extruder.to_json(material.nominal)}
         for index, routine in enumerate(routines):
             key, end, measured = (material.name, index), f"_{index}" if index else "", []
             for one in groups.get(key, []):

@@ -258,18 +258,15 @@ def _routine(
     )
 
 
-def first_and_last(recordings: Iterable[TrialRecording]) -> list[TrialRecording]:
-    """Of recordings with conditions those of the first and the last trial of each material, in the order of
-    their names."""
-    by_material: dict[str, list[TrialRecording]] = {}
+def first_and_last(recordings: Iterable[TrialRecording]) -> list[Path]:
+    """Of recordings with conditions the paths of the first and the last trial of each material, in the order
+    of their names."""
+    by_material: dict[str, list[tuple[int, Path]]] = {}
     for recording in recordings:
-        if recording.conditions:
-            by_material.setdefault(recording.conditions.material, []).append(recording)
-    ends = {}
-    for trials in by_material.values():
-        ordered = sorted(trials, key=lambda one: (one.conditions.trial, one.path))
-        ends |= {recording.path: recording for recording in (ordered[0], ordered[-1])}
-    return [ends[path] for path in sorted(ends, key=Path)]
+        conditions = recording.conditions
+        if conditions:
+            by_material.setdefault(conditions.material, []).append((conditions.trial, Path(recording.path)))
+    return sorted({path for trials in by_material.values() for _, path in (min(trials), max(trials))})
 
 
 def read_trial(

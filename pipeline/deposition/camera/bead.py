@@ -36,10 +36,11 @@ class Bead(NamedTuple):
 
 
 def area(width: np.ndarray | float, contact_angle_deg: float) -> np.ndarray | float:
-    """Cross-section A = c w^2 in mm^2 of a bead w mm wide: the circular segment that meets the substrate at
-    theta, c = (theta - sin theta cos theta) / (4 sin^2 theta).
+    """Cross-section in mm^2 of a bead w mm wide, the circular segment that meets the substrate at theta:
 
-    At 90 degrees c = pi/8. Raises ValueError where theta is not between 0 and 180 degrees.
+        A = c w^2,   c = (theta - sin theta cos theta) / (4 sin^2 theta)
+
+    At 90 degrees c = pi/8. Raises ValueError if theta is not between 0 and 180 degrees.
     """
     if not 0 < contact_angle_deg < 180:
         raise ValueError(

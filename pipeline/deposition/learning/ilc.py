@@ -129,11 +129,13 @@ def hoelzle_law(
     drive: Drive,
     sample_time_s: float,
 ) -> Law:
-    """u_{j+1} = Q (u_j + L e_j) of the last trial (Hoelzle 2009, eq. 2); q is
-    `zero_phase` or takes the same, the model the nominal (1).
+    """The paper's law on the last trial (Hoelzle 2009, eq. 2); q is `zero_phase` or takes the same, the model
+    the nominal (1).
 
-    u_j is what the drive applied, so that nothing winds up at its
-    limits; e_j = 0 where the flow was not observable.
+        u_{j+1} = Q (u_j + L e_j)
+
+    u_j is what the drive applied, so that nothing winds up at its limits; e_j = 0 where the flow was not
+    observable.
     """
     b, a = _slow_inverse(model, settings, sample_time_s)
 
@@ -236,15 +238,18 @@ def command(
 
 
 class InverseLaw:
-    """The model inverse, u_{j+1} = Q sum_i w_i (u_i + L e_i) over the trials i <= j that it is given, L the
-    inverse of the model identified from the first of them; it remembers that model.
+    """The model inverse over the trials i <= j that it is given, L the inverse of the model identified from
+    the first of them; it remembers that model.
 
-    Written with the average d of what the model misses: u_{j+1} = L Q ((r + yield) / g - d), the same thing
-    where the gain g of the next trial is 1, and for one trial Q (u + L e). The weights w_i average what does
-    not repeat, and follow what changes (`trial_filter.repeating`); Q stays outside, so that it erodes nothing
-    as they fall, and |1 - k + k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k. Q ends earlier where
-    the model's lag would have to be inverted far above its frequency (`known_share`), and what is learned is
-    bounded by what the model alone asks for (`bounded`).
+        u_{j+1} = Q sum_i w_i (u_i + L e_i)
+                = L Q ((r + yield) / g - d)
+
+    The second line, with the average d of what the model misses, is the same if the gain g of the next trial
+    is 1; for one trial both are Q (u + L e). The weights w_i average what does not repeat, and follow what
+    changes (`trial_filter.repeating`); Q stays outside, so that it erodes nothing as they fall, and |1 - k +
+    k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k. Q ends earlier where the model's lag would have
+    to be inverted far above its frequency (`known_share`), and what is learned is bounded by what the model
+    alone asks for (`bounded`).
 
     `identify_trials` trials are identified together: beyond the on-off trial 0 the first
     learned commands show the extruder as it will be driven.

@@ -205,8 +205,10 @@ def convergence(
 def convergence_of_model_inverse(
     sequence: TrialSequence, rng: np.random.Generator, noise: Noise, *, plants: int, settings: LawSettings
 ) -> Convergence:
-    """gamma = max |Q| (|1 - L P| + |L P Delta|) of the model inverse once its model is identified: of that
-    model, and over plants that the first trials cannot tell from it.
+    """gamma of the model inverse once its model is identified: of that model, and over plants that the first
+    trials cannot tell from it.
+
+        gamma = max_f |Q| (|1 - L P| + |L P Delta|)
 
     That is the largest |Q (1 - L P (1 + Delta'))| of all |Delta'(f)| <= |Delta(f)|, and Delta is what the
     model leaves of the trials that identified it and of the next one, which it has not seen

@@ -83,16 +83,20 @@ def compose(
     """The command u (T,) in mm for the wanted flow r (T,) in mm^3/s, as functions of r and of the
     on-indicator p, with x = r + yield p:
 
-    u(t) = advance * [ rate x'(t) + level x(t) + slow <x>(t) + play
-    q(t) sin(2 pi f t) ], <x> = x / (sigma s + 1)
+        u(t) = advance * [ rate x'(t) + level x(t) + slow <x>(t) + play q(t) sin(2 pi f t) ]
+        <x> = x / (sigma s + 1)
 
-    The weights invert the chain (for an exponent, of the pressed x that gives r; where flow falls
-    otherwise than it rises, with the time constant of each sample's direction): with c the creeping
-    share, sigma = (1 - c) T + c tau, rate = tau T / (sigma K), level = (tau + T - tau T / sigma) / (sigma
-    K) and level + slow = 1 / K; without creep rate = tau / K, level = 1 / K, slow = 0. Computed in its
-    exact discrete form. The dither is as wide as the play: it walks through the play wherever that
-    stands, so that its mean position is the command's (Zames and Shneydor 1976); q lets it die out after
-    a stop.
+    The weights invert the chain, with c the creeping share:
+
+        sigma = (1 - c) T + c tau
+        rate = tau T / (sigma K)
+        level = (tau + T - tau T / sigma) / (sigma K)
+        level + slow = 1 / K
+
+    Without creep rate = tau / K, level = 1 / K, slow = 0. For an exponent x is the pressed one that gives r;
+    if flow falls otherwise than it rises, tau is that of each sample's direction. Computed in its exact
+    discrete form. The dither is as wide as the play: it walks through the play wherever that stands, so that
+    its mean position is the command's (Zames and Shneydor 1976); q lets it die out after a stop.
 
     The yield is loaded over as long as the drive needs. Where it cannot follow u even so, the command whose
     flow comes nearest: it sets out early and catches up late. What the dither takes is left of the limits.

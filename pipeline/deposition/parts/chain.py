@@ -112,8 +112,9 @@ def records(trainings: Sequence[Training], *, early: int = 3) -> Records:
 
 
 def backlash(x: np.ndarray, play: np.ndarray) -> np.ndarray:
-    """Play of full width `play` (...,) along the last axis of x (..., T), y(t) = min(max(y(t-1), x(t) -
-    play/2), x(t) + play/2) from y(-1) = 0.
+    """Play of full width `play` (...,) along the last axis of x (..., T), from y(-1) = 0:
+
+        y(t) = min(max(y(t-1), x(t) - play/2), x(t) + play/2)
 
     Each step clips y to [x - play/2, x + play/2], and clips compose to clips: blocks of
     the time axis are walked side by side, then joined.

@@ -91,8 +91,9 @@ def _material(values: Mapping[str, Any]) -> LearnedMaterial:
     chain |= {"extruder": _extruder(chain["extruder"]), "structure": tuple(chain["structure"])}
     missed |= {name: _number(missed[name]) for name in ("ratio", "changed")}
     missed["by_place"] = np.array(missed["by_place"], float)
-    known = {"chain": Chain(**chain), "missed": Missed(**missed), "covered": Covered(**values["covered"])}
-    return LearnedMaterial(**dict(values) | known)
+    known: dict[str, Any] = dict(values)
+    known |= {"chain": Chain(**chain), "missed": Missed(**missed), "covered": Covered(**values["covered"])}
+    return LearnedMaterial(**known)
 
 
 def _number(value: float | None) -> float:
