@@ -158,31 +158,29 @@ def first_experiment(arguments: argparse.Namespace) -> None:
 def compose(arguments: argparse.Namespace) -> None:
     """A part program into plunger commands (CSV, Parquet, MCAP, G-code with leads), tasks and lines as
     Parquet, and whether it will print."""
-    from pipeline.deposition.workflow import compose_parts, exports, part_programs
-    from pipeline.deposition.workflow.segment_library import read_learned
-    from pipeline.deposition.workflow.settings import ComposeParts, Printer
+    from pipeline.commands import compose as command
+    from pipeline.deposition.parts.part_report import summary_lines
+    from pipeline.deposition.settings import ComposeParts, Printer
+    from stages.compose_parts import compose_part
 
     if arguments.out.exists() and not arguments.out.is_dir():
         raise ValueError(
             f"--out {arguments.out}: should be a folder but is a file; name a folder, "
             "which is made where it is missing"
         )
-    asked = part_programs.asked(
+    request = command.request(
         scale=arguments.scale, speed=arguments.speed, filament_mm=arguments.filament_mm,
         extruder=arguments.extruder, bead=arguments.bead,
     )  # fmt: skip
-    formats = exports.formats(arguments.formats)
-    learned = read_learned(
-        "datasets/segment_library/library.parquet", "datasets/segment_library/learned.json"
-    )
+    formats, learned = command.formats(arguments.formats), command.read_learned()
     printer, settings = params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts")
-    part = compose_parts.compose(arguments.part, learned, printer, settings, asked)
+    part = compose_part(arguments.part, learned, printer, settings, **request)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    files = exports.write(part, arguments.out, formats)
-    print(compose_parts.summary_lines(part))
+    files = command.write(part, arguments.out, formats)
+    print(summary_lines(part))
     print("written: " + ", ".join(str(file) for file in files))
     if arguments.verify:
-        from pipeline.deposition.workflow import verify_part
+        from pipeline.commands import verify_part
 
         print(verify_part.write(part, learned, printer, settings, arguments.out))
         print(verify_part.write_next(part, learned, printer, arguments.part.parent, arguments.out))
@@ -210,16 +208,16 @@ def calibrate_tip(arguments: argparse.Namespace) -> None:
 def calibrate_camera(arguments: argparse.Namespace) -> None:
     """Pictures of printed lines of known widths into section camera of params.yaml:
     size of a pixel, rotation, measured columns, edge bias by width; and a page."""
-    from pipeline.deposition.workflow import calibrate_camera as camera
+    from pipeline.commands import calibrate_camera as camera
 
-    asked = camera.Asked(
+    request = camera.CalibrationRequest(
         arguments.images,
         camera.numbers(arguments.widths, "--widths", "0.5,0.9,1.3"),
         camera.pixel(arguments.tip),
         arguments.pitch,
     )
     out = arguments.out or Path(f"{arguments.images[0].stem}.camera.html")
-    print(camera.calibrate(asked, out, write=arguments.write))
+    print(camera.calibrate(request, out, write=arguments.write))
 
 
 def shadow(arguments: argparse.Namespace) -> None:

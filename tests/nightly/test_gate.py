@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.deposition.workflow.tables import SCORES
+from pipeline.deposition.tables import SCORES
 from pipeline.nightly import champion, judge, night, promoting, reporting, screening
 from pipeline.nightly.decision import Evidence
 from pipeline.nightly.reproducing import Reproduced

@@ -6,16 +6,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from pipeline.deposition.workflow.tables import (
-    FILMED,
-    LESSONS,
-    LIBRARY,
-    LINES,
-    SCORES,
-    SIGNALS,
-    TASKS,
-    TRIALS,
-)
+from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
 from pipeline.store import artifacts, params
 from pipeline.temperature import tables
 from pipeline.temperature.settings import Plant

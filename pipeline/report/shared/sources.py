@@ -9,16 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.deposition.workflow.tables import (
-    FILMED,
-    LESSONS,
-    LIBRARY,
-    LINES,
-    SCORES,
-    SIGNALS,
-    TASKS,
-    TRIALS,
-)
+from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
 from pipeline.setpoint.workflow.tables import (
     AGENT_CURVE,
     CLASSIFIED,

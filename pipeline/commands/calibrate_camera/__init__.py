@@ -18,8 +18,9 @@ import numpy as np
 from pipeline.deposition.camera import bead, ladder, line
 from pipeline.deposition.camera.edges import BLOCK, FEWEST_BLOCKS
 from pipeline.deposition.camera.ladder import Ladder, Rung
-from pipeline.deposition.workflow import trial_readings
-from pipeline.deposition.workflow.settings import Camera, Printer
+from pipeline.deposition.settings import Camera, Printer
+from pipeline.reading.image_topics import Frames, Walk, image_topic
+from pipeline.reading.mcap_columns import topics
 from pipeline.store import artifacts, params
 from pipeline.store.params_text import replaced
 
@@ -31,9 +32,9 @@ RIM, COLUMN = 1.15, 30
 WIDER, BESIDE_PX = 1.15, 36
 
 
-class Asked(NamedTuple):
-    """What the command was asked: pictures or recordings, the known widths in mm in their order, the tip
-    (x, y) in px, and the distance of neighbouring lines in mm where one picture shows all (NaN elsewhere)."""
+class CalibrationRequest(NamedTuple):
+    """What a person requests: pictures or recordings, the known widths in mm in their order, the tip
+    (x, y) in px, and the distance of neighbouring lines in mm if one picture shows all (NaN else)."""
 
     images: Sequence[Path]
     widths_mm: Sequence[float]
@@ -51,15 +52,15 @@ class Calibrated(NamedTuple):
     scale_from: str
 
 
-def calibrate(asked: Asked, out: Path, *, write: bool) -> str:
+def calibrate(request: CalibrationRequest, out: Path, *, write: bool) -> str:
     """Writes the page to `out`, with `write` the values into params.yaml, and returns a summary. Raises
     ValueError where a picture cannot be read, shows fewer lines than widths are known, or contradicts them.
     """
     camera, printer = params.load(Camera, "camera"), params.load(Printer, "printer")
-    pictures = [_frames(path, camera) for path in asked.images]
-    done = calibrated(pictures, asked, camera, printer)
+    pictures = [_frames(path, camera) for path in request.images]
+    done = calibrated(pictures, request, camera, printer)
     lines = [f"{key}: {_shown(value)}" for key, value in done.values.items()]
-    artifacts.write_text(out, _page(asked, done, lines))
+    artifacts.write_text(out, _page(request, done, lines))
     written = "paste these lines into params.yaml, or run it again with --write"
     if write:
         path = Path(params.FILE)
@@ -80,18 +81,18 @@ def calibrate(asked: Asked, out: Path, *, write: bool) -> str:
         + f"{written}; page: {out}"
         + (
             ""
-            if asked.tip_px
+            if request.tip_px
             else "; without --tip X,Y the nozzle's column and the direction stay as they are"
         )
     )
 
 
 def calibrated(
-    pictures: Sequence[Sequence[np.ndarray]], asked: Asked, camera: Camera, printer: Printer
+    pictures: Sequence[Sequence[np.ndarray]], request: CalibrationRequest, camera: Camera, printer: Printer
 ) -> Calibrated:
     """The calibration from frames of each picture or recording: one line in each, in the order of the known
     widths; or all of them in a single one, matched by their order of width."""
-    widths = list(asked.widths_mm)
+    widths = list(request.widths_mm)
     together = len(pictures) == 1 and len(widths) > 1
     if not together and len(pictures) != len(widths):
         raise ValueError(
@@ -106,23 +107,23 @@ def calibrated(
             found = ladder.rungs(
                 bead.gray(frame),
                 wanted,
-                tip=asked.tip_px,
+                tip=request.tip_px,
                 hidden_px=rim_px,
                 longest_blur_px=camera.longest_blur_px,
             )
-            _check(asked.images[k], found, widths if together else widths[k : k + 1])
+            _check(request.images[k], found, widths if together else widths[k : k + 1])
             found = sorted(found, key=lambda rung: rung.width_px)
             known = sorted(widths) if together else widths[k : k + 1]
             measured += [(width, frame, rung) for width, rung in zip(known, found, strict=True)]
-    scale, scale_from = _scale(measured, asked, together)
+    scale, scale_from = _scale(measured, request, together)
     fitted = ladder.calibrated(
         np.array([width for width, _, _ in measured]),
         np.array([rung.width_px for _, _, rung in measured]),
         np.array([rung.angle_deg for _, _, rung in measured]),
         mm_per_px=scale,
-        from_tip=asked.tip_px is not None and not together,
+        from_tip=request.tip_px is not None and not together,
     )
-    return Calibrated(fitted, _values(fitted, measured, asked, camera, printer), measured, scale_from)
+    return Calibrated(fitted, _values(fitted, measured, request, camera, printer), measured, scale_from)
 
 
 def _check(path: Path, found: Sequence[Rung], widths: Sequence[float]) -> None:
@@ -142,24 +143,24 @@ def _check(path: Path, found: Sequence[Rung], widths: Sequence[float]) -> None:
 
 
 def _scale(
-    measured: Sequence[tuple[float, np.ndarray, Rung]], asked: Asked, together: bool
+    measured: Sequence[tuple[float, np.ndarray, Rung]], request: CalibrationRequest, together: bool
 ) -> tuple[float | None, str]:
     """Size of a pixel in mm from what has no edges, and what told it; None: the slope of the widths."""
-    if not math.isnan(asked.pitch_mm):
+    if not math.isnan(request.pitch_mm):
         if not together:
             raise ValueError(
                 "calibrate-camera: --pitch needs one picture that shows all lines, but there are "
-                f"{len(asked.images)}; leave it out"
+                f"{len(request.images)}; leave it out"
             )
-        found = [rung.found for _, _, rung in measured[: len(asked.widths_mm)]]
-        return asked.pitch_mm / ladder.pitch_px(found), "the pitch of the ladder"
+        found = [rung.found for _, _, rung in measured[: len(request.widths_mm)]]
+        return request.pitch_mm / ladder.pitch_px(found), "the pitch of the ladder"
     return None, "known over measured widths"
 
 
 def _values(
     fitted: Ladder,
     measured: Sequence[tuple[float, np.ndarray, Rung]],
-    asked: Asked,
+    request: CalibrationRequest,
     camera: Camera,
     printer: Printer,
 ) -> dict[str, Any]:
@@ -174,40 +175,35 @@ def _values(
         "known_widths_mm": [round(float(width), 4) for width in fitted.known_mm],
         "edge_bias_px": [round(float(bias), 3) for bias in fitted.edge_bias_px],
     }
-    if asked.tip_px is None:
+    if request.tip_px is None:
         return values
     direction = fitted.rotation_deg
-    if len(asked.images) == 1 and len(asked.widths_mm) > 1:
+    if len(request.images) == 1 and len(request.widths_mm) > 1:
         # of lines side by side none shows to which side it was printed: to where there is more of the picture
         a = math.radians(direction)
-        middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2]) - np.array(asked.tip_px)
+        middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2]) - np.array(request.tip_px)
         direction += 180 if middle @ np.array([math.cos(a), math.sin(a)]) < 0 else 0
     half = 0.5 * WIDER * float(fitted.measured_px.max()) + BESIDE_PX
     hidden = math.ceil(RIM * printer.nozzle_outer_mm / 2 / fitted.mm_per_px)
-    pose = line.Pose(direction, *asked.tip_px, 0.0, 0.0, 0, 0)
+    pose = line.Pose(direction, *request.tip_px, 0.0, 0.0, 0, 0)
     size = (int(shape[0]), int(shape[1]))
     first, last = (COLUMN + at for at in line.span(pose, size, (hidden, math.floor(math.hypot(*size))), half))
     if last - first < BLOCK * FEWEST_BLOCKS:
         raise ValueError(
-            f"calibrate-camera: of the line from the tip at {asked.tip_px[0]:g}, {asked.tip_px[1]:g} px on, "
-            f"towards {direction:.0f} degrees, only {max(last - first, 0)} columns lie in the picture with "
-            "both edges; check --tip, or turn the camera"
+            f"calibrate-camera: of the line from the tip at {request.tip_px[0]:g}, {request.tip_px[1]:g} px "
+            f"on, towards {direction:.0f} degrees, only {max(last - first, 0)} columns lie in the picture "
+            "with both edges; check --tip, or turn the camera"
         )
     return values | {
         "mm_per_px": -abs(values["mm_per_px"]),
         "rotation_deg": round(direction % 360, 2),
-        "tip_px": [round(float(at), 1) for at in asked.tip_px],
+        "tip_px": [round(float(at), 1) for at in request.tip_px],
         "nozzle_column": COLUMN,
         "columns": [first, last],
     }
 
 
-def settings_of(camera: Camera, values: dict[str, Any]) -> Camera:
-    """Section `camera` with the values of a calibration, checked."""
-    return Camera.model_validate_json(json.dumps(camera.model_dump() | values))
-
-
-# ---- what was asked
+# ---- what was requested
 
 
 def numbers(text: str, flag: str, example: str) -> list[float]:
@@ -239,7 +235,9 @@ def pixel(text: str) -> tuple[float, float] | None:
 def _frames(path: Path, camera: Camera) -> list[np.ndarray]:
     """The picture of a file in gray, or SAMPLE frames of an MCAP recording, spread over it."""
     if path.suffix.lower() == ".mcap":
-        frames = trial_readings.frames_of(path, camera)
+        topic = image_topic(path, topics(path), camera.topics.image)
+        walk = Walk(path, topic, set(), "log_time")
+        frames = Frames(walk, topic, "log_time", start_ns=0, unreadable_share=camera.unreadable_share)
         wanted = set(np.linspace(0, len(frames) - 1, min(SAMPLE, len(frames))).astype(int).tolist())
         chosen = [frame for k, (_, frame) in enumerate(frames) if k in wanted]
         if not chosen:
@@ -272,7 +270,7 @@ def _shown(value: Any) -> str:
     return f"{value:.10g}"
 
 
-def _page(asked: Asked, done: Calibrated, lines: Sequence[str]) -> str:
+def _page(request: CalibrationRequest, done: Calibrated, lines: Sequence[str]) -> str:
     """The page: the first picture to click on, each line with its measured edges, the table and the lines to
     paste."""
     first = done.rungs[0][1]
@@ -288,15 +286,15 @@ def _page(asked: Asked, done: Calibrated, lines: Sequence[str]) -> str:
         f"<tr><td>{known:g} mm</td><td>{px:.2f} px</td><td>{bias:+.2f} px</td></tr>"
         for known, px, bias in zip(*_columns(done.ladder), strict=True)
     )
-    images = " ".join(shlex.quote(str(path)) for path in asked.images)
-    widths = ",".join(f"{width:g}" for width in asked.widths_mm)
+    images = " ".join(shlex.quote(str(path)) for path in request.images)
+    widths = ",".join(f"{width:g}" for width in request.widths_mm)
     command = json.dumps(f"./run beadline calibrate-camera {images} --widths {widths} --tip ")
     values = {
-        "name": html.escape(", ".join(path.name for path in asked.images)),
+        "name": html.escape(", ".join(path.name for path in request.images)),
         "picture": _embedded(first if first.dtype == np.uint8 else (first >> 8).astype(np.uint8)),
         "width": first.shape[1],
         "height": first.shape[0],
-        "tip": json.dumps(list(asked.tip_px)) if asked.tip_px else "null",
+        "tip": json.dumps(list(request.tip_px)) if request.tip_px else "null",
         "command": command.replace("<", "\\u003c"),
         "rows": rows,
         "figures": "".join(figures),

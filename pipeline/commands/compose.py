@@ -1,24 +1,29 @@
-"""A composed part as files: its commands as CSV, Parquet, MCAP and G-code with leads; tasks and lines as
-Parquet; whether it will print as JSON."""
+"""`beadline compose PART`: a part program into plunger commands as CSV, Parquet, MCAP and G-code with leads;
+tasks and lines as Parquet; whether it will print as JSON."""
 
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from pipeline.deposition.parts import leads
-from pipeline.deposition.parts.composition import Composed
-from pipeline.deposition.workflow import compose_parts
-from pipeline.deposition.workflow.compose_parts import Part
-from pipeline.deposition.workflow.tables import LINES, TASKS
-from pipeline.deposition.workflow.trial_files import COMMAND, TYPES
+from pipeline.deposition.parts import leads, part_report, stored
+from pipeline.deposition.parts.composition import Composed, LearnedLibrary
+from pipeline.deposition.parts.part import ComposedPart
+from pipeline.deposition.tables import LIBRARY, LINES, TASKS
 from pipeline.reading.mcap_frames import tables_of, write_frames
 from pipeline.reading.signals import Source
+from pipeline.reading.trial_files import COMMAND, TYPES
 from pipeline.store import artifacts
 from pipeline.store.tables import FLOAT, Column, Schema
 
 FORMATS = ("csv", "parquet", "mcap", "gcode")
-LEAD_SHARE = 0.005  # of the largest command: how near G-code with leads follows it
+
+
+def read_learned() -> LearnedLibrary:
+    """Library and chains, as segment_library wrote them."""
+    table = artifacts.read_table("datasets/segment_library/library.parquet", LIBRARY)
+    return stored.restore(table, artifacts.read_json("datasets/segment_library/learned.json"))
 
 
 def formats(text: str) -> tuple[str, ...]:
@@ -30,21 +35,42 @@ def formats(text: str) -> tuple[str, ...]:
     return names
 
 
-def write(part: Part, folder: Path, formats: Collection[str] = ("csv",)) -> list[Path]:
+def request(
+    *, scale: float, speed: float, filament_mm: float | None, extruder: str, bead: str
+) -> dict[str, Any]:
+    """What a person requests on the command line: keywords of `compose_parts.compose_part`. Raises ValueError
+    naming the flag."""
+    for flag, value, most in (
+        ("--scale", scale, 1e3),
+        ("--speed", speed, 1e3),
+        ("--filament-mm", filament_mm, 200),
+    ):
+        if value is not None and not 0 < value <= most:
+            raise ValueError(f"{flag}: expected a number above 0, at most {most:g}, found {value:g}")
+    return {
+        "scale": scale,
+        "speed": speed,
+        "filament_mm": filament_mm,
+        "extruder": extruder.strip().upper(),
+        "declared_bead": bead == "declared",
+    }
+
+
+def write(part: ComposedPart, folder: Path, formats: Collection[str] = ("csv",)) -> list[Path]:
     """The commands of all tools in each format, tasks and lines as Parquet, and the conformance report as
     JSON, beside one another in `folder`: all of them, or none."""
     with artifacts.together(folder) as place:
-        files = _commands(part, place, formats)
+        files = _write_commands(part, place, formats)
         # one after the other: a long part's tables are as long as itself
-        for schema, rows in ((TASKS, compose_parts.task_rows), (LINES, compose_parts.line_rows)):
+        for schema, rows in ((TASKS, part_report.task_rows), (LINES, part_report.line_rows)):
             files.append(place / f"{part.name}.{schema.name}.parquet")
             artifacts.write_table(files[-1], schema, rows(part))
         files.append(place / f"{part.name}.conformance.json")
-        artifacts.write_json(files[-1], compose_parts.report(part))
+        artifacts.write_json(files[-1], part_report.report(part))
     return [folder / file.name for file in files]
 
 
-def _commands(part: Part, folder: Path, formats: Collection[str]) -> list[Path]:
+def _write_commands(part: ComposedPart, folder: Path, formats: Collection[str]) -> list[Path]:
     """The commands of all tools on one clock, in each of the formats."""
     composed, files = part.composed, []
     time_s = np.arange(len(composed.streams[0].u)) * composed.sample_time_s
@@ -71,27 +97,18 @@ def _commands(part: Part, folder: Path, formats: Collection[str]) -> list[Path]:
 
 
 def _sources(composed: Composed) -> list[Source]:
-    """Where the commands stand in a recording: the trials' topic where there is one tool, else one a tool."""
+    """Where the commands stand in a recording: the trials' topic if there is one tool, else one a tool."""
     field = COMMAND.source.partition(":")[2]
     if len(composed.streams) == 1:
         return [COMMAND]
     return [COMMAND._replace(source=f"/plunger/T{stream.tool}:{field}") for stream in composed.streams]
 
 
-def with_leads(part: Part) -> str:
-    """The part as G-code whose E is the plunger's place, so that it primes ahead of each line and lets back
-    ahead of its end; with what no program can hold said in its head."""
+def with_leads(part: ComposedPart) -> str:
+    """The part as G-code whose E is the plunger's place (`leads.text`)."""
     program, composed = part.program, part.composed
-    letter = program.extruder if len(program.extruder) == 1 and program.extruder.isalpha() else "E"
-    peak = max(float(np.abs(stream.u).max()) for stream in composed.streams)
-    found = leads.legs(
+    return leads.text(
         program.moves, part.planned, {stream.tool: stream.u for stream in composed.streams},
-        lead_in_s=composed.lead_in_s, sample_time_s=composed.sample_time_s, tolerance_mm=LEAD_SHARE * peak,
+        letter=program.extruder if len(program.extruder) == 1 and program.extruder.isalpha() else "E",
+        lead_in_s=composed.lead_in_s, sample_time_s=composed.sample_time_s,
     )  # fmt: skip
-    head = [
-        f"; {letter} is the plunger's place in mm (absolute), no filament; it moves ahead of the lines.",
-        "; Feeds are means over short legs, ramps too: a firmware that accelerates slower comes late.",
-    ]
-    if found.lost_mm > LEAD_SHARE * peak:
-        head.append(f"; Left out: {found.lost_mm:.3g} mm of a tool's command while another tool was in use.")
-    return "\n".join([*head, *leads.program(found, letter=letter), ""])

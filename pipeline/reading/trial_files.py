@@ -7,18 +7,20 @@ chunks with CRCs. Read from that form or from a machine's own topics. Equal inpu
 
 import math
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.reading.excluded import readable
 from pipeline.reading.formats import file_format
 from pipeline.reading.image_topics import Frames, image_topic
 from pipeline.reading.mcap_columns import Topic, resolve, topics
 from pipeline.reading.mcap_frames import check_overlap, damage, read_frames, span_of, tables_of, write_frames
 from pipeline.reading.signals import Note, Source
 from pipeline.store.artifacts import write_csv
+from pipeline.store.params import Mapped
 
 SCHEMA, VERSION = "beadline.trial", "1"
 # what a trial has, where our own recordings have it
@@ -34,7 +36,7 @@ TYPES = {
 }
 
 
-class Conditions(NamedTuple):
+class TrialConditions(NamedTuple):
     """What a trial was run with, kept in the recording's metadata.
 
     `trial` counts from 0, `law` names what made the command. A bead w_px wide is (w_px - offset_px) /
@@ -56,7 +58,7 @@ class Conditions(NamedTuple):
     nozzle_column: float
 
 
-class Signals(NamedTuple):
+class TrialSignals(NamedTuple):
     """What a machine did in one trial, on one clock time_s (T,): gantry, plunger command and, where it is
     simulated, the true flow; all (T,)."""
 
@@ -67,7 +69,7 @@ class Signals(NamedTuple):
     flow_mm3_per_s: np.ndarray | None = None
 
 
-class Trial(NamedTuple):
+class TrialRecording(NamedTuple):
     """A recording as it was made: signals {name: (time_s (n,), values (n,))} on their own clocks,
     frames, and notes of what was damaged or left out.
 
@@ -75,7 +77,7 @@ class Trial(NamedTuple):
     """
 
     path: str
-    conditions: Conditions | None
+    conditions: TrialConditions | None
     signals: dict[str, tuple[np.ndarray, np.ndarray]]
     frames: Frames
     notes: list[Note]
@@ -86,9 +88,9 @@ class Trial(NamedTuple):
 
 def write_trial(
     path: str | Path,
-    conditions: Conditions,
+    conditions: TrialConditions,
     frames: Iterable[tuple[float, np.ndarray]],
-    signals: Signals,
+    signals: TrialSignals,
     *,
     encoding: str,
 ) -> None:
@@ -108,7 +110,7 @@ def write_trial(
 
 
 def write_command(
-    path: str | Path, conditions: Conditions, *, time_s: np.ndarray, command_mm: np.ndarray
+    path: str | Path, conditions: TrialConditions, *, time_s: np.ndarray, command_mm: np.ndarray
 ) -> None:
     """The next trial's command u (T,) in mm as path.csv (time_s, displacement_mm) and path.mcap; `path` has
     no ending. Raises ValueError as write_trial does."""
@@ -123,7 +125,7 @@ def write_command(
     )
 
 
-def _metadata(path: str | Path, conditions: Conditions) -> dict[str, str]:
+def _metadata(path: str | Path, conditions: TrialConditions) -> dict[str, str]:
     wrong = [
         name
         for name, value in conditions._asdict().items()
@@ -143,6 +145,130 @@ def _crc(pairs: dict[str, str]) -> str:
 # ---- reading
 
 
+def open_trial(
+    path: str | Path, *, image: str, time: str, mapping: Mapping[str, Mapped], unreadable_share: float
+) -> TrialRecording:
+    """A recording through the topics of section `camera`. Raises ValueError as read_trial does."""
+    return read_trial(
+        path, sources=sources(mapping), image=image, time=time, unreadable_share=unreadable_share
+    )
+
+
+def sources(mapping: Mapping[str, Mapped]) -> tuple[Source, ...]:
+    """Where a recording has our signals, `mapping` in place of our own topics. Raises ValueError for a signal
+    that no trial has, and for another unit."""
+    ours = {source.signal: source for source in SOURCES}
+    for name, place in mapping.items():
+        if name not in ours:
+            raise ValueError(
+                f"params.yaml: camera.topics.mapping.{name} is no signal of a trial; "
+                f"map {', '.join(list(ours)[:-1])}"
+            )
+        if place.unit != ours[name].unit:
+            raise ValueError(
+                f"params.yaml: camera.topics.mapping.{name}.unit is {place.unit} but {name} is in "
+                f"{ours[name].unit}; convert with scale and offset, and write unit: {ours[name].unit}"
+            )
+        ours[name] = Source(name, place.source, place.unit, place.scale, place.offset)
+    return tuple(ours.values())
+
+
+def trial_paths(folder: Path) -> list[Path]:
+    """The recordings of trials below a folder, without those that a person excluded."""
+    return readable(sorted(folder.rglob("[!.]*.mcap")), folder)
+
+
+def group_trials(
+    recordings: Iterable[TrialRecording],
+    folder: Path,
+    *,
+    materials: Sequence[str],
+    nozzle: str,
+    routines: Sequence[tuple[float, float]],
+) -> dict[tuple[str, int], list[TrialRecording]]:
+    """Recordings by (material, number of the routine), in the order of their trials. A routine is
+    (speed in mm/s, pause in s).
+
+    Raises ValueError, naming the file, for an unknown material, nozzle or routine, and if a trial is missing
+    or there twice.
+    """
+    groups: dict[tuple[str, int], dict[int, TrialRecording]] = {}
+    for recording in recordings:
+        conditions = checked_conditions(recording)
+        number, material = conditions.trial, conditions.material
+        index = _routine(recording.path, conditions, materials, nozzle, routines)
+        trials = groups.setdefault((material, index), {})
+        if number in trials:
+            raise ValueError(
+                f"{recording.path}: trial {number} of material {material} is in {trials[number].path} too; "
+                "keep one of the two"
+            )
+        trials[number] = recording
+    for (material, index), trials in groups.items():
+        lacking = sorted(set(range(max(trials))) - set(trials))
+        if lacking:
+            raise ValueError(
+                f"{folder}: trial {lacking[0]} of material {material}, routine {index}, "
+                f"is missing beside trial {max(trials)}; add it, or renumber the others"
+            )
+    return {key: [trials[number] for number in sorted(trials)] for key, trials in sorted(groups.items())}
+
+
+def checked_conditions(recording: TrialRecording) -> TrialConditions:
+    """What a trial was run with. Raises ValueError if its recording does not say, or says what cannot be."""
+    conditions = recording.conditions
+    if conditions is None:
+        raise ValueError(
+            f"{recording.path}: expected metadata with material, trial and calibration (record {SCHEMA}), "
+            "found none; copy it from the command in datasets/train_ilc/next"
+        )
+    if not conditions.px_per_mm > 0 or conditions.trial < 0:
+        raise ValueError(
+            f"{recording.path}: expected a scale px_per_mm above 0 and a trial from 0 on, "
+            f"found {conditions.px_per_mm:g} and {conditions.trial}; mend the metadata record {SCHEMA}"
+        )
+    return conditions
+
+
+def _routine(
+    path: str,
+    conditions: TrialConditions,
+    materials: Sequence[str],
+    nozzle: str,
+    routines: Sequence[tuple[float, float]],
+) -> int:
+    if conditions.material not in materials:
+        raise ValueError(
+            f"{path}: material {conditions.material} is not among printer.materials {', '.join(materials)}; "
+            "add it to params.yaml, or take the file away"
+        )
+    if conditions.nozzle != nozzle:
+        raise ValueError(
+            f"{path}: expected a nozzle of {nozzle} mm (printer.nozzle_mm), found {conditions.nozzle}; "
+            "what one nozzle learned does not hold for another"
+        )
+    for index, (speed, pause_s) in enumerate(routines):
+        if max(abs(speed - conditions.speed_mm_per_s), abs(pause_s - conditions.pause_s)) < 1e-6:
+            return index
+    expected = ", ".join(f"{speed:g} mm/s with {pause_s:g} s" for speed, pause_s in routines)
+    raise ValueError(
+        f"{path}: expected one of the routines of train_ilc ({expected}), "
+        f"found {conditions.speed_mm_per_s:g} mm/s with a pause of "
+        f"{conditions.pause_s:g} s; add that routine to printer.routines in params.expert.yaml"
+    )
+
+
+def first_and_last(recordings: Iterable[TrialRecording]) -> list[Path]:
+    """Of recordings with conditions the paths of the first and the last trial of each material, in the order
+    of their names."""
+    by_material: dict[str, list[tuple[int, Path]]] = {}
+    for recording in recordings:
+        conditions = recording.conditions
+        if conditions:
+            by_material.setdefault(conditions.material, []).append((conditions.trial, Path(recording.path)))
+    return sorted({path for trials in by_material.values() for _, path in (min(trials), max(trials))})
+
+
 def read_trial(
     path: str | Path,
     *,
@@ -150,7 +276,7 @@ def read_trial(
     image: str = "",
     time: str = "",
     unreadable_share: float,
-) -> Trial:
+) -> TrialRecording:
     """A trial of `write_trial`, or a machine's own recording through `sources`, which map position_mm,
     speed_mm_per_s, command_mm and, if there is one, flow_mm3_per_s.
 
@@ -179,7 +305,9 @@ def read_trial(
         ) from None
 
 
-def _read(path: Path, sources: Sequence[Source], image: str, time: str, unreadable_share: float) -> Trial:
+def _read(
+    path: Path, sources: Sequence[Source], image: str, time: str, unreadable_share: float
+) -> TrialRecording:
     there = topics(path)
     if not any(topic.count for topic in there.values()):
         raise ValueError(f"{path}: it has no whole message ({damage(path)}); copy the recording again")
@@ -202,7 +330,7 @@ def _read(path: Path, sources: Sequence[Source], image: str, time: str, unreadab
                 f"{outside} of {len(frames.time_s)} frames lie before or after the command",
             )
         )
-    return Trial(
+    return TrialRecording(
         str(path), _conditions(path, recording.metadata.get(SCHEMA, {}), notes), signals, frames, notes
     )
 
@@ -229,7 +357,7 @@ def _places(
     return places
 
 
-def _conditions(path: Path, metadata: dict[str, str], notes: list[Note]) -> Conditions | None:
+def _conditions(path: Path, metadata: dict[str, str], notes: list[Note]) -> TrialConditions | None:
     if not metadata:
         notes.append(
             Note(
@@ -252,9 +380,9 @@ def _conditions(path: Path, metadata: dict[str, str], notes: list[Note]) -> Cond
             f"{path}: the trial's conditions have version {pairs.get('schema_version')} but {VERSION} is "
             "read; record it with this version"
         )
-    kinds = Conditions.__annotations__
+    kinds = TrialConditions.__annotations__
     try:
-        return Conditions(**{name: kinds[name](pairs[name]) for name in Conditions._fields})
+        return TrialConditions(**{name: kinds[name](pairs[name]) for name in TrialConditions._fields})
     except KeyError as error:
         raise ValueError(
             f"{path}: the trial's conditions lack {error.args[0]}; write it into the metadata record {SCHEMA}"
