@@ -21,7 +21,8 @@ from pipeline.runtime.certificate import sha256
 from pipeline.runtime.export import c, klipper, python, vectors
 from pipeline.runtime.export.vectors import TOLERANCE
 from pipeline.runtime.machine import Exported
-from pipeline.runtime.supervisor import KINDS, MODES, Supervised
+from pipeline.runtime.supervised import Supervised
+from pipeline.runtime.supervisor import KINDS, MODES
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers.controller import ramp
 from pipeline.temperature.plant import Plant, hold_output

@@ -128,7 +128,7 @@ def define(name: str, value: float | int | str) -> str:
 # ---- machine.h
 
 
-class Sizes(NamedTuple):
+class ArrayLengths(NamedTuple):
     """Lengths of the arrays: `watched` states of a governor's member, `instants` it looks ahead an output;
     `watch` states of the supervisor's observer, `theta` ways in which a plant may differ, `bank` of
     hypotheses, `ring` of past samples."""
@@ -146,7 +146,7 @@ class Sizes(NamedTuple):
     signals: int
 
 
-def sizes(exported: Exported) -> Sizes:
+def sizes(exported: Exported) -> ArrayLengths:
     m, p = exported.controller.law.D.shape
     laws = [one for one in (exported.controller, exported.fallback) if one is not None]
     memory = max([1, *(len(one.law.A) for one in laws)])
@@ -157,7 +157,7 @@ def sizes(exported: Exported) -> Sizes:
         governed = (f, q // 2, family.above.shape[1] // p)
     watch, bank = exported.supervision.watch, exported.supervision.bank
     supervised = (len(watch.A), len(watch.prior), len(bank.form), innovations.RING, max(m, p))
-    return Sizes(m, p, memory, *governed, *supervised)
+    return ArrayLengths(m, p, memory, *governed, *supervised)
 
 
 def governor_of(exported: Exported) -> Governor | None:
@@ -286,7 +286,7 @@ def _governing(exported: Exported) -> str:
     return text + "".join(table(f"governor_{name}", values) for name, values in halves.items())
 
 
-def _no_members(at: Sizes) -> dict[str, np.ndarray]:
+def _no_members(at: ArrayLengths) -> dict[str, np.ndarray]:
     """The tables of `member_halves` where nothing is governed."""
     f, n, p, m, h = at.members, at.watched, at.outputs, at.inputs, at.outputs * at.instants
     shapes = {

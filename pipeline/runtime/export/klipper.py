@@ -35,7 +35,7 @@ HORIZON_S, LONGEST = 600.0, 2000  # of the step response that is fitted, in s an
 STRANGE = 0.1  # of the largest excursion: a response further off is not that of a block and a sensor
 
 
-class Pid(NamedTuple):
+class KlipperPid(NamedTuple):
     """Klipper's pid_Kp in 1/255 of full duty per degC, pid_Ki per degC and s, pid_Kd times s per degC."""
 
     Kp: float
@@ -130,7 +130,7 @@ def one_heater(exported: Exported) -> None:
         )
 
 
-def pid(exported: Exported) -> Pid:
+def pid(exported: Exported) -> KlipperPid:
     """SIMC's PI in Klipper's units. Raises ValueError where the heater does not warm the sensor."""
     model, limits = strictly_proper(exported.model), exported.controller.limits
     T = exported.machine.sample_time_s
@@ -143,7 +143,7 @@ def pid(exported: Exported) -> Pid:
             "identified model; Klipper's PID heats, look at the record"
         )
     Kp = PID_PARAM_BASE / 100.0 * float(pairs.gain[0])
-    return Pid(Kp, Kp / (float(pairs.reset[0]) * T), 0.0)
+    return KlipperPid(Kp, Kp / (float(pairs.reset[0]) * T), 0.0)
 
 
 def _horizon(sample_time_s: float) -> int:

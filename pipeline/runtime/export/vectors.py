@@ -1,7 +1,7 @@
 """Golden vectors: what the object does on its own model, with noise, changed references, faults, hand-overs.
 
 A script says what happens to machine and controller at each sample. `played` runs it with any object that has
-the calls of supervisor.Supervised; the C test runs the same script with the exported code. Both close the
+the calls of supervised.Supervised; the C test runs the same script with the exported code. Both close the
 loop themselves: outputs fed to a law that is unstable by itself would tell rounding errors apart, no more.
 
     x(t+1) = A x + B (share u + extra) + b,   y = C x + d + add, or what `reading` says
@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.runtime.machine import Exported
+from pipeline.runtime.supervised import Supervised
 from pipeline.runtime.supervisor import KINDS, MODES
 from pipeline.temperature.plant import Plant, hold_output, strictly_proper
 
@@ -47,7 +48,7 @@ class Played(NamedTuple):
     causes: np.ndarray
 
 
-class Start(NamedTuple):
+class EpisodeStart(NamedTuple):
     """Where an episode begins: the model's state x (n,), the inputs u (m,) that hold it, outputs y (p,)."""
 
     x: np.ndarray
@@ -55,7 +56,7 @@ class Start(NamedTuple):
     y: np.ndarray
 
 
-def start(exported: Exported) -> Start:
+def start(exported: Exported) -> EpisodeStart:
     """The model at rest in the middle of its outputs' limits; where none is declared, at a third of the
     inputs' range."""
     model, machine = strictly_proper(exported.model), exported.machine
@@ -64,9 +65,9 @@ def start(exported: Exported) -> Start:
     third = low + (high - low) / 3
     if np.isfinite(bottom).all() and np.isfinite(top).all():
         x, u = hold_output(model, (bottom + top) / 2)
-        return Start(x, np.clip(u, low, high), model.C @ x + model.d)
+        return EpisodeStart(x, np.clip(u, low, high), model.C @ x + model.d)
     x = np.linalg.lstsq(np.eye(model.n) - model.A, model.B @ third + model.b, rcond=None)[0]
-    return Start(x, third, model.C @ x + model.d)
+    return EpisodeStart(x, third, model.C @ x + model.d)
 
 
 def script(exported: Exported, *, episodes: int, steps: int, rng: np.random.Generator) -> Script:
@@ -156,7 +157,7 @@ def fault(made: Script, kind: str, when: slice, exported: Exported, rng: np.rand
         made.t_s[when.start :] += 500.0 * T
 
 
-def played(make: Any, model: Plant, at: Start, script: Script) -> Played:
+def played(make: Any, model: Plant, at: EpisodeStart, script: Script) -> Played:
     """The script run on `model` with the object that `make()` gives."""
     plant = strictly_proper(model)
     T, m = script.manual.shape
@@ -200,7 +201,7 @@ def _before(one: Any, make: Any, do: int, y: np.ndarray) -> Any:
     return one
 
 
-def as_csv(at: Start, script: Script, done: Played) -> str:
+def as_csv(at: EpisodeStart, script: Script, done: Played) -> str:
     """golden.csv: the start in its first line, then a line a sample, numbers as they read back bit by bit."""
     lines = [",".join(map(repr, np.r_[at.x, at.u, at.y].tolist()))]
     columns = [script.do, script.told, done.mode, done.causes]
@@ -247,8 +248,6 @@ def golden(
 ) -> str:
     """golden.csv of a controller: what its object does in `episodes` that do not magnify rounding, as
     `replays` of each show."""
-    from pipeline.runtime.supervisor import Supervised
-
     rng, scripts, done = np.random.default_rng(seed), [], []
     for _ in range(10 * episodes):
         asked = episode(exported, steps, rng)
