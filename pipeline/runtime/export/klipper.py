@@ -71,7 +71,7 @@ def settings(
         "control: pid",
         f"pid_Kp: {Kp:.4g}  # 1/255 of full duty per degC",
         f"pid_Ki: {Ki:.4g}  # 1/255 of full duty per degC and s",
-        f"pid_Kd: 0  # SIMC's rule for a first-order model has no derivative",
+        "pid_Kd: 0  # SIMC's rule for a first-order model has no derivative",
         f"max_power: {heater.high / 100:g}",
     ]
     for option, value in (("min_temp", sensor.low), ("max_temp", sensor.high)):
