@@ -66,7 +66,7 @@ def main() -> None:
     with artifacts.stage("certify") as out:
         settings, loops = params.load(Certify, "certify"), params.load(params.Loops, "loops")
         temperature: dict[str, Any] = {}
-        setpoint = {"controller": "", "why": NOT_ASKED.format("setpoint"), "largest_difference": {}}
+        setpoint = {"controller": "", **_not_measured(NOT_ASKED.format("setpoint"))}
         if loops.temperature:
             temperature = certify_temperature(out / "temperature", settings)
         if loops.setpoint:

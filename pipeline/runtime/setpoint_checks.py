@@ -44,12 +44,12 @@ def write(
     from the networks."""
     if decides is None:
         why = f"{name} has no filter whose tables could be exported."
-        return {"controller": name, "why": why, "largest_difference": {}}
+        return {"controller": name, "measured": False, "why": why, "largest_difference": {}}
     setpoint.write(folder, setpoint.weights(model, decides))
     difference = {"log_flow": of_reader(folder, model, np.random.default_rng(seed))}
     if isinstance(decides, BeliefAgent):
         difference["values"] = of_agent(folder, decides, np.random.default_rng(seed))
-    return {"controller": name, "why": WHY, "largest_difference": difference}
+    return {"controller": name, "measured": True, "why": WHY, "largest_difference": difference}
 
 
 def of_reader(folder: Path, model: CalibratedClassifier, rng: np.random.Generator) -> float:
