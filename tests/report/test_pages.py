@@ -15,8 +15,8 @@ import pytest
 
 from pipeline.report.shared.page import environment
 from pipeline.store import artifacts
-from stages.report import main
 from tests.report import made
+from tests.report.made import main
 
 INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT = (
     Path(f"reports/{name}.html")
@@ -152,10 +152,7 @@ def test_an_artifact_that_is_missing_or_broken_is_said_so_in_its_place(
 
 
 def test_with_nothing_at_all_the_pages_are_there_and_every_place_says_not_measured(project):
-    for path in [
-        *Path("datasets").rglob("*.parquet"),
-        *Path("datasets").rglob("*.json"),
-    ]:
+    for path in [*Path("datasets").rglob("*.parquet"), *Path("datasets").rglob("*.json")]:
         path.unlink()
     main()
     page = Page(INDEX).text

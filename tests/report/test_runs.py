@@ -11,11 +11,12 @@ import pytest
 from pipeline import cli
 from pipeline.report.runs import curves, figures
 from pipeline.report.runs.page import Run, render_two
-from pipeline.report.shared.verdict import Figure, ReportRules
 from pipeline.store import artifacts, params
-from stages.report import main
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import Figure
 from tests.report import made
 from tests.report.conftest import loaded
+from tests.report.made import main
 from tests.report.made_runs import Made, ends, make, metrics, parameters
 from tests.report.test_pages import RUNS, Page, change
 
@@ -232,16 +233,18 @@ def test_the_headline_is_a_run_in_few_values_and_gives_its_figures_back():
     kept = figures.headline(whole)
     assert {name: value for name, value in kept.items() if name != "bands"} == {
         "temperature": "pass: pi_simc",
-        "settling_s": 26.0, "disk_margin": 0.5, "cost": 3.0,
+        "settling_s": 26.0,
+        "disk_margin": 0.5,
+        "cost": 3.0,
         "deposition": "undecided",
-        "flow_error_percent": 2.5, "line_volume_percent": 2.0, "learned_percent": 2.0,
+        "flow_error_percent": 2.5,
+        "line_volume_percent": 2.0,
+        "learned_percent": 2.0,
         "setpoint": "fail",
-
-            "settled_percent": 75.0,
-            "stay_percent": 71.0,
-            "disturbed_percent": 0.5,
-            "right_70_150_percent": 82.5
-        ,
+        "settled_percent": 75.0,
+        "stay_percent": 71.0,
+        "disturbed_percent": 0.5,
+        "right_70_150_percent": 82.5,
     }
     again = figures.measured({"report": json.loads(json.dumps(kept))})
     assert again.figures == figures.measured(whole).figures
