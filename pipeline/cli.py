@@ -100,7 +100,7 @@ def runs(arguments: argparse.Namespace) -> None:
     commits, tags, branches or DVC experiments whose metrics git has."""
     from pipeline.report.runs import commits
     from pipeline.report.runs import page as runs_page
-    from pipeline.report.shared.verdict import ReportRules
+    from pipeline.verdict.settings import ReportRules
 
     a, b = (commits.run_of(name) for name in (arguments.a, arguments.b))
     path = (
@@ -158,31 +158,29 @@ def first_experiment(arguments: argparse.Namespace) -> None:
 def compose(arguments: argparse.Namespace) -> None:
     """A part program into plunger commands (CSV, Parquet, MCAP, G-code with leads), tasks and lines as
     Parquet, and whether it will print."""
-    from pipeline.deposition.workflow import compose_parts, exports, part_programs
-    from pipeline.deposition.workflow.segment_library import read_learned
-    from pipeline.deposition.workflow.settings import ComposeParts, Printer
+    from pipeline.commands import compose as command
+    from pipeline.deposition.parts.part_report import summary_lines
+    from pipeline.deposition.settings import ComposeParts, Printer
+    from stages.compose_parts import compose_part
 
     if arguments.out.exists() and not arguments.out.is_dir():
         raise ValueError(
             f"--out {arguments.out}: should be a folder but is a file; name a folder, "
             "which is made where it is missing"
         )
-    asked = part_programs.asked(
+    request = command.request(
         scale=arguments.scale, speed=arguments.speed, filament_mm=arguments.filament_mm,
         extruder=arguments.extruder, bead=arguments.bead,
     )  # fmt: skip
-    formats = exports.formats(arguments.formats)
-    learned = read_learned(
-        "datasets/segment_library/library.parquet", "datasets/segment_library/learned.json"
-    )
+    formats, learned = command.formats(arguments.formats), command.read_learned()
     printer, settings = params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts")
-    part = compose_parts.compose(arguments.part, learned, printer, settings, asked)
+    part = compose_part(arguments.part, learned, printer, settings, **request)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    files = exports.write(part, arguments.out, formats)
-    print(compose_parts.summary_lines(part))
+    files = command.write(part, arguments.out, formats)
+    print(summary_lines(part))
     print("written: " + ", ".join(str(file) for file in files))
     if arguments.verify:
-        from pipeline.deposition.workflow import verify_part
+        from pipeline.commands import verify_part
 
         print(verify_part.write(part, learned, printer, settings, arguments.out))
         print(verify_part.write_next(part, learned, printer, arguments.part.parent, arguments.out))
@@ -210,16 +208,16 @@ def calibrate_tip(arguments: argparse.Namespace) -> None:
 def calibrate_camera(arguments: argparse.Namespace) -> None:
     """Pictures of printed lines of known widths into section camera of params.yaml:
     size of a pixel, rotation, measured columns, edge bias by width; and a page."""
-    from pipeline.deposition.workflow import calibrate_camera as camera
+    from pipeline.commands import calibrate_camera as camera
 
-    asked = camera.Asked(
+    request = camera.CalibrationRequest(
         arguments.images,
         camera.numbers(arguments.widths, "--widths", "0.5,0.9,1.3"),
         camera.pixel(arguments.tip),
         arguments.pitch,
     )
     out = arguments.out or Path(f"{arguments.images[0].stem}.camera.html")
-    print(camera.calibrate(asked, out, write=arguments.write))
+    print(camera.calibrate(request, out, write=arguments.write))
 
 
 def shadow(arguments: argparse.Namespace) -> None:
@@ -308,7 +306,7 @@ def training_print(arguments: argparse.Namespace) -> None:
 def export(arguments: argparse.Namespace) -> None:
     """A certified controller as C99 without heap, as one file of Python, or as settings for Klipper and
     Kalico; what sees and decides in the setpoint loop as weights with readers that need numpy alone."""
-    from pipeline.runtime.workflow.exports import export as write
+    from pipeline.commands.export import export as write
 
     print(write(arguments.controller, arguments.to, arguments.out, arguments.section, arguments.power))
 
@@ -317,19 +315,20 @@ def replay(arguments: argparse.Namespace) -> None:
     """A recording, and what a certified controller would have asked on it and why not: as MCAP with a layout
     for Foxglove, and a page. Frames of the nozzle's camera go through the loop of shadow with the classifier
     and the filter of CONTROLLER. Nothing is sent."""
-    from pipeline.runtime.workflow import exports
+    from pipeline.commands import export as exports
 
     if exports.shows_frames(arguments.controller):
-        from pipeline.runtime.workflow import replay_camera
+        from pipeline.commands import replay_camera
 
         arguments.source, arguments.rate, arguments.once = str(arguments.recording), 5.0, True
         _watch(arguments, replay_camera.ready(arguments.controller))
         return
+    from pipeline.commands import replay as replaying
     from pipeline.report.replay import page
-    from pipeline.runtime.workflow import replay as replaying
 
-    asked = replaying.Asked(replaying.temperatures(arguments.reference), arguments.out)
-    done, made, told = replaying.replay_recording(arguments.controller, arguments.recording, asked)
+    done, made, told = replaying.replay_recording(
+        arguments.controller, arguments.recording, arguments.out, replaying.temperatures(arguments.reference)
+    )
     inputs, outputs = ([one.name for one in side] for side in (made.machine.inputs, made.machine.outputs))
     shown = page.Shown(
         done.time_s, done.applied, done.asked, done.measured, done.reference, done.off, inputs, outputs, told

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from ruamel.yaml import YAML
 
-from pipeline.deposition.workflow.settings import TrainIlc
+from pipeline.deposition.settings import TrainIlc
 from pipeline.report.shared.sources import QUICK_LOOK
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint
 from pipeline.store import artifacts, params, params_text

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import joblib
 import numpy as np
 
-from pipeline.deposition.workflow.tables import SCORES
+from pipeline.deposition.tables import SCORES
 from pipeline.nightly.decision import Evidence
 from pipeline.nightly.settings import HoldOut, Loop, Nightly, Rule
 from pipeline.reading import recording_folders

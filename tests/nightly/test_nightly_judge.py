@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.deposition.workflow.tables import SCORES
+from pipeline.deposition.tables import SCORES
 from pipeline.nightly import judge, promoting
 from pipeline.nightly.decision import FIRST, KEPT, PROMOTED, Evidence, decide
 from pipeline.nightly.settings import HoldOut, Loop, Nightly
