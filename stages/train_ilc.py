@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pipeline.deposition.camera import latency, readings, trial_flow
-    from pipeline.deposition.extruder import Routine
-    from pipeline.deposition.learning import ilc, training
+    from pipeline.deposition.extruder import Extruder, Routine
+    from pipeline.deposition.learning.ilc import Trial
     from pipeline.reading.trial_files import TrialRecording
 
 # the readings of a recording are remembered; this code decides what they are
@@ -111,24 +111,24 @@ def simulate(folder: Path, sections: Sections, index: int, kind: str) -> Results
     nominal, rng = material.nominal, np.random.default_rng(seed)
     K, tau, flow = nominal.gain, nominal.time_constant_s, printer.steady_flow
     plant = extruder.draw(rng, gain=K, time_constant_s=tau, steady_flow=flow)
-    case = training.TrainingCase(nominal, plant, printer.training_routines())
+    routines = printer.training_routines()
     # of what the camera sees, and of what does not repeat in pictures and in flow; of plants
     rngs = [np.random.default_rng([*seed, number]) for number in range(1, 5)]
-    updates = {"flow": settings.trials * (len(case.routines) + 2), "pixels": settings.pixel_trials}[kind]
+    updates = {"flow": settings.trials * (len(routines) + 2), "pixels": settings.pixel_trials}[kind]
     title, place = f"train_ilc: {material.name} in {kind}", 1 + 2 * index + (kind == "pixels")
     with tqdm(total=updates, desc=title, position=place, mininterval=2, leave=False) as bar:
         if kind == "pixels":
-            return learn_in_pictures(folder, sections, material, case, rngs[:2], bar)
+            return learn_in_pictures(folder, sections, material, plant, routines[0], rngs[:2], bar)
         by_routine, figures, models = training.learn_in_flow(
-            case, rngs[2:], settings.shares, trials=settings.trials, plants=settings.family_plants,
-            settings=settings.laws(printer), on_step=lambda _: bar.update(),
+            nominal, plant, routines, rngs[2:], settings.shares, trials=settings.trials,
+            plants=settings.family_plants, settings=settings.laws(printer), on_step=lambda _: bar.update(),
         )  # fmt: skip
     sequences = {(material.name, number): of_routine for number, of_routine in by_routine.items()}
     return sequences, {}, {material.name: models}, {material.name: figures}
 
 
 def learn_in_pictures(
-    folder: Path, sections: Sections, material: PrinterMaterial, case: training.TrainingCase,
+    folder: Path, sections: Sections, material: PrinterMaterial, plant: Extruder, routine: Routine,
     rngs: Sequence[np.random.Generator], bar: Any,
 ) -> Results:  # fmt: skip
     """The model inverse on the reference routine of a simulated machine, the flow measured from pictures.
@@ -138,17 +138,17 @@ def learn_in_pictures(
     from pipeline.deposition.learning import training
     from pipeline.reading import trial_files
 
-    (settings, printer, camera), routine, measured = sections, case.routines[0], []
+    (settings, printer, camera), measured = sections, []
     laws, name = settings.laws(printer), material.name
     film = rendering.SimulatedCamera(rendering.SCENES[camera.scene], rngs[0])
     calibration = rendering.calibrate(film, camera.known_widths_mm, rngs[0], camera.mounting)
 
-    def measure(u: np.ndarray) -> ilc.Trial:
+    def measure(u: np.ndarray) -> Trial:
         number, law = len(measured), "pixels" if measured else "on_off"
         path = folder / f"{name}_{number:02d}.mcap"
         known = trial_conditions(printer, camera, material, routine, number, law, calibration[:2])
         pictures, applied, truth = simulated_trial.simulate_trial(
-            case.plant, film, routine, u, rngs[1], noise=settings.shares._asdict(), drive=laws.drive,
+            plant, film, routine, u, rngs[1], noise=settings.shares._asdict(), drive=laws.drive,
             sample_time_s=laws.sample_time_s, **camera.film(printer),
         )  # fmt: skip
         signals = trial_files.TrialSignals(routine.time_s, routine.position, routine.speed, applied, truth)
@@ -162,7 +162,7 @@ def learn_in_pictures(
         return measured[-1].trial
 
     sequence = training.run_trials(
-        "pixels", training.model_inverse(routine, laws), measure, routine, case.nominal,
+        "pixels", training.model_inverse(routine, laws), measure, routine, material.nominal,
         trials=settings.pixel_trials, settings=laws, on_step=lambda _: bar.update(),
     )  # fmt: skip
     figures = training.figures(sequence, rise=laws.rise) | trial_flow.flow_errors(measured, routine)
@@ -220,13 +220,12 @@ def learn_from_recordings(
 
 def read(recording: TrialRecording, camera: Camera, memo: Path | None = None) -> readings.Readings:
     """The readings of a recording's frames, out of the memo if it holds them."""
-    from pipeline.deposition.camera import latency, readings
+    from pipeline.deposition.camera import readings
     from pipeline.reading import trial_memo
 
     def measure() -> readings.Readings:
         with artifacts.about(recording.path):
-            gantry = latency.Gantry(*recording.signals["position_mm"])
-            return readings.read(recording.frames, gantry, camera.mounting)
+            return readings.read(recording.frames, recording.signals["position_mm"], camera.mounting)
 
     if memo is None:
         return measure()
