@@ -1,7 +1,7 @@
 """A machine learns its routines: on-off first, then the paper's law or the model inverse, trial after trial;
 and the convergence of both over a family of plants before anything runs."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -253,11 +253,11 @@ def prospects(
     nominal: Extruder,
     routines: Sequence[Routine],
     rng: np.random.Generator,
+    settings: LawSettings,
     *,
     plants: int,
     steady_flow: float,
     worst_ratio: float,
-    settings: LawSettings,
 ) -> dict[str, Any]:
     """What is known before anything runs: gamma of the paper's law on the nominal model and over the family,
     and the headroom of the drive over each routine."""
@@ -347,6 +347,20 @@ def model_figures(model: ilc.TrialModel | None) -> dict[str, float] | None:
         "lag_hz": e.lag_hz, "yield": e.yield_, "noise": model.noise,
         "fit_percent": model.fit_percent,
     }  # fmt: skip
+
+
+def join(parts: Iterable[tuple[dict, dict, dict, dict]]) -> tuple[dict, dict, dict, dict]:
+    """All results as one: trial sequences and measured trials by (material, number of the routine), models
+    and figures by material; dictionaries of one material are put together."""
+    sequences, measured, models, figures = {}, {}, {}, {}
+    for part in parts:
+        for key, of_routine in part[0].items():
+            sequences.setdefault(key, []).extend(of_routine)
+        measured.update(part[1])
+        for joint, of_part in ((models, part[2]), (figures, part[3])):
+            for name, values in of_part.items():
+                joint.setdefault(name, {}).update(values)
+    return sequences, measured, models, figures
 
 
 # ---- as tables
