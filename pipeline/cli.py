@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 from pipeline.nightly import commands as nights
 from pipeline.store import artifacts, params
 from pipeline.store.printable import printable
-from pipeline.temperature.workflow.settings import Ingest, Plant
+from pipeline.temperature.settings import Plant
+from stages.ingest import Ingest
 
 if TYPE_CHECKING:
     from pipeline.setpoint.workflow.shadow.deploy import Ready
@@ -99,7 +100,7 @@ def runs(arguments: argparse.Namespace) -> None:
     commits, tags, branches or DVC experiments whose metrics git has."""
     from pipeline.report.runs import commits
     from pipeline.report.runs import page as runs_page
-    from pipeline.report.shared.verdict import ReportRules
+    from pipeline.verdict.settings import ReportRules
 
     a, b = (commits.run_of(name) for name in (arguments.a, arguments.b))
     path = (
@@ -135,7 +136,7 @@ def quick(arguments: argparse.Namespace) -> None:
 def init(arguments: argparse.Namespace) -> None:
     """Recordings of a new machine into params.yaml: mapping, plant, panel and
     rules that fit its pace; and what a person must still decide."""
-    from pipeline.temperature.workflow import propose_params
+    from pipeline.commands import propose_params
 
     initialised = propose_params.proposed(arguments.recordings, sample_time=arguments.time)
     changed = propose_params.write(initialised.values, force=arguments.force)
@@ -147,7 +148,7 @@ def init(arguments: argparse.Namespace) -> None:
 def first_experiment(arguments: argparse.Namespace) -> None:
     """A staircase for a machine of which there is no record yet: which input, which level, for how long, and
     at which temperature to stop. No model is behind it."""
-    from pipeline.temperature.workflow import first_experiment as first
+    from pipeline.commands import first_experiment as first
 
     plan = first.staircase(params.load(Plant, "plant"), arguments.hold)
     artifacts.write_csv(arguments.out, first.columns(plan))
@@ -305,7 +306,7 @@ def training_print(arguments: argparse.Namespace) -> None:
 def export(arguments: argparse.Namespace) -> None:
     """A certified controller as C99 without heap, as one file of Python, or as settings for Klipper and
     Kalico; what sees and decides in the setpoint loop as weights with readers that need numpy alone."""
-    from pipeline.runtime.workflow.exports import export as write
+    from pipeline.commands.export import export as write
 
     print(write(arguments.controller, arguments.to, arguments.out, arguments.section, arguments.power))
 
@@ -314,19 +315,20 @@ def replay(arguments: argparse.Namespace) -> None:
     """A recording, and what a certified controller would have asked on it and why not: as MCAP with a layout
     for Foxglove, and a page. Frames of the nozzle's camera go through the loop of shadow with the classifier
     and the filter of CONTROLLER. Nothing is sent."""
-    from pipeline.runtime.workflow import exports
+    from pipeline.commands import export as exports
 
     if exports.shows_frames(arguments.controller):
-        from pipeline.runtime.workflow import replay_camera
+        from pipeline.commands import replay_camera
 
         arguments.source, arguments.rate, arguments.once = str(arguments.recording), 5.0, True
         _watch(arguments, replay_camera.ready(arguments.controller))
         return
+    from pipeline.commands import replay as replaying
     from pipeline.report.replay import page
-    from pipeline.runtime.workflow import replay as replaying
 
-    asked = replaying.Asked(replaying.temperatures(arguments.reference), arguments.out)
-    done, made, told = replaying.replay_recording(arguments.controller, arguments.recording, asked)
+    done, made, told = replaying.replay_recording(
+        arguments.controller, arguments.recording, arguments.out, replaying.temperatures(arguments.reference)
+    )
     inputs, outputs = ([one.name for one in side] for side in (made.machine.inputs, made.machine.outputs))
     shown = page.Shown(
         done.time_s, done.applied, done.asked, done.measured, done.reference, done.off, inputs, outputs, told

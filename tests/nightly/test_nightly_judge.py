@@ -17,8 +17,8 @@ from pipeline.setpoint.workflow import tables
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
 from pipeline.temperature.controllers import window
+from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.temperature.plant import baam, simulate
-from pipeline.temperature.workflow.contestants import CONTESTANTS
 from tests.nightly import shifts_recorded as nights
 from tests.nightly.toy_nights import SETTINGS
 

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.reading import excluded, trial_files
-from pipeline.temperature.workflow import ingest
+from pipeline.reading import excluded, recording_folders, trial_files
 from tests import nozzle_folders
 from tests.temperature.test_ingest import BUDGET, INLINE, JOB, folder
 
@@ -41,7 +40,7 @@ def test_temperatures_are_ingested_without_an_excluded_recording_until_it_is_men
     raw = folder(tmp_path, 3)
 
     def read() -> list[str]:
-        results = ingest.process(raw, JOB, INLINE, memo=tmp_path / "memo", budget=BUDGET)
+        results = recording_folders.read_folder(raw, JOB, INLINE, memo=tmp_path / "memo", budget=BUDGET)
         assert not [result.reason for result in results if result.reason]
         return [result.name for result in results]
 

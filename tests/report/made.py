@@ -8,8 +8,8 @@ import yaml
 
 from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import tables
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Plant
 from tests.report import made_certificate, made_setpoint
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -53,6 +53,14 @@ NEXT_EXPERIMENT = {
 }
 DITHER = {"written": False, "reason": "PI needs an input for each of the 2 outputs; found 1 inputs"}
 SCALED = {"change_percent": -60.0, "gain_difference": 1e-15}
+
+
+def main():
+    """The verdicts and the pages of the project in the working directory."""
+    from stages import report, verdict
+
+    verdict.main()
+    report.main()
 
 
 def figure(q90, low, high, **more):
