@@ -9,12 +9,12 @@ from pipeline.report.temperature.judgement import winner
 from pipeline.runtime.workflow import export_controllers as export
 from pipeline.runtime.workflow import export_setpoint
 from pipeline.runtime.workflow.settings import ExportControllers
-from pipeline.setpoint.workflow import contestants
-from pipeline.setpoint.workflow.agent_files import restore_agents
-from pipeline.setpoint.workflow.classifier_files import restore_classifier
-from pipeline.setpoint.workflow.settings import EvaluateSetpoint
-from pipeline.setpoint.workflow.tables import WINDOWS
-from pipeline.setpoint.workflow.windows import window_tables
+from pipeline.setpoint.agents.files import restore_agents
+from pipeline.setpoint.controllers import build_controllers
+from pipeline.setpoint.settings import EvaluateSetpoint
+from pipeline.setpoint.simulation.recorded import window_tables
+from pipeline.setpoint.tables import WINDOW_PARTS, WINDOWS
+from pipeline.setpoint.vision.files import restore_classifier
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import evaluate_temperature, learned, tables
 from pipeline.temperature.workflow.settings import Panel, Plant, TemperatureRules, Tracking, TuneWeights
@@ -74,10 +74,11 @@ def main() -> None:
         model = restore_classifier(
             "datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet"
         )
-        windows = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
+        table = artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS)
+        windows = window_tables(table, WINDOW_PARTS)
         agents = restore_agents("datasets/train_agent/weights.safetensors")
         baselines = params.load(EvaluateSetpoint, "evaluate_setpoint").baselines
-        specs = contestants.controllers(contestants.Problem(baselines, agents, windows["learn"]))
+        specs = build_controllers(baselines, agents, windows["learn"])
         default = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
         decides = export_setpoint.decider(default, specs, agents)
         setpoint = export_setpoint.write(out / "setpoint", default, model, decides, settings.seed)

@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.deposition.workflow.tables import SCORES
 from pipeline.nightly.decision import Evidence
 from pipeline.nightly.settings import HoldOut, Loop, Nightly, Rule
-from pipeline.setpoint.workflow import tables
+from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
 from pipeline.temperature.controllers import window

@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pipeline.papers import files
-from pipeline.setpoint import score
-from pipeline.setpoint.agents import agent, judging
+from pipeline.setpoint.agents import agent, score, trials
 from pipeline.setpoint.published import PHASES, ROTATION
 from pipeline.setpoint.simulation.simulator import (
     Conditions,
@@ -29,9 +28,9 @@ from pipeline.setpoint.simulation.simulator import (
     rollout,
 )
 from pipeline.setpoint.vision.vision_transformer import PAPER, parameters, vision_transformer
-from pipeline.setpoint.workflow import train_agent
-from pipeline.setpoint.workflow.settings import TrainAgent
 from pipeline.store import params
+from stages import train_agent
+from stages.train_agent import TrainAgent
 
 COMMAND = "./run dvc repro datasets/papers/dvc.yaml:setpoint"
 MEMO = Path("datasets/memo/train_agent")
@@ -85,7 +84,7 @@ def asked() -> tuple[Conditions, dict[str, slice]]:
         end += part.flow.shape[0]
 
     for accuracy in (1.0, RHO, 1 - RHO):
-        add(f"starts_{100 * accuracy:.0f}", judging.starts(20, accuracy=accuracy))
+        add(f"starts_{100 * accuracy:.0f}", trials.starts(20, accuracy=accuracy))
     for name, (flow, temperature) in SINGLE.items():
         for accuracy in (1.0, RHO):
             add(f"{name}_{100 * accuracy:.0f}", nominal(np.full(RUNS, flow), temperature, accuracy=accuracy))
@@ -134,8 +133,8 @@ def starts(path: Trajectory, place: slice) -> dict[str, Any]:
     by_start = {
         f"{flow:g}, {temperature:g}": 100.0
         * float(settled[(q[:, 0] == flow) & (np.abs(u[:, 0] - temperature) < 1e-3)].mean())
-        for temperature in judging.START_TEMPERATURES
-        for flow in judging.START_FLOWS
+        for temperature in trials.START_TEMPERATURES
+        for flow in trials.START_FLOWS
     }
     return {
         "runs": told.runs,
@@ -209,13 +208,13 @@ def seeds(settings: TrainAgent, count: int = TRAINING_SEEDS) -> dict[str, Any]:
     """Settled in percent at accuracy 0.7 after phase 4, by training seed 0, 1, ...; each judged from 21
     starts, 100 runs a start."""
     controller = agent.greedy(agent.paper_encoder(settings.li_2025.history))
-    conditions, settled = judging.starts(RUNS, accuracy=RHO), []
+    conditions, settled = trials.starts(RUNS, accuracy=RHO), []
     MEMO.mkdir(parents=True, exist_ok=True)
     for seed in range(count):
         own = settings.model_copy(update={"seed": seed})
         network = train_agent.published_agent(own, MEMO, lambda *_: None).networks[-1]
         key = jax.random.key(1000 + seed)
-        score = judging.evaluate(controller, network, paper_windows(), conditions, key)
+        score = trials.evaluate(controller, network, paper_windows(), conditions, key)
         settled.append(round(score.settled.percent, 2))
     return {"settled": settled, "least": min(settled), "most": max(settled), "seeds": len(settled)}
 

@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.setpoint.published import BEST_TEMPERATURE
+
 UNDER, GOOD, OVER = range(3)
 
 
@@ -77,4 +79,4 @@ def _carried(x: np.ndarray, knots: np.ndarray, to: np.ndarray) -> np.ndarray:
 
 
 # as Li and Pattinson 2025 printed it; 20 and 310 %, 180 and 240 °C are the edges of the published figures
-PLA = Material(210.0, (180.0, 240.0), (90.0, 110.0), (20.0, 310.0))
+PLA = Material(BEST_TEMPERATURE, (180.0, 240.0), (90.0, 110.0), (20.0, 310.0))

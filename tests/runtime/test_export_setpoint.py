@@ -11,6 +11,8 @@ import pytest
 from pipeline.runtime.export import agent_reader, flow_filter, flow_reader, setpoint
 from pipeline.runtime.workflow import export_setpoint, exports
 from pipeline.setpoint.agents import agent, bayes, belief_agent
+from pipeline.setpoint.agents.files import Agents
+from pipeline.setpoint.controllers import BuiltController as ControllerSpec
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
 from pipeline.setpoint.simulation.simulator import TEMPERATURE_LIMITS, Observation
 from pipeline.setpoint.vision import classifier, window_flow
@@ -18,8 +20,6 @@ from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
 from pipeline.setpoint.vision.calibration import Calibration, Familiar
 from pipeline.setpoint.vision.vision_transformer import SMALL, convolutional, vision_transformer
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
-from pipeline.setpoint.workflow.agent_files import Agents
-from pipeline.setpoint.workflow.contestants import ControllerSpec
 from pipeline.store import artifacts
 
 WINDOWS, FRAMES = 1000, 2

@@ -32,7 +32,7 @@ from pipeline.setpoint.agents.agent import (
     weights,
     with_weights,
 )
-from pipeline.setpoint.agents.judging import evaluate, starts
+from pipeline.setpoint.agents.trials import evaluate, starts
 from pipeline.setpoint.simulation import simulator
 from pipeline.setpoint.simulation.simulator import STAND, Observation, begin, nominal, paper_windows
 from tests.setpoint.synthetic import synthetic_table

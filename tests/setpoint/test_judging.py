@@ -5,21 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pipeline.setpoint.agents import baselines, judging
-from pipeline.setpoint.agents.judging import (
-    DOES_NOTHING,
-    START_FLOWS,
-    START_TEMPERATURES,
-    Camera,
-    Case,
-    Judged,
-    all_cases,
-    choose,
-    lead,
-    starts,
-    still_in,
-)
-from pipeline.setpoint.score import judge, outcomes, summary
+from pipeline.setpoint.agents import baselines
+from pipeline.setpoint.agents.criteria import NO_CONTROL
+from pipeline.setpoint.agents.score import judge, outcomes, summary
+from pipeline.setpoint.agents.trials import START_FLOWS, START_TEMPERATURES, starts
+from pipeline.setpoint.evaluation import judging
+from pipeline.setpoint.evaluation.judging import Camera, Case, Judged, all_cases, choose, lead, still_in
 from pipeline.setpoint.simulation.recorded import recorded_windows
 from pipeline.setpoint.simulation.simulator import STAND, Action, Controller, nominal
 from pipeline.statistics import effective_runs, redrawn_mean, redrawn_share, shared_variance, wilson
@@ -343,13 +334,13 @@ def contestant(calm, clog, harmed=None, seed=0):
     return Judged(kept, {"in band": good, "in band, another camera": np.ones((24, 20), bool)})
 
 
-ORDER = (DOES_NOTHING, "simple", "filter", "agent")
+ORDER = (NO_CONTROL, "simple", "filter", "agent")
 BARS = {"in band": 2.0}
 IDLE = contestant(0.0, 0.0)
 
 
 def test_the_default_is_the_best_in_its_worst_case_and_the_margin_is_said():
-    judged = {DOES_NOTHING: IDLE, "simple": contestant(1.0, 0.6), "filter": contestant(0.97, 0.96)}
+    judged = {NO_CONTROL: IDLE, "simple": contestant(1.0, 0.6), "filter": contestant(0.97, 0.96)}
     choice = choose(judged, simplest_first=ORDER, bars=BARS)
     assert (choice.name, choice.case) == ("filter", "clog")
     assert choice.margin == pytest.approx(choice.worst - 100 * judged["simple"].kept["clog"].mean())
@@ -420,7 +411,7 @@ def test_an_interval_of_segments_makes_a_tie_of_what_runs_alone_would_tell_apart
 
 def test_whoever_does_harm_is_no_candidate_and_the_sentence_says_why():
     judged = {
-        DOES_NOTHING: IDLE,
+        NO_CONTROL: IDLE,
         "simple": contestant(0.8, 0.8),
         "agent": contestant(1.0, 1.0, harmed=spread(0.05)),
     }
@@ -442,11 +433,11 @@ def test_whoever_does_harm_is_no_candidate_and_the_sentence_says_why():
 
 def test_where_nothing_helps_or_all_do_harm_nothing_is_done():
     judged = {name: contestant(1.0, 1.0, harmed=spread(0.5)) for name in ("simple", "agent")}
-    choice = choose({DOES_NOTHING: IDLE} | judged, simplest_first=ORDER, bars=BARS)
-    assert choice.name == DOES_NOTHING
+    choice = choose({NO_CONTROL: IDLE} | judged, simplest_first=ORDER, bars=BARS)
+    assert choice.name == NO_CONTROL
     assert set(choice.refused) == {"simple", "agent"}
-    idle = choose({DOES_NOTHING: IDLE, "agent": contestant(0.5, 0.0)}, simplest_first=ORDER, bars=BARS)
-    assert idle.name == DOES_NOTHING
+    idle = choose({NO_CONTROL: IDLE, "agent": contestant(0.5, 0.0)}, simplest_first=ORDER, bars=BARS)
+    assert idle.name == NO_CONTROL
     assert (
         "no controller does better beyond noise, the best is agent 0.0 % in its own (clog)" in idle.sentence
     )
@@ -507,8 +498,8 @@ def test_alike_in_the_worst_case_is_not_alike_where_another_is_better_on_average
     assert choice.name == "filter"
     assert "over the cases on average filter keeps 10" in choice.sentence
     assert still_in(judged, BARS) == ["filter"]
-    assert choose({DOES_NOTHING: plain, "filter": filter_}, simplest_first=ORDER, bars=BARS).name == (
-        DOES_NOTHING
+    assert choose({NO_CONTROL: plain, "filter": filter_}, simplest_first=ORDER, bars=BARS).name == (
+        NO_CONTROL
     )
     # better by less than counts
     near = filter_._replace(kept={**filter_.kept, "accuracy 0.7": ~spread(0.28)})

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from pipeline.setpoint import settings
 from pipeline.setpoint.deployment import deployment, pixels
 from pipeline.setpoint.deployment.pixels import Loop, Machine, at_rest, calm, run, tick
-from pipeline.setpoint.frames import familiar
+from pipeline.setpoint.frames import familiar, known_camera
+from pipeline.setpoint.frames import files as camera_files
 from pipeline.setpoint.simulation import actuation
 from pipeline.setpoint.simulation.actuation import ACTS, Limits, Waits
 from pipeline.setpoint.simulation.simulator import Action, Controller
-from pipeline.setpoint.workflow import camera_files, known_camera, settings
 from pipeline.store import params
 from tests.setpoint.step_response import settling_s, step_response
 

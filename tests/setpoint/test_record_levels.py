@@ -7,14 +7,14 @@ from functools import partial
 import numpy as np
 import pytest
 
+from pipeline.commands import record_levels
+from pipeline.commands.levels_files import restore_levels
+from pipeline.commands.record_levels import Eye, Protocol
+from pipeline.commands.shadow.decide import Mind
+from pipeline.commands.shadow.deploy import of_camera
+from pipeline.reading.watch_sources import Folder, Shown
 from pipeline.setpoint import levels
 from pipeline.setpoint.material import Material
-from pipeline.setpoint.workflow import record_levels
-from pipeline.setpoint.workflow.levels_files import restore_levels
-from pipeline.setpoint.workflow.record_levels import Eye, Protocol
-from pipeline.setpoint.workflow.shadow.decide import Mind
-from pipeline.setpoint.workflow.shadow.deploy import of_camera
-from pipeline.setpoint.workflow.watch_sources import Folder, Shown
 from tests.setpoint.test_shadow import ASKED, FRAMES, TIP, by_width, deployed, fill, picture
 
 FLOWS, HOLD, RATE = (60.0, 80.0, 100.0, 125.0, 160.0), 6.0, 10

@@ -20,16 +20,18 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from pipeline.commands import shadow
+from pipeline.commands.shadow import decision_log
+from pipeline.commands.shadow.decide import Asked, Deployed
+from pipeline.commands.shadow.windows import Windows
+from pipeline.reading import watch_sources
+from pipeline.reading.watch_sources import Folder, Recording, Shown
 from pipeline.setpoint.agents import bayes
 from pipeline.setpoint.deployment import deployment
 from pipeline.setpoint.material import PLA, Material
 from pipeline.setpoint.simulation import actuation
 from pipeline.setpoint.vision.calibrated_classifier import FrameReadings
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration, window_flow
-from pipeline.setpoint.workflow import decision_log, shadow, watch_sources
-from pipeline.setpoint.workflow.shadow.decide import Asked, Deployed
-from pipeline.setpoint.workflow.shadow.windows import Windows
-from pipeline.setpoint.workflow.watch_sources import Folder, Recording, Shown
 from pipeline.store import artifacts
 from tests.nozzle_folders import ANY
 
@@ -437,8 +439,8 @@ def test_a_full_disk_costs_no_decision(tmp_path, monkeypatch, capsys):
 DRIVER = """
     import sys, time
     from pathlib import Path
-    from pipeline.setpoint.workflow import shadow
-    from pipeline.setpoint.workflow.watch_sources import source
+    from pipeline.commands import shadow
+    from pipeline.reading.watch_sources import source
     from tests.nozzle_folders import ANY
     from tests.setpoint.test_shadow import ASKED, deployed
     with shadow.until_told() as stopped:

@@ -14,11 +14,11 @@ from pipeline.runtime.export.setpoint import BeliefAgent, Decider
 from pipeline.runtime.workflow.export_controllers import Written, hashes
 from pipeline.setpoint.agents.bayes import Filter
 from pipeline.setpoint.agents.belief_agent import belief_encoder
+from pipeline.setpoint.agents.files import Agents
+from pipeline.setpoint.controllers import BuiltController as BuiltController
 from pipeline.setpoint.published import FLOW_MOVES
 from pipeline.setpoint.simulation.simulator import TEMPERATURE_LIMITS, Observation
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, read_frames
-from pipeline.setpoint.workflow.agent_files import Agents
-from pipeline.setpoint.workflow.contestants import ControllerSpec
 
 BELIEF = "our agent"  # sees what its own filter believes
 FRAMES = 64  # drawn key areas on which reader and network are compared
@@ -29,7 +29,7 @@ WHY = (
 )
 
 
-def decider(name: str, specs: dict[str, ControllerSpec], agents: Agents) -> Decider | None:
+def decider(name: str, specs: dict[str, BuiltController], agents: Agents) -> Decider | None:
     """What the controller that is the default decides by; None where it has no filter."""
     if name == BELIEF:
         return BeliefAgent(agents.belief, agents.belief_dqn)

@@ -7,7 +7,7 @@ one maximum and a one-step target of its own; step 100 ends an episode without e
 still looks ahead.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -427,3 +427,31 @@ def with_weights(network: eqx.Module, arrays: dict[str, np.ndarray]) -> eqx.Modu
             "the file; train again, or load them into the network that they were trained in"
         )
     return jax.tree.unflatten(jax.tree.structure(network), [jnp.asarray(arrays[name]) for name in own])
+
+
+# ---- rows of controllers.CONTROLLERS: settings, agents and recorded windows -> controller and parameters
+
+
+@cache  # one controller for all phases, so that what was compiled for it is found again
+def _published(history: int) -> Controller:
+    return greedy(paper_encoder(history))
+
+
+def _build_after_phase(number: int, agents: Any) -> tuple[Controller, QNetwork] | None:
+    """The agent of Li and Pattinson (2025) after so many of its phases; None if it was not trained so far."""
+    if number > len(agents.li_2025):
+        return None
+    network = agents.li_2025[number - 1]
+    return _published(history_of(network)), network
+
+
+def build_after_phase_3(
+    settings: Mapping[str, Any], agents: Any, windows: Any
+) -> tuple[Controller, QNetwork] | None:
+    return _build_after_phase(3, agents)
+
+
+def build_after_phase_4(
+    settings: Mapping[str, Any], agents: Any, windows: Any
+) -> tuple[Controller, QNetwork] | None:
+    return _build_after_phase(4, agents)

@@ -6,8 +6,9 @@ controller here moves the target to 210 °C in the largest steps that lambda's c
 then follows. The Bayes filters are in bayes.py.
 """
 
+from collections.abc import Mapping
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -106,3 +107,22 @@ def sequential_test() -> Controller:
         return S, Action(move, temperature_move(observation))
 
     return Controller(lambda: jnp.zeros(CLASSES), act)
+
+
+# ---- rows of controllers.CONTROLLERS: settings, agents and recorded windows -> controller and parameters
+
+
+def build_no_control(settings: Mapping[str, float], agents: Any, windows: Any) -> tuple[Controller, tuple]:
+    return nothing(), ()
+
+
+def build_proportional(
+    settings: Mapping[str, float], agents: Any, windows: Any
+) -> tuple[Controller, Proportional]:
+    return proportional(), Proportional(**settings)
+
+
+def build_sequential_test(
+    settings: Mapping[str, float], agents: Any, windows: Any
+) -> tuple[Controller, SequentialTest]:
+    return sequential_test(), SequentialTest(**settings)

@@ -24,9 +24,9 @@ the watch, to which such a camera is another, and 96 if told as well. Prints in 
 of the runs, and in 0.8 % with the table of the very segments that they are watched by.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -529,3 +529,20 @@ def class_filter(
         move_fixed_cost,
         jnp.asarray(_prior(known_start_share, known_start_std))[None],
     )
+
+
+# ---- rows of controllers.CONTROLLERS: settings, agents and recorded windows -> controller and parameters
+
+
+def build_class_filter(
+    settings: Mapping[str, float], agents: Any, windows: WindowTable
+) -> tuple[Controller, Filter]:
+    return bayes(1), class_filter(**settings)
+
+
+def build_robust_filter(
+    settings: Mapping[str, Any], agents: Any, windows: WindowTable
+) -> tuple[Controller, Filter]:
+    model = CameraErrorModel(**settings)
+    hypotheses = len(model.gains) * (len(model.accuracies) + model.width_bias_levels)
+    return bayes(hypotheses), watching_filter(windows, model)

@@ -8,7 +8,8 @@ Nothing tells the agent the classifier's accuracy, the actuator's gain or the se
 accuracies and gains are hypotheses of the filter.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -46,6 +47,7 @@ from pipeline.setpoint.simulation.simulator import (
     STAND,
     TEMPERATURE_LIMITS,
     Conditions,
+    Controller,
     Observation,
     State,
     Windows,
@@ -361,3 +363,14 @@ def _environment(table: WindowTable, settings: BeliefTraining) -> EnvSpec:
         Partial(disturbed, settings.disturbances, settings.dqn.episode),
         Partial(rewards, settings.costs),
     )
+
+
+def _strange(of: bayes.Filter, network: BeliefNetwork, memory: bayes.FilterState) -> jax.Array:
+    return bayes.strange(of, memory)
+
+
+def build(settings: Mapping[str, Any], agents: Any, windows: WindowTable) -> tuple[Controller, BeliefNetwork]:
+    """The row of controllers.CONTROLLERS: the network on the belief of its filter, which also tells whether
+    the camera is another."""
+    controller = greedy(belief_encoder(agents.belief))
+    return controller._replace(strange=Partial(_strange, agents.belief.filter)), agents.belief_dqn

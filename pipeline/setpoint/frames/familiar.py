@@ -24,6 +24,9 @@ OCTAVES = 5
 NEAR, REACH, START = 14, 28, 12
 # a frame's measures vary with its bead; a window's are the medians of a few
 FRAMES = 4
+# of windows of the known camera, the share that may be called foreign; pictures of other machines lie so far
+# off that it may be small
+FALSE_ALARMS = 0.01
 NAMES = (
     *(f"gray level, {p} %" for p in LEVELS),
     *(f"structure of {2**k} px" for k in range(OCTAVES)),
@@ -242,3 +245,31 @@ def unlike(camera: Camera, window: np.ndarray) -> str:
     z = (np.asarray(window, float) - camera.mean) / camera.deviation
     k = int(np.abs(z).argmax())
     return f"{NAMES[k]}: {abs(z[k]):.0f} deviations {'above' if z[k] > 0 else 'below'} the known camera's"
+
+
+def fit_recorded_camera(surroundings: np.ndarray, segment: np.ndarray, *, length: int) -> Camera | None:
+    """The camera of frames with `surroundings` (n, measures), by windows of `length` of them in a row in one
+    stretch `segment` (n,) of constant settings. What errs together is such a stretch; if these are too few, a
+    window; None if those are too few as well."""
+    windows, stretch = window_medians(surroundings, segment, length=length)
+    for together in (stretch, np.arange(len(windows))):
+        try:
+            return fit_camera(windows, together, false_alarms=FALSE_ALARMS)
+        except ValueError:
+            continue
+    return None
+
+
+def window_medians(
+    surroundings: np.ndarray, segment: np.ndarray, *, length: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(measures of the windows (w, f), stretch of each (w,)), of those with a measured frame."""
+    rows, stretch = [], []
+    for number in np.unique(segment):
+        measures = surroundings[segment == number]
+        for start in range(0, len(measures) - length + 1, length):
+            rows.append(median(measures[start : start + length].astype(float)))
+            stretch.append(number)
+    windows = np.array(rows, float).reshape(-1, surroundings.shape[1])
+    sound = np.isfinite(windows).all(axis=1)
+    return windows[sound], np.array(stretch, int)[sound]

@@ -8,6 +8,8 @@ looks thin here looks thin there. Of a table with flows an error is drawn: that 
 in the same way, and about it that of any of the NEAREST windows recorded at flows like this one.
 """
 
+import collections
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -227,3 +229,51 @@ def _check(table: WindowTable) -> None:
             f"recorded windows: expected flow bins 0 to {bins - 1}, "
             f"found {np.min(table.flow_bin)} to {np.max(table.flow_bin)}"
         )
+
+
+# ---- as columns of a table
+
+
+def window_rows(tables: Mapping[str, WindowTable]) -> dict[str, np.ndarray]:
+    """Tables by part as columns of schema WINDOWS; flows are missing of a classifier that names
+    classes only."""
+    columns = collections.defaultdict(list)
+    for part, table in tables.items():
+        columns["part"] += [part] * len(table.named)
+        columns["flow_percent"].append(np.broadcast_to(table.flow, len(table.named)))
+        columns["flow_bin"].append(table.flow_bin)
+        columns["flow_low_percent"].append(table.flow_edges[table.flow_bin])
+        columns["flow_high_percent"].append(table.flow_edges[table.flow_bin + 1])
+        columns["segment"].append(table.segment)
+        columns["named"].append(table.named)
+        columns["flow_seen_percent"].append(np.broadcast_to(table.flow_seen, len(table.named)))
+        columns["spread"].append(np.broadcast_to(table.spread, len(table.named)))
+        for c, name in enumerate(("under", "good", "over")):
+            columns[f"p_{name}"].append(table.shares[:, c])
+    return {name: values if name == "part" else np.concatenate(values) for name, values in columns.items()}
+
+
+def window_tables(columns: Mapping[str, np.ndarray], parts: Sequence[str]) -> dict[str, WindowTable]:
+    """The reverse of `window_rows`. Raises ValueError if one of the parts has no window."""
+    tables = {}
+    for part in parts:
+        rows = np.asarray(columns["part"] == part)
+        if not rows.any():
+            raise ValueError(
+                f"recorded windows: expected some of each part, {', '.join(parts)}, but found none of "
+                f"{part}; record them again with ./run dvc repro train_classifier"
+            )
+        bins, first = np.unique(columns["flow_bin"][rows], return_index=True)
+        low, high = (columns[f"flow_{end}_percent"][rows][first] for end in ("low", "high"))
+        shares = np.stack([columns[f"p_{name}"][rows] for name in ("under", "good", "over")], axis=1)
+        tables[part] = WindowTable(
+            shares,
+            columns["named"][rows],
+            np.searchsorted(bins, columns["flow_bin"][rows]),
+            columns["segment"][rows],
+            np.append(low, high[-1]),
+            columns["flow_seen_percent"][rows],
+            columns["spread"][rows],
+            columns["flow_percent"][rows],
+        )
+    return tables
