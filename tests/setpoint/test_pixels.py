@@ -11,12 +11,12 @@ from scipy.stats import norm
 from pipeline.setpoint import settings
 from pipeline.setpoint.deployment import deployment, pixels
 from pipeline.setpoint.deployment.pixels import Loop, Machine, at_rest, calm, run, tick
-from pipeline.setpoint.frames import familiar, known_camera
-from pipeline.setpoint.frames import files as camera_files
+from pipeline.setpoint.frames import familiar
 from pipeline.setpoint.simulation import actuation
 from pipeline.setpoint.simulation.actuation import ACTS, Limits, Waits
 from pipeline.setpoint.simulation.simulator import Action, Controller
 from pipeline.store import params
+from stages.render_frames import RenderFrames, render_camera
 from tests.setpoint.step_response import settling_s, step_response
 
 MACHINE = Machine(heater_s=15.0, heater_delay_s=2.0, melt_s=1.2, softening_per_degC=0.02)
@@ -269,16 +269,15 @@ def test_a_camera_that_moved_is_held_for_that_and_one_that_shook_a_little_is_not
 @pytest.fixture(scope="module")
 def camera():
     """That of rendered segments, seen in one window each."""
-    settings_of = params.load(settings.RenderFrames, "render_frames")
-    return known_camera.drawn(
-        settings_of.model_copy(update={"camera_segments": 240}), params.load(params.Execution, "execution")
-    )
+    declared = params.load(RenderFrames, "render_frames").model_copy(update={"camera_segments": 240})
+    measures = render_camera(declared, params.load(params.Execution, "execution"))
+    return familiar.fit_camera(measures, np.arange(240), false_alarms=familiar.FALSE_ALARMS)
 
 
 def test_pictures_of_another_kind_are_held_and_those_of_the_known_camera_are_not(camera):
     """Two windows as they are rendered, then two through a lens so far out of focus as none of the segments;
     where no camera is known, those are acted on."""
-    foreign = functools.partial(familiar.foreign, camera, false_alarms=camera_files.FALSE_ALARMS)
+    foreign = functools.partial(familiar.foreign, camera, false_alarms=familiar.FALSE_ALARMS)
     loop = CALM_LIGHT._replace(foreign=foreign)
     blurred = calm(6)._replace(blur_px=np.full(6, 6.0), burst_at=np.full(6, 2), burst_for=np.full(6, 2))
     got = run(FILTERED, None, SIX, loop, blurred, decisions=4, rng=np.random.default_rng(3))

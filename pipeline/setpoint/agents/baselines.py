@@ -87,8 +87,9 @@ def sequential_test() -> Controller:
     """A running test of the three classes, 10 % against under or over where it leads good by the threshold
     (Wald 1945; capped as in Page's CUSUM, 1954).
 
-    S_i <- max(S_i + log P(x | i) - max_j (S_j + log P(x | j)), -cap): the cap is what lets a class come back,
-    once a move or a clog has made it true.
+        S_i <- max(S_i + log P(x | i) - max_j (S_j + log P(x | j)), -cap)
+
+    The cap lets a class come back, once a move or a clog has made it true.
     """
 
     def act(

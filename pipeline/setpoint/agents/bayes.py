@@ -4,11 +4,13 @@ camera errs, and the move with the least expected loss.
 Its moves and the windows it shows tell the flow. The filter carries b(h, q), the belief that the
 flow is q, the camera errs in the manner of h, and the extruder follows its commands with the gain g_h:
 
-b(h, q) <- sum_h' T(h', h) [(1 - hazard) b(h', q - g_h' move) + hazard b'(h') prior(q)] the move; a
-clog or the like, with a small probability; another segment b(h, q) <- b(h, q) P(window | h, q,
-window before) / sum the window a = argmin_a sum b(h, q) loss(q + g_h a) + move_cost |a| loss(q) =
-|q - 100| + outside_cost where that is more than 10; a move costs move_fixed_cost more, so that a print that
-may well be good is left alone
+    b(h, q) <- sum_h' T(h', h) [(1 - hazard) b(h', q - g_h' move) + hazard b'(h') prior(q)]    the move
+    b(h, q) <- b(h, q) P(window | h, q, window before) / sum                                   the window
+    a = argmin_a sum b(h, q) loss(q + g_h a) + move_cost |a|                                   the next move
+    loss(q) = |q - 100| + (outside_cost if |q - 100| > 10)
+
+With the probability `hazard` the nozzle clogs or the like at a move; T leads to another segment. A move costs
+move_fixed_cost more, so that a print that may well be good is left alone.
 
 Manners of erring (`evidence`): anywhere with one probability, as in the paper's simulator; or as a
 trained classifier does by its recorded windows, seen through a segment that makes every bead look

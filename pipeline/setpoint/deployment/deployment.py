@@ -60,10 +60,13 @@ def judge_window(
     W), tip moved (E,) -> what they say together.
 
     A frame counts when its key area is valid, its probabilities are a distribution and its score is at most
-    `foreign_above`. Of the m that count p = softmax( sum_i log p_i / (1 + (m - 1) correlation) ) frames of
-    one segment repeat each other (design effect; Kish 1965) w_c = #{i: argmax p_i = c}, p = w / m, p-hat = p
-    / max p Li and Pattinson 2025, eq. 1-4 members = {c: p_c >= conformal_level} split conformal set (Sadinle,
-    Lei, Wasserman 2019) Held: fewer than `least_frames` count (by what cost the most of them), the tip has
+    `foreign_above`. Of the m that count
+
+        p = softmax( sum_i log p_i / (1 + (m - 1) correlation) )    design effect of one segment: Kish 1965
+        w_c = #{i: argmax p_i = c},  p = w / m,  p-hat = p / max p  Li and Pattinson 2025, eq. 1-4
+        members = {c: p_c >= conformal_level}                       split conformal: Sadinle et al. 2019
+
+    Held: fewer than `least_frames` count (by what cost the most of them), the tip has
     moved, or the set is no single class.
 
     flows(frames that count (E, W)) -> flow_seen (E,), spread (E,), class probabilities (E, 3) is of a

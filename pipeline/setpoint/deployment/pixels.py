@@ -66,9 +66,11 @@ def tick(
     """The next state and the mean flow (E,) out of the nozzle over a tick,
     for those that run (E,) bool; the others stand still.
 
-    T' = (target(t - delay) - T) / heater_s; V' = feed - V / tau(T), flow = V / tau, tau = melt_s
-    exp(-softening (T - 210)): what is fed leaves, later, and a melt that heats up lets go of what it holds.
-    Both exact for inputs held over the tick.
+        T' = (target(t - delay) - T) / heater_s
+        V' = feed - V / tau(T)    flow = V / tau    tau = melt_s exp(-softening (T - 210))
+
+    What is fed leaves, later, and a melt that heats up lets go of what it holds. Both are exact for inputs
+    that are constant over the tick.
     """
     tau = _melt_s(machine, state.temperature)
     stored = feed * tau + (state.stored - feed * tau) * np.exp(-tick_s / tau)

@@ -4,8 +4,9 @@ disturbances in mid-episode, and rollouts.
 One decision is one window of frames. At step t the controller sees an
 `Observation` and answers with an `Action`; then
 
-q_bar <- clip(q_bar + gain a_q, 20, 310), q = blockage q_bar, u_bar <- clip(u_bar + a_u, 180, 240) where t mod
-lambda = 0, u_hat += (u_bar - u_hat) / delta
+    q_bar <- clip(q_bar + gain a_q, 20, 310)    q = blockage q_bar
+    u_bar <- clip(u_bar + a_u, 180, 240)        if t mod lambda = 0
+    u_hat <- u_hat + (u_bar - u_hat) / delta
 
 What may be sent, how long to wait and when to hold is `actuation`'s, as in the loop through pixels. The
 commanded flow acts at once, or as fast as the melt lets it, and the class depends on the true flow q alone.
