@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import stages
 from pipeline.setpoint.controllers import THROUGH_PIXELS, BuiltController, build_controllers
 from pipeline.setpoint.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.setpoint.tables import DECISIONS, PATHS, SCOREBOARD, WINDOW_PARTS, WINDOWS
@@ -259,4 +260,4 @@ def pixel_loop(model: Any, settings: EvaluateSetpoint, view: TrainClassifier, ca
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "evaluate_setpoint", loop="setpoint")

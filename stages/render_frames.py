@@ -7,6 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
+import stages
 from pipeline.setpoint.settings import Counts
 from pipeline.setpoint.tables import FRAME_PARTS, WINDOW_PARTS
 from pipeline.store import artifacts, params
@@ -145,4 +146,4 @@ def counts(by_part: dict[str, Any]) -> dict[str, dict[str, int]]:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "render_frames", loop="setpoint")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from pydantic import Field
 
+import stages
 from pipeline.setpoint.settings import RobustFilter
 from pipeline.setpoint.tables import AGENT_CURVE, WINDOW_PARTS, WINDOWS
 from pipeline.store import artifacts, params
@@ -316,4 +317,4 @@ def guesses(settings: Li2025) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "train_agent", loop="setpoint")

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+import stages
 from pipeline.setpoint.settings import SetpointMaterial, TrainClassifier
 from pipeline.setpoint.tables import (
     CLASSIFIED,
@@ -252,4 +253,4 @@ def write_frames(
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "train_classifier", loop="setpoint")

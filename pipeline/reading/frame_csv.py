@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.reading.csv_rows import MISSING, CsvLayout, floats, list_layout, sound_rows
 from pipeline.reading.formats import column_place
 from pipeline.reading.instants import instants, month_first
 from pipeline.reading.signals import Note, nearest_names
-from pipeline.store.csv_rows import MISSING, CsvLayout, floats, list_layout, sound_rows
 
 ROWS_AT_ONCE = 10_000
 # what a printer can be told; beyond it the column is another one, or in another unit

@@ -16,10 +16,10 @@ from pipeline.reading.frame_csv import stretches
 from pipeline.reading.frame_images import concatenate
 from pipeline.reading.image_topics import Frames, Walk, image_topic
 from pipeline.reading.mcap_columns import Topic, resolve, topics
+from pipeline.reading.mcap_frames import check_overlap, damage, read_frames, span_of
 from pipeline.reading.mcap_messages import UnreadableMessage
 from pipeline.reading.signals import Note, Source, nearest_names
 from pipeline.store.artifacts import sha256
-from pipeline.store.mcap_frames import check_overlap, damage, read_frames, span_of
 
 # the section of params.yaml with our signals' places in a recording
 PLACE = "params.yaml: train_classifier.topics"

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import joblib
 import numpy as np
-import pyarrow as pa
 
 from pipeline.reading import frame_folder
 from pipeline.reading.frame_folder import NozzleFrames, ReadOptions
@@ -20,14 +19,14 @@ from pipeline.setpoint.material import PLA, Material
 from pipeline.setpoint.settings import TrainClassifier
 from pipeline.store import artifacts
 from pipeline.store.params import Execution
-from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema
+from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema, bytes_of
 
 MEMO = Path("datasets/memo/train_classifier")
 HERE = Path(__file__).parents[1]
 # the code that decides what an entry of the memo holds
 CODE = (
     "setpoint/recordings.py", "setpoint/frames/front_end.py", "setpoint/frames/key_area.py",
-    "setpoint/frames/travel.py", "setpoint/frames/familiar.py", "store/mcap_frames.py",
+    "setpoint/frames/travel.py", "setpoint/frames/familiar.py", "reading/mcap_frames.py",
     "reading/frame_images.py", "reading/frame_mcap.py", "reading/image_messages.py",
     "reading/image_topics.py",
 )  # fmt: skip
@@ -36,7 +35,7 @@ KEY_AREAS = Schema(
     2,
     (
         Column(
-            "image", pa.binary(key_area.SHAPE[0] * key_area.SHAPE[1]), NONE, "16 x 48 gray levels, row by row"
+            "image", bytes_of(key_area.SHAPE[0] * key_area.SHAPE[1]), NONE, "16 x 48 gray levels, row by row"
         ),
         Column("angle_deg", FLOAT, "deg", "direction of the line, 0 right, 90 down", nullable=True),
         Column("miss_px", FLOAT, "px", "by which the line passes beside the tip", nullable=True),
@@ -46,7 +45,7 @@ KEY_AREAS = Schema(
         Column("tip_y_px", FLOAT, "px", "where the tip was taken to be", nullable=True),
         Column(
             "surroundings",
-            pa.binary(4 * len(familiar.NAMES)),
+            bytes_of(4 * len(familiar.NAMES)),
             NONE,
             "measures of familiar.NAMES, single precision, NaN where not taken",
         ),

@@ -28,8 +28,8 @@ from pipeline.deposition.workflow.trial_files import (
     write_trial,
 )
 from pipeline.reading import image_messages
+from pipeline.reading.mcap_frames import ENCODERS
 from pipeline.reading.recordings import read
-from pipeline.store.mcap_frames import ENCODERS
 from tests.mcap_writing import NO, ZSTD, Written, cdr, chunks, flipped
 
 CONDITIONS = Conditions(

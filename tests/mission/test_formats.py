@@ -165,9 +165,6 @@ def test_a_misspelt_section_of_another_stage_is_refused_by_name(begun, tmp_path)
         play(folder, "ingest")
 
 
-@pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="a section is read by its stage alone: the first stage runs"
-)
 def test_a_misspelt_key_is_refused_by_name_before_the_first_stage(checkout):
     text = (checkout / "params.yaml").read_text(encoding="utf-8")
     assert "  settled_error_degC:" in text
@@ -198,9 +195,6 @@ def test_a_misspelt_key_is_refused_by_name_before_the_first_stage(checkout):
 # ---- pins
 
 
-@pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="no stage looks at the pins: it writes other bytes unseen"
-)
 def test_a_stage_without_the_pins_refuses_to_write(tmp_path):
     folder = begin(tmp_path / "project")
     declare(folder, {"generate_probing.samples": 200})

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.papers import files, reproduce_study
-from pipeline.store import made, params
+from pipeline.papers import files, made, reproduce_study
+from pipeline.store import params
 from pipeline.temperature import study
 from pipeline.temperature.published import GAMMA, REFERENCE
 from pipeline.temperature.test_set import tuning

@@ -12,9 +12,9 @@ from pipeline.deposition.workflow import compose_parts
 from pipeline.deposition.workflow.compose_parts import Part
 from pipeline.deposition.workflow.tables import LINES, TASKS
 from pipeline.deposition.workflow.trial_files import COMMAND, TYPES
+from pipeline.reading.mcap_frames import tables_of, write_frames
 from pipeline.reading.signals import Source
 from pipeline.store import artifacts
-from pipeline.store.mcap_frames import tables_of, write_frames
 from pipeline.store.tables import FLOAT, Column, Schema
 
 FORMATS = ("csv", "parquet", "mcap", "gcode")

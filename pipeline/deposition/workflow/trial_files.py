@@ -16,9 +16,9 @@ import numpy as np
 from pipeline.reading.formats import file_format
 from pipeline.reading.image_topics import Frames, image_topic
 from pipeline.reading.mcap_columns import Topic, resolve, topics
+from pipeline.reading.mcap_frames import check_overlap, damage, read_frames, span_of, tables_of, write_frames
 from pipeline.reading.signals import Note, Source
 from pipeline.store.artifacts import write_csv
-from pipeline.store.mcap_frames import check_overlap, damage, read_frames, span_of, tables_of, write_frames
 
 SCHEMA, VERSION = "beadline.trial", "1"
 # what a trial has, where our own recordings have it

@@ -9,6 +9,7 @@ made and whether its method has changed since. No verdict, choice or export read
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from pipeline.papers import made
 from pipeline.report.papers import deposition, setpoint, study, temperature
 from pipeline.report.papers.figures import Drawn
 from pipeline.report.papers.relearned import sentences
@@ -16,7 +17,7 @@ from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS, Pap
 from pipeline.report.shared import page
 from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import Missing
-from pipeline.store import artifacts, made
+from pipeline.store import artifacts
 
 # glyph of a verdict, by the states that the pages know
 GLYPHS = {HOLDS: "passed", SHAPE: "passed", FAILS: "failed", OPEN: "open"}

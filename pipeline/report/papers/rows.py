@@ -9,9 +9,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pipeline.papers import made
 from pipeline.report.shared.digits import number
 from pipeline.report.shared.verdict import Missing
-from pipeline.store import artifacts, made
+from pipeline.store import artifacts
 
 HOLDS, SHAPE, FAILS, OPEN = "holds", "holds in shape", "does not hold", "cannot be judged"
 VERDICTS = (HOLDS, SHAPE, FAILS, OPEN)

@@ -32,7 +32,7 @@ CODE = Path(__file__).parents[2]
 # what decides what an entry of the memo holds: changed code reads everything again
 READING = (
     "store/artifacts.py",
-    "store/csv_rows.py",
+    "reading/csv_rows.py",
     "store/params.py",
     "store/tables.py",
     "temperature/workflow/ingest.py",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.store import made
+from pipeline.papers import made
 
 ROOT = Path(__file__).resolve().parents[2]
 
