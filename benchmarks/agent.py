@@ -17,7 +17,7 @@ import optax
 from benchmarks import results
 from benchmarks.results import Row
 from pipeline.setpoint.agents import agent, belief_agent, trials
-from pipeline.setpoint.agents.score import Score
+from pipeline.setpoint.agents.score import RunScore
 from pipeline.setpoint.evaluation import judging
 from pipeline.setpoint.simulation.recorded import recorded_windows
 from pipeline.setpoint.simulation.simulator import paper_windows, rollout
@@ -29,7 +29,7 @@ from tests.setpoint.synthetic import synthetic_table
 UPDATES = 500  # of each timing
 
 
-def figures(score: Score) -> dict[str, float]:
+def figures(score: RunScore) -> dict[str, float]:
     shares = {name: round(getattr(score, name).percent, 2) for name in ("settled", "stay", "recovered")}
     return shares | {
         name: round(getattr(score, name), 2)
@@ -87,7 +87,7 @@ def speeds(settings: Li2025) -> dict[str, Any]:
         jax.tree_util.Partial(agent.anywhere, jnp.asarray(1.0)),
         jax.tree_util.Partial(agent.ellipse, a, b),
     )
-    train_state = agent.TrainState(network, network, optimiser.init(network))
+    train_state = agent.DqnState(network, network, optimiser.init(network))
     controller = agent.greedy(encoder)
     problem = agent.DqnProblem(encoder, env, optimiser, agent.dqn_target, train_agent.dqn_settings(settings))
     conditions = jax.tree.map(lambda leaf: leaf[:1024], trials.starts(49, accuracy=1.0))

@@ -254,7 +254,7 @@ def record_levels(arguments: argparse.Namespace) -> None:
     from pipeline.commands import record_levels as levels
     from pipeline.commands.shadow import deploy
     from pipeline.commands.training_print import numbers
-    from pipeline.reading.watch_sources import Recording
+    from pipeline.reading.watch_sources import RecordingSource
     from pipeline.setpoint.recordings import read_options
     from pipeline.setpoint.settings import SetpointMaterial
     from pipeline.setpoint.vision.calibrated_classifier import read_frames
@@ -271,7 +271,7 @@ def record_levels(arguments: argparse.Namespace) -> None:
         deploy.pixel(arguments.tip) if arguments.tip else options.tip_px,
     )
     place = arguments.source
-    source = levels.source_of(place, lambda path: Recording(path, options.topics))
+    source = levels.source_of(place, lambda path: RecordingSource(path, options.topics))
     levels_eye = levels.Eye(
         partial(read_frames, eye.model), partial(window_flow, fitted=fitted.flow), eye.view.window,
         eye.view.least_score, eye.digest, eye.view.false_alarms, material,
@@ -293,7 +293,7 @@ def training_print(arguments: argparse.Namespace) -> None:
         x, y = printing.numbers(getattr(arguments, flag[2:]), flag, 2)
         return x, y
 
-    asked = printing.Print(
+    asked = printing.TrainingPrint(
         flows=printing.numbers(arguments.flows, "--flows"),
         temperatures=printing.numbers(arguments.temperatures, "--temperatures"),
         bed=pair("--bed"), height=one("--height"), size=pair("--size"), nozzle=one("--nozzle"),

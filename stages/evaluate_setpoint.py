@@ -17,7 +17,7 @@ from pipeline.store import artifacts, params
 
 if TYPE_CHECKING:
     from pipeline.setpoint.evaluation.contest import Contest
-    from pipeline.setpoint.evaluation.judging import Case, Choice
+    from pipeline.setpoint.evaluation.judging import Case, DefaultChoice
     from pipeline.setpoint.evaluation.pixel_rollouts import PixelRollouts
     from pipeline.setpoint.simulation.recorded import WindowTable
 
@@ -70,7 +70,7 @@ def choose_default(
     settings: EvaluateSetpoint,
     *,
     room: int = 0,
-) -> "Choice":
+) -> "DefaultChoice":
     """The default, by the segments to choose on (sequential halving): in each of settings.rounds every
     controller that may still become the default runs on settings.redraws further redraws of them."""
     import jax
@@ -206,7 +206,9 @@ def simulate_pixels(
     starts = pixel_rollouts.spread_starts(own.starts, own.runs)
     hard_starts, disturbances, words = pixel_rollouts.disturbed_episodes(own.decisions)
 
-    def run(name: str, starts: np.ndarray, disturbances: pixels.Disturbances, seed: int) -> pixels.Episodes:
+    def run(
+        name: str, starts: np.ndarray, disturbances: pixels.PixelDisturbances, seed: int
+    ) -> pixels.Episodes:
         built, rng = controllers[name], np.random.default_rng([settings.seed, seed])
         episodes = pixels.run(
             built.controller, built.parameters, starts, loop, disturbances, decisions=own.decisions, rng=rng
@@ -233,13 +235,13 @@ def pixel_loop(model: Any, settings: EvaluateSetpoint, view: TrainClassifier, ca
     from pipeline.setpoint.vision.window_flow import window_flow
 
     q, fitted = settings.pixels, model.calibration
-    return pixels.Loop(
-        machine=pixels.Machine(q.heater_s, q.heater_delay_s, q.melt_s, q.softening_per_degC),
+    return pixels.PixelLoop(
+        machine=pixels.MachineDynamics(q.heater_s, q.heater_delay_s, q.melt_s, q.softening_per_degC),
         classify=partial(read_frames, model),
         frames=view.window,
         frame_rate_hz=q.frame_rate_hz,
         waits=actuation.Waits(q.wait_s, q.wait_s, q.idle_wait_s),
-        limits=actuation.Limits(
+        limits=actuation.SetpointLimits(
             *(np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True)),
             np.array(q.per_action),
             np.array(q.per_minute),

@@ -54,6 +54,8 @@ def main() -> None:
         execution = params.load(Execution, "execution")
         source = params.value("train_classifier.source", one_of=("simulated", "recordings"))
         simulated = source == "simulated"
+        import numpy as np
+
         from pipeline.setpoint.frames import familiar, files
 
         by_part = render(settings, execution) if simulated else {}
@@ -61,8 +63,9 @@ def main() -> None:
         artifacts.write_json(out / "frames.json", counts(by_part))
         if simulated:
             measures = render_camera(settings, execution)
-            segments = range(len(measures))
-            camera = familiar.fit_camera(measures, segments, false_alarms=familiar.FALSE_ALARMS)
+            camera = familiar.fit_camera(
+                measures, np.arange(len(measures)), false_alarms=familiar.FALSE_ALARMS
+            )
             files.store_camera(out / files.CAMERA_FILE, camera)
 
 

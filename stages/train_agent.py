@@ -153,7 +153,7 @@ def train_agents(settings: TrainAgent, windows: "WindowTable", *, memo: Path | N
 
 def published_agent(
     settings: TrainAgent, memo: Path | None, on_step: Callable[..., object]
-) -> "agent.Published":
+) -> "agent.PublishedAgent":
     """The agent of Li and Pattinson (2025): trained, or taken from the memo if the same settings were trained
     by the same code. A damaged entry is trained again."""
     import jax
@@ -185,7 +185,7 @@ def filter_belief(settings: BeliefDqn, windows: "WindowTable") -> Any:
     from pipeline.setpoint.agents import bayes, belief_agent
 
     model = bayes.CameraErrorModel(**settings.filter.model_dump())
-    costs = belief_agent.Costs(**settings.costs.model_dump())
+    costs = belief_agent.StepCosts(**settings.costs.model_dump())
     values = belief_agent.observed_values(costs, settings.gamma)
     robust = bayes.watching_filter(windows, model)
     return belief_agent.Belief(robust, jnp.asarray(values, jnp.float32), settings.gamma)
@@ -227,8 +227,8 @@ def belief_training(settings: BeliefDqn) -> "belief_agent.BeliefTraining":
     from pipeline.setpoint.agents import belief_agent
 
     return belief_agent.BeliefTraining(
-        costs=belief_agent.Costs(**settings.costs.model_dump()),
-        disturbances=belief_agent.Disturbances(**settings.disturbances.model_dump()),
+        costs=belief_agent.StepCosts(**settings.costs.model_dump()),
+        disturbances=belief_agent.EpisodeDisturbances(**settings.disturbances.model_dump()),
         dqn=dqn_settings(settings),
         learning_rate=settings.learning_rate,
         updates=settings.updates,

@@ -20,7 +20,7 @@ FLOWS, SHOTS = (60.0, 100.0, 150.0), 3
 
 
 @functools.cache
-def scenes(prints: int = 2) -> tuple[nozzle_scene.Frames, ...]:
+def scenes(prints: int = 2) -> tuple[nozzle_scene.RenderedFrames, ...]:
     """Three segments, one of each class, for each print."""
     rng = np.random.default_rng(5)
     return tuple(

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.setpoint.frames.familiar import Camera
+from pipeline.setpoint.frames.familiar import KnownCamera
 from pipeline.setpoint.levels import Levels, LevelWindows
 from pipeline.store import artifacts
 
@@ -22,7 +22,7 @@ class RecordedLevels(NamedTuple):
     levels: Levels
     windows: LevelWindows
     weights: str
-    camera: Camera | None
+    camera: KnownCamera | None
     foreign_above: float
 
 
@@ -30,7 +30,7 @@ def store_levels(path: str | Path, recorded: RecordedLevels) -> None:
     """Raises OSError, one sentence, where it cannot be written."""
     fitted, windows = recorded.levels, recorded.windows
     digest = np.frombuffer(bytes.fromhex(recorded.weights), np.uint8)
-    camera = recorded.camera or Camera(*(np.zeros(0) for _ in Camera._fields))
+    camera = recorded.camera or KnownCamera(*(np.zeros(0) for _ in KnownCamera._fields))
     artifacts.write_arrays(
         path,
         *SCHEMA,
@@ -81,7 +81,7 @@ def restore_levels(path: str | Path, weights: str) -> RecordedLevels:
         float(found["spread"]),
         bool(found["straight"]),
     )
-    looks = Camera(*(found[f"camera_{name}"] for name in Camera._fields))
+    looks = KnownCamera(*(found[f"camera_{name}"] for name in KnownCamera._fields))
     windows = LevelWindows(found["window_seen"], found["window_flow"])
     known = looks if looks.scores.size else None
     return RecordedLevels(fitted, windows, digest, known, float(found["foreign_above"]))

@@ -38,7 +38,7 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class Print(NamedTuple):
+class TrainingPrint(NamedTuple):
     """What is printed: flows in percent, temperatures in degC; bed (x, y) and height, size (x, y) of the
     cuboid, nozzle, layer and filament in mm; speeds in mm/s; bed and best temperature in degC; melt: the most
     that the hot end melts, mm^3/s."""
@@ -58,7 +58,7 @@ class Print(NamedTuple):
     melt: float
 
 
-class Setting(NamedTuple):
+class PrintLayer(NamedTuple):
     """A layer at z mm: its flow in percent and temperature in degC, whether pictures of it are to be learned
     from, the lines of the program (from 1) that lay it, and the seconds of its extruding moves."""
 
@@ -71,11 +71,11 @@ class Setting(NamedTuple):
     seconds: float
 
 
-class Program(NamedTuple):
+class PrintProgram(NamedTuple):
     """The lines of the G-code, and the settings in their order."""
 
     lines: list[str]
-    settings: list[Setting]
+    settings: list[PrintLayer]
 
 
 def numbers(text: str, flag: str, count: int = 0) -> tuple[float, ...]:
@@ -94,7 +94,7 @@ def numbers(text: str, flag: str, count: int = 0) -> tuple[float, ...]:
     return values
 
 
-def check(asked: Print) -> None:
+def check(asked: TrainingPrint) -> None:
     """Raises ValueError, one sentence, for what does not fit onto the bed or through the nozzle, and for
     settings of which nothing can be learned."""
     for name, values in (("--flows", asked.flows), ("--temperatures", asked.temperatures)):
@@ -129,11 +129,11 @@ def check(asked: Print) -> None:
         )
 
 
-def program(asked: Print) -> Program:
+def program(asked: TrainingPrint) -> PrintProgram:
     """The G-code. Raises ValueError as `check` does."""
     check(asked)
     lines = _begin(asked)
-    settings: list[Setting] = []
+    settings: list[PrintLayer] = []
     for number, ((flow, temperature, collect), z) in enumerate(
         zip(_layers(asked), _tops(asked), strict=True)
     ):
@@ -144,11 +144,11 @@ def program(asked: Print) -> Program:
         first = len(lines) + 1
         moves, length = _raster(asked, z, flow, along_x=number % 2 == GROUND % 2)
         lines += moves
-        settings.append(Setting(flow, temperature, collect, z, first, len(lines), length / asked.speed))
-    return Program(lines + _end(asked, settings[-1].z), settings)
+        settings.append(PrintLayer(flow, temperature, collect, z, first, len(lines), length / asked.speed))
+    return PrintProgram(lines + _end(asked, settings[-1].z), settings)
 
 
-def write(asked: Print, out: Path, tip: tuple[float, float] | None) -> str:
+def write(asked: TrainingPrint, out: Path, tip: tuple[float, float] | None) -> str:
     """Writes the program to `out` and its settings beside it as CSV; what a person is told."""
     made = program(asked)
     beside = out.with_suffix(".settings.csv")
@@ -169,7 +169,7 @@ def write(asked: Print, out: Path, tip: tuple[float, float] | None) -> str:
 # ---- the layers
 
 
-def _layers(asked: Print) -> list[tuple[float, float, bool]]:
+def _layers(asked: TrainingPrint) -> list[tuple[float, float, bool]]:
     """(flow, temperature, whether it is collected) of each layer. Within a temperature flows follow one
     another so that too much and too little take turns: no trend over the height is one over the flow."""
     between = (100.0, asked.best_temperature, False)
@@ -184,29 +184,29 @@ def _layers(asked: Print) -> list[tuple[float, float, bool]]:
     return layers
 
 
-def _tops(asked: Print) -> list[float]:
+def _tops(asked: TrainingPrint) -> list[float]:
     """z of the nozzle in each layer, mm: above a layer with too much in it there is less room, so the next is
     higher by what was laid."""
     heights = [asked.layer * max(1.0, flow / 100.0) for flow, _, _ in _layers(asked)]
     return [asked.layer, *(asked.layer + z for z in np.cumsum(heights[:-1]).tolist())]
 
 
-def _line_area(asked: Print) -> float:
+def _line_area(asked: TrainingPrint) -> float:
     """mm^2 of a line's cross-section: as far apart as the lines lie times the layer's height, so that 100 %
     fills the cuboid."""
     return _spacing(asked) * asked.layer
 
 
-def _spacing(asked: Print) -> float:
+def _spacing(asked: TrainingPrint) -> float:
     """mm between lines with round sides, 1.2 nozzles wide, that touch: w - h (1 - pi / 4)."""
     return WIDER * asked.nozzle - asked.layer * (1 - np.pi / 4)
 
 
-def _corner(asked: Print) -> tuple[float, float]:
+def _corner(asked: TrainingPrint) -> tuple[float, float]:
     return (asked.bed[0] - asked.size[0]) / 2, (asked.bed[1] - asked.size[1]) / 2
 
 
-def _raster(asked: Print, z: float, flow: float, *, along_x: bool) -> tuple[list[str], float]:
+def _raster(asked: TrainingPrint, z: float, flow: float, *, along_x: bool) -> tuple[list[str], float]:
     """Lines back and forth over the cuboid at this flow, and their length in mm. What is drawn back between
     layers is so at 100 %, or more would come forward than went back."""
     corner, size = _corner(asked), asked.size if along_x else asked.size[::-1]
@@ -232,7 +232,7 @@ def _raster(asked: Print, z: float, flow: float, *, along_x: bool) -> tuple[list
     return [*moves, "M221 S100", f"G1 E{-RETRACT:.5f} F1800"], length
 
 
-def _heat(asked: Print, before: Setting | None, temperature: float, z: float) -> list[str]:
+def _heat(asked: TrainingPrint, before: PrintLayer | None, temperature: float, z: float) -> list[str]:
     """Where the temperature of a layer is another one, the nozzle waits for it beside the part; R waits for
     cooling too."""
     if before is not None and before.temperature == temperature:
@@ -245,7 +245,7 @@ def _heat(asked: Print, before: Setting | None, temperature: float, z: float) ->
     ]
 
 
-def _begin(asked: Print) -> list[str]:
+def _begin(asked: TrainingPrint) -> list[str]:
     """Units, heat, home, and a line along the front that fills the nozzle."""
     per_mm = _line_area(asked) / (np.pi / 4 * asked.filament**2)
     length = min(asked.bed[0] - 4 * MARGIN, 100.0)
@@ -262,7 +262,7 @@ def _begin(asked: Print) -> list[str]:
     ]  # fmt: skip
 
 
-def _end(asked: Print, z: float) -> list[str]:
+def _end(asked: TrainingPrint, z: float) -> list[str]:
     x, y = _corner(asked)
     return [
         f"G0 Z{z + LIFT:.3f} F600", f"G0 X{x - ASIDE:.3f} Y{y:.3f} F{60 * asked.travel:g}",
@@ -270,7 +270,7 @@ def _end(asked: Print, z: float) -> list[str]:
     ]  # fmt: skip
 
 
-def _table(asked: Print, made: Program, print_id: str, tip: tuple[float, float] | None) -> str:
+def _table(asked: TrainingPrint, made: PrintProgram, print_id: str, tip: tuple[float, float] | None) -> str:
     """The columns that a folder of frames needs, a line for each layer; timestamp in seconds of extruding
     moves since the first layer began, without heating and travel."""
     stream = io.StringIO()

@@ -20,7 +20,7 @@ from pipeline.papers import files
 from pipeline.setpoint.agents import agent, score, trials
 from pipeline.setpoint.published import PHASES, ROTATION
 from pipeline.setpoint.simulation.simulator import (
-    Conditions,
+    EpisodeConditions,
     Trajectory,
     nominal,
     paper_windows,
@@ -53,7 +53,7 @@ WAITS_S, MELTS_S = (3.0, 6.0), (0.0, 2.0, 4.0)
 RHO = 0.7
 
 
-class Agents(NamedTuple):
+class PhaseNetworks(NamedTuple):
     """The networks after each phase, the fourth with the class right with probability 0.7 and with 0.3, and
     the mean reward of a step of each phase."""
 
@@ -61,7 +61,7 @@ class Agents(NamedTuple):
     rewards: list[np.ndarray]
 
 
-def trained(settings: TrainAgent) -> Agents:
+def trained(settings: TrainAgent) -> PhaseNetworks:
     """The paper's agent, and the one whose phase 4 takes rho for the probability of a wrong class."""
     other = settings.model_copy(update={"li_2025": settings.li_2025.model_copy(update={"accuracy": 1 - RHO})})
     MEMO.mkdir(parents=True, exist_ok=True)
@@ -70,14 +70,14 @@ def trained(settings: TrainAgent) -> Agents:
     )
     by_name = {f"phase_{i + 1}": network for i, network in enumerate(as_read.networks)}
     by_name["phase_4_rho_wrong"] = otherwise.networks[-1]
-    return Agents(by_name, [np.asarray(part) for part in as_read.rewards])
+    return PhaseNetworks(by_name, [np.asarray(part) for part in as_read.rewards])
 
 
-def asked() -> tuple[Conditions, dict[str, slice]]:
+def asked() -> tuple[EpisodeConditions, dict[str, slice]]:
     """Everything that each agent is asked, as one batch, and where in it."""
     parts, places, end = [], {}, 0
 
-    def add(name: str, part: Conditions) -> None:
+    def add(name: str, part: EpisodeConditions) -> None:
         nonlocal end
         parts.append(part)
         places[name] = slice(end, end + part.flow.shape[0])
@@ -191,7 +191,7 @@ def reward_figures() -> dict[str, float]:
     return {name: float(reward(jnp.array(q), jnp.array(u), a=a, b=b)) for name, (q, u) in points.items()}
 
 
-def rewards_of(agents: Agents, episode: int) -> dict[str, Any]:
+def rewards_of(agents: PhaseNetworks, episode: int) -> dict[str, Any]:
     """Figure 6: the mean reward of a step times the steps of an episode, 50 means a phase."""
     phases = [
         [round(episode * float(part.mean()), 3) for part in np.array_split(values, 50)]
@@ -249,7 +249,7 @@ def arithmetic() -> dict[str, Any]:
     }
 
 
-def sizes(networks: Agents) -> dict[str, Any]:
+def sizes(networks: PhaseNetworks) -> dict[str, Any]:
     """Parameters of the networks, and what table 1 lists."""
     classifier = vision_transformer(PAPER, np.random.default_rng(0))
     return {

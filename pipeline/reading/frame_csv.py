@@ -33,7 +33,7 @@ COLUMNS = {"img_path", "flow_rate", "target_hotend", "hotend", "nozzle_tip_y", L
 NOTHING = {*MISSING, "nat"}
 
 
-class Log(NamedTuple):
+class FrameLog(NamedTuple):
     """The n rows of one CSV: flow in percent of nominal, temperature in degC, tip (n, 2) in px, direction in
     degrees, label 0, 1 or 2; NaN, or empty text, where a row has none. `image` is as it was written, with
     forward slashes; `setting` counts the stretches of constant settings from 0, over all prints."""
@@ -51,7 +51,7 @@ class Log(NamedTuple):
     notes: list[Note]
 
 
-def read_log(path: Path, hotend: float = np.nan) -> Log:
+def read_log(path: Path, hotend: float = np.nan) -> FrameLog:
     """The frames that a CSV lists, those of a print one behind the other. Raises ValueError, one sentence
     with the line, for a needed column that is not there, text in place of a number, a flow or temperature
     that no printer has, a label that is no class, and time that runs backwards within a print.
@@ -88,7 +88,7 @@ def read_log(path: Path, hotend: float = np.nan) -> Log:
         *(numbers[name] for name in ("flow_rate", "target_hotend", *SETTINGS) if name in numbers),
     ]
     tip = np.column_stack([numbers.get(name, missing) for name in ("nozzle_tip_x", "nozzle_tip_y")])
-    return Log(
+    return FrameLog(
         path, lines[order], [texts["img_path"][i].replace("\\", "/") for i in order],
         numbers["flow_rate"][order], temperature[order], [prints[i] for i in order],
         stretches(np.column_stack(settings)[order]), tip[order], numbers.get(DIRECTION, missing)[order],

@@ -18,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from pipeline.reading.excluded import readable
-from pipeline.reading.frame_csv import Log, read_log
+from pipeline.reading.frame_csv import FrameLog, read_log
 from pipeline.reading.frame_images import MISSING, UNREADABLE, concatenate, key_areas_of_files, read_image
 from pipeline.reading.frame_mcap import RecordedFrames, Topics, frames_at, read_recording
 from pipeline.reading.signals import Note
@@ -91,7 +91,7 @@ class NozzleFrames(NamedTuple):
     notes: list[Note]
 
 
-class _Part(NamedTuple):
+class _FrameFile(NamedTuple):
     """The frames of one file; reasons that the file itself gives go before those of the front end."""
 
     path: Path
@@ -162,7 +162,7 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution) -> Noz
     return _joined(folder, parts, options, copies + _unread(folder, unread))
 
 
-def _crops(log: Log, folder: Path, images: list[str], why: list[str], options: ReadOptions) -> list:
+def _crops(log: FrameLog, folder: Path, images: list[str], why: list[str], options: ReadOptions) -> list:
     """Calls that crop the key areas of a log's images, piece by piece; a line with a reason has no path."""
     tips = log.tip
     if options.tip_px is not None:
@@ -271,7 +271,7 @@ def _images(folder: Path) -> set[str]:
     return files
 
 
-def _image_paths(log: Log, folder: Path, there: set[str]) -> tuple[list[str], list[Note]]:
+def _image_paths(log: FrameLog, folder: Path, there: set[str]) -> tuple[list[str], list[Note]]:
     """Each image's path from `folder` on, empty where it is not there: all of a
     file's lie in one place, that where most are found."""
     parts = [[part for part in image.split("/") if part not in ("", ".")] for image in log.image]
@@ -315,7 +315,7 @@ def _image_paths(log: Log, folder: Path, there: set[str]) -> tuple[list[str], li
     return below(*best, parts), notes
 
 
-def _listed(logs: Sequence[Log], images: Sequence[list[str]]) -> list[list[str]]:
+def _listed(logs: Sequence[FrameLog], images: Sequence[list[str]]) -> list[list[str]]:
     """Why a line cannot be learned from, before any image is opened. Raises
     ValueError where two lines contradict one another."""
     first: dict[str, tuple[int, int]] = {}
@@ -339,7 +339,7 @@ def _listed(logs: Sequence[Log], images: Sequence[list[str]]) -> list[list[str]]
     return reasons
 
 
-def _check_alike(before: Log, i: int, log: Log, j: int) -> None:
+def _check_alike(before: FrameLog, i: int, log: FrameLog, j: int) -> None:
     ours, theirs = (
         (one.flow[row], one.temperature[row], one.print_id[row]) for one, row in ((before, i), (log, j))
     )
@@ -356,7 +356,7 @@ def _check_alike(before: Log, i: int, log: Log, j: int) -> None:
         )
 
 
-def _pieces(log: Log) -> Iterator[slice]:
+def _pieces(log: FrameLog) -> Iterator[slice]:
     """At most TOGETHER lines of one print each: what is added to a folder does not move what was there."""
     ends = [i for i in range(1, len(log.print_id)) if log.print_id[i] != log.print_id[i - 1]]
     for start, stop in zip([0, *ends], [*ends, len(log.print_id)], strict=True):
@@ -367,8 +367,8 @@ def _pieces(log: Log) -> Iterator[slice]:
 
 
 def _of_log(
-    log: Log, pieces: Sequence[Any], why: list[str], images: list[Path], material: Any, notes: list[Note]
-) -> _Part:
+    log: FrameLog, pieces: Sequence[Any], why: list[str], images: list[Path], material: Any, notes: list[Note]
+) -> _FrameFile:
     areas = concatenate(pieces)
     areas = areas._replace(reasons=[mine or front for mine, front in zip(why, areas.reasons, strict=True)])
     label, labelled = material.label(log.flow), np.isfinite(log.label) & np.isfinite(log.flow)
@@ -390,19 +390,19 @@ def _of_log(
         for line, image in zip(log.line, log.image, strict=True)
     ]
     pictures = [(image, -1) for image in images]
-    return _Part(
+    return _FrameFile(
         log.path, areas, log.flow, log.temperature, log.print_id, log.setting, places, pictures, notes
     )
 
 
-def _of_recording(path: Path, film: RecordedFrames) -> _Part:
+def _of_recording(path: Path, film: RecordedFrames) -> _FrameFile:
     reasons = film.areas.reasons
     for reason, values in ((NO_TEMPERATURE, film.temperature), (NO_FLOW, film.flow)):
         reasons = [
             front if present else reason for front, present in zip(reasons, np.isfinite(values), strict=True)
         ]
     places = [f"{time:.3f} s" for time in film.time_s]
-    return _Part(
+    return _FrameFile(
         path,
         film.areas._replace(reasons=reasons),
         film.flow,
@@ -415,7 +415,9 @@ def _of_recording(path: Path, film: RecordedFrames) -> _Part:
     )
 
 
-def _joined(folder: Path, parts: Sequence[_Part], options: ReadOptions, notes: list[Note]) -> NozzleFrames:
+def _joined(
+    folder: Path, parts: Sequence[_FrameFile], options: ReadOptions, notes: list[Note]
+) -> NozzleFrames:
     """All parts, copies of frames left out, every rejection counted by file and reason; flows and
     temperatures carried to the published material."""
     digests: set[str] = set()
@@ -470,7 +472,9 @@ def _joined(folder: Path, parts: Sequence[_Part], options: ReadOptions, notes: l
     )
 
 
-def _rejections(folder: Path, part: _Part, reasons: Sequence[str], remedies: Mapping[str, str]) -> list[Note]:
+def _rejections(
+    folder: Path, part: _FrameFile, reasons: Sequence[str], remedies: Mapping[str, str]
+) -> list[Note]:
     """One note for each kind of reason, with the first frame and what to do."""
     by_kind: dict[str, list[int]] = {}
     for i, reason in enumerate(reasons):

@@ -40,7 +40,7 @@ COPY = "the frame is a copy of the one before"
 PLAUSIBLE = {"flow_percent": (0.0, 1000.0), "temperature_degC": (0.0, 600.0)}
 
 
-class Shown(NamedTuple):
+class CameraFrame(NamedTuple):
     """A frame (height, width) uint8 or uint16, or in its place the reason why there is none, at time_s of its
     source's clock; what the source says of flow in percent, temperature in degC, travel direction in degrees
     and tip (x, y) in px, NaN where it says nothing; print_id "" likewise."""
@@ -55,7 +55,7 @@ class Shown(NamedTuple):
     print_id: str = ""
 
 
-class Source(Protocol):
+class FrameSource(Protocol):
     """`frames` gives what came since it was last asked; `waits_for` says why nothing comes, "" where
     something may; `lacks` what a source that is there has none of; `ended`: nothing more will come; `rest_s`:
     how long to wait before the next look."""
@@ -67,16 +67,16 @@ class Source(Protocol):
     @property
     def lacks(self) -> str: ...
 
-    def frames(self) -> Iterator[Shown]: ...
+    def frames(self) -> Iterator[CameraFrame]: ...
 
 
-def source(place: str, topics: Topics, *, rate_hz: float) -> Source:
+def source(place: str, topics: Topics, *, rate_hz: float) -> FrameSource:
     """The source that a path or an address names. Raises ValueError for an address that is none, and for a
     file that is no recording."""
     if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", place):
         return Snapshots(place, rate_hz)
     if place.lower().endswith(".mcap") and not Path(place).is_dir():
-        return Recording(Path(place), topics)
+        return RecordingSource(Path(place), topics)
     if Path(place).is_file():
         raise ValueError(
             f"{place}: expected a folder of pictures, a recording (.mcap) or an address, found another file; "
@@ -104,7 +104,7 @@ class Folder:
         self.unfinished: dict[str, tuple[int, float]] = {}
         self.before = b""
 
-    def frames(self) -> Iterator[Shown]:
+    def frames(self) -> Iterator[CameraFrame]:
         if not self.path.is_dir():
             self.waits_for = f"the folder {self.path} is not there yet"
             return
@@ -134,7 +134,7 @@ class Folder:
         # a folder of very many names is looked through less often
         self.rest_s = max(LOOK_S, 5 * (time.monotonic() - began))
 
-    def _picture(self, name: str, time_s: float, size: int) -> Shown | None:
+    def _picture(self, name: str, time_s: float, size: int) -> CameraFrame | None:
         """None where the file is still being written."""
         path = self.path / name
         try:
@@ -143,7 +143,7 @@ class Folder:
                 raise ValueError(f"found a picture of {len(data)} bytes without its end")
             frame, digest = read_image(path), hashlib.blake2b(data, digest_size=16).digest()
         except FileNotFoundError:
-            return Shown(name, time_s, f"{UNREADABLE}: it was removed")
+            return CameraFrame(name, time_s, f"{UNREADABLE}: it was removed")
         except (OSError, ValueError) as error:
             before = self.unfinished.get(name, (-1, 0.0))
             if before[0] != size:
@@ -151,9 +151,9 @@ class Folder:
                 return None
             if self.clock() - before[1] < SETTLE_S:
                 return None
-            return Shown(name, time_s, f"{UNREADABLE}: {str(error).partition('found ')[2] or error}")
+            return CameraFrame(name, time_s, f"{UNREADABLE}: {str(error).partition('found ')[2] or error}")
         copy, self.before = digest == self.before, digest
-        return Shown(name, time_s, COPY if copy else frame)
+        return CameraFrame(name, time_s, COPY if copy else frame)
 
 
 def _counted(name: str) -> list:
@@ -171,7 +171,7 @@ def _has_end(data: bytes) -> bool:
 # ---- a recording that grows
 
 
-class Recording:
+class RecordingSource:
     """Frames of the image topic, with the setpoints that held when they were taken."""
 
     def __init__(self, path: Path, where: Topics) -> None:
@@ -196,7 +196,7 @@ class Recording:
     def damage(self) -> list[str]:
         return self.file.damage
 
-    def frames(self) -> Iterator[Shown]:
+    def frames(self) -> Iterator[CameraFrame]:
         try:
             for message in self.file.messages(lambda channel: True):
                 if not image_messages.is_image(message.channel):
@@ -221,7 +221,7 @@ class Recording:
             )
         return channel.topic == self.camera
 
-    def _frame(self, message: Message) -> Shown:
+    def _frame(self, message: Message) -> CameraFrame:
         self.count += 1
         name, stamp = f"{self.camera} {self.count}", message.log_time
         try:
@@ -238,7 +238,7 @@ class Recording:
         except ValueError as error:
             frame = f"{UNREADABLE}: {error}"
         number = self.signals.get("print_id", np.nan)
-        return Shown(
+        return CameraFrame(
             name,
             stamp / 1e9,
             frame,
@@ -366,7 +366,7 @@ class Snapshots:
         self.waits_for, self.lacks = f"{self.shown} has not answered yet", "a picture"
         self.count, self.before = 0, b""
 
-    def frames(self) -> Iterator[Shown]:
+    def frames(self) -> Iterator[CameraFrame]:
         """One picture, or none where the camera does not answer; a new one for each period of the rate."""
         began = time.monotonic()
         try:
@@ -379,7 +379,7 @@ class Snapshots:
             except ValueError as error:
                 frame = f"{UNREADABLE}: {error}"
             self.waits_for = ""
-            yield Shown(name, time.time(), frame)
+            yield CameraFrame(name, time.time(), frame)
         except urllib.error.HTTPError as error:
             error.close()
             self.waits_for = f"{self.shown} answers {error.code} {error.reason}"

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pipeline.setpoint.agents.files import Agents
     from pipeline.setpoint.settings import Baselines
     from pipeline.setpoint.simulation.recorded import WindowTable
-    from pipeline.setpoint.simulation.simulator import Controller
+    from pipeline.setpoint.simulation.simulator import SetpointController
 
 Kind = Literal["model-based", "data-driven", "baseline", "reference"]
 
@@ -27,7 +27,7 @@ class ControllerRow(NamedTuple):
 
 class BuiltController(NamedTuple):
     group: str  # of its row
-    controller: "Controller"
+    controller: "SetpointController"
     parameters: Any  # a pytree of numbers or arrays
 
 

@@ -15,7 +15,7 @@ from pipeline.reading.frame_mcap import Topics
 from pipeline.setpoint.frames import familiar, front_end, key_area
 from pipeline.setpoint.frames.front_end import FrameKeyAreas
 from pipeline.setpoint.frames.rendered import LabelledFrames
-from pipeline.setpoint.material import PLA, Material
+from pipeline.setpoint.material import PLA, PrintedMaterial
 from pipeline.setpoint.settings import TrainClassifier
 from pipeline.store import artifacts
 from pipeline.store.params import Execution
@@ -55,7 +55,9 @@ KEY_AREAS = Schema(
 )
 
 
-def read_options(settings: TrainClassifier, material: Material = PLA, memo: Path = MEMO) -> ReadOptions:
+def read_options(
+    settings: TrainClassifier, material: PrintedMaterial = PLA, memo: Path = MEMO
+) -> ReadOptions:
     """As section `train_classifier` says, of a material."""
     mapping = {name: (m.source, m.unit, m.scale, m.offset) for name, m in settings.topics.mapping.items()}
     topics = Topics(settings.topics.image, settings.topics.time, mapping)
@@ -74,7 +76,7 @@ def read_parts(
     settings: TrainClassifier,
     window_parts: Sequence[str],
     execution: Execution,
-    material: Material = PLA,
+    material: PrintedMaterial = PLA,
 ) -> tuple[dict[str, LabelledFrames], dict[str, LabelledFrames], dict[str, Any], NozzleFrames]:
     """The frames of a user's folder by part of `settings.prints`; those whose windows stand for the camera,
     by part of `window_parts`; what was read, counted; and all of it. Frames without a known class or
@@ -148,7 +150,11 @@ def read_memo(entry: Path, count: int) -> FrameKeyAreas | None:
         return None
     images = np.frombuffer(b"".join(table["image"]), np.uint8).reshape(-1, *key_area.SHAPE)
     measures = np.frombuffer(b"".join(table["surroundings"]), "<f4").reshape(-1, len(familiar.NAMES))
-    figures = (table[name] for name in ("angle_deg", "miss_px", "score", "padded_share"))
-    tip = np.column_stack([table["tip_x_px"], table["tip_y_px"]])
-    texts = (table[name].tolist() for name in ("reason", "digest"))
-    return FrameKeyAreas(images, *figures, tip, measures, *texts)
+    return FrameKeyAreas(
+        images=images,
+        **{name: table[name] for name in ("angle_deg", "miss_px", "score", "padded_share")},
+        tip=np.column_stack([table["tip_x_px"], table["tip_y_px"]]),
+        surroundings=measures,
+        reasons=table["reason"].tolist(),
+        digests=table["digest"].tolist(),
+    )

@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from pipeline.store.params import Mapped, Section
 
 if TYPE_CHECKING:
-    from pipeline.setpoint.material import Material
+    from pipeline.setpoint.material import PrintedMaterial
 
 # as far as pixels.py looks for the nozzle's tip, in px: a number of its own, since that module imports much
 REACH_PX = 30
@@ -41,10 +41,10 @@ class SetpointMaterial(Section):
             )
         return self
 
-    def material(self) -> "Material":
-        from pipeline.setpoint.material import Material
+    def material(self) -> "PrintedMaterial":
+        from pipeline.setpoint.material import PrintedMaterial
 
-        return Material(**self.model_dump())
+        return PrintedMaterial(**self.model_dump())
 
 
 class Counts(Section):
@@ -130,12 +130,12 @@ class RobustFilter(Section):
         return len(self.gains) * (len(self.accuracies) + self.width_bias_levels)
 
 
-class Proportional(Section):
+class ProportionalSettings(Section):
     gain: float = Field(gt=0, le=1000)
     time_constant: float = Field(ge=1, le=1000)
 
 
-class SequentialTest(Section):
+class SequentialTestSettings(Section):
     accuracy: float = Field(gt=0.34, lt=1)
     threshold: float = Field(gt=0, le=100)
     cap: float = Field(gt=0, le=100)
@@ -154,9 +154,9 @@ class ClassFilter(Section):
 class Baselines(Section):
     """Settings of the controllers without learning, tuned on windows and seeds that nothing is judged on."""
 
-    proportional: Proportional
-    filtered_proportional: Proportional
-    sequential_test: SequentialTest
+    proportional: ProportionalSettings
+    filtered_proportional: ProportionalSettings
+    sequential_test: SequentialTestSettings
     bayes_exact: ClassFilter
     bayes_leak: ClassFilter
     bayes_robust: RobustFilter

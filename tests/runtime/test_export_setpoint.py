@@ -17,7 +17,7 @@ from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
 from pipeline.setpoint.simulation.simulator import TEMPERATURE_LIMITS, Observation
 from pipeline.setpoint.vision import classifier, window_flow
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
-from pipeline.setpoint.vision.calibration import Calibration, Familiar
+from pipeline.setpoint.vision.calibration import ClassifierCalibration, Familiar
 from pipeline.setpoint.vision.vision_transformer import SMALL, convolutional, vision_transformer
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.store import artifacts
@@ -41,7 +41,7 @@ def model() -> CalibratedClassifier:
     flow = FlowCalibration(0.8 * knots + 0.02, np.linspace(0.8, 1.4, len(knots)), 0.3)
     familiar = Familiar(np.zeros((3, FEATURES)), np.eye(FEATURES))
     network = vision_transformer(SMALL, np.random.default_rng(1))
-    return CalibratedClassifier(network, Calibration(1.3, 0.2, 0.1, familiar, 9.0, flow))
+    return CalibratedClassifier(network, ClassifierCalibration(1.3, 0.2, 0.1, familiar, 9.0, flow))
 
 
 def written(model: CalibratedClassifier, folder: Path) -> tuple[dict, dict]:
@@ -131,7 +131,7 @@ def our_agent() -> setpoint.BeliefAgent:
     both |= {"transition": jnp.array([[0.98, 0.02], [0.01, 0.99]]), "after_jump": jnp.eye(2)}
     both |= {"gains": jnp.array([1.0, 0.6]), "window_repeat_probability": jnp.array([0.3, 0.1])}
     two = one._replace(**both, prior=jnp.tile(one.prior, (2, 1)) / 2)
-    costs = belief_agent.Costs(10.0, 1.0, 0.02)
+    costs = belief_agent.StepCosts(10.0, 1.0, 0.02)
     values = jnp.asarray(belief_agent.observed_values(costs, 0.8), jnp.float32)
     network = belief_agent.BeliefNetwork(2, jax.random.key(3))
     rng = np.random.default_rng(5)

@@ -11,7 +11,7 @@ from pipeline.setpoint.controllers import CONTROLLERS, BuiltController, build_co
 from pipeline.setpoint.evaluation import contest as contests
 from pipeline.setpoint.evaluation import judging, scoreboard
 from pipeline.setpoint.evaluation.contest import Contest
-from pipeline.setpoint.evaluation.judging import Choice
+from pipeline.setpoint.evaluation.judging import DefaultChoice
 from pipeline.setpoint.evaluation.pixel_rollouts import PixelRollouts
 from pipeline.setpoint.settings import EvaluateSetpoint
 from pipeline.setpoint.tables import SCOREBOARD
@@ -73,7 +73,9 @@ def test_what_is_told_is_of_other_segments_and_the_default_s_harm_stands_by_case
 
 
 def test_where_nothing_else_may_run_the_choice_is_written_without_a_margin(tmp_path):
-    alone = judging.Choice("do nothing", 0.0, "accuracy 1", *3 * (float("nan"),), {"ours": "harms"}, "Alone.")
+    alone = judging.DefaultChoice(
+        "do nothing", 0.0, "accuracy 1", *3 * (float("nan"),), {"ours": "harms"}, "Alone."
+    )
     artifacts.write_json(tmp_path / "choice.json", scoreboard.choice_record(alone))
     read = artifacts.read_json(tmp_path / "choice.json")
     assert [read[name] for name in ("margin", "margin_low", "margin_high")] == [None] * 3
@@ -107,7 +109,7 @@ def test_the_number_of_cores_changes_nothing_and_the_runs_drawn_are_among_those_
     assert list(one.scores) == list(three.scores) == list(specs)
     rows = [scoreboard.scoreboard(groups, contest, NO_PIXELS) for contest in both]
     np.testing.assert_equal(*rows)
-    choice = judging.Choice("sequential test", 0.0, CLOGGED, *3 * (0.0,), {}, "")
+    choice = judging.DefaultChoice("sequential test", 0.0, CLOGGED, *3 * (0.0,), {}, "")
     columns = scoreboard.paths(groups, one, choice, NO_PIXELS)
     np.testing.assert_equal(columns, scoreboard.paths(groups, three, choice, NO_PIXELS))
     check_the_case_that_decides(columns, one)
@@ -147,7 +149,7 @@ def test_a_case_that_decides_and_is_kept_of_everybody_is_kept_once_and_to_the_en
     rest = judging.Runs(np.full((21, 201), 100.0), np.full((21, 201), 210.0))
     kept = {name: dict.fromkeys(("accuracy 0.7", "recorded, fresh"), rest) for name in SIMPLE}
     contest = Contest({}, {name: judged(0.5) for name in SIMPLE}, {}, kept)
-    choice = judging.Choice("do nothing", 0.0, "recorded, fresh", *3 * (0.0,), {}, "")
+    choice = judging.DefaultChoice("do nothing", 0.0, "recorded, fresh", *3 * (0.0,), {}, "")
     columns = scoreboard.paths(groups, contest, choice, NO_PIXELS)
     assert len(columns["step"]) == len(SIMPLE) * 21 * (101 + 201)
 
@@ -155,7 +157,7 @@ def test_a_case_that_decides_and_is_kept_of_everybody_is_kept_once_and_to_the_en
 def judged(share, worst="clog"):
     """So much of the runs is kept in the worst case, and all in another."""
     runs = np.arange(20) < 20 * share
-    return judging.Judged({"other": np.ones((1, 20), bool), worst: runs[None]}, {})
+    return judging.JudgedRuns({"other": np.ones((1, 20), bool), worst: runs[None]}, {})
 
 
 def test_beside_the_default_stand_doing_nothing_the_strongest_rule_and_our_strongest_agent():
@@ -165,7 +167,7 @@ def test_beside_the_default_stand_doing_nothing_the_strongest_rule_and_our_stron
     }  # fmt: skip
     shares = dict(zip(kinds, (0.1, 0.4, 0.6, 0.9, 0.8, 0.7, 0.5, 0.6), strict=True))
     contest = Contest({}, {name: judged(share) for name, share in shares.items()}, {}, {})
-    choice = judging.Choice("default", 80.0, "clog", *3 * (0.0,), {"harmful": "harms"}, "")
+    choice = judging.DefaultChoice("default", 80.0, "clog", *3 * (0.0,), {"harmful": "harms"}, "")
     who = scoreboard.compared(kinds, contest, choice)
     assert who == ["do nothing", "quick", "default", "agent"]
     # where no other rule may run, the strongest of those stands there
@@ -197,7 +199,7 @@ def test_who_cannot_win_any_more_runs_in_one_round_only(settings, monkeypatch):
     # the runs are paired: one lost in each of eight redraws is told at once, one in one of them never
     once = dict.fromkeys(("do nothing", "slow", "good"), cases)
     assert asked == once | dict.fromkeys(("better", "nearly"), 3 * cases)
-    assert isinstance(choice, Choice)
+    assert isinstance(choice, DefaultChoice)
     assert choice.name == "better"
 
 

@@ -7,7 +7,7 @@ import pytest
 from pipeline.reading import frame_folder
 from pipeline.setpoint import published
 from pipeline.setpoint.frames import nozzle_scene
-from pipeline.setpoint.material import PLA, Material
+from pipeline.setpoint.material import PLA, PrintedMaterial
 from pipeline.setpoint.recordings import FrontEnd
 from pipeline.setpoint.settings import SetpointMaterial
 from pipeline.setpoint.simulation import simulator
@@ -36,7 +36,7 @@ def test_the_published_material_is_what_the_scenes_and_the_simulator_are_of():
         PLA.temperature_range_degC,
     )
     assert nozzle_scene.BORDERS == PLA.good_flow_percent
-    assert isinstance(PLA, Material)
+    assert isinstance(PLA, PrintedMaterial)
 
 
 def test_the_published_material_stands_for_itself_to_the_bit():

@@ -10,17 +10,17 @@ from scipy.stats import norm
 
 from pipeline.setpoint import settings
 from pipeline.setpoint.deployment import deployment, pixels
-from pipeline.setpoint.deployment.pixels import Loop, Machine, at_rest, calm, run, tick
+from pipeline.setpoint.deployment.pixels import MachineDynamics, PixelLoop, at_rest, calm, run, tick
 from pipeline.setpoint.frames import familiar
 from pipeline.setpoint.simulation import actuation
-from pipeline.setpoint.simulation.actuation import ACTS, Limits, Waits
-from pipeline.setpoint.simulation.simulator import Action, Controller
+from pipeline.setpoint.simulation.actuation import ACTS, SetpointLimits, Waits
+from pipeline.setpoint.simulation.simulator import Action, SetpointController
 from pipeline.store import params
 from stages.render_frames import RenderFrames, render_camera
 from tests.setpoint.step_response import settling_s, step_response
 
-MACHINE = Machine(heater_s=15.0, heater_delay_s=2.0, melt_s=1.2, softening_per_degC=0.02)
-LIMITS = Limits(
+MACHINE = MachineDynamics(heater_s=15.0, heater_delay_s=2.0, melt_s=1.2, softening_per_degC=0.02)
+LIMITS = SetpointLimits(
     np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([120.0, 40.0])
 )
 JUDGE = functools.partial(
@@ -99,7 +99,7 @@ def _classify(images, temperature):
     return np.stack([under, np.clip(1 - under - over, 0, 1), over], axis=1), np.where(width > 0, 0.0, 9.0)
 
 
-LOOP = Loop(
+LOOP = PixelLoop(
     machine=MACHINE,
     classify=_classify,
     frames=8,
@@ -142,8 +142,8 @@ def _filtered(parameters, memory, observation, key):
     return memory, Action(2 + size * jnp.sign(memory).astype(int), 2 + towards)
 
 
-FILTERED = Controller(lambda: jnp.zeros(()), _filtered)
-BANG = Controller(
+FILTERED = SetpointController(lambda: jnp.zeros(()), _filtered)
+BANG = SetpointController(
     lambda: jnp.zeros(()),
     lambda parameters, memory, observation, key: (memory + 1, Action(jnp.int32(4), jnp.int32(4))),
 )

@@ -34,7 +34,7 @@ from pipeline.setpoint.tables import (
 )
 from pipeline.setpoint.vision import files
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, classify
-from pipeline.setpoint.vision.calibration import Calibration, Familiar
+from pipeline.setpoint.vision.calibration import ClassifierCalibration, Familiar
 from pipeline.setpoint.vision.files import CLASSIFIER_SCHEMA, restore_classifier, store_classifier
 from pipeline.setpoint.vision.vision_transformer import SMALL as SMALL_SIZE
 from pipeline.setpoint.vision.vision_transformer import named_arrays, vision_transformer
@@ -126,7 +126,7 @@ def stored(project) -> Path:
     """A project with a classifier that has learned nothing, and made-up windows; to be spoiled."""
     knots = np.log(np.array(KNOTS_PERCENT) / 100)
     flow = FlowCalibration(knots, np.ones(len(knots)), 0.5)
-    known = Calibration(1.0, 0.1, 0.2, Familiar(np.zeros((3, 4)), np.eye(4)), 9.0, flow)
+    known = ClassifierCalibration(1.0, 0.1, 0.2, Familiar(np.zeros((3, 4)), np.eye(4)), 9.0, flow)
     out = project / "datasets/train_classifier"
     store_classifier(
         out,

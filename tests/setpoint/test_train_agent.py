@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.setpoint.agents import agent, claims
-from pipeline.setpoint.agents.agent import Published, QNetwork
+from pipeline.setpoint.agents.agent import PublishedAgent, QNetwork
 from pipeline.setpoint.simulation.simulator import (
     Action,
-    Controller,
+    SetpointController,
     Trajectory,
     nominal,
     paper_windows,
@@ -38,7 +38,7 @@ def test_history_and_lambda_are_swept(settings):
     assert [network.vision.in_features for network in trained.networks] == [7 + 3] * 4
     assert {agent.history_of(network) for network in trained.networks} == {7}
     conditions = nominal(np.full(2, 100.0), 190.0, accuracy=1.0)._replace(flow_actions=jnp.full(2, 4.0))
-    up = Controller(lambda: (), lambda p, m, o, key: (m, Action(jnp.int32(2), jnp.int32(3))))
+    up = SetpointController(lambda: (), lambda p, m, o, key: (m, Action(jnp.int32(2), jnp.int32(3))))
     path = rollout(up, (), paper_windows(), conditions, jax.random.key(0), steps=10)
     np.testing.assert_array_equal(np.flatnonzero(np.diff(path.target[0])), [0, 4, 8])
     told = train_agent.paper_claims(swept, trained.networks)
@@ -52,7 +52,7 @@ def test_the_published_agent_is_trained_once_for_all_windows(settings, tmp_path,
     def train(key, how, *, on_step):
         calls.append(how)
         network = QNetwork(key, how.history)
-        return Published((network,) * 4, (jnp.arange(5.0),) * 4)
+        return PublishedAgent((network,) * 4, (jnp.arange(5.0),) * 4)
 
     monkeypatch.setattr(agent, "train_published", train)
     first = train_agent.published_agent(settings, tmp_path, print)

@@ -24,7 +24,7 @@ from pipeline.setpoint.simulation.recorded import window_rows
 from pipeline.setpoint.tables import WINDOW_PARTS, WINDOWS
 from pipeline.setpoint.vision import calibration
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
-from pipeline.setpoint.vision.calibration import Calibration, Familiar
+from pipeline.setpoint.vision.calibration import ClassifierCalibration, Familiar
 from pipeline.setpoint.vision.files import store_classifier
 from pipeline.setpoint.vision.vision_transformer import SMALL, vision_transformer
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
@@ -79,7 +79,7 @@ def make() -> None:
     bands = calibration.appearance(np.zeros((1, 16, 48), np.uint8)).shape[1]
     features = network.head.classes.W.shape[0] + bands
     knots = np.log(np.array(KNOTS_PERCENT) / 100)
-    known = Calibration(
+    known = ClassifierCalibration(
         1.0, 0.1, 0.2, Familiar(np.zeros((3, features)), np.eye(features)), 1e9,
         FlowCalibration(knots, np.ones(len(knots)), 0.5),
     )  # fmt: skip

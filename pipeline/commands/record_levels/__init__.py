@@ -10,13 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.commands.levels_files import RecordedLevels, store_levels
-from pipeline.reading.watch_sources import Folder, Recording, Shown, Source
+from pipeline.reading.watch_sources import CameraFrame, Folder, FrameSource, RecordingSource
 from pipeline.setpoint import levels
 from pipeline.setpoint.frames import familiar
-from pipeline.setpoint.frames.familiar import FALSE_ALARMS, Camera
+from pipeline.setpoint.frames.familiar import FALSE_ALARMS, KnownCamera
 from pipeline.setpoint.frames.front_end import find_key_areas
 from pipeline.setpoint.levels import Levels, LevelWindows
-from pipeline.setpoint.material import PLA, Material
+from pipeline.setpoint.material import PLA, PrintedMaterial
 from pipeline.setpoint.vision.calibrated_classifier import FrameReadings
 from pipeline.setpoint.vision.calibration import foreign_above
 from pipeline.setpoint.vision.window_flow import WindowFlow
@@ -52,7 +52,7 @@ class Eye(NamedTuple):
     least_score: float
     weights: str
     false_alarms: float
-    material: Material = PLA
+    material: PrintedMaterial = PLA
 
 
 class Level(NamedTuple):
@@ -80,7 +80,9 @@ class _Window(NamedTuple):
     looks: np.ndarray
 
 
-def record(source: Source, protocol: Protocol, eye: Eye, *, place: str) -> tuple[RecordedLevels, list[Level]]:
+def record(
+    source: FrameSource, protocol: Protocol, eye: Eye, *, place: str
+) -> tuple[RecordedLevels, list[Level]]:
     """The levels that the frames of a source show. Raises ValueError, one sentence, where they do not
     suffice."""
     windows = _windows(source, protocol, eye, place)
@@ -114,7 +116,7 @@ def record(source: Source, protocol: Protocol, eye: Eye, *, place: str) -> tuple
     return RecordedLevels(fitted, kept, eye.weights, _camera(windows), above), told
 
 
-def _camera(windows: Sequence[_Window]) -> Camera | None:
+def _camera(windows: Sequence[_Window]) -> KnownCamera | None:
     """How this camera looks, each window counted as a segment; None where there are too few to know it by."""
     looks = np.array([window.looks for window in windows])
     try:
@@ -124,7 +126,7 @@ def _camera(windows: Sequence[_Window]) -> Camera | None:
 
 
 def write(
-    recorded: RecordedLevels, told: Sequence[Level], out: Path, place: str, material: Material = PLA
+    recorded: RecordedLevels, told: Sequence[Level], out: Path, place: str, material: PrintedMaterial = PLA
 ) -> str:
     """Writes the levels to `out` and a page beside it; what a person is told, in flows of what is printed."""
     page = out.with_suffix(".html")
@@ -146,10 +148,10 @@ def write(
 # ---- frames
 
 
-def _windows(source: Source, protocol: Protocol, eye: Eye, place: str) -> list[_Window]:
+def _windows(source: FrameSource, protocol: Protocol, eye: Eye, place: str) -> list[_Window]:
     """The windows of the levels, a few frames in memory at a time."""
     found: list[_Window] = []
-    waiting: list[tuple[float, Shown]] = []
+    waiting: list[tuple[float, CameraFrame]] = []
     times: list[float] = []
     for flow, shown in _of_levels(_timed(_frames(source, place), times), protocol):
         if waiting and waiting[-1][0] != flow:
@@ -176,7 +178,7 @@ def _timed(frames, times: list[float]):
         yield shown
 
 
-def _frames(source: Source, place: str):
+def _frames(source: FrameSource, place: str):
     """Every frame that a source has now. Raises ValueError where it has none."""
     count = 0
     while True:
@@ -216,7 +218,7 @@ def _of_levels(frames, protocol: Protocol):
             yield flow, shown
 
 
-def _seen(window: Sequence[Shown], flow: float, protocol: Protocol, eye: Eye) -> _Window:
+def _seen(window: Sequence[CameraFrame], flow: float, protocol: Protocol, eye: Eye) -> _Window:
     tips = np.array([shown.tip if protocol.tip is None else protocol.tip for shown in window])
     directions = np.array([shown.direction_deg for shown in window])
     areas = find_key_areas([shown.frame for shown in window], tips, directions, least_score=eye.least_score)
@@ -233,7 +235,7 @@ def _seen(window: Sequence[Shown], flow: float, protocol: Protocol, eye: Eye) ->
     return _Window(flow, float(shown.flow_seen[0]), len(window), readings.distance[valid], looks)
 
 
-def source_of(place: Path, recording: Callable[[Path], Recording]) -> Source:
+def source_of(place: Path, recording: Callable[[Path], RecordingSource]) -> FrameSource:
     """A folder of pictures or an MCAP recording. Raises ValueError where there is none."""
     if not place.exists():
         raise ValueError(f"{place} is missing; name the folder of pictures, or the recording")
@@ -243,7 +245,7 @@ def source_of(place: Path, recording: Callable[[Path], Recording]) -> Source:
 # ---- the page
 
 
-def _page(recorded: RecordedLevels, told: Sequence[Level], place: str, material: Material) -> str:
+def _page(recorded: RecordedLevels, told: Sequence[Level], place: str, material: PrintedMaterial) -> str:
     fitted = recorded.levels
     low, high = material.own_flow(levels.shown(fitted, BORDERS))
     rows = "".join(
@@ -266,7 +268,7 @@ def _page(recorded: RecordedLevels, told: Sequence[Level], place: str, material:
     return printable_page(string.Template(template).substitute(values))
 
 
-def _drawing(fitted: Levels, published: LevelWindows, material: Material) -> str:
+def _drawing(fitted: Levels, published: LevelWindows, material: PrintedMaterial) -> str:
     """Windows as dots over the flow commanded, and the curve; both axes logarithmic, in percent."""
     windows = LevelWindows(*(material.own_flow(column) for column in published))
     curve_flow = np.geomspace(windows.flow.min() / 1.1, windows.flow.max() * 1.1, 40)

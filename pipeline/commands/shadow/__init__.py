@@ -10,11 +10,11 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.commands.shadow.decide import Asked, Decision, Deployed, Mind
+from pipeline.commands.shadow.decide import DeployedLoop, Mind, ShadowDecision, WatchOptions
 from pipeline.commands.shadow.decision_log import DecisionLog
 from pipeline.commands.shadow.page import ENDED, render
-from pipeline.commands.shadow.windows import GAP_S, Windows
-from pipeline.reading.watch_sources import Recording, Snapshots, Source
+from pipeline.commands.shadow.windows import GAP_S, FrameWindows
+from pipeline.reading.watch_sources import FrameSource, RecordingSource, Snapshots
 from pipeline.setpoint.simulation.actuation import ACTS
 from pipeline.store import artifacts
 from pipeline.store.printable import counted, printable
@@ -41,17 +41,27 @@ class Watched(NamedTuple):
 
 
 def watch(
-    source: Source, deployed: Deployed, asked: Asked, out: Path, *, place: str, stopped: Callable[[], bool]
+    source: FrameSource,
+    deployed: DeployedLoop,
+    asked: WatchOptions,
+    out: Path,
+    *,
+    place: str,
+    stopped: Callable[[], bool],
 ) -> Watched:
     """Watches until `stopped`, or with asked.once until the source ends; `place` is its name as shown.
 
     The page and the decisions stand in `out`. Raises OSError where not even the first page can be written.
     """
     about = {"source": place, "controller": deployed.name, "sent": "nothing"}
-    log, windows, mind = DecisionLog(out, about), Windows(deployed.window, deployed.settle_s), Mind(deployed)
+    log, windows, mind = (
+        DecisionLog(out, about),
+        FrameWindows(deployed.window, deployed.settle_s),
+        Mind(deployed),
+    )
     page, frames, first = out / "index.html", 0, log.path
     changes, held, broken = 0, 0, ""
-    decisions: list[Decision] = []
+    decisions: list[ShadowDecision] = []
 
     def show(state: str, notes: list[str]) -> float:
         return _write_page(page, render(place, deployed, decisions, state, notes, log.trouble))
@@ -115,7 +125,7 @@ def _rest(seconds: float, stopped: Callable[[], bool]) -> None:
         time.sleep(min(left, 0.2))
 
 
-def _has_ended(source: Source, came: bool, quiet_s: float, decisions: int) -> bool:
+def _has_ended(source: FrameSource, came: bool, quiet_s: float, decisions: int) -> bool:
     """Whether a source that is looked at once has no more: nothing came for quiet_s since its last frame or
     since it is there. A camera that never ends has shown a window.
 
@@ -128,9 +138,9 @@ def _has_ended(source: Source, came: bool, quiet_s: float, decisions: int) -> bo
     return not came and not source.waits_for and (source.ended or quiet_s > SILENT_S)
 
 
-def _damage(source: Source) -> list[str]:
+def _damage(source: FrameSource) -> list[str]:
     """What a recording's reader has remarked."""
-    return source.damage if isinstance(source, Recording) else []
+    return source.damage if isinstance(source, RecordingSource) else []
 
 
 def _log_time(time_s: float) -> int:

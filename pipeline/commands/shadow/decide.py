@@ -9,20 +9,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.reading.watch_sources import Shown
+from pipeline.reading.watch_sources import CameraFrame
 from pipeline.setpoint.agents import bayes
 from pipeline.setpoint.deployment import deployment
-from pipeline.setpoint.deployment.deployment import Window, camera_seen
+from pipeline.setpoint.deployment.deployment import JudgedWindow, camera_seen
 from pipeline.setpoint.deployment.pixels import ADVANTAGE, LIKENESS, LOOKS, REACH_PX, TEMPLATE_PX
 from pipeline.setpoint.frames import familiar, key_area
-from pipeline.setpoint.frames.familiar import FALSE_ALARMS, Camera
+from pipeline.setpoint.frames.familiar import FALSE_ALARMS, KnownCamera
 from pipeline.setpoint.frames.front_end import FrameKeyAreas, find_key_areas
-from pipeline.setpoint.material import PLA, Material
+from pipeline.setpoint.material import PLA, PrintedMaterial
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.setpoint.simulation import actuation
-from pipeline.setpoint.simulation.actuation import ACTS, FOREIGN, Limits, is_evidence
-from pipeline.setpoint.simulation.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, Observation
+from pipeline.setpoint.simulation.actuation import ACTS, FOREIGN, SetpointLimits, is_evidence
+from pipeline.setpoint.simulation.simulator import (
+    FLOW_LIMITS,
+    TEMPERATURE_LIMITS,
+    Observation,
+    SetpointController,
+)
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, FrameReadings, read_frames
 from pipeline.store.printable import printable
 
@@ -30,7 +35,7 @@ from pipeline.store.printable import printable
 SHOWN = 3
 
 
-class Drawn(NamedTuple):
+class DrawnFrame(NamedTuple):
     """A frame's crop (350, 350, 3) uint8 RGB with the key area drawn in; the reason where it was rejected."""
 
     name: str
@@ -38,7 +43,7 @@ class Drawn(NamedTuple):
     reason: str
 
 
-class Asked(NamedTuple):
+class WatchOptions(NamedTuple):
     """What a person says of the print: flow in percent and temperature in degC where the source does not say
     them, the tip (x, y) in px or None, and whether to end where the source does."""
 
@@ -48,7 +53,7 @@ class Asked(NamedTuple):
     once: bool
 
 
-class Deployed(NamedTuple):
+class DeployedLoop(NamedTuple):
     """What decides.
 
     read(images (n, 16, 48), temperature (n,)) -> what n key areas show; window_flow(log_flow, deviation,
@@ -61,33 +66,33 @@ class Deployed(NamedTuple):
 
     read: Callable[[np.ndarray, np.ndarray], FrameReadings]
     window_flow: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
-    known: Camera | None
+    known: KnownCamera | None
     name: str
-    controller: Controller
+    controller: SetpointController
     parameters: Any
     window: int
     least_score: float
-    judge: Callable[..., Window]
-    limits: Limits
+    judge: Callable[..., JudgedWindow]
+    limits: SetpointLimits
     settle_s: float
     tip_tolerance_px: float
-    material: Material = PLA
+    material: PrintedMaterial = PLA
 
 
-class Decision(NamedTuple):
+class ShadowDecision(NamedTuple):
     """One window: what was seen, what it would do, and what the page shows of it; setpoint, would and flow
     seen are of the material that is printed. belief (N,) over bayes.GRID, flows of the published one, or None
     where the controller has none; pictures are of some of its frames."""
 
     number: int
     time_s: float
-    judged: Window
+    judged: JudgedWindow
     setpoint: tuple[float, float]
     would: np.ndarray
     belief: np.ndarray | None
     names: list[str]
     reasons: list[str]
-    pictures: list[Drawn]
+    pictures: list[DrawnFrame]
     row: dict[str, Any]
 
 
@@ -96,18 +101,18 @@ class Looks(NamedTuple):
     and the distance that is foreign there."""
 
     window_flow: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
-    known: Camera | None
+    known: KnownCamera | None
     foreign_above: float
 
 
 def deployed(
     model: CalibratedClassifier,
-    spec: tuple[str, Controller, Any],
+    spec: tuple[str, SetpointController, Any],
     looks: Looks,
     settings: EvaluateSetpoint,
     view: TrainClassifier,
-    material: Material,
-) -> Deployed:
+    material: PrintedMaterial,
+) -> DeployedLoop:
     """The loop as it is deployed through pixels, without a machine."""
     q, fitted = settings.pixels, model.calibration
     judge = partial(
@@ -117,14 +122,14 @@ def deployed(
         foreign_above=looks.foreign_above,
         conformal_level=fitted.level,
     )
-    limits = Limits(
+    limits = SetpointLimits(
         *(np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True)),
         np.array(q.per_action),
         np.array(q.per_minute),
     )
     read = partial(read_frames, model)
     eye = read, looks.window_flow, looks.known
-    return Deployed(
+    return DeployedLoop(
         *eye, *spec, view.window, view.least_score, judge, limits, q.wait_s, q.tip_tolerance_px, material
     )
 
@@ -133,7 +138,7 @@ class Mind:
     """What the controller remembers, in the place of the one that would act: its memory, the number of
     windows it would have acted on, and the setpoint at the last window that it was shown."""
 
-    def __init__(self, deployed: Deployed) -> None:
+    def __init__(self, deployed: DeployedLoop) -> None:
         self.deployed = deployed
         self.memory = deployed.controller.start()
         self.acted, self.shown_flow, self.last_seen, self.number = 0, np.nan, np.nan, 0
@@ -141,7 +146,9 @@ class Mind:
         self.decide_jit = eqx.filter_jit(actuation.decide)
         self.key = jax.random.key(0)
 
-    def decide(self, window: list[Shown], asked: Asked, first_s: float, notes: list[str]) -> Decision:
+    def decide(
+        self, window: list[CameraFrame], asked: WatchOptions, first_s: float, notes: list[str]
+    ) -> ShadowDecision:
         """The decision that this window asks for; the memory is changed as a deployed controller's is."""
         temperature = np.array([_known(shown.temperature, asked.temperature) for shown in window])
         setpoint = (_known(window[-1].flow, asked.flow), float(temperature[-1]))
@@ -165,13 +172,13 @@ class Mind:
         low, median, high = (None, None, None) if belief is None else belief_range(belief, material)
         row |= {"belief_flow_percent": median, "belief_low_percent": low, "belief_high_percent": high}
         names = [shown.name for shown in window]
-        return Decision(
+        return ShadowDecision(
             self.number, time_s, judged, setpoint, would, belief, names, areas.reasons, pictures, row
         )
 
     def _judged(
         self, areas: FrameKeyAreas, temperature: np.ndarray, tip_moved: bool, notes: list[str]
-    ) -> Window:
+    ) -> JudgedWindow:
         """What the frames say together."""
         of = self.deployed
         valid = np.array([not reason for reason in areas.reasons])
@@ -192,8 +199,8 @@ class Mind:
         return judged
 
     def _answer(
-        self, judged: Window, setpoint: tuple[float, float], temperature: float, notes: list[str]
-    ) -> tuple[Window, np.ndarray]:
+        self, judged: JudgedWindow, setpoint: tuple[float, float], temperature: float, notes: list[str]
+    ) -> tuple[JudgedWindow, np.ndarray]:
         """(2,) the change of flow in percent and target in degC that would be sent, within the limits; and
         the window with the reason that the controller adds. Setpoint and change are of the material that is
         printed, window and temperature of the published one."""
@@ -238,7 +245,7 @@ class Mind:
         after = actuation.moved(at, wanted[None], np.zeros(1), limits).value[0]
         return judged, _own_setpoint(material, after) - _own_setpoint(material, inside)
 
-    def _tip_moved(self, window: list[Shown], tips: np.ndarray, notes: list[str]) -> bool:
+    def _tip_moved(self, window: list[CameraFrame], tips: np.ndarray, notes: list[str]) -> bool:
         """Whether the nozzle is elsewhere than on the first frame of the watch."""
         seen = [(i, shown.frame) for i, shown in enumerate(window) if isinstance(shown.frame, np.ndarray)]
         if not seen or not np.isfinite(tips[seen[0][0]]).all():
@@ -260,7 +267,7 @@ class Mind:
         )
 
 
-def _published(material: Material, setpoint: tuple[float, float]) -> np.ndarray:
+def _published(material: PrintedMaterial, setpoint: tuple[float, float]) -> np.ndarray:
     """(2,) flow in percent and target in degC of the published material that stand for a setpoint."""
     return np.array(
         [
@@ -270,12 +277,12 @@ def _published(material: Material, setpoint: tuple[float, float]) -> np.ndarray:
     )
 
 
-def _own_setpoint(material: Material, published: np.ndarray) -> np.ndarray:
+def _own_setpoint(material: PrintedMaterial, published: np.ndarray) -> np.ndarray:
     """The inverse of _published."""
     return np.array([material.own_flow(published[0]), material.own_temperature(published[1])])
 
 
-def _own(judged: Window, material: Material) -> Window:
+def _own(judged: JudgedWindow, material: PrintedMaterial) -> JudgedWindow:
     """The flow that windows show, and its deviation, as of the material that is printed."""
     seen, step = judged.flow_seen, np.exp(judged.spread)
     if material == PLA:
@@ -284,7 +291,7 @@ def _own(judged: Window, material: Material) -> Window:
     return judged._replace(flow_seen=material.own_flow(seen), spread=own)
 
 
-def _pictures(window: list[Shown], areas: FrameKeyAreas) -> list[Drawn]:
+def _pictures(window: list[CameraFrame], areas: FrameKeyAreas) -> list[DrawnFrame]:
     """Some frames of the window with the key area drawn in."""
     pictures = []
     for i in np.unique(np.linspace(0, len(window) - 1, SHOWN).astype(int)):
@@ -294,7 +301,7 @@ def _pictures(window: list[Shown], areas: FrameKeyAreas) -> list[Drawn]:
         figures = (float(column[i]) for column in (areas.angle_deg, areas.miss_px, areas.score))
         area = key_area.KeyArea(areas.images[i], *figures, float(areas.padded_share[i]), reason)
         tip = (float(areas.tip[i, 0]), float(areas.tip[i, 1]))
-        pictures.append(Drawn(window[i].name, key_area.drawn(frame, tip, area), reason))
+        pictures.append(DrawnFrame(window[i].name, key_area.drawn(frame, tip, area), reason))
     return pictures
 
 
@@ -302,7 +309,7 @@ def _known(said: float, otherwise: float) -> float:
     return float(said) if np.isfinite(said) else otherwise
 
 
-def _tip(shown: Shown, asked: Asked) -> tuple[float, float]:
+def _tip(shown: CameraFrame, asked: WatchOptions) -> tuple[float, float]:
     """The tip of the command line or the settings, or else the recording's."""
     return shown.tip if asked.tip is None else asked.tip
 
@@ -316,7 +323,7 @@ def believed(memory: Any) -> np.ndarray | None:
     return total / total.sum()
 
 
-def belief_range(belief: np.ndarray, material: Material) -> tuple[float, float, float]:
+def belief_range(belief: np.ndarray, material: PrintedMaterial) -> tuple[float, float, float]:
     """The flows in percent, of a material, below which 5, 50 and 95 % of the belief lie."""
     low, median, high = np.interp([0.05, 0.5, 0.95], np.cumsum(belief), material.own_flow(bayes.GRID))
     return float(low), float(median), float(high)
@@ -325,10 +332,10 @@ def belief_range(belief: np.ndarray, material: Material) -> tuple[float, float, 
 def _row(
     number: int,
     time_s: float,
-    judged: Window,
+    judged: JudgedWindow,
     would: np.ndarray,
     setpoint: tuple[float, float],
-    window: list[Shown],
+    window: list[CameraFrame],
     areas: FrameKeyAreas,
     notes: list[str],
 ) -> dict[str, Any]:

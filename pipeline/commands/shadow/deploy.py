@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.commands.levels_files import LEVELS_FILE, restore_levels
-from pipeline.commands.shadow.decide import Asked, Deployed, Looks, deployed
+from pipeline.commands.shadow.decide import DeployedLoop, Looks, WatchOptions, deployed
 from pipeline.reading.frame_mcap import Topics
 from pipeline.setpoint import levels
 from pipeline.setpoint.agents.files import restore_agents
@@ -34,12 +34,12 @@ CAMERA = "datasets/train_classifier/known_camera.parquet"
 class Ready(NamedTuple):
     """What decides; where recordings have what we need; the tip of the settings."""
 
-    deployed: Deployed
+    deployed: DeployedLoop
     topics: Topics
     tip: tuple[float, float] | None
 
 
-class Trained(NamedTuple):
+class TrainedClassifier(NamedTuple):
     """The classifier of train_classifier, the digest of its weights, and section `train_classifier`."""
 
     model: CalibratedClassifier
@@ -47,11 +47,11 @@ class Trained(NamedTuple):
     view: TrainClassifier
 
 
-def trained() -> Trained:
+def trained() -> TrainedClassifier:
     """Raises ValueError, one sentence, where the stage has not run."""
     view = params.load(TrainClassifier, "train_classifier")
     model = restore_classifier(WEIGHTS, "datasets/train_classifier/calibration.parquet")
-    return Trained(model, artifacts.sha256(WEIGHTS), view)
+    return TrainedClassifier(model, artifacts.sha256(WEIGHTS), view)
 
 
 def ready(levels_file: str | None) -> Ready:
@@ -99,11 +99,11 @@ def of_camera(
     return WindowFlow(seen, np.where(some, of.spread, np.nan), prob)
 
 
-def asked(flow: float, temperature: float, tip: str, *, once: bool, settings: Ready) -> Asked:
+def asked(flow: float, temperature: float, tip: str, *, once: bool, settings: Ready) -> WatchOptions:
     """What the command line says, checked; the tip of the settings where it says none."""
     bounded("--flow", flow)
     bounded("--temperature", temperature)
-    return Asked(flow, temperature, pixel(tip) if tip else settings.tip, once)
+    return WatchOptions(flow, temperature, pixel(tip) if tip else settings.tip, once)
 
 
 def bounded(flag: str, value: float) -> float:

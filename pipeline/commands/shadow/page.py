@@ -10,10 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.commands.shadow.decide import Decision, Deployed, Drawn
+from pipeline.commands.shadow.decide import DeployedLoop, DrawnFrame, ShadowDecision
 from pipeline.setpoint.agents import bayes
 from pipeline.setpoint.deployment import deployment
-from pipeline.setpoint.material import GOOD, Material
+from pipeline.setpoint.material import GOOD, PrintedMaterial
 from pipeline.setpoint.simulation import actuation
 from pipeline.setpoint.simulation.actuation import ACTS
 from pipeline.store.printable import counted, printable, printable_page
@@ -26,7 +26,12 @@ REASONS_LISTED, NOTES_LISTED = 5, 10
 
 
 def render(
-    place: str, of: Deployed, decisions: Sequence[Decision], state: str, notes: Sequence[str], trouble: str
+    place: str,
+    of: DeployedLoop,
+    decisions: Sequence[ShadowDecision],
+    state: str,
+    notes: Sequence[str],
+    trouble: str,
 ) -> str:
     """The page after these decisions of `of`, the last one at the end. `state` is a sentence on why nothing
     comes, "" where frames do; `trouble` why the decisions cannot be written. After ENDED it refreshes itself
@@ -53,7 +58,7 @@ def _text(text: str) -> str:
     return html.escape(printable(text))
 
 
-def _would(last: Decision) -> str:
+def _would(last: ShadowDecision) -> str:
     """What it would do now, and why."""
     acts = last.judged.reason[0] == ACTS
     words = f"It would {_text(last.row['would'])}." if last.row["would"].startswith("change") else ""
@@ -66,7 +71,7 @@ def _would(last: Decision) -> str:
     )
 
 
-def _shares(last: Decision) -> str:
+def _shares(last: ShadowDecision) -> str:
     """Bars of the window's shares."""
     bars = "".join(
         f'<tr><th>{name}</th><td><svg width="260" height="14" role="img" aria-label="{p:.2f}">'
@@ -81,7 +86,7 @@ def _shares(last: Decision) -> str:
     return f"<h2>What the window shows</h2><table>{bars}</table><p class=quiet>{frames}</p>"
 
 
-def _belief(belief: np.ndarray, material: Material) -> str:
+def _belief(belief: np.ndarray, material: PrintedMaterial) -> str:
     """The belief over the flow of a material as a drawing, on a logarithmic axis, with the good range
     shaded."""
     grid, (thin, thick) = material.own_flow(bayes.GRID), material.good_flow_percent
@@ -111,7 +116,7 @@ def _belief(belief: np.ndarray, material: Material) -> str:
     )
 
 
-def _frames(last: Decision) -> str:
+def _frames(last: ShadowDecision) -> str:
     """The window's frames with the key area, and why frames were rejected."""
     figures = "".join(
         f'<figure><img alt="frame {_text(one.name)}" src="{_embedded(one)}">'
@@ -127,7 +132,7 @@ def _frames(last: Decision) -> str:
     return f"<h2>Last frames</h2><div class=row>{figures}</div>{rejected}"
 
 
-def _row(one: Decision) -> str:
+def _row(one: ShadowDecision) -> str:
     acts = one.judged.reason[0] == ACTS
     does = _text(one.row["would"]) if acts else f"hold: {_text(actuation.REASONS[one.judged.reason[0]])}"
     shares = " ".join(f"{p:.2f}" for p in one.judged.p[0])
@@ -143,7 +148,7 @@ def _list(texts: Sequence[str]) -> str:
     return f"<ul>{''.join(f'<li>{_text(text)}</li>' for text in texts)}</ul>" if texts else ""
 
 
-def _embedded(one: Drawn) -> str:
+def _embedded(one: DrawnFrame) -> str:
     """A JPEG inside the page."""
     bgr = cv2.cvtColor(one.picture, cv2.COLOR_RGB2BGR)
     data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 80])[1]

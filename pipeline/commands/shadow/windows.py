@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.reading.watch_sources import Shown
+from pipeline.reading.watch_sources import CameraFrame
 from pipeline.store.printable import counted
 
 # frames further apart than this are of no one window
@@ -13,18 +13,18 @@ SET_BACK = 5
 NOTED = 20
 
 
-class Windows:
+class FrameWindows:
     """Frames as they come -> windows of frames that are in order, without a gap, and at one flow setpoint.
     `notes` says what was left out since they were last taken."""
 
     def __init__(self, length: int, settle_s: float) -> None:
         self.length, self.settle_s = length, settle_s
-        self.frames: list[Shown] = []
+        self.frames: list[CameraFrame] = []
         self.notes: list[str] = []
         self.first_s, self.last_s, self.late = np.nan, -np.inf, 0
         self.flow, self.waits_until, self.waited = np.nan, -np.inf, 0
 
-    def add(self, shown: Shown) -> list[Shown] | None:
+    def add(self, shown: CameraFrame) -> list[CameraFrame] | None:
         """The window that this frame fills, None where it fills none."""
         if not np.isfinite(shown.time_s):
             self.notes.append(f"{shown.name}: its time is no number")
@@ -48,7 +48,7 @@ class Windows:
         full, self.frames = self.frames, []
         return full
 
-    def _in_order(self, shown: Shown) -> bool:
+    def _in_order(self, shown: CameraFrame) -> bool:
         since = shown.time_s - self.last_s
         if since < 0:
             self.late += 1

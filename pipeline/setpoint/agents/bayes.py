@@ -46,8 +46,8 @@ from pipeline.setpoint.simulation.simulator import (
     GOOD_BORDERS,
     UNDER,
     Action,
-    Controller,
     Observation,
+    SetpointController,
     flow_class,
     nominal,
     paper_windows,
@@ -121,7 +121,7 @@ def start_prior(*, known_start_share: float, known_start_std: float) -> np.ndarr
 
 
 @cache  # one pair of functions, so that what was compiled for it is found again
-def bayes(hypotheses: int) -> Controller:
+def bayes(hypotheses: int) -> SetpointController:
     """The filter and its greedy move, for Filter parameters of so many hypotheses."""
 
     def act(
@@ -133,7 +133,7 @@ def bayes(hypotheses: int) -> Controller:
             temperature_move(observation),
         )
 
-    return Controller(lambda: initial_state(hypotheses), act, strange)
+    return SetpointController(lambda: initial_state(hypotheses), act, strange)
 
 
 def filter_update(parameters: Filter, state: FilterState, observation: Observation) -> FilterState:
@@ -538,13 +538,13 @@ def class_filter(
 
 def build_class_filter(
     settings: Mapping[str, float], agents: Any, windows: WindowTable
-) -> tuple[Controller, Filter]:
+) -> tuple[SetpointController, Filter]:
     return bayes(1), class_filter(**settings)
 
 
 def build_robust_filter(
     settings: Mapping[str, Any], agents: Any, windows: WindowTable
-) -> tuple[Controller, Filter]:
+) -> tuple[SetpointController, Filter]:
     model = CameraErrorModel(**settings)
     hypotheses = len(model.gains) * (len(model.accuracies) + model.width_bias_levels)
     return bayes(hypotheses), watching_filter(windows, model)

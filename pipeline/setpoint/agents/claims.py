@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pipeline.setpoint.agents import agent, belief_agent, trials
-from pipeline.setpoint.agents.score import Score
+from pipeline.setpoint.agents.score import RunScore
 from pipeline.setpoint.simulation.simulator import nominal, paper_windows, rollout
 
 # runs from each single start, and decisions at the end over which a run has come to rest
@@ -103,7 +103,7 @@ def parameters(network: Any) -> int:
     return sum(np.size(leaf) for leaf in jax.tree.leaves(network))
 
 
-def _figures(score: Score) -> dict[str, Any]:
+def _figures(score: RunScore) -> dict[str, Any]:
     steps = {
         name: float(value) if np.isfinite(value) else None
         for name, value in (("median_steps", score.median_steps), ("p90_steps", score.p90_steps))

@@ -73,13 +73,13 @@ def store_published(path: Path, networks: Sequence[QNetwork], rewards: Sequence[
     write_weights(path, PUBLISHED_SCHEMA, arrays, {"phases": str(len(networks))})
 
 
-def restore_published(path: Path) -> agent.Published:
+def restore_published(path: Path) -> agent.PublishedAgent:
     """What `store_published` wrote. Raises ValueError where the file is none."""
     arrays, about = read_weights(path, PUBLISHED_SCHEMA)
     with artifacts.about(path):
         parts = [_part(arrays, f"phase{i + 1}") for i in range(int(about["phases"]))]
         rewards = tuple(jnp.asarray(part.pop("rewards")) for part in parts)
-        return agent.Published(tuple(_network(part) for part in parts), rewards)
+        return agent.PublishedAgent(tuple(_network(part) for part in parts), rewards)
 
 
 def _network(part: dict[str, np.ndarray]) -> QNetwork:

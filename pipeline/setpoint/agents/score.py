@@ -46,7 +46,7 @@ class Outcomes(NamedTuple):
     flow_error: np.ndarray
 
 
-class Score(NamedTuple):
+class RunScore(NamedTuple):
     """n runs. Shares of all runs as `Outcomes` says, `beyond` one for each of BEYOND.
 
     median_steps and p90_steps of the settled runs until they are inside for good (NaN where none settled);
@@ -68,7 +68,7 @@ class Score(NamedTuple):
     beyond: tuple[Share, ...]
 
 
-def judge(flow: np.ndarray, temperature: np.ndarray) -> Score:
+def judge(flow: np.ndarray, temperature: np.ndarray) -> RunScore:
     """The score of n trajectories of at least 200 decisions that share nothing, by their true flow (percent)
     and temperature (°C), each (n, 201 or more).
 
@@ -107,7 +107,7 @@ def outcomes(flow: np.ndarray, temperature: np.ndarray) -> Outcomes:
     )
 
 
-def summary(of: Outcomes, *, redraws: int = 1, shared: float = 0.0) -> Score:
+def summary(of: Outcomes, *, redraws: int = 1, shared: float = 0.0) -> RunScore:
     """The score of runs that are `redraws` equal blocks, one after the other, each on a redraw of segments
     of its own, where a block's runs have the share `shared` of their variance in common
     (`statistics.shared_variance`). With one redraw the runs share nothing, and the intervals are Wilson's."""
@@ -116,7 +116,7 @@ def summary(of: Outcomes, *, redraws: int = 1, shared: float = 0.0) -> Score:
         return wilson(happened) if redraws == 1 else redrawn_share(happened.reshape(redraws, -1), shared)
 
     median, p90 = np.percentile(of.entered[of.settled], [50, 90]) if of.settled.any() else (np.nan, np.nan)
-    return Score(
+    return RunScore(
         runs=len(of.flow),
         settled=share(of.settled),
         stay=share(of.stay),

@@ -21,7 +21,7 @@ from pipeline.setpoint.vision.calibration import hard_shares, window_probabiliti
 CLASSES = ("under", "good", "over")
 
 
-class Window(NamedTuple):
+class JudgedWindow(NamedTuple):
     """What E windows of frames say. `reason` indexes REASONS: 0 acts, all else holds.
 
     p (E, 3) soft shares, counts of which the paper makes its shares: shares (E, 3) and scaled (E, 3) of (4),
@@ -55,7 +55,7 @@ def judge_window(
     correlation: float,
     foreign_above: float,
     conformal_level: float,
-) -> Window:
+) -> JudgedWindow:
     """E windows of W frames each: class probabilities (E, W, 3), valid (E, W), out-of-distribution scores (E,
     W), tip moved (E,) -> what they say together.
 
@@ -103,7 +103,7 @@ def judge_window(
     few = np.where(sound.sum(axis=1) >= least_frames, FOREIGN, FEW)
     reason = np.where((members.sum(axis=1) != 1) & np.isnan(flow_seen), AMBIGUOUS, ACTS)
     reason = np.where(tip_moved, TIP, np.where(m < least_frames, few, reason))
-    return Window(
+    return JudgedWindow(
         p,
         shares,
         shares / shares.max(axis=1, keepdims=True),
@@ -128,11 +128,11 @@ def _median(scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def camera_seen(
-    window: Window,
+    window: JudgedWindow,
     last_seen: np.ndarray,
     looks: np.ndarray,
     foreign: Callable[[np.ndarray], np.ndarray] | None,
-) -> Window:
+) -> JudgedWindow:
     """E windows, held too where the picture stands still or is of no camera that is known.
 
     last_seen (E,) is the flow that the window before showed, NaN where there was none; looks (E, measures)
@@ -145,7 +145,7 @@ def camera_seen(
     return window._replace(reason=reason)
 
 
-def why(time_s: float, window: Window, i: int, change: np.ndarray) -> str:
+def why(time_s: float, window: JudgedWindow, i: int, change: np.ndarray) -> str:
     """One line of the strip "why it acted" for window i: time, what
     was seen, what was sent or why it was held."""
     frames = f"{time_s:6.1f} s: {window.valid[i]} frames valid, {window.used[i]} count"

@@ -7,18 +7,18 @@ import jax
 import numpy as np
 
 from pipeline.setpoint.agents.criteria import harm_bar
-from pipeline.setpoint.agents.score import Outcomes, Score, summary
+from pipeline.setpoint.agents.score import Outcomes, RunScore, summary
 from pipeline.setpoint.evaluation import judging
-from pipeline.setpoint.evaluation.judging import Case, Choice, Judged, Runs
-from pipeline.setpoint.simulation.simulator import Controller, Windows
+from pipeline.setpoint.evaluation.judging import Case, DefaultChoice, JudgedRuns, Runs
+from pipeline.setpoint.simulation.simulator import SetpointController, WindowSource
 from pipeline.statistics import Mean, shared_variance
 
 
 class Contest(NamedTuple):
     """Every controller on segments that are read once, by name."""
 
-    scores: dict[str, dict[str, Score]]  # by case
-    judged: dict[str, Judged]
+    scores: dict[str, dict[str, RunScore]]  # by case
+    judged: dict[str, JudgedRuns]
     redraws: dict[str, int]  # of the segments, that its runs are on
     paths: dict[str, Mapping[str, Runs]]  # by case that counts, the first run from each start
 
@@ -35,10 +35,10 @@ def harm_limits(*, perfect: float, in_band: float) -> dict[str, float]:
 
 
 def simulate(
-    controller: Controller,
+    controller: SetpointController,
     parameters: Any,
     cases: Mapping[str, Case],
-    windows: Windows,
+    windows: WindowSource,
     redraws: int,
     key: jax.Array,
     on_case: Callable[[], object],
@@ -57,7 +57,7 @@ def simulate(
     return outcomes, paths
 
 
-def one_round(redrawn: Windows, number: int, redraws: int) -> Windows:
+def one_round(redrawn: WindowSource, number: int, redraws: int) -> WindowSource:
     """The redraws of one round, as many in each, so that all rounds are one program."""
     part = slice(number * redraws, (number + 1) * redraws)
     return redrawn._replace(table=jax.tree.map(lambda leaf: leaf[part], redrawn.table))
@@ -70,26 +70,26 @@ def append(before: Mapping[str, Outcomes], batch: Mapping[str, Outcomes]) -> dic
     return {case: jax.tree.map(lambda *a: np.concatenate(a), before[case], of) for case, of in batch.items()}
 
 
-def judge(outcomes: Mapping[str, Outcomes], cases: Mapping[str, Case], redraws: int) -> Judged:
+def judge(outcomes: Mapping[str, Outcomes], cases: Mapping[str, Case], redraws: int) -> JudgedRuns:
     """A controller's runs by case, block by block: kept from wrong starts, harmed from good ones."""
 
     def blocks(happened: np.ndarray) -> np.ndarray:
         return happened.reshape(redraws, -1)
 
-    return Judged(
+    return JudgedRuns(
         {name: blocks(outcomes[name].stay) for name, case in cases.items() if not case.good},
         {name: blocks(outcomes[name].beyond[:, -1]) for name, case in cases.items() if case.good},
     )
 
 
 def eliminate(
-    survivors: Sequence[str], judged: Mapping[str, Judged], limits: Mapping[str, float]
+    survivors: Sequence[str], judged: Mapping[str, JudgedRuns], limits: Mapping[str, float]
 ) -> list[str]:
     """Those of the survivors that may still become the default."""
     return [name for name in judging.still_in(judged, limits) if name in survivors]
 
 
-def summaries(outcomes: Mapping[str, Outcomes], redraws: int) -> dict[str, Score]:
+def summaries(outcomes: Mapping[str, Outcomes], redraws: int) -> dict[str, RunScore]:
     """The scores of one controller by case; all cases alike tell how much the runs on one redraw share."""
     figures: dict[str, list[np.ndarray]] = {"fresh": [], "sticky": []}
     for case, of in outcomes.items():
@@ -105,7 +105,7 @@ def summaries(outcomes: Mapping[str, Outcomes], redraws: int) -> dict[str, Score
     }
 
 
-def with_figures(choice: Choice, contest: Contest) -> Choice:
+def with_figures(choice: DefaultChoice, contest: Contest) -> DefaultChoice:
     """The choice with its figures on the segments that are read once; the margin there over the strongest
     other, with its interval, is of the redraws that both ran on. Its sentence says what it was chosen by, and
     then these."""

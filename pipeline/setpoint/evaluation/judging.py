@@ -19,7 +19,13 @@ from pipeline.setpoint.agents.score import Outcomes, outcomes
 from pipeline.setpoint.agents.trials import START_FLOWS, START_TEMPERATURES, STARTS, good_starts, starts
 from pipeline.setpoint.published import BEST_FLOW
 from pipeline.setpoint.simulation.recorded import WindowTable, recorded_windows
-from pipeline.setpoint.simulation.simulator import Conditions, Controller, Windows, paper_windows, rollout
+from pipeline.setpoint.simulation.simulator import (
+    EpisodeConditions,
+    SetpointController,
+    WindowSource,
+    paper_windows,
+    rollout,
+)
 from pipeline.statistics import Mean, Share, effective_runs, redrawn_mean, shared_variance, wilson_interval
 
 GOOD_STARTS = np.linspace(92.5, 107.5, STARTS)  # percent: prints that nothing is wrong with
@@ -31,7 +37,7 @@ OTHER_CAMERA = (
 MOVED_BORDERS = (0.92, 1.08)  # of those learned
 
 
-class Camera(NamedTuple):
+class CameraFault(NamedTuple):
     """It shows 100 scale (q / 100)^exponent percent for the flow q, repeats its last window for stuck_for
     decisions from FAULT_STEP on, and shows none for blind_for."""
 
@@ -45,12 +51,12 @@ class Case(NamedTuple):
     """Conditions (n,), persistence 0 of the paper's windows; the camera. good: from good starts, where harm
     is what counts."""
 
-    conditions: Conditions
-    camera: Camera = Camera()
+    conditions: EpisodeConditions
+    camera: CameraFault = CameraFault()
     good: bool = False
 
 
-class Choice(NamedTuple):
+class DefaultChoice(NamedTuple):
     """The default. worst is the share of its runs (percent) that settle and stay in its worst case; margin
     the points by which that exceeds the worst of the strongest other, with its 95 % interval (NaN where
     nothing else was judged). refused: who may not run, and why."""
@@ -115,23 +121,23 @@ def counts(case: str) -> bool:
     return not case.startswith(("perfect", "in band"))
 
 
-def cameras() -> dict[str, Camera]:
+def cameras() -> dict[str, CameraFault]:
     """The camera right, of another make, at fault, and with borders moved, by what a case's name ends in."""
     scale, exponent = OTHER_CAMERA
     low, high = MOVED_BORDERS
     return {
-        "": Camera(),
-        ", another camera": Camera(scale, exponent),
-        f", stuck {FAULT_LENGTH}": Camera(stuck_for=FAULT_LENGTH),
-        f", blind {FAULT_LENGTH}": Camera(blind_for=FAULT_LENGTH),
-        f", borders {100 * low:g} %": Camera(1 / low),
-        f", borders {100 * high:g} %": Camera(1 / high),
+        "": CameraFault(),
+        ", another camera": CameraFault(scale, exponent),
+        f", stuck {FAULT_LENGTH}": CameraFault(stuck_for=FAULT_LENGTH),
+        f", blind {FAULT_LENGTH}": CameraFault(blind_for=FAULT_LENGTH),
+        f", borders {100 * low:g} %": CameraFault(1 / low),
+        f", borders {100 * high:g} %": CameraFault(1 / high),
     }
 
 
 def cases(
-    recorded: Windows, *, runs: int, segment_mean_decisions: float
-) -> dict[str, tuple[Windows, Conditions]]:
+    recorded: WindowSource, *, runs: int, segment_mean_decisions: float
+) -> dict[str, tuple[WindowSource, EpisodeConditions]]:
     """The cases from wrong starts as sources of windows and conditions. recorded: of `recorded_windows`."""
     return {
         name: (shown_by(recorded, case.camera), case.conditions)
@@ -140,21 +146,23 @@ def cases(
     }
 
 
-class Shown(NamedTuple):
+class DistortedWindows(NamedTuple):
     """recorded windows and how the camera maps the flow that they show."""
 
-    recorded: Windows
+    recorded: WindowSource
     scale: jax.Array
     exponent: jax.Array
 
 
-def shown_by(recorded: Windows, camera: Camera) -> Windows:
+def shown_by(recorded: WindowSource, camera: CameraFault) -> WindowSource:
     """The windows of this camera: those of the paper where conditions.persistence is 0, else recorded ones at
     the flow that the camera makes of the true one. One program for all of them."""
-    return Windows(_shown, Shown(recorded, jnp.float32(camera.scale), jnp.float32(camera.exponent)))
+    return WindowSource(
+        _shown, DistortedWindows(recorded, jnp.float32(camera.scale), jnp.float32(camera.exponent))
+    )
 
 
-def _shown(table: Shown, conditions: Conditions, flow, segment, u) -> tuple[jax.Array, ...]:
+def _shown(table: DistortedWindows, conditions: EpisodeConditions, flow, segment, u) -> tuple[jax.Array, ...]:
     seen = BEST_FLOW * table.scale * (flow / BEST_FLOW) ** table.exponent
     paper = paper_windows().draw((), conditions, flow, segment, u)
     recorded = table.recorded.draw(table.recorded.table, conditions, seen, segment, u)
@@ -164,7 +172,7 @@ def _shown(table: Shown, conditions: Conditions, flow, segment, u) -> tuple[jax.
 # ---- runs on redrawn segments
 
 
-def redrawn(table: WindowTable, redraws: int, rng: np.random.Generator, *, room: int = 0) -> Windows:
+def redrawn(table: WindowTable, redraws: int, rng: np.random.Generator, *, room: int = 0) -> WindowSource:
     """`redraws` tables of as many segments as the table has, drawn from them with replacement: a source whose
     arrays have a leading axis (redraws,), and room for as many windows and segments at least. Tables with the
     same room are one program.
@@ -223,7 +231,9 @@ class Runs(NamedTuple):
     temperature: np.ndarray
 
 
-def runs(controller: Controller, parameters: Any, case: Case, recorded: Windows, keys: jax.Array) -> Runs:
+def runs(
+    controller: SetpointController, parameters: Any, case: Case, recorded: WindowSource, keys: jax.Array
+) -> Runs:
     """The case's runs (n,) on each redraw of `recorded` (of `redrawn`), one key each (B,). The same key, the
     same chance for every controller."""
     camera, one = case.camera, jnp.ones_like(case.conditions.flow)
@@ -248,13 +258,17 @@ def first_of_each(of: Runs) -> Runs:
     return Runs(*(a[0].reshape(shape)[:, 0].reshape(STARTS, STEPS + 1) for a in of))
 
 
-def ask(controller: Controller, parameters: Any, case: Case, recorded: Windows, keys: jax.Array) -> Outcomes:
+def ask(
+    controller: SetpointController, parameters: Any, case: Case, recorded: WindowSource, keys: jax.Array
+) -> Outcomes:
     """What becomes of the case's `runs`."""
     return become(runs(controller, parameters, case, recorded, keys))
 
 
-def _asked(controller: Controller, parameters, windows: Windows, conditions: Conditions, keys):
-    shown: Shown = windows.table
+def _asked(
+    controller: SetpointController, parameters, windows: WindowSource, conditions: EpisodeConditions, keys
+):
+    shown: DistortedWindows = windows.table
 
     def one(table, key):
         of = windows._replace(table=shown._replace(recorded=shown.recorded._replace(table=table)))
@@ -271,7 +285,7 @@ def _asked(controller: Controller, parameters, windows: Windows, conditions: Con
 ALIKE_POINTS = 2.0
 
 
-class Judged(NamedTuple):
+class JudgedRuns(NamedTuple):
     """A contestant's runs by case, each (B, n) on B redraws: kept, settled and stayed (from wrong starts);
     harmed, farther than +-25 % from 100 % (from good starts)."""
 
@@ -279,7 +293,7 @@ class Judged(NamedTuple):
     harmed: Mapping[str, np.ndarray]
 
 
-def harmless(of: Judged, bars: Mapping[str, float]) -> str:
+def harmless(of: JudgedRuns, bars: Mapping[str, float]) -> str:
     """ "" where the contestant leaves +-25 % in at most bars[case] percent of the runs of each case; else
     where it leaves it most beyond its bar."""
     over = {case: 100.0 * float(of.harmed[case].mean()) - bar for case, bar in bars.items()}
@@ -290,13 +304,13 @@ def harmless(of: Judged, bars: Mapping[str, float]) -> str:
     return f"leaves +-25 % in {share:.1f} % of the runs ({case}), of at most {bars[case]:g} %"
 
 
-def worst_case(of: Judged) -> tuple[float, str]:
+def worst_case(of: JudgedRuns) -> tuple[float, str]:
     """The least share (0 to 1) of runs that settle and stay, and where; of two alike the first case."""
     case = min(of.kept, key=lambda name: float(of.kept[name].mean()))
     return float(of.kept[case].mean()), case
 
 
-def lead(of: Judged, other: Judged) -> Mean:
+def lead(of: JudgedRuns, other: JudgedRuns) -> Mean:
     """By how many points the worst case of `of` exceeds the worst of the other, with its 95 % interval, from
     the redraws that both have: same segments, same chance.
 
@@ -318,7 +332,7 @@ def _at_once(of: Mean, redraws: int, comparisons: int) -> Mean:
     return Mean(of.value, of.value - half, of.value + half)
 
 
-def lead_on_average(of: Judged, other: Judged) -> Mean:
+def lead_on_average(of: JudgedRuns, other: JudgedRuns) -> Mean:
     """The same of the mean over the cases: a worst case can be one segment's doing, and then hides who is
     better everywhere else. The redraws that both have are the sample. One comparison, so its interval is of
     itself alone."""
@@ -327,7 +341,7 @@ def lead_on_average(of: Judged, other: Judged) -> Mean:
     return redrawn_mean(100.0 * np.mean(leads, axis=0)[:, None], 1.0)
 
 
-def surely_better(judged: Mapping[str, Judged], best: str, name: str) -> bool:
+def surely_better(judged: Mapping[str, JudgedRuns], best: str, name: str) -> bool:
     """Whether `best` is told from another by more than ALIKE_POINTS: in the worst case, or on average. From
     doing nothing by the worst case alone."""
     if lead(judged[best], judged[name]).low > ALIKE_POINTS:
@@ -335,7 +349,7 @@ def surely_better(judged: Mapping[str, Judged], best: str, name: str) -> bool:
     return name != NO_CONTROL and lead_on_average(judged[best], judged[name]).low > ALIKE_POINTS
 
 
-def _lead_in(of: Judged, case: str, other: Judged, against: str) -> Mean:
+def _lead_in(of: JudgedRuns, case: str, other: JudgedRuns, against: str) -> Mean:
     """The same of one case of each. Cases alike are compared run by run; of others the variances add."""
     both = min(len(of.kept[case]), len(other.kept[against]))
     ours, theirs = (100.0 * blocks[:both].astype(float) for blocks in (of.kept[case], other.kept[against]))
@@ -355,12 +369,12 @@ def _lead_in(of: Judged, case: str, other: Judged, against: str) -> Mean:
     return _at_once(Mean(value, value - half, value + half), both, len(other.kept))
 
 
-def _shared(of: Judged, group: str, redraws: int) -> float:
+def _shared(of: JudgedRuns, group: str, redraws: int) -> float:
     """What a contestant's runs on one redraw share in the cases of a group."""
     return shared_variance([of.kept[c][:redraws] for c in of.kept if alike(c) == group]) if group else 0.0
 
 
-def still_in(judged: Mapping[str, Judged], bars: Mapping[str, float]) -> list[str]:
+def still_in(judged: Mapping[str, JudgedRuns], bars: Mapping[str, float]) -> list[str]:
     """Who may still become the default: whom the best harmless one is not surely better than, as `choose`
     tells ties, and whose harm is not beyond its bar by the whole of its interval."""
     sound = [name for name, of in judged.items() if not harmless(of, bars)] or list(judged)
@@ -373,7 +387,7 @@ def still_in(judged: Mapping[str, Judged], bars: Mapping[str, float]) -> list[st
     ]
 
 
-def _interval(of: Judged, figures: Mapping[str, np.ndarray], case: str) -> Share:
+def _interval(of: JudgedRuns, figures: Mapping[str, np.ndarray], case: str) -> Share:
     """Of a case, with what its runs share told by all cases alike."""
     group = [
         blocks for side in (of.kept, of.harmed) for name, blocks in side.items() if alike(name) == alike(case)
@@ -384,8 +398,8 @@ def _interval(of: Judged, figures: Mapping[str, np.ndarray], case: str) -> Share
 
 
 def choose(
-    judged: Mapping[str, Judged], *, simplest_first: Sequence[str], bars: Mapping[str, float]
-) -> Choice:
+    judged: Mapping[str, JudgedRuns], *, simplest_first: Sequence[str], bars: Mapping[str, float]
+) -> DefaultChoice:
     """The default: of the contestants that do no harm the simplest that the one with the best worst case is
     not `surely_better` than.
 
@@ -416,10 +430,10 @@ def choose(
         f"{name} is the default: in its worst case ({case}) {100 * worst:.1f} % of the runs settle and stay"
     )
     beside = "".join(f" Not asked: {other} {why}." for other, why in refused.items())
-    return Choice(name, 100 * worst, case, *margin, refused, f"{opening}; {why}.{beside}")
+    return DefaultChoice(name, 100 * worst, case, *margin, refused, f"{opening}; {why}.{beside}")
 
 
-def _reason(name: str, rival: str, judged: Mapping[str, Judged], margin: Mean) -> str:
+def _reason(name: str, rival: str, judged: Mapping[str, JudgedRuns], margin: Mean) -> str:
     worst, case = worst_case(judged[rival])
     other = f"{rival} {100 * worst:.1f} % in its own ({case})"
     ends = f"95 % interval over all cases at once {margin.low:+.1f} to {margin.high:+.1f} points"
@@ -444,7 +458,9 @@ def _reason(name: str, rival: str, judged: Mapping[str, Judged], margin: Mean) -
     return f"{other} {near}, and of two alike the simpler runs"
 
 
-def _check(judged: Mapping[str, Judged], simplest_first: Sequence[str], bars: Mapping[str, float]) -> None:
+def _check(
+    judged: Mapping[str, JudgedRuns], simplest_first: Sequence[str], bars: Mapping[str, float]
+) -> None:
     asked = {frozenset(of.kept) for of in judged.values()}
     if len(asked) != 1 or any(bars.keys() - of.harmed.keys() for of in judged.values()):
         raise ValueError(

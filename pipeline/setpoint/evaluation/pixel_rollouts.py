@@ -31,7 +31,7 @@ def spread_starts(count: int, runs: int) -> np.ndarray:
     ).astype(float)
 
 
-def disturbed_episodes(decisions: int) -> tuple[np.ndarray, pixels.Disturbances, tuple[str, str]]:
+def disturbed_episodes(decisions: int) -> tuple[np.ndarray, pixels.PixelDisturbances, tuple[str, str]]:
     """Starts (2, 2), disturbances and words of the two episodes that the page shows, whatever comes of them:
     the hardest start, and a clog with pictures out of focus later."""
     D, never = decisions, np.iinfo(int).max

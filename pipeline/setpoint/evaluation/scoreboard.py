@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from pipeline.setpoint.agents.criteria import BEYOND, NO_CONTROL, STEPS
-from pipeline.setpoint.agents.score import Score
+from pipeline.setpoint.agents.score import RunScore
 from pipeline.setpoint.deployment import deployment, pixels
 from pipeline.setpoint.evaluation import judging
 from pipeline.setpoint.evaluation.contest import Contest
-from pipeline.setpoint.evaluation.judging import Choice
+from pipeline.setpoint.evaluation.judging import DefaultChoice
 from pipeline.setpoint.evaluation.pixel_rollouts import DWELL, PixelRollouts
 from pipeline.setpoint.simulation import actuation
 from pipeline.statistics import Share, wilson
@@ -39,7 +39,7 @@ def scoreboard(groups: Mapping[str, str], contest: Contest, rollouts: PixelRollo
     )
 
 
-def _score_row(name: str, kind: str, case: str, score: Score, redraws: int) -> dict[str, Any]:
+def _score_row(name: str, kind: str, case: str, score: RunScore, redraws: int) -> dict[str, Any]:
     clogged = case.endswith("clog")
     shares: dict[str, Share | None] = {
         "settled": score.settled,
@@ -79,7 +79,7 @@ def _columns(rows: list[dict[str, Any]]) -> dict[str, list]:
     return {name: [row[name] for row in rows] for name in rows[0]}
 
 
-def compared(groups: Mapping[str, str], contest: Contest, choice: Choice) -> list[str]:
+def compared(groups: Mapping[str, str], contest: Contest, choice: DefaultChoice) -> list[str]:
     """Who is set beside the default in its worst case, in the contestants' order: doing nothing, the
     strongest simple rule and the strongest agent of ours. The strongest keeps most in its own worst case;
     who may not run gives way to who may."""
@@ -92,7 +92,7 @@ def compared(groups: Mapping[str, str], contest: Contest, choice: Choice) -> lis
 
 
 def paths(
-    groups: Mapping[str, str], contest: Contest, choice: Choice, rollouts: PixelRollouts
+    groups: Mapping[str, str], contest: Contest, choice: DefaultChoice, rollouts: PixelRollouts
 ) -> dict[str, Any]:
     """Columns of schema PATHS: one run from each of the 21 starts, of those judged. Of every controller
     PATH_STEPS decisions of the cases PATHS_OF; of those that are compared STEPS of the choice's case, which
@@ -158,7 +158,7 @@ def decisions(name: str, rollouts: PixelRollouts) -> dict[str, list]:
         return {}
     for i, words in enumerate(rollouts.words):
         for d in range(episodes.time_s.shape[1]):
-            window = deployment.Window(*(field[:, d] for field in episodes.windows))
+            window = deployment.JudgedWindow(*(field[:, d] for field in episodes.windows))
             prob, score, sent = window.p[i], window.score[i], episodes.sent[i, d]
             rows.append(
                 {
@@ -185,7 +185,7 @@ def decisions(name: str, rollouts: PixelRollouts) -> dict[str, list]:
 
 
 def metrics(
-    groups: Mapping[str, str], contest: Contest, choice: Choice, rollouts: PixelRollouts
+    groups: Mapping[str, str], contest: Contest, choice: DefaultChoice, rollouts: PixelRollouts
 ) -> dict[str, Any]:
     """By controller, simulator and case; then the default, its cases and what it does to good prints."""
     figures: dict[str, Any] = {
@@ -221,7 +221,7 @@ def metrics(
     }
 
 
-def _shares(case: str, score: Score) -> dict[str, float | int | None]:
+def _shares(case: str, score: RunScore) -> dict[str, float | int | None]:
     """Of a case of the default: low and high are the ends of the 95 % interval of the runs that stay."""
     figures: dict[str, float | int | None] = {
         "runs": score.runs,
@@ -239,7 +239,7 @@ def _shares(case: str, score: Score) -> dict[str, float | int | None]:
     return figures
 
 
-def _harm(score: Score) -> dict[str, float | int]:
+def _harm(score: RunScore) -> dict[str, float | int]:
     """Percent of runs from good starts that leave +-10, 15 and 25 % within 200 decisions, with intervals."""
     named = {f"beyond_{points}": share for points, share in zip(BEYOND, score.beyond, strict=True)}
     return (
@@ -250,7 +250,7 @@ def _harm(score: Score) -> dict[str, float | int]:
     )
 
 
-def _figures(case: str, score: Score) -> dict[str, float | None]:
+def _figures(case: str, score: RunScore) -> dict[str, float | None]:
     if not judging.counts(case):
         return {f"beyond_{points}": share.percent for points, share in zip(BEYOND, score.beyond, strict=True)}
     return {
@@ -263,7 +263,7 @@ def _figures(case: str, score: Score) -> dict[str, float | None]:
     }
 
 
-def choice_record(choice: Choice) -> dict[str, Any]:
+def choice_record(choice: DefaultChoice) -> dict[str, Any]:
     """What choice.json holds: null where there is no figure, as of a margin where nothing else may run."""
     return {
         name: _plain(value) if isinstance(value, float) else value for name, value in choice._asdict().items()

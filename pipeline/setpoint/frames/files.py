@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.setpoint.frames import familiar
-from pipeline.setpoint.frames.familiar import Camera
+from pipeline.setpoint.frames.familiar import KnownCamera
 from pipeline.setpoint.frames.rendered import LabelledFrames
 from pipeline.store import artifacts
 
@@ -14,9 +14,9 @@ CAMERA_FILE, CAMERA_SCHEMA = "known_camera.parquet", ("known_camera", 1)
 FRAMES_SCHEMA = "frames 1"
 
 
-def store_camera(path: Path, camera: Camera | None) -> None:
+def store_camera(path: Path, camera: KnownCamera | None) -> None:
     """Writes the camera; empty arrays where there is none."""
-    mean, deviation, whitening, scores = camera or Camera(*(np.zeros(0) for _ in Camera._fields))
+    mean, deviation, whitening, scores = camera or KnownCamera(*(np.zeros(0) for _ in KnownCamera._fields))
     units = "1", "as the measures of familiar.NAMES"
     artifacts.write_arrays(
         path,
@@ -30,7 +30,7 @@ def store_camera(path: Path, camera: Camera | None) -> None:
     )
 
 
-def restore_camera(path: str | Path) -> Camera | None:
+def restore_camera(path: str | Path) -> KnownCamera | None:
     """What `store_camera` wrote, None where there was no camera. Raises ValueError for a file of other
     measures."""
     arrays = artifacts.read_arrays(str(path), *CAMERA_SCHEMA)
@@ -41,7 +41,7 @@ def restore_camera(path: str | Path) -> Camera | None:
             f"{path}: expected {len(familiar.NAMES)} measures, found {arrays['mean'].shape}; "
             f"{artifacts.remedy(str(path))}"
         )
-    return Camera(*(arrays[name] for name in Camera._fields))
+    return KnownCamera(*(arrays[name] for name in KnownCamera._fields))
 
 
 def store_frames(folder: Path, by_part: dict[str, LabelledFrames]) -> None:

@@ -118,7 +118,7 @@ def _motion(
 def _cropped(frame: np.ndarray | str, tip: np.ndarray) -> key_area.Crop | str:
     """The crop round the tip (x, y), or the reason why there is none."""
     reason = frame if isinstance(frame, str) else _shallow(frame)
-    if reason or not np.isfinite(tip).all():
+    if reason or isinstance(frame, str) or not np.isfinite(tip).all():
         return reason or NO_TIP
     try:
         return key_area.crop(frame, (float(tip[0]), float(tip[1])))

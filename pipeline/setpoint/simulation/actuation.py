@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 if TYPE_CHECKING:
-    from pipeline.setpoint.simulation.simulator import Action, Controller, Observation
+    from pipeline.setpoint.simulation.simulator import Action, Observation, SetpointController
 
 REASONS = (
     "acts",
@@ -43,7 +43,7 @@ def still(flow_seen, last_seen):
 
 
 def decide(
-    controller: "Controller",
+    controller: "SetpointController",
     parameters: Any,
     memory: Any,
     observation: "Observation",
@@ -63,7 +63,7 @@ def decide(
 # ---- what may be sent
 
 
-class Limits(NamedTuple):
+class SetpointLimits(NamedTuple):
     """Of (flow in percent, target temperature in °C), each (2,): the box, the largest change of one action
     and the travel allowed in any 60 s."""
 
@@ -84,7 +84,7 @@ class Setpoints(NamedTuple):
     clipped: Any
 
 
-def setpoints(start: np.ndarray, limits: Limits) -> Setpoints:
+def setpoints(start: np.ndarray, limits: SetpointLimits) -> Setpoints:
     """Setpoints at rest at start (E, 2). Raises ValueError where a start lies outside the box."""
     start = np.asarray(start, float)
     outside = ~((start >= limits.low) & (start <= limits.high)).all(axis=1)
@@ -108,7 +108,7 @@ def at_rest(value, *, remembered: int) -> Setpoints:
     )
 
 
-def moved(state: Setpoints, change, time_s, limits: Limits) -> Setpoints:
+def moved(state: Setpoints, change, time_s, limits: SetpointLimits) -> Setpoints:
     """The setpoints after the wanted change (..., 2) at time_s (...,), cut to the size of one action, to what
     is left of the last 60 s' travel, and to the box.
 

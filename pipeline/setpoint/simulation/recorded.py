@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint.simulation.simulator import GOOD_BORDERS, Conditions, Windows
+from pipeline.setpoint.simulation.simulator import GOOD_BORDERS, EpisodeConditions, WindowSource
 
 UNSEEN = np.array(np.nan)  # of a table of classes only
 DITHER = 1e-3  # of log flow_seen: a window drawn twice is not a picture that stands still
@@ -118,7 +118,7 @@ def smooth_mean(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.interp(x, at, (weight @ y) / np.maximum(weight.sum(axis=1), 1e-12))
 
 
-def recorded_windows(table: WindowTable) -> Windows:
+def recorded_windows(table: WindowTable) -> WindowSource:
     """The table as a source of windows: fresh where conditions.persistence is 1, sticky above."""
     _check(table)
     shares, bins = np.asarray(table.shares, np.float32), len(table.flow_edges) - 1
@@ -146,7 +146,7 @@ def recorded_windows(table: WindowTable) -> Windows:
         flow_edges=jnp.asarray(table.flow_edges, jnp.float32),
         seen=jnp.asarray([len(log_flow), len(bias)], jnp.int32),
     )
-    return Windows(_recorded_draw, ranked)
+    return WindowSource(_recorded_draw, ranked)
 
 
 def _errors(table: WindowTable) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -160,7 +160,7 @@ def _errors(table: WindowTable) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
 
 
 def _recorded_draw(
-    ranked: _Ranked, conditions: Conditions, flow, segment, u
+    ranked: _Ranked, conditions: EpisodeConditions, flow, segment, u
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     flow_bin = (flow >= ranked.flow_edges[1:-1]).sum()
     s = ranked.first_segment[flow_bin] + jnp.floor(segment * ranked.segments[flow_bin]).astype(jnp.int32)

@@ -13,7 +13,7 @@ from pipeline.setpoint.vision.calibrated_classifier import (
     WindowPredictions,
     YardstickClasses,
 )
-from pipeline.setpoint.vision.calibration import Calibration, ClassifierOutputs, WindowTruth
+from pipeline.setpoint.vision.calibration import ClassifierCalibration, ClassifierOutputs, WindowTruth
 from pipeline.setpoint.vision.classifier import Labelled, TrainState
 from pipeline.setpoint.vision.parts import all_frames
 from pipeline.setpoint.vision.vision_transformer import Classifier
@@ -25,7 +25,7 @@ EVERY = 3
 class Assessment(NamedTuple):
     """The classifier on the frames that it is judged on."""
 
-    fitted: Calibration
+    fitted: ClassifierCalibration
     data: Labelled  # the frames, rejected ones too
     frames: ClassifierOutputs  # of the classifier on them
     windows: WindowPredictions
@@ -40,7 +40,7 @@ def fewer(learned: Labelled) -> Labelled:
 
 
 def assess(
-    fitted: Calibration,
+    fitted: ClassifierCalibration,
     outputs: ClassifierOutputs,
     cnn: Classifier,
     learned: Labelled,

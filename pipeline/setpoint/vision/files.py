@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from pipeline.setpoint.vision import calibration
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
-from pipeline.setpoint.vision.calibration import Calibration
+from pipeline.setpoint.vision.calibration import ClassifierCalibration
 from pipeline.setpoint.vision.classifier import TrainState
 from pipeline.setpoint.vision.vision_transformer import (
     PAPER,
@@ -77,7 +77,7 @@ def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedCl
     numbers = (float(fitted[name]) for name in ("temperature", "correlation", "level"))
     return CalibratedClassifier(
         network,
-        Calibration(
+        ClassifierCalibration(
             *numbers,
             calibration.Familiar(fitted["means"], fitted["whitening"]),
             float(fitted["foreign_above"]),

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from pipeline.setpoint.frames import key_area, nozzle_scene
-from pipeline.setpoint.material import Material
+from pipeline.setpoint.material import PrintedMaterial
 from pipeline.setpoint.vision import calibrated_classifier
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
 
@@ -83,7 +83,12 @@ def _in_turn(lists: Sequence[list[int]]) -> list[int]:
 
 
 def describe_recorded(
-    model: CalibratedClassifier, groups: Groups, frames: Any, i: int, judged: np.ndarray, material: Material
+    model: CalibratedClassifier,
+    groups: Groups,
+    frames: Any,
+    i: int,
+    judged: np.ndarray,
+    material: PrintedMaterial,
 ) -> dict[str, Any]:
     """The row of frame i: what became of it, the share of the `judged` frames (n,) of which it is one, and
     what was made of it."""
