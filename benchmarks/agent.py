@@ -49,7 +49,7 @@ def one_seed(settings: TrainAgent, runs: int, segment_mean_decisions: float) -> 
         "kept_round": trained.best_round,
     }
     agents = trained.agents
-    row["claims"] = train_agent.claims(settings, agents.li_2025)
+    row["claims"] = train_agent.paper_claims(settings, agents.li_2025)
     published = agent.greedy(agent.paper_encoder(settings.li_2025.history))
     on_belief = agent.greedy(belief_agent.belief_encoder(agents.belief))
     before = belief_agent.BeliefNetwork(agents.belief.filter.evidence.shape[0], jax.random.key(0))

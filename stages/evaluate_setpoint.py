@@ -206,9 +206,7 @@ def simulate_pixels(
     starts = pixel_rollouts.spread_starts(own.starts, own.runs)
     hard_starts, disturbances, words = pixel_rollouts.disturbed_episodes(own.decisions)
 
-    def run(
-        name: str, starts: np.ndarray, disturbances: pixels.PixelDisturbances, seed: int
-    ) -> pixels.Episodes:
+    def run(name: str, starts: np.ndarray, disturbances: Any, seed: int) -> pixels.Episodes:
         built, rng = controllers[name], np.random.default_rng([settings.seed, seed])
         episodes = pixels.run(
             built.controller, built.parameters, starts, loop, disturbances, decisions=own.decisions, rng=rng
@@ -223,14 +221,10 @@ def simulate_pixels(
 
 
 def pixel_loop(model: Any, settings: EvaluateSetpoint, view: TrainClassifier, camera: Any) -> Any:
-    """The loop as deployed (pixels.Loop), with limits of what one action and one minute may change. Windows
-    that are not of the known camera are held."""
-    import numpy as np
-
+    """The loop as deployed (pixels.PixelLoop). Windows that are not of the known camera are held."""
     from pipeline.setpoint.deployment import deployment, pixels
     from pipeline.setpoint.frames import familiar
     from pipeline.setpoint.simulation import actuation
-    from pipeline.setpoint.simulation.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS
     from pipeline.setpoint.vision.calibrated_classifier import read_frames
     from pipeline.setpoint.vision.window_flow import window_flow
 
@@ -241,17 +235,9 @@ def pixel_loop(model: Any, settings: EvaluateSetpoint, view: TrainClassifier, ca
         frames=view.window,
         frame_rate_hz=q.frame_rate_hz,
         waits=actuation.Waits(q.wait_s, q.wait_s, q.idle_wait_s),
-        limits=actuation.SetpointLimits(
-            *(np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True)),
-            np.array(q.per_action),
-            np.array(q.per_minute),
-        ),
-        judge=partial(
-            deployment.judge_window,
-            least_frames=q.least_frames,
-            correlation=fitted.correlation,
-            foreign_above=fitted.foreign_above,
-            conformal_level=fitted.level,
+        limits=deployment.deployed_limits(q.per_action, q.per_minute),
+        judge=deployment.window_judge(
+            fitted, least_frames=q.least_frames, foreign_above=fitted.foreign_above
         ),
         least_score=view.least_score,
         tip_tolerance_px=q.tip_tolerance_px,

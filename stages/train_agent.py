@@ -197,30 +197,15 @@ def filter_belief(settings: BeliefDqn, windows: "WindowTable") -> Any:
 def dqn_settings(settings: Learning) -> "agent.DqnSettings":
     from pipeline.setpoint.agents import agent
 
-    return agent.DqnSettings(
-        settings.gamma,
-        settings.tau,
-        settings.batch,
-        settings.capacity,
-        settings.environments,
-        settings.episode,
-    )
+    return agent.DqnSettings(**settings.model_dump(include={*agent.DqnSettings._fields}))
 
 
 def published_training(settings: Li2025) -> "agent.PublishedTraining":
     from pipeline.setpoint.agents import agent
 
-    return agent.PublishedTraining(
-        dqn=dqn_settings(settings),
-        learning_rate=settings.learning_rate,
-        updates=tuple(settings.updates),
-        accuracy=settings.accuracy,
-        explore=settings.explore,
-        explore_again=settings.explore_again,
-        least=settings.least,
-        history=settings.history,
-        flow_actions=settings.flow_actions,
-    )
+    numbers = settings.model_dump(include={*agent.PublishedTraining._fields})
+    numbers["updates"] = tuple(settings.updates)
+    return agent.PublishedTraining(dqn=dqn_settings(settings), **numbers)
 
 
 def belief_training(settings: BeliefDqn) -> "belief_agent.BeliefTraining":

@@ -6,7 +6,7 @@ the simulator, frames for the page, and known_camera.parquet, by which frames of
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import stages
 from pipeline.setpoint.settings import SetpointMaterial, TrainClassifier
@@ -126,8 +126,8 @@ def train(
     )
     learned, held_out = (Labelled(*by_part[part].labelled()) for part in ("learned", "held_out"))
     augment = {"along_bead": classifier.along_bead, "adr": classifier.adr}[settings.augmentation]
-    transformer = vision_transformer(SIZES[settings.size], np.random.default_rng([settings.seed, 10]))
-    cnn = convolutional(np.random.default_rng([settings.seed, 11]))
+    rngs = [np.random.default_rng([settings.seed, stream]) for stream in (10, 11)]
+    transformer, cnn = vision_transformer(SIZES[settings.size], rngs[0]), convolutional(rngs[1])
     untrained = {
         TRANSFORMER: (transformer, getattr(settings, settings.size), learned),
         CNN: (cnn, settings.cnn, fewer(learned)),
@@ -156,11 +156,8 @@ def train(
 
 # ---- what it is worth
 
-Given = TypeVar("Given")
-Made = TypeVar("Made")
 
-
-def each(parts: Mapping[str, Given], work: Callable[[Given], Made]) -> dict[str, Made]:
+def each(parts: Mapping[str, Any], work: Callable[[Any], Any]) -> dict[str, Any]:
     """work of each part, on every core at once; what comes out does not depend on the cores."""
     import os
     from concurrent.futures import ThreadPoolExecutor

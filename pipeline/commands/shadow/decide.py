@@ -22,12 +22,7 @@ from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.setpoint.simulation import actuation
 from pipeline.setpoint.simulation.actuation import ACTS, FOREIGN, SetpointLimits, is_evidence
-from pipeline.setpoint.simulation.simulator import (
-    FLOW_LIMITS,
-    TEMPERATURE_LIMITS,
-    Observation,
-    SetpointController,
-)
+from pipeline.setpoint.simulation.simulator import Observation, SetpointController
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, FrameReadings, read_frames
 from pipeline.store.printable import printable
 
@@ -114,19 +109,11 @@ def deployed(
     material: PrintedMaterial,
 ) -> DeployedLoop:
     """The loop as it is deployed through pixels, without a machine."""
-    q, fitted = settings.pixels, model.calibration
-    judge = partial(
-        deployment.judge_window,
-        least_frames=q.least_frames,
-        correlation=fitted.correlation,
-        foreign_above=looks.foreign_above,
-        conformal_level=fitted.level,
+    q = settings.pixels
+    judge = deployment.window_judge(
+        model.calibration, least_frames=q.least_frames, foreign_above=looks.foreign_above
     )
-    limits = SetpointLimits(
-        *(np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True)),
-        np.array(q.per_action),
-        np.array(q.per_minute),
-    )
+    limits = deployment.deployed_limits(q.per_action, q.per_minute)
     read = partial(read_frames, model)
     eye = read, looks.window_flow, looks.known
     return DeployedLoop(

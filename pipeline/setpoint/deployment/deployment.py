@@ -1,7 +1,8 @@
 """From the frames of a window to a setpoint that may be sent: what the frames say together, and why it acted.
 When to hold, limits and waits are `actuation`'s."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,10 +14,12 @@ from pipeline.setpoint.simulation.actuation import (
     FOREIGN,
     REASONS,
     TIP,
+    SetpointLimits,
     is_evidence,
     still,
 )
-from pipeline.setpoint.vision.calibration import hard_shares, window_probabilities
+from pipeline.setpoint.simulation.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS
+from pipeline.setpoint.vision.calibration import ClassifierCalibration, hard_shares, window_probabilities
 
 CLASSES = ("under", "good", "over")
 
@@ -42,6 +45,26 @@ class JudgedWindow(NamedTuple):
     reason: np.ndarray
     flow_seen: np.ndarray
     spread: np.ndarray
+
+
+def deployed_limits(per_action: Sequence[float], per_minute: Sequence[float]) -> SetpointLimits:
+    """The published limits of setpoints, and what one action and one minute may change, (2,) each: flow in
+    percent and target in °C."""
+    ends = (np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True))
+    return SetpointLimits(*ends, np.array(per_action), np.array(per_minute))
+
+
+def window_judge(
+    fitted: ClassifierCalibration, *, least_frames: int, foreign_above: float
+) -> Callable[..., "JudgedWindow"]:
+    """`judge_window` by a classifier's calibration."""
+    return partial(
+        judge_window,
+        least_frames=least_frames,
+        correlation=fitted.correlation,
+        foreign_above=foreign_above,
+        conformal_level=fitted.level,
+    )
 
 
 def judge_window(
