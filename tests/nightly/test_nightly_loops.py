@@ -25,7 +25,7 @@ from pipeline.nightly.settings import Nightly
 from pipeline.report.nightly.record import Night
 from pipeline.report.shared.night import Alarm, LoopDrift, NightDrift
 from pipeline.report.shared.verdict import PASSED, Verdict
-from pipeline.setpoint.workflow import tables
+from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
 from tests.nightly.toy_nights import Project, entered
 

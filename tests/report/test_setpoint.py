@@ -13,8 +13,9 @@ from pipeline.report.setpoint import verdict as setpoint_verdict
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.shared.verdict import Figure, Question
+from pipeline.setpoint.agents.criteria import harm_bar
 from pipeline.setpoint.simulation.simulator import reward
-from pipeline.setpoint.workflow.tables import PATHS, harm_bar
+from pipeline.setpoint.tables import PATHS
 from pipeline.store import artifacts, params
 from stages.report import main
 from tests.report import made, made_setpoint

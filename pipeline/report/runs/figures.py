@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from pipeline.report.shared.verdict import Figure, Question, ReportRules
 from pipeline.report.temperature.answers import comparison
 from pipeline.report.temperature.verdict import questions
-from pipeline.setpoint.workflow.tables import harm_bar
+from pipeline.setpoint.agents.criteria import harm_bar
 
 LOOPS = ("temperature", "deposition", "setpoint")
 Metrics = Mapping[str, Any]  # {stage: its file of reports/metrics}; another commit's may hold anything

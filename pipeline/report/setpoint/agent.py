@@ -16,15 +16,8 @@ from pipeline.report.shared.digits import THIN, number, percent, quantity
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Figure, Missing
-from pipeline.setpoint.workflow.tables import (
-    BEST_FLOW,
-    BEST_TEMPERATURE,
-    FLOW_BAND,
-    PHASES,
-    ROTATION,
-    SETTLED_BY,
-    TEMPERATURE_BAND,
-)
+from pipeline.setpoint.agents.criteria import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, PHASES, ROTATION
 
 # rewards whose lines are drawn, of the last phase
 LEVELS = (0.5, 0.0, -0.5, -0.8)

@@ -27,7 +27,8 @@ from pipeline.report.shared.card import Card, Cell, Deciding, Entrant, Row, Step
 from pipeline.report.shared.digits import THIN, band, count
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import FAILED, PASSED, Figure, Missing, Verdict
-from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, FLOW_BAND
+from pipeline.setpoint.agents.criteria import BEYOND, FLOW_BAND
+from pipeline.setpoint.agents.criteria import NO_CONTROL as DOES_NOTHING
 
 MOVES, TITLE = "Nozzle camera to setpoints", "Setpoint, the case that decides"
 # cases that the picture has room for, the worst first

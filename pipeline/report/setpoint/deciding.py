@@ -13,14 +13,9 @@ from pipeline.report.shared.digits import THIN, count, number, shortened
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table
 from pipeline.report.shared.verdict import Missing
-from pipeline.setpoint.workflow.tables import (
-    BEST_FLOW,
-    BEST_TEMPERATURE,
-    DOES_NOTHING,
-    FLOW_BAND,
-    SETTLED_BY,
-    TEMPERATURE_BAND,
-)
+from pipeline.setpoint.agents.criteria import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND
+from pipeline.setpoint.agents.criteria import NO_CONTROL as DOES_NOTHING
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 
 TITLE = "Flow, decision by decision"
 # percent of flow that the picture shows

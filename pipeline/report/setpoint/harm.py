@@ -13,7 +13,8 @@ from pipeline.report.shared.digits import THIN, band, number
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import Figure, Missing
-from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING
+from pipeline.setpoint.agents.criteria import BEYOND
+from pipeline.setpoint.agents.criteria import NO_CONTROL as DOES_NOTHING
 
 TITLE = "Harm against recovery"
 # a clog that halves the evidence: to 0.6 of the flow, and to 0.75

@@ -35,7 +35,7 @@ from pipeline.report.shared.difference import Change
 from pipeline.report.shared.digits import THIN, band, count, number, percent, quantity
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, state
-from pipeline.setpoint.workflow.tables import BEYOND
+from pipeline.setpoint.agents.criteria import BEYOND
 
 WORDS = (
     "window_of_frames",

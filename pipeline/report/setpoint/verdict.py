@@ -27,7 +27,8 @@ from pipeline.report.shared.verdict import (
     state,
     words_for,
 )
-from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, harm_bar
+from pipeline.setpoint.agents.criteria import BEYOND, harm_bar
+from pipeline.setpoint.agents.criteria import NO_CONTROL as DOES_NOTHING
 
 AGENT, PAPER, BASELINE = "agent", "paper", "baseline"
 SIMULATORS = {

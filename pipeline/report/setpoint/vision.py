@@ -15,7 +15,7 @@ from pipeline.report.shared.digits import THIN, band, number, percent, quantity,
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Figure, Missing
-from pipeline.setpoint.workflow.tables import ALPHA
+from pipeline.setpoint.published import ALPHA
 
 CLASSES = ("under", "good", "over")
 # characters of a frame's place in its recording that are shown, its end

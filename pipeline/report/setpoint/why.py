@@ -13,7 +13,8 @@ from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, count, number
 from pipeline.report.shared.sources import Sources, Table
 from pipeline.report.shared.verdict import Missing
-from pipeline.setpoint.workflow.tables import BEST_FLOW, BEST_TEMPERATURE, FLOW_BAND, TEMPERATURE_BAND
+from pipeline.setpoint.agents.criteria import FLOW_BAND, TEMPERATURE_BAND
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 
 EPISODES, WIDTH, LEFT = 2, 1112, 36
 # decisions that are told in words

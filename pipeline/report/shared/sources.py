@@ -22,7 +22,7 @@ from pipeline.deposition.workflow.tables import (
     TRIALS,
 )
 from pipeline.report.shared.verdict import Missing, ReportRules
-from pipeline.setpoint.workflow.tables import (
+from pipeline.setpoint.tables import (
     AGENT_CURVE,
     CLASSIFIED,
     CLASSIFIER_CURVE,
