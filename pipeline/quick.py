@@ -68,7 +68,7 @@ def quick() -> str:
         _furnish(folder, sizes, root)
         with contextlib.chdir(folder):
             took = [_timed(name) for name in order]
-            report = artifacts.read_metrics("report")
+            report = artifacts.read_figures("report")
         for name in ("pipeline", "stages"):
             (folder / name).unlink()
     return summary(report["verdicts"], took, time.perf_counter() - begun)
@@ -220,7 +220,7 @@ def _copy_kept(folder: Path) -> str:
             raise ValueError(
                 f"{KEPT / name}: expected SHA-256 {digest[:8]} of kept.json; git checkout {KEPT}"
             )
-        target = folder / (name if name.startswith("reports/") else f"datasets/{name}")
+        target = folder / "datasets" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(KEPT / name, target)
     return str(kept.get("commit"))
@@ -235,7 +235,6 @@ def keep() -> str:
         for path in sorted(Path("datasets", stage).rglob("*"))
         if path.is_file() and "live" not in path.parts
     ]
-    figures = [Path("reports/metrics", f"{stage}.json") for stage in TRAINED]
     absent = [
         stage for stage in TRAINED if not artifacts.exists(Path("datasets", stage, "weights.safetensors"))
     ]
@@ -243,10 +242,9 @@ def keep() -> str:
         raise ValueError(
             f"datasets/{absent[0]}: expected what training left, found none; ./run dvc repro {absent[0]}"
         )
-    for name in (*TRAINED, "reports"):
+    for name in TRAINED:
         shutil.rmtree(KEPT / name, ignore_errors=True)
     names = {path.relative_to("datasets").as_posix(): path for path in found}
-    names |= {path.as_posix(): path for path in figures}
     for name, path in names.items():
         (KEPT / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, KEPT / name)

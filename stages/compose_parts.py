@@ -11,6 +11,15 @@ from pipeline.deposition.workflow.settings import ComposeParts, Printer, TrainIl
 from pipeline.deposition.workflow.tables import LINES, SCORES, SIGNALS, TASKS
 from pipeline.store import artifacts, params
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "*.*.*.rms_percent_of_on_off",
+    "*.*.*.worst_line_volume_percent",
+    "*.*.chosen",
+    "*.*.forecast",
+    "*.*.judged.judged",
+)
+
 
 def main() -> None:
     with artifacts.stage("compose_parts") as out:
@@ -32,7 +41,7 @@ def main() -> None:
             compose_parts.reports(done, refused), parts, Path("datasets/parts")
         )
         artifacts.write_json(out / "conformance.json", reports)
-        artifacts.write_metrics("compose_parts", compose_parts.figures(done) | {"refused": refused})
+        artifacts.write_metrics("compose_parts", compose_parts.figures(done) | {"refused": refused}, METRICS)
 
 
 if __name__ == "__main__":

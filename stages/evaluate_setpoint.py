@@ -16,6 +16,19 @@ from pipeline.setpoint.workflow.tables import DECISIONS, PATHS, SCOREBOARD, WIND
 from pipeline.setpoint.workflow.windows import window_tables
 from pipeline.store import artifacts, params
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "default",
+    "worst",
+    "margin*",
+    "cases.*.settled",
+    "cases.*.stay",
+    "cases.*.recovered",
+    "harm.*.beyond_25*",
+    "*.paper.*.stay",
+    "*.recorded.*.stay",
+)
+
 
 def main() -> None:
     with artifacts.stage("evaluate_setpoint") as out:
@@ -55,7 +68,7 @@ def main() -> None:
         )
         artifacts.write_json(out / "choice.json", evaluate_setpoint.choice_record(choice))
         artifacts.write_metrics(
-            "evaluate_setpoint", evaluate_setpoint.metrics(controllers, contest, choice, rollouts)
+            "evaluate_setpoint", evaluate_setpoint.metrics(controllers, contest, choice, rollouts), METRICS
         )
 
 

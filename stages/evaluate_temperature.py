@@ -13,6 +13,23 @@ from pipeline.temperature.workflow.settings import (
     TuneWeights,
 )
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "plants",
+    "cases",
+    "contestants.*.settled_error.q90",
+    "contestants.*.settling.q90",
+    "contestants.*.overshoot.q90",
+    "contestants.*.at_limits.q90",
+    "contestants.*.energy.median",
+    "contestants.*.cost.median",
+    "contestants.*.cost.q90",
+    "contestants.*.never_settled_percent",
+    "contestants.*.crossings.cases",
+    "contestants.*.margins",
+    "contestants.*.stable.count",
+)
+
 
 def main() -> None:
     with artifacts.stage("evaluate_temperature") as out:
@@ -47,7 +64,7 @@ def main() -> None:
             judged.trajectories,
         )
         artifacts.write_json(out / "summary.json", judged.summary)
-        artifacts.write_metrics("evaluate_temperature", judged.summary)
+        artifacts.write_metrics("evaluate_temperature", judged.summary, METRICS)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,9 @@ from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import evaluate_temperature, learned, tables
 from pipeline.temperature.workflow.settings import Panel, Plant, TemperatureRules, Tracking, TuneWeights
 
+# figures of control that git keeps and that runs are compared by
+METRICS = ("*.contestant", "*.certificate.verdict", "*.largest_difference")
+
 
 def main() -> None:
     with artifacts.stage("export_controllers") as out:
@@ -44,9 +47,9 @@ def main() -> None:
         judged = export.Judged(machine, made, posed.setting, posed.problem, weights, summary, simulated)
         verdict = winner(
             {
-                "identify_plant": artifacts.read_metrics("identify_plant"),
-                "learn_kernel": artifacts.read_metrics("learn_kernel"),
-                "evaluate_temperature": artifacts.read_metrics("evaluate_temperature"),
+                "identify_plant": artifacts.read_figures("identify_plant"),
+                "learn_kernel": artifacts.read_figures("learn_kernel"),
+                "evaluate_temperature": artifacts.read_figures("evaluate_temperature"),
             },
             params.load(ReportRules, "report"),
             machine,
@@ -87,7 +90,7 @@ def main() -> None:
         )
         shown = export.metrics({"temperature": temperature, "setpoint": setpoint, "deposition": deposition})
         artifacts.write_json(out / "exported.json", shown)
-        artifacts.write_metrics("export_controllers", shown)
+        artifacts.write_metrics("export_controllers", shown, METRICS)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,15 @@ from pipeline.temperature import plant
 from pipeline.temperature.workflow import generate_probing
 from pipeline.temperature.workflow.settings import GenerateProbing, Plant, Tracking, check_output_limits
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "next_experiment.seconds",
+    "next_experiment.highest_degC",
+    "next_experiment.lowest_degC",
+    "next_experiment.expected_gap_percent",
+    "closed_loop.at_limits_percent",
+)
+
 
 def main() -> None:
     with artifacts.stage("generate_probing") as out:
@@ -29,7 +38,7 @@ def main() -> None:
         if result.dither:
             artifacts.write_csv(out / "next_experiment_closed_loop.csv", result.dither)
         artifacts.write_json(out / "forecast.json", result.metrics)
-        artifacts.write_metrics("generate_probing", result.metrics)
+        artifacts.write_metrics("generate_probing", result.metrics, METRICS)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,19 @@ from pipeline.temperature import plant
 from pipeline.temperature.workflow import identify_plant
 from pipeline.temperature.workflow.settings import IdentifyPlant, Plant
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "order",
+    "samples*",
+    "fit_holdout",
+    "fit_holdout_ahead",
+    "fit_holdout_band",
+    "whiteness_passed",
+    "excitation.rank",
+    "excitation.condition",
+    "largest_pole",
+)
+
 
 def main() -> None:
     with artifacts.stage("identify_plant") as out:
@@ -17,7 +30,7 @@ def main() -> None:
         artifacts.write_arrays(out / "spread.parquet", "spread", 1, plant.stored(identified.spread))
         for name, (schema, columns) in identified.tables.items():
             artifacts.write_table(out / f"{name}.parquet", schema, columns)
-        artifacts.write_metrics("identify_plant", identified.metrics)
+        artifacts.write_metrics("identify_plant", identified.metrics, METRICS)
 
 
 if __name__ == "__main__":

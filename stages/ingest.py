@@ -11,6 +11,9 @@ from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import ingest
 from pipeline.temperature.workflow.settings import Ingest, Plant, check_output_limits
 
+# figures of control that git keeps and that runs are compared by
+METRICS = ("recordings", "samples", "segments", "findings")
+
 
 def main() -> None:
     with artifacts.stage("ingest") as out:
@@ -35,7 +38,7 @@ def main() -> None:
         artifacts.write_table(out / "record.parquet", record.schema, record.columns)
         artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)
         artifacts.write_json(out / "printer_pid.json", ingest.printer_pids(folder, results, spec))
-        artifacts.write_metrics("ingest", metrics)
+        artifacts.write_metrics("ingest", metrics, METRICS)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,16 @@ from pipeline.temperature.controllers import window
 from pipeline.temperature.workflow import learn_kernel
 from pipeline.temperature.workflow.settings import LearnKernel, Panel, Plant, Tracking
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "window",
+    "samples*",
+    "half_record_gap_percent",
+    "rank",
+    "condition",
+    "candidates.*.gap_on_window_model_percent",
+)
+
 
 def main() -> None:
     with artifacts.stage("learn_kernel") as out:
@@ -20,7 +30,7 @@ def main() -> None:
         artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(learned.window))
         if learned.best.learned is not None:
             artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, learned.best.learned.stored())
-        artifacts.write_metrics("learn_kernel", learned.metrics)
+        artifacts.write_metrics("learn_kernel", learned.metrics, METRICS)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,9 @@ from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import probe_machine
 from pipeline.temperature.workflow.settings import GenerateProbing, Plant, check_output_limits
 
+# figures of control that git keeps and that runs are compared by
+METRICS = ("samples", "excitation_*", "limited_share")
+
 
 def main() -> None:
     with artifacts.stage("probe_machine") as out:
@@ -18,7 +21,7 @@ def main() -> None:
             result = probe_machine.probed(settings, machine)
             metrics = result.metrics
             artifacts.write_recording(out / "probing.mcap", result.time_s, result.signals)
-        artifacts.write_metrics("probe_machine", metrics)
+        artifacts.write_metrics("probe_machine", metrics, METRICS)
 
 
 if __name__ == "__main__":

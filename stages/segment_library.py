@@ -8,6 +8,15 @@ from pipeline.deposition.workflow.settings import Printer, SegmentLibrary
 from pipeline.deposition.workflow.tables import LIBRARY
 from pipeline.store import artifacts, params
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "columns",
+    "materials.*.chain.residual_percent",
+    "materials.*.chain.held_out_percent",
+    "materials.*.learned_percent",
+    "checks.*.percent",
+)
+
 
 def main() -> None:
     with artifacts.stage("segment_library") as out:
@@ -21,7 +30,7 @@ def main() -> None:
         artifacts.write_table(out / "library.parquet", LIBRARY, table)
         artifacts.write_json(out / "learned.json", rest)
         artifacts.write_metrics(
-            "segment_library", {"columns": len(table["task"]), **segment_library.figures(rest)}
+            "segment_library", {"columns": len(table["task"]), **segment_library.figures(rest)}, METRICS
         )
 
 

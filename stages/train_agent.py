@@ -12,6 +12,9 @@ from pipeline.setpoint.workflow.tables import AGENT_CURVE, WINDOWS
 from pipeline.setpoint.workflow.windows import window_tables
 from pipeline.store import artifacts, params
 
+# figures of control that git keeps and that runs are compared by
+METRICS = ("*.settled*", "*.stay", "*.overshoot_p95", "*.median_steps", "*.runs")
+
 
 def main() -> None:
     with artifacts.stage("train_agent") as out:
@@ -23,7 +26,7 @@ def main() -> None:
         curve = train_agent.curve_rows(trained)
         artifacts.write_table(out / "agents.parquet", AGENT_CURVE, curve)
         artifacts.write_learning_curve(out / "live", curve, of="agent", step="update", figures=("reward",))
-        artifacts.write_metrics("train_agent", train_agent.metrics(settings, trained))
+        artifacts.write_metrics("train_agent", train_agent.metrics(settings, trained), METRICS)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,19 @@ from pipeline.setpoint.workflow.tables import CLASSIFIED, CLASSIFIER_CURVE, RELI
 from pipeline.setpoint.workflow.windows import window_rows
 from pipeline.store import artifacts, params
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "*_accuracy",
+    "right_70_150",
+    "images",
+    "windows",
+    "ece_*",
+    "conformal.coverage",
+    "conformal.held",
+    "out_of_distribution.false_alarms",
+    "out_of_distribution.*.found",
+)
+
 
 def main() -> None:
     with artifacts.stage("train_classifier") as out:
@@ -53,7 +66,7 @@ def main() -> None:
         camera = known_camera.known(Path("datasets/render_frames"), found.recorded, length=settings.window)
         camera_files.store_camera(out / camera_files.FILE, camera)
         artifacts.write_metrics(
-            "train_classifier", train_classifier.metrics(settings, judged, networks, found.read)
+            "train_classifier", train_classifier.metrics(settings, judged, networks, found.read), METRICS
         )
 
 

@@ -10,6 +10,17 @@ from pipeline.deposition.workflow.settings import Camera, Printer, TrainIlc
 from pipeline.deposition.workflow.tables import FILMED, LESSONS, TRIALS
 from pipeline.store import artifacts, params
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "*.gamma*",
+    "*.*.last_ratio",
+    "*.*.best_ratio",
+    "*.*.trials",
+    "*.*.saturated",
+    "*.pixels.flow_error*",
+    "*.pixels.rejected_percent",
+)
+
 
 def main() -> None:
     with artifacts.stage("train_ilc") as out:
@@ -28,7 +39,7 @@ def main() -> None:
             out / "frames/frames.json",
             train_ilc.shown(settings, camera, execution, recorded=recorded, out=out),
         )
-        artifacts.write_metrics("train_ilc", done.metrics)
+        artifacts.write_metrics("train_ilc", done.metrics, METRICS)
 
 
 if __name__ == "__main__":

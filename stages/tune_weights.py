@@ -7,6 +7,9 @@ from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import learned, tables, tune_weights
 from pipeline.temperature.workflow.settings import Panel, Plant, Tracking, TuneWeights
 
+# figures of control that git keeps and that runs are compared by
+METRICS = ("contestants.*.cost*", "contestants.*.failed")
+
 
 def main() -> None:
     with artifacts.stage("tune_weights") as out:
@@ -29,7 +32,7 @@ def main() -> None:
         artifacts.write_learning_curve(
             out / "live", tuned.history, of="contestant", step="evaluation", figures=("cost", "incumbent")
         )
-        artifacts.write_metrics("tune_weights", tuned.metrics)
+        artifacts.write_metrics("tune_weights", tuned.metrics, METRICS)
 
 
 if __name__ == "__main__":

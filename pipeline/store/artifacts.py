@@ -20,7 +20,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipeline.store import params, tables
 from pipeline.store.printable import printable
@@ -227,16 +227,17 @@ def write_metrics(stage: str, figures: Mapping, metrics: Sequence[str] = ("*",))
     write_json(REPORTS / "metrics" / f"{stage}.json", _matching(_plain(stage, "", figures), patterns))
 
 
-def _matching(figures: Mapping, patterns: Sequence[Sequence[str]]) -> dict:
-    """The figures and sections that a pattern takes, in their order."""
-    chosen = {}
-    for key, value in figures.items():
-        rests = [rest for first, *rest in patterns if fnmatch.fnmatchcase(key, first)]
+def _matching(figures: Mapping | list, patterns: Sequence[Sequence[str]]) -> dict | list:
+    """The figures and sections that a pattern takes, in their order. A place in a list is a key."""
+    listed = isinstance(figures, list)
+    chosen: dict[Any, Any] = {}
+    for key, value in enumerate(figures) if listed else figures.items():
+        rests = [rest for first, *rest in patterns if fnmatch.fnmatchcase(str(key), first)]
         if not all(rests):
             chosen[key] = value
-        elif isinstance(value, Mapping) and (inner := _matching(value, rests)):
+        elif isinstance(value, Mapping | list) and (inner := _matching(value, rests)):
             chosen[key] = inner
-    return chosen
+    return list(chosen.values()) if listed else chosen
 
 
 def read_metrics(stage: str) -> dict:

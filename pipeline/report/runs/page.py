@@ -13,7 +13,7 @@ from pipeline.report.shared import charts, page
 from pipeline.report.shared.difference import accepted_on, changed_parameters, move
 from pipeline.report.shared.digits import MINUS, THIN, band, count, declared, quantity, short, with_unit
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import FAILED, Figure, Missing, Question, ReportRules, row_places, state
+from pipeline.report.shared.verdict import FAILED, Figure, Question, ReportRules, row_places, state
 from pipeline.report.temperature.contestants import heading
 from pipeline.report.temperature.judgement import Judgement
 
@@ -59,8 +59,12 @@ class Panel(NamedTuple):
 
 def render(sources: Sources, judged: Judgement, metrics: Mapping[str, Any]) -> str:
     """The text of runs.html: this run beside the accepted one. `metrics` are those of the report itself."""
-    now = {stage: found for stage, found in sources.metrics.items() if not isinstance(found, Missing)}
-    this = Run("This run", {**now, "report": metrics}, sources.declared.everything, curves(sources.tables))
+    this = Run(
+        "This run",
+        {**sources.measured, "report": metrics},
+        sources.declared.everything,
+        curves(sources.tables),
+    )
     told = changes(sources, judged)
     day = accepted_on(sources)
     return page.render(
