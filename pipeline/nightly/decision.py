@@ -7,9 +7,9 @@ import numpy as np
 
 from pipeline.nightly.settings import Rule
 from pipeline.report.nightly.record import FIRST, KEPT, PROMOTED, Guard, LoopDecision
-from pipeline.report.shared.digits import THIN, beyond_meaning
 from pipeline.report.shared.night import Alarm
 from pipeline.statistics import Paired, blocks_needed, paired
+from pipeline.verdict.digits import THIN, beyond_meaning
 
 
 class Evidence(NamedTuple):

@@ -18,10 +18,11 @@ from pipeline.report.nightly.production import Champion, ChampionMetrics, Champi
 from pipeline.report.nightly.record import CANDIDATE, KEPT, LoopDecision, Night
 from pipeline.report.shared import headline
 from pipeline.report.shared.sources import Declared, Sources, collect
-from pipeline.report.shared.verdict import PASSED, ReportRules, Verdict
 from pipeline.report.temperature.judgement import judgement
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow.settings import Plant
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import PASSED, Verdict
 
 # stages whose figures the pages show; those before `learn_kernel` have no tables there
 MEASURED = (

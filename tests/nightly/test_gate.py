@@ -19,10 +19,11 @@ from pipeline.report.index import page as index_page
 from pipeline.report.nightly import page as nightly_page
 from pipeline.report.nightly.production import Champion, ChampionState, Installed, Lineage
 from pipeline.report.nightly.record import CANDIDATE, FIRST, KEPT, PROMOTED, Night
-from pipeline.report.shared.digits import typeset
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, ReportRules, Verdict
 from pipeline.report.temperature.judgement import judgement
 from pipeline.store import artifacts, params
+from pipeline.verdict.digits import typeset
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Verdict
 from stages import report
 from tests.conftest import ROOT
 from tests.nightly.toy_nights import Project, entered
@@ -371,7 +372,7 @@ def test_the_night_reads_what_the_pages_are_made_of():
 
 
 def test_the_report_keeps_the_verdict_of_each_loop_as_the_night_reads_it(project, monkeypatch):
-    report.main()
+    made.main()
     made_anew = []
     monkeypatch.setattr(promoting, "dvc", lambda *command, **_: made_anew.append(command))
     verdicts, tonight = promoting.verdicts_of(settings(), TONIGHT)
@@ -388,7 +389,7 @@ def test_the_report_keeps_the_verdict_of_each_loop_as_the_night_reads_it(project
 
 
 def test_pages_that_cannot_be_made_anew_are_told_and_the_night_goes_on(project, monkeypatch):
-    report.main()
+    made.main()
     drift("alarms")(None)
 
     def refused(*_, **__):

@@ -24,9 +24,9 @@ from pipeline.nightly.reproducing import Reproduced
 from pipeline.nightly.settings import Nightly
 from pipeline.report.nightly.record import Night
 from pipeline.report.shared.night import Alarm, LoopDrift, NightDrift
-from pipeline.report.shared.verdict import PASSED, Verdict
 from pipeline.setpoint.workflow import tables
 from pipeline.store import artifacts, params
+from pipeline.verdict.verdict import PASSED, Verdict
 from tests.nightly.toy_nights import Project, entered
 
 LOOPS = {

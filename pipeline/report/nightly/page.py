@@ -12,11 +12,11 @@ from pipeline.report.nightly import record
 from pipeline.report.nightly.production import Champion, ChampionState, HistoryLine
 from pipeline.report.nightly.record import Guard, LoopDecision, Night
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import beyond_meaning, count, number, quantity, short
 from pipeline.report.shared.night import PLANT
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED
-from pipeline.report.temperature.contestants import heading
 from pipeline.statistics import Paired
+from pipeline.verdict.controllers import heading
+from pipeline.verdict.digits import beyond_meaning, count, number, quantity, short
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED
 
 SHOWN = 40  # nights in the table, the newest first
 REACH = 20.0  # percent: half the width of the picture of the plant's parameters

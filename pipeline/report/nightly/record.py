@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pipeline.report.nightly.production import Champion, ChampionState
 from pipeline.report.shared import night as drift_records
 from pipeline.report.shared.night import NightDrift
-from pipeline.report.shared.verdict import Verdict
+from pipeline.verdict.verdict import Verdict
 
 if TYPE_CHECKING:  # it imports scipy, and a night with nothing new is done without
     from pipeline.statistics import Paired

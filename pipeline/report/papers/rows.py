@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.papers import made
-from pipeline.report.shared.digits import number
-from pipeline.report.shared.verdict import Missing
 from pipeline.store import artifacts
+from pipeline.verdict.digits import number
+from pipeline.verdict.verdict import Missing
 
 HOLDS, SHAPE, FAILS, OPEN = "holds", "holds in shape", "does not hold", "cannot be judged"
 VERDICTS = (HOLDS, SHAPE, FAILS, OPEN)
