@@ -46,8 +46,8 @@ def quick() -> str:
     with _fresh() as folder:
         loops = _furnish(folder, files, smaller, root)
         with contextlib.chdir(folder):
-            for name, loop in chosen_stages(files, root / "dvc.yaml").items():
-                rows.append(_run(name, is_on=not loop or loops[loop]))
+            for name, is_on in chosen_stages(files, loops, root / "dvc.yaml").items():
+                rows.append(_run(name, is_on=is_on))
             report = artifacts.read_figures("report")
         for name in ("pipeline", "stages"):
             (folder / name).unlink()
@@ -139,19 +139,20 @@ def _fresh() -> Generator[Path]:
             shutil.rmtree(left, ignore_errors=True)
 
 
-def chosen_stages(files: Files, pipeline: Path) -> dict[str, str]:
-    """{stage: its loop, "" for all loops} in the order of dvc.yaml, in which each stands behind those whose
+def chosen_stages(files: Files, loops: Mapping[str, bool], pipeline: Path) -> dict[str, bool]:
+    """{stage: whether its loop is on} in the order of dvc.yaml, in which each stands behind those whose
     results it reads, without LEFT_OUT. A classifier of somebody's own frames cannot be kept here: their
     setpoint loop is left out."""
     entries = YAML(typ="safe").load(pipeline.read_text(encoding="utf-8"))["stages"]
     skipped = {*LEFT_OUT, *(() if _renders(files) else ("evaluate_setpoint",))}
-    return {name: _loop(entry) for name, entry in entries.items() if name not in skipped}
-
-
-def _loop(entry: Mapping[str, Any]) -> str:
-    """The loop by whose switch a stage of dvc.yaml runs."""
-    keys = [key for key in entry.get("params", ()) if isinstance(key, str) and key.startswith("loops.")]
-    return keys[0].removeprefix("loops.") if keys else ""
+    switches = {f"loops.{loop}": is_on for loop, is_on in loops.items()}
+    chosen = {}
+    for name, entry in entries.items():
+        keys = [key for key in entry.get("params", ()) if isinstance(key, str)]
+        is_on = all(switches.get(key, True) for key in keys)
+        if not is_on or name not in skipped:
+            chosen[name] = is_on
+    return chosen
 
 
 def _source(files: Files, section: str) -> Any:

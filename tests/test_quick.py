@@ -24,6 +24,7 @@ from pipeline.setpoint.workflow.windows import window_tables
 from pipeline.store import artifacts, params
 from pipeline.verdict.verdict import words_for
 
+ALL_ON = dict.fromkeys(params.Loops.model_fields, True)
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
     *("certificate", "deposition", "identification", "index", "papers", "runs"),
@@ -238,7 +239,7 @@ def test_a_classifier_of_recorded_frames_is_not_replaced_by_the_kept_one(checkou
     Path(params.FILE).write_text(f"{head}train_classifier:{tail.replace('simulated ', 'recordings', 1)}")
     Path("dvc.yaml").write_text((ROOT / "dvc.yaml").read_text())
     files, smaller = quick.smaller_sizes()
-    assert "evaluate_setpoint" not in quick.chosen_stages(files, Path("dvc.yaml"))
+    assert "evaluate_setpoint" not in quick.chosen_stages(files, ALL_ON, Path("dvc.yaml"))
     Path("look").mkdir()
     quick._furnish(Path("look"), files, smaller, checkout)
     assert not Path("look/datasets/train_classifier").exists()
@@ -261,12 +262,15 @@ def test_of_a_loop_that_is_off_nothing_is_kept_and_no_stage_runs(checkout):
 
 def test_every_stage_but_training_and_export_runs_after_what_it_reads(monkeypatch):
     monkeypatch.chdir(ROOT)
-    stages = quick.chosen_stages(quick.smaller_sizes()[0], Path("dvc.yaml"))
-    order = list(stages)
+    files, _ = quick.smaller_sizes()
+    order = list(quick.chosen_stages(files, ALL_ON, Path("dvc.yaml")))
     every = {path.stem for path in Path("stages").glob("*.py")} - {"__init__"}
     assert set(order) == every - set(quick.LEFT_OUT)
-    assert set(stages.values()) == {"", *params.Loops.model_fields}
-    assert stages["train_ilc"] == "deposition" and stages["report"] == ""
+    off = quick.chosen_stages(files, ALL_ON | {"setpoint": False}, Path("dvc.yaml"))
+    assert [name for name, is_on in off.items() if not is_on] == [
+        *("render_frames", "train_classifier", "train_agent", "evaluate_setpoint")
+    ]
+    assert off["report"] and off["train_ilc"]
     wires = yaml.safe_load(Path("dvc.yaml").read_text())["stages"]
     for at, name in enumerate(order):
         read = {dep.split("/")[1] for dep in wires[name]["deps"] if dep.startswith("datasets/")}

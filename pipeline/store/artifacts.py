@@ -9,13 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fnmatch
-import hashlib
 import json
 import math
 import os
 import re
-import shutil
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
@@ -229,10 +226,12 @@ def write_metrics(stage: str, figures: Mapping, metrics: Sequence[str] = ("*",))
 
 def _matching(figures: Mapping | list, patterns: Sequence[Sequence[str]]) -> dict | list:
     """The figures and sections that a pattern takes, in their order. A place in a list is a key."""
+    from fnmatch import fnmatchcase
+
     listed = isinstance(figures, list)
     chosen: dict[Any, Any] = {}
     for key, value in enumerate(figures) if listed else figures.items():
-        rests = [rest for first, *rest in patterns if fnmatch.fnmatchcase(str(key), first)]
+        rests = [rest for first, *rest in patterns if fnmatchcase(str(key), first)]
         if not all(rests):
             chosen[key] = value
         elif isinstance(value, Mapping | list) and (inner := _matching(value, rests)):
@@ -427,6 +426,8 @@ def write_recording(
 def sha256(path: str | Path) -> str:
     """Digest of a file, or of a folder by relative names and contents. Dot files and __pycache__ do not
     count."""
+    import hashlib
+
     path = Path(path)
     if not path.is_dir():
         with path.open("rb") as stream:
@@ -475,7 +476,7 @@ def stage(name: str) -> Iterator[Path]:
         _waiting.reset(tokens[0])
         _fresh.reset(tokens[1])
         for left in (folder, waiting):
-            shutil.rmtree(left, ignore_errors=True)
+            _remove(left)
 
 
 def _drop_others(names: Iterable[str], folder: Path) -> None:
@@ -498,7 +499,7 @@ def _replace(folder: Path, retired: Path, target: Path) -> None:
     finally:
         if filled and not target.exists() and retired.exists():
             retired.rename(target)
-    shutil.rmtree(retired, ignore_errors=True)
+    _remove(retired)
 
 
 def _tidy(name: str) -> None:
@@ -511,7 +512,13 @@ def _tidy(name: str) -> None:
         if ending[2] == ".old" and not (DATASETS / name).exists():
             left.rename(DATASETS / name)
         else:
-            shutil.rmtree(left)
+            _remove(left)
+
+
+def _remove(folder: Path) -> None:
+    import shutil
+
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _alive(pid: int) -> bool:
@@ -553,7 +560,7 @@ def together(folder: Path) -> Iterator[Path]:
     for left in folder.glob(".together.*"):
         pid = left.suffix[1:]
         if pid.isdigit() and not _alive(int(pid)):
-            shutil.rmtree(left, ignore_errors=True)
+            _remove(left)
     waiting = folder / f".together.{os.getpid()}"
     try:
         waiting.mkdir(parents=True, exist_ok=True)
@@ -563,7 +570,7 @@ def together(folder: Path) -> Iterator[Path]:
     except OSError as error:
         raise OSError(reason(error).replace(str(waiting), str(folder))) from None
     finally:
-        shutil.rmtree(waiting, ignore_errors=True)
+        _remove(waiting)
 
 
 def _on_disk(path: Path) -> None:
