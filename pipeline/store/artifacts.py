@@ -13,6 +13,7 @@ import json
 import math
 import os
 import re
+import shutil
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
@@ -476,7 +477,7 @@ def stage(name: str) -> Iterator[Path]:
         _waiting.reset(tokens[0])
         _fresh.reset(tokens[1])
         for left in (folder, waiting):
-            _remove(left)
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def _drop_others(names: Iterable[str], folder: Path) -> None:
@@ -499,7 +500,7 @@ def _replace(folder: Path, retired: Path, target: Path) -> None:
     finally:
         if filled and not target.exists() and retired.exists():
             retired.rename(target)
-    _remove(retired)
+    shutil.rmtree(retired, ignore_errors=True)
 
 
 def _tidy(name: str) -> None:
@@ -512,13 +513,7 @@ def _tidy(name: str) -> None:
         if ending[2] == ".old" and not (DATASETS / name).exists():
             left.rename(DATASETS / name)
         else:
-            _remove(left)
-
-
-def _remove(folder: Path) -> None:
-    import shutil
-
-    shutil.rmtree(folder, ignore_errors=True)
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def _alive(pid: int) -> bool:
@@ -560,7 +555,7 @@ def together(folder: Path) -> Iterator[Path]:
     for left in folder.glob(".together.*"):
         pid = left.suffix[1:]
         if pid.isdigit() and not _alive(int(pid)):
-            _remove(left)
+            shutil.rmtree(left, ignore_errors=True)
     waiting = folder / f".together.{os.getpid()}"
     try:
         waiting.mkdir(parents=True, exist_ok=True)
@@ -570,7 +565,7 @@ def together(folder: Path) -> Iterator[Path]:
     except OSError as error:
         raise OSError(reason(error).replace(str(waiting), str(folder))) from None
     finally:
-        _remove(waiting)
+        shutil.rmtree(waiting, ignore_errors=True)
 
 
 def _on_disk(path: Path) -> None:
