@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 from pipeline.nightly import commands as nights
 from pipeline.store import artifacts, params
 from pipeline.store.printable import printable
-from pipeline.temperature.workflow.settings import Ingest, Plant
+from pipeline.temperature.settings import Plant
+from stages.ingest import Ingest
 
 if TYPE_CHECKING:
     from pipeline.setpoint.workflow.shadow.deploy import Ready
@@ -133,7 +134,7 @@ def quick(arguments: argparse.Namespace) -> None:
 def init(arguments: argparse.Namespace) -> None:
     """Recordings of a new machine into params.yaml: mapping, plant, panel and
     rules that fit its pace; and what a person must still decide."""
-    from pipeline.temperature.workflow import propose_params
+    from pipeline.commands import propose_params
 
     initialised = propose_params.proposed(arguments.recordings, sample_time=arguments.time)
     changed = propose_params.write(initialised.values, force=arguments.force)
@@ -145,7 +146,7 @@ def init(arguments: argparse.Namespace) -> None:
 def first_experiment(arguments: argparse.Namespace) -> None:
     """A staircase for a machine of which there is no record yet: which input, which level, for how long, and
     at which temperature to stop. No model is behind it."""
-    from pipeline.temperature.workflow import first_experiment as first
+    from pipeline.commands import first_experiment as first
 
     plan = first.staircase(params.load(Plant, "plant"), arguments.hold)
     artifacts.write_csv(arguments.out, first.columns(plan))
@@ -155,31 +156,29 @@ def first_experiment(arguments: argparse.Namespace) -> None:
 def compose(arguments: argparse.Namespace) -> None:
     """A part program into plunger commands (CSV, Parquet, MCAP, G-code with leads), tasks and lines as
     Parquet, and whether it will print."""
-    from pipeline.deposition.workflow import compose_parts, exports, part_programs
-    from pipeline.deposition.workflow.segment_library import read_learned
-    from pipeline.deposition.workflow.settings import ComposeParts, Printer
+    from pipeline.commands import compose as command
+    from pipeline.deposition.parts.part_report import summary_lines
+    from pipeline.deposition.settings import ComposeParts, Printer
+    from stages.compose_parts import compose_part
 
     if arguments.out.exists() and not arguments.out.is_dir():
         raise ValueError(
             f"--out {arguments.out}: should be a folder but is a file; name a folder, "
             "which is made where it is missing"
         )
-    asked = part_programs.asked(
+    request = command.request(
         scale=arguments.scale, speed=arguments.speed, filament_mm=arguments.filament_mm,
         extruder=arguments.extruder, bead=arguments.bead,
     )  # fmt: skip
-    formats = exports.formats(arguments.formats)
-    learned = read_learned(
-        "datasets/segment_library/library.parquet", "datasets/segment_library/learned.json"
-    )
+    formats, learned = command.formats(arguments.formats), command.read_learned()
     printer, settings = params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts")
-    part = compose_parts.compose(arguments.part, learned, printer, settings, asked)
+    part = compose_part(arguments.part, learned, printer, settings, **request)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    files = exports.write(part, arguments.out, formats)
-    print(compose_parts.summary_lines(part))
+    files = command.write(part, arguments.out, formats)
+    print(summary_lines(part))
     print("written: " + ", ".join(str(file) for file in files))
     if arguments.verify:
-        from pipeline.deposition.workflow import verify_part
+        from pipeline.commands import verify_part
 
         print(verify_part.write(part, learned, printer, settings, arguments.out))
         print(verify_part.write_next(part, learned, printer, arguments.part.parent, arguments.out))
@@ -207,16 +206,16 @@ def calibrate_tip(arguments: argparse.Namespace) -> None:
 def calibrate_camera(arguments: argparse.Namespace) -> None:
     """Pictures of printed lines of known widths into section camera of params.yaml:
     size of a pixel, rotation, measured columns, edge bias by width; and a page."""
-    from pipeline.deposition.workflow import calibrate_camera as camera
+    from pipeline.commands import calibrate_camera as camera
 
-    asked = camera.Asked(
+    request = camera.CalibrationRequest(
         arguments.images,
         camera.numbers(arguments.widths, "--widths", "0.5,0.9,1.3"),
         camera.pixel(arguments.tip),
         arguments.pitch,
     )
     out = arguments.out or Path(f"{arguments.images[0].stem}.camera.html")
-    print(camera.calibrate(asked, out, write=arguments.write))
+    print(camera.calibrate(request, out, write=arguments.write))
 
 
 def shadow(arguments: argparse.Namespace) -> None:
@@ -305,7 +304,7 @@ def training_print(arguments: argparse.Namespace) -> None:
 def export(arguments: argparse.Namespace) -> None:
     """A certified controller as C99 without heap, as one file of Python, or as settings for Klipper and
     Kalico; what sees and decides in the setpoint loop as weights with readers that need numpy alone."""
-    from pipeline.runtime.workflow.exports import export as write
+    from pipeline.commands.export import export as write
 
     print(write(arguments.controller, arguments.to, arguments.out, arguments.section, arguments.power))
 
@@ -314,19 +313,20 @@ def replay(arguments: argparse.Namespace) -> None:
     """A recording, and what a certified controller would have asked on it and why not: as MCAP with a layout
     for Foxglove, and a page. Frames of the nozzle's camera go through the loop of shadow with the classifier
     and the filter of CONTROLLER. Nothing is sent."""
-    from pipeline.runtime.workflow import exports
+    from pipeline.commands import export as exports
 
     if exports.shows_frames(arguments.controller):
-        from pipeline.runtime.workflow import replay_camera
+        from pipeline.commands import replay_camera
 
         arguments.source, arguments.rate, arguments.once = str(arguments.recording), 5.0, True
         _watch(arguments, replay_camera.ready(arguments.controller))
         return
+    from pipeline.commands import replay as replaying
     from pipeline.report.replay import page
-    from pipeline.runtime.workflow import replay as replaying
 
-    asked = replaying.Asked(replaying.temperatures(arguments.reference), arguments.out)
-    done, made, told = replaying.replay_recording(arguments.controller, arguments.recording, asked)
+    done, made, told = replaying.replay_recording(
+        arguments.controller, arguments.recording, arguments.out, replaying.temperatures(arguments.reference)
+    )
     inputs, outputs = ([one.name for one in side] for side in (made.machine.inputs, made.machine.outputs))
     shown = page.Shown(
         done.time_s, done.applied, done.asked, done.measured, done.reference, done.off, inputs, outputs, told

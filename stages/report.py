@@ -121,7 +121,7 @@ def main() -> None:
     from pipeline.report.shared.sources import Declared, collect, digest
     from pipeline.report.temperature.judgement import judgement, shown
     from pipeline.report.viewer import page as viewer_page
-    from pipeline.temperature.workflow.settings import Plant
+    from pipeline.temperature.settings import Plant
     from pipeline.verdict.settings import ReportRules
 
     with artifacts.stage("report"):

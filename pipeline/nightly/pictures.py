@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deposition.workflow import trial_files, trial_readings
 from pipeline.nightly import camera_drift
 from pipeline.nightly.inputs import quarantine
 from pipeline.nightly.settings import Drift
+from pipeline.reading import trial_files
 from pipeline.reading.excluded import readable
 from pipeline.report.shared.night import Alarm, LoopDrift
 from pipeline.store import params
 
 if TYPE_CHECKING:
-    from pipeline.deposition.workflow.settings import Camera
+    from pipeline.deposition.settings import Camera
     from pipeline.setpoint.workflow.settings import TrainClassifier
 
 FRAMES = 40  # pictures of a recording that are looked at
@@ -33,7 +33,7 @@ def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
     paths = [path for path in trials if not only or path.as_posix() in only]
     for path in paths[-most:]:
         try:
-            stats = _frame_stats(trial_readings.opened(path, camera))
+            stats = _frame_stats(trial_files.open_trial(path, **camera.recording))
         except ValueError:
             continue
         rows.append([stats.mean.tolist(), stats.deviation.tolist(), stats.frames])
@@ -42,12 +42,12 @@ def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
 
 def _camera() -> "Camera":
     """Section `camera`, through whose topics a trial is read, however many of its frames can be."""
-    from pipeline.deposition.workflow.settings import Camera
+    from pipeline.deposition.settings import Camera
 
     return params.load(Camera, "camera").model_copy(update={"unreadable_share": 1.0})
 
 
-def _frame_stats(trial: trial_files.Trial) -> camera_drift.FrameStats:
+def _frame_stats(trial: trial_files.TrialRecording) -> camera_drift.FrameStats:
     frames = trial.frames
     every = max(len(frames.time_s) // FRAMES, 1)
     return camera_drift.figures(
@@ -67,7 +67,7 @@ def trials_drift(
     ]
     for path in (path for path in paths if path.lower().endswith(".mcap")):
         try:
-            trial = trial_readings.opened(path, camera)
+            trial = trial_files.open_trial(path, **camera.recording)
         except ValueError as error:
             drifted.quarantined[path] = quarantine(path, loop, str(error))
             continue

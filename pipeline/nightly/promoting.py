@@ -16,11 +16,10 @@ from pipeline.nightly.settings import Loop, Nightly
 from pipeline.report.nightly import record
 from pipeline.report.nightly.production import Champion, ChampionMetrics, ChampionState, Lineage, candidate_of
 from pipeline.report.nightly.record import CANDIDATE, KEPT, LoopDecision, Night
-from pipeline.report.shared import headline
 from pipeline.report.shared.sources import Declared, Sources, collect
-from pipeline.report.temperature.judgement import judgement
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
+from pipeline.verdict.night import verdicts as verdicts_of_night
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import PASSED, Verdict
 
@@ -96,10 +95,10 @@ def verdicts_of(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], Ni
     if not loops:
         return {}, night
     sources, named = page_sources(), settings.holdout.controller
-    each = headline.verdicts(sources, judgement(sources))
+    each = sources.verdicts
     night = _as_the_pages_say(each, night)
     if named != judge.PAGE:
-        each = headline.verdicts(sources, judgement(sources, named=named))
+        each = verdicts_of_night(sources.evidence, sources.stored, sources.nightly, named=named)
     return {name: each[name] for name in loops}, night
 
 

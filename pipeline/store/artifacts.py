@@ -222,10 +222,10 @@ def write_metrics(stage: str, figures: Mapping, metrics: Sequence[str] = ("*",))
     fresh = _fresh.get()
     write_json((fresh if fresh else DATASETS / stage) / "figures.json", figures)
     patterns = [tuple(pattern.split(".")) for pattern in metrics]
-    write_json(REPORTS / "metrics" / f"{stage}.json", _matching(_plain(stage, "", figures), patterns))
+    write_json(REPORTS / "metrics" / f"{stage}.json", matching(_plain(stage, "", figures), patterns))
 
 
-def _matching(figures: Mapping | list, patterns: Sequence[Sequence[str]]) -> dict | list:
+def matching(figures: Mapping | list, patterns: Sequence[Sequence[str]]) -> dict | list:
     """The figures and sections that a pattern takes, in their order. A place in a list is a key."""
     from fnmatch import fnmatchcase
 
@@ -235,7 +235,7 @@ def _matching(figures: Mapping | list, patterns: Sequence[Sequence[str]]) -> dic
         rests = [rest for first, *rest in patterns if fnmatchcase(str(key), first)]
         if not all(rests):
             chosen[key] = value
-        elif isinstance(value, Mapping | list) and (inner := _matching(value, rests)):
+        elif isinstance(value, Mapping | list) and (inner := matching(value, rests)):
             chosen[key] = inner
     return list(chosen.values()) if listed else chosen
 
@@ -358,11 +358,12 @@ def exists(path: str | Path) -> bool:
 
 @contextlib.contextmanager
 def about(path: str | Path) -> Iterator[None]:
-    """Puts the file's name in front of what the body refuses."""
+    """Puts the file's name in front of what the body refuses, unless it stands there."""
     try:
         yield
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        sentence = str(error)
+        raise ValueError(sentence if sentence.startswith(str(path)) else f"{path}: {sentence}") from None
 
 
 def write_recording(

@@ -25,7 +25,7 @@ SECTIONS = (
     "evaluate_setpoint",
     "evaluate_temperature",
     "execution",
-    "export_controllers",
+    "certify",
     "generate_probing",
     "identify_plant",
     "ingest",
@@ -47,8 +47,8 @@ SECTIONS = (
 )
 # the second pipeline has a file of its own, which no owner of a machine needs to know
 PAPERS, PAPERS_SECTIONS = "datasets/papers/params.yaml", ("reproduce_study",)
-# old dotted key or section -> new one, for one version; none since 0.2
-RENAMED: dict[str, str] = {}
+# old dotted key or section -> new one, for one version
+RENAMED: dict[str, str] = {"export_controllers": "certify"}
 
 
 class Section(pydantic.BaseModel):

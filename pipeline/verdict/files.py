@@ -3,11 +3,11 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from pipeline.deposition.workflow.tables import SCORES
+from pipeline.deposition.tables import SCORES
 from pipeline.setpoint.workflow.tables import SCOREBOARD
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
-from pipeline.temperature.workflow.tables import DYNAMICS, RESIDUALS
+from pipeline.temperature.settings import Plant
+from pipeline.temperature.tables import DYNAMICS, RESIDUALS
 from pipeline.verdict.evidence import OFF, Evidence, switched_off
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import Missing
@@ -38,7 +38,7 @@ TABLES = {
 }
 
 
-def read_evidence(certified: Mapping[str, Mapping[str, Any]]) -> Evidence:
+def read_evidence(certified: Mapping[str, Mapping[str, Any]] | None = None) -> Evidence:
     """What the stages that ran wrote; a Missing in the place of each file that is not there, or broken."""
     figures = {stage: _read(f"datasets/{stage}/figures.json", stage, artifacts.read_json) for stage in STAGES}
     off = {stage for stage in STAGES if switched_off(figures[stage])}
@@ -50,7 +50,7 @@ def read_evidence(certified: Mapping[str, Mapping[str, Any]]) -> Evidence:
         params.load(ReportRules, "report"),
         params.read(),
         artifacts.exists(QUICK_LOOK),
-        certified,
+        certified or {},
     )
 
 

@@ -83,7 +83,7 @@ def test_the_ends_of_rows_that_come_one_by_one_are_those_of_the_interval():
 
 
 def test_the_routines_themselves_are_judged():
-    assert all(judged(t.r) == forecast.Judged(True, "", "") for t in trainings(PLANT))
+    assert all(judged(t.r) == forecast.ForecastJudgement(True, "", "") for t in trainings(PLANT))
 
 
 @pytest.mark.parametrize(

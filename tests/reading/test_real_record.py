@@ -14,9 +14,8 @@ import pytest
 import yaml
 
 from pipeline.store import artifacts, params
-from pipeline.temperature import plant
-from pipeline.temperature.workflow import tables
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature import plant, tables
+from pipeline.temperature.settings import Plant
 
 RECORD = "data/tclab_mlid_prbs/prbs.csv"
 SPIKE_S, SPIKE_DEGC = 1789, 40.718
@@ -107,7 +106,7 @@ def record(tree: Path) -> dict[str, np.ndarray]:
 
 
 def metrics(tree: Path, stage: str) -> dict:
-    return artifacts.read_json(tree / f"reports/metrics/{stage}.json")
+    return artifacts.read_json(tree / f"datasets/{stage}/figures.json")
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from pipeline.report.identification import page as identification_page
 from pipeline.report.setpoint import page as setpoint_page
 from pipeline.report.temperature import page as temperature_page
 from pipeline.store import artifacts
-from pipeline.temperature.workflow import tables
+from pipeline.temperature import tables
 from tests.report import made, made_setpoint
 from tests.report.conftest import MACHINE, populate
 from tests.report.test_pages import change, change_all
@@ -55,11 +55,7 @@ def one_missing():
 
 
 def nothing():
-    for path in [
-        *Path("datasets").rglob("*.parquet"),
-        *Path("datasets").rglob("*.json"),
-        *Path("reports/metrics").glob("*.json"),
-    ]:
+    for path in [*Path("datasets").rglob("*.parquet"), *Path("datasets").rglob("*.json")]:
         path.unlink()
 
 
@@ -74,7 +70,7 @@ def long_sentences():
             "drift": {"alarms": [{"loop": "temperature", "cause": LONG}]},
         },
     )
-    Path("reports/metrics/evaluate_temperature.json").write_text("{")
+    Path("datasets/evaluate_temperature/figures.json").write_text("{")
 
 
 STATES = (

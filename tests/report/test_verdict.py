@@ -12,7 +12,7 @@ import pytest
 from pipeline.report.temperature.beside import best_sentence, deciding_sentence
 from pipeline.report.temperature.judgement import judgement
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.controllers import in_a_sentence
 from pipeline.verdict.decide import decide, questions, standings
 from pipeline.verdict.deposition import verdict as deposition
@@ -429,7 +429,7 @@ def test_a_page_of_any_comparison_prints_no_number_beyond_meaning_and_never_says
     words_of_numbers_are_readable(shown)
     first = Page(INDEX).text
     assert not re.search(r"\b(nan|inf|None)\b|\b[Dd]eploy\b", first)
-    decision = artifacts.read_metrics("report")["verdict"]["decision"]
+    decision = artifacts.read_figures("report")["verdict"]["decision"]
     assert shown.count(decision.rstrip(".")) >= 2 and decision in first  # title and head
 
 

@@ -21,8 +21,8 @@ from pipeline.report.viewer import packed
 from pipeline.report.viewer import page as viewer_page
 from pipeline.report.viewer.series import Event, Key, Line, Shown
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import tables
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.settings import ReportRules
 from tests.report.conftest import expect, loaded, timers_fired
 
@@ -469,7 +469,7 @@ def million(tmp_path_factory):
         declared = Declared(
             params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read("params.yaml")
         )
-        sources = collect(declared, report.METRICS, report.FOLDERS, "accepted.json", ("pipeline",))
+        sources = collect(declared, report.FIGURES, report.FOLDERS, "accepted.json", ("pipeline",))
         made_page = viewer_page.render(sources, judgement(sources))
         artifacts.write_text("reports/viewer.html", made_page.text)
         artifacts.write_folder("reports/data", made_page.files)

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pipeline.commands import export
+from pipeline.runtime import setpoint_checks
 from pipeline.runtime.export import agent_reader, flow_filter, flow_reader, setpoint
-from pipeline.runtime.workflow import export_setpoint, exports
 from pipeline.setpoint.agents import agent, bayes, belief_agent
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
 from pipeline.setpoint.simulation.simulator import TEMPERATURE_LIMITS, Observation
@@ -196,38 +197,43 @@ def test_the_stage_exports_what_was_chosen(model, our_agent, tmp_path):
     """Our agent with its network where it is the default, the filter where a filter is, nothing else."""
     agents = Agents((), our_agent.belief, our_agent.network)
     specs = {
-        export_setpoint.BELIEF: ControllerSpec(
+        setpoint_checks.BELIEF: ControllerSpec(
             "agent", agent.greedy(agent.paper_encoder()), our_agent.network
         ),
         "Bayes": ControllerSpec("baseline", bayes.bayes(1), bayes.class_filter(**CLASS_FILTER)),
         "proportional": ControllerSpec("baseline", bayes.bayes(1), ()),
     }
-    learned, filtered, none = (
-        export_setpoint.write(tmp_path / name, name, model, export_setpoint.decider(name, specs, agents), 1)
+    default = {
+        name: setpoint_checks.write(
+            tmp_path / name, name, model, setpoint_checks.decider(name, specs, agents), 1
+        )
         for name in specs
-    )
+    }
+    learned, filtered, none = default.values()
+    files = [{path.name for path in (tmp_path / name).glob("*")} for name in specs]
     both = {"agent.safetensors", "agent_reader.py"}
-    assert {Path(name).name for name in learned.files} - both == {Path(name).name for name in filtered.files}
-    assert learned.largest_difference["values"] < SINGLE and "values" not in filtered.largest_difference
-    assert not none.files and "has no filter" in none.why
+    assert both < files[0] and files[0] - both == files[1]
+    assert learned["largest_difference"]["values"] < SINGLE
+    assert "values" not in filtered["largest_difference"]
+    assert not files[2] and "has no filter" in none["why"]
 
 
 def test_another_network_is_told_by_its_values(our_agent, model, tmp_path):
     setpoint.write(tmp_path, setpoint.weights(model, our_agent))
     other = our_agent._replace(network=belief_agent.BeliefNetwork(2, jax.random.key(4)))
-    assert export_setpoint.of_agent(tmp_path, other, np.random.default_rng(1)) > 1e-3
+    assert setpoint_checks.of_agent(tmp_path, other, np.random.default_rng(1)) > 1e-3
 
 
 def test_the_command_exports_the_folder_of_the_stage(model, our_agent, tmp_path):
     setpoint.write(tmp_path / "made", setpoint.weights(model, our_agent))
-    told = exports.export(tmp_path / "made", "python", tmp_path / "out", "extruder", None)
+    told = export.export(tmp_path / "made", "python", tmp_path / "out", "extruder", None)
     assert told.startswith("classifier, filter, agent. It has no certificate")
     names = {path.name for path in (tmp_path / "made").iterdir()}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names and len(names) == 6
     for name in names:
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "made" / name).read_bytes()
     with pytest.raises(ValueError, match="run in Python alone, found --to c; write --to python"):
-        exports.export(tmp_path / "made", "c", None, "extruder", None)
+        export.export(tmp_path / "made", "c", None, "extruder", None)
     artifacts.write_text(tmp_path / "made" / "filter.safetensors", "broken")
     with pytest.raises(ValueError, match=r"filter.safetensors holds no whole weights"):
-        exports.export(tmp_path / "made", "python", None, "extruder", None)
+        export.export(tmp_path / "made", "python", None, "extruder", None)

@@ -13,8 +13,8 @@ import pytest
 from mcap.reader import make_reader
 
 from pipeline import cli
+from pipeline.commands import replay_camera
 from pipeline.runtime.export import setpoint
-from pipeline.runtime.workflow import replay_camera
 from pipeline.setpoint.agents import bayes, belief_agent
 from pipeline.setpoint.frames import nozzle_scene
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier

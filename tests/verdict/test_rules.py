@@ -108,7 +108,7 @@ def test_a_row_with_a_mistake_is_refused_by_name(add, row, sentence):
 def certified(**refused: str) -> None:
     path = Path("datasets/certify/certified.json")
     path.parent.mkdir(parents=True, exist_ok=True)
-    each = {name: {"passed": False, "why": why} for name, why in refused.items()}
+    each = {name: {"measured": False, "why": why} for name, why in refused.items()}
     path.write_text(json.dumps({"temperature": each, "setpoint": {}}))
 
 

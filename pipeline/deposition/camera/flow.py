@@ -92,8 +92,9 @@ class Flow(NamedTuple):
 
 
 def deposit_share(distance: np.ndarray, radius: float) -> np.ndarray:
-    """Share of what leaves a round nozzle that falls behind `distance` ahead of its middle: 1/2 + (z sqrt(1 -
-    z^2) + arcsin z) / pi, z = distance / radius in -1..1.
+    """Share of what leaves a round nozzle that falls behind `distance` ahead of its middle:
+
+        1/2 + (z sqrt(1 - z^2) + arcsin z) / pi,   z = distance / radius in -1..1
 
     Its derivative is the footprint f: the chord of the nozzle at that distance, over its area.
     """
@@ -193,8 +194,8 @@ def estimate(
 ) -> Flow:
     """Q(t) = z + shapes' a at the samples time_s (T,), evenly spaced, of the gantry's position (T,), from
 
-    min |W (A - K Q)|^2 + strength |D2 z|^2, K[i, k] = mean over place
-    i of integral of hat_k(t) f(s - x(t)) dt,
+        min |W (A - K Q)|^2 + strength |D2 z|^2
+        K[i, k] = mean over place i of integral of hat_k(t) f(s - x(t)) dt
 
     D2 the second difference: z is an integrated random walk, and the shapes (k, T) are where the flow may
     turn sharply, each by an amplitude that the data choose (the wanted flow r as one row; a model's answer to
@@ -392,8 +393,10 @@ class _Fit(NamedTuple):
 
 
 def _solve(log_strength: float, data: _Data) -> _Fit:
-    """Minimum over z and a by elimination of z; -2 log likelihood = minimum + log det (M +
-    strength P) + log det S - (T - 2) log strength."""
+    """Minimum over z and a by elimination of z:
+
+    -2 log likelihood = minimum + log det (M + strength P) + log det S - (T - 2) log strength
+    """
     M, P, C, shapes, right, energy = data
     factor = scipy.linalg.cholesky_banded(_sum(M, P, np.exp(log_strength)), lower=True)
     solved = scipy.linalg.cho_solve_banded((factor, True), np.column_stack([right, C]))

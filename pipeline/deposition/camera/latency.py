@@ -35,6 +35,8 @@ class Latency(NamedTuple):
 
 
 UNTOLD = Latency(0.0, math.inf)
+# a latency known to this is taken off; one that is less known counts as unknown, s
+KNOWN_S = 0.005
 
 
 class Gantry(NamedTuple):
@@ -125,3 +127,11 @@ def pooled(estimates: Sequence[Latency]) -> Latency:
     mean = float(weight @ values / weight.sum())
     scatter = float(weight @ np.square(values - mean) / weight.sum()) / max(len(told) - 1, 1)
     return Latency(mean, max(1 / math.sqrt(weight.sum()), math.sqrt(scatter)))
+
+
+def of_camera(latency_s: float | None, estimates: Sequence[Latency]) -> Latency:
+    """The latency that is taken off: as given, or as the recordings together tell it to KNOWN_S."""
+    if latency_s is not None:
+        return Latency(latency_s, 0.0)
+    together = pooled(estimates)
+    return together if together.deviation_s <= KNOWN_S else UNTOLD

@@ -1,13 +1,13 @@
 """A machine learns its routines: on-off first, then the paper's law or the model inverse, trial after trial;
 and the convergence of both over a family of plants before anything runs."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pipeline.deposition.drive import Drive, obeyed
-from pipeline.deposition.extruder import Extruder, Routine, disturb, draw, flow, frequency_response
+from pipeline.deposition.extruder import Extruder, Routine, disturb, draw, flow, frequency_response, to_json
 from pipeline.deposition.learning import ilc
 from pipeline.deposition.learning.ilc import Law, Trial
 from pipeline.deposition.learning.trial_model import deviations
@@ -15,6 +15,9 @@ from pipeline.deposition.learning.unmodelled import unmodelled
 
 # the frequencies of the convergence test reach to half the sampling rate
 FREQUENCIES = 2000
+# an extruder is known to 30 %: what is off by this factor is a unit, a scale or a picture of another size,
+# and the next command would be off as much
+WRONG_GAIN = 3.0
 
 
 class LawSettings(NamedTuple):
@@ -43,7 +46,7 @@ class TrialSequence(NamedTuple):
     law: str
     routine: Routine
     trials: list[Trial]
-    rows: list[ilc.Row]
+    rows: list[ilc.TrialRow]
     model: ilc.TrialModel | None
 
 
@@ -202,8 +205,10 @@ def convergence(
 def convergence_of_model_inverse(
     sequence: TrialSequence, rng: np.random.Generator, noise: Noise, *, plants: int, settings: LawSettings
 ) -> Convergence:
-    """gamma = max |Q| (|1 - L P| + |L P Delta|) of the model inverse once its model is identified: of that
-    model, and over plants that the first trials cannot tell from it.
+    """gamma of the model inverse once its model is identified: of that model, and over plants that the first
+    trials cannot tell from it.
+
+        gamma = max_f |Q| (|1 - L P| + |L P Delta|)
 
     That is the largest |Q (1 - L P (1 + Delta'))| of all |Delta'(f)| <= |Delta(f)|, and Delta is what the
     model leaves of the trials that identified it and of the next one, which it has not seen
@@ -256,13 +261,110 @@ def actuator_headroom(
     return headroom
 
 
+def prospects(
+    nominal: Extruder,
+    routines: Sequence[Routine],
+    rng: np.random.Generator,
+    *,
+    plants: int,
+    steady_flow: float,
+    worst_ratio: float,
+    settings: LawSettings,
+) -> dict[str, Any]:
+    """What is known before anything runs: gamma of the paper's law on the nominal model and over the family,
+    and the headroom of the drive over each routine."""
+    gamma = convergence(nominal, rng, plants=plants, steady_flow=steady_flow, settings=settings)
+    headrooms = [
+        actuator_headroom(routine, nominal, worst_ratio=worst_ratio, settings=settings)
+        for routine in routines
+    ]
+    return {
+        "gamma": gamma.nominal,
+        "gamma_worst": gamma.family.max(),
+        "gamma_above_1_percent": 100 * np.mean(gamma.family > 1),
+        "actuator_headroom": [
+            {"peak_over_steady": one.peak / one.steady, "least_ratio": one.ratio, "ramp_s": one.ramp_s}
+            for one in headrooms
+        ],
+    }
+
+
+def learn_in_flow(
+    case: TrainingCase,
+    rngs: Sequence[np.random.Generator],
+    noise: Noise,
+    *,
+    trials: int,
+    plants: int,
+    settings: LawSettings,
+    on_step: Callable[[Trial], None],
+) -> tuple[dict[int, list[TrialSequence]], dict[str, Any], dict[str, Any]]:
+    """Both laws on the measured flow of a simulated machine: their sequences by number of the routine,
+    figures, and the models as JSON. `rngs` draw what does not repeat, and the plants of the convergence
+    test."""
+    sequences = train(case, rngs[0], noise, trials=trials, settings=settings, on_step=on_step)
+    hoelzle, reference, *others, hoelzle_nominal = sequences
+    gamma = convergence_of_model_inverse(reference, rngs[1], noise, plants=plants, settings=settings)
+    rows = {
+        "gamma_model_inverse": gamma.nominal,
+        "gamma_model_inverse_worst": gamma.family.max(),
+        "hoelzle_2009_nominal": figures(hoelzle_nominal, rise=settings.rise),
+        "hoelzle_2009": figures(hoelzle, rise=settings.rise),
+        "model_inverse": figures(reference, rise=settings.rise),
+        "other_routines": [figures(sequence, rise=settings.rise) for sequence in others],
+    }
+    by_routine = {0: [hoelzle_nominal, hoelzle, reference]}
+    by_routine |= {index: [sequence] for index, sequence in enumerate(others, 1)}
+    models = {"nominal": to_json(case.nominal), "plant": to_json(case.plant)}
+    return by_routine, rows, models | {"identified": model_figures(reference.model)}
+
+
+def resume(
+    trials: Sequence[Trial], routine: Routine, nominal: Extruder, settings: LawSettings
+) -> tuple[TrialSequence | None, np.ndarray, dict[str, Any]]:
+    """What was learned in the trials so far, the next command u (T,) in mm, and its figures: trial 0 is
+    on-off control. Raises ValueError if they show another gain than the nominal one by more than
+    WRONG_GAIN."""
+    u0 = on_off(routine.r, nominal)
+    if not trials:
+        first = obeyed(u0, settings.drive, sample_time_s=settings.sample_time_s)
+        return None, first, {"best_trial": 0, "rolled_back": False, "restarts": []}
+    law = model_inverse(routine, settings)
+    u, best, rolled_back, restarts = ilc.next_step(trials, routine.r, law, rise=settings.rise)
+    gain_ratio = law.model.extruder.gain / nominal.gain if law.model else 1.0
+    if not 1 / WRONG_GAIN < gain_ratio < WRONG_GAIN:
+        raise ValueError(
+            f"the trials show {gain_ratio:.3g} times the gain of printer.materials; "
+            "check the units of the command, the calibration and the frames' size, or write the gain as it is"
+        )
+    rows = ilc.table(
+        trials, routine.r, steady=float(u0.max()), drive=settings.drive,
+        sample_time_s=settings.sample_time_s, rise=settings.rise,
+    )  # fmt: skip
+    sequence = TrialSequence("pixels", routine, list(trials), rows, law.model)
+    return sequence, u, {"best_trial": best, "rolled_back": rolled_back, "restarts": restarts}
+
+
+def model_figures(model: ilc.TrialModel | None) -> dict[str, float] | None:
+    """An identified model as JSON."""
+    if model is None:
+        return None
+    e = model.extruder
+    return {
+        "gain": e.gain, "time_constant_s": e.time_constant_s, "delay_s": e.delay_s,
+        "lag_hz": e.lag_hz, "yield": e.yield_, "noise": model.noise,
+        "fit_percent": model.fit_percent,
+    }  # fmt: skip
+
+
 # ---- as tables
 
 
 def trial_rows(sequences: dict[tuple[str, int], list[TrialSequence]]) -> dict[str, np.ndarray]:
     """One row a trial of every sequence, by (material, number of the routine)."""
     columns: dict[str, list] = {
-        name: [] for name in ("material", "law", "routine", "speed_mm_per_s", "pause_s", *ilc.Row._fields)
+        name: []
+        for name in ("material", "law", "routine", "speed_mm_per_s", "pause_s", *ilc.TrialRow._fields)
     }
     for (material, index), of_routine in sequences.items():
         for sequence in of_routine:

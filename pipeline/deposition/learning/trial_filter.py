@@ -56,9 +56,13 @@ def repeating(
     """Of the commands u (J, T) in mm and flows y (J, T) in mm^3/s of all trials, NaN where not observable,
     for the wanted flow r (T,).
 
-    A Kalman filter over trials with the weight k_j = max(1/j, least), d <- d + k_j ((y + yield) / g_j -
-    (G u_j + d)), g_j the gain of trial j by least squares of its flow; the first trials in full and with g =
-    1. A static machine wants 1/j. On one that changes a faster weight foretells the next trial better, of the
+    A Kalman filter over trials, g_j the gain of trial j by least squares of its flow; the first trials count
+    in full and with g = 1:
+
+        k_j = max(1/j, least)
+        d <- d + k_j ((y + yield) / g_j - (G u_j + d))
+
+    A static machine wants 1/j. On one that changes a faster weight foretells the next trial better, of the
     disturbance by its Q-filtered innovation, of the gain by that of ln g_j: this evidence chooses
     (exponential smoothing and its trend: Holt 1957; chosen by one-step errors: Gardner 2006).
 

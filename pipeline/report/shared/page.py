@@ -15,7 +15,7 @@ from pipeline.report.shared.pictures import Column
 from pipeline.report.shared.sources import QUICK_LOOK, Source, Sources
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
-from pipeline.temperature.workflow.contestants import CONTESTANTS
+from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.verdict import digits
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 

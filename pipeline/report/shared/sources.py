@@ -9,16 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.deposition.workflow.tables import (
-    FILMED,
-    LESSONS,
-    LIBRARY,
-    LINES,
-    SCORES,
-    SIGNALS,
-    TASKS,
-    TRIALS,
-)
+from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
 from pipeline.setpoint.workflow.tables import (
     AGENT_CURVE,
     CLASSIFIED,
@@ -30,8 +21,8 @@ from pipeline.setpoint.workflow.tables import (
     WINDOWS,
 )
 from pipeline.store import artifacts
-from pipeline.temperature.workflow import tables as schemas
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature import tables as schemas
+from pipeline.temperature.settings import Plant
 from pipeline.verdict import night
 from pipeline.verdict.evidence import OFF, Evidence, Table, switched_off
 from pipeline.verdict.files import QUICK_LOOK

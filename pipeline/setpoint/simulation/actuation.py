@@ -4,14 +4,11 @@ The loop through pixels (`pixels`) and the simulators (`simulator`) call the sam
 what would run. Limits and holds take numpy arrays or jax's, with any leading axes.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-if TYPE_CHECKING:
-    from pipeline.setpoint.simulation.simulator import Action, Controller, Observation
 
 REASONS = (
     "acts",
@@ -43,14 +40,10 @@ def still(flow_seen, last_seen):
 
 
 def decide(
-    controller: "Controller",
-    parameters: Any,
-    memory: Any,
-    observation: "Observation",
-    reason: jax.Array,
-    key: jax.Array,
-) -> tuple[Any, "Action", jax.Array]:
-    """Memory, action and reason of one episode. Memory stays as it was where the window is no evidence, and
+    controller: Any, parameters: Any, memory: Any, observation: Any, reason: jax.Array, key: jax.Array
+) -> tuple[Any, Any, jax.Array]:
+    """Memory, action and reason of one episode, of a `simulator.Controller` that sees an
+    `simulator.Observation`. Memory stays as it was where the window is no evidence, and
     where the controller takes the camera for another than its table's the reason is TABLE. The action counts
     where the reason is ACTS; whoever sends it looks."""
     after, action = controller.act(parameters, memory, observation, key)
