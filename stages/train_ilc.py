@@ -29,6 +29,17 @@ Sections = tuple[TrainIlc, Printer, Camera]
 # trial sequences and measured trials by (material, number of the routine), models and figures by material
 Results = tuple[dict[tuple[str, int], list], dict[tuple[str, int], list], dict[str, dict], dict[str, dict]]
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "*.gamma*",
+    "*.*.last_ratio",
+    "*.*.best_ratio",
+    "*.*.trials",
+    "*.*.saturated",
+    "*.pixels.flow_error*",
+    "*.pixels.rejected_percent",
+)
+
 
 def main() -> None:
     import numpy as np
@@ -76,7 +87,7 @@ def main() -> None:
         frames = (out / "frames").resolve()
         rows = run_all([delayed(show_frames)(path.resolve(), frames, camera) for path in paths], execution)
         artifacts.write_json(frames / "frames.json", [row for of_path in rows for row in of_path])
-        artifacts.write_metrics("train_ilc", figures)
+        artifacts.write_metrics("train_ilc", figures, METRICS)
 
 
 def simulate(folder: Path, sections: Sections, index: int, kind: str) -> Results:
