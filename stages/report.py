@@ -8,25 +8,14 @@ Every file read is hashed, and the pages carry the hashes. The drift on page one
 """
 
 import hashlib
+from typing import TYPE_CHECKING
 
 import stages
-from pipeline.report.about import page as about_page
-from pipeline.report.certificate import page as certificate_page
-from pipeline.report.deposition import page as deposition_page
-from pipeline.report.identification import page as identification_page
-from pipeline.report.index import page as index_page
-from pipeline.report.papers import page as papers_page
-from pipeline.report.runs import curves, figures
-from pipeline.report.runs import page as runs_page
-from pipeline.report.setpoint import page as setpoint_page
-from pipeline.report.shared.page import LOOP_OF
-from pipeline.report.shared.sources import Declared, Sources, collect, digest
-from pipeline.report.temperature import page as temperature_page
-from pipeline.report.temperature.judgement import Judgement, judgement, shown
-from pipeline.report.viewer import page as viewer_page
 from pipeline.store import artifacts, params
-from pipeline.temperature.settings import Plant
-from pipeline.verdict.settings import ReportRules
+
+if TYPE_CHECKING:
+    from pipeline.report.shared.sources import Sources
+    from pipeline.report.temperature.judgement import Judgement
 
 # what the pages show of each stage: its figures, and its folder of tables
 FIGURES = {
@@ -100,8 +89,16 @@ MADE = (
 )
 
 
-def of_loops(sources: Sources, judged: Judgement) -> dict[str, str]:
+def of_loops(sources: "Sources", judged: "Judgement") -> dict[str, str]:
     """The pages of each loop; one sentence in their place if it is switched off."""
+    from pipeline.report.about import page as about_page
+    from pipeline.report.certificate import page as certificate_page
+    from pipeline.report.deposition import page as deposition_page
+    from pipeline.report.identification import page as identification_page
+    from pipeline.report.setpoint import page as setpoint_page
+    from pipeline.report.shared.page import LOOP_OF
+    from pipeline.report.temperature import page as temperature_page
+
     pages = {
         "temperature": lambda: temperature_page.render(sources, judged),
         "identification": lambda: identification_page.render(sources),
@@ -116,6 +113,17 @@ def of_loops(sources: Sources, judged: Judgement) -> dict[str, str]:
 
 
 def main() -> None:
+    from pipeline.report.about import page as about_page
+    from pipeline.report.index import page as index_page
+    from pipeline.report.papers import page as papers_page
+    from pipeline.report.runs import curves, figures
+    from pipeline.report.runs import page as runs_page
+    from pipeline.report.shared.sources import Declared, collect, digest
+    from pipeline.report.temperature.judgement import judgement, shown
+    from pipeline.report.viewer import page as viewer_page
+    from pipeline.temperature.settings import Plant
+    from pipeline.verdict.settings import ReportRules
+
     with artifacts.stage("report"):
         declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
         sources = collect(declared, FIGURES, FOLDERS, "reports/accepted.json", ("pipeline", "stages"))

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fnmatch
-import hashlib
 import json
 import math
 import os
@@ -229,10 +227,12 @@ def write_metrics(stage: str, figures: Mapping, metrics: Sequence[str] = ("*",))
 
 def matching(figures: Mapping | list, patterns: Sequence[Sequence[str]]) -> dict | list:
     """The figures and sections that a pattern takes, in their order. A place in a list is a key."""
+    from fnmatch import fnmatchcase
+
     listed = isinstance(figures, list)
     chosen: dict[Any, Any] = {}
     for key, value in enumerate(figures) if listed else figures.items():
-        rests = [rest for first, *rest in patterns if fnmatch.fnmatchcase(str(key), first)]
+        rests = [rest for first, *rest in patterns if fnmatchcase(str(key), first)]
         if not all(rests):
             chosen[key] = value
         elif isinstance(value, Mapping | list) and (inner := matching(value, rests)):
@@ -428,6 +428,8 @@ def write_recording(
 def sha256(path: str | Path) -> str:
     """Digest of a file, or of a folder by relative names and contents. Dot files and __pycache__ do not
     count."""
+    import hashlib
+
     path = Path(path)
     if not path.is_dir():
         with path.open("rb") as stream:
@@ -512,7 +514,7 @@ def _tidy(name: str) -> None:
         if ending[2] == ".old" and not (DATASETS / name).exists():
             left.rename(DATASETS / name)
         else:
-            shutil.rmtree(left)
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def _alive(pid: int) -> bool:

@@ -6,8 +6,6 @@ key of it in one. A path to params.yaml means both files: the other one lies bes
 own begin with x_.
 """
 
-import difflib
-import hashlib
 import json
 import re
 import types
@@ -195,6 +193,8 @@ def home(dotted: str, path: str | Path = FILE) -> str:
 def digest(model: Section) -> str:
     """SHA-256 of the section's canonical JSON. Equal parameters have equal digests, whatever their order and
     spelling in the file."""
+    import hashlib
+
     canonical = json.dumps(model.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()
 
@@ -242,11 +242,12 @@ def files(path: str | Path = FILE) -> dict[str, dict]:
 def _section(section: str, path: str | Path) -> dict:
     sections = read(path)
     if section not in sections:
+        from pipeline.store import params_text
+
         expert = Path(path).with_name(EXPERT)
         if not expert.exists():
-            raise ValueError(
-                f"{path}: section {section} is missing, and so is {expert}; {RESTORE.format(expert)}"
-            )
+            remedy = params_text.RESTORE.format(expert)
+            raise ValueError(f"{path}: section {section} is missing, and so is {expert}; {remedy}")
         raise ValueError(
             f"{_files_of(files(path), section)}: section {section} is missing; "
             f"add {section}: with its keys below it"
@@ -282,7 +283,6 @@ def _files_of(sections: dict[str, dict], section: str, location: Sequence = ()) 
 
 # ---- the sentences
 
-RESTORE = "run from the root of the project, or restore it with git checkout {}"
 _NO_SECTION = "must be a section with keys below it but is {}; indent its keys by two spaces"
 _BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 _COMPARISONS = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}
@@ -377,6 +377,8 @@ def _shown(value: Any) -> str:
 
 def _nearest(name: Any, names) -> str:
     """The name that is most like `name`, "" where none is."""
+    import difflib
+
     matches = difflib.get_close_matches(str(name), [str(other) for other in names], n=1, cutoff=0.6)
     return next(iter(matches), "")
 

@@ -1,6 +1,6 @@
 """Two runs side by side: figures of the three loops with their bands, parameters that differ, curves."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -124,7 +124,7 @@ def _parts(a: Run | None, b: Run, rules: ReportRules) -> dict[str, Any]:
     before, now = measured(a.metrics) if a else Measured({}, {}, {}), measured(b.metrics)
     another = a is not None and _signals(a) != _signals(b)
     loops = []
-    for loop in LOOPS:
+    for loop in loops_of(b):
         rows = [
             _row(one, before.figures.get(loop, {}).get(one.key), now.figures.get(loop, {}).get(one.key))
             for one in questions[loop]
@@ -140,9 +140,20 @@ def _parts(a: Run | None, b: Run, rules: ReportRules) -> dict[str, Any]:
         "compared": a is not None,
         "parameters": differing[:MOST_PARAMETERS],
         "more": max(len(differing) - MOST_PARAMETERS, 0),
-        "panels": _panels(a.curves if a else {}, b.curves),
+        "panels": _panels(*(curves_of(run.curves if run else {}, loops_of(b)) for run in (a, b))),
         "kept": bool(a and a.curves),
     }
+
+
+def loops_of(run: Run) -> list[str]:
+    """The loops that are on."""
+    switches = run.parameters.get("loops")
+    return [loop for loop in LOOPS if not isinstance(switches, dict) or switches.get(loop) is not False]
+
+
+def curves_of(drawn: Mapping[str, Curve], loops: Sequence[str]) -> dict[str, Curve]:
+    """The curves of these loops: their names begin with the loop."""
+    return {name: curve for name, curve in drawn.items() if name.partition(":")[0].lower() in loops}
 
 
 def _signals(run: Run) -> list[set]:
