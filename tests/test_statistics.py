@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.nightly.decision import FIRST, KEPT, PROMOTED, Evidence, decide
+from pipeline.nightly.records import Alarm
 from pipeline.nightly.settings import Rule
-from pipeline.report.shared.night import Alarm
 from pipeline.statistics import blocks_needed, paired
 
 RULE = Rule(

@@ -8,14 +8,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.nightly import champion, judge, reporting, screening
+from pipeline.nightly import champion, judge, records, reporting, screening
 from pipeline.nightly.decision import decide
 from pipeline.nightly.processes import STATE, dvc
+from pipeline.nightly.records import (
+    CANDIDATE,
+    KEPT,
+    Champion,
+    ChampionMetrics,
+    ChampionState,
+    Lineage,
+    LoopDecision,
+    Night,
+    candidate_of,
+)
 from pipeline.nightly.reproducing import wiring
-from pipeline.nightly.settings import Loop, Nightly
-from pipeline.report.nightly import record
-from pipeline.report.nightly.production import Champion, ChampionMetrics, ChampionState, Lineage, candidate_of
-from pipeline.report.nightly.record import CANDIDATE, KEPT, LoopDecision, Night
+from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.report.shared import headline
 from pipeline.report.shared.sources import Declared, Sources, collect
 from pipeline.report.shared.verdict import PASSED, ReportRules, Verdict
@@ -61,7 +69,7 @@ def judged(
             decision, metrics = decided(settings, name, night, state, verdict)
         except reporting.REFUSALS as error:  # what cannot be judged stops no other loop
             why = reporting.told(error, night.run)
-            decision = LoopDecision(record.FAILED, [f"it cannot be judged, and its champion stays: {why}"])
+            decision = LoopDecision(records.FAILED, [f"it cannot be judged, and its champion stays: {why}"])
             metrics = None
         decisions[name] = decision = decision._replace(verdict=verdict)
         if decision.promotes or decision.decision == CANDIDATE:
@@ -73,12 +81,12 @@ def judged(
             and verdict.state == PASSED
         ):
             state = _without_candidate(state, name)
-    if all(decision.decision == record.FAILED for decision in decisions.values()):
+    if all(decision.decision == records.FAILED for decision in decisions.values()):
         whys = (f"{name}: {decision.reasons[0]}" for name, decision in decisions.items())
         raise ValueError("; ".join(whys))
     promoted = tuple(name for name, decision in decisions.items() if decision.promotes)
     night = night._replace(decisions=decisions, promoted=promoted)
-    outcome = record.PROMOTED if promoted else CANDIDATE if night.candidates else KEPT
+    outcome = records.PROMOTED if promoted else CANDIDATE if night.candidates else KEPT
     reasons = (f"{name}: {reason}" for name, decision in decisions.items() for reason in decision.reasons)
     return night.ended(outcome, *reasons), state
 
@@ -177,7 +185,7 @@ def decided(
     return JudgedLoop(decision, _metrics(challenger))
 
 
-def there(loop: Loop) -> list[str]:
+def there(loop: NightlyLoop) -> list[str]:
     """The artifacts of a loop without the optional ones that its record did not determine."""
     return [path for path in loop.artifacts if path not in OPTIONAL or Path(path).is_file()]
 
@@ -196,13 +204,13 @@ def _kept(reason: str) -> JudgedLoop:
     return JudgedLoop(LoopDecision(KEPT, [reason]))
 
 
-def _metrics(evidence: judge.Evidence) -> ChampionMetrics:
+def _metrics(evidence: judge.CaseCosts) -> ChampionMetrics:
     mean_cost = float(np.mean([cost for _, cost in evidence.cases.values()]))
     guards = {name: figure for name, figure in evidence.guards.items() if np.isfinite(figure)}
     return ChampionMetrics(evidence.panel, mean_cost if np.isfinite(mean_cost) else None, guards)
 
 
-def uncertified(loop: Loop, contestant: str) -> str:
+def uncertified(loop: NightlyLoop, contestant: str) -> str:
     """Why a challenger of the temperature loop that passes the page's rules has no certificate; empty where
     it has one, and where the project has no stage that certifies."""
     if not _asks_for_one(loop):
@@ -219,12 +227,12 @@ def uncertified(loop: Loop, contestant: str) -> str:
     return ""
 
 
-def certified(loop: Loop) -> list[str]:
+def certified(loop: NightlyLoop) -> list[str]:
     """The files of a certified controller that are there, for the champion's folder."""
     return [path for path in CERTIFIED if _asks_for_one(loop) and Path(path).is_file()]
 
 
-def _asks_for_one(loop: Loop) -> bool:
+def _asks_for_one(loop: NightlyLoop) -> bool:
     """Whether a loop's champion needs a certificate: that of the temperature loop, where the project has the
     stage that certifies."""
     wired = loop.judge == "temperature" and Path("dvc.yaml").is_file()
@@ -243,7 +251,7 @@ def _candidate(
         evidence = judging.measure(Path("datasets"), verdict.subject)
     except ValueError as reason:
         return JudgedLoop(decision._replace(reasons=[why, f"not measured: {reason}"]))
-    guards = {name: record.Guard(None, figure, None) for name, figure in evidence.guards.items()}
+    guards = {name: records.Guard(None, figure, None) for name, figure in evidence.guards.items()}
     return JudgedLoop(decision._replace(guards=guards), _metrics(evidence))
 
 

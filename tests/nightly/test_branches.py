@@ -14,9 +14,9 @@ import pytest
 import yaml
 
 from pipeline.nightly import accepting, branches, champion, inputs, merging, night, processes, remembered
+from pipeline.nightly.records import Champion, ChampionState, Installed
 from pipeline.nightly.settings import Nightly
 from pipeline.reading import excluded
-from pipeline.report.nightly.production import Champion, ChampionState, Installed
 from pipeline.store import artifacts, params
 from tests.nightly.toy_nights import ROOT, SETTINGS, Project, entered
 
@@ -170,7 +170,7 @@ def test_a_fresh_clone_knows_what_waits_on_the_remote(by_branch, tmp_path):
         installed=there.installed._replace(folder=there.installed.folder | {"md5": "0.dir"})
     )
     artifacts.write_json(
-        champion.FILE, champion.in_production(waits, "toy", there, event="promoted").written()
+        champion.FILE, champion.in_production(waits, "toy", there, event="promoted").to_json()
     )
     processes.commit([str(champion.FILE)], "waits", branch="nightly")
     by_branch.run("git", "checkout", "-q", "--", ".")

@@ -12,13 +12,21 @@ import pytest
 
 from pipeline.deposition.workflow.tables import SCORES
 from pipeline.nightly import champion, judge, night, promoting, reporting, screening
-from pipeline.nightly.decision import Evidence
-from pipeline.nightly.reproducing import Reproduced
+from pipeline.nightly.decision import CaseCosts
+from pipeline.nightly.records import (
+    CANDIDATE,
+    FIRST,
+    KEPT,
+    PROMOTED,
+    Champion,
+    ChampionState,
+    Installed,
+    Lineage,
+    Night,
+)
 from pipeline.nightly.settings import Nightly
 from pipeline.report.index import page as index_page
 from pipeline.report.nightly import page as nightly_page
-from pipeline.report.nightly.production import Champion, ChampionState, Installed, Lineage
-from pipeline.report.nightly.record import CANDIDATE, FIRST, KEPT, PROMOTED, Night
 from pipeline.report.shared.digits import typeset
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, ReportRules, Verdict
 from pipeline.report.temperature.judgement import judgement
@@ -62,7 +70,7 @@ def project(passing, monkeypatch):
 
     def measure(folder, contestant=""):
         cost = 2.0 if Path(folder).parts[0] == "champion" else 1.0
-        return Evidence("panel", {f"case {k}": (f"plant {k}", cost) for k in range(8)}, {"worst_case": cost})
+        return CaseCosts("panel", {f"case {k}": (f"plant {k}", cost) for k in range(8)}, {"worst_case": cost})
 
     monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(measure, lambda _: {"worst_case": 0.1}))
     monkeypatch.setattr(screening, "reference", lambda *_: None)
@@ -444,7 +452,7 @@ def test_the_champion_and_the_challenger_are_each_judged_as_their_own_contestant
 
     def measure(folder, contestant=""):
         asked.append((str(folder), contestant))
-        return Evidence("panel", {f"case {k}": (f"plant {k}", 1.0) for k in range(8)}, {"worst_case": 1.0})
+        return CaseCosts("panel", {f"case {k}": (f"plant {k}", 1.0) for k in range(8)}, {"worst_case": 1.0})
 
     monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(measure, lambda _: {}))
     verdict = promoting.verdicts_of(settings(), TONIGHT)[0]["temperature"]
@@ -519,7 +527,7 @@ def played(tmp_path, monkeypatch):
     copy = Project(tmp_path / "toy")
     own = {"judge": "deposition", "cases": "", "recordings": "", "artifacts": ["datasets/compose_parts/x"]}
     copy.set(loops={"deposition": own})
-    evidence = Evidence("panel", {f"case {k}": (f"part {k}", 1.0) for k in range(8)}, {"worst": np.inf})
+    evidence = CaseCosts("panel", {f"case {k}": (f"part {k}", 1.0) for k in range(8)}, {"worst": np.inf})
     monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(lambda *_: evidence, lambda _: {"worst": 1.0}))
     monkeypatch.setattr(screening, "reference", lambda *_: None)
     return copy
@@ -539,7 +547,7 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
             # the pages that the stages make show the drift of this very night
             assert artifacts.read_json(NIGHTLY)["run"] == run == f"night-{number:04d}"
             artifact.write_text(files)
-            return Reproduced()
+            return {}, ()
 
         monkeypatch.setattr(night, "_reproduce", reproduced)
         verdict = Verdict("deposition", state, *words_of[state], "", "", "", "basis", subject="basis")

@@ -26,7 +26,7 @@ from pipeline.nightly import (
     screening,
     watch,
 )
-from pipeline.report.nightly.production import Champion
+from pipeline.nightly.records import Champion
 from tests.nightly.toy_nights import Project, entered
 
 TOMORROW = datetime.timedelta(days=1)

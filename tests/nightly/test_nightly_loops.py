@@ -19,11 +19,9 @@ from pipeline.nightly import (
     screening,
     watch,
 )
+from pipeline.nightly.records import Alarm, LoopDrift, Night, NightDrift
 from pipeline.nightly.remembered import DriftMemory
-from pipeline.nightly.reproducing import Reproduced
 from pipeline.nightly.settings import Nightly
-from pipeline.report.nightly.record import Night
-from pipeline.report.shared.night import Alarm, LoopDrift, NightDrift
 from pipeline.report.shared.verdict import PASSED, Verdict
 from pipeline.setpoint.workflow import tables
 from pipeline.store import artifacts, params
@@ -57,9 +55,9 @@ def passing(loop: str) -> tuple[str, Verdict]:
     return loop, Verdict(loop, PASSED, *said, winner="ours", subject="ours", rehearsal=True)
 
 
-def played(*_: None) -> Reproduced:
+def played(*_: None) -> tuple[dict, tuple]:
     """Stages that did what they were played to do."""
-    return Reproduced()
+    return {}, ()
 
 
 def deposition(cost: float, guard: float) -> None:

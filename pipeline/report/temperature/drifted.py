@@ -4,7 +4,7 @@ reports/metrics/nightly.json -> a figure, or why there is none."""
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from pipeline.report.shared import night
+from pipeline.nightly.records import NightDrift, RecordingFigures
 from pipeline.report.shared.digits import beyond_meaning, number
 from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import FAILED, OPEN, UNDECIDED, Figure, Missing
@@ -33,7 +33,7 @@ def drift(sources: Sources) -> Drift:
     if isinstance(nightly, Missing):
         return Drift(nightly, f"{nightly.state.capitalize()}.", nightly.sentence(), "")
     when = f"{nightly.get('run', 'last night')}, {str(nightly.get('when', ''))[:10]}".strip(", ")
-    drifted = night.read(nightly.get("drift")).of(LOOP)
+    drifted = NightDrift.read(nightly.get("drift")).of(LOOP)
     for alarms, state, word in (
         (drifted.alarms, FAILED, "Drifted."),
         (drifted.watched, UNDECIDED, "Perhaps."),
@@ -57,7 +57,7 @@ def drift(sources: Sources) -> Drift:
     return Drift(Figure(percent, percent - half, percent + half, note=text), "None found.", text, when)
 
 
-def _most(figures: Mapping[str, night.RecordingFigures]) -> tuple[str, float, float] | None:
+def _most(figures: Mapping[str, RecordingFigures]) -> tuple[str, float, float] | None:
     """The parameter of the plant that moved most of all recordings of the night, against its own noise: name,
     change and half of its 90 % band in percent."""
     changes = [
