@@ -15,6 +15,10 @@ from pipeline.store.printable import printable
 from pipeline.temperature.workflow.settings import Ingest, Plant
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.nightly.records import ChampionState, Night
+    from pipeline.nightly.settings import Nightly
     from pipeline.setpoint.workflow.shadow.deploy import Ready
 
 
@@ -338,6 +342,13 @@ def replay(arguments: argparse.Namespace) -> None:
     print(f"written: {arguments.out}/index.html, replay.mcap, layout.json, replay.json")
 
 
+def render_night(nights: "Sequence[Night]", state: "ChampionState", settings: "Nightly") -> str:
+    """The page of a night: of every night that is remembered, and of what is in production."""
+    from pipeline.report.nightly import page
+
+    return page.render(nights, state, settings)
+
+
 def version() -> str:
     """The version that pyproject.toml beside the code states; without one, that of the installed package."""
     project = Path(__file__).resolve().parents[1] / "pyproject.toml"
@@ -609,7 +620,7 @@ def main() -> None:
     _add_training_print(commands)
     _add_export(commands)
     _add_replay(commands)
-    nights.add(commands)
+    nights.add(commands, render_night)
     for name, command in commands.choices.items():
         _tell(name, command)
     arguments = parser.parse_args()

@@ -79,19 +79,20 @@ class NightWork(NamedTuple):
         return self._replace(night=nothing).ended(records.FAILED, why)
 
 
-def nightly(now: datetime.datetime | None = None) -> tuple[int, str]:
-    """Exit status and the one-line summary of a night. Whatever happens, somebody is told."""
+def nightly(render: reporting.Render, now: datetime.datetime | None = None) -> tuple[int, str]:
+    """Exit status and the one-line summary of a night; `render` makes its page. Somebody learns of the night,
+    whatever happens."""
     started = now or datetime.datetime.now(datetime.UTC)
     try:
         with guarding.locked():
-            return _night(started)
+            return _night(started, render)
     except guarding.BusyError as busy:
         return BUSY, f"nightly: refused: {busy}"
     except Exception as error:  # nothing may end a night without a word
         return reporting.last_resort(error, started)
 
 
-def _night(now: datetime.datetime) -> tuple[int, str]:
+def _night(now: datetime.datetime, render: reporting.Render) -> tuple[int, str]:
     clock = time.monotonic()
     last, aside = remembered.opened()
     night = Night(last.night + 1, f"night-{last.night + 1:04d}", watch.stamp(now))
@@ -112,10 +113,10 @@ def _night(now: datetime.datetime) -> tuple[int, str]:
     night = work.night._replace(seconds=round(time.monotonic() - clock, 1))
     night = night.noted(f"watch: {overdue}") if overdue else night
     tonight = _to_remember(job, work) if job else last._replace(night=night.number)
-    told = reporting.report(night, tonight, settings)
+    status, summary = reporting.report(night, tonight, settings, render)
     if mended:
         guarding.RUNNING.unlink(missing_ok=True)
-    return told
+    return status, summary
 
 
 # ---- the night, step by step

@@ -12,12 +12,15 @@ import numpy as np
 
 from pipeline.nightly import champion, guarding, records, remembered, watch
 from pipeline.nightly.processes import STATE
-from pipeline.nightly.records import Night
+from pipeline.nightly.records import ChampionState, Night
 from pipeline.nightly.remembered import METRICS, Remembered
 from pipeline.nightly.settings import Nightly
 from pipeline.store import artifacts, params
 
 OK, FAILED, DRIFTED, QUARANTINED, BUSY = 0, 1, 3, 4, 75
+# every night that is remembered, what is in production, and the settings -> the page. The caller brings it, so
+# that the night knows no page
+Render = Callable[[Sequence[Night], ChampionState, Nightly], str]
 PAGE = Path("reports/nightly.html")
 # what ends a night in a sentence; anything else is a mistake of this program, whose traceback is in the log
 REFUSALS = (ValueError, OSError, MemoryError, np.linalg.LinAlgError)
@@ -54,8 +57,9 @@ def settings_or_known(last: Remembered, run: str) -> tuple[Nightly | None, list[
 # ---- the report
 
 
-def report(night: Night, tonight: Remembered, settings: Nightly | None) -> tuple[int, str]:
-    """State, page, alarm or heartbeat; the exit status and the summary. `tonight` is what is remembered."""
+def report(night: Night, tonight: Remembered, settings: Nightly | None, render: Render) -> tuple[int, str]:
+    """State, page, alarm or heartbeat; the exit status and the summary. `tonight` is what is remembered,
+    `render` makes the page."""
     troubles: list[str] = []
 
     def attempt(part: Callable[[], None]) -> bool:
@@ -71,7 +75,9 @@ def report(night: Night, tonight: Remembered, settings: Nightly | None) -> tuple
     attempt(lambda: remembered.remember(tonight))
     attempt(lambda: remembered.add(night))
     shown = night.noted(*troubles)
-    made = night.outcome == records.NOTHING_NEW or (settings and attempt(lambda: _page(shown, settings)))
+    made = night.outcome == records.NOTHING_NEW or (
+        settings and attempt(lambda: _write_page(shown, settings, render))
+    )
     if not made:
         attempt(lambda: artifacts.write_text(PAGE, plain_page(night, troubles)))
     status = FAILED if troubles else exit_status(night)
@@ -92,11 +98,9 @@ def report(night: Night, tonight: Remembered, settings: Nightly | None) -> tuple
     return status, summary(night, troubles)
 
 
-def _page(night: Night, settings: Nightly) -> None:
-    from pipeline.report.nightly import page
-
+def _write_page(night: Night, settings: Nightly, render: Render) -> None:
     nights = [*(earlier for earlier in remembered.nights() if earlier.number != night.number), night]
-    artifacts.write_text(PAGE, page.render(nights, champion.read(), watch.shown(settings)))
+    artifacts.write_text(PAGE, render(nights, champion.read(), watch.shown(settings)))
 
 
 def plain_page(night: Night, troubles: Sequence[str]) -> str:

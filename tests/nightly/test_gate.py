@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.cli import render_night
 from pipeline.deposition.workflow.tables import SCORES
 from pipeline.nightly import champion, judge, night, promoting, reporting, screening
 from pipeline.nightly.decision import CaseCosts
@@ -556,7 +557,7 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
             promoting, "verdicts_of", lambda settings, night: ({"deposition": verdict}, night)
         )
         Path("learn.py").write_text(f"# night {number}\n")
-        status, summary = night.nightly()
+        status, summary = night.nightly(render_night)
         assert status == night.OK, summary
         return summary, json.loads(played.run("git", "show", "HEAD:champion.json").stdout)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.cli import render_night
 from pipeline.deposition.workflow.tables import SCORES
 from pipeline.nightly import (
     accepting,
@@ -117,7 +118,7 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
         monkeypatch.setattr(night, "_reproduce", lambda *_, of=(cost, guard): played(score(*of)))
         project.record(f"night {k}", [10.0])
         Path("learn.py").write_text(f"# night {k}\n")  # something is new
-        status, summary = night.nightly()
+        status, summary = night.nightly(render_night)
         decided = remembered.nights()[-1].decisions[loop]
         assert status == night.OK and decided.decision == decision and reason in " ".join(decided.reasons), (
             summary,
@@ -149,13 +150,13 @@ def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(
     said = json.loads(Path("params.yaml").read_text())
     Path("params.yaml").write_text(json.dumps(said | {"camera": camera}))
     monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0)))
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK, summary
     broken = Path("datasets/raw/deposition/trial_7.mcap")
     broken.parent.mkdir(parents=True)
     broken.write_bytes(b"\x89MCAP0\r\n half a file")
     Path("learn.py").write_text("# something else is new\n")
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.QUARANTINED == 4 and "trial_7.mcap" in summary, summary
     assert not broken.exists() and (inputs.QUARANTINE / "deposition/trial_7.mcap").read_bytes().endswith(
         b"half a file"
@@ -187,7 +188,7 @@ def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project,
         }
     )
     monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0)))
-    assert night.nightly()[0] == night.OK
+    assert night.nightly(render_night)[0] == night.OK
     with pytest.raises(
         ValueError,
         match="expected a loop with a champion and a drift alarm, found none; loops with an alarm: none",
@@ -224,7 +225,7 @@ def test_an_alarm_of_the_setpoint_camera_changes_nothing_for_another_loop(projec
     }
     project.set(loops=both)
     monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0), setpoint(10.0, 2.0)))
-    assert night.nightly()[0] == night.OK
+    assert night.nightly(render_night)[0] == night.OK
     raised = Alarm(
         "setpoint", "setpoint: contrast", "print_8.csv", "the line stands out by 25 gray levels", 9.0
     )
@@ -232,7 +233,7 @@ def test_an_alarm_of_the_setpoint_camera_changes_nothing_for_another_loop(projec
     remembered.remember(remembered.last()._replace(drift=memory))
     monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(5.0, 2.0), setpoint(5.0, 2.0)))
     Path("learn.py").write_text("# something is new\n")
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     tonight = remembered.nights()[-1]
     # the setpoint loop, whose camera it is, keeps its champion; the other is promoted as on any night
     assert status == night.DRIFTED and tonight.promoted == ("deposition",), summary
