@@ -18,8 +18,8 @@ from pipeline.nightly.settings import Nightly
 from pipeline.store import artifacts, params
 
 OK, FAILED, DRIFTED, QUARANTINED, BUSY = 0, 1, 3, 4, 75
-# every night that is remembered, what is in production, and the settings -> the page. The caller brings it, so
-# that the night knows no page
+# every night that is remembered, what is in production, and the settings -> the page. The caller brings it,
+# so that the night knows no page
 Render = Callable[[Sequence[Night], ChampionState, Nightly], str]
 PAGE = Path("reports/nightly.html")
 # what ends a night in a sentence; anything else is a mistake of this program, whose traceback is in the log
