@@ -2,15 +2,14 @@
 which nothing runs; one that passes goes in production where it is better than the champion, or there is none.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.nightly import champion, judge, records, reporting, screening
+from pipeline.nightly import champion, judge, records, reporting, screening, verdicts
 from pipeline.nightly.decision import decide
-from pipeline.nightly.processes import STATE, dvc
 from pipeline.nightly.records import (
     CANDIDATE,
     KEPT,
@@ -24,21 +23,9 @@ from pipeline.nightly.records import (
 )
 from pipeline.nightly.reproducing import wiring
 from pipeline.nightly.settings import Nightly, NightlyLoop
-from pipeline.report.shared import headline
-from pipeline.report.shared.sources import Declared, Sources, collect
-from pipeline.report.shared.verdict import PASSED, ReportRules, Verdict
-from pipeline.report.temperature.judgement import judgement
-from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.report.shared.verdict import PASSED, Verdict
+from pipeline.store import artifacts
 
-# stages whose metrics the pages show; those before `learn_kernel` have no tables there
-MEASURED = (
-    "probe_machine", "generate_probing", "learn_kernel", "ingest", "identify_plant", "tune_weights",
-    "evaluate_temperature", "train_ilc", "segment_library", "compose_parts",
-    "train_classifier", "train_agent", "evaluate_setpoint", "export_controllers",
-)  # fmt: skip
-REPORT = "reports/metrics/report.json"
-ACCEPTED = "reports/accepted.json"
 # artifacts that only some contestants are designed from, and that a record may not determine
 OPTIONAL = {f"datasets/{path}" for path in judge.DESIGNED_FROM.values()}
 # the certified controller of the temperature loop, installed beside what it was designed from
@@ -60,11 +47,11 @@ def judged(
     """The night with a decision on each loop; what is in production, and the candidates beside it. Their
     files lie in champion/<loop> and champion/<loop>.candidate by then. Raises ValueError where no loop can be
     judged."""
-    verdicts, night = verdicts_of(settings, night)
+    by_loop, night = verdicts.read_verdicts(settings, night)
     made_from = lineage()  # with the lock of the pages, where they were made anew
     decisions: dict[str, LoopDecision] = {}
     for name in settings.loops:
-        verdict = verdicts.get(name)
+        verdict = by_loop.get(name)
         try:
             decision, metrics = decided(settings, name, night, state, verdict)
         except reporting.REFUSALS as error:  # what cannot be judged stops no other loop
@@ -89,52 +76,6 @@ def judged(
     outcome = records.PROMOTED if promoted else CANDIDATE if night.candidates else KEPT
     reasons = (f"{name}: {reason}" for name, decision in decisions.items() for reason in decision.reasons)
     return night.ended(outcome, *reasons), state
-
-
-# ---- the pages
-
-
-def verdicts_of(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], Night]:
-    """The verdict of each loop that has a page, from the files that the pages are made of; the night with a
-    note where the pages are of other files. A loop that is judged by a file of costs has none: its rules are
-    the guards of that file. Where nightly.holdout.controller names a contestant, the temperature loop's
-    verdict is about that one."""
-    loops = [name for name, loop in settings.loops.items() if loop.judge != "cases"]
-    if not loops:
-        return {}, night
-    sources, named = page_sources(), settings.holdout.controller
-    each = headline.verdicts(sources, judgement(sources))
-    night = _as_the_pages_say(each, night)
-    if named != judge.PAGE:
-        each = headline.verdicts(sources, judgement(sources, named=named))
-    return {name: each[name] for name in loops}, night
-
-
-def page_sources() -> Sources:
-    """What the stage `report` reads."""
-    declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
-    return collect(
-        declared,
-        {stage: f"reports/metrics/{stage}.json" for stage in MEASURED},
-        {stage: f"datasets/{stage}" for stage in MEASURED},
-        ACCEPTED,
-        (),
-    )
-
-
-def _as_the_pages_say(pages: Mapping[str, Verdict], night: Night) -> Night:
-    """Makes the pages anew where they were made before drift or production changed, so that they say what the
-    night goes by."""
-    if not artifacts.exists(REPORT):
-        return night
-    shown = artifacts.read_json(REPORT).get("verdicts") or {}
-    if all(shown.get(loop) == verdict.metrics() for loop, verdict in pages.items()):
-        return night
-    try:
-        dvc("repro", "--single-item", "--force", "report", log=STATE / "logs" / f"{night.run}-report.log")
-    except ValueError as error:
-        return night.noted(f"the pages are not of tonight ({error}); run ./run dvc repro --force report")
-    return night
 
 
 # ---- one loop

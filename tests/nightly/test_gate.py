@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.cli import render_night
 from pipeline.deposition.workflow.tables import SCORES
-from pipeline.nightly import champion, judge, night, promoting, reporting, screening
+from pipeline.nightly import champion, judge, night, promoting, reporting, screening, verdicts
 from pipeline.nightly.decision import CaseCosts
 from pipeline.nightly.records import (
     CANDIDATE,
@@ -289,7 +289,7 @@ def test_page_and_night_never_disagree(project, seed):
         candidates={loop: other("night-0005") for loop in LOOPS if rng.random() < 0.5},
     )
     tonight, after = promoting.judged(asked, TONIGHT, before, lineage=Lineage)
-    sources = promoting.page_sources()
+    sources = verdicts.page_sources()
     index = words(index_page.render(sources, judgement(sources)))
     page = nightly_page.render([tonight], after, asked)
     summary = reporting.summary(tonight, [])
@@ -372,27 +372,27 @@ def test_a_champion_of_the_heaters_has_a_passed_certificate_of_its_own(
 
 
 def test_the_night_reads_what_the_pages_are_made_of():
-    assert {stage: f"reports/metrics/{stage}.json" for stage in promoting.MEASURED} == {
-        stage: report.METRICS[stage] for stage in promoting.MEASURED
+    assert {stage: f"reports/metrics/{stage}.json" for stage in verdicts.MEASURED} == {
+        stage: report.METRICS[stage] for stage in verdicts.MEASURED
     }
-    assert set(promoting.MEASURED) == set(report.METRICS) >= set(report.FOLDERS)
+    assert set(verdicts.MEASURED) == set(report.METRICS) >= set(report.FOLDERS)
     assert all(folder == f"datasets/{stage}" for stage, folder in report.FOLDERS.items())
 
 
 def test_the_report_keeps_the_verdict_of_each_loop_as_the_night_reads_it(project, monkeypatch):
     report.main()
     made_anew = []
-    monkeypatch.setattr(promoting, "dvc", lambda *command, **_: made_anew.append(command))
-    verdicts, tonight = promoting.verdicts_of(settings(), TONIGHT)
+    monkeypatch.setattr(verdicts, "dvc", lambda *command, **_: made_anew.append(command))
+    by_loop, tonight = verdicts.read_verdicts(settings(), TONIGHT)
     kept = artifacts.read_metrics("report")
-    assert kept["verdicts"] == {loop: verdict.metrics() for loop, verdict in verdicts.items()}
-    assert {name: kept["verdict"][name] for name in kept["verdict"]} == verdicts["temperature"].metrics() | {
+    assert kept["verdicts"] == {loop: verdict.metrics() for loop, verdict in by_loop.items()}
+    assert {name: kept["verdict"][name] for name in kept["verdict"]} == by_loop["temperature"].metrics() | {
         "rehearsal": False
     }
     assert made_anew == [] and tonight == TONIGHT
     # the drift that they were made with is over since: they are made anew, so that both say the same
     drift("alarms")(None)
-    promoting.verdicts_of(settings(), TONIGHT)
+    verdicts.read_verdicts(settings(), TONIGHT)
     assert made_anew == [("repro", "--single-item", "--force", "report")]
 
 
@@ -403,9 +403,9 @@ def test_pages_that_cannot_be_made_anew_are_told_and_the_night_goes_on(project, 
     def refused(*_, **__):
         raise ValueError("dvc repro failed: no room")
 
-    monkeypatch.setattr(promoting, "dvc", refused)
-    verdicts, tonight = promoting.verdicts_of(settings(), TONIGHT)
-    assert verdicts["temperature"].state == FAILED
+    monkeypatch.setattr(verdicts, "dvc", refused)
+    by_loop, tonight = verdicts.read_verdicts(settings(), TONIGHT)
+    assert by_loop["temperature"].state == FAILED
     assert tonight.notes == (
         "the pages are not of tonight (dvc repro failed: no room); run ./run dvc repro --force report",
     )
@@ -414,13 +414,13 @@ def test_pages_that_cannot_be_made_anew_are_told_and_the_night_goes_on(project, 
 def test_a_contestant_that_is_named_to_run_must_pass_itself(project):
     stages = made.metrics()
     own = stages["evaluate_temperature"]["contestants"]["varx_riccati"]
-    assert promoting.verdicts_of(settings(controller="varx_riccati"), TONIGHT)[0]["temperature"].winner == (
+    assert verdicts.read_verdicts(settings(controller="varx_riccati"), TONIGHT)[0]["temperature"].winner == (
         "varx_riccati"
     )
     own["overshoot"] = made.figure(9.0, 8.0, 10.0)
     artifacts.write_metrics("evaluate_temperature", stages["evaluate_temperature"])
     by_page, named = (
-        promoting.verdicts_of(settings(controller=name), TONIGHT)[0]["temperature"]
+        verdicts.read_verdicts(settings(controller=name), TONIGHT)[0]["temperature"]
         for name in ("page", "varx_riccati")
     )
     assert (by_page.state, by_page.winner) == (PASSED, "subspace_lqg")
@@ -433,13 +433,13 @@ def test_a_contestant_that_is_named_to_run_must_pass_itself(project):
     assert tonight.decisions["temperature"].decision == CANDIDATE
     assert after.candidates["temperature"].contestant == "varx_riccati"
     # one that was not judged at all is open
-    lost = promoting.verdicts_of(settings(controller="printer_pid"), TONIGHT)[0]["temperature"]
+    lost = verdicts.read_verdicts(settings(controller="printer_pid"), TONIGHT)[0]["temperature"]
     assert lost.state == OPEN and lost.subject == "printer_pid" and "was not judged" in lost.reason
 
 
 def test_what_runs_stays_where_the_page_finds_nobody_better_beyond_the_bands(project):
     """The page's incumbent is the champion's contestant, where there is one."""
-    assert promoting.verdicts_of(settings(), TONIGHT)[0]["temperature"].winner == "subspace_lqg"
+    assert verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"].winner == "subspace_lqg"
     present = other()._replace(contestant="varx_riccati")
     state = ChampionState({"temperature": present})
     artifacts.write_json(NIGHTLY, TONIGHT.metrics(state))
@@ -456,7 +456,7 @@ def test_the_champion_and_the_challenger_are_each_judged_as_their_own_contestant
         return CaseCosts("panel", {f"case {k}": (f"plant {k}", 1.0) for k in range(8)}, {"worst_case": 1.0})
 
     monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(measure, lambda _: {}))
-    verdict = promoting.verdicts_of(settings(), TONIGHT)[0]["temperature"]
+    verdict = verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"]
     for present in (other()._replace(contestant="pi_simc"), other()):
         state = ChampionState({"temperature": present})
         promoting.decided(settings(), "temperature", TONIGHT, state, verdict)
@@ -470,7 +470,7 @@ def test_the_champion_and_the_challenger_are_each_judged_as_their_own_contestant
 
 
 def test_the_same_files_as_another_contestant_are_another_challenger(project):
-    verdict = promoting.verdicts_of(settings(), TONIGHT)[0]["temperature"]
+    verdict = verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"]
     files = Installed({"md5": "0"}, champion.md5_of(LOOPS["temperature"]))
     decisions = {
         contestant: promoting.decided(
@@ -498,7 +498,7 @@ def test_the_same_files_as_another_contestant_are_another_challenger(project):
 
 
 def test_a_champion_that_would_lack_what_it_is_designed_from_is_not_promoted(project):
-    verdict = promoting.verdicts_of(settings(), TONIGHT)[0]["temperature"]._replace(subject="pi_simc")
+    verdict = verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"]._replace(subject="pi_simc")
     decided = promoting.decided(settings(), "temperature", TONIGHT, ChampionState(), verdict).decision
     assert decided.decision == KEPT and decided.reasons == [
         "pi_simc is designed from datasets/identify_plant/spread.parquet, which the champion would lack; add "
@@ -554,7 +554,7 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
         verdict = Verdict("deposition", state, *words_of[state], "", "", "", "basis", subject="basis")
         verdict = verdict._replace(rehearsal=True)
         monkeypatch.setattr(
-            promoting, "verdicts_of", lambda settings, night: ({"deposition": verdict}, night)
+            verdicts, "read_verdicts", lambda settings, night: ({"deposition": verdict}, night)
         )
         Path("learn.py").write_text(f"# night {number}\n")
         status, summary = night.nightly(render_night)

@@ -14,10 +14,10 @@ from pipeline.nightly import (
     champion,
     inputs,
     night,
-    promoting,
     remembered,
     reporting,
     screening,
+    verdicts,
     watch,
 )
 from pipeline.nightly.records import Alarm, LoopDrift, Night, NightDrift
@@ -45,7 +45,7 @@ def project(empty, tmp_path, monkeypatch):
     pass."""
     copy = entered(empty, tmp_path / "toy", monkeypatch)
     monkeypatch.setattr(
-        promoting, "verdicts_of", lambda settings, night: (dict(map(passing, settings.loops)), night)
+        verdicts, "read_verdicts", lambda settings, night: (dict(map(passing, settings.loops)), night)
     )
     Path("dvc.lock").write_text("schema: '2.0'\nstages: {}\n")
     return copy
