@@ -1,5 +1,5 @@
-"""The verdict of each loop that the night obeys: that of the run, with tonight's drift and with the controllers
-that are in production."""
+"""The verdict of each loop that the night obeys: that of the run, with the drift of tonight and with the
+controllers that are in production."""
 
 from collections.abc import Mapping
 
