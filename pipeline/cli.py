@@ -334,7 +334,7 @@ def replay(arguments: argparse.Namespace) -> None:
     asked = replaying.Asked(replaying.temperatures(arguments.reference), arguments.out)
     done, made, told = replaying.replay_recording(arguments.controller, arguments.recording, asked)
     inputs, outputs = ([one.name for one in side] for side in (made.machine.inputs, made.machine.outputs))
-    shown = page.Shown(
+    shown = page.ReplayData(
         done.time_s, done.applied, done.asked, done.measured, done.reference, done.off, inputs, outputs, told
     )
     artifacts.write_text(arguments.out / "index.html", page.render(shown))

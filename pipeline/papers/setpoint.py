@@ -54,7 +54,7 @@ WAITS_S, MELTS_S = (3.0, 6.0), (0.0, 2.0, 4.0)
 RHO = 0.7
 
 
-class Agents(NamedTuple):
+class StudyAgents(NamedTuple):
     """The networks after each phase, the fourth with the class right with probability 0.7 and with 0.3, and
     the mean reward of a step of each phase."""
 
@@ -62,7 +62,7 @@ class Agents(NamedTuple):
     rewards: list[np.ndarray]
 
 
-def trained(settings: TrainAgent) -> Agents:
+def trained(settings: TrainAgent) -> StudyAgents:
     """The paper's agent, and the one whose phase 4 takes rho for the probability of a wrong class."""
     other = settings.model_copy(update={"li_2025": settings.li_2025.model_copy(update={"accuracy": 1 - RHO})})
     MEMO.mkdir(parents=True, exist_ok=True)
@@ -71,7 +71,7 @@ def trained(settings: TrainAgent) -> Agents:
     )
     by_name = {f"phase_{i + 1}": network for i, network in enumerate(as_read.networks)}
     by_name["phase_4_rho_wrong"] = otherwise.networks[-1]
-    return Agents(by_name, [np.asarray(part) for part in as_read.rewards])
+    return StudyAgents(by_name, [np.asarray(part) for part in as_read.rewards])
 
 
 def asked() -> tuple[Conditions, dict[str, slice]]:
@@ -192,7 +192,7 @@ def reward_figures() -> dict[str, float]:
     return {name: float(reward(jnp.array(q), jnp.array(u), a=a, b=b)) for name, (q, u) in points.items()}
 
 
-def rewards_of(agents: Agents, episode: int) -> dict[str, Any]:
+def rewards_of(agents: StudyAgents, episode: int) -> dict[str, Any]:
     """Figure 6: the mean reward of a step times the steps of an episode, 50 means a phase."""
     phases = [
         [round(episode * float(part.mean()), 3) for part in np.array_split(values, 50)]
@@ -250,7 +250,7 @@ def arithmetic() -> dict[str, Any]:
     }
 
 
-def sizes(networks: Agents) -> dict[str, Any]:
+def sizes(networks: StudyAgents) -> dict[str, Any]:
     """Parameters of the networks, and what table 1 lists."""
     classifier = vision_transformer(PAPER, np.random.default_rng(0))
     return {

@@ -13,7 +13,7 @@ LOOPS = ("temperature", "deposition", "setpoint")
 Metrics = Mapping[str, Any]  # {stage: its file of reports/metrics}; another commit's may hold anything
 
 
-class Measured(NamedTuple):
+class RunFigures(NamedTuple):
     """{loop: {key: figure}}, and by loop whose figures they are and the verdict's words."""
 
     figures: Mapping[str, Mapping[str, Figure]]
@@ -46,7 +46,7 @@ def asked(rules: ReportRules, metrics: Metrics) -> dict[str, list[Question]]:
     }
 
 
-def measured(metrics: Metrics) -> Measured:
+def measured(metrics: Metrics) -> RunFigures:
     """The figures of one run."""
     report, heat = section(metrics, "report"), section(metrics, "evaluate_temperature")
     camera = section(metrics, "evaluate_setpoint")
@@ -60,7 +60,7 @@ def measured(metrics: Metrics) -> Measured:
         "setpoint": setpoint(camera, section(metrics, "train_classifier")),
     }
     verdicts = {loop: section(section(report, "verdicts"), loop).get("decision") for loop in LOOPS}
-    return Measured(
+    return RunFigures(
         figures,
         {"temperature": winner, "setpoint": str(camera.get("default") or "")},
         {loop: str(decision) for loop, decision in verdicts.items() if decision},

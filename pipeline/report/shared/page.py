@@ -12,8 +12,8 @@ import jinja2
 from markupsafe import Markup, escape
 
 from pipeline.report.shared import digits
-from pipeline.report.shared.pictures import Column
-from pipeline.report.shared.sources import QUICK_LOOK, Source, Sources
+from pipeline.report.shared.pictures import PictureColumn
+from pipeline.report.shared.sources import QUICK_LOOK, SourceFile, Sources
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
@@ -100,7 +100,7 @@ def glyph(state: str) -> Markup:
     )
 
 
-def widest(columns: Sequence[Column]) -> int:
+def widest(columns: Sequence[PictureColumn]) -> int:
     """Width in px for which the widest chart of these columns was drawn."""
     panels = "".join(str(panel) for column in columns for panel in column.panels)
     return max(map(int, re.findall(r'style="--w:(\d+)px"', panels)), default=208)
@@ -152,7 +152,7 @@ def in_viewer(table: str, **place: str | Sequence[str]) -> Markup:
     return Markup('<a class="in-viewer" href="viewer.html#{}">Open in the viewer</a>').format(state)
 
 
-def origin(sources: list[Source], **place: str | Sequence[str]) -> Markup:
+def origin(sources: list[SourceFile], **place: str | Sequence[str]) -> Markup:
     """Where the figures beside it are from: artifact and hash; the whole hash stands at the foot of the page.
     A time series is linked to its place in the viewer, which `place` tells."""
     if not sources:
@@ -163,12 +163,12 @@ def origin(sources: list[Source], **place: str | Sequence[str]) -> Markup:
     return files(sources)
 
 
-def files(sources: Sequence[Source]) -> Markup:
+def files(sources: Sequence[SourceFile]) -> Markup:
     """The artifacts by name: a click gives the file, the title its digest."""
     return Markup('<p class="src">From {}.</p>').format(linked(sources)) if sources else Markup("")
 
 
-def linked(sources: Sequence[Source], *, short: bool = False) -> Markup:
+def linked(sources: Sequence[SourceFile], *, short: bool = False) -> Markup:
     """The links to these files, with commas between them; `short`: without their folder."""
     return Markup(", ").join(
         placed(

@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, count, number, short
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources, Table
 from pipeline.report.shared.verdict import Missing
 from pipeline.report.temperature.answers import comparison, entry, judged, refused
@@ -68,7 +68,7 @@ def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
             if who in runs
             else [_hole(without.get(who, "no trajectory was recorded"))]
         )
-        shown.append(Column(heading(who), kind(who), who, panels))
+        shown.append(PictureColumn(heading(who), kind(who), who, panels))
     return Picture(
         name,
         title,
@@ -203,7 +203,9 @@ def plants(sources: Sources) -> Picture:
             f"{count(len(both), 'plant')}."
         )
         shown.append(
-            Column("The pair", "mean cost on each plant, a line a plant", "", [_slopes(both, a, b, finding)])
+            PictureColumn(
+                "The pair", "mean cost on each plant, a line a plant", "", [_slopes(both, a, b, finding)]
+            )
         )
     names = [
         name
@@ -212,7 +214,7 @@ def plants(sources: Sources) -> Picture:
     ]
     if not names:
         return placeholder("plants", title, Missing("not measured", "no case has a cost"))
-    shown.append(Column("All contestants", "cost of every case", "", [_boxes(cases, names)]))
+    shown.append(PictureColumn("All contestants", "cost of every case", "", [_boxes(cases, names)]))
     return Picture(
         "plants",
         title,
