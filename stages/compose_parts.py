@@ -4,6 +4,7 @@ tasks.parquet, lines.parquet, scores.parquet and conformance.json."""
 
 from pathlib import Path
 
+import stages
 from pipeline.deposition.workflow import compose_parts, verify_part
 from pipeline.deposition.workflow.segment_library import read_learned
 from pipeline.deposition.workflow.settings import ComposeParts, Printer, TrainIlc
@@ -35,4 +36,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "compose_parts", loop="deposition")

@@ -5,6 +5,7 @@ two episodes through pixels, and choice.json, the default with its worst case.""
 
 from concurrent.futures import ThreadPoolExecutor
 
+import stages
 from pipeline.setpoint.agents import judging
 from pipeline.setpoint.workflow import contestants, evaluate_setpoint
 from pipeline.setpoint.workflow.agent_files import restore_agents
@@ -59,4 +60,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "evaluate_setpoint", loop="setpoint")

@@ -1,6 +1,7 @@
 """Judge every temperature controller as it would be deployed: reads what the temperature stages wrote; writes
 datasets/evaluate_temperature: cases.parquet, trajectories.parquet and summary.json."""
 
+import stages
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import evaluate_temperature, learned, tables
 from pipeline.temperature.workflow.settings import (
@@ -50,4 +51,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "evaluate_temperature", loop="temperature")

@@ -4,6 +4,7 @@ datasets/export_controllers: temperature/ (controller.json, arrays.safetensors, 
 setpoint/, and exported.json, which says what there is and why not. Where the certificate is refused it is all
 that is written of that loop."""
 
+import stages
 from pipeline.report.shared.verdict import ReportRules
 from pipeline.report.temperature.judgement import winner
 from pipeline.runtime.workflow import export_controllers as export
@@ -90,4 +91,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "export_controllers")

@@ -3,6 +3,7 @@ datasets/generate_probing: next_experiment.csv, what to play on the machine next
 next_experiment_closed_loop.csv, what to add to its controller's commands. Either is left out where no
 forecast holds it within the limits; forecast.json says why."""
 
+import stages
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
 from pipeline.temperature.workflow import generate_probing
@@ -32,4 +33,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "generate_probing", loop="temperature")

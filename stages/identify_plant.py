@@ -2,6 +2,7 @@
 datasets/identify_plant: plant, spread, order, and what the page of the identification shows:
 holdout, residuals, steps, dynamics, poles, levels."""
 
+import stages
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
 from pipeline.temperature.workflow import identify_plant
@@ -20,4 +21,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "identify_plant", loop="temperature")

@@ -6,6 +6,7 @@ parameters and code, is taken from a memo; a broken one is quarantined with its 
 import sys
 from pathlib import Path
 
+import stages
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import ingest
 from pipeline.temperature.workflow.settings import Ingest, Plant, check_output_limits
@@ -38,4 +39,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "ingest", loop="temperature")

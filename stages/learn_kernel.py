@@ -2,6 +2,7 @@
 datasets/learn_kernel/window.parquet and, where the record determines it, kernel.parquet: what the data say
 whatever the weights, so that new weights need no pass over the data."""
 
+import stages
 from pipeline.store import artifacts, params
 from pipeline.temperature.controllers import window
 from pipeline.temperature.workflow import learn_kernel
@@ -23,4 +24,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "learn_kernel", loop="temperature")

@@ -1,6 +1,7 @@
 """Probe the study's extruder: writes datasets/probe_machine/probing.mcap (simulated), in the very format that
 a user's recordings come in. With recordings it probes nothing, and nothing.json says so."""
 
+import stages
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import probe_machine
 from pipeline.temperature.workflow.settings import GenerateProbing, Plant, check_output_limits
@@ -21,4 +22,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "probe_machine", loop="temperature")

@@ -2,6 +2,7 @@
 datasets/render_frames/<part>.safetensors, frames.json with how many, and known_camera.parquet; no part where
 the frames are recordings. A classifier that is trained anew renders nothing anew."""
 
+import stages
 from pipeline.setpoint.workflow import camera_files, known_camera, render_frames
 from pipeline.setpoint.workflow.settings import RenderFrames
 from pipeline.store import artifacts, params
@@ -21,4 +22,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "render_frames", loop="setpoint")

@@ -9,6 +9,7 @@ Every file read is hashed, and the pages carry the hashes. The drift on page one
 
 import hashlib
 
+import stages
 from pipeline.report.about import page as about_page
 from pipeline.report.certificate import page as certificate_page
 from pipeline.report.deposition import page as deposition_page
@@ -132,4 +133,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "report")

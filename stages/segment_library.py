@@ -2,6 +2,7 @@
 library.parquet, the columns of the paper's matrix (3), and learned.json, the identified chain of each
 material, the demarcation and the paper's four assumptions in figures."""
 
+import stages
 from pipeline.deposition.workflow import segment_library
 from pipeline.deposition.workflow.settings import Printer, SegmentLibrary
 from pipeline.deposition.workflow.tables import LIBRARY
@@ -25,4 +26,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "segment_library", loop="deposition")

@@ -4,6 +4,7 @@ filter, and agents.parquet, the learning curves."""
 
 from pathlib import Path
 
+import stages
 from pipeline.setpoint.workflow import train_agent
 from pipeline.setpoint.workflow.agent_files import store_agents
 from pipeline.setpoint.workflow.settings import TrainAgent
@@ -26,4 +27,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "train_agent", loop="setpoint")

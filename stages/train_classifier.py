@@ -5,6 +5,7 @@ the simulator, frames for the page, and known_camera.parquet, by which frames of
 
 from pathlib import Path
 
+import stages
 from pipeline.setpoint.workflow import camera_files, gallery, known_camera, parts, train_classifier
 from pipeline.setpoint.workflow.classifier_files import store_classifier
 from pipeline.setpoint.workflow.settings import SetpointMaterial, TrainClassifier
@@ -57,4 +58,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "train_classifier", loop="setpoint")

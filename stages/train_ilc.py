@@ -3,6 +3,7 @@ writes datasets/train_ilc: trials.parquet, lessons.parquet, filmed.parquet, mode
 recordings of the first and the last trial, frames of these with the measured edges, and, for a
 real machine, the command of the next one in next/."""
 
+import stages
 from pipeline.deposition.learning import training
 from pipeline.deposition.workflow import train_ilc, trial_video
 from pipeline.deposition.workflow.settings import Camera, Printer, TrainIlc
@@ -31,4 +32,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "train_ilc", loop="deposition")

@@ -2,6 +2,7 @@
 wrote; writes datasets/tune_weights/weights.json and history.parquet. No data stage is touched by new
 weights."""
 
+import stages
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import learned, tables, tune_weights
 from pipeline.temperature.workflow.settings import Panel, Plant, Tracking, TuneWeights
@@ -32,4 +33,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stages.run(main, "tune_weights", loop="temperature")

@@ -398,17 +398,14 @@ def expected(root: Path, stage: str) -> dict[str, Any]:
         for item in node.items
         if ast.unparse(item).startswith("artifacts.stage(")
     ]
-    if any(frame.optional_vars for frame in frames):
+    writes_figures = any(function == "write_metrics" for *_, function in calls(tree))
+    if writes_figures or any(frame.optional_vars for frame in frames):
         written.add(f"datasets/{stage}")
     for call, _, function in calls(tree):
         assert function not in ("stage", "write_metrics") or literal(name, call, 0) == stage, (
             f"{name}:{call.lineno} the stage's name is {stage}"
         )
-    metrics = (
-        [f"reports/metrics/{stage}.json"]
-        if any(function == "write_metrics" for *_, function in calls(tree))
-        else []
-    )
+    metrics = [f"reports/metrics/{stage}.json"] if writes_figures else []
     entry = {
         "cmd": f"python -m stages.{stage}",
         "deps": [

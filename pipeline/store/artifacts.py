@@ -5,8 +5,11 @@ target and renames, and `stage` does so for all that a stage writes. If anything
 artifacts stay.
 """
 
+from __future__ import annotations
+
 import contextlib
 import errno
+import fnmatch
 import hashlib
 import json
 import math
@@ -17,28 +20,28 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-
-import cv2
-import mcap.writer
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-import safetensors
-from safetensors.numpy import load_file, save_file
+from typing import TYPE_CHECKING
 
 from pipeline.store import params, tables
 from pipeline.store.printable import printable
 from pipeline.store.tables import ARRAYS, Column, Schema
 
+# the libraries of files are imported by the functions that open one: a stage that writes JSON waits for none
+if TYPE_CHECKING:
+    import numpy as np
+    import pyarrow as pa
+
 DATASETS, REPORTS = Path("datasets"), Path("reports")
 WHOLE = ".whole"  # inside a stage: the folder that it lies in will hold nothing else
-REFUSALS = (ValueError, OSError, MemoryError, np.linalg.LinAlgError, pa.ArrowException)
+REFUSALS = (ValueError, OSError, MemoryError)  # LinAlgError is a ValueError
 # how XLA, OpenCV and C++ say that their memory ran out
 OUT_OF_MEMORY = ("RESOURCE_EXHAUSTED", "Insufficient memory", "bad_alloc")
 CSV_ROWS = 1 << 15  # written at once: text takes ten times the memory of its numbers
 
 # inside a stage: the folder where what goes to reports/ waits until the stage has ended well
 _waiting: ContextVar[Path | None] = ContextVar("_waiting", default=None)
+# and the fresh folder that becomes datasets/<stage> then
+_fresh: ContextVar[Path | None] = ContextVar("_fresh", default=None)
 
 
 # ---- tables
@@ -52,6 +55,9 @@ def write_table(
 
     Missing floats are NaN. Raises ValueError naming the column and the row.
     """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     tables.check_names(path, schema, columns, "give exactly the columns of the schema")
     arrays = [_array(path, column, columns[column.name]) for column in schema.columns]
     lengths = {column.name: len(array) for column, array in zip(schema.columns, arrays, strict=True)}
@@ -70,6 +76,10 @@ def read_table(path: str | Path, schema: Schema) -> dict[str, np.ndarray]:
 
     Raises ValueError for a table of another schema.
     """
+    import numpy as np
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     command = remedy(path)
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
@@ -87,7 +97,10 @@ def read_table(path: str | Path, schema: Schema) -> dict[str, np.ndarray]:
 
 
 def version(path: str | Path) -> int | None:
-    """The version of the schema that a table was written with; None where the file is no table that says."""
+    """The version of the schema that a table was written with; None if it is no such table."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     try:
         told = (pq.read_schema(path).metadata or {}).get(b"schema_version", b"").decode()
     except (OSError, pa.ArrowException):
@@ -100,6 +113,8 @@ def write_arrays(
 ) -> None:
     """Named real arrays {name: (array, unit, meaning)} of any shape as one Parquet table. Integers and
     booleans come back as floats."""
+    import numpy as np
+
     rows = []
     for key, (array, unit, meaning) in arrays.items():
         values = np.asarray(array)
@@ -131,6 +146,8 @@ def read_arrays(
     Raises ValueError where one has not the shape that `shapes` gives it (None: any length): it is of another
     machine or of another run than what it is read beside.
     """
+    import numpy as np
+
     table = read_table(path, ARRAYS._replace(name=name, version=version))
     arrays = {}
     for key, shape, values in zip(table["name"], table["shape"], table["values"], strict=True):
@@ -161,11 +178,14 @@ def _shape(lengths: Sequence[int | None]) -> str:
 
 def _array(path: str | Path, column: Column, values) -> pa.Array:
     """Values in the column's type, NaN as missing. Nothing is rounded."""
+    import numpy as np
+    import pyarrow as pa
+
     try:
         if isinstance(values, pa.Array | pa.ChunkedArray):
             values = values.to_numpy(zero_copy_only=False)
         values = values.tolist() if isinstance(values, np.ndarray) and values.dtype.kind in "UO" else values
-        return pa.array(values, column.type, from_pandas=True)
+        return pa.array(values, tables.arrow_type(column.type), from_pandas=True)
     except (pa.ArrowException, TypeError, ValueError, OverflowError) as error:
         raise ValueError(
             f"{path}: column {column.name} does not fit {column.type} ({reason(error)}); "
@@ -194,15 +214,39 @@ def read_json(path: str | Path):
         raise ValueError(f"{path} is not whole JSON ({reason(error)}); {remedy(path)}") from None
 
 
-def write_metrics(stage: str, data: Mapping) -> None:
-    """Writes reports/metrics/<stage>.json. Inside the frame of a stage the file is put in place when the
-    stage has ended well."""
-    write_json(REPORTS / "metrics" / f"{stage}.json", data)
+def write_metrics(stage: str, figures: Mapping, metrics: Sequence[str] = ("*",)) -> None:
+    """Writes all figures to datasets/<stage>/figures.json, which pages and later stages read, and those that
+    match `metrics` to reports/metrics/<stage>.json, which git keeps and DVC compares.
+
+    A pattern is a dotted path whose keys may hold * for any text. It takes a figure, or all figures below a
+    section.
+    """
+    fresh = _fresh.get()
+    write_json((fresh if fresh else DATASETS / stage) / "figures.json", figures)
+    patterns = [tuple(pattern.split(".")) for pattern in metrics]
+    write_json(REPORTS / "metrics" / f"{stage}.json", _matching(_plain(stage, "", figures), patterns))
+
+
+def _matching(figures: Mapping, patterns: Sequence[Sequence[str]]) -> dict:
+    """The figures and sections that a pattern takes, in their order."""
+    chosen = {}
+    for key, value in figures.items():
+        rests = [rest for first, *rest in patterns if fnmatch.fnmatchcase(key, first)]
+        if not all(rests):
+            chosen[key] = value
+        elif isinstance(value, Mapping) and (inner := _matching(value, rests)):
+            chosen[key] = inner
+    return chosen
 
 
 def read_metrics(stage: str) -> dict:
-    """The data that the stage wrote with `write_metrics`."""
+    """The metrics that the stage wrote with `write_metrics`."""
     return read_json(REPORTS / "metrics" / f"{stage}.json")
+
+
+def read_figures(stage: str) -> dict:
+    """All figures that the stage wrote with `write_metrics`."""
+    return read_json(DATASETS / stage / "figures.json")
 
 
 def write_learning_curve(
@@ -217,7 +261,7 @@ def write_learning_curve(
     lines: dict[tuple[str, str], list[str]] = {}
     for name, at, *values in zip(*(columns[key] for key in (of, step, *figures)), strict=True):
         for figure, value in zip(figures, values, strict=True):
-            if value is not None and np.isfinite(value):
+            if value is not None and math.isfinite(value):
                 lines.setdefault((name.replace(" ", "_"), figure), []).append(
                     f"{int(at)}\t{float(value)!r}\n"
                 )
@@ -251,6 +295,8 @@ def write_folder(path: str | Path, files: Mapping[str, str | bytes]) -> None:
 
 def write_jpeg(path: str | Path, picture: np.ndarray) -> None:
     """A picture (h, w, 3) uint8 in RGB, at the quality of a page."""
+    import cv2
+
     done, data = cv2.imencode(
         ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80]
     )
@@ -263,6 +309,8 @@ def write_jpeg(path: str | Path, picture: np.ndarray) -> None:
 def write_csv(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
     """A CSV file of numbers and plain words for readers without Parquet: a header line of names, then one
     line a sample, floats by repr."""
+    import numpy as np
+
     arrays = [np.asarray(values) for values in columns.values()]
     with beside(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
         stream.write(",".join(columns) + "\n")
@@ -274,7 +322,7 @@ def write_csv(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
 def _plain(path: str | Path, place: str, data):
     if isinstance(data, tuple) and hasattr(data, "_asdict"):
         data = data._asdict()
-    if isinstance(data, np.ndarray | np.generic):
+    if type(data).__module__ == "numpy":
         data = data.tolist()
     if isinstance(data, Mapping):
         bad_key = next((key for key in data if not isinstance(key, str)), None)
@@ -286,7 +334,7 @@ def _plain(path: str | Path, place: str, data):
         return {key: _plain(path, f"{place}.{key}" if place else key, value) for key, value in data.items()}
     if isinstance(data, list | tuple):
         return [_plain(path, f"{place}[{i}]", value) for i, value in enumerate(data)]
-    if isinstance(data, float) and not np.isfinite(data):
+    if isinstance(data, float) and not math.isfinite(data):
         raise ValueError(
             f"{path}: {place} is {data} but must be finite; write null where there is no figure, "
             "and say why beside it"
@@ -329,6 +377,9 @@ def write_recording(
     metadata has name and version of the schema, and unit and meaning of each signal. Raises ValueError for
     lengths that differ and for values that are not finite.
     """
+    import mcap.writer
+    import numpy as np
+
     time = np.asarray(time_s, float)
     for name, (values, _, _) in {"time_s": (time, "s", ""), **signals}.items():
         if np.shape(values) != time.shape or time.ndim != 1:
@@ -398,7 +449,7 @@ def stage(name: str) -> Iterator[Path]:
     with status 1 and one line, and change no file.
     """
     folder, retired, waiting = (DATASETS / f".{name}.{os.getpid()}{end}" for end in ("", ".old", ".reports"))
-    token = _waiting.set(waiting)
+    tokens = _waiting.set(waiting), _fresh.set(folder)
     try:
         _tidy(name)
         folder.mkdir(parents=True)
@@ -412,15 +463,16 @@ def stage(name: str) -> Iterator[Path]:
             target = temporary.relative_to(waiting)
             target.parent.mkdir(parents=True, exist_ok=True)
             temporary.replace(target)
-    except (*REFUSALS, RuntimeError, cv2.error) as error:
-        if not isinstance(error, REFUSALS) and not _out_of_memory(error):
+    except Exception as error:
+        if not (isinstance(error, REFUSALS) or _is_of_arrow(error) or _out_of_memory(error)):
             raise
         # the temporary folder's name means nothing to a reader
         sentence = reason(error).replace(str(folder), str(DATASETS / name))
         print(printable(f"{name}: {sentence}"), file=sys.stderr)
         raise SystemExit(1) from None
     finally:
-        _waiting.reset(token)
+        _waiting.reset(tokens[0])
+        _fresh.reset(tokens[1])
         for left in (folder, waiting):
             shutil.rmtree(left, ignore_errors=True)
 
@@ -557,7 +609,12 @@ def reason(error: Exception) -> str:
     return "; ".join(line.strip() for line in text.splitlines() if line.strip())
 
 
+def _is_of_arrow(error: Exception) -> bool:
+    return any(kind.__module__ == "pyarrow.lib" for kind in type(error).__mro__)
+
+
 def _out_of_memory(error: Exception) -> bool:
+    """Whether a library ran out of memory: XLA and C++ say so by RuntimeError, OpenCV by its own error."""
     return any(words in str(error) for words in OUT_OF_MEMORY)
 
 
@@ -566,6 +623,9 @@ def write_weights(
 ) -> None:
     """Writes arrays of any shape and kind, bit by bit, with `about`: what a reader must know to use them.
     Equal arrays give equal bytes."""
+    import numpy as np
+    from safetensors.numpy import save_file
+
     metadata = {"schema": name, **about}
     # the library writes metadata in the order of a hash that differs between processes, so one key has all
     packed = {"beadline": "\n".join(f"{key}={metadata[key]}" for key in sorted(metadata))}
@@ -578,6 +638,9 @@ def write_weights(
 def read_weights(path: str | Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Arrays and `about` of `write_weights`. Raises ValueError if the file is missing, broken, or of another
     schema."""
+    import safetensors
+    from safetensors.numpy import load_file
+
     command = remedy(path)
     try:
         arrays = load_file(path)

@@ -15,14 +15,10 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from pipeline.store import artifacts
 from pipeline.store.params import Execution
+from pipeline.store.pins import PINS
 
 CODE = Path(__file__).resolve().parents[1]
-# what `run` exports for the sake of last bits, and the packages whose sums they pin
-PINS = (
-    "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "NPROC",
-    "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "XLA_FLAGS", "ONEDNN_MAX_CPU_ISA",
-    "TENSORFLOW_USE_CUSTOM_CONTRACTION_KERNEL", "ARROW_USER_SIMD_LEVEL", "OPENCV_IPP", "OPENCV_CPU_DISABLE",
-)  # fmt: skip
+# the packages whose sums the pins of `run` fix
 PACKAGES = ("numpy", "scipy", "jaxlib", "opencv-python-headless", "pyarrow", "scikit-learn")
 
 

@@ -6,24 +6,18 @@ key of it in one. A path to params.yaml means both files: the other one lies bes
 own begin with x_.
 """
 
-import copy
 import difflib
-import functools
 import hashlib
 import json
 import re
 import types
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import pydantic
 from pydantic import Field
-from ruamel.yaml import YAML
-from ruamel.yaml.composer import MaxDepthExceededError
-from ruamel.yaml.error import MarkedYAMLError, StreamMark, YAMLError
-from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 FILE, EXPERT = "params.yaml", "params.expert.yaml"
 # every section that code reads
@@ -38,6 +32,7 @@ SECTIONS = (
     "identify_plant",
     "ingest",
     "learn_kernel",
+    "loops",
     "nightly",
     "panel",
     "plant",
@@ -56,9 +51,6 @@ SECTIONS = (
 PAPERS, PAPERS_SECTIONS = "datasets/papers/params.yaml", ("reproduce_study",)
 # old dotted key or section -> new one, for one version; none since 0.2
 RENAMED: dict[str, str] = {}
-# the project's own files are 6 levels deep
-DEEPEST, LONGEST_NUMBER, LARGEST = 50, 30, 200_000
-_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("bool", "null", "int", "float", "str", "map", "seq")}
 
 
 class Section(pydantic.BaseModel):
@@ -69,10 +61,21 @@ class Section(pydantic.BaseModel):
     tuples. NaN and infinity are refused.
     """
 
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    # built when a section is first checked: that takes longer than the import of most stages
+    model_config = pydantic.ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True
+    )
 
 
 # ---- sections that belong to no loop
+
+
+class Loops(Section):
+    """Section `loops`: those that the machine has. Stages of the others write that they were not asked."""
+
+    temperature: bool
+    deposition: bool
+    setpoint: bool
 
 
 class Mapped(Section):
@@ -118,6 +121,27 @@ def load(model: type[S], section: str, path: str | Path = FILE) -> S:
     Raises ValueError with a line for each key that is unknown, renamed, missing or out of bounds, and for
     each section, this or another, that is none of SECTIONS.
     """
+    _check_names(path)
+    return _load(model, section, path)
+
+
+def check(models: Mapping[str, type[Section]], path: str | Path = FILE) -> None:
+    """Checks the sections that `models` names by these models. Raises ValueError with a line for each problem
+    of the two files."""
+    problems = _problems_of_names(path)
+    misspelt = {_nearest(name, models) for name in {*read(path)}.difference(models)}
+    for section, model in models.items():
+        if section in misspelt:
+            continue  # its keys are below another name
+        try:
+            _load(model, section, path)
+        except ValueError as error:
+            problems += str(error).splitlines()
+    if problems:
+        raise ValueError("\n".join(dict.fromkeys(problems)))
+
+
+def _load(model: type[S], section: str, path: str | Path) -> S:
     sections = files(path)
     values = _section(section, path)
     try:
@@ -138,6 +162,7 @@ def value(dotted: str, path: str | Path = FILE, *, one_of: tuple) -> Any:
     Raises ValueError as `load` does.
     """
     section, *keys = dotted.split(".")
+    _check_names(path)
     choice: Any = _section(section, path)
     place = _files_of(files(path), section, keys)
     for key in keys:
@@ -174,61 +199,6 @@ def digest(model: Section) -> str:
     return hashlib.sha256(canonical.encode()).hexdigest()
 
 
-@functools.lru_cache(maxsize=8)
-def _parsed(text: str) -> Any:
-    """YAML 1.2 as DVC reads it, by the same parser: 1e-6 is a number, `no` and `on` are words."""
-    yaml = YAML(typ="safe", pure=True)
-    yaml.max_depth = DEEPEST
-    try:
-        node = yaml.compose(text)
-    except MaxDepthExceededError as error:
-        error.problem = f"it is nested deeper than {DEEPEST} levels; put fewer into each other"
-        raise
-    if node is None:
-        return None
-    _check(node)
-    try:
-        return yaml.constructor.construct_document(node)
-    except (KeyError, IndexError, ValueError) as error:
-        raise MarkedYAMLError(problem=f"{error} does not fit its tag; take the tag out") from None
-
-
-def _check(node: Node) -> None:
-    """Raises MarkedYAMLError for what a reader of the file would take for something else, and for what JSON
-    has no type for. An alias is its anchor's node, so that it is not reached."""
-    if node.anchor:
-        raise _refused(node, f"the anchor &{node.anchor} is refused; write the values out at each place")
-    tag = str(node.tag)
-    if tag.endswith(":timestamp") and isinstance(node, ScalarNode):
-        raise _refused(node, f'{node.value} is a date; write it in quotes: "{node.value}"')
-    if tag not in _TAGS:
-        raise _refused(node, f"the tag {tag} names no type of parameters; take it out")
-    if isinstance(node, ScalarNode) and tag.endswith((":int", ":float")):
-        if len(node.value) > LONGEST_NUMBER:
-            raise _refused(node, f"a number has {len(node.value)} digits; write at most {LONGEST_NUMBER}")
-        if "_" in node.value:
-            raise _refused(node, f"{node.value} has underscores; write {node.value.replace('_', '')}")
-    if isinstance(node, SequenceNode):
-        for inner in node.value:
-            _check(inner)
-    if isinstance(node, MappingNode):
-        lines: dict[str, int] = {}
-        for key, inner in node.value:
-            if not isinstance(key, ScalarNode):
-                raise _refused(key, "a key is no word; write a name before the colon")
-            _check(key)
-            if key.value in lines:
-                raise _refused(
-                    key, f"{key.value} is given twice, first in line {lines[key.value]}; keep one of the two"
-                )
-            lines[key.value] = key.start_mark.line + 1
-            _check(inner)
-
-
-def _refused(node: Node, problem: str) -> MarkedYAMLError:
-    return MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
-
-
 def read(path: str | Path = FILE) -> dict:
     """Every section with its keys of both files, unchecked.
 
@@ -255,53 +225,27 @@ def files(path: str | Path = FILE) -> dict[str, dict]:
 
     Raises ValueError with file and line for a file that is no YAML or has a key twice.
     """
-    expert = Path(path).with_name(EXPERT)
-    return {str(name): _sections(name) for name in (path, *([expert] if expert.exists() else []))}
+    from pipeline.store import params_text
 
-
-def _sections(path: str | Path) -> dict:
-    try:
-        size = Path(path).stat().st_size
-        if not Path(path).is_file():
-            raise ValueError(f"{path} is no file; {_RESTORE.format(path)}")
-        if size > LARGEST:
+    expert, by_file = Path(path).with_name(EXPERT), {}
+    for name in (path, *([expert] if expert.exists() else [])):
+        sections = params_text.read(name)
+        if type(sections) is not dict:
             raise ValueError(
-                f"{path} has {size} bytes but may have {LARGEST}; restore it with git checkout {path}"
+                f"{name} must hold sections (name: and indented keys) but holds {_shown(sections)}; "
+                f"restore it with git checkout {name}"
             )
-        text = Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ValueError(f"{path} is missing; {_RESTORE.format(path)}") from None
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8") from None
-    try:
-        sections = copy.deepcopy(_parsed(text))
-    except MarkedYAMLError as error:
-        line = f"line {error.problem_mark.line + 1}: " if isinstance(error.problem_mark, StreamMark) else ""
-        # "expected one document", "but found another"
-        context = f"{error.context}, " if str(error.problem).startswith("but") else ""
-        problem = " ".join(f"{context}{error.problem}".split())
-        remedy = "" if ";" in problem else "; mend the line: key: value, indented by spaces"
-        raise ValueError(f"{path}: {line}{problem}{remedy}") from None
-    except (ValueError, OverflowError) as error:
-        raise ValueError(f"{path}: {error}; take that out") from None
-    except YAMLError as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())}; remove that character") from None
-    if type(sections) is not dict:
-        raise ValueError(
-            f"{path} must hold sections (name: and indented keys) but holds {_shown(sections)}; "
-            f"restore it with git checkout {path}"
-        )
-    return sections
+        by_file[str(name)] = sections
+    return by_file
 
 
 def _section(section: str, path: str | Path) -> dict:
     sections = read(path)
-    _check_names(files(path))
     if section not in sections:
         expert = Path(path).with_name(EXPERT)
         if not expert.exists():
             raise ValueError(
-                f"{path}: section {section} is missing, and so is {expert}; {_RESTORE.format(expert)}"
+                f"{path}: section {section} is missing, and so is {expert}; {RESTORE.format(expert)}"
             )
         raise ValueError(
             f"{_files_of(files(path), section)}: section {section} is missing; "
@@ -312,17 +256,20 @@ def _section(section: str, path: str | Path) -> dict:
     return sections[section]
 
 
-def _check_names(by_file: dict[str, dict]) -> None:
-    """Raises ValueError with a line for each section that no code reads."""
-    problems = [
+def _check_names(path: str | Path) -> None:
+    if problems := _problems_of_names(path):
+        raise ValueError("\n".join(problems))
+
+
+def _problems_of_names(path: str | Path) -> list[str]:
+    """A sentence for each section that no code reads."""
+    return [
         f"{file}: {_no_section(str(name))}"
-        for file, sections in by_file.items()
+        for file, sections in files(path).items()
         for name in sections
         if name not in (PAPERS_SECTIONS if file.endswith(PAPERS) else SECTIONS)
         and not str(name).startswith("x_")
     ]
-    if problems:
-        raise ValueError("\n".join(problems))
 
 
 def _files_of(sections: dict[str, dict], section: str, location: Sequence = ()) -> str:
@@ -335,7 +282,7 @@ def _files_of(sections: dict[str, dict], section: str, location: Sequence = ()) 
 
 # ---- the sentences
 
-_RESTORE = "run from the root of the project, or restore it with git checkout {}"
+RESTORE = "run from the root of the project, or restore it with git checkout {}"
 _NO_SECTION = "must be a section with keys below it but is {}; indent its keys by two spaces"
 _BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 _COMPARISONS = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}

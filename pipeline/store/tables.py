@@ -3,12 +3,21 @@
 What does not fit is refused by column and row.
 """
 
-import math
-from pathlib import Path
-from typing import NamedTuple
+from __future__ import annotations
 
-import pyarrow as pa
-import pyarrow.compute as pc
+import math
+from collections.abc import Collection
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+# types of columns, by Arrow's names; a list is list<double>, bytes of one length are binary[768]
+TEXT, FLOAT, BOOL, COUNT, INDEX, BYTES = "string", "double", "bool", "int64", "int32", "binary"
+
+# the unit of what has none
+NONE = "1"
 
 
 class Column(NamedTuple):
@@ -18,7 +27,7 @@ class Column(NamedTuple):
     """
 
     name: str
-    type: pa.DataType
+    type: str
     unit: str
     meaning: str
     low: float | None = None
@@ -32,16 +41,30 @@ class Schema(NamedTuple):
     columns: tuple[Column, ...]
 
 
-TEXT, FLOAT, BOOL, COUNT, INDEX = pa.string(), pa.float64(), pa.bool_(), pa.int64(), pa.int32()
+def list_of(kind: str) -> str:
+    return f"list<{kind}>"
 
-# the unit of what has none
-NONE = "1"
+
+def bytes_of(length: int) -> str:
+    return f"{BYTES}[{length}]"
+
+
+def arrow_type(kind: str) -> pa.DataType:
+    """Arrow's type of this name."""
+    import pyarrow as pa
+
+    name, _, length = kind.rstrip(">]").partition("<" if kind.startswith("list<") else "[")
+    if name == "list":
+        return pa.list_(arrow_type(length))
+    return pa.binary(int(length)) if length else pa.type_for_alias(name)
 
 
 def arrow(schema: Schema) -> pa.Schema:
     """Arrow's schema: name and version in its metadata, unit and meaning in each field's."""
+    import pyarrow as pa
+
     fields = [
-        pa.field(name, kind, nullable, {"unit": unit, "meaning": meaning})
+        pa.field(name, arrow_type(kind), nullable, {"unit": unit, "meaning": meaning})
         for name, kind, unit, meaning, _, _, nullable in schema.columns
     ]
     return pa.schema(fields, {"schema": schema.name, "schema_version": str(schema.version)})
@@ -60,7 +83,7 @@ def check(path: str | Path, schema: Schema, table: pa.Table, remedy: str) -> Non
     check_names(path, schema, table.column_names, remedy)
     for column in schema.columns:
         kind = table.schema.field(column.name).type
-        if kind != column.type:
+        if kind != arrow_type(column.type):
             raise ValueError(f"{path}: column {column.name} is {kind} but should be {column.type}; {remedy}")
         unit = (table.schema.field(column.name).metadata or {}).get(b"unit", b"").decode()
         if unit != column.unit:
@@ -71,7 +94,7 @@ def check(path: str | Path, schema: Schema, table: pa.Table, remedy: str) -> Non
     check_values(path, schema, table, remedy)
 
 
-def check_names(path: str | Path, schema: Schema, names, remedy: str) -> None:
+def check_names(path: str | Path, schema: Schema, names: Collection[str], remedy: str) -> None:
     """Refuses a table that lacks columns or has others."""
     expected = [column.name for column in schema.columns]
     missing = [name for name in expected if name not in names]
@@ -87,6 +110,8 @@ def check_names(path: str | Path, schema: Schema, names, remedy: str) -> None:
 
 def check_values(path: str | Path, schema: Schema, table: pa.Table, remedy: str) -> None:
     """Refuses missing values, infinities and values out of range, with the row."""
+    import pyarrow.compute as pc
+
     for column in schema.columns:
         values = table[column.name]
         if values.null_count and not column.nullable:
@@ -95,11 +120,14 @@ def check_values(path: str | Path, schema: Schema, table: pa.Table, remedy: str)
                 f"{path}: column {column.name} has no value (NaN) in row {row}, "
                 f"the first of {values.null_count}; {remedy}"
             )
-        if pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
+        if column.type in (FLOAT, COUNT, INDEX):
             _check_range(path, column, values, remedy)
 
 
 def _check_range(path: str | Path, column: Column, values: pa.ChunkedArray, remedy: str) -> None:
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
     extremes = pc.min_max(values).as_py()
     smallest, largest = extremes["min"], extremes["max"]
     if smallest is None:
@@ -129,7 +157,7 @@ ARRAYS = Schema(
         Column("name", TEXT, NONE, "name of the array"),
         Column("unit", TEXT, NONE, "unit of its values"),
         Column("meaning", TEXT, NONE, "what it is"),
-        Column("shape", pa.list_(COUNT), NONE, "lengths of its axes"),
-        Column("values", pa.list_(FLOAT), NONE, "its values in row-major order"),
+        Column("shape", list_of(COUNT), NONE, "lengths of its axes"),
+        Column("values", list_of(FLOAT), NONE, "its values in row-major order"),
     ),
 )

@@ -198,9 +198,6 @@ def test_a_misspelt_key_is_refused_by_name_before_the_first_stage(checkout):
 # ---- pins
 
 
-@pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="no stage looks at the pins: it writes other bytes unseen"
-)
 def test_a_stage_without_the_pins_refuses_to_write(tmp_path):
     folder = begin(tmp_path / "project")
     declare(folder, {"generate_probing.samples": 200})

@@ -161,7 +161,7 @@ def with_column(number, **changed):
         (pa.table({"a": [1]}), " holds no schema but scores version 1 is expected"),
         (table().drop_columns("share"), ": table scores version 1 lacks share"),
         (table(with_column(1, unit="1")), ": column share is in 1 but should be in percent"),
-        (table(with_column(2, type=pa.int32())), ": column steps is int32 but should be int64"),
+        (table(with_column(2, type="int32")), ": column steps is int32 but should be int64"),
         (table(share=[3.0, 200.0]), ": column share is 200 percent in row 1 but must be at most 100 percent"),
     ],
 )
@@ -314,6 +314,32 @@ def test_broken_json_is_refused_with_its_place(project):
         ValueError, match=r"reports/metrics/report.json is missing; make it again with ./run dvc repro report"
     ):
         artifacts.read_metrics("report")
+
+
+FIGURES = {
+    "machine": "ab12",
+    "cases": {"gain 0.6": {"settled": 97.5, "stay": 90.0}, "clog": {"settled": 50.0, "runs": [1, 2]}},
+    "harm": {"perfect": {"beyond_25": 0.0}},
+}
+
+
+@pytest.mark.parametrize(
+    ("metrics", "chosen"),
+    [
+        (("*",), FIGURES),
+        (("cases.*.settled",), {"cases": {"gain 0.6": {"settled": 97.5}, "clog": {"settled": 50.0}}}),
+        (("harm", "cases.clog.r*"), {"cases": {"clog": {"runs": [1, 2]}}, "harm": FIGURES["harm"]}),
+        (("cases.gain 0*.stay", "settled"), {"cases": {"gain 0.6": {"stay": 90.0}}}),
+        ((), {}),
+    ],
+)
+def test_metrics_are_the_figures_that_match_a_pattern(project, metrics, chosen):
+    with artifacts.stage("evaluate"):
+        artifacts.write_metrics("evaluate", FIGURES, metrics)
+    assert artifacts.read_figures("evaluate") == FIGURES
+    kept = artifacts.read_metrics("evaluate")
+    assert kept == chosen and list(kept) == list(chosen)
+    assert set(everything(project)) == {"datasets/evaluate/figures.json", "reports/metrics/evaluate.json"}
 
 
 # ---- learning curves and recordings

@@ -3,9 +3,7 @@
 Other columns are another version: raise the number with them.
 """
 
-import pyarrow as pa
-
-from pipeline.store.tables import BOOL, COUNT, FLOAT, INDEX, NONE, TEXT, Column, Schema
+from pipeline.store.tables import BOOL, COUNT, FLOAT, INDEX, NONE, TEXT, Column, Schema, list_of
 
 TRIALS = Schema(
     "trials",
@@ -77,7 +75,7 @@ LIBRARY = Schema(
         Column("pause_s", FLOAT, "s", "pause that it was learned with; 0 but for a Corner", low=0),
         Column("lead", COUNT, NONE, "samples that it begins ahead of its event", low=0),
         Column("length", COUNT, NONE, "samples that follow", low=0),
-        Column("signal_mm", pa.list_(FLOAT), "mm", "the basis signal"),
+        Column("signal_mm", list_of(FLOAT), "mm", "the basis signal"),
     ),
 )
 FILMED = Schema(

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import cv2
 import joblib
 import numpy as np
-import pyarrow as pa
 
 from pipeline.deposition.camera import bead, latency, line
 from pipeline.deposition.camera.latency import Gantry, Latency
@@ -22,7 +21,7 @@ from pipeline.reading.image_topics import Frames, Walk, image_topic
 from pipeline.reading.mcap_columns import topics
 from pipeline.reading.signals import Source
 from pipeline.store import artifacts
-from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema
+from pipeline.store.tables import BYTES, FLOAT, NONE, TEXT, Column, Schema
 
 MEMO = Path("datasets/memo/train_ilc")
 # the code that decides what an entry of the memo holds
@@ -38,8 +37,8 @@ READINGS = Schema(
     (
         Column("time_s", FLOAT, "s", "of the frame, as stamped"),
         Column("reason", TEXT, NONE, "why the frame has no usable bead; empty where it has"),
-        Column("columns", pa.binary(), "px", "measured columns, 64-bit floats"),
-        Column("widths", pa.binary(), "px", "widths there, 64-bit floats; 0 bare, NaN unread"),
+        Column("columns", BYTES, "px", "measured columns, 64-bit floats"),
+        Column("widths", BYTES, "px", "widths there, 64-bit floats; 0 bare, NaN unread"),
         Column("latency_s", FLOAT, "s", "how late the frames are against the gantry, of the whole recording"),
         Column("latency_deviation_s", FLOAT, "s", "its standard deviation; missing: not told", nullable=True),
     ),

@@ -13,12 +13,11 @@ from typing import Any, NamedTuple
 import cv2
 import joblib
 import numpy as np
-import pyarrow as pa
 
 from pipeline.reading.image_messages import check_size
 from pipeline.setpoint.frames import familiar, key_area, travel
 from pipeline.store import artifacts
-from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema
+from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema, bytes_of
 
 HERE = Path(__file__).parents[2]
 # the code that decides what an entry of the memo holds
@@ -49,7 +48,7 @@ KEY_AREAS = Schema(
     2,
     (
         Column(
-            "image", pa.binary(key_area.SHAPE[0] * key_area.SHAPE[1]), NONE, "16 x 48 gray levels, row by row"
+            "image", bytes_of(key_area.SHAPE[0] * key_area.SHAPE[1]), NONE, "16 x 48 gray levels, row by row"
         ),
         Column("angle_deg", FLOAT, "deg", "direction of the line, 0 right, 90 down", nullable=True),
         Column("miss_px", FLOAT, "px", "by which the line passes beside the tip", nullable=True),
@@ -59,7 +58,7 @@ KEY_AREAS = Schema(
         Column("tip_y_px", FLOAT, "px", "where the tip was taken to be", nullable=True),
         Column(
             "surroundings",
-            pa.binary(4 * len(familiar.NAMES)),
+            bytes_of(4 * len(familiar.NAMES)),
             NONE,
             "measures of familiar.NAMES, single precision, NaN where not taken",
         ),
