@@ -103,7 +103,7 @@ def runs(arguments: argparse.Namespace) -> None:
     commits, tags, branches or DVC experiments whose metrics git has."""
     from pipeline.report.runs import commits
     from pipeline.report.runs import page as runs_page
-    from pipeline.report.shared.verdict import ReportRules
+    from pipeline.verdict.settings import ReportRules
 
     a, b = (commits.run_of(name) for name in (arguments.a, arguments.b))
     path = (

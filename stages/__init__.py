@@ -27,7 +27,7 @@ SECTIONS = {
     "plant": "pipeline.temperature.workflow.settings:Plant",
     "printer": "pipeline.deposition.workflow.settings:Printer",
     "render_frames": "pipeline.setpoint.workflow.settings:RenderFrames",
-    "report": "pipeline.report.shared.verdict:ReportRules",
+    "report": "pipeline.verdict.settings:ReportRules",
     "segment_library": "pipeline.deposition.workflow.settings:SegmentLibrary",
     "setpoint_material": "pipeline.setpoint.workflow.settings:SetpointMaterial",
     "tracking": "pipeline.temperature.workflow.settings:Tracking",

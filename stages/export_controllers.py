@@ -5,8 +5,6 @@ setpoint/, and exported.json, which says what there is and why not. Where the ce
 that is written of that loop."""
 
 import stages
-from pipeline.report.shared.verdict import ReportRules
-from pipeline.report.temperature.judgement import winner
 from pipeline.runtime.workflow import export_controllers as export
 from pipeline.runtime.workflow import export_setpoint
 from pipeline.runtime.workflow.settings import ExportControllers
@@ -19,6 +17,7 @@ from pipeline.setpoint.workflow.windows import window_tables
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import evaluate_temperature, learned, tables
 from pipeline.temperature.workflow.settings import Panel, Plant, TemperatureRules, Tracking, TuneWeights
+from pipeline.verdict.verdict import read
 
 
 def main() -> None:
@@ -42,22 +41,7 @@ def main() -> None:
         posed = learned.posed(made, machine, panel, tracking, tuning, record, simulated=simulated)
         summary = artifacts.read_json("datasets/evaluate_temperature/summary.json")
         judged = export.Judged(machine, made, posed.setting, posed.problem, weights, summary, simulated)
-        verdict = winner(
-            {
-                "identify_plant": artifacts.read_metrics("identify_plant"),
-                "learn_kernel": artifacts.read_metrics("learn_kernel"),
-                "evaluate_temperature": artifacts.read_metrics("evaluate_temperature"),
-            },
-            params.load(ReportRules, "report"),
-            machine,
-            recorded=not simulated,
-            model={
-                "residuals": artifacts.read_table(
-                    "datasets/identify_plant/residuals.parquet", tables.RESIDUALS
-                ),
-                "dynamics": artifacts.read_table("datasets/identify_plant/dynamics.parquet", tables.DYNAMICS),
-            },
-        )
+        verdict = read("datasets/verdict")["temperature"]
         name, why = export.chosen(verdict.winner, f"{verdict.decision} {verdict.lead}")
         temperature = export.nothing(why)
         if name:

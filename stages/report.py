@@ -19,14 +19,13 @@ from pipeline.report.papers import page as papers_page
 from pipeline.report.runs import curves
 from pipeline.report.runs import page as runs_page
 from pipeline.report.setpoint import page as setpoint_page
-from pipeline.report.shared import headline
 from pipeline.report.shared.sources import Declared, collect, digest
-from pipeline.report.shared.verdict import ReportRules
 from pipeline.report.temperature import page as temperature_page
 from pipeline.report.temperature.judgement import judgement, shown
 from pipeline.report.viewer import page as viewer_page
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow.settings import Plant
+from pipeline.verdict.settings import ReportRules
 
 # what the pages show of each stage: its figures, and its folder of tables
 METRICS = {
@@ -87,9 +86,7 @@ def main() -> None:
         judged = judgement(sources)
         told = {
             "verdict": judged.verdict.metrics(),
-            "verdicts": {
-                loop: verdict.metrics() for loop, verdict in headline.verdicts(sources, judged).items()
-            },
+            "verdicts": {loop: verdict.metrics() for loop, verdict in sources.verdicts.items()},
             "figures": shown(judged),
         }
         viewer = viewer_page.render(sources, judged)

@@ -15,13 +15,13 @@ import yaml
 from pipeline import quick
 from pipeline.report.shared.headline import Loop, decision
 from pipeline.report.shared.sources import QUICK_LOOK
-from pipeline.report.shared.verdict import words_for
 from pipeline.setpoint.workflow.agent_files import restore_agents
 from pipeline.setpoint.workflow.camera_files import FILE, restore_camera
 from pipeline.setpoint.workflow.classifier_files import restore_classifier
 from pipeline.setpoint.workflow.tables import WINDOWS
 from pipeline.setpoint.workflow.windows import window_tables
 from pipeline.store import artifacts, params
+from pipeline.verdict.verdict import words_for
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (

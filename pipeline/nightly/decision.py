@@ -7,8 +7,8 @@ import numpy as np
 
 from pipeline.nightly.records import FIRST, KEPT, PROMOTED, Alarm, Guard, LoopDecision
 from pipeline.nightly.settings import PromotionRule
-from pipeline.report.shared.digits import THIN, beyond_meaning
 from pipeline.statistics import Paired, blocks_needed, paired
+from pipeline.verdict.digits import THIN, beyond_meaning
 
 
 class CaseCosts(NamedTuple):

@@ -23,8 +23,8 @@ from pipeline.nightly.records import (
 )
 from pipeline.nightly.reproducing import wiring
 from pipeline.nightly.settings import Nightly, NightlyLoop
-from pipeline.report.shared.verdict import PASSED, Verdict
 from pipeline.store import artifacts
+from pipeline.verdict.verdict import PASSED, Verdict
 
 # artifacts that only some contestants are designed from, and that a record may not determine
 OPTIONAL = {f"datasets/{path}" for path in judge.DESIGNED_FROM.values()}

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pipeline.report.shared.verdict import Verdict
+from pipeline.verdict.verdict import Verdict
 
 if TYPE_CHECKING:  # it imports scipy, and a night with nothing new is done without
     from pipeline.statistics import Paired

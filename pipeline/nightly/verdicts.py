@@ -2,58 +2,51 @@
 controllers that are in production."""
 
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 from pipeline.nightly import judge
 from pipeline.nightly.processes import STATE, dvc
 from pipeline.nightly.records import Night
+from pipeline.nightly.remembered import METRICS
 from pipeline.nightly.settings import Nightly
-from pipeline.report.shared import headline
-from pipeline.report.shared.sources import Declared, Sources, collect
-from pipeline.report.shared.verdict import ReportRules, Verdict
-from pipeline.report.temperature.judgement import judgement
-from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.store import artifacts
+from pipeline.verdict import night as verdict_night
+from pipeline.verdict import verdict
+from pipeline.verdict.files import read_evidence
+from pipeline.verdict.verdict import Verdict
 
-# stages whose metrics the pages show; those before `learn_kernel` have no tables there
-MEASURED = (
-    "probe_machine", "generate_probing", "learn_kernel", "ingest", "identify_plant", "tune_weights",
-    "evaluate_temperature", "train_ilc", "segment_library", "compose_parts",
-    "train_classifier", "train_agent", "evaluate_setpoint", "export_controllers",
-)  # fmt: skip
+STORED, CERTIFIED = "datasets/verdict", "datasets/certify/certified.json"
 REPORT = "reports/metrics/report.json"
-ACCEPTED = "reports/accepted.json"
 
 
 def read_verdicts(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], Night]:
-    """The verdict of each loop that has a page, from the files that the pages are made of; the night with a
-    note where the pages are of other files. A loop that is judged by a file of costs has none: its rules are
-    the guards of that file. Where nightly.holdout.controller names a contestant, the temperature loop's
-    verdict is about that one."""
+    """The verdict of each loop that has a page, as pages say it; the night with a note if they are of other
+    files. A loop that is judged by a file of costs has none: its rules are the guards of that file. If
+    nightly.holdout.controller names a controller, the temperature loop's verdict is about that one."""
     loops = [name for name, loop in settings.loops.items() if loop.judge != "cases"]
     if not loops:
         return {}, night
-    sources, named = page_sources(), settings.holdout.controller
-    each = headline.verdicts(sources, judgement(sources))
-    night = _make_pages_agree(each, night)
+    evidence = read_evidence(_read_json(CERTIFIED) or {})
+    stored, tonight, named = verdict.read(STORED), _read_json(METRICS), settings.holdout.controller
+    by_loop = verdict_night.verdicts(evidence, stored, tonight)
+    night = _make_pages_agree(by_loop, night)
     if named != judge.PAGE:
-        each = headline.verdicts(sources, judgement(sources, named=named))
-    return {name: each[name] for name in loops}, night
+        by_loop = verdict_night.verdicts(evidence, stored, tonight, named=named)
+    if lacking := [name for name in loops if name not in by_loop]:
+        raise ValueError(
+            f"{STORED}/{lacking[0]}.json: expected the verdict of this run, found none; "
+            "run ./run dvc repro verdict, or switch the loop off in section loops"
+        )
+    return {name: by_loop[name] for name in loops}, night
 
 
-def page_sources() -> Sources:
-    """What the stage `report` reads."""
-    declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
-    return collect(
-        declared,
-        {stage: f"reports/metrics/{stage}.json" for stage in MEASURED},
-        {stage: f"datasets/{stage}" for stage in MEASURED},
-        ACCEPTED,
-        (),
-    )
+def _read_json(path: str | Path) -> Any:
+    return artifacts.read_json(path) if artifacts.exists(path) else None
 
 
 def _make_pages_agree(pages: Mapping[str, Verdict], night: Night) -> Night:
-    """Makes the pages anew where they were made before drift or production changed, so that they say what the
+    """Makes the pages anew if they were made before drift or production changed, so that they say what the
     night goes by."""
     if not artifacts.exists(REPORT):
         return night

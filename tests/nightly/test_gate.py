@@ -28,11 +28,15 @@ from pipeline.nightly.records import (
 from pipeline.nightly.settings import Nightly
 from pipeline.report.index import page as index_page
 from pipeline.report.nightly import page as nightly_page
-from pipeline.report.shared.digits import typeset
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, ReportRules, Verdict
+from pipeline.report.shared.sources import Declared, Sources, collect
 from pipeline.report.temperature.judgement import judgement
 from pipeline.store import artifacts, params
+from pipeline.temperature.workflow.settings import Plant
+from pipeline.verdict.digits import typeset
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Verdict
 from stages import report
+from stages import verdict as stage_verdict
 from tests.conftest import ROOT
 from tests.nightly.toy_nights import Project, entered
 from tests.report import made, made_certificate, made_setpoint
@@ -54,6 +58,7 @@ def passing(tmp_path_factory):
     folder = tmp_path_factory.mktemp("passing")
     with contextlib.chdir(folder):
         populate(folder)
+        stage_verdict.main()
     return folder, {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
@@ -259,8 +264,10 @@ def written(rng) -> dict[str, str]:
         expected[loop] = worst([state for state, _ in changes])
     for stage in (*made.metrics(), *made.deposition_metrics(), *made_setpoint.metrics()):
         Path(f"reports/metrics/{stage}.json").unlink(missing_ok=True)
+        Path(f"datasets/{stage}/figures.json").unlink(missing_ok=True)
     for stage, figures in stages.items():
         artifacts.write_metrics(stage, figures)
+    stage_verdict.main()
     return expected
 
 
@@ -289,7 +296,7 @@ def test_page_and_night_never_disagree(project, seed):
         candidates={loop: other("night-0005") for loop in LOOPS if rng.random() < 0.5},
     )
     tonight, after = promoting.judged(asked, TONIGHT, before, lineage=Lineage)
-    sources = verdicts.page_sources()
+    sources = page_sources()
     index = words(index_page.render(sources, judgement(sources)))
     page = nightly_page.render([tonight], after, asked)
     summary = reporting.summary(tonight, [])
@@ -371,24 +378,33 @@ def test_a_champion_of_the_heaters_has_a_passed_certificate_of_its_own(
     assert all(tonight.decisions[loop].promotes for loop in LOOPS if loop != "temperature")
 
 
-def test_the_night_reads_what_the_pages_are_made_of():
-    assert {stage: f"reports/metrics/{stage}.json" for stage in verdicts.MEASURED} == {
-        stage: report.METRICS[stage] for stage in verdicts.MEASURED
-    }
-    assert set(verdicts.MEASURED) == set(report.METRICS) >= set(report.FOLDERS)
-    assert all(folder == f"datasets/{stage}" for stage, folder in report.FOLDERS.items())
+def page_sources() -> Sources:
+    """What the stage `report` reads."""
+    declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
+    return collect(declared, report.METRICS, report.FOLDERS, "reports/accepted.json", ())
+
+
+@pytest.mark.parametrize("key", ["", "watched", "alarms"])
+def test_the_night_goes_by_the_verdicts_that_the_pages_show(project, key):
+    drift(key)(None)
+    by_loop, _ = verdicts.read_verdicts(settings(), TONIGHT)
+    assert by_loop == page_sources().verdicts and by_loop.keys() == LOOPS.keys()
+
+
+def test_a_loop_whose_verdict_is_missing_is_never_promoted(project):
+    Path("datasets/verdict/deposition.json").unlink()
+    with pytest.raises(ValueError, match=r"^datasets/verdict/deposition\.json: expected the verdict"):
+        verdicts.read_verdicts(settings(), TONIGHT)
 
 
 def test_the_report_keeps_the_verdict_of_each_loop_as_the_night_reads_it(project, monkeypatch):
-    report.main()
+    made.main()
     made_anew = []
     monkeypatch.setattr(verdicts, "dvc", lambda *command, **_: made_anew.append(command))
     by_loop, tonight = verdicts.read_verdicts(settings(), TONIGHT)
     kept = artifacts.read_metrics("report")
     assert kept["verdicts"] == {loop: verdict.metrics() for loop, verdict in by_loop.items()}
-    assert {name: kept["verdict"][name] for name in kept["verdict"]} == by_loop["temperature"].metrics() | {
-        "rehearsal": False
-    }
+    assert kept["verdict"] == by_loop["temperature"].metrics()
     assert made_anew == [] and tonight == TONIGHT
     # the drift that they were made with is over since: they are made anew, so that both say the same
     drift("alarms")(None)
@@ -397,7 +413,7 @@ def test_the_report_keeps_the_verdict_of_each_loop_as_the_night_reads_it(project
 
 
 def test_pages_that_cannot_be_made_anew_are_told_and_the_night_goes_on(project, monkeypatch):
-    report.main()
+    made.main()
     drift("alarms")(None)
 
     def refused(*_, **__):
@@ -419,6 +435,7 @@ def test_a_contestant_that_is_named_to_run_must_pass_itself(project):
     )
     own["overshoot"] = made.figure(9.0, 8.0, 10.0)
     artifacts.write_metrics("evaluate_temperature", stages["evaluate_temperature"])
+    stage_verdict.main()
     by_page, named = (
         verdicts.read_verdicts(settings(controller=name), TONIGHT)[0]["temperature"]
         for name in ("page", "varx_riccati")

@@ -23,9 +23,9 @@ from pipeline.nightly import (
 from pipeline.nightly.records import Alarm, LoopDrift, Night, NightDrift
 from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly
-from pipeline.report.shared.verdict import PASSED, Verdict
 from pipeline.setpoint.workflow import tables
 from pipeline.store import artifacts, params
+from pipeline.verdict.verdict import PASSED, Verdict
 from tests.nightly.toy_nights import Project, entered
 
 LOOPS = {

@@ -64,6 +64,14 @@ DITHER = {"written": False, "reason": "PI needs an input for each of the 2 outpu
 SCALED = {"change_percent": -60.0, "gain_difference": 1e-15}
 
 
+def main():
+    """The verdicts and the pages of the project in the working directory."""
+    from stages import report, verdict
+
+    verdict.main()
+    report.main()
+
+
 def figure(q90, low, high, **more):
     """A figure over all cases: its 90 % quantile with the band of that."""
     case = {"case": 7, "plant": 3, "kind": "ramp", "start_degC": 20.0}

@@ -13,12 +13,14 @@ from pipeline.deposition.toolpath import gcode
 from pipeline.deposition.workflow import part_programs, tables
 from pipeline.deposition.workflow.settings import Printer
 from pipeline.deposition.workflow.tables import SIGNALS
-from pipeline.report.deposition import rules
-from pipeline.report.shared.verdict import OPEN
 from pipeline.store import artifacts, params
-from stages.report import main
+from pipeline.verdict import deposition as rules
+from pipeline.verdict.evidence import Evidence
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import OPEN, Missing
 from tests.conftest import ROOT
 from tests.report import made
+from tests.report.made import main
 from tests.report.test_pages import Page, change_all, figures
 
 PAGE, FOLDER = Path("reports/deposition.html"), Path("datasets/compose_parts")
@@ -39,6 +41,13 @@ ARTIFACTS = [
         for name in ("signals.parquet", "scores.parquet", "lines.parquet", "conformance.json")
     ),
 ]
+
+
+def evidence():
+    """What the rules of a part are asked of, without figures of other stages."""
+    gap = Missing("not measured", "")
+    limits = params.load(ReportRules, "report", Path(__file__).parents[2] / "params.yaml")
+    return Evidence({"train_ilc": gap}, {"conformance": gap}, None, limits, {})
 
 
 def page():
@@ -191,7 +200,8 @@ def test_where_the_drive_cannot_follow_a_signal_is_held_against_the_best_reachab
         assert "Near the best reachable" in text and f"{error / 38:.2f} ×" in text
         # the flow error itself is not asked for: the drive fails, and the signal by its ratio alone
         structure = rules.Structure("square", "A", {"basis": rules.Score(error, None, None)}, "basis", None)
-        near = rules._near([structure], {("square", "A"): 38.0})[0]
+        case = rules.Parts(evidence(), [structure], {("square", "A"): 38.0})
+        near = {rule.name: rule for rule, _ in rules.rules_of(case)}["Near the best reachable"]
         assert near.state == ("failed" if failed == 2 else "passed")
         assert "First failed rule: the drive follows." in text
 
@@ -304,7 +314,9 @@ def test_several_forecasts_that_are_not_judged_are_all_named():
         rules.Structure(name, "A", {"basis": score}, "basis", None, why="too fast", trial="print it slower")
         for name in ("one", "two", "three", "four", "five")
     ]
-    ours, paper = rules._forecast([*parts, parts[0]._replace(scores={"basis": score._replace(judged=True)})])
+    judged = parts[0]._replace(scores={"basis": score._replace(judged=True)})
+    case = rules.Parts(evidence(), [*parts, judged], {})
+    ours, paper = rules.rules_of(case)[1]
     assert ours == paper and ours.state == OPEN and ours.text == "5 of 6 not"
     assert ours.reason == (
         "The forecast of one, material A, is not judged: too fast. "

@@ -9,8 +9,8 @@ import pytest
 
 from pipeline import cli
 from pipeline.store import artifacts
-from stages.report import main
 from tests.report import made
+from tests.report.made import main
 from tests.report.test_pages import INDEX, RUNS, TEMPERATURE, Page, change
 
 DEPOSITION = Path("reports/deposition.html")

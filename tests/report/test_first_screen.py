@@ -13,7 +13,6 @@ from pipeline.report.setpoint import page as setpoint_page
 from pipeline.report.temperature import page as temperature_page
 from pipeline.store import artifacts
 from pipeline.temperature.workflow import tables
-from stages import report
 from tests.report import made, made_setpoint
 from tests.report.conftest import MACHINE, populate
 from tests.report.test_pages import change, change_all
@@ -101,7 +100,7 @@ def page_one(tmp_path, monkeypatch):
         with contextlib.chdir(tmp_path):
             populate(tmp_path)
             changed()
-            report.main()
+            made.main()
         return tmp_path / "reports"
 
     return built
@@ -152,7 +151,7 @@ def hundred(folder):
 
 def test_with_a_hundred_recordings_the_pages_stay_small(project):
     hundred(project)
-    report.main()
+    made.main()
     sizes = {path.stem: path.stat().st_size for path in Path("reports").glob("*.html")}
     # the bars of the pages
     assert sizes.pop("index") <= 150_000 and max(sizes.values()) <= 1_500_000, sizes

@@ -10,12 +10,12 @@ import yaml
 
 from pipeline.report.identification.page import since
 from pipeline.report.shared import charts
-from pipeline.report.shared.verdict import Figure
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import tables
 from pipeline.temperature.workflow.settings import Plant
-from stages.report import main
+from pipeline.verdict.verdict import Figure
 from tests.report import made
+from tests.report.made import main
 from tests.report.test_pages import IDENTIFICATION, TEMPERATURE, Page, change, figures
 
 FOLDER = Path("datasets/identify_plant")

@@ -7,8 +7,8 @@ import pytest
 from pipeline.report.shared.page import MARKS
 from pipeline.store import artifacts
 from pipeline.temperature.workflow.contestants import CONTESTANTS
-from stages.report import main
 from tests.report import made
+from tests.report.made import main
 from tests.report.test_pages import TEMPERATURE, Page
 
 

@@ -15,8 +15,8 @@ import pytest
 
 from pipeline.report.shared.page import environment
 from pipeline.store import artifacts
-from stages.report import main
 from tests.report import made
+from tests.report.made import main
 
 INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT = (
     Path(f"reports/{name}.html")

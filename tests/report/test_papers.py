@@ -15,7 +15,6 @@ from pipeline.papers import temperature as papers_temperature
 from pipeline.report.papers import page, rows, setpoint
 from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import Missing
 from pipeline.setpoint.workflow import train_agent
 from pipeline.setpoint.workflow.settings import TrainAgent
 from pipeline.store import params
@@ -24,6 +23,7 @@ from pipeline.temperature.controllers.kernel import exact_gains
 from pipeline.temperature.plant import baam
 from pipeline.temperature.tracking import gains
 from pipeline.temperature.workflow.record import read_published
+from pipeline.verdict.verdict import Missing
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEDS = {

@@ -9,10 +9,10 @@ import pytest
 import yaml
 
 from pipeline import cli
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Verdict
-from pipeline.report.temperature.judgement import trust_first
 from pipeline.store import artifacts
-from stages.report import main
+from pipeline.verdict.decide import trust_first
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Verdict
+from tests.report.made import main
 from tests.report.test_pages import IDENTIFICATION, INDEX, TEMPERATURE, Page, change, figures
 
 OF_THE_STUDY = (

@@ -11,11 +11,12 @@ import pytest
 from pipeline import cli
 from pipeline.report.runs import curves, figures
 from pipeline.report.runs.page import Run, render_two
-from pipeline.report.shared.verdict import Figure, ReportRules
 from pipeline.store import artifacts, params
-from stages.report import main
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import Figure
 from tests.report import made
 from tests.report.conftest import loaded
+from tests.report.made import main
 from tests.report.made_runs import Made, ends, make, metrics, parameters
 from tests.report.test_pages import RUNS, Page, change
 

@@ -9,15 +9,15 @@ import pytest
 import yaml
 
 from pipeline.report.setpoint import agent as setpoint_agent
-from pipeline.report.setpoint import verdict as setpoint_verdict
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
-from pipeline.report.shared.verdict import Figure, Question
 from pipeline.setpoint.simulation.simulator import reward
 from pipeline.setpoint.workflow.tables import PATHS, harm_bar
 from pipeline.store import artifacts, params
-from stages.report import main
+from pipeline.verdict import setpoint as setpoint_verdict
+from pipeline.verdict.verdict import Figure, Question
 from tests.report import made, made_setpoint
+from tests.report.made import main
 from tests.report.test_pages import Page, change, figures
 
 PAGE, INDEX = Path("reports/setpoint.html"), Path("reports/index.html")
@@ -134,7 +134,7 @@ def test_a_share_that_straddles_its_limit_is_undecided_and_says_how_many_runs_wo
         "about 760 runs in all would decide." in text
     )
     assert setpoint_verdict.undecided(
-        Question(0, "", "", "%", 97.0, True, ""), Figure(97.0, 96.0, 98.0)
+        Question(0, "", "", "%", 97.0, True, ""), Figure(97.0, 96.0, 98.0), {}
     ).endswith("no number of runs would decide.")
 
 
@@ -260,10 +260,10 @@ def test_harm_that_may_be_chance_is_undecided_and_says_how_many_segments_would_t
     assert harm_rules(project)[0][0] == ("undecided", "0.9\u202f%")
     # half the interval is four times as wide as the distance from the limit: 16 times the segments
     asked = Question(0, "", "", "%", 1.0, False, "")
-    assert setpoint_verdict.undecided(asked, Figure(0.9, 0.5, 1.3), clustered=True).endswith(
+    assert setpoint_verdict.undecided(asked, Figure(0.9, 0.5, 1.3), {"clustered": True}).endswith(
         "about 16 times as many segments would decide."
     )
-    assert setpoint_verdict.undecided(asked, Figure(0.5, 0.2, 0.9), clustered=True) == ""
+    assert setpoint_verdict.undecided(asked, Figure(0.5, 0.2, 0.9), {"clustered": True}) == ""
 
 
 def test_harm_without_a_declared_bar_is_not_measured_and_does_not_pass(project):

@@ -16,7 +16,6 @@ import pytest
 
 from pipeline.report.shared import page as shared_page
 from pipeline.report.shared.sources import Declared, SourceFile, collect, linked
-from pipeline.report.shared.verdict import ReportRules
 from pipeline.report.temperature.judgement import judgement
 from pipeline.report.viewer import packed
 from pipeline.report.viewer import page as viewer_page
@@ -24,6 +23,7 @@ from pipeline.report.viewer.series import Event, Key, SeriesLine, ViewerTable
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import tables
 from pipeline.temperature.workflow.settings import Plant
+from pipeline.verdict.settings import ReportRules
 from tests.report.conftest import expect, loaded, timers_fired
 
 
@@ -144,7 +144,7 @@ def test_a_small_table_is_copied_beside_the_page_and_a_large_one_linked(tmp_path
 
 
 def test_the_folder_holds_what_this_run_wrote_and_nothing_older(project):
-    from stages.report import main
+    from tests.report.made import main
 
     main()
     first = {file.name: file.read_bytes() for file in Path("reports/data").iterdir()}
@@ -170,7 +170,7 @@ def test_a_stage_that_fails_leaves_the_old_folder(project):
 
 
 def test_without_its_artifacts_the_page_says_what_is_missing(project):
-    from stages.report import main
+    from tests.report.made import main
 
     for name in ("evaluate_temperature/trajectories", "train_ilc/lessons"):
         Path(f"datasets/{name}.parquet").unlink()
@@ -185,7 +185,7 @@ def test_without_its_artifacts_the_page_says_what_is_missing(project):
 
 
 def test_a_series_that_has_no_room_is_listed_and_the_others_are_shown(project, monkeypatch):
-    from stages.report import main
+    from tests.report.made import main
 
     monkeypatch.setattr(packed, "LARGEST", 60_000)
     monkeypatch.setattr("pipeline.report.shared.sources.LARGEST_COPIES", 1000)

@@ -5,14 +5,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from pipeline.report.deposition import change as deposition_change
-from pipeline.report.deposition import rules as deposition_rules
 from pipeline.report.setpoint import change as setpoint_change
 from pipeline.report.shared.difference import Difference, Move
-from pipeline.report.shared.digits import count
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.contestants import in_a_sentence
 from pipeline.report.temperature.judgement import Judgement
+from pipeline.verdict.controllers import in_a_sentence
+from pipeline.verdict.deposition import structures
+from pipeline.verdict.digits import count
+from pipeline.verdict.verdict import Missing
 
 ANOTHER = "The accepted run is of another machine: nothing to compare."
 # figures of a loop that page one names
@@ -116,7 +116,7 @@ def _moved(move: Move, whose: str = "") -> Moved:
 
 def deposition_moves(sources: Sources) -> list[Move]:
     """Flow errors of the composer in use, stream by stream."""
-    parts = deposition_rules.structures(sources)
+    parts = structures(sources.evidence)
     return [] if isinstance(parts, Missing) else deposition_change.moves(sources, parts)
 
 

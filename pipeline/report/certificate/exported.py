@@ -5,10 +5,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import count
-from pipeline.report.shared.sources import LARGEST_COPY, Sources, lookup
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing, Verdict
-from pipeline.report.temperature.contestants import BY_NAME, in_a_sentence
+from pipeline.report.shared.sources import LARGEST_COPY, Sources
+from pipeline.verdict.controllers import BY_NAME, in_a_sentence
+from pipeline.verdict.digits import count
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 
 STAGE, LOOPS = "export_controllers", ("temperature", "deposition", "setpoint")
 FOLDER = "datasets/export_controllers"

@@ -8,11 +8,12 @@ import numpy as np
 
 from pipeline.report.certificate import exported
 from pipeline.report.shared import charts, page, words
-from pipeline.report.shared.digits import number, with_unit
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
-from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing, Verdict
-from pipeline.report.temperature.contestants import BY_NAME, heading
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.controllers import BY_NAME, heading
+from pipeline.verdict.digits import number, with_unit
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 
 WORDS = ("verdict", "margin_disk", "margin_delay", "spread", "step", "hash")
 MOST_BANDS = 40  # gains that are listed, those that are surest of all inputs first

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.deposition.rules import LIBRARY, MARK, NAMES, OURS, Structure, real, structures, worst
+from pipeline.report.deposition.marks import MARK, real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.card import (
     Card,
@@ -19,9 +19,11 @@ from pipeline.report.shared.card import (
     note_of,
     of_verdict,
 )
-from pipeline.report.shared.digits import THIN, band, count, decimals, number, percent
-from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import PASSED, Missing, Verdict
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.deposition import LIBRARY, NAMES, OURS, Structure, structures, worst
+from pipeline.verdict.digits import THIN, band, count, decimals, number, percent
+from pipeline.verdict.evidence import Table
+from pipeline.verdict.verdict import PASSED, Missing, Verdict
 
 MOVES = "Plunger command to flow at the nozzle"
 # how long a stretch of a part is drawn, s
@@ -33,7 +35,7 @@ Read = Callable[[Structure, str], float | None]
 
 def card(sources: Sources, verdict: Verdict) -> Card:
     """Flow error, line volume and what learning the part itself would gain, of three composers."""
-    parts, names = structures(sources), shown(verdict.winner or "")
+    parts, names = structures(sources.evidence), shown(verdict.winner or "")
     step = _step(sources, verdict)
     if isinstance(parts, Missing):
         return of_verdict(
@@ -132,7 +134,7 @@ def _step(sources: Sources, verdict: Verdict) -> CardStep:
 
 def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     """Six seconds of the part on which the composer in use fares worst, about its largest error."""
-    parts, table = structures(sources), sources.tables["signals"]
+    parts, table = structures(sources.evidence), sources.tables["signals"]
     if isinstance(parts, Missing):
         return parts
     if isinstance(table, Missing):

@@ -9,12 +9,13 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.deposition.rules import real
+from pipeline.report.deposition.marks import real
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, count, number, percent, short
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
-from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import Missing
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.digits import THIN, count, number, percent, short
+from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.verdict import Missing
 
 # law -> head, what it is, class of its line; the order of every row of panels
 LAWS = {

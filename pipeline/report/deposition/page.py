@@ -12,27 +12,16 @@ from markupsafe import Markup
 from pipeline.report.deposition import change as deposition_change
 from pipeline.report.deposition import learning as deposition_learning
 from pipeline.report.deposition import parts as deposition_parts
-from pipeline.report.deposition.rules import (
-    HEADS,
-    LIBRARY,
-    MARK,
-    NAMES,
-    NOT_JUDGED,
-    OURS,
-    PAPER,
-    Score,
-    Structure,
-    gamma,
-    real,
-    structures,
-)
-from pipeline.report.deposition.verdict import verdict
+from pipeline.report.deposition.marks import HEADS, MARK, PAPER, real
 from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Change, Move
-from pipeline.report.shared.digits import THIN, number, percent, short
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
-from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import Figure, Missing, Question, ReportRules
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.deposition import LIBRARY, NAMES, NOT_JUDGED, OURS, Score, Structure, gamma, structures
+from pipeline.verdict.digits import THIN, number, percent, short
+from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import Figure, Missing, Question
 
 WORDS = (
     "on_off",
@@ -68,7 +57,7 @@ SECTIONS = ("printer", "camera", "train_ilc", "segment_library", "compose_parts"
 
 def render(sources: Sources) -> str:
     """The text of deposition.html."""
-    judged, parts = verdict(sources), structures(sources)
+    judged, parts = sources.verdicts["deposition"], structures(sources.evidence)
     measured = [] if isinstance(parts, Missing) else parts
     return page.render(
         "deposition.html",
@@ -111,7 +100,7 @@ def render(sources: Sources) -> str:
 
 
 def _beforehand(sources: Sources) -> str:
-    before = gamma(sources)
+    before = gamma(sources.evidence)
     if before is None:
         return (
             "The convergence of the paper’s law was not tested beforehand; the model inversion identifies "

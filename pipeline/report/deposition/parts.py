@@ -7,12 +7,14 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.deposition.rules import MARK, NAMES, PAPER, asked_of_the_drive, real
+from pipeline.report.deposition.marks import MARK, PAPER, real
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import MINUS, THIN, count, number, percent, short, shortened
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
-from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import Missing
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.deposition import NAMES, asked_of_the_drive
+from pipeline.verdict.digits import MINUS, THIN, count, number, percent, short, shortened
+from pipeline.verdict.evidence import Table
+from pipeline.verdict.verdict import Missing
 
 # parts and streams that are drawn; the others stand in the tables
 PARTS, STREAMS = 4, 8

@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.report.identification.model_errors import MOST_INPUTS
-from pipeline.report.shared.digits import THIN, band, count, decimals, number, short
-from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import Missing
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.digits import THIN, band, count, decimals, number, short
+from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.verdict import Missing
 
 # Klipper's pid_Kp, pid_Ki and pid_Kd are of a duty of 0 to 255, ours of one in percent
 KLIPPER_FROM_PERCENT = 2.55

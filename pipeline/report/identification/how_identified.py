@@ -4,7 +4,10 @@ forbids, what was chosen, and every output's fits with and without a free mean."
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from pipeline.report.identification.model import (
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.digits import THIN, band, count, decimals, number, short
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.identification import (
     Fit,
     band_of,
     fit_figure,
@@ -12,9 +15,7 @@ from pipeline.report.identification.model import (
     flagged_sentence,
     percent_of,
 )
-from pipeline.report.shared.digits import THIN, band, count, decimals, number, short
-from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import Figure, Missing
+from pipeline.verdict.verdict import Figure, Missing
 
 LEAST_P = 1e-6  # smaller ones are all the same to a reader
 

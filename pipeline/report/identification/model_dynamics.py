@@ -10,11 +10,12 @@ from markupsafe import Markup
 from pipeline.report.identification.how_identified import left_out_words, loop_state
 from pipeline.report.identification.model_errors import Room, blank, matrix, room
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import DASH, THIN, band, count, decimals, number, short
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
-from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import Missing
+from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import evidence
+from pipeline.verdict.digits import DASH, THIN, band, count, decimals, number, short
+from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.verdict import Missing
 
 MOST_DOTS = 600  # of the cloud of poles
 

@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.identification.model import Fit, percent_of
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, count, number, short
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
-from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import Missing
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.digits import THIN, count, number, short
+from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.identification import Fit, percent_of
+from pipeline.verdict.verdict import Missing
 
 MOST_INPUTS = 7  # panels in a row of a matrix; a machine with more shows the strongest
 

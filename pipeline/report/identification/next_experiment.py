@@ -4,9 +4,10 @@ and what it would teach."""
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.report.shared.digits import THIN, number, short
-from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import Missing
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.digits import THIN, number, short
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.verdict import Missing
 
 
 def next_experiment(sources: Sources) -> dict[str, Any]:

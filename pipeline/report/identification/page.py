@@ -13,20 +13,12 @@ from pipeline.report.identification import (
     model_errors,
     next_experiment,
 )
-from pipeline.report.identification.model import LEAST_FIT, Fit, ahead_words, fits, trust
 from pipeline.report.shared import charts, page, words
-from pipeline.report.shared.digits import MINUS, THIN, band, count, decimals, number, percent, quantity, short
-from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import (
-    FAILED,
-    PASSED,
-    UNDECIDED,
-    Figure,
-    Missing,
-    Question,
-    Verdict,
-    state,
-)
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.digits import MINUS, THIN, band, count, decimals, number, percent, quantity, short
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.identification import Fit, ahead_words, fits, least_fit
+from pipeline.verdict.verdict import FAILED, PASSED, UNDECIDED, Figure, Missing, Question, Verdict, state
 
 WORDS = (
     "trusted",
@@ -51,7 +43,7 @@ WORDS = (
 
 def render(sources: Sources) -> str:
     """The text of identification.html."""
-    judged_fits, judged, ahead = fits(sources), trust(sources), ahead_words(sources)
+    judged_fits, judged, ahead = fits(sources.evidence), sources.model, ahead_words(sources.evidence)
     return page.render(
         "identification.html",
         here="identification",
@@ -109,11 +101,11 @@ def _judged_on(sources: Sources) -> str:
 def answer(sources: Sources, fit: Fit, ahead: str) -> dict[str, Any]:
     """Fits with bands, the yardstick, the share that is missed as a strip, what the
     residuals say, and the change since the accepted run."""
-    question = Question(0, "", fit.name, "%", LEAST_FIT, True, "")
+    question = Question(0, "", fit.name, "%", least_fit(), True, "")
     bar = (
         fit.held
         if isinstance(fit.held, Missing)
-        else Question(0, "", fit.name, "%", max(fit.held.value, LEAST_FIT), True, "")
+        else Question(0, "", fit.name, "%", max(fit.held.value, least_fit()), True, "")
     )
     states = [
         state(question, fit.simulated),
@@ -139,7 +131,7 @@ def answer(sources: Sources, fit: Fit, ahead: str) -> dict[str, Any]:
         ],
         "held": _value(fit.held),
         "strip": charts.strip(
-            Question(0, "", fit.name, "%", 100 - LEAST_FIT, False, ""), shown, (11, 23, 23)
+            Question(0, "", fit.name, "%", 100 - least_fit(), False, ""), shown, (11, 23, 23)
         ),
         "change": change,
         "moved": moved,

@@ -13,12 +13,12 @@ from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.shared import headline, page, words
 from pipeline.report.shared.card import Card, CardStep, Deciding
 from pipeline.report.shared.difference import accepted_on
-from pipeline.report.shared.digits import count, shortened
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 from pipeline.report.temperature import card as temperature_card
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.twelve import drift_state
+from pipeline.verdict.digits import count, shortened
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 
 # the gravest first
 GRAVEST = (FAILED, OPEN, PASSED)
@@ -26,7 +26,7 @@ GRAVEST = (FAILED, OPEN, PASSED)
 
 def render(sources: Sources, judged: Judgement) -> str:
     """The text of index.html."""
-    loops, verdicts = headline.loops(sources, judged), headline.verdicts(sources, judged)
+    loops, verdicts = headline.loops(sources), sources.verdicts
     first, picture = deciding(sources, judged, verdicts)
     shown = cards(sources, judged, verdicts)
     told = changes.changes(sources, judged)

@@ -11,10 +11,10 @@ from pipeline.nightly import records
 from pipeline.nightly.records import PLANT, Champion, ChampionState, Guard, HistoryLine, LoopDecision, Night
 from pipeline.nightly.settings import Nightly
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import beyond_meaning, count, number, quantity, short
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED
-from pipeline.report.temperature.contestants import heading
 from pipeline.statistics import Paired
+from pipeline.verdict.controllers import heading
+from pipeline.verdict.digits import beyond_meaning, count, number, quantity, short
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED
 
 SHOWN = 40  # nights in the table, the newest first
 REACH = 20.0  # percent: half the width of the picture of the plant's parameters

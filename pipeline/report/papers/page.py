@@ -13,8 +13,8 @@ from pipeline.report.papers.relearned import sentences
 from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS, Paper, read
 from pipeline.report.shared import page
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import Missing
 from pipeline.store import artifacts, made
+from pipeline.verdict.verdict import Missing
 
 # glyph of a verdict, by the states that the pages know
 GLYPHS = {HOLDS: "passed", SHAPE: "passed", FAILS: "failed", OPEN: "open"}

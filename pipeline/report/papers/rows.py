@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import number
-from pipeline.report.shared.verdict import Missing
 from pipeline.store import artifacts, made
+from pipeline.verdict.digits import number
+from pipeline.verdict.verdict import Missing
 
 HOLDS, SHAPE, FAILS, OPEN = "holds", "holds in shape", "does not hold", "cannot be judged"
 VERDICTS = (HOLDS, SHAPE, FAILS, OPEN)

@@ -8,9 +8,9 @@ from markupsafe import Markup
 
 from pipeline.report.papers.figures import PaperCurve, PaperFigure, plane, plot
 from pipeline.report.shared import charts
-from pipeline.report.shared.digits import number
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import Missing
+from pipeline.verdict.digits import number
+from pipeline.verdict.verdict import Missing
 
 CLASSES = ("insufficient", "optimal", "excessive")
 FLOW, TEMPERATURE = charts.linear(0, 320), charts.linear(180, 240)

@@ -9,11 +9,11 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts
-from pipeline.report.shared.digits import number, percent, short
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
-from pipeline.report.shared.sources import Table, lookup
-from pipeline.report.shared.verdict import Missing
 from pipeline.report.temperature import evidence, trades
+from pipeline.verdict.digits import number, percent, short
+from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.verdict import Missing
 
 
 class StudyPart(NamedTuple):

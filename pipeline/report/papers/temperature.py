@@ -8,8 +8,8 @@ from markupsafe import Markup
 
 from pipeline.report.papers.figures import HEIGHT, WIDTH, PaperCurve, PaperFigure, axis, plot
 from pipeline.report.shared import charts
-from pipeline.report.shared.digits import number
 from pipeline.report.shared.sources import Sources
+from pipeline.verdict.digits import number
 
 
 def pictures(results: Mapping[str, Any], sources: Sources) -> list[PaperFigure]:

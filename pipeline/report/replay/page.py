@@ -8,7 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import count
+from pipeline.verdict.digits import count
 
 WIDE, TALL = 880, 170
 

@@ -4,10 +4,11 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.verdict import Figure, Question, ReportRules
-from pipeline.report.temperature.answers import comparison
-from pipeline.report.temperature.verdict import questions
 from pipeline.setpoint.workflow.tables import harm_bar
+from pipeline.verdict.decide import questions
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.temperature import comparison
+from pipeline.verdict.verdict import Figure, Question
 
 LOOPS = ("temperature", "deposition", "setpoint")
 Metrics = Mapping[str, Any]  # {stage: its file of reports/metrics}; another commit's may hold anything

@@ -10,11 +10,12 @@ from pipeline.report.runs.curves import READERS, Curve, curves, restored
 from pipeline.report.runs.figures import LOOPS, RunFigures, asked, measured
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.difference import accepted_on, changed_parameters, move
-from pipeline.report.shared.digits import MINUS, THIN, band, count, declared, quantity, short, with_unit
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import FAILED, Figure, Missing, Question, ReportRules, row_places, state
-from pipeline.report.temperature.contestants import heading
 from pipeline.report.temperature.judgement import Judgement
+from pipeline.verdict.controllers import heading
+from pipeline.verdict.digits import MINUS, THIN, band, count, declared, quantity, short, with_unit
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import FAILED, Figure, Missing, Question, row_places, state
 
 # the stages that give the figures
 MEASURED_BY = ("evaluate_temperature", "compose_parts", "train_ilc", "evaluate_setpoint", "train_classifier")

@@ -9,12 +9,9 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.setpoint.verdict import AGENT, BASELINE, PAPER, Board, Case, case_text, role
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, number, percent, quantity
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
-from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import Figure, Missing
+from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.workflow.tables import (
     BEST_FLOW,
     BEST_TEMPERATURE,
@@ -24,6 +21,10 @@ from pipeline.setpoint.workflow.tables import (
     SETTLED_BY,
     TEMPERATURE_BAND,
 )
+from pipeline.verdict.digits import THIN, number, percent, quantity
+from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.setpoint import AGENT, BASELINE, PAPER, Board, Case, case_text, role
+from pipeline.verdict.verdict import Figure, Missing
 
 # rewards whose lines are drawn, of the last phase
 LEVELS = (0.5, 0.0, -0.5, -0.8)

@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.setpoint.verdict import CLASS_BORDERS, share_in
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, band, number, percent, quantity
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
-from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import Figure, Missing
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.digits import THIN, band, number, percent, quantity
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.setpoint import CLASS_BORDERS, share_in
+from pipeline.verdict.verdict import Figure, Missing
 
 TITLE = "Right and covered, by flow"
 # An ideal reader of the width that a rendered bead was drawn with: per cent of 960 new segments of 20 frames,

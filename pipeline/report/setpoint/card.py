@@ -7,7 +7,22 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.setpoint import deciding as deciding_case
-from pipeline.report.setpoint.verdict import (
+from pipeline.report.shared import charts, page
+from pipeline.report.shared.card import (
+    Card,
+    CardCell,
+    CardRow,
+    CardStep,
+    Deciding,
+    Entrant,
+    best_of,
+    of_verdict,
+)
+from pipeline.report.shared.sources import Sources
+from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, FLOW_BAND
+from pipeline.verdict.digits import THIN, band, count
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.setpoint import (
     BASELINE,
     Board,
     Case,
@@ -22,21 +37,7 @@ from pipeline.report.setpoint.verdict import (
     within,
     worst,
 )
-from pipeline.report.shared import charts, page
-from pipeline.report.shared.card import (
-    Card,
-    CardCell,
-    CardRow,
-    CardStep,
-    Deciding,
-    Entrant,
-    best_of,
-    of_verdict,
-)
-from pipeline.report.shared.digits import THIN, band, count
-from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import FAILED, PASSED, Figure, Missing, Verdict
-from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, FLOW_BAND
+from pipeline.verdict.verdict import FAILED, PASSED, Figure, Missing, Verdict
 
 MOVES, TITLE = "Nozzle camera to setpoints", "Setpoint, the case that decides"
 # cases that the picture has room for, the worst first
@@ -45,14 +46,14 @@ MOST_CASES = 8
 
 def card(sources: Sources, verdict: Verdict) -> Card:
     """Settling, staying and harm of the default, the agent and doing nothing."""
-    scores, step = board(sources), _step(sources, verdict)
+    scores, step = board(sources.evidence, sources.subject("setpoint")), _step(sources, verdict)
     if isinstance(scores, Missing) or not verdict.winner:
         why = scores.sentence() if isinstance(scores, Missing) else verdict.reason
         return of_verdict(
             verdict, MOVES, step, entrants=[], rows=[], basis="", beside="", sources=[], missing=why
         )
     names, asked = shown(sources, scores), sources.declared.rules
-    limits = bars(sources, scores)
+    limits = bars(sources.evidence, scores)
     harms = [harm_of(scores, name, limits) for name in names]
     limit = next((harm.limit for harm in harms if isinstance(harm, Harm)), None)
     clustered = any(cell.redraws > 1 for cell in scores.cells.values())
@@ -165,7 +166,7 @@ def _step(sources: Sources, verdict: Verdict) -> CardStep:
 def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     """The case that decides, decision by decision; where its runs were not kept, runs that settle, or settle
     and stay, in every case that counts, the worst first. Of the default, the agent and doing nothing."""
-    scores = board(sources)
+    scores = board(sources.evidence, sources.subject("setpoint"))
     if isinstance(scores, Missing):
         return scores
     if not scores.default:

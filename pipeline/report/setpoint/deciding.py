@@ -7,12 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.setpoint.verdict import Board, Case, case_text, role, worst
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, count, number, shortened
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
-from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import Missing
+from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.workflow.tables import (
     BEST_FLOW,
     BEST_TEMPERATURE,
@@ -21,6 +18,10 @@ from pipeline.setpoint.workflow.tables import (
     SETTLED_BY,
     TEMPERATURE_BAND,
 )
+from pipeline.verdict.digits import THIN, count, number, shortened
+from pipeline.verdict.evidence import Table
+from pipeline.verdict.setpoint import Board, Case, case_text, role, worst
+from pipeline.verdict.verdict import Missing
 
 TITLE = "Flow, decision by decision"
 # percent of flow that the picture shows

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.setpoint.verdict import Board, Case, Harm, bars, case_text, harm_of, role, share_text
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, band, number
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import Figure, Missing
 from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING
+from pipeline.verdict.digits import THIN, band, number
+from pipeline.verdict.setpoint import Board, Case, Harm, bars, case_text, harm_of, role, share_text
+from pipeline.verdict.verdict import Figure, Missing
 
 TITLE = "Harm against recovery"
 # a clog that halves the evidence: to 0.6 of the flow, and to 0.75
@@ -25,7 +25,7 @@ def harms(sources: Sources, board: Board | Missing) -> dict[str, Any]:
     """The chart, and the contestants as a table: those that may run first."""
     if isinstance(board, Missing):
         return {"picture": placeholder("harm", TITLE, board), "rows": (), "clustered": ""}
-    limits = bars(sources, board)
+    limits = bars(sources.evidence, board)
     found = {name: harm_of(board, name, limits) for name in board.names}
     known = {name: harm for name, harm in found.items() if isinstance(harm, Harm)}
     if not known:

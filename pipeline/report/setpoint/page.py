@@ -12,9 +12,13 @@ from pipeline.report.setpoint import deciding as setpoint_deciding
 from pipeline.report.setpoint import harm as setpoint_harm
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
-from pipeline.report.setpoint.verdict import (
+from pipeline.report.shared import charts, page, words
+from pipeline.report.shared.sources import Sources
+from pipeline.setpoint.workflow.tables import BEYOND
+from pipeline.verdict.digits import THIN, band, count, number, percent, quantity
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.setpoint import (
     BASELINE,
-    HEADS,
     SIMULATORS,
     Board,
     Case,
@@ -25,14 +29,12 @@ from pipeline.report.setpoint.verdict import (
     role,
     share_text,
     summary,
-    verdict,
     worst,
 )
-from pipeline.report.shared import charts, page, words
-from pipeline.report.shared.digits import THIN, band, count, number, percent, quantity
-from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, state
-from pipeline.setpoint.workflow.tables import BEYOND
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, state
+
+# what the two columns of its rules are, and the mark of the second
+HEADS = ("Data\u2011driven", "Baseline", "baseline")
 
 WORDS = (
     "window_of_frames",
@@ -67,7 +69,7 @@ LANES = {"data_driven": "dd", "kernel": "dd", "model_based": "mb", "exact_model"
 
 def render(sources: Sources) -> str:
     """The text of setpoint.html."""
-    judged, scores = verdict(sources), board(sources)
+    judged, scores = sources.verdicts["setpoint"], board(sources.evidence, sources.subject("setpoint"))
     judged_scores = None if isinstance(scores, Missing) else scores
     claimed = setpoint_agent.claims(sources)
     return page.render(
@@ -85,7 +87,7 @@ def render(sources: Sources) -> str:
         second=judged_scores is not None
         and bool(judged_scores.default)
         and judged_scores.kinds[judged_scores.default] == BASELINE,
-        summary=summary(sources, judged_scores) if judged_scores and judged_scores.default else "",
+        summary=summary(sources.evidence, judged_scores) if judged_scores and judged_scores.default else "",
         no_board=scores if isinstance(scores, Missing) else None,
         heads=heads(judged_scores),
         answers=answers(sources, judged_scores) if judged_scores else [],

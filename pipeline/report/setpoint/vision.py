@@ -8,17 +8,19 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.setpoint.verdict import CLASS_BORDERS, NAMES, accuracy, share_text
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, band, number, percent, quantity, short
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
-from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import Figure, Missing
+from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.workflow.tables import ALPHA
+from pipeline.verdict.digits import THIN, band, number, percent, quantity, short
+from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.setpoint import CLASS_BORDERS, accuracy, share_text
+from pipeline.verdict.verdict import Figure, Missing
 
 CLASSES = ("under", "good", "over")
 # characters of a frame's place in its recording that are shown, its end
 LONGEST = 60
+NAMES = {"svc": "support vector machine", "cnn": "convolutional network", "width": "width rule"}
 DIAGRAMS = (
     ("image", "raw", "One image, as trained", "softmax of the network", "ece_image_raw"),
     ("image", "calibrated", "One image, calibrated", "logits over one temperature", "ece_image"),

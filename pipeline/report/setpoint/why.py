@@ -9,10 +9,11 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, count, number
-from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import Missing
+from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.workflow.tables import BEST_FLOW, BEST_TEMPERATURE, FLOW_BAND, TEMPERATURE_BAND
+from pipeline.verdict.digits import THIN, count, number
+from pipeline.verdict.evidence import Table
+from pipeline.verdict.verdict import Missing
 
 EPISODES, WIDTH, LEFT = 2, 1112, 36
 # decisions that are told in words

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from pipeline.report.shared.sources import SourceFile
-from pipeline.report.shared.verdict import PASSED, Verdict
+from pipeline.verdict.verdict import PASSED, Verdict
 
 # letters of a reason that a card has room for in the widest font
 ROOM = 200

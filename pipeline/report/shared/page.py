@@ -11,13 +11,13 @@ from collections.abc import Sequence
 import jinja2
 from markupsafe import Markup, escape
 
-from pipeline.report.shared import digits
 from pipeline.report.shared.pictures import PictureColumn
 from pipeline.report.shared.sources import QUICK_LOOK, SourceFile, Sources
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
 from pipeline.temperature.workflow.contestants import CONTESTANTS
+from pipeline.verdict import digits
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 
 GLYPHS = {
     PASSED: "tick",

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from markupsafe import Markup
 
-from pipeline.report.shared.verdict import Missing
+from pipeline.verdict.verdict import Missing
 
 
 class PictureColumn(NamedTuple):

@@ -9,8 +9,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from pipeline.deposition.workflow.tables import (
     FILMED,
     LESSONS,
@@ -21,7 +19,6 @@ from pipeline.deposition.workflow.tables import (
     TASKS,
     TRIALS,
 )
-from pipeline.report.shared.verdict import Missing, ReportRules
 from pipeline.setpoint.workflow.tables import (
     AGENT_CURVE,
     CLASSIFIED,
@@ -35,8 +32,12 @@ from pipeline.setpoint.workflow.tables import (
 from pipeline.store import artifacts
 from pipeline.temperature.workflow import tables as schemas
 from pipeline.temperature.workflow.settings import Plant
-
-Table = dict[str, np.ndarray]
+from pipeline.verdict import night
+from pipeline.verdict.evidence import Evidence, Table
+from pipeline.verdict.files import QUICK_LOOK
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import LOOPS, Missing, Verdict
+from pipeline.verdict.verdict import read as read_verdicts
 
 
 class Declared(NamedTuple):
@@ -65,7 +66,7 @@ class SourceFile(NamedTuple):
 class Sources(NamedTuple):
     """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what
     was; `absent`: what was not, by path; `accepted`: the accepted run, or None; `nightly`: what the last
-    night measured, None before the first; `quick`: the run is a quick look.
+    night measured, None before the first; `quick`: the run is a quick look; `stored`: its verdicts.
     """
 
     declared: Declared
@@ -77,6 +78,31 @@ class Sources(NamedTuple):
     code: str
     nightly: dict | Missing | None = None
     quick: bool = False
+    stored: Mapping[str, Verdict] = {}
+
+    @property
+    def evidence(self) -> Evidence:
+        """What the figures of a verdict are found in."""
+        declared = self.declared
+        return Evidence(
+            self.metrics, self.tables, declared.machine, declared.rules, declared.everything, self.quick
+        )
+
+    @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """The verdict of each loop that is on, as the stage `verdict` stored it, with what the last night
+        measured."""
+        loops = {loop: verdict for loop, verdict in self.stored.items() if loop in LOOPS}
+        return night.verdicts(self.evidence, loops, self.nightly)
+
+    @property
+    def model(self) -> Verdict:
+        """The verdict on the identified model."""
+        return self.stored["identification"]
+
+    def subject(self, loop: str) -> str:
+        """The controller that a loop's verdict is about; "" without a verdict."""
+        return self.stored[loop].subject if loop in self.stored else ""
 
     @property
     def recorded(self) -> bool:
@@ -109,8 +135,6 @@ class Sources(NamedTuple):
 # what the nightly job writes after the pages: no dependency of theirs (DVC would ask for it before the first
 # night), they show the night before
 NIGHTLY = "reports/metrics/nightly.json"
-# what `beadline quick` writes before the pages: what is smaller than in a full run, which every page says
-QUICK_LOOK = "reports/quick_look.json"
 
 
 def collect(
@@ -155,9 +179,10 @@ def collect(
     )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
     read = linked(read)
+    stored = read_verdicts("datasets/verdict", (*LOOPS, "identification"))
     return Sources(
         declared, figures, tables, read, absent, before, folders_of_code, night,
-        quick=artifacts.exists(QUICK_LOOK),
+        quick=artifacts.exists(QUICK_LOOK), stored=stored,
     )  # fmt: skip
 
 
@@ -338,15 +363,3 @@ def read_accepted(path: str) -> dict:
             "accept a run of this version with ./run beadline accept"
         )
     return run
-
-
-def lookup(data: Any, dotted: str, *, what: str = "") -> Any:
-    """data["a"]["b"] of "a.b", or the Missing that stands for it; null is missing too."""
-    value = data
-    for key in dotted.split("."):
-        if isinstance(value, Missing):
-            return value
-        value = value.get(key) if isinstance(value, Mapping) else None
-        if value is None:
-            return Missing("not measured", f"{what or dotted} is not among what the stage measured")
-    return value

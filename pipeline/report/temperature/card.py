@@ -17,15 +17,16 @@ from pipeline.report.shared.card import (
     note_of,
     of_verdict,
 )
-from pipeline.report.shared.digits import THIN, declared, short, with_unit
-from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, Verdict, state
-from pipeline.report.temperature.answers import comparison
-from pipeline.report.temperature.contestants import heading, kind
+from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.deciding import degrees, runs_of, until_settled
 from pipeline.report.temperature.judgement import Judgement, named_before
 from pipeline.report.temperature.scorecard import setting
-from pipeline.report.temperature.wording import OFF_THE_SCALE, banded, places_of, worded
+from pipeline.verdict.controllers import heading, kind
+from pipeline.verdict.digits import THIN, declared, short, with_unit
+from pipeline.verdict.evidence import Table
+from pipeline.verdict.temperature import comparison
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, Verdict, state
+from pipeline.verdict.wording import OFF_THE_SCALE, banded, places_of, worded
 
 MOVES = "Heaters and motor to barrel temperatures"
 # who stands beside the pair where nobody runs yet: PI, or doing nothing where the verdict is about PI

@@ -6,10 +6,11 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import count, number, percent, short
 from pipeline.report.shared.pictures import PictureColumn
-from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import Missing
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.digits import count, number, percent, short
+from pipeline.verdict.evidence import Table
+from pipeline.verdict.verdict import Missing
 
 # ---- orders, for the page of the identification
 

@@ -8,10 +8,11 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, count, number, short
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
-from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import UNJUDGED, Missing
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.digits import THIN, count, number, short
+from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.verdict import UNJUDGED, Missing
 
 
 def excitation(sources: Sources) -> Picture:

@@ -5,13 +5,14 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.report.shared.digits import THIN, count, declared, number, short, with_unit
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
-from pipeline.report.temperature.answers import comparison, entry, finite, judged, refused, unstable
-from pipeline.report.temperature.contestants import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.report.temperature.wording import banded, places_of, worded
+from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
+from pipeline.verdict.digits import THIN, count, declared, number, short, with_unit
+from pipeline.verdict.evidence import entry
+from pipeline.verdict.temperature import comparison, finite, names, refused, unstable
+from pipeline.verdict.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
+from pipeline.verdict.wording import banded, places_of, worded
 
 # figures without a rule
 UNRULED = (
@@ -36,19 +37,19 @@ def scorecard(sources: Sources, judgement: Judgement, words: Mapping[str, str]) 
     """Every contestant that was judged, in the order of simplicity, and those that were refused."""
     metrics = sources.metrics
     compared = comparison(metrics)
-    names = judged(metrics)
-    if not names:
+    judged = names(metrics)
+    if not judged:
         gap = metrics["evaluate_temperature"]
         why = gap if isinstance(gap, Missing) else Missing("not measured", "No contestant was judged")
         return {"missing": why, "heads": [], "rows": [], "caption": "", "below": []}
     asked = {question.key: question for question in (*judgement.asked, *UNRULED)}
-    rows = [_row(sources, asked[key], names, judgement, words.get(key, "")) for key in ORDER if key in asked]
+    rows = [_row(sources, asked[key], judged, judgement, words.get(key, "")) for key in ORDER if key in asked]
     return {
         "missing": None,
-        "heads": [{"mark": name, "name": heading(name), "kind": kind(name)} for name in names],
+        "heads": [{"mark": name, "name": heading(name), "kind": kind(name)} for name in judged],
         "rows": rows,
         "caption": _caption(sources),
-        "below": [*filter(None, [_gap(compared, names), _at_bound(compared, names)]), *_refused(sources)],
+        "below": [*filter(None, [_gap(compared, judged), _at_bound(compared, judged)]), *_refused(sources)],
     }
 
 

@@ -6,10 +6,10 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, count, short
 from pipeline.report.shared.pictures import PictureColumn
-from pipeline.report.shared.sources import Table
-from pipeline.report.shared.verdict import Missing
+from pipeline.verdict.digits import THIN, count, short
+from pipeline.verdict.evidence import Table
+from pipeline.verdict.verdict import Missing
 
 
 class Search(NamedTuple):

@@ -5,12 +5,12 @@ import math
 from typing import Any
 
 from pipeline.report.shared import charts, page, words
-from pipeline.report.shared.digits import declared, with_unit
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import PASSED, UNJUDGED, Figure, Missing, Question, state
-from pipeline.report.temperature.contestants import heading
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.report.temperature.wording import banded, places_of, worded
+from pipeline.verdict.controllers import heading
+from pipeline.verdict.digits import declared, with_unit
+from pipeline.verdict.verdict import PASSED, UNJUDGED, Figure, Missing, Question, state
+from pipeline.verdict.wording import banded, places_of, worded
 
 
 def rows(sources: Sources, judged: Judgement) -> list[dict[str, Any]]:

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.report.shared.digits import number
-from pipeline.report.shared.sources import SourceFile, Table
+from pipeline.report.shared.sources import SourceFile
 from pipeline.report.viewer.series import UNITS, ViewerTable, runs
+from pipeline.verdict.digits import number
+from pipeline.verdict.evidence import Table
 
 # of the folder, in bytes: what a reader will still send to a colleague; of one copied table; of one table's
 # events, which stand in the page

@@ -11,13 +11,13 @@ from markupsafe import Markup
 
 from pipeline.report.certificate import exported
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, number, short
 from pipeline.report.shared.sources import Sources, copies
-from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.contestants import heading
 from pipeline.report.temperature.deciding import degrees, runs_of, until_settled
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.viewer import packed, series
+from pipeline.verdict.controllers import heading
+from pipeline.verdict.digits import THIN, number, short
+from pipeline.verdict.verdict import Missing
 
 VENDOR = Path(__file__).parent / "vendor"
 LIBRARY = "uPlot.js"

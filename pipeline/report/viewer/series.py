@@ -13,9 +13,10 @@ from pipeline.report.deposition.learning import LAWS
 from pipeline.report.setpoint.deciding import Clog, clog
 from pipeline.report.shared.charts import stretches
 from pipeline.report.shared.page import MARKS
-from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.contestants import heading
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.controllers import heading
+from pipeline.verdict.evidence import Table
+from pipeline.verdict.verdict import Missing
 
 UNITS = {"degC": "°C", "percent": "%", "mm^3/s": "mm³/s", "1": "", "degC per percent": "°C/%"}
 

@@ -3,39 +3,15 @@ and the verdict. No page, no file."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import Field
-
-from pipeline.report.shared.digits import decimals
-from pipeline.store import params
+from pipeline.store import artifacts
+from pipeline.verdict.digits import decimals
 
 PASSED, FAILED, UNDECIDED, OPEN = "passed", "failed", "undecided", "not measured"
 # a rule that cannot be judged before somebody declares what it asks about
 UNJUDGED = "not applicable"
-
-
-class ReportRules(params.Section):
-    """Section `report`: what a controller must hold to be ready; of the temperature loop at the 90 %
-    quantile of all cases, margins on the median plant. The comparison resolves settling_s where it is
-    null."""
-
-    settled_error_degC: float = Field(gt=0, le=1000)
-    settling_s: float | None = Field(gt=0, le=1e6)
-    overshoot_degC: float = Field(gt=0, le=1000)
-    at_limits_percent: float = Field(gt=0, le=100)
-    disk_margin: float = Field(gt=0, le=2)
-    delay_margin_s: float = Field(gt=0, le=1e6)
-    flow_error_percent: float = Field(gt=0, le=1e6)
-    line_volume_percent: float = Field(gt=0, le=1e6)
-    above_whole_points: float = Field(ge=0, le=1e6)
-    learned_percent: float = Field(gt=0, le=1e6)
-    settled_percent: float = Field(gt=0, le=100)
-    stay_percent: float = Field(gt=0, le=100)
-    image_accuracy: float = Field(gt=0, le=1)
-    window_right_70_150: float = Field(gt=0, le=1)
-    ece_image: float = Field(gt=0, le=1)
-    ece_window: float = Field(gt=0, le=1)
 
 
 class Figure(NamedTuple):
@@ -254,3 +230,59 @@ class Verdict(NamedTuple):
 
 
 WRITTEN = ("state", "decision", "lead", "reason", "remedy", "rule", "winner", "subject", "rehearsal")
+
+
+# ---- the files of the stage `verdict`
+
+LOOPS = ("temperature", "deposition", "setpoint")
+
+
+def write(verdicts: Mapping[str, Verdict], folder: str | Path) -> None:
+    """Writes each verdict to `folder`/<loop>.json. Equal verdicts give equal bytes."""
+    for loop, verdict in verdicts.items():
+        lines = [[_encode(rule) for rule in line] for line in verdict.rules]
+        artifacts.write_json(Path(folder) / f"{loop}.json", verdict._asdict() | {"rules": lines})
+
+
+def read(folder: str | Path, names: Sequence[str] = LOOPS) -> dict[str, Verdict]:
+    """The verdicts that `write` wrote, by loop. A loop that is switched off has no file and is left out."""
+    files = {loop: Path(folder) / f"{loop}.json" for loop in names}
+    return {
+        loop: _decode(artifacts.read_json(path)) for loop, path in files.items() if artifacts.exists(path)
+    }
+
+
+def _encode(rule: Rule) -> dict[str, Any]:
+    """A rule for JSON, which knows no infinity: a number that is not finite is text."""
+    figure, question = rule.figure, rule.question
+    return rule._asdict() | {
+        "figure": {name: _text(value) for name, value in figure._asdict().items()},
+        "question": question and {name: _text(value) for name, value in question._asdict().items()},
+        "state": rule.state,
+    }
+
+
+def _text(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_text(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _decode(fields: Mapping[str, Any]) -> Verdict:
+    rules = tuple(tuple(_rule(rule) for rule in line) for line in fields["rules"])
+    return Verdict(**{**fields, "rules": rules})
+
+
+def _rule(fields: Mapping[str, Any]) -> Rule:
+    figure, question = fields["figure"], fields["question"]
+    values = {name: value for name, value in fields.items() if name != "state"}
+    return Rule(**values)._replace(
+        figure=Missing(**figure)
+        if "state" in figure
+        else Figure(
+            *(float(figure[end]) for end in ("value", "low", "high")),
+            runs=tuple(map(float, figure["runs"])),
+            note=figure["note"],
+        ),
+        question=question and Question(**{**question, "limit": float(question["limit"])}),
+    )

@@ -1,48 +1,42 @@
-"""Metrics of the stages -> the figures of each contestant that the rules are asked of: as deployed, over all
-plants, at the 90 % quantile with the band of that quantile. No page, no file."""
+"""Figures of the stages -> the figures of each controller of the temperature loop that its rules ask for: as
+deployed, over all plants, at the 90 % quantile with the band of that quantile."""
 
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.report.shared.digits import number
-from pipeline.report.shared.verdict import OPEN, Figure, Missing
-from pipeline.report.temperature.contestants import BY_NAME, YARDSTICKS, heading
+from pipeline.verdict.controllers import BY_NAME, DATA_DRIVEN, YARDSTICKS, heading
+from pipeline.verdict.digits import number
+from pipeline.verdict.evidence import Figures, entry
+from pipeline.verdict.rules import at_path, rows
+from pipeline.verdict.verdict import OPEN, Figure, Missing, count_of
 
-Metrics = Mapping[str, Any]  # {stage: its metrics, or why there are none}
+LOOP = "temperature"
 REPEAT = "Run ./run dvc repro evaluate_temperature"
 # figures of the scorecard that come as median and quantile
 QUANTILES = ("settled_error", "settling", "overshoot", "at_limits", "energy", "cost")
 
 
-def entry(data: Any, *names: str) -> Any:
-    """data[name][name]...; None where any of them is not there."""
-    for name in names:
-        data = data.get(name) if isinstance(data, Mapping) else None
-    return data
-
-
-def comparison(metrics: Metrics) -> Mapping[str, Any]:
+def comparison(figures: Figures) -> Mapping[str, Any]:
     """The metrics of the comparison; {} where there are none."""
-    compared = metrics.get("evaluate_temperature")
+    compared = figures.get("evaluate_temperature")
     return compared if isinstance(compared, Mapping) else {}
 
 
-def judged(metrics: Metrics) -> list[str]:
-    """Contestants with figures, in the declared order of simplicity, the yardstick last."""
-    compared = comparison(metrics)
-    names = list(entry(compared, "contestants") or {})
-    declared = [name for name in entry(compared, "order") or BY_NAME if name in names]
-    listed = [*declared, *(name for name in names if name not in declared)]
-    return [name for name in listed if name not in YARDSTICKS] + [n for n in listed if n in YARDSTICKS]
+def names(figures: Figures) -> list[str]:
+    """Controllers with figures, in the declared order of simplicity, the yardstick last."""
+    compared = comparison(figures)
+    listed = list(entry(compared, "contestants") or {})
+    ordered = [name for name in entry(compared, "order") or BY_NAME if name in listed]
+    return sorted(dict.fromkeys([*ordered, *listed]), key=lambda name: name in YARDSTICKS)
 
 
-def refused(metrics: Metrics) -> dict[str, str]:
-    """Why contestants could not take part, by name."""
-    reasons = {name: str(why) for name, why in (entry(comparison(metrics), "refused") or {}).items()}
-    kernel = entry(metrics.get("learn_kernel"), "refused")
-    if kernel and "learned_kernel" not in (entry(comparison(metrics), "contestants") or {}):
-        reasons.setdefault("learned_kernel", str(kernel))
+def refused(figures: Figures) -> dict[str, str]:
+    """Why controllers could not take part, by name."""
+    reasons = {name: str(why) for name, why in (entry(comparison(figures), "refused") or {}).items()}
+    kernel = entry(figures.get("learn_kernel"), "refused")
+    if kernel and DATA_DRIVEN not in (entry(comparison(figures), "contestants") or {}):
+        reasons.setdefault(DATA_DRIVEN, str(kernel))
     return reasons
 
 
@@ -61,26 +55,30 @@ def quantile(figures: Any) -> Figure | None:
     return Figure(value, min(low, value), max(high, value))
 
 
-def of_contestant(metrics: Metrics, name: str, undeclared: Sequence[str] = ()) -> dict[str, Figure | Missing]:
-    """{key: figure} of one contestant; `undeclared` are outputs without low and high."""
-    figures = entry(comparison(metrics), "contestants", name)
-    if figures is None:
-        gap = _without(metrics, name)
-        keys = (*QUANTILES, "disk", "delay_s", "crossings")
-        return dict.fromkeys(keys, gap) | {"data": data(metrics, name)}
+def of_controller(figures: Figures, name: str, undeclared: Sequence[str] = ()) -> dict[str, Figure | Missing]:
+    """{key: figure} of one controller; `undeclared` are outputs without low and high."""
+    own = entry(comparison(figures), "contestants", name)
+    by_path = {key: row for key, row in rows(LOOP).items() if "." in row.figure}
+    if own is None:
+        keys = (*QUANTILES, "disk", "delay_s", "crossings", *by_path)
+        return dict.fromkeys(keys, _without(figures, name)) | {"data": data(figures, name)}
     gap = Missing(OPEN, "This figure is not in the scorecard", REPEAT)
     return {
-        **{key: quantile(entry(figures, key)) or gap for key in QUANTILES},
-        **{key: _margin(figures, key) or _without_margin(figures, gap) for key in ("disk", "delay_s")},
-        "crossings": crossings(figures, undeclared),
-        "data": data(metrics, name),
+        **{key: quantile(entry(own, key)) or gap for key in QUANTILES},
+        **{key: _margin(own, key) or _without_margin(own, gap) for key in ("disk", "delay_s")},
+        **{
+            key: at_path(figures, row.figure.format(controller=name), at_least=row.at_least is not None)
+            for key, row in by_path.items()
+        },
+        "crossings": crossings(own, undeclared),
+        "data": data(figures, name),
     }
 
 
-def _without(metrics: Metrics, name: str) -> Missing:
-    """Why a contestant has no figures: refused, or nothing was measured."""
-    compared = metrics.get("evaluate_temperature")
-    if reason := refused(metrics).get(name):
+def _without(figures: Figures, name: str) -> Missing:
+    """Why a controller has no figures: refused, or nothing was measured."""
+    compared = figures.get("evaluate_temperature")
+    if reason := refused(figures).get(name):
         return Missing("failed", reason)
     if isinstance(compared, Missing):
         return compared
@@ -88,7 +86,7 @@ def _without(metrics: Metrics, name: str) -> Missing:
 
 
 def unstable(figures: Any) -> tuple[int, int]:
-    """(plants that a contestant does not hold stable, plants)."""
+    """(plants that a controller does not hold stable, plants)."""
     stable, of = (entry(figures, "stable", key) for key in ("count", "of"))
     return (of - stable, of) if isinstance(stable, int) and isinstance(of, int) else (0, 0)
 
@@ -100,11 +98,11 @@ def _margin(figures: Any, key: str) -> Figure | None:
     if not isinstance(margin, Mapping) or "median" not in margin:
         return None
     median = 0.0 if unstable(figures)[0] else finite(margin["median"])
-    return Figure(median, median, median)
+    return count_of(median)
 
 
 def _without_margin(figures: Mapping[str, Any], gap: Missing) -> Missing:
-    """A contestant that closes no loop has no margin to lose."""
+    """A controller that closes no loop has no margin to lose."""
     if "margins" in figures and figures["margins"] is None:
         return Missing("not applicable", "it closes no loop")
     return gap
@@ -122,15 +120,15 @@ def crossings(figures: Any, undeclared: Sequence[str] = ()) -> Figure | Missing:
     cases, of = (entry(figures, "crossings", key) for key in ("cases", "of"))
     if not isinstance(cases, int):
         return Missing(OPEN, "Crossings of the outputs’ limits are not in the scorecard", REPEAT)
-    return Figure(float(cases), float(cases), float(cases), note=f"of {number(finite(of), 0)} cases")
+    return count_of(float(cases))._replace(note=f"of {number(finite(of), 0)} cases")
 
 
 # ---- the data
 
 
-def data(metrics: Metrics, name: str) -> Figure | Missing:
-    """Samples of the record over the samples that a contestant needs: for its noise, and for its unknowns."""
-    learned = metrics.get("learn_kernel")
+def data(figures: Figures, name: str) -> Figure | Missing:
+    """Samples of the record over the samples that a controller needs: for its noise, and for its unknowns."""
+    learned = figures.get("learn_kernel")
     learned_from = BY_NAME[name].learned_from if name in BY_NAME else "plant"
     if learned_from == "kernel":
         if entry(learned, "refused") and entry(learned, "samples_needed") is None:
@@ -138,27 +136,27 @@ def data(metrics: Metrics, name: str) -> Figure | Missing:
         return _of(learned, entry(learned, "samples"), entry(learned, "samples_needed"))
     if learned_from == "window":
         noise, past = entry(learned, "samples_needed_for_noise"), entry(learned, "window")
-        needed = None if noise is None or past is None else max(noise, _unknowns(metrics, past))
+        needed = None if noise is None or past is None else max(noise, _unknowns(figures, past))
         return _of(learned, entry(learned, "samples"), needed)
     if learned_from == "plant":
-        return _model_data(metrics)
+        return _model_data(figures)
     return Missing("not applicable", f"{heading(name)} learns nothing from the record")
 
 
-def _unknowns(metrics: Metrics, past: int) -> int:
+def _unknowns(figures: Figures, past: int) -> int:
     """Unknowns of one output's regression on `past` samples of every signal and a constant."""
-    model = metrics.get("identify_plant")
+    model = figures.get("identify_plant")
     return past * sum(len(entry(model, key) or ()) for key in ("delays", "fit_holdout")) + 1
 
 
-def _model_data(metrics: Metrics) -> Figure | Missing:
+def _model_data(figures: Figures) -> Figure | Missing:
     """The model has fewer unknowns than the window, so that noise asks no more of it; its
     own first step, a long VARX, asks for its unknowns."""
-    model = metrics.get("identify_plant")
+    model = figures.get("identify_plant")
     past, needed = entry(model, "past"), entry(model, "samples_needed")
-    noise = entry(metrics.get("learn_kernel"), "samples_needed_for_noise")
+    noise = entry(figures.get("learn_kernel"), "samples_needed_for_noise")
     if needed is None and past is not None and noise is not None:
-        needed = max(noise, _unknowns(metrics, past))
+        needed = max(noise, _unknowns(figures, past))
     return _of(model, entry(model, "rows"), needed)
 
 
@@ -171,4 +169,4 @@ def _of(stage: Any, samples: Any, needed: Any) -> Figure | Missing:
     note = f"{number(samples, 0)} of {number(needed, 0)} samples" + (
         f"; record {number(more, 0)} more" if more else ""
     )
-    return Figure(ratio, ratio, ratio, note=note)
+    return count_of(ratio)._replace(note=note)

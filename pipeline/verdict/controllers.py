@@ -1,5 +1,5 @@
-"""What the pages say of a contestant of the temperature loop, from the table of contestants: heading, kind,
-and how it reads in a sentence. One that the table does not know goes by its own name."""
+"""The controllers of the temperature loop as verdicts and pages name them, from the table of controllers. One
+that the table does not know goes by its own name."""
 
 from pipeline.temperature.workflow.contestants import CONTESTANTS
 

@@ -1,17 +1,19 @@
-"""Scoreboard and classifier's figures -> who sets flow and temperature by default, by how much, and whether
-it may steer a printer, in words. No page, no file."""
+"""Scoreboard and classifier's figures -> who sets flow and temperature, and whether it may steer."""
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from pipeline.report.shared.digits import THIN, band, count, number, quantity
-from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import (
+from pipeline.setpoint.controllers import KINDS
+from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, harm_bar
+from pipeline.verdict.digits import THIN, band, count, number, quantity
+from pipeline.verdict.evidence import Evidence, lookup
+from pipeline.verdict.rules import Reading, Row, at_path, judge, rows
+from pipeline.verdict.verdict import (
     FAILED,
     OPEN,
     PASSED,
@@ -27,8 +29,8 @@ from pipeline.report.shared.verdict import (
     state,
     words_for,
 )
-from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, harm_bar
 
+LOOP = "setpoint"
 AGENT, PAPER, BASELINE = "agent", "paper", "baseline"
 SIMULATORS = {
     "paper": "The paper’s simulator",
@@ -49,10 +51,6 @@ NOT_APART = (
     " Controllers learn, are chosen and judged on windows of prints that the classifier was calibrated, "
     "chosen and judged on: the folder has too few prints to keep them apart."
 )
-# what the two columns of its rules are, and the mark of the second
-HEADS = ("Data\u2011driven", "Baseline", "baseline")
-
-
 NO_CLOG = Missing("not applicable", "nothing happens in this case")
 
 
@@ -117,16 +115,12 @@ class Board(NamedTuple):
 
 
 def role(board: Board, name: str) -> str:
-    """The mark of a controller: circle what learned (hollow: not the one that
-    competes), square the Bayes filter, ring the others."""
+    """The mark of a controller by its kind: circle what learned (hollow: not the one that competes), square
+    the first that is model-based (hollow: the others), ring the baselines."""
     if board.kinds[name] != BASELINE:
         return "data_driven" if name == board.learned() else "kernel"
-    if "bayes" in name.lower():
-        first = next(
-            other for other in board.names if board.kinds[other] == BASELINE and "bayes" in other.lower()
-        )
-        return "model_based" if name == first else "exact_model"
-    return "baseline"
+    models = [other for other in board.names if KINDS.get(other) in ("model-based", "reference")]
+    return "baseline" if name not in models else "model_based" if name == models[0] else "exact_model"
 
 
 def case_text(case: Case, *, whole: bool = False) -> str:
@@ -143,8 +137,9 @@ def within(case: Case) -> str:
     return text[:1].lower() + text[1:]
 
 
-def board(sources: Sources) -> Board | Missing:
-    table, choice = sources.tables["scoreboard"], sources.tables["choice"]
+def board(evidence: Evidence, subject: str = "") -> Board | Missing:
+    """Everybody who was judged; the default is the one of the choice, or the `subject` of a verdict."""
+    table, choice = evidence.tables["scoreboard"], evidence.tables["choice"]
     if isinstance(table, Missing):
         return table
     if not len(table["controller"]):
@@ -157,7 +152,7 @@ def board(sources: Sources) -> Board | Missing:
     refused = {name: str(why) for name, why in refused.items()} if isinstance(refused, Mapping) else {}
     unranked = Board(list(kinds), kinds, list(dict.fromkeys(case for _, case in cells)), cells, "", refused)
     ranked = sorted(kinds, key=lambda name: (name not in refused, _rank(unranked, name)), reverse=True)
-    chosen = str(said.get("name", ""))
+    chosen = subject or str(said.get("name", ""))
     return unranked._replace(names=ranked, default=chosen if chosen in kinds else "")
 
 
@@ -222,54 +217,33 @@ def share_text(figure: Figure | Missing) -> str:
 
 # of each a pair: what learned, and the best baseline; a rule of the classifier holds for every controller
 Pair = tuple[Rule, Rule]
-SEEING = ("vision", "by-flow", "reliability")
 
 
 def of_classifier(rule: Rule) -> bool:
     """Whether the rule is asked of the classifier, on which every controller rests."""
-    return rule.place in SEEING
+    return any("see" in row.needed_for for row in rows(LOOP).values() if row.name == rule.name)
 
 
-def rules(sources: Sources, board: Board | None) -> tuple[Pair, ...]:
-    asked = sources.declared.rules
-    return (
-        _does_no_harm(sources, board),
-        _control(board, "Settles, worst case", "settled", asked.settled_percent, "settle"),
-        _control(board, "Stays, worst case", "stay", asked.stay_percent, "settle and stay"),
-        _accurate(
-            sources,
-            Question(0, "image_accuracy", "Right, an image", "%", 100 * asked.image_accuracy, True, ""),
-            ("svc", "cnn", "width"),
-            "frames of segments it never saw",
-        ),
-        _right_by_flow(sources, 100 * asked.window_right_70_150),
-        _calibrated(sources, "Calibrated, an image", asked.ece_image, ("ece_image", "ece_image_raw")),
-        _calibrated(sources, "Calibrated, a window", asked.ece_window, ("ece_window", "ece_window_counts")),
+def rules(evidence: Evidence, board: Board | None) -> tuple[Pair, ...]:
+    names = (board.learned(), board.baseline()) if board else ("", "")
+    return tuple(
+        (_rule(evidence, board, key, row, names[0], 0), _rule(evidence, board, key, row, names[1], 1))
+        for key, row in rows(LOOP).items()
     )
 
 
-def _control(board: Board | None, name: str, what: str, limit: float, does: str) -> Pair:
-    question = Question(0, what, name, "%", limit, True, "")
-    rule = Rule(
-        name, question, Missing(OPEN, ""), text=OPEN, limit=f"≥ {limit:g}{THIN}%", place="scoreboard",
-        reason="Nothing was judged.",
-    )  # fmt: skip
-    if board is None:
-        return rule, rule
-    remedy = "A classifier whose errors persist for fewer decisions."
+def _rule(evidence: Evidence, board: Board | None, key: str, row: Row, name: str, column: int) -> Rule:
+    question = row.question(key, row.limit(evidence.rules))
 
-    def held(controller: str) -> Rule:
-        figure, case = worst(board, controller, what)
-        shares = case is not None and board.cells[controller, case].redraws > 1
-        reason = (
-            figure.sentence()
-            if isinstance(figure, Missing)
-            else f"In its worst case ({within(case)}) {share_text(figure)} of its runs {does}; "
-            f"{limit:g}{THIN}% are asked for.{undecided(question, figure, clustered=shares)}"
-        )
-        return rule._replace(figure=figure, text=share_text(figure), reason=reason, remedy=remedy)
+    def read() -> Reading:
+        if key in CONTROL:
+            return CONTROL[key](evidence, board, name)
+        if key in SEEING:
+            return SEEING[key](evidence, column)
+        path = row.figure.format(controller=name)
+        return at_path(evidence.figures, path, at_least=question.at_least), {}
 
-    return held(board.learned()), held(board.baseline())
+    return judge(row, question, read, undecided)
 
 
 class Harm(NamedTuple):
@@ -282,9 +256,9 @@ class Harm(NamedTuple):
     case: Case
 
 
-def bars(sources: Sources, board: Board) -> dict[Case, float]:
+def bars(evidence: Evidence, board: Board) -> dict[Case, float]:
     """Percent of runs that may leave +-25 % from good starts, by case; {} where nobody declared it."""
-    most = sources.declared.everything.get("evaluate_setpoint", {}).get("most_harmed") or {}
+    most = evidence.params.get("evaluate_setpoint", {}).get("most_harmed") or {}
     perfect, in_band = most.get("perfect_percent"), most.get("in_band_percent")
     if perfect is None or in_band is None:
         return {}
@@ -309,39 +283,52 @@ def harm_of(board: Board, name: str, limits: Mapping[Case, float]) -> Harm | Mis
     )
 
 
-def _does_no_harm(sources: Sources, board: Board | None) -> Pair:
+def _share(what: str) -> Callable[[Evidence, Board | None, str], Reading]:
+    """The reading of the smallest share `what` of the cases that count."""
+
+    def read(evidence: Evidence, board: Board | None, name: str) -> Reading:
+        if board is None:
+            return Missing(OPEN, ""), {"reason": "Nothing was judged.", "remedy": ""}
+        figure, case = worst(board, name, what)
+        if isinstance(figure, Missing):
+            return figure, {"text": figure.state}
+        return figure, {
+            "text": share_text(figure),
+            "within": within(case),
+            "clustered": board.cells[name, case].redraws > 1,
+        }
+
+    return read
+
+
+def _harm(evidence: Evidence, board: Board | None, name: str) -> Reading:
     """How often a print that was good is spoilt, beside what doing nothing spoils."""
-    question = Question(0, "harm", "Does no harm", "%", 0.0, False, "")
-    rule = Rule(
-        "Does no harm", question, Missing(OPEN, ""), text=OPEN, place="harm",
-        reason="Nothing was judged from good starts.",
-        remedy="Run ./run dvc repro evaluate_setpoint.",
-    )  # fmt: skip
-    limits = bars(sources, board) if board else {}
+    limits = bars(evidence, board) if board else {}
+    absent = {
+        "reason": "Nothing was judged from good starts.",
+        "remedy": "Run ./run dvc repro evaluate_setpoint.",
+        "allowed": "",
+    }
     if board is None or not limits:
-        return rule, rule
+        return Missing(OPEN, ""), absent
+    harm = harm_of(board, name, limits)
+    if isinstance(harm, Missing):
+        return Missing(OPEN, ""), absent | {"reason": harm.sentence()}
     idle = harm_of(board, DOES_NOTHING, limits)
-    beside = "" if isinstance(idle, Missing) else f" With doing nothing {share_text(idle.figure)} do."
     ends = sorted(set(limits.values()))
+    return harm.figure, {
+        "limit": harm.limit,
+        "text": share_text(harm.figure),
+        "allowed": f"≤ {' or '.join(f'{end:g}' for end in ends)}{THIN}%",
+        "case_text": case_text(harm.case, whole=True),
+        "idle": "" if isinstance(idle, Missing) else f" With doing nothing {share_text(idle.figure)} do.",
+        "clustered": True,
+    }
 
-    def held(name: str) -> Rule:
-        harm = harm_of(board, name, limits)
-        if isinstance(harm, Missing):
-            return rule._replace(reason=harm.sentence())
-        asked = question._replace(limit=harm.limit)
-        return rule._replace(
-            question=asked,
-            figure=harm.figure,
-            text=share_text(harm.figure),
-            limit=f"≤ {' or '.join(f'{end:g}' for end in ends)}{THIN}%",
-            reason=f"{case_text(harm.case, whole=True)}, {share_text(harm.figure)} of its runs leave "
-            f"±{BEYOND[-1]}{THIN}%; at most {harm.limit:g}{THIN}% may."
-            f"{undecided(asked, harm.figure, clustered=True)}{beside}",
-            remedy="A dearer move (evaluate_setpoint.baselines.bayes_robust.move_fixed_cost), or a "
-            "classifier with a smaller spread.",
-        )
 
-    return held(board.learned()), held(board.baseline())
+def _seen(figure: Figure | Missing, text: str = "") -> Reading:
+    """The reading of a share of frames or windows."""
+    return figure, {"text": text or share_text(figure), "clustered": True}
 
 
 def share_in(row: Mapping[str, Any] | None) -> Figure | None:
@@ -353,36 +340,68 @@ def share_in(row: Mapping[str, Any] | None) -> Figure | None:
     return Figure(value, low, high)
 
 
-def _right_by_flow(sources: Sources, limit: float) -> Pair:
+def _right_by_flow(evidence: Evidence, column: int) -> Reading:
     """Windows named rightly were every flow from 70 to 150 % as frequent; yardsticks are not judged so."""
-    name, found = f"Right, 70–150{THIN}% of flow", lookup(sources.metrics["train_classifier"], "right_70_150")
-    share = found if isinstance(found, Missing) else share_in(found)
-    figure = share or Missing(OPEN, "no window lies between 70 and 150 % of flow")
-    question = Question(0, "right_70_150", name, "%", limit, True, "")
-    mine = Rule(
-        name,
-        question,
-        figure,
-        text=share_text(figure),
-        limit=f"≥ {limit:g}{THIN}%",
-        place="by-flow",
-        reason=figure.sentence()
-        if isinstance(figure, Missing)
-        else f"Were every flow from 70 to 150{THIN}% as frequent, {share_text(figure)} of the windows would "
-        f"be named rightly; {limit:g}{THIN}% are asked for.{undecided(question, figure, clustered=True)}",
-        remedy="More segments to train on (render_frames.segments), or another view of the nozzle.",
-    )
-    gap = Missing("not applicable", "the yardsticks are judged on windows of all flows")
-    return mine, mine._replace(figure=gap, text="not judged so")
+    if column:
+        return _seen(
+            Missing("not applicable", "the yardsticks are judged on windows of all flows"), "not judged so"
+        )
+    figure = lookup(evidence.figures["train_classifier"], "right_70_150")
+    if not isinstance(figure, Missing):
+        figure = share_in(figure) or Missing(OPEN, "no window lies between 70 and 150 % of flow")
+    return _seen(figure)
 
 
-def undecided(question: Question, figure: Figure, *, clustered: bool = False) -> str:
+def _accuracy(evidence: Evidence, column: int) -> Reading:
+    """The classifier's accuracy, beside the best of its yardsticks."""
+    classifier = evidence.figures["train_classifier"]
+    if not column:
+        return _seen(accuracy(classifier, "image"))
+    others = {name: accuracy(classifier, f"{name}_image") for name in BRIEF}
+    known = {name: figure for name, figure in others.items() if isinstance(figure, Figure)}
+    if not known:
+        return _seen(Missing("not measured", "no yardstick"))
+    best = max(known, key=lambda name: known[name].value)
+    return _seen(known[best], f"{share_text(known[best])} {BRIEF[best]}")
+
+
+def accuracy(metrics: Mapping | Missing, name: str) -> Figure | Missing:
+    """In percent, with the interval where the stage gives one."""
+    value = lookup(metrics, f"{name}_accuracy")
+    if isinstance(value, Missing):
+        return value
+    ends = lookup(metrics, f"intervals_percent.{name}")
+    return Figure(100 * value, *((100 * value,) * 2 if isinstance(ends, Missing) else map(float, ends)))
+
+
+def _calibration(*keys: str) -> Callable[[Evidence, int], Reading]:
+    """The reading of the error of calibration: of the classifier, and without its calibration."""
+
+    def read(evidence: Evidence, column: int) -> Reading:
+        error = lookup(evidence.figures["train_classifier"], keys[column])
+        if isinstance(error, Missing):
+            return error._replace(state=OPEN), {"reason": "It was not measured."}
+        return count_of(error), {"text": number(error, 3)}
+
+    return read
+
+
+CONTROL = {"harm": _harm, "settled": _share("settled"), "stay": _share("stay")}
+SEEING = {
+    "image_accuracy": _accuracy,
+    "right_70_150": _right_by_flow,
+    "ece_image": _calibration("ece_image", "ece_image_raw"),
+    "ece_window": _calibration("ece_window", "ece_window_counts"),
+}
+
+
+def undecided(question: Question, figure: Figure, words: Mapping[str, Any]) -> str:
     """What would tell, where the interval straddles the limit: of runs that share nothing
     z^2 p (1 - p) / (p - limit)^2 at 95 %; of clustered ones the segments by which the interval shrinks."""
     if state(question, figure) != UNDECIDED:
         return ""
     p, off = figure.value / 100, abs(figure.value - question.limit) / 100
-    if clustered:
+    if words.get("clustered"):
         times = ((figure.high - figure.low) / 200 / off) ** 2 if off else math.inf
         more = (
             f"about {number(max(math.ceil(times - 1e-6), 2), 0)} times as many segments would decide"
@@ -404,89 +423,24 @@ def _round(value: float) -> int:
     return math.ceil(value / power) * power
 
 
-NAMES = {"svc": "support vector machine", "cnn": "convolutional network", "width": "width rule"}
+# yardsticks of the classifier
 BRIEF = {"svc": "SVC", "cnn": "CNN", "width": "width"}
-
-
-def _accurate(sources: Sources, question: Question, others: Sequence[str], of: str) -> Pair:
-    """The classifier's accuracy, beside the best of its yardsticks."""
-    metrics, kind = sources.metrics["train_classifier"], question.key.removesuffix("_accuracy")
-    mine = accuracy(metrics, kind)
-    beside = [
-        (figure, other)
-        for other in others
-        if isinstance(figure := accuracy(metrics, f"{other}_{kind}"), Figure)
-    ]
-    best, who = max(
-        beside, key=lambda pair: pair[0].value, default=(Missing("not measured", "no yardstick"), "")
-    )
-    reason = (
-        mine.sentence()
-        if isinstance(mine, Missing)
-        else f"The classifier names {share_text(mine)} of {of} rightly; "
-        f"{question.limit:g}{THIN}% are asked for.{undecided(question, mine, clustered=True)}"
-    )
-    rule = Rule(
-        question.title,
-        question,
-        mine,
-        text=share_text(mine),
-        limit=f"≥ {question.limit:g}{THIN}%",
-        place="vision",
-        reason=reason,
-        remedy="More segments to train on (render_frames.segments), or another view of the nozzle.",
-    )
-    return rule, rule._replace(figure=best, text=share_text(best) + (f" {BRIEF[who]}" if who else ""))
-
-
-def accuracy(metrics: Mapping | Missing, name: str) -> Figure | Missing:
-    """In percent, with the interval where the stage gives one."""
-    value = lookup(metrics, f"{name}_accuracy")
-    if isinstance(value, Missing):
-        return value
-    ends = lookup(metrics, f"intervals_percent.{name}")
-    return Figure(100 * value, *((100 * value,) * 2 if isinstance(ends, Missing) else map(float, ends)))
-
-
-def _calibrated(sources: Sources, name: str, limit: float, keys: tuple[str, str]) -> Pair:
-    mine, raw = (lookup(sources.metrics["train_classifier"], key) for key in keys)
-    texts = [OPEN if isinstance(value, Missing) else number(value, 3) for value in (mine, raw)]
-    rule = Rule(
-        name,
-        Question(0, keys[0], name, "", limit, False, ""),
-        _plain(mine),
-        text=texts[0],
-        limit=f"≤ {limit:g}",
-        place="reliability",
-        reason="It was not measured."
-        if isinstance(mine, Missing)
-        else (
-            f"Stated and true shares of right answers differ by {texts[0]} on average; {limit:g} is allowed."
-        ),
-        remedy="Calibrate on more segments (render_frames.segments.calibration).",
-    )
-    return rule, rule._replace(figure=_plain(raw), text=texts[1])
-
-
-def _plain(value: float | Missing) -> Figure | Missing:
-    return value._replace(state=OPEN) if isinstance(value, Missing) else count_of(value)
 
 
 # ---- the verdict
 
 
-def verdict(sources: Sources) -> Verdict:
-    """Who sets flow and temperature by default: `winner`, "" where nobody chose. `note` says of what printers
+def verdict(evidence: Evidence) -> Verdict:
+    """Who sets flow and temperature by default: `winner`, "" if nobody chose. `note` says of what printers
     anything is claimed."""
-    scores = board(sources)
-    recorded = sources.declared.everything.get("train_classifier", {}).get("source") == "recordings"
-    claim, words = CLAIM_RECORDED if recorded else CLAIM, words_for(recorded=recorded, quick=sources.quick)
-    if recorded and lookup(sources.metrics["train_classifier"], "data.windows_apart") is False:
+    scores, recorded = board(evidence), evidence.recorded("train_classifier")
+    claim, words = CLAIM_RECORDED if recorded else CLAIM, words_for(recorded=recorded, quick=evidence.quick)
+    if recorded and lookup(evidence.figures["train_classifier"], "data.windows_apart") is False:
         claim += NOT_APART
     if isinstance(scores, Missing) or not scores.default:
-        gap = scores if isinstance(scores, Missing) else sources.tables["choice"]
+        gap = scores if isinstance(scores, Missing) else evidence.tables["choice"]
         return Verdict(
-            loop="setpoint",
+            loop=LOOP,
             state=OPEN,
             decision=words.undecided,
             lead="No controller was chosen.",
@@ -497,18 +451,25 @@ def verdict(sources: Sources) -> Verdict:
             rule="",
             winner="",
             note=claim,
-            rules=rules(sources, None if isinstance(scores, Missing) else scores),
+            rules=rules(evidence, None if isinstance(scores, Missing) else scores),
         )
-    lines, name = rules(sources, scores), named(scores, scores.default)
-    column = int(scores.kinds[scores.default] == BASELINE)
-    asked = [line[0 if of_classifier(line[0]) else column] for line in lines]
-    ended, first = overall([rule.state for rule in asked]), deciding(asked)
+    scores = _certified(evidence, scores)
+    lines, refusal = rules(evidence, scores), evidence.refusal(LOOP, scores.default)
+    asked = _asked(lines, scores)
+    if refusal:
+        gap = Missing(UNDECIDED, refusal)
+        asked.append(Rule("certificate", None, gap, text="refused", limit="passed", reason=refusal))
+    name = named(scores, scores.default)
+    ended, first = (
+        overall([rule.state for rule in asked if _binding(rule)]),
+        deciding(filter(_binding, asked)),
+    )
     settled = Verdict(
-        loop="setpoint",
+        loop=LOOP,
         state=PASSED,
         decision=words.passed.format(name),
         lead=f"All {count(len(asked), 'rule')} passed.",
-        reason=summary(sources, scores),
+        reason=summary(evidence, scores),
         remedy="",
         rule="",
         winner=scores.default,
@@ -519,6 +480,8 @@ def verdict(sources: Sources) -> Verdict:
         return settled
     failed = first.state == FAILED
     return settled._replace(
+        winner=None if refusal else scores.default,
+        subject=scores.default,
         state=ended,
         decision=words.of(ended),
         lead=f"First {'failed' if failed else 'undecided'} rule: {first.name[:1].lower()}{first.name[1:]}.",
@@ -526,6 +489,33 @@ def verdict(sources: Sources) -> Verdict:
         remedy=_conditions(asked, claim == CLAIM),
         rule=first.name,
     )
+
+
+def _certified(evidence: Evidence, board: Board) -> Board:
+    """The board with its default; if the certificate of that one is refused, with the next that passes and is
+    not refused, if there is one."""
+    if not evidence.refusal(LOOP, board.default):
+        return board
+    names = [name for name in board.names if name not in board.refused and not evidence.refusal(LOOP, name)]
+    others = (board._replace(default=name) for name in names)
+    passing = (
+        other
+        for other in others
+        if all(rule.state == PASSED for rule in _asked(rules(evidence, other), other) if _binding(rule))
+    )
+    return next(passing, board)
+
+
+def _asked(lines: Sequence[Pair], board: Board) -> list[Rule]:
+    """The rules of the default: those of the classifier, and those of its column."""
+    column = int(board.kinds[board.default] == BASELINE)
+    return [line[0 if of_classifier(line[0]) else column] for line in lines]
+
+
+def _binding(rule: Rule) -> bool:
+    """Whether the loop cannot steer without the rule."""
+    row = next((row for row in rows(LOOP).values() if row.name == rule.name), None)
+    return row is None or bool(row.needed_for)
 
 
 def _conditions(asked: Sequence[Rule], rendered: bool) -> str:
@@ -571,7 +561,7 @@ def _noise(choice: Any, mine: Figure, other: Figure) -> str:
     return f" (95{THIN}% interval {band(low, high, 1)} points{within_noise})"
 
 
-def summary(sources: Sources, board: Board) -> str:
+def summary(evidence: Evidence, board: Board) -> str:
     """The default's worst case, by how much it beats the next of those that may run, and,
     where the agent is neither, how far it came."""
     mine, place = worst(board, board.default, "lasting")
@@ -584,9 +574,9 @@ def summary(sources: Sources, board: Board) -> str:
     if not others:
         return f"{text}. {'Nothing else may run' if judged else 'Nothing else was judged'}."
     figure, where = worst(board, others[0], "lasting")
-    margin = lookup(sources.tables["choice"], "margin")
+    margin = lookup(evidence.tables["choice"], "margin")
     points = mine.value - figure.value if isinstance(margin, Missing) else float(margin)
-    noise = _noise(sources.tables["choice"], mine, figure)
+    noise = _noise(evidence.tables["choice"], mine, figure)
     rival = f"the next, {named(board, others[0])}, in its own ({within(where)}: {share_text(figure)})"
     text += (
         f", {number(abs(points), 1)} points {'more' if points > 0 else 'fewer'} than of {rival}{noise}."

@@ -1,12 +1,12 @@
-"""Model-based against data-driven in a sentence, the case that decides, and how the pair ended over
-relearnings. Metrics of the comparison -> words, no page, no file."""
+"""Model-based against data-driven in a sentence: figures of the comparison -> words."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import band, number
-from pipeline.report.temperature.answers import Metrics, comparison, entry, finite, judged, refused
-from pipeline.report.temperature.contestants import DATA_DRIVEN, INDIRECT, MODEL_BASED, in_a_sentence
+from pipeline.verdict.controllers import DATA_DRIVEN, INDIRECT, MODEL_BASED, in_a_sentence
+from pipeline.verdict.digits import band, number
+from pipeline.verdict.evidence import Figures, entry
+from pipeline.verdict.temperature import comparison, finite, names, refused
 
 
 class PairSentence(NamedTuple):
@@ -17,28 +17,28 @@ class PairSentence(NamedTuple):
     note: str = ""
 
 
-def pair_names(metrics: Metrics) -> tuple[str, str]:
-    """The model-based contestant and the data-driven one; the indirect one where the kernel is refused."""
-    pair = entry(comparison(metrics), "pair")
+def pair_names(figures: Figures) -> tuple[str, str]:
+    """The model-based controller and the data-driven one; the indirect one where the kernel is refused."""
+    pair = entry(comparison(figures), "pair")
     if isinstance(pair, Mapping) and {"a", "b"} <= pair.keys():
         return str(pair["a"]), str(pair["b"])
-    without_kernel = DATA_DRIVEN in refused(metrics) and INDIRECT in judged(metrics)
+    without_kernel = DATA_DRIVEN in refused(figures) and INDIRECT in names(figures)
     return MODEL_BASED, INDIRECT if without_kernel else DATA_DRIVEN
 
 
-def pair_sentence(metrics: Metrics) -> PairSentence:
+def pair_sentence(figures: Figures) -> PairSentence:
     """ "subspace + LQG costs 6 % less than the learned kernel on the same 60 plants (90 % interval 3-9 %,
     p = 0.01)", or that there is no difference. `difference` is that of the cheaper one."""
-    pair = entry(comparison(metrics), "pair")
-    a, b = pair_names(metrics)
-    reason_of = refused(metrics).get(DATA_DRIVEN)
+    pair = entry(comparison(figures), "pair")
+    a, b = pair_names(figures)
+    reason_of = refused(figures).get(DATA_DRIVEN)
     instead = f"The learned kernel is refused: {reason_of}." if reason_of and b != DATA_DRIVEN else ""
     kind = "data-driven" if b == DATA_DRIVEN else "data-driven, indirect"
     head = f"Model-based against {kind}:"
     if not isinstance(pair, Mapping) or (pair.get("winner") is None and pair.get("difference") is None):
-        gap = refused(metrics).get(a) or refused(metrics).get(b) or "not measured"
+        gap = refused(figures).get(a) or refused(figures).get(b) or "not measured"
         return PairSentence(f"{head} {gap.rstrip('.')}.", None, instead)
-    plants = entry(pair, "plants") or entry(comparison(metrics), "plants")
+    plants = entry(pair, "plants") or entry(comparison(figures), "plants")
     winner = entry(pair, "winner")
     p = entry(pair, "p")
     chance = "" if p is None else f"p {'< 0.0001' if p < 1e-4 else f'= {number(p, 4 if p < 0.01 else 2)}'}"
@@ -69,27 +69,6 @@ def _interval(pair: Mapping[str, Any], *, sign: int) -> str:
 def _bracket(*parts: str) -> str:
     inside = ", ".join(filter(None, parts))
     return f" ({inside})" if inside else ""
-
-
-def deciding_sentence(metrics: Metrics, winner: str | None) -> str:
-    """Which case decides, and the verdict without its plant."""
-    case = entry(comparison(metrics), "deciding")
-    if not isinstance(case, Mapping) or entry(case, "plant") is None:
-        return ""
-    compared, plant = comparison(metrics), case["plant"]
-    kind = f", {reference_of(case)}" if case.get("kind") else ""
-    changes = []
-    if entry(compared, "best") == winner and case.get("best_without") != winner:
-        other = case.get("best_without")
-        changes.append(f"the best would be {in_a_sentence(other)}" if other else "nobody would pass")
-    pair = entry(compared, "pair", "winner")
-    if case.get("pair_without") != pair:
-        other = case.get("pair_without")
-        changes.append(
-            f"the pair would go to {in_a_sentence(other)}" if other else "the pair would be undecided"
-        )
-    without = " and ".join(changes) if changes else "the same"
-    return f"Deciding case: plant {plant}{kind}. Without plant {plant} {without}."
 
 
 def reference_of(case: Mapping[str, Any]) -> str:
