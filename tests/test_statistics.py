@@ -5,10 +5,10 @@ import pytest
 
 from pipeline.nightly.decision import FIRST, KEPT, PROMOTED, CaseCosts, decide
 from pipeline.nightly.records import Alarm
-from pipeline.nightly.settings import Rule
+from pipeline.nightly.settings import PromotionRule
 from pipeline.statistics import blocks_needed, paired
 
-RULE = Rule(
+RULE = PromotionRule(
     level=0.01,
     least_improvement_percent=5,
     worst_case_percent=5,
