@@ -181,6 +181,24 @@ def conditions(machine: Plant, setting: CaseConditions, rules: TemperatureRules)
     }
 
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "plants",
+    "cases",
+    "contestants.*.settled_error.q90",
+    "contestants.*.settling.q90",
+    "contestants.*.overshoot.q90",
+    "contestants.*.at_limits.q90",
+    "contestants.*.energy.median",
+    "contestants.*.cost.median",
+    "contestants.*.cost.q90",
+    "contestants.*.never_settled_percent",
+    "contestants.*.crossings.cases",
+    "contestants.*.margins",
+    "contestants.*.stable.count",
+)
+
+
 def main() -> None:
     with artifacts.stage("evaluate_temperature") as out:
         settings = params.load(EvaluateTemperature, "evaluate_temperature")
@@ -190,7 +208,7 @@ def main() -> None:
         drawn = tables.trajectories(loaded.machine.inputs, loaded.machine.outputs)
         artifacts.write_table(out / "trajectories.parquet", drawn, trajectories)
         artifacts.write_json(out / "summary.json", summary)
-        artifacts.write_metrics("evaluate_temperature", summary)
+        artifacts.write_metrics("evaluate_temperature", summary, METRICS)
 
 
 if __name__ == "__main__":

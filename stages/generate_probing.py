@@ -29,6 +29,15 @@ if TYPE_CHECKING:
 EXCITED = 12  # lags over which the experiment's excitation is counted
 Columns = dict[str, "np.ndarray"]
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "next_experiment.seconds",
+    "next_experiment.highest_degC",
+    "next_experiment.lowest_degC",
+    "next_experiment.expected_gap_percent",
+    "closed_loop.at_limits_percent",
+)
+
 
 def main() -> None:
     with artifacts.stage("generate_probing") as out:
@@ -51,7 +60,7 @@ def main() -> None:
         if dither:
             artifacts.write_csv(out / "next_experiment_closed_loop.csv", dither)
         artifacts.write_json(out / "forecast.json", figures)
-        artifacts.write_metrics("generate_probing", figures)
+        artifacts.write_metrics("generate_probing", figures, METRICS)
 
 
 def design(

@@ -55,6 +55,20 @@ class RecordSegments(NamedTuple):
     notes: list[str]
 
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "order",
+    "samples*",
+    "fit_holdout",
+    "fit_holdout_ahead",
+    "fit_holdout_band",
+    "whiteness_passed",
+    "excitation.rank",
+    "excitation.condition",
+    "largest_pole",
+)
+
+
 def main() -> None:
     with artifacts.stage("identify_plant") as out:
         from pipeline.temperature.plant import stored
@@ -65,7 +79,7 @@ def main() -> None:
         artifacts.write_arrays(out / "spread.parquet", "spread", 1, stored(spread))
         for name, (schema, columns) in page_tables.items():
             artifacts.write_table(out / f"{name}.parquet", schema, columns)
-        artifacts.write_metrics("identify_plant", figures)
+        artifacts.write_metrics("identify_plant", figures, METRICS)
 
 
 def identify(

@@ -44,6 +44,17 @@ def read_record(machine: Plant) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return segments(table, [i.name for i in machine.inputs], [o.name for o in machine.outputs])[:2]
 
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "window",
+    "samples*",
+    "half_record_gap_percent",
+    "rank",
+    "condition",
+    "candidates.*.gap_on_window_model_percent",
+)
+
+
 def main() -> None:
     with artifacts.stage("learn_kernel") as out:
         import numpy as np
@@ -89,7 +100,7 @@ def main() -> None:
         artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(long))
         if best.learned is not None:
             artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, best.learned.stored())
-        artifacts.write_metrics("learn_kernel", figures(long, enough, candidates, best))
+        artifacts.write_metrics("learn_kernel", figures(long, enough, candidates, best), METRICS)
 
 
 def figures(

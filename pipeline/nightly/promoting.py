@@ -23,13 +23,13 @@ from pipeline.verdict.night import verdicts as verdicts_of_night
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import PASSED, Verdict
 
-# stages whose metrics the pages show; those before `learn_kernel` have no tables there
+# stages whose figures the pages show; those before `learn_kernel` have no tables there
 MEASURED = (
     "probe_machine", "generate_probing", "learn_kernel", "ingest", "identify_plant", "tune_weights",
     "evaluate_temperature", "train_ilc", "segment_library", "compose_parts",
     "train_classifier", "train_agent", "evaluate_setpoint", "export_controllers",
 )  # fmt: skip
-REPORT = "reports/metrics/report.json"
+REPORT = "datasets/report/figures.json"
 ACCEPTED = "reports/accepted.json"
 # artifacts that only some contestants are designed from, and that a record may not determine
 OPTIONAL = {f"datasets/{path}" for path in judge.DESIGNED_FROM.values()}
@@ -107,7 +107,7 @@ def page_sources() -> Sources:
     declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
     return collect(
         declared,
-        {stage: f"reports/metrics/{stage}.json" for stage in MEASURED},
+        {stage: f"datasets/{stage}/figures.json" for stage in MEASURED},
         {stage: f"datasets/{stage}" for stage in MEASURED},
         ACCEPTED,
         (),

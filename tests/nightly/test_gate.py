@@ -250,7 +250,7 @@ def written(rng) -> dict[str, str]:
                 change(stages)
         expected[loop] = worst([state for state, _ in changes])
     for stage in (*made.metrics(), *made.deposition_metrics(), *made_setpoint.metrics()):
-        Path(f"reports/metrics/{stage}.json").unlink(missing_ok=True)
+        Path(f"datasets/{stage}/figures.json").unlink(missing_ok=True)
     for stage, figures in stages.items():
         artifacts.write_metrics(stage, figures)
     return expected
@@ -364,10 +364,10 @@ def test_a_champion_of_the_heaters_has_a_passed_certificate_of_its_own(
 
 
 def test_the_night_reads_what_the_pages_are_made_of():
-    assert {stage: f"reports/metrics/{stage}.json" for stage in promoting.MEASURED} == {
-        stage: report.METRICS[stage] for stage in promoting.MEASURED
+    assert {stage: f"datasets/{stage}/figures.json" for stage in promoting.MEASURED} == {
+        stage: report.FIGURES[stage] for stage in promoting.MEASURED
     }
-    assert set(promoting.MEASURED) == set(report.METRICS) >= set(report.FOLDERS)
+    assert set(promoting.MEASURED) == set(report.FIGURES) >= set(report.FOLDERS)
     assert all(folder == f"datasets/{stage}" for stage, folder in report.FOLDERS.items())
 
 
@@ -376,7 +376,7 @@ def test_the_report_keeps_the_verdict_of_each_loop_as_the_night_reads_it(project
     made_anew = []
     monkeypatch.setattr(promoting, "dvc", lambda *command, **_: made_anew.append(command))
     verdicts, tonight = promoting.verdicts_of(settings(), TONIGHT)
-    kept = artifacts.read_metrics("report")
+    kept = artifacts.read_figures("report")
     assert kept["verdicts"] == {loop: verdict.metrics() for loop, verdict in verdicts.items()}
     assert {name: kept["verdict"][name] for name in kept["verdict"]} == verdicts["temperature"].metrics() | {
         "rehearsal": False

@@ -181,13 +181,13 @@ def files(sources: Sequence[Source]) -> Markup:
     return Markup('<p class="src">From {}.</p>').format(linked(sources)) if sources else Markup("")
 
 
-def linked(sources: Sequence[Source], *, short: bool = False) -> Markup:
-    """The links to these files, with commas between them; `short`: without their folder."""
+def linked(sources: Sequence[Source]) -> Markup:
+    """The links to these files, with commas between them."""
     return Markup(", ").join(
         placed(
             source.link,
             source.path,
-            verbatim(source.path.rsplit("/", 1)[1] if short else source.path.split("/", 1)[1]),
+            verbatim(source.path.split("/", 1)[1]),
             f"{source.path}, SHA-256 {source.sha256[:8]}",
         )
         for source in sources
