@@ -16,7 +16,7 @@ from ruamel.yaml import YAML
 
 from pipeline.deposition.settings import TrainIlc
 from pipeline.report.shared.sources import QUICK_LOOK
-from pipeline.setpoint.workflow.settings import EvaluateSetpoint
+from pipeline.setpoint.settings import EvaluateSetpoint
 from pipeline.store import artifacts, params, params_text
 from pipeline.temperature.settings import Panel, TuneWeights
 from stages.evaluate_temperature import EvaluateTemperature

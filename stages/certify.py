@@ -66,7 +66,7 @@ def main() -> None:
     with artifacts.stage("certify") as out:
         settings, loops = params.load(Certify, "certify"), params.load(params.Loops, "loops")
         temperature: dict[str, Any] = {}
-        setpoint = {"controller": "", "why": NOT_ASKED.format("setpoint"), "largest_difference": {}}
+        setpoint = {"controller": "", **_not_measured(NOT_ASKED.format("setpoint"))}
         if loops.temperature:
             temperature = certify_temperature(out / "temperature", settings)
         if loops.setpoint:
@@ -218,22 +218,23 @@ def certify_setpoint(folder: Path, seed: int) -> dict[str, Any]:
     """The files of the default controller, which have no certificate, and how far they are from the
     networks."""
     from pipeline.runtime import setpoint_checks
-    from pipeline.setpoint.workflow import contestants
-    from pipeline.setpoint.workflow.agent_files import restore_agents
-    from pipeline.setpoint.workflow.classifier_files import restore_classifier
-    from pipeline.setpoint.workflow.settings import EvaluateSetpoint
-    from pipeline.setpoint.workflow.tables import WINDOWS
-    from pipeline.setpoint.workflow.windows import window_tables
+    from pipeline.setpoint.agents.files import restore_agents
+    from pipeline.setpoint.controllers import build_controllers
+    from pipeline.setpoint.settings import EvaluateSetpoint
+    from pipeline.setpoint.simulation.recorded import window_tables
+    from pipeline.setpoint.tables import WINDOW_PARTS, WINDOWS
+    from pipeline.setpoint.vision.files import restore_classifier
 
     model = restore_classifier(
         "datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet"
     )
-    windows = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
+    columns = artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS)
+    learned = window_tables(columns, WINDOW_PARTS)["learn"]
     agents = restore_agents("datasets/train_agent/weights.safetensors")
     baselines = params.load(EvaluateSetpoint, "evaluate_setpoint").baselines
-    specs = contestants.controllers(contestants.Problem(baselines, agents, windows["learn"]))
     default = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
-    decides = setpoint_checks.decider(default, specs, agents)
+    built = build_controllers(baselines, agents, learned).get(default)
+    decides = setpoint_checks.decider(default, built and built.parameters, agents.belief, agents.belief_dqn)
     return setpoint_checks.write(folder, default, model, decides, seed)
 
 

@@ -98,7 +98,8 @@ def compose_part(
         )  # fmt: skip
         return part.compose(
             path.stem, program, extruded, learned, settings.of_part(printer), printer.gantry,
-            materials={one.tool: one.name for one in printer.materials}, shortest_s=settings.shortest_s,
+            materials={one.tool: one.name for one in printer.materials},
+            longest_ramp_s=printer.longest_ramp_s, shortest_s=settings.shortest_s,
             largest_error_percent=settings.largest_error_percent,
         )  # fmt: skip
 

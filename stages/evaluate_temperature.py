@@ -38,7 +38,7 @@ class TunedValues(Section, extra="allow"):
     """The parameters of one controller by name, the weights q (p,) and r (m,) that they stand for, and what
     its search says of them."""
 
-    __pydantic_extra__: dict[str, Positive]
+    __pydantic_extra__: dict[str, Positive]  # ty: ignore[incompatible-mutable-override]
     q: list[Positive] = []
     r: list[Positive] = []
     cost: float
@@ -117,7 +117,7 @@ def compare(
     machine, setting, rules = loaded.machine, loaded.setting, loaded.rules
     outcomes, refused = evaluate_all(loaded.problem, loaded.weights, setting, execution)
     entrants = [name for name in outcomes if BY_NAME[name].role != "yardstick"]
-    summary = {
+    summary: dict[str, Any] = {
         **conditions(machine, setting, rules),
         "contestants": {
             name: evaluation.summarise(

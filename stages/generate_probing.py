@@ -162,7 +162,7 @@ def columns(u: np.ndarray, names: Sequence[str], sample_time_s: float) -> Column
     return {"time_s": sample_time_s * np.arange(len(u)), **{name: u[:, k] for k, name in enumerate(names)}}
 
 
-def by_signal(signals: Sequence[PlantSignal], values: Sequence[float]) -> dict[str, float | None]:
+def by_signal(signals: Sequence[PlantSignal], values: np.ndarray) -> dict[str, float | None]:
     """{name: value}, None if it is not finite."""
     return {
         signal.name: float(value) if abs(value) < float("inf") else None

@@ -146,9 +146,10 @@ def read_record(settings: IdentifyPlant, machine: Machine, path: str) -> RecordS
     with artifacts.about(path):
         model_choice.check_inputs(u, offset=settings.offset, names=acting)
         model_choice.check_outputs(y, names=outputs)
-    unlimited = [(-float("inf"), float("inf"))] * len(machine.disturbances)
-    limits = [(i.low, i.high) for i in machine.inputs] + unlimited
-    u, clipped = model_choice.within_limits(u, tuple(zip(*limits, strict=True)), names=acting)
+    unlimited = [float("inf")] * len(machine.disturbances)
+    low = [i.low for i in machine.inputs] + [-limit for limit in unlimited]
+    high = [i.high for i in machine.inputs] + unlimited
+    u, clipped = model_choice.within_limits(u, (low, high), names=acting)
     return RecordSegments(u, y, tuple(recordings), recorded, clipped)
 
 

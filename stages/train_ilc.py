@@ -5,7 +5,7 @@ in next/."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,14 +18,13 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pipeline.deposition.camera import latency, readings, trial_flow
-    from pipeline.deposition.extruder import Routine
-    from pipeline.deposition.learning import ilc, training
+    from pipeline.deposition.extruder import Extruder, Routine
+    from pipeline.deposition.learning.ilc import Trial
     from pipeline.reading.trial_files import TrialRecording
 
 # the readings of a recording are remembered; this code decides what they are
 MEMO, PIPELINE = Path("datasets/memo/train_ilc"), Path(__file__).resolve().parents[1] / "pipeline"
-READERS = ("deposition/camera", "reading/image_messages.py", "reading/image_topics.py")
-READERS += ("reading/trial_files.py", "reading/mcap_frames.py")
+READERS = ("deposition/camera", "reading")
 Sections = tuple[TrainIlc, Printer, Camera]
 # trial sequences and measured trials by (material, number of the routine), models and figures by material
 Results = tuple[dict[tuple[str, int], list], dict[tuple[str, int], list], dict[str, dict], dict[str, dict]]
@@ -47,9 +46,9 @@ def main() -> None:
         routines, laws = printer.training_routines(), settings.laws(printer)
         prospects = {
             material.name: training.prospects(
-                material.nominal, routines, np.random.default_rng([settings.seed, 0, 0]),
+                material.nominal, routines, np.random.default_rng([settings.seed, 0, 0]), laws,
                 plants=settings.family_plants, steady_flow=printer.steady_flow,
-                worst_ratio=settings.worst_ratio, settings=laws,
+                worst_ratio=settings.worst_ratio,
             )
             for material in printer.materials
         }  # fmt: skip
@@ -70,7 +69,7 @@ def main() -> None:
             title = "train_ilc: materials, in flow and in pictures"
             results = list(tqdm(work, total=len(calls), desc=title))
             paths = sorted((out / "recordings").glob("*.mcap"))
-        sequences, measured, models, figures = join([({}, {}, {}, prospects), *results])
+        sequences, measured, models, figures = training.join([({}, {}, {}, prospects), *results])
         artifacts.write_table(out / "trials.parquet", TRIALS, training.trial_rows(sequences))
         artifacts.write_table(out / "lessons.parquet", LESSONS, training.sample_rows(sequences))
         artifacts.write_table(out / "filmed.parquet", FILMED, trial_flow.filmed_rows(measured))
@@ -79,22 +78,6 @@ def main() -> None:
         rows = run_all([delayed(show_frames)(path.resolve(), frames, camera) for path in paths], execution)
         artifacts.write_json(frames / "frames.json", [row for of_path in rows for row in of_path])
         artifacts.write_metrics("train_ilc", figures)
-
-
-def join(parts: Iterable[Results]) -> Results:
-    """All results as one; dictionaries of one material are put together."""
-    sequences, measured, models, figures = {}, {}, {}, {}
-    for part in parts:
-        for key, of_routine in part[0].items():
-            sequences.setdefault(key, []).extend(of_routine)
-        measured.update(part[1])
-        for joint, of_part in ((models, part[2]), (figures, part[3])):
-            for name, values in of_part.items():
-                joint.setdefault(name, {}).update(values)
-    return sequences, measured, models, figures
-
-
-# ---- a simulated machine
 
 
 def simulate(folder: Path, sections: Sections, index: int, kind: str) -> Results:
@@ -109,26 +92,26 @@ def simulate(folder: Path, sections: Sections, index: int, kind: str) -> Results
     settings, printer, _ = sections
     material, seed = printer.materials[index], [settings.seed, index]
     nominal, rng = material.nominal, np.random.default_rng(seed)
-    K, tau, flow = nominal.gain, nominal.time_constant_s, printer.steady_flow
-    plant = extruder.draw(rng, gain=K, time_constant_s=tau, steady_flow=flow)
-    case = training.TrainingCase(nominal, plant, printer.training_routines())
+    K, tau = nominal.gain, nominal.time_constant_s
+    plant = extruder.draw(rng, gain=K, time_constant_s=tau, steady_flow=printer.steady_flow)
+    routines = printer.training_routines()
     # of what the camera sees, and of what does not repeat in pictures and in flow; of plants
     rngs = [np.random.default_rng([*seed, number]) for number in range(1, 5)]
-    updates = {"flow": settings.trials * (len(case.routines) + 2), "pixels": settings.pixel_trials}[kind]
+    updates = {"flow": settings.trials * (len(routines) + 2), "pixels": settings.pixel_trials}[kind]
     title, place = f"train_ilc: {material.name} in {kind}", 1 + 2 * index + (kind == "pixels")
     with tqdm(total=updates, desc=title, position=place, mininterval=2, leave=False) as bar:
         if kind == "pixels":
-            return learn_in_pictures(folder, sections, material, case, rngs[:2], bar)
+            return learn_in_pictures(folder, sections, material, plant, routines[0], rngs[:2], bar)
         by_routine, figures, models = training.learn_in_flow(
-            case, rngs[2:], settings.shares, trials=settings.trials, plants=settings.family_plants,
-            settings=settings.laws(printer), on_step=lambda _: bar.update(),
+            nominal, plant, routines, rngs[2:], settings.shares, trials=settings.trials,
+            plants=settings.family_plants, settings=settings.laws(printer), on_step=lambda _: bar.update(),
         )  # fmt: skip
     sequences = {(material.name, number): of_routine for number, of_routine in by_routine.items()}
     return sequences, {}, {material.name: models}, {material.name: figures}
 
 
 def learn_in_pictures(
-    folder: Path, sections: Sections, material: PrinterMaterial, case: training.TrainingCase,
+    folder: Path, sections: Sections, material: PrinterMaterial, plant: Extruder, routine: Routine,
     rngs: Sequence[np.random.Generator], bar: Any,
 ) -> Results:  # fmt: skip
     """The model inverse on the reference routine of a simulated machine, the flow measured from pictures.
@@ -136,25 +119,24 @@ def learn_in_pictures(
     draw what the camera sees, and what does not repeat."""
     from pipeline.deposition.camera import rendering, simulated_trial, trial_flow
     from pipeline.deposition.learning import training
-    from pipeline.reading import trial_files
+    from pipeline.reading.trial_files import TrialConditions, TrialSignals, open_trial, write_trial
 
-    (settings, printer, camera), routine, measured = sections, case.routines[0], []
+    (settings, printer, camera), measured = sections, []
     laws, name = settings.laws(printer), material.name
     film = rendering.SimulatedCamera(rendering.SCENES[camera.scene], rngs[0])
     calibration = rendering.calibrate(film, camera.known_widths_mm, rngs[0], camera.mounting)
 
-    def measure(u: np.ndarray) -> ilc.Trial:
+    def measure(u: np.ndarray) -> Trial:
         number, law = len(measured), "pixels" if measured else "on_off"
         path = folder / f"{name}_{number:02d}.mcap"
         known = trial_conditions(printer, camera, material, routine, number, law, calibration[:2])
         pictures, applied, truth = simulated_trial.simulate_trial(
-            case.plant, film, routine, u, rngs[1], noise=settings.shares._asdict(), drive=laws.drive,
+            plant, film, routine, u, rngs[1], noise=settings.shares._asdict(), drive=laws.drive,
             sample_time_s=laws.sample_time_s, **camera.film(printer),
         )  # fmt: skip
-        signals = trial_files.TrialSignals(routine.time_s, routine.position, routine.speed, applied, truth)
-        conditions = trial_files.TrialConditions(**known)
-        trial_files.write_trial(path, conditions, pictures, signals, encoding=camera.encoding)
-        recording = trial_files.open_trial(path, **camera.recording)
+        signals = TrialSignals(routine.time_s, routine.position, routine.speed, applied, truth)
+        write_trial(path, TrialConditions(**known), pictures, signals, encoding=camera.encoding)
+        recording = open_trial(path, **camera.recording)
         earlier, values = [trial.latency for trial in measured], read(recording, camera)
         measured.append(measure_trial(recording, values, earlier, routine, printer, camera))
         if number > 1:
@@ -162,15 +144,12 @@ def learn_in_pictures(
         return measured[-1].trial
 
     sequence = training.run_trials(
-        "pixels", training.model_inverse(routine, laws), measure, routine, case.nominal,
+        "pixels", training.model_inverse(routine, laws), measure, routine, material.nominal,
         trials=settings.pixel_trials, settings=laws, on_step=lambda _: bar.update(),
     )  # fmt: skip
     figures = training.figures(sequence, rise=laws.rise) | trial_flow.flow_errors(measured, routine)
     figures, models = figures | trial_flow.latency_figures(measured), {"calibration": calibration._asdict()}
     return {(name, 0): [sequence]}, {(name, 0): measured}, {name: models}, {name: {"pixels": figures}}
-
-
-# ---- trials of a real machine
 
 
 def learn_from_recordings(
@@ -187,6 +166,7 @@ def learn_from_recordings(
     routines, laws, results = printer.training_routines(), settings.laws(printer), ({}, {}, {}, {})
     groups = trial_files.group_trials(recordings, folder, **printer.expected_trials(routines))
     values = {one.path: read(one, camera, MEMO) for one in recordings}
+    scale = (abs(camera.mm_per_px), 0.0)
     following.mkdir()
     for material in printer.materials:
         figures: dict[str, Any] = {}
@@ -201,10 +181,9 @@ def learn_from_recordings(
                 trials = [one.trial for one in measured]
                 sequence, u, of_step = training.resume(trials, routine, material.nominal, laws)
             name = f"{material.name}_routine_{index}_trial_{number:02d}"
-            scale = (abs(camera.mm_per_px), 0.0)
             known = trial_conditions(printer, camera, material, routine, number, law, scale)
-            conditions, time_s = trial_files.TrialConditions(**known), routine.time_s
-            trial_files.write_command(following / name, conditions, time_s=time_s, command_mm=u)
+            said = trial_files.TrialConditions(**known)
+            trial_files.write_command(following / name, said, time_s=routine.time_s, command_mm=u)
             figures[f"routine_{index}"] = {"next": name} | of_step
             if sequence:
                 results[0][key], results[1][key] = [sequence], measured
@@ -215,18 +194,14 @@ def learn_from_recordings(
     return results
 
 
-# ---- what the pictures of a recording say
-
-
 def read(recording: TrialRecording, camera: Camera, memo: Path | None = None) -> readings.Readings:
     """The readings of a recording's frames, out of the memo if it holds them."""
-    from pipeline.deposition.camera import latency, readings
+    from pipeline.deposition.camera import readings
     from pipeline.reading import trial_memo
 
     def measure() -> readings.Readings:
         with artifacts.about(recording.path):
-            gantry = latency.Gantry(*recording.signals["position_mm"])
-            return readings.read(recording.frames, gantry, camera.mounting)
+            return readings.read(recording.frames, recording.signals["position_mm"], camera.mounting)
 
     if memo is None:
         return measure()
@@ -248,7 +223,7 @@ def measure_trial(
     known = trial_files.checked_conditions(recording)
     with artifacts.about(recording.path):
         return trial_flow.measure_trial(
-            values, recording.signals, routine, camera.mounting, scale=(known.px_per_mm, known.offset_px),
+            values, recording.signals, routine, camera.mounting, scale=known.scale,
             view=flow.View(known.mm_per_px, known.nozzle_column), nozzle_mm=printer.nozzle_mm,
             latency=latency.of_camera(camera.latency_s, [*earlier, values.latency]),
             contact_angle_deg=known.contact_angle_deg, width_deviation_mm=camera.width_deviation_mm,
@@ -265,8 +240,7 @@ def show_frames(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]
     frames, signals, known = recording.frames, recording.signals, recording.conditions
     if known is None:
         return rows
-    scale = (known.px_per_mm, known.offset_px)
-    for number, picture, row in excerpts(frames, signals, camera.mounting, scale=scale):
+    for number, picture, row in excerpts(frames, signals, camera.mounting, scale=known.scale):
         name = f"{path.stem}_{number:05d}.jpg"
         artifacts.write_jpeg(folder / name, picture)
         head = {"file": name, "place": row["place"], "material": known.material, "trial": known.trial}

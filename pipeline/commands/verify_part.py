@@ -20,30 +20,30 @@ def write(
 ) -> str:
     """For each material of the part its verification print, as G-code and, composed as any part is, as
     command, tasks and report, in `folder`; in words what was written and what each is forecast to come to."""
-    text, composed = [], part.composed
+    sentences, composed = [], part.composed
     for stream in composed.streams:
         material, Ts = _material(learned, stream), composed.sample_time_s
         flows = forecast.flows(material.chain, material.missed, stream.u, stream.r, sample_time_s=Ts)
         hardest = verification.windows(flows, stream.r, composed.lines, stream.tool, sample_time_s=Ts)
-        made = verification.program(
+        text, duration_s = verification.program(
             part.name, hardest, composed.lines, stream.tool, bead_area_mm2=printer.bead_area_mm2
         )
         path = folder / f"{part.name}_verify_{stream.material}.gcode"
-        artifacts.write_text(path, made.text)
+        artifacts.write_text(path, text)
         print_ = compose_part(path, learned, printer, settings)
         files = compose.write(print_, folder)
         events = ", ".join(window.event for window in hardest)
-        text.append(
-            f"verification of {part.name}, {stream.material}: {events} in {made.duration_s:.0f} s: {path}, "
+        sentences.append(
+            f"verification of {part.name}, {stream.material}: {events} in {duration_s:.0f} s: {path}, "
             + ", ".join(str(file) for file in files)
         )
-        text.append(part_report.forecast_sentence(print_.composed, print_.composed.streams[0]))
-        text.append(
+        sentences.append(part_report.forecast_sentence(print_.composed, print_.composed.streams[0]))
+        sentences.append(
             f"print it; copy it and its measured flow, as {measured_name(path.stem, stream.material)} with "
             f"columns {' and '.join(COLUMNS)} (or .parquet, or .mcap with the plunger's topic), to "
             "datasets/parts: the page then shows it beside the forecast"
         )
-    return "\n".join(text)
+    return "\n".join(sentences)
 
 
 def _material(learned: LearnedLibrary, stream: Stream) -> LearnedMaterial:

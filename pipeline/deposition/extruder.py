@@ -175,10 +175,9 @@ def lagged(u: np.ndarray, delay_s: float, lag_hz: float, sample_time_s: float) -
 
 
 def backlash(x: np.ndarray, play: float) -> np.ndarray:
-    """Play of full width `play` on x (T,): the output stays until x leaves it by half the play, from y(-1) =
-    0:
+    """Play of full width `play` on x (T,): the output stays until x leaves it by half the play. y(-1) = 0 and
 
-        y(t) = min(max(y(t-1), x(t) - play/2), x(t) + play/2)
+    y(t) = min(max(y(t-1), x(t) - play/2), x(t) + play/2)
     """
     half, y, out = play / 2, 0.0, []
     for value in x.tolist():

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from pipeline.deposition.extruder import Extruder, Routine
     from pipeline.deposition.learning.training import LawSettings, Noise
     from pipeline.deposition.parts.composition import PartSettings
-    from pipeline.deposition.parts.part_motion import GantryLimits
 
 
 class PrinterMaterial(Section):
@@ -104,14 +103,15 @@ class Printer(Section):
         return self.bead_area_mm2 * self.speed_mm_per_s
 
     @property
-    def gantry(self) -> GantryLimits:
-        """How the gantry moves."""
-        from pipeline.deposition.parts.part_motion import GantryLimits
-
-        return GantryLimits(
-            self.acceleration_mm_per_s2, self.junction_deviation_mm, self.gantry_speed_limit_mm_per_s,
-            self.speed_mm_per_s, self.tool_change_s, self.longest_ramp_s,
-        )  # fmt: skip
+    def gantry(self) -> dict[str, float]:
+        """How the gantry moves: keywords of `motion.plan`."""
+        return {
+            "acceleration": self.acceleration_mm_per_s2,
+            "junction_deviation_mm": self.junction_deviation_mm,
+            "speed_limit": self.gantry_speed_limit_mm_per_s,
+            "unset_feed": self.speed_mm_per_s,
+            "tool_change_s": self.tool_change_s,
+        }
 
     def training_routines(self) -> list[Routine]:
         """The training routines: the reference, on which laws are compared, and those of the library. If the

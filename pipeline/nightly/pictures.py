@@ -17,7 +17,7 @@ from pipeline.store import params
 
 if TYPE_CHECKING:
     from pipeline.deposition.settings import Camera
-    from pipeline.setpoint.workflow.settings import TrainClassifier
+    from pipeline.setpoint.settings import TrainClassifier
 
 FRAMES = 40  # pictures of a recording that are looked at
 
@@ -111,18 +111,16 @@ def of_prints(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
 
 
 def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[PrintFigures]:
-    from pipeline.setpoint.workflow import frame_folder
-    from pipeline.setpoint.workflow.settings import SetpointMaterial, TrainClassifier
+    from pipeline.reading import frame_folder
+    from pipeline.setpoint.recordings import read_options
+    from pipeline.setpoint.settings import SetpointMaterial, TrainClassifier
 
     settings = params.load(TrainClassifier, "train_classifier")
     if settings.source != "recordings":
         return []
     material = params.load(SetpointMaterial, "setpoint_material").material()
     frames = frame_folder.read_folder(
-        folder,
-        frame_folder.read_options(settings, material),
-        params.load(params.Execution, "execution"),
-        memo=Path("datasets/memo/train_classifier"),
+        folder, read_options(settings, material), params.load(params.Execution, "execution")
     )
     prints = []
     numbered = [(number, name) for number, name in enumerate(frames.prints) if not only or name in only]
@@ -149,7 +147,7 @@ class NewPrints(NamedTuple):
 def prints_drift(limits: Drift, loop: str, new: NewPrints, pending: set[str]) -> LoopDrift:
     """Of new prints: files that cannot be read are set aside. Classes, frames without a line, and the line's
     contrast are held against the prints of the champion's reference."""
-    from pipeline.setpoint.workflow.settings import TrainClassifier
+    from pipeline.setpoint.settings import TrainClassifier
 
     drifted = LoopDrift.none(loop)
     settings = params.load(TrainClassifier, "train_classifier")
@@ -182,13 +180,14 @@ def prints_drift(limits: Drift, loop: str, new: NewPrints, pending: set[str]) ->
 
 def _unreadable(path: str, settings: "TrainClassifier") -> str:
     """Why a print's file cannot be read; empty where it can."""
-    from pipeline.setpoint.workflow import frame_csv, frame_folder, frame_mcap
+    from pipeline.reading import frame_csv, frame_mcap
+    from pipeline.setpoint.recordings import read_options
 
     try:
         if path.lower().endswith(".csv"):
             frame_csv.read_log(Path(path))
         elif path.lower().endswith(".mcap"):
-            frame_mcap.open_film(Path(path), frame_folder.read_options(settings).topics)
+            frame_mcap.open_film(Path(path), read_options(settings).topics)
     except ValueError as error:
         return str(error)
     return ""

@@ -57,6 +57,11 @@ class TrialConditions(NamedTuple):
     mm_per_px: float
     nozzle_column: float
 
+    @property
+    def scale(self) -> tuple[float, float]:
+        """px_per_mm and offset_px."""
+        return self.px_per_mm, self.offset_px
+
 
 class TrialSignals(NamedTuple):
     """What a machine did in one trial, on one clock time_s (T,): gantry, plunger command and, where it is

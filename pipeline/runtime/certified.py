@@ -19,7 +19,7 @@ MEASURED, CERTIFIED = "measured.json", "certified.json"
 GROUPS = (RULES[:4], RULES[4:7], RULES[7:12], RULES[12:])
 
 
-class Measured(NamedTuple):
+class MeasuredController(NamedTuple):
     """A certificate before its limits: `draft` holds the rules that no limit of section `report` enters, and
     `figures`, by rule, what the other rules compare."""
 
@@ -28,7 +28,7 @@ class Measured(NamedTuple):
 
 
 def decide(
-    measured: Measured, *, settled_error_degC: float, disk_margin: float, delay_margin_s: float
+    measured: MeasuredController, *, settled_error_degC: float, disk_margin: float, delay_margin_s: float
 ) -> Certificate:
     """The certificate under these limits, as section `report` declares them. The first rule that fails, in
     the order of RULES, refuses the controller; rules of later groups are not asked."""
@@ -148,14 +148,14 @@ def _number(value: float | None) -> float:
 # ---- the files of the stage certify
 
 
-def write(folder: Path, measured: Measured) -> None:
+def write(folder: Path, measured: MeasuredController) -> None:
     """measured.json of a controller's folder."""
     artifacts.write_json(folder / MEASURED, plain(measured))
 
 
-def read(folder: Path) -> Measured:
+def read(folder: Path) -> MeasuredController:
     about = artifacts.read_json(folder / MEASURED)
-    return Measured(rebuilt(about["draft"]), about["figures"])
+    return MeasuredController(rebuilt(about["draft"]), about["figures"])
 
 
 def results(

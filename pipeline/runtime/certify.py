@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.runtime import bands, certificate_evidence, certificate_loop
 from pipeline.runtime.certificate import LOOP, VERSION, Certificate, EvidenceRecord, Rules
 from pipeline.runtime.certificate_evidence import WindowModels
-from pipeline.runtime.certified import Measured
+from pipeline.runtime.certified import MeasuredController
 from pipeline.runtime.machine import Exported, controller_sha256
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.test_set import panel
@@ -69,7 +69,7 @@ def measure(
     *,
     learning: bands.GainRoute | None = None,
     delay_share: float = 1.0,
-) -> Measured:
+) -> MeasuredController:
     """What the certificate of a controller says before its limits are known.
 
     `family` is the spread of the identified plant, `models` what certificate_evidence.window_models drew from
@@ -80,7 +80,7 @@ def measure(
     results = certificate_evidence.of_signals(exported, record, rules)
     figures, fields = {}, {}
     if not all(one.passed for one in results):
-        return Measured(_draft(exported, record)._replace(rules=tuple(results)), {})
+        return MeasuredController(_draft(exported, record)._replace(rules=tuple(results)), {})
     results = [*results, *models.results]
     if models.noise_degC is not None:
         names = [one.name for one in exported.machine.outputs]
@@ -102,7 +102,7 @@ def measure(
                 figures["delay_margin"]["share"] = delay_share
                 if learning is not None:
                     fields["bands"] = certificate_loop.gain_bands(exported, record, learning, rules, rng)
-    return Measured(_draft(exported, record)._replace(rules=tuple(results), **fields), figures)
+    return MeasuredController(_draft(exported, record)._replace(rules=tuple(results), **fields), figures)
 
 
 def _draft(exported: Exported, record: EvidenceRecord) -> Certificate:

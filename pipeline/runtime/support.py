@@ -1,22 +1,28 @@
 """Where a recording is off the support of what a controller was learned from and judged on: temperatures and
-commands beyond what was seen, and outputs that no plant of its spread would have had.
+commands beyond those of the record, and outputs that no plant of its spread would have had.
 
-Plants of the spread each forecast the outputs a few samples ahead, every one from its own observer and with
-the inputs that were applied. f_k (p,) is what plant k of K forecasts more than their mean, e (p,) the
-machine's miss of that mean. Two questions are asked of them.
+Plants of the spread forecast the outputs a few samples ahead, each from its own observer and with the inputs
+that were applied. f_k (p,) is what plant k of K forecasts more than their mean, e (p,) the machine's miss of
+that mean. Two questions follow.
 
-Sample by sample: is e larger than the plants differ? d^2 = e' (S + R)^-1 e, S the covariance (p, p) of the
-f_k, R what the sensors' noise adds. A forecast is off where d is larger than nearly always on the
-controller's own plants.
+Sample by sample: is e larger than the plants differ? S (p, p) is the covariance of the f_k, R what the noise
+of the sensors adds:
 
-Of the log as a whole: the machine is one plant all along. Were it of the spread, one mixture c (K,) would
-explain all its misses, e = sum_k c_k f_k + rest, c ~ N(0, I / (K - 1)), the rest as large as on honest logs.
-The most likely c is a ridge regression. `misfit` is the mean square of what it leaves, `departure` the mean
-square of c, in units of the spread. Swapped sensors misfit; a gain far from the spread departs.
+    d^2 = e' (S + R)^-1 e
 
-A steady disagreement is taken for weather (another ambient, more heat lost) by every observer. So a log in
-which nothing moves tells nothing of which sensor is which, or of what a heater's percent is worth: it is
-judged by its ranges alone."""
+A forecast is off if d is larger than nearly always on the controller's own plants.
+
+For the log as a whole: the machine is one plant all the time. If it were of the spread, one mixture c (K,)
+would explain all its misses, with a rest as large as on honest logs:
+
+    e = sum_k c_k f_k + rest,   c ~ N(0, I / (K - 1))
+
+The most likely c is a ridge regression. `misfit` is the mean square of the rest, `departure` the mean square
+of c, in units of the spread. Swapped sensors misfit; a gain far from the spread departs.
+
+Every observer takes a steady disagreement for weather (another ambient, more heat lost). So a log in which
+nothing moves cannot say which sensor is which, or what a heater's percent is worth: it is judged by its
+ranges alone."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -96,34 +102,27 @@ def distances(run: FamilyForecasts, noise: np.ndarray) -> np.ndarray:
 NOISES = 2.0  # deviations: of the sample that is forecast, and of those from which
 
 
-class Explained(NamedTuple):
-    """The mixture c (K,) of the plants that explains a log best, and what it leaves (a, p) in °C."""
+def fit_mixture(run: FamilyForecasts, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mixture c (K,) of the plants that explains all forecasts best, each output in units of `rest` (p,),
+    and the rest (a, p) in °C:
 
-    c: np.ndarray
-    left: np.ndarray
+        c = (w F'F + (K - 1) I)^-1 w F'e
 
-
-def explained(run: FamilyForecasts, rest: np.ndarray) -> Explained:
-    """c = (w F'F + (K - 1) I)^-1 w F'e of all forecasts, each output in units of `rest` (p,). What is left is
-    alike from one forecast to the next: a long log counts as one of ENOUGH forecasts, w = ENOUGH / their
-    number, or little errors that never change would pass for another machine."""
+    The rest is alike from one forecast to the next: a long log counts as one of ENOUGH forecasts, w = ENOUGH
+    / their number. Otherwise little errors that never change would pass for another machine."""
     K = len(run.apart)
     F, weight = (run.apart / rest).reshape(K, -1), min(ENOUGH / len(run.start), 1.0)
     c = np.linalg.solve(weight * F @ F.T + (K - 1) * np.eye(K), weight * F @ (run.miss / rest).ravel())
-    return Explained(c, run.miss - np.tensordot(c, run.apart, axes=1))
+    return c, run.miss - np.tensordot(c, run.apart, axes=1)
 
 
 def figures(run: FamilyForecasts, noise: np.ndarray, furthest: float, rest: np.ndarray) -> np.ndarray:
     """Of a log: the share of forecasts further off than `furthest`, its misfit, and its departure."""
     if not len(run.start):
         return np.zeros(3)
-    fitted = explained(run, rest)
+    c, left = fit_mixture(run, rest)
     return np.array(
-        [
-            (distances(run, noise) > furthest).mean(),
-            ((fitted.left / rest) ** 2).mean(),
-            (len(fitted.c) - 1) * (fitted.c**2).mean(),
-        ]
+        [(distances(run, noise) > furthest).mean(), ((left / rest) ** 2).mean(), (len(c) - 1) * (c**2).mean()]
     )
 
 
@@ -238,7 +237,7 @@ def _rest(runs: Sequence[FamilyForecasts], noise: np.ndarray) -> np.ndarray:
     leave less where forecasts are few."""
     rest, least = NOISES * noise, noise + 1e-9
     for _ in range(3):
-        left = [(explained(run, np.maximum(rest, least)).left ** 2).mean(axis=0) for run in runs]
+        left = [(fit_mixture(run, np.maximum(rest, least))[1] ** 2).mean(axis=0) for run in runs]
         rest = np.sqrt(np.mean(left, axis=0))
     return np.maximum(rest, least)
 

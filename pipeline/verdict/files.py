@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from pipeline.deposition.tables import SCORES
-from pipeline.setpoint.workflow.tables import SCOREBOARD
+from pipeline.setpoint.tables import SCOREBOARD
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant
 from pipeline.temperature.tables import DYNAMICS, RESIDUALS

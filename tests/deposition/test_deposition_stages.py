@@ -18,6 +18,7 @@ from pipeline import cli
 from pipeline.deposition.camera import rendering, simulated_trial
 from pipeline.deposition.drive import Drive, demand, follows
 from pipeline.deposition.extruder import draw, flow
+from pipeline.deposition.learning import training
 from pipeline.deposition.parts import stored
 from pipeline.deposition.settings import Camera, Printer, trial_conditions
 from pipeline.deposition.tables import LESSONS, LIBRARY, TASKS
@@ -346,7 +347,7 @@ def test_learning_is_what_its_parts_are():
     """Figures of one material come from two processes: put together nothing is lost."""
     a = ({("A", 0): [1]}, {}, {"A": {"x": 1}}, {"A": {"gamma": 1}})
     b = ({("A", 0): [2], ("B", 0): [3]}, {("A", 0): [4]}, {"A": {"y": 2}}, {"A": {"pixels": 2}, "B": {}})
-    sequences, measured, models, figures = train_ilc.join([a, b])
+    sequences, measured, models, figures = training.join([a, b])
     assert sequences == {("A", 0): [1, 2], ("B", 0): [3]} and measured == {("A", 0): [4]}
     assert models == {"A": {"x": 1, "y": 2}}
     assert figures == {"A": {"gamma": 1, "pixels": 2}, "B": {}}

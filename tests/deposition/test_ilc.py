@@ -353,9 +353,7 @@ def test_the_convergence_test_counts_where_q_ends(monkeypatch):
 
     def gamma():
         rng, noise = np.random.default_rng(0), training.Noise(0.03, 0.01, 0.01)
-        return training.convergence_of_model_inverse(
-            sequence, rng, noise, plants=2, settings=settings
-        ).nominal
+        return training.convergence_of_model_inverse(sequence, rng, noise, plants=2, settings=settings)[0]
 
     ending = gamma()
     monkeypatch.setattr(ilc, "known_share", lambda f, model: np.ones_like(f))

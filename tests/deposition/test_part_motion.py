@@ -32,7 +32,7 @@ def machine(printer):
 
 
 def planned(name, printer=PRINTER):
-    return part_motion.plan_part(moves(name), *machine(printer))
+    return part_motion.plan_part(moves(name), *machine(printer), printer.longest_ramp_s)
 
 
 def sufficient_ramp(name, printer=PRINTER):

@@ -41,10 +41,10 @@ def test_the_print_is_shorter_than_a_long_part_and_holds_its_hardest_events():
     made = composed(LONG)
     windows = hardest(made)
     assert {window.event for window in windows} <= set(NAMES) and 1 <= len(windows) <= 2
-    found = verification.program("long", windows, made.lines, 0, bead_area_mm2=AREA)
-    assert found.duration_s < 0.2 * len(made.streams[0].r) * TS
+    text, duration_s = verification.program("long", windows, made.lines, 0, bead_area_mm2=AREA)
+    assert duration_s < 0.2 * len(made.streams[0].r) * TS
     # the ends of a long line remain, at the speed of the part
-    lines = lines_of(found.text)
+    lines = lines_of(text)
     np.testing.assert_allclose(lines.speed, 8.0)
     np.testing.assert_allclose(lines.length, 2 * verification.PLATEAU_S * 8.0)
 
@@ -52,7 +52,7 @@ def test_the_print_is_shorter_than_a_long_part_and_holds_its_hardest_events():
 def test_runs_and_gaps_of_the_print_are_those_of_the_part():
     made = of_part("dashes")
     windows = hardest(made)
-    lines = lines_of(verification.program("dashes", windows, made.lines, 0, bead_area_mm2=AREA).text)
+    lines = lines_of(verification.program("dashes", windows, made.lines, 0, bead_area_mm2=AREA)[0])
     mine = np.concatenate([window.lines for window in windows])
     np.testing.assert_allclose(lines.length, made.lines.length[mine], atol=1e-3)
     gaps = lines.begin_s[1:] - lines.end_s[:-1]

@@ -13,7 +13,7 @@ from pipeline.nightly.settings import HoldOut, Loop, Nightly
 from pipeline.report.nightly import page as nightly_page
 from pipeline.report.nightly.production import Champion, ChampionState, Installed
 from pipeline.report.nightly.record import Night
-from pipeline.setpoint.workflow import tables
+from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
 from pipeline.temperature.controllers import window

@@ -24,7 +24,7 @@ from pipeline.nightly.reproducing import Reproduced
 from pipeline.nightly.settings import Nightly
 from pipeline.report.nightly.record import Night
 from pipeline.report.shared.night import Alarm, LoopDrift, NightDrift
-from pipeline.setpoint.workflow import tables
+from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
 from pipeline.verdict.verdict import PASSED, Verdict
 from tests.nightly.toy_nights import Project, entered

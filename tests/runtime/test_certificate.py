@@ -83,7 +83,7 @@ def measure(
     rules: Rules = RULES,
     family: Sequence[Plant] = FAMILY,
     learning: bands.GainRoute | None = None,
-) -> certified.Measured:
+) -> certified.MeasuredController:
     made, rng = exported or designed(zones()), np.random.default_rng(1)
     models = certificate_evidence.window_models(made.machine, record, rules, rng)
     return certify.measure(made, family, record, rules, models, rng, learning=learning)

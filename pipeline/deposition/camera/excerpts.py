@@ -8,7 +8,6 @@ import numpy as np
 
 from pipeline.deposition.camera import bead
 from pipeline.deposition.camera.bead import Bead
-from pipeline.deposition.camera.latency import Gantry
 from pipeline.deposition.camera.pose import Mounting
 from pipeline.deposition.camera.readings import TrialFrames, measure_beads
 
@@ -22,7 +21,7 @@ def excerpts(
 ) -> Iterator[tuple[int, np.ndarray, dict[str, Any]]]:
     """(number, picture (h, w, 3) in RGB, figures) of the frames to show; signals {name: (time_s (n,), values
     (n,))} have the gantry's place and speed, scale is (px_per_mm, offset_px) of the widths."""
-    gantry, (px_per_mm, offset_px) = Gantry(*signals["position_mm"]), scale
+    gantry, (px_per_mm, offset_px) = signals["position_mm"], scale
     beads = [(time, one) for time, _, one in measure_beads(frames, gantry, mounting)]
     if not beads:
         return

@@ -262,23 +262,17 @@ def _robust_fit(
     for _ in range(ROUNDS):
         weight = np.sqrt(robust) / deviation
         H = scipy.sparse.diags(weight) @ K
-        data = _Data(
-            _banded((H.T @ H).tocoo(), steps),
-            P,
-            H.T @ (H @ shapes),
-            shapes,
-            H.T @ (weight * A),
-            float(np.sum((weight * A) ** 2)),
-        )
+        M, C = _banded((H.T @ H).tocoo(), steps), H.T @ (H @ shapes)
+        data = (M, P, C, shapes, H.T @ (weight * A), float(np.sum((weight * A) ** 2)))
         best = scipy.optimize.minimize_scalar(
             _unlikely, args=(data,), bounds=STRENGTHS, method="bounded", options={"xatol": 0.1}
         )
         fit = _solve(best.x, data)
         Q = fit.z + shapes @ fit.a
         robust = np.minimum(1.0, HUBER * deviation / np.maximum(np.abs(A - K @ Q), 1e-12))
-    U = shapes - scipy.linalg.cho_solve_banded((fit.factor, True), data.C)
+    U = shapes - scipy.linalg.cho_solve_banded((fit.factor, True), C)
     spread = U @ np.linalg.inv(np.linalg.cholesky(fit.S)).T
-    deviation = np.sqrt(_inverse_diagonal(_sum(data.M, P, np.exp(best.x))) + np.sum(spread**2, axis=1))
+    deviation = np.sqrt(_inverse_diagonal(_sum(M, P, np.exp(best.x))) + np.sum(spread**2, axis=1))
     return _RobustFit(fit, deviation, spread, float(np.exp(best.x)), noise, int(np.sum(robust < 0.5)))
 
 
@@ -369,16 +363,9 @@ def _sum(M: np.ndarray, P: np.ndarray, strength: float) -> np.ndarray:
     return total
 
 
-class _Data(NamedTuple):
-    """Normal equations: M = H'H banded, P = D2'D2 banded, shapes (T, k)
-    and C = H'H shapes, right side H'y, energy y'y."""
-
-    M: np.ndarray
-    P: np.ndarray
-    C: np.ndarray
-    shapes: np.ndarray
-    right: np.ndarray
-    energy: float
+# normal equations: M = H'H banded, P = D2'D2 banded, C = H'H shapes, shapes (T, k), right side H'y, energy
+# y'y
+_Data = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]
 
 
 class _Fit(NamedTuple):

@@ -90,9 +90,9 @@ def read(frames: TrialFrames, gantry: Gantry, mounting: Mounting) -> Readings:
 def _latency(
     time_s: np.ndarray, signals: Sequence[np.ndarray], mounting: Mounting, gantry: Gantry
 ) -> Latency:
-    known = np.isfinite(gantry.position_mm)
+    known = np.isfinite(gantry[1])
     if known.sum() < 3 or not signals:
         return latency.UNTOLD
     step_mm = mounting.mm_per_px * (mounting.columns[1] - mounting.columns[0]) / signals[0].shape[1]
-    known_gantry = Gantry(gantry.time_s[known], gantry.position_mm[known])
+    known_gantry = (gantry[0][known], gantry[1][known])
     return latency.estimate(time_s, np.array(signals), known_gantry, step_mm=step_mm)

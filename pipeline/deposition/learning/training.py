@@ -1,7 +1,7 @@
 """A machine learns its routines: on-off first, then the paper's law or the model inverse, trial after trial;
 and the convergence of both over a family of plants before anything runs."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,23 +48,6 @@ class TrialSequence(NamedTuple):
     trials: list[Trial]
     rows: list[ilc.TrialRow]
     model: ilc.TrialModel | None
-
-
-class TrainingCase(NamedTuple):
-    """What a material is trained on: nominal model, the machine that it
-    runs on, and its routines, the reference first."""
-
-    nominal: Extruder
-    plant: Extruder
-    routines: list[Routine]
-
-
-class Convergence(NamedTuple):
-    """gamma of the nominal plant and of each plant of the family (N,); below 1 the error shrinks at every
-    trial."""
-
-    nominal: float
-    family: np.ndarray
 
 
 def on_off(r: np.ndarray, model: Extruder) -> np.ndarray:
@@ -133,7 +116,9 @@ def run_trials(
 
 
 def train(
-    case: TrainingCase,
+    nominal: Extruder,
+    plant: Extruder,
+    routines: Sequence[Routine],
     rng: np.random.Generator,
     noise: Noise,
     *,
@@ -143,22 +128,22 @@ def train(
 ) -> list[TrialSequence]:
     """The paper's law on the reference routine and the model inverse on every routine, on the simulated
     machine; last the paper's law on its own nominal model, as the paper ran it."""
-    first, sequences = case.routines[0], []
+    first, sequences = routines[0], []
     work = [
-        ("hoelzle_2009", first, case.plant),
-        *(("model_inverse", routine, case.plant) for routine in case.routines),
-        ("hoelzle_2009_nominal", first, case.nominal),
+        ("hoelzle_2009", first, plant),
+        *(("model_inverse", routine, plant) for routine in routines),
+        ("hoelzle_2009_nominal", first, nominal),
     ]
-    for name, routine, plant in work:
-        measure = simulated(plant, rng, noise, steady_flow=float(routine.r.max()), settings=settings)
+    for name, routine, machine in work:
+        measure = simulated(machine, rng, noise, steady_flow=float(routine.r.max()), settings=settings)
         law = (
             model_inverse(routine, settings)
             if name == "model_inverse"
-            else hoelzle_2009(routine, case.nominal, settings)
+            else hoelzle_2009(routine, nominal, settings)
         )
         sequences.append(
             run_trials(
-                name, law, measure, routine, case.nominal, trials=trials, settings=settings, on_step=on_step
+                name, law, measure, routine, nominal, trials=trials, settings=settings, on_step=on_step
             )
         )
     return sequences
@@ -184,9 +169,12 @@ def figures(sequence: TrialSequence, *, rise: float) -> dict[str, float | list[i
 
 def convergence(
     nominal: Extruder, rng: np.random.Generator, *, plants: int, steady_flow: float, settings: LawSettings
-) -> Convergence:
-    """gamma = max |Q (1 - L P)| of the paper's law over `plants` draws
-    around the nominal model, before anything runs."""
+) -> tuple[float, np.ndarray]:
+    """gamma of the paper's law on the nominal plant, and on each of `plants` draws around it, before anything
+    runs; below 1 the error shrinks at every trial.
+
+        gamma = max_f |Q (1 - L P)|
+    """
     f = np.linspace(0.0, 0.5 / settings.sample_time_s, FREQUENCIES)
     law, Ts = settings.hoelzle_2009, settings.sample_time_s
     Q = ilc.magnitude(f, order=law.order, cutoff_hz=law.cutoff_hz, sample_time_s=Ts) ** 2
@@ -199,12 +187,12 @@ def convergence(
         [frequency_response(plant, f, sample_time_s=settings.sample_time_s) for plant in [nominal, *family]]
     )
     gammas = ilc.gamma(Q, L, P)
-    return Convergence(float(gammas[0]), gammas[1:])
+    return float(gammas[0]), gammas[1:]
 
 
 def convergence_of_model_inverse(
     sequence: TrialSequence, rng: np.random.Generator, noise: Noise, *, plants: int, settings: LawSettings
-) -> Convergence:
+) -> tuple[float, np.ndarray]:
     """gamma of the model inverse once its model is identified: of that model, and over plants that the first
     trials cannot tell from it.
 
@@ -233,7 +221,7 @@ def convergence_of_model_inverse(
     ]
     P = np.stack([frequency_response(plant, f, sample_time_s=Ts) for plant in [e, *family]])
     gammas = ilc.gamma(Q, L, P, unmodelled(sequence.model, u, y, f, sample_time_s=Ts))
-    return Convergence(float(gammas[0]), gammas[1:])
+    return float(gammas[0]), gammas[1:]
 
 
 def _first_trials(sequence: TrialSequence, count: int, settings: LawSettings) -> list[Trial]:
@@ -265,23 +253,23 @@ def prospects(
     nominal: Extruder,
     routines: Sequence[Routine],
     rng: np.random.Generator,
+    settings: LawSettings,
     *,
     plants: int,
     steady_flow: float,
     worst_ratio: float,
-    settings: LawSettings,
 ) -> dict[str, Any]:
     """What is known before anything runs: gamma of the paper's law on the nominal model and over the family,
     and the headroom of the drive over each routine."""
-    gamma = convergence(nominal, rng, plants=plants, steady_flow=steady_flow, settings=settings)
+    gamma, family = convergence(nominal, rng, plants=plants, steady_flow=steady_flow, settings=settings)
     headrooms = [
         actuator_headroom(routine, nominal, worst_ratio=worst_ratio, settings=settings)
         for routine in routines
     ]
     return {
-        "gamma": gamma.nominal,
-        "gamma_worst": gamma.family.max(),
-        "gamma_above_1_percent": 100 * np.mean(gamma.family > 1),
+        "gamma": gamma,
+        "gamma_worst": family.max(),
+        "gamma_above_1_percent": 100 * np.mean(family > 1),
         "actuator_headroom": [
             {"peak_over_steady": one.peak / one.steady, "least_ratio": one.ratio, "ramp_s": one.ramp_s}
             for one in headrooms
@@ -290,7 +278,9 @@ def prospects(
 
 
 def learn_in_flow(
-    case: TrainingCase,
+    nominal: Extruder,
+    plant: Extruder,
+    routines: Sequence[Routine],
     rngs: Sequence[np.random.Generator],
     noise: Noise,
     *,
@@ -302,12 +292,14 @@ def learn_in_flow(
     """Both laws on the measured flow of a simulated machine: their sequences by number of the routine,
     figures, and the models as JSON. `rngs` draw what does not repeat, and the plants of the convergence
     test."""
-    sequences = train(case, rngs[0], noise, trials=trials, settings=settings, on_step=on_step)
+    sequences = train(
+        nominal, plant, routines, rngs[0], noise, trials=trials, settings=settings, on_step=on_step
+    )
     hoelzle, reference, *others, hoelzle_nominal = sequences
-    gamma = convergence_of_model_inverse(reference, rngs[1], noise, plants=plants, settings=settings)
+    gamma, family = convergence_of_model_inverse(reference, rngs[1], noise, plants=plants, settings=settings)
     rows = {
-        "gamma_model_inverse": gamma.nominal,
-        "gamma_model_inverse_worst": gamma.family.max(),
+        "gamma_model_inverse": gamma,
+        "gamma_model_inverse_worst": family.max(),
         "hoelzle_2009_nominal": figures(hoelzle_nominal, rise=settings.rise),
         "hoelzle_2009": figures(hoelzle, rise=settings.rise),
         "model_inverse": figures(reference, rise=settings.rise),
@@ -315,7 +307,7 @@ def learn_in_flow(
     }
     by_routine = {0: [hoelzle_nominal, hoelzle, reference]}
     by_routine |= {index: [sequence] for index, sequence in enumerate(others, 1)}
-    models = {"nominal": to_json(case.nominal), "plant": to_json(case.plant)}
+    models = {"nominal": to_json(nominal), "plant": to_json(plant)}
     return by_routine, rows, models | {"identified": model_figures(reference.model)}
 
 
@@ -355,6 +347,20 @@ def model_figures(model: ilc.TrialModel | None) -> dict[str, float] | None:
         "lag_hz": e.lag_hz, "yield": e.yield_, "noise": model.noise,
         "fit_percent": model.fit_percent,
     }  # fmt: skip
+
+
+def join(parts: Iterable[tuple[dict, dict, dict, dict]]) -> tuple[dict, dict, dict, dict]:
+    """All results as one: trial sequences and measured trials by (material, number of the routine), models
+    and figures by material; dictionaries of one material are put together."""
+    sequences, measured, models, figures = {}, {}, {}, {}
+    for part in parts:
+        for key, of_routine in part[0].items():
+            sequences.setdefault(key, []).extend(of_routine)
+        measured.update(part[1])
+        for joint, of_part in ((models, part[2]), (figures, part[3])):
+            for name, values in of_part.items():
+                joint.setdefault(name, {}).update(values)
+    return sequences, measured, models, figures
 
 
 # ---- as tables

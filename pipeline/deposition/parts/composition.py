@@ -283,7 +283,7 @@ def commands(
     return {name: _command(name, learned.library, share, drive) for name in COMPOSERS}
 
 
-def _judge(library: Library, share: ToolShare, drive: Drive) -> dict[str, forecast.Interval]:
+def _judge(library: Library, share: ToolShare, drive: Drive) -> dict[str, tuple[float, float, float]]:
     """Forecast error of each composer in % of on-off control's, over the first EXCERPT_S from where this tool
     begins to print: all by the same members and residuals."""
     Ts, material = library.sample_time_s, share.material
@@ -356,7 +356,7 @@ def compose(
         r[r < 1e-9 * r.max()] = 0.0  # rounding of the sums behind the rate
         share = ToolShare(tool, material, r, tasks, lines)
         percents = _judge(library, share, drive)
-        best = min(percents, key=lambda name: percents[name].high)
+        best = min(percents, key=lambda name: percents[name][2])
         predictions += [
             ComposerForecast(tool, material.material, name, *percent, name == best)
             for name, percent in percents.items()
@@ -366,7 +366,7 @@ def compose(
             at = _of(tasks, tool, name)
             error[at] = nearest(
                 library, name, material.material, settings.nozzle_mm, tasks.speed[at], tasks.pause_s[at]
-            ).error_percent
+            )[3]
     return Composed(tuple(streams), tasks, lines, error, predictions, ahead * Ts, Ts)
 
 

@@ -66,14 +66,6 @@ class ForecastJudgement(NamedTuple):
     trial: str
 
 
-class Interval(NamedTuple):
-    """90 % of what may come out, and the middle of it, in %."""
-
-    low: float
-    median: float
-    high: float
-
-
 def places(r: np.ndarray, sample_time_s: float) -> np.ndarray:
     """Place (T,) of each sample of a wanted flow r (T,): event x BINS + bin of the time since it.
 
@@ -249,8 +241,9 @@ def ends(values: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def error_percent(made: np.ndarray, on_off: np.ndarray, r: np.ndarray) -> Interval:
+def error_percent(made: np.ndarray, on_off: np.ndarray, r: np.ndarray) -> tuple[float, float, float]:
     """R.m.s. error of the flows `made` (M, T) in % of that of the flows of on-off control (M, T), member by
-    member."""
+    member: 90 % of what may come out lies between the first and the last, the middle of it beside them."""
     ratio = np.linalg.norm(made - r, axis=1) / np.maximum(np.linalg.norm(on_off - r, axis=1), 1e-12)
-    return Interval(*(float(value) for value in interval(100 * ratio)))
+    low, median, high = (float(value) for value in interval(100 * ratio))
+    return low, median, high

@@ -11,7 +11,6 @@ from pipeline.deposition.parts import composition, conformance, extrusion, part_
 from pipeline.deposition.parts.composition import Composed, LearnedLibrary, PartSettings
 from pipeline.deposition.parts.conformance import Conformance
 from pipeline.deposition.parts.extrusion import Extruded
-from pipeline.deposition.parts.part_motion import GantryLimits
 from pipeline.deposition.toolpath import gcode
 from pipeline.deposition.toolpath.gcode import Moves, PartProgram
 from pipeline.deposition.toolpath.motion import Motion
@@ -69,8 +68,9 @@ def compose(
     extruded: Extruded,
     learned: LearnedLibrary,
     settings: PartSettings,
-    gantry: GantryLimits,
+    gantry: Mapping[str, float],
     *,
+    longest_ramp_s: float | None,
     materials: dict[int, str],
     shortest_s: float,
     largest_error_percent: float,
@@ -78,7 +78,7 @@ def compose(
     """A part program, composed; `materials` are the tools' names. Raises ValueError naming the line if there
     is one."""
     area, moves = settings.bead_area_mm2, program.moves
-    planned = part_motion.plan_part(moves, gantry, settings, learned, materials)
+    planned = part_motion.plan_part(moves, gantry, settings, learned, materials, longest_ramp_s)
     # a printed line is as long as the declared bead would be of the volume that E asks for
     beads = extrusion.as_lengths(program, extruded, bead_area_mm2=area)
     composed = composition.compose(learned, beads, planned, settings, materials=materials)

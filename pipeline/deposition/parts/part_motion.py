@@ -2,7 +2,7 @@
 ramps."""
 
 import math
-from typing import NamedTuple
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -26,34 +26,22 @@ JUDGED_S = 300.0
 LONGEST_H = 72
 
 
-class GantryLimits(NamedTuple):
-    """How the gantry moves: its acceleration, junction deviation and highest speed, the speed of moves before
-    any F, the time of a change of tool, and the longest ramp that printed moves may have for the drive's
-    sake, None if they are as quick as it goes."""
-
-    acceleration_mm_per_s2: float
-    junction_deviation_mm: float
-    speed_limit_mm_per_s: float
-    unset_speed_mm_per_s: float
-    tool_change_s: float
-    longest_ramp_s: float | None
-
-
 def plan_part(
     moves: Moves,
-    gantry: GantryLimits,
+    gantry: Mapping[str, float],
     settings: PartSettings,
     learned: LearnedLibrary,
     materials: dict[int, str],
+    longest_ramp_s: float | None,
 ) -> motion.Motion:
     """The gantry's plan of a part: its printed moves as quick as the machine goes, or slower until the drive
-    follows the flow of each material as identified, with ramps of at most gantry.longest_ramp_s. `materials`
-    are the tools' names. Raises ValueError for a plan longer than any print."""
-    longest_s = gantry.longest_ramp_s
-    if longest_s is None:
-        plan = _plan(moves, gantry, math.inf)
+    follows the flow of each material as identified, with ramps of at most longest_ramp_s. `gantry` are
+    keywords of `motion.plan`, `materials` the tools' names. Raises ValueError for a plan longer than any
+    print."""
+    if longest_ramp_s is None:
+        plan = motion.plan(moves, **gantry)
     else:
-        plan = _followed(moves, gantry, settings, learned, materials, longest_s)[0]
+        plan = _followed(moves, gantry, settings, learned, materials, longest_ramp_s)[0]
     check_duration(moves, plan)
     return plan
 
@@ -80,7 +68,7 @@ def slowed_to(plan: motion.Motion, moves: Moves) -> float | None:
 
 def sufficient_ramp(
     moves: Moves,
-    gantry: GantryLimits,
+    gantry: Mapping[str, float],
     settings: PartSettings,
     learned: LearnedLibrary,
     materials: dict[int, str],
@@ -90,21 +78,9 @@ def sufficient_ramp(
     return _followed(moves, gantry, settings, learned, materials, LONGEST_RAMP_S)[1]
 
 
-def _plan(moves: Moves, gantry: GantryLimits, printing_acceleration: float) -> motion.Motion:
-    return motion.plan(
-        moves,
-        acceleration=gantry.acceleration_mm_per_s2,
-        junction_deviation_mm=gantry.junction_deviation_mm,
-        speed_limit=gantry.speed_limit_mm_per_s,
-        unset_feed=gantry.unset_speed_mm_per_s,
-        tool_change_s=gantry.tool_change_s,
-        printing_acceleration=printing_acceleration,
-    )
-
-
 def _followed(
     moves: Moves,
-    gantry: GantryLimits,
+    gantry: Mapping[str, float],
     settings: PartSettings,
     learned: LearnedLibrary,
     materials: dict[int, str],
@@ -114,7 +90,7 @@ def _followed(
     the plan with the longest, if it follows none."""
     extruders = _extruders(moves, settings.nozzle_mm, learned, materials)
     speed, Ts = _printing_speed(moves, gantry), learned.library.sample_time_s
-    quick = _plan(moves, gantry, math.inf)
+    quick = motion.plan(moves, **gantry)
     check_duration(moves, quick)
     if settings.drive == UNLIMITED or not extruders:
         return quick, 0.0
@@ -127,9 +103,10 @@ def _followed(
     # short lines and corners ask for more than the single line that the ramp is chosen on
     while True:
         acceleration = speed / ramp_s if ramp_s else math.inf
-        lost = _lost(_plan(excerpt, gantry, acceleration), excerpt, settings, extruders, Ts)
+        slow = {**gantry, "printing_acceleration": acceleration}
+        lost = _lost(motion.plan(excerpt, **slow), excerpt, settings, extruders, Ts)
         if lost <= LOSS or ramp_s >= longest_s:
-            return _plan(moves, gantry, acceleration), ramp_s if lost <= LOSS else math.inf
+            return motion.plan(moves, **slow), ramp_s if lost <= LOSS else math.inf
         ramp_s = min(max(LONGER * ramp_s, FIRST_S), longest_s)
 
 
@@ -151,10 +128,10 @@ def _prints(moves: Moves) -> np.ndarray:
     return (moves.kind == Kind.EXTRUDE) & (moves.length > 0)
 
 
-def _printing_speed(moves: Moves, gantry: GantryLimits) -> float:
+def _printing_speed(moves: Moves, gantry: Mapping[str, float]) -> float:
     """The highest speed in mm/s of a printed move, within the gantry's limit."""
-    feeds = np.where(np.isfinite(moves.feed), moves.feed, gantry.unset_speed_mm_per_s)[_prints(moves)]
-    return min(float(feeds.max(initial=0.0)), gantry.speed_limit_mm_per_s)
+    feeds = np.where(np.isfinite(moves.feed), moves.feed, gantry["unset_feed"])[_prints(moves)]
+    return min(float(feeds.max(initial=0.0)), gantry["speed_limit"])
 
 
 def _lost(

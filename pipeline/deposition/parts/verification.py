@@ -38,14 +38,6 @@ class PartWindow(NamedTuple):
     deviation: float
 
 
-class VerificationPrint(NamedTuple):
-    """A verification print: the part program, its windows, and how long it prints in s."""
-
-    text: str
-    windows: tuple[PartWindow, ...]
-    duration_s: float
-
-
 def windows(
     made: np.ndarray, r: np.ndarray, lines: PrintedLines, tool: int, *, sample_time_s: float
 ) -> tuple[PartWindow, ...]:
@@ -98,9 +90,10 @@ def _apart(found: Sequence[PartWindow]) -> tuple[PartWindow, ...]:
 
 def program(
     name: str, chosen: Sequence[PartWindow], lines: PrintedLines, tool: int, *, bead_area_mm2: float
-) -> VerificationPrint:
-    """The part program of the windows: each line as long and as fast as in the part (of one longer than two
-    plateaus the ends), each pause and gap as long, along x; the nozzle goes on through a gap."""
+) -> tuple[str, float]:
+    """The part program of the windows, and how long it prints in s: each line as long and as fast as in the
+    part (of one longer than two plateaus the ends), each pause and gap as long, along x; the nozzle goes on
+    through a gap."""
     text = [f"; verifies {name}, T{tool}: {', '.join(window.event for window in chosen)}"]
     text += ["; filament_diameter = 1.75", "G21", "G90", "M83", f"T{tool}", "G0 X0 Y0 Z0.3 F600"]
     x = y = duration = 0.0
@@ -125,7 +118,7 @@ def program(
         x, y = (0.0, y + BESIDE_MM) if x > TRACK_MM else (x + BESIDE_MM, y)
         text += [f"G0 X{x:.4f} Y{y:.4f} F600", f"G4 P{1000 * REST_S:.0f}"]
         duration += REST_S
-    return VerificationPrint("\n".join(text) + "\n", tuple(chosen), duration)
+    return "\n".join(text) + "\n", duration
 
 
 def _shortened(length_mm: float, speed: float) -> float:

@@ -17,8 +17,8 @@ from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.difference import Change
 from pipeline.report.shared.sources import Sources
+from pipeline.setpoint.agents.criteria import BEYOND
 from pipeline.setpoint.controllers import KINDS
-from pipeline.setpoint.workflow.tables import BEYOND
 from pipeline.verdict.digits import THIN, band, count, number, percent, quantity
 from pipeline.verdict.evidence import lookup
 from pipeline.verdict.setpoint import (

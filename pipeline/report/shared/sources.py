@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
-from pipeline.setpoint.workflow.tables import (
+from pipeline.setpoint.tables import (
     AGENT_CURVE,
     CLASSIFIED,
     CLASSIFIER_CURVE,

@@ -22,6 +22,8 @@ WATCH, STEP, HAND_OVER, RESTORE, ACKNOWLEDGE, BEGIN = range(6)
 # readings that are none of the plant's: no number at all, and the one before once more
 LOST, REPEATED = np.inf, -np.inf
 TOLERANCE = 1e-9  # of each input's range
+# largest share of an input's range by which readings moved by UNSURE may move an input: a law's own gains
+OWN_GAINS = 1e-6
 UNSURE = 1e-9  # degC: what no reading is known to, and more than rounding of any forecast
 
 
@@ -213,19 +215,13 @@ def as_csv(at: EpisodeStart, script: Script, done: Played) -> str:
     return "\n".join(lines) + "\n"
 
 
-class Determined(NamedTuple):
-    """What an episode did, and by how much at most, as a share of an input's range, the object asked for
-    something else when its readings moved by UNSURE; infinite where a mode or a cause was another."""
+def play_often(exported: Exported, make: Any, script: Script, *, replays: int = 3) -> tuple[Played, float]:
+    """An episode, and by how much, as a share of an input's range, the object asks for something else when
+    its readings move by UNSURE up or down, in `replays` episodes more; infinite if a mode or a cause differs.
+    Ends with the first difference above OWN_GAINS.
 
-    done: Played
-    differs: float
-
-
-def determined(exported: Exported, make: Any, script: Script, *, replays: int = 3) -> Determined:
-    """Plays an episode, and `replays` times more with readings that differ by UNSURE up or down.
-
-    Where a law swings between its governor and its limits, the loop itself may magnify rounding, twofold a
-    sample. There the object disagrees with itself, and nobody can agree with it: not on another CPU, and not
+    If a law swings between its governor and its limits, the loop itself may magnify rounding, twofold a
+    sample. Then the object disagrees with itself, and nobody can agree with it: not on another CPU, and not
     in C.
     """
     at, rng = start(exported), np.random.default_rng(0)
@@ -236,11 +232,9 @@ def determined(exported: Exported, make: Any, script: Script, *, replays: int = 
         other = played(make, exported.model, at, script._replace(add=script.add + shift))
         same = np.array_equal(one.mode, other.mode) and np.array_equal(one.causes, other.causes)
         differs = max(differs, float((np.abs(one.u - other.u) / span).max()) if same else np.inf)
-    return Determined(one, differs)
-
-
-# largest share of an input's range by which readings moved by UNSURE may move an input: a law's own gains
-OWN_GAINS = 1e-6
+        if differs > OWN_GAINS:
+            break
+    return one, differs
 
 
 def golden(
@@ -251,10 +245,12 @@ def golden(
     rng, scripts, done = np.random.default_rng(seed), [], []
     for _ in range(10 * episodes):
         asked = episode(exported, steps, rng)
-        found = determined(exported, lambda: Supervised(exported, rehearsal=True), asked, replays=replays)
-        if found.differs <= OWN_GAINS:
+        one, differs = play_often(
+            exported, lambda: Supervised(exported, rehearsal=True), asked, replays=replays
+        )
+        if differs <= OWN_GAINS:
             scripts.append(asked)
-            done.append(found.done)
+            done.append(one)
         if len(done) == episodes:
             return as_csv(start(exported), joined(scripts), joined(done))
     raise ValueError(

@@ -206,7 +206,9 @@ def design_controllers(
     are refused. Raises ValueError if there is none but doing nothing."""
     designs, refused = {}, {}
     for controller in CONTROLLERS:
-        values = {one.name: tuned.get(controller.name, {}).get(one.name) for one in controller.parameters}
+        values: dict[str, Any] = {
+            one.name: tuned.get(controller.name, {}).get(one.name) for one in controller.parameters
+        }
         untuned = None in values.values()
         if untuned:
             values = parameters(controller, bounds(controller, problem)[1])

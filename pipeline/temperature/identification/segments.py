@@ -42,8 +42,6 @@ def split(
 ) -> tuple[tuple[list[np.ndarray], list[np.ndarray]], tuple[list[np.ndarray], list[np.ndarray]]]:
     """(u, y) of the first part of every segment, and of its last part."""
     cuts = [round(len(segment) * (1 - last_share)) for segment in u]
-    first, last = (
-        tuple([segment[part(cut)] for segment, cut in zip(signal, cuts, strict=True)] for signal in (u, y))
-        for part in (lambda cut: slice(None, cut), lambda cut: slice(cut, None))
-    )
-    return first, last
+    first = [[segment[:cut] for segment, cut in zip(signal, cuts, strict=True)] for signal in (u, y)]
+    last = [[segment[cut:] for segment, cut in zip(signal, cuts, strict=True)] for signal in (u, y)]
+    return (first[0], first[1]), (last[0], last[1])

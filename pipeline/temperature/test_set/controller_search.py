@@ -39,6 +39,8 @@ def search(
 
     def cost(theta: np.ndarray) -> float:
         candidate = controller.design(problem, table.parameters(controller, theta))
+        if candidate is None:
+            raise ValueError("the record does not allow this candidate")
         far = np.log(theta / start) / np.log(high / low)
         return _cost(candidate, rests, settings, setting) * (1 + NEARER * float(far @ far))
 

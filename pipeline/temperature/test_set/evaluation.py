@@ -207,11 +207,9 @@ def decide(
     choice = comparison.chosen(costs, block, able, seed=seed)
     a, b = table.PAIR
     b = b if b in costs else table.INDIRECT
-    one = two = None
-    if a in costs and b in costs:
-        one, two = a, b
-    elif len(entrants) > 1:
-        one, two = entrants[-2:]
+    one, two = a, b
+    if not (a in costs and b in costs):
+        one, two = entrants[max(len(entrants) - 2, 0)], entrants[-1]
     index = comparison.deciding_plant(costs[one], costs[two], block)
     rest = block != index
     without = {name: values[rest] for name, values in costs.items()}
