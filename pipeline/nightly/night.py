@@ -6,10 +6,11 @@ aside; 75: another night is at work.
 
 import datetime
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import stages
 from pipeline.nightly import (
     branches,
     champion,
@@ -53,8 +54,8 @@ class NightWork(NamedTuple):
     """A night under way: its record, what it is made from {path: digest}, new recordings {loop: {path:
     digest}}, the memory of drift, and what is in production.
 
-    `moved` are inputs that changed while the stages ran. `lost` is {loop: why its stages failed}. `done`: no
-    further step follows.
+    `moved` are inputs that changed while the stages ran. `lost` is {loop: why its stages failed}, `off` are
+    the loops that section `loops` switches off. `done`: no further step follows.
     """
 
     night: Night
@@ -64,6 +65,7 @@ class NightWork(NamedTuple):
     state: ChampionState = ChampionState()
     moved: tuple[str, ...] = ()
     lost: Mapping[str, str] = {}
+    off: tuple[str, ...] = ()
     done: bool = False
 
     def ended(self, outcome: str, *reasons: str) -> "NightWork":
@@ -155,7 +157,7 @@ def _worked(job: Job, work: NightWork) -> NightWork:
         if work.done:
             break
         try:
-            work = step(_sound(job, work.lost), work)
+            work = step(_without(job, (*work.lost, *work.off)), work)
         except Exception as error:  # refused in a sentence, or a mistake of this program
             work = work.failed(error)
             # until the stages have run nothing is changed, and after that production may be
@@ -173,17 +175,28 @@ def _undone(work: NightWork, *undo: Callable[[], list[str]]) -> NightWork:
     return work
 
 
-def _sound(job: Job, lost: Mapping[str, str]) -> Job:
-    """The job without the loops whose stages failed: nothing of them is judged or committed."""
-    if not lost:
+def _without(job: Job, names: Collection[str]) -> Job:
+    """The job without these loops: nothing of them is judged or committed."""
+    if not names:
         return job
-    loops = {name: loop for name, loop in job.settings.loops.items() if name not in lost}
+    loops = {name: loop for name, loop in job.settings.loops.items() if name not in names}
     return job._replace(settings=job.settings.model_copy(update={"loops": loops}))
 
 
 def _ready(job: Job, work: NightWork) -> NightWork:
+    """Checks every section of the parameters before a stage runs, and leaves out the loops that are switched
+    off."""
     guarding.ready(job.settings.least_free_mb)
     branches.check(job.settings)
+    switches = stages.check_parameters()
+    off = tuple(name for name in job.settings.loops if not switches.get(name, True))
+    if not off:
+        return work
+    alarms = tuple(alarm for alarm in work.memory.alarms if alarm.loop not in off)
+    night = work.night.noted(f"no part of the night, by section loops: {', '.join(off)}")
+    work = work._replace(off=off, memory=work.memory._replace(alarms=alarms), night=night)
+    if len(off) == len(job.settings.loops):
+        return work.ended(records.NOTHING_NEW, "section loops switches off every loop")
     return work
 
 
@@ -219,12 +232,11 @@ def _screened(job: Job, work: NightWork) -> NightWork:
     screened = screening.look(job.settings, state.champions, work.new, work.memory, night=night.number)
     quarantined = {**night.quarantined, **screened.drift.quarantined}
     digests = inputs.after_quarantine(work.digests, quarantined, job.settings.loops, job.hashes)
-    work = NightWork(
-        night._replace(screened=True, drift=screened.drift, quarantined=quarantined),
-        screened.memory,
-        digests,
-        work.new,
-        state,
+    work = work._replace(
+        night=night._replace(screened=True, drift=screened.drift, quarantined=quarantined),
+        memory=screened.memory,
+        digests=digests,
+        state=state,
     )
     if _nothing_new(digests, job.last):
         return work.ended(records.QUARANTINED, "all that was new is quarantined")
@@ -250,7 +262,7 @@ def _learned(job: Job, work: NightWork) -> NightWork:
         if moved:
             return work._replace(moved=moved)
         work = work._replace(lost=lost, night=work.night.noted(*notes))
-        return _with_lost(_judge(_sound(job, work.lost), work))
+        return _with_lost(_judge(_without(job, work.lost), work))
     except Exception as error:
         return _undone(work.failed(error), guarding.back_to_before)
 
@@ -447,7 +459,11 @@ def _to_remember(job: Job, work: NightWork) -> Remembered:
         # a night that lost a loop is repeated
         inputs=None if night.lost else inputs.digest(work.digests),
         unpushed=night.unpushed,
-        recordings={name: inputs.recordings(work.digests, loop) for name, loop in job.settings.loops.items()},
+        # those of a loop that is switched off are no news when it is switched on
+        recordings={
+            name: last.recordings.get(name, {}) if name in work.off else inputs.recordings(work.digests, loop)
+            for name, loop in job.settings.loops.items()
+        },
         drift=work.memory,
         hashes=job.hashes.now,
         settings=known,

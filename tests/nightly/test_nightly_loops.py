@@ -132,6 +132,42 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
     assert metrics and metrics.mean_cost == pytest.approx(8.0 + 0.35 + (1.0 if loop == "setpoint" else 0.0))
 
 
+def test_a_loop_that_is_switched_off_is_no_part_of_the_night(project, monkeypatch):
+    own = {loop: {"judge": loop, "cases": "", "recordings": "", "artifacts": LOOPS[loop]} for loop in LOOPS}
+    alarm = Alarm("setpoint", "setpoint: ink", "a print", "the ink looks different", 9.0)
+    monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0), setpoint(10.0, 2.0)))
+    remembered.remember(
+        remembered.Remembered(drift=DriftMemory(alarms=(alarm,)), recordings={"setpoint": {}})
+    )
+    project.set(loops_on={"setpoint": False}, loops=own)
+    status, summary = night.nightly(render_night)
+    tonight = remembered.nights()[-1]
+    assert status == night.OK and tonight.promoted == ("deposition",), summary
+    assert "no part of the night, by section loops: setpoint" in summary
+    assert list(tonight.decisions) == list(champion.read().champions) == ["deposition"]
+    assert not tonight.drift.alarms
+    # switched on, the night has it again
+    project.set(loops=own)
+    status, summary = night.nightly(render_night)
+    assert status == night.OK and "promoted setpoint" in summary and "no part" not in summary
+    # without any there is nothing to do
+    project.set(loops_on=dict.fromkeys(own, False), loops=own)
+    monkeypatch.setattr(night, "_reproduce", lambda *_: pytest.fail("no stage is asked"))
+    status, summary = night.nightly(render_night)
+    assert status == night.OK and "section loops switches off every loop" in summary
+
+
+def test_every_section_of_the_parameters_is_checked_before_the_first_stage(project, monkeypatch):
+    own = {"judge": "deposition", "cases": "", "recordings": "", "artifacts": LOOPS["deposition"]}
+    project.set(loops={"deposition": own})
+    written = Path("params.yaml").read_text()
+    Path("params.yaml").write_text(written.replace('"max_order"', '"max_ordre"'))
+    monkeypatch.setattr(night, "_reproduce", lambda *_: pytest.fail("no stage is asked"))
+    status, summary = night.nightly(render_night)
+    assert status == night.FAILED and "max_ordre" in summary and "max_order" in summary
+    assert "max_ordre" in Path("reports/nightly.html").read_text()
+
+
 def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(project, monkeypatch):
     project.set(
         loops={

@@ -583,7 +583,7 @@ def camera(sources: Sources) -> dict[str, Any]:
     """By material: frames read and rejected, uncertainty, and what the calibration left."""
     filmed, models = sources.tables["filmed"], sources.tables["models"]
     if isinstance(filmed, Missing):
-        return {"missing": filmed}
+        return {"missing": filmed, "untold": ""}
     by_material = pd.DataFrame(filmed).groupby("material", sort=False).agg(
         trials=("trial", "size"),
         frames=("frames", "sum"),

@@ -468,7 +468,7 @@ def frames(sources: Sources) -> dict[str, Any]:
     from recordings real ones: accepted, wrong, rejected and foreign, each with its share."""
     index = sources.tables["nozzle_frames"]
     if isinstance(index, Missing):
-        return {"missing": index}
+        return {"missing": index, "lead": ""}
     table: list[Any] = list(index)
     recorded = [row for row in table if row.get("group") in GROUPS]
     origin = page.origin(sources.source("nozzle_frames"))
