@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 from ruamel.yaml import YAML
 
 from pipeline.deposition.settings import TrainIlc
-from pipeline.report.shared.sources import QUICK_LOOK
 from pipeline.setpoint.settings import EvaluateSetpoint
 from pipeline.store import artifacts, params, params_text
 from pipeline.temperature.settings import Panel, TuneWeights
+from pipeline.verdict.settings import QUICK_LOOK
 from stages.evaluate_temperature import EvaluateTemperature
 from stages.identify_plant import IdentifyPlant
 

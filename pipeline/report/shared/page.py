@@ -12,11 +12,12 @@ import jinja2
 from markupsafe import Markup, escape
 
 from pipeline.report.shared.pictures import Column
-from pipeline.report.shared.sources import QUICK_LOOK, Source, Sources
+from pipeline.report.shared.sources import Source, Sources
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
 from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.verdict import digits
+from pipeline.verdict.settings import QUICK_LOOK
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 
 GLYPHS = {
