@@ -16,7 +16,11 @@ from pipeline.temperature.settings import Plant
 from stages.ingest import Ingest
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from pipeline.commands.shadow.deploy import Ready
+    from pipeline.nightly.records import ChampionState, Night
+    from pipeline.nightly.settings import Nightly
 
 
 def accept(_: argparse.Namespace) -> None:
@@ -328,12 +332,19 @@ def replay(arguments: argparse.Namespace) -> None:
         arguments.controller, arguments.recording, arguments.out, replaying.temperatures(arguments.reference)
     )
     inputs, outputs = ([one.name for one in side] for side in (made.machine.inputs, made.machine.outputs))
-    shown = page.Shown(
+    shown = page.ReplayData(
         done.time_s, done.applied, done.asked, done.measured, done.reference, done.off, inputs, outputs, told
     )
     artifacts.write_text(arguments.out / "index.html", page.render(shown))
     print(f"{arguments.recording}: {told['samples']} samples. {page.decision(told)}")
     print(f"written: {arguments.out}/index.html, replay.mcap, layout.json, replay.json")
+
+
+def render_night(nights: "Sequence[Night]", state: "ChampionState", settings: "Nightly") -> str:
+    """The page of a night: of every night that is remembered, and of what is in production."""
+    from pipeline.report.nightly import page
+
+    return page.render(nights, state, settings)
 
 
 def version() -> str:
@@ -607,7 +618,7 @@ def main() -> None:
     _add_training_print(commands)
     _add_export(commands)
     _add_replay(commands)
-    nights.add(commands)
+    nights.add(commands, render_night)
     for name, command in commands.choices.items():
         _tell(name, command)
     arguments = parser.parse_args()
