@@ -81,7 +81,14 @@ GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64
 # the one file of metrics, with a column a value; the figures of other stages are outs
 HEADLINE = "reports/metrics/report.json"
 # memos (results are the same whatever is in them), and what the night and the quick look say beside a run
-UNTRACKED = ("datasets/memo", "reports/metrics/nightly.json", "reports/quick_look.json")
+UNTRACKED: tuple[str, ...] = ("reports/nightly.html", "reports/metrics/nightly.json")
+UNTRACKED += (
+    "datasets/memo",
+    "reports/metrics/nightly.json",
+    "reports/nightly.html",
+    "reports/quick_look.json",
+)
+PLACES = ("stages/", "pipeline/verdict/", "pipeline/report/")
 # the second pipeline: results that no recording changes, and no stage of the root asks for
 PAPERS = "datasets/papers/dvc.yaml"
 # a stage depends on these rooms whole, and on at most 8 files or folders of a loop's methods
@@ -380,10 +387,10 @@ def covered(path: str, deps: Iterable[str]) -> bool:
 
 def expected(root: Path, name: str) -> dict[str, set[str]]:
     """What a stage imports and opens, directly or through what it imports: code, deps, params, outs, metrics.
-    Paths stand in stages and in verdict; other modules take them as arguments."""
+    Paths stand in stages, verdict and pages; other modules take them as arguments."""
     code, stage = reached(root, name), Path(name).stem
     tree, read = code[name], set()
-    for file in [file for file in code if file.startswith(("stages/", "pipeline/verdict/")) or file == name]:
+    for file in [file for file in code if file.startswith(PLACES) or file == name]:
         read |= paths(file, code[file])[0]
         if any((receiver, verb) == ("params", "read") for _, receiver, verb in calls(code[file])):
             read |= {params.FILE, params.EXPERT}

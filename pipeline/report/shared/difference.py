@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.sources import NIGHTLY, Sources, digest
+from pipeline.report.shared.sources import Sources, digest
 from pipeline.verdict.digits import MINUS, THIN, beyond_meaning, count, decimals, number, short
 from pipeline.verdict.verdict import Figure, Missing, Question
 
@@ -75,17 +75,8 @@ def difference(sources: Sources) -> Difference | None:
     if before is None or isinstance(before, Missing):
         return None
     hashes = before.get("hashes") or {}
-    now = {
-        path: source.sha256
-        for path, source in sources.read.items()
-        if path.startswith(("datasets/", "reports/metrics/")) and path != NIGHTLY
-    }
-    then = {
-        path: value
-        for path, value in hashes.items()
-        if path.startswith(("datasets/", "reports/metrics/"))
-        and path.rsplit("/", 1)[-1] not in ("report.json", "nightly.json")
-    }
+    now = {path: source.sha256 for path, source in sources.read.items() if path.startswith("datasets/")}
+    then = {path: value for path, value in hashes.items() if path.startswith("datasets/")}
     recorded = {path.split("/", 1)[0] for path in then}
     now = {path: value for path, value in now.items() if path.split("/", 1)[0] in recorded}
     changed = [path for path in sorted(now) if then.get(path) != now[path]]
