@@ -94,7 +94,7 @@ def test_limits_that_no_file_tells_are_left_to_a_person_and_asked_for_by_the_sta
     init(monkeypatch, "rig.csv", "--copy")
     assert "low and high of temperature_1: between which °C the machine must stay" in capsys.readouterr().out
     with pytest.raises(SystemExit):
-        runpy.run_module("stages.ingest", run_name="__main__")
+        runpy.run_module("stages.ingest", run_name="__main__", alter_sys=True)
     asked = capsys.readouterr().err
     assert "plant.outputs: temperature_1 should have low and high" in asked
 
