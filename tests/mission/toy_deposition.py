@@ -88,8 +88,8 @@ def lay_out(changes: dict[str, Any], parts: tuple[str, ...] = ("fig9",)) -> None
 
 
 def run_stage(name: str) -> None:
-    """What `./run dvc repro` runs, verdicts before the pages that read them. Raises Refused with the last line
-    that the stage printed."""
+    """What `./run dvc repro` runs, verdicts before the pages that read them. Raises Refused with the last
+    line that the stage printed."""
     with _quiet():
         for stage in ("verdict", "report") if name == "report" else (name,):
             importlib.import_module(f"stages.{stage}").main()
