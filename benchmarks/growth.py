@@ -140,7 +140,7 @@ def trial(samples: int, folder: Path) -> Work:
     """The command of the next trial after three of so many samples at 50 Hz, the model identified anew."""
     from pipeline.deposition.extruder import Extruder, flow, routine
     from pipeline.deposition.learning import ilc
-    from pipeline.deposition.workflow.settings import Printer
+    from pipeline.deposition.settings import Printer
 
     printer = params.load(Printer, "printer")
     step, fixed_s = printer.sample_time_s, 8.0
@@ -161,14 +161,14 @@ def trial(samples: int, folder: Path) -> Work:
 
 def materials(count: int, folder: Path) -> Work:
     """The library of so many materials, each with all trials of one of the two that were trained on."""
-    from pipeline.deposition.parts import composition
-    from pipeline.deposition.workflow import segment_library
-    from pipeline.deposition.workflow.settings import Printer, SegmentLibrary
-    from pipeline.deposition.workflow.tables import LESSONS
+    from pipeline.deposition.parts import composition, stored
+    from pipeline.deposition.settings import Printer
+    from pipeline.deposition.tables import LESSONS
+    from stages.segment_library import SegmentLibrary
 
     printer, settings = params.load(Printer, "printer"), params.load(SegmentLibrary, "segment_library")
     samples = artifacts.read_table("datasets/train_ilc/lessons.parquet", LESSONS)
-    known = segment_library.trainings(samples, settings.law, printer.trained(), printer.nozzle_mm)
+    known = stored.trainings(samples, settings.law, printer.training_routines(), printer.nozzle_mm)
     names = sorted({one.material for one in known})
     many = [
         one._replace(material=f"{k:04}")

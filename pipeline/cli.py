@@ -16,7 +16,11 @@ from pipeline.temperature.settings import Plant
 from stages.ingest import Ingest
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from pipeline.commands.shadow.deploy import Ready
+    from pipeline.nightly.records import ChampionState, Night
+    from pipeline.nightly.settings import Nightly
 
 
 def accept(_: argparse.Namespace) -> None:
@@ -24,18 +28,16 @@ def accept(_: argparse.Namespace) -> None:
     from pipeline.report.shared.sources import machine
 
     metrics = {
-        path.stem: artifacts.read_json(path)
-        for path in sorted(Path("reports/metrics").glob("*.json"))
-        if path.stem not in ("report", "nightly")
+        path.parent.name: artifacts.read_json(path)
+        for path in sorted(Path("datasets").glob("[a-z]*/figures.json"))
+        if path.parent.name != "report"
     }
     if not metrics:
-        raise ValueError(
-            "reports/metrics: expected the figures of a run, found none; run ./run dvc repro first"
-        )
+        raise ValueError("datasets: expected the figures of a run, found none; run ./run dvc repro first")
     files = sorted(
         path
         for path in Path("datasets").rglob("*")
-        if path.is_file() and path.parts[1] not in {"memo"} and not path.parts[1].startswith(".")
+        if path.is_file() and path.parts[1] not in {"memo", "report"} and not path.parts[1].startswith(".")
     )
     hashes = {path.as_posix(): artifacts.sha256(path) for path in [*files, Path("pipeline"), Path("stages")]}
     run = {
@@ -67,9 +69,9 @@ def _shown() -> dict:
     """What the pages show: figures with their bands, the verdict of each loop, which controller of the
     temperature loop the verdict names, and the curves; nothing if no page was made. Raises ValueError if the
     pages are of another run."""
-    if not artifacts.exists("reports/metrics/report.json"):
+    if not artifacts.exists("datasets/report/figures.json"):
         return {"figures": {}, "winner": None, "verdicts": {}, "curves": {}}
-    report = artifacts.read_metrics("report")
+    report = artifacts.read_figures("report")
     stale = [
         path
         for path, recorded in report["read"].items()
@@ -100,7 +102,7 @@ def runs(arguments: argparse.Namespace) -> None:
     commits, tags, branches or DVC experiments whose metrics git has."""
     from pipeline.report.runs import commits
     from pipeline.report.runs import page as runs_page
-    from pipeline.report.shared.verdict import ReportRules
+    from pipeline.verdict.settings import ReportRules
 
     a, b = (commits.run_of(name) for name in (arguments.a, arguments.b))
     path = (
@@ -158,31 +160,29 @@ def first_experiment(arguments: argparse.Namespace) -> None:
 def compose(arguments: argparse.Namespace) -> None:
     """A part program into plunger commands (CSV, Parquet, MCAP, G-code with leads), tasks and lines as
     Parquet, and whether it will print."""
-    from pipeline.deposition.workflow import compose_parts, exports, part_programs
-    from pipeline.deposition.workflow.segment_library import read_learned
-    from pipeline.deposition.workflow.settings import ComposeParts, Printer
+    from pipeline.commands import compose as command
+    from pipeline.deposition.parts.part_report import summary_lines
+    from pipeline.deposition.settings import ComposeParts, Printer
+    from stages.compose_parts import compose_part
 
     if arguments.out.exists() and not arguments.out.is_dir():
         raise ValueError(
             f"--out {arguments.out}: should be a folder but is a file; name a folder, "
             "which is made where it is missing"
         )
-    asked = part_programs.asked(
+    request = command.request(
         scale=arguments.scale, speed=arguments.speed, filament_mm=arguments.filament_mm,
         extruder=arguments.extruder, bead=arguments.bead,
     )  # fmt: skip
-    formats = exports.formats(arguments.formats)
-    learned = read_learned(
-        "datasets/segment_library/library.parquet", "datasets/segment_library/learned.json"
-    )
+    formats, learned = command.formats(arguments.formats), command.read_learned()
     printer, settings = params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts")
-    part = compose_parts.compose(arguments.part, learned, printer, settings, asked)
+    part = compose_part(arguments.part, learned, printer, settings, **request)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    files = exports.write(part, arguments.out, formats)
-    print(compose_parts.summary_lines(part))
+    files = command.write(part, arguments.out, formats)
+    print(summary_lines(part))
     print("written: " + ", ".join(str(file) for file in files))
     if arguments.verify:
-        from pipeline.deposition.workflow import verify_part
+        from pipeline.commands import verify_part
 
         print(verify_part.write(part, learned, printer, settings, arguments.out))
         print(verify_part.write_next(part, learned, printer, arguments.part.parent, arguments.out))
@@ -210,16 +210,16 @@ def calibrate_tip(arguments: argparse.Namespace) -> None:
 def calibrate_camera(arguments: argparse.Namespace) -> None:
     """Pictures of printed lines of known widths into section camera of params.yaml:
     size of a pixel, rotation, measured columns, edge bias by width; and a page."""
-    from pipeline.deposition.workflow import calibrate_camera as camera
+    from pipeline.commands import calibrate_camera as camera
 
-    asked = camera.Asked(
+    request = camera.CalibrationRequest(
         arguments.images,
         camera.numbers(arguments.widths, "--widths", "0.5,0.9,1.3"),
         camera.pixel(arguments.tip),
         arguments.pitch,
     )
     out = arguments.out or Path(f"{arguments.images[0].stem}.camera.html")
-    print(camera.calibrate(asked, out, write=arguments.write))
+    print(camera.calibrate(request, out, write=arguments.write))
 
 
 def shadow(arguments: argparse.Namespace) -> None:
@@ -332,12 +332,19 @@ def replay(arguments: argparse.Namespace) -> None:
         arguments.controller, arguments.recording, arguments.out, replaying.temperatures(arguments.reference)
     )
     inputs, outputs = ([one.name for one in side] for side in (made.machine.inputs, made.machine.outputs))
-    shown = page.Shown(
+    shown = page.ReplayData(
         done.time_s, done.applied, done.asked, done.measured, done.reference, done.off, inputs, outputs, told
     )
     artifacts.write_text(arguments.out / "index.html", page.render(shown))
     print(f"{arguments.recording}: {told['samples']} samples. {page.decision(told)}")
     print(f"written: {arguments.out}/index.html, replay.mcap, layout.json, replay.json")
+
+
+def render_night(nights: "Sequence[Night]", state: "ChampionState", settings: "Nightly") -> str:
+    """The page of a night: of every night that is remembered, and of what is in production."""
+    from pipeline.report.nightly import page
+
+    return page.render(nights, state, settings)
 
 
 def version() -> str:
@@ -611,7 +618,7 @@ def main() -> None:
     _add_training_print(commands)
     _add_export(commands)
     _add_replay(commands)
-    nights.add(commands)
+    nights.add(commands, render_night)
     for name, command in commands.choices.items():
         _tell(name, command)
     arguments = parser.parse_args()

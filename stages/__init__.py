@@ -13,9 +13,9 @@ from typing import Any
 ROOT = Path(__file__).absolute().parents[1]
 # for each section of params.yaml and params.expert.yaml the class that knows all its keys
 SECTIONS = {
-    "camera": "pipeline.deposition.workflow.settings:Camera",
+    "camera": "pipeline.deposition.settings:Camera",
     "certify": "stages.certify:Certify",
-    "compose_parts": "pipeline.deposition.workflow.settings:ComposeParts",
+    "compose_parts": "pipeline.deposition.settings:ComposeParts",
     "evaluate_setpoint": "pipeline.setpoint.settings:EvaluateSetpoint",
     "evaluate_temperature": "stages.evaluate_temperature:EvaluateTemperature",
     "execution": "pipeline.store.params:Execution",
@@ -27,15 +27,15 @@ SECTIONS = {
     "nightly": "pipeline.nightly.settings:Nightly",
     "panel": "pipeline.temperature.settings:Panel",
     "plant": "pipeline.temperature.settings:Plant",
-    "printer": "pipeline.deposition.workflow.settings:Printer",
+    "printer": "pipeline.deposition.settings:Printer",
     "render_frames": "stages.render_frames:RenderFrames",
-    "report": "pipeline.report.shared.verdict:ReportRules",
-    "segment_library": "pipeline.deposition.workflow.settings:SegmentLibrary",
+    "report": "pipeline.verdict.settings:ReportRules",
+    "segment_library": "stages.segment_library:SegmentLibrary",
     "setpoint_material": "pipeline.setpoint.settings:SetpointMaterial",
     "tracking": "pipeline.temperature.settings:Tracking",
     "train_agent": "stages.train_agent:TrainAgent",
     "train_classifier": "pipeline.setpoint.settings:TrainClassifier",
-    "train_ilc": "pipeline.deposition.workflow.settings:TrainIlc",
+    "train_ilc": "pipeline.deposition.settings:TrainIlc",
     "tune_weights": "pipeline.temperature.settings:TuneWeights",
 }
 # what a stage writes instead of its results if its loop is switched off

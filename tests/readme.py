@@ -11,14 +11,15 @@ from typing import Any
 
 from pipeline.report.papers import page as papers_page
 from pipeline.report.papers import rows
-from pipeline.report.shared.verdict import FAILED, UNDECIDED, Figure, Missing, Question, ReportRules, state
-from pipeline.report.temperature.answers import comparison, judged, of_contestant
-from pipeline.report.temperature.contestants import heading, kind
-from pipeline.report.temperature.pairs import pair_sentence
 from pipeline.report.temperature.scorecard import setting
-from pipeline.report.temperature.verdict import questions
-from pipeline.report.temperature.wording import places_of, worded
 from pipeline.store import artifacts
+from pipeline.verdict.controllers import heading, kind
+from pipeline.verdict.decide import questions
+from pipeline.verdict.pairs import pair_sentence
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.temperature import comparison, names, of_controller
+from pipeline.verdict.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
+from pipeline.verdict.wording import places_of, worded
 
 ACCEPTED, PAPERS = "reports/accepted.json", "datasets/papers"
 KEYS = ("temperature", "setpoint", "deposition")
@@ -96,7 +97,7 @@ def _loops(accepted: Mapping[str, Any]) -> str:
 
 def _settling(accepted: Mapping[str, Any]) -> str:
     asked = {question.key: question for question in _questions(accepted)}["settling"]
-    figure = of_contestant(accepted["metrics"], accepted["verdicts"]["temperature"]["subject"])["settling"]
+    figure = of_controller(accepted["metrics"], accepted["verdicts"]["temperature"]["subject"])["settling"]
     return f"Settling time {_cell(asked, figure)} (at most {asked.limit:g} s)."
 
 
@@ -151,8 +152,8 @@ def _temperature(accepted: Mapping[str, Any]) -> str:
         f"| Controller | {' | '.join(map(_head, shown))} | Cost, median case |",
         f"|---|{'---|' * (len(shown) + 1)}",
     ]
-    for name in judged(metrics):
-        figures = of_contestant(metrics, name)
+    for name in names(metrics):
+        figures = of_controller(metrics, name)
         cells = " | ".join(_cell(question, figures[question.key]) for question in shown)
         cost = comparison(metrics)["contestants"][name]["cost"]["median"]
         lines.append(f"| {heading(name)} ({kind(name)}) | {cells} | {cost:.3g} |")

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deposition.workflow import trial_files, trial_readings
 from pipeline.nightly import camera_drift
 from pipeline.nightly.inputs import quarantine
-from pipeline.nightly.settings import Drift
+from pipeline.nightly.records import Alarm, LoopDrift
+from pipeline.nightly.settings import DriftLimits
+from pipeline.reading import trial_files
 from pipeline.reading.excluded import readable
-from pipeline.report.shared.night import Alarm, LoopDrift
 from pipeline.store import params
 
 if TYPE_CHECKING:
-    from pipeline.deposition.workflow.settings import Camera
+    from pipeline.deposition.settings import Camera
     from pipeline.setpoint.settings import TrainClassifier
 
 FRAMES = 40  # pictures of a recording that are looked at
@@ -33,7 +33,7 @@ def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
     paths = [path for path in trials if not only or path.as_posix() in only]
     for path in paths[-most:]:
         try:
-            stats = _frame_stats(trial_readings.opened(path, camera))
+            stats = _frame_stats(trial_files.open_trial(path, **camera.recording))
         except ValueError:
             continue
         rows.append([stats.mean.tolist(), stats.deviation.tolist(), stats.frames])
@@ -42,12 +42,12 @@ def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
 
 def _camera() -> "Camera":
     """Section `camera`, through whose topics a trial is read, however many of its frames can be."""
-    from pipeline.deposition.workflow.settings import Camera
+    from pipeline.deposition.settings import Camera
 
     return params.load(Camera, "camera").model_copy(update={"unreadable_share": 1.0})
 
 
-def _frame_stats(trial: trial_files.Trial) -> camera_drift.FrameStats:
+def _frame_stats(trial: trial_files.TrialRecording) -> camera_drift.FrameStats:
     frames = trial.frames
     every = max(len(frames.time_s) // FRAMES, 1)
     return camera_drift.figures(
@@ -56,7 +56,7 @@ def _frame_stats(trial: trial_files.Trial) -> camera_drift.FrameStats:
 
 
 def trials_drift(
-    limits: Drift, loop: str, paths: Sequence[str], reference: Mapping[str, Any], pending: set[str]
+    limits: DriftLimits, loop: str, paths: Sequence[str], reference: Mapping[str, Any], pending: set[str]
 ) -> LoopDrift:
     """Of new trials: those that cannot be read are set aside, the others' pictures held against those of
     `reference`."""
@@ -67,7 +67,7 @@ def trials_drift(
     ]
     for path in (path for path in paths if path.lower().endswith(".mcap")):
         try:
-            trial = trial_readings.opened(path, camera)
+            trial = trial_files.open_trial(path, **camera.recording)
         except ValueError as error:
             drifted.quarantined[path] = quarantine(path, loop, str(error))
             continue
@@ -99,7 +99,7 @@ class PrintFigures(NamedTuple):
     segment_frames: float
     contrast: camera_drift.Contrast
 
-    def written(self) -> list[Any]:
+    def to_json(self) -> list[Any]:
         """As the champion's reference.json keeps it."""
         contrast = [self.contrast.mean.tolist(), self.contrast.deviation.tolist()]
         return [self.name, self.counts.tolist(), self.segment_frames, *contrast]
@@ -107,7 +107,7 @@ class PrintFigures(NamedTuple):
 
 def of_prints(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[Any]]:
     """What reference.json keeps of the last `most` prints below `folder`; `only` those named."""
-    return [figures.written() for figures in _print_figures(folder, most, only)]
+    return [figures.to_json() for figures in _print_figures(folder, most, only)]
 
 
 def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[PrintFigures]:
@@ -136,35 +136,35 @@ def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[Pr
     return prints
 
 
-class NewPrints(NamedTuple):
-    """The loop's folder of recordings, the new files in it, and the champion's reference.json."""
-
-    folder: str
-    paths: Sequence[str]
-    reference: Mapping[str, Any]
-
-
-def prints_drift(limits: Drift, loop: str, new: NewPrints, pending: set[str]) -> LoopDrift:
-    """Of new prints: files that cannot be read are set aside. Classes, frames without a line, and the line's
-    contrast are held against the prints of the champion's reference."""
+def prints_drift(
+    limits: DriftLimits,
+    loop: str,
+    folder: str,
+    paths: Sequence[str],
+    reference: Sequence[Sequence[Any]],
+    pending: set[str],
+) -> LoopDrift:
+    """Drift of the new prints `paths` in the loop's folder of recordings. A file that cannot be read is set
+    aside. Classes, frames without a line, and the line's contrast are compared with the prints that the
+    champion's reference.json has under "camera"."""
     from pipeline.setpoint.settings import TrainClassifier
 
     drifted = LoopDrift.none(loop)
     settings = params.load(TrainClassifier, "train_classifier")
     if settings.source != "recordings":
         return drifted
-    for path in new.paths:
+    for path in paths:
         if reason := _unreadable(path, settings):
             drifted.quarantined[path] = quarantine(path, loop, reason)
     before = [
         PrintFigures(name, np.array(counts), together, camera_drift.Contrast(np.array(mean), np.array(std)))
-        for name, counts, together, mean, std in new.reference.get("camera", [])
+        for name, counts, together, mean, std in reference
     ]
     if not before:
         return drifted
     names = {figures.name for figures in before}
     try:
-        prints = [figures for figures in _print_figures(Path(new.folder), 10**6) if figures.name not in names]
+        prints = [figures for figures in _print_figures(Path(folder), 10**6) if figures.name not in names]
     except ValueError as error:  # what the stage will refuse as well, and say so
         drifted.notes.append(str(error))
         return drifted
@@ -198,9 +198,9 @@ def _unreadable(path: str, settings: "TrainClassifier") -> str:
 
 def with_alarms(
     drifted: LoopDrift,
-    limits: Drift,
+    limits: DriftLimits,
     path: str,
-    causes: Sequence[camera_drift.Change],
+    causes: Sequence[camera_drift.CameraChange],
     pending: set[str],
     consequences: Sequence[str] = (),
 ) -> LoopDrift:

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.report.shared import headline
-from pipeline.report.shared.sources import Declared, Sources
-from pipeline.report.shared.verdict import Missing, ReportRules, Verdict
-from pipeline.report.temperature.judgement import judgement
 from pipeline.temperature.settings import Plant
+from pipeline.verdict import loops
+from pipeline.verdict.evidence import Evidence
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import Missing, Verdict
 
 HERE = Path(__file__).parent
 INPUTS, ANSWERS = HERE / "frozen_metrics.json", HERE / "frozen_verdicts.json"
@@ -131,23 +131,22 @@ def share(name: str, value: float | None, by: float) -> float | None:
 # ---- the verdicts
 
 
-def sources_of(inputs: Mapping[str, Any], drawn: Mapping[str, Any]) -> Sources:
-    """What the stage `report` would read, without its files."""
+def evidence_of(inputs: Mapping[str, Any], drawn: Mapping[str, Any]) -> Evidence:
+    """What the stage `verdict` would read, without its files."""
     everything = copy.deepcopy(inputs["params"])
     if drawn["recorded"]:
         for section in ("generate_probing", "train_ilc", "train_classifier"):
             everything[section]["source"] = "recordings"
-    declared = Declared(
-        ReportRules.model_validate(everything["report"]),
-        Plant.model_validate(everything["plant"]),
-        everything,
-    )
     metrics = {name: drawn["metrics"].get(name, NOT_MADE) for name in inputs["metrics"]}
     tables = Tables({
         name: {key: column(values) for key, values in table.items()} if name in inputs["columns"] else table
         for name, table in drawn["tables"].items()
     })  # fmt: skip
-    return Sources(declared, metrics, tables, {}, {}, None, "", {}, quick=drawn["quick"])
+    rules, machine = (
+        ReportRules.model_validate(everything["report"]),
+        Plant.model_validate(everything["plant"]),
+    )
+    return Evidence(metrics, tables, machine, rules, everything, quick=drawn["quick"])
 
 
 def column(values: list) -> np.ndarray:
@@ -160,16 +159,16 @@ def answer(verdict: Verdict) -> dict[str, Any]:
     rules: dict[str, list[list[str]]] = {}
     for line in verdict.rules:
         question = line[0].question
-        key = (question.key if question else "") or line[0].name
+        key = question.key if question and verdict.loop != "deposition" else line[0].name
         rules.setdefault(key, []).append([rule.state for rule in line])
     return {"state": verdict.state, "winner": verdict.winner, "subject": verdict.subject, "rules": rules}
 
 
 def answers(inputs: Mapping[str, Any], seed: int) -> dict[str, Any]:
     """The verdict of each loop, or the error by which the report ends."""
-    sources = sources_of(inputs, draw(inputs, seed))
+    evidence = evidence_of(inputs, draw(inputs, seed))
     try:
-        verdicts = headline.verdicts(sources, judgement(sources))
+        verdicts = loops.verdicts(evidence)
     except Exception as error:
         return {"error": type(error).__name__}
     return {loop: answer(verdict) for loop, verdict in verdicts.items()}

@@ -58,7 +58,7 @@ def render_only(monkeypatch):
             for function in [name for name in vars(modules[other]) if name.startswith("render")]:
                 blank = empty if other == "viewer" else ""
                 monkeypatch.setattr(modules[other], function, lambda *_, blank=blank: blank)
-        report.main()
+        made.main()
 
     return render
 
@@ -66,7 +66,7 @@ def render_only(monkeypatch):
 @pytest.fixture(scope="session")
 def reports(populated, tmp_path_factory):
     """The folder of the small project's pages, which nobody changes."""
-    from stages.report import main
+    from tests.report.made import main
 
     folder = tmp_path_factory.mktemp("built")
     shutil.copytree(populated, folder, dirs_exist_ok=True)

@@ -6,16 +6,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from pipeline.deposition.workflow.tables import (
-    FILMED,
-    LESSONS,
-    LIBRARY,
-    LINES,
-    SCORES,
-    SIGNALS,
-    TASKS,
-    TRIALS,
-)
+from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
 from pipeline.store import artifacts, params
 from pipeline.temperature import tables
 from pipeline.temperature.settings import Plant
@@ -62,6 +53,14 @@ NEXT_EXPERIMENT = {
 }
 DITHER = {"written": False, "reason": "PI needs an input for each of the 2 outputs; found 1 inputs"}
 SCALED = {"change_percent": -60.0, "gain_difference": 1e-15}
+
+
+def main():
+    """The verdicts and the pages of the project in the working directory."""
+    from stages import report, verdict
+
+    verdict.main()
+    report.main()
 
 
 def figure(q90, low, high, **more):

@@ -8,13 +8,15 @@ import pytest
 
 from pipeline.report.certificate import exported
 from pipeline.report.certificate.page import judged_margins
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, ReportRules, Verdict
-from pipeline.report.temperature import judgement
-from pipeline.report.temperature.judgement import trust_first
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant
-from stages.report import main
+from pipeline.verdict import decide, identification
+from pipeline.verdict.decide import trust_first
+from pipeline.verdict.evidence import Evidence
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Verdict
 from tests.report import made_certificate
+from tests.report.made import main
 from tests.report.test_pages import Page
 
 PAGE, INDEX = Path("reports/certificate.html"), Path("reports/index.html")
@@ -39,7 +41,7 @@ def test_a_passed_certificate_of_a_simulated_plant_is_a_simulation(project):
 
 def test_a_certificate_of_recordings_says_no_more_than_page_one(project):
     made_certificate.write(evidence="recorded")
-    shown = SimpleNamespace(metrics={"export_controllers": artifacts.read_metrics("export_controllers")})
+    shown = SimpleNamespace(metrics={"export_controllers": artifacts.read_figures("export_controllers")})
     ready = Verdict("temperature", PASSED, "Ready for a supervised trial.", "", "", "", "", "pi")
     line = exported.lines(shown, ready)[0]
     assert (line.state, line.word, line.why) == (PASSED, "May run.", "")
@@ -78,12 +80,12 @@ def test_margins_of_the_plants_that_page_one_judges_on_stand_beside_the_certific
 def test_a_model_that_nobody_may_trust_exports_nothing(monkeypatch):
     passed = Verdict("temperature", PASSED, "Ready.", "", "", "", "", "pi")
     doubted = passed._replace(decision="Do not trust this model.", state=FAILED)
-    monkeypatch.setattr(judgement, "decide", lambda *_, **__: passed)
-    monkeypatch.setattr(judgement, "trust", lambda _: doubted)
-    machine = params.load(Plant, "plant")
-    for recorded, winner in ((True, None), (False, "pi")):
-        found = judgement.winner({}, params.load(ReportRules, "report"), machine, recorded=recorded, model={})
-        assert found.winner == winner
+    monkeypatch.setattr(decide, "decide", lambda *_, **__: passed)
+    monkeypatch.setattr(identification, "trust", lambda _: doubted)
+    machine, rules = params.load(Plant, "plant"), params.load(ReportRules, "report")
+    for source, winner in (("recordings", None), ("simulated", "pi")):
+        run = Evidence({}, {}, machine, rules, {"generate_probing": {"source": source}})
+        assert decide.verdict(run).winner == winner
 
 
 def test_a_refused_certificate_names_its_first_failed_rule_and_no_file(project):
@@ -97,7 +99,7 @@ def test_a_refused_certificate_names_its_first_failed_rule_and_no_file(project):
     assert "Certificate refused." in first and "temperature/controller.json" not in first
 
 
-@pytest.mark.parametrize("lost", [made_certificate.PATH, "reports/metrics/export_controllers.json"])
+@pytest.mark.parametrize("lost", [made_certificate.PATH, "datasets/export_controllers/figures.json"])
 def test_where_nothing_was_exported_both_pages_say_so(project, lost):
     Path(lost).unlink()
     main()

@@ -8,17 +8,19 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.deposition.parts import extrusion
+from pipeline.deposition import tables
+from pipeline.deposition.parts import extrusion, part_report
+from pipeline.deposition.settings import Printer
+from pipeline.deposition.tables import SIGNALS
 from pipeline.deposition.toolpath import gcode
-from pipeline.deposition.workflow import part_programs, tables
-from pipeline.deposition.workflow.settings import Printer
-from pipeline.deposition.workflow.tables import SIGNALS
-from pipeline.report.deposition import rules
-from pipeline.report.shared.verdict import OPEN
 from pipeline.store import artifacts, params
-from stages.report import main
+from pipeline.verdict import deposition as rules
+from pipeline.verdict.evidence import Evidence
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import OPEN, Missing
 from tests.conftest import ROOT
 from tests.report import made
+from tests.report.made import main
 from tests.report.test_pages import Page, change_all, figures
 
 PAGE, FOLDER = Path("reports/deposition.html"), Path("datasets/compose_parts")
@@ -39,6 +41,13 @@ ARTIFACTS = [
         for name in ("signals.parquet", "scores.parquet", "lines.parquet", "conformance.json")
     ),
 ]
+
+
+def evidence():
+    """What the rules of a part are asked of, without figures of other stages."""
+    gap = Missing("not measured", "")
+    limits = params.load(ReportRules, "report", Path(__file__).parents[2] / "params.yaml")
+    return Evidence({"train_ilc": gap}, {"conformance": gap}, None, limits, {})
 
 
 def page():
@@ -191,7 +200,8 @@ def test_where_the_drive_cannot_follow_a_signal_is_held_against_the_best_reachab
         assert "Near the best reachable" in text and f"{error / 38:.2f} ×" in text
         # the flow error itself is not asked for: the drive fails, and the signal by its ratio alone
         structure = rules.Structure("square", "A", {"basis": rules.Score(error, None, None)}, "basis", None)
-        near = rules._near([structure], {("square", "A"): 38.0})[0]
+        case = rules.Parts(evidence(), [structure], {("square", "A"): 38.0})
+        near = {rule.name: rule for rule, _ in rules.rules_of(case)}["Near the best reachable"]
         assert near.state == ("failed" if failed == 2 else "passed")
         assert "First failed rule: the drive follows." in text
 
@@ -304,7 +314,9 @@ def test_several_forecasts_that_are_not_judged_are_all_named():
         rules.Structure(name, "A", {"basis": score}, "basis", None, why="too fast", trial="print it slower")
         for name in ("one", "two", "three", "four", "five")
     ]
-    ours, paper = rules._forecast([*parts, parts[0]._replace(scores={"basis": score._replace(judged=True)})])
+    judged = parts[0]._replace(scores={"basis": score._replace(judged=True)})
+    case = rules.Parts(evidence(), [*parts, judged], {})
+    ours, paper = rules.rules_of(case)[1]
     assert ours == paper and ours.state == OPEN and ours.text == "5 of 6 not"
     assert ours.reason == (
         "The forecast of one, material A, is not judged: too fast. "
@@ -349,7 +361,7 @@ def test_what_is_missing_or_broken_is_said_in_its_place(project, render_only, pa
 
 
 def test_before_the_stages_ran_the_page_and_the_card_say_so(project):
-    for path in [*ARTIFACTS, *(f"reports/metrics/{stage}.json" for stage in made.deposition_metrics())]:
+    for path in [*ARTIFACTS, *(f"datasets/{stage}/figures.json" for stage in made.deposition_metrics())]:
         Path(path).unlink()
     text = page()
     assert (
@@ -447,7 +459,7 @@ def test_what_e_asks_for_stands_beside_the_declared_bead_with_the_difference(pro
     bead = 10 / 60
     by_e = extrusion.wanted(program, bead_area_mm2=bead, declared_mm={0: 1.75})
     printer = params.load(Printer, "printer", ROOT / "params.yaml").model_copy(update={"bead_area_mm2": bead})
-    conformance(program=part_programs.told(program, by_e, printer))
+    conformance(program=part_report.program_report(program, by_e, bead_area_mm2=printer.bead_area_mm2))
     text = page()
     assert "E gives the volumes of 1 of two tools; it asks for 1.44 times the declared bead’s." in text
     assert (
@@ -456,7 +468,7 @@ def test_what_e_asks_for_stands_beside_the_declared_bead_with_the_difference(pro
     assert "square T1 declared bead: the diameter of what E pushes is not known not told" in text
     # the declared bead's volumes, where no diameter is known; of a report that did not count E, the stage
     nothing = extrusion.wanted(program, bead_area_mm2=bead)
-    conformance(program=part_programs.told(program, nothing, printer))
+    conformance(program=part_report.program_report(program, nothing, bead_area_mm2=printer.bead_area_mm2))
     assert "No line’s volume is E’s: each is its length times the declared bead’s area." in page()
     report = artifacts.read_json(FOLDER / "conformance.json")["square"]
     artifacts.write_json(

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from pipeline.report.shared.digits import (
+from pipeline.verdict.digits import (
     band,
     count,
     decimals,

@@ -4,11 +4,14 @@ that its figures are no dependency of the pages."""
 import re
 from pathlib import Path
 
-from pipeline.report.shared.verdict import FAILED, PASSED, Missing, ReportRules
-from pipeline.report.temperature.verdict import NEVER, decide
 from pipeline.store import artifacts, params
-from stages.report import main
+from pipeline.temperature.settings import Plant
+from pipeline.verdict.decide import NEVER, decide
+from pipeline.verdict.evidence import Evidence
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import FAILED, PASSED, Missing
 from tests.report import made
+from tests.report.made import main
 from tests.report.test_pages import DEPOSITION, INDEX, TEMPERATURE, Page, figures
 
 NIGHT = Path("reports/metrics/nightly.json")
@@ -101,7 +104,8 @@ def test_drift_is_judged_by_the_night_alone_and_a_drifted_machine_fails(project)
     main()
     stages = made.metrics()
     rules = params.load(ReportRules, "report")
-    open_drift = decide(stages, rules, recorded=False, drift=NEVER)
-    drifted = decide(stages, rules, recorded=False, drift=Missing("failed", "The machine has changed"))
+    run = Evidence(stages, {}, params.load(Plant, "plant"), rules, {})
+    open_drift = decide(run, drift=NEVER)
+    drifted = decide(run, drift=Missing("failed", "The machine has changed"))
     assert (open_drift.state, drifted.state) == (PASSED, FAILED)
     assert drifted.lead == "First failed rule: drift." and "The machine has changed." in drifted.reason

@@ -13,7 +13,6 @@ from pipeline.report.setpoint import page as setpoint_page
 from pipeline.report.temperature import page as temperature_page
 from pipeline.store import artifacts
 from pipeline.temperature import tables
-from stages import report
 from tests.report import made, made_setpoint
 from tests.report.conftest import MACHINE, populate
 from tests.report.test_pages import change, change_all
@@ -56,11 +55,7 @@ def one_missing():
 
 
 def nothing():
-    for path in [
-        *Path("datasets").rglob("*.parquet"),
-        *Path("datasets").rglob("*.json"),
-        *Path("reports/metrics").glob("*.json"),
-    ]:
+    for path in [*Path("datasets").rglob("*.parquet"), *Path("datasets").rglob("*.json")]:
         path.unlink()
 
 
@@ -75,7 +70,7 @@ def long_sentences():
             "drift": {"alarms": [{"loop": "temperature", "cause": LONG}]},
         },
     )
-    Path("reports/metrics/evaluate_temperature.json").write_text("{")
+    Path("datasets/evaluate_temperature/figures.json").write_text("{")
 
 
 STATES = (
@@ -101,7 +96,7 @@ def page_one(tmp_path, monkeypatch):
         with contextlib.chdir(tmp_path):
             populate(tmp_path)
             changed()
-            report.main()
+            made.main()
         return tmp_path / "reports"
 
     return built
@@ -152,7 +147,7 @@ def hundred(folder):
 
 def test_with_a_hundred_recordings_the_pages_stay_small(project):
     hundred(project)
-    report.main()
+    made.main()
     sizes = {path.stem: path.stat().st_size for path in Path("reports").glob("*.html")}
     # the bars of the pages
     assert sizes.pop("index") <= 150_000 and max(sizes.values()) <= 1_500_000, sizes

@@ -9,8 +9,8 @@ import yaml
 
 from pipeline.store import artifacts, params
 from pipeline.temperature import tables
-from stages.report import main
 from tests.report import made
+from tests.report.made import main
 from tests.report.test_identification_page import FOLDER, page, rewrite, white
 from tests.report.test_pages import IDENTIFICATION, TEMPERATURE, Page, change
 

@@ -14,9 +14,9 @@ import yaml
 from pipeline import cli
 from pipeline.report.shared.sources import machine
 from pipeline.store import artifacts, params
-from stages.report import main
 from tests import fake_uv
 from tests.report import made
+from tests.report.made import main
 from tests.report.test_pages import change
 
 HERE = {

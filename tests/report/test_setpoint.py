@@ -9,16 +9,16 @@ import pytest
 import yaml
 
 from pipeline.report.setpoint import agent as setpoint_agent
-from pipeline.report.setpoint import verdict as setpoint_verdict
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
-from pipeline.report.shared.verdict import Figure, Question
 from pipeline.setpoint.agents.criteria import harm_bar
 from pipeline.setpoint.simulation.simulator import reward
 from pipeline.setpoint.tables import PATHS
 from pipeline.store import artifacts, params
-from stages.report import main
+from pipeline.verdict import setpoint as setpoint_verdict
+from pipeline.verdict.verdict import Figure, Question
 from tests.report import made, made_setpoint
+from tests.report.made import main
 from tests.report.test_pages import Page, change, figures
 
 PAGE, INDEX = Path("reports/setpoint.html"), Path("reports/index.html")
@@ -79,7 +79,7 @@ def test_what_may_be_claimed_stands_in_the_verdict_and_on_page_one(project):
     Path("params.yaml").write_text(yaml.safe_dump(sections))
     shared = "the folder has too few prints to keep them apart"
     for apart in (True, False):
-        figures = artifacts.read_metrics("train_classifier")
+        figures = artifacts.read_figures("train_classifier")
         figures["data"]["windows_apart"] = apart
         artifacts.write_metrics("train_classifier", figures)
         assert (shared in page()) is not apart
@@ -135,7 +135,7 @@ def test_a_share_that_straddles_its_limit_is_undecided_and_says_how_many_runs_wo
         "about 760 runs in all would decide." in text
     )
     assert setpoint_verdict.undecided(
-        Question(0, "", "", "%", 97.0, True, ""), Figure(97.0, 96.0, 98.0)
+        Question(0, "", "", "%", 97.0, True, ""), Figure(97.0, 96.0, 98.0), {}
     ).endswith("no number of runs would decide.")
 
 
@@ -161,7 +161,7 @@ def test_what_is_missing_or_broken_is_said_in_its_place(project, paths, how):
 
 
 def test_before_the_stages_ran_the_page_and_the_card_say_so(project):
-    for path in [*ARTIFACTS, *(f"reports/metrics/{stage}.json" for stage in made_setpoint.metrics())]:
+    for path in [*ARTIFACTS, *(f"datasets/{stage}/figures.json" for stage in made_setpoint.metrics())]:
         Path(path).unlink()
     text = page()
     assert "Undecided (simulation). No controller was chosen." in text
@@ -213,7 +213,7 @@ def test_the_card_sets_the_default_beside_another_and_doing_nothing_where_each_f
 
 
 def test_how_a_figure_moved_since_the_accepted_run_is_said(project):
-    accepted = made.accepted(metrics={"evaluate_setpoint": artifacts.read_metrics("evaluate_setpoint")})
+    accepted = made.accepted(metrics={"evaluate_setpoint": artifacts.read_figures("evaluate_setpoint")})
     cases = accepted["metrics"]["evaluate_setpoint"]["our agent"]["paper"]
     cases["accuracy 0.7"]["settled"] = 97.0
     cases["accuracy 0.9"] = {
@@ -261,10 +261,10 @@ def test_harm_that_may_be_chance_is_undecided_and_says_how_many_segments_would_t
     assert harm_rules(project)[0][0] == ("undecided", "0.9\u202f%")
     # half the interval is four times as wide as the distance from the limit: 16 times the segments
     asked = Question(0, "", "", "%", 1.0, False, "")
-    assert setpoint_verdict.undecided(asked, Figure(0.9, 0.5, 1.3), clustered=True).endswith(
+    assert setpoint_verdict.undecided(asked, Figure(0.9, 0.5, 1.3), {"clustered": True}).endswith(
         "about 16 times as many segments would decide."
     )
-    assert setpoint_verdict.undecided(asked, Figure(0.5, 0.2, 0.9), clustered=True) == ""
+    assert setpoint_verdict.undecided(asked, Figure(0.5, 0.2, 0.9), {"clustered": True}) == ""
 
 
 def test_harm_without_a_declared_bar_is_not_measured_and_does_not_pass(project):
@@ -320,7 +320,7 @@ def test_the_default_is_the_baseline_that_is_shown_and_judged_though_another_is_
 
 def test_windows_of_all_flows_are_held_against_no_bar(project):
     """The rule asks for flows from 70 to 150 %; an image's bar is of all flows."""
-    figures = artifacts.read_metrics("train_classifier") | {"window_accuracy": 0.5, "image_accuracy": 0.5}
+    figures = artifacts.read_figures("train_classifier") | {"window_accuracy": 0.5, "image_accuracy": 0.5}
     artifacts.write_metrics("train_classifier", figures)
     main()
     assert len(re.findall(r'class="num bad">50.0', PAGE.read_text())) == 1

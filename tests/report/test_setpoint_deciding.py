@@ -12,8 +12,8 @@ import pytest
 from pipeline.report.setpoint import deciding
 from pipeline.setpoint.tables import SCOREBOARD
 from pipeline.store import artifacts
-from stages.report import main
 from tests.report import made_setpoint
+from tests.report.made import main
 from tests.report.test_pages import Page, change
 from tests.report.test_viewer import manifest
 

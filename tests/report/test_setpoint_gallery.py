@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from pipeline.store import artifacts
-from stages.report import main
+from tests.report.made import main
 from tests.report.test_pages import Page
 
 PAGE, INDEX = Path("reports/setpoint.html"), Path("datasets/train_classifier/frames/frames.json")

@@ -4,14 +4,24 @@ never two sentences that contradict one another."""
 import copy
 import math
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipeline.report.deposition.verdict import verdict as deposition
-from pipeline.report.identification.model import trust
-from pipeline.report.setpoint.verdict import verdict as setpoint
-from pipeline.report.shared.verdict import (
+from pipeline.report.temperature.beside import best_sentence, deciding_sentence
+from pipeline.report.temperature.judgement import judgement
+from pipeline.store import artifacts, params
+from pipeline.temperature.settings import Plant
+from pipeline.verdict.controllers import in_a_sentence
+from pipeline.verdict.decide import decide, questions, standings
+from pipeline.verdict.deposition import verdict as deposition
+from pipeline.verdict.evidence import Evidence
+from pipeline.verdict.identification import trust
+from pipeline.verdict.pairs import pair_sentence
+from pipeline.verdict.setpoint import verdict as setpoint
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import (
     FAILED,
     OPEN,
     PASSED,
@@ -19,7 +29,6 @@ from pipeline.report.shared.verdict import (
     Figure,
     Missing,
     Question,
-    ReportRules,
     Rule,
     Verdict,
     deciding,
@@ -27,11 +36,6 @@ from pipeline.report.shared.verdict import (
     share,
     state,
 )
-from pipeline.report.temperature.contestants import in_a_sentence
-from pipeline.report.temperature.judgement import judgement
-from pipeline.report.temperature.pairs import deciding_sentence, pair_sentence
-from pipeline.report.temperature.verdict import best_sentence, decide, questions, standings
-from pipeline.store import artifacts, params
 from stages import report
 from tests.report import made
 from tests.report.test_pages import INDEX, TEMPERATURE, Page
@@ -67,8 +71,18 @@ def metrics(**changed):
     return stages
 
 
-def judge(stages, **more):
-    return decide(stages, RULES, **({"recorded": False} | more))
+def evidence(stages, *, recorded=False, undeclared=()):
+    """What the temperature loop is judged from; `undeclared` are outputs without low and high."""
+    machine = params.load(Plant, "plant", Path(__file__).parents[2] / "params.yaml")
+    named = zip(machine.outputs, undeclared, strict=False)
+    outputs = [output.model_copy(update={"name": name, "low": None}) for output, name in named]
+    outputs += machine.outputs[len(outputs) :]
+    declared = {"generate_probing": {"source": "recordings"}} if recorded else {}
+    return Evidence(stages, {}, machine.model_copy(update={"outputs": outputs}), RULES, declared)
+
+
+def judge(stages, *, recorded=False, undeclared=(), **night):
+    return decide(evidence(stages, recorded=recorded, undeclared=undeclared), **night)
 
 
 @pytest.mark.parametrize(
@@ -115,9 +129,10 @@ def test_one_engine_for_every_loop_the_first_rule_of_the_gravest_state_decides()
 def test_the_verdict_of_every_loop_has_the_same_fields(project, monkeypatch):
     caught = []
     monkeypatch.setattr(report, "judgement", lambda sources: caught.append(sources) or judgement(sources))
-    report.main()
+    made.main()
     sources = caught[0]
-    verdicts = [judgement(sources).verdict, deposition(sources), setpoint(sources), trust(sources)]
+    of_run = sources.evidence
+    verdicts = [judgement(sources).verdict, deposition(of_run), setpoint(of_run), trust(of_run)]
     assert [one.loop for one in verdicts] == ["temperature", "deposition", "setpoint", "identification"]
     assert {type(one) for one in verdicts} == {Verdict}
     for one in verdicts:
@@ -361,7 +376,7 @@ def test_no_two_sentences_contradict_one_another_whatever_passes_fails_or_is_ope
         undeclared = ("zone_1",) if rng.random() < 0.2 else ()
         incumbent = str(rng.choice(["", "pi", "subspace_lqg"]))
         verdict = judge(stages, recorded=recorded, undeclared=undeclared, incumbent=incumbent)
-        held = standings(stages, RULES, undeclared=undeclared)
+        held = standings(evidence(stages, undeclared=undeclared))
         states.add(verdict.state)
         passing = [name for name, one in held.items() if one.passes and name != "exact_model"]
         assert (verdict.state == PASSED) == bool(passing) == (verdict.winner in passing), seed
@@ -408,13 +423,13 @@ def test_a_page_of_any_comparison_prints_no_number_beyond_meaning_and_never_says
     artifacts.write_metrics("evaluate_temperature", {
         **made.metrics()["evaluate_temperature"], **random_comparison(np.random.default_rng(seed))
     })  # fmt: skip
-    report.main()
+    made.main()
     page = Page(TEMPERATURE).text
     shown = page[: page.index("Findings in plain words")]
     words_of_numbers_are_readable(shown)
     first = Page(INDEX).text
     assert not re.search(r"\b(nan|inf|None)\b|\b[Dd]eploy\b", first)
-    decision = artifacts.read_metrics("report")["verdict"]["decision"]
+    decision = artifacts.read_figures("report")["verdict"]["decision"]
     assert shown.count(decision.rstrip(".")) >= 2 and decision in first  # title and head
 
 

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 
 from pipeline.report.shared import page as shared_page
-from pipeline.report.shared.sources import Declared, Source, collect, linked
-from pipeline.report.shared.verdict import ReportRules
+from pipeline.report.shared.sources import Declared, SourceFile, collect, linked
 from pipeline.report.temperature.judgement import judgement
 from pipeline.report.viewer import packed
 from pipeline.report.viewer import page as viewer_page
-from pipeline.report.viewer.series import Event, Key, Line, Shown
+from pipeline.report.viewer.series import Event, Key, SeriesLine, ViewerTable
 from pipeline.store import artifacts, params
 from pipeline.temperature import tables
 from pipeline.temperature.settings import Plant
+from pipeline.verdict.settings import ReportRules
 from tests.report.conftest import expect, loaded, timers_fired
 
 
@@ -44,13 +44,13 @@ def columns(text):
 # ---- the files
 
 
-SHOWN = Shown(
+SHOWN = ViewerTable(
     "toy",
     "Toy",
     "",
     ("time_s", "time", "s"),
     (Key("who", "Who"), Key("trial", "Trial")),
-    (Line("y", "y", "degC", "y", "Y"), Line("r", "r", "degC", "y", "Y", beside="y")),
+    (SeriesLine("y", "y", "degC", "y", "Y"), SeriesLine("r", "r", "degC", "y", "Y", beside="y")),
     books=1,
 )
 
@@ -133,7 +133,7 @@ def test_a_small_table_is_copied_beside_the_page_and_a_large_one_linked(tmp_path
     path = Path("datasets/ingest/record.parquet")
     path.parent.mkdir(parents=True)
     path.write_bytes(b"x" * 1000)
-    read = {path.as_posix(): Source("record", path.as_posix(), "ingest", "record 1", "0")}
+    read = {path.as_posix(): SourceFile("record", path.as_posix(), "ingest", "record 1", "0")}
     [source] = linked(read).values()
     assert source.link == "data/ingest.record.parquet" and packed.size_of(source) == "1 kB"
     for bound in ("LARGEST_COPY", "LARGEST_COPIES"):
@@ -144,7 +144,7 @@ def test_a_small_table_is_copied_beside_the_page_and_a_large_one_linked(tmp_path
 
 
 def test_the_folder_holds_what_this_run_wrote_and_nothing_older(project):
-    from stages.report import main
+    from tests.report.made import main
 
     main()
     first = {file.name: file.read_bytes() for file in Path("reports/data").iterdir()}
@@ -170,7 +170,7 @@ def test_a_stage_that_fails_leaves_the_old_folder(project):
 
 
 def test_without_its_artifacts_the_page_says_what_is_missing(project):
-    from stages.report import main
+    from tests.report.made import main
 
     for name in ("evaluate_temperature/trajectories", "train_ilc/lessons"):
         Path(f"datasets/{name}.parquet").unlink()
@@ -185,7 +185,7 @@ def test_without_its_artifacts_the_page_says_what_is_missing(project):
 
 
 def test_a_series_that_has_no_room_is_listed_and_the_others_are_shown(project, monkeypatch):
-    from stages.report import main
+    from tests.report.made import main
 
     monkeypatch.setattr(packed, "LARGEST", 60_000)
     monkeypatch.setattr("pipeline.report.shared.sources.LARGEST_COPIES", 1000)
@@ -469,7 +469,7 @@ def million(tmp_path_factory):
         declared = Declared(
             params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read("params.yaml")
         )
-        sources = collect(declared, report.METRICS, report.FOLDERS, "accepted.json", ("pipeline",))
+        sources = collect(declared, report.FIGURES, report.FOLDERS, "accepted.json", ("pipeline",))
         made_page = viewer_page.render(sources, judgement(sources))
         artifacts.write_text("reports/viewer.html", made_page.text)
         artifacts.write_folder("reports/data", made_page.files)

@@ -5,14 +5,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from pipeline.report.deposition import change as deposition_change
-from pipeline.report.deposition import rules as deposition_rules
 from pipeline.report.setpoint import change as setpoint_change
 from pipeline.report.shared.difference import Difference, Move
-from pipeline.report.shared.digits import count
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.contestants import in_a_sentence
 from pipeline.report.temperature.judgement import Judgement
+from pipeline.verdict.controllers import in_a_sentence
+from pipeline.verdict.deposition import structures
+from pipeline.verdict.digits import count
+from pipeline.verdict.verdict import Missing
 
 ANOTHER = "The accepted run is of another machine: nothing to compare."
 # figures of a loop that page one names
@@ -93,7 +93,7 @@ def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
     ]
     streams = deposition_moves(sources)
     cases = setpoint_change.changes(sources)
-    return [
+    loops = [
         LoopChange("temperature", temperature, _both([move for _, move in mine])),
         LoopChange("deposition", [_moved(move) for move in streams if move.moved], _both(streams)),
         LoopChange(
@@ -102,6 +102,7 @@ def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
             sum(change.text not in ("first run", "new") for _, change in cases),
         ),
     ]
+    return [loop for loop in loops if loop.loop in sources.verdicts]
 
 
 def _both(moves: Sequence[Move]) -> int:
@@ -116,7 +117,7 @@ def _moved(move: Move, whose: str = "") -> Moved:
 
 def deposition_moves(sources: Sources) -> list[Move]:
     """Flow errors of the composer in use, stream by stream."""
-    parts = deposition_rules.structures(sources)
+    parts = structures(sources.evidence)
     return [] if isinstance(parts, Missing) else deposition_change.moves(sources, parts)
 
 

@@ -3,10 +3,11 @@ two composers may differ and still count as one."""
 
 from collections.abc import Sequence
 
-from pipeline.report.deposition.rules import SAME, Structure
 from pipeline.report.shared.difference import Move
-from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import Figure, Missing, Question
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.deposition import SAME, Structure
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.verdict import Figure, Missing, Question
 
 
 def moves(sources: Sources, parts: Sequence[Structure]) -> list[Move]:

@@ -2,7 +2,7 @@
 accepted run, what to do next, and which file to load."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -11,36 +11,22 @@ from pipeline.report.certificate import exported
 from pipeline.report.deposition import card as deposition_card
 from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.shared import headline, page, words
-from pipeline.report.shared.card import Card, Deciding, Step
+from pipeline.report.shared.card import Card, CardStep, Deciding
 from pipeline.report.shared.difference import accepted_on
-from pipeline.report.shared.digits import count, shortened
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 from pipeline.report.temperature import card as temperature_card
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.twelve import drift_state
+from pipeline.verdict.digits import count, shortened
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 
 # the gravest first
 GRAVEST = (FAILED, OPEN, PASSED)
 
 
-class File(NamedTuple):
-    """What leaves the house of one loop: the file to load with its digest, and its certificate; `link` leads
-    to a copy beside the pages, "" where there is none."""
-
-    loop: str
-    name: str
-    path: str
-    sha256: str
-    state: str
-    word: str
-    certificate: str
-    link: str
-
-
 def render(sources: Sources, judged: Judgement) -> str:
     """The text of index.html."""
-    loops, verdicts = headline.loops(sources, judged), headline.verdicts(sources, judged)
+    loops, verdicts = headline.loops(sources), sources.verdicts
     first, picture = deciding(sources, judged, verdicts)
     shown = cards(sources, judged, verdicts)
     told = changes.changes(sources, judged)
@@ -52,7 +38,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         decision=headline.decision(loops, quick=sources.quick),
         state=headline.state(loops),
         data=data(sources),
-        claim=f"{headline.claim(sources)} {drifts(judged)}",
+        claim=f"{headline.claim(sources, list(verdicts))} {drifts(judged)}",
         cards=shown,
         picture=picture,
         change=told,
@@ -65,12 +51,13 @@ def render(sources: Sources, judged: Judgement) -> str:
 
 
 def cards(sources: Sources, judged: Judgement, verdicts: Mapping[str, Verdict]) -> list[Card]:
-    """Temperature, deposition, setpoint."""
-    return [
-        temperature_card.card(sources, judged, verdicts["temperature"]),
-        deposition_card.card(sources, verdicts["deposition"]),
-        setpoint_card.card(sources, verdicts["setpoint"]),
-    ]
+    """Temperature, deposition, setpoint, without a loop that is switched off."""
+    drawn = {
+        "temperature": lambda verdict: temperature_card.card(sources, judged, verdict),
+        "deposition": lambda verdict: deposition_card.card(sources, verdict),
+        "setpoint": lambda verdict: setpoint_card.card(sources, verdict),
+    }
+    return [drawn[loop](verdict) for loop, verdict in verdicts.items()]
 
 
 def deciding(
@@ -92,7 +79,7 @@ def _graveness(verdict: Verdict) -> str:
     return verdict.state if verdict.state in (FAILED, PASSED) else OPEN
 
 
-def steps(shown: Sequence[Card], first: str) -> list[tuple[str, Step]]:
+def steps(shown: Sequence[Card], first: str) -> list[tuple[str, CardStep]]:
     """(loop, what to do next), that of the loop that decides first."""
     ordered = sorted(shown, key=lambda card: card.loop != first)
     return [(card.loop, card.step) for card in ordered]
@@ -100,8 +87,9 @@ def steps(shown: Sequence[Card], first: str) -> list[tuple[str, Step]]:
 
 def data(sources: Sources) -> str:
     """On whose data the loops were judged: simulated machines, or which recordings."""
-    made = [name for name in headline.NAMES if headline.simulated(sources, name)]
-    if len(made) == len(headline.NAMES):
+    names = list(sources.verdicts)
+    made = [name for name in names if headline.simulated(sources, name)]
+    if len(made) == len(names):
         return "Simulated machines; no recording was read."
     table = sources.tables["record"]
     read = [] if isinstance(table, Missing) or not sources.recorded else list(np.unique(table["recording"]))
@@ -109,9 +97,7 @@ def data(sources: Sources) -> str:
     more = f" and {len(read) - 2} more" if len(read) > 2 else ""
     told = {"temperature": f"temperature {count(len(read), 'recording')} ({listed}{more})" if read else ""}
     theirs = [
-        told.get(name) or f"{name} recordings of datasets/raw/{name}"
-        for name in headline.NAMES
-        if name not in made
+        told.get(name) or f"{name} recordings of datasets/raw/{name}" for name in names if name not in made
     ]
     simulated = [f"{' and '.join(made)} simulated"] if made else []
     text = "; ".join([*theirs, *simulated])
@@ -126,21 +112,21 @@ def drifts(judged: Judgement) -> str:
     return f"Drift: temperature {word[:1].lower()}{word[1:].rstrip('.')}, not measured in the others."
 
 
-def files(sources: Sources, verdict: Verdict) -> list[File] | Missing:
+def files(sources: Sources, verdict: Verdict) -> list[dict[str, Any]] | Missing:
     """What leaves the house, a line a loop."""
     lines = exported.lines(sources, verdict)
     if isinstance(lines, Missing):
         return lines
     return [
-        File(
-            line.loop,
-            line.name,
-            line.file,
-            line.sha256,
-            line.state,
-            line.word,
-            line.certificate,
-            exported.link(sources, line),
-        )
+        {
+            "loop": line.loop,
+            "name": line.name,
+            "path": line.file,
+            "sha256": line.sha256,
+            "state": line.state,
+            "word": line.word,
+            "certificate": line.certificate,
+            "link": exported.link(sources, line),
+        }
         for line in lines
     ]

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.report.shared.digits import count, number
-from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.contestants import in_a_sentence
+from pipeline.verdict.controllers import in_a_sentence
+from pipeline.verdict.digits import count, number
+from pipeline.verdict.verdict import Missing
 
 
 def sentences(results: Mapping[str, Any] | Missing) -> list[str]:

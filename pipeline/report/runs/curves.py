@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.report.shared.sources import Table
-from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.contestants import heading
+from pipeline.verdict.controllers import heading
+from pipeline.verdict.evidence import Table
+from pipeline.verdict.verdict import Missing
 
 # of one curve at most
 SAMPLES = 40

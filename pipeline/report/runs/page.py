@@ -1,21 +1,21 @@
 """Two runs side by side: figures of the three loops with their bands, parameters that differ, curves."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from markupsafe import Markup
 
 from pipeline.report.about.changes import ANOTHER, changes
 from pipeline.report.runs.curves import READERS, Curve, curves, restored
-from pipeline.report.runs.figures import LOOPS, Measured, asked, measured
+from pipeline.report.runs.figures import LOOPS, RunFigures, asked, measured
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.difference import accepted_on, changed_parameters, move
-from pipeline.report.shared.digits import MINUS, THIN, band, count, declared, quantity, short, with_unit
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import FAILED, Figure, Missing, Question, ReportRules, row_places, state
-from pipeline.report.temperature.contestants import heading
 from pipeline.report.temperature.judgement import Judgement
+from pipeline.verdict.controllers import heading
+from pipeline.verdict.digits import MINUS, THIN, band, count, declared, quantity, short, with_unit
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import FAILED, Figure, Question, row_places, state
 
 # the stages that give the figures
 MEASURED_BY = ("evaluate_temperature", "compose_parts", "train_ilc", "evaluate_setpoint", "train_classifier")
@@ -32,35 +32,14 @@ class Run(NamedTuple):
     curves: Mapping[str, Curve] = {}
 
 
-class Cell(NamedTuple):
-    """A figure of one run: value, band, whether it is beyond its limit."""
-
-    text: str
-    band: str = ""
-    bad: bool = False
-
-
-class Row(NamedTuple):
-    """A figure of both runs."""
-
-    title: str
-    limit: str
-    cells: tuple[Cell, Cell]
-    change: str
-    moved: bool = False
-
-
-class Panel(NamedTuple):
-    """A curve of both runs."""
-
-    title: str
-    svg: Markup
-
-
 def render(sources: Sources, judged: Judgement, metrics: Mapping[str, Any]) -> str:
     """The text of runs.html: this run beside the accepted one. `metrics` are those of the report itself."""
-    now = {stage: found for stage, found in sources.metrics.items() if not isinstance(found, Missing)}
-    this = Run("This run", {**now, "report": metrics}, sources.declared.everything, curves(sources.tables))
+    this = Run(
+        "This run",
+        {**sources.measured, "report": metrics},
+        sources.declared.everything,
+        curves(sources.tables),
+    )
     told = changes(sources, judged)
     day = accepted_on(sources)
     return page.render(
@@ -97,7 +76,7 @@ def render_two(a: Run, b: Run, rules: ReportRules) -> str:
     """The page of any two runs."""
     parts = _parts(a, b, rules)
     rows = [row for _, rows in parts["loops"] for row in rows]
-    moved = sum(row.moved for row in rows)
+    moved = sum(row["moved"] for row in rows)
     figures = count(moved, "figure")
     return page.render(
         "runs.html",
@@ -116,16 +95,16 @@ def render_two(a: Run, b: Run, rules: ReportRules) -> str:
 def _parts(a: Run | None, b: Run, rules: ReportRules) -> dict[str, Any]:
     """What the template shows of two runs."""
     questions = asked(rules, b.metrics)
-    before, now = measured(a.metrics) if a else Measured({}, {}, {}), measured(b.metrics)
+    before, now = measured(a.metrics) if a else RunFigures({}, {}, {}), measured(b.metrics)
     another = a is not None and _signals(a) != _signals(b)
     loops = []
-    for loop in LOOPS:
+    for loop in loops_of(b):
         rows = [
             _row(one, before.figures.get(loop, {}).get(one.key), now.figures.get(loop, {}).get(one.key))
             for one in questions[loop]
         ]
         if another and loop == "temperature":
-            rows = [row._replace(change="another machine", moved=False) for row in rows]
+            rows = [row | {"change": "another machine", "moved": False} for row in rows]
         loops.append((_head(loop, before, now), rows))
     differing = list(changed_parameters(a.parameters, b.parameters)) if a else []
     return {
@@ -135,9 +114,20 @@ def _parts(a: Run | None, b: Run, rules: ReportRules) -> dict[str, Any]:
         "compared": a is not None,
         "parameters": differing[:MOST_PARAMETERS],
         "more": max(len(differing) - MOST_PARAMETERS, 0),
-        "panels": _panels(a.curves if a else {}, b.curves),
+        "panels": _panels(*(curves_of(run.curves if run else {}, loops_of(b)) for run in (a, b))),
         "kept": bool(a and a.curves),
     }
+
+
+def loops_of(run: Run) -> list[str]:
+    """The loops that are on."""
+    switches = run.parameters.get("loops")
+    return [loop for loop in LOOPS if not isinstance(switches, dict) or switches.get(loop) is not False]
+
+
+def curves_of(drawn: Mapping[str, Curve], loops: Sequence[str]) -> dict[str, Curve]:
+    """The curves of these loops: their names begin with the loop."""
+    return {name: curve for name, curve in drawn.items() if name.partition(":")[0].lower() in loops}
 
 
 def _signals(run: Run) -> list[set]:
@@ -152,7 +142,7 @@ def _signals(run: Run) -> list[set]:
 # ---- figures
 
 
-def _head(loop: str, before: Measured, now: Measured) -> dict[str, Any]:
+def _head(loop: str, before: RunFigures, now: RunFigures) -> dict[str, Any]:
     """A loop, and by run whose figures they are with the verdict."""
     return {
         "loop": loop,
@@ -161,26 +151,26 @@ def _head(loop: str, before: Measured, now: Measured) -> dict[str, Any]:
     }
 
 
-def _row(question: Question, before: Figure | None, now: Figure | None) -> Row:
+def _row(question: Question, before: Figure | None, now: Figure | None) -> dict[str, Any]:
     bound = "at least" if question.at_least else "at most"
     limit = with_unit(question.limit, question.unit, declared(question.limit))
     text, moved = _change(question, before, now)
-    return Row(
-        question.title,
-        f"{bound} {limit}" if np.isfinite(question.limit) else "none",
-        (_cell(question, before), _cell(question, now)),
-        text,
-        moved,
-    )
+    return {
+        "title": question.title,
+        "limit": f"{bound} {limit}" if np.isfinite(question.limit) else "none",
+        "cells": (_cell(question, before), _cell(question, now)),
+        "change": text,
+        "moved": moved,
+    }
 
 
-def _cell(question: Question, figure: Figure | None) -> Cell:
+def _cell(question: Question, figure: Figure | None) -> dict[str, Any]:
     if figure is None:
-        return Cell("not measured")
+        return {"text": "not measured", "band": "", "bad": False}
     places = row_places(question, [figure])
     text = quantity(figure.value, question.unit, places, beyond=question.beyond)
     ends = band(figure.low, figure.high, places, beyond=question.beyond)
-    return Cell(text, ends or "no band", bad=state(question, figure) == FAILED)
+    return {"text": text, "band": ends or "no band", "bad": state(question, figure) == FAILED}
 
 
 def _change(question: Question, before: Figure | None, now: Figure | None) -> tuple[str, bool]:
@@ -201,11 +191,11 @@ def _change(question: Question, before: Figure | None, now: Figure | None) -> tu
 # ---- curves
 
 
-def _panels(before: Mapping[str, Curve], now: Mapping[str, Curve]) -> list[Panel]:
+def _panels(before: Mapping[str, Curve], now: Mapping[str, Curve]) -> list[dict[str, Any]]:
     return [_panel(name, before.get(name), now.get(name)) for name in dict.fromkeys([*now, *before])]
 
 
-def _panel(name: str, before: Curve | None, now: Curve | None) -> Panel:
+def _panel(name: str, before: Curve | None, now: Curve | None) -> dict[str, Any]:
     """This run's curve is solid, the accepted run's grey and dashed."""
     drawn = [(curve, css) for curve, css in ((before, "line thin dash"), (now, "line")) if curve]
     x, y = (np.concatenate([curve[end] for curve, _ in drawn]) for end in (2, 3))
@@ -220,7 +210,7 @@ def _panel(name: str, before: Curve | None, now: Curve | None) -> Panel:
         title=f"{up}{', log' if frame.y.log else ''}",
         across=across,
     )
-    return Panel(name, svg)
+    return {"title": name, "svg": svg}
 
 
 def _scale(values: np.ndarray) -> charts.Axis:

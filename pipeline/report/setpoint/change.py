@@ -1,10 +1,11 @@
 """How the settled runs of the setpoint loop's default moved since the accepted run."""
 
-from pipeline.report.setpoint.verdict import Case, Cell, board, within
 from pipeline.report.shared.difference import Change
-from pipeline.report.shared.digits import MINUS, THIN, number
-from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import FAILED, Missing, Question, state
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.digits import MINUS, THIN, number
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.setpoint import Case, Cell, board, within
+from pipeline.verdict.verdict import FAILED, Missing, Question, state
 
 # points closer than this are one: the accepted figures are kept rounded
 SAME = 0.05
@@ -43,7 +44,7 @@ def change(sources: Sources, case: Case, cell: Cell | None) -> Change:
 
 def changes(sources: Sources) -> list[tuple[str, Change]]:
     """Every case of the default that counts, with how its settled runs moved."""
-    scores = board(sources)
+    scores = board(sources.evidence, sources.subject("setpoint"))
     if isinstance(scores, Missing) or not scores.default:
         return []
     counting = scores.counting(scores.default)

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.shared.digits import number
-from pipeline.report.shared.verdict import FAILED, Figure, Missing, Question, share, state
+from pipeline.verdict.digits import number
+from pipeline.verdict.verdict import FAILED, Figure, Missing, Question, share, state
 
 
 def _n(value: float) -> str:

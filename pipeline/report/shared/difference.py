@@ -5,9 +5,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import MINUS, THIN, beyond_meaning, count, decimals, number, short
 from pipeline.report.shared.sources import NIGHTLY, Sources, digest
-from pipeline.report.shared.verdict import Figure, Missing, Question
+from pipeline.verdict.digits import MINUS, THIN, beyond_meaning, count, decimals, number, short
+from pipeline.verdict.verdict import Figure, Missing, Question
 
 
 class Move(NamedTuple):

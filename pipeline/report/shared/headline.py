@@ -4,11 +4,8 @@ decision, the rule that decided it and what to do."""
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from pipeline.report.deposition import verdict as deposition_verdict
-from pipeline.report.setpoint import verdict as setpoint_verdict
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import Verdict
-from pipeline.report.temperature.judgement import Judgement
+from pipeline.verdict import loops as verdict_loops
 
 NAMES = ("temperature", "deposition", "setpoint")
 MOVES = ("heaters to barrel", "plunger to flow", "camera to setpoints")
@@ -29,38 +26,25 @@ class Loop(NamedTuple):
     recorded: bool = False
 
 
-def verdicts(sources: Sources, judged: Judgement) -> dict[str, Verdict]:
-    """The verdict of each loop, which the pages show and the nightly job obeys."""
-    each = (judged.verdict, deposition_verdict.verdict(sources), setpoint_verdict.verdict(sources))
-    return {
-        verdict.loop: verdict._replace(
-            subject=verdict.subject or verdict.winner or "", rehearsal=simulated(sources, verdict.loop)
+def loops(sources: Sources) -> list[Loop]:
+    """The loops that are on: the verdict of each as the head of page one counts it."""
+    verdicts = sources.verdicts
+    return [
+        Loop(
+            name,
+            moves,
+            verdict.word if name == "temperature" or verdict.subject else ABSENT,
+            verdict.decision,
+            verdict.lead,
+            verdict.reason,
+            verdict.remedy,
+            not verdict.rehearsal,
         )
-        for verdict in each
-    }
+        for name, moves in zip(NAMES, MOVES, strict=True)
+        if (verdict := verdicts.get(name))
+    ]
 
 
-def loops(sources: Sources, judged: Judgement) -> list[Loop]:
-    """Temperature, deposition, setpoint: the verdict of each as the head of page one counts it."""
-    shown = []
-    for (name, verdict), moves in zip(verdicts(sources, judged).items(), MOVES, strict=True):
-        measured = name == "temperature" or verdict.winner
-        shown.append(
-            Loop(
-                name,
-                moves,
-                verdict.word if measured else ABSENT,
-                verdict.decision,
-                verdict.lead,
-                verdict.reason,
-                verdict.remedy,
-                sources.recorded if name == "temperature" else not simulated(sources, name),
-            )
-        )
-    return shown
-
-
-SOURCES = {"temperature": "generate_probing", "deposition": "train_ilc", "setpoint": "train_classifier"}
 RECORDED = {
     "temperature": "judged on models of the recorded machine",
     "deposition": "forecast by the model of the recorded machine",
@@ -69,7 +53,8 @@ RECORDED = {
 
 
 def simulated(sources: Sources, name: str) -> bool:
-    return sources.declared.everything.get(SOURCES[name], {}).get("source") != "recordings"
+    """Whether a loop was judged on simulated machines."""
+    return verdict_loops.simulated(sources.evidence, name)
 
 
 def claim(sources: Sources, names: Sequence[str] = NAMES) -> str:

@@ -11,13 +11,14 @@ from collections.abc import Sequence
 import jinja2
 from markupsafe import Markup, escape
 
-from pipeline.report.shared import digits
-from pipeline.report.shared.pictures import Column
-from pipeline.report.shared.sources import QUICK_LOOK, Source, Sources
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
+from pipeline.report.shared.pictures import PictureColumn
+from pipeline.report.shared.sources import SourceFile, Sources
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
 from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
+from pipeline.verdict import digits
+from pipeline.verdict.settings import QUICK_LOOK
+from pipeline.verdict.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 
 GLYPHS = {
     PASSED: "tick",
@@ -83,12 +84,25 @@ def environment() -> jinja2.Environment:
     return templates
 
 
+# the loop that a page is about
+LOOP_OF = {
+    "temperature": "temperature",
+    "identification": "temperature",
+    "certificate": "temperature",
+    "deposition": "deposition",
+    "setpoint": "setpoint",
+}
+
+
 def render(template: str, *, sources: Sources | None = None, **values) -> str:
     """A whole page; at its foot the table of the files that the pages of this run are made from."""
     # the nightly job writes its page after the others
     nightly = values["here"] == "nightly" or artifacts.exists("reports/nightly.html")
     quick = artifacts.read_json(QUICK_LOOK) if artifacts.exists(QUICK_LOOK) else None
-    frame = {"beside": [("nightly", "Nightly")] if nightly else [], "quick": quick, "sources": sources}
+    # the pages of a loop that is switched off say so, and no page leads to them
+    off = [] if sources is None else [key for key, loop in LOOP_OF.items() if loop not in sources.verdicts]
+    beside = [("nightly", "Nightly")] if nightly else []
+    frame = {"beside": beside, "quick": quick, "sources": sources, "off": off}
     return printable_page(environment().get_template(template).render(**frame, **values))
 
 
@@ -100,7 +114,7 @@ def glyph(state: str) -> Markup:
     )
 
 
-def widest(columns: Sequence[Column]) -> int:
+def widest(columns: Sequence[PictureColumn]) -> int:
     """Width in px for which the widest chart of these columns was drawn."""
     panels = "".join(str(panel) for column in columns for panel in column.panels)
     return max(map(int, re.findall(r'style="--w:(\d+)px"', panels)), default=208)
@@ -152,7 +166,7 @@ def in_viewer(table: str, **place: str | Sequence[str]) -> Markup:
     return Markup('<a class="in-viewer" href="viewer.html#{}">Open in the viewer</a>').format(state)
 
 
-def origin(sources: list[Source], **place: str | Sequence[str]) -> Markup:
+def origin(sources: list[SourceFile], **place: str | Sequence[str]) -> Markup:
     """Where the figures beside it are from: artifact and hash; the whole hash stands at the foot of the page.
     A time series is linked to its place in the viewer, which `place` tells."""
     if not sources:
@@ -163,18 +177,18 @@ def origin(sources: list[Source], **place: str | Sequence[str]) -> Markup:
     return files(sources)
 
 
-def files(sources: Sequence[Source]) -> Markup:
+def files(sources: Sequence[SourceFile]) -> Markup:
     """The artifacts by name: a click gives the file, the title its digest."""
     return Markup('<p class="src">From {}.</p>').format(linked(sources)) if sources else Markup("")
 
 
-def linked(sources: Sequence[Source], *, short: bool = False) -> Markup:
-    """The links to these files, with commas between them; `short`: without their folder."""
+def linked(sources: Sequence[SourceFile]) -> Markup:
+    """The links to these files, with commas between them."""
     return Markup(", ").join(
         placed(
             source.link,
             source.path,
-            verbatim(source.path.rsplit("/", 1)[1] if short else source.path.split("/", 1)[1]),
+            verbatim(source.path.split("/", 1)[1]),
             f"{source.path}, SHA-256 {source.sha256[:8]}",
         )
         for source in sources

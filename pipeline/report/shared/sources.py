@@ -9,19 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from pipeline.deposition.workflow.tables import (
-    FILMED,
-    LESSONS,
-    LIBRARY,
-    LINES,
-    SCORES,
-    SIGNALS,
-    TASKS,
-    TRIALS,
-)
-from pipeline.report.shared.verdict import Missing, ReportRules
+from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
 from pipeline.setpoint.tables import (
     AGENT_CURVE,
     CLASSIFIED,
@@ -35,8 +23,11 @@ from pipeline.setpoint.tables import (
 from pipeline.store import artifacts
 from pipeline.temperature import tables as schemas
 from pipeline.temperature.settings import Plant
-
-Table = dict[str, np.ndarray]
+from pipeline.verdict import night
+from pipeline.verdict.evidence import OFF, Evidence, Table, switched_off
+from pipeline.verdict.settings import QUICK_LOOK, ReportRules
+from pipeline.verdict.verdict import LOOPS, Missing, Verdict
+from pipeline.verdict.verdict import read as read_verdicts
 
 
 class Declared(NamedTuple):
@@ -48,7 +39,7 @@ class Declared(NamedTuple):
     everything: dict[str, Any]
 
 
-class Source(NamedTuple):
+class SourceFile(NamedTuple):
     """One file that the pages show: what it is called here (a table's name, or the stage of metrics), the
     stage that wrote it, name and version of its schema, the digest of its bytes, and where it is found from
     the pages.
@@ -65,18 +56,43 @@ class Source(NamedTuple):
 class Sources(NamedTuple):
     """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what
     was; `absent`: what was not, by path; `accepted`: the accepted run, or None; `nightly`: what the last
-    night measured, None before the first; `quick`: the run is a quick look.
+    night measured, None before the first; `quick`: the run is a quick look; `stored`: its verdicts.
     """
 
     declared: Declared
     metrics: Mapping[str, dict | Missing]
     tables: Mapping[str, Table | Missing]
-    read: Mapping[str, Source]
+    read: Mapping[str, SourceFile]
     absent: Mapping[str, Missing]
     accepted: dict | Missing | None
     code: str
     nightly: dict | Missing | None = None
     quick: bool = False
+    stored: Mapping[str, Verdict] = {}
+
+    @property
+    def evidence(self) -> Evidence:
+        """What the figures of a verdict are found in."""
+        declared = self.declared
+        return Evidence(
+            self.metrics, self.tables, declared.machine, declared.rules, declared.everything, self.quick
+        )
+
+    @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """The verdict of each loop that is on, as the stage `verdict` stored it, with what the last night
+        measured."""
+        loops = {loop: verdict for loop, verdict in self.stored.items() if loop in LOOPS}
+        return loops if self.nightly is None else night.verdicts(self.evidence, loops, self.nightly)
+
+    @property
+    def model(self) -> Verdict:
+        """The verdict on the identified model."""
+        return self.stored["identification"]
+
+    def subject(self, loop: str) -> str:
+        """The controller that a loop's verdict is about; "" without a verdict."""
+        return self.stored[loop].subject if loop in self.stored else ""
 
     @property
     def recorded(self) -> bool:
@@ -97,11 +113,16 @@ class Sources(NamedTuple):
             for kind, signals in (("inputs", machine.inputs), ("outputs", machine.outputs))
         )
 
+    @property
+    def measured(self) -> dict[str, dict]:
+        """The figures of the stages that could be read."""
+        return {stage: found for stage, found in self.metrics.items() if not isinstance(found, Missing)}
+
     def zone(self, place: int) -> str:
         """A zone by its number; of a user's machine by the name of its output."""
         return self.declared.machine.outputs[place].name if self.recorded else f"zone {place + 1}"
 
-    def source(self, *names: str) -> list[Source]:
+    def source(self, *names: str) -> list[SourceFile]:
         """Those of the files that could be read."""
         return [source for name in names for source in self.read.values() if source.name == name]
 
@@ -109,8 +130,6 @@ class Sources(NamedTuple):
 # what the nightly job writes after the pages: no dependency of theirs (DVC would ask for it before the first
 # night), they show the night before
 NIGHTLY = "reports/metrics/nightly.json"
-# what `beadline quick` writes before the pages: what is smaller than in a full run, which every page says
-QUICK_LOOK = "reports/quick_look.json"
 
 
 def collect(
@@ -120,17 +139,23 @@ def collect(
     accepted: str,
     code: tuple[str, ...],
 ) -> Sources:
-    """Reads the metrics files and the folders of stages, {stage: path} each. What is missing or broken is no
-    error here: its place on the page says so."""
-    read: dict[str, Source] = {}
+    """Reads the files of figures and the folders of stages, {stage: path} each. What is missing or broken is
+    no error here: its place on the page says so."""
+    read: dict[str, SourceFile] = {}
     absent: dict[str, Missing] = {}
     figures: dict[str, Any] = {}
     tables: dict[str, Any] = {}
     for stage, path in metrics.items():
-        figures[stage] = _read(read, path, stage, stage, "metrics", artifacts.read_json)
-        if isinstance(figures[stage], Missing):
+        figures[stage] = _read(read, path, stage, stage, "figures", artifacts.read_json)
+        if switched_off(figures[stage]):
+            figures[stage] = OFF
+            del read[path]
+        elif isinstance(figures[stage], Missing):
             absent[path] = figures[stage]
     for name, stage, file, kind, reader in _tables(declared.machine):
+        if figures.get(stage) is OFF:
+            tables[name] = OFF
+            continue
         path = f"{folders[stage]}/{file}"
         tables[name] = _read(read, path, name, stage, kind, reader)
         if name == "printer_pid" and not tables[name]:
@@ -142,7 +167,7 @@ def collect(
     for name, stage in (("frames", "train_ilc"), ("nozzle_frames", "train_classifier")):
         for frame in [] if isinstance(tables[name], Missing) else tables[name]:
             path = frame["path"]
-            read[path] = Source("frame", path, stage, "JPEG", artifacts.sha256(path))
+            read[path] = SourceFile("frame", path, stage, "JPEG", artifacts.sha256(path))
     before = (
         _read(read, accepted, "accepted", "accept", "accepted", read_accepted)
         if artifacts.exists(accepted)
@@ -155,9 +180,10 @@ def collect(
     )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
     read = linked(read)
+    stored = read_verdicts("datasets/verdict", (*LOOPS, "identification"))
     return Sources(
         declared, figures, tables, read, absent, before, folders_of_code, night,
-        quick=artifacts.exists(QUICK_LOOK),
+        quick=artifacts.exists(QUICK_LOOK), stored=stored,
     )  # fmt: skip
 
 
@@ -165,7 +191,7 @@ def collect(
 LARGEST_COPY, LARGEST_COPIES = 4_000_000, 10_000_000
 
 
-def linked(read: Mapping[str, Source]) -> dict[str, Source]:
+def linked(read: Mapping[str, SourceFile]) -> dict[str, SourceFile]:
     """The same with the link to each file: where it lies below reports/; else a copy in reports/data, so that
     the folder of the pages is whole by itself, where the file is small; else its place below datasets/."""
     room, taken, found = LARGEST_COPIES, set(), {}
@@ -311,7 +337,7 @@ def _frames(path: str) -> list[dict[str, Any]]:
 
 
 def _read(
-    read: dict[str, Source], path: str, name: str, stage: str, schema: str, reader: Callable[[str], Any]
+    read: dict[str, SourceFile], path: str, name: str, stage: str, schema: str, reader: Callable[[str], Any]
 ) -> Any:
     if not artifacts.exists(path):
         return Missing(
@@ -321,7 +347,7 @@ def _read(
         content = reader(path)
     except ValueError as error:
         return Missing("failed", str(error))
-    read[path] = Source(name, path, stage, schema, artifacts.sha256(path))
+    read[path] = SourceFile(name, path, stage, schema, artifacts.sha256(path))
     return content
 
 
@@ -338,15 +364,3 @@ def read_accepted(path: str) -> dict:
             "accept a run of this version with ./run beadline accept"
         )
     return run
-
-
-def lookup(data: Any, dotted: str, *, what: str = "") -> Any:
-    """data["a"]["b"] of "a.b", or the Missing that stands for it; null is missing too."""
-    value = data
-    for key in dotted.split("."):
-        if isinstance(value, Missing):
-            return value
-        value = value.get(key) if isinstance(value, Mapping) else None
-        if value is None:
-            return Missing("not measured", f"{what or dotted} is not among what the stage measured")
-    return value

@@ -3,10 +3,11 @@
 import numpy as np
 
 from pipeline.report.shared import charts
-from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.temperature.answers import comparison, entry
+from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.pictures import drawn
+from pipeline.verdict.evidence import Table, entry
+from pipeline.verdict.temperature import comparison
 
 
 def runs_of(sources: Sources, judged: Judgement, table: Table) -> tuple[dict[str, np.ndarray], str]:

@@ -2,10 +2,11 @@
 
 from typing import Any
 
-from pipeline.report.identification.model import flagged_sentence
-from pipeline.report.shared.digits import THIN, short
-from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import Missing
+from pipeline.report.shared.sources import Sources
+from pipeline.verdict.digits import THIN, short
+from pipeline.verdict.evidence import lookup
+from pipeline.verdict.identification import flagged_sentence
+from pipeline.verdict.verdict import Missing
 
 
 def findings(sources: Sources) -> list[tuple[str, str]]:

@@ -5,36 +5,25 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from pipeline.report.identification.model import UNTRUSTED, trust
 from pipeline.report.shared.difference import Difference, Move, difference, moves
-from pipeline.report.shared.digits import count
-from pipeline.report.shared.sources import Declared, Sources, Table
-from pipeline.report.shared.verdict import (
-    OPEN,
-    PASSED,
-    Answers,
-    Figure,
-    Missing,
-    Question,
-    ReportRules,
-    Verdict,
-)
-from pipeline.report.temperature.answers import Metrics, comparison, entry, of_contestant
-from pipeline.report.temperature.contestants import YARDSTICKS, heading, kind
-from pipeline.report.temperature.drifted import Drift, drift
-from pipeline.report.temperature.pairs import PairSentence, deciding_sentence, pair_names, pair_sentence
-from pipeline.report.temperature.verdict import (
-    GROUPS,
+from pipeline.report.shared.sources import Sources
+from pipeline.report.temperature.beside import best_sentence, deciding_sentence
+from pipeline.verdict.controllers import heading, kind
+from pipeline.verdict.decide import (
+    LOOP,
     Standing,
-    best_sentence,
     choose,
-    closest,
-    decide,
+    groups,
     questions,
     rival,
     standings,
+    undeclared_outputs,
 )
-from pipeline.temperature.settings import Plant
+from pipeline.verdict.digits import count
+from pipeline.verdict.night import Drift, drift, in_production
+from pipeline.verdict.pairs import PairSentence, pair_names, pair_sentence
+from pipeline.verdict.temperature import comparison, of_controller
+from pipeline.verdict.verdict import OPEN, Answers, Figure, Question, Verdict
 
 
 class Judgement(NamedTuple):
@@ -59,51 +48,22 @@ class Judgement(NamedTuple):
     drifted: Drift
 
 
-def winner(
-    metrics: Metrics,
-    rules: ReportRules,
-    machine: Plant,
-    *,
-    recorded: bool,
-    model: Mapping[str, Table | Missing],
-) -> Verdict:
-    """The verdict that the run gives by itself: without a night's drift, and without who runs today; `model`
-    are the tables by which page one trusts a recorded machine's model, "residuals" and "dynamics"."""
-    verdict = decide(metrics, rules, recorded=recorded, undeclared=undeclared_outputs(machine))
-    if not recorded:
-        return verdict
-    return trust_first(
-        verdict, trust(Sources(Declared(rules, machine, {}), metrics, model, {}, {}, None, ""))
-    )
-
-
-def judgement(sources: Sources, *, named: str = "") -> Judgement:
-    """What the pages say; where somebody has `named` the contestant that runs, the verdict is about it."""
-    metrics, rules = sources.metrics, sources.declared.rules
-    drifted = drift(sources)
-    undeclared = undeclared_outputs(sources.declared.machine)
-    asked = questions(rules, comparison(metrics))
-    held = standings(metrics, rules, undeclared=undeclared, drift=drifted.answer)
-    incumbent = in_production(sources)
-    best = choose(metrics, held, incumbent)
-    competing = [name for name in held if name not in YARDSTICKS]
-    subject = best or (closest(held) if competing else pair_names(metrics)[0])
-    beside = rival(metrics, subject)
-    answers = {name: of_contestant(metrics, name, undeclared) for name in (*held, subject, beside)}
+def judgement(sources: Sources) -> Judgement:
+    """What the pages say of the verdict, and the figures that stand behind it."""
+    evidence, drifted = sources.evidence, drift(sources.nightly)
+    figures = evidence.figures
+    # of a loop that is switched off the pages still know the names
+    off = Verdict(LOOP, OPEN, "", "", "", "", "", None, subject=pair_names(figures)[0])
+    verdict = sources.verdicts.get(LOOP, off)
+    asked = questions(evidence.rules, comparison(figures))
+    held = standings(evidence, drifted.answer)
+    subject, beside = verdict.subject, rival(figures, verdict.subject)
+    undeclared = undeclared_outputs(evidence)
+    answers = {name: of_controller(figures, name, undeclared) for name in (*held, subject, beside)}
     changed = None if sources.another_machine else difference(sources)
-    moved = moves(sources, asked, answers) if changed else {}
-    verdict = decide(
-        metrics,
-        rules,
-        recorded=sources.recorded,
-        undeclared=undeclared,
-        drift=drifted.answer,
-        incumbent=incumbent,
-        named=named,
-        quick=sources.quick,
+    best = (
+        verdict.winner if verdict.rule != "trust" else choose(figures, held, in_production(sources.nightly))
     )
-    if sources.recorded:
-        verdict = trust_first(verdict, trust(sources))
     return Judgement(
         asked,
         held,
@@ -111,50 +71,24 @@ def judgement(sources: Sources, *, named: str = "") -> Judgement:
         beside,
         answers,
         verdict,
-        pair_sentence(metrics),
-        deciding_sentence(metrics, best),
-        best_sentence(metrics, held, best),
+        pair_sentence(figures),
+        deciding_sentence(figures, best),
+        best_sentence(figures, held, best),
         changed,
-        moved,
+        moves(sources, asked, answers) if changed else {},
         drifted,
     )
-
-
-def undeclared_outputs(machine: Plant) -> list[str]:
-    """Outputs whose lowest or highest allowed temperature nobody declared."""
-    return [output.name for output in machine.outputs if output.low is None or output.high is None]
-
-
-def in_production(sources: Sources) -> str:
-    """The contestant that runs, as the nightly job wrote it; "" if no night has promoted one."""
-    runs = entry(sources.nightly, "champion", "temperature", "contestant")
-    return runs if isinstance(runs, str) else ""
 
 
 def named_before(sources: Sources) -> str:
     """The contestant in production, else the one that the accepted run of this machine named; "" if there is
     neither. A page shows the accepted one beside the others; it decides nothing, because `export_controllers`
     does not read it and the two would name different controllers."""
-    if runs := in_production(sources):
+    if runs := in_production(sources.nightly):
         return runs
     if not isinstance(sources.accepted, dict) or sources.another_machine:
         return ""
     return str(sources.accepted.get("winner") or "")
-
-
-def trust_first(verdict: Verdict, model: Verdict) -> Verdict:
-    """The verdict on contestants that were judged on an identified model. Where that model is good for no
-    use, this comes before every rule that its figures pass or fail, and nothing is ready."""
-    if not model.decision.startswith(UNTRUSTED):
-        return verdict
-    first = verdict._replace(lead=model.decision, reason=f"{model.lead} {model.reason}", rule="trust")
-    if verdict.state == PASSED:
-        return first._replace(state=OPEN, decision="Not ready.", remedy=_remedy(model, ""), winner=None)
-    return first._replace(remedy=_remedy(model, f"On that model: {verdict.lead} {verdict.reason}"))
-
-
-def _remedy(model: Verdict, then: str) -> str:
-    return f"{model.remedy} {then}".strip()
 
 
 class RuleLine(NamedTuple):
@@ -198,7 +132,7 @@ def verdict_parts(judged: Judgement, *, claim: str = "") -> VerdictParts:
     rules = [
         RuleLine(
             line[0].name[:1].upper() + line[0].name[1:],
-            GROUPS[line[0].name][1],
+            groups()[line[0].name][1],
             tuple(rule.state for rule in line),
             first=line[0].name == verdict.rule,
         )

@@ -1,15 +1,14 @@
 """The page of the temperature loop: verdict, the pair, the scorecard, three pictures, findings, the record,
 words."""
 
-from pipeline.report.identification.model import trust
 from pipeline.report.shared import headline, page, words
 from pipeline.report.shared.difference import accepted_on
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import findings, pictures, recording, scorecard, twelve
-from pipeline.report.temperature.answers import comparison, refused
-from pipeline.report.temperature.answers import judged as names_judged
-from pipeline.report.temperature.contestants import BY_NAME
 from pipeline.report.temperature.judgement import Judgement, heads, verdict_parts
+from pipeline.verdict.controllers import BY_NAME
+from pipeline.verdict.temperature import comparison, refused
+from pipeline.verdict.temperature import names as names_judged
 
 WORDS = (
     "verdict",
@@ -63,7 +62,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         flaws=recording.flaws(sources),
         panel=scorecard.declared_panel(sources),
         weights=scorecard.weights(sources),
-        trusted=trust(sources),
+        trusted=sources.model,
         words=words.chosen(sources, (*dict.fromkeys(contestants), *WORDS)),
         from_scorecard=sources.source("evaluate_temperature", "cases"),
         from_quality=sources.source("quality"),

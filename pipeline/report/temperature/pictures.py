@@ -8,14 +8,15 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, count, number, short
-from pipeline.report.shared.pictures import Column, Picture, placeholder
-from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.answers import comparison, entry, judged, refused
-from pipeline.report.temperature.contestants import YARDSTICKS, heading, in_a_sentence, kind
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.report.temperature.pairs import pair_names, reference_of
+from pipeline.verdict.controllers import YARDSTICKS, heading, in_a_sentence, kind
+from pipeline.verdict.digits import THIN, count, number, short
+from pipeline.verdict.evidence import Table, entry
+from pipeline.verdict.pairs import pair_names, reference_of
+from pipeline.verdict.temperature import comparison, names, refused
+from pipeline.verdict.verdict import Missing
 
 CASES = {"typical": "A typical case", "deciding": "The case that decides"}
 # a cost or temperature beyond it is of a loop that is lost; it is drawn at the edge
@@ -25,7 +26,7 @@ LARGEST = 1e4
 def drawn(sources: Sources, judgement: Judgement) -> list[str]:
     """Who is drawn: the pair, the best, and PI, in the order of simplicity."""
     wanted = {*pair_names(sources.metrics), judgement.subject, "pi"}
-    return [name for name in (*judged(sources.metrics), *refused(sources.metrics)) if name in wanted]
+    return [name for name in (*names(sources.metrics), *refused(sources.metrics)) if name in wanted]
 
 
 def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
@@ -68,7 +69,7 @@ def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
             if who in runs
             else [_hole(without.get(who, "no trajectory was recorded"))]
         )
-        shown.append(Column(heading(who), kind(who), who, panels))
+        shown.append(PictureColumn(heading(who), kind(who), who, panels))
     return Picture(
         name,
         title,
@@ -203,16 +204,16 @@ def plants(sources: Sources) -> Picture:
             f"{count(len(both), 'plant')}."
         )
         shown.append(
-            Column("The pair", "mean cost on each plant, a line a plant", "", [_slopes(both, a, b, finding)])
+            PictureColumn(
+                "The pair", "mean cost on each plant, a line a plant", "", [_slopes(both, a, b, finding)]
+            )
         )
-    names = [
-        name
-        for name in judged(sources.metrics)
-        if name in set(cases["contestant"]) and name not in YARDSTICKS
+    drawn_names = [
+        name for name in names(sources.metrics) if name in set(cases["contestant"]) and name not in YARDSTICKS
     ]
-    if not names:
+    if not drawn_names:
         return placeholder("plants", title, Missing("not measured", "no case has a cost"))
-    shown.append(Column("All contestants", "cost of every case", "", [_boxes(cases, names)]))
+    shown.append(PictureColumn("All contestants", "cost of every case", "", [_boxes(cases, drawn_names)]))
     return Picture(
         "plants",
         title,

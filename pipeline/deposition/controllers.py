@@ -1,0 +1,70 @@
+"""The table of controllers of the deposition loop: laws that learn a command trial by trial, and composers
+that make the command of a part. Each has one row with its name, its heading on pages and its kind.
+
+A name stands in artifacts: column `law` of trials.parquet and lessons.parquet, column `composer` of
+scores.parquet, and `<name>_mm3_per_s` of signals.parquet. It never changes. Nothing guesses a kind from a
+name.
+
+Kinds: a data-driven command was learned trial by trial, on training routines or as a library of their
+signals; a model-based one inverts the identified chain of the extruder; on-off control is the baseline. A
+command that was learned on the very part is the reference: no other composer knows the part beforehand."""
+
+import importlib
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+
+class DepositionController(NamedTuple):
+    """One controller of this loop."""
+
+    name: str
+    heading: str
+    kind: Literal["model-based", "data-driven", "baseline", "reference"]
+    explanation: str
+    flow: str = ""  # meaning of its column in signals.parquet; a law has none
+    # "file.function" of pipeline/deposition/parts: library, share of a part, drive -> command (T,) in mm,
+    # without learning on the part; on-off control and full-part ILC are made by `evaluation`
+    command: str = ""
+
+
+# in the order of every page
+LAWS = (
+    DepositionController("hoelzle_2009", "The paper’s law", "data-driven", "nominal model, Q both ways"),
+    DepositionController(
+        "hoelzle_2009_nominal", "The paper’s law, nominal", "data-driven", "on its own nominal model"
+    ),
+    DepositionController("model_inverse", "Model inversion", "data-driven", "identified model, inverted"),
+    DepositionController(
+        "pixels", "Model inversion through pictures", "data-driven", "flow measured from camera frames"
+    ),
+)
+# the simplest first
+COMPOSERS = (
+    DepositionController(
+        "on_off", "On\u2011off", "baseline", "wanted flow over gain",
+        "true flow of on-off control; predicted on a real machine",
+    ),
+    DepositionController(
+        "priority", "Library, priority", "data-driven", "the paper’s rule",
+        "the same of the library by the priority rule", "composition.by_priority",
+    ),
+    DepositionController(
+        "superposition", "Library, superposition", "data-driven", "overlaps are added",
+        "the same of the library by superposition", "composition.by_superposition",
+    ),
+    DepositionController(
+        "basis", "Basis functions", "model-based", "identified chain, inverted",
+        "the same of the basis functions", "composition.by_basis_functions",
+    ),
+    DepositionController(
+        "ilc", "Learned whole", "reference", "trials of this very part",
+        "the same after full-part ILC; missing on a real machine",
+    ),
+)  # fmt: skip
+CONTROLLERS = {controller.name: controller for controller in (*LAWS, *COMPOSERS)}
+
+
+def command(name: str) -> Callable:
+    """The function that makes the command of a composer."""
+    file, _, function = CONTROLLERS[name].command.partition(".")
+    return getattr(importlib.import_module(f"pipeline.deposition.parts.{file}"), function)

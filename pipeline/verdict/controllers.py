@@ -1,0 +1,32 @@
+"""The controllers of the temperature loop as verdicts and pages name them, from the table of controllers. One
+that the table does not know goes by its own name."""
+
+from pipeline.temperature.controllers.table import BY_NAME, CONTROLLERS
+
+# shown beside the others, never the best of them
+YARDSTICKS = tuple(controller.name for controller in CONTROLLERS if controller.role == "yardstick")
+
+
+def _by_role(role: str) -> str:
+    return next(controller.name for controller in CONTROLLERS if controller.role == role)
+
+
+# the user asked to see model-based beside data-driven; the indirect one stands in where the kernel is refused
+MODEL_BASED, DATA_DRIVEN, INDIRECT = (_by_role(role) for role in ("model_based", "data_driven", "indirect"))
+
+
+def heading(name: str) -> str:
+    return BY_NAME[name].heading if name in BY_NAME else name
+
+
+def kind(name: str) -> str:
+    return BY_NAME[name].method if name in BY_NAME else ""
+
+
+def in_a_sentence(name: str) -> str:
+    """ "the learned kernel", "subspace + LQG", "hold"."""
+    text = BY_NAME[name].word if name == "printer_pid" else heading(name)
+    if text.startswith(("PI", "VARX")):
+        return text
+    article = "the " if name in (DATA_DRIVEN, *YARDSTICKS) else ""
+    return f"{article}{text[:1].lower()}{text[1:]}"

@@ -1,0 +1,676 @@
+"""Scores of the composers, learning, conformance -> whose signal to use, and whether the parts will print."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from pipeline.deposition.controllers import COMPOSERS as TABLE
+from pipeline.verdict.digits import THIN, count, number, percent, short
+from pipeline.verdict.evidence import Evidence, lookup, need
+from pipeline.verdict.rules import Reading, Row, at_path, judge, rows
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import (
+    FAILED,
+    OPEN,
+    PASSED,
+    UNJUDGED,
+    Missing,
+    Rule,
+    Verdict,
+    Words,
+    count_of,
+    deciding,
+    overall,
+    words_for,
+)
+
+LOOP = "deposition"
+# errors closer than this, in points of on-off control's, are one: the simpler composer is taken
+SAME = 0.5
+# the simplest first; what learned the very part is a reference, and no composer of another
+COMPOSERS = tuple(row.name for row in TABLE if row.kind != "reference")
+REFERENCE = next(row.name for row in TABLE if row.kind == "reference")
+BASELINE = next(row.name for row in TABLE if row.kind == "baseline")
+OURS, LIBRARY = (
+    next(row.name for row in TABLE if row.kind == kind) for kind in ("model-based", "data-driven")
+)
+NAMES = {row.name: row.heading for row in TABLE}
+NOT_JUDGED = "not judged"
+# in a sentence
+USE = {
+    "on_off": "on\u2011off control",
+    "priority": "the library by its priority rule",
+    "superposition": "the library by superposition",
+    "basis": "the basis functions",
+}
+# in the place of a forecast that a report of an earlier version does not have
+NO_FORECAST = {"reason": "the conformance report has none", "trial": "run ./run dvc repro compose_parts"}
+
+
+def phrase(name: str) -> str:
+    """ "the basis functions"; a composer without a phrase goes by its heading."""
+    return USE.get(name, NAMES.get(name, name))
+
+
+class Score(NamedTuple):
+    """r.m.s. flow error in % of on-off control's, true where the machine is simulated, else the upper end of
+    its forecast; the middle of the forecast; largest volume error of a line in %; the forecast's 90 %
+    interval, and whether it may be believed."""
+
+    error: float
+    predicted: float | None
+    worst_line: float | None
+    low: float | None = None
+    high: float | None = None
+    judged: bool = True
+
+
+class Structure(NamedTuple):
+    """One material of one part program, its scores by composer, and
+    the composer that was chosen beforehand."""
+
+    part: str
+    material: str
+    scores: Mapping[str, Score]
+    chosen: str
+    asked: ReportRules
+    simulated: bool = True
+    why: str = ""
+    trial: str = ""
+
+    def judged(self) -> bool:
+        """Whether the forecast may be believed; of a part of which nothing was chosen there is none."""
+        return self.chosen not in self.scores or self.scores[self.chosen].judged
+
+    def unknown(self) -> bool:
+        """Whether nothing tells how the chosen composer does: its forecast is not to be believed, and the
+        true flow is not known."""
+        return not self.simulated and not self.judged()
+
+    def error(self, composer: str) -> float | None:
+        """The flow error of a composer; None if it has none."""
+        return self.scores[composer].error if composer in self.scores else None
+
+    def worst_line(self, composer: str) -> float | None:
+        """The volume error of its worst line; None if no line was judged."""
+        return self.scores[composer].worst_line if composer in self.scores else None
+
+    def best(self) -> str:
+        """The composer, on-off control too, with the least error; what
+        learned the part itself is a yardstick."""
+        return min(
+            (name for name in COMPOSERS if name in self.scores),
+            key=lambda name: self.scores[name].error,
+            default="",
+        )
+
+    def state(self) -> str:
+        """Of the composer that was chosen, by flow, volume, and whether its forecast is judged."""
+        score = self.scores.get(self.chosen)
+        if score is None or self.unknown():
+            return OPEN
+        if (
+            score.error > self.asked.flow_error_percent
+            or (score.worst_line or 0.0) > self.asked.line_volume_percent
+        ):
+            return FAILED
+        return PASSED if score.judged else OPEN
+
+
+def structures(evidence: Evidence) -> list[Structure] | Missing:
+    """Every material of every part, in the order of the table."""
+    table = evidence.tables["scores"]
+    if isinstance(table, Missing):
+        return table
+    groups = pd.DataFrame(table).groupby(["part", "material"], sort=False)
+    conformance = evidence.tables["conformance"]
+    told = {} if isinstance(conformance, Missing) else conformance
+    parts = [_structure(rows, evidence.rules, told) for _, rows in groups]
+    return parts or Missing("not measured", "no part was composed", "Copy a part program to datasets/parts")
+
+
+def _structure(rows: pd.DataFrame, rules: ReportRules, conformance: Mapping[str, Any]) -> Structure:
+    """One material of one part from its rows of the scores and its forecast in the conformance report; a
+    composer without an error is left out."""
+    judged = rows.dropna(subset="rms_percent_of_on_off")
+    each: list[Any] = list(judged.itertuples())
+    part, material = rows.part.iloc[0], rows.material.iloc[0]
+    forecast = conformance.get(part, {}).get("forecast", {}).get(material, NO_FORECAST)
+    scores = {
+        row.composer: Score(
+            row.rms_percent_of_on_off,
+            _finite(row.predicted_percent),
+            _finite(row.worst_line_volume_percent),
+            *(forecast.get("composers", {}).get(row.composer, {}).get(end) for end in ("low", "high")),
+            judged=bool(forecast.get("judged")),
+        )
+        for row in each
+    }
+    chosen = judged.composer[judged.chosen.astype(bool)]
+    return Structure(
+        part,
+        material,
+        scores,
+        "" if chosen.empty else chosen.iloc[-1],
+        rules,
+        simulated=REFERENCE in scores,
+        why=forecast.get("reason", ""),
+        trial=forecast.get("trial", ""),
+    )
+
+
+def _finite(figure: float) -> float | None:
+    return None if math.isnan(figure) else figure
+
+
+def worst(parts: Sequence[Structure], composer: str) -> tuple[float, Structure] | None:
+    """The largest error of a composer and where."""
+    return _largest(parts, lambda part: part.error(composer))
+
+
+def winner(parts: Sequence[Structure]) -> str:
+    """The composer with the least worst error; among those as good, the simplest."""
+    errors = {name: pair[0] for name in COMPOSERS if (pair := worst(parts, name))}
+    return next((name for name, error in errors.items() if error <= min(errors.values()) + SAME), "")
+
+
+# ---- the rules: of each a pair, that of the model-based composer and that of the library
+
+
+Pair = tuple[Rule, Rule]
+
+
+class Parts(NamedTuple):
+    """What the rules of one composer are asked of: the parts, those that the drive can follow, and the least
+    error in % of on-off control's that any command leaves of the others, by part and material."""
+
+    evidence: Evidence
+    parts: Sequence[Structure]
+    bound: Mapping[tuple[str, str], float]
+
+    @property
+    def followed(self) -> list[Structure]:
+        return [part for part in self.parts if (part.part, part.material) not in self.bound]
+
+
+def rules(evidence: Evidence, parts: Sequence[Structure]) -> tuple[Pair, ...]:
+    """The rules of a run, of the model-based composer and of the library."""
+    return rules_of(Parts(evidence, parts, _bound(evidence)))
+
+
+def rules_of(case: Parts) -> tuple[Pair, ...]:
+    """The drive first, then what may be believed. If the drive cannot follow, a signal is held against the
+    best that any command could reach within it, else against the flow that is wanted."""
+    asked = {key: row for key, row in rows(LOOP).items() if key != "near" or case.bound}
+    return tuple((_rule(case, key, row, OURS), _rule(case, key, row, LIBRARY)) for key, row in asked.items())
+
+
+def _rule(case: Parts, key: str, row: Row, composer: str) -> Rule:
+    question = row.question(key, row.limit(case.evidence.rules))
+
+    def read() -> Reading:
+        if key in FIGURES:
+            return FIGURES[key](case, composer)
+        path = row.figure.format(controller=composer)
+        return at_path(case.evidence.figures, path, at_least=question.at_least), {}
+
+    rule = judge(row, question, read)
+    if not isinstance(rule.figure, Missing):
+        return rule
+    if rule.figure.state == UNJUDGED:
+        return rule._replace(question=None)
+    return rule._replace(figure=rule.figure._replace(state=OPEN))
+
+
+def _open(text: str = OPEN, reason: str = "", **words: str) -> Reading:
+    """The reading of a figure that is not known."""
+    return Missing(OPEN, ""), {"text": text, "reason": reason, **words}
+
+
+def _largest(
+    parts: Sequence[Structure], value: Callable[[Structure], float | None]
+) -> tuple[float, Structure] | None:
+    """The largest value of the parts that have one, and where."""
+    known = [(figure, part) for part in parts if (figure := value(part)) is not None]
+    return max(known, key=lambda pair: pair[0], default=None)
+
+
+def _worst_of(
+    parts: Sequence[Structure],
+    value: Callable[[Structure], float | None],
+    worded: Callable[[float], str],
+    shown: Callable[[str], str] = str,
+) -> Reading:
+    """The largest value of the parts; open if one of the parts is not known."""
+    if any(part.unknown() for part in parts):
+        return _open(NOT_JUDGED, remedy="")
+    pair = _largest(parts, value)
+    if pair is None:
+        return _open()
+    text = worded(pair[0])
+    return count_of(pair[0]), {"text": shown(text), "value": text, "where": where(pair[1])}
+
+
+def _two_digits(value: float) -> str:
+    return percent(value, 2)
+
+
+def _flow(case: Parts, composer: str) -> Reading:
+    return _worst_of(case.followed, lambda part: part.error(composer), _two_digits)
+
+
+def _line(case: Parts, composer: str) -> Reading:
+    return _worst_of(
+        case.followed, lambda part: part.worst_line(composer), _two_digits, lambda text: f"±{text}"
+    )
+
+
+def _near(case: Parts, composer: str) -> Reading:
+    """If the drive cannot follow: the error over the least that any command within it leaves."""
+
+    def ratio(part: Structure) -> float | None:
+        error = part.error(composer)
+        return None if error is None else error / max(case.bound[part.part, part.material], 1e-9)
+
+    bounded = [part for part in case.parts if (part.part, part.material) in case.bound]
+    figure, words = _worst_of(bounded, ratio, lambda value: f"{number(value, 2)} ×")
+    if isinstance(figure, Missing):
+        return figure, words
+    part = max((part for part in bounded if ratio(part) is not None), key=lambda part: ratio(part) or 0.0)
+    least = percent(case.bound[part.part, part.material], 2)
+    return figure, {**words, "value": percent(part.scores[composer].error, 2), "least": least}
+
+
+def _above(case: Parts, composer: str) -> Reading:
+    """By how many points a composer lies above what learned the part itself, at most."""
+
+    def above(part: Structure) -> float | None:
+        error, reached = part.error(composer), part.error(REFERENCE)
+        return None if error is None or reached is None else error - reached
+
+    pair = _largest(case.parts, above)
+    if pair is None:
+        return _open()
+    points, part = pair
+    text = f"{'+' if points > 0 else '−'}{number(abs(points), 1)} points"
+    return count_of(points), {"text": text, "value": number(points, 1), "where": where(part)}
+
+
+def _forecast(case: Parts, composer: str) -> Reading:
+    """Whether every forecast may be believed; open if one is not judged, simulated or not: a simulation does
+    not pass what would not be printed on a machine without another trial."""
+    doubtful = [part for part in case.parts if not part.judged()]
+    if not case.parts:
+        return _open(reason="No part was composed.")
+    if not doubtful:
+        return count_of(0), {"text": "all"}
+    first, others = doubtful[0], [f"{part.part} ({part.material})" for part in doubtful[1:]]
+    also = f" Nor is that of {', '.join(others[:3])}" if others else ""
+    also += f" and {len(others) - 3} more" if len(others) > 3 else ""
+    return _open(
+        f"{len(doubtful)} of {len(case.parts)} not",
+        f"The forecast of {where(first)} is not judged: {first.why}.{also}{'.' if also else ''}",
+        remedy=f"To judge it, {first.trial}.",
+    )
+
+
+def where(structure: Structure) -> str:
+    return f"{structure.part}, material {structure.material},"
+
+
+def _learning(case: Parts, composer: str) -> Reading:
+    laws = ("pixels", "model_inverse") if composer == OURS else ("hoelzle_2009",)
+    # figures of an earlier version name the best alone
+    keys = [f"{law}.{which}_ratio" for law in laws for which in ("last", "best")]
+    ratios = next((ratios for key in keys if (ratios := _each(case.evidence, key))), None)
+    if ratios is None:
+        return _open(reason="No trial was learned from.")
+    share = 100 * max(ratios)
+    return count_of(share), {"text": percent(share, 2)}
+
+
+def _each(evidence: Evidence, key: str) -> list[float]:
+    """A figure of every material that has it."""
+    learning = evidence.figures["train_ilc"]
+    figures = (
+        [] if isinstance(learning, Missing) else [lookup(material, key) for material in learning.values()]
+    )
+    return [float(value) for value in figures if not isinstance(value, Missing)]
+
+
+def gamma(evidence: Evidence) -> dict[str, float] | None:
+    """Of the paper's law, before anything ran: nominal, worst of the family, and the share of it above 1 in
+    %, each the worst of all materials."""
+    figures = {key: _each(evidence, key) for key in ("gamma", "gamma_worst", "gamma_above_1_percent")}
+    return {key: max(values) for key, values in figures.items()} if all(figures.values()) else None
+
+
+def _convergence(case: Parts, composer: str) -> Reading:
+    """Ours is tested once its first trials have identified the machine, over the machines that these cannot
+    tell apart."""
+    if composer == OURS:
+        values, absent = (
+            _each(case.evidence, "gamma_model_inverse_worst"),
+            (Missing(UNJUDGED, ""), "rolls back"),
+        )
+    else:
+        before = gamma(case.evidence)
+        values, absent = [] if before is None else [before["gamma_worst"]], (Missing(OPEN, ""), OPEN)
+    if not values:
+        return absent[0], {"text": absent[1]}
+    return count_of(max(values)), {"text": f"γ up to {number(max(values), 2)}"}
+
+
+class Asked(NamedTuple):
+    """One stream of a part: the largest command (mm) and speed (mm/s) that it asks for, the drive's limits
+    beside them (None: not declared), the share of its time at a limit in %, and whether the drive follows."""
+
+    part: str
+    material: str
+    command_mm: float
+    speed_mm_per_s: float
+    amplitude_mm: float | None
+    limit_mm_per_s: float | None
+    share: float
+    enough: bool
+
+    def text(self) -> str:
+        """Largest command and speed."""
+        return f"{short(self.command_mm, 2)}{THIN}mm, {short(self.speed_mm_per_s, 2)}{THIN}mm/s"
+
+    def limit(self) -> str:
+        """The drive's own."""
+        if self.amplitude_mm is None or self.limit_mm_per_s is None:
+            return "declared"
+        return f"{self.amplitude_mm:g}{THIN}mm, {self.limit_mm_per_s:g}{THIN}mm/s"
+
+
+def asked_of_the_drive(part: str, material: str, saturation: Mapping[str, Any]) -> Asked:
+    """One stream out of the conformance report of its part; nan where an earlier version wrote it."""
+    limits = (saturation.get(key) for key in ("amplitude_mm", "speed_mm_per_s"))
+    return Asked(
+        part,
+        material,
+        float(saturation.get("largest_command_mm", math.nan)),
+        float(saturation.get("largest_speed_mm_per_s", math.nan)),
+        *(None if limit is None else float(limit) for limit in limits),
+        float(saturation["share_percent"]),
+        bool(saturation["enough"]),
+    )
+
+
+def _drive(case: Parts, composer: str) -> Reading:
+    """Whether the drive follows every command as it is asked for; open until a drive is declared."""
+    conformance = need(case.evidence.tables["conformance"])
+    saturations = {
+        (part, material): saturation
+        for part, report in conformance.items()
+        for material, saturation in report.get("saturation", {}).items()
+    }
+    streams = [asked_of_the_drive(*place, saturation) for place, saturation in saturations.items()]
+    if not streams:
+        return _open(reason="No part was composed.")
+    if any(math.isnan(stream.command_mm) for stream in streams):
+        return _open(
+            reason="The conformance report is of an earlier version and names no command.",
+            remedy="Run ./run dvc repro compose_parts.",
+        )
+    worst = max(streams, key=lambda stream: (not stream.enough, stream.command_mm, stream.speed_mm_per_s))
+    place = f"{worst.part}, material {worst.material},"
+    if any(stream.limit() == "declared" for stream in streams):
+        return _open(
+            worst.text(),
+            f"The command for {place} goes to {worst.text()}, and no drive is declared.",
+            remedy="Declare the drive (printer.drive).",
+            allowed=worst.limit(),
+        )
+    ramp = conformance[worst.part].get("ramp_that_would_do_s", {}).get(worst.material)
+    least = case.bound.get((worst.part, worst.material))
+    best = (
+        "no signal can make up for it"
+        if least is None
+        else f"the best signal within it leaves {percent(least, 2)} of on\u2011off control’s flow error"
+    )
+    # a drive that follows what is asked for up to a little: how much that little is
+    leaves = [saturation.get("least_percent") for saturation in saturations.values()]
+    followed = worst.enough and all(share is not None for share in leaves)
+    return count_of(sum(not stream.enough for stream in streams)), {
+        "allowed": worst.limit(),
+        "text": f"leaves {percent(max(leaves), 2)}" if followed else worst.text(),
+        "case": "stronger" if ramp is None else "ramp",
+        "ramp": "" if ramp is None else f"{ramp:.2f}{THIN}s",
+        "where": place,
+        "demand": worst.text(),
+        "limits": worst.limit(),
+        "share": percent(worst.share, 2),
+        "best": best,
+    }
+
+
+def _bound(evidence: Evidence) -> dict[tuple[str, str], float]:
+    """The least error in % of on-off control's that any command leaves, by part and material, of the streams
+    that the drive cannot follow."""
+    conformance = evidence.tables["conformance"]
+    if isinstance(conformance, Missing):
+        return {}
+    return {
+        (part, material): float(saturation["least_percent"])
+        for part, report in conformance.items()
+        for material, saturation in report.get("saturation", {}).items()
+        if not saturation["enough"] and saturation.get("least_percent") is not None
+    }
+
+
+def _printed(case: Parts, composer: str) -> Reading:
+    conformance = need(case.evidence.tables["conformance"])
+    refused = [
+        (part, line) for part, report in conformance.items() for line in _listed(report.get("refused", []))
+    ]
+    # the priority rule does not print a line that is shorter than the lead
+    short_lines = sum(report.get("shorter_than_lead", 0) for report in conformance.values())
+    lost = len(refused) + (0 if composer == OURS else short_lines)
+    return count_of(lost), {
+        "text": f"{lost:,} not" if lost else "all",
+        "lines": count(len(refused), "line was", "lines were").capitalize(),
+        "first": f", the first in {refused[0][0]}: {refused[0][1]}" if refused else "",
+    }
+
+
+def _listed(refused: Any) -> list[str]:
+    if isinstance(refused, str):
+        return [refused]
+    return [f"line {line['line']}, {line['why']}" for line in refused for _ in range(line.get("count", 1))]
+
+
+FIGURES: dict[str, Callable[[Parts, str], Reading]] = {
+    "drive": _drive,
+    "forecast": _forecast,
+    "near": _near,
+    "flow": _flow,
+    "line": _line,
+    "above": _above,
+    "learning": _learning,
+    "convergence": _convergence,
+    "printed": _printed,
+}
+
+
+# ---- the verdict
+
+
+def verdict(evidence: Evidence) -> Verdict:
+    """Whose signal to use: the composer with the least worst error; then the rules, for it. `winner` is the
+    composer, "" if nothing was composed; `note` is the price of the signals."""
+    parts, machine = structures(evidence), evidence.recorded("train_ilc")
+    words = words_for(recorded=machine, quick=evidence.quick)
+    if isinstance(parts, Missing):
+        return Verdict(
+            loop=LOOP,
+            state=OPEN,
+            decision=words.undecided,
+            lead="Nothing was composed.",
+            reason=parts.sentence(),
+            remedy="",
+            rule="",
+            winner="",
+            note=_price(evidence, []),
+            rules=rules(evidence, []),
+        )
+    use, lines = winner(parts), rules(evidence, parts)
+    # the column of the model-based composer, and that of the library for the others
+    column = 0 if use == OURS else 1
+    needs = {row.name: row.needed_for for row in rows(LOOP).values()}
+    asked = [line[column] for line in lines if use == OURS or "learning" not in needs[line[0].name]]
+    judged = [rule for rule in asked if rule.state != UNJUDGED]
+    # what cannot be measured on a machine's own trials does not hold them up; a drive can be declared, and a
+    # forecast that is not judged has a trial that judges it
+    binding = [
+        rule
+        for rule in judged
+        if "machine" in needs[rule.name]
+        or ("simulation" in needs[rule.name] and not (machine and rule.state == OPEN))
+    ]
+    state = FAILED if use == BASELINE else overall([rule.state for rule in binding])
+    first = None if state == PASSED else deciding(binding) or deciding(judged)
+    reported = first is not None and first.reason and (column == 0 or "machine" in needs[first.name])
+    summary = _summary(parts, use, machine)
+    return Verdict(
+        loop=LOOP,
+        state=state,
+        decision=_decision(state, use if worst(_known(parts), use) else "", words),
+        lead=_lead(state, first, len(judged), condition=len(judged) < len(asked)),
+        reason=f"{first.reason} {summary}" if reported else summary,
+        remedy=first.remedy if first else "",
+        rule=first.name if first else "",
+        winner=use,
+        note=_price(evidence, parts),
+        rules=lines,
+    )
+
+
+def _known(parts: Sequence[Structure]) -> list[Structure]:
+    """The parts of which it is known what they come to."""
+    return [part for part in parts if not part.unknown()]
+
+
+def _decision(state: str, use: str, words: Words) -> str:
+    """The decision; which composer comes closest only where that is known of any part."""
+    if not use:
+        return words.of(state)
+    if state == PASSED:
+        return words.passed.format(phrase(use))
+    return f"{words.of(state).rstrip('.')}: {phrase(use)} {'come' if use == OURS else 'comes'} closest."
+
+
+def _lead(state: str, first: Rule | None, judged: int, *, condition: bool) -> str:
+    """How many rules passed, and on what condition; or the first that did not."""
+    if state != PASSED:
+        if first is None:
+            return "Nothing beats on\u2011off control."
+        word = "failed" if state == FAILED else "undecided"
+        return f"First {word} rule: {first.name[:1].lower()}{first.name[1:]}."
+    return f"All {count(judged, 'rule')} {'that can be judged ' if condition else ''}passed."
+
+
+def _peak(evidence: Evidence) -> float:
+    """The largest command of our laws over the steady one; 0 where none was learned."""
+    learning = evidence.figures["train_ilc"]
+    learned = (
+        []
+        if isinstance(learning, Missing)
+        else [laws[law] for laws in learning.values() for law in ("model_inverse", "pixels") if law in laws]
+    )
+    return max((law["peak_over_steady"] for law in learned), default=0.0)
+
+
+def _summary(parts: Sequence[Structure], use: str, machine: bool) -> str:
+    """The composer in use with its figure and its yardsticks: on-off control, the
+    others, and what learning each structure reaches."""
+    parts = _known(parts)
+    found = worst(parts, use)
+    if found is None:
+        return "What the parts come to is not known."
+    error, place = found
+    others = [
+        f"{_bare(name)} {percent(pair[0], 2)}"
+        for name in COMPOSERS
+        if name not in (use, BASELINE) and (pair := worst(parts, name))
+    ]
+    full = worst(parts, REFERENCE)
+    others += [f"learning each part from scratch {percent(full[0], 2)}"] if full else []
+    lines = [line for part in parts if (line := part.worst_line(use)) is not None]
+    volume = (
+        f" Worst printed line: {percent(max(lines), 2)} off its volume, "
+        f"±{place.asked.line_volume_percent:g}{THIN}% allowed."
+        if lines
+        else ""
+    )
+    forecast = (
+        " These figures are forecasts of the identified machine: the true flow of a real one is not known."
+        if machine
+        else ""
+    )
+    return (
+        f"{_bare(use)[:1].upper()}{_bare(use)[1:]} {'leave' if use == OURS else 'leaves'} at most "
+        f"{percent(error, 2)} of on\u2011off control’s flow error "
+        f"({place.part}, {place.material}); {', '.join(others)}.{volume}{forecast}"
+    )
+
+
+def _bare(name: str) -> str:
+    return phrase(name).removeprefix("the ")
+
+
+def _price(evidence: Evidence, parts: Sequence[Structure]) -> str:
+    """What the signals cost: trials, peak command, what the paper's law would have done,
+    and the lines that the priority rule would lose."""
+    learning, sentences = evidence.figures["train_ilc"], []
+    if not isinstance(learning, Missing):
+        learned = [
+            laws[law] for laws in learning.values() for law in ("model_inverse", "pixels") if law in laws
+        ]
+        routines = max((len(laws.get("other_routines", [])) for laws in learning.values()), default=0)
+        if learned:
+            trials, peak = max(law["trials"] for law in learned), _peak(evidence)
+            of = (
+                f"{count(routines, 'routine')} of {trials + 1} trials" if routines else f"{trials + 1} trials"
+            )
+            sentences.append(
+                f"Price: {of} for each material, and commands up to {number(peak, 0)} times the steady one."
+            )
+    before = gamma(evidence)
+    if before:
+        safe = before["gamma_worst"] < 1
+        sentences.append(
+            f"Before anything ran, γ of the paper’s law was {number(before['gamma'], 2)} on the nominal "
+            f"plant and {number(before['gamma_worst'], 2)} on the worst of its family, "
+            f"above 1 on {percent(before['gamma_above_1_percent'], 2)}: "
+            f"{'it may be run' if safe else 'do not run it'} on this machine."
+        )
+    conformance = evidence.tables["conformance"]
+    short = (
+        {}
+        if isinstance(conformance, Missing)
+        else {part: report.get("shorter_than_lead", 0) for part, report in conformance.items()}
+    )
+    sentences += [
+        f"{count(n, 'line', 'lines').capitalize()} of {part} {'is' if n == 1 else 'are'} shorter than the "
+        f"lead: the priority rule would not print {'it' if n == 1 else 'them'}."
+        for part, n in short.items()
+        if n
+    ][:2]
+    missed = [
+        part
+        for part in parts
+        if part.chosen
+        and part.chosen != part.best()
+        and part.scores[part.chosen].error > part.scores[part.best()].error + SAME
+    ]
+    sentences += (
+        [f"The forecast chose wrongly for {where(missed[0])[:-1]}: {_bare(missed[0].best())} is better."]
+        if missed
+        else []
+    )
+    return " ".join(sentences)

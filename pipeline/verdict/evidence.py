@@ -1,0 +1,82 @@
+"""What a verdict is made from, and how a figure is found in it."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from pipeline.temperature.settings import Plant
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import Missing
+
+Table = dict[str, np.ndarray]
+Figures = Mapping[str, Any]  # {stage: its figures, or why there are none}
+OFF = Missing("not applicable", "this loop is switched off (loops in params.yaml)")
+
+
+Value = TypeVar("Value")
+
+
+class Evidence(NamedTuple):
+    """Figures by stage and tables by name, each with a Missing in its place if it could not be read."""
+
+    figures: Figures
+    tables: Mapping[str, Any]
+    machine: Plant  # inputs and outputs of the temperature loop
+    rules: ReportRules  # section `report`: the limits
+    params: Mapping[str, Any]  # every section, as text
+    quick: bool = False  # the run is a quick look
+    certified: Mapping[str, Mapping[str, Any]] = {}  # loop -> controller -> {"passed", "why"}
+
+    def recorded(self, stage: str) -> bool:
+        """Whether the stage learns from recordings of a user's machine."""
+        return self.params.get(stage, {}).get("source") == "recordings"
+
+    def refusal(self, loop: str, controller: str) -> str:
+        """Why the stage `certify` refuses a controller; "" if it passed it, and if nothing is known."""
+        known = self.certified.get(loop, {}).get(controller)
+        return str(known["why"]) if known and not known["passed"] else ""
+
+
+def switched_off(figures: Any) -> bool:
+    """Whether a stage wrote that it was not asked, because its loop is switched off."""
+    return isinstance(figures, Mapping) and figures.get("asked") is False
+
+
+class Absent(Exception):
+    """A figure that a rule asks for is not there; `gap` says why."""
+
+    def __init__(self, gap: Missing) -> None:
+        super().__init__(gap.reason)
+        self.gap = gap
+
+
+def entry(data: Any, *names: str) -> Any:
+    """data[name][name]...; None if one of them is not there."""
+    for name in names:
+        data = data.get(name) if isinstance(data, Mapping) else None
+    return data
+
+
+def lookup(data: Any, dotted: str, *, what: str = "") -> Any:
+    """data["a"]["b"] of "a.b", or the Missing that stands for it; null is missing too."""
+    value = data
+    for key in dotted.split("."):
+        if isinstance(value, Missing):
+            return value
+        value = value.get(key) if isinstance(value, Mapping) else None
+        if value is None:
+            return Missing("not measured", f"{what or dotted} is not among what the stage measured")
+    return value
+
+
+def need(value: Value | Missing) -> Value:
+    """The value itself. Raises Absent if it is a Missing."""
+    if isinstance(value, Missing):
+        raise Absent(value)
+    return value
+
+
+def need_figure(data: Any, dotted: str) -> Any:
+    """data["a"]["b"] of "a.b". Raises Absent if it is not there."""
+    return need(lookup(data, dotted))

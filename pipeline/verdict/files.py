@@ -1,0 +1,66 @@
+"""The evidence of a run, read from what its stages wrote."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from pipeline.deposition.tables import SCORES
+from pipeline.setpoint.tables import SCOREBOARD
+from pipeline.store import artifacts, params
+from pipeline.temperature.settings import Plant
+from pipeline.temperature.tables import DYNAMICS, RESIDUALS
+from pipeline.verdict.evidence import OFF, Evidence, switched_off
+from pipeline.verdict.settings import QUICK_LOOK, ReportRules
+from pipeline.verdict.verdict import Missing
+
+# stages whose figures the rules may ask for
+FIGURES = {
+    "ingest": "datasets/ingest/figures.json",
+    "identify_plant": "datasets/identify_plant/figures.json",
+    "learn_kernel": "datasets/learn_kernel/figures.json",
+    "tune_weights": "datasets/tune_weights/figures.json",
+    "evaluate_temperature": "datasets/evaluate_temperature/figures.json",
+    "train_ilc": "datasets/train_ilc/figures.json",
+    "segment_library": "datasets/segment_library/figures.json",
+    "compose_parts": "datasets/compose_parts/figures.json",
+    "train_classifier": "datasets/train_classifier/figures.json",
+    "train_agent": "datasets/train_agent/figures.json",
+    "evaluate_setpoint": "datasets/evaluate_setpoint/figures.json",
+}
+TABLES = {
+    "residuals": ("datasets/identify_plant/residuals.parquet", RESIDUALS),
+    "dynamics": ("datasets/identify_plant/dynamics.parquet", DYNAMICS),
+    "scores": ("datasets/compose_parts/scores.parquet", SCORES),
+    "conformance": ("datasets/compose_parts/conformance.json", None),
+    "scoreboard": ("datasets/evaluate_setpoint/scoreboard.parquet", SCOREBOARD),
+    "choice": ("datasets/evaluate_setpoint/choice.json", None),
+}
+
+
+def read_evidence(certified: Mapping[str, Mapping[str, Any]] | None = None) -> Evidence:
+    """What the stages that ran wrote; a Missing in the place of each file that is not there, or broken."""
+    figures = {stage: _read(path, stage, artifacts.read_json) for stage, path in FIGURES.items()}
+    off = {stage for stage in FIGURES if switched_off(figures[stage])}
+    places = {name: (path, path.split("/")[1], _reader(schema)) for name, (path, schema) in TABLES.items()}
+    return Evidence(
+        {**figures, **dict.fromkeys(off, OFF)},
+        {name: OFF if place[1] in off else _read(*place) for name, place in places.items()},
+        params.load(Plant, "plant"),
+        params.load(ReportRules, "report"),
+        params.read(),
+        artifacts.exists(QUICK_LOOK),
+        certified or {},
+    )
+
+
+def _reader(schema: Any) -> Callable[[str], Any]:
+    return artifacts.read_json if schema is None else lambda path: artifacts.read_table(path, schema)
+
+
+def _read(path: str, stage: str, reader: Callable[[str], Any]) -> Any:
+    if not artifacts.exists(path):
+        name = path.rsplit("/", 1)[-1]
+        return Missing("not measured", f"{name} of {stage} is not there", f"Run ./run dvc repro {stage}")
+    try:
+        return reader(path)
+    except ValueError as error:
+        return Missing("failed", str(error))

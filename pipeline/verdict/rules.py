@@ -1,0 +1,180 @@
+"""A row of rules.toml held against a figure -> a rule with its state and its sentences."""
+
+import functools
+import math
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pydantic
+from pydantic import Field
+
+from pipeline.store import params
+from pipeline.verdict.digits import THIN
+from pipeline.verdict.evidence import Absent, Figures
+from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.verdict import OPEN, PASSED, UNDECIDED, Figure, Missing, Question, Rule, count_of
+
+PATH = Path(__file__).with_name("rules.toml")
+# a figure, and the words that the sentences of its row have places for
+Reading = tuple[Figure | Missing, Mapping[str, Any]]
+Limit = float | str
+
+
+class Row(params.Section):
+    """A rule. `figure` is a dotted path into the figures of a stage (datasets/<stage>/figures.json), with *
+    for the worst of several and {controller} for a controller's own; or the name of a function of its loop.
+
+    Its limit is a number, or the key of section `report` that holds one, times `scale`. `needed_for` are the
+    uses that it keeps from passing. `fails` and `remedy` are sentences, or a sentence for each case.
+    """
+
+    name: str
+    figure: str
+    at_least: Limit | None = None
+    at_most: Limit | None = None
+    below: Limit | None = None
+    unit: str = ""
+    scale: float = Field(1.0, gt=0)
+    needed_for: list[str] = []
+    fails: str | dict[str, str] = "{name} is {value} (limit {limit})."
+    passes: str = ""
+    remedy: str | dict[str, str] = ""
+    title: str = ""  # above a row of a page; "": its name
+    line: str = ""  # the line of the verdict in which it stands; "": its own
+    answer: int = 0  # its number on the page of the temperature loop
+    allowed: str = ""  # the limit as a page has it; "": with sign and unit
+    place: str = ""  # the picture behind it
+    beyond: str = "never"  # an infinite figure in words
+
+    def limit(self, limits: ReportRules) -> float:
+        """The limit that is declared; infinite where the key is null."""
+        declared = next(limit for limit in (self.at_least, self.at_most, self.below) if limit is not None)
+        value = getattr(limits, declared) if isinstance(declared, str) else declared
+        if value is None:
+            return math.inf
+        return math.nextafter(value, -math.inf) if self.below is not None else value * self.scale
+
+    def question(self, key: str, limit: float) -> Question:
+        """What the rule asks."""
+        at_least = self.at_least is not None
+        return Question(
+            self.answer, key, self.title or self.name, self.unit, limit, at_least, self.name, self.beyond
+        )
+
+    def limit_text(self, limit: float) -> str:
+        """ "≤ 6 %"."""
+        sign = "≥" if self.at_least is not None else "≤" if self.below is None else "<"
+        text = self.allowed or f"{sign} {{limit:g}}{THIN if self.unit else ''}{self.unit}"
+        return text.format(limit=limit)
+
+
+# limits of any size, for the keys alone
+_ANY = ReportRules.model_construct(None, **dict.fromkeys(ReportRules.model_fields, 1.0))
+
+
+@functools.cache
+def _rows(path: Path) -> dict[str, dict[str, Row]]:
+    with path.open("rb") as file:
+        loops = tomllib.load(file)
+    return {
+        loop: {key: _row(path, loop, key, row) for key, row in each.items()} for loop, each in loops.items()
+    }
+
+
+def _row(path: Path, loop: str, key: str, fields: Mapping[str, Any]) -> Row:
+    try:
+        row = Row.model_validate(fields)
+        row.limit(_ANY)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise ValueError(f"{path.name}: [{loop}.{key}] {where}: {first['msg']}") from None
+    except (AttributeError, StopIteration):
+        raise ValueError(
+            f"{path.name}: [{loop}.{key}] expected at_least, at_most or below: a number, or a key of section "
+            f"report ({', '.join(ReportRules.model_fields)})"
+        ) from None
+    return row
+
+
+def rows(loop: str) -> dict[str, Row]:
+    """The rules of a loop, in the order in which they are asked, by their keys."""
+    return _rows(PATH).get(loop, {})
+
+
+# ---- figures by path
+
+
+def at_path(figures: Figures, path: str, *, at_least: bool) -> Figure | Missing:
+    """The figure at a dotted path, of several the worst. A mapping with q90, low and high is a quantile with
+    its band."""
+    values = [value for value in map(_as_figure, _leaves(figures, path.split("."))) if value is not None]
+    if not values:
+        return Missing(OPEN, f"{path} is not among what the stages measured")
+    return (min if at_least else max)(values, key=lambda figure: figure.value)
+
+
+def _leaves(data: Any, names: list[str]) -> Iterator[Any]:
+    if not names:
+        yield data
+    elif isinstance(data, Mapping):
+        keys = list(data) if names[0] == "*" else [key for key in names[:1] if key in data]
+        for key in keys:
+            yield from _leaves(data[key], names[1:])
+
+
+def _as_figure(value: Any) -> Figure | None:
+    if isinstance(value, Mapping) and value.get("q90") is not None:
+        return Figure(value["q90"], value.get("low", value["q90"]), value.get("high", value["q90"]))
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return count_of(float(value)) if number else None
+
+
+# ---- a rule
+
+
+def judge(
+    row: Row,
+    question: Question,
+    read: Callable[[], Reading],
+    decides: Callable[[Question, Figure, Mapping[str, Any]], str] | None = None,
+) -> Rule:
+    """The rule of a row with the figure that `read` gives, or with the gap by which it raises Absent.
+
+    Words for the sentences come with the figure; of these `limit` replaces the question's, `case` names the
+    sentence of several, and `text`, `allowed`, `reason`, `fails`, `remedy` replace what the row says.
+    `decides` says what would decide a rule that is undecided.
+    """
+    try:
+        figure, words = read()
+    except Absent as absent:
+        figure, words = absent.gap, {"remedy": ""}
+    question = question._replace(limit=float(words.get("limit", question.limit)))
+    allowed = words.get("allowed", row.limit_text(question.limit))
+    if isinstance(figure, Missing):
+        remedy = row.remedy if isinstance(row.remedy, str) else ""
+        return Rule(
+            row.name,
+            question,
+            figure,
+            words.get("text", OPEN),
+            allowed,
+            row.place,
+            words.get("reason", figure.sentence()),
+            words.get("remedy", remedy),
+        )
+    case, text = words.get("case", ""), words.get("text", _text(figure.value, row.unit))
+    rule = Rule(row.name, question, figure, text, allowed, row.place)
+    undecided = decides(question, figure, words) if decides and rule.state == UNDECIDED else ""
+    fails = words.get("fails") or (row.fails if isinstance(row.fails, str) else row.fails[case])
+    remedy = words.get("remedy") or (row.remedy if isinstance(row.remedy, str) else row.remedy[case])
+    limit = words.get("limit_words") or _text(question.limit, row.unit)
+    places = {"name": row.name, "value": text, **words, "limit": limit, "undecided": undecided}
+    sentence = row.passes if row.passes and rule.state == PASSED else fails
+    return rule._replace(reason=sentence.format(**places), remedy=remedy.format(**places))
+
+
+def _text(value: float, unit: str) -> str:
+    return f"{value:g}{THIN if unit else ''}{unit}"

@@ -1,0 +1,600 @@
+"""Scoreboard and classifier's figures -> who sets flow and temperature, and whether it may steer."""
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from pipeline.setpoint.agents.criteria import BEYOND, harm_bar
+from pipeline.setpoint.controllers import KINDS
+from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
+from pipeline.verdict.digits import THIN, band, count, number, quantity
+from pipeline.verdict.evidence import Evidence, lookup
+from pipeline.verdict.rules import Reading, Row, at_path, judge, rows
+from pipeline.verdict.verdict import (
+    CERTIFICATE,
+    FAILED,
+    OPEN,
+    PASSED,
+    UNDECIDED,
+    Figure,
+    Missing,
+    Question,
+    Rule,
+    Verdict,
+    count_of,
+    deciding,
+    overall,
+    state,
+    words_for,
+)
+
+LOOP = "setpoint"
+AGENT, PAPER, BASELINE = "agent", "paper", "baseline"
+SIMULATORS = {
+    "paper": "The paper’s simulator",
+    "recorded": "Recorded windows",
+    "harm": "From good starts",
+    "pixels": "Through pictures",
+}
+CLAIM = (
+    "The classifier is trained and judged on rendered frames: eight real pictures allow no claim about real "
+    "printers."
+)
+CLAIM_RECORDED = (
+    "The classifier is trained and judged on recordings of datasets/raw/setpoint, split by print; "
+    "it is known "
+    "on these printers only."
+)
+NOT_APART = (
+    " Controllers learn, are chosen and judged on windows of prints that the classifier was calibrated, "
+    "chosen and judged on: the folder has too few prints to keep them apart."
+)
+NO_CLOG = Missing("not applicable", "nothing happens in this case")
+
+
+class Cell(NamedTuple):
+    """One controller in one case: shares of runs in percent with their 95 % intervals, or why one is missing.
+    Then steps until inside for good; overshoot and flow error in percent; beyond, of good starts those that
+    leave them by each of BEYOND points; back, within +-15 % after a clog, and decisions until inside again.
+    redraws of the segments, by which the intervals are clustered."""
+
+    runs: int
+    counts: bool
+    settled: Figure | Missing
+    stay: Figure | Missing
+    recovered: Figure | Missing
+    median: float
+    p90: float
+    overshoot: float
+    flow_error: float
+    worst_start: tuple[float, float, float]
+    beyond: tuple[Figure | Missing, ...] = ()
+    back: Figure | Missing = NO_CLOG
+    recovery_steps: float = math.nan
+    redraws: int = 1
+
+
+# borders of the classes in percent of nominal flow
+CLASS_BORDERS = (90.0, 110.0)
+Case = tuple[str, str]  # simulator, case
+
+
+class Board(NamedTuple):
+    """Who was judged, the best worst case first, with the kind of each; cases in the table's order; who runs
+    by default ("" where nobody chose); who may not, and why. Those who may not stand behind the others."""
+
+    names: list[str]
+    kinds: Mapping[str, str]
+    cases: list[Case]
+    cells: Mapping[tuple[str, Case], Cell]
+    default: str
+    refused: Mapping[str, str]
+
+    def counting(self, name: str) -> list[tuple[Case, Cell]]:
+        """The cases that count for the choice."""
+        return [(case, cell) for case in self.cases if (cell := self.cells.get((name, case))) and cell.counts]
+
+    def best(self, *kinds: str) -> str:
+        """Of these kinds, the one with the best worst case; "" where there is none."""
+        return next((name for name in self.names if self.kinds[name] in kinds), "")
+
+    def baseline(self) -> str:
+        """The baseline that is shown: the default where it is one, else the best."""
+        mine = self.default and self.kinds[self.default] == BASELINE
+        return self.default if mine else self.best(BASELINE)
+
+    def learned(self) -> str:
+        """The agent that competes: the default where it is one, else ours, else the paper's."""
+        return (
+            self.default
+            if self.default and self.kinds[self.default] != BASELINE
+            else self.best(AGENT) or self.best(PAPER)
+        )
+
+
+def role(board: Board, name: str) -> str:
+    """The mark of a controller by its kind: circle what learned (hollow: not the one that competes), square
+    the first that is model-based (hollow: the others), ring the baselines."""
+    if board.kinds[name] != BASELINE:
+        return "data_driven" if name == board.learned() else "kernel"
+    models = [other for other in board.names if KINDS.get(other) in ("model-based", "reference")]
+    return "baseline" if name not in models else "model_based" if name == models[0] else "exact_model"
+
+
+def case_text(case: Case, *, whole: bool = False) -> str:
+    """ "accuracy 0.7, clog" -> "accuracy 70 %, clog"; `whole`: after the simulator's name."""
+    simulator, name = case
+    name = re.sub(rf"^{re.escape(simulator)}[, ]*", "", name) or "as it is"
+    name = re.sub(r"accuracy (\d\.?\d*)", lambda match: f"accuracy {100 * float(match[1]):g}{THIN}%", name)
+    return f"{SIMULATORS.get(simulator, simulator)}, {name}" if whole else name
+
+
+def within(case: Case) -> str:
+    """The same in the middle of a sentence."""
+    text = case_text(case, whole=True)
+    return text[:1].lower() + text[1:]
+
+
+def board(evidence: Evidence, subject: str = "") -> Board | Missing:
+    """Everybody who was judged; the default is the one of the choice, or the `subject` of a verdict."""
+    table, choice = evidence.tables["scoreboard"], evidence.tables["choice"]
+    if isinstance(table, Missing):
+        return table
+    if not len(table["controller"]):
+        return Missing("not measured", "the scoreboard is empty", "Run ./run dvc repro evaluate_setpoint")
+    rows: list[Any] = list(pd.DataFrame(table).itertuples())
+    cells = {(row.controller, (row.simulator, row.case)): _cell(row) for row in rows}
+    kinds = {row.controller: row.kind for row in rows}
+    said = choice if isinstance(choice, Mapping) else {}
+    refused = said.get("refused")
+    refused = {name: str(why) for name, why in refused.items()} if isinstance(refused, Mapping) else {}
+    unranked = Board(list(kinds), kinds, list(dict.fromkeys(case for _, case in cells)), cells, "", refused)
+    ranked = sorted(kinds, key=lambda name: (name not in refused, _rank(unranked, name)), reverse=True)
+    chosen = subject or str(said.get("name", ""))
+    return unranked._replace(names=ranked, default=chosen if chosen in kinds else "")
+
+
+def _cell(row: Any) -> Cell:
+    """A row of the scoreboard."""
+    return Cell(
+        row.runs,
+        row.counts,
+        _figure(row.settled_percent, row.settled_low_percent, row.settled_high_percent),
+        _figure(row.stay_percent, row.stay_low_percent, row.stay_high_percent),
+        _figure(row.recovered_percent, row.recovered_low_percent, row.recovered_high_percent),
+        row.median_steps,
+        row.p90_steps,
+        row.overshoot_p95_percent,
+        row.flow_error_percent,
+        (row.worst_start_flow_percent, row.worst_start_temperature_degC, row.worst_start_settled_percent),
+        tuple(
+            _figure(*(getattr(row, f"beyond_{points}_{end}percent") for end in ("", "low_", "high_")))
+            for points in BEYOND
+        ),
+        _figure(row.back_percent, row.back_low_percent, row.back_high_percent),
+        row.recovery_steps,
+        row.redraws,
+    )
+
+
+def _figure(value: float, low: float, high: float) -> Figure | Missing:
+    if math.isnan(value):
+        return Missing("not applicable", "runs end before")
+    return Figure(value, value if math.isnan(low) else low, value if math.isnan(high) else high)
+
+
+def lasting(cell: Cell) -> Figure | Missing:
+    """The share by which a case is read: settled and staying, or
+    settled where runs end before that can be told."""
+    return cell.stay if isinstance(cell.stay, Figure) else cell.settled
+
+
+def _rank(board: Board, name: str) -> tuple[float, float]:
+    values = [share.value for _, cell in board.counting(name) if isinstance(share := lasting(cell), Figure)]
+    return (min(values), float(np.mean(values))) if values else (-1.0, -1.0)
+
+
+def worst(board: Board, name: str, what: str) -> tuple[Figure | Missing, Case | None]:
+    """The smallest share `what` (settled, stay, lasting) of the cases that count, and where."""
+    shares = [
+        (figure, case)
+        for case, cell in board.counting(name)
+        if isinstance(figure := lasting(cell) if what == "lasting" else getattr(cell, what), Figure)
+    ]
+    if not shares:
+        return Missing("not measured", f"no case of {name or 'any controller'}"), None
+    return min(shares, key=lambda pair: pair[0].value)
+
+
+def share_text(figure: Figure | Missing) -> str:
+    return figure.state if isinstance(figure, Missing) else quantity(figure.value, "%", 1)
+
+
+# ---- the rules
+
+
+# of each a pair: what learned, and the best baseline; a rule of the classifier holds for every controller
+Pair = tuple[Rule, Rule]
+
+
+def of_classifier(rule: Rule) -> bool:
+    """Whether the rule is asked of the classifier, on which every controller rests."""
+    return any("see" in row.needed_for for row in rows(LOOP).values() if row.name == rule.name)
+
+
+def rules(evidence: Evidence, board: Board | None) -> tuple[Pair, ...]:
+    names = (board.learned(), board.baseline()) if board else ("", "")
+    return tuple(
+        (_rule(evidence, board, key, row, names[0], 0), _rule(evidence, board, key, row, names[1], 1))
+        for key, row in rows(LOOP).items()
+    )
+
+
+def _rule(evidence: Evidence, board: Board | None, key: str, row: Row, name: str, column: int) -> Rule:
+    question = row.question(key, row.limit(evidence.rules))
+
+    def read() -> Reading:
+        if key in CONTROL:
+            return CONTROL[key](evidence, board, name)
+        if key in SEEING:
+            return SEEING[key](evidence, column)
+        path = row.figure.format(controller=name)
+        return at_path(evidence.figures, path, at_least=question.at_least), {}
+
+    return judge(row, question, read, undecided)
+
+
+class Harm(NamedTuple):
+    """Of the runs of one controller from good starts those that leave +-25 %, and how many may, in percent;
+    its state, and the case."""
+
+    figure: Figure
+    limit: float
+    state: str
+    case: Case
+
+
+def bars(evidence: Evidence, board: Board) -> dict[Case, float]:
+    """Percent of runs that may leave +-25 % from good starts, by case; {} where nobody declared it."""
+    most = evidence.params.get("evaluate_setpoint", {}).get("most_harmed") or {}
+    perfect, in_band = most.get("perfect_percent"), most.get("in_band_percent")
+    if perfect is None or in_band is None:
+        return {}
+    harm = [case for case in board.cases if case[0] == "harm"]
+    limits = {case: harm_bar(case[1], perfect=perfect, in_band=in_band) for case in harm}
+    return {case: limit for case, limit in limits.items() if limit is not None}
+
+
+def harm_of(board: Board, name: str, limits: Mapping[Case, float]) -> Harm | Missing:
+    """The barred case that decides: of the gravest state the one that is most beyond its bar."""
+    found = []
+    for case, limit in limits.items():
+        cell = board.cells.get((name, case))
+        if cell and cell.beyond and isinstance(share := cell.beyond[-1], Figure):
+            question = Question(0, "harm", "Does no harm", "%", limit, False, "")
+            found.append(Harm(share, limit, state(question, share), case))
+    order = (PASSED, UNDECIDED, FAILED)
+    return max(
+        found,
+        key=lambda harm: (order.index(harm.state), harm.figure.value - harm.limit),
+        default=Missing("not measured", f"no run of {name or 'any controller'} from a good start"),
+    )
+
+
+def _share(what: str) -> Callable[[Evidence, Board | None, str], Reading]:
+    """The reading of the smallest share `what` of the cases that count."""
+
+    def read(evidence: Evidence, board: Board | None, name: str) -> Reading:
+        if board is None:
+            return Missing(OPEN, ""), {"reason": "Nothing was judged.", "remedy": ""}
+        figure, case = worst(board, name, what)
+        if isinstance(figure, Missing) or case is None:
+            return figure, {"text": share_text(figure)}
+        return figure, {
+            "text": share_text(figure),
+            "within": within(case),
+            "clustered": board.cells[name, case].redraws > 1,
+        }
+
+    return read
+
+
+def _harm(evidence: Evidence, board: Board | None, name: str) -> Reading:
+    """How often a print that was good is spoilt, beside what doing nothing spoils."""
+    limits = bars(evidence, board) if board else {}
+    absent = {
+        "reason": "Nothing was judged from good starts.",
+        "remedy": "Run ./run dvc repro evaluate_setpoint.",
+        "allowed": "",
+    }
+    if board is None or not limits:
+        return Missing(OPEN, ""), absent
+    harm = harm_of(board, name, limits)
+    if isinstance(harm, Missing):
+        return Missing(OPEN, ""), absent | {"reason": harm.sentence()}
+    idle = harm_of(board, DOES_NOTHING, limits)
+    ends = sorted(set(limits.values()))
+    return harm.figure, {
+        "limit": harm.limit,
+        "text": share_text(harm.figure),
+        "allowed": f"≤ {' or '.join(f'{end:g}' for end in ends)}{THIN}%",
+        "case_text": case_text(harm.case, whole=True),
+        "idle": "" if isinstance(idle, Missing) else f" With doing nothing {share_text(idle.figure)} do.",
+        "clustered": True,
+    }
+
+
+def _seen(figure: Figure | Missing, text: str = "") -> Reading:
+    """The reading of a share of frames or windows."""
+    return figure, {"text": text or share_text(figure), "clustered": True}
+
+
+def share_in(row: Mapping[str, Any] | None) -> Figure | None:
+    """A share with its interval as train_classifier.json gives it; None where it counts no window."""
+    ends = [None if row is None else row.get(key) for key in ("percent", "low", "high")]
+    if any(end is None for end in ends):
+        return None
+    value, low, high = (float(end) for end in ends if end is not None)
+    return Figure(value, low, high)
+
+
+def _right_by_flow(evidence: Evidence, column: int) -> Reading:
+    """Windows named rightly were every flow from 70 to 150 % as frequent; yardsticks are not judged so."""
+    if column:
+        return _seen(
+            Missing("not applicable", "the yardsticks are judged on windows of all flows"), "not judged so"
+        )
+    figure = lookup(evidence.figures["train_classifier"], "right_70_150")
+    if not isinstance(figure, Missing):
+        figure = share_in(figure) or Missing(OPEN, "no window lies between 70 and 150 % of flow")
+    return _seen(figure)
+
+
+def _accuracy(evidence: Evidence, column: int) -> Reading:
+    """The classifier's accuracy, beside the best of its yardsticks."""
+    classifier = evidence.figures["train_classifier"]
+    if not column:
+        return _seen(accuracy(classifier, "image"))
+    others = {name: accuracy(classifier, f"{name}_image") for name in BRIEF}
+    known = {name: figure for name, figure in others.items() if isinstance(figure, Figure)}
+    if not known:
+        return _seen(Missing("not measured", "no yardstick"))
+    best = max(known, key=lambda name: known[name].value)
+    return _seen(known[best], f"{share_text(known[best])} {BRIEF[best]}")
+
+
+def accuracy(metrics: Mapping | Missing, name: str) -> Figure | Missing:
+    """In percent, with the interval where the stage gives one."""
+    value = lookup(metrics, f"{name}_accuracy")
+    if isinstance(value, Missing):
+        return value
+    ends = lookup(metrics, f"intervals_percent.{name}")
+    low, high = (100 * value, 100 * value) if isinstance(ends, Missing) else map(float, ends)
+    return Figure(100 * value, low, high)
+
+
+def _calibration(*keys: str) -> Callable[[Evidence, int], Reading]:
+    """The reading of the error of calibration: of the classifier, and without its calibration."""
+
+    def read(evidence: Evidence, column: int) -> Reading:
+        error = lookup(evidence.figures["train_classifier"], keys[column])
+        if isinstance(error, Missing):
+            return error._replace(state=OPEN), {"reason": "It was not measured."}
+        return count_of(error), {"text": number(error, 3)}
+
+    return read
+
+
+CONTROL = {"harm": _harm, "settled": _share("settled"), "stay": _share("stay")}
+SEEING = {
+    "image_accuracy": _accuracy,
+    "right_70_150": _right_by_flow,
+    "ece_image": _calibration("ece_image", "ece_image_raw"),
+    "ece_window": _calibration("ece_window", "ece_window_counts"),
+}
+
+
+def undecided(question: Question, figure: Figure, words: Mapping[str, Any]) -> str:
+    """What would tell, where the interval straddles the limit: of runs that share nothing
+    z^2 p (1 - p) / (p - limit)^2 at 95 %; of clustered ones the segments by which the interval shrinks."""
+    if state(question, figure) != UNDECIDED:
+        return ""
+    p, off = figure.value / 100, abs(figure.value - question.limit) / 100
+    if words.get("clustered"):
+        times = ((figure.high - figure.low) / 200 / off) ** 2 if off else math.inf
+        more = (
+            f"about {number(max(math.ceil(times - 1e-6), 2), 0)} times as many segments would decide"
+            if times < 1000
+            else "no number of segments would decide"
+        )
+        return f" Its interval, {band(figure.low, figure.high, 1)}, straddles that; {more}."
+    needed = 1.96**2 * p * (1 - p) / off**2 if off else math.inf
+    more = (
+        f"about {_round(needed):,} runs in all would decide"
+        if needed < 1e7
+        else "no number of runs would decide"
+    )
+    return f" Its interval, {band(figure.low, figure.high, 1)}, straddles that; {more}."
+
+
+def _round(value: float) -> int:
+    power = 10 ** max(math.floor(math.log10(max(value, 1))) - 1, 0)
+    return math.ceil(value / power) * power
+
+
+# yardsticks of the classifier
+BRIEF = {"svc": "SVC", "cnn": "CNN", "width": "width"}
+
+
+# ---- the verdict
+
+
+def verdict(evidence: Evidence) -> Verdict:
+    """Who sets flow and temperature by default: `winner`, "" if nobody chose. `note` says of what printers
+    anything is claimed."""
+    scores, recorded = board(evidence), evidence.recorded("train_classifier")
+    claim, words = CLAIM_RECORDED if recorded else CLAIM, words_for(recorded=recorded, quick=evidence.quick)
+    if recorded and lookup(evidence.figures["train_classifier"], "data.windows_apart") is False:
+        claim += NOT_APART
+    if isinstance(scores, Missing) or not scores.default:
+        gap = scores if isinstance(scores, Missing) else evidence.tables["choice"]
+        return Verdict(
+            loop=LOOP,
+            state=OPEN,
+            decision=words.undecided,
+            lead="No controller was chosen.",
+            reason=gap.sentence()
+            if isinstance(gap, Missing)
+            else "The choice names a controller that was not judged.",
+            remedy="",
+            rule="",
+            winner="",
+            note=claim,
+            rules=rules(evidence, None if isinstance(scores, Missing) else scores),
+        )
+    scores = _certified(evidence, scores)
+    lines, refusal = rules(evidence, scores), evidence.refusal(LOOP, scores.default)
+    asked = _asked(lines, scores)
+    if refusal:
+        gap = Missing(UNDECIDED, refusal)
+        asked.append(Rule(CERTIFICATE, None, gap, text="refused", limit="passed", reason=refusal))
+    name = named(scores, scores.default)
+    ended, first = (
+        overall([rule.state for rule in asked if _binding(rule)]),
+        deciding(filter(_binding, asked)),
+    )
+    settled = Verdict(
+        loop=LOOP,
+        state=PASSED,
+        decision=words.passed.format(name),
+        lead=f"All {count(len(asked), 'rule')} passed.",
+        reason=summary(evidence, scores),
+        remedy="",
+        rule="",
+        winner=scores.default,
+        note=claim,
+        rules=lines,
+    )
+    if first is None:
+        return settled
+    failed = first.state == FAILED
+    return settled._replace(
+        winner=None if refusal else scores.default,
+        subject=scores.default,
+        state=ended,
+        decision=words.of(ended),
+        lead=f"First {'failed' if failed else 'undecided'} rule: {first.name[:1].lower()}{first.name[1:]}.",
+        reason=_closest(name, first),
+        remedy=_conditions(asked, claim == CLAIM),
+        rule=first.name,
+    )
+
+
+def _certified(evidence: Evidence, board: Board) -> Board:
+    """The board with its default; if the certificate of that one is refused, with the next that passes and is
+    not refused, if there is one."""
+    if not evidence.refusal(LOOP, board.default):
+        return board
+    names = [name for name in board.names if name not in board.refused and not evidence.refusal(LOOP, name)]
+    others = (board._replace(default=name) for name in names)
+    passing = (
+        other
+        for other in others
+        if all(rule.state == PASSED for rule in _asked(rules(evidence, other), other) if _binding(rule))
+    )
+    return next(passing, board)
+
+
+def _asked(lines: Sequence[Pair], board: Board) -> list[Rule]:
+    """The rules of the default: those of the classifier, and those of its column."""
+    column = int(board.kinds[board.default] == BASELINE)
+    return [line[0 if of_classifier(line[0]) else column] for line in lines]
+
+
+def _binding(rule: Rule) -> bool:
+    """Whether the loop cannot steer without the rule."""
+    row = next((row for row in rows(LOOP).values() if row.name == rule.name), None)
+    return row is None or bool(row.needed_for)
+
+
+def _conditions(asked: Sequence[Rule], rendered: bool) -> str:
+    """What would have to come out before the loop may steer: every rule that
+    does not pass with its figure, and what to try."""
+    short = [rule for rule in asked if rule.state != PASSED]
+    figures = [
+        f"{rule.name[:1].lower()}{rule.name[1:]} {rule.limit} (now "
+        f"{rule.text}{', undecided' if rule.state == UNDECIDED else ''})"
+        for rule in short
+    ]
+    real = " Recordings of the real printer: none are in (datasets/raw/setpoint)." if rendered else ""
+    remedies = dict.fromkeys(rule.remedy for rule in short if rule.remedy)
+    return f"Before it may: {', '.join(figures)}.{real} To try: {' '.join(remedies)}"
+
+
+def _closest(name: str, rule: Rule) -> str:
+    """Who comes closest, and how far it is off; a rule of the classifier holds whoever controls."""
+    return (
+        f"{rule.reason} By runs that settle and stay {name} comes closest."
+        if of_classifier(rule)
+        else f"Judged is {name}: {rule.reason[:1].lower()}{rule.reason[1:]}"
+    )
+
+
+def named(board: Board, name: str) -> str:
+    """ "the agent “ours”", "the baseline “Bayes, robust”"."""
+    kind = {AGENT: "the agent", PAPER: "the paper’s agent"}.get(board.kinds[name], "the baseline")
+    return (
+        kind
+        if name.lower() in ("agent", "our agent", "ours", "the paper's agent", "paper", "the paper’s agent")
+        else f"{kind} “{name}”"
+    )
+
+
+def _noise(choice: Any, mine: Figure, other: Figure) -> str:
+    """The interval of the margin where the choice gives one, and whether it is within noise."""
+    ends = [lookup(choice, f"margin_{end}") for end in ("low", "high")]
+    if any(isinstance(end, Missing) for end in ends):
+        return ", which is within the noise of these runs" if other.high >= mine.low else ""
+    low, high = (float(end) for end in ends)
+    within_noise = " and within noise" if low <= 0 <= high else ""
+    return f" (95{THIN}% interval {band(low, high, 1)} points{within_noise})"
+
+
+def summary(evidence: Evidence, board: Board) -> str:
+    """The default's worst case, by how much it beats the next of those that may run, and,
+    where the agent is neither, how far it came."""
+    mine, place = worst(board, board.default, "lasting")
+    if place is None or isinstance(mine, Missing):
+        return ""
+    runs = board.cells[board.default, place].runs
+    text = f"In its worst case ({within(place)}) {share_text(mine)} of {runs:,} runs settle and stay"
+    judged = [name for name in board.names if name != board.default and worst(board, name, "lasting")[1]]
+    others = [name for name in judged if name not in board.refused]
+    if not others:
+        return f"{text}. {'Nothing else may run' if judged else 'Nothing else was judged'}."
+    figure, where = worst(board, others[0], "lasting")
+    if where is None or isinstance(figure, Missing):
+        return text
+    margin = lookup(evidence.tables["choice"], "margin")
+    points = mine.value - figure.value if isinstance(margin, Missing) else float(margin)
+    noise = _noise(evidence.tables["choice"], mine, figure)
+    rival = f"the next, {named(board, others[0])}, in its own ({within(where)}: {share_text(figure)})"
+    text += (
+        f", {number(abs(points), 1)} points {'more' if points > 0 else 'fewer'} than of {rival}{noise}."
+        if abs(points) >= 0.05
+        else f", as many as of {rival}."
+    )
+    learned = board.learned()
+    if not learned or learned in (board.default, others[0]):
+        return text
+    figure, where = worst(board, learned, "lasting")
+    if where is None:
+        return text
+    name = named(board, learned)
+    if learned in board.refused:
+        return f"{text} {name[:1].upper()}{name[1:]} may not run, for its harm."
+    return f"{text} {name[:1].upper()}{name[1:]} did not earn it: {share_text(figure)} ({within(where)})."

@@ -1,0 +1,172 @@
+"""Figures of the stages -> the figures of each controller of the temperature loop that its rules ask for: as
+deployed, over all plants, at the 90 % quantile with the band of that quantile."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pipeline.verdict.controllers import BY_NAME, DATA_DRIVEN, YARDSTICKS, heading
+from pipeline.verdict.digits import number
+from pipeline.verdict.evidence import Figures, entry
+from pipeline.verdict.rules import at_path, rows
+from pipeline.verdict.verdict import OPEN, Figure, Missing, count_of
+
+LOOP = "temperature"
+REPEAT = "Run ./run dvc repro evaluate_temperature"
+# figures of the scorecard that come as median and quantile
+QUANTILES = ("settled_error", "settling", "overshoot", "at_limits", "energy", "cost")
+
+
+def comparison(figures: Figures) -> Mapping[str, Any]:
+    """The metrics of the comparison; {} where there are none."""
+    compared = figures.get("evaluate_temperature")
+    return compared if isinstance(compared, Mapping) else {}
+
+
+def names(figures: Figures) -> list[str]:
+    """Controllers with figures, in the declared order of simplicity, the yardstick last."""
+    compared = comparison(figures)
+    listed = list(entry(compared, "contestants") or {})
+    ordered = [name for name in entry(compared, "order") or BY_NAME if name in listed]
+    return sorted(dict.fromkeys([*ordered, *listed]), key=lambda name: name in YARDSTICKS)
+
+
+def refused(figures: Figures) -> dict[str, str]:
+    """Why controllers could not take part, by name."""
+    reasons = {name: str(why) for name, why in (entry(comparison(figures), "refused") or {}).items()}
+    kernel = entry(figures.get("learn_kernel"), "refused")
+    if kernel and DATA_DRIVEN not in (entry(comparison(figures), "contestants") or {}):
+        reasons.setdefault(DATA_DRIVEN, str(kernel))
+    return reasons
+
+
+def finite(value: Any) -> float:
+    """A number of the metrics; null, and what is no number, is without end."""
+    numeric = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if numeric and math.isfinite(value) else math.inf
+
+
+def quantile(figures: Any) -> Figure | None:
+    """The 90 % quantile with its band; None where the figure is not there."""
+    if not isinstance(figures, Mapping) or "q90" not in figures:
+        return None
+    value = finite(figures["q90"])
+    low, high = (finite(figures.get(end, figures["q90"])) for end in ("low", "high"))
+    return Figure(value, min(low, value), max(high, value))
+
+
+def of_controller(figures: Figures, name: str, undeclared: Sequence[str] = ()) -> dict[str, Figure | Missing]:
+    """{key: figure} of one controller; `undeclared` are outputs without low and high."""
+    own = entry(comparison(figures), "contestants", name)
+    by_path = {key: row for key, row in rows(LOOP).items() if "." in row.figure}
+    if own is None:
+        keys = (*QUANTILES, "disk", "delay_s", "crossings", *by_path)
+        return dict.fromkeys(keys, _without(figures, name)) | {"data": data(figures, name)}
+    gap = Missing(OPEN, "This figure is not in the scorecard", REPEAT)
+    return {
+        **{key: quantile(entry(own, key)) or gap for key in QUANTILES},
+        **{key: _margin(own, key) or _without_margin(own, gap) for key in ("disk", "delay_s")},
+        **{
+            key: at_path(figures, row.figure.format(controller=name), at_least=row.at_least is not None)
+            for key, row in by_path.items()
+        },
+        "crossings": crossings(own, undeclared),
+        "data": data(figures, name),
+    }
+
+
+def _without(figures: Figures, name: str) -> Missing:
+    """Why a controller has no figures: refused, or nothing was measured."""
+    compared = figures.get("evaluate_temperature")
+    if reason := refused(figures).get(name):
+        return Missing("failed", reason)
+    if isinstance(compared, Missing):
+        return compared
+    return Missing(OPEN, f"{heading(name)} is not among what the stage measured", REPEAT)
+
+
+def unstable(figures: Any) -> tuple[int, int]:
+    """(plants that a controller does not hold stable, plants)."""
+    stable, of = (entry(figures, "stable", key) for key in ("count", "of"))
+    return (of - stable, of) if isinstance(stable, int) and isinstance(of, int) else (0, 0)
+
+
+def _margin(figures: Any, key: str) -> Figure | None:
+    """A margin of the median plant; none where a plant's loop is unstable. The panel's spread has gain, speed
+    and delay in it: a margin on its worst plant would ask for the same doubt twice."""
+    margin = entry(figures, "margins", key)
+    if not isinstance(margin, Mapping) or "median" not in margin:
+        return None
+    median = 0.0 if unstable(figures)[0] else finite(margin["median"])
+    return count_of(median)
+
+
+def _without_margin(figures: Mapping[str, Any], gap: Missing) -> Missing:
+    """A controller that closes no loop has no margin to lose."""
+    if "margins" in figures and figures["margins"] is None:
+        return Missing("not applicable", "it closes no loop")
+    return gap
+
+
+def crossings(figures: Any, undeclared: Sequence[str] = ()) -> Figure | Missing:
+    """Cases in which a true output leaves its declared low or high."""
+    if undeclared:
+        names = ", ".join(undeclared)
+        return Missing(
+            OPEN,
+            f"low and high of {names} are not declared",
+            "Declare low and high below plant.outputs in params.yaml",
+        )
+    cases, of = (entry(figures, "crossings", key) for key in ("cases", "of"))
+    if not isinstance(cases, int):
+        return Missing(OPEN, "Crossings of the outputs’ limits are not in the scorecard", REPEAT)
+    return count_of(float(cases))._replace(note=f"of {number(finite(of), 0)} cases")
+
+
+# ---- the data
+
+
+def data(figures: Figures, name: str) -> Figure | Missing:
+    """Samples of the record over the samples that a controller needs: for its noise, and for its unknowns."""
+    learned = figures.get("learn_kernel")
+    learned_from = BY_NAME[name].learned_from if name in BY_NAME else "plant"
+    if learned_from == "kernel":
+        if entry(learned, "refused") and entry(learned, "samples_needed") is None:
+            return Missing("failed", str(entry(learned, "refused")))
+        return _of(learned, entry(learned, "samples"), entry(learned, "samples_needed"))
+    if learned_from == "window":
+        noise, past = entry(learned, "samples_needed_for_noise"), entry(learned, "window")
+        needed = None if noise is None or past is None else max(noise, _unknowns(figures, past))
+        return _of(learned, entry(learned, "samples"), needed)
+    if learned_from == "plant":
+        return _model_data(figures)
+    return Missing("not applicable", f"{heading(name)} learns nothing from the record")
+
+
+def _unknowns(figures: Figures, past: int) -> int:
+    """Unknowns of one output's regression on `past` samples of every signal and a constant."""
+    model = figures.get("identify_plant")
+    return past * sum(len(entry(model, key) or ()) for key in ("delays", "fit_holdout")) + 1
+
+
+def _model_data(figures: Figures) -> Figure | Missing:
+    """The model has fewer unknowns than the window, so that noise asks no more of it; its
+    own first step, a long VARX, asks for its unknowns."""
+    model = figures.get("identify_plant")
+    past, needed = entry(model, "past"), entry(model, "samples_needed")
+    noise = entry(figures.get("learn_kernel"), "samples_needed_for_noise")
+    if needed is None and past is not None and noise is not None:
+        needed = max(noise, _unknowns(figures, past))
+    return _of(model, entry(model, "rows"), needed)
+
+
+def _of(stage: Any, samples: Any, needed: Any) -> Figure | Missing:
+    if isinstance(stage, Missing):
+        return stage
+    if samples is None or not needed:
+        return Missing(OPEN, "the number of samples that are needed is not known")
+    ratio, more = samples / needed, max(needed - samples, 0)
+    note = f"{number(samples, 0)} of {number(needed, 0)} samples" + (
+        f"; record {number(more, 0)} more" if more else ""
+    )
+    return count_of(ratio)._replace(note=note)

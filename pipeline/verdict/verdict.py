@@ -1,0 +1,293 @@
+"""What the verdicts of all loops stand on: a figure, the rule that it is held against, which rule decides,
+and the verdict. No page, no file."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pipeline.store import artifacts
+from pipeline.verdict.digits import decimals
+
+PASSED, FAILED, UNDECIDED, OPEN = "passed", "failed", "undecided", "not measured"
+# a rule that cannot be judged before somebody declares what it asks about
+UNJUDGED = "not applicable"
+# the rule of a controller whose certificate is refused; no row holds it
+CERTIFICATE = "certificate"
+
+
+class Figure(NamedTuple):
+    """A median and its 90 % band; infinite where a run never settles, or no delay breaks a loop. `runs` are
+    the repetitions behind them, where they are known.
+    """
+
+    value: float
+    low: float
+    high: float
+    runs: tuple[float, ...] = ()
+    note: str = ""
+
+
+class Missing(NamedTuple):
+    """In the place of a figure: its state (not measured, failed, not
+    applicable, stale), why, and what to do."""
+
+    state: str
+    reason: str
+    remedy: str = ""
+
+    def sentence(self) -> str:
+        return " ".join(part for part in (_ended(self.reason), _ended(self.remedy)) if part)
+
+
+def _ended(text: str) -> str:
+    text = text.strip()
+    return text if not text or text.endswith((".", "!", "?")) else text + "."
+
+
+class Question(NamedTuple):
+    """One row of page one: the answer's number, the figure's key, what is asked, its unit, its limit, and
+    which of the five rules it belongs to.
+    """
+
+    answer: int
+    key: str
+    title: str
+    unit: str
+    limit: float
+    at_least: bool
+    rule: str
+    beyond: str = "never"
+
+
+Answers = Mapping[str, Figure | Missing]
+ROLES = {"data_driven": "data-driven", "model_based": "model-based", "baseline": "baseline"}
+# the largest number below 1: what a figure may be at most that must be less than 1
+BELOW_ONE = math.nextafter(1.0, 0.0)
+
+
+def state(question: Question, figure: Figure | Missing) -> str:
+    """Passed: the whole band is inside the limit; failed: the whole
+    band is outside; undecided: it straddles."""
+    if isinstance(figure, Missing):
+        return FAILED if figure.state == FAILED else OPEN
+    best, worst = (figure.high, figure.low) if question.at_least else (figure.low, figure.high)
+    inside = (lambda end: end >= question.limit) if question.at_least else (lambda end: end <= question.limit)
+    return PASSED if inside(worst) else UNDECIDED if inside(best) else FAILED
+
+
+def row_places(question: Question, figures: Sequence[Figure | Missing]) -> int:
+    """One number of decimals for a row: what the widest band supports,
+    but enough to show the smallest value at all."""
+    mine = [(f, decimals(f.low, f.high, value=f.value)) for f in figures if isinstance(f, Figure)]
+    if question.key == "data":
+        return 0 if all(f.value >= 10 for f, _ in mine) else 2
+    if not mine:
+        return decimals(0, 0, value=question.limit)
+    places = min(own for _, own in mine)
+    return max([places, *(own for f, own in mine if f.value and round(f.value, places) == 0)])
+
+
+def share(question: Question, value: float) -> float:
+    """Share of the allowance used: value / limit, or required / actual where more is better. Of what must not
+    happen at all, none or all of it."""
+    if not question.limit:
+        return math.inf if value > 0 else 0.0
+    if question.at_least:
+        return math.inf if value <= 0 else 0.0 if math.isinf(value) else question.limit / value
+    return math.inf if math.isinf(value) else value / question.limit
+
+
+# ---- rules
+
+
+def count_of(number: float) -> Figure:
+    """A figure that was counted or computed once: its band is itself."""
+    return Figure(number, number, number)
+
+
+class Rule(NamedTuple):
+    """One rule held against one controller: what is asked, and the figure with its band.
+
+    `text` and `limit` say both as the page does. `place` is the id of the picture behind it. `reason` says in
+    a sentence why the rule does not pass, `remedy` what to do then. A rule that asks no question, such as
+    drift, has the state of what is missing, and passes where nothing is.
+    """
+
+    name: str
+    question: Question | None
+    figure: Figure | Missing
+    text: str = ""
+    limit: str = ""
+    place: str = ""
+    reason: str = ""
+    remedy: str = ""
+
+    @property
+    def state(self) -> str:
+        """Passed, failed, undecided (the band straddles the limit) or not measured."""
+        if self.question is None:
+            return self.figure.state if isinstance(self.figure, Missing) else PASSED
+        return state(self.question, self.figure)
+
+
+# which rule is named: the first of the gravest state, or the first failed one before any that is open
+BY_SEVERITY = ((FAILED,), (UNDECIDED,), (OPEN,))
+FAILED_FIRST = ((FAILED,), (UNDECIDED, OPEN))
+
+
+def deciding(rules: Iterable[Rule], order: Sequence[Sequence[str]] = BY_SEVERITY) -> Rule | None:
+    """The rule that decides: the first in the gravest state; None where none failed or is open."""
+    rules = list(rules)
+    return next((rule for states in order for rule in rules if rule.state in states), None)
+
+
+def worst_state(states: Sequence[str]) -> str:
+    """The gravest of these states: failed, undecided, not measured, passed."""
+    return next((wanted for group in BY_SEVERITY for wanted in group if wanted in states), PASSED)
+
+
+def overall(states: Sequence[str]) -> str:
+    """What a verdict says of rules in these states: failed, open or passed."""
+    return {FAILED: FAILED, PASSED: PASSED}.get(worst_state(states), OPEN)
+
+
+# ---- the verdict
+
+
+class Words(NamedTuple):
+    """What a verdict may say. A verdict on simulated machines says that it is one."""
+
+    passed: str
+    failed: str
+    undecided: str
+
+    def of(self, state: str) -> str:
+        """The word for a verdict in this state, `passed` with a place for the controller."""
+        return {PASSED: self.passed, FAILED: self.failed}.get(state, self.undecided)
+
+
+SIMULATION = Words("Pass (simulation): {}.", "Fail (simulation).", "Undecided (simulation).")
+NOT_READY = "Not ready for a supervised trial."
+TRIAL = Words("Ready for a supervised trial: {}.", NOT_READY, NOT_READY)
+# few plants, short searches: neither a simulation nor a trial is passed by them
+QUICK = Words("Quick look passed: {}.", "Quick look failed.", "Quick look undecided.")
+
+
+def words_for(*, recorded: bool, quick: bool) -> Words:
+    """The words of a run on recordings or on simulated machines; a quick look says that it is one."""
+    return QUICK if quick else TRIAL if recorded else SIMULATION
+
+
+class Verdict(NamedTuple):
+    """What is decided on one loop, and by which rule.
+
+    `state` is passed, failed or not measured. Decision, lead, reason, remedy and note are whole sentences.
+    `rule` names the rule that decides, "" where all passed. `winner` is the controller that should run.
+    `rules` has a line for each rule, and in it an entry for each controller that is shown. `subject` is the
+    controller that the verdict is about, passed or not; `rehearsal`: it was judged on simulated data.
+    """
+
+    loop: str
+    state: str
+    decision: str
+    lead: str
+    reason: str
+    remedy: str
+    rule: str
+    winner: str | None
+    note: str = ""
+    rules: tuple[tuple[Rule, ...], ...] = ()
+    subject: str = ""
+    rehearsal: bool = False
+
+    @property
+    def word(self) -> str:
+        """Passed, failed or open: the class of the verdict on a page."""
+        return {PASSED: "passed", FAILED: "failed"}.get(self.state, "open")
+
+    @property
+    def sentence(self) -> str:
+        """The decision, and the rule that decided it: "Fail (simulation). First failed rule: settling." """
+        return f"{self.decision} {self.lead}".strip()
+
+    def metrics(self) -> dict[str, str | bool | None]:
+        """What datasets/report/figures.json keeps of it."""
+        return {name: getattr(self, name) for name in WRITTEN}
+
+    @classmethod
+    def read(cls, loop: str, fields: Mapping[str, Any]) -> "Verdict":
+        """What `metrics` wrote. Of a file that somebody edited, what is missing is empty, and open."""
+        text = {name: str(fields.get(name) or "") for name in WRITTEN}
+        verdict = cls(
+            loop, text["state"] or OPEN, text["decision"], text["lead"], text["reason"], "", "", None
+        )
+        return verdict._replace(
+            remedy=text["remedy"],
+            rule=text["rule"],
+            winner=text["winner"] or None,
+            subject=text["subject"],
+            rehearsal=bool(fields.get("rehearsal")),
+        )
+
+
+WRITTEN = ("state", "decision", "lead", "reason", "remedy", "rule", "winner", "subject", "rehearsal")
+
+
+# ---- the files of the stage `verdict`
+
+LOOPS = ("temperature", "deposition", "setpoint")
+
+
+def write(verdicts: Mapping[str, Verdict], folder: str | Path) -> None:
+    """Writes each verdict to `folder`/<loop>.json. Equal verdicts give equal bytes."""
+    for loop, verdict in verdicts.items():
+        lines = [[_encode(rule) for rule in line] for line in verdict.rules]
+        # whom the rules would name, and whose certificate is refused: its certificate is still exported
+        refused = verdict.subject if verdict.rule == CERTIFICATE else None
+        fields = {**verdict._asdict(), "rules": lines, "refused": refused}
+        artifacts.write_json(Path(folder) / f"{loop}.json", fields)
+
+
+def read(folder: str | Path, names: Sequence[str] = LOOPS) -> dict[str, Verdict]:
+    """The verdicts that `write` wrote, by loop. A loop that is switched off has no file and is left out."""
+    files = {loop: Path(folder) / f"{loop}.json" for loop in names}
+    return {
+        loop: _decode(artifacts.read_json(path)) for loop, path in files.items() if artifacts.exists(path)
+    }
+
+
+def _encode(rule: Rule) -> dict[str, Any]:
+    """A rule for JSON, which knows no infinity: a number that is not finite is text."""
+    figure, question = rule.figure, rule.question
+    return rule._asdict() | {
+        "figure": {name: _text(value) for name, value in figure._asdict().items()},
+        "question": question and {name: _text(value) for name, value in question._asdict().items()},
+        "state": rule.state,
+    }
+
+
+def _text(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_text(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _decode(fields: Mapping[str, Any]) -> Verdict:
+    rules = tuple(tuple(_rule(rule) for rule in line) for line in fields["rules"])
+    return Verdict(**{name: fields[name] for name in Verdict._fields})._replace(rules=rules)
+
+
+def _rule(fields: Mapping[str, Any]) -> Rule:
+    figure, question = fields["figure"], fields["question"]
+    values = {name: value for name, value in fields.items() if name != "state"}
+    return Rule(**values)._replace(
+        figure=Missing(**figure)
+        if "state" in figure
+        else Figure(
+            *(float(figure[end]) for end in ("value", "low", "high")),
+            runs=tuple(map(float, figure["runs"])),
+            note=figure["note"],
+        ),
+        question=question and Question(**question)._replace(limit=float(question["limit"])),
+    )

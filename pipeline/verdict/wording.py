@@ -1,0 +1,77 @@
+"""Figures of the temperature loop in sentences: with their unit, or in words if their digits say nothing."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pipeline.verdict.controllers import in_a_sentence
+from pipeline.verdict.digits import band, beyond_meaning, declared, quantity, with_unit
+from pipeline.verdict.verdict import Figure, Missing, Question, row_places
+
+OFF_THE_SCALE = "off the scale"
+# what an infinite figure is called
+INFINITE = {"settling": "never settles", "disk": "unlimited", "delay_s": "unlimited", "data": "unlimited"}
+
+
+def places_of(question: Question, figures: Sequence[Figure | Missing]) -> int:
+    """Decimals of a row: as its bands support, two at most, but enough to show the smallest figure at all."""
+    places = row_places(question, figures)
+    small = [f.value for f in figures if isinstance(f, Figure) and f.value and round(f.value, 2) == 0]
+    return places if small else min(places, 2)
+
+
+def worded(question: Question, value: float, places: int) -> str:
+    """A figure with its unit; in words where its digits say nothing."""
+    if math.isinf(value):
+        return INFINITE.get(question.key, "unstable")
+    if beyond_meaning(value, question.unit) or abs(value) > 1e4:
+        return OFF_THE_SCALE
+    return quantity(value, question.unit, places)
+
+
+def banded(question: Question, figure: Figure, places: int) -> str:
+    """The band of a figure, "" where it is none or one of its ends says nothing."""
+    ends = worded(question, figure.low, places), worded(question, figure.high, places)
+    if OFF_THE_SCALE in ends or any(map(math.isinf, (figure.low, figure.high))):
+        return "" if ends[0] == ends[1] else " to ".join(ends).replace("never settles", "never")
+    return band(figure.low, figure.high, places, unit=question.unit)
+
+
+def name_first(name: str) -> str:
+    text = in_a_sentence(name) if name else "it"
+    return f"{text[:1].upper()}{text[1:]}"
+
+
+LOST = "{who} {lost} at the 90 % quantile of all cases; the rule allows {limit}."
+
+
+def words_of(question: Question, figure: Figure, name: str) -> dict[str, Any]:
+    """What the sentence of a rule says of a controller: who, its value and the limit; `fails` is the sentence
+    of a figure without digits."""
+    places = places_of(question, [figure])
+    value = worded(question, figure.value, places)
+    # a limit too small for the figure's decimals has its own
+    exact = (
+        places
+        if math.isinf(question.limit) or round(question.limit, places) or not question.limit
+        else declared(question.limit)
+    )
+    words = {
+        "limit": question.limit,
+        "who": name_first(name),
+        "value": value,
+        "limit_words": with_unit(question.limit, question.unit, exact),
+        "note": figure.note,
+        "text": "",
+    }
+    if question.key == "data" or not (math.isinf(figure.value) or value == OFF_THE_SCALE):
+        return words
+    key = f" in {question.key.replace('_', ' ')}" if value == OFF_THE_SCALE else ""
+    lost = value if value == INFINITE["settling"] else f"is {value}{key}"
+    return words | {"fails": LOST, "lost": lost}
+
+
+def straddling(question: Question, figure: Figure, words: Mapping[str, Any]) -> str:
+    """That the band of a quantile straddles its limit."""
+    ends = banded(question, figure, places_of(question, [figure]))
+    return f" The band of that quantile, {ends}, straddles the limit."
