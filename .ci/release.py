@@ -7,7 +7,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path.cwd()))
 
-from pipeline.store import artifacts, made  # noqa: E402
+from pipeline.papers import made  # noqa: E402
+from pipeline.store import artifacts  # noqa: E402
 
 
 def main() -> None:

@@ -18,13 +18,13 @@ import numpy as np
 
 from benchmarks import results
 from benchmarks.results import Row
-from pipeline.deposition.camera.bead import Calibration, area, calibrate, measure, measure_all
+from pipeline.deposition.camera.bead import WidthCalibration, area, calibrate, measure, measure_all
 from pipeline.deposition.camera.flow import Flow, View, estimate, sections
-from pipeline.deposition.camera.rendering import HARD, NOMINAL, Camera, Scene
+from pipeline.deposition.camera.rendering import HARD, NOMINAL, Scene, SimulatedCamera
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, routine
 from pipeline.deposition.learning import ilc
-from pipeline.deposition.workflow.trial_files import Conditions, Signals, read_trial, write_trial
+from pipeline.reading.trial_files import TrialConditions, TrialSignals, read_trial, write_trial
 
 TS, SPEED, ANGLE_DEG, PX_PER_MM = 0.02, 8.0, 90.0, 125.0
 AREA = float(area(0.88, ANGLE_DEG))
@@ -48,7 +48,7 @@ OTHERS = {
 }
 
 
-def millimetres(calibration: Calibration, widths_px: np.ndarray) -> np.ndarray:
+def millimetres(calibration: WidthCalibration, widths_px: np.ndarray) -> np.ndarray:
     """Widths in mm; 0 (bare substrate) stays 0 and NaN stays NaN."""
     return np.where(widths_px == 0, 0.0, calibration.gain * widths_px + calibration.offset)
 
@@ -57,7 +57,7 @@ def widths(scene: Scene, seed: int, frames: int) -> tuple[np.ndarray, np.ndarray
     """Per width: mean error (px), deviation (px), and mean error after a calibration on the first, third and
     fifth, other frames than those judged."""
     rng = np.random.default_rng(seed)
-    camera = Camera(scene, rng)
+    camera = SimulatedCamera(scene, rng)
 
     def measured(width):
         return [
@@ -105,7 +105,7 @@ def empty_figures(frames: int = 500) -> dict[str, Any]:
     for name, (scene, _) in LEVELS.items():
         rng, beads = np.random.default_rng(300), []
         for _ in range(25):
-            camera = Camera(scene, rng)
+            camera = SimulatedCamera(scene, rng)
             beads += [
                 measure(
                     camera.empty(stage_px=int(rng.integers(0, 10**6))),
@@ -125,7 +125,7 @@ def empty_figures(frames: int = 500) -> dict[str, Any]:
     return out
 
 
-def flow_through_camera(camera: Camera, Q: np.ndarray, calibration) -> Flow:
+def flow_through_camera(camera: SimulatedCamera, Q: np.ndarray, calibration) -> Flow:
     frames = camera.trial(
         R.time_s,
         Q,
@@ -155,7 +155,7 @@ def flow_through_camera(camera: Camera, Q: np.ndarray, calibration) -> Flow:
     )
 
 
-def gauged(camera: Camera, rng: np.random.Generator, each: int = 5):
+def gauged(camera: SimulatedCamera, rng: np.random.Generator, each: int = 5):
     """A calibration on four known widths, as a user would make it."""
     widths_mm = np.repeat([0.55, 0.75, 0.95, 1.2], each)
     frames = [camera.frame(w * PX_PER_MM, stage_px=int(rng.integers(0, 10**6))) for w in widths_mm]
@@ -208,7 +208,7 @@ def flow_figures(seeds: int = 3) -> dict[str, Any]:
         rows: dict[str, list[dict[str, float]]] = {}
         for seed in range(400, 400 + seeds):
             rng = np.random.default_rng(seed)
-            camera = Camera(scene, rng)
+            camera = SimulatedCamera(scene, rng)
             calibration = gauged(camera, rng)
             for name, plant in plants(seed):
                 first = flow(plant, R.r / MATERIALS[name].gain, sample_time_s=TS)
@@ -228,7 +228,7 @@ def learned(name: str, plant: Extruder, scene: Scene, seed: int, trials: int) ->
 
     What is laid is the true flow with the trial noise of the plant family; the figure is the true flow's."""
     rng = np.random.default_rng(seed)
-    camera = Camera(scene, rng)
+    camera = SimulatedCamera(scene, rng)
     calibration = gauged(camera, rng)
 
     def run(u):
@@ -265,19 +265,19 @@ def pixel_figures(trials: int = 15) -> dict[str, Any]:
 # ---- recorded trials
 
 RECORDED, ROUNDS = 450, 5
-CONDITIONS = Conditions("A", "0.6 mm", 0, "on-off", 8.0, 0.6, 0.304, 125.0, 0.0, 90.0, -0.008, 60.0)
+CONDITIONS = TrialConditions("A", "0.6 mm", 0, "on-off", 8.0, 0.6, 0.304, 125.0, 0.0, 90.0, -0.008, 60.0)
 
 
 def rendered(count: int) -> list[np.ndarray]:
     """Frames of the nominal scene, the bead at 80 to 120 px."""
-    camera = Camera(NOMINAL, np.random.default_rng(0))
+    camera = SimulatedCamera(NOMINAL, np.random.default_rng(0))
     return [camera.frame(100.0 + 20 * np.sin(k), stage_px=33 * k) for k in range(count)]
 
 
 def record(path: Path, frames: list[np.ndarray], encoding: str) -> None:
     t = np.arange(RECORDED // 30 * 50) / 50
     stream: Iterator = ((k / 30, frames[k % len(frames)]) for k in range(RECORDED))
-    signals = Signals(t, 8 * t, np.full(t.size, 8.0), np.sin(t), np.cos(t))
+    signals = TrialSignals(t, 8 * t, np.full(t.size, 8.0), np.sin(t), np.cos(t))
     write_trial(path, CONDITIONS, stream, signals, encoding=encoding)
 
 

@@ -40,7 +40,8 @@ import re, sys, time
 from pathlib import Path
 from pipeline import cli
 from pipeline.deposition.toolpath import gcode, motion
-from pipeline.deposition.workflow import compose_parts, exports
+from pipeline.commands import compose
+from pipeline.deposition.parts import part, part_report, stored
 # of this process alone: the peak that getrusage tells began in its parent
 peak = lambda: int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 1024
 imports, begin, cpu, path = peak(), time.perf_counter(), time.process_time(), sys.argv[2]

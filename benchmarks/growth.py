@@ -102,7 +102,7 @@ def ingestion(rows: int, folder: Path) -> Work:
 
 def write_recording(path: Path, seed: int, samples: int) -> None:
     """A CSV of the machine of params.yaml with signals of its names."""
-    from pipeline.temperature.workflow.settings import Plant
+    from pipeline.temperature.settings import Plant
 
     machine = params.load(Plant, "plant")
     names = [signal.name for signal in [*machine.acting, *machine.outputs]]
@@ -113,23 +113,25 @@ def write_recording(path: Path, seed: int, samples: int) -> None:
 
 def recordings(count: int, folder: Path) -> Work:
     """So many CSV of 300 samples, none read before."""
-    from pipeline.temperature.workflow import ingest
-    from pipeline.temperature.workflow.settings import Ingest, Plant
+    from pipeline.reading.isolated import Budget
+    from pipeline.reading.recording_folders import join, read_folder
+    from pipeline.temperature.settings import Plant
+    from stages.ingest import Ingest, recording_wish
 
     machine, settings = params.load(Plant, "plant"), params.load(Ingest, "ingest")
     raw = folder / "raw"
     raw.mkdir()
     for k in range(count):
         write_recording(raw / f"{k:05}.csv", k, 300)
-    spec = ingest.spec_of(settings, machine, "simulated")  # our own names
+    wish = recording_wish(settings, machine, {})  # our own names
     execution, calls = params.load(params.Execution, "execution"), iter(range(MOST + 1))
-    budget = ingest.Budget(settings.longest_s, settings.largest_mb)
+    budget = Budget(settings.longest_s, settings.largest_mb)
 
     def work() -> int:
         memo = folder / f"memo_{next(calls)}"
-        results = ingest.process(raw, spec, execution, memo=memo, budget=budget)
-        record, _, _ = ingest.collect(results, machine, strict=True)
-        return len(record.columns["time_s"])
+        results = read_folder(raw, wish, execution, memo=memo, budget=budget)
+        record, _, _ = join(results, wish, strict=True)
+        return len(record["time_s"])
 
     return work
 
@@ -138,7 +140,7 @@ def trial(samples: int, folder: Path) -> Work:
     """The command of the next trial after three of so many samples at 50 Hz, the model identified anew."""
     from pipeline.deposition.extruder import Extruder, flow, routine
     from pipeline.deposition.learning import ilc
-    from pipeline.deposition.workflow.settings import Printer
+    from pipeline.deposition.settings import Printer
 
     printer = params.load(Printer, "printer")
     step, fixed_s = printer.sample_time_s, 8.0
@@ -159,14 +161,14 @@ def trial(samples: int, folder: Path) -> Work:
 
 def materials(count: int, folder: Path) -> Work:
     """The library of so many materials, each with all trials of one of the two that were trained on."""
-    from pipeline.deposition.parts import composition
-    from pipeline.deposition.workflow import segment_library
-    from pipeline.deposition.workflow.settings import Printer, SegmentLibrary
-    from pipeline.deposition.workflow.tables import LESSONS
+    from pipeline.deposition.parts import composition, stored
+    from pipeline.deposition.settings import Printer
+    from pipeline.deposition.tables import LESSONS
+    from stages.segment_library import SegmentLibrary
 
     printer, settings = params.load(Printer, "printer"), params.load(SegmentLibrary, "segment_library")
     samples = artifacts.read_table("datasets/train_ilc/lessons.parquet", LESSONS)
-    known = segment_library.trainings(samples, settings.law, printer.trained(), printer.nozzle_mm)
+    known = stored.trainings(samples, settings.law, printer.training_routines(), printer.nozzle_mm)
     names = sorted({one.material for one in known})
     many = [
         one._replace(material=f"{k:04}")
@@ -179,25 +181,23 @@ def materials(count: int, folder: Path) -> Work:
 
 def plants(count: int, folder: Path) -> Work:
     """Subspace + LQG as deployed on so many plants of the judging half, with its figures."""
-    from pipeline.temperature.test_set import panel
-    from pipeline.temperature.workflow import cases, evaluate_temperature, learned
-    from pipeline.temperature.workflow.settings import Panel, Plant, Tracking, TuneWeights
+    from pipeline.temperature.controllers.table import design_controllers
+    from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights
+    from pipeline.temperature.test_set import cases, panel
+    from stages.evaluate_temperature import read_weights
+    from stages.tune_weights import load_design_problem
 
     machine, tracking = params.load(Plant, "plant"), params.load(Tracking, "tracking")
     tuning, asked = params.load(TuneWeights, "tune_weights"), params.load(Panel, "panel")
     judging = asked.judging.model_copy(update={"plants": count})
     asked = asked.model_copy(update={"judging": judging, "steps": STEPS, "settled_steps": 10})
-    made = learned.read_learned(
-        "datasets/identify_plant/plant.parquet", "datasets/identify_plant/spread.parquet",
-        "datasets/learn_kernel", "datasets/ingest/printer_pid.json", machine,
-    )  # fmt: skip
-    record = "datasets/ingest/record.parquet"
-    posed = learned.posed(made, machine, asked, tracking, tuning, record, simulated=True)
-    weights = evaluate_temperature.read_weights("datasets/tune_weights/weights.json", machine)
-    design = evaluate_temperature.designed(posed.problem, weights)[0]["subspace_lqg"]
-    half = posed.setting.rehearsal.judging
-    at = panel.rests(design.model, half, posed.setting.limits)
-    return lambda: cases.played(design, at, half, posed.setting)
+    setting, problem = load_design_problem(machine, asked, tracking, tuning, simulated=True)
+    weights = read_weights("datasets/tune_weights/weights.json").contestants
+    tuned = {name: values.model_dump() for name, values in weights.items()}
+    design = design_controllers(problem, tuned)[0]["subspace_lqg"]
+    half = setting.rehearsal.judging
+    at = panel.rests(design.model, half, setting.limits)
+    return lambda: cases.play(design, at, half, setting)
 
 
 def lines(count: int, folder: Path) -> Work:

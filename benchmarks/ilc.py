@@ -70,7 +70,7 @@ def run(
     drive: Drive,
     rise: float,
     noise=NOISE,
-) -> list[ilc.Row]:
+) -> list[ilc.TrialRow]:
     """One row a trial; where the loop stopped, the trials after it print
     the best one's command, so its row is repeated."""
     rng = np.random.default_rng(seed)
@@ -91,7 +91,7 @@ def hoelzle_2009(name: str, r: np.ndarray, q=ilc.zero_phase) -> ilc.Law:
     return ilc.hoelzle_law(r, MATERIALS[name], q, HOELZLE, drive=UNLIMITED, sample_time_s=TS)
 
 
-def percent(rows: list[ilc.Row], trial: int) -> float:
+def percent(rows: list[ilc.TrialRow], trial: int) -> float:
     return round(100 * rows[trial].ratio, 2)
 
 
@@ -146,7 +146,7 @@ def hoelzle_figures(seeds: int) -> dict[str, Any]:
     return out
 
 
-def spread(rows: list[list[ilc.Row]], bars: dict[int, float | None]) -> dict[str, Any]:
+def spread(rows: list[list[ilc.TrialRow]], bars: dict[int, float | None]) -> dict[str, Any]:
     """Trial -> median, 90 % point and worst over the plants, and the share of plants within the bar."""
     out = {}
     for trial, bar in bars.items():

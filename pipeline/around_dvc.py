@@ -1,10 +1,10 @@
 """What `run` does around DVC: python -P pipeline/around_dvc.py OPTIONS COMMAND...
 
-OPTIONS are those of uv, in one word; COMMAND begins with dvc or beadline. Before it, recordings that are none
-are refused, a table of locks that a killed DVC left empty is removed, and reports/machine.js says where the
-pages are made. After `dvc repro` the last line is the verdict. DVC runs in this process: a signal reaches it,
-and its exit status is the one of `run`. Only the standard library is imported: DVC itself takes most of a
-repro with nothing to do.
+OPTIONS are those of uv, in one word; COMMAND begins with dvc or beadline. Before it, files that are no
+recordings and parameters that fit no section are refused, a table of locks that a killed DVC left empty is
+removed, and reports/machine.js says where the pages are made. If the pages are those of this `dvc repro`, the
+last line is the verdict. DVC runs in this process: a signal reaches it, and its exit status is the one of
+`run`. Only the standard library is imported: DVC itself takes most of a repro with nothing to do.
 """
 
 import contextlib
@@ -18,6 +18,7 @@ import time
 import zlib
 from pathlib import Path
 
+import stages
 from pipeline.reading.plain_files import check_plain_files
 from pipeline.store.printable import printable
 
@@ -27,6 +28,7 @@ RAW = Path("datasets/raw")
 # the code, as git is asked whether it has changed
 CODE = "pipeline stages run pyproject.toml uv.lock dvc.yaml params.yaml params.expert.yaml".split()
 MAKES_PAGES = ("dvc repro ", "dvc exp run ", "beadline nightly ")
+RUNS_STAGES = (*MAKES_PAGES, "beadline quick ")
 
 
 def main() -> None:
@@ -38,37 +40,37 @@ def main() -> None:
         write_machine(options)
     if words.startswith("dvc "):
         remove_empty_locks(ROOT / ".dvc/tmp/rwlock")
-    if words.startswith(("dvc ", "beadline nightly ")):
+    if words.startswith(("dvc ", "beadline nightly ", "beadline quick ")):
         try:
             for folder in dict.fromkeys([RAW, Path(os.path.relpath(ROOT / RAW))]):
                 check_plain_files(folder)
-            check_params()
+            check_params(runs_stages=words.startswith(RUNS_STAGES) and not shows_only)
         except ValueError as error:
-            sys.exit(f"run: {' '.join(printable(str(error)).split())}")
+            sys.exit(f"run: {printable('; '.join(str(error).splitlines()))}")
     if command[0] != "dvc":
         os.execvp(command[0], command)
+    page = ROOT / "reports/index.html"
+    before = version(page)
     status = run_dvc(command)
-    verdict = first_title(ROOT / "reports/index.html")
-    if status == 0 and verdict and words.startswith("dvc repro ") and not shows_only:
-        print(f"{verdict}. Open {ROOT}/reports/index.html")
+    # of stages by name, report may be none
+    names_stages = any(not word.startswith("-") for word in command[2:])
+    is_new = version(page) != before or not names_stages
+    if status == 0 and words.startswith("dvc repro ") and not shows_only and is_new:
+        if verdict := first_title(page):
+            print(f"{verdict}. Open {page}")
     sys.exit(status)
 
 
-def check_params() -> None:
-    """Raises ValueError, in one sentence, for parameters that cannot be read. DVC would read them first, by a
-    parser in C that crashes on hostile text. A content that was read once is not read again."""
-    paths = [ROOT / name for name in ("params.yaml", "params.expert.yaml")]
-    remembered, digest = ROOT / ".dvc/tmp/params_read", b""
-    if all(path.is_file() for path in paths):
-        digest = str(zlib.crc32(b"".join(map(read, paths)))).encode()
-    if digest and read(remembered) == digest:
-        return
-    from pipeline.store import params
+def check_params(*, runs_stages: bool) -> None:
+    """Raises ValueError with a line for each problem of the parameters. DVC would read them first, by a
+    parser in C that crashes on hostile text; and a stage would find them after those before it."""
+    path = os.path.relpath(ROOT / "params.yaml")
+    if runs_stages:
+        stages.check_parameters(path)
+    elif not stages.checked_loops(path):
+        from pipeline.store import params
 
-    params.files(os.path.relpath(paths[0]))
-    with contextlib.suppress(OSError):
-        remembered.parent.mkdir(exist_ok=True)
-        remembered.write_bytes(digest)
+        params.files(path)
 
 
 def run_dvc(command: list[str]) -> int:
@@ -102,6 +104,14 @@ def remove_empty_locks(rwlock: Path) -> None:
         time.sleep(wait_s)
     print("run: .dvc/tmp/rwlock was left half written by a killed DVC and is removed", file=sys.stderr)
     rwlock.unlink(missing_ok=True)
+
+
+def version(page: Path) -> tuple[int, int]:
+    """What differs after the page was written or checked out again."""
+    try:
+        return page.stat().st_ino, page.stat().st_mtime_ns
+    except OSError:
+        return (0, 0)
 
 
 def first_title(page: Path) -> str:

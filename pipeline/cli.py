@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING
 from pipeline.nightly import commands as nights
 from pipeline.store import artifacts, params
 from pipeline.store.printable import printable
-from pipeline.temperature.workflow.settings import Ingest, Plant
+from pipeline.temperature.settings import Plant
+from stages.ingest import Ingest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.commands.shadow.deploy import Ready
     from pipeline.nightly.records import ChampionState, Night
     from pipeline.nightly.settings import Nightly
-    from pipeline.setpoint.workflow.shadow.deploy import Ready
 
 
 def accept(_: argparse.Namespace) -> None:
@@ -139,7 +140,7 @@ def quick(arguments: argparse.Namespace) -> None:
 def init(arguments: argparse.Namespace) -> None:
     """Recordings of a new machine into params.yaml: mapping, plant, panel and
     rules that fit its pace; and what a person must still decide."""
-    from pipeline.temperature.workflow import propose_params
+    from pipeline.commands import propose_params
 
     initialised = propose_params.proposed(arguments.recordings, sample_time=arguments.time)
     changed = propose_params.write(initialised.values, force=arguments.force)
@@ -151,7 +152,7 @@ def init(arguments: argparse.Namespace) -> None:
 def first_experiment(arguments: argparse.Namespace) -> None:
     """A staircase for a machine of which there is no record yet: which input, which level, for how long, and
     at which temperature to stop. No model is behind it."""
-    from pipeline.temperature.workflow import first_experiment as first
+    from pipeline.commands import first_experiment as first
 
     plan = first.staircase(params.load(Plant, "plant"), arguments.hold)
     artifacts.write_csv(arguments.out, first.columns(plan))
@@ -161,31 +162,29 @@ def first_experiment(arguments: argparse.Namespace) -> None:
 def compose(arguments: argparse.Namespace) -> None:
     """A part program into plunger commands (CSV, Parquet, MCAP, G-code with leads), tasks and lines as
     Parquet, and whether it will print."""
-    from pipeline.deposition.workflow import compose_parts, exports, part_programs
-    from pipeline.deposition.workflow.segment_library import read_learned
-    from pipeline.deposition.workflow.settings import ComposeParts, Printer
+    from pipeline.commands import compose as command
+    from pipeline.deposition.parts.part_report import summary_lines
+    from pipeline.deposition.settings import ComposeParts, Printer
+    from stages.compose_parts import compose_part
 
     if arguments.out.exists() and not arguments.out.is_dir():
         raise ValueError(
             f"--out {arguments.out}: should be a folder but is a file; name a folder, "
             "which is made where it is missing"
         )
-    asked = part_programs.asked(
+    request = command.request(
         scale=arguments.scale, speed=arguments.speed, filament_mm=arguments.filament_mm,
         extruder=arguments.extruder, bead=arguments.bead,
     )  # fmt: skip
-    formats = exports.formats(arguments.formats)
-    learned = read_learned(
-        "datasets/segment_library/library.parquet", "datasets/segment_library/learned.json"
-    )
+    formats, learned = command.formats(arguments.formats), command.read_learned()
     printer, settings = params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts")
-    part = compose_parts.compose(arguments.part, learned, printer, settings, asked)
+    part = compose_part(arguments.part, learned, printer, settings, **request)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    files = exports.write(part, arguments.out, formats)
-    print(compose_parts.summary_lines(part))
+    files = command.write(part, arguments.out, formats)
+    print(summary_lines(part))
     print("written: " + ", ".join(str(file) for file in files))
     if arguments.verify:
-        from pipeline.deposition.workflow import verify_part
+        from pipeline.commands import verify_part
 
         print(verify_part.write(part, learned, printer, settings, arguments.out))
         print(verify_part.write_next(part, learned, printer, arguments.part.parent, arguments.out))
@@ -194,7 +193,7 @@ def compose(arguments: argparse.Namespace) -> None:
 def calibrate_tip(arguments: argparse.Namespace) -> None:
     """A picture of the nozzle's camera into a page on which a click gives the
     tip; with --tip, what the front end makes of it."""
-    from pipeline.setpoint.workflow.calibrate_tip import calibrate
+    from pipeline.commands.calibrate_tip import calibrate
 
     sections = params.read()
     try:
@@ -213,31 +212,31 @@ def calibrate_tip(arguments: argparse.Namespace) -> None:
 def calibrate_camera(arguments: argparse.Namespace) -> None:
     """Pictures of printed lines of known widths into section camera of params.yaml:
     size of a pixel, rotation, measured columns, edge bias by width; and a page."""
-    from pipeline.deposition.workflow import calibrate_camera as camera
+    from pipeline.commands import calibrate_camera as camera
 
-    asked = camera.Asked(
+    request = camera.CalibrationRequest(
         arguments.images,
         camera.numbers(arguments.widths, "--widths", "0.5,0.9,1.3"),
         camera.pixel(arguments.tip),
         arguments.pitch,
     )
     out = arguments.out or Path(f"{arguments.images[0].stem}.camera.html")
-    print(camera.calibrate(asked, out, write=arguments.write))
+    print(camera.calibrate(request, out, write=arguments.write))
 
 
 def shadow(arguments: argparse.Namespace) -> None:
     """Watch a printer's camera: what the controller would do in each window and why,
     as MCAP and a local page. Nothing is sent."""
-    from pipeline.setpoint.workflow.shadow import deploy
+    from pipeline.commands.shadow import deploy
 
     _watch(arguments, deploy.ready(str(arguments.levels or "")))
 
 
 def _watch(arguments: argparse.Namespace, ready: "Ready") -> None:
     """Watches a source of frames with the loop that is ready."""
-    from pipeline.setpoint.workflow import shadow as watching
-    from pipeline.setpoint.workflow.shadow import deploy
-    from pipeline.setpoint.workflow.watch_sources import shown_place, source
+    from pipeline.commands import shadow as watching
+    from pipeline.commands.shadow import deploy
+    from pipeline.reading.watch_sources import shown_place, source
 
     asked = deploy.asked(
         arguments.flow, arguments.temperature, arguments.tip, once=arguments.once, settings=ready
@@ -255,14 +254,14 @@ def record_levels(arguments: argparse.Namespace) -> None:
     and a page."""
     from functools import partial
 
+    from pipeline.commands import record_levels as levels
+    from pipeline.commands.shadow import deploy
+    from pipeline.commands.training_print import numbers
+    from pipeline.reading.watch_sources import RecordingSource
+    from pipeline.setpoint.recordings import read_options
+    from pipeline.setpoint.settings import SetpointMaterial
     from pipeline.setpoint.vision.calibrated_classifier import read_frames
     from pipeline.setpoint.vision.window_flow import window_flow
-    from pipeline.setpoint.workflow import record_levels as levels
-    from pipeline.setpoint.workflow.frame_folder import read_options
-    from pipeline.setpoint.workflow.settings import SetpointMaterial
-    from pipeline.setpoint.workflow.shadow import deploy
-    from pipeline.setpoint.workflow.training_print import numbers
-    from pipeline.setpoint.workflow.watch_sources import Recording
 
     eye = deploy.trained()
     options, fitted = read_options(eye.view), eye.model.calibration
@@ -275,7 +274,7 @@ def record_levels(arguments: argparse.Namespace) -> None:
         deploy.pixel(arguments.tip) if arguments.tip else options.tip_px,
     )
     place = arguments.source
-    source = levels.source_of(place, lambda path: Recording(path, options.topics))
+    source = levels.source_of(place, lambda path: RecordingSource(path, options.topics))
     levels_eye = levels.Eye(
         partial(read_frames, eye.model), partial(window_flow, fitted=fitted.flow), eye.view.window,
         eye.view.least_score, eye.digest, eye.view.false_alarms, material,
@@ -287,8 +286,8 @@ def record_levels(arguments: argparse.Namespace) -> None:
 def training_print(arguments: argparse.Namespace) -> None:
     """The G-code of a print from which the classifier learns: flows and temperatures in steps,
     with a layer at 100 % between; and a table of which setting holds from which line on."""
-    from pipeline.setpoint.workflow import training_print as printing
-    from pipeline.setpoint.workflow.shadow.deploy import pixel
+    from pipeline.commands import training_print as printing
+    from pipeline.commands.shadow.deploy import pixel
 
     def one(flag: str) -> float:
         return printing.numbers(str(getattr(arguments, flag[2:].replace("-", "_"))), flag, 1)[0]
@@ -297,7 +296,7 @@ def training_print(arguments: argparse.Namespace) -> None:
         x, y = printing.numbers(getattr(arguments, flag[2:]), flag, 2)
         return x, y
 
-    asked = printing.Print(
+    asked = printing.TrainingPrint(
         flows=printing.numbers(arguments.flows, "--flows"),
         temperatures=printing.numbers(arguments.temperatures, "--temperatures"),
         bed=pair("--bed"), height=one("--height"), size=pair("--size"), nozzle=one("--nozzle"),
@@ -311,7 +310,7 @@ def training_print(arguments: argparse.Namespace) -> None:
 def export(arguments: argparse.Namespace) -> None:
     """A certified controller as C99 without heap, as one file of Python, or as settings for Klipper and
     Kalico; what sees and decides in the setpoint loop as weights with readers that need numpy alone."""
-    from pipeline.runtime.workflow.exports import export as write
+    from pipeline.commands.export import export as write
 
     print(write(arguments.controller, arguments.to, arguments.out, arguments.section, arguments.power))
 
@@ -320,19 +319,20 @@ def replay(arguments: argparse.Namespace) -> None:
     """A recording, and what a certified controller would have asked on it and why not: as MCAP with a layout
     for Foxglove, and a page. Frames of the nozzle's camera go through the loop of shadow with the classifier
     and the filter of CONTROLLER. Nothing is sent."""
-    from pipeline.runtime.workflow import exports
+    from pipeline.commands import export as exports
 
     if exports.shows_frames(arguments.controller):
-        from pipeline.runtime.workflow import replay_camera
+        from pipeline.commands import replay_camera
 
         arguments.source, arguments.rate, arguments.once = str(arguments.recording), 5.0, True
         _watch(arguments, replay_camera.ready(arguments.controller))
         return
+    from pipeline.commands import replay as replaying
     from pipeline.report.replay import page
-    from pipeline.runtime.workflow import replay as replaying
 
-    asked = replaying.Asked(replaying.temperatures(arguments.reference), arguments.out)
-    done, made, told = replaying.replay_recording(arguments.controller, arguments.recording, asked)
+    done, made, told = replaying.replay_recording(
+        arguments.controller, arguments.recording, arguments.out, replaying.temperatures(arguments.reference)
+    )
     inputs, outputs = ([one.name for one in side] for side in (made.machine.inputs, made.machine.outputs))
     shown = page.ReplayData(
         done.time_s, done.applied, done.asked, done.measured, done.reference, done.off, inputs, outputs, told

@@ -14,11 +14,13 @@ from typing import Any, NamedTuple
 
 from ruamel.yaml import YAML
 
-from pipeline.deposition.workflow.settings import TrainIlc
+from pipeline.deposition.settings import TrainIlc
 from pipeline.report.shared.sources import QUICK_LOOK
-from pipeline.setpoint.workflow.settings import EvaluateSetpoint
+from pipeline.setpoint.settings import EvaluateSetpoint
 from pipeline.store import artifacts, params, params_text
-from pipeline.temperature.workflow.settings import EvaluateTemperature, IdentifyPlant, Panel, TuneWeights
+from pipeline.temperature.settings import Panel, TuneWeights
+from stages.evaluate_temperature import EvaluateTemperature
+from stages.identify_plant import IdentifyPlant
 
 SIZES, FOLDER = Path("params.quick.yaml"), Path("quick")
 # the sections whose sizes a quick look may set; what a machine is and what is good enough stay as they are

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import os
 import re
 import sys
 import zlib
@@ -9,36 +10,37 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+ROOT = Path(__file__).absolute().parents[1]
 # for each section of params.yaml and params.expert.yaml the class that knows all its keys
 SECTIONS = {
-    "camera": "pipeline.deposition.workflow.settings:Camera",
-    "compose_parts": "pipeline.deposition.workflow.settings:ComposeParts",
-    "evaluate_setpoint": "pipeline.setpoint.workflow.settings:EvaluateSetpoint",
-    "evaluate_temperature": "pipeline.temperature.workflow.settings:EvaluateTemperature",
+    "camera": "pipeline.deposition.settings:Camera",
+    "certify": "stages.certify:Certify",
+    "compose_parts": "pipeline.deposition.settings:ComposeParts",
+    "evaluate_setpoint": "pipeline.setpoint.settings:EvaluateSetpoint",
+    "evaluate_temperature": "stages.evaluate_temperature:EvaluateTemperature",
     "execution": "pipeline.store.params:Execution",
-    "export_controllers": "pipeline.runtime.workflow.settings:ExportControllers",
-    "generate_probing": "pipeline.temperature.workflow.settings:GenerateProbing",
-    "identify_plant": "pipeline.temperature.workflow.settings:IdentifyPlant",
-    "ingest": "pipeline.temperature.workflow.settings:Ingest",
-    "learn_kernel": "pipeline.temperature.workflow.settings:LearnKernel",
+    "generate_probing": "pipeline.temperature.settings:GenerateProbing",
+    "identify_plant": "stages.identify_plant:IdentifyPlant",
+    "ingest": "stages.ingest:Ingest",
+    "learn_kernel": "stages.learn_kernel:LearnKernel",
     "loops": "pipeline.store.params:Loops",
     "nightly": "pipeline.nightly.settings:Nightly",
-    "panel": "pipeline.temperature.workflow.settings:Panel",
-    "plant": "pipeline.temperature.workflow.settings:Plant",
-    "printer": "pipeline.deposition.workflow.settings:Printer",
-    "render_frames": "pipeline.setpoint.workflow.settings:RenderFrames",
+    "panel": "pipeline.temperature.settings:Panel",
+    "plant": "pipeline.temperature.settings:Plant",
+    "printer": "pipeline.deposition.settings:Printer",
+    "render_frames": "stages.render_frames:RenderFrames",
     "report": "pipeline.verdict.settings:ReportRules",
-    "segment_library": "pipeline.deposition.workflow.settings:SegmentLibrary",
-    "setpoint_material": "pipeline.setpoint.workflow.settings:SetpointMaterial",
-    "tracking": "pipeline.temperature.workflow.settings:Tracking",
-    "train_agent": "pipeline.setpoint.workflow.settings:TrainAgent",
-    "train_classifier": "pipeline.setpoint.workflow.settings:TrainClassifier",
-    "train_ilc": "pipeline.deposition.workflow.settings:TrainIlc",
-    "tune_weights": "pipeline.temperature.workflow.settings:TuneWeights",
+    "segment_library": "stages.segment_library:SegmentLibrary",
+    "setpoint_material": "pipeline.setpoint.settings:SetpointMaterial",
+    "tracking": "pipeline.temperature.settings:Tracking",
+    "train_agent": "stages.train_agent:TrainAgent",
+    "train_classifier": "pipeline.setpoint.settings:TrainClassifier",
+    "train_ilc": "pipeline.deposition.settings:TrainIlc",
+    "tune_weights": "pipeline.temperature.settings:TuneWeights",
 }
 # what a stage writes instead of its results if its loop is switched off
 NOT_ASKED = {"asked": False}
-# beside params.yaml: digests of the files that were checked last, and the loops
+# beside params.yaml: the digest of the files that were checked last, and their loops
 CHECKED = ".dvc/tmp/params_checked.json"
 
 
@@ -82,23 +84,31 @@ def check_parameters(path: str | Path = "params.yaml") -> dict[str, bool]:
 
     Raises ValueError with a line for each problem. Files that were checked once are not checked again.
     """
-    memory = Path(path).parent / CHECKED
-    try:
-        checked = json.loads(memory.read_bytes())
-        if all(_digest(file) == digest for file, digest in checked["files"].items()):
-            return checked["loops"]
-    except (OSError, ValueError, KeyError, AttributeError, TypeError):
-        pass  # no memory, or not a whole one
+    if loops := checked_loops(path):
+        return loops
     from pipeline.store import params
 
     params.check({section: model(section) for section in SECTIONS}, path)
     loops = params.load(params.Loops, "loops", path).model_dump()
-    files = [str(Path(path).absolute()), str(Path(path).with_name(params.EXPERT).absolute())]
-    for name, module in list(sys.modules.items()):
-        if name.partition(".")[0] in ("pipeline", "stages") and module.__file__:
-            files.append(module.__file__)
-    _remember(memory, {"files": {file: _digest(file) for file in files}, "loops": loops})
+    _remember(Path(path).parent / CHECKED, {"digest": _digest(path), "loops": loops})
     return loops
+
+
+def checked_loops(path: str | Path = "params.yaml") -> dict[str, bool]:
+    """Section `loops` of files that have not changed since they were checked; {} of others."""
+    try:
+        checked = json.loads((Path(path).parent / CHECKED).read_bytes())
+        return checked["loops"] if checked["digest"] == _digest(path) else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}  # no memory, or not a whole one
+
+
+def _digest(path: str | Path) -> int:
+    """Of both files, and of the code that checks them."""
+    modules = sorted({module.partition(":")[0] for module in SECTIONS.values()})
+    code = [Path(__file__), *(ROOT / f"{module.replace('.', '/')}.py" for module in modules)]
+    files = [Path(path), Path(path).with_name("params.expert.yaml"), *code]
+    return zlib.crc32(b"\0".join(file.read_bytes() for file in files))
 
 
 def model(section: str) -> Any:
@@ -107,14 +117,8 @@ def model(section: str) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
-def _digest(file: str) -> int:
-    return zlib.crc32(Path(file).read_bytes())
-
-
 def _remember(memory: Path, checked: dict[str, Any]) -> None:
     """Keeps what was checked, if this is a project of DVC that can be written."""
-    import os
-
     beside = memory.with_name(f".{memory.name}.{os.getpid()}")
     try:
         if memory.parents[1].is_dir():

@@ -2,37 +2,123 @@
 datasets/segment_library and datasets/train_ilc/models.json; writes datasets/compose_parts: signals.parquet,
 tasks.parquet, lines.parquet, scores.parquet and conformance.json."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import stages
-from pipeline.deposition.workflow import compose_parts, verify_part
-from pipeline.deposition.workflow.segment_library import read_learned
-from pipeline.deposition.workflow.settings import ComposeParts, Printer, TrainIlc
-from pipeline.deposition.workflow.tables import LINES, SCORES, SIGNALS, TASKS
+from pipeline.deposition.settings import ComposeParts, Printer, TrainIlc
+from pipeline.deposition.tables import LIBRARY, LINES, SCORES, SIGNALS, TASKS
 from pipeline.store import artifacts, params
+
+if TYPE_CHECKING:
+    from pipeline.deposition.parts.composition import LearnedLibrary
+    from pipeline.deposition.parts.part import ComposedPart
 
 
 def main() -> None:
+    import numpy as np
+    from tqdm import tqdm
+
+    from pipeline.deposition.extruder import from_json
+    from pipeline.deposition.parts import evaluation, part_report, stored
+    from pipeline.reading import part_files
+
     with artifacts.stage("compose_parts") as out:
-        settings, printer, training = (
-            params.load(ComposeParts, "compose_parts"),
-            params.load(Printer, "printer"),
-            params.load(TrainIlc, "train_ilc"),
-        )
-        learned = read_learned(
-            "datasets/segment_library/library.parquet", "datasets/segment_library/learned.json"
-        )
+        settings, printer = params.load(ComposeParts, "compose_parts"), params.load(Printer, "printer")
+        training = params.load(TrainIlc, "train_ilc")
+        table = artifacts.read_table("datasets/segment_library/library.parquet", LIBRARY)
+        learned = stored.restore(table, artifacts.read_json("datasets/segment_library/learned.json"))
         models = artifacts.read_json("datasets/train_ilc/models.json")
-        parts, refused = compose_parts.compose_all(Path("datasets/parts"), learned, printer, settings)
-        done = compose_parts.judged(parts, learned, models, printer, settings, training)
-        rows = compose_parts.rows(done)
+        folder, parts, refused = Path("datasets/parts"), [], {}
+        for path in part_files.part_programs(folder):
+            try:
+                parts.append(compose_part(path, learned, printer, settings))
+            except ValueError as error:
+                refused[path.stem] = str(error)
+        if not parts:
+            first = next(iter(refused.values()))
+            raise ValueError(
+                f"{folder}: none of {len(refused)} part programs can be composed; the first: {first}"
+            )
+        judging = evaluation.Judging(
+            nominals={name: from_json(model["nominal"]) for name, model in models.items()},
+            plants={name: from_json(model["plant"]) for name, model in models.items() if "plant" in model},
+            laws=training.laws(printer), noise=training.shares, updates=settings.full_part_updates,
+            bead_area_mm2=printer.bead_area_mm2, shortest_s=settings.shortest_s,
+        )  # fmt: skip
+        rng = np.random.default_rng(settings.seed)
+        scored = [
+            (part, evaluation.judge(learned, part.composed, part.conformance.lines, judging, rng))
+            for part in tqdm(parts, desc="compose_parts: parts", mininterval=2)
+        ]
+        rows = part_report.rows(scored)
         for name, schema in (("signals", SIGNALS), ("scores", SCORES), ("tasks", TASKS), ("lines", LINES)):
             artifacts.write_table(out / f"{name}.parquet", schema, rows[name])
-        reports = verify_part.with_measured(
-            compose_parts.reports(done, refused), parts, Path("datasets/parts")
-        )
+        reports = {part.name: report_with_measured(part, folder) for part in parts}
+        reports |= {name: {"refused": why} for name, why in refused.items()}
         artifacts.write_json(out / "conformance.json", reports)
-        artifacts.write_metrics("compose_parts", compose_parts.figures(done) | {"refused": refused})
+        artifacts.write_metrics("compose_parts", part_report.figures(scored) | {"refused": refused})
+
+
+def compose_part(
+    path: Path,
+    learned: LearnedLibrary,
+    printer: Printer,
+    settings: ComposeParts,
+    *,
+    scale: float = 1.0,
+    speed: float = 1.0,
+    filament_mm: float | None = None,
+    extruder: str = "",
+    declared_bead: bool = False,
+) -> ComposedPart:
+    """A part program, composed: X, Y and Z `scale` times as large, feeds `speed` times as fast; with the
+    diameter of what E pushes, what drives the extrusion, and the declared bead instead of E, if a person
+    requests these. Raises ValueError naming the file, and the line if there is one."""
+    from pipeline.deposition.parts import part
+    from pipeline.reading.part_files import read_part_program
+
+    learned_s = learned.library.sample_time_s
+    if learned_s != printer.sample_time_s:
+        raise ValueError(
+            f"params.yaml: printer.sample_time_s is {printer.sample_time_s:g} but the library was learned "
+            f"at {learned_s:g} s; learn it again with ./run dvc repro"
+        )
+    data = read_part_program(path)
+    with artifacts.about(path):
+        program = part.parse(data, scale=scale, speed=speed, extruder=extruder)
+        del data
+        declared_mm = printer.filament_mm
+        extruded = part.volumes(
+            program, bead_area_mm2=printer.bead_area_mm2, filament_mm=filament_mm, scale=scale,
+            declared_mm={one.tool: declared_mm for one in printer.materials if declared_mm is not None},
+            declared_bead=declared_bead,
+        )  # fmt: skip
+        return part.compose(
+            path.stem, program, extruded, learned, settings.of_part(printer), printer.gantry,
+            materials={one.tool: one.name for one in printer.materials},
+            longest_ramp_s=printer.longest_ramp_s, shortest_s=settings.shortest_s,
+            largest_error_percent=settings.largest_error_percent,
+        )  # fmt: skip
+
+
+def report_with_measured(part: ComposedPart, folder: Path) -> dict[str, Any]:
+    """The conformance report of a part, with measured_percent beside the forecast of each material whose
+    print was measured."""
+    from pipeline.deposition.parts import part_report, verification
+    from pipeline.reading import part_files
+
+    report = part_report.report(part)
+    for stream in part.composed.streams:
+        path = part_files.measured_path(folder, part.name, stream.material)
+        if path:
+            y, _ = part_files.read_measured(path, len(stream.r), part.composed.sample_time_s)
+            with artifacts.about(path):
+                percent = verification.measured_percent(y, stream.on_off, stream.r)
+            report["forecast"][stream.material]["measured_percent"] = percent
+    return report
 
 
 if __name__ == "__main__":

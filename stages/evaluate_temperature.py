@@ -1,53 +1,196 @@
-"""Judge every temperature controller as it would be deployed: reads what the temperature stages wrote; writes
-datasets/evaluate_temperature: cases.parquet, trajectories.parquet and summary.json."""
+"""Compare every temperature controller, tuned, as it would be deployed, on plants that nobody learned or
+tuned on: reads what the temperature stages wrote; writes datasets/evaluate_temperature: cases.parquet,
+trajectories.parquet and summary.json."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+from pydantic import Field, ValidationError
 
 import stages
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import evaluate_temperature, learned, tables
-from pipeline.temperature.workflow.settings import (
-    EvaluateTemperature,
-    Panel,
-    Plant,
-    TemperatureRules,
-    Tracking,
-    TuneWeights,
-)
+from pipeline.store.params import Execution, Section
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Panel, Plant, TemperatureRules, Tracking, TuneWeights
+from stages.tune_weights import load_design_problem
+
+if TYPE_CHECKING:
+    from pipeline.temperature.controllers.problem import DesignProblem
+    from pipeline.temperature.test_set.cases import CaseConditions, Rehearsal
+    from pipeline.temperature.test_set.evaluation import ControllerOutcome
+
+
+class EvaluateTemperature(Section):
+    """Section `evaluate_temperature`: the seed of its tests, and how often the plants are resampled for a
+    band."""
+
+    seed: int = Field(ge=0, le=2**31)
+    resamples: int = Field(ge=20, le=100_000)
+
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class TunedValues(Section, extra="allow"):
+    """The parameters of one controller by name, the weights q (p,) and r (m,) that they stand for, and what
+    its search says of them."""
+
+    __pydantic_extra__: dict[str, Positive]  # ty: ignore[incompatible-mutable-override]
+    q: list[Positive] = []
+    r: list[Positive] = []
+    cost: float
+    cost_at_start: float | None
+    failed: int
+    evaluations: int
+    at_bound: list[str]
+
+
+class Weights(Section):
+    """datasets/tune_weights/weights.json: what the search was designed for, and its result by controller."""
+
+    design: dict[str, Any] = {}
+    contestants: dict[str, TunedValues] = Field(min_length=1)
+
+
+def read_weights(path: str | Path) -> Weights:
+    """What tune_weights wrote. Raises ValueError for a file of another version."""
+    try:
+        return Weights.model_validate(artifacts.read_json(path))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise ValueError(f"{path}: {place}: {first['msg']}; {artifacts.remedy(path)}") from None
+
+
+class EvaluationInputs(NamedTuple):
+    """What every controller is designed from and compared by: sections, the rules with what the record says
+    of them, the conditions of all cases, the problem, and the tuned parameters by controller."""
+
+    machine: Plant
+    panel: Panel
+    rules: TemperatureRules
+    setting: CaseConditions
+    problem: DesignProblem
+    weights: dict[str, dict[str, Any]]
+    simulated: bool
+
+
+def load_problem() -> EvaluationInputs:
+    """The parameters, and what the stages before wrote: the same for the evaluation and for the
+    certificate."""
+    machine, panel = params.load(Plant, "plant"), params.load(Panel, "panel")
+    simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
+    setting, problem = load_design_problem(
+        machine,
+        panel,
+        params.load(Tracking, "tracking"),
+        params.load(TuneWeights, "tune_weights"),
+        simulated=simulated,
+    )
+    rules = resolve(params.load(TemperatureRules, "report"), panel, setting.rehearsal)
+    weights = read_weights("datasets/tune_weights/weights.json").contestants
+    tuned = {name: values.model_dump() for name, values in weights.items()}
+    return EvaluationInputs(machine, panel, rules, setting, problem, tuned, simulated)
+
+
+def resolve(rules: TemperatureRules, panel: Panel, rehearsal: Rehearsal) -> TemperatureRules:
+    """The rules with a settling time: as declared, else as the record says, else the panel's; and with a fast
+    machine's delay margin (cases.faster)."""
+    from pipeline.temperature.test_set.cases import faster
+
+    settling_s = rules.settling_s or rehearsal.settling_s or panel.settling_s
+    delay_margin_s = faster(panel, rehearsal) * rules.delay_margin_s
+    return rules.model_copy(update={"settling_s": settling_s, "delay_margin_s": delay_margin_s})
+
+
+def compare(
+    settings: EvaluateTemperature, loaded: EvaluationInputs, execution: Execution
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """Every controller on the judging half of the panel: the cases and two of them as trajectories, both as
+    columns, and the summary."""
+    from pipeline.temperature.controllers.table import BY_NAME
+    from pipeline.temperature.test_set import evaluation
+
+    machine, setting, rules = loaded.machine, loaded.setting, loaded.rules
+    outcomes, refused = evaluate_all(loaded.problem, loaded.weights, setting, execution)
+    entrants = [name for name in outcomes if BY_NAME[name].role != "yardstick"]
+    summary: dict[str, Any] = {
+        **conditions(machine, setting, rules),
+        "contestants": {
+            name: evaluation.summarise(
+                outcome,
+                setting,
+                loaded.weights.get(name, {}),
+                seed=settings.seed,
+                resamples=settings.resamples,
+            )
+            for name, outcome in outcomes.items()
+        },
+        "order": entrants,
+        "refused": refused,
+    }
+    summary |= evaluation.decide(outcomes, entrants, summary, rules, setting, settings.seed)
+    typical = evaluation.typical_case(outcomes, entrants)
+    drawn = {"typical": typical, "deciding": summary["deciding"]["case"]}
+    return (
+        evaluation.case_columns(outcomes, setting, [output.name for output in machine.outputs]),
+        evaluation.trajectory_columns(outcomes, drawn, setting, machine),
+        summary,
+    )
+
+
+def evaluate_all(
+    problem: DesignProblem,
+    weights: Mapping[str, Mapping[str, Any]],
+    setting: CaseConditions,
+    execution: Execution,
+) -> tuple[dict[str, ControllerOutcome], dict[str, str]]:
+    """The outcome of every controller on the judging half of the panel; by name why others are refused."""
+    from joblib import delayed
+    from tqdm import tqdm
+
+    from pipeline.store.execution import run_all
+    from pipeline.temperature.controllers.table import design_controllers
+    from pipeline.temperature.test_set.evaluation import evaluate
+
+    designs, refused = design_controllers(problem, weights)
+    calls = [delayed(evaluate)(name, design, setting) for name, design in designs.items()]
+    results = run_all(calls, execution)
+    outcomes = dict(tqdm(results, total=len(calls), desc="evaluate_temperature: controllers", mininterval=2))
+    return {name: outcomes[name] for name in designs}, refused
+
+
+def conditions(machine: Plant, setting: CaseConditions, rules: TemperatureRules) -> dict[str, Any]:
+    rehearsal = setting.rehearsal
+    return {
+        "simulated": rehearsal.source == "declared",
+        "plants": len(rehearsal.judging.plants),
+        "cases": len(rehearsal.judging.plant),
+        "noise_degC": rehearsal.noise.tolist(),
+        "seed": rehearsal.judging.seed,
+        "steps": rehearsal.judging.steps,
+        "settled_steps": setting.settled,
+        "sample_time_s": setting.sample_time_s,
+        "band_degC": rehearsal.band_degC,
+        "limits": rules.model_dump() | {"source": rehearsal.source},
+        "outputs_limited": all(o.low is not None and o.high is not None for o in machine.outputs),
+        "infeasible": rehearsal.infeasible,
+    }
 
 
 def main() -> None:
     with artifacts.stage("evaluate_temperature") as out:
-        settings, machine = (
-            params.load(EvaluateTemperature, "evaluate_temperature"),
-            params.load(Plant, "plant"),
-        )
-        tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
-        tuning, execution = (
-            params.load(TuneWeights, "tune_weights"),
-            params.load(params.Execution, "execution"),
-        )
-        simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
-        made = learned.read_learned(
-            "datasets/identify_plant/plant.parquet",
-            "datasets/identify_plant/spread.parquet",
-            "datasets/learn_kernel",
-            "datasets/ingest/printer_pid.json",
-            machine,
-        )
-        weights = evaluate_temperature.read_weights("datasets/tune_weights/weights.json", machine)
-        record = "datasets/ingest/record.parquet"
-        posed = learned.posed(made, machine, panel, tracking, tuning, record, simulated=simulated)
-        rules = evaluate_temperature.resolved(params.load(TemperatureRules, "report"), panel, posed.rehearsal)
-        judged = evaluate_temperature.judged(
-            settings, machine, posed.setting, posed.problem, weights, rules, execution
-        )
-        artifacts.write_table(out / "cases.parquet", tables.CASES, judged.cases)
-        artifacts.write_table(
-            out / "trajectories.parquet",
-            tables.trajectories(machine.inputs, machine.outputs),
-            judged.trajectories,
-        )
-        artifacts.write_json(out / "summary.json", judged.summary)
-        artifacts.write_metrics("evaluate_temperature", judged.summary)
+        settings = params.load(EvaluateTemperature, "evaluate_temperature")
+        execution, loaded = params.load(Execution, "execution"), load_problem()
+        cases, trajectories, summary = compare(settings, loaded, execution)
+        artifacts.write_table(out / "cases.parquet", tables.CASES, cases)
+        drawn = tables.trajectories(loaded.machine.inputs, loaded.machine.outputs)
+        artifacts.write_table(out / "trajectories.parquet", drawn, trajectories)
+        artifacts.write_json(out / "summary.json", summary)
+        artifacts.write_metrics("evaluate_temperature", summary)
 
 
 if __name__ == "__main__":

@@ -1,77 +1,160 @@
-"""The controller that the verdict recommends, certified and written: reads what evaluate_temperature read and
-wrote, what train_classifier, train_agent and evaluate_setpoint left, and what compose_parts wrote; writes
-datasets/export_controllers: temperature/ (controller.json, arrays.safetensors, certificate.json, c/, python/)
-setpoint/, and exported.json, which says what there is and why not. Where the certificate is refused it is all
-that is written of that loop."""
+"""Export the controller that the verdict names: copies the files that the stage certify prepared, and writes
+the certificate under the limits of section `report`. Reads datasets/verdict/temperature.json,
+datasets/certify and, of the deposition loop, what compose_parts wrote.
+
+Writes datasets/export_controllers: temperature/ (controller.json, arrays.safetensors, support.safetensors,
+certificate.json, c/, python/), setpoint/, and exported.json, which says what there is, and why not."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import stages
-from pipeline.runtime.workflow import export_controllers as export
-from pipeline.runtime.workflow import export_setpoint
-from pipeline.runtime.workflow.settings import ExportControllers
-from pipeline.setpoint.workflow import contestants
-from pipeline.setpoint.workflow.agent_files import restore_agents
-from pipeline.setpoint.workflow.classifier_files import restore_classifier
-from pipeline.setpoint.workflow.settings import EvaluateSetpoint
-from pipeline.setpoint.workflow.tables import WINDOWS
-from pipeline.setpoint.workflow.windows import window_tables
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import evaluate_temperature, learned, tables
-from pipeline.temperature.workflow.settings import Panel, Plant, TemperatureRules, Tracking, TuneWeights
-from pipeline.verdict.verdict import read
+from pipeline.temperature.settings import TemperatureRules
+from stages.certify import NOT_ASKED, PLACE
+
+if TYPE_CHECKING:
+    from pipeline.runtime.certificate import Certificate
+
+MARKED = ("c/machine.h", "c/README.txt", "python/controller.py")  # which hold the certificate's SHA-256
+VERDICT, CERTIFY = Path("datasets/verdict/temperature.json"), Path("datasets/certify")
+COMPOSED = ("datasets/compose_parts/signals.parquet", "datasets/compose_parts/lines.parquet")
 
 
 def main() -> None:
     with artifacts.stage("export_controllers") as out:
-        settings, machine = (
-            params.load(ExportControllers, "export_controllers"),
-            params.load(Plant, "plant"),
-        )
-        tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
-        tuning, rules = params.load(TuneWeights, "tune_weights"), params.load(TemperatureRules, "report")
-        simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
-        made = learned.read_learned(
-            "datasets/identify_plant/plant.parquet",
-            "datasets/identify_plant/spread.parquet",
-            "datasets/learn_kernel",
-            "datasets/ingest/printer_pid.json",
-            machine,
-        )
-        weights = evaluate_temperature.read_weights("datasets/tune_weights/weights.json", machine)
-        record = "datasets/ingest/record.parquet"
-        posed = learned.posed(made, machine, panel, tracking, tuning, record, simulated=simulated)
-        summary = artifacts.read_json("datasets/evaluate_temperature/summary.json")
-        judged = export.Judged(machine, made, posed.setting, posed.problem, weights, summary, simulated)
-        verdict = read("datasets/verdict")["temperature"]
-        name, why = export.chosen(verdict.winner, f"{verdict.decision} {verdict.lead}")
-        temperature = export.nothing(why)
+        found, loops = artifacts.read_json(CERTIFY / "certified.json"), params.load(params.Loops, "loops")
+        exported = {
+            "temperature": describe(why=NOT_ASKED.format("temperature"), unit="percent"),
+            "setpoint": export_setpoint(out / "setpoint", found["setpoint"]),
+            "deposition": describe(why=NOT_ASKED.format("deposition"), unit="mm"),
+        }
+        if loops.temperature:
+            exported["temperature"] = export_temperature(out / "temperature", found["temperature"])
+        if loops.deposition:
+            exported["deposition"] = name_composed()
+        artifacts.write_json(out / "exported.json", exported)
+        artifacts.write_metrics("export_controllers", exported)
+
+
+def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
+    """Files of the controller that the verdict names. If the verdict names none because the certificate of
+    its controller is refused, that certificate alone."""
+    from pipeline.runtime import certificate, certified
+
+    verdict = artifacts.read_json(VERDICT)
+    name = verdict["winner"] or verdict.get("refused")
+    if name is None or name == "hold":
+        why = f"Not exported: {verdict['decision']} {verdict['lead']}"
         if name:
-            one = export.exported(judged, name)
-            shown = tables.trajectories(machine.inputs, machine.outputs)
-            played = artifacts.read_table("datasets/evaluate_temperature/trajectories.parquet", shown)
-            difference = export.replayed(one, judged, played)
-            export.check_same(one, difference)
-            resolved = evaluate_temperature.resolved(rules, panel, posed.rehearsal)
-            certificate = export.certified(one, judged, resolved, settings, record)
-            within = export.supported(one, judged, panel, settings.seed, record)
-            temperature = export.write_temperature(
-                out / "temperature", one, certificate, within, {"judged": difference}
-            )
-        model = restore_classifier(
-            "datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet"
-        )
-        windows = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
-        agents = restore_agents("datasets/train_agent/weights.safetensors")
-        baselines = params.load(EvaluateSetpoint, "evaluate_setpoint").baselines
-        specs = contestants.controllers(contestants.Problem(baselines, agents, windows["learn"]))
-        default = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
-        decides = export_setpoint.decider(default, specs, agents)
-        setpoint = export_setpoint.write(out / "setpoint", default, model, decides, settings.seed)
-        deposition = export.deposition(
-            ("datasets/compose_parts/signals.parquet", "datasets/compose_parts/lines.parquet")
-        )
-        shown = export.metrics({"temperature": temperature, "setpoint": setpoint, "deposition": deposition})
-        artifacts.write_json(out / "exported.json", shown)
-        artifacts.write_metrics("export_controllers", shown)
+            why = "Doing nothing is recommended: there is no controller to export."
+        return describe(why=why, unit="percent")
+    source, one = CERTIFY / "temperature" / name, found[name]
+    if not one["measured"]:
+        return describe(name, why=one["why"], unit="percent")
+    rules = params.load(TemperatureRules, "report")
+    decided = certified.decide(
+        certified.read(source),
+        settled_error_degC=rules.settled_error_degC,
+        disk_margin=rules.disk_margin,
+        delay_margin_s=rules.delay_margin_s,
+    )
+    artifacts.write_text(folder / "certificate.json", certificate.to_json(decided))
+    if decided.verdict == "passed":
+        copy(source, folder, certificate.sha256(decided))
+    return describe(
+        name,
+        certificate=summarise(decided),
+        why=certified.refusal(decided),
+        files=hashes(folder) if decided.verdict == "passed" else {},
+        largest_difference=one["largest_difference"],
+        unit="percent",
+    )
+
+
+def export_setpoint(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
+    """Classifier, filter and agent with their readers, if the loop is asked for."""
+    source = CERTIFY / "setpoint"
+    if source.exists():
+        copy(source, folder, "")
+    return describe(
+        found["controller"],
+        why=found["why"],
+        files=hashes(folder),
+        largest_difference=found["largest_difference"],
+    )
+
+
+def name_composed() -> dict[str, Any]:
+    """The commands that compose wrote; they are exported there."""
+    files = {path: artifacts.sha256(path) for path in COMPOSED if artifacts.exists(path)}
+    why = "Commands are played as compose wrote them: there is no law to certify."
+    return describe("composed commands", why=why, files=files, unit="mm")
+
+
+def describe(
+    contestant: str = "",
+    *,
+    certificate: dict[str, Any] | None = None,
+    why: str,
+    files: dict[str, str] | None = None,
+    largest_difference: dict[str, float] | None = None,
+    unit: str = "1",
+) -> dict[str, Any]:
+    """One loop in exported.json: its controller, its certificate in short or why there is none, files with
+    their SHA-256, and the largest differences in `unit` by what was compared."""
+    return {
+        "contestant": contestant,
+        "certificate": certificate,
+        "why": why,
+        "files": files or {},
+        "largest_difference": largest_difference or {},
+        "unit": unit,
+    }
+
+
+def summarise(decided: "Certificate") -> dict[str, Any]:
+    from pipeline.runtime import certificate
+
+    return {
+        "sha256": certificate.sha256(decided),
+        "verdict": decided.verdict,
+        "first_failed": decided.first_failed,
+        "evidence": decided.evidence,
+        "controller_sha256": decided.controller_sha256,
+        "plant_sha256": decided.plant_sha256,
+        "spread_sha256": decided.spread_sha256,
+        "sample_time_s": decided.sample_time_s,
+        "rules": [
+            {key: getattr(one, key) for key in ("name", "passed", "found", "limit", "unit")}
+            for one in decided.rules
+        ],
+    }
+
+
+def copy(source: Path, folder: Path, certificate_sha256: str) -> None:
+    """The prepared files, with the SHA-256 in its marked places."""
+    for path in files_below(source):
+        name = path.relative_to(source).as_posix()
+        if name in MARKED:
+            text = path.read_text(encoding="utf-8").replace(PLACE, certificate_sha256)
+            artifacts.write_text(folder / name, text)
+        elif name != "measured.json":
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, folder / name)
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """SHA-256 of each file below a folder of the stage, by its path below that of the stage."""
+    return {
+        path.relative_to(folder.parent).as_posix(): artifacts.sha256(path) for path in files_below(folder)
+    }
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    return (path for path in sorted(folder.rglob("*")) if path.is_file())
 
 
 if __name__ == "__main__":

@@ -1,35 +1,265 @@
-"""The next experiment: reads datasets/identify_plant and datasets/ingest/record.parquet; writes
-datasets/generate_probing: next_experiment.csv, what to play on the machine next, and
-next_experiment_closed_loop.csv, what to add to its controller's commands. Either is left out where no
-forecast holds it within the limits; forecast.json says why."""
+"""The next experiment on the identified family, to be played instead of the controller or added to its
+commands: reads datasets/identify_plant and datasets/ingest/record.parquet; writes datasets/generate_probing:
+next_experiment.csv and next_experiment_closed_loop.csv. Either is left out if no forecast holds it within
+plant.outputs.low and high; forecast.json says why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import stages
 from pipeline.store import artifacts, params
-from pipeline.temperature import plant
-from pipeline.temperature.workflow import generate_probing
-from pipeline.temperature.workflow.settings import GenerateProbing, Plant, Tracking, check_output_limits
+from pipeline.temperature import tables
+from pipeline.temperature.settings import (
+    GenerateProbing,
+    Plant,
+    PlantSignal,
+    Tracking,
+    check_output_limits,
+    given_centre,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from pipeline.temperature.experiment import Dither, Experiment, Family, Lesson, Limits, Wish
+    from pipeline.temperature.plant import Plant as Model
+
+EXCITED = 12  # lags over which the experiment's excitation is counted
+Columns = dict[str, "np.ndarray"]
 
 
 def main() -> None:
     with artifacts.stage("generate_probing") as out:
+        from pipeline.temperature.identification.segments import segments
+        from pipeline.temperature.plant import restored
+
         settings, machine = params.load(GenerateProbing, "generate_probing"), params.load(Plant, "plant")
         tracking = params.load(Tracking, "tracking")
         check_output_limits(machine, settings.source)
         shapes = {"D": (None, len(machine.outputs), len(machine.inputs))}
-        plants = plant.restored(
-            artifacts.read_arrays("datasets/identify_plant/plant.parquet", "plant", 1, shapes=shapes)
-        ) + plant.restored(
-            artifacts.read_arrays("datasets/identify_plant/spread.parquet", "spread", 1, shapes=shapes)
+        plant = artifacts.read_arrays("datasets/identify_plant/plant.parquet", "plant", 1, shapes=shapes)
+        spread = artifacts.read_arrays("datasets/identify_plant/spread.parquet", "spread", 1, shapes=shapes)
+        family = [*restored(plant), *restored(spread)]
+        schema = tables.record(machine.acting, machine.outputs)
+        record = artifacts.read_table("datasets/ingest/record.parquet", schema)
+        u, y, _ = segments(record, [i.name for i in machine.inputs], [o.name for o in machine.outputs])
+        commands, dither, figures = design(settings, machine, tracking, family, u, y)
+        if commands:
+            artifacts.write_csv(out / "next_experiment.csv", commands)
+        if dither:
+            artifacts.write_csv(out / "next_experiment_closed_loop.csv", dither)
+        artifacts.write_json(out / "forecast.json", figures)
+        artifacts.write_metrics("generate_probing", figures)
+
+
+def design(
+    settings: GenerateProbing,
+    machine: Plant,
+    tracking: Tracking,
+    plants: Sequence[Model],
+    u: Sequence[np.ndarray],
+    y: Sequence[np.ndarray],
+) -> tuple[Columns, Columns, dict[str, Any]]:
+    """Columns of the commands to play and of those to add to a controller's, empty if they are not safe, and
+    figures, for the machine of the record u, y and of the identified `plants`, the model first. What makes an
+    experiment unsafe is a reason in the figures, not an error."""
+    import numpy as np
+
+    from pipeline.temperature import experiment, forecast
+
+    lacking = [o.name for o in machine.outputs if o.low is None or o.high is None]
+    if lacking:
+        return refuse(settings, f"declare low and high of {', '.join(lacking)} under plant.outputs")
+    limits, wish = experiment_limits(settings, machine), experiment_wish(settings, machine)
+    names = experiment.Names([i.name for i in machine.inputs], [o.name for o in machine.outputs])
+    doubt = forecast.Doubt(settings.doubt_input_gain, settings.doubt_ambient_degC, settings.doubt_delay_steps)
+    try:
+        family = experiment.family_of(
+            plants,
+            (list(u), list(y)),
+            reach=limits.high - limits.low,
+            longest=settings.samples,
+            doubt=doubt,
+            names=names,
         )
-        result = generate_probing.designed(
-            settings, machine, tracking, plants, "datasets/ingest/record.parquet"
-        )
-        if result.commands:
-            artifacts.write_csv(out / "next_experiment.csv", result.commands)
-        if result.dither:
-            artifacts.write_csv(out / "next_experiment_closed_loop.csv", result.dither)
-        artifacts.write_json(out / "forecast.json", result.metrics)
-        artifacts.write_metrics("generate_probing", result.metrics)
+        plan = experiment.design(family, wish, limits, np.random.default_rng(settings.seed))
+    except (ValueError, np.linalg.LinAlgError) as error:
+        return refuse(settings, " ".join(str(error).split()))
+    dither, why_not = design_dither(family, wish, limits, settings.seed)
+    step = machine.sample_time_s
+    figures = {
+        "source": settings.source,
+        "next_experiment": plan_figures(machine, limits, family, plan, tracking.gamma),
+        "closed_loop": {"written": False, "reason": why_not}
+        if dither is None
+        else dither_figures(machine, dither),
+    }
+    added = (
+        {}
+        if dither is None or dither.reason
+        else columns(dither.u, [f"{n}_dither" for n in names.inputs], step)
+    )
+    return columns(plan.u, names.inputs, step) if plan.written else {}, added, figures
+
+
+def refuse(settings: GenerateProbing, reason: str) -> tuple[Columns, Columns, dict[str, Any]]:
+    none = {"written": False, "reason": reason}
+    return {}, {}, {"source": settings.source, "next_experiment": none, "closed_loop": none}
+
+
+def experiment_limits(settings: GenerateProbing, machine: Plant) -> Limits:
+    import numpy as np
+
+    from pipeline.temperature.experiment import Limits
+
+    low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
+    y_low, y_high = np.array([(o.low, o.high) for o in machine.outputs], float).T
+    return Limits(low, high, settings.rate_percent_per_step, y_low, y_high)
+
+
+def experiment_wish(settings: GenerateProbing, machine: Plant) -> Wish:
+    import numpy as np
+
+    from pipeline.temperature.experiment import Wish
+
+    centre = given_centre(settings, machine)
+    return Wish(
+        np.array([o.reference for o in machine.outputs], float),
+        settings.amplitude_percent,
+        settings.samples,
+        settings.signal,
+        settings.shortest_steps,
+        None if centre is None else np.array(centre),
+    )
+
+
+def design_dither(family: Family, wish: Wish, limits: Limits, seed: int) -> tuple[Dither | None, str]:
+    """What may be added to the commands of a PI a zone, tuned by SIMC; None with the reason if the machine
+    has none."""
+    import numpy as np
+
+    from pipeline.temperature import experiment
+    from pipeline.temperature.controllers import baseline
+    from pipeline.temperature.identification.trust import horizon
+
+    try:
+        rise = horizon(family.model, wish.samples)
+        pi = baseline.controller(family.model, (limits.low, limits.high), horizon=rise)
+        law = pi.design(np.ones(family.model.p), np.ones(family.model.m), 0.0)
+        return experiment.dither(family, law, wish, limits, np.random.default_rng(seed)), ""
+    except (ValueError, np.linalg.LinAlgError) as error:
+        return None, f"no simple controller to add it to: {' '.join(str(error).split())}"
+
+
+# ---- figures
+
+
+def columns(u: np.ndarray, names: Sequence[str], sample_time_s: float) -> Columns:
+    import numpy as np
+
+    return {"time_s": sample_time_s * np.arange(len(u)), **{name: u[:, k] for k, name in enumerate(names)}}
+
+
+def by_signal(signals: Sequence[PlantSignal], values: np.ndarray) -> dict[str, float | None]:
+    """{name: value}, None if it is not finite."""
+    return {
+        signal.name: float(value) if abs(value) < float("inf") else None
+        for signal, value in zip(signals, values, strict=True)
+    }
+
+
+def plan_figures(
+    machine: Plant, limits: Limits, family: Family, plan: Experiment, gamma: float
+) -> dict[str, Any]:
+    import numpy as np
+
+    from pipeline.temperature.probing import excitation
+
+    inputs, outputs, begin = machine.inputs, machine.outputs, family.begin
+    figures = {
+        "written": plan.written,
+        "reason": plan.reason,
+        "highest_degC": by_signal(outputs, plan.extremes.highest),
+        "lowest_degC": by_signal(outputs, plan.extremes.lowest),
+        "limit_degC": {
+            o.name: {"low": low, "high": high}
+            for o, low, high in zip(outputs, limits.y_low, limits.y_high, strict=True)
+        },
+        "band_degC": by_signal(outputs, family.band.width),
+        "doubt": family.doubt,
+        "start_percent": by_signal(inputs, begin.u),
+        "start_degC": by_signal(outputs, begin.y),
+        "slowest_time_constant_s": family.seconds(family.pace.slowest),
+    }
+    if not plan.written or plan.lesson is None:
+        return figures
+    # lags that span the fastest time constant: over closer ones a slow signal repeats itself
+    most = len(plan.u) // (len(inputs) + 1)
+    order = max(min(EXCITED, most), 1)
+    lag = max(min(round(family.pace.fastest / EXCITED), most // order), 1)
+    rank = excitation(plan.u[::lag], order)
+    return figures | {
+        "centre_percent": by_signal(inputs, plan.centre),
+        "amplitude_percent": by_signal(inputs, plan.amplitude),
+        "target_degC": by_signal(outputs, plan.target),
+        "samples": len(plan.u),
+        "seconds": family.seconds(len(plan.u)),
+        "excitation_order": rank.order,
+        "excitation_lag_s": family.seconds(lag),
+        "excitation_rank": rank.rank,
+        "excitation_full_rank": rank.full,
+        "excitation_condition": rank.condition if np.isfinite(rank.condition) else None,
+        "level_percent_per_band": excitation(plan.u, 1).level,
+        "information": plan.lesson.information,
+        "expected_error_percent": expected_errors(machine, family, plan.lesson),
+        "expected_gap_percent": expected_gap_percent(family, plan.lesson, gamma),
+    }
+
+
+def expected_gap_percent(family: Family, lesson: Lesson, gamma: float) -> float | None:
+    """None if no controller of the perturbed model holds the machine."""
+    import numpy as np
+
+    from pipeline.temperature.experiment import expected_gap
+
+    try:
+        gap = expected_gap(family.model, lesson, gamma)
+    except (ValueError, np.linalg.LinAlgError):
+        return None
+    return 100 * gap if np.isfinite(gap) else None
+
+
+def expected_errors(machine: Plant, family: Family, lesson: Lesson) -> dict[str, Any]:
+    """{output: {input: {gain, time_constant}}}: expected standard errors in percent of each seen pair."""
+    return {
+        output.name: {
+            signal.name: {
+                "gain": 100 * float(lesson.gain_error[o, j]),
+                "time_constant": 100 * float(lesson.time_constant_error[o, j]),
+            }
+            for j, signal in enumerate(machine.inputs)
+            if family.pace.seen[o, j]
+        }
+        for o, output in enumerate(machine.outputs)
+    }
+
+
+def dither_figures(machine: Plant, dither: Dither) -> dict[str, Any]:
+    figures: dict[str, Any] = {"written": not dither.reason, "reason": dither.reason}
+    if dither.extremes is not None:
+        figures |= {
+            "highest_degC": by_signal(machine.outputs, dither.extremes.highest),
+            "lowest_degC": by_signal(machine.outputs, dither.extremes.lowest),
+        }
+    if dither.reason:
+        return figures
+    return figures | {
+        "amplitude_percent": by_signal(machine.inputs, dither.amplitude),
+        "seconds": machine.sample_time_s * len(dither.u),
+        "at_limits_percent": 100 * dither.limited,
+    }
 
 
 if __name__ == "__main__":

@@ -1,23 +1,285 @@
-"""Record -> plant and its spread: reads datasets/ingest/record.parquet; writes
-datasets/identify_plant: plant, spread, order, and what the page of the identification shows:
-holdout, residuals, steps, dynamics, poles, levels."""
+"""Record -> plant and its spread: reads datasets/ingest/record.parquet; writes datasets/identify_plant:
+plant, spread, order, and what the page of the identification shows: holdout, residuals, steps, dynamics,
+first_order, poles, levels.
+
+Order and window are chosen on the first part of every segment and judged on the last. The plant that is
+handed on is fitted to both parts. A family of plants around it shows its error."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from pydantic import Field
 
 import stages
 from pipeline.store import artifacts, params
-from pipeline.temperature import plant
-from pipeline.temperature.workflow import identify_plant
-from pipeline.temperature.workflow.settings import IdentifyPlant, Plant
+from pipeline.store.params import Section
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Plant as Machine
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from pipeline.store.tables import Schema
+    from pipeline.temperature.identification.model_choice import Identified
+    from pipeline.temperature.identification.trust import Holdout, Steps
+    from pipeline.temperature.identification.validation import Excitation, Residuals
+    from pipeline.temperature.plant import Plant
+
+    Segments = list[np.ndarray]
+    Tables = dict[str, tuple[Schema, dict[str, Any]]]
+
+
+class IdentifyPlant(Section):
+    """Section `identify_plant`."""
+
+    seed: int = Field(ge=0, le=2**31)
+    order: int = Field(ge=0, le=60)
+    max_order: int = Field(ge=1, le=60)
+    offset: bool
+    feedthrough: Literal["chosen", "none"]
+    refinement: Literal["none", "prediction", "simulation", "validated"]
+    holdout_share: float = Field(gt=0, lt=0.9)
+    ahead_steps: int = Field(ge=1, le=10_000)
+    spread_plants: int = Field(ge=20, le=1000)
+
+
+class RecordSegments(NamedTuple):
+    """The record as it can be identified, u with disturbances after the inputs; the recording of each
+    segment; `recorded` samples before any were cut, and what was clipped."""
+
+    u: Segments
+    y: Segments
+    recordings: tuple[int, ...]
+    recorded: int
+    notes: list[str]
+
+
+class ModelJudgement(NamedTuple):
+    """The chosen model on the last part of the record, and what the first part excites; `still` (p,): its fit
+    with the inputs held."""
+
+    holdout: Holdout
+    residuals: Residuals
+    excitation: Excitation
+    samples: int
+    still: np.ndarray
 
 
 def main() -> None:
     with artifacts.stage("identify_plant") as out:
-        settings, machine = params.load(IdentifyPlant, "identify_plant"), params.load(Plant, "plant")
-        identified = identify_plant.identified(settings, machine, "datasets/ingest/record.parquet")
-        artifacts.write_arrays(out / "plant.parquet", "plant", 1, plant.stored([identified.plant]))
-        artifacts.write_arrays(out / "spread.parquet", "spread", 1, plant.stored(identified.spread))
-        for name, (schema, columns) in identified.tables.items():
+        from pipeline.temperature.plant import stored
+
+        settings, machine = params.load(IdentifyPlant, "identify_plant"), params.load(Machine, "plant")
+        plant, spread, page_tables, figures = identify(settings, machine, "datasets/ingest/record.parquet")
+        artifacts.write_arrays(out / "plant.parquet", "plant", 1, stored([plant]))
+        artifacts.write_arrays(out / "spread.parquet", "spread", 1, stored(spread))
+        for name, (schema, columns) in page_tables.items():
             artifacts.write_table(out / f"{name}.parquet", schema, columns)
-        artifacts.write_metrics("identify_plant", identified.metrics)
+        artifacts.write_metrics("identify_plant", figures)
+
+
+def identify(
+    settings: IdentifyPlant, machine: Machine, path: str
+) -> tuple[Plant, list[Plant], Tables, dict[str, Any]]:
+    """The plant of the record in `path`, its spread, tables for the page of the identification, and figures.
+    Raises ValueError if the record does not determine the plant."""
+    import numpy as np
+
+    from pipeline.temperature.identification import model_choice, trust, validation
+    from pipeline.temperature.identification.segments import split
+    from pipeline.temperature.plant import at_disturbances, observability
+
+    acting, inputs = [signal.name for signal in machine.acting], len(machine.inputs)
+    record = read_record(settings, machine, path)
+    first, last = split(record.u, record.y, settings.holdout_share)
+    choices = model_choice.Settings(
+        order=settings.order or None,
+        feedthrough=None if settings.feedthrough == "chosen" else False,
+        offset=settings.offset,
+        refinement=settings.refinement,
+        max_order=settings.max_order,
+        recordings=record.recordings,
+        inputs=inputs,
+    )
+    with artifacts.about(path):
+        chosen = model_choice.identify(
+            *first, sample_time_s=machine.sample_time_s, settings=choices, names=acting
+        )
+    judgement = judge_model(settings, chosen, first, last)
+    fitted = model_choice.refit(record.u, record.y, chosen, names=acting)
+    if not (observed := observability(fitted.plant)).passed:
+        raise ValueError(f"{path}: {observed.reason}")
+    family = validation.bootstrap_spread(
+        record.u,
+        record.y,
+        fitted,
+        count=settings.spread_plants,
+        order=fitted.order + 1,
+        rng=np.random.default_rng(settings.seed),
+    )
+    # controllers do not know the disturbances: at their mean they are part of the offsets
+    level = np.vstack(record.u).mean(axis=0)[inputs:]
+    plant, *spread = (at_disturbances(one, inputs, level) for one in (fitted.plant, *family))
+    left_out = [
+        at_disturbances(one, inputs, level) for one in validation.left_out_plants(record.u, record.y, fitted)
+    ]
+    steps = trust.steps(plant, spread, max(map(len, record.u)), left_out=left_out)
+    page_tables = {
+        "order": (tables.ORDER, model_choice.rows(chosen)),
+        **judgement_tables(machine, last[1], judgement),
+        **model_tables(machine, record.u, plant, spread, steps),
+    }
+    figures = fit_figures(settings, machine, record, chosen, fitted, judgement)
+    return plant, spread, page_tables, figures | warnings(machine, fitted, steps)
+
+
+def read_record(settings: IdentifyPlant, machine: Machine, path: str) -> RecordSegments:
+    from pipeline.temperature.identification import model_choice
+    from pipeline.temperature.identification.segments import segments, without_gaps
+
+    acting, outputs = [s.name for s in machine.acting], [o.name for o in machine.outputs]
+    table = artifacts.read_table(path, tables.record(machine.acting, machine.outputs))
+    u, y, names = segments(table, acting, outputs)
+    recorded = sum(map(len, u))
+    u, y, recordings = without_gaps(u, y, names)
+    with artifacts.about(path):
+        model_choice.check_inputs(u, offset=settings.offset, names=acting)
+        model_choice.check_outputs(y, names=outputs)
+    unlimited = [float("inf")] * len(machine.disturbances)
+    low = [i.low for i in machine.inputs] + [-limit for limit in unlimited]
+    high = [i.high for i in machine.inputs] + unlimited
+    u, clipped = model_choice.within_limits(u, (low, high), names=acting)
+    return RecordSegments(u, y, tuple(recordings), recorded, clipped)
+
+
+def judge_model(
+    settings: IdentifyPlant,
+    chosen: Identified,
+    first: tuple[Segments, Segments],
+    last: tuple[Segments, Segments],
+) -> ModelJudgement:
+    import numpy as np
+
+    from pipeline.temperature.identification import trust, validation
+
+    holdout = trust.holdout(
+        chosen.plant,
+        *last,
+        settings.ahead_steps,
+        block=2 * chosen.past,
+        rng=np.random.default_rng(settings.seed),
+        drift=chosen.drift,
+    )
+    closed = chosen.feedback is not None and chosen.feedback.closed
+    lags = trust.residual_lags(last[0])
+    return ModelJudgement(
+        holdout,
+        validation.residual_tests(chosen.plant, *last, lags=lags, closed=closed),
+        validation.excitation(first[0], chosen.past),
+        sum(map(len, last[0])),
+        trust.fit_of_held_inputs(chosen.plant, *last),
+    )
+
+
+# ---- tables and figures
+
+
+def judgement_tables(machine: Machine, measured: Segments, judgement: ModelJudgement) -> Tables:
+    from pipeline.temperature.identification import trust
+
+    inputs, outputs = [s.name for s in machine.acting], [o.name for o in machine.outputs]
+    ahead = trust.holdout_rows(measured, judgement.holdout, outputs, machine.sample_time_s)
+    return {
+        "holdout": (tables.holdout(machine.outputs), ahead),
+        "residuals": (tables.RESIDUALS, trust.residual_rows(judgement.residuals, outputs, inputs)),
+    }
+
+
+def model_tables(machine: Machine, u: Segments, plant: Plant, spread: list[Plant], steps: Steps) -> Tables:
+    from pipeline.temperature.identification import trust
+
+    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+    responses, moved = (steps, outputs, inputs, machine.sample_time_s), [a[:, : len(inputs)] for a in u]
+    return {
+        "steps": (tables.STEPS, trust.step_rows(*responses)),
+        "dynamics": (tables.DYNAMICS, trust.dynamics_rows(*responses)),
+        "first_order": (tables.FIRST_ORDER, trust.first_order_rows(*responses)),
+        "poles": (tables.POLES, trust.pole_rows(plant, spread)),
+        "levels": (tables.LEVELS, trust.level_rows(trust.input_levels(moved), inputs)),
+    }
+
+
+def fit_figures(
+    settings: IdentifyPlant,
+    machine: Machine,
+    record: RecordSegments,
+    chosen: Identified,
+    fitted: Identified,
+    judgement: ModelJudgement,
+) -> dict[str, Any]:
+    import numpy as np
+
+    from pipeline.temperature.identification import order, trust, validation
+    from pipeline.temperature.plant import controllability
+
+    inputs, outputs = [s.name for s in machine.acting], [o.name for o in machine.outputs]
+    return {
+        "order": fitted.order,
+        "order_tolerance_percent": 100 * order.WORTH_A_STATE,
+        "past": fitted.past,
+        "fit": fitted.fit,
+        # of what is not recorded; None if the left-out blocks do not prefer it, and in no controller
+        "drift_samples": 1.0 / fitted.drift if fitted.drift else None,
+        "feedthrough": dict(zip(outputs, fitted.feedthrough, strict=True)),
+        "validation": "recordings" if len(set(record.recordings)) > 1 else "blocks",
+        "rows": fitted.rows,
+        "dropped_rows": fitted.dropped_rows,
+        "samples": record.recorded,
+        "samples_cut": record.recorded - sum(map(len, record.u)),
+        "samples_holdout": judgement.samples,
+        "delays": dict(zip(inputs, fitted.delays, strict=True)),
+        "notes": list(dict.fromkeys([*record.notes, *fitted.notes])),
+        "ahead_steps": settings.ahead_steps,
+        **trust.fit_figures(judgement.holdout, outputs),
+        "fit_holdout_inputs_held": dict(zip(outputs, judgement.still.tolist(), strict=True)),
+        **trust.outcome_figures(judgement.residuals, judgement.excitation, outputs, inputs),
+        "controllable": controllability(fitted.plant).passed,
+        "largest_pole": np.abs(np.linalg.eigvals(fitted.plant.A)).max(),
+        "advice": validation.advice(
+            judgement.residuals,
+            judgement.excitation,
+            judgement.holdout.fit[0],
+            outputs=outputs,
+            inputs=inputs,
+            still_percent=judgement.still,
+            order_given=settings.order > 0,
+        ),
+    }
+
+
+def warnings(machine: Machine, fitted: Identified, steps: Steps) -> dict[str, Any]:
+    """Whether the record was taken in closed loop, and the gains that physics forbids."""
+    from pipeline.temperature.identification.closed_loop import LEVEL_CLOSED
+    from pipeline.temperature.identification.trust import forbidden_gains
+
+    names, feedback = [i.name for i in machine.inputs], fitted.feedback
+    forbidden = forbidden_gains(
+        steps,
+        [o.name for o in machine.outputs],
+        names,
+        [i.heats for i in machine.inputs],
+        [i.high - i.low for i in machine.inputs],
+    )
+    answers = [] if feedback is None else feedback.p_value.tolist()
+    return {
+        "closed_loop": {
+            "closed": feedback is not None and feedback.closed,
+            "level": LEVEL_CLOSED / (2 * len(names)),
+            "p_value": dict(zip(names, answers, strict=False)),
+        },
+        "forbidden_gains": [gain._asdict() for gain in forbidden],
+    }
 
 
 if __name__ == "__main__":

@@ -1,41 +1,114 @@
 """Recordings -> one table: reads datasets/probe_machine (simulated) or every file below
-datasets/raw/temperature (recordings); writes datasets/ingest/record.parquet,
-quality.parquet and printer_pid.json. A recording that was processed before, with the same
-parameters and code, is taken from a memo; a broken one is quarantined with its reason."""
+datasets/raw/temperature (recordings); writes datasets/ingest/record.parquet, quality.parquet and
+printer_pid.json. A recording that was processed before, with the same parameters and code, is taken from a
+memo; a broken one is quarantined with its reason."""
+
+from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
 
 import stages
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import ingest
-from pipeline.temperature.workflow.settings import Ingest, Plant, check_output_limits
+from pipeline.store.params import Execution, Mapped, Section
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Plant, check_output_limits
+
+if TYPE_CHECKING:
+    from pipeline.reading.recording_folders import RecordingWish
+    from pipeline.reading.signals import Source
+
+
+class Ingest(Section):
+    """Section `ingest`."""
+
+    mapping: dict[str, Mapped]
+    time: str = Field(max_length=300)
+    decimal: Literal["", ".", ","]
+    max_gap_s: float = Field(gt=0, le=86400)
+    longest_s: float = Field(ge=1, le=86400)
+    largest_mb: int = Field(ge=100, le=1_000_000)
+    strict: bool
 
 
 def main() -> None:
     with artifacts.stage("ingest") as out:
-        settings, machine, execution = (
-            params.load(Ingest, "ingest"),
-            params.load(Plant, "plant"),
-            params.load(params.Execution, "execution"),
-        )
+        from pipeline.reading import recording_folders
+        from pipeline.reading.isolated import Budget
+
+        settings, machine = params.load(Ingest, "ingest"), params.load(Plant, "plant")
         source = params.value("generate_probing.source", one_of=("simulated", "recordings"))
         check_output_limits(machine, source)
-        folder = Path(
-            {"simulated": "datasets/probe_machine", "recordings": "datasets/raw/temperature"}[source]
+        # what probe_machine wrote has our own names
+        folder, mapping = Path("datasets/probe_machine"), {}
+        if source == "recordings":
+            folder, mapping = Path("datasets/raw/temperature"), settings.mapping
+        wish = recording_wish(settings, machine, mapping)
+        results = recording_folders.read_folder(
+            folder,
+            wish,
+            params.load(Execution, "execution"),
+            memo=Path("datasets/memo/ingest"),
+            budget=Budget(settings.longest_s, settings.largest_mb),
         )
-        spec = ingest.spec_of(settings, machine, source)
-        budget = ingest.Budget(settings.longest_s, settings.largest_mb)
-        results = ingest.process(folder, spec, execution, memo=Path("datasets/memo/ingest"), budget=budget)
-        record, quality, metrics = ingest.collect(
-            results, machine, strict=settings.strict or "--strict" in sys.argv
-        )
-        done = ingest.work_done(results)
+        strict = settings.strict or "--strict" in sys.argv
+        record, quality, figures = recording_folders.join(results, wish, strict=strict)
+        done = recording_folders.count_work(results)
         print(f"ingest: {done['processed']} recordings read, {done['reused']} taken from the memo")
-        artifacts.write_table(out / "record.parquet", record.schema, record.columns)
-        artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)
-        artifacts.write_json(out / "printer_pid.json", ingest.printer_pids(folder, results, spec))
-        artifacts.write_metrics("ingest", metrics)
+        artifacts.write_table(out / "record.parquet", wish.record, record)
+        artifacts.write_table(out / "quality.parquet", wish.quality, quality)
+        inputs = [signal.name for signal in machine.inputs]
+        pids = recording_folders.printer_pids(folder, results, wish.sources, inputs)
+        artifacts.write_json(out / "printer_pid.json", pids)
+        artifacts.write_metrics("ingest", figures)
+
+
+def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, Mapped]) -> RecordingWish:
+    """What to take from every recording of the machine."""
+    from pipeline.reading.recording_folders import RecordingWish
+
+    return RecordingWish(
+        sources(machine, mapping),
+        limits={signal.name: (signal.low, signal.high) for signal in machine.inputs},
+        held=tuple(signal.name for signal in machine.acting),
+        sample_time_s=machine.sample_time_s,
+        time=settings.time,
+        max_gap_s=settings.max_gap_s,
+        decimal=settings.decimal,
+        record=tables.record(machine.acting, machine.outputs),
+        quality=tables.QUALITY,
+    )
+
+
+def sources(machine: Plant, mapping: dict[str, Mapped]) -> tuple[Source, ...]:
+    """Where a recording has the signals of the machine: by `mapping`, else under their own names. Raises
+    ValueError for a mapping of no signal, or of another unit."""
+    from pipeline.reading.signals import Source, nearest_names
+
+    signals = [*machine.acting, *machine.outputs]
+    unknown = sorted(set(mapping) - {signal.name for signal in signals})
+    if unknown:
+        raise ValueError(
+            f"params.yaml: ingest.mapping.{unknown[0]} is no signal of the plant; "
+            f"{nearest_names(unknown[0], [s.name for s in signals])}"
+        )
+    found = []
+    for signal in signals:
+        mapped = mapping.get(signal.name)
+        if mapped is None:
+            found.append(Source(signal.name, signal.name, signal.unit))
+            continue
+        if mapped.unit != signal.unit:
+            raise ValueError(
+                f"params.yaml: ingest.mapping.{signal.name}.unit is {mapped.unit} but the plant's "
+                f"{signal.name} is in {signal.unit}; convert with scale and offset, "
+                f"and write unit: {signal.unit}"
+            )
+        found.append(Source(signal.name, mapped.source, mapped.unit, mapped.scale, mapped.offset))
+    return tuple(found)
 
 
 if __name__ == "__main__":

@@ -1,26 +1,120 @@
 """Learn controllers from the record alone: reads datasets/ingest/record.parquet; writes
-datasets/learn_kernel/window.parquet and, where the record determines it, kernel.parquet: what the data say
+datasets/learn_kernel/window.parquet and, if the record determines it, kernel.parquet: what the data say
 whatever the weights, so that new weights need no pass over the data."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
 
 import stages
 from pipeline.store import artifacts, params
-from pipeline.temperature.controllers import window
-from pipeline.temperature.workflow import learn_kernel
-from pipeline.temperature.workflow.settings import LearnKernel, Panel, Plant, Tracking
+from pipeline.store.params import Section
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Panel, Plant, Tracking
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from pipeline.temperature.controllers.window import Window
+    from pipeline.temperature.judging import Candidate, Sufficiency
+
+
+class LearnKernel(Section):
+    """Section `learn_kernel`."""
+
+    longest_window: int = Field(ge=1, le=200)
+    largest_kernel_window: int = Field(ge=1, le=10)
+    offset: bool
+    gain_spread: float = Field(ge=0, le=1)
+    allowed_gap_percent: float = Field(gt=0, le=100)
+
+
+RECORD = "datasets/ingest/record.parquet"
+COLD_SHARE = 0.1  # quantile of the recorded temperatures at which a check run starts on somebody's machine
+
+
+def read_record(machine: Plant) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Segments u (T, m) and y (T, p). Window and kernel know inputs alone: what disturbances do counts as
+    noise."""
+    from pipeline.temperature.identification.segments import segments
+
+    table = artifacts.read_table(RECORD, tables.record(machine.acting, machine.outputs))
+    return segments(table, [i.name for i in machine.inputs], [o.name for o in machine.outputs])[:2]
 
 
 def main() -> None:
     with artifacts.stage("learn_kernel") as out:
+        import numpy as np
+
+        from pipeline.temperature import judging
+        from pipeline.temperature.controllers import window
+        from pipeline.temperature.identification import model_choice
+        from pipeline.temperature.test_set.scorecard import Yardstick
+
         settings, machine = params.load(LearnKernel, "learn_kernel"), params.load(Plant, "plant")
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
         simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
-        learned = learn_kernel.learned(
-            settings, machine, tracking, panel, "datasets/ingest/record.parquet", simulated=simulated
+        inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+        q, r = np.full(len(outputs), tracking.yardstick_q), np.full(len(inputs), tracking.yardstick_r)
+        yardstick = Yardstick(q, r, tracking.gamma)
+        u, y = read_record(machine)
+        with artifacts.about(RECORD):
+            model_choice.check_inputs(u, offset=settings.offset, names=inputs)
+            model_choice.check_outputs(y, names=outputs)
+        # candidates are compared on a run from the panel's first training start on the simulated machine, and
+        # from the cold end of what was recorded on another
+        start_degC = (
+            panel.training.starts_degC[0] if simulated else float(np.nanquantile(np.vstack(y), COLD_SHARE))
         )
-        artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(learned.window))
-        if learned.best.learned is not None:
-            artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, learned.best.learned.stored())
-        artifacts.write_metrics("learn_kernel", learned.metrics)
+        check = judging.CheckRun(start_degC, np.array([o.reference for o in machine.outputs]), panel.steps)
+        long = window.learn(
+            u, y, longest=settings.longest_window, offset=settings.offset, gain_spread=settings.gain_spread
+        )
+        enough = judging.sufficiency(
+            u,
+            y,
+            long,
+            yardstick,
+            check,
+            allowed=settings.allowed_gap_percent / 100,
+            offset=settings.offset,
+            gain_spread=settings.gain_spread,
+        )
+        candidates = judging.kernel_candidates(
+            u, y, long, yardstick, check, largest=settings.largest_kernel_window, offset=settings.offset
+        )
+        best = min(candidates, key=lambda candidate: candidate.gap)
+        artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(long))
+        if best.learned is not None:
+            artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, best.learned.stored())
+        artifacts.write_metrics("learn_kernel", figures(long, enough, candidates, best))
+
+
+def figures(
+    long: Window, enough: Sufficiency, candidates: list[Candidate], best: Candidate
+) -> dict[str, Any]:
+    kernel = best.learned
+    return {
+        "window": long.N,
+        "samples": long.samples,
+        "half_record_gap_percent": 100 * enough.half_gap,
+        "samples_needed_for_noise": enough.needed,
+        "state": best.state if kernel else None,
+        "refused": None if kernel else best.refusal,
+        "rank": kernel.rank if kernel else None,
+        "identifiable": kernel.unknowns if kernel else None,
+        "samples_needed": kernel.samples_needed if kernel else None,
+        "condition": kernel.condition if kernel else None,
+        "candidates": {
+            c.state: {
+                "gap_on_window_model_percent": 100 * c.gap if c.gap < float("inf") else None,
+                "refusal": c.refusal or None,
+            }
+            for c in candidates
+        },
+    }
 
 
 if __name__ == "__main__":

@@ -19,12 +19,13 @@ from pipeline.report.papers import page as papers_page
 from pipeline.report.runs import curves
 from pipeline.report.runs import page as runs_page
 from pipeline.report.setpoint import page as setpoint_page
-from pipeline.report.shared.sources import Declared, collect, digest
+from pipeline.report.shared.page import LOOP_OF
+from pipeline.report.shared.sources import Declared, Sources, collect, digest
 from pipeline.report.temperature import page as temperature_page
-from pipeline.report.temperature.judgement import judgement, shown
+from pipeline.report.temperature.judgement import Judgement, judgement, shown
 from pipeline.report.viewer import page as viewer_page
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.settings import ReportRules
 
 # what the pages show of each stage: its figures, and its folder of tables
@@ -79,6 +80,21 @@ MADE = (
 )
 
 
+def of_loops(sources: Sources, judged: Judgement) -> dict[str, str]:
+    """The pages of each loop; one sentence in their place if it is switched off."""
+    pages = {
+        "temperature": lambda: temperature_page.render(sources, judged),
+        "identification": lambda: identification_page.render(sources),
+        "deposition": lambda: deposition_page.render(sources),
+        "setpoint": lambda: setpoint_page.render(sources),
+        "certificate": lambda: certificate_page.render(sources, judged.verdict),
+    }
+    return {
+        name: render() if LOOP_OF[name] in sources.verdicts else about_page.render_off(sources)
+        for name, render in pages.items()
+    }
+
+
 def main() -> None:
     with artifacts.stage("report"):
         declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
@@ -92,11 +108,7 @@ def main() -> None:
         viewer = viewer_page.render(sources, judged)
         pages = {
             "index": index_page.render(sources, judged),
-            "temperature": temperature_page.render(sources, judged),
-            "identification": identification_page.render(sources),
-            "deposition": deposition_page.render(sources),
-            "setpoint": setpoint_page.render(sources),
-            "certificate": certificate_page.render(sources, judged.verdict),
+            **of_loops(sources, judged),
             "papers": papers_page.render(sources, PAPERS, OTHERS),
             "viewer": viewer.text,
             "runs": runs_page.render(sources, judged, told),

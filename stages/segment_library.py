@@ -2,27 +2,47 @@
 library.parquet, the columns of the paper's matrix (3), and learned.json, the identified chain of each
 material, the demarcation and the paper's four assumptions in figures."""
 
+from typing import Any, Literal
+
 import stages
-from pipeline.deposition.workflow import segment_library
-from pipeline.deposition.workflow.settings import Printer, SegmentLibrary
-from pipeline.deposition.workflow.tables import LIBRARY
+from pipeline.deposition.settings import Printer
+from pipeline.deposition.tables import LESSONS, LIBRARY
 from pipeline.store import artifacts, params
 
 
+class SegmentLibrary(params.Section):
+    """Section `segment_library`."""
+
+    law: Literal["model_inverse", "pixels"]
+
+
 def main() -> None:
+    from pipeline.deposition.parts import composition, stored
+
     with artifacts.stage("segment_library") as out:
         settings = params.load(SegmentLibrary, "segment_library")
         printer = params.load(Printer, "printer")
+        # the recordings of a real machine have but one law
         recorded = params.value("train_ilc.source", one_of=("simulated", "recordings")) == "recordings"
-        learned = segment_library.learned(
-            settings, printer, "datasets/train_ilc/lessons.parquet", recorded=recorded
-        )
-        table, rest = segment_library.stored(learned)
-        artifacts.write_table(out / "library.parquet", LIBRARY, table)
+        law, routines = "pixels" if recorded else settings.law, printer.training_routines()
+        samples = artifacts.read_table("datasets/train_ilc/lessons.parquet", LESSONS)
+        with artifacts.about("datasets/train_ilc/lessons.parquet"):
+            trainings = stored.trainings(samples, law, routines, printer.nozzle_mm)
+            learned = composition.learn(trainings, sample_time_s=printer.sample_time_s)
+        rest = stored.to_json(learned)
+        artifacts.write_table(out / "library.parquet", LIBRARY, stored.to_table(learned.library))
         artifacts.write_json(out / "learned.json", rest)
-        artifacts.write_metrics(
-            "segment_library", {"columns": len(table["task"]), **segment_library.figures(rest)}
-        )
+        figures = {"columns": len(learned.library.columns)} | rest
+        figures["materials"] = [material_figures(material) for material in rest["materials"]]
+        artifacts.write_metrics("segment_library", figures)
+
+
+def material_figures(material: dict[str, Any]) -> dict[str, Any]:
+    """What was learned of a material, without the chains that the trials cannot tell apart and without what
+    they missed place by place."""
+    chain = {name: value for name, value in material["chain"].items() if name not in ("left_out", "members")}
+    missed = {name: value for name, value in material["missed"].items() if name != "by_place"}
+    return material | {"chain": chain, "missed": missed}
 
 
 if __name__ == "__main__":

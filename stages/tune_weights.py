@@ -1,35 +1,181 @@
-"""Tune every contestant by itself, by Bayesian optimisation: reads what identify_plant and learn_kernel
-wrote; writes datasets/tune_weights/weights.json and history.parquet. No data stage is touched by new
-weights."""
+"""Tune every controller by itself, by Bayesian optimisation, as it would be deployed: reads what
+identify_plant and learn_kernel wrote; writes datasets/tune_weights/weights.json and history.parquet. New
+weights rerun no stage of data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import stages
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import learned, tables, tune_weights
-from pipeline.temperature.workflow.settings import Panel, Plant, Tracking, TuneWeights
+from pipeline.store.params import Execution
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights
+
+if TYPE_CHECKING:
+    from pipeline.temperature.controllers.printer_pid import HeaterPid
+    from pipeline.temperature.controllers.problem import DesignProblem
+    from pipeline.temperature.test_set.cases import CaseConditions
+    from pipeline.temperature.test_set.tuning import SearchResult
+
+
+def read_models(
+    plant_path: str | Path,
+    spread_path: str | Path | None,
+    learned_folder: str | Path,
+    printer_pid_path: str | Path | None,
+    machine: Plant,
+) -> dict[str, Any]:
+    """The plant, its family, window, kernel and PIDs of a printer that controllers are designed from.
+    `learned_folder` has a kernel only if the record determines one; without a path there is no spread, or no
+    PID. Raises ValueError for a file of another machine than `machine`, as an earlier run leaves it."""
+    from pipeline.temperature.controllers import kernel, window
+    from pipeline.temperature.plant import restored, strictly_proper
+
+    m, p = len(machine.inputs), len(machine.outputs)
+    learned, square = Path(learned_folder), {"D": (None, p, m)}
+    model = artifacts.read_arrays(plant_path, "plant", 1, shapes=square)
+    spread = restored(artifacts.read_arrays(spread_path, "spread", 1, shapes=square)) if spread_path else []
+    long = artifacts.read_arrays(
+        learned / "window.parquet", "window", 1, shapes={"Theta": (p, None), "covariance": (p, p)}
+    )
+    has_kernel = artifacts.exists(learned / "kernel.parquet")
+    family = [strictly_proper(one) for one in (restored(model)[0], *spread)]
+    return {
+        "plant": family[0],
+        "family": family,
+        "window": window.restored(long),
+        "kernel": kernel.restored(artifacts.read_arrays(learned / "kernel.parquet", "kernel", 1))
+        if has_kernel
+        else None,
+        "printer_pid": heater_pids(artifacts.read_json(printer_pid_path), machine)
+        if printer_pid_path
+        else (),
+    }
+
+
+def heater_pids(stored: Mapping[str, Any], machine: Plant) -> tuple[HeaterPid, ...]:
+    """The PIDs of heaters whose duty is an input of the machine and whose temperature is an output."""
+    from pipeline.temperature.controllers.printer_pid import HeaterPid
+
+    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+    return tuple(
+        HeaterPid(
+            inputs.index(pid["input"]),
+            outputs.index(pid["output"]),
+            *(pid[key] for key in ("Kp", "Ki", "Kd", "most_percent", "smooth_s")),
+        )
+        for pid in stored.get("heaters", [])
+        if pid["input"] in inputs and pid["output"] in outputs
+    )
+
+
+def load_design_problem(
+    machine: Plant, panel: Panel, tracking: Tracking, tuning: TuneWeights, *, simulated: bool
+) -> tuple[CaseConditions, DesignProblem]:
+    """What controllers are tuned and judged on, and what they are designed from. A simulated machine is the
+    study's; otherwise cases follow from the record of ingest."""
+    from pipeline.temperature.identification.segments import segments, without_gaps
+    from pipeline.temperature.plant import baam
+    from pipeline.temperature.test_set import cases
+
+    models = read_models(
+        "datasets/identify_plant/plant.parquet",
+        "datasets/identify_plant/spread.parquet",
+        "datasets/learn_kernel",
+        "datasets/ingest/printer_pid.json",
+        machine,
+    )
+    truth, family = None, models["family"]
+    if simulated:
+        truth = baam()._replace(sample_time_s=machine.sample_time_s)
+        rehearsal = cases.from_declaration(panel, machine, truth, family)
+    else:
+        schema = tables.record(machine.acting, machine.outputs)
+        record = artifacts.read_table("datasets/ingest/record.parquet", schema)
+        u, y, recordings = segments(
+            record, [s.name for s in machine.acting], [o.name for o in machine.outputs]
+        )
+        rehearsal = cases.from_record(panel, machine, family, *without_gaps(u, y, recordings))
+    setting = cases.conditions(tuning, machine, tracking, panel, rehearsal, family)
+    return setting, cases.design_problem(models, tracking, setting, truth)
+
+
+def search_all(
+    settings: TuneWeights, problem: DesignProblem, setting: CaseConditions, execution: Execution
+) -> tuple[dict[str, SearchResult], dict[str, str]]:
+    """The best parameters of every controller that has some, and by name why others are refused: "" if the
+    record does not allow the controller."""
+    from joblib import delayed
+    from tqdm import tqdm
+
+    from pipeline.store.execution import run_all
+    from pipeline.temperature.controllers.table import CONTROLLERS
+    from pipeline.temperature.test_set.controller_search import search
+
+    calls = [delayed(search)(one.name, settings, problem, setting) for one in CONTROLLERS if one.parameters]
+    outcomes = dict(
+        tqdm(run_all(calls, execution), total=len(calls), desc="tune_weights: controllers", mininterval=2)
+    )
+    refused = {name: outcome for name, outcome in outcomes.items() if isinstance(outcome, str)}
+    results = {name: outcome for name, outcome in outcomes.items() if not isinstance(outcome, str)}
+    if not results:
+        raise ValueError(
+            "tune_weights: expected a controller that can be designed, found none: "
+            + "; ".join(f"{name}: {reason}" for name, reason in refused.items())
+            + "; record the machine longer, or change its inputs in section plant of params.yaml"
+        )
+    return results, refused
+
+
+def candidates(results: Mapping[str, SearchResult]) -> dict[str, Sequence]:
+    """The candidates of all searches as columns, one row a candidate."""
+    from pipeline.temperature.controllers.table import BY_NAME, parameters
+
+    rows = []
+    for name, result in results.items():
+        history = result.history
+        for k, theta in enumerate(history.theta):
+            values = parameters(BY_NAME[name], theta)
+            rows.append(
+                {
+                    "contestant": name,
+                    "evaluation": k + 1,
+                    "cost": history.cost[k],
+                    "incumbent": history.incumbent[k],
+                    "values": ", ".join(f"{key} {value:.4g}" for key, value in values.items()),
+                    "chosen": bool((theta == result.theta).all()),
+                    "failure": history.failed[k],
+                }
+            )
+    return {column.name: [row[column.name] for row in rows] for column in tables.TUNING.columns}
 
 
 def main() -> None:
     with artifacts.stage("tune_weights") as out:
+        from pipeline.temperature.test_set.controller_search import tuned_values
+
         settings, machine = params.load(TuneWeights, "tune_weights"), params.load(Plant, "plant")
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
-        execution = params.load(params.Execution, "execution")
         simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
-        made = learned.read_learned(
-            "datasets/identify_plant/plant.parquet",
-            "datasets/identify_plant/spread.parquet",
-            "datasets/learn_kernel",
-            "datasets/ingest/printer_pid.json",
-            machine,
-        )
-        record = "datasets/ingest/record.parquet"
-        posed = learned.posed(made, machine, panel, tracking, settings, record, simulated=simulated)
-        tuned = tune_weights.tuned(settings, posed.problem, posed.setting, execution)
-        artifacts.write_json(out / "weights.json", tuned.weights)
-        artifacts.write_table(out / "history.parquet", tables.TUNING, tuned.history)
+        setting, problem = load_design_problem(machine, panel, tracking, settings, simulated=simulated)
+        results, refused = search_all(settings, problem, setting, params.load(Execution, "execution"))
+        tuned = {name: tuned_values(name, result, problem) for name, result in results.items()}
+        design = {"horizon_steps": problem.horizon, "noise_degC": problem.noise.tolist()}
+        artifacts.write_json(out / "weights.json", {"design": design, "contestants": tuned})
+        history = candidates(results)
+        artifacts.write_table(out / "history.parquet", tables.TUNING, history)
         artifacts.write_learning_curve(
-            out / "live", tuned.history, of="contestant", step="evaluation", figures=("cost", "incumbent")
+            out / "live", history, of="contestant", step="evaluation", figures=("cost", "incumbent")
         )
-        artifacts.write_metrics("tune_weights", tuned.metrics)
+        figures = {
+            name: {key: value for key, value in values.items() if key not in ("q", "r")}
+            for name, values in tuned.items()
+        }
+        reasons = {name: reason for name, reason in refused.items() if reason}
+        artifacts.write_metrics("tune_weights", {"contestants": figures, "refused": reasons})
 
 
 if __name__ == "__main__":

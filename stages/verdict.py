@@ -5,10 +5,13 @@ A verdict says who should run, the first rule that failed or is undecided, and w
 rules.toml). Pages, export, README and the nightly job read it. A loop that is switched off has none.
 """
 
+from typing import Any
+
 import stages
 from pipeline.store import artifacts
 
 METRICS = ("*.state", "*.winner")
+CERTIFIED = "datasets/certify/certified.json"
 
 
 def main() -> None:
@@ -17,15 +20,31 @@ def main() -> None:
     from pipeline.verdict.verdict import write
 
     with artifacts.stage("verdict") as out:
-        certified = {}
-        if artifacts.exists("datasets/certify/certified.json"):
-            certified = artifacts.read_json("datasets/certify/certified.json")
-        evidence = read_evidence(certified)
+        evidence = read_evidence()
+        evidence = evidence._replace(certified=certificates(evidence.rules))
         verdicts = loops.verdicts(evidence)
         write(loops.with_model(evidence, verdicts), out)
-        artifacts.write_metrics(
-            "verdict", {loop: verdict.metrics() for loop, verdict in verdicts.items()}, METRICS
-        )
+        figures = {loop: verdict.metrics() for loop, verdict in verdicts.items()}
+        artifacts.write_metrics("verdict", figures, METRICS)
+
+
+def certificates(rules: Any) -> dict[str, dict[str, dict[str, Any]]]:
+    """{loop: {controller: {"passed", "why"}}} by the limits of `report`; {} if certify did not run."""
+    from pipeline.runtime import certified
+
+    if not artifacts.exists(CERTIFIED):
+        return {}
+    temperature = certified.results(
+        "datasets/certify",
+        settled_error_degC=rules.settled_error_degC,
+        disk_margin=rules.disk_margin,
+        delay_margin_s=rules.delay_margin_s,
+    )
+    setpoint = artifacts.read_json(CERTIFIED).get("setpoint", {})
+    refused = (
+        {setpoint["controller"]: {"passed": False, "why": setpoint["why"]}} if setpoint.get("why") else {}
+    )
+    return {"temperature": temperature, "setpoint": refused}
 
 
 if __name__ == "__main__":

@@ -21,8 +21,8 @@ FORKED.set_forkserver_preload(
     [
         "distributed",
         "pandas",
-        "pipeline.temperature.workflow.evaluate_temperature",
-        "pipeline.temperature.workflow.ingest",
+        "pipeline.temperature.test_set.evaluation",
+        "pipeline.reading.recording_folders",
         "tests.cluster",
     ]
 )

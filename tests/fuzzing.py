@@ -23,7 +23,7 @@ from pipeline.deposition.toolpath import gcode
 from pipeline.reading import recordings
 from pipeline.reading.inspection import inspect
 from pipeline.store import artifacts, params, tables
-from pipeline.temperature.workflow.settings import Panel, Plant
+from pipeline.temperature.settings import Panel, Plant
 from tests.reading import damaging, hostile
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+import stages
 from tests import fake_uv
 
 
@@ -56,6 +57,15 @@ def test_the_last_line_is_the_verdict_of_page_one(copy):
         assert fake_uv.run(copy, "dvc", *others).stdout == f"dvc {' '.join(others)}\n"
     page.unlink()
     assert fake_uv.run(copy, "dvc", "repro").stdout == "dvc repro\n"
+
+
+def test_a_repro_of_named_stages_ends_with_the_verdict_only_if_it_made_the_page(copy):
+    page = copy / "reports/index.html"
+    fake_uv.write(page, "<title>Fail · beadline</title>")
+    assert fake_uv.run(copy, "dvc", "repro", "-f", "train_ilc").stdout == "dvc repro -f train_ilc\n"
+    makes = "import pathlib\ndef main(_):\n    pathlib.Path({!r}).write_text({!r})\n    return 0\n"
+    fake_uv.write(copy / "fake/dvc/cli.py", makes.format(str(page), "<title>Pass · beadline</title>"))
+    assert fake_uv.run(copy, "dvc", "repro", "report").stdout == f"Pass. Open {page}\n"
 
 
 def test_the_exit_status_of_dvc_is_handed_on_without_a_last_line(root, tmp_path):
@@ -131,14 +141,36 @@ def test_parameters_that_nobody_can_read_are_refused_before_dvc_reads_them(copy,
         assert ended.stderr.count("\n") == 1
 
 
-def test_parameters_that_were_read_once_are_not_read_again_until_they_change(copy):
+RUNS_STAGES = ("dvc repro", "dvc exp run -S report.settled_percent=90", "beadline quick", "beadline nightly")
+
+
+@pytest.mark.parametrize("command", RUNS_STAGES)
+def test_misspelt_keys_are_refused_by_name_before_a_command_that_runs_stages(copy, command):
+    text = (copy / "params.yaml").read_text()
+    misspelt = text.replace("settled_error_degC:", "settled_eror_degC:").replace("  watch_h:", "  wach_h:")
+    (copy / "params.yaml").write_text(misspelt)
+    ended = fake_uv.run(copy, *command.split())
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert ended.stderr == (
+        "run: params.yaml: nightly.wach_h is unknown; did you mean watch_h?; "
+        "params.yaml: report.settled_eror_degC is unknown; did you mean settled_error_degC?\n"
+    )
+
+
+@pytest.mark.parametrize("command", ["dvc status", "dvc pull", "dvc repro --help", "beadline init log.csv"])
+def test_misspelt_keys_stop_no_command_that_runs_no_stage(copy, command):
+    (copy / "params.yaml").write_text((copy / "params.yaml").read_text().replace("  watch_h:", "  wach_h:"))
+    assert fake_uv.run(copy, *command.split()).returncode == 0
+
+
+def test_parameters_that_were_checked_once_are_not_read_again_until_they_change(copy):
     (copy / ".dvc/tmp").mkdir(parents=True)
-    assert fake_uv.run(copy, "dvc", "status").returncode == 0
-    remembered = (copy / ".dvc/tmp/params_read").read_bytes()
-    assert fake_uv.run(copy, "dvc", "status").returncode == 0
+    assert fake_uv.run(copy, "dvc", "repro").returncode == 0
+    remembered = (copy / stages.CHECKED).read_bytes()
+    assert fake_uv.run(copy, "dvc", "repro").returncode == 0
     (copy / "params.yaml").write_text("x: [")
     assert fake_uv.run(copy, "dvc", "status").returncode == 1
-    assert (copy / ".dvc/tmp/params_read").read_bytes() == remembered
+    assert (copy / stages.CHECKED).read_bytes() == remembered
 
 
 def test_what_goes_around_dvc_imports_the_standard_library_alone(root):
@@ -147,4 +179,4 @@ def test_what_goes_around_dvc_imports_the_standard_library_alone(root):
     ended = subprocess.run(
         [sys.executable, "-S", "-c", code], cwd=root, capture_output=True, text=True, check=True
     )
-    assert set(ended.stdout.split()) <= sys.stdlib_module_names | {"pipeline", "__main__"}
+    assert set(ended.stdout.split()) <= sys.stdlib_module_names | {"pipeline", "stages", "__main__"}

@@ -76,7 +76,7 @@ def test_parameters_that_were_checked_are_not_checked_again_until_they_change(pr
         stages.check_parameters()
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{", '{"files": {"gone.py": 1}}', '{"files": 3}'])
+@pytest.mark.parametrize("text", ["", "[]", "{", "3", '{"digest": 3}'])
 def test_a_broken_memory_is_none(project, text):
     change(project, "params.yaml", "  watch_h:", "  wach_h:")
     (project / stages.CHECKED).parent.mkdir()

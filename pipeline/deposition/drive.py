@@ -22,28 +22,18 @@ class Drive(NamedTuple):
 UNLIMITED = Drive(math.inf, math.inf, 0.0)
 
 
-class Asked(NamedTuple):
-    """What a command asks of a drive: its largest |u| in mm and its largest |du/dt| in mm/s, from rest at
-    0."""
-
-    command_mm: float
-    speed_mm_per_s: float
-
-
-def asked(u: np.ndarray, *, sample_time_s: float) -> Asked:
-    """The largest command and speed of u (..., T) in mm, held between samples."""
+def demand(u: np.ndarray, *, sample_time_s: float) -> tuple[float, float]:
+    """What a command u (..., T) in mm, held between samples, needs of a drive: its largest |u| in mm and its
+    largest |du/dt| in mm/s, from rest at 0."""
     if u.size == 0:
-        return Asked(0.0, 0.0)
-    return Asked(float(np.abs(u).max()), float(np.abs(_moves(u)).max()) / sample_time_s)
+        return 0.0, 0.0
+    return float(np.abs(u).max()), float(np.abs(_moves(u)).max()) / sample_time_s
 
 
 def follows(u: np.ndarray, drive: Drive, *, sample_time_s: float) -> bool:
     """Whether the drive can do the command u (..., T) in mm as it stands; rounding is not beyond it."""
-    most = asked(u, sample_time_s=sample_time_s)
-    return (
-        most.command_mm <= BEYOND * drive.amplitude_mm
-        and most.speed_mm_per_s <= BEYOND * drive.speed_mm_per_s
-    )
+    command_mm, speed = demand(u, sample_time_s=sample_time_s)
+    return command_mm <= BEYOND * drive.amplitude_mm and speed <= BEYOND * drive.speed_mm_per_s
 
 
 def obeyed(u: np.ndarray, drive: Drive, *, sample_time_s: float) -> np.ndarray:

@@ -2,6 +2,7 @@
 chain that trials run on, its draws, and the training routine."""
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -21,12 +22,15 @@ PLAY, YIELD = (0.01, 0.04), (0.02, 0.10)
 class Extruder(NamedTuple):
     """Plunger command u (mm) -> flow y (mm^3/s), in this order:
 
-    the drive's limits and backlash; transport delay; lag w^2 / (s^2 + 2 zeta w s + w^2); play (backlash of
-    full width `play`, mm of command); K ((1 - c) / (tau s + 1) + c / (T s + 1)), c the share of the gain that
-    creeps with T; yield dead band y = max(x - yield, 0), mm^3/s.
+        the drive's limits and backlash
+        transport delay
+        lag: w^2 / (s^2 + 2 zeta w s + w^2)
+        play: backlash of full width `play`, mm of command
+        K ((1 - c) / (tau s + 1) + c / (T s + 1)), c the share of the gain that creeps with T
+        yield dead band: y = max(x - yield, 0), mm^3/s
 
-    `gain` K in mm^3/s per mm. The defaults are the nominal model (1):
-    no delay, no lag, no play, no yield, no creep.
+    `gain` K in mm^3/s per mm. The defaults are the nominal model (1): no delay, no lag, no play, no yield, no
+    creep.
     """
 
     gain: float
@@ -37,6 +41,16 @@ class Extruder(NamedTuple):
     yield_: float = 0.0
     creep_share: float = 0.0
     creep_time_s: float = 20.0
+
+
+def to_json(extruder: Extruder) -> dict[str, float | None]:
+    """An extruder as JSON: no lag is null."""
+    return {name: float(value) if np.isfinite(value) else None for name, value in extruder._asdict().items()}
+
+
+def from_json(values: Mapping[str, float | None]) -> Extruder:
+    """What `to_json` made."""
+    return Extruder(**{name: np.inf if value is None else value for name, value in values.items()})
 
 
 class Routine(NamedTuple):
@@ -161,8 +175,10 @@ def lagged(u: np.ndarray, delay_s: float, lag_hz: float, sample_time_s: float) -
 
 
 def backlash(x: np.ndarray, play: float) -> np.ndarray:
-    """Play of full width `play` on x (T,): the output stays until x leaves it by half the play, y(t) =
-    min(max(y(t-1), x(t) - play/2), x(t) + play/2), y(-1) = 0."""
+    """Play of full width `play` on x (T,): the output stays until x leaves it by half the play. y(-1) = 0 and
+
+    y(t) = min(max(y(t-1), x(t) - play/2), x(t) + play/2)
+    """
     half, y, out = play / 2, 0.0, []
     for value in x.tolist():
         if y < value - half:

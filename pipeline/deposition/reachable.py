@@ -93,6 +93,27 @@ def ramp_that_loses_little(
     return high
 
 
+def ramp_of_all(
+    extruders: Sequence[Extruder],
+    drive: Drive,
+    *,
+    steady_flow: float,
+    ramp_s: float,
+    longest_s: float,
+    sample_time_s: float,
+) -> float:
+    """The time in s in which the gantry may reach a printing speed such that the drive follows the flow of
+    each of the extruders (`ramp_that_loses_little`), in whole hundredths; at most longest_s."""
+    ramps = [
+        ramp_that_loses_little(
+            extruder, drive, steady_flow=steady_flow, ramp_s=ramp_s, longest_s=longest_s,
+            sample_time_s=sample_time_s,
+        )
+        for extruder in extruders
+    ]  # fmt: skip
+    return min(math.ceil(100 * min(max(ramps), longest_s)) / 100, longest_s)
+
+
 def flow(extruder: Extruder, r: np.ndarray, drive: Drive, sample_time_s: float) -> np.ndarray:
     """The flow (T,) in mm^3/s nearest to r (T,) that the drive lets the extruder's gain, time constant and
     yield press out; its delay and lag, which a command can be sent ahead of, its play and creep are left

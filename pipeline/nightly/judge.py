@@ -8,17 +8,22 @@ from typing import Any, NamedTuple
 import joblib
 import numpy as np
 
-from pipeline.deposition.workflow.tables import SCORES
+from pipeline.deposition.tables import SCORES
 from pipeline.nightly.decision import CaseCosts
 from pipeline.nightly.settings import HoldOut, Nightly, NightlyLoop, PromotionRule
-from pipeline.setpoint.workflow import tables
+from pipeline.reading import recording_folders
+from pipeline.reading.isolated import Budget
+from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
-from pipeline.temperature.controllers import window
-from pipeline.temperature.test_set import panel
-from pipeline.temperature.workflow import cases, contestants, evaluate_temperature, ingest, learned
-from pipeline.temperature.workflow.settings import Panel, Tracking, TuneWeights
-from pipeline.temperature.workflow.settings import Plant as Machine
+from pipeline.temperature.controllers import table, window
+from pipeline.temperature.controllers.problem import Design
+from pipeline.temperature.settings import Panel, Tracking, TuneWeights
+from pipeline.temperature.settings import Plant as Machine
+from pipeline.temperature.test_set import cases, evaluation, panel
+from stages.evaluate_temperature import read_weights
+from stages.ingest import Ingest, recording_wish
+from stages.tune_weights import read_models
 
 MEMO = Path(".beadline/panel")
 PAGE, EARLIER = "page", "varx_riccati"  # of nightly.holdout.controller
@@ -240,7 +245,7 @@ def _closed_loop(frozen: FrozenPanel, folder: Path, contestant: str, rule: Promo
     )
 
 
-def judged(frozen: FrozenPanel, folder: Path, name: str) -> evaluate_temperature.JudgedContestant:
+def judged(frozen: FrozenPanel, folder: Path, name: str) -> evaluation.ControllerOutcome:
     """The contestant `name` whose files lie below `folder`, as it would be deployed: its own governor,
     today's limits. Raises NotComparable where it cannot be designed from them."""
     try:
@@ -248,31 +253,30 @@ def judged(frozen: FrozenPanel, folder: Path, name: str) -> evaluate_temperature
     except ValueError as reason:
         raise NotComparable(str(reason)) from None
     # the gap to the optimum is for pages
-    return evaluate_temperature.judged_one(name, design._replace(plain=None), setting)[1]
+    return evaluation.evaluate(name, design._replace(plain=None), setting)[1]
 
 
-def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[contestants.Design, cases.Setting]:
+def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[Design, cases.CaseConditions]:
     machine, tracking = frozen.machine, frozen.tracking
-    made = _learned(folder, name, machine)
-    setting = cases.shared(
-        frozen.tuning, machine, tracking, frozen.settings, frozen.rehearsal, [made.model, *made.spread]
+    models = _models(folder, name, machine)
+    setting = cases.conditions(
+        frozen.tuning, machine, tracking, frozen.settings, frozen.rehearsal, models["family"]
     )
     path = folder / "tune_weights/weights.json"
-    stored = artifacts.read_json(path)
-    contestant = contestants.BY_NAME[name]
-    mine = evaluate_temperature.read_weights(str(path), machine).get(name, {})
-    values = {one.name: mine.get(one.name) for one in contestant.parameters}
+    stored = read_weights(path)
+    contestant = table.BY_NAME[name]
+    tuned = stored.contestants[name].model_dump() if name in stored.contestants else {}
+    values = {one.name: tuned.get(one.name) for one in contestant.parameters}
     if lacking := [key for key, value in values.items() if value is None]:
         raise ValueError(
             f"{path}: expected {', '.join(lacking)} of {name}, found none; let tune_weights tune it, or name "
-            f"one of {', '.join(stored.get('contestants', {})) or 'those that it has'} in "
+            f"one of {', '.join(stored.contestants)} in "
             "nightly.holdout.controller"
         )
     # what it was tuned for, not what it is judged by
-    of = stored.get("design", {})
-    problem = learned.problem(made, tracking, setting, None)._replace(
-        horizon=int(of.get("horizon_steps", frozen.settings.steps)),
-        noise=np.array(of.get("noise_degC", frozen.rehearsal.noise), float),
+    problem = cases.design_problem(models, tracking, setting, None)._replace(
+        horizon=int(stored.design.get("horizon_steps", frozen.settings.steps)),
+        noise=np.array(stored.design.get("noise_degC", frozen.rehearsal.noise), float),
     )
     design = contestant.design(problem, values)
     if design is None:
@@ -280,7 +284,7 @@ def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[contestants
     return design, setting
 
 
-def _learned(folder: Path, name: str, machine: Machine) -> learned.Learned:
+def _models(folder: Path, name: str, machine: Machine) -> dict[str, Any]:
     """What a contestant is designed from; of what only some need, what lies there."""
     own = DESIGNED_FROM.get(name)
     if own and not (folder / own).exists():
@@ -289,7 +293,7 @@ def _learned(folder: Path, name: str, machine: Machine) -> learned.Learned:
             "nightly.loops.temperature.artifacts, or name another one in nightly.holdout.controller"
         )
     spread, pid = folder / "identify_plant/spread.parquet", folder / "ingest/printer_pid.json"
-    return learned.read_learned(
+    return read_models(
         folder / "identify_plant/plant.parquet",
         spread if spread.exists() else None,
         folder / "learn_kernel",
@@ -305,7 +309,7 @@ def identified(folder: Path) -> plant.Plant:
 
 def _predictor(folder: Path, name: str, machine: Machine) -> plant.Plant:
     """The model that a contestant predicts with: the window where it was learned from one."""
-    if contestants.BY_NAME[name].learned_from not in ("window", "kernel"):
+    if table.BY_NAME[name].learned_from not in ("window", "kernel"):
         return identified(folder)
     long = window.restored(artifacts.read_arrays(folder / "learn_kernel/window.parquet", "window", 1))
     return window.predictor(long, machine.sample_time_s)
@@ -327,20 +331,13 @@ def record_segments(
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
     """{recording: [(u, y), ...]} below a folder, read as the stage `ingest` reads, through its memo; reasons
     of those that cannot be read go to `broken`."""
-    declared: dict[str, Any] = params.read()["ingest"]
-    mapping = {
-        name: (m["source"], m["unit"], float(m["scale"]), float(m["offset"]))
-        for name, m in declared["mapping"].items()
-    }
-    spec = ingest.IngestSpec(
-        machine, mapping, declared["time"], float(declared["max_gap_s"]), declared["decimal"]
-    )
-    results = ingest.process(
+    settings = params.load(Ingest, "ingest")
+    results = recording_folders.read_folder(
         folder,
-        spec,
+        recording_wish(settings, machine, settings.mapping),
         params.load(params.Execution, "execution"),
         memo=Path("datasets/memo/ingest"),
-        budget=ingest.Budget(float(declared["longest_s"]), float(declared["largest_mb"])),
+        budget=Budget(settings.longest_s, settings.largest_mb),
     )
     segments = {}
     for result in results:

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deposition.workflow import trial_files, trial_readings
 from pipeline.nightly import camera_drift
 from pipeline.nightly.inputs import quarantine
 from pipeline.nightly.records import Alarm, LoopDrift
 from pipeline.nightly.settings import DriftLimits
+from pipeline.reading import trial_files
 from pipeline.reading.excluded import readable
 from pipeline.store import params
 
 if TYPE_CHECKING:
-    from pipeline.deposition.workflow.settings import Camera
-    from pipeline.setpoint.workflow.settings import TrainClassifier
+    from pipeline.deposition.settings import Camera
+    from pipeline.setpoint.settings import TrainClassifier
 
 FRAMES = 40  # pictures of a recording that are looked at
 
@@ -33,7 +33,7 @@ def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
     paths = [path for path in trials if not only or path.as_posix() in only]
     for path in paths[-most:]:
         try:
-            stats = _frame_stats(trial_readings.opened(path, camera))
+            stats = _frame_stats(trial_files.open_trial(path, **camera.recording))
         except ValueError:
             continue
         rows.append([stats.mean.tolist(), stats.deviation.tolist(), stats.frames])
@@ -42,12 +42,12 @@ def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
 
 def _camera() -> "Camera":
     """Section `camera`, through whose topics a trial is read, however many of its frames can be."""
-    from pipeline.deposition.workflow.settings import Camera
+    from pipeline.deposition.settings import Camera
 
     return params.load(Camera, "camera").model_copy(update={"unreadable_share": 1.0})
 
 
-def _frame_stats(trial: trial_files.Trial) -> camera_drift.FrameStats:
+def _frame_stats(trial: trial_files.TrialRecording) -> camera_drift.FrameStats:
     frames = trial.frames
     every = max(len(frames.time_s) // FRAMES, 1)
     return camera_drift.figures(
@@ -67,7 +67,7 @@ def trials_drift(
     ]
     for path in (path for path in paths if path.lower().endswith(".mcap")):
         try:
-            trial = trial_readings.opened(path, camera)
+            trial = trial_files.open_trial(path, **camera.recording)
         except ValueError as error:
             drifted.quarantined[path] = quarantine(path, loop, str(error))
             continue
@@ -111,18 +111,16 @@ def of_prints(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
 
 
 def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[PrintFigures]:
-    from pipeline.setpoint.workflow import frame_folder
-    from pipeline.setpoint.workflow.settings import SetpointMaterial, TrainClassifier
+    from pipeline.reading import frame_folder
+    from pipeline.setpoint.recordings import read_options
+    from pipeline.setpoint.settings import SetpointMaterial, TrainClassifier
 
     settings = params.load(TrainClassifier, "train_classifier")
     if settings.source != "recordings":
         return []
     material = params.load(SetpointMaterial, "setpoint_material").material()
     frames = frame_folder.read_folder(
-        folder,
-        frame_folder.read_options(settings, material),
-        params.load(params.Execution, "execution"),
-        memo=Path("datasets/memo/train_classifier"),
+        folder, read_options(settings, material), params.load(params.Execution, "execution")
     )
     prints = []
     numbered = [(number, name) for number, name in enumerate(frames.prints) if not only or name in only]
@@ -149,7 +147,7 @@ def prints_drift(
     """Drift of the new prints `paths` in the loop's folder of recordings. A file that cannot be read is set
     aside. Classes, frames without a line, and the line's contrast are compared with the prints that the
     champion's reference.json has under "camera"."""
-    from pipeline.setpoint.workflow.settings import TrainClassifier
+    from pipeline.setpoint.settings import TrainClassifier
 
     drifted = LoopDrift.none(loop)
     settings = params.load(TrainClassifier, "train_classifier")
@@ -182,13 +180,14 @@ def prints_drift(
 
 def _unreadable(path: str, settings: "TrainClassifier") -> str:
     """Why a print's file cannot be read; empty where it can."""
-    from pipeline.setpoint.workflow import frame_csv, frame_folder, frame_mcap
+    from pipeline.reading import frame_csv, frame_mcap
+    from pipeline.setpoint.recordings import read_options
 
     try:
         if path.lower().endswith(".csv"):
             frame_csv.read_log(Path(path))
         elif path.lower().endswith(".mcap"):
-            frame_mcap.open_film(Path(path), frame_folder.read_options(settings).topics)
+            frame_mcap.open_film(Path(path), read_options(settings).topics)
     except ValueError as error:
         return str(error)
     return ""

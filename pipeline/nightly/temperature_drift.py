@@ -22,7 +22,7 @@ from pipeline.nightly.records import (
 )
 from pipeline.nightly.settings import DriftLimits, NightlyLoop
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 
 REFERENCE = "reference.json"  # in the champion's folder
 PIECES = 4  # into which a single record of the champion is cut, to stand for nights

@@ -16,8 +16,7 @@ from pipeline.verdict import verdict
 from pipeline.verdict.files import read_evidence
 from pipeline.verdict.verdict import Verdict
 
-STORED, CERTIFIED = "datasets/verdict", "datasets/certify/certified.json"
-REPORT = "reports/metrics/report.json"
+STORED, REPORT = "datasets/verdict", "reports/metrics/report.json"
 
 
 def read_verdicts(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], Night]:
@@ -27,7 +26,7 @@ def read_verdicts(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], 
     loops = [name for name, loop in settings.loops.items() if loop.judge != "cases"]
     if not loops:
         return {}, night
-    evidence = read_evidence(_read_json(CERTIFIED) or {})
+    evidence = read_evidence()  # as the pages do
     stored, tonight, named = verdict.read(STORED), _read_json(METRICS), settings.holdout.controller
     by_loop = verdict_night.verdicts(evidence, stored, tonight)
     night = _make_pages_agree(by_loop, night)

@@ -16,9 +16,9 @@ import scipy.signal
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, Routine, disturb, flow, frequency_response, routine
 from pipeline.deposition.learning import ilc
-from pipeline.deposition.parts.composition import Learned, PartSettings, compose, learn, priority
+from pipeline.deposition.parts.composition import LearnedLibrary, PartSettings, compose, learn, priority
 from pipeline.deposition.parts.library import CORNER, NO_FLOW, START, STEADY, STOP, TASKS, Training
-from pipeline.deposition.toolpath.gcode import Kind, Program, parse
+from pipeline.deposition.toolpath.gcode import Kind, PartProgram, parse
 from pipeline.deposition.toolpath.motion import plan
 from pipeline.deposition.toolpath.tasks import DWELL
 from pipeline.papers import files
@@ -159,7 +159,7 @@ def convergence(delay_s: float) -> float:
     return float(ilc.gamma(Q, L, P))
 
 
-def library(task: Routine) -> tuple[Learned, dict[str, Any]]:
+def library(task: Routine) -> tuple[LearnedLibrary, dict[str, Any]]:
     """Figure 6 and matrix (3): the commands of the last trials of A and B, cut into basis signals."""
     trainings = []
     for name, nominal in MATERIALS.items():
@@ -195,7 +195,7 @@ def library(task: Routine) -> tuple[Learned, dict[str, Any]]:
     }
 
 
-def composed(known: Learned, path: Path, tools: dict[int, str], *, curves: bool) -> dict[str, Any]:
+def composed(known: LearnedLibrary, path: Path, tools: dict[int, str], *, curves: bool) -> dict[str, Any]:
     """One part by the paper's rule of priority: its tasks, their commands, and the error of the true flow in
     percent of on-off control, on the nominal machines."""
     program = parse(path.read_text())
@@ -229,7 +229,7 @@ def composed(known: Learned, path: Path, tools: dict[int, str], *, curves: bool)
     return out | {"worst_percent": max(out["percent"].values())}
 
 
-def drawn(program: Program) -> list[dict[str, Any]]:
+def drawn(program: PartProgram) -> list[dict[str, Any]]:
     """Each printed move as a line of points in mm, with its tool: figure 12."""
     moves, rows = program.moves, []
     for k in np.flatnonzero((moves.kind == Kind.EXTRUDE) & (moves.length > 0)):

@@ -6,7 +6,8 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.store import artifacts, made
+from pipeline.papers import made
+from pipeline.store import artifacts
 
 
 def write(name: str, result: Mapping[str, Any]) -> None:

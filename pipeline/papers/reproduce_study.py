@@ -7,23 +7,37 @@ Its figures as published; its learners on noise-free and on many noisy data sets
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from joblib import delayed
+from pydantic import Field
 from tqdm import tqdm
 
 from pipeline.papers import files
+from pipeline.papers.study_draws import read_published
 from pipeline.store import params
 from pipeline.store.execution import run_all
-from pipeline.store.params import Execution
+from pipeline.store.params import Execution, Section
 from pipeline.temperature import published, study
 from pipeline.temperature.test_set import tuning
-from pipeline.temperature.workflow.record import read_published
-from pipeline.temperature.workflow.settings import ReproduceStudy
 
 # samples of a data set of the study, and starts of its algorithm 1
 SAMPLES, STARTS = 15_000, 300
+
+
+class ReproduceStudy(Section):
+    """Section `reproduce_study`: the study's own part; the bounds are those of its search for Q and R."""
+
+    seed: int = Field(ge=0, le=2**31)
+    data_sets: int = Field(ge=1, le=1000)
+    initial: int = Field(ge=4, le=5000)
+    evaluations: int = Field(ge=8, le=5000)
+    acquisition: Literal["expected_improvement", "upper_confidence_bound"]
+    q_low: float = Field(gt=0, le=1e6)
+    q_high: float = Field(gt=0, le=1e6)
+    r_low: float = Field(gt=0, le=1e6)
+    r_high: float = Field(gt=0, le=1e6)
 
 
 class Reproduced(NamedTuple):
@@ -75,7 +89,7 @@ def _noisy(settings: ReproduceStudy, execution: Execution) -> dict[str, list]:
     return study.rows(work, list(results))
 
 
-def _parity(settings: ReproduceStudy) -> tuning.Result:
+def _parity(settings: ReproduceStudy) -> tuning.SearchResult:
     low, high = (
         np.repeat(ends, (study.OUTPUTS, study.INPUTS))
         for ends in ((settings.q_low, settings.r_low), (settings.q_high, settings.r_high))

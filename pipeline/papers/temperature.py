@@ -20,11 +20,11 @@ import scipy.linalg
 import scipy.special
 
 from pipeline.papers import files
+from pipeline.papers.study_draws import read_published
 from pipeline.temperature import study
 from pipeline.temperature.plant import baam
 from pipeline.temperature.published import GAMMA, IDENTITY, K_DATA, REFERENCE, TAU, TUNED_DATA, TUNED_MODEL
 from pipeline.temperature.tracking import algorithm_1, gains, observer_gain, stabilises
-from pipeline.temperature.workflow.record import read_published
 
 COMMAND = "./run dvc repro datasets/papers/dvc.yaml:temperature"
 N, SAMPLES, LENGTH, SCALE, MU, STOP = 6, 15_000, 84, 1000.0, 1e-4, 1e-3

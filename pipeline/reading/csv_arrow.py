@@ -16,8 +16,8 @@ import pyarrow.compute as pc
 import pyarrow.csv
 
 from pipeline.reading.arrow_arrays import numbers
+from pipeline.reading.csv_rows import COMMENT, MISSING, CsvLayout, rows
 from pipeline.reading.formats import Growing
-from pipeline.store.csv_rows import COMMENT, MISSING, CsvLayout, rows
 
 BLOCK_BYTES = 1 << 20
 # a first block of short rows may promise what is not there

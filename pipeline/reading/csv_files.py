@@ -10,6 +10,21 @@ import numpy as np
 
 from pipeline.reading.csv_arrow import iso_zone, read_plain
 from pipeline.reading.csv_layout import csv_layout
+from pipeline.reading.csv_rows import (
+    LONGEST_TAIL,
+    MISSING,
+    SWITCH,
+    ColumnStyle,
+    CsvLayout,
+    broken_line,
+    column_style,
+    decimal_mark,
+    floats,
+    is_ambiguous,
+    is_number,
+    rows,
+    sound_rows,
+)
 from pipeline.reading.formats import (
     FileColumn,
     FileColumns,
@@ -34,21 +49,6 @@ from pipeline.reading.instants import (
 )
 from pipeline.reading.long_tables import check_one_signal, naming_columns
 from pipeline.reading.signals import Note
-from pipeline.store.csv_rows import (
-    LONGEST_TAIL,
-    MISSING,
-    SWITCH,
-    ColumnStyle,
-    CsvLayout,
-    broken_line,
-    column_style,
-    decimal_mark,
-    floats,
-    is_ambiguous,
-    is_number,
-    rows,
-    sound_rows,
-)
 
 FIELDS_AT_ONCE = 20_000
 # rows that tell what a column holds; fewer of a wide table

@@ -6,9 +6,9 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from pipeline.reading.csv_rows import MISSING, CsvLayout, decimal_mark, is_quantity, opening
 from pipeline.reading.formats import is_time_name
 from pipeline.reading.signals import Note
-from pipeline.store.csv_rows import MISSING, CsvLayout, decimal_mark, is_quantity, opening
 
 
 def csv_layout(path: Path, decimal: str = "") -> CsvLayout:

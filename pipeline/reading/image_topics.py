@@ -5,7 +5,7 @@ when they are asked for.
 """
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -251,6 +251,16 @@ class Frames:
                             self._time, picture.stamp_ns
                         )
                         yield (time - self._start_ns) / 1e9, picture
+
+    def chosen(self, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
+        """(number, frame) of the pictures with these numbers; only they are decoded, and one that cannot be
+        decoded is left out."""
+        for number, (_, picture) in enumerate(self.pictures()):
+            if number in numbers:
+                try:
+                    yield number, gray(picture)
+                except UnreadableMessage:
+                    continue
 
     def notes(self) -> list[Note]:
         """What the last walk left out."""

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import python_calamine
 
+from pipeline.reading.csv_rows import MISSING
 from pipeline.reading.formats import date_column, is_time_name
 from pipeline.reading.instants import DAY_NS, over_midnight
 from pipeline.reading.long_tables import check_one_signal, naming_columns
 from pipeline.reading.signals import Note
 from pipeline.reading.whole_tables import LARGEST_UNPACKED, WholeTable, check_width
-from pipeline.store.csv_rows import MISSING
 
 MOST_CELLS = 15_000_000
 # of all cells together, in characters

@@ -72,7 +72,7 @@ class Predictors(NamedTuple):
         )
 
 
-class Learning(NamedTuple):
+class GainRoute(NamedTuple):
     """How the gains were learned: by which route, from windows of N samples, with weights diag(q) (p,),
     diag(r) (m,), the discount and the spread of input gains that window.learn allows for."""
 
@@ -168,7 +168,7 @@ def _own_moments(S: np.ndarray, of: Moments, m: int, p: int, N: int) -> np.ndarr
 def bands(
     u: Segments,
     y: Segments,
-    learning: Learning,
+    learning: GainRoute,
     *,
     resamples: int = 200,
     level: float = 0.9,
@@ -202,7 +202,7 @@ def bands(
     return Bands(here, centre - reach, centre + reach, level, len(found))
 
 
-def gain(u: Segments, y: Segments, learning: Learning) -> np.ndarray:
+def gain(u: Segments, y: Segments, learning: GainRoute) -> np.ndarray:
     """[K K_r] (m, N (m+p) + p) of the record itself."""
     data = rows(u, y, learning.N)
     of = moments(data, max(2 * learning.N, 10))
@@ -211,7 +211,7 @@ def gain(u: Segments, y: Segments, learning: Learning) -> np.ndarray:
     return _gain(data, of, taken[0], learned.window(0), learning)
 
 
-def _gain(data: Rows, of: Moments, counts: np.ndarray, learned: Window, learning: Learning) -> np.ndarray:
+def _gain(data: Rows, of: Moments, counts: np.ndarray, learned: Window, learning: GainRoute) -> np.ndarray:
     """[K K_r] (m, N (m+p) + p) of one resample, whose window model is `learned`."""
     Q, R = np.diag(learning.q), np.diag(learning.r)
     if learning.route == "window":
@@ -258,7 +258,7 @@ def _predicted(learned: Window, data: Rows, of: Moments, counts: np.ndarray) -> 
 # ---- the controller on what the record leaves open
 
 
-class Asked(NamedTuple):
+class ReferenceSteps(NamedTuple):
     """From rest at `start` (p,) °C the references (g, p) °C, `steps` each; an error is settled as the mean of
     the last `settled` steps."""
 
@@ -289,7 +289,7 @@ class _Plants(NamedTuple):
 
 
 def met(
-    controller: Deployed, model: Plant, sampled: Predictors, asked: Asked, rng: np.random.Generator
+    controller: Deployed, model: Plant, sampled: Predictors, asked: ReferenceSteps, rng: np.random.Generator
 ) -> Met:
     """Window models under the controller as deployed, all at once, with innovations of their own covariance.
 
@@ -331,7 +331,7 @@ def met_spread(
     controller: Deployed,
     model: Plant,
     spread: Sequence[Plant],
-    asked: Asked,
+    asked: ReferenceSteps,
     noise: np.ndarray,
     rng: np.random.Generator,
 ) -> Met:
@@ -359,7 +359,7 @@ def met_spread(
     )
 
 
-def _run(controller: Deployed, model: Plant, plants: _Plants, asked: Asked) -> Met:
+def _run(controller: Deployed, model: Plant, plants: _Plants, asked: ReferenceSteps) -> Met:
     law, limits = controller.law, controller.limits
     at = [constant(r) for r in (asked.start, *asked.references)]
     here, *aims = [aim(law, rest(model, one, limits), one) for one in at]

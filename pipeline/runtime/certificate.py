@@ -1,9 +1,8 @@
-"""The certificate of a controller: what was shown of it, on what evidence, and whether it may leave.
+"""The certificate of a controller: what was measured of it, on which evidence, and whether it is exported.
 
-Here is the document: the record that it rests on, what is asked, what was found, and its JSON. The rules are
-asked in the declared order of RULES by certify.py; the first that fails refuses.
-
-Words are of what was shown: "recorded" or "simulated" evidence.
+This module is the document: the record that it rests on, its rules, their results, and its JSON. certify.py
+measures; certified.py compares with the limits, in the declared order of RULES. The first rule that fails
+refuses the controller. The evidence is "recorded" or "simulated".
 """
 
 import hashlib
@@ -13,72 +12,57 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from pipeline.runtime.machine import Signal
+from pipeline.runtime.signals import Signal
 
 VERSION, LOOP = 1, "temperature"
 Segments = Sequence[np.ndarray]
 
 
-class Record(NamedTuple):
-    """What a certificate rests on: signals as recorded, and the segments that were learned from, u (T, m), y
-    (T, p); `newest` segments come from the machine as it is now, by the wires that the controller will have.
-    All are without gaps. `cold_degC` (p,) is what the sensors read of the cold machine, None where nobody
-    looked."""
+class EvidenceRecord(NamedTuple):
+    """What a certificate rests on: the signals as they were recorded, and segments without gaps. The newest
+    segments come from the machine as it is today, with the wiring that the controller will have."""
 
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
     sample_time_s: float
-    u: list[np.ndarray]
-    y: list[np.ndarray]
+    u: list[np.ndarray]  # segments (T, m), from which the models were learned
+    y: list[np.ndarray]  # segments (T, p) in °C
     newest_u: list[np.ndarray]
     newest_y: list[np.ndarray]
-    cold_degC: np.ndarray | None = None
+    cold_degC: np.ndarray | None = None  # (p,) readings of the cold machine, if somebody took them
 
 
 class Rules(NamedTuple):
-    """What is asked. From rest at `start` (p,) °C the references (g, p) °C are asked for, `steps` each; over
-    the last `settled` of them the mean error may be `settled_error_degC`, beyond the limits of outputs
-    `crossing_degC`. In a share `failing` of the plants either may be more.
+    """How a controller is measured, and the limits that no params file changes. From rest at `start` each of
+    `references` is held for `steps` samples."""
 
-    `disk_margin` and `delay_margin_s` are asked, as on page one, of the median plant, here of family and
-    record; a share `tail` of them of nine in ten, and of the window model of the newest record alone.
-    `samples` are those for each unknown of a window model. `moves` is the least share of an input's range
-    that it moves by itself. Of the newest record's movement over `ahead` steps the model may miss
-    `unexplained` beyond what the record's own window model misses, and of errors of one step no more than the
-    settled error allowed may be foretold by errors and inputs before. On the window model of the newest
-    record alone twice that error is allowed.
-    `noise`: the deviation of a settled mean as a share of the settled error allowed. A cold machine is as
-    warm as its room, `room_degC`; where no cold reading is given, the record's window models must not
-    contradict `extrapolated_degC` at rest without inputs, wider by what a line from hot to cold misses.
-    `reach`: by how much of the recorded span references may lie beyond it.
-    """
-
-    references: np.ndarray
-    start: np.ndarray
+    references: np.ndarray  # (g, p) °C
+    start: np.ndarray  # (p,) °C
     steps: int = 300
-    settled: int = 50
-    settled_error_degC: float = 0.5
-    crossing_degC: float = 1.0
-    failing: float = 0.1
-    disk_margin: float = 0.4
-    delay_margin_s: float = 1.0
-    tail: float = 0.5
+    settled: int = 50  # the last samples, over which the settled error is the mean error
+    crossing_degC: float = 1.0  # allowed beyond the limits of outputs
+    failing: float = 0.1  # share of the plants that may miss a limit
+    tail: float = 0.5  # share of a margin's limit for nine plants in ten, and for the newest record alone
     plants: int = 1000
     poles_of: int = 24
     resamples: int = 200
     longest_window: int = 24
-    samples: float = 5.0
-    moves: float = 0.002
+    samples: float = 5.0  # for each unknown of a window model
+    moves: float = 0.002  # least share of an input's range that it moves by itself
     ahead: int = 20
+    # share of the newest record's movement over `ahead` samples that the model may miss beyond what the
+    # record's own window model misses
     unexplained: float = 0.5
-    noise: float = 0.3
-    room_degC: tuple[float, float] = (5.0, 45.0)
+    noise: float = 0.3  # deviation of a settled mean as a share of the settled error's limit
+    room_degC: tuple[float, float] = (5.0, 45.0)  # of a cold machine
+    # without a cold reading: what the record's window models may extrapolate to at rest without inputs, wider
+    # by the error of a straight line from hot to cold
     extrapolated_degC: tuple[float, float] = (-50.0, 110.0)
-    reach: float = 0.5
+    reach: float = 0.5  # of the recorded span, by which references may lie beyond it
 
 
 class RuleResult(NamedTuple):
-    """One rule: what was found, the limit, and a sentence. `asked` is False where an earlier one refused."""
+    """One rule: the figure, the limit, and a sentence. `asked` is False if an earlier rule refused."""
 
     name: str
     passed: bool
@@ -107,7 +91,7 @@ class MarginsFound(NamedTuple):
     delay_s: tuple[float | None, float | None, float | None]
 
 
-class Worst(NamedTuple):
+class WorstPlants(NamedTuple):
     """Over `plants` sampled plants: settled error in °C, median, 99 % quantile and worst, how many settle
     worse than allowed, and how many did not stay finite."""
 
@@ -154,7 +138,7 @@ class Certificate(NamedTuple):
     samples: tuple[int, int]
     poles: tuple[Poles, ...]
     margins: MarginsFound | None
-    worst: Worst | None
+    worst: WorstPlants | None
     violations: tuple[Violation, ...]
     bands: GainBands | None
     rules: tuple[RuleResult, ...]
@@ -211,7 +195,7 @@ def _finite(value: float | None) -> float | None:
 def to_json(certificate: Certificate) -> str:
     """Canonical JSON: sorted keys, no blanks; limits that are not declared are null."""
     return json.dumps(
-        _plain(certificate), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+        plain(certificate), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
     )
 
 
@@ -235,12 +219,25 @@ def from_json(text: str) -> Certificate:
     if missing:
         raise ValueError(f"the certificate has no {missing[0]}; certify the controller again")
     try:
-        return _read(about)
+        certificate = rebuilt(about)
+        _check(certificate)
     except (TypeError, KeyError, ValueError) as error:
         raise ValueError(f"the certificate cannot be read ({error}); certify the controller again") from None
+    return certificate
 
 
-def _read(about: dict[str, Any]) -> Certificate:
+def _check(certificate: Certificate) -> None:
+    """Raises ValueError if the verdict is not that of the rules, or the rules are of another version."""
+    first = next((one.name for one in certificate.rules if not one.passed), None)
+    if certificate.first_failed != first or certificate.verdict != ("refused" if first else "passed"):
+        raise ValueError(f"its verdict {certificate.verdict} is not that of its rules")
+    if tuple(one.name for one in certificate.rules) != RULES:
+        raise ValueError("its rules are not those of this version")
+
+
+def rebuilt(about: dict[str, Any]) -> Certificate:
+    """The certificate of a JSON object."""
+
     def signals(entries: list[dict[str, Any]]) -> tuple[Signal, ...]:
         return tuple(
             Signal(
@@ -263,30 +260,26 @@ def _read(about: dict[str, Any]) -> Certificate:
         ),
         "margins": margins
         and MarginsFound(margins["plants"], tuple(margins["disk"]), tuple(margins["delay_s"])),
-        "worst": worst and Worst(**(worst | {"settled_error_degC": tuple(worst["settled_error_degC"])})),
+        "worst": worst
+        and WorstPlants(**(worst | {"settled_error_degC": tuple(worst["settled_error_degC"])})),
         "violations": tuple(Violation(**one) for one in about["violations"]),
         "bands": about["bands"]
         and GainBands(**{name: _tuples(part) for name, part in about["bands"].items()}),
         "rules": tuple(RuleResult(**one) for one in about["rules"]),
     }
-    certificate = Certificate(**made)
-    first = next((one.name for one in certificate.rules if not one.passed), None)
-    if certificate.first_failed != first or certificate.verdict != ("refused" if first else "passed"):
-        raise ValueError(f"its verdict {certificate.verdict} is not that of its rules")
-    if tuple(one.name for one in certificate.rules) != RULES:
-        raise ValueError("its rules are not those of this version")
-    return certificate
+    return Certificate(**made)
 
 
 def _tuples(value: Any) -> Any:
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Values as JSON has them; numbers that are not finite are null."""
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        return {name: _plain(part) for name, part in value._asdict().items()}
+        return {name: plain(part) for name, part in value._asdict().items()}
     if isinstance(value, tuple | list):
-        return [_plain(part) for part in value]
+        return [plain(part) for part in value]
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value

@@ -1,66 +1,111 @@
-"""Certify a controller on its record. Three questions, asked in the declared order of certificate.RULES; the
-first rule that fails refuses.
-
-Is the record of this machine, and does the evidence hold (certificate_evidence.py)? Would it work
-(certificate_loop.py)?
+"""Measure a controller on its record, for its certificate. Three questions, in the declared order of
+certificate.RULES: is the record of this machine, does the evidence hold (certificate_evidence.py), and would
+the controller work (certificate_loop.py)? What is allowed is compared afterwards (certified.py).
 """
 
+import copy
 from collections.abc import Sequence
 
 import numpy as np
 
 from pipeline.runtime import bands, certificate_evidence, certificate_loop
-from pipeline.runtime.certificate import LOOP, RULES, VERSION, Certificate, Record, RuleResult, Rules
+from pipeline.runtime.certificate import LOOP, VERSION, Certificate, EvidenceRecord, Rules
+from pipeline.runtime.certificate_evidence import WindowModels
+from pipeline.runtime.certified import MeasuredController
 from pipeline.runtime.machine import Exported, controller_sha256
 from pipeline.temperature.plant import Plant
+from pipeline.temperature.test_set import panel
+
+NEWEST = 0.25  # of a single recording: its end stands for the machine as it is today
+REACH = 0.25  # of the recorded span, beyond which no reference is certified
+COOLEST = 0.05  # quantile of the recorded temperatures
 
 
-def certify(
+def split_newest(
+    u: Sequence[np.ndarray], y: Sequence[np.ndarray], recordings: Sequence[int]
+) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """u, y, newest u, newest y of pieces (T, m), (T, p) without a missing sample and the recording of each.
+    The newest are the pieces of the last recording, or the last quarter of the longest piece of a single
+    one."""
+    pieces, new = list(zip(u, y, strict=True)), [number == recordings[-1] for number in recordings]
+    if all(new):
+        longest = max(range(len(pieces)), key=lambda i: len(pieces[i][0]))
+        a, b = pieces[longest]
+        cut = round((1 - NEWEST) * len(a))
+        pieces[longest : longest + 1] = [(a[:cut], b[:cut]), (a[cut:], b[cut:])]
+        new = [i == longest + 1 for i in range(len(pieces))]
+    learned, newest = (
+        [piece for piece, flag in zip(pieces, new, strict=True) if flag == wanted] for wanted in (False, True)
+    )
+    return [a for a, _ in learned], [b for _, b in learned], [a for a, _ in newest], [b for _, b in newest]
+
+
+def require(half: panel.Cases, record: EvidenceRecord, settled: int, plants: int, resamples: int) -> Rules:
+    """How each controller is measured: on the constant references of the judging half that the record
+    reaches, from where the record is coolest. References further off were simulated only. If the record
+    reaches none, all are taken, and the certificate is refused."""
+    constants = sorted({int(half.asked[row, 0]) for row in np.flatnonzero(half.kind == "constant")})
+    references = np.array([half.references[index].H[:, 0] for index in constants])
+    y = np.concatenate([*record.y, *record.newest_y])
+    low, high = y.min(axis=0), y.max(axis=0)
+    near = (references >= low - REACH * (high - low)) & (references <= high + REACH * (high - low))
+    return Rules(
+        references=references[near.all(axis=1)] if near.all(axis=1).any() else references,
+        start=np.quantile(y, COOLEST, axis=0),
+        steps=half.steps // 2,
+        settled=min(settled, half.steps // 4),
+        plants=plants,
+        resamples=resamples,
+    )
+
+
+def measure(
     exported: Exported,
     family: Sequence[Plant],
-    record: Record,
+    record: EvidenceRecord,
     rules: Rules,
+    models: WindowModels,
     rng: np.random.Generator,
     *,
-    learning: bands.Learning | None = None,
-) -> Certificate:
-    """The certificate of a controller on its record; `family` is the spread of the identified plant.
+    learning: bands.GainRoute | None = None,
+    delay_share: float = 1.0,
+) -> MeasuredController:
+    """What the certificate of a controller says before its limits are known.
 
-    `learning` says how gains were learned, where a record's bands of them are wanted. Raises ValueError where
-    the arrays of the record do not have the machine's number of signals.
+    `family` is the spread of the identified plant, `models` what certificate_evidence.window_models drew from
+    the record with `rng`, which is copied. `learning` says how gains were learned from the record; then bands
+    of them are measured. `delay_share` of a declared delay margin is required of this machine.
     """
-    _check(exported, record, rules)
+    rng = copy.deepcopy(rng)
+    results = certificate_evidence.of_signals(exported, record, rules)
+    figures, fields = {}, {}
+    if not all(one.passed for one in results):
+        return MeasuredController(_draft(exported, record)._replace(rules=tuple(results)), {})
+    results = [*results, *models.results]
+    if models.noise_degC is not None:
+        names = [one.name for one in exported.machine.outputs]
+        noise_degC = models.noise_degC.tolist()
+        figures["noise"] = {
+            "degC": noise_degC, "outputs": names, "settled": rules.settled, "limit": rules.noise
+        }  # fmt: skip
+        if models.of_newest is None:
+            results.append(certificate_evidence.no_newest(record, rules))
     with np.errstate(all="ignore"):  # what diverges is a finding
-        return _certified(exported, family, record, rules, rng, learning)
-
-
-def _certified(
-    exported: Exported,
-    family: Sequence[Plant],
-    record: Record,
-    rules: Rules,
-    rng: np.random.Generator,
-    learning: bands.Learning | None,
-) -> Certificate:
-    results = [*certificate_evidence.of_signals(exported, record, rules)]
-    shown = certificate_loop.Shown()
-    if all(one.passed for one in results):
-        sampled, of_evidence = certificate_evidence.of_evidence(exported, record, rules, rng)
-        results += of_evidence
-        if sampled is not None and all(one.passed for one in results):
-            shown, of_loop = certificate_loop.of_loop(exported, family, sampled, rules, rng)
-            results += of_loop
-            if learning is not None:
-                shown = shown._replace(
-                    bands=certificate_loop.gain_bands(exported, record, learning, rules, rng)
+        if models.of_record is not None and models.of_newest is not None:
+            unexplained, more = certificate_evidence.of_newest(exported, record, models.of_newest, rules)
+            results, figures = [*results, unexplained], figures | more
+            if all(one.passed for one in results):
+                fields, of_loop, more = certificate_loop.of_loop(
+                    exported, family, models.of_record, models.of_newest, rules, rng
                 )
-    done = {one.name for one in results}
-    first = next((one.name for one in results if not one.passed), None)
-    results += [
-        RuleResult(name, False, None, None, "", f"Not asked, because {first} failed.", False)
-        for name in RULES
-        if name not in done
-    ]
+                results, figures = [*results, *of_loop], figures | more
+                figures["delay_margin"]["share"] = delay_share
+                if learning is not None:
+                    fields["bands"] = certificate_loop.gain_bands(exported, record, learning, rules, rng)
+    return MeasuredController(_draft(exported, record)._replace(rules=tuple(results), **fields), figures)
+
+
+def _draft(exported: Exported, record: EvidenceRecord) -> Certificate:
     return Certificate(
         VERSION,
         LOOP,
@@ -73,38 +118,12 @@ def _certified(
         exported.machine.inputs,
         exported.machine.outputs,
         (sum(map(len, record.u)), sum(map(len, record.newest_u))),
-        shown.poles,
-        shown.margins,
-        shown.worst,
-        shown.violations,
-        shown.bands,
-        tuple(results),
-        "passed" if first is None else "refused",
-        first,
+        poles=(),
+        margins=None,
+        worst=None,
+        violations=(),
+        bands=None,
+        rules=(),
+        verdict="refused",
+        first_failed=None,
     )
-
-
-def _check(exported: Exported, record: Record, rules: Rules) -> None:
-    m, p = exported.controller.law.D.shape
-    for what, parts, count in (
-        ("u", record.u, m),
-        ("newest_u", record.newest_u, m),
-        ("y", record.y, p),
-        ("newest_y", record.newest_y, p),
-    ):
-        if not parts or any(part.ndim != 2 or part.shape[1] != count for part in parts):
-            shapes = [part.shape for part in parts]
-            raise ValueError(
-                f"certificate of {exported.name}: expected segments {what} of {count} columns but found "
-                f"shapes {shapes}; give the record of the machine that the controller is for"
-            )
-        if not all(np.isfinite(part).all() for part in parts):
-            raise ValueError(
-                f"certificate of {exported.name}: {what} holds samples that are missing; cut the record into "
-                "segments without them"
-            )
-    if np.shape(rules.references)[1:] != (p,) or np.shape(rules.start) != (p,):
-        raise ValueError(
-            f"certificate of {exported.name}: expected references (g, {p}) and a start ({p},) but found "
-            f"{np.shape(rules.references)} and {np.shape(rules.start)}; give one temperature an output"
-        )

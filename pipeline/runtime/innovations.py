@@ -82,7 +82,7 @@ class Watch(NamedTuple):
     strongest: np.ndarray
 
 
-class Spread(NamedTuple):
+class PlantDeviations(NamedTuple):
     """Deviations of an honest plant from the model: of each input's gain, of its pace, of the share of heat
     lost a step, and of a sample of delay (0: the model's; 1: in time or late, nobody knows)."""
 
@@ -96,7 +96,7 @@ def watch(
     model: Plant,
     limits: tuple[np.ndarray, np.ndarray],
     noise_degC: np.ndarray,
-    spread: Spread,
+    spread: PlantDeviations,
     *,
     drift: float = 0.05,
     follows: float = 0.3,

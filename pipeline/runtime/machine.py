@@ -18,40 +18,21 @@ import types
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from safetensors.numpy import save as as_bytes
 
+from pipeline.runtime import certificate as certificates
+from pipeline.runtime.certificate import Certificate
+from pipeline.runtime.signals import DEGC, PERCENT, Machine, Signal
+from pipeline.runtime.supervisor import Supervision
 from pipeline.store import artifacts
 from pipeline.temperature.controllers.controller import Deployed
 from pipeline.temperature.plant import Plant
 
-if TYPE_CHECKING:
-    from pipeline.runtime.certificate import Certificate
-    from pipeline.runtime.supervisor import Supervision
-
 VERSION = 1
-PERCENT, DEGC = "percent", "degC"
 CONTROLLER, ARRAYS, CERTIFICATE = "controller.json", "arrays.safetensors", "certificate.json"
-
-
-class Signal(NamedTuple):
-    """An input with the limits of its command, or an output with its declared limits, -inf and inf where
-    none is."""
-
-    name: str
-    unit: str
-    low: float
-    high: float
-
-
-class Machine(NamedTuple):
-    """What a controller is wired to: its signals in order, and the time between two samples."""
-
-    inputs: tuple[Signal, ...]
-    outputs: tuple[Signal, ...]
-    sample_time_s: float
 
 
 class Exported(NamedTuple):
@@ -206,24 +187,24 @@ def _units(inputs: Sequence[Signal], outputs: Sequence[Signal]) -> str:
 
 
 def write(folder: str | Path, exported: Exported, certificate: Certificate) -> None:
-    """The three files of a CONTROLLER folder. Raises ValueError, and writes nothing, where `check` or
+    """The three files of a CONTROLLER folder. Raises ValueError, and writes nothing, if `check` or
     `check_certificate` refuses."""
-    from pipeline.runtime import certificate as certificates
-
     check(exported)
     check_certificate(exported, certificate)
+    write_controller(folder, exported)
+    artifacts.write_text(Path(folder) / CERTIFICATE, certificates.to_json(certificate))
+
+
+def write_controller(folder: str | Path, exported: Exported) -> None:
+    """controller.json and arrays.safetensors."""
     text, arrays = _parts(exported)
-    folder = Path(folder)
-    artifacts.write_text(folder / CONTROLLER, text)
-    artifacts.write_weights(folder / ARRAYS, "controller", arrays, {})
-    artifacts.write_text(folder / CERTIFICATE, certificates.to_json(certificate))
+    artifacts.write_text(Path(folder) / CONTROLLER, text)
+    artifacts.write_weights(Path(folder) / ARRAYS, "controller", arrays, {})
 
 
 def read(folder: str | Path) -> tuple[Exported, Certificate]:
     """The controller and certificate of a folder that `write` wrote. Raises ValueError where a file is
     missing, broken, or not the one that was certified."""
-    from pipeline.runtime import certificate as certificates
-
     folder = Path(folder)
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder; give a CONTROLLER folder with {CONTROLLER}")
@@ -308,7 +289,7 @@ def _number(value: float) -> float | None:
 
 
 def _exported(about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Exported:
-    kinds = typing.get_type_hints(Exported, localns=_names())
+    kinds = typing.get_type_hints(Exported)
     try:
         inputs, outputs = (
             tuple(
@@ -333,12 +314,6 @@ def _exported(about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Exp
 
 # the fields of Exported that are records of arrays
 RECORDS = ("controller", "model", "fallback", "supervision")
-
-
-def _names() -> dict[str, Any]:
-    from pipeline.runtime.supervisor import Supervision
-
-    return {"Supervision": Supervision}
 
 
 def _flatten(place: str, value: Any, arrays: dict[str, np.ndarray], words: dict[str, Any]) -> None:

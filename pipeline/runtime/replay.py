@@ -70,7 +70,7 @@ def _walked(A: np.ndarray, drive: np.ndarray, z: np.ndarray, shift: int, *, keep
 # ---- what it would have asked
 
 
-class Log(NamedTuple):
+class GaplessLog(NamedTuple):
     """A recorded stretch without a gap: inputs u (T, m) in percent that were applied, outputs y (T, p) in °C
     measured before, references r (T, p) in °C; all finite."""
 
@@ -92,7 +92,7 @@ class Replayed(NamedTuple):
 WHY = ("", "limit", "rate", "governor")
 
 
-def replayed(controller: Deployed, model: Plant, log: Log, *, hold: int = 30) -> Replayed:
+def replayed(controller: Deployed, model: Plant, log: GaplessLog, *, hold: int = 30) -> Replayed:
     """What the controller would have asked on a log. It watches the first `hold` samples, for which nothing
     is asked: they are as recorded."""
     T = len(log.u)
@@ -116,7 +116,7 @@ def replayed(controller: Deployed, model: Plant, log: Log, *, hold: int = 30) ->
     return Replayed(wished, limited, asked, target)
 
 
-def why(controller: Deployed, log: Log, run: Replayed) -> np.ndarray:
+def why(controller: Deployed, log: GaplessLog, run: Replayed) -> np.ndarray:
     """Of each sample and input (T, m) the index in WHY of what kept it from what the law wished."""
     limits, tiny = controller.limits, 1e-9 * (controller.limits.high - controller.limits.low)
     outside = (run.wished < limits.low - tiny) | (run.wished > limits.high + tiny)
@@ -127,7 +127,7 @@ def why(controller: Deployed, log: Log, run: Replayed) -> np.ndarray:
 
 
 def _aimed(
-    controller: Deployed, model: Plant, log: Log, hold: int
+    controller: Deployed, model: Plant, log: GaplessLog, hold: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Feed (T, m) and target (T, p) of each sample, and by how much more the law would feed (m,) at the
     hand-over if it were aimed at where the machine is."""
@@ -156,7 +156,7 @@ def _held(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return asked, which.ravel()[np.cumsum(new) - 1]
 
 
-def _without_integral(controller: Deployed, log: Log, feeds: np.ndarray) -> np.ndarray:
+def _without_integral(controller: Deployed, log: GaplessLog, feeds: np.ndarray) -> np.ndarray:
     """feed - K z - D y (T, m)."""
     law = controller.law
     base = feeds - log.y @ law.D.T
@@ -173,7 +173,7 @@ def _without_integral(controller: Deployed, log: Log, feeds: np.ndarray) -> np.n
 
 
 def _integral(
-    controller: Deployed, log: Log, base: np.ndarray, target: np.ndarray, hold: int, bump: np.ndarray
+    controller: Deployed, log: GaplessLog, base: np.ndarray, target: np.ndarray, hold: int, bump: np.ndarray
 ) -> np.ndarray:
     """xi (T, p) at each sample, from the hand-over at `hold` on:
     xi(t+1) = xi + integral (clip(y* - y) + clip(beyond(P (u - base + K_r xi))))."""
@@ -234,7 +234,7 @@ BY_HAND, MOST_AT_ONCE = 128, 1 << 13
 
 
 def _conditional(
-    controller: Deployed, log: Log, base: np.ndarray, target: np.ndarray, xi: np.ndarray, hold: int
+    controller: Deployed, log: GaplessLog, base: np.ndarray, target: np.ndarray, xi: np.ndarray, hold: int
 ) -> np.ndarray:
     """xi (T, p) of a law with conditional integration (tracking.Law): it rests where the command is cut."""
     law, limits, back = controller.law, controller.limits, controller.back
@@ -253,7 +253,7 @@ SIDE_BY_SIDE = 400  # chunks of a long recording
 
 
 def _governed(
-    family: Governor, log: Log, u: np.ndarray, target: np.ndarray, low: np.ndarray, high: np.ndarray
+    family: Governor, log: GaplessLog, u: np.ndarray, target: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
     """Commands (T, m) after the governor, whose memory goes on from the recorded inputs. Chunks start so much
     earlier that what they have not seen has faded."""

@@ -1,22 +1,28 @@
 """Where a recording is off the support of what a controller was learned from and judged on: temperatures and
-commands beyond what was seen, and outputs that no plant of its spread would have had.
+commands beyond those of the record, and outputs that no plant of its spread would have had.
 
-Plants of the spread each forecast the outputs a few samples ahead, every one from its own observer and with
-the inputs that were applied. f_k (p,) is what plant k of K forecasts more than their mean, e (p,) the
-machine's miss of that mean. Two questions are asked of them.
+Plants of the spread forecast the outputs a few samples ahead, each from its own observer and with the inputs
+that were applied. f_k (p,) is what plant k of K forecasts more than their mean, e (p,) the machine's miss of
+that mean. Two questions follow.
 
-Sample by sample: is e larger than the plants differ? d^2 = e' (S + R)^-1 e, S the covariance (p, p) of the
-f_k, R what the sensors' noise adds. A forecast is off where d is larger than nearly always on the
-controller's own plants.
+Sample by sample: is e larger than the plants differ? S (p, p) is the covariance of the f_k, R what the noise
+of the sensors adds:
 
-Of the log as a whole: the machine is one plant all along. Were it of the spread, one mixture c (K,) would
-explain all its misses, e = sum_k c_k f_k + rest, c ~ N(0, I / (K - 1)), the rest as large as on honest logs.
-The most likely c is a ridge regression. `misfit` is the mean square of what it leaves, `departure` the mean
-square of c, in units of the spread. Swapped sensors misfit; a gain far from the spread departs.
+    d^2 = e' (S + R)^-1 e
 
-A steady disagreement is taken for weather (another ambient, more heat lost) by every observer. So a log in
-which nothing moves tells nothing of which sensor is which, or of what a heater's percent is worth: it is
-judged by its ranges alone."""
+A forecast is off if d is larger than nearly always on the controller's own plants.
+
+For the log as a whole: the machine is one plant all the time. If it were of the spread, one mixture c (K,)
+would explain all its misses, with a rest as large as on honest logs:
+
+    e = sum_k c_k f_k + rest,   c ~ N(0, I / (K - 1))
+
+The most likely c is a ridge regression. `misfit` is the mean square of the rest, `departure` the mean square
+of c, in units of the spread. Swapped sensors misfit; a gain far from the spread departs.
+
+Every observer takes a steady disagreement for weather (another ambient, more heat lost). So a log in which
+nothing moves cannot say which sensor is which, or what a heater's percent is worth: it is judged by its
+ranges alone."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -24,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from pipeline.runtime.replay import BLOCK, Log, scanned
+from pipeline.runtime.replay import BLOCK, GaplessLog, scanned
 from pipeline.temperature.controllers.governor import instants
 from pipeline.temperature.plant import Plant, markov_parameters
 from pipeline.temperature.tracking import reached_state, riccati
@@ -61,7 +67,7 @@ class Support(NamedTuple):
     allowed: np.ndarray
 
 
-class Forecasts(NamedTuple):
+class FamilyForecasts(NamedTuple):
     """Forecasts of a log: the sample at which each begins (a,), what each plant forecasts more than their
     mean (K, a, p), and the machine's miss of the mean (a, p), in °C."""
 
@@ -76,16 +82,16 @@ def horizon(spread: Sequence[Plant]) -> int:
     return int(np.median([instants([one])[-1] for one in spread]))
 
 
-def forecasts(watch: "Watch", log: Log, steps: int) -> Forecasts:
+def forecasts(observers: "Observers", log: GaplessLog, steps: int) -> FamilyForecasts:
     """Forecasts over `steps` samples, AT_ONCE of them under way at a time; none in the first 2 `steps`, while
     the observers find the machine."""
     start = np.arange(2 * steps, len(log.u) - steps, max(steps // AT_ONCE, 1))
-    told = _told(watch, log, start, steps)
-    mean = told.mean(axis=0)
-    return Forecasts(start, told - mean, log.y[start + steps] - mean)
+    outputs = _forecast(observers, log, start, steps)
+    mean = outputs.mean(axis=0)
+    return FamilyForecasts(start, outputs - mean, log.y[start + steps] - mean)
 
 
-def distances(run: Forecasts, noise: np.ndarray) -> np.ndarray:
+def distances(run: FamilyForecasts, noise: np.ndarray) -> np.ndarray:
     """d (a,) of every forecast, with sensors' noise (p,)."""
     S = np.einsum("kai,kaj->aij", run.apart, run.apart) / (len(run.apart) - 1)
     near = S + np.diag((NOISES * noise) ** 2)
@@ -96,38 +102,31 @@ def distances(run: Forecasts, noise: np.ndarray) -> np.ndarray:
 NOISES = 2.0  # deviations: of the sample that is forecast, and of those from which
 
 
-class Explained(NamedTuple):
-    """The mixture c (K,) of the plants that explains a log best, and what it leaves (a, p) in °C."""
+def fit_mixture(run: FamilyForecasts, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mixture c (K,) of the plants that explains all forecasts best, each output in units of `rest` (p,),
+    and the rest (a, p) in °C:
 
-    c: np.ndarray
-    left: np.ndarray
+        c = (w F'F + (K - 1) I)^-1 w F'e
 
-
-def explained(run: Forecasts, rest: np.ndarray) -> Explained:
-    """c = (w F'F + (K - 1) I)^-1 w F'e of all forecasts, each output in units of `rest` (p,). What is left is
-    alike from one forecast to the next: a long log counts as one of ENOUGH forecasts, w = ENOUGH / their
-    number, or little errors that never change would pass for another machine."""
+    The rest is alike from one forecast to the next: a long log counts as one of ENOUGH forecasts, w = ENOUGH
+    / their number. Otherwise little errors that never change would pass for another machine."""
     K = len(run.apart)
     F, weight = (run.apart / rest).reshape(K, -1), min(ENOUGH / len(run.start), 1.0)
     c = np.linalg.solve(weight * F @ F.T + (K - 1) * np.eye(K), weight * F @ (run.miss / rest).ravel())
-    return Explained(c, run.miss - np.tensordot(c, run.apart, axes=1))
+    return c, run.miss - np.tensordot(c, run.apart, axes=1)
 
 
-def figures(run: Forecasts, noise: np.ndarray, furthest: float, rest: np.ndarray) -> np.ndarray:
+def figures(run: FamilyForecasts, noise: np.ndarray, furthest: float, rest: np.ndarray) -> np.ndarray:
     """Of a log: the share of forecasts further off than `furthest`, its misfit, and its departure."""
     if not len(run.start):
         return np.zeros(3)
-    fitted = explained(run, rest)
+    c, left = fit_mixture(run, rest)
     return np.array(
-        [
-            (distances(run, noise) > furthest).mean(),
-            ((fitted.left / rest) ** 2).mean(),
-            (len(fitted.c) - 1) * (fitted.c**2).mean(),
-        ]
+        [(distances(run, noise) > furthest).mean(), ((left / rest) ** 2).mean(), (len(c) - 1) * (c**2).mean()]
     )
 
 
-class Watch(NamedTuple):
+class Observers(NamedTuple):
     """Observers L of the states [x; w] of K plants, one behind the other: w (p,) in °C a step is a drift that
     the plant does not explain, so that a steady disagreement (another ambient, more heat lost) vanishes from
     its forecasts, as in temperature.governor. `first` (K, n, p) finds x of the first outputs."""
@@ -141,12 +140,14 @@ class Watch(NamedTuple):
     first: np.ndarray
 
 
-def watched_by(spread: Sequence[Plant], steps: int) -> Watch:
+def design_observers(spread: Sequence[Plant], steps: int) -> Observers:
     """The observers of plants of one order: the same for every log."""
-    return Watch(*(np.stack(part) for part in zip(*(_watch(one, steps) for one in spread), strict=True)))
+    return Observers(
+        *(np.stack(part) for part in zip(*(_design_observer(one, steps) for one in spread), strict=True))
+    )
 
 
-def _watch(plant: Plant, steps: int) -> tuple[np.ndarray, ...]:
+def _design_observer(plant: Plant, steps: int) -> tuple[np.ndarray, ...]:
     """Process noise comes in by the inputs, sensors are TAU percent^2 of every input noisier, and the drift
     wanders a step by DRIFT of what a percent of every input does at most."""
     n, p, slower = plant.n, plant.p, max(steps / UNHURRIED, 1.0)
@@ -162,34 +163,37 @@ def _watch(plant: Plant, steps: int) -> tuple[np.ndarray, ...]:
     return A, np.vstack([plant.B, none]), C, np.r_[plant.b, np.zeros(p)], plant.d, L, likely
 
 
-def _told(watch: Watch, log: Log, start: np.ndarray, steps: int) -> np.ndarray:
+def _forecast(observers: Observers, log: GaplessLog, start: np.ndarray, steps: int) -> np.ndarray:
     """Outputs (K, a, p) that the plants forecast `steps` samples after each start (a,)."""
-    K, p = watch.d.shape
-    away = (log.y[0] - watch.d)[..., None]
-    x = np.concatenate([np.matmul(watch.first, away)[..., 0], np.zeros((K, p))], axis=1)
-    moved, states = watch.A - watch.L @ watch.C, np.empty((K, len(start), x.shape[1]))
-    B, b, L = watch.B.swapaxes(1, 2), watch.b[:, None], watch.L.swapaxes(1, 2)
+    K, p = observers.d.shape
+    away = (log.y[0] - observers.d)[..., None]
+    x = np.concatenate([np.matmul(observers.first, away)[..., 0], np.zeros((K, p))], axis=1)
+    moved, states = observers.A - observers.L @ observers.C, np.empty((K, len(start), x.shape[1]))
+    B, b, L = observers.B.swapaxes(1, 2), observers.b[:, None], observers.L.swapaxes(1, 2)
     for first in range(0, len(log.u), BLOCK // K):
         rows = slice(first, first + BLOCK // K)
         inside = np.flatnonzero((start >= rows.start) & (start < rows.stop))
-        drive = np.matmul(log.u[rows], B) + np.matmul(log.y[rows] - watch.d[:, None], L) + b
+        drive = np.matmul(log.u[rows], B) + np.matmul(log.y[rows] - observers.d[:, None], L) + b
         walked = scanned(moved, drive, x)
         states[:, inside], x = walked[:, start[inside] - first], walked[:, -1]
     for step in range(steps):
-        states = np.matmul(states, watch.A.swapaxes(1, 2)) + np.matmul(log.u[start + step], B) + b
-    return np.matmul(states, watch.C.swapaxes(1, 2)) + watch.d[:, None]
+        states = np.matmul(states, observers.A.swapaxes(1, 2)) + np.matmul(log.u[start + step], B) + b
+    return np.matmul(states, observers.C.swapaxes(1, 2)) + observers.d[:, None]
 
 
 def support(
-    spread: Sequence[Plant], honest: Sequence[Log], noise_degC: np.ndarray, seen: Sequence[Log] = ()
+    spread: Sequence[Plant],
+    honest: Sequence[GaplessLog],
+    noise_degC: np.ndarray,
+    seen: Sequence[GaplessLog] = (),
 ) -> Support:
     """Of logs of the controller's own plants, whose sensors have noise (p,), and of recordings of the machine
     that were `seen`: these are on support whatever the plants say. Raises ValueError where no log is long
     enough."""
     steps = horizon(spread)
-    watch, noise = watched_by(spread, steps), np.asarray(noise_degC, float)
+    observers, noise = design_observers(spread, steps), np.asarray(noise_degC, float)
     groups = [
-        [forecasts(watch, log, steps) for log in logs if len(log.u) > 4 * steps]
+        [forecasts(observers, log, steps) for log in logs if len(log.u) > 4 * steps]
         for logs in (honest, [piece for log in seen for piece in _pieces(log, steps)])
     ]
     groups = [runs for runs in groups if runs]
@@ -217,23 +221,23 @@ def support(
     return Support(*ranges, tuple(spread), noise, steps, furthest, rest, allowed)
 
 
-def _pieces(log: Log, steps: int) -> list[Log]:
+def _pieces(log: GaplessLog, steps: int) -> list[GaplessLog]:
     """A recording whole, and in up to PIECES parts, each long enough to be judged by itself: what a mixture
     may be, and leave, differs with the length."""
     count = min(max(len(log.u) // (5 * steps), 1), PIECES)
-    parts = [Log(*part) for part in zip(*(np.array_split(one, count) for one in log), strict=True)]
+    parts = [GaplessLog(*part) for part in zip(*(np.array_split(one, count) for one in log), strict=True)]
     return [log, *parts] if count > 1 else parts
 
 
 PIECES = 8
 
 
-def _rest(runs: Sequence[Forecasts], noise: np.ndarray) -> np.ndarray:
+def _rest(runs: Sequence[FamilyForecasts], noise: np.ndarray) -> np.ndarray:
     """Deviation (p,) in °C of what mixtures leave of honest logs; at least the sensors' noise, of which they
     leave less where forecasts are few."""
     rest, least = NOISES * noise, noise + 1e-9
     for _ in range(3):
-        left = [(explained(run, np.maximum(rest, least)).left ** 2).mean(axis=0) for run in runs]
+        left = [(fit_mixture(run, np.maximum(rest, least))[1] ** 2).mean(axis=0) for run in runs]
         rest = np.sqrt(np.mean(left, axis=0))
     return np.maximum(rest, least)
 
@@ -249,7 +253,7 @@ def _seldom_above(found: np.ndarray) -> np.ndarray:
     return ranked[int(np.argmax(kept))]
 
 
-class Told(NamedTuple):
+class SupportCheck(NamedTuple):
     """What is said of a log: by sample (T,) the sum of TEMPERATURE, COMMAND and FORECAST; its `figures` over
     what they may be (3,), above 1 off support, 0 where it is judged by its ranges alone; the share of samples
     outside the ranges; `abstains`: a replay of it says nothing of this controller; `still`: so little moves
@@ -264,8 +268,8 @@ class Told(NamedTuple):
     short: bool = False
 
 
-def told(within: Support, log: Log, watch: Watch) -> Told:
-    """Where a log is off support, by `watched_by` of its plants. One too short for a forecast is judged by
+def check_log(within: Support, log: GaplessLog, observers: Observers) -> SupportCheck:
+    """Where a log is off support, by the observers of its plants. One too short for a forecast is judged by
     its ranges alone."""
     off = np.zeros(len(log.u), np.int8)
     for low, high, values, kind in (
@@ -275,23 +279,23 @@ def told(within: Support, log: Log, watch: Watch) -> Told:
         off[((values < low) | (values > high)).any(axis=1)] |= kind
     every, runs = max(within.steps // AT_ONCE, 1), []
     for first, part in _stretches(log):
-        runs.append(forecasts(watch, part, within.steps))
+        runs.append(forecasts(observers, part, within.steps))
         far = distances(runs[-1], within.noise) > within.furthest
         for start in first + runs[-1].start[far]:
             off[start + within.steps - every : start + within.steps] |= FORECAST
-    joined = Forecasts(
+    joined = FamilyForecasts(
         *(np.concatenate(part, axis=-2 if part[0].ndim > 1 else 0) for part in zip(*runs, strict=True))
     )
     outside = float((off & (TEMPERATURE | COMMAND) != 0).mean()) if len(off) else 0.0
     if still := not any(_moves(within, part) for _, part in _stretches(log)):
         off &= ~np.int8(FORECAST)
-        return Told(off, np.zeros(3), outside, outside > LEAST_SHARE, still)
+        return SupportCheck(off, np.zeros(3), outside, outside > LEAST_SHARE, still)
     over = figures(joined, within.noise, within.furthest, within.rest) / within.allowed
     off_support = bool((over > 1).any()) or outside > LEAST_SHARE
-    return Told(off, over, outside, off_support, still, not len(joined.start))
+    return SupportCheck(off, over, outside, off_support, still, not len(joined.start))
 
 
-def _moves(within: Support, log: Log) -> bool:
+def _moves(within: Support, log: GaplessLog) -> bool:
     """Whether an output moved, or its inputs would have moved it on a plant of the spread."""
     plant = within.spread[0]
     drive = (log.u - log.u.mean(axis=0)) @ plant.B.T
@@ -299,12 +303,12 @@ def _moves(within: Support, log: Log) -> bool:
     return any(bool((part.std(axis=0) > STILL * within.rest).any()) for part in (log.y, answer))
 
 
-def reasons(said: Told) -> list[str]:
+def reasons(checked: SupportCheck) -> list[str]:
     """Why a log is off support, the strongest reason first; or what could not be told of it."""
-    found = [(said.outside / LEAST_SHARE, OUTSIDE)] + list(zip(said.figures, OF_FIGURES, strict=True))
+    found = [(checked.outside / LEAST_SHARE, OUTSIDE)] + list(zip(checked.figures, OF_FIGURES, strict=True))
     over = sorted((one for one in found if one[0] > 1), key=lambda one: -one[0])
-    untold = [text for so, text in ((said.still, STILL_TOLD), (said.short, SHORT_TOLD)) if so]
-    return [sentence.format(times) for times, sentence in over] + untold
+    unknown = [text for so, text in ((checked.still, STILL_TOLD), (checked.short, SHORT_TOLD)) if so]
+    return [sentence.format(times) for times, sentence in over] + unknown
 
 
 OUTSIDE = "Temperatures or commands lie outside what was seen, {:.2g} times as often as they may."
@@ -324,10 +328,10 @@ SHORT_TOLD = (
 )
 
 
-def _stretches(log: Log) -> list[tuple[int, Log]]:
+def _stretches(log: GaplessLog) -> list[tuple[int, GaplessLog]]:
     """The log whole, or of a long one stretches evenly apart, each with its first sample."""
     T = len(log.u)
     if T <= MOST_SAMPLES:
         return [(0, log)]
     firsts = np.linspace(0, T - STRETCH, MOST_SAMPLES // STRETCH).astype(int)
-    return [(int(at), Log(*(part[at : at + STRETCH] for part in log))) for at in firsts]
+    return [(int(at), GaplessLog(*(part[at : at + STRETCH] for part in log))) for at in firsts]

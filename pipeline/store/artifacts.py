@@ -357,11 +357,12 @@ def exists(path: str | Path) -> bool:
 
 @contextlib.contextmanager
 def about(path: str | Path) -> Iterator[None]:
-    """Puts the file's name in front of what the body refuses."""
+    """Puts the file's name in front of what the body refuses, unless it stands there."""
     try:
         yield
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        sentence = str(error)
+        raise ValueError(sentence if sentence.startswith(str(path)) else f"{path}: {sentence}") from None
 
 
 def write_recording(

@@ -27,7 +27,7 @@ SECTIONS = (
     "evaluate_setpoint",
     "evaluate_temperature",
     "execution",
-    "export_controllers",
+    "certify",
     "generate_probing",
     "identify_plant",
     "ingest",
@@ -49,8 +49,8 @@ SECTIONS = (
 )
 # the second pipeline has a file of its own, which no owner of a machine needs to know
 PAPERS, PAPERS_SECTIONS = "datasets/papers/params.yaml", ("reproduce_study",)
-# old dotted key or section -> new one, for one version; none since 0.2
-RENAMED: dict[str, str] = {}
+# old dotted key or section -> new one, for one version
+RENAMED: dict[str, str] = {"export_controllers": "certify"}
 
 
 class Section(pydantic.BaseModel):
@@ -242,11 +242,12 @@ def files(path: str | Path = FILE) -> dict[str, dict]:
 def _section(section: str, path: str | Path) -> dict:
     sections = read(path)
     if section not in sections:
+        from pipeline.store import params_text
+
         expert = Path(path).with_name(EXPERT)
         if not expert.exists():
-            raise ValueError(
-                f"{path}: section {section} is missing, and so is {expert}; {RESTORE.format(expert)}"
-            )
+            remedy = params_text.RESTORE.format(expert)
+            raise ValueError(f"{path}: section {section} is missing, and so is {expert}; {remedy}")
         raise ValueError(
             f"{_files_of(files(path), section)}: section {section} is missing; "
             f"add {section}: with its keys below it"
@@ -282,7 +283,6 @@ def _files_of(sections: dict[str, dict], section: str, location: Sequence = ()) 
 
 # ---- the sentences
 
-RESTORE = "run from the root of the project, or restore it with git checkout {}"
 _NO_SECTION = "must be a section with keys below it but is {}; indent its keys by two spaces"
 _BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 _COMPARISONS = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}

@@ -12,8 +12,10 @@ if TYPE_CHECKING:
 
 
 class Plant(NamedTuple):
-    """x(t+1) = A x + B u + b + K e, y = C x + D u + d + e (seed 1, (1), with an
-    offset and the innovation form of an identified model).
+    """x(t+1) = A x + B u + b + K e
+    y = C x + D u + d + e
+
+    Seed 1, (1), with an offset and the innovation form of an identified model.
 
     A (n, n), B (n, m), C (p, n), D (p, m), b (n,), d (p,), K (n, p) the Kalman gain; one step is
     `sample_time_s` seconds, u in percent of duty, y in °C.

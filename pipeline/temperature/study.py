@@ -19,7 +19,7 @@ from pipeline.temperature.plant import baam
 from pipeline.temperature.probing import study_probe, study_signal
 from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, Figures
 from pipeline.temperature.test_set.scorecard import Panel, Yardstick, cost, optimum, panel, regret, simulate
-from pipeline.temperature.test_set.tuning import Result, fitness
+from pipeline.temperature.test_set.tuning import SearchResult, fitness
 from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
 
 OUTPUTS, INPUTS = 5, 7
@@ -271,7 +271,7 @@ def scaled_weights(scale: float = 0.4) -> ScaledWeights:
     return ScaledWeights(float(100 * (J[1] / J[0] - 1)), float(np.abs(one.K_x - other.K_x).max()))
 
 
-def candidates(result: Result) -> dict[str, list | np.ndarray]:
+def candidates(result: SearchResult) -> dict[str, list | np.ndarray]:
     """The candidates of a search for the least (37) as columns, one row a candidate; NaN where one failed."""
     history = result.history
     parts = np.array(
@@ -291,7 +291,7 @@ def candidates(result: Result) -> dict[str, list | np.ndarray]:
     }
 
 
-def parity_metrics(result: Result) -> dict:
+def parity_metrics(result: SearchResult) -> dict:
     """What a search for the least (37) ends at, beside its known optimum, Q = R = I, and the weights that it
     recommends."""
     optimum = np.ones(OUTPUTS + INPUTS)

@@ -25,11 +25,12 @@ class Law(NamedTuple):
     """A controller as it runs: memory z, measured y, reference r, and
     the input that was really applied (clipped or not).
 
-    u = -K z - D y - K_r (r + xi) - k, z(t+1) = A z + B_u u_applied +
-    B_y y + B_r r + c, xi(t+1) = xi + integral (r - y)
+    u = -K z - D y - K_r (r + xi) - k
+    z(t+1) = A z + B_u u_applied + B_y y + B_r r + c
+    xi(t+1) = xi + integral (r - y)
 
-    Shapes with q memories: A (q, q), B_u (q, m), B_y (q, p), B_r (q, p), c (q,), K (m,
-    q), D (m, p), K_r (m, p), k (m,). It takes over from a plant that was held by u0 at y0
+    Shapes with q memories: A (q, q), B_u (q, m), B_y (q, p), B_r (q, p), c (q,), K (m, q),
+    D (m, p), K_r (m, p), k (m,). It takes over from a plant that was held by u0 at y0
     with z = start_u u0 + start_y y0 + start and xi = 0.
 
     `integral` is the share of the error that xi takes a step: the outer integrator's, or that of a law with
@@ -77,8 +78,9 @@ def riccati(
     tolerance: float = 1e-14,
     max_doublings: int = 60,
 ) -> np.ndarray:
-    """P = Q + A'PA - A'PB (R + B'PB)^-1 B'PA by structure-preserving doubling (Chu,
-    Fan, Lin, Wang 2004): each step doubles the horizon.
+    """P = Q + A'PA - A'PB (R + B'PB)^-1 B'PA
+
+    by structure-preserving doubling (Chu, Fan, Lin, Wang 2004): each step doubles the horizon.
 
     A (n, n), B (n, m), Q (n, n) and R (m, m) symmetric, R > 0. Raises ValueError where the recursion does not
     settle: (A, B) is not stabilisable.
@@ -106,8 +108,10 @@ def gains(plant: Plant, Q: np.ndarray, R: np.ndarray, gamma: float, F: np.ndarra
     """The optimal u = -K_x x - K_r r - k for (3) with r(t+1) = F r(t) (default:
     constant): discrete Riccati equation on sqrt(gamma) (A, B).
 
-    With w = [r; 1], x+ = A x + B u + E w and y - r = C x + G w: K_w = S^-1 gamma B'(P E + P_xw F_w), P_xw =
-    C'QG + gamma (A - B K_x)'(P E + P_xw F_w).
+    With w = [r; 1], x+ = A x + B u + E w and y - r = C x + G w:
+
+    K_w = S^-1 gamma B'(P E + P_xw F_w)
+    P_xw = C'QG + gamma (A - B K_x)'(P E + P_xw F_w)
     """
     _strictly_proper(plant)
     p, F = plant.p, np.eye(plant.p) if F is None else F
@@ -194,8 +198,10 @@ def observer_gain(plant: Plant, tau: float) -> np.ndarray:
 
 
 def robust_observer_gain(plant: Plant, tau: float) -> np.ndarray:
-    """L = A P C'(C P C' + tau I)^-1 with P of the dual Riccati equation for process noise B B': stable for
-    every tau > 0, and the same in any coordinates.
+    """L = A P C'(C P C' + tau I)^-1
+
+    with P of the dual Riccati equation for process noise B B': stable for every tau > 0, and the same in any
+    coordinates.
 
     The Kalman gain of a record trusts its model wherever it goes. What a model gets wrong on another day acts
     like its inputs (their gain, heat lost), so that it is those directions that the observer follows; tau in

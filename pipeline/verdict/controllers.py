@@ -1,15 +1,14 @@
 """The controllers of the temperature loop as verdicts and pages name them, from the table of controllers. One
 that the table does not know goes by its own name."""
 
-from pipeline.temperature.workflow.contestants import CONTESTANTS
+from pipeline.temperature.controllers.table import BY_NAME, CONTROLLERS
 
-BY_NAME = {contestant.name: contestant for contestant in CONTESTANTS}
 # shown beside the others, never the best of them
-YARDSTICKS = tuple(contestant.name for contestant in CONTESTANTS if contestant.role == "yardstick")
+YARDSTICKS = tuple(controller.name for controller in CONTROLLERS if controller.role == "yardstick")
 
 
 def _by_role(role: str) -> str:
-    return next(contestant.name for contestant in CONTESTANTS if contestant.role == role)
+    return next(controller.name for controller in CONTROLLERS if controller.role == role)
 
 
 # the user asked to see model-based beside data-driven; the indirect one stands in where the kernel is refused

@@ -135,6 +135,7 @@ def _structure(rows: pd.DataFrame, rules: ReportRules, conformance: Mapping[str,
     """One material of one part from its rows of the scores and its forecast in the conformance report; a
     composer without an error is left out."""
     judged = rows.dropna(subset="rms_percent_of_on_off")
+    each: list[Any] = list(judged.itertuples())
     part, material = rows.part.iloc[0], rows.material.iloc[0]
     forecast = conformance.get(part, {}).get("forecast", {}).get(material, NO_FORECAST)
     scores = {
@@ -145,7 +146,7 @@ def _structure(rows: pd.DataFrame, rules: ReportRules, conformance: Mapping[str,
             *(forecast.get("composers", {}).get(row.composer, {}).get(end) for end in ("low", "high")),
             judged=bool(forecast.get("judged")),
         )
-        for row in judged.itertuples()
+        for row in each
     }
     chosen = judged.composer[judged.chosen.astype(bool)]
     return Structure(
@@ -277,17 +278,17 @@ def _near(case: Parts, composer: str) -> Reading:
     figure, words = _worst_of(bounded, ratio, lambda value: f"{number(value, 2)} ×")
     if isinstance(figure, Missing):
         return figure, words
-    part = _largest(bounded, ratio)[1]
+    part = max((part for part in bounded if ratio(part) is not None), key=lambda part: ratio(part) or 0.0)
     least = percent(case.bound[part.part, part.material], 2)
-    return figure, {**words, "value": percent(part.error(composer), 2), "least": least}
+    return figure, {**words, "value": percent(part.scores[composer].error, 2), "least": least}
 
 
 def _above(case: Parts, composer: str) -> Reading:
     """By how many points a composer lies above what learned the part itself, at most."""
 
     def above(part: Structure) -> float | None:
-        ends = part.error(composer), part.error(REFERENCE)
-        return None if None in ends else ends[0] - ends[1]
+        error, reached = part.error(composer), part.error(REFERENCE)
+        return None if error is None or reached is None else error - reached
 
     pair = _largest(case.parts, above)
     if pair is None:
@@ -599,11 +600,7 @@ def _summary(parts: Sequence[Structure], use: str, machine: bool) -> str:
     ]
     full = worst(parts, REFERENCE)
     others += [f"learning each part from scratch {percent(full[0], 2)}"] if full else []
-    lines = [
-        part.scores[use].worst_line
-        for part in parts
-        if use in part.scores and part.scores[use].worst_line is not None
-    ]
+    lines = [line for part in parts if (line := part.worst_line(use)) is not None]
     volume = (
         f" Worst printed line: {percent(max(lines), 2)} off its volume, "
         f"±{place.asked.line_volume_percent:g}{THIN}% allowed."

@@ -1,16 +1,20 @@
 """What a verdict is made from, and how a figure is found in it."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import Missing
 
 Table = dict[str, np.ndarray]
 Figures = Mapping[str, Any]  # {stage: its figures, or why there are none}
+OFF = Missing("not applicable", "this loop is switched off (loops in params.yaml)")
+
+
+Value = TypeVar("Value")
 
 
 class Evidence(NamedTuple):
@@ -32,6 +36,11 @@ class Evidence(NamedTuple):
         """Why the stage `certify` refuses a controller; "" if it passed it, and if nothing is known."""
         known = self.certified.get(loop, {}).get(controller)
         return str(known["why"]) if known and not known["passed"] else ""
+
+
+def switched_off(figures: Any) -> bool:
+    """Whether a stage wrote that it was not asked, because its loop is switched off."""
+    return isinstance(figures, Mapping) and figures.get("asked") is False
 
 
 class Absent(Exception):
@@ -61,7 +70,7 @@ def lookup(data: Any, dotted: str, *, what: str = "") -> Any:
     return value
 
 
-def need(value: Any) -> Any:
+def need(value: Value | Missing) -> Value:
     """The value itself. Raises Absent if it is a Missing."""
     if isinstance(value, Missing):
         raise Absent(value)

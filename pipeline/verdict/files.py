@@ -3,12 +3,12 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from pipeline.deposition.workflow.tables import SCORES
-from pipeline.setpoint.workflow.tables import SCOREBOARD
+from pipeline.deposition.tables import SCORES
+from pipeline.setpoint.tables import SCOREBOARD
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
-from pipeline.temperature.workflow.tables import DYNAMICS, RESIDUALS
-from pipeline.verdict.evidence import Evidence
+from pipeline.temperature.settings import Plant
+from pipeline.temperature.tables import DYNAMICS, RESIDUALS
+from pipeline.verdict.evidence import OFF, Evidence, switched_off
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import Missing
 
@@ -38,16 +38,19 @@ TABLES = {
 }
 
 
-def read_evidence(certified: Mapping[str, Mapping[str, Any]]) -> Evidence:
-    """What the stages that ran wrote; a Missing in the place of each file that is not there."""
+def read_evidence(certified: Mapping[str, Mapping[str, Any]] | None = None) -> Evidence:
+    """What the stages that ran wrote; a Missing in the place of each file that is not there, or broken."""
+    figures = {stage: _read(f"datasets/{stage}/figures.json", stage, artifacts.read_json) for stage in STAGES}
+    off = {stage for stage in STAGES if switched_off(figures[stage])}
+    places = {name: (path, path.split("/")[1], _reader(schema)) for name, (path, schema) in TABLES.items()}
     return Evidence(
-        {stage: _read(f"datasets/{stage}/figures.json", stage, artifacts.read_json) for stage in STAGES},
-        {name: _read(path, path.split("/")[1], _reader(schema)) for name, (path, schema) in TABLES.items()},
+        {**figures, **dict.fromkeys(off, OFF)},
+        {name: OFF if place[1] in off else _read(*place) for name, place in places.items()},
         params.load(Plant, "plant"),
         params.load(ReportRules, "report"),
         params.read(),
         artifacts.exists(QUICK_LOOK),
-        certified,
+        certified or {},
     )
 
 
@@ -59,4 +62,7 @@ def _read(path: str, stage: str, reader: Callable[[str], Any]) -> Any:
     if not artifacts.exists(path):
         name = path.rsplit("/", 1)[-1]
         return Missing("not measured", f"{name} of {stage} is not there", f"Run ./run dvc repro {stage}")
-    return reader(path)
+    try:
+        return reader(path)
+    except ValueError as error:
+        return Missing("failed", str(error))

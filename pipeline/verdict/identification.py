@@ -62,12 +62,11 @@ def trust(evidence: Evidence) -> Verdict:
     first = deciding(needed) or deciding(rules.values())
     ended = overall(list(uses.values()))
     if first is None:
-        weakest = min(fits(evidence), key=lambda fit: fit.simulated.value)
-        lead = f"All {count(len(rules), 'rule')} passed;"
-        reason = (
-            f"weakest in simulation: {weakest.name}, {percent_of(weakest.simulated)} "
-            f"of at least {least_fit():g}{THIN}%."
+        weakest, least = min(
+            ((fit.name, need(fit.simulated)) for fit in fits(evidence)), key=lambda pair: pair[1].value
         )
+        lead = f"All {count(len(rules), 'rule')} passed;"
+        reason = f"weakest in simulation: {weakest}, {percent_of(least)} of at least {least_fit():g}{THIN}%."
         remedy = "Valid for the range of inputs and temperatures that the record covers."
     else:
         word = "failed" if first.state == FAILED else "undecided"
@@ -112,8 +111,9 @@ def _rule(evidence: Evidence, key: str) -> Rule:
 
     rule = judge(row, question, read)
     if isinstance(rule.figure, Figure):
-        fit = rule.state == UNDECIDED and rule.question.unit == "%"
-        return rule._replace(remedy=_longer(rule.question, rule.figure)) if fit else rule
+        asked = rule.question or question
+        undecided = rule.state == UNDECIDED and asked.unit == "%"
+        return rule._replace(remedy=_longer(asked, rule.figure)) if undecided else rule
     gap = rule.figure
     remedy = gap.remedy and gap.remedy.rstrip(".") + "."
     return rule._replace(reason=gap.reason.rstrip(".") + ".", remedy=remedy)
@@ -236,7 +236,7 @@ def _ahead(evidence: Evidence, question: Question) -> Reading:
         "output": fit.name,
         "steps": ahead_words(evidence),
         "value": _with_band(figure),
-        "held": percent_of(fit.held),
+        "held": percent_of(need(fit.held)),
         "least": f"{question.limit:g}{THIN}%",
     }
 
@@ -246,12 +246,10 @@ def _longer(question: Question, figure: Figure) -> str:
     limit = question.limit
     reach = limit - figure.low if figure.value > limit else figure.high - limit
     away = abs(figure.value - limit)
-    times = math.ceil(((reach + away) / away) ** 2) if away > 0 else math.inf
-    return (
-        f"A hold-out {count(times, 'time', 'times')} as long would decide."
-        if times <= 12
-        else "Only a far longer record would decide."
-    )
+    times = ((reach + away) / away) ** 2 if away > 0 else math.inf
+    if times > 12:
+        return "Only a far longer record would decide."
+    return f"A hold-out {count(math.ceil(times), 'time', 'times')} as long would decide."
 
 
 def _residuals(evidence: Evidence, rows: np.ndarray) -> Reading:
@@ -368,7 +366,8 @@ FIGURES = {
 def flagged_remedy(gains: Sequence[Mapping[str, Any]]) -> str:
     """What to do before a controller is designed from the model."""
     remedy = rows(LOOP)[GAINS].remedy
-    return remedy["certain" if any(gain["certain"] for gain in gains) else "possible"]
+    case = "certain" if any(gain["certain"] for gain in gains) else "possible"
+    return remedy if isinstance(remedy, str) else remedy[case]
 
 
 def flagged_sentence(gains: Sequence[Mapping[str, Any]]) -> str:

@@ -70,6 +70,10 @@ class Row(params.Section):
         return text.format(limit=limit)
 
 
+# limits of any size, for the keys alone
+_ANY = ReportRules.model_construct(None, **dict.fromkeys(ReportRules.model_fields, 1.0))
+
+
 @functools.cache
 def _rows(path: Path) -> dict[str, dict[str, Row]]:
     with path.open("rb") as file:
@@ -82,7 +86,7 @@ def _rows(path: Path) -> dict[str, dict[str, Row]]:
 def _row(path: Path, loop: str, key: str, fields: Mapping[str, Any]) -> Row:
     try:
         row = Row.model_validate(fields)
-        row.limit(ReportRules.model_construct(**dict.fromkeys(ReportRules.model_fields, 1.0)))
+        row.limit(_ANY)
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
@@ -147,16 +151,22 @@ def judge(
         figure, words = read()
     except Absent as absent:
         figure, words = absent.gap, {"remedy": ""}
-    question = question._replace(limit=words.get("limit", question.limit))
-    case, missing = words.get("case", ""), isinstance(figure, Missing)
-    text = words.get("text", OPEN if missing else _text(figure.value, row.unit))
+    question = question._replace(limit=float(words.get("limit", question.limit)))
     allowed = words.get("allowed", row.limit_text(question.limit))
-    rule = Rule(row.name, question, figure, text, allowed, row.place)
-    if missing:
+    if isinstance(figure, Missing):
         remedy = row.remedy if isinstance(row.remedy, str) else ""
-        return rule._replace(
-            reason=words.get("reason", figure.sentence()), remedy=words.get("remedy", remedy)
+        return Rule(
+            row.name,
+            question,
+            figure,
+            words.get("text", OPEN),
+            allowed,
+            row.place,
+            words.get("reason", figure.sentence()),
+            words.get("remedy", remedy),
         )
+    case, text = words.get("case", ""), words.get("text", _text(figure.value, row.unit))
+    rule = Rule(row.name, question, figure, text, allowed, row.place)
     undecided = decides(question, figure, words) if decides and rule.state == UNDECIDED else ""
     fails = words.get("fails") or (row.fails if isinstance(row.fails, str) else row.fails[case])
     remedy = words.get("remedy") or (row.remedy if isinstance(row.remedy, str) else row.remedy[case])

@@ -8,12 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from pipeline.setpoint.agents.criteria import BEYOND, harm_bar
 from pipeline.setpoint.controllers import KINDS
-from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, harm_bar
+from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.verdict.digits import THIN, band, count, number, quantity
 from pipeline.verdict.evidence import Evidence, lookup
 from pipeline.verdict.rules import Reading, Row, at_path, judge, rows
 from pipeline.verdict.verdict import (
+    CERTIFICATE,
     FAILED,
     OPEN,
     PASSED,
@@ -290,8 +292,8 @@ def _share(what: str) -> Callable[[Evidence, Board | None, str], Reading]:
         if board is None:
             return Missing(OPEN, ""), {"reason": "Nothing was judged.", "remedy": ""}
         figure, case = worst(board, name, what)
-        if isinstance(figure, Missing):
-            return figure, {"text": figure.state}
+        if isinstance(figure, Missing) or case is None:
+            return figure, {"text": share_text(figure)}
         return figure, {
             "text": share_text(figure),
             "within": within(case),
@@ -371,7 +373,8 @@ def accuracy(metrics: Mapping | Missing, name: str) -> Figure | Missing:
     if isinstance(value, Missing):
         return value
     ends = lookup(metrics, f"intervals_percent.{name}")
-    return Figure(100 * value, *((100 * value,) * 2 if isinstance(ends, Missing) else map(float, ends)))
+    low, high = (100 * value, 100 * value) if isinstance(ends, Missing) else map(float, ends)
+    return Figure(100 * value, low, high)
 
 
 def _calibration(*keys: str) -> Callable[[Evidence, int], Reading]:
@@ -458,7 +461,7 @@ def verdict(evidence: Evidence) -> Verdict:
     asked = _asked(lines, scores)
     if refusal:
         gap = Missing(UNDECIDED, refusal)
-        asked.append(Rule("certificate", None, gap, text="refused", limit="passed", reason=refusal))
+        asked.append(Rule(CERTIFICATE, None, gap, text="refused", limit="passed", reason=refusal))
     name = named(scores, scores.default)
     ended, first = (
         overall([rule.state for rule in asked if _binding(rule)]),
@@ -565,7 +568,7 @@ def summary(evidence: Evidence, board: Board) -> str:
     """The default's worst case, by how much it beats the next of those that may run, and,
     where the agent is neither, how far it came."""
     mine, place = worst(board, board.default, "lasting")
-    if place is None:
+    if place is None or isinstance(mine, Missing):
         return ""
     runs = board.cells[board.default, place].runs
     text = f"In its worst case ({within(place)}) {share_text(mine)} of {runs:,} runs settle and stay"
@@ -574,6 +577,8 @@ def summary(evidence: Evidence, board: Board) -> str:
     if not others:
         return f"{text}. {'Nothing else may run' if judged else 'Nothing else was judged'}."
     figure, where = worst(board, others[0], "lasting")
+    if where is None or isinstance(figure, Missing):
+        return text
     margin = lookup(evidence.tables["choice"], "margin")
     points = mine.value - figure.value if isinstance(margin, Missing) else float(margin)
     noise = _noise(evidence.tables["choice"], mine, figure)

@@ -12,6 +12,8 @@ from pipeline.verdict.digits import decimals
 PASSED, FAILED, UNDECIDED, OPEN = "passed", "failed", "undecided", "not measured"
 # a rule that cannot be judged before somebody declares what it asks about
 UNJUDGED = "not applicable"
+# the rule of a controller whose certificate is refused; no row holds it
+CERTIFICATE = "certificate"
 
 
 class Figure(NamedTuple):
@@ -241,7 +243,10 @@ def write(verdicts: Mapping[str, Verdict], folder: str | Path) -> None:
     """Writes each verdict to `folder`/<loop>.json. Equal verdicts give equal bytes."""
     for loop, verdict in verdicts.items():
         lines = [[_encode(rule) for rule in line] for line in verdict.rules]
-        artifacts.write_json(Path(folder) / f"{loop}.json", verdict._asdict() | {"rules": lines})
+        # whom the rules would name, and whose certificate is refused: its certificate is still exported
+        refused = verdict.subject if verdict.rule == CERTIFICATE else None
+        fields = {**verdict._asdict(), "rules": lines, "refused": refused}
+        artifacts.write_json(Path(folder) / f"{loop}.json", fields)
 
 
 def read(folder: str | Path, names: Sequence[str] = LOOPS) -> dict[str, Verdict]:
@@ -270,7 +275,7 @@ def _text(value: Any) -> Any:
 
 def _decode(fields: Mapping[str, Any]) -> Verdict:
     rules = tuple(tuple(_rule(rule) for rule in line) for line in fields["rules"])
-    return Verdict(**{**fields, "rules": rules})
+    return Verdict(**{name: fields[name] for name in Verdict._fields})._replace(rules=rules)
 
 
 def _rule(fields: Mapping[str, Any]) -> Rule:
@@ -284,5 +289,5 @@ def _rule(fields: Mapping[str, Any]) -> Rule:
             runs=tuple(map(float, figure["runs"])),
             note=figure["note"],
         ),
-        question=question and Question(**{**question, "limit": float(question["limit"])}),
+        question=question and Question(**question)._replace(limit=float(question["limit"])),
     )

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pipeline.verdict.controllers import in_a_sentence
-from pipeline.verdict.digits import band, beyond_meaning, quantity, with_unit
+from pipeline.verdict.digits import band, beyond_meaning, declared, quantity, with_unit
 from pipeline.verdict.verdict import Figure, Missing, Question, row_places
 
 OFF_THE_SCALE = "off the scale"
@@ -50,11 +50,17 @@ def words_of(question: Question, figure: Figure, name: str) -> dict[str, Any]:
     of a figure without digits."""
     places = places_of(question, [figure])
     value = worded(question, figure.value, places)
+    # a limit too small for the figure's decimals has its own
+    exact = (
+        places
+        if math.isinf(question.limit) or round(question.limit, places) or not question.limit
+        else declared(question.limit)
+    )
     words = {
         "limit": question.limit,
         "who": name_first(name),
         "value": value,
-        "limit_words": with_unit(question.limit, question.unit, places),
+        "limit_words": with_unit(question.limit, question.unit, exact),
         "note": figure.note,
         "text": "",
     }

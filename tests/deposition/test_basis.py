@@ -7,7 +7,7 @@ import pytest
 from pipeline.deposition.drive import Drive, at_limit, follows
 from pipeline.deposition.extruder import Extruder, draw, lagged, ramp
 from pipeline.deposition.parts import basis
-from pipeline.deposition.parts.chain import Identified
+from pipeline.deposition.parts.chain import IdentifiedExtruder
 from tests.deposition.trained import TS, percent_of_on_off, protocol
 
 STEADY = 2.432
@@ -46,7 +46,7 @@ def test_the_weights_are_those_of_the_docstring():
     for k in range(len(x) - 1):
         slow[k + 1] = a * slow[k] + (1 - a) * x[k]
     expected = rate * np.gradient(x, 0.001) + level * x + (1 / K - level) * slow
-    u = basis._inverse(Identified(K, tau, creep_share=c, creep_time_s=T), x / K, 0.001)
+    u = basis._inverse(IdentifiedExtruder(K, tau, creep_share=c, creep_time_s=T), x / K, 0.001)
     np.testing.assert_allclose(
         u[:2400], expected[:2400], atol=0.01 * expected.max()
     )  # 1 ms steps against derivatives; the cut at 2.5 s left out

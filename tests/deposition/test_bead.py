@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.deposition.camera.bead import area, calibrate, drawn, gray, measure, measure_all
-from pipeline.deposition.camera.rendering import HARD, NOMINAL, Camera
+from pipeline.deposition.camera.rendering import HARD, NOMINAL, SimulatedCamera
 
 VIEW = {"columns": (0, 600), "longest_blur_px": 6.0}
 WIDTHS = (60.0, 85.0, 110.0, 135.0, 160.0)
@@ -32,7 +32,7 @@ def strip(
 def figures(scene, *, seed: int, frames: int = 20) -> tuple[np.ndarray, np.ndarray]:
     """Mean error and standard deviation in px at each of WIDTHS; every frame on another part of the stage."""
     rng = np.random.default_rng(seed)
-    camera = Camera(scene, rng)
+    camera = SimulatedCamera(scene, rng)
     widths = [
         [measure(camera.frame(w, stage_px=int(rng.integers(0, 10**6))), **VIEW).width for _ in range(frames)]
         for w in WIDTHS
@@ -82,7 +82,7 @@ def test_tilted_dark_bright_sharp_and_dim_scenes_err_less_than_0_2_px(changes):
 
 
 def test_the_strongest_gradient_falls_for_the_specular_line_where_ours_does_not():
-    camera, errors = Camera(HARD, np.random.default_rng(104)), []
+    camera, errors = SimulatedCamera(HARD, np.random.default_rng(104)), []
     for i in range(10):
         frame = camera.frame(110.0, stage_px=97 * i)
         steps = np.diff(cv2.blur(frame, (9, 3)).astype(float), axis=0)
@@ -92,7 +92,7 @@ def test_the_strongest_gradient_falls_for_the_specular_line_where_ours_does_not(
 
 
 def test_the_angle_of_a_tilted_line_comes_out_and_its_width_is_across_it():
-    camera = Camera(NOMINAL._replace(tilt_deg=2.0), np.random.default_rng(105))
+    camera = SimulatedCamera(NOMINAL._replace(tilt_deg=2.0), np.random.default_rng(105))
     bead = measure(camera.frame(110.0, stage_px=0), **VIEW)
     assert bead.angle_deg == pytest.approx(2.0, abs=0.1)  # the line wanders by 0.2 px over 600
     vertical = np.nanmedian(bead.bottom - bead.top)
@@ -101,13 +101,13 @@ def test_the_angle_of_a_tilted_line_comes_out_and_its_width_is_across_it():
 
 def test_the_blur_of_the_edge_comes_out():
     for blur in (1.2, 2.0, 3.0):
-        camera = Camera(NOMINAL._replace(blur_px=blur), np.random.default_rng(106))
+        camera = SimulatedCamera(NOMINAL._replace(blur_px=blur), np.random.default_rng(106))
         measured = np.mean([measure(camera.frame(110.0, stage_px=97 * i), **VIEW).blur_px for i in range(5)])
         assert measured == pytest.approx(blur, rel=0.2)  # the pixel's own width and the wander add to it
 
 
 def test_a_line_that_begins_in_the_frame_is_read_where_it_is_and_zero_before():
-    camera = Camera(NOMINAL, np.random.default_rng(107))
+    camera = SimulatedCamera(NOMINAL, np.random.default_rng(107))
     bead = measure(camera.frame(np.where(np.arange(640) < 296, 0.0, 110.0), stage_px=0), **VIEW)
     assert bead.reason == ""
     before, after = bead.columns < 288, bead.columns > 304
@@ -116,7 +116,7 @@ def test_a_line_that_begins_in_the_frame_is_read_where_it_is_and_zero_before():
 
 
 def test_a_step_of_the_width_stays_a_step():
-    camera = Camera(NOMINAL, np.random.default_rng(108))
+    camera = SimulatedCamera(NOMINAL, np.random.default_rng(108))
     bead = measure(camera.frame(np.where(np.arange(640) < 296, 90.0, 250.0), stage_px=0), **VIEW)
     np.testing.assert_allclose(bead.widths[bead.columns < 288], 90.0, atol=1.5)
     np.testing.assert_allclose(bead.widths[bead.columns > 304], 250.0, atol=1.5)
@@ -129,7 +129,7 @@ def test_a_step_of_the_width_stays_a_step():
 def test_an_empty_frame_gives_no_bead_and_no_width_anywhere(scene):
     rng = np.random.default_rng(109)
     for _ in range(3):
-        camera = Camera(scene, rng)
+        camera = SimulatedCamera(scene, rng)
         for _ in range(20):
             bead = measure(camera.empty(stage_px=int(rng.integers(0, 10**6))), **VIEW)
             assert bead.reason == "no bead"
@@ -158,7 +158,7 @@ def test_a_frame_that_cannot_be_measured_says_why_and_gives_no_width(frame, reas
 
 
 def test_16_bit_and_colour_frames_give_the_same_width():
-    frame = Camera(NOMINAL, np.random.default_rng(110)).frame(110.0, stage_px=0)
+    frame = SimulatedCamera(NOMINAL, np.random.default_rng(110)).frame(110.0, stage_px=0)
     width = measure(frame, **VIEW).width
     assert measure(frame.astype(np.uint16) * 257, **VIEW).width == pytest.approx(width, abs=1e-3)  # float32
     for code in (cv2.COLOR_GRAY2BGR, cv2.COLOR_GRAY2BGRA):
@@ -207,7 +207,7 @@ def test_colour_becomes_gray_by_the_usual_weights():
 
 @pytest.mark.parametrize("level", [NOMINAL, HARD])
 def test_many_frames_at_once_give_the_same_numbers_as_each_alone(level):
-    camera = Camera(level, np.random.default_rng(112))
+    camera = SimulatedCamera(level, np.random.default_rng(112))
     widths = [110.0, 0.0, 25.0, np.where(np.arange(640) < 300, 0.0, 200.0), 70.0]
     frames = [camera.frame(w, stage_px=97 * i) for i, w in enumerate(widths)] + [
         strip(110.0, level=255.0),

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.deposition.workflow import trial_files
-from pipeline.deposition.workflow.settings import Camera
+from pipeline.deposition.settings import Camera
+from pipeline.reading import trial_files
 from pipeline.store import params
 from tests.foreign.camera import Eye, Stage, tip_of
 
@@ -92,8 +92,10 @@ def test_recordings_of_the_lines_do_in_place_of_pictures(calibrate, pictures):
         time = np.arange(10) * 0.1
         noisy = ((t, frame + np.uint8(i % 3)) for i, t in enumerate(time[:5]))
         names.append(f"line_{k}.mcap")
-        signals = trial_files.Signals(time, 8 * time, np.full(10, 8.0), np.zeros(10))
-        conditions = trial_files.Conditions("A", "0.6", 0, "", 8.0, 0.6, 0.3, 95.0, 0.0, 90.0, -0.0105, 30.0)
+        signals = trial_files.TrialSignals(time, 8 * time, np.full(10, 8.0), np.zeros(10))
+        conditions = trial_files.TrialConditions(
+            "A", "0.6", 0, "", 8.0, 0.6, 0.3, 95.0, 0.0, 90.0, -0.0105, 30.0
+        )
         trial_files.write_trial(names[-1], conditions, noisy, signals, encoding="png")
     status, said, wrong = calibrate(*names, "--widths", "0.5,0.9,1.2")
     assert (status, wrong) == (0, "")

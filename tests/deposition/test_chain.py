@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.deposition import extruder
 from pipeline.deposition.extruder import Extruder
-from pipeline.deposition.parts.chain import Identified, backlash, forecast, identify, simulate
+from pipeline.deposition.parts.chain import IdentifiedExtruder, backlash, forecast, identify, simulate
 from tests.deposition.trained import CREEPING, PLANT, TS, learned, trainings
 from tests.foreign import extruders as foreign_extruders
 
@@ -97,7 +97,7 @@ def test_the_structure_of_an_extruder_that_the_chain_did_not_draw_is_found_and_n
 def test_a_flow_that_falls_otherwise_than_it_rises_is_walked_sample_by_sample():
     rng = np.random.default_rng(1)
     u = rng.standard_normal((3, 60))
-    e = Identified(1.5, 2.0, fall_ratio=0.5)
+    e = IdentifiedExtruder(1.5, 2.0, fall_ratio=0.5)
     flows = simulate([e], u, sample_time_s=TS)[0]
     for row, y in zip(u, flows, strict=True):
         p = 0.0

@@ -24,7 +24,6 @@ from pipeline.deposition.parts.library import Basis, Library
 from pipeline.deposition.parts.library import learned as learned_command
 from pipeline.deposition.toolpath import gcode
 from pipeline.deposition.toolpath.motion import plan
-from pipeline.deposition.workflow import compose_parts
 from tests.deposition.trained import (
     AREA,
     CREEPING,
@@ -225,7 +224,7 @@ def test_a_long_job_is_judged_on_its_first_minutes_with_the_clock_of_these(monke
     monkeypatch.setattr(composition, "EXCERPT_S", 12.0)
     lines = "".join(f"G1 X{40 * k + 24} E1 F480\nG0 X{40 * k + 40}\n" for k in range(1, 12))
     made = composed(f"G21\nG90\nM83\nT0\nG0 X40 Y0 F480\nG4 P30000\n{lines}")
-    share = composition.Share(0, learned(PLANT).materials[0], made.streams[0].r, made.tasks, made.lines)
+    share = composition.ToolShare(0, learned(PLANT).materials[0], made.streams[0].r, made.tasks, made.lines)
     excerpt = composition._excerpt(share, TS)
     begin = int(np.argmax(share.r > 0)) - round(composition.MARGIN_S / TS)
     np.testing.assert_array_equal(excerpt.r, share.r[begin : begin + round(12 / TS)])
@@ -245,7 +244,7 @@ def test_a_command_that_the_drive_cannot_follow_is_sent_ahead_by_delay_and_lag()
     material = learned(PLANT).materials[0]
     chain = material.chain._replace(extruder=material.chain.extruder._replace(delay_s=0.3))
     r = np.repeat([0.0, 1.0, 0.0], [200, 400, 200])
-    share = composition.Share(0, material._replace(chain=chain), r, made.tasks, made.lines)
+    share = composition.ToolShare(0, material._replace(chain=chain), r, made.tasks, made.lines)
     sent = composition._sent_ahead(share, TS)
     ahead = 200 - int(np.argmax(sent > 0.5))
     assert ahead == pytest.approx((0.3 + basis.mean_lag_s(chain.extruder)) / TS, abs=1)
@@ -347,8 +346,7 @@ def test_on_a_machine_whose_flow_nobody_knows_a_composer_scores_the_upper_end_of
     )  # fmt: skip
     ends = np.abs([checks.lines.low_percent, checks.lines.high_percent]).max()
     assert np.all(checks.lines.low_percent <= checks.lines.high_percent)
-    part = compose_parts.Part("dashes", None, None, made, checks, None, None)
-    chosen = next(score for score in compose_parts.upper_ends(part, scores, plain) if score.chosen)
+    chosen = next(score for score in evaluation.upper_ends(made, checks.lines, scores, plain) if score.chosen)
     assert chosen.worst_line_volume_percent == ends > checks.worst_line_volume_percent
 
 

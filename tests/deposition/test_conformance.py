@@ -15,7 +15,7 @@ from pipeline.deposition.parts.conformance import (
     volume_between,
 )
 from pipeline.deposition.reachable import LOSS, lost
-from pipeline.deposition.toolpath.gcode import Refusal
+from pipeline.deposition.toolpath.gcode_words import LineRefusal
 from tests.deposition.test_composition import composed, of_part
 from tests.deposition.trained import AREA, NOMINAL, PLANT, RAMP, TS, learned, protocol
 
@@ -127,8 +127,8 @@ def test_the_ramp_that_would_do_does_and_a_shorter_one_does_not():
 
 def test_refusals_carry_their_lines_and_the_library_s_guesses_only_where_it_is_used():
     made = composed("G21\nG90\nM83\nT0\nG0 X10 F480\nG1 X20 E1\nG4 P200\nG1 X30 E1\nG0 X0\nG4 P3000")
-    reader = [Refusal(3, "cannot be read")]
-    assert conform(made, learned(PLANT), **REPORT, refusals=reader).refused == [(3, "cannot be read")]
+    reader = [LineRefusal(3, "cannot be read")]
+    assert conform(made, learned(PLANT), **REPORT, refusals=reader).refused == [(3, "cannot be read", 1)]
     forced = made._replace(streams=tuple(s._replace(composer="priority") for s in made.streams))
     refused = conform(forced, learned(PLANT), **REPORT, refusals=reader).refused
     assert [r.line for r in refused] == [3, 6]

@@ -15,14 +15,16 @@ import pytest
 import yaml
 
 from pipeline import cli
-from pipeline.deposition.camera.bead import Calibration
-from pipeline.deposition.drive import Drive, asked, follows
+from pipeline.deposition.camera import rendering, simulated_trial
+from pipeline.deposition.drive import Drive, demand, follows
 from pipeline.deposition.extruder import draw, flow
-from pipeline.deposition.learning.training import Noise
-from pipeline.deposition.workflow import train_ilc, trial_files, trial_video
-from pipeline.deposition.workflow.settings import Camera, Printer
-from pipeline.deposition.workflow.tables import LESSONS, TASKS
+from pipeline.deposition.learning import training
+from pipeline.deposition.parts import stored
+from pipeline.deposition.settings import Camera, Printer, trial_conditions
+from pipeline.deposition.tables import LESSONS, LIBRARY, TASKS
+from pipeline.reading import trial_files
 from pipeline.store import artifacts, params
+from stages import train_ilc
 
 ROOT = Path(__file__).parents[2]
 STAGES = ("train_ilc", "segment_library", "compose_parts")
@@ -151,26 +153,23 @@ def machine(asked: int, index: int = 0, **changes) -> Path:
     """A machine of the family prints the command that the stage asked for, and what its camera saw is put
     into the folder; returns the recording."""
     printer, camera = params.load(Printer, "printer"), params.load(Camera, "camera")
-    routine, material = printer.trained()[index], printer.materials[0]
+    routine, material = printer.training_routines()[index], printer.materials[0]
     command = np.loadtxt(
         f"datasets/train_ilc/next/A_routine_{index}_trial_{asked:02d}.csv", delimiter=",", skiprows=1
     )[:, 1]
     plant = draw(np.random.default_rng(3), gain=1.08, time_constant_s=0.8, steady_flow=printer.steady_flow)
-    scene = trial_video.scene(camera, np.random.default_rng(asked))
-    conditions = trial_video.conditions(
-        material,
-        routine,
-        asked,
-        "model_inverse",
-        printer=printer,
-        camera=camera,
-        calibration=Calibration(abs(camera.mm_per_px), 0.0, 0.0, np.zeros(0)),
-    )._replace(**changes)
+    film = rendering.SimulatedCamera(rendering.SCENES[camera.scene], np.random.default_rng(asked))
+    scale = (abs(camera.mm_per_px), 0.0)
+    known = trial_conditions(printer, camera, material, routine, asked, "model_inverse", scale)
     path = Path(f"datasets/raw/deposition/print_{index}_{asked}{'_'.join(changes)}.mcap")
-    simulated = trial_video.SimulatedMachine(plant, printer, camera, scene, Noise(0.03, 0.01, 0.01))
-    trial_video.simulate_recording(
-        path, conditions, simulated, routine, command, np.random.default_rng(100 + asked)
-    )
+    pictures, applied, truth = simulated_trial.simulate_trial(
+        plant, film, routine, command, np.random.default_rng(100 + asked),
+        noise={"white": 0.03, "drift": 0.01, "gain": 0.01}, drive=printer.limits,
+        sample_time_s=printer.sample_time_s, **camera.film(printer),
+    )  # fmt: skip
+    signals = trial_files.TrialSignals(routine.time_s, routine.position, routine.speed, applied, truth)
+    conditions = trial_files.TrialConditions(**known | changes)
+    trial_files.write_trial(path, conditions, pictures, signals, encoding=camera.encoding)
     truth = flow(plant, command, sample_time_s=printer.sample_time_s)
     errors.append(float(np.sqrt(np.mean((truth - routine.r) ** 2))))
     return path
@@ -236,25 +235,15 @@ def record_first_trial(
     """The first trial of a machine, by a recorder that began earlier, in the
     dark, or with its gantry or plunger in other units."""
     printer, camera = params.load(Printer, "printer"), params.load(Camera, "camera")
-    calibration = Calibration(abs(camera.mm_per_px), 0.0, 0.0, np.zeros(0))
-    conditions = trial_video.conditions(
-        printer.materials[0],
-        routine,
-        0,
-        "model_inverse",
-        printer=printer,
-        camera=camera,
-        calibration=calibration,
+    known = trial_conditions(
+        printer, camera, printer.materials[0], routine, 0, "model_inverse", (abs(camera.mm_per_px), 0.0)
     )
+    conditions = trial_files.TrialConditions(**known)
+    film = rendering.SimulatedCamera(rendering.SCENES[camera.scene], np.random.default_rng(0))
     truth = flow(plant, u, sample_time_s=printer.sample_time_s)
-    pictures = trial_video.scene(camera, np.random.default_rng(0)).trial(
-        routine.time_s, truth, routine.position, view=trial_video.view(camera),
-        frame_rate_hz=camera.frames_per_s,
-        nozzle_mm=(printer.nozzle_mm / 2, printer.nozzle_outer_mm / 2),
-        contact_angle_deg=camera.contact_angle_deg,
-    )  # fmt: skip
+    pictures = film.trial(routine.time_s, truth, routine.position, **camera.film(printer))
     frames = ((time + late_s, 0 * frame if dark else frame) for time, frame in pictures)
-    signals = trial_files.Signals(
+    signals = trial_files.TrialSignals(
         routine.time_s + late_s, shown_mm * routine.position, routine.speed, command * u
     )
     trial_files.write_trial(path, conditions, frames, signals, encoding="jpeg")
@@ -263,7 +252,7 @@ def record_first_trial(
 def test_a_trial_begins_where_its_gantry_does_whenever_its_recorder_began(project):
     printer, camera = params.load(Printer, "printer"), params.load(Camera, "camera")
     routine, plant = (
-        printer.trained()[0],
+        printer.training_routines()[0],
         draw(np.random.default_rng(3), gain=1.08, time_constant_s=0.8, steady_flow=printer.steady_flow),
     )
     u = routine.r / 1.08
@@ -271,7 +260,9 @@ def test_a_trial_begins_where_its_gantry_does_whenever_its_recorder_began(projec
     # a clock of the calendar is counted from its whole second: this one is 0.41 s late
     for late_s in (0.0, 2.0, 1.7e9 + 0.41):
         record_first_trial(Path("trial.mcap"), plant, routine, u, late_s=late_s)
-        measured = trial_video.measure_trial("trial.mcap", routine, printer=printer, camera=camera)
+        recording = trial_files.open_trial("trial.mcap", **camera.recording)
+        values = train_ilc.read(recording, camera)
+        measured = train_ilc.measure_trial(recording, values, [], routine, printer, camera)
         flows.append(measured.flow.flow)
     # the clock of a record holds nanoseconds; a tenth of a percent of
     # the steady flow is far below what pictures tell
@@ -283,7 +274,7 @@ def test_a_trial_in_the_dark_or_in_other_units_is_refused_by_file(project, capsy
     stage("train_ilc")
     printer = params.load(Printer, "printer")
     routine, plant = (
-        printer.trained()[0],
+        printer.training_routines()[0],
         draw(np.random.default_rng(3), gain=1.08, time_constant_s=0.8, steady_flow=printer.steady_flow),
     )
     path = Path("datasets/raw/deposition/trial.mcap")
@@ -337,14 +328,11 @@ def test_a_pixel_without_a_size_is_refused_by_its_key(project, capsys):
 
 
 def test_what_was_learned_survives_being_stored(finished):
-    from pipeline.deposition.workflow.segment_library import read_learned, restored, stored
-
-    learned = read_learned(
-        "datasets/segment_library/library.parquet", "datasets/segment_library/learned.json"
-    )
-    table, rest = stored(learned)
-    again = restored(
-        {name: np.array(values, object) for name, values in table.items()}, json.loads(json.dumps(rest))
+    table = artifacts.read_table("datasets/segment_library/library.parquet", LIBRARY)
+    learned = stored.restore(table, artifacts.read_json("datasets/segment_library/learned.json"))
+    again = stored.restore(
+        {name: np.array(values, object) for name, values in stored.to_table(learned.library).items()},
+        json.loads(json.dumps(stored.to_json(learned))),
     )
     assert again.library.marks == learned.library.marks
     for a, b in zip(again.materials, learned.materials, strict=True):
@@ -357,14 +345,12 @@ def test_what_was_learned_survives_being_stored(finished):
 
 def test_learning_is_what_its_parts_are():
     """Figures of one material come from two processes: put together nothing is lost."""
-    a = train_ilc.Part({("A", 0): [1]}, {}, {"A": {"x": 1}}, {"A": {"gamma": 1}})
-    b = train_ilc.Part(
-        {("A", 0): [2], ("B", 0): [3]}, {("A", 0): [4]}, {"A": {"y": 2}}, {"A": {"pixels": 2}, "B": {}}
-    )
-    joint = train_ilc.joined([a, b])
-    assert joint.sequences == {("A", 0): [1, 2], ("B", 0): [3]}
-    assert joint.models == {"A": {"x": 1, "y": 2}}
-    assert joint.metrics == {"A": {"gamma": 1, "pixels": 2}, "B": {}}
+    a = ({("A", 0): [1]}, {}, {"A": {"x": 1}}, {"A": {"gamma": 1}})
+    b = ({("A", 0): [2], ("B", 0): [3]}, {("A", 0): [4]}, {"A": {"y": 2}}, {"A": {"pixels": 2}, "B": {}})
+    sequences, measured, models, figures = training.join([a, b])
+    assert sequences == {("A", 0): [1, 2], ("B", 0): [3]} and measured == {("A", 0): [4]}
+    assert models == {"A": {"x": 1, "y": 2}}
+    assert figures == {"A": {"gamma": 1, "pixels": 2}, "B": {}}
 
 
 def test_every_command_that_is_learned_with_obeys_the_declared_drive(project):
@@ -374,7 +360,7 @@ def test_every_command_that_is_learned_with_obeys_the_declared_drive(project):
     stage("train_ilc")
     printer = params.load(Printer, "printer")
     # slower than on-off control's own ramps
-    assert 8.0 < asked(printer.trained()[0].r / 1.08, sample_time_s=printer.sample_time_s).speed_mm_per_s
+    assert 8.0 < demand(printer.training_routines()[0].r / 1.08, sample_time_s=printer.sample_time_s)[1]
     table = artifacts.read_table("datasets/train_ilc/lessons.parquet", LESSONS)
     commands, step = np.array(table["command_mm"]), 8.0 * printer.sample_time_s
     first = np.array(table["time_s"]) == 0.0

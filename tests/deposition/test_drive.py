@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.deposition.drive import UNLIMITED, Drive, asked, at_limit, follows, obeyed
+from pipeline.deposition.drive import UNLIMITED, Drive, at_limit, demand, follows, obeyed
 from pipeline.deposition.extruder import Extruder, backlash, flow
 from pipeline.deposition.learning import ilc
 from pipeline.deposition.parts import basis
@@ -42,10 +42,10 @@ def test_what_the_drive_did_it_can_do_again_and_rows_stand_alone():
 
 
 def test_a_command_asks_for_its_peak_and_its_steepest_step_from_rest():
-    most = asked(np.array([-0.5, 0.1, -3.0, -2.9]), sample_time_s=0.1)
-    assert most.command_mm == 3.0 and most.speed_mm_per_s == pytest.approx(31.0)
-    assert asked(np.array([2.0, 2.0]), sample_time_s=0.1).speed_mm_per_s == pytest.approx(20.0)
-    assert asked(np.zeros(0), sample_time_s=0.1) == (0.0, 0.0)
+    command_mm, speed = demand(np.array([-0.5, 0.1, -3.0, -2.9]), sample_time_s=0.1)
+    assert command_mm == 3.0 and speed == pytest.approx(31.0)
+    assert demand(np.array([2.0, 2.0]), sample_time_s=0.1)[1] == pytest.approx(20.0)
+    assert demand(np.zeros(0), sample_time_s=0.1) == (0.0, 0.0)
 
 
 def test_samples_at_the_amplitude_and_at_the_speed_are_at_a_limit():

@@ -10,13 +10,15 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.deposition.parts import extrusion, leads
-from pipeline.deposition.parts.conformance import Refused
+from pipeline.commands import compose
+from pipeline.deposition.parts import extrusion, leads, part_motion, part_report
+from pipeline.deposition.settings import ComposeParts, Printer
 from pipeline.deposition.toolpath import gcode, motion
 from pipeline.deposition.toolpath.gcode import Kind
-from pipeline.deposition.workflow import compose_parts, exports, part_motion, part_programs
-from pipeline.deposition.workflow.settings import ComposeParts, Printer
+from pipeline.deposition.toolpath.gcode_words import LineRefusal
+from pipeline.reading import part_files
 from pipeline.store import params
+from stages.compose_parts import compose_part
 from tests.deposition.trained import NOZZLE, PLANT, TS, learned
 
 ROOT = Path(__file__).parents[2]
@@ -33,7 +35,7 @@ def machine():
 def part(tmp_path, machine, text, **asked):
     path = tmp_path / "job.gcode"
     path.write_text(text)
-    return compose_parts.compose(path, learned(PLANT), *machine, part_programs.Asked(**asked))
+    return compose_part(path, learned(PLANT), *machine, **asked)
 
 
 def line(area_mm2: float, length: float = 40, head: str = "; filament_diameter = 1.75\n") -> str:
@@ -59,12 +61,12 @@ def test_the_command_presses_out_what_e_asks_for(tmp_path, machine, share):
 def test_the_difference_to_the_declared_bead_is_told(tmp_path, machine):
     bead = machine[0].bead_area_mm2
     done = part(tmp_path, machine, line(bead / 3.2))
-    text = compose_parts.summary_lines(done)
+    text = part_report.summary_lines(done)
     assert (
         "volumes by E, diameter 1.75 mm, as the program says" in text
         and "0.31 of the declared bead's" in text
     )
-    told = compose_parts.report(done)["program"]["e_beside_declared_bead"][0]
+    told = part_report.report(done)["program"]["e_beside_declared_bead"][0]
     assert told["by_e_mm3"] / told["declared_mm3"] == pytest.approx(1 / 3.2, rel=1e-5)
     assert told["area_mm2"] == pytest.approx([bead / 3.2] * 3, rel=1e-5)
 
@@ -98,7 +100,7 @@ def test_the_diameter_is_what_was_asked_for_else_the_program_s_else_the_machine_
 def test_without_a_diameter_lines_are_declared_beads_and_why_is_told(tmp_path, machine, head, asked, why):
     done = part(tmp_path, machine, line(0.1, head=head), **asked)
     assert done.conformance.lines.planned_mm3[0] == pytest.approx(40 * machine[0].bead_area_mm2)
-    assert f"T0: declared bead: {why}" in compose_parts.summary_lines(done)
+    assert f"T0: declared bead: {why}" in part_report.summary_lines(done)
 
 
 def test_flow_percent_and_cubic_millimetres_count():
@@ -136,7 +138,7 @@ def test_dots_are_not_told_in_percent(tmp_path, machine):
     text = "G21\nG90\nM83\nG0 X5 F480\nG1 X45 E40 F480\nG0 X60\nG1 X60.02 E.02\nG0 X80\nG1 X120 E40\nG0 X0\n"
     lines = part(tmp_path, machine, text).conformance.lines
     assert np.isnan(lines.error_percent).tolist() == [False, True, False]
-    text = compose_parts.summary_lines(part(tmp_path, machine, text))
+    text = part_report.summary_lines(part(tmp_path, machine, text))
     assert "of all lines the worst is line 7" not in text and re.search(r"worst is line [59]:", text)
 
 
@@ -144,11 +146,11 @@ def test_the_summary_is_short_whatever_the_program_holds(tmp_path, machine):
     words = "".join(f"WORD_{chr(65 + k % 26)}{chr(65 + k // 26)}A A=1\n" for k in range(200))
     text = line(0.3) + words * 3 + "G1 X Y\n" * 500 + "".join(f"N{k} G1 X1 *1\n" for k in range(300))
     done = part(tmp_path, machine, text)
-    told = compose_parts.summary_lines(done).splitlines()
+    told = part_report.summary_lines(done).splitlines()
     assert len(told) < 30 and max(map(len, told)) < 300
     assert "and 188 more words that are no moves" in told
     assert any("(and 499 more such)" in one for one in told)
-    report = compose_parts.report(done)
+    report = part_report.report(done)
     assert len(report["program"]["words"]) == 200 and report["program"]["words"][0]["count"] == 3
     assert sum(report["program"]["lines"].values()) == report["lines_of_the_program"]
     assert report["program"]["lines"]["refused"] == 800 and len(report["refused"]) == 2
@@ -167,7 +169,7 @@ def test_commands_are_the_same_in_every_format(tmp_path, machine):
     from mcap.reader import make_reader
 
     done = part(tmp_path, machine, TWO)
-    files = exports.write(done, tmp_path / "out", exports.FORMATS)
+    files = compose.write(done, tmp_path / "out", compose.FORMATS)
     assert sorted(file.name for file in files) == [
         "job.conformance.json", "job.leads.gcode", "job.lines.parquet", "job.signal.csv", "job.signal.mcap",
         "job.signal.parquet", "job.tasks.parquet",
@@ -191,7 +193,7 @@ def test_commands_are_the_same_in_every_format(tmp_path, machine):
 
 def test_gcode_with_leads_moves_gantry_and_plunger_as_the_signal_does(tmp_path, machine):
     done = part(tmp_path, machine, TWO)
-    text = exports.with_leads(done)
+    text = compose.with_leads(done)
     program, Ts = gcode.parse(text), done.composed.sample_time_s
     m = program.moves
     assert program.refusals == [] and program.extruder == "E"
@@ -221,7 +223,7 @@ def test_gcode_with_leads_moves_gantry_and_plunger_as_the_signal_does(tmp_path, 
 
 def test_leads_prime_ahead_of_a_line_and_let_back_ahead_of_its_end(tmp_path, machine):
     done = part(tmp_path, machine, line(machine[0].bead_area_mm2, length=60))
-    m = gcode.parse(exports.with_leads(done)).moves
+    m = gcode.parse(compose.with_leads(done)).moves
     first = int(np.argmax((m.start[:, 0] < 5.001) & (m.end[:, 0] > 5.001)))
     peak = np.cumsum(m.e)[: first + 1].max()
     steady = np.interp(40, m.end[first:, 0], np.cumsum(m.e)[first:])
@@ -282,31 +284,31 @@ def test_bends_keep_straight_lines_within_the_tolerance():
 def test_flags_out_of_range_are_refused_by_name(flags, why):
     given = {"scale": 1.0, "speed": 1.0, "filament_mm": None, "extruder": "", "bead": "e"} | flags
     with pytest.raises(ValueError, match=why):
-        part_programs.asked(**given)
+        compose.request(**given)
     with pytest.raises(ValueError, match=r"--as: expected some of csv, parquet, mcap, gcode, found xls"):
-        exports.formats("csv,xls")
+        compose.formats("csv,xls")
 
 
 def test_pipes_and_large_files_are_refused_without_being_read(tmp_path, monkeypatch):
     os.mkfifo(tmp_path / "pipe.gcode")
     with pytest.raises(ValueError, match=r"pipe\.gcode"):
-        part_programs.read(tmp_path / "pipe.gcode")
+        part_files.read_part_program(tmp_path / "pipe.gcode")
     with (tmp_path / "large.gcode").open("wb") as file:
         file.truncate(2_000_000_000)
     with pytest.raises(
         ValueError, match=r"large\.gcode: expected at most 1,000 MB of G-code, found 2,000 MB"
     ):
-        part_programs.read(tmp_path / "large.gcode")
+        part_files.read_part_program(tmp_path / "large.gcode")
     with pytest.raises(ValueError, match="name a part program"):
-        part_programs.read(tmp_path / "none.gcode")
+        part_files.read_part_program(tmp_path / "none.gcode")
 
 
 def test_what_the_library_lacks_is_told_once_a_task_with_the_number_of_its_lines(tmp_path, machine):
     done = part(tmp_path, machine, TWO)
-    many = [Refused(k, f"the library lacks Corner at {k} mm/s; an error of {k} %") for k in range(40, 90)]
-    many += [Refused(7, "the library lacks Stop at 8 mm/s")]
+    many = [LineRefusal(k, f"the library lacks Corner at {k} mm/s; an error of {k} %") for k in range(40, 90)]
+    many += [LineRefusal(7, "the library lacks Stop at 8 mm/s")]
     program = gcode.parse("G1 X1\n" + "G1 X Y\n" * 3)
-    kinds = part_programs.grouped(done.conformance._replace(refused=many), program.refusals)
+    kinds = part_report.grouped(done.conformance._replace(refused=many), program.refusals)
     assert [(one.line, one.count) for one in kinds] == [(2, 3), (7, 1), (40, 50)]
     assert kinds[2].why == "the library lacks Corner at 40 mm/s; an error of 40 % (and 49 more such)"
 

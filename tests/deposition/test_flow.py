@@ -10,7 +10,7 @@ import pytest
 from pipeline.deposition.camera.bead import area, measure
 from pipeline.deposition.camera.edges import BLOCK
 from pipeline.deposition.camera.flow import Sections, View, deposit_share, estimate, sections
-from pipeline.deposition.camera.rendering import HARD, NOMINAL, Camera
+from pipeline.deposition.camera.rendering import HARD, NOMINAL, SimulatedCamera
 from pipeline.deposition.extruder import draw, flow, routine
 
 AREA, SPEED = float(area(0.88, 90.0)), 8.0
@@ -243,7 +243,7 @@ def test_what_no_frame_saw_is_not_observable_and_the_rest_does_not_suffer():
 def test_through_pixels_the_flow_is_within_2_5_percent_and_6_in_the_corner_without_lag(case):
     Q = {"wanted": SHORT.r, "on-off": on_off(SHORT), "between": (SHORT.r + on_off(SHORT)) / 2}[case]
     cv2.setNumThreads(1)
-    estimated = inverted(SHORT, seen_through(Camera(NOMINAL, np.random.default_rng(20)), SHORT, Q))
+    estimated = inverted(SHORT, seen_through(SimulatedCamera(NOMINAL, np.random.default_rng(20)), SHORT, Q))
     corner = (SHORT.time_s > SHORT.pause_s[0] - 0.5) & (SHORT.time_s < SHORT.pause_s[1] + 0.5)
     assert percent(estimated, Q) <= 2.5
     assert percent(estimated, Q, corner) <= 6.0
@@ -253,7 +253,7 @@ def test_through_pixels_the_flow_is_within_2_5_percent_and_6_in_the_corner_witho
 
 def test_through_hard_pixels_the_flow_is_within_the_bars_too():
     Q = on_off(SHORT)
-    estimated = inverted(SHORT, seen_through(Camera(HARD, np.random.default_rng(21)), SHORT, Q))
+    estimated = inverted(SHORT, seen_through(SimulatedCamera(HARD, np.random.default_rng(21)), SHORT, Q))
     corner = (SHORT.time_s > SHORT.pause_s[0] - 0.5) & (SHORT.time_s < SHORT.pause_s[1] + 0.5)
     assert percent(estimated, Q) <= 2.5
     assert percent(estimated, Q, corner) <= 6.0
@@ -261,7 +261,9 @@ def test_through_hard_pixels_the_flow_is_within_the_bars_too():
 
 def test_a_line_printed_the_other_way_is_read_by_a_mirrored_view():
     Q = on_off(SHORT)
-    places = seen_through(Camera(NOMINAL, np.random.default_rng(22)), SHORT, Q, view=View(-1 / 125, -9.0))
+    places = seen_through(
+        SimulatedCamera(NOMINAL, np.random.default_rng(22)), SHORT, Q, view=View(-1 / 125, -9.0)
+    )
     assert percent(inverted(SHORT, places), Q) <= 2.5
 
 

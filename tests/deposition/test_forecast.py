@@ -51,11 +51,11 @@ def test_the_true_error_lies_within_the_interval_and_the_interval_is_narrow():
     def flows(command):
         return forecast.flows(MATERIAL.chain, MATERIAL.missed, command, task.r, sample_time_s=TS)
 
-    told = forecast.error_percent(flows(u), flows(on_off), task.r)
+    low, median, high = forecast.error_percent(flows(u), flows(on_off), task.r)
     made, first = (flow(PLANT, command, sample_time_s=TS) - task.r for command in (u, on_off))
     true = 100 * np.linalg.norm(made) / np.linalg.norm(first)
-    assert told.low <= true <= told.high
-    assert told.low < told.median < told.high < 1.1 * told.low + 3
+    assert low <= true <= high
+    assert low < median < high < 1.1 * low + 3
 
 
 def test_what_was_missed_is_carried_to_its_event_in_proportion_to_the_flow():
@@ -83,7 +83,7 @@ def test_the_ends_of_rows_that_come_one_by_one_are_those_of_the_interval():
 
 
 def test_the_routines_themselves_are_judged():
-    assert all(judged(t.r) == forecast.Judged(True, "", "") for t in trainings(PLANT))
+    assert all(judged(t.r) == forecast.ForecastJudgement(True, "", "") for t in trainings(PLANT))
 
 
 @pytest.mark.parametrize(

@@ -353,9 +353,7 @@ def test_the_convergence_test_counts_where_q_ends(monkeypatch):
 
     def gamma():
         rng, noise = np.random.default_rng(0), training.Noise(0.03, 0.01, 0.01)
-        return training.convergence_of_model_inverse(
-            sequence, rng, noise, plants=2, settings=settings
-        ).nominal
+        return training.convergence_of_model_inverse(sequence, rng, noise, plants=2, settings=settings)[0]
 
     ending = gamma()
     monkeypatch.setattr(ilc, "known_share", lambda f, model: np.ones_like(f))
@@ -624,8 +622,10 @@ def test_the_table_says_what_each_trial_was():
     first, second = ilc.table(
         trials, r, steady=0.5, drive=Drive(2.0, np.inf, 0.0), sample_time_s=TS, rise=0.1
     )
-    assert first == ilc.Row(0, pytest.approx(0.4), pytest.approx(0.5), 1.0, 4.0, 0.5, False)
-    assert second == ilc.Row(1, pytest.approx(0.1), pytest.approx(0.1), pytest.approx(0.25), 2.0, 0.0, False)
+    assert first == ilc.TrialRow(0, pytest.approx(0.4), pytest.approx(0.5), 1.0, 4.0, 0.5, False)
+    assert second == ilc.TrialRow(
+        1, pytest.approx(0.1), pytest.approx(0.1), pytest.approx(0.25), 2.0, 0.0, False
+    )
 
 
 def test_a_trial_of_another_length_or_without_flow_is_refused_by_number():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.deposition.camera import latency
-from pipeline.deposition.camera.latency import Gantry, Latency
+from pipeline.deposition.camera.latency import Latency
 from pipeline.deposition.extruder import Extruder, flow, routine
 from tests.foreign.camera import GROUNDS, Eye, trial
 
@@ -33,7 +33,7 @@ def told(eye: Eye, delay_s: float = 0.1, seed: int = 3) -> Latency:
     signals = [cv2.resize(frame[:, FIRST:], size, interpolation=cv2.INTER_AREA) for _, frame in frames]
     return latency.estimate(
         np.array([time for time, _ in frames]), np.array(signals),
-        Gantry(ROUTINE.time_s, ROUTINE.position), step_mm=-STEP_PX * eye.mm_per_px,
+        (ROUTINE.time_s, ROUTINE.position), step_mm=-STEP_PX * eye.mm_per_px,
     )  # fmt: skip
 
 
@@ -53,7 +53,7 @@ def test_pictures_of_noise_tell_no_latency():
     time = np.arange(150) / 30
     for seed in range(4):
         noise = np.random.default_rng(seed).normal(100, 3, (150, 12, 40))
-        gantry = Gantry(ROUTINE.time_s, ROUTINE.position)
+        gantry = (ROUTINE.time_s, ROUTINE.position)
         assert latency.estimate(time, noise, gantry, step_mm=-0.08) == latency.UNTOLD
 
 
@@ -64,7 +64,7 @@ def test_at_an_even_speed_no_latency_is_told():
     signals = np.array(
         [[np.interp(8 * t + 0.08 * np.arange(40), np.arange(4000) * 0.02, ground)] for t in frames]
     )
-    assert latency.estimate(frames, signals, Gantry(time, 8 * time), step_mm=0.08) == latency.UNTOLD
+    assert latency.estimate(frames, signals, (time, 8 * time), step_mm=0.08) == latency.UNTOLD
 
 
 def test_several_recordings_count_by_their_certainty_and_scatter():

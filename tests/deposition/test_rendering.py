@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.deposition.camera.bead import area
 from pipeline.deposition.camera.flow import View
-from pipeline.deposition.camera.rendering import HARD, NOMINAL, Camera
+from pipeline.deposition.camera.rendering import HARD, NOMINAL, SimulatedCamera
 
 CLEAN = NOMINAL._replace(
     shading=0.0,
@@ -24,7 +24,7 @@ TIME = np.arange(0.0, 2.0, 0.02)
 
 
 def trial(scene, flow, position, *, seed=0, view=VIEW):
-    camera = Camera(scene, np.random.default_rng(seed))
+    camera = SimulatedCamera(scene, np.random.default_rng(seed))
     return list(
         camera.trial(
             TIME, flow, position, view=view, frame_rate_hz=30.0, nozzle_mm=NOZZLE, contact_angle_deg=90.0
@@ -39,7 +39,7 @@ def summed_width(frame: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("width", [12.0, 60.1, 110.33, 300.0])
 def test_the_bead_is_as_wide_as_asked_for_on_average_over_the_columns(width):
-    camera = Camera(CLEAN, np.random.default_rng(1))
+    camera = SimulatedCamera(CLEAN, np.random.default_rng(1))
     measured = np.mean([summed_width(camera.frame(width, stage_px=0)) for _ in range(5)])
     assert measured == pytest.approx(
         width, abs=0.03
@@ -47,7 +47,7 @@ def test_the_bead_is_as_wide_as_asked_for_on_average_over_the_columns(width):
 
 
 def test_a_tilted_bead_is_as_wide_across_its_line():
-    camera = Camera(CLEAN._replace(tilt_deg=2.0), np.random.default_rng(1))
+    camera = SimulatedCamera(CLEAN._replace(tilt_deg=2.0), np.random.default_rng(1))
     measured = summed_width(camera.frame(110.0, stage_px=0)).mean() * np.cos(np.radians(2.0))
     assert measured == pytest.approx(110.0, abs=0.05)
 
@@ -76,7 +76,7 @@ def test_a_pause_lays_its_volume_over_one_footprint():
 
 def test_what_lies_on_the_stage_moves_with_it_and_the_line_does_not():
     still = NOMINAL._replace(noise=0.0, glare=0.0)
-    camera = Camera(still, np.random.default_rng(2))
+    camera = SimulatedCamera(still, np.random.default_rng(2))
     a, b = (camera.frame(0.0, stage_px=k).astype(float) for k in (0, 40))
     np.testing.assert_array_equal(a[:, 40:], b[:, :-40])
 
@@ -106,7 +106,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others():
 
 
 def test_one_camera_lays_every_trial_on_a_fresh_part_of_the_stage():
-    camera = Camera(NOMINAL._replace(noise=0.0), np.random.default_rng(7))
+    camera = SimulatedCamera(NOMINAL._replace(noise=0.0), np.random.default_rng(7))
     first, second = (
         next(
             camera.trial(

@@ -14,25 +14,24 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
-from pipeline.deposition.workflow import trial_files
-from pipeline.deposition.workflow.trial_files import (
+from pipeline.reading import image_messages, trial_files
+from pipeline.reading.mcap_frames import ENCODERS
+from pipeline.reading.recordings import read
+from pipeline.reading.trial_files import (
     COMMAND,
     FLOW,
     POSITION,
     SPEED,
-    Conditions,
-    Signals,
-    Trial,
+    TrialConditions,
+    TrialRecording,
+    TrialSignals,
     read_trial,
     write_command,
     write_trial,
 )
-from pipeline.reading import image_messages
-from pipeline.reading.recordings import read
-from pipeline.store.mcap_frames import ENCODERS
 from tests.mcap_writing import NO, ZSTD, Written, cdr, chunks, flipped
 
-CONDITIONS = Conditions(
+CONDITIONS = TrialConditions(
     material="A",
     nozzle="0.6 mm",
     trial=3,
@@ -71,12 +70,12 @@ def pictures(count: int = 60, **kind):
 
 def written(path: Path, encoding: str = "raw", frames=None, **changes) -> Path:
     conditions = changes.pop("conditions", CONDITIONS)
-    signals = Signals(**(SIGNALS | changes))
+    signals = TrialSignals(**(SIGNALS | changes))
     write_trial(path, conditions, pictures() if frames is None else frames, signals, encoding=encoding)
     return path
 
 
-def opened(path: Path, **settings) -> Trial:
+def opened(path: Path, **settings) -> TrialRecording:
     return read_trial(path, **({"unreadable_share": 0.1} | settings))
 
 
@@ -546,7 +545,7 @@ def large(tmp_path_factory) -> bytes:
     ).read_bytes()
 
 
-def intact(trial: Trial) -> int:
+def intact(trial: TrialRecording) -> int:
     """How many frames came out; each is the one that was written at its time, and so are the samples."""
     time, command = trial.signals["command_mm"]
     np.testing.assert_array_equal(command, SIGNALS["command_mm"][np.rint(time * 50).astype(int)])

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.deposition.camera import bead
+from pipeline.deposition.camera import bead, latency, pose, trial_flow
 from pipeline.deposition.extruder import Extruder, flow, routine
-from pipeline.deposition.workflow import trial_files, trial_readings, trial_video
-from pipeline.deposition.workflow.settings import Camera, Printer
+from pipeline.deposition.settings import Camera, Printer, trial_conditions
+from pipeline.reading import trial_files
 from pipeline.store import params
+from stages import train_ilc
 from tests.foreign.camera import Eye, tip_of, trial
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,20 +37,22 @@ def settings(**changes) -> Camera:
 def recorded(path: Path, eye: Eye) -> Path:
     frames = trial(eye, ROUTINE.time_s, TRUTH, ROUTINE.position, np.random.default_rng(5), hz=30,
                    contact_angle_deg=90.0)  # fmt: skip
-    scale = bead.Calibration(eye.mm_per_px, 0.0, 0.0, np.zeros(0))
-    conditions = trial_video.conditions(
-        PRINTER.materials[0], ROUTINE, 0, "on_off", printer=PRINTER, camera=settings(), calibration=scale
+    known = trial_conditions(
+        PRINTER, settings(), PRINTER.materials[0], ROUTINE, 0, "on_off", (eye.mm_per_px, 0.0)
     )
-    signals = trial_files.Signals(ROUTINE.time_s, ROUTINE.position, ROUTINE.speed, U, TRUTH)
+    conditions = trial_files.TrialConditions(**known)
+    signals = trial_files.TrialSignals(ROUTINE.time_s, ROUTINE.position, ROUTINE.speed, U, TRUTH)
     trial_files.write_trial(path, conditions, frames, signals, encoding="jpeg")
     return path
 
 
-def flow_of(path: Path, camera: Camera, **other) -> trial_video.MeasuredTrial:
-    return trial_video.measure_trial(path, ROUTINE, printer=PRINTER, camera=camera, **other)
+def flow_of(path: Path, camera: Camera, memo: Path | None = None) -> trial_flow.MeasuredTrial:
+    recording = trial_files.open_trial(path, **camera.recording)
+    values = train_ilc.read(recording, camera, memo)
+    return train_ilc.measure_trial(recording, values, [], ROUTINE, PRINTER, camera)
 
 
-def error(measured: trial_video.MeasuredTrial) -> float:
+def error(measured: trial_flow.MeasuredTrial) -> float:
     """R.m.s. error of the flow in % of the steady flow, where it could be observed."""
     miss = measured.trial.y - TRUTH
     return 100 * float(np.sqrt(np.nanmean(miss**2))) / ROUTINE.r.max()
@@ -73,7 +76,7 @@ def test_a_turned_and_late_camera_measures_the_flow_whether_its_rotation_is_give
     camera = settings(tip_px=tip(140.0), rotation_deg=rotation_deg, columns=[76, 200])
     measured = flow_of(turned, camera)
     assert measured.of_camera.latency_s == pytest.approx(0.08, abs=0.005)
-    figures = trial_video.latency_figures([measured])
+    figures = trial_flow.latency_figures([measured])
     assert figures["latency_s"] == measured.of_camera.latency_s
     # dark edges of this camera err by half a pixel in 55, 2 % of the flow, before calibration
     assert error(measured) < 6
@@ -82,9 +85,9 @@ def test_a_turned_and_late_camera_measures_the_flow_whether_its_rotation_is_give
 
 
 def test_a_latency_that_is_not_told_is_said_to_be_unknown(turned, monkeypatch):
-    monkeypatch.setattr(trial_readings.latency, "estimate", lambda *_, **__: trial_readings.latency.UNTOLD)
+    monkeypatch.setattr(latency, "estimate", lambda *_, **__: latency.UNTOLD)
     measured = flow_of(turned, settings(tip_px=tip(140.0), rotation_deg=140.0, columns=[76, 200]))
-    assert trial_video.latency_figures([measured]) == {"latency_s": None, "latency_deviation_s": None}
+    assert trial_flow.latency_figures([measured]) == {"latency_s": None, "latency_deviation_s": None}
 
 
 def test_a_recording_is_measured_once_and_anew_where_file_or_settings_change(turned, tmp_path, monkeypatch):
@@ -108,8 +111,8 @@ def test_a_recording_is_measured_once_and_anew_where_file_or_settings_change(tur
 def test_the_edge_bias_of_calibration_comes_off_the_widths():
     camera = settings(known_widths_mm=[0.5, 0.9, 1.3], edge_bias_px=[1.0, 2.0, 2.0])
     seen = np.array([0.5, 0.7, 0.9, 1.2]) / 0.016 + np.array([1.0, 1.5, 2.0, 2.0])
-    np.testing.assert_allclose(trial_video.width_px(seen, camera) * 0.016, [0.5, 0.7, 0.9, 1.2], atol=1e-9)
-    assert trial_video.width_px(seen, settings()) is seen
+    np.testing.assert_allclose(camera.mounting.true_px(seen) * 0.016, [0.5, 0.7, 0.9, 1.2], atol=1e-9)
+    assert settings().mounting.true_px(seen) is seen
 
 
 def test_the_mapping_of_topics_reaches_a_recording_of_other_names(turned):
@@ -117,7 +120,7 @@ def test_the_mapping_of_topics_reaches_a_recording_of_other_names(turned):
     camera = Camera.model_validate(
         settings().model_dump() | {"topics": {"image": "", "time": "", "mapping": mapping}}
     )
-    signals = trial_readings.opened(turned, camera).signals
+    signals = trial_files.open_trial(turned, **camera.recording).signals
     np.testing.assert_allclose(signals["position_mm"][1], 2 * ROUTINE.speed + 1, atol=1e-9)
     for name, unit, words in (
         ("positon_mm", "mm", "camera.topics.mapping.positon_mm is no signal of a trial"),
@@ -128,7 +131,7 @@ def test_the_mapping_of_topics_reaches_a_recording_of_other_names(turned):
             settings().model_dump() | {"topics": {"image": "", "time": "", "mapping": mapping}}
         )
         with pytest.raises(ValueError, match=words):
-            trial_readings.opened(turned, wrong)
+            trial_files.open_trial(turned, **wrong.recording)
 
 
 def test_without_a_tip_a_level_line_stays_as_it_lies_and_an_askew_one_is_turned_by_what_its_frames_show(
@@ -137,5 +140,7 @@ def test_without_a_tip_a_level_line_stays_as_it_lies_and_an_askew_one_is_turned_
     camera = settings(tip_px=None, rotation_deg=None)
     for angle in (0.0, 25.0):
         path = recorded(tmp_path / f"{angle:g}.mcap", EYE._replace(angle_deg=angle, ground="striped"))
-        pose = trial_readings.pose_of(trial_readings.opened(path, camera), camera)
-        assert (pose is None) if not angle else pose.angle_deg == pytest.approx(angle, abs=2)
+        recording = trial_files.open_trial(path, **camera.recording)
+        frames, gantry = recording.frames, recording.signals["position_mm"]
+        turn = pose.pose(camera.mounting, frames.time_s, gantry, frames.chosen)
+        assert (turn is None) if not angle else turn.angle_deg == pytest.approx(angle, abs=2)

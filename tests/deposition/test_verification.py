@@ -14,7 +14,7 @@ from pipeline.deposition.parts.forecast import NAMES
 from pipeline.deposition.toolpath import gcode
 from pipeline.deposition.toolpath.motion import plan
 from pipeline.deposition.toolpath.tasks import printed_lines
-from pipeline.deposition.workflow import verify_part
+from pipeline.reading import part_files
 from tests.deposition.test_composition import MACHINE, composed, of_part
 from tests.deposition.trained import AREA, NOMINAL, PLANT, TS, learned, percent_of_on_off
 from tests.foreign import parts as foreign_parts
@@ -41,10 +41,10 @@ def test_the_print_is_shorter_than_a_long_part_and_holds_its_hardest_events():
     made = composed(LONG)
     windows = hardest(made)
     assert {window.event for window in windows} <= set(NAMES) and 1 <= len(windows) <= 2
-    found = verification.program("long", windows, made.lines, 0, bead_area_mm2=AREA)
-    assert found.duration_s < 0.2 * len(made.streams[0].r) * TS
+    text, duration_s = verification.program("long", windows, made.lines, 0, bead_area_mm2=AREA)
+    assert duration_s < 0.2 * len(made.streams[0].r) * TS
     # the ends of a long line remain, at the speed of the part
-    lines = lines_of(found.text)
+    lines = lines_of(text)
     np.testing.assert_allclose(lines.speed, 8.0)
     np.testing.assert_allclose(lines.length, 2 * verification.PLATEAU_S * 8.0)
 
@@ -52,7 +52,7 @@ def test_the_print_is_shorter_than_a_long_part_and_holds_its_hardest_events():
 def test_runs_and_gaps_of_the_print_are_those_of_the_part():
     made = of_part("dashes")
     windows = hardest(made)
-    lines = lines_of(verification.program("dashes", windows, made.lines, 0, bead_area_mm2=AREA).text)
+    lines = lines_of(verification.program("dashes", windows, made.lines, 0, bead_area_mm2=AREA)[0])
     mine = np.concatenate([window.lines for window in windows])
     np.testing.assert_allclose(lines.length, made.lines.length[mine], atol=1e-3)
     gaps = lines.begin_s[1:] - lines.end_s[:-1]
@@ -131,11 +131,11 @@ def written(tmp_path, text):
 
 def test_a_measured_print_is_read_at_the_clock_of_the_command(tmp_path):
     path = written(tmp_path, "time_s,flow_mm3_per_s\n0.02,1\n0.04,2\n0.06,3\n")
-    y, u = verify_part.read_measured(path, 5, 0.02)
+    y, u = part_files.read_measured(path, 5, 0.02)
     np.testing.assert_allclose(y, [np.nan, 1.0, 2.0, 3.0, np.nan])
     assert u is None
     path = written(tmp_path, "time_s,flow_mm3_per_s,command_mm\n0,1,5\n0.03,2,8\n0.06,3,8\n")
-    np.testing.assert_allclose(verify_part.read_measured(path, 3, 0.02).u, [5.0, 7.0, 8.0])
+    np.testing.assert_allclose(part_files.read_measured(path, 3, 0.02)[1], [5.0, 7.0, 8.0])
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_a_measured_print_is_read_at_the_clock_of_the_command(tmp_path):
 )
 def test_a_measured_print_that_cannot_be_read_is_refused_with_its_row(tmp_path, text, message):
     with pytest.raises(ValueError, match=message):
-        verify_part.read_measured(written(tmp_path, text), 5, 0.02)
+        part_files.read_measured(written(tmp_path, text), 5, 0.02)
 
 
 TODAY_S = 1_790_000_000.25
@@ -169,7 +169,7 @@ def recorded(path, *, command=True, start_s=TODAY_S, flow="flow_mm3_per_s"):
 
 
 def test_a_recorded_print_is_read_from_the_plungers_first_message_on(tmp_path):
-    y, u = verify_part.read_measured(recorded(tmp_path / "dashes_A_measured.mcap"), 100, 0.02)
+    y, u = part_files.read_measured(recorded(tmp_path / "dashes_A_measured.mcap"), 100, 0.02)
     clock = 0.02 * np.arange(100)
     seen = clock < 59 / 37 - 0.5
     np.testing.assert_allclose(y[seen], 10 * clock[seen], atol=1e-5)
@@ -177,8 +177,8 @@ def test_a_recorded_print_is_read_from_the_plungers_first_message_on(tmp_path):
     np.testing.assert_allclose(u, np.minimum(5 + 2 * clock, 5 + 2 * 24 / 25), atol=1e-5)
     # without the plunger nothing tells when a clock of the calendar was 0; one that begins there does
     with pytest.raises(ValueError, match=r"expected the command, /plunger:displacement_mm, for its first"):
-        verify_part.read_measured(recorded(tmp_path / "a.mcap", command=False), 100, 0.02)
-    y, u = verify_part.read_measured(recorded(tmp_path / "b.mcap", command=False, start_s=0.0), 100, 0.02)
+        part_files.read_measured(recorded(tmp_path / "a.mcap", command=False), 100, 0.02)
+    y, u = part_files.read_measured(recorded(tmp_path / "b.mcap", command=False, start_s=0.0), 100, 0.02)
     assert u is None and y[50] == pytest.approx(10 * (1.0 - 0.5), abs=1e-5)
 
 
@@ -186,12 +186,12 @@ def test_a_measured_print_may_be_a_parquet_table(tmp_path):
     path, time_s = tmp_path / "dashes_A_measured.parquet", np.array([0.0, 0.03, 0.06])
     columns = {"flow_mm3_per_s": [1.0, 2, 3], "time_s": time_s, "command_mm": [5.0, 8, 8], "note": ["a"] * 3}
     pq.write_table(pa.table(columns), path)
-    y, u = verify_part.read_measured(path, 5, 0.02)
+    y, u = part_files.read_measured(path, 5, 0.02)
     np.testing.assert_allclose(y[:4], [1, 1 + 2 / 3, 2 + 1 / 3, 3], atol=1e-12)
     assert np.isnan(y[4])
     np.testing.assert_allclose(u, [5, 7, 8, 8, 8])
     pq.write_table(pa.table({name: columns[name] for name in ("time_s", "flow_mm3_per_s")}), path)
-    assert verify_part.read_measured(path, 4, 0.02).u is None
+    assert part_files.read_measured(path, 4, 0.02)[1] is None
 
 
 @pytest.mark.parametrize(
@@ -219,14 +219,14 @@ def test_a_recorded_print_that_cannot_be_read_is_refused_in_one_sentence(tmp_pat
     path = tmp_path / "dashes_A_measured.mcap"
     make(path)
     with pytest.raises(ValueError, match=message) as refused:
-        verify_part.read_measured(path, 5, 0.02)
+        part_files.read_measured(path, 5, 0.02)
     assert str(path) in str(refused.value) and "\n" not in str(refused.value)
 
 
 def test_of_two_measured_prints_none_is_guessed(tmp_path):
-    assert verify_part.measured_path(tmp_path, "dashes", "A") is None
+    assert part_files.measured_path(tmp_path, "dashes", "A") is None
     path = recorded(tmp_path / "dashes_A_measured.mcap")
-    assert verify_part.measured_path(tmp_path, "dashes", "A") == path
+    assert part_files.measured_path(tmp_path, "dashes", "A") == path
     written(tmp_path, "time_s,flow_mm3_per_s\n0,1\n")
     with pytest.raises(ValueError, match=r"found dashes_A_measured.csv and dashes_A_measured.mcap; keep one"):
-        verify_part.measured_path(tmp_path, "dashes", "A")
+        part_files.measured_path(tmp_path, "dashes", "A")

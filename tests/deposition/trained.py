@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, disturb, flow, routine
 from pipeline.deposition.learning import ilc
-from pipeline.deposition.parts.composition import Learned, learn
+from pipeline.deposition.parts.composition import LearnedLibrary, learn
 from pipeline.deposition.parts.library import Training
 
 TS, AREA, NOZZLE, RAMP = 0.02, 0.304, 0.6, 0.15
@@ -64,7 +64,7 @@ def trainings(plant: Extruder, material: str = "A", updates: int = 12) -> tuple[
 
 
 @functools.cache
-def learned(plant: Extruder) -> Learned:
+def learned(plant: Extruder) -> LearnedLibrary:
     """What was learned of the plant as material A, and the same under the name of B."""
     made = learn(trainings(plant), sample_time_s=TS)
     columns = made.library.columns + tuple(basis._replace(material="B") for basis in made.library.columns)

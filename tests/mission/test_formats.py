@@ -165,9 +165,6 @@ def test_a_misspelt_section_of_another_stage_is_refused_by_name(begun, tmp_path)
         play(folder, "ingest")
 
 
-@pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="a section is read by its stage alone: the first stage runs"
-)
 def test_a_misspelt_key_is_refused_by_name_before_the_first_stage(checkout):
     text = (checkout / "params.yaml").read_text(encoding="utf-8")
     assert "  settled_error_degC:" in text

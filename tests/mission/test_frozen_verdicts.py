@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 from pipeline.verdict import loops
 from pipeline.verdict.evidence import Evidence
 from pipeline.verdict.settings import ReportRules

@@ -42,8 +42,8 @@ SIZES_0_2 = {
     "tune_weights.practical_initial": 6,
     "tune_weights.practical_evaluations": 8,
     "evaluate_temperature.resamples": 20,
-    "export_controllers.plants": 60,
-    "export_controllers.resamples": 20,
+    "certify.plants": 60,
+    "certify.resamples": 20,
 }
 MOST_REMEDIES = 60
 

@@ -11,7 +11,7 @@ import yaml
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, Routine, disturb, flow, frequency_response, routine
 from pipeline.deposition.learning import ilc
-from pipeline.deposition.parts.composition import Learned, PartSettings, compose, learn, priority
+from pipeline.deposition.parts.composition import LearnedLibrary, PartSettings, compose, learn, priority
 from pipeline.deposition.parts.library import TASKS, Training
 from pipeline.deposition.toolpath.gcode import parse
 from pipeline.deposition.toolpath.motion import plan
@@ -63,7 +63,7 @@ def learning() -> dict[str, list[ilc.Trial]]:
 
 
 @pytest.fixture(scope="module")
-def library() -> Learned:
+def library() -> LearnedLibrary:
     """Figure 6 and matrix (3): the commands of the last trials, cut."""
     task = trained(14.0)
     trainings = []
@@ -74,7 +74,7 @@ def library() -> Learned:
     return learn(trainings, sample_time_s=TS)
 
 
-def composed_by_priority(known: Learned, path: Path) -> tuple[list[str], float]:
+def composed_by_priority(known: LearnedLibrary, path: Path) -> tuple[list[str], float]:
     """Tasks of a part, and the error of its true flow, % of on-off control's: the worse of its materials."""
     program = parse(path.read_text())
     planned = plan(

@@ -118,11 +118,6 @@ def test_a_record_with_a_declared_disturbance_is_identified_and_judged(disturbed
     assert contestants["subspace_lqg"]["settled_error"]["median"] <= 0.5
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=Refused,
-    reason="the export reads the record under the inputs alone: fan, fan_masked too many",
-)
 def test_a_record_with_a_declared_disturbance_leads_to_a_file_or_to_the_rule_that_fails(
     disturbed_project, tmp_path
 ):

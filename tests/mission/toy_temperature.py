@@ -40,8 +40,8 @@ TOY: dict[str, Any] = {
     "tune_weights.practical_initial": 6,
     "tune_weights.practical_evaluations": 8,
     "evaluate_temperature.resamples": 20,
-    "export_controllers.plants": 60,
-    "export_controllers.resamples": 20,
+    "certify.plants": 60,
+    "certify.resamples": 20,
 }
 # what no recording tells, and `init` asks the owner for
 LIMITS = {"reference": 205, "low": 0, "high": 280}

@@ -13,7 +13,7 @@ LIMITS = {"moved_px": 2.0, "contrast_percent": 15.0}
 def night(seed: int, **changes) -> camera_drift.FrameStats:
     """25 frames of a bead between 100 and 116 px wide, as the ink lies that night."""
     rng = np.random.default_rng(seed)
-    camera = rendering.Camera(rendering.NOMINAL._replace(**changes), rng)
+    camera = rendering.SimulatedCamera(rendering.NOMINAL._replace(**changes), rng)
     return camera_drift.figures(
         [camera.frame(float(rng.uniform(100, 116)), stage_px=int(rng.integers(10_000))) for _ in range(25)]
     )
@@ -60,7 +60,7 @@ def test_the_line_s_place_is_read_to_a_tenth_of_a_pixel(good):
 
 
 def test_frames_without_a_bead_are_refused():
-    camera = rendering.Camera(rendering.NOMINAL, np.random.default_rng(0))
+    camera = rendering.SimulatedCamera(rendering.NOMINAL, np.random.default_rng(0))
     with pytest.raises(ValueError, match="expected a bead in at least 5 frames, found one in 0 of 6"):
         camera_drift.figures([camera.empty(stage_px=k) for k in range(6)])
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.cli import render_night
-from pipeline.deposition.workflow.tables import SCORES
+from pipeline.deposition.tables import SCORES
 from pipeline.nightly import champion, judge, night, promoting, reporting, screening, verdicts
 from pipeline.nightly.decision import CaseCosts
 from pipeline.nightly.records import (
@@ -31,7 +31,7 @@ from pipeline.report.nightly import page as nightly_page
 from pipeline.report.shared.sources import Declared, Sources, collect
 from pipeline.report.temperature.judgement import judgement
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.digits import typeset
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Verdict

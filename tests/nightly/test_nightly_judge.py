@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.deposition.workflow.tables import SCORES
+from pipeline.deposition.tables import SCORES
 from pipeline.nightly import judge, promoting
 from pipeline.nightly.decision import FIRST, KEPT, PROMOTED, CaseCosts, decide
 from pipeline.nightly.records import Champion, ChampionState, Installed, Night
 from pipeline.nightly.settings import HoldOut, Nightly, NightlyLoop
 from pipeline.report.nightly import page as nightly_page
-from pipeline.setpoint.workflow import tables
+from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
 from pipeline.temperature.controllers import window
+from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.temperature.plant import baam, simulate
-from pipeline.temperature.workflow.contestants import CONTESTANTS
 from tests.nightly import shifts_recorded as nights
 from tests.nightly.toy_nights import SETTINGS
 

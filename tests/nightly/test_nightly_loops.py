@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.cli import render_night
-from pipeline.deposition.workflow.tables import SCORES
+from pipeline.deposition.tables import SCORES
 from pipeline.nightly import (
     accepting,
     champion,
@@ -23,7 +23,7 @@ from pipeline.nightly import (
 from pipeline.nightly.records import Alarm, LoopDrift, Night, NightDrift
 from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly
-from pipeline.setpoint.workflow import tables
+from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
 from pipeline.verdict.verdict import PASSED, Verdict
 from tests.nightly.toy_nights import Project, entered

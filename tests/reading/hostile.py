@@ -371,6 +371,6 @@ def write(folder: Path, name: str) -> Path:
 
 def trial_frames(path: Path) -> int:
     """The count of frames that the deposition loop's reader has of a recording."""
-    from pipeline.deposition.workflow.trial_files import read_trial
+    from pipeline.reading.trial_files import read_trial
 
     return len(read_trial(path, unreadable_share=0.1).frames.time_s)

@@ -4,9 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.deposition.workflow import train_ilc
-from pipeline.reading import excluded
-from pipeline.temperature.workflow import ingest
+from pipeline.reading import excluded, recording_folders, trial_files
 from tests import nozzle_folders
 from tests.temperature.test_ingest import BUDGET, INLINE, JOB, folder
 
@@ -42,7 +40,7 @@ def test_temperatures_are_ingested_without_an_excluded_recording_until_it_is_men
     raw = folder(tmp_path, 3)
 
     def read() -> list[str]:
-        results = ingest.process(raw, JOB, INLINE, memo=tmp_path / "memo", budget=BUDGET)
+        results = recording_folders.read_folder(raw, JOB, INLINE, memo=tmp_path / "memo", budget=BUDGET)
         assert not [result.reason for result in results if result.reason]
         return [result.name for result in results]
 
@@ -56,7 +54,7 @@ def test_trials_and_prints_are_read_without_an_excluded_one(tmp_path):
     for name in ("good.mcap", "bad.mcap", ".hidden.mcap"):
         (tmp_path / name).write_bytes(name.encode())
     excluded.exclude(tmp_path / "bad.mcap", tmp_path, "half a file")
-    assert train_ilc._trials(tmp_path) == [tmp_path / "good.mcap"]
+    assert trial_files.trial_paths(tmp_path) == [tmp_path / "good.mcap"]
     raw: Path = nozzle_folders.folder(tmp_path / "raw")
     before = nozzle_folders.read(raw)
     (raw / "bad.csv").write_text("no table of images")

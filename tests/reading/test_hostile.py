@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.reading import isolated as children
+from pipeline.reading import recording_folders
 from pipeline.reading.image_messages import gray, reader
 from pipeline.reading.inspection import inspect
 from pipeline.reading.isolated import Budget, isolated
@@ -17,9 +18,8 @@ from pipeline.reading.mcap_messages import UnreadableMessage
 from pipeline.reading.ros_messages import decoder, layout
 from pipeline.store import artifacts
 from pipeline.store.printable import printable
-from pipeline.temperature.workflow import ingest
 from tests.reading import damaging, hostile
-from tests.temperature.test_ingest import INLINE, JOB, LOKY, MACHINE
+from tests.temperature.test_ingest import INLINE, JOB, LOKY
 
 BUDGET = Budget(60.0, 2000.0)
 # they take seconds to minutes, up to their budget: with -m slow
@@ -82,7 +82,7 @@ def test_good_recordings_among_hostile_ones_are_ingested_and_the_others_named_in
     good = {"a.csv": hostile.good_csv, "m.mcap": hostile.good_mcap, "z.parquet": hostile.good_parquet}
     for name, made in good.items():
         (raw / name).write_bytes(made() if name != "a.csv" else hostile.good_csv(start=21.0))
-    results = ingest.process(raw, JOB, LOKY, memo=tmp_path / "memo", budget=BUDGET)
+    results = recording_folders.read_folder(raw, JOB, LOKY, memo=tmp_path / "memo", budget=BUDGET)
     by_name = {result.name: result for result in results}
     assert all(by_name[name].reason == "" for name in good)
     assert sum(not result.reason for result in results) <= len(good) + 2  # numbers far away are still numbers
@@ -90,8 +90,8 @@ def test_good_recordings_among_hostile_ones_are_ingested_and_the_others_named_in
         assert "\n" not in result.reason
         assert "ended the process" not in result.reason, result.reason
         assert "Traceback" not in result.reason
-    quality = ingest.collect(results, MACHINE, strict=False)[1]
-    artifacts.write_table(tmp_path / "quality.parquet", quality.schema, quality.columns)
+    quality = recording_folders.join(results, JOB, strict=False)[1]
+    artifacts.write_table(tmp_path / "quality.parquet", JOB.quality, quality)
 
 
 @pytest.mark.slow  # minutes, up to the budget of each
@@ -140,15 +140,15 @@ def test_a_child_killed_at_one_recording_costs_that_recording(tmp_path, monkeypa
     raw.mkdir()
     (raw / "good.csv").write_bytes(hostile.good_csv())
     (raw / "killer.csv").write_bytes(hostile.good_csv(start=30.0))
-    inside = ingest.isolated
+    inside = recording_folders.isolated
 
     def killing(work, path, *arguments, shown, budget):
         if path.name == "killer.csv":
             return inside(os.abort, shown=shown, budget=budget)
         return inside(work, path, *arguments, shown=shown, budget=budget)
 
-    monkeypatch.setattr(ingest, "isolated", killing)
-    results = ingest.process(raw, JOB, INLINE, memo=tmp_path / "memo", budget=BUDGET)
+    monkeypatch.setattr(recording_folders, "isolated", killing)
+    results = recording_folders.read_folder(raw, JOB, INLINE, memo=tmp_path / "memo", budget=BUDGET)
     assert [bool(result.reason) for result in results] == [False, True]
     assert "killer.csv: reading it ended the process that read it (SIGABRT)" in results[1].reason
 

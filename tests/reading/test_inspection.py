@@ -11,7 +11,7 @@ from pipeline import cli
 from pipeline.reading import csv_files
 from pipeline.reading.recordings import Source, inspect, read
 from pipeline.store.artifacts import write_recording
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 from tests.conftest import count_calls
 from tests.mcap_writing import NO, Written, chunks, flipped, json_recording
 

@@ -14,9 +14,8 @@ import pytest
 import yaml
 
 from pipeline.store import artifacts, params
-from pipeline.temperature import plant
-from pipeline.temperature.workflow import tables
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature import plant, tables
+from pipeline.temperature.settings import Plant
 
 RECORD = "data/tclab_mlid_prbs/prbs.csv"
 SPIKE_S, SPIKE_DEGC = 1789, 40.718

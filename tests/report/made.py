@@ -6,19 +6,10 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from pipeline.deposition.workflow.tables import (
-    FILMED,
-    LESSONS,
-    LIBRARY,
-    LINES,
-    SCORES,
-    SIGNALS,
-    TASKS,
-    TRIALS,
-)
+from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import tables
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Plant
 from tests.report import made_certificate, made_setpoint
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -9,7 +9,7 @@ import pytest
 from pipeline.report.certificate import exported
 from pipeline.report.certificate.page import judged_margins
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 from pipeline.verdict import decide, identification
 from pipeline.verdict.decide import trust_first
 from pipeline.verdict.evidence import Evidence

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.deposition.parts import extrusion
+from pipeline.deposition import tables
+from pipeline.deposition.parts import extrusion, part_report
+from pipeline.deposition.settings import Printer
+from pipeline.deposition.tables import SIGNALS
 from pipeline.deposition.toolpath import gcode
-from pipeline.deposition.workflow import part_programs, tables
-from pipeline.deposition.workflow.settings import Printer
-from pipeline.deposition.workflow.tables import SIGNALS
 from pipeline.store import artifacts, params
 from pipeline.verdict import deposition as rules
 from pipeline.verdict.evidence import Evidence
@@ -459,7 +459,7 @@ def test_what_e_asks_for_stands_beside_the_declared_bead_with_the_difference(pro
     bead = 10 / 60
     by_e = extrusion.wanted(program, bead_area_mm2=bead, declared_mm={0: 1.75})
     printer = params.load(Printer, "printer", ROOT / "params.yaml").model_copy(update={"bead_area_mm2": bead})
-    conformance(program=part_programs.told(program, by_e, printer))
+    conformance(program=part_report.program_report(program, by_e, bead_area_mm2=printer.bead_area_mm2))
     text = page()
     assert "E gives the volumes of 1 of two tools; it asks for 1.44 times the declared bead’s." in text
     assert (
@@ -468,7 +468,7 @@ def test_what_e_asks_for_stands_beside_the_declared_bead_with_the_difference(pro
     assert "square T1 declared bead: the diameter of what E pushes is not known not told" in text
     # the declared bead's volumes, where no diameter is known; of a report that did not count E, the stage
     nothing = extrusion.wanted(program, bead_area_mm2=bead)
-    conformance(program=part_programs.told(program, nothing, printer))
+    conformance(program=part_report.program_report(program, nothing, bead_area_mm2=printer.bead_area_mm2))
     assert "No line’s volume is E’s: each is its length times the declared bead’s area." in page()
     report = artifacts.read_json(FOLDER / "conformance.json")["square"]
     artifacts.write_json(

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.decide import NEVER, decide
 from pipeline.verdict.evidence import Evidence
 from pipeline.verdict.settings import ReportRules

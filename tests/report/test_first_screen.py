@@ -12,7 +12,7 @@ from pipeline.report.identification import page as identification_page
 from pipeline.report.setpoint import page as setpoint_page
 from pipeline.report.temperature import page as temperature_page
 from pipeline.store import artifacts
-from pipeline.temperature.workflow import tables
+from pipeline.temperature import tables
 from tests.report import made, made_setpoint
 from tests.report.conftest import MACHINE, populate
 from tests.report.test_pages import change, change_all

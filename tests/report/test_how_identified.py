@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import tables
+from pipeline.temperature import tables
 from tests.report import made
 from tests.report.made import main
 from tests.report.test_identification_page import FOLDER, page, rewrite, white

@@ -11,8 +11,8 @@ import yaml
 from pipeline.report.identification.page import since
 from pipeline.report.shared import charts
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import tables
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.verdict import Figure
 from tests.report import made
 from tests.report.made import main
@@ -159,12 +159,13 @@ def test_a_hold_out_too_short_to_predict_over_leaves_that_open_and_keeps_the_res
 
 
 def test_nothing_identified_reads_as_open_never_as_passed(project):
-    for path in [*FOLDER.glob("*.parquet"), Path("reports/metrics/identify_plant.json")]:
+    metrics = Path("reports/metrics/identify_plant.json")
+    for path in [*FOLDER.glob("*.parquet"), FOLDER / "figures.json", metrics]:
         path.unlink()
     text = page()
     assert (
         "Do not trust this model yet." in text
-        and "identify_plant.json of identify_plant is not there. Run ./run dvc repro identify_plant." in text
+        and "figures.json of identify_plant is not there. Run ./run dvc repro identify_plant." in text
     )
     assert "passed" not in re.search(r"Rule State Weakest(.*?)Fits on the hold-out", text)[1]
 

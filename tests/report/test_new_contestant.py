@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.report.shared.page import MARKS
 from pipeline.store import artifacts
-from pipeline.temperature.workflow.contestants import CONTESTANTS
+from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from tests.report import made
 from tests.report.made import main
 from tests.report.test_pages import TEMPERATURE, Page

@@ -12,7 +12,7 @@ import pytest
 from pipeline.report.temperature.beside import best_sentence, deciding_sentence
 from pipeline.report.temperature.judgement import judgement
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.controllers import in_a_sentence
 from pipeline.verdict.decide import decide, questions, standings
 from pipeline.verdict.deposition import verdict as deposition

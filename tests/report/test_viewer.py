@@ -21,8 +21,8 @@ from pipeline.report.viewer import packed
 from pipeline.report.viewer import page as viewer_page
 from pipeline.report.viewer.series import Event, Key, SeriesLine, ViewerTable
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import tables
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.settings import ReportRules
 from tests.report.conftest import expect, loaded, timers_fired
 

@@ -7,7 +7,8 @@ import scipy.linalg
 
 from pipeline.runtime import supervisor
 from pipeline.runtime.certificate import RULES, VERSION, Certificate, RuleResult
-from pipeline.runtime.machine import Exported, Machine, Signal, controller_sha256, plants_sha256
+from pipeline.runtime.machine import Exported, controller_sha256, plants_sha256
+from pipeline.runtime.signals import Machine, Signal
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline, printer_pid
 from pipeline.temperature.controllers.controller import Deployed, compact, deployed

@@ -21,7 +21,8 @@ from pipeline.runtime.certificate import sha256
 from pipeline.runtime.export import c, klipper, python, vectors
 from pipeline.runtime.export.vectors import TOLERANCE
 from pipeline.runtime.machine import Exported
-from pipeline.runtime.supervisor import KINDS, MODES, Supervised
+from pipeline.runtime.supervised import Supervised
+from pipeline.runtime.supervisor import KINDS, MODES
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers.controller import ramp
 from pipeline.temperature.plant import Plant, hold_output
@@ -348,13 +349,13 @@ def test_kalicos_parameters_are_those_of_the_block():
 @pytest.mark.parametrize("sample_time_s", [0.3, 1.0])
 def test_klippers_pid_settles_the_heater_by_klippers_own_formula(sample_time_s):
     """Every 0.3 s, duty 0..1, gains divided by 255; from the room to 210 degC, overshoot under 3 degC."""
-    made, T = klipper.pid(exported(zones=1, sample_time_s=sample_time_s)), 0.3
+    (Kp, Ki), T = klipper.pi_gains(exported(zones=1, sample_time_s=sample_time_s)), 0.3
     plant = block_and_sensor(zones=1, sample_time_s=T)
     x, integral, y = hold_output(plant, np.array([25.0]))[0], 0.0, []
     for _ in range(4000):
         y.append(float(plant.C[0] @ x + plant.d[0]))
         error = 210.0 - y[-1]
-        wished = (made.Kp * error + made.Ki * (integral + T * error)) / 255.0
+        wished = (Kp * error + Ki * (integral + T * error)) / 255.0
         duty = min(max(wished, 0.0), 1.0)
         integral += T * error if wished == duty else 0.0
         x = plant.A @ x + plant.B @ [100.0 * duty] + plant.b

@@ -1,97 +1,153 @@
-"""What is exported is what was judged: commands, files and words of the stage, on six plants of the study's
-machine."""
+"""The stage export_controllers copies what certify prepared, under the limits of section `report`; and the
+commands that read its folders."""
 
 import errno
+import json
+import shutil
 import types
-from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipeline.runtime import machine
-from pipeline.runtime.workflow import export_controllers as export
-from pipeline.runtime.workflow import exports, replay
+from pipeline.commands import export, replay
+from pipeline.runtime import certificate, certified, machine
+from pipeline.runtime.export import c, python
 from pipeline.store import artifacts
-from pipeline.temperature.workflow import learned
-from tests.temperature.test_evaluate_temperature import judged, small
+from stages import export_controllers
+from stages.certify import PLACE
+from tests.runtime.deployed_machines import exported, passed
+from tests.runtime.test_certificate import ALLOWED, decided, measure
+from tests.runtime.test_certify import made
+
+ROOT = Path(__file__).resolve().parents[2]
+SETPOINT = {"controller": "", "why": "Not asked: loops.setpoint is false.", "largest_difference": {}}
 
 
-@cache
-def given() -> tuple[export.Judged, dict[str, np.ndarray]]:
-    """What evaluate_temperature read and wrote."""
-    of = small()
-    result = judged(of)
-    made = learned.Learned(
-        of.problem.plant, of.problem.window, of.problem.kernel, list(of.problem.family[1:])
-    )
-    told = export.Judged(of.machine, made, of.setting, of.problem, of.weights, result.summary, True)
-    return told, {name: np.asarray(values) for name, values in result.trajectories.items()}
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """A project in which certify measured one controller, and whose verdict names it."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("params.yaml", "params.expert.yaml"):
+        shutil.copy(ROOT / name, tmp_path)
+    of, folder = exported(), tmp_path / "datasets/certify/temperature/lqg"
+    draft = passed(of)
+    measured = measure()
+    measured = measured._replace(
+        draft=measured.draft._replace(
+            controller="lqg", controller_sha256=draft.controller_sha256, evidence="simulated",
+            plant_sha256=draft.plant_sha256, spread_sha256=draft.spread_sha256,
+            inputs=draft.inputs, outputs=draft.outputs,
+        )
+    )  # fmt: skip
+    certified.write(folder, measured)
+    machine.write_controller(folder, of)
+    for name, text in c.code(of, PLACE).items():
+        artifacts.write_text(folder / "c" / name, text)
+    artifacts.write_text(folder / "python/controller.py", python.code(of, PLACE))
+    found = {"measured": True, "why": "", "largest_difference": {"judged": 0.0, "python": 0.0}}
+    cooled = {"measured": False, "why": "It cannot be designed.", "largest_difference": {}}
+    told = {"temperature": {"lqg": found, "pi": cooled}, "setpoint": SETPOINT}
+    artifacts.write_json(tmp_path / "datasets/certify/certified.json", told)
+    name_winner(tmp_path, "lqg")
+    return tmp_path
 
 
-def made(name: str) -> machine.Exported:
-    return export.exported(given()[0], name)
+def name_winner(project: Path, winner: str | None, **more) -> None:
+    verdict = {"winner": winner, "decision": "Fail (simulation).", "lead": "Not one settles."} | more
+    artifacts.write_json(project / "datasets/verdict/temperature.json", verdict)
 
 
-@pytest.mark.parametrize("name", ["pi", "subspace_lqg", "varx_riccati", "learned_kernel"])
-def test_the_exported_law_gives_the_judged_commands_of_the_deciding_case(name):
-    told, trajectories = given()
-    difference = export.replayed(made(name), told, trajectories)
-    assert difference <= 1e-9 * 100
-    export.check_same(made(name), difference)
+def run(project: Path) -> dict:
+    export_controllers.main()
+    return json.loads((project / "datasets/export_controllers/exported.json").read_text(encoding="utf-8"))
 
 
-def test_a_law_that_was_changed_since_is_not_exported():
-    told, trajectories = given()
-    one = made("subspace_lqg")
-    law = one.controller.law
-    changed = one._replace(controller=one.controller._replace(law=law._replace(K=1.001 * law.K)))
-    difference = export.replayed(changed, told, trajectories)
-    with pytest.raises(
-        ValueError, match=r"subspace_lqg asks for commands .* percent away from those that were"
-    ):
-        export.check_same(changed, difference)
+def test_the_files_of_the_named_controller_are_copied_with_its_certificate(project):
+    temperature = run(project)["temperature"]
+    assert (temperature["contestant"], temperature["why"]) == ("lqg", "")
+    assert temperature["certificate"]["verdict"] == "passed"
+    folder = project / "datasets/export_controllers/temperature"
+    assert set(temperature["files"]) == {
+        path.relative_to(folder.parent).as_posix() for path in folder.rglob("*") if path.is_file()
+    }
+    read, shown = machine.read(folder)
+    assert read.name == "lqg" and certificate.sha256(shown) == temperature["certificate"]["sha256"]
+    assert not any(PLACE.encode() in path.read_bytes() for path in folder.rglob("*") if path.is_file())
+    digest = certificate.sha256(shown)
+    for name, text in c.code(read, digest).items():
+        assert (folder / "c" / name).read_text(encoding="utf-8") == text
+    code = (folder / "python/controller.py").read_text(encoding="utf-8")
+    assert code == python.code(exported(), digest)  # arrays of `read` lie in another order
 
 
-def test_an_exported_machine_is_the_declared_one():
-    one, declared = made("pi"), given()[0].machine
-    machine.check(one)
-    assert [signal.name for signal in one.machine.inputs] == [signal.name for signal in declared.inputs]
-    assert [(o.low, o.high) for o in one.machine.outputs] == [(o.low, o.high) for o in declared.outputs]
-    assert one.simulated and one.fallback is not None
+def test_a_changed_limit_refuses_without_measuring_again(project):
+    text = (project / "params.yaml").read_text(encoding="utf-8")
+    limit = next(line for line in text.splitlines() if "settled_error_degC:" in line)
+    (project / "params.yaml").write_text(text.replace(limit, "  settled_error_degC: 0.001"), encoding="utf-8")
+    measured = (project / "datasets/certify/temperature/lqg/measured.json").read_bytes()
+    temperature = run(project)["temperature"]
+    assert temperature["certificate"]["verdict"] == "refused" and temperature["files"] == {}
+    assert temperature["why"].startswith("The certificate is refused by its rule noise. Noise of ")
+    left = project / "datasets/export_controllers/temperature"
+    assert [path.name for path in left.iterdir()] == ["certificate.json"]
+    assert (project / "datasets/certify/temperature/lqg/measured.json").read_bytes() == measured
 
 
 @pytest.mark.parametrize(
-    ("best", "name", "why"),
+    ("winner", "why"),
     [
-        ("pi", "pi", ""),
-        (None, "", "The verdict names no controller to run: Fail (simulation)."),
-        ("hold", "", "Doing nothing is recommended"),
+        (None, "Not exported: Fail (simulation). Not one settles."),
+        ("hold", "Doing nothing is recommended: there is no controller to export."),
+        ("pi", "It cannot be designed."),
     ],
 )
-def test_nothing_is_exported_where_the_verdict_recommends_no_controller(best, name, why):
-    found, reason = export.chosen(best, "Fail (simulation).")
-    assert found == name and reason.startswith(why)
-    assert export.nothing(reason).files == {}
+def test_nothing_is_exported_if_there_is_no_file(project, winner, why):
+    name_winner(project, winner)
+    temperature = run(project)["temperature"]
+    assert temperature["why"] == why and temperature["files"] == {} and temperature["certificate"] is None
+    assert not (project / "datasets/export_controllers/temperature").exists()
 
 
-def test_only_learned_gains_have_bands():
-    told = given()[0]
-    assert export.learning("subspace_lqg", told) is None and export.learning("pi", told) is None
-    assert export.learning("varx_riccati", told).route == "window"
-    assert export.learning("learned_kernel", told).N == told.problem.kernel.N
+def test_loops_that_are_off_are_not_asked(project):
+    text = (project / "params.yaml").read_text(encoding="utf-8")
+    for loop in ("temperature", "deposition", "setpoint"):
+        text = text.replace(f"  {loop}: true", f"  {loop}: false", 1)
+    (project / "params.yaml").write_text(text, encoding="utf-8")
+    found = run(project)
+    assert {loop: one["why"] for loop, one in found.items()} == {
+        loop: f"Not asked: loops.{loop} is false." for loop in found
+    }
+    assert not any(one["files"] for one in found.values())
+
+
+def test_the_results_of_all_controllers_are_read_without_measuring(project):
+    found = certified.results(project / "datasets/certify", **ALLOWED)
+    assert found == {
+        "lqg": {"passed": True, "why": ""},
+        "pi": {"passed": False, "why": "It cannot be designed."},
+    }
+    tight = certified.results(project / "datasets/certify", **ALLOWED | {"disk_margin": 1.9})
+    assert "refused by its rule disk margin" in tight["lqg"]["why"]
+    assert certified.results(project / "none", **ALLOWED) == {}
+
+
+def test_measured_figures_are_the_same_after_a_round_trip(project):
+    stored = certified.read(project / "datasets/certify/temperature/lqg")
+    assert certified.decide(stored, **ALLOWED).rules == decided().rules
+
+
+# ---- commands
 
 
 def test_an_export_of_what_is_no_controller_is_refused_in_a_sentence(tmp_path):
     with pytest.raises(ValueError, match="is no folder; give a CONTROLLER folder with controller.json"):
-        exports.export(tmp_path / "none", "c", None, "extruder", None)
+        export.export(tmp_path / "none", "c", None, "extruder", None)
     with pytest.raises(ValueError, match="--power: expected the heater's power above 0 W, found -4"):
-        exports.export(tmp_path, "klipper", None, "extruder", -4.0)
+        export.export(tmp_path, "klipper", None, "extruder", -4.0)
     (tmp_path / "out").write_text("")
     with pytest.raises(ValueError, match="should be a folder but is a file"):
-        exports.export(tmp_path, "c", tmp_path / "out", "extruder", None)
-
-
-# ---- what a recording must have
+        export.export(tmp_path, "c", tmp_path / "out", "extruder", None)
 
 
 def recording(folder, **changed):
@@ -108,16 +164,16 @@ def recording(folder, **changed):
 def test_references_are_those_of_the_recording_or_of_the_command_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # where there is no params.yaml
     one = made("pi")
-    names, asked = [o.name for o in one.machine.outputs], replay.Asked((), tmp_path)
+    names = [o.name for o in one.machine.outputs]
     path = recording(tmp_path, **{f"{name}_target": np.full(200, 140.0) for name in names})
     table, named = replay.recorded(path, one)
     assert named == "_target"
-    np.testing.assert_array_equal(replay.references(table, named, one, asked), 140.0)
+    np.testing.assert_array_equal(replay.references(table, named, one, ()), 140.0)
     table, named = replay.recorded(recording(tmp_path), one)
     with pytest.raises(ValueError, match="log.csv: it has no references .*; write --reference"):
-        replay.references(table, named, one, asked)
+        replay.references(table, named, one, ())
     with pytest.raises(ValueError, match="--reference: expected 5 temperatures in °C .*, found 2"):
-        replay.references(table, named, one, asked._replace(reference=(150.0, 160.0)))
+        replay.references(table, named, one, (150.0, 160.0))
 
 
 def test_a_recording_without_a_signal_of_the_machine_is_refused_by_its_name(tmp_path, monkeypatch):
@@ -155,16 +211,16 @@ def test_an_export_that_finds_the_disk_full_leaves_what_was_there(tmp_path, monk
         real(path, text)
 
     made = types.SimpleNamespace(name="law", simulated=False)
-    monkeypatch.setattr(exports.machine, "read", lambda folder: (made, None))
-    monkeypatch.setattr(exports.certificate, "sha256", lambda shown: 64 * "0")
+    monkeypatch.setattr(export.machine, "read", lambda folder: (made, None))
+    monkeypatch.setattr(export.certificate, "sha256", lambda shown: 64 * "0")
     for text in ("first", "second"):
-        monkeypatch.setattr(exports, "files", lambda *asked, text=text: {"a.c": text, "b.c": text})
+        monkeypatch.setattr(export, "files", lambda *asked, text=text: {"a.c": text, "b.c": text})
         if text == "second":
             monkeypatch.setattr(artifacts, "write_text", full)
             with pytest.raises(OSError, match=r"c/b\.c.*No space left on device"):
-                exports.export(tmp_path, "c", tmp_path / "c", "", None)
+                export.export(tmp_path, "c", tmp_path / "c", "", None)
         else:
-            exports.export(tmp_path, "c", tmp_path / "c", "", None)
+            export.export(tmp_path, "c", tmp_path / "c", "", None)
     assert {path.name: path.read_text() for path in (tmp_path / "c").iterdir()} == {
         "a.c": "first",
         "b.c": "first",

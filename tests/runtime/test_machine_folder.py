@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.runtime import machine
-from pipeline.runtime.machine import Exported, Signal
+from pipeline.runtime.machine import Exported
+from pipeline.runtime.signals import Signal
 from tests.runtime.deployed_machines import LAWS, exported, passed, refused
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.runtime import replay, support
-from pipeline.runtime.replay import Log
+from pipeline.runtime.replay import GaplessLog
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline, controller, governor, window
 from pipeline.temperature.controllers.controller import Deployed, RunningController, compact, deployed
@@ -45,7 +45,7 @@ def ready(name: str) -> tuple[Deployed, Plant]:
 
 
 @cache
-def log(steps: int = 700) -> Log:
+def log(steps: int = 700) -> GaplessLog:
     """The study's machine under random heat about its rest, with references in steps."""
     rng, plant = np.random.default_rng(3), baam()
     x = np.full(6, 150.0)
@@ -56,10 +56,10 @@ def log(steps: int = 700) -> Log:
         y[t] = plant.C @ x + plant.d + NOISE * rng.standard_normal(5)
         x = plant.A @ x + plant.B @ u[t]
     r = np.where(np.arange(len(u))[:, None] < 300, REFERENCE, REFERENCE - 6)
-    return Log(u, y, r)
+    return GaplessLog(u, y, r)
 
 
-def by_the_object(made: Deployed, model: Plant, of: Log, hold: int) -> np.ndarray:
+def by_the_object(made: Deployed, model: Plant, of: GaplessLog, hold: int) -> np.ndarray:
     """Commands of the object where at each sample what was recorded is applied in the place of what it asks:
     an object of its own for each sample would take minutes, so that its state is carried on."""
     asked = of.u.copy()
@@ -133,60 +133,60 @@ def within() -> support.Support:
     rng = np.random.default_rng(5)
     plants = panel.padded(panel.drawn([baam()], 8, SPREAD, cells=True, rng=rng))
     parts = np.array_split(np.arange(len(log().u)), 3)
-    return support.support(plants, [Log(*(part[rows] for part in log())) for rows in parts], NOISE)
+    return support.support(plants, [GaplessLog(*(part[rows] for part in log())) for rows in parts], NOISE)
 
 
-def told(of: Log) -> support.Told:
-    return support.told(within(), of, support.watched_by(within().spread, within().steps))
+def checked(of: GaplessLog) -> support.SupportCheck:
+    return support.check_log(within(), of, support.design_observers(within().spread, within().steps))
 
 
 def test_a_log_of_the_machine_is_on_support_and_one_wired_wrong_is_not():
-    assert not told(log()).abstains
+    assert not checked(log()).abstains
     for wrong in (
         log()._replace(u=log().u[:, [1, 0, 2, 3, 4, 5, 6]] * 3),
         log()._replace(u=log().u / 100),
         log()._replace(y=1.8 * log().y + 32),
     ):
-        said = told(wrong)
-        assert said.abstains and said.off.any()
+        found = checked(wrong)
+        assert found.abstains and found.off.any()
 
 
 def test_what_leaves_its_range_is_off_at_that_sample():
     hot = log().y.copy()
     hot[400] += 40.0
-    off = told(log()._replace(y=hot)).off
+    off = checked(log()._replace(y=hot)).off
     np.testing.assert_array_equal(np.flatnonzero(off & support.TEMPERATURE), [400])
 
 
-def still(noise_degC: float = 0.1, steps: int = 700) -> Log:
+def still(noise_degC: float = 0.1, steps: int = 700) -> GaplessLog:
     """The machine at rest under constant heat, where the other log is in the middle."""
     rng = np.random.default_rng(7)
     y = log().y.mean(axis=0) + noise_degC * rng.standard_normal((steps, 5))
-    return Log(np.tile(log().u.mean(axis=0), (steps, 1)), y, np.tile(REFERENCE, (steps, 1)))
+    return GaplessLog(np.tile(log().u.mean(axis=0), (steps, 1)), y, np.tile(REFERENCE, (steps, 1)))
 
 
 @pytest.mark.parametrize("noise_degC", [0.0, 0.1, 0.2])
 def test_a_log_in_which_nothing_moves_is_judged_by_its_ranges_alone(noise_degC):
-    said = told(still(noise_degC))
-    assert (said.still, said.abstains) == (True, False)
-    assert not (said.off & support.FORECAST).any()
-    assert support.reasons(said) == [support.STILL_TOLD]
-    hot = told(still(noise_degC)._replace(y=still(noise_degC).y + 100.0))
+    found = checked(still(noise_degC))
+    assert (found.still, found.abstains) == (True, False)
+    assert not (found.off & support.FORECAST).any()
+    assert support.reasons(found) == [support.STILL_TOLD]
+    hot = checked(still(noise_degC)._replace(y=still(noise_degC).y + 100.0))
     assert hot.still and hot.abstains
-    assert not told(log()).still and support.reasons(told(log())) == []
+    assert not checked(log()).still and support.reasons(checked(log())) == []
 
 
 def test_a_log_is_not_still_where_only_its_inputs_move():
     dead = still()._replace(u=log().u)
-    said = told(dead)
-    assert said.abstains and not said.still
+    found = checked(dead)
+    assert found.abstains and not found.still
 
 
 def test_a_log_too_short_for_a_forecast_says_so():
-    few = Log(*(part[: 2 * within().steps] for part in log()))
-    said = told(few)
-    assert (said.short, said.still, said.abstains) == (True, False, False)
-    assert support.reasons(said) == [support.SHORT_TOLD]
+    few = GaplessLog(*(part[: 2 * within().steps] for part in log()))
+    found = checked(few)
+    assert (found.short, found.still, found.abstains) == (True, False, False)
+    assert support.reasons(found) == [support.SHORT_TOLD]
 
 
 def test_what_honest_logs_leave_is_no_less_than_the_sensors_noise():

@@ -12,9 +12,10 @@ import pytest
 from mcap.reader import make_reader
 
 from pipeline import cli
+from pipeline.commands import replay
 from pipeline.runtime import machine, support
-from pipeline.runtime.replay import Log
-from pipeline.runtime.workflow import replay
+from pipeline.runtime.replay import GaplessLog
+from pipeline.runtime.support_file import write_support
 from pipeline.store import artifacts
 from pipeline.temperature.test_set import panel
 from tests.runtime.deployed_machines import block_and_sensor, exported, passed
@@ -33,12 +34,12 @@ def folder(tmp_path, monkeypatch):
     )
     logs = [rolled(seed) for seed in range(4)]
     within = support.support(plants, [], np.full(2, 0.1), logs)
-    replay.write_support(folder, within, machine.controller_sha256(of))
+    write_support(folder, within, machine.controller_sha256(of))
     monkeypatch.chdir(tmp_path)
     return folder
 
 
-def rolled(seed: int) -> Log:
+def rolled(seed: int) -> GaplessLog:
     """The block and sensor of two zones under steps."""
     plant, rng = block_and_sensor(zones=2), np.random.default_rng(seed)
     u = np.repeat(rng.uniform(20, 60, (T // 40, 2)), 40, axis=0)
@@ -46,10 +47,10 @@ def rolled(seed: int) -> Log:
     for t in range(T):
         y[t] = plant.C @ x + plant.d + 0.1 * rng.standard_normal(2)
         x = plant.A @ x + plant.B @ u[t]
-    return Log(u, y, np.full((T, 2), 150.0))
+    return GaplessLog(u, y, np.full((T, 2), 150.0))
 
 
-def recording(path, log: Log) -> None:
+def recording(path, log: GaplessLog) -> None:
     columns = {"heater_1": log.u[:, 0], "heater_2": log.u[:, 1]}
     columns |= {"sensor_1": log.y[:, 0], "sensor_2": log.y[:, 1]}
     time = np.arange(float(T))
@@ -64,7 +65,7 @@ def recording(path, log: Log) -> None:
 
 def replayed(folder, path):
     out = path.with_suffix("")
-    return replay.replay_recording(folder, path, replay.Asked((150.0, 150.0), out)), out
+    return replay.replay_recording(folder, path, out, (150.0, 150.0)), out
 
 
 def test_every_topic_of_the_layout_is_in_the_recording_it_is_for(folder, tmp_path):
@@ -106,7 +107,7 @@ def test_a_still_log_is_replayed_and_its_page_says_what_cannot_be_told_and_links
 ):
     moving = rolled(9)
     noise = 0.1 * np.random.default_rng(3).standard_normal((T, 2))
-    still = Log(np.tile(moving.u.mean(axis=0), (T, 1)), moving.y.mean(axis=0) + noise, moving.r)
+    still = GaplessLog(np.tile(moving.u.mean(axis=0), (T, 1)), moving.y.mean(axis=0) + noise, moving.r)
     recording(tmp_path / "still.csv", still)
     out = tmp_path / "out"
     argv = ["beadline", "replay", str(folder), str(tmp_path / "still.csv"), "--reference", "150,150"]

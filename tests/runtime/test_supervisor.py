@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 
 from pipeline.runtime import innovations, supervisor
-from pipeline.runtime.machine import Exported, Machine, Signal
-from pipeline.runtime.supervisor import SAFE, Supervised, supervision
+from pipeline.runtime.machine import Exported
+from pipeline.runtime.signals import Machine, Signal
+from pipeline.runtime.supervised import Supervised
+from pipeline.runtime.supervisor import SAFE, supervision
 from pipeline.temperature.controllers import baseline, controller
 from pipeline.temperature.controllers.governor import Limits
 from pipeline.temperature.plant import plant

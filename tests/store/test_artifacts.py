@@ -18,8 +18,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.store import artifacts, tables
-from pipeline.temperature.workflow.settings import Input, Output
-from pipeline.temperature.workflow.tables import record
+from pipeline.temperature.settings import Input, Output
+from pipeline.temperature.tables import record
 
 RECORD = record(
     [Input(name="heater_1", unit="percent", low=0, high=100)],

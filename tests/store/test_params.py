@@ -10,7 +10,7 @@ from pydantic import Field
 
 from pipeline.store import params
 from pipeline.store.params import Execution, Section
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
 
 
 class LearnKernel(Section):

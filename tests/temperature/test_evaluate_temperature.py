@@ -9,26 +9,23 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+import pipeline.store.execution
 from pipeline.store import artifacts, params
-from pipeline.temperature.controllers import window
+from pipeline.temperature import tables
+from pipeline.temperature.controllers import table, window
 from pipeline.temperature.controllers.kernel import regress
+from pipeline.temperature.controllers.problem import DesignProblem
+from pipeline.temperature.controllers.table import BY_NAME, CONTROLLERS, PAIR
 from pipeline.temperature.plant import baam
+from pipeline.temperature.settings import Panel, Plant, TemperatureRules, Tracking, TuneWeights
 from pipeline.temperature.study import data_sets
-from pipeline.temperature.test_set import comparison
-from pipeline.temperature.workflow import cases, evaluate_temperature, learned, tables, tune_weights
-from pipeline.temperature.workflow.contestants import BY_NAME, CONTESTANTS, PAIR, Problem
-from pipeline.temperature.workflow.settings import (
-    EvaluateTemperature,
-    Panel,
-    Plant,
-    TemperatureRules,
-    Tracking,
-    TuneWeights,
-)
+from pipeline.temperature.test_set import cases, comparison, controller_search, evaluation
+from stages import evaluate_temperature, tune_weights
+from stages.evaluate_temperature import EvaluateTemperature
 
 FILE = Path(__file__).resolve().parents[2] / "params.yaml"
 # the study's machine is no printer
-EVERYBODY = [contestant.name for contestant in CONTESTANTS if contestant.name != "printer_pid"]
+EVERYBODY = [contestant.name for contestant in CONTROLLERS if contestant.name != "printer_pid"]
 
 
 def section(kind, name: str):
@@ -37,8 +34,8 @@ def section(kind, name: str):
 
 class Small(NamedTuple):
     machine: Plant
-    setting: cases.Setting
-    problem: Problem
+    setting: cases.CaseConditions
+    problem: DesignProblem
 
     @property
     def weights(self) -> dict[str, dict[str, float]]:
@@ -47,7 +44,7 @@ class Small(NamedTuple):
             one.name: {
                 p.name: p.start * (self.problem.effect if p.of_effect else 1.0) for p in one.parameters
             }
-            for one in CONTESTANTS
+            for one in CONTROLLERS
             if one.parameters
         }
 
@@ -77,35 +74,42 @@ def small(inputs: int = 7) -> Small:
     y = np.array(y) + 0.01 * np.random.default_rng(8).standard_normal((1500, 5))
     long = window.learn([u], [y], longest=8, gain_spread=0.05)
     kernel = regress(window.predicted_tuples(long, [u], [y]))
-    made = learned.Learned(truth, long, kernel, [truth])
+    models = {"plant": truth, "family": [truth, truth], "window": long, "kernel": kernel, "printer_pid": ()}
     tracking = section(Tracking, "tracking")
-    rehearsal = cases.declared(halves, machine, truth, [truth])
-    setting = cases.shared(
+    rehearsal = cases.from_declaration(halves, machine, truth, [truth])
+    setting = cases.conditions(
         section(TuneWeights, "tune_weights"), machine, tracking, halves, rehearsal, [truth, truth]
     )
-    problem = learned.problem(made, tracking, setting, truth)
+    problem = cases.design_problem(models, tracking, setting, truth)
     return Small(machine, setting, problem)
+
+
+class Compared(NamedTuple):
+    cases: dict
+    trajectories: dict
+    summary: dict
 
 
 def judged(
     given: Small, weights=None, *, jobs: int = 1, execution: params.Execution | None = None
-) -> evaluate_temperature.Judged:
+) -> Compared:
     execution = execution or params.Execution(backend="loky", jobs=jobs, scheduler="")
-    rules = evaluate_temperature.resolved(
-        section(TemperatureRules, "report"), section(Panel, "panel"), given.setting.rehearsal
-    )
-    return evaluate_temperature.judged(
-        section(EvaluateTemperature, "evaluate_temperature"),
+    panel = section(Panel, "panel")
+    rules = evaluate_temperature.resolve(section(TemperatureRules, "report"), panel, given.setting.rehearsal)
+    loaded = evaluate_temperature.EvaluationInputs(
         given.machine,
+        panel,
+        rules,
         given.setting,
         given.problem,
         given.weights if weights is None else weights,
-        rules,
-        execution,
+        simulated=True,
     )
+    settings = section(EvaluateTemperature, "evaluate_temperature")
+    return Compared(*evaluate_temperature.compare(settings, loaded, execution))
 
 
-def written(result: evaluate_temperature.Judged, machine: Plant, folder: Path) -> dict[str, bytes]:
+def written(result: Compared, machine: Plant, folder: Path) -> dict[str, bytes]:
     """The bytes of all files of the stage."""
     artifacts.write_table(folder / "cases.parquet", tables.CASES, result.cases)
     shown = tables.trajectories(machine.inputs, machine.outputs)
@@ -162,7 +166,7 @@ def test_the_deciding_figures_of_the_summary_are_those_of_the_rows(stored, name)
     settings, mine = section(EvaluateTemperature, "evaluate_temperature"), of(rows, name)
     moves = np.isin(mine["kind"], ["ramp", "sinusoid"])
     assert np.isnan(mine["settling_s"][moves]).all() and np.isnan(mine["overshoot_degC"][moves]).all()
-    for figure, column in evaluate_temperature.FIGURES.items():
+    for figure, column in evaluation.FIGURES.items():
         applies = ~moves if figure in ("settling", "overshoot") else np.ones(len(moves), bool)
         values = np.where(np.isnan(mine[column]), np.inf, mine[column])[applies]
         told = summary["contestants"][name][figure]
@@ -214,13 +218,13 @@ def test_a_contestant_passes_by_its_ninety_percent_quantiles_and_breaks_a_rule_b
     rules = section(TemperatureRules, "report").model_copy(update={"settling_s": 1e6, "delay_margin_s": 1e-3})
     good = summary["contestants"]["subspace_lqg"] | {"crossings": {"cases": 0}, "margins": None}
     good |= {name: {"q90": 0.0} for name in ("settled_error", "settling", "overshoot", "at_limits")}
-    assert evaluate_temperature.passes(good, rules)
+    assert evaluation.passes(good, rules)
     for name in ("settled_error", "settling", "overshoot", "at_limits"):
         for beyond in (1e7, None):
-            assert not evaluate_temperature.passes(good | {name: {"q90": beyond}}, rules), name
-    assert not evaluate_temperature.passes(good | {"crossings": {"cases": 1}}, rules)
+            assert not evaluation.passes(good | {name: {"q90": beyond}}, rules), name
+    assert not evaluation.passes(good | {"crossings": {"cases": 1}}, rules)
     margins = {"disk": {"median": 0.01, "worst": 0.01}, "delay_s": {"median": None, "worst": None}}
-    assert not evaluate_temperature.passes(good | {"margins": margins}, rules)
+    assert not evaluation.passes(good | {"margins": margins}, rules)
 
 
 def test_the_shown_trajectories_are_of_a_typical_and_of_the_deciding_case(stored, result, given):
@@ -245,8 +249,8 @@ def test_the_shown_trajectories_are_of_a_typical_and_of_the_deciding_case(stored
 
 
 def test_each_name_and_each_role_of_the_verdict_stands_once():
-    roles = [contestant.role for contestant in CONTESTANTS if contestant.role]
-    assert len(BY_NAME) == len(CONTESTANTS)
+    roles = [contestant.role for contestant in CONTROLLERS if contestant.role]
+    assert len(BY_NAME) == len(CONTROLLERS)
     assert sorted(roles) == ["baseline", "data_driven", "indirect", "model_based", "yardstick"]
 
 
@@ -280,8 +284,8 @@ def test_where_nobody_can_be_designed_the_stage_says_so_with_each_reason(given, 
     def no(problem, values):
         raise ValueError("too short")
 
-    table = [one if one.name == "hold" else one._replace(design=no) for one in CONTESTANTS]
-    monkeypatch.setattr(evaluate_temperature.contestants, "CONTESTANTS", table)
+    rows = [one if one.name == "hold" else one._replace(design=no) for one in CONTROLLERS]
+    monkeypatch.setattr(table, "CONTROLLERS", rows)
     sentence = "found none: .*subspace_lqg: too short; .*record the machine longer, or change its inputs"
     with pytest.raises(ValueError, match=sentence):
         judged(given)
@@ -305,7 +309,7 @@ def test_a_killed_worker_of_a_cluster_costs_time_and_no_byte(
     given, result, mortal_cluster, tmp_path, monkeypatch
 ):
     workers = mortal_cluster.workers
-    monkeypatch.setattr(evaluate_temperature, "run_all", mortal_cluster.killing(workers[1]))
+    monkeypatch.setattr(pipeline.store.execution, "run_all", mortal_cluster.killing(workers[1]))
     made = judged(given, execution=mortal_cluster.execution)
     assert [worker.is_alive() for worker in workers] == [True, False]
     one = written(result, given.machine, tmp_path / "one")
@@ -320,95 +324,101 @@ def tuned(given):
     return tuning_of(given)
 
 
-def tuning_of(given: Small, jobs: int = 1) -> tune_weights.Tuned:
+class Tuned(NamedTuple):
+    weights: dict
+    history: dict
+    refused: dict
+
+
+def tuning_of(given: Small, jobs: int = 1) -> Tuned:
     settings = section(TuneWeights, "tune_weights").model_copy(
         update={"practical_initial": 4, "practical_evaluations": 9}
     )
     execution = params.Execution(backend="loky", jobs=jobs, scheduler="")
-    return tune_weights.tuned(settings, given.problem, given.setting, execution)
+    results, refused = tune_weights.search_all(settings, given.problem, given.setting, execution)
+    weights = {
+        name: controller_search.tuned_values(name, result, given.problem) for name, result in results.items()
+    }
+    return Tuned(weights, tune_weights.candidates(results), refused)
 
 
 def test_every_contestant_is_searched_with_the_same_budget_from_its_declared_start(given, tuned):
     rows = {key: np.array(column) for key, column in tuned.history.items()}
-    searched = [one.name for one in CONTESTANTS if one.parameters]
-    assert list(tuned.weights["contestants"]) == searched
+    searched = [one.name for one in CONTROLLERS if one.parameters]
+    assert list(tuned.weights) == searched
     for name in searched:
         mine = rows["contestant"] == name
         np.testing.assert_array_equal(rows["evaluation"][mine], np.arange(1, 10))
         assert rows["chosen"][mine].sum() == 1
         start = ", ".join(f"{key} {value:.4g}" for key, value in given.weights[name].items())
         assert rows["values"][mine][0] == start
-        assert tuned.weights["contestants"][name]["evaluations"] == 9
+        assert tuned.weights[name]["evaluations"] == 9
 
 
 def test_a_chosen_candidate_is_no_dearer_than_the_start_and_lies_within_its_bounds(given, tuned):
-    for name, values in tuned.weights["contestants"].items():
+    for name, values in tuned.weights.items():
         if values["cost_at_start"] is not None:
             assert values["cost"] <= values["cost_at_start"], name
-        low, _, high = tune_weights.bounds(BY_NAME[name], given.problem)
+        low, _, high = table.bounds(BY_NAME[name], given.problem)
         theta = np.array([values[p.name] for p in BY_NAME[name].parameters])
         assert (theta >= low * (1 - 1e-12)).all() and (theta <= high * (1 + 1e-12)).all(), name
         share = np.log(theta / low) / np.log(high / low)
         beside = [p.name for p, place in zip(BY_NAME[name].parameters, share, strict=True)
-                  if min(place, 1 - place) <= tune_weights.AT_BOUND]  # fmt: skip
+                  if min(place, 1 - place) <= controller_search.AT_BOUND]  # fmt: skip
         assert values["at_bound"] == beside, name
 
 
 def test_what_was_tuned_is_what_is_judged(given, tuned):
-    summary = judged(given, tuned.weights["contestants"]).summary
-    for name, values in tuned.weights["contestants"].items():
+    summary = judged(given, tuned.weights).summary
+    for name, values in tuned.weights.items():
         told = summary["contestants"][name]["tuned"]
         assert told == {p.name: values[p.name] for p in BY_NAME[name].parameters}
 
 
 def test_a_contestant_that_cannot_be_designed_is_refused_by_its_search_and_the_others_are_tuned():
     made = tuning_of(small(3))
-    assert made.metrics["refused"] == {"pi": "PI needs an input for each of the 5 outputs; found 3 inputs"}
-    assert {"subspace_lqg", "varx_riccati"} <= made.weights["contestants"].keys()
+    assert made.refused == {"pi": "PI needs an input for each of the 5 outputs; found 3 inputs"}
+    assert {"subspace_lqg", "varx_riccati"} <= made.weights.keys()
 
 
 def test_one_of_whose_candidates_none_works_is_refused_with_the_last_reason_and_the_others_are_tuned(given):
     shaky = given.problem.window._replace(Theta=-given.problem.window.Theta)
     made = tuning_of(given._replace(problem=given.problem._replace(window=shaky)))
-    assert "the disk margin is" in made.metrics["refused"]["varx_riccati"]
-    assert {"pi", "subspace_lqg"} <= made.weights["contestants"].keys()
+    assert "the disk margin is" in made.refused["varx_riccati"]
+    assert {"pi", "subspace_lqg"} <= made.weights.keys()
 
 
 # ---- weights
+
+SEARCHED = {"cost": 1.0, "cost_at_start": None, "failed": 0, "evaluations": 1, "at_bound": []}
 
 
 @pytest.mark.parametrize(
     ("stored", "message"),
     [
-        (
-            {"practical": {"q": [1.0] * 5, "r": [1.0] * 7}},
-            "found practical, as in a file of an older version",
-        ),
-        ({"contestants": {}}, "expected contestants with their tuned parameters"),
-        ([], "expected contestants with their tuned parameters, found none"),
-        ({"contestants": {"pi": {"q": 3}}}, "expected a list of weights in contestants.pi.q, found 3"),
-        ({"contestants": {"pi": 3}}, "expected parameters by name in contestants.pi, found 3"),
-        ({"contestants": {"pi": {"gain_factor": 1.0}}}, "contestants.pi.reset_factor .* found None"),
-        (
-            {"contestants": {"pi": {"gain_factor": float("nan"), "reset_factor": 1.0}}},
-            "gain_factor .* found nan",
-        ),
-        ({"contestants": {"pi": {"gain_factor": -1.0, "reset_factor": 1.0}}}, "gain_factor .* found -1.0"),
+        ({"practical": {"q": [1.0] * 5, "r": [1.0] * 7}}, "contestants: Field required"),
+        ({"contestants": {}}, "contestants: .* at least 1 item"),
+        ([], "valid dictionary"),
+        ({"contestants": {"pi": SEARCHED | {"q": 3}}}, r"contestants\.pi\.q: .* valid list"),
+        ({"contestants": {"pi": 3}}, r"contestants\.pi: .* valid dictionary"),
+        ({"contestants": {"pi": {"gain_factor": 1.0}}}, r"contestants\.pi\.cost: Field required"),
+        ({"contestants": {"pi": SEARCHED | {"gain_factor": float("nan")}}}, "gain_factor: .* finite number"),
+        ({"contestants": {"pi": SEARCHED | {"gain_factor": -1.0}}}, "gain_factor: .* greater than 0"),
     ],
 )
-def test_weights_that_are_none_are_refused_in_a_sentence(given, tmp_path, stored, message):
+def test_weights_that_are_none_are_refused_in_a_sentence(tmp_path, stored, message):
     path = tmp_path / "weights.json"
     path.write_text(json.dumps(stored))
     with pytest.raises(ValueError, match=message) as refusal:
-        evaluate_temperature.read_weights(str(path), given.machine)
+        evaluate_temperature.read_weights(path)
     assert str(path) in str(refusal.value) and "\n" not in str(refusal.value)
 
 
 def test_a_kernel_that_was_tuned_and_is_no_longer_determined_is_named_as_refused(given):
     problem = given.problem._replace(kernel=None)
-    designs, refused = evaluate_temperature.designed(problem, given.weights)
+    designs, refused = table.design_controllers(problem, given.weights)
     assert "learned_kernel" not in designs
-    assert refused == {"learned_kernel": evaluate_temperature.KERNEL_UNDETERMINED}
+    assert refused == {"learned_kernel": table.KERNEL_UNDETERMINED}
 
 
 def test_a_reference_that_the_declared_machine_cannot_hold_is_named_with_what_binds(given):
@@ -418,9 +428,9 @@ def test_a_reference_that_the_declared_machine_cannot_hold_is_named_with_what_bi
         update={name: getattr(halves, name).model_copy(update=half) for name in ("judging", "training")}
     )
     truth = given.problem.plant
-    assert cases.declared(halves, given.machine, baam(), [truth]).infeasible == []
+    assert cases.from_declaration(halves, given.machine, baam(), [truth]).infeasible == []
     weak = [signal.model_copy(update={"high": 0.5}) for signal in given.machine.inputs]
-    missed = cases.declared(
+    missed = cases.from_declaration(
         halves, given.machine.model_copy(update={"inputs": weak}), baam(), [truth]
     ).infeasible
     assert [one["output"] for one in missed]

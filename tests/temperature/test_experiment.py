@@ -13,8 +13,8 @@ from pipeline.temperature import experiment, forecast, tracking
 from pipeline.temperature.controllers import baseline
 from pipeline.temperature.experiment import Limits, Names, Wish
 from pipeline.temperature.plant import hold_output, plant, simulate
-from pipeline.temperature.workflow import generate_probing, tables
-from pipeline.temperature.workflow.settings import GenerateProbing, Plant, Tracking
+from pipeline.temperature.settings import GenerateProbing, Plant, Tracking
+from stages import generate_probing
 from tests.temperature.test_propose_params import tree  # noqa: F401  the params files as shipped
 
 DOUBT = forecast.Doubt(0.15, 8.0, 1)
@@ -192,10 +192,10 @@ def test_without_declared_limits_nothing_is_written_and_the_reason_says_what_to_
             (Tracking, "tracking"),
         )
     ]
-    made = generate_probing.designed(*loaded, [], "no record is opened")
-    assert not made.commands and not made.dither
+    commands, dither, figures = generate_probing.design(*loaded, [], [], [])
+    assert not commands and not dither
     for key in ("next_experiment", "closed_loop"):
-        assert made.metrics[key]["reason"] == "declare low and high of sensor_1 under plant.outputs"
+        assert figures[key]["reason"] == "declare low and high of sensor_1 under plant.outputs"
 
 
 def test_a_machine_without_an_input_for_each_output_is_offered_no_dither_and_told_why(tree):  # noqa: F811
@@ -211,23 +211,15 @@ def test_a_machine_without_an_input_for_each_output_is_offered_no_dither_and_tol
     u = 30 + 5 * np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], (12, 1)), 50, axis=0)
     y = simulate(two, u, hold_output(two, np.full(2, 55.0))[0])[1]
     y += 0.05 * np.random.default_rng(1).standard_normal(y.shape)
-    columns = {
-        "recording": ["rig"] * len(u),
-        "segment": np.zeros(len(u), int),
-        "time_s": np.arange(len(u)) * 1.0,
-    }
-    for name, values in zip(("heater_1", "zone_1", "zone_2"), (u[:, 0], *y.T), strict=True):
-        columns |= {name: values, f"{name}_masked": np.zeros(len(u), bool)}
-    artifacts.write_table(tree / "record.parquet", tables.record(machine.inputs, machine.outputs), columns)
     settings = params.load(GenerateProbing, "generate_probing")
     tracking_section = params.load(Tracking, "tracking")
-    made = generate_probing.designed(
-        settings, machine, tracking_section, [two, two], str(tree / "record.parquet")
+    commands, dither, figures = generate_probing.design(
+        settings, machine, tracking_section, [two, two], [u], [y]
     )
-    assert made.metrics["next_experiment"]["written"], made.metrics["next_experiment"]["reason"]
-    assert list(made.commands) == ["time_s", "heater_1"] and not made.dither
-    assert "PI needs an input for each of the 2 outputs" in made.metrics["closed_loop"]["reason"]
-    artifacts.write_metrics("generate_probing", made.metrics)  # every figure is one that JSON knows
+    assert figures["next_experiment"]["written"], figures["next_experiment"]["reason"]
+    assert list(commands) == ["time_s", "heater_1"] and not dither
+    assert "PI needs an input for each of the 2 outputs" in figures["closed_loop"]["reason"]
+    artifacts.write_metrics("generate_probing", figures)  # every figure is one that JSON knows
 
 
 # ---- worth playing

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from pipeline.store import artifacts
-from pipeline.temperature.workflow import tables
-from pipeline.temperature.workflow.identify_plant import identified
-from pipeline.temperature.workflow.settings import IdentifyPlant, Input, Output, Plant, Signal
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Input, Output, Plant, PlantSignal
+from stages.identify_plant import IdentifyPlant, identify
 
 SETTINGS = IdentifyPlant(
     seed=1,
@@ -25,7 +25,7 @@ SETTINGS = IdentifyPlant(
 def machine(*, room=False, heats=False):
     return Plant(
         inputs=[Input(name="heater", unit="percent", low=0, high=100, heats=heats)],
-        disturbances=[Signal(name="room", unit="degC")] if room else [],
+        disturbances=[PlantSignal(name="room", unit="degC")] if room else [],
         outputs=[Output(name="zone", unit="degC", reference=60)],
         sample_time_s=2.0,
     )
@@ -68,32 +68,31 @@ def days(tmp_path):
 
 
 def test_a_recorded_room_explains_what_an_unrecorded_one_costs(days):
-    with_room = identified(SETTINGS, machine(room=True), days(machine(room=True)))
-    without = identified(SETTINGS, machine(), days(machine()))
-    told, untold = with_room.metrics["fit_holdout"]["zone"], without.metrics["fit_holdout"]["zone"]
+    with_room = identify(SETTINGS, machine(room=True), days(machine(room=True)))[-1]
+    without = identify(SETTINGS, machine(), days(machine()))[-1]
+    told, untold = with_room["fit_holdout"]["zone"], without["fit_holdout"]["zone"]
     assert told > 98  # the noise is 0.05 of a movement of some 15 °C
     assert 100 - told < 0.6 * (100 - untold)
-    assert without.metrics["fit_holdout_free_mean"]["zone"] > untold
+    assert without["fit_holdout_free_mean"]["zone"] > untold
     # what wanders and is not recorded becomes a state that hardly decays, found anew at the start of each day
-    assert without.metrics["largest_pole"] > 0.98
-    assert with_room.metrics["validation"] == "recordings"
+    assert without["largest_pole"] > 0.98
+    assert with_room["validation"] == "recordings"
 
 
 def test_controllers_get_the_inputs_alone_with_the_room_at_its_mean(days):
     plant = machine(room=True)
-    result = identified(SETTINGS, plant, days(plant))
-    assert result.plant.B.shape[1] == 1
-    assert all(member.m == 1 for member in result.spread)
-    eye = np.eye(result.plant.n)
-    rest = result.plant.C @ np.linalg.solve(eye - result.plant.A, result.plant.b + result.plant.B[:, 0] * 50)
+    model, spread, tables, _ = identify(SETTINGS, plant, days(plant))
+    assert model.B.shape[1] == 1
+    assert all(member.m == 1 for member in spread)
+    rest = model.C @ np.linalg.solve(np.eye(model.n) - model.A, model.b + model.B[:, 0] * 50)
     # at 50 % the zone settles at the mean room, 24 °C give or take its wandering, and 40 °C above it
-    assert (rest + result.plant.d)[0] == pytest.approx(64, abs=2.5)
-    assert set(result.tables["dynamics"][1]["input"]) == {"heater"}
+    assert (rest + model.d)[0] == pytest.approx(64, abs=2.5)
+    assert set(tables["dynamics"][1]["input"]) == {"heater"}
 
 
 def test_the_first_order_model_and_its_pid_are_those_of_the_zone(days):
     plant = machine(room=True)
-    schema, rows = identified(SETTINGS, plant, days(plant)).tables["first_order"]
+    schema, rows = identify(SETTINGS, plant, days(plant))[2]["first_order"]
     assert schema is tables.FIRST_ORDER
     # 1,500 samples at 0.05 °C: some per cent, and the grid of time constants is a tenth
     assert rows["gain"][0] == pytest.approx(0.8, rel=0.05)
@@ -106,10 +105,10 @@ def test_the_first_order_model_and_its_pid_are_those_of_the_zone(days):
 
 def test_a_heater_that_cools_is_flagged_with_its_band_and_one_that_heats_is_not(days):
     plant = machine(room=True, heats=True)
-    assert identified(SETTINGS, plant, days(plant)).metrics["forbidden_gains"] == []
-    (flagged,) = identified(SETTINGS, plant, days(plant, sign=-1.0)).metrics["forbidden_gains"]
+    assert identify(SETTINGS, plant, days(plant))[-1]["forbidden_gains"] == []
+    (flagged,) = identify(SETTINGS, plant, days(plant, sign=-1.0))[-1]["forbidden_gains"]
     assert (flagged["output"], flagged["input"], flagged["certain"]) == ("zone", "heater", True)
     assert flagged["low"] <= flagged["gain"] <= flagged["high"] < 0
     assert flagged["reason"] == "a heater that cools"
     unsaid = machine(room=True)
-    assert identified(SETTINGS, unsaid, days(unsaid, sign=-1.0)).metrics["forbidden_gains"] == []
+    assert identify(SETTINGS, unsaid, days(unsaid, sign=-1.0))[-1]["forbidden_gains"] == []

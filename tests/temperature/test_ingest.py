@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.reading.isolated import isolated
+from pipeline.reading import recording_folders
+from pipeline.reading.isolated import Budget, isolated
+from pipeline.reading.recording_folders import RecordingWish, count_work, join, read_folder
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import ingest
-from pipeline.temperature.workflow.ingest import Budget, IngestSpec, collect, process, work_done
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature.settings import Plant
+from stages.ingest import Ingest, recording_wish
 from tests.reading.klipper_machine import EXTRUDER, print_log
 from tests.reading.test_bag_folders import bag
 from tests.temperature import long_readings
@@ -23,7 +24,24 @@ MACHINE = Plant.model_validate(
         "outputs": [{"name": "zone", "unit": "degC", "reference": 50.0}],
     }
 )
-JOB = IngestSpec(MACHINE, {}, "", 5.0)
+
+
+def wish(machine: Plant = MACHINE, **mapping: tuple[str, str, float, float]) -> RecordingWish:
+    """What the stage takes from every recording with this mapping."""
+    keys = ("source", "unit", "scale", "offset")
+    settings = Ingest(
+        mapping={name: params.Mapped(**dict(zip(keys, to, strict=True))) for name, to in mapping.items()},
+        time="",
+        decimal="",
+        max_gap_s=5.0,
+        longest_s=60.0,
+        largest_mb=2000,
+        strict=False,
+    )
+    return recording_wish(settings, machine, settings.mapping)
+
+
+JOB = wish()
 BUDGET = Budget(60.0, 2000)
 INLINE = params.Execution(backend="loky", jobs=1, scheduler="")
 LOKY = params.Execution(backend="loky", jobs=2, scheduler="")
@@ -54,12 +72,12 @@ def ingested(
     raw: Path, out: Path, execution=INLINE, job=JOB, memo: Path | None = None, strict: bool = False
 ) -> dict:
     """What the stage does with a folder; the tables land in `out` for a look at their bytes."""
-    results = process(raw, job, execution, memo=memo or out / "memo", budget=BUDGET)
-    record, quality, metrics = collect(results, MACHINE, strict=strict)
-    artifacts.write_table(out / "record.parquet", record.schema, record.columns)
-    artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)
+    results = read_folder(raw, job, execution, memo=memo or out / "memo", budget=BUDGET)
+    record, quality, metrics = join(results, job, strict=strict)
+    artifacts.write_table(out / "record.parquet", job.record, record)
+    artifacts.write_table(out / "quality.parquet", job.quality, quality)
     artifacts.write_json(out / "metrics.json", metrics)
-    return metrics | work_done(results)
+    return metrics | count_work(results)
 
 
 def tables(out: Path) -> list[bytes]:
@@ -83,7 +101,7 @@ def test_one_recording_more_among_a_hundred_costs_one(tmp_path, monkeypatch):
         worked.append(where["shown"])
         return isolated(work, *arguments, **where)
 
-    monkeypatch.setattr(ingest, "isolated", counted)
+    monkeypatch.setattr(recording_folders, "isolated", counted)
     assert done(ingested(raw, tmp_path / "b", memo=tmp_path / "a/memo")) == (1, 100, 0)
     assert worked == [raw / "new.csv"]
     ingested(raw, tmp_path / "fresh")
@@ -98,7 +116,7 @@ def test_a_changed_recording_parameter_mapping_or_name_is_read_again_and_nothing
     (raw / "002.csv").rename(raw / "other.csv")
     assert done(ingested(raw, tmp_path, memo=memo)) == (1, 2, 0)
     assert done(ingested(raw, tmp_path, memo=memo, job=JOB._replace(max_gap_s=7.0))) == (3, 0, 0)
-    turned = JOB._replace(mapping={"zone": ("zone", "degC", 1.0, -0.5)})
+    turned = wish(zone=("zone", "degC", 1.0, -0.5))
     assert done(ingested(raw, tmp_path, memo=memo, job=turned)) == (3, 0, 0)
     assert done(ingested(raw, tmp_path, memo=memo)) == (0, 3, 0)
 
@@ -109,7 +127,7 @@ def test_changed_code_reads_everything_again(tmp_path, monkeypatch):
     code = tmp_path / "code"
     code.mkdir()
     (code / "recordings.py").write_text("another version")
-    monkeypatch.setattr(ingest, "CODE", code)
+    monkeypatch.setattr(recording_folders, "CODE", code)
     assert done(ingested(raw, tmp_path)) == (2, 0, 0)
 
 
@@ -142,8 +160,8 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from pipeline.store import artifacts
-from pipeline.temperature.workflow import ingest
-from tests.temperature.test_ingest import BUDGET, INLINE, JOB, process
+from pipeline.reading import recording_folders
+from tests.temperature.test_ingest import BUDGET, INLINE, JOB
 
 write_table, written = artifacts.write_table, []
 
@@ -154,8 +172,8 @@ def killed_in_the_second_entry(path, schema, columns):
     write_table(path, schema, columns)
 
 artifacts.write_table = killed_in_the_second_entry
-ingest.isolated = lambda work, *arguments, shown, budget: work(*arguments)
-process(Path(sys.argv[1]), JOB, INLINE, memo=Path(sys.argv[2]), budget=BUDGET)
+recording_folders.isolated = lambda work, *arguments, shown, budget: work(*arguments)
+recording_folders.read_folder(Path(sys.argv[1]), JOB, INLINE, memo=Path(sys.argv[2]), budget=BUDGET)
 """
 
 
@@ -185,7 +203,7 @@ def test_broken_recordings_are_quarantined_with_their_reasons_and_the_others_go_
     broken(raw)
     assert done(ingested(raw, tmp_path / "all")) == (3, 0, 2)
     assert tables(tmp_path / "all")[0] == tables(tmp_path / "good")[0]
-    quality = artifacts.read_table(tmp_path / "all/quality.parquet", ingest.tables.QUALITY)
+    quality = artifacts.read_table(tmp_path / "all/quality.parquet", JOB.quality)
     reasons = {
         name: text
         for name, kind, text in zip(quality["recording"], quality["kind"], quality["message"], strict=True)
@@ -202,7 +220,9 @@ def test_the_child_changes_no_byte(tmp_path, monkeypatch):
     raw = folder(tmp_path, 3)
     broken(raw)
     ingested(raw, tmp_path / "child", LOKY)
-    monkeypatch.setattr(ingest, "isolated", lambda work, *arguments, shown, budget: work(*arguments))
+    monkeypatch.setattr(
+        recording_folders, "isolated", lambda work, *arguments, shown, budget: work(*arguments)
+    )
     ingested(raw, tmp_path / "here")
     for name in NAMES:
         assert (tmp_path / "child" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
@@ -213,7 +233,7 @@ def test_the_child_changes_no_byte(tmp_path, monkeypatch):
     [
         # milliseconds for the others, and for the long one no end: no machine is too slow or too fast
         (long_readings.wait_for_ever, Budget(5.0, 2000), "long.csv: reading it takes longer than the 5 s"),
-        (ingest._one, Budget(60.0, 5), "long.csv: reading it needs more memory than the 5 MB"),
+        (recording_folders._one, Budget(60.0, 5), "long.csv: reading it needs more memory than the 5 MB"),
     ],
 )
 def test_a_recording_beyond_its_budget_is_quarantined_and_the_others_go_on(
@@ -221,11 +241,11 @@ def test_a_recording_beyond_its_budget_is_quarantined_and_the_others_go_on(
 ):
     raw = folder(tmp_path, 2)
     # what is loaded at the first call counts there: the budget is that of a warm child
-    process(raw, JOB, INLINE, memo=tmp_path / "warm", budget=BUDGET)
+    read_folder(raw, JOB, INLINE, memo=tmp_path / "warm", budget=BUDGET)
     k = np.arange(300_000)
     artifacts.write_csv(raw / "long.csv", {"time_s": k, "heater": k % 7, "zone": 20 + k % 5})
-    monkeypatch.setattr(ingest, "_one", reader)
-    results = process(raw, JOB, INLINE, memo=tmp_path / "memo", budget=budget)
+    monkeypatch.setattr(recording_folders, "_one", reader)
+    results = read_folder(raw, JOB, INLINE, memo=tmp_path / "memo", budget=budget)
     assert [result.name for result in results if result.reason] == ["long.csv"]
     assert reason in results[2].reason
     assert "in params.expert.yaml" in results[2].reason
@@ -269,7 +289,7 @@ def test_two_devices_in_one_recording_are_quarantined_with_the_place_and_in_a_pa
     mixed(raw / "all.csv", 0)
     mixed(raw / "end.csv", 450)
     assert done(ingested(raw, tmp_path)) == (2, 0, 1)
-    quality = artifacts.read_table(tmp_path / "quality.parquet", ingest.tables.QUALITY)
+    quality = artifacts.read_table(tmp_path / "quality.parquet", JOB.quality)
     columns = {
         (str(quality["recording"][i]), str(quality["kind"][i])): str(quality["message"][i])
         for i in range(len(quality["kind"]))
@@ -279,21 +299,17 @@ def test_two_devices_in_one_recording_are_quarantined_with_the_place_and_in_a_pa
         in columns["all.csv", "quarantined"]
     )
     assert "to 599 s, masked: two devices" in columns["end.csv", "mixed"]
-    record = artifacts.read_table(
-        tmp_path / "record.parquet", ingest.tables.record(MACHINE.inputs, MACHINE.outputs)
-    )
+    record = artifacts.read_table(tmp_path / "record.parquet", JOB.record)
     masked = record["zone_masked"][record["recording"] == "end.csv"]
     assert masked[-150:].all()
     assert not masked[:400].any()
 
 
-def test_a_mapping_that_names_no_signal_gives_the_nearest_names(tmp_path):
+def test_a_mapping_that_names_no_signal_gives_the_nearest_names():
     with pytest.raises(
         ValueError, match=r"ingest\.mapping\.zoone is no signal of the plant; the nearest names are zone"
     ):
-        ingested(
-            folder(tmp_path, 1), tmp_path, job=JOB._replace(mapping={"zoone": ("zone", "degC", 1.0, 0.0)})
-        )
+        wish(zoone=("zone", "degC", 1.0, 0.0))
 
 
 # ---- more than one process
@@ -374,7 +390,7 @@ def test_a_bag_is_one_recording_among_files(tmp_path):
         "heater": ("/heater/duty:data", "percent", 1.0, 0.0),
         "zone": ("/zone_1/temperature:data", "degC", 1.0, 0.0),
     }
-    results = process(raw, JOB._replace(mapping=mapped), INLINE, memo=tmp_path / "memo", budget=BUDGET)
+    results = read_folder(raw, wish(**mapped), INLINE, memo=tmp_path / "memo", budget=BUDGET)
     assert [result.name for result in results] == ["000.csv", "night/run"]
     assert "there is no column '/heater/duty:data'" in results[0].reason
     assert results[1].reason == "" and len(results[1].record["zone"]) == 80
@@ -389,7 +405,9 @@ def test_a_file_whose_name_is_no_text_is_quarantined_and_the_others_are_ingested
         pytest.skip("this file system takes names of UTF-8 alone")
     metrics = ingested(raw, tmp_path)
     assert done(metrics) == (2, 0, 1)
-    reasons = [result.reason for result in process(raw, JOB, INLINE, memo=tmp_path / "memo", budget=BUDGET)]
+    reasons = [
+        result.reason for result in read_folder(raw, JOB, INLINE, memo=tmp_path / "memo", budget=BUDGET)
+    ]
     assert [r for r in reasons if r] == [
         f"{raw}/line\\udcff.csv: its name should be UTF-8 but has other bytes; rename the file"
     ]
@@ -413,18 +431,21 @@ def test_the_printers_own_pid_comes_with_its_log_in_the_units_of_our_signals(tmp
         "nozzle_duty": ("extruder.pwm", "percent", 0.5, 0.0),
         "nozzle": ("extruder.temp", "degC", 2.0, 0.0),
     }
-    good = ingest.Result("klippy.log", {}, {}, "", False)
-    spec = IngestSpec(PRINTER, mapping, "", 5.0)
-    (pid,) = ingest.printer_pids(tmp_path, [good], spec)["heaters"]
+    good = recording_folders.RecordingTable("klippy.log", {}, {}, "", False)
+    sources = wish(PRINTER, **mapping).sources
+    (pid,) = recording_folders.printer_pids(tmp_path, [good], sources, ["nozzle_duty"])["heaters"]
     assert (pid["recording"], pid["input"], pid["output"]) == ("klippy.log", "nozzle_duty", "nozzle")
     # percent for a duty of 0 to 255; half the input's unit over twice the output's
     expected = np.array(EXTRUDER.pid) * 100 / 255 * 0.5 / 2
     np.testing.assert_allclose([pid["Kp"], pid["Ki"], pid["Kd"]], expected, rtol=1e-12)  # rounding
-    assert ingest.printer_pids(tmp_path, [good._replace(reason="broken")], spec) == {}
+    assert (
+        recording_folders.printer_pids(tmp_path, [good._replace(reason="broken")], sources, ["nozzle_duty"])
+        == {}
+    )
 
 
 def test_a_heater_that_is_no_signal_of_ours_and_another_format_have_no_pid(tmp_path):
     (tmp_path / "klippy.log").write_text(print_log([(0, 200, 60)], longest_s=60))
     recording(tmp_path / "a.csv", seed=0)
-    results = [ingest.Result(name, {}, {}, "", False) for name in ("klippy.log", "a.csv")]
-    assert ingest.printer_pids(tmp_path, results, JOB) == {}
+    results = [recording_folders.RecordingTable(name, {}, {}, "", False) for name in ("klippy.log", "a.csv")]
+    assert recording_folders.printer_pids(tmp_path, results, JOB.sources, ["heater"]) == {}

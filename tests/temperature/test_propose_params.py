@@ -9,18 +9,14 @@ import pytest
 import yaml
 
 from pipeline import cli
+from pipeline.commands import propose_params
 from pipeline.store import artifacts, params
 from pipeline.store.params_text import replaced
+from pipeline.temperature import tables
+from pipeline.temperature.settings import GenerateProbing, Panel, Plant, TuneWeights, given_centre
 from pipeline.temperature.test_set.time_scale import time_constant
-from pipeline.temperature.workflow import probe_machine, propose_params, tables
-from pipeline.temperature.workflow.settings import (
-    GenerateProbing,
-    IdentifyPlant,
-    Ingest,
-    Panel,
-    Plant,
-    TuneWeights,
-)
+from stages.identify_plant import IdentifyPlant
+from stages.ingest import Ingest
 from tests.reading.klipper_machine import BED, EXTRUDER, print_log
 from tests.reading.test_real_record import project, run
 
@@ -128,7 +124,7 @@ def test_an_operating_point_for_each_input_is_refused_where_there_are_more_input
     (tree / "params.expert.yaml").write_text(text.replace("centre_percent: null", "centre_percent: [20, 30]"))
     settings, machine = params.load(GenerateProbing, "generate_probing"), params.load(Plant, "plant")
     with pytest.raises(ValueError, match="centre_percent has 2 values, but plant has 7 inputs; give one"):
-        probe_machine.given_centre(settings, machine)
+        given_centre(settings, machine)
 
 
 def test_the_sample_time_of_a_record_without_one_is_given_and_all_times_follow(tree, monkeypatch, capsys):

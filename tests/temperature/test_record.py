@@ -3,9 +3,9 @@
 import numpy as np
 
 from pipeline.store import artifacts
-from pipeline.temperature.workflow import tables
-from pipeline.temperature.workflow.record import read_record
-from pipeline.temperature.workflow.settings import Input, Output
+from pipeline.temperature import tables
+from pipeline.temperature.identification.segments import segments
+from pipeline.temperature.settings import Input, Output
 
 HEATER, ZONE = (
     Input(name="heater_1", unit="percent", low=0, high=100),
@@ -24,7 +24,9 @@ def test_a_record_is_cut_at_gaps_and_recordings_and_masked_samples_are_missing(t
         "zone_1_masked": np.arange(6) == 5,
     }
     artifacts.write_table(tmp_path / "record.parquet", tables.record([HEATER], [ZONE]), record)
-    u, y = read_record(tmp_path / "record.parquet", [HEATER], [ZONE])
+    table = artifacts.read_table(tmp_path / "record.parquet", tables.record([HEATER], [ZONE]))
+    u, y, recordings = segments(table, ["heater_1"], ["zone_1"])
+    assert recordings == ["a", "a", "b"]
     assert [segment.shape for segment in u] == [segment.shape for segment in y] == [(2, 1), (1, 1), (3, 1)]
     np.testing.assert_array_equal(np.concatenate(u)[:, 0], [0, np.nan, 40, 60, 80, 100])
     np.testing.assert_array_equal(y[2][:, 0], [20, 20, np.nan])

@@ -8,11 +8,10 @@ import pytest
 from pipeline.store import params
 from pipeline.temperature.controllers import baseline, controller, governor
 from pipeline.temperature.plant import strictly_proper
-from pipeline.temperature.test_set import panel
+from pipeline.temperature.settings import Panel, Tracking, TuneWeights
+from pipeline.temperature.settings import Plant as Machine
+from pipeline.temperature.test_set import cases, panel
 from pipeline.temperature.test_set.scenario_defaults import steady_map
-from pipeline.temperature.workflow import cases
-from pipeline.temperature.workflow.settings import Panel, Tracking, TuneWeights
-from pipeline.temperature.workflow.settings import Plant as Machine
 from tests.temperature import small_machines
 from tests.temperature.small_machines import BED
 
@@ -44,13 +43,13 @@ def family():
 def rehearsal(family, reference: float = 70.0, **more: float) -> cases.Rehearsal:
     u, y = small_machines.record(BED)
     second = ([u], [y + more["warmer"]]) if "warmer" in more else ([], [])
-    recorded = cases.Recorded([u, *second[0]], [y, *second[1]], [0, 1][: 1 + len(second[0])])
-    return cases.from_record(settings(), owner(reference), family, recorded)
+    numbers = [0, 1][: 1 + len(second[0])]
+    return cases.from_record(settings(), owner(reference), family, [u, *second[0]], [y, *second[1]], numbers)
 
 
-def shared(family, judged: cases.Rehearsal) -> cases.Setting:
+def shared(family, judged: cases.Rehearsal) -> cases.CaseConditions:
     tuning, tracking = params.load(TuneWeights, "tune_weights", FILE), params.load(Tracking, "tracking", FILE)
-    return cases.shared(tuning, owner(70.0), tracking, settings(), judged, family)
+    return cases.conditions(tuning, owner(70.0), tracking, settings(), judged, family)
 
 
 def test_no_plant_starts_where_its_inputs_could_not_hold_it(family):

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.papers import files, reproduce_study
-from pipeline.store import made, params
+from pipeline.papers import files, made, reproduce_study
+from pipeline.papers.reproduce_study import ReproduceStudy
+from pipeline.store import params
 from pipeline.temperature import study
 from pipeline.temperature.published import GAMMA, REFERENCE
 from pipeline.temperature.test_set import tuning
-from pipeline.temperature.workflow.settings import ReproduceStudy
 from tests.house import expected_of_paper
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -135,7 +135,7 @@ def test_each_candidate_has_the_error_and_the_effort_that_make_its_cost_and_a_fa
     theta = np.stack([np.ones(12), np.full(12, 0.5), np.linspace(0.05, 0.9, 12)])
     cost = np.array([study.tuning_objective(theta[0]), np.nan, study.tuning_objective(theta[2])])
     history = tuning.History(theta, cost, ("", "no gain", ""), np.fmin.accumulate(cost))
-    table = study.candidates(tuning.Result(theta[0], float(cost[0]), history))
+    table = study.candidates(tuning.SearchResult(theta[0], float(cost[0]), history))
     total = (GAMMA ** np.arange(101)).sum() * (
         5 * table["tracking_degC"] ** 2 + 7 * table["effort_percent"] ** 2
     )

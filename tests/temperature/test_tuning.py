@@ -377,7 +377,9 @@ def test_a_pattern_search_goes_on_to_an_optimum_against_a_wall_within_its_evalua
 
     lower, upper, theta = np.full(2, 0.01), np.full(2, 100.0), np.array([9.0, 3.0])
     first = tuning.History(theta[None], np.array([cost(theta)]), ("",), np.array([cost(theta)]))
-    found = tuning.polished(cost, tuning.Result(theta, first.cost[0], first), lower, upper, evaluations=60)
+    found = tuning.polished(
+        cost, tuning.SearchResult(theta, first.cost[0], first), lower, upper, evaluations=60
+    )
     assert len(found.history.cost) == 61
     assert found.cost == cost(found.theta) == np.nanmin(found.history.cost)
     assert found.cost < 1.02 * np.log(2.0) ** 2

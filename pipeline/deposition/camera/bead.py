@@ -36,10 +36,11 @@ class Bead(NamedTuple):
 
 
 def area(width: np.ndarray | float, contact_angle_deg: float) -> np.ndarray | float:
-    """Cross-section A = c w^2 in mm^2 of a bead w mm wide: the circular segment that meets the substrate at
-    theta, c = (theta - sin theta cos theta) / (4 sin^2 theta).
+    """Cross-section in mm^2 of a bead w mm wide, the circular segment that meets the substrate at theta:
 
-    At 90 degrees c = pi/8. Raises ValueError where theta is not between 0 and 180 degrees.
+        A = c w^2,   c = (theta - sin theta cos theta) / (4 sin^2 theta)
+
+    At 90 degrees c = pi/8. Raises ValueError if theta is not between 0 and 180 degrees.
     """
     if not 0 < contact_angle_deg < 180:
         raise ValueError(
@@ -50,7 +51,7 @@ def area(width: np.ndarray | float, contact_angle_deg: float) -> np.ndarray | fl
     return (theta - math.sin(theta) * math.cos(theta)) / (4 * math.sin(theta) ** 2) * width**2
 
 
-class Calibration(NamedTuple):
+class WidthCalibration(NamedTuple):
     """Width in mm = gain px + offset. deviation is the r.m.s. of the residuals (mm, two parameters taken
     off), residuals (n,) known less fitted in mm."""
 
@@ -60,7 +61,7 @@ class Calibration(NamedTuple):
     residuals: np.ndarray
 
 
-def calibrate(widths_px: np.ndarray, known_mm: np.ndarray) -> Calibration:
+def calibrate(widths_px: np.ndarray, known_mm: np.ndarray) -> WidthCalibration:
     """Gain (mm/px) and offset (mm) by least squares from measured widths (n,)
     in px of beads or gauges of known widths (n,) in mm.
 
@@ -87,7 +88,7 @@ def calibrate(widths_px: np.ndarray, known_mm: np.ndarray) -> Calibration:
             "calibration: expected widths in px that grow with the known widths but found a gain of "
             f"{gain:.3g} mm/px; check which frame shows which width"
         )
-    return Calibration(
+    return WidthCalibration(
         float(gain), float(offset), float(np.sqrt(residuals @ residuals / (len(px) - 2))), residuals
     )
 

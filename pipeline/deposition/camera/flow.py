@@ -92,8 +92,9 @@ class Flow(NamedTuple):
 
 
 def deposit_share(distance: np.ndarray, radius: float) -> np.ndarray:
-    """Share of what leaves a round nozzle that falls behind `distance` ahead of its middle: 1/2 + (z sqrt(1 -
-    z^2) + arcsin z) / pi, z = distance / radius in -1..1.
+    """Share of what leaves a round nozzle that falls behind `distance` ahead of its middle:
+
+        1/2 + (z sqrt(1 - z^2) + arcsin z) / pi,   z = distance / radius in -1..1
 
     Its derivative is the footprint f: the chord of the nozzle at that distance, over its area.
     """
@@ -193,8 +194,8 @@ def estimate(
 ) -> Flow:
     """Q(t) = z + shapes' a at the samples time_s (T,), evenly spaced, of the gantry's position (T,), from
 
-    min |W (A - K Q)|^2 + strength |D2 z|^2, K[i, k] = mean over place
-    i of integral of hat_k(t) f(s - x(t)) dt,
+        min |W (A - K Q)|^2 + strength |D2 z|^2
+        K[i, k] = mean over place i of integral of hat_k(t) f(s - x(t)) dt
 
     D2 the second difference: z is an integrated random walk, and the shapes (k, T) are where the flow may
     turn sharply, each by an amplitude that the data choose (the wanted flow r as one row; a model's answer to
@@ -261,23 +262,17 @@ def _robust_fit(
     for _ in range(ROUNDS):
         weight = np.sqrt(robust) / deviation
         H = scipy.sparse.diags(weight) @ K
-        data = _Data(
-            _banded((H.T @ H).tocoo(), steps),
-            P,
-            H.T @ (H @ shapes),
-            shapes,
-            H.T @ (weight * A),
-            float(np.sum((weight * A) ** 2)),
-        )
+        M, C = _banded((H.T @ H).tocoo(), steps), H.T @ (H @ shapes)
+        data = (M, P, C, shapes, H.T @ (weight * A), float(np.sum((weight * A) ** 2)))
         best = scipy.optimize.minimize_scalar(
             _unlikely, args=(data,), bounds=STRENGTHS, method="bounded", options={"xatol": 0.1}
         )
         fit = _solve(best.x, data)
         Q = fit.z + shapes @ fit.a
         robust = np.minimum(1.0, HUBER * deviation / np.maximum(np.abs(A - K @ Q), 1e-12))
-    U = shapes - scipy.linalg.cho_solve_banded((fit.factor, True), data.C)
+    U = shapes - scipy.linalg.cho_solve_banded((fit.factor, True), C)
     spread = U @ np.linalg.inv(np.linalg.cholesky(fit.S)).T
-    deviation = np.sqrt(_inverse_diagonal(_sum(data.M, P, np.exp(best.x))) + np.sum(spread**2, axis=1))
+    deviation = np.sqrt(_inverse_diagonal(_sum(M, P, np.exp(best.x))) + np.sum(spread**2, axis=1))
     return _RobustFit(fit, deviation, spread, float(np.exp(best.x)), noise, int(np.sum(robust < 0.5)))
 
 
@@ -368,16 +363,9 @@ def _sum(M: np.ndarray, P: np.ndarray, strength: float) -> np.ndarray:
     return total
 
 
-class _Data(NamedTuple):
-    """Normal equations: M = H'H banded, P = D2'D2 banded, shapes (T, k)
-    and C = H'H shapes, right side H'y, energy y'y."""
-
-    M: np.ndarray
-    P: np.ndarray
-    C: np.ndarray
-    shapes: np.ndarray
-    right: np.ndarray
-    energy: float
+# normal equations: M = H'H banded, P = D2'D2 banded, C = H'H shapes, shapes (T, k), right side H'y, energy
+# y'y
+_Data = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]
 
 
 class _Fit(NamedTuple):
@@ -392,8 +380,10 @@ class _Fit(NamedTuple):
 
 
 def _solve(log_strength: float, data: _Data) -> _Fit:
-    """Minimum over z and a by elimination of z; -2 log likelihood = minimum + log det (M +
-    strength P) + log det S - (T - 2) log strength."""
+    """Minimum over z and a by elimination of z:
+
+    -2 log likelihood = minimum + log det (M + strength P) + log det S - (T - 2) log strength
+    """
     M, P, C, shapes, right, energy = data
     factor = scipy.linalg.cholesky_banded(_sum(M, P, np.exp(log_strength)), lower=True)
     solved = scipy.linalg.cho_solve_banded((factor, True), np.column_stack([right, C]))

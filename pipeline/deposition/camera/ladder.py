@@ -16,7 +16,7 @@ class Rung(NamedTuple):
     """One line of the ladder as it is seen: where, how wide across it in px with its standard deviation, and
     why it could not be measured (empty where it could). `pose` is how it was turned."""
 
-    found: line.Line
+    found: line.ImageLine
     pose: line.Pose
     bead: bead.Bead
     angle_deg: float
@@ -84,7 +84,7 @@ def _of_sign(
     return out
 
 
-def _measured(frame: np.ndarray, found: line.Line, behind_px: float, longest_blur_px: float) -> Rung:
+def _measured(frame: np.ndarray, found: line.ImageLine, behind_px: float, longest_blur_px: float) -> Rung:
     """The line of a picture, turned a second time where the first measurement shows that it lies askew."""
     for _ in range(2):
         pose = line.pose_on(found, (frame.shape[0], frame.shape[1]), behind_px=behind_px)
@@ -109,7 +109,7 @@ def _measured(frame: np.ndarray, found: line.Line, behind_px: float, longest_blu
     )
 
 
-def _covered(shape: tuple[int, int], found: line.Line) -> np.ndarray:
+def _covered(shape: tuple[int, int], found: line.ImageLine) -> np.ndarray:
     """(h, w) bool: what a line and its edges cover of a picture."""
     a = math.radians(found.angle_deg)
     y, x = np.mgrid[: shape[0], : shape[1]]
@@ -148,7 +148,7 @@ def calibrated(
     )
 
 
-def pitch_px(found: Sequence[line.Line]) -> float:
+def pitch_px(found: Sequence[line.ImageLine]) -> float:
     """Mean distance in px of the middles of neighbouring parallel lines: no edge enters. Raises ValueError
     for fewer than two lines."""
     if len(found) < 2:

@@ -35,23 +35,23 @@ class Latency(NamedTuple):
 
 
 UNTOLD = Latency(0.0, math.inf)
+# a latency known to this is taken off; one that is less known counts as unknown, s
+KNOWN_S = 0.005
 
 
-class Gantry(NamedTuple):
-    """time_s (T,) and position_mm (T,) along the line, as recorded."""
-
-    time_s: np.ndarray
-    position_mm: np.ndarray
+# the gantry as recorded: time_s (T,), and its place (T,) in mm along the line
+Gantry = tuple[np.ndarray, np.ndarray]
 
 
 def near_changes(time_s: np.ndarray, gantry: Gantry) -> np.ndarray:
     """(F,) bool: whether the gantry's speed changes near a frame."""
-    speed = np.abs(np.gradient(gantry.position_mm, gantry.time_s))
+    clock, position = gantry
+    speed = np.abs(np.gradient(position, clock))
     top = float(speed.max())
     if not top > 0:
         return np.zeros(len(time_s), bool)
-    first = np.searchsorted(gantry.time_s, time_s - NEAR_S - LATEST_S)
-    last = np.maximum(np.searchsorted(gantry.time_s, time_s + NEAR_S - EARLIEST_S), first + 1)
+    first = np.searchsorted(clock, time_s - NEAR_S - LATEST_S)
+    last = np.maximum(np.searchsorted(clock, time_s + NEAR_S - EARLIEST_S), first + 1)
     last = np.minimum(last, len(speed))
     first = np.minimum(first, last - 1)
     return np.array([np.ptp(speed[a:b]) > CHANGE * top for a, b in zip(first, last, strict=True)])
@@ -68,12 +68,12 @@ def estimate(time_s: np.ndarray, signals: np.ndarray, gantry: Gantry, *, step_mm
     # what rides with the camera says nothing of the motion
     values = values - values.mean(axis=0)
     times, cells = time_s[used], float(abs(step_mm))
-    if np.ptp(gantry.position_mm) > LONGEST_CELLS * cells:
+    if np.ptp(gantry[1]) > LONGEST_CELLS * cells:
         return UNTOLD
     along = step_mm * np.arange(values.shape[2])
 
     def miss(L: float) -> float:
-        x = np.interp(times - L, gantry.time_s, gantry.position_mm)
+        x = np.interp(times - L, *gantry)
         return _disagreement((x[:, None] + along) / cells, values)
 
     grid = np.arange(EARLIEST_S, LATEST_S + STEP_S / 2, STEP_S)
@@ -90,7 +90,7 @@ def estimate(time_s: np.ndarray, signals: np.ndarray, gantry: Gantry, *, step_mm
         return UNTOLD
     best = float(np.clip(-curve[1] / (2 * curve[0]), -STEP_S, STEP_S))
     least = max(float(np.polyval(curve, best)), 1e-9)
-    x = np.interp(times - grid[k], gantry.time_s, gantry.position_mm)
+    x = np.interp(times - grid[k], *gantry)
     places = len(np.unique(np.floor((x[:, None] + along) / cells)))
     free = values.size - values.shape[1] * places
     variance = least / max(free, 1.0)
@@ -125,3 +125,11 @@ def pooled(estimates: Sequence[Latency]) -> Latency:
     mean = float(weight @ values / weight.sum())
     scatter = float(weight @ np.square(values - mean) / weight.sum()) / max(len(told) - 1, 1)
     return Latency(mean, max(1 / math.sqrt(weight.sum()), math.sqrt(scatter)))
+
+
+def of_camera(latency_s: float | None, estimates: Sequence[Latency]) -> Latency:
+    """The latency that is taken off: as given, or as the recordings together tell it to KNOWN_S."""
+    if latency_s is not None:
+        return Latency(latency_s, 0.0)
+    together = pooled(estimates)
+    return together if together.deviation_s <= KNOWN_S else UNTOLD

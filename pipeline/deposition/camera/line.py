@@ -30,7 +30,7 @@ OUTSIDE = -1e6
 WIDE_PX, LEAST_PX = 64, 96
 
 
-class Line(NamedTuple):
+class ImageLine(NamedTuple):
     """A line in a picture: its direction (0 right, 90 down), within 180 degrees where no tip says from where
     it comes; a point in its middle and its width in px of the picture; `contrast`, bead less ground in
     levels, and `score`, that contrast over its deviation along the line."""
@@ -64,7 +64,7 @@ def find(
     hidden_px: float = 0.0,
     mask: np.ndarray | None = None,
     sign: int = 0,
-) -> Line | None:
+) -> ImageLine | None:
     """The line with the most energy in the picture (h, w), or the one that comes out beside the nozzle's tip
     (x, y) in px, seen from `hidden_px` on; None where there is none. What `mask` (h, w) marks is not looked
     at. `sign` is 1 for a bead brighter than its ground, -1 for a darker one, 0 for either."""
@@ -91,8 +91,8 @@ def find(
     x0, y0 = ((at + 0.5) * shrunk - 0.5 for at in centre)
     along = best.along * shrunk
     x, y = x0 - math.sin(a) * across + math.cos(a) * along, y0 + math.cos(a) * across + math.sin(a) * along
-    return Line(best.turn % (180 if tip is None else 360), x, y, best.width * shrunk, best.contrast / level,
-                best.score)  # fmt: skip
+    angle, width_px = best.turn % (180 if tip is None else 360), best.width * shrunk
+    return ImageLine(angle, x, y, width_px, best.contrast / level, best.score)
 
 
 class _Band(NamedTuple):
@@ -210,7 +210,7 @@ def turned(frame: np.ndarray, pose: Pose) -> np.ndarray:
 
 
 def pose_on(
-    line: Line, shape: tuple[int, int], *, ahead_px: float = math.inf, behind_px: float = math.inf
+    line: ImageLine, shape: tuple[int, int], *, ahead_px: float = math.inf, behind_px: float = math.inf
 ) -> Pose:
     """The pose in which only the line and its surroundings are left: half its width again on both sides, and
     as much of its length, up to `longest_px`, as lies with them inside of the frame (rows, columns). A line
@@ -238,7 +238,7 @@ def span(pose: Pose, shape: tuple[int, int], columns: tuple[int, int], half: flo
     return columns[0] + first, columns[0] + first + int(np.argmin(np.append(inside[first:], False)))
 
 
-def foot(line: Line, x: float, y: float) -> tuple[float, float]:
+def foot(line: ImageLine, x: float, y: float) -> tuple[float, float]:
     """The point of the line that is nearest to (x, y)."""
     a = math.radians(line.angle_deg)
     along = (x - line.x) * math.cos(a) + (y - line.y) * math.sin(a)

@@ -2,15 +2,19 @@
 the nozzle sees, with everything that misleads an edge detector."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from pipeline.deposition.camera import bead
 from pipeline.deposition.camera.bead import area
 from pipeline.deposition.camera.flow import View, deposit_share
+from pipeline.deposition.camera.pose import Mounting
 
+# frames of each known width, spread over the stage
+CALIBRATION_FRAMES = 12
 # table of profiles: steps of width and of vertical shift in px; stochastic rounding keeps the mean exact
 WIDTH_STEP, SHIFTS = 0.25, 4
 # instants a frame at which material leaves the nozzle
@@ -51,8 +55,10 @@ class Scene(NamedTuple):
 NOMINAL = Scene(480, 640, 60.0, 90.0, 0.20, 90.0, -0.30, 2.0, 1.2, 10.0, 2.0, 3.0, 3.0, 0.2, 0.6, 8.0)
 HARD = Scene(480, 640, 70.0, 50.0, 0.35, 120.0, 0.55, 2.2, 2.8, 25.0, 5.0, 3.0, 8.0, 0.5, 1.5, 25.0)
 
+SCENES = {"nominal": NOMINAL, "hard": HARD}
 
-class Camera:
+
+class SimulatedCamera:
     """Renders frames of one scene; it remembers its tables and its banks
     of noise and texture. A frame takes about 0.3 ms."""
 
@@ -159,6 +165,27 @@ class Camera:
         y, x = np.ogrid[: self.scene.height, : self.scene.width]
         middle = self.scene.height / 2 - 0.5 + self.scene.offset_px
         return np.nonzero((y - middle) ** 2 + (x - view.nozzle_column) ** 2 < radius_px**2)
+
+
+def calibrate(
+    camera: SimulatedCamera, known_widths_mm: Sequence[float], rng: np.random.Generator, mounting: Mounting
+) -> bead.WidthCalibration:
+    """Pixels to mm on pictures of beads of known widths. Raises ValueError if one cannot be measured."""
+    widths_mm = np.repeat(known_widths_mm, CALIBRATION_FRAMES)
+    px, columns, blur_px = abs(mounting.mm_per_px), mounting.columns, mounting.longest_blur_px
+    frames = [camera.frame(width / px, stage_px=int(rng.integers(0, 10_000))) for width in widths_mm]
+    beads = [bead.measure(frame, columns=columns, longest_blur_px=blur_px) for frame in frames]
+    bad = [f"{width:g} mm: {one.reason}" for width, one in zip(widths_mm, beads, strict=True) if one.reason]
+    if bad:
+        reasons = ", ".join(
+            f"{bad.count(what)} of {CALIBRATION_FRAMES} of {what}" for what in dict.fromkeys(bad)
+        )
+        raise ValueError(
+            f"camera: known widths should be seen in every picture but are not ({reasons}); "
+            f"fit camera.known_widths_mm to what is seen at {px:g} mm per px, "
+            "or raise camera.longest_blur_px"
+        )
+    return bead.calibrate(np.array([one.width for one in beads]), widths_mm)
 
 
 def _instants(begin, end, time_s, flow, position) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ import scipy.fft
 import scipy.signal
 
 from pipeline.deposition import reachable
-from pipeline.deposition.drive import Drive, asked, at_limit, follows, obeyed
+from pipeline.deposition.drive import Drive, at_limit, demand, follows, obeyed
 from pipeline.deposition.extruder import Extruder, flow, frequency_response
 from pipeline.deposition.learning.trial_filter import Repeating, repeating
 from pipeline.deposition.learning.trial_model import TrialModel, identify_with_lag, lag_delay_s
@@ -129,11 +129,13 @@ def hoelzle_law(
     drive: Drive,
     sample_time_s: float,
 ) -> Law:
-    """u_{j+1} = Q (u_j + L e_j) of the last trial (Hoelzle 2009, eq. 2); q is
-    `zero_phase` or takes the same, the model the nominal (1).
+    """The paper's law on the last trial (Hoelzle 2009, eq. 2); q is `zero_phase` or takes the same, the model
+    the nominal (1).
 
-    u_j is what the drive applied, so that nothing winds up at its
-    limits; e_j = 0 where the flow was not observable.
+        u_{j+1} = Q (u_j + L e_j)
+
+    u_j is what the drive applied, so that nothing winds up at its limits; e_j = 0 where the flow was not
+    observable.
     """
     b, a = _slow_inverse(model, settings, sample_time_s)
 
@@ -236,15 +238,18 @@ def command(
 
 
 class InverseLaw:
-    """The model inverse, u_{j+1} = Q sum_i w_i (u_i + L e_i) over the trials i <= j that it is given, L the
-    inverse of the model identified from the first of them; it remembers that model.
+    """The model inverse over the trials i <= j that it is given, L the inverse of the model identified from
+    the first of them; it remembers that model.
 
-    Written with the average d of what the model misses: u_{j+1} = L Q ((r + yield) / g - d), the same thing
-    where the gain g of the next trial is 1, and for one trial Q (u + L e). The weights w_i average what does
-    not repeat, and follow what changes (`trial_filter.repeating`); Q stays outside, so that it erodes nothing
-    as they fall, and |1 - k + k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k. Q ends earlier where
-    the model's lag would have to be inverted far above its frequency (`known_share`), and what is learned is
-    bounded by what the model alone asks for (`bounded`).
+        u_{j+1} = Q sum_i w_i (u_i + L e_i)
+                = L Q ((r + yield) / g - d)
+
+    The second line, with the average d of what the model misses, is the same if the gain g of the next trial
+    is 1; for one trial both are Q (u + L e). The weights w_i average what does not repeat, and follow what
+    changes (`trial_filter.repeating`); Q stays outside, so that it erodes nothing as they fall, and |1 - k +
+    k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k. Q ends earlier where the model's lag would have
+    to be inverted far above its frequency (`known_share`), and what is learned is bounded by what the model
+    alone asks for (`bounded`).
 
     `identify_trials` trials are identified together: beyond the on-off trial 0 the first
     learned commands show the extruder as it will be driven.
@@ -334,7 +339,7 @@ def actuator_headroom(
         cutoff_hz=cutoff_hz,
         sample_time_s=sample_time_s,
     )
-    needed = asked(inverse(x, model, sample_time_s=sample_time_s), sample_time_s=sample_time_s)
+    command_mm, speed = demand(inverse(x, model, sample_time_s=sample_time_s), sample_time_s=sample_time_s)
     steady = float((r.max() + model.yield_) / model.gain)
     best, first = (
         rms(r - flow(model, u, sample_time_s=sample_time_s))
@@ -344,7 +349,7 @@ def actuator_headroom(
         )
     )
     ramp_s = max(_ramp_of_amplitude(drive, steady, model), _ramp_of_speed(drive, steady, model))
-    return ActuatorHeadroom(needed.command_mm, steady, best / first, ramp_s, needed.speed_mm_per_s)
+    return ActuatorHeadroom(command_mm, steady, best / first, ramp_s, speed)
 
 
 def _ramp_of_amplitude(drive: Drive, steady: float, model: Extruder) -> float:
@@ -387,7 +392,7 @@ def check_headroom(headroom: ActuatorHeadroom, *, drive: Drive, worst_ratio: flo
 # ---- the learning loop
 
 
-class Step(NamedTuple):
+class NextCommand(NamedTuple):
     """Next command u (T,) in mm; the best trial of the machine as it is now; whether the last trial rose, so
     that u goes back to the best; and the trials at which the machine was found changed."""
 
@@ -452,7 +457,7 @@ def _scattered(errors: list[float]) -> float:
     return float(np.median(errors)) + SCATTER * deviation
 
 
-def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) -> Step:
+def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) -> NextCommand:
     """What follows from the trials so far; nothing else is remembered,
     so that a folder of recordings can be continued.
 
@@ -474,7 +479,7 @@ def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) 
         u = best
     elif state.halvings:
         u = best + (u - best) / 2**state.halvings
-    return Step(u, state.best, state.risen[-1], state.restarts)
+    return NextCommand(u, state.best, state.risen[-1], state.restarts)
 
 
 def learn(
@@ -496,7 +501,7 @@ def learn(
     return done
 
 
-class Row(NamedTuple):
+class TrialRow(NamedTuple):
     """One trial: errors in mm^3/s (true is NaN where nothing was simulated), ratio to trial 0 of the true
     error where known, else of the measured one."""
 
@@ -511,7 +516,7 @@ class Row(NamedTuple):
 
 def table(
     trials: Sequence[Trial], r: np.ndarray, *, steady: float, drive: Drive, sample_time_s: float, rise: float
-) -> list[Row]:
+) -> list[TrialRow]:
     """A row a trial; `steady` is the steady command in mm, saturated the share of time at a limit of the
     drive, rolled_back whether the trial was left for a better one."""
     measured = [rms(r - trial.y) for trial in trials]
@@ -521,7 +526,7 @@ def table(
     for j, (u, _, truth) in enumerate(trials):
         ratio = measured[j] / measured[0] if truth is None else true[j] / true[0]
         rows.append(
-            Row(
+            TrialRow(
                 j,
                 true[j],
                 measured[j],

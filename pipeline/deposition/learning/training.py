@@ -1,13 +1,13 @@
 """A machine learns its routines: on-off first, then the paper's law or the model inverse, trial after trial;
 and the convergence of both over a family of plants before anything runs."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pipeline.deposition.drive import Drive, obeyed
-from pipeline.deposition.extruder import Extruder, Routine, disturb, draw, flow, frequency_response
+from pipeline.deposition.extruder import Extruder, Routine, disturb, draw, flow, frequency_response, to_json
 from pipeline.deposition.learning import ilc
 from pipeline.deposition.learning.ilc import Law, Trial
 from pipeline.deposition.learning.trial_model import deviations
@@ -15,6 +15,9 @@ from pipeline.deposition.learning.unmodelled import unmodelled
 
 # the frequencies of the convergence test reach to half the sampling rate
 FREQUENCIES = 2000
+# an extruder is known to 30 %: what is off by this factor is a unit, a scale or a picture of another size,
+# and the next command would be off as much
+WRONG_GAIN = 3.0
 
 
 class LawSettings(NamedTuple):
@@ -43,25 +46,8 @@ class TrialSequence(NamedTuple):
     law: str
     routine: Routine
     trials: list[Trial]
-    rows: list[ilc.Row]
+    rows: list[ilc.TrialRow]
     model: ilc.TrialModel | None
-
-
-class TrainingCase(NamedTuple):
-    """What a material is trained on: nominal model, the machine that it
-    runs on, and its routines, the reference first."""
-
-    nominal: Extruder
-    plant: Extruder
-    routines: list[Routine]
-
-
-class Convergence(NamedTuple):
-    """gamma of the nominal plant and of each plant of the family (N,); below 1 the error shrinks at every
-    trial."""
-
-    nominal: float
-    family: np.ndarray
 
 
 def on_off(r: np.ndarray, model: Extruder) -> np.ndarray:
@@ -130,7 +116,9 @@ def run_trials(
 
 
 def train(
-    case: TrainingCase,
+    nominal: Extruder,
+    plant: Extruder,
+    routines: Sequence[Routine],
     rng: np.random.Generator,
     noise: Noise,
     *,
@@ -140,22 +128,22 @@ def train(
 ) -> list[TrialSequence]:
     """The paper's law on the reference routine and the model inverse on every routine, on the simulated
     machine; last the paper's law on its own nominal model, as the paper ran it."""
-    first, sequences = case.routines[0], []
+    first, sequences = routines[0], []
     work = [
-        ("hoelzle_2009", first, case.plant),
-        *(("model_inverse", routine, case.plant) for routine in case.routines),
-        ("hoelzle_2009_nominal", first, case.nominal),
+        ("hoelzle_2009", first, plant),
+        *(("model_inverse", routine, plant) for routine in routines),
+        ("hoelzle_2009_nominal", first, nominal),
     ]
-    for name, routine, plant in work:
-        measure = simulated(plant, rng, noise, steady_flow=float(routine.r.max()), settings=settings)
+    for name, routine, machine in work:
+        measure = simulated(machine, rng, noise, steady_flow=float(routine.r.max()), settings=settings)
         law = (
             model_inverse(routine, settings)
             if name == "model_inverse"
-            else hoelzle_2009(routine, case.nominal, settings)
+            else hoelzle_2009(routine, nominal, settings)
         )
         sequences.append(
             run_trials(
-                name, law, measure, routine, case.nominal, trials=trials, settings=settings, on_step=on_step
+                name, law, measure, routine, nominal, trials=trials, settings=settings, on_step=on_step
             )
         )
     return sequences
@@ -181,9 +169,12 @@ def figures(sequence: TrialSequence, *, rise: float) -> dict[str, float | list[i
 
 def convergence(
     nominal: Extruder, rng: np.random.Generator, *, plants: int, steady_flow: float, settings: LawSettings
-) -> Convergence:
-    """gamma = max |Q (1 - L P)| of the paper's law over `plants` draws
-    around the nominal model, before anything runs."""
+) -> tuple[float, np.ndarray]:
+    """gamma of the paper's law on the nominal plant, and on each of `plants` draws around it, before anything
+    runs; below 1 the error shrinks at every trial.
+
+        gamma = max_f |Q (1 - L P)|
+    """
     f = np.linspace(0.0, 0.5 / settings.sample_time_s, FREQUENCIES)
     law, Ts = settings.hoelzle_2009, settings.sample_time_s
     Q = ilc.magnitude(f, order=law.order, cutoff_hz=law.cutoff_hz, sample_time_s=Ts) ** 2
@@ -196,14 +187,16 @@ def convergence(
         [frequency_response(plant, f, sample_time_s=settings.sample_time_s) for plant in [nominal, *family]]
     )
     gammas = ilc.gamma(Q, L, P)
-    return Convergence(float(gammas[0]), gammas[1:])
+    return float(gammas[0]), gammas[1:]
 
 
 def convergence_of_model_inverse(
     sequence: TrialSequence, rng: np.random.Generator, noise: Noise, *, plants: int, settings: LawSettings
-) -> Convergence:
-    """gamma = max |Q| (|1 - L P| + |L P Delta|) of the model inverse once its model is identified: of that
-    model, and over plants that the first trials cannot tell from it.
+) -> tuple[float, np.ndarray]:
+    """gamma of the model inverse once its model is identified: of that model, and over plants that the first
+    trials cannot tell from it.
+
+        gamma = max_f |Q| (|1 - L P| + |L P Delta|)
 
     That is the largest |Q (1 - L P (1 + Delta'))| of all |Delta'(f)| <= |Delta(f)|, and Delta is what the
     model leaves of the trials that identified it and of the next one, which it has not seen
@@ -228,7 +221,7 @@ def convergence_of_model_inverse(
     ]
     P = np.stack([frequency_response(plant, f, sample_time_s=Ts) for plant in [e, *family]])
     gammas = ilc.gamma(Q, L, P, unmodelled(sequence.model, u, y, f, sample_time_s=Ts))
-    return Convergence(float(gammas[0]), gammas[1:])
+    return float(gammas[0]), gammas[1:]
 
 
 def _first_trials(sequence: TrialSequence, count: int, settings: LawSettings) -> list[Trial]:
@@ -256,13 +249,128 @@ def actuator_headroom(
     return headroom
 
 
+def prospects(
+    nominal: Extruder,
+    routines: Sequence[Routine],
+    rng: np.random.Generator,
+    settings: LawSettings,
+    *,
+    plants: int,
+    steady_flow: float,
+    worst_ratio: float,
+) -> dict[str, Any]:
+    """What is known before anything runs: gamma of the paper's law on the nominal model and over the family,
+    and the headroom of the drive over each routine."""
+    gamma, family = convergence(nominal, rng, plants=plants, steady_flow=steady_flow, settings=settings)
+    headrooms = [
+        actuator_headroom(routine, nominal, worst_ratio=worst_ratio, settings=settings)
+        for routine in routines
+    ]
+    return {
+        "gamma": gamma,
+        "gamma_worst": family.max(),
+        "gamma_above_1_percent": 100 * np.mean(family > 1),
+        "actuator_headroom": [
+            {"peak_over_steady": one.peak / one.steady, "least_ratio": one.ratio, "ramp_s": one.ramp_s}
+            for one in headrooms
+        ],
+    }
+
+
+def learn_in_flow(
+    nominal: Extruder,
+    plant: Extruder,
+    routines: Sequence[Routine],
+    rngs: Sequence[np.random.Generator],
+    noise: Noise,
+    *,
+    trials: int,
+    plants: int,
+    settings: LawSettings,
+    on_step: Callable[[Trial], None],
+) -> tuple[dict[int, list[TrialSequence]], dict[str, Any], dict[str, Any]]:
+    """Both laws on the measured flow of a simulated machine: their sequences by number of the routine,
+    figures, and the models as JSON. `rngs` draw what does not repeat, and the plants of the convergence
+    test."""
+    sequences = train(
+        nominal, plant, routines, rngs[0], noise, trials=trials, settings=settings, on_step=on_step
+    )
+    hoelzle, reference, *others, hoelzle_nominal = sequences
+    gamma, family = convergence_of_model_inverse(reference, rngs[1], noise, plants=plants, settings=settings)
+    rows = {
+        "gamma_model_inverse": gamma,
+        "gamma_model_inverse_worst": family.max(),
+        "hoelzle_2009_nominal": figures(hoelzle_nominal, rise=settings.rise),
+        "hoelzle_2009": figures(hoelzle, rise=settings.rise),
+        "model_inverse": figures(reference, rise=settings.rise),
+        "other_routines": [figures(sequence, rise=settings.rise) for sequence in others],
+    }
+    by_routine = {0: [hoelzle_nominal, hoelzle, reference]}
+    by_routine |= {index: [sequence] for index, sequence in enumerate(others, 1)}
+    models = {"nominal": to_json(nominal), "plant": to_json(plant)}
+    return by_routine, rows, models | {"identified": model_figures(reference.model)}
+
+
+def resume(
+    trials: Sequence[Trial], routine: Routine, nominal: Extruder, settings: LawSettings
+) -> tuple[TrialSequence | None, np.ndarray, dict[str, Any]]:
+    """What was learned in the trials so far, the next command u (T,) in mm, and its figures: trial 0 is
+    on-off control. Raises ValueError if they show another gain than the nominal one by more than
+    WRONG_GAIN."""
+    u0 = on_off(routine.r, nominal)
+    if not trials:
+        first = obeyed(u0, settings.drive, sample_time_s=settings.sample_time_s)
+        return None, first, {"best_trial": 0, "rolled_back": False, "restarts": []}
+    law = model_inverse(routine, settings)
+    u, best, rolled_back, restarts = ilc.next_step(trials, routine.r, law, rise=settings.rise)
+    gain_ratio = law.model.extruder.gain / nominal.gain if law.model else 1.0
+    if not 1 / WRONG_GAIN < gain_ratio < WRONG_GAIN:
+        raise ValueError(
+            f"the trials show {gain_ratio:.3g} times the gain of printer.materials; "
+            "check the units of the command, the calibration and the frames' size, or write the gain as it is"
+        )
+    rows = ilc.table(
+        trials, routine.r, steady=float(u0.max()), drive=settings.drive,
+        sample_time_s=settings.sample_time_s, rise=settings.rise,
+    )  # fmt: skip
+    sequence = TrialSequence("pixels", routine, list(trials), rows, law.model)
+    return sequence, u, {"best_trial": best, "rolled_back": rolled_back, "restarts": restarts}
+
+
+def model_figures(model: ilc.TrialModel | None) -> dict[str, float] | None:
+    """An identified model as JSON."""
+    if model is None:
+        return None
+    e = model.extruder
+    return {
+        "gain": e.gain, "time_constant_s": e.time_constant_s, "delay_s": e.delay_s,
+        "lag_hz": e.lag_hz, "yield": e.yield_, "noise": model.noise,
+        "fit_percent": model.fit_percent,
+    }  # fmt: skip
+
+
+def join(parts: Iterable[tuple[dict, dict, dict, dict]]) -> tuple[dict, dict, dict, dict]:
+    """All results as one: trial sequences and measured trials by (material, number of the routine), models
+    and figures by material; dictionaries of one material are put together."""
+    sequences, measured, models, figures = {}, {}, {}, {}
+    for part in parts:
+        for key, of_routine in part[0].items():
+            sequences.setdefault(key, []).extend(of_routine)
+        measured.update(part[1])
+        for joint, of_part in ((models, part[2]), (figures, part[3])):
+            for name, values in of_part.items():
+                joint.setdefault(name, {}).update(values)
+    return sequences, measured, models, figures
+
+
 # ---- as tables
 
 
 def trial_rows(sequences: dict[tuple[str, int], list[TrialSequence]]) -> dict[str, np.ndarray]:
     """One row a trial of every sequence, by (material, number of the routine)."""
     columns: dict[str, list] = {
-        name: [] for name in ("material", "law", "routine", "speed_mm_per_s", "pause_s", *ilc.Row._fields)
+        name: []
+        for name in ("material", "law", "routine", "speed_mm_per_s", "pause_s", *ilc.TrialRow._fields)
     }
     for (material, index), of_routine in sequences.items():
         for sequence in of_routine:

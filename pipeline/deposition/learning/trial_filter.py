@@ -1,7 +1,8 @@
 """What repeats from trial to trial beyond the model, filtered over the trials: a disturbance, and a gain that
 may change. How fast each is followed is chosen by what would have foretold the trials best."""
 
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
@@ -26,12 +27,6 @@ WEIGHT_MARGIN, GAIN_MARGIN = 0.8, 0.5
 GAIN_BOUNDS = (0.2, 5.0)
 
 
-class Smoother(Protocol):
-    """Q: (..., T) -> (..., T)."""
-
-    def __call__(self, x: np.ndarray, /) -> np.ndarray: ...
-
-
 class Repeating(NamedTuple):
     """y = max(gain (G u + disturbance) - yield, 0): the disturbance (T,) in mm^3/s, the gain of the next
     trial over the model's as forecast; `weight`, the least weight of a new trial that was chosen, and
@@ -50,15 +45,19 @@ def repeating(
     model: TrialModel,
     *,
     floor: float,
-    smooth: Smoother,
+    smooth: Callable[[np.ndarray], np.ndarray],
     sample_time_s: float,
 ) -> Repeating:
     """Of the commands u (J, T) in mm and flows y (J, T) in mm^3/s of all trials, NaN where not observable,
-    for the wanted flow r (T,).
+    for the wanted flow r (T,); `smooth` is Q: (..., T) -> (..., T).
 
-    A Kalman filter over trials with the weight k_j = max(1/j, least), d <- d + k_j ((y + yield) / g_j -
-    (G u_j + d)), g_j the gain of trial j by least squares of its flow; the first trials in full and with g =
-    1. A static machine wants 1/j. On one that changes a faster weight foretells the next trial better, of the
+    A Kalman filter over trials, g_j the gain of trial j by least squares of its flow; the first trials count
+    in full and with g = 1:
+
+        k_j = max(1/j, least)
+        d <- d + k_j ((y + yield) / g_j - (G u_j + d))
+
+    A static machine wants 1/j. On one that changes a faster weight foretells the next trial better, of the
     disturbance by its Q-filtered innovation, of the gain by that of ln g_j: this evidence chooses
     (exponential smoothing and its trend: Holt 1957; chosen by one-step errors: Gardner 2006).
 

@@ -37,8 +37,9 @@ class TrialModel(NamedTuple):
 def identify(
     u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float, yield_: float | None = None
 ) -> TrialModel:
-    """The model that simulates the trials best from rest: min over (K, tau,
-    delay, yield) of the sum of (max(x - yield, 0) - y)^2.
+    """The model that simulates the trials best from rest:
+
+        min over (K, tau, delay, yield) of sum (max(x - yield, 0) - y)^2
 
     u (T,) in mm and measured flow y (T,) in mm^3/s of each trial; NaN in y is a sample that was not
     observable. `yield_` in mm^3/s where it is known and not sought. Raises ValueError where a command holds

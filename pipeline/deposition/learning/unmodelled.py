@@ -28,12 +28,12 @@ def unmodelled(
     """|Delta(f)| (F,) of P = P_model (1 + Delta), from the trials that identified the model; 0 at frequencies
     that they do not excite.
 
-    |Delta|^2 = (S_residual - S_noise) / S_flow, the residual y - y_model of the whole model with its dead
-    band, each spectrum summed over the trials and smoothed over SMOOTHED_HZ; S_noise is the level of the
-    residual at the highest frequencies. What does not repeat and is slow counts as Delta: one trial does not
-    tell it from the machine. u (T,) in mm and y (T,) in mm^3/s of each trial, NaN where not observable;
-    frequency_hz (F,).
-    """
+        |Delta|^2 = (S_residual - S_noise) / S_flow
+
+    The residual y - y_model is that of the whole model with its dead band, each spectrum summed over the
+    trials and smoothed over SMOOTHED_HZ; S_noise is the level of the residual at the highest frequencies.
+    What does not repeat and is slow counts as Delta: one trial does not tell it from the machine. u (T,) in
+    mm and y (T,) in mm^3/s of each trial, NaN where not observable; frequency_hz (F,)."""
     n = max(len(a) for a in u)
     f = np.fft.rfftfreq(n, sample_time_s)
     residual, simulated = np.zeros(len(f)), np.zeros(len(f))

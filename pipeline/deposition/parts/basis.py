@@ -8,9 +8,9 @@ import scipy.ndimage
 import scipy.signal
 
 from pipeline.deposition import reachable
-from pipeline.deposition.drive import UNLIMITED, Drive, asked, follows, obeyed
+from pipeline.deposition.drive import UNLIMITED, Drive, demand, follows, obeyed
 from pipeline.deposition.extruder import DAMPING, Extruder, ramp
-from pipeline.deposition.parts.chain import Identified, fronts
+from pipeline.deposition.parts.chain import IdentifiedExtruder, fronts
 
 # the yield is loaded this long before the flow begins and kept through gaps of twice that: long against the
 # lag, short against a pause between lines
@@ -50,23 +50,23 @@ def loaded(r: np.ndarray, margin_s: float, sample_time_s: float) -> np.ndarray:
     return np.clip(near, 0.0, 1.0)
 
 
-def advance(extruder: Extruder | Identified, sample_time_s: float) -> np.ndarray:
+def advance(extruder: Extruder | IdentifiedExtruder, sample_time_s: float) -> np.ndarray:
     """Centred impulse response of conj(H) / (|H|^2 + FLOOR), scaled to gain 1, with H
     of delay and lags: what comes late is sent ahead."""
     half = round(SPAN_S / sample_time_s)
     impulse = np.zeros(4 * half)
     impulse[0] = 1.0
-    H = np.fft.rfft(fronts([Identified(*extruder)], impulse[None], sample_time_s)[0, 0])
+    H = np.fft.rfft(fronts([IdentifiedExtruder(*extruder)], impulse[None], sample_time_s)[0, 0])
     h = np.roll(np.fft.irfft(np.conj(H) / (np.abs(H) ** 2 + FLOOR), len(impulse)), half)[: 2 * half + 1]
     return h / h.sum()
 
 
-def mean_lag_s(extruder: Extruder | Identified) -> float:
+def mean_lag_s(extruder: Extruder | IdentifiedExtruder) -> float:
     """The mean delay in s of the lags: 2 zeta / w of the second-order one."""
-    return DAMPING / (math.pi * extruder.lag_hz) + Identified(*extruder).second_lag_s
+    return DAMPING / (math.pi * extruder.lag_hz) + IdentifiedExtruder(*extruder).second_lag_s
 
 
-def shift(extruder: Extruder | Identified, sample_time_s: float) -> np.ndarray:
+def shift(extruder: Extruder | IdentifiedExtruder, sample_time_s: float) -> np.ndarray:
     """Centred impulse response that sends a signal ahead by the delay and the
     mean delay of the lag, and never beyond its limits."""
     half = round(SPAN_S / sample_time_s)
@@ -78,28 +78,32 @@ def shift(extruder: Extruder | Identified, sample_time_s: float) -> np.ndarray:
 
 
 def compose(
-    extruder: Extruder | Identified, r: np.ndarray, *, sample_time_s: float, drive: Drive = UNLIMITED
+    extruder: Extruder | IdentifiedExtruder, r: np.ndarray, *, sample_time_s: float, drive: Drive = UNLIMITED
 ) -> np.ndarray:
     """The command u (T,) in mm for the wanted flow r (T,) in mm^3/s, as functions of r and of the
     on-indicator p, with x = r + yield p:
 
-    u(t) = advance * [ rate x'(t) + level x(t) + slow <x>(t) + play
-    q(t) sin(2 pi f t) ], <x> = x / (sigma s + 1)
+        u(t) = advance * [ rate x'(t) + level x(t) + slow <x>(t) + play q(t) sin(2 pi f t) ]
+        <x> = x / (sigma s + 1)
 
-    The weights invert the chain (for an exponent, of the pressed x that gives r; where flow falls
-    otherwise than it rises, with the time constant of each sample's direction): with c the creeping
-    share, sigma = (1 - c) T + c tau, rate = tau T / (sigma K), level = (tau + T - tau T / sigma) / (sigma
-    K) and level + slow = 1 / K; without creep rate = tau / K, level = 1 / K, slow = 0. Computed in its
-    exact discrete form. The dither is as wide as the play: it walks through the play wherever that
-    stands, so that its mean position is the command's (Zames and Shneydor 1976); q lets it die out after
-    a stop.
+    The weights invert the chain, with c the creeping share:
+
+        sigma = (1 - c) T + c tau
+        rate = tau T / (sigma K)
+        level = (tau + T - tau T / sigma) / (sigma K)
+        level + slow = 1 / K
+
+    Without creep rate = tau / K, level = 1 / K, slow = 0. For an exponent x is the pressed one that gives r;
+    if flow falls otherwise than it rises, tau is that of each sample's direction. Computed in its exact
+    discrete form. The dither is as wide as the play: it walks through the play wherever that stands, so that
+    its mean position is the command's (Zames and Shneydor 1976); q lets it die out after a stop.
 
     The yield is loaded over as long as the drive needs. Where it cannot follow u even so, the command whose
     flow comes nearest: it sets out early and catches up late. What the dither takes is left of the limits.
     """
     if not np.any(r > 0):
         return np.zeros(len(r))
-    extruder = Identified(*extruder)
+    extruder = IdentifiedExtruder(*extruder)
     ahead, dithered = advance(extruder, sample_time_s), dither(extruder, r, sample_time_s)
     u = np.zeros(len(r))
     for times in LOADS if extruder.yield_ > 0 else LOADS[:1]:
@@ -115,7 +119,7 @@ def compose(
     return obeyed(scipy.signal.oaconvolve(v + dithered, ahead, "same"), drive, sample_time_s=sample_time_s)
 
 
-def dither(extruder: Extruder | Identified, r: np.ndarray, sample_time_s: float) -> np.ndarray:
+def dither(extruder: Extruder | IdentifiedExtruder, r: np.ndarray, sample_time_s: float) -> np.ndarray:
     """q(t) sin(2 pi f t) (T,) in mm, as wide as the play; q fades after a stop."""
     fading = extruder.play * loaded(r, DITHER_S, sample_time_s)
     return fading * np.sin(2 * np.pi * DITHER_HZ * sample_time_s * np.arange(len(r)))
@@ -123,14 +127,14 @@ def dither(extruder: Extruder | Identified, r: np.ndarray, sample_time_s: float)
 
 def _beside(dithered: np.ndarray, ahead: np.ndarray, drive: Drive, sample_time_s: float) -> Drive:
     """What the dither, sent ahead, leaves of the drive; never less than half of it."""
-    takes = asked(scipy.signal.oaconvolve(dithered, ahead, "same"), sample_time_s=sample_time_s)
+    command_mm, speed = demand(scipy.signal.oaconvolve(dithered, ahead, "same"), sample_time_s=sample_time_s)
     return drive._replace(
-        amplitude_mm=max(drive.amplitude_mm - takes.command_mm, drive.amplitude_mm / 2),
-        speed_mm_per_s=max(drive.speed_mm_per_s - takes.speed_mm_per_s, drive.speed_mm_per_s / 2),
+        amplitude_mm=max(drive.amplitude_mm - command_mm, drive.amplitude_mm / 2),
+        speed_mm_per_s=max(drive.speed_mm_per_s - speed, drive.speed_mm_per_s / 2),
     )
 
 
-def pressed_of(extruder: Identified, x: np.ndarray) -> np.ndarray:
+def pressed_of(extruder: IdentifiedExtruder, x: np.ndarray) -> np.ndarray:
     """p (T,) in mm whose flow without yield is x (T,) >= 0: `chain.flow_of` undone."""
     if extruder.exponent == 1.0:
         return x / extruder.gain
@@ -138,14 +142,14 @@ def pressed_of(extruder: Identified, x: np.ndarray) -> np.ndarray:
     return extruder.level * np.maximum(x / full, 0.0) ** (1 / extruder.exponent)
 
 
-def _modes(extruder: Identified, sample_time_s: float) -> tuple[np.ndarray, np.ndarray]:
+def _modes(extruder: IdentifiedExtruder, sample_time_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Share and pole of the fast and of the creeping mode: each is
     m(t+1) = pole m(t) + share v(t), and p their sum."""
     poles = np.exp(-sample_time_s / np.array([extruder.time_constant_s, extruder.creep_time_s]))
     return np.array([1 - extruder.creep_share, extruder.creep_share]) * (1 - poles), poles
 
 
-def _inverse(extruder: Identified, p: np.ndarray, sample_time_s: float) -> np.ndarray:
+def _inverse(extruder: IdentifiedExtruder, p: np.ndarray, sample_time_s: float) -> np.ndarray:
     """v (T,), held between samples, that brings both modes together to p at every next sample."""
     (g, h), (a, b) = _modes(extruder, sample_time_s)
     if extruder.fall_ratio == 1.0:
@@ -166,11 +170,11 @@ def _inverse(extruder: Identified, p: np.ndarray, sample_time_s: float) -> np.nd
 
 
 def reached(
-    extruder: Extruder | Identified, v: np.ndarray, r: np.ndarray, drive: Drive, sample_time_s: float
+    extruder: Extruder | IdentifiedExtruder, v: np.ndarray, r: np.ndarray, drive: Drive, sample_time_s: float
 ) -> np.ndarray:
     """v (T,) that the drive can follow whose fast mode comes nearest to that of the unlimited v; where no
     flow r (T,) is wanted only what rises above the yield costs. Delay and lag lie before v."""
-    extruder = Identified(*extruder)
+    extruder = IdentifiedExtruder(*extruder)
     (share, creeping), (a, b) = _modes(extruder, sample_time_s)
     g, h = share * extruder.gain, creeping * extruder.gain
     fast, slow = (scipy.signal.lfilter([gain], [1.0, -pole], v) for gain, pole in ((g, a), (h, b)))

@@ -13,7 +13,7 @@ from pipeline.deposition.extruder import DAMPING, Extruder, lagged
 from pipeline.deposition.parts.library import Training
 
 
-class Identified(NamedTuple):
+class IdentifiedExtruder(NamedTuple):
     """An extruder as `extruder.Extruder`, in the same order, with what the trials may show beside it.
 
     Flow falls with fall_ratio times the time constant that it rises with; a further lag second_lag_s follows
@@ -74,12 +74,12 @@ class Chain(NamedTuple):
     means.
     """
 
-    extruder: Identified
+    extruder: IdentifiedExtruder
     residual_percent: float
     held_out_percent: float
     structure: tuple[str, ...]
-    left_out: tuple[Identified, ...]
-    members: tuple[Identified, ...]
+    left_out: tuple[IdentifiedExtruder, ...]
+    members: tuple[IdentifiedExtruder, ...]
     trials: int
     rows: int
 
@@ -112,8 +112,9 @@ def records(trainings: Sequence[Training], *, early: int = 3) -> Records:
 
 
 def backlash(x: np.ndarray, play: np.ndarray) -> np.ndarray:
-    """Play of full width `play` (...,) along the last axis of x (..., T), y(t) = min(max(y(t-1), x(t) -
-    play/2), x(t) + play/2) from y(-1) = 0.
+    """Play of full width `play` (...,) along the last axis of x (..., T), from y(-1) = 0:
+
+        y(t) = min(max(y(t-1), x(t) - play/2), x(t) + play/2)
 
     Each step clips y to [x - play/2, x + play/2], and clips compose to clips: blocks of
     the time axis are walked side by side, then joined.
@@ -169,7 +170,7 @@ def asymmetric(x: np.ndarray, rise: np.ndarray, fall: np.ndarray) -> np.ndarray:
     return walked.T
 
 
-def fronts(extruders: Sequence[Identified], u: np.ndarray, sample_time_s: float) -> np.ndarray:
+def fronts(extruders: Sequence[IdentifiedExtruder], u: np.ndarray, sample_time_s: float) -> np.ndarray:
     """u (N, T) behind the delay and the lags of each extruder: (P, N, T)."""
     made: dict[tuple[float, ...], np.ndarray] = {}
     for e in extruders:
@@ -184,11 +185,11 @@ def fronts(extruders: Sequence[Identified], u: np.ndarray, sample_time_s: float)
 
 
 def simulate(
-    extruders: Sequence[Extruder | Identified], u: np.ndarray, *, sample_time_s: float
+    extruders: Sequence[Extruder | IdentifiedExtruder], u: np.ndarray, *, sample_time_s: float
 ) -> np.ndarray:
     """Flow (P, N, T) of each of P extruders under the rows u (N, T),
     each from rest: extruder.flow for many at once, where that has the structure."""
-    those = [Identified(*e) for e in extruders]
+    those = [IdentifiedExtruder(*e) for e in extruders]
     x = fronts(those, u, sample_time_s)
     x = backlash(x, np.array([e.play for e in those])[:, None])
     rise = np.exp([-sample_time_s / e.time_constant_s for e in those])
@@ -208,7 +209,7 @@ def simulate(
     return p
 
 
-def flow_of(extruder: Identified, p: np.ndarray) -> np.ndarray:
+def flow_of(extruder: IdentifiedExtruder, p: np.ndarray) -> np.ndarray:
     """K level (p / level)^exponent in mm^3/s of the pressed p in mm, odd in p: the flow without yield."""
     if extruder.exponent == 1.0:
         return extruder.gain * p
@@ -216,15 +217,15 @@ def flow_of(extruder: Identified, p: np.ndarray) -> np.ndarray:
     return extruder.gain * extruder.level * np.sign(share) * np.abs(share) ** extruder.exponent
 
 
-def forecast(extruder: Extruder | Identified, u: np.ndarray, *, sample_time_s: float) -> np.ndarray:
+def forecast(extruder: Extruder | IdentifiedExtruder, u: np.ndarray, *, sample_time_s: float) -> np.ndarray:
     """Predicted flow (T,) of one command (T,) from rest."""
     return simulate([extruder], u[None], sample_time_s=sample_time_s)[0, 0]
 
 
-def _extruder(z: np.ndarray, steady_flow: float) -> Identified:
+def _extruder(z: np.ndarray, steady_flow: float) -> IdentifiedExtruder:
     gain = math.exp(z[0])
     level = steady_flow / gain
-    return Identified(
+    return IdentifiedExtruder(
         gain,
         math.exp(z[1]),
         float(z[2]),
@@ -253,7 +254,7 @@ def innovations(error: np.ndarray, weight: np.ndarray, sample_time_s: float) -> 
     return np.where(weight > 0, white, 0.0)
 
 
-class Problem(NamedTuple):
+class ChainProblem(NamedTuple):
     """What is fitted: rows, the steady flow (mm^3/s) that errors are shares of, the clock."""
 
     rows: Records
@@ -269,7 +270,7 @@ class Problem(NamedTuple):
         return innovations(difference, self.rows.weight, self.sample_time_s) / self.steady_flow
 
 
-class Fit(NamedTuple):
+class ChainFit(NamedTuple):
     """Unknowns z, those that were moved, and at z by row: Gauss-Newton's matrix H (N, p, p), its gradient g
     (N, p), the sum of squared innovations cost (N,)."""
 
@@ -284,7 +285,7 @@ class Fit(NamedTuple):
         return _stepped(self.z, self.free, self.H[~out].sum(axis=0), self.g[~out].sum(axis=0))
 
 
-def _normal(problem: Problem, z: np.ndarray, free: np.ndarray) -> Fit:
+def _normal(problem: ChainProblem, z: np.ndarray, free: np.ndarray) -> ChainFit:
     """Gauss-Newton's equations at z: one batch of simulations."""
     sides = np.where(z + STEP < HIGH, STEP, -STEP)[free]
     shifted = np.repeat(z[None], len(free) + 1, axis=0)
@@ -292,7 +293,7 @@ def _normal(problem: Problem, z: np.ndarray, free: np.ndarray) -> Fit:
     flows = problem.flows(list(shifted))
     e = problem.white(flows[:1] - problem.rows.y)[0]
     J = (problem.white(flows[1:] - flows[0]) / sides[:, None, None]).transpose(1, 0, 2)
-    return Fit(z, free, J @ J.transpose(0, 2, 1), (J @ e[..., None])[..., 0], np.sum(e * e, axis=1))
+    return ChainFit(z, free, J @ J.transpose(0, 2, 1), (J @ e[..., None])[..., 0], np.sum(e * e, axis=1))
 
 
 def _stepped(
@@ -309,7 +310,7 @@ def _stepped(
     return out
 
 
-def fit(problem: Problem, z: np.ndarray, free: np.ndarray, *, evaluations: int) -> Fit:
+def fit(problem: ChainProblem, z: np.ndarray, free: np.ndarray, *, evaluations: int) -> ChainFit:
     """The unknowns with those in `free` moved to the least sum of squared innovations of simulated - measured
     flow (output error; Levenberg 1944 and Marquardt 1963 within bounds)."""
     best, damping = _normal(problem, z, free), 1e-4
@@ -326,7 +327,7 @@ def fit(problem: Problem, z: np.ndarray, free: np.ndarray, *, evaluations: int) 
     return best
 
 
-def _start(problem: Problem) -> np.ndarray:
+def _start(problem: ChainProblem) -> np.ndarray:
     """K from the volume out by the displacement in, tau, delay by the best of a coarse grid."""
     rows, steady_flow = problem.rows, problem.steady_flow
     displaced = np.sum(rows.u * (rows.weight > 0))
@@ -346,7 +347,9 @@ def _start(problem: Problem) -> np.ndarray:
     return grid[int(np.argmin([np.sum(((f - rows.y) * rows.weight) ** 2) for f in flows]))]
 
 
-def _left_out(problem: Problem, fitted: Fit, folds: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+def _left_out(
+    problem: ChainProblem, fitted: ChainFit, folds: np.ndarray
+) -> tuple[list[np.ndarray], np.ndarray]:
     """The unknowns fitted without each fold, and the flow (N, T) of every row by the fit that did not see
     it."""
     names, z = np.unique(folds), []
@@ -357,12 +360,12 @@ def _left_out(problem: Problem, fitted: Fit, folds: np.ndarray) -> tuple[list[np
     return z, flows[np.searchsorted(names, folds), np.arange(len(folds))]
 
 
-class Candidate(NamedTuple):
+class ChainCandidate(NamedTuple):
     """A structure: the extras that it has, its fit, and the sum of squared innovations (N,) of each row by
     the fit to the other routines."""
 
     extras: tuple[str, ...]
-    fitted: Fit
+    fitted: ChainFit
     unseen: np.ndarray
 
 
@@ -371,15 +374,15 @@ def _free(extras: Sequence[str]) -> np.ndarray:
 
 
 def _candidate(
-    problem: Problem, extras: tuple[str, ...], z: np.ndarray, folds: np.ndarray, evaluations: int
-) -> Candidate:
+    problem: ChainProblem, extras: tuple[str, ...], z: np.ndarray, folds: np.ndarray, evaluations: int
+) -> ChainCandidate:
     fitted = fit(problem, z, _free(extras), evaluations=evaluations)
     _, flows = _left_out(problem, fitted, folds)
     white = problem.white((flows - problem.rows.y)[None])[0]
-    return Candidate(extras, fitted, np.sum(white**2, axis=1))
+    return ChainCandidate(extras, fitted, np.sum(white**2, axis=1))
 
 
-def _prefers(better: Candidate, than: Candidate, folds: np.ndarray) -> bool:
+def _prefers(better: ChainCandidate, than: ChainCandidate, folds: np.ndarray) -> bool:
     """Whether what was left out prefers one structure: its squared innovations fall by MARGIN in all, and
     fall in AGREE of the folds."""
     fall = than.unseen - better.unseen
@@ -387,7 +390,7 @@ def _prefers(better: Candidate, than: Candidate, folds: np.ndarray) -> bool:
     return bool(agree >= AGREE and fall.sum() > MARGIN * than.unseen.sum())
 
 
-def choose(problem: Problem, folds: np.ndarray) -> list[Candidate]:
+def choose(problem: ChainProblem, folds: np.ndarray) -> list[ChainCandidate]:
     """Forward selection: the extras whose fit promises most are tried in turn, and each is kept where rows
     left out prefer it; last the lag goes where they do not miss it. All structures tried, the chosen
     one first."""
@@ -448,14 +451,14 @@ def averaged(error: np.ndarray, observable: np.ndarray, sample_time_s: float) ->
     )
 
 
-def _within(fitted: Fit, away: np.ndarray) -> np.ndarray:
+def _within(fitted: ChainFit, away: np.ndarray) -> np.ndarray:
     """The unknowns moved by `away` (free,), within their bounds."""
     z, free = fitted.z.copy(), fitted.free
     z[free] = np.clip(z[free] + away, LOW[free], HIGH[free])
     return z
 
 
-def _members(problem: Problem, fitted: Fit) -> list[np.ndarray]:
+def _members(problem: ChainProblem, fitted: ChainFit) -> list[np.ndarray]:
     """MEMBERS vectors of unknowns that the trials cannot tell from the best: z +- what leaving out each
     trial moves, the signs balanced over members (balanced repeated replication, McCarthy 1969).
 
@@ -488,7 +491,7 @@ def identify(trainings: Sequence[Training], *, sample_time_s: float) -> Chain:
             f"{[len(t.u) for t in trainings]}; run more trials"
         )
     rows = records(trainings)
-    problem = Problem(rows, max(float(np.max(training.r)) for training in trainings), sample_time_s)
+    problem = ChainProblem(rows, max(float(np.max(training.r)) for training in trainings), sample_time_s)
     folds = rows.routine if len(trainings) > 1 else np.arange(len(rows.routine))
     chosen = choose(problem, folds)[0]
     z = chosen.fitted.z

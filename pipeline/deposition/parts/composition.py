@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.deposition.drive import Drive, at_limit, follows, obeyed
 from pipeline.deposition.parts import basis, forecast
 from pipeline.deposition.parts.chain import Chain, averaged, identify, simulate
-from pipeline.deposition.parts.forecast import Covered, Judged, Missed
+from pipeline.deposition.parts.forecast import Covered, ForecastJudgement, Missed
 from pipeline.deposition.parts.library import (
     CORNER,
     START,
@@ -26,9 +26,9 @@ from pipeline.deposition.parts.library import (
     nearest,
     of_task,
 )
-from pipeline.deposition.toolpath.gcode import Kind, Moves, Program
+from pipeline.deposition.toolpath.gcode import Kind, Moves, PartProgram
 from pipeline.deposition.toolpath.motion import Motion, rate, sampled
-from pipeline.deposition.toolpath.tasks import Lines, Tasks, halting, printed_lines, refuse, sequence
+from pipeline.deposition.toolpath.tasks import PrintedLines, Tasks, halting, printed_lines, refuse, sequence
 
 COMPOSERS = PRIORITY, SUPERPOSITION, BASIS = "priority", "superposition", "basis"
 # rest before the first line and after the last: longer than any lead
@@ -37,7 +37,7 @@ MARGIN_S = 2.0
 EXCERPT_S = 600.0
 
 
-class Material(NamedTuple):
+class LearnedMaterial(NamedTuple):
     """What was learned of one material and nozzle: its chain, the gain (mm^3/s per mm) by
     which on-off control set out in the first trial, and the error of the learned trials
     themselves in % of the steady flow (means over 0.2 s); what fits without a routine missed on it, and what
@@ -52,11 +52,11 @@ class Material(NamedTuple):
     covered: Covered
 
 
-class Learned(NamedTuple):
+class LearnedLibrary(NamedTuple):
     """The library of all materials, what the composers know of each, and the assumptions in figures."""
 
     library: Library
-    materials: tuple[Material, ...]
+    materials: tuple[LearnedMaterial, ...]
     checks: list[Check]
 
 
@@ -73,7 +73,7 @@ class PartSettings(NamedTuple):
     drive: Drive
 
 
-class Prediction(NamedTuple):
+class ComposerForecast(NamedTuple):
     """Forecast r.m.s. error of one composer on one tool's share of a part, in % of that of on-off control:
     90 % of what may come out lies between low and high. `chosen` is the composer with the least `high`."""
 
@@ -102,18 +102,18 @@ class Stream(NamedTuple):
     y: np.ndarray
     on_off: np.ndarray
     saturated: float
-    judged: Judged
+    judged: ForecastJudgement
 
 
-class Share(NamedTuple):
+class ToolShare(NamedTuple):
     """One tool's share of a part before it is composed: the tool, its material, the wanted flow r (T,) in
     mm^3/s, and the tasks and lines of the whole part."""
 
     tool: int
-    material: Material
+    material: LearnedMaterial
     r: np.ndarray
     tasks: Tasks
-    lines: Lines
+    lines: PrintedLines
 
 
 class Composed(NamedTuple):
@@ -123,14 +123,14 @@ class Composed(NamedTuple):
 
     streams: tuple[Stream, ...]
     tasks: Tasks
-    lines: Lines
+    lines: PrintedLines
     error_percent: np.ndarray
-    predictions: list[Prediction]
+    predictions: list[ComposerForecast]
     lead_in_s: float
     sample_time_s: float
 
 
-def learn(trainings: Sequence[Training], *, sample_time_s: float) -> Learned:
+def learn(trainings: Sequence[Training], *, sample_time_s: float) -> LearnedLibrary:
     """Library, chains and checks from all learned trials: what segment_library stores.
 
     Of each material and nozzle at least one routine; two speeds and two pauses make it hold for others.
@@ -151,7 +151,7 @@ def learn(trainings: Sequence[Training], *, sample_time_s: float) -> Learned:
         )
         chain = identify(mine, sample_time_s=sample_time_s)
         materials.append(
-            Material(
+            LearnedMaterial(
                 *key,
                 chain,
                 gain,
@@ -160,7 +160,7 @@ def learn(trainings: Sequence[Training], *, sample_time_s: float) -> Learned:
                 forecast.covered(mine, sample_time_s=sample_time_s),
             )
         )
-    return Learned(library, tuple(materials), check(trainings, library))
+    return LearnedLibrary(library, tuple(materials), check(trainings, library))
 
 
 def _of(tasks: Tasks, tool: int, name: str) -> np.ndarray:
@@ -168,7 +168,7 @@ def _of(tasks: Tasks, tool: int, name: str) -> np.ndarray:
 
 
 def _steady(
-    library: Library, material: str, nozzle_mm: float, lines: Lines, tool: int, samples: int
+    library: Library, material: str, nozzle_mm: float, lines: PrintedLines, tool: int, samples: int
 ) -> np.ndarray:
     """Steady-State (T,) from each printed line's begin to the next
     one's in its run, at the level of its speed."""
@@ -203,7 +203,14 @@ def _placed(library: Library, name: str, material: str, nozzle_mm: float, tasks:
 
 
 def priority(
-    library: Library, material: str, nozzle_mm: float, tasks: Tasks, lines: Lines, tool: int, *, samples: int
+    library: Library,
+    material: str,
+    nozzle_mm: float,
+    tasks: Tasks,
+    lines: PrintedLines,
+    tool: int,
+    *,
+    samples: int,
 ) -> np.ndarray:
     """u (T,) by the paper's hierarchy (fig. 7): at each sample the highest of Stop, Start, Corner,
     Steady-State, No-Flow that is active; each sent ahead by its lead."""
@@ -215,7 +222,14 @@ def priority(
 
 
 def superposition(
-    library: Library, material: str, nozzle_mm: float, tasks: Tasks, lines: Lines, tool: int, *, samples: int
+    library: Library,
+    material: str,
+    nozzle_mm: float,
+    tasks: Tasks,
+    lines: PrintedLines,
+    tool: int,
+    *,
+    samples: int,
 ) -> np.ndarray:
     """u (T,) as the steady level with every task's deviation from it added, so that tasks which overlap both
     count (the extruder is nearly linear)."""
@@ -229,7 +243,7 @@ def superposition(
     return u
 
 
-def _command(composer: str, library: Library, share: Share, drive: Drive) -> np.ndarray:
+def _command(composer: str, library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
     """u (T,) in mm of one composer for one tool's share of a part, which the drive can follow."""
     material, Ts = share.material, library.sample_time_s
     if composer == BASIS:
@@ -249,25 +263,27 @@ def _command(composer: str, library: Library, share: Share, drive: Drive) -> np.
     return basis.reached(material.chain.extruder, u, _sent_ahead(share, Ts), drive, Ts)
 
 
-def _sent_ahead(share: Share, Ts: float) -> np.ndarray:
+def _sent_ahead(share: ToolShare, Ts: float) -> np.ndarray:
     """The wanted flow (T,) at the time when a command for it is sent: earlier by delay and lag of the
     chain."""
     extruder, t = share.material.chain.extruder, np.arange(len(share.r)) * Ts
     return np.interp(t + extruder.delay_s + basis.mean_lag_s(extruder), t, share.r, right=0.0)
 
 
-def commands(learned: Learned, composed: Composed, stream: Stream, *, drive: Drive) -> dict[str, np.ndarray]:
+def commands(
+    learned: LearnedLibrary, composed: Composed, stream: Stream, *, drive: Drive
+) -> dict[str, np.ndarray]:
     """The command (T,) of every composer for one stream of a part, to set beside the chosen one."""
     material = next(
         one
         for one in learned.materials
         if (one.material, one.nozzle_mm) == (stream.material, stream.nozzle_mm)
     )
-    share = Share(stream.tool, material, stream.r, composed.tasks, composed.lines)
+    share = ToolShare(stream.tool, material, stream.r, composed.tasks, composed.lines)
     return {name: _command(name, learned.library, share, drive) for name in COMPOSERS}
 
 
-def _judge(library: Library, share: Share, drive: Drive) -> dict[str, forecast.Interval]:
+def _judge(library: Library, share: ToolShare, drive: Drive) -> dict[str, tuple[float, float, float]]:
     """Forecast error of each composer in % of on-off control's, over the first EXCERPT_S from where this tool
     begins to print: all by the same members and residuals."""
     Ts, material = library.sample_time_s, share.material
@@ -283,7 +299,7 @@ def _judge(library: Library, share: Share, drive: Drive) -> dict[str, forecast.I
     }
 
 
-def _excerpt(share: Share, Ts: float) -> Share:
+def _excerpt(share: ToolShare, Ts: float) -> ToolShare:
     """The first EXCERPT_S of a share with its own tasks and lines, its clock from MARGIN_S before the tool
     begins to print."""
     r, tasks, lines = share.r, share.tasks, share.lines
@@ -293,18 +309,23 @@ def _excerpt(share: Share, Ts: float) -> Share:
     tasks = Tasks(*(np.asarray(column)[near] for column in tasks))
     tasks = tasks._replace(begin_s=tasks.begin_s - begin * Ts)
     near = (lines.begin_s < (upto + 1) * Ts) & (lines.begin_s >= (begin - 1) * Ts)
-    lines = Lines(*(np.asarray(column)[near] for column in lines))
+    lines = PrintedLines(*(np.asarray(column)[near] for column in lines))
     lines = lines._replace(begin_s=lines.begin_s - begin * Ts, end_s=lines.end_s - begin * Ts)
     return share._replace(r=r[begin:upto], tasks=tasks, lines=lines)
 
 
-def _on_off(share: Share, drive: Drive, Ts: float) -> np.ndarray:
+def _on_off(share: ToolShare, drive: Drive, Ts: float) -> np.ndarray:
     """u (T,) in mm of on-off control, as the first trial set out: r over the gain known then."""
     return obeyed(share.r / share.material.on_off_gain, drive, sample_time_s=Ts)
 
 
 def compose(
-    learned: Learned, program: Program, motion: Motion, settings: PartSettings, *, materials: dict[int, str]
+    learned: LearnedLibrary,
+    program: PartProgram,
+    motion: Motion,
+    settings: PartSettings,
+    *,
+    materials: dict[int, str],
 ) -> Composed:
     """Commands for all tools of a part, each by the composer that is predicted to do best for its material.
 
@@ -333,11 +354,11 @@ def compose(
         material = _material(learned, materials, tool, settings.nozzle_mm, lines)
         r = basis.boxed(unshaped, settings.ramp_s, Ts)
         r[r < 1e-9 * r.max()] = 0.0  # rounding of the sums behind the rate
-        share = Share(tool, material, r, tasks, lines)
+        share = ToolShare(tool, material, r, tasks, lines)
         percents = _judge(library, share, drive)
-        best = min(percents, key=lambda name: percents[name].high)
+        best = min(percents, key=lambda name: percents[name][2])
         predictions += [
-            Prediction(tool, material.material, name, *percent, name == best)
+            ComposerForecast(tool, material.material, name, *percent, name == best)
             for name, percent in percents.items()
         ]
         streams.append(_stream(library, share, unshaped, best, drive))
@@ -345,7 +366,7 @@ def compose(
             at = _of(tasks, tool, name)
             error[at] = nearest(
                 library, name, material.material, settings.nozzle_mm, tasks.speed[at], tasks.pause_s[at]
-            ).error_percent
+            )[3]
     return Composed(tuple(streams), tasks, lines, error, predictions, ahead * Ts, Ts)
 
 
@@ -366,8 +387,8 @@ def _wanted(
 
 
 def _material(
-    learned: Learned, materials: dict[int, str], tool: int, nozzle_mm: float, lines: Lines
-) -> Material:
+    learned: LearnedLibrary, materials: dict[int, str], tool: int, nozzle_mm: float, lines: PrintedLines
+) -> LearnedMaterial:
     """What was learned of the tool's material with this nozzle."""
     first = lines.line[lines.tool == tool][0]
     if tool not in materials:
@@ -385,7 +406,7 @@ def _material(
     )
 
 
-def _stream(library: Library, share: Share, unshaped: np.ndarray, composer: str, drive: Drive) -> Stream:
+def _stream(library: Library, share: ToolShare, unshaped: np.ndarray, composer: str, drive: Drive) -> Stream:
     """The share by one composer: its command, and the flows that the chain predicts for it and for on-off."""
     material, u, Ts = share.material, _command(composer, library, share, drive), library.sample_time_s
     y, on_off = (

@@ -8,22 +8,22 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.deposition import reachable
-from pipeline.deposition.drive import Drive, asked, at_limit, obeyed
+from pipeline.deposition.drive import Drive, at_limit, demand, obeyed
 from pipeline.deposition.extruder import Extruder
 from pipeline.deposition.parts import basis, forecast
-from pipeline.deposition.parts.chain import Identified
+from pipeline.deposition.parts.chain import IdentifiedExtruder
 from pipeline.deposition.parts.chain import forecast as predicted_flow
 from pipeline.deposition.parts.composition import (
     BASIS,
     EXCERPT_S,
     MARGIN_S,
     Composed,
-    Learned,
-    Material,
+    LearnedLibrary,
+    LearnedMaterial,
     Stream,
 )
 from pipeline.deposition.parts.library import STOP, Library
-from pipeline.deposition.toolpath.gcode import Refusal
+from pipeline.deposition.toolpath.gcode_words import LineRefusal
 
 # flow this long before a line begins and after it ends is its own, unless a neighbour is nearer
 REACH_S = 1.0
@@ -70,13 +70,6 @@ class Saturation(NamedTuple):
     enough: bool
 
 
-class Refused(NamedTuple):
-    """What was not composed as it stands: line number and one sentence."""
-
-    line: int
-    why: str
-
-
 class Conformance(NamedTuple):
     """The report on a part: its lines, the worst error in % among the `judged` lines of at least shortest_s,
     for each tool the saturation with the ramp as it is and the ramp of the gantry in s with which the drive
@@ -87,22 +80,22 @@ class Conformance(NamedTuple):
     judged: int
     saturation: dict[int, Saturation]
     ramp_that_would_do_s: dict[int, float]
-    refused: list[Refused]
+    refused: list[LineRefusal]
 
 
 def conform(
     composed: Composed,
-    learned: Learned,
+    learned: LearnedLibrary,
     *,
     bead_area_mm2: float,
     ramp_s: float,
     drive: Drive,
     shortest_s: float,
     largest_error_percent: float,
-    refusals: Sequence[Refusal] = (),
+    refusals: Sequence[LineRefusal] = (),
 ) -> Conformance:
-    """Whether the part will print: line volumes, saturation, refusals of the program's reader, and
-    tasks whose signal the library only guesses (predicted error above largest_error_percent, or
+    """Whether the part will print: line volumes, saturation, refusals of the program's reader, and tasks
+    whose signal the library only guesses (predicted error above largest_error_percent, or
     unknown), where the library's signals are used."""
     lines = line_volumes(composed, learned.library, bead_area_mm2=bead_area_mm2)
     lines = _intervals(lines, composed, learned)
@@ -118,17 +111,17 @@ def conform(
             material.chain.extruder, some, on_off_gain=material.on_off_gain, **settings
         )
         ramps[stream.tool] = ramp_that_would_do(material.chain.extruder, some, **settings)
-    refused = [Refused(refusal.line, refusal.why) for refusal in refusals]
+    refused = [*refusals]
     by_library = np.isin(
         composed.tasks.tool, [stream.tool for stream in composed.streams if stream.composer != BASIS]
     )
     for k in np.flatnonzero(by_library & ~(composed.error_percent <= largest_error_percent)):
         speed, pause = composed.tasks.speed[k], composed.tasks.pause_s[k]
-        asked = f"{composed.tasks.task[k]} at {speed:g} mm/s with a pause of {pause:.2f} s"
+        missing = f"{composed.tasks.task[k]} at {speed:g} mm/s with a pause of {pause:.2f} s"
         refused.append(
-            Refused(
+            LineRefusal(
                 int(composed.tasks.line[k]),
-                f"the library lacks {asked}; the nearest signal has a predicted error of "
+                f"the library lacks {missing}; the nearest signal has a predicted error of "
                 f"{composed.error_percent[k]:.0f} %",
             )
         )
@@ -136,7 +129,7 @@ def conform(
     return Conformance(lines, worst, int(judged.sum()), saturations, ramps, sorted(refused))
 
 
-def _intervals(lines: LineVolumes, composed: Composed, learned: Learned) -> LineVolumes:
+def _intervals(lines: LineVolumes, composed: Composed, learned: LearnedLibrary) -> LineVolumes:
     """The lines with the 90 % interval of each one's volume, of what the streams' forecasts may come to."""
     low, high = lines.low_percent.copy(), lines.high_percent.copy()
     for stream in composed.streams:
@@ -153,7 +146,7 @@ def _intervals(lines: LineVolumes, composed: Composed, learned: Learned) -> Line
     return lines._replace(low_percent=low, high_percent=high)
 
 
-def _material(learned: Learned, stream: Stream) -> Material:
+def _material(learned: LearnedLibrary, stream: Stream) -> LearnedMaterial:
     """What was learned of the stream's material with its nozzle."""
     return next(
         material
@@ -213,7 +206,7 @@ def volume_between(
 
 
 def saturation(
-    extruder: Extruder | Identified,
+    extruder: Extruder | IdentifiedExtruder,
     unshaped: np.ndarray,
     *,
     on_off_gain: float,
@@ -227,7 +220,8 @@ def saturation(
     r[r < 1e-9 * r.max(initial=0.0)] = 0.0  # rounding of the sums behind the rate
     free = basis.compose(extruder, r, sample_time_s=sample_time_s)
     u = basis.compose(extruder, r, sample_time_s=sample_time_s, drive=drive)
-    steady, most = (r.max() + extruder.yield_) / extruder.gain, asked(free, sample_time_s=sample_time_s)
+    steady = (r.max() + extruder.yield_) / extruder.gain
+    command_mm, speed = demand(free, sample_time_s=sample_time_s)
     first = obeyed(r / on_off_gain, drive, sample_time_s=sample_time_s)
     on_off, limited, unlimited = (
         float(np.linalg.norm(predicted_flow(extruder, command, sample_time_s=sample_time_s) - r))
@@ -240,9 +234,9 @@ def saturation(
         ramp_s,
         drive.amplitude_mm,
         drive.speed_mm_per_s,
-        most.command_mm,
-        most.speed_mm_per_s,
-        most.command_mm / steady,
+        command_mm,
+        speed,
+        command_mm / steady,
         100 * float(share),
         100 * limited / on_off,
         100 * least / on_off,
@@ -251,7 +245,7 @@ def saturation(
 
 
 def ramp_that_would_do(
-    extruder: Extruder | Identified,
+    extruder: Extruder | IdentifiedExtruder,
     unshaped: np.ndarray,
     *,
     ramp_s: float,
@@ -271,6 +265,6 @@ def ramp_that_would_do(
     )
 
 
-def _plain(extruder: Extruder | Identified) -> Extruder:
+def _plain(extruder: Extruder | IdentifiedExtruder) -> Extruder:
     """Its gain, time constant and yield: what a drive's limits stand against."""
     return Extruder(extruder.gain, extruder.time_constant_s, yield_=extruder.yield_)

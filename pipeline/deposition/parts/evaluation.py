@@ -1,6 +1,7 @@
 """Every composer on one part, beside on-off control and full-part ILC; judged by the true flow of the
 machine, on a real one by the forecast."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,13 +11,13 @@ from pipeline.deposition.extruder import Extruder, Routine, flow
 from pipeline.deposition.learning import ilc, training
 from pipeline.deposition.learning.training import LawSettings, Noise
 from pipeline.deposition.parts.chain import forecast
-from pipeline.deposition.parts.composition import Composed, Learned, Stream, commands
-from pipeline.deposition.parts.conformance import line_volumes
+from pipeline.deposition.parts.composition import Composed, LearnedLibrary, Stream, commands
+from pipeline.deposition.parts.conformance import LineVolumes, line_volumes
 
 ON_OFF, FULL_PART_ILC = "on_off", "ilc"
 
 
-class Score(NamedTuple):
+class ComposerScore(NamedTuple):
     """One composer on one stream: r.m.s. error of its flow y (T,) in % of on-off control's, as judged and as
     predicted beforehand (NaN where nothing predicts it), and the largest error of a printed line's volume in
     % (NaN where no line is long enough)."""
@@ -44,7 +45,9 @@ class Judging(NamedTuple):
     shortest_s: float
 
 
-def evaluate(learned: Learned, composed: Composed, judging: Judging, rng: np.random.Generator) -> list[Score]:
+def evaluate(
+    learned: LearnedLibrary, composed: Composed, judging: Judging, rng: np.random.Generator
+) -> list[ComposerScore]:
     """Scores of all composers on all streams.
 
     On a real machine nobody knows the true flow: a composer scores the upper end of its forecast, its flow is
@@ -73,8 +76,36 @@ def evaluate(learned: Learned, composed: Composed, judging: Judging, rng: np.ran
             told = predicted.get(name)
             percent = told.high if told and not plant else 100 * error / max(yardstick, 1e-12)
             middle = told.median if told else np.nan
-            scores.append(Score(i, name, name == stream.composer, percent, middle, worst, y))
+            scores.append(ComposerScore(i, name, name == stream.composer, percent, middle, worst, y))
     return scores
+
+
+def judge(
+    learned: LearnedLibrary,
+    composed: Composed,
+    lines: LineVolumes,
+    judging: Judging,
+    rng: np.random.Generator,
+) -> list[ComposerScore]:
+    """Scores of all composers; on a machine whose true flow nobody knows the worst line of the chosen
+    composer is the farther end of its interval, for the flow of the chain that made the command is no measure
+    of it."""
+    scores = evaluate(learned, composed, judging, rng)
+    return upper_ends(composed, lines, scores, judging)
+
+
+def upper_ends(
+    composed: Composed, lines: LineVolumes, scores: Sequence[ComposerScore], judging: Judging
+) -> list[ComposerScore]:
+    """The scores, with the farther ends of the lines' intervals where the true flow is unknown."""
+    streams, long_enough = composed.streams, lines.duration_s >= judging.shortest_s - 1e-9
+    ends, out = np.maximum(np.abs(lines.low_percent), np.abs(lines.high_percent)), []
+    for score in scores:
+        own = long_enough & (lines.tool == streams[score.stream].tool)
+        real = score.chosen and streams[score.stream].material not in judging.plants
+        worst = float(ends[own].max()) if real and own.any() else score.worst_line_volume_percent
+        out.append(score._replace(worst_line_volume_percent=worst))
+    return out
 
 
 def _full_part_ilc(
@@ -91,7 +122,9 @@ def _full_part_ilc(
     return ilc.next_step(trials, stream.r, law, rise=laws.rise).u
 
 
-def _worst_line(learned: Learned, composed: Composed, i: int, y: np.ndarray, judging: Judging) -> float:
+def _worst_line(
+    learned: LearnedLibrary, composed: Composed, i: int, y: np.ndarray, judging: Judging
+) -> float:
     """Largest error in % of the volume of a line of stream i under the flow y."""
     with_flow = composed._replace(
         streams=(*composed.streams[:i], composed.streams[i]._replace(y=y), *composed.streams[i + 1 :])

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.deposition.toolpath.gcode import Kind, Moves, Program
+from pipeline.deposition.toolpath.gcode import Kind, Moves, PartProgram
 
 
 class Extruded(NamedTuple):
@@ -19,7 +19,7 @@ class Extruded(NamedTuple):
     source: dict[int, str]
 
 
-class Difference(NamedTuple):
+class VolumeDifference(NamedTuple):
     """E of one tool beside the declared bead: volumes in mm^3 of the lines that E counts for, and the 5 %,
     50 % and 95 % quantiles of their bead area in mm^2, weighted by length."""
 
@@ -29,7 +29,7 @@ class Difference(NamedTuple):
     area_mm2: tuple[float, float, float]
 
 
-def volumes(program: Program, diameter_mm: Mapping[int, float]) -> np.ndarray:
+def volumes(program: PartProgram, diameter_mm: Mapping[int, float]) -> np.ndarray:
     """mm^3 (N,) that E of every move presses out: e x flow x pi d^2 / 4, and e x flow where M200 makes E
     count mm^3; NaN where neither is known, and where no letter drives the extrusion."""
     moves = program.moves
@@ -42,7 +42,7 @@ def volumes(program: Program, diameter_mm: Mapping[int, float]) -> np.ndarray:
 
 
 def wanted(
-    program: Program,
+    program: PartProgram,
     *,
     bead_area_mm2: float,
     asked_mm: float | None = None,
@@ -75,12 +75,12 @@ def wanted(
     return Extruded(volume, by_e, source)
 
 
-def _lettered(program: Program) -> bool:
+def _lettered(program: PartProgram) -> bool:
     """Whether letters drive the extrusion, not a switch."""
     return bool(program.extruder) and program.extruder.isalpha()
 
 
-def differences(moves: Moves, extruded: Extruded, *, bead_area_mm2: float) -> list[Difference]:
+def differences(moves: Moves, extruded: Extruded, *, bead_area_mm2: float) -> list[VolumeDifference]:
     """E beside the declared bead, of each tool whose lines E counts for."""
     found = []
     for tool in np.unique(moves.tool[extruded.by_e]).tolist():
@@ -91,12 +91,12 @@ def differences(moves: Moves, extruded: Extruded, *, bead_area_mm2: float) -> li
         low, middle, high = ((volume / length)[order][np.searchsorted(share, q)] for q in (0.05, 0.5, 0.95))
         declared = bead_area_mm2 * float(length.sum())
         found.append(
-            Difference(tool, float(volume.sum()), declared, (float(low), float(middle), float(high)))
+            VolumeDifference(tool, float(volume.sum()), declared, (float(low), float(middle), float(high)))
         )
     return found
 
 
-def resized(program: Program, *, scale: float = 1.0, speed: float = 1.0) -> Program:
+def resized(program: PartProgram, *, scale: float = 1.0, speed: float = 1.0) -> PartProgram:
     """The program with X, Y and Z `scale` times as large and every feed `speed` times as fast."""
     moves = program.moves
     if scale == speed == 1.0:
@@ -108,7 +108,7 @@ def resized(program: Program, *, scale: float = 1.0, speed: float = 1.0) -> Prog
     return program._replace(moves=moves)
 
 
-def as_lengths(program: Program, extruded: Extruded, *, bead_area_mm2: float) -> Program:
+def as_lengths(program: PartProgram, extruded: Extruded, *, bead_area_mm2: float) -> PartProgram:
     """The program with every printed move as long as the declared bead would be of its volume: what a
     composer, which wants bead area x length, then presses out is what E asks for."""
     moves = program.moves

@@ -58,20 +58,12 @@ class Covered(NamedTuple):
     longest_s: float
 
 
-class Judged(NamedTuple):
+class ForecastJudgement(NamedTuple):
     """Whether the forecast may be believed; where not, the reason and the trial that would judge it."""
 
     judged: bool
     reason: str
     trial: str
-
-
-class Interval(NamedTuple):
-    """90 % of what may come out, and the middle of it, in %."""
-
-    low: float
-    median: float
-    high: float
 
 
 def places(r: np.ndarray, sample_time_s: float) -> np.ndarray:
@@ -156,11 +148,11 @@ def covered(trainings: Sequence[Training], *, sample_time_s: float) -> Covered:
     return Covered(min(speeds), max(speeds), float(np.mean(areas)), steepest, min(pauses), max(runs))
 
 
-def judged(missed: Missed, covered: Covered, r: np.ndarray, *, sample_time_s: float) -> Judged:
+def judged(missed: Missed, covered: Covered, r: np.ndarray, *, sample_time_s: float) -> ForecastJudgement:
     """Whether a forecast of the wanted flow r (T,) may be believed."""
     again = "print its verification (beadline compose PART --verify) and learn from it"
     if not math.isfinite(missed.ratio):
-        return Judged(
+        return ForecastJudgement(
             False, "fewer than three trials with learned commands tell no scatter", "run more trials"
         )
     if missed.changed > CHANGED:
@@ -168,17 +160,17 @@ def judged(missed: Missed, covered: Covered, r: np.ndarray, *, sample_time_s: fl
             f"the machine changed while it learned: the trials' levels vary {missed.changed:.1f} times as "
             f"much as from trial to trial ({CHANGED:g} allowed)"
         )
-        return Judged(False, reason, "learn again from on-off control")
+        return ForecastJudgement(False, reason, "learn again from on-off control")
     if missed.ratio > FACTOR:
         reason = (
             f"on routines left out the chain misses {missed.event} by {missed.ratio:.1f} times what repeated "
             f"trials scatter ({FACTOR:g} allowed)"
         )
-        return Judged(False, reason, again)
+        return ForecastJudgement(False, reason, again)
     return _asked(covered, r, sample_time_s)
 
 
-def _asked(covered: Covered, r: np.ndarray, sample_time_s: float) -> Judged:
+def _asked(covered: Covered, r: np.ndarray, sample_time_s: float) -> ForecastJudgement:
     """Whether what r (T,) asks for was trained."""
     near = round(NEAR_S / sample_time_s)
     on = r > 0.5 * np.maximum(scipy.ndimage.maximum_filter1d(r, near + 1, mode="constant"), 1e-12)
@@ -194,18 +186,20 @@ def _asked(covered: Covered, r: np.ndarray, sample_time_s: float) -> Judged:
     if fast > BEYOND * covered.fastest or slow < covered.slowest / BEYOND:
         asked = fast if fast > BEYOND * covered.fastest else slow
         reason = f"the part prints at {asked:.3g} mm/s, trained were {trained}"
-        return Judged(False, reason, add.format(f"speed_mm_per_s: {asked:.3g}"))
+        return ForecastJudgement(False, reason, add.format(f"speed_mm_per_s: {asked:.3g}"))
     if steep > BEYOND * covered.steepest:
         times = steep / covered.steepest
         reason = f"the wanted flow changes {times:.1f} times as fast as in any routine"
-        return Judged(False, reason, "lengthen printer.ramp_s, or train with ramps as short as the part's")
+        return ForecastJudgement(
+            False, reason, "lengthen printer.ramp_s, or train with ramps as short as the part's"
+        )
     if shortest < least:
         reason = f"a run or gap of {shortest:.2f} s, the shortest trained pause is {covered.shortest_s:g} s"
-        return Judged(False, reason, add.format(f"pause_s: {shortest:.2f}"))
+        return ForecastJudgement(False, reason, add.format(f"pause_s: {shortest:.2f}"))
     if lengths.max() > LONGER * covered.longest_s:
         reason = f"a run of {lengths.max():.0f} s, the longest trained one is {covered.longest_s:.0f} s"
-        return Judged(False, reason, add.format(f"on_s: {lengths.max() / LONGER:.0f}"))
-    return Judged(True, "", "")
+        return ForecastJudgement(False, reason, add.format(f"on_s: {lengths.max() / LONGER:.0f}"))
+    return ForecastJudgement(True, "", "")
 
 
 def flows(chain: Chain, missed: Missed, u: np.ndarray, r: np.ndarray, *, sample_time_s: float) -> np.ndarray:
@@ -247,8 +241,9 @@ def ends(values: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def error_percent(made: np.ndarray, on_off: np.ndarray, r: np.ndarray) -> Interval:
+def error_percent(made: np.ndarray, on_off: np.ndarray, r: np.ndarray) -> tuple[float, float, float]:
     """R.m.s. error of the flows `made` (M, T) in % of that of the flows of on-off control (M, T), member by
-    member."""
+    member: 90 % of what may come out lies between the first and the last, the middle of it beside them."""
     ratio = np.linalg.norm(made - r, axis=1) / np.maximum(np.linalg.norm(on_off - r, axis=1), 1e-12)
-    return Interval(*(float(value) for value in interval(100 * ratio)))
+    low, median, high = (float(value) for value in interval(100 * ratio))
+    return low, median, high

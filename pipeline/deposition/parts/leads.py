@@ -10,6 +10,8 @@ import numpy as np
 from pipeline.deposition.toolpath.gcode import Kind, Moves
 from pipeline.deposition.toolpath.motion import Motion, sampled
 
+# how near the plunger follows its command, as share of the largest one
+LEAD_SHARE = 0.005
 # how near the gantry is to its planned place at any time, mm: a sixteenth of a nozzle
 WAY_MM = 0.05
 
@@ -102,6 +104,31 @@ def bends(u: np.ndarray, tolerance: float) -> np.ndarray:
         wide = tolerance / (k - start)
         low, high, last = max(low, slope - wide), min(high, slope + wide), k
     return np.unique(np.append(kept, len(u) - 1))
+
+
+def text(
+    moves: Moves,
+    motion: Motion,
+    commands: Mapping[int, np.ndarray],
+    *,
+    letter: str,
+    lead_in_s: float,
+    sample_time_s: float,
+) -> str:
+    """The part as G-code whose E, or another letter, is the plunger's place, so that it primes ahead of each
+    line and lets back ahead of its end; what no program can hold stands in its head. Parameters as of
+    `legs`."""
+    tolerance_mm = LEAD_SHARE * max(float(np.abs(u).max()) for u in commands.values())
+    found = legs(
+        moves, motion, commands, lead_in_s=lead_in_s, sample_time_s=sample_time_s, tolerance_mm=tolerance_mm
+    )
+    head = [
+        f"; {letter} is the plunger's place in mm (absolute), no filament; it moves ahead of the lines.",
+        "; Feeds are means over short legs, ramps too: a firmware that accelerates slower comes late.",
+    ]
+    if found.lost_mm > tolerance_mm:
+        head.append(f"; Left out: {found.lost_mm:.3g} mm of a tool's command while another tool was in use.")
+    return "\n".join([*head, *program(found, letter=letter), ""])
 
 
 def program(found: Legs, *, letter: str = "E") -> list[str]:

@@ -62,16 +62,6 @@ class Library(NamedTuple):
     marks: dict[str, tuple[float, float]]
 
 
-class Nearest(NamedTuple):
-    """For M tasks: `columns` of the task, which of them is nearest (M,), the factor on its signal (M,), its
-    predicted error in percent (M,)."""
-
-    columns: list[Basis]
-    column: np.ndarray
-    factor: np.ndarray
-    error_percent: np.ndarray
-
-
 class Check(NamedTuple):
     """One of the paper's four assumptions as a figure."""
 
@@ -263,9 +253,10 @@ def of_task(library: Library, task: str, material: str, nozzle_mm: float) -> lis
 
 def nearest(
     library: Library, task: str, material: str, nozzle_mm: float, speed: np.ndarray, pause_s: np.ndarray
-) -> Nearest:
-    """The nearest column for each of M tasks of `speed` (M,) in mm/s and `pause_s` (M,): in pause first, for
-    that is what scaling cannot make up for."""
+) -> tuple[list[Basis], np.ndarray, np.ndarray, np.ndarray]:
+    """For M tasks of `speed` (M,) in mm/s and `pause_s` (M,): the columns of the task, which of them is
+    nearest (M,), in pause first, for that is what scaling cannot make up for; the factor on its signal (M,),
+    and its predicted error in percent (M,)."""
     columns = of_task(library, task, material, nozzle_mm)
     still = of_task(library, STEADY, material, nozzle_mm)
     per_speed = float(np.mean([basis.signal[0] / basis.speed for basis in still]))
@@ -281,12 +272,8 @@ def nearest(
         _slopes(columns, per_speed), (off_speed[rows, column], off_pause[rows, column]), strict=True
     ):
         error += np.where(off < 1e-6, 0.0, 100 * slope * off)
-    return Nearest(
-        columns,
-        column,
-        speed / np.array([basis.speed for basis in columns])[column],
-        np.zeros(len(column)) if task == NO_FLOW else error,
-    )
+    factor = speed / np.array([basis.speed for basis in columns])[column]
+    return columns, column, factor, np.zeros(len(column)) if task == NO_FLOW else error
 
 
 def check(trainings: Sequence[Training], library: Library) -> list[Check]:

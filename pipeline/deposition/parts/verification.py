@@ -12,9 +12,9 @@ from pipeline.deposition.drive import Drive, obeyed
 from pipeline.deposition.extruder import Extruder
 from pipeline.deposition.learning import ilc
 from pipeline.deposition.parts import basis
-from pipeline.deposition.parts.chain import Identified
+from pipeline.deposition.parts.chain import IdentifiedExtruder
 from pipeline.deposition.parts.forecast import BINS, CORNER, NAMES, START, STOP, places
-from pipeline.deposition.toolpath.tasks import Lines
+from pipeline.deposition.toolpath.tasks import PrintedLines
 
 # the flow is unsure as a whole over this; of each event the hardest, with the runs that hang together with it
 SPREAD_S, WINDOW_S = 0.4, 6.0
@@ -29,7 +29,7 @@ SHARE, CUTOFF_HZ, ORDER = 0.5, 2.0, 2
 FILAMENT_MM2 = math.pi * 1.75**2 / 4
 
 
-class Window(NamedTuple):
+class PartWindow(NamedTuple):
     """Neighbouring lines (L,) of a part, by their place in Lines, the event that is hardest there, and the
     standard deviation of what may come out, in mm^3/s."""
 
@@ -38,17 +38,9 @@ class Window(NamedTuple):
     deviation: float
 
 
-class Print(NamedTuple):
-    """A verification print: the part program, its windows, and how long it prints in s."""
-
-    text: str
-    windows: tuple[Window, ...]
-    duration_s: float
-
-
 def windows(
-    made: np.ndarray, r: np.ndarray, lines: Lines, tool: int, *, sample_time_s: float
-) -> tuple[Window, ...]:
+    made: np.ndarray, r: np.ndarray, lines: PrintedLines, tool: int, *, sample_time_s: float
+) -> tuple[PartWindow, ...]:
     """The hardest Start, Corner and Stop of one tool's share of a part, in the order of the part: where what
     may come out (M, T) for the wanted flow r (T,) differs most. Windows that overlap are one. Raises
     ValueError where the tool prints nothing."""
@@ -65,11 +57,11 @@ def windows(
         if len(at):
             worst = at[np.argmax(spread[at])]
             near = _around(lines, mine, worst * sample_time_s)
-            found.append(Window(near, NAMES[kind], float(spread[worst])))
+            found.append(PartWindow(near, NAMES[kind], float(spread[worst])))
     return _apart(found)
 
 
-def _around(lines: Lines, mine: np.ndarray, time_s: float) -> np.ndarray:
+def _around(lines: PrintedLines, mine: np.ndarray, time_s: float) -> np.ndarray:
     """The run at time_s, or the one nearest to it, and its neighbours while all fits into WINDOW_S."""
     begin, end = lines.begin_s[mine], lines.end_s[mine]
     first = last = int(np.argmin(np.maximum(begin - time_s, 0) + np.maximum(time_s - end, 0)))
@@ -84,9 +76,9 @@ def _around(lines: Lines, mine: np.ndarray, time_s: float) -> np.ndarray:
     return mine[first : last + 1]
 
 
-def _apart(found: Sequence[Window]) -> tuple[Window, ...]:
+def _apart(found: Sequence[PartWindow]) -> tuple[PartWindow, ...]:
     """Windows in their order, those that share a line as one, named by the harder event."""
-    out: list[Window] = []
+    out: list[PartWindow] = []
     for window in sorted(found, key=lambda one: int(one.lines[0])):
         if out and window.lines[0] <= out[-1].lines[-1]:
             harder = max(out[-1], window, key=lambda one: one.deviation)
@@ -96,9 +88,12 @@ def _apart(found: Sequence[Window]) -> tuple[Window, ...]:
     return tuple(out)
 
 
-def program(name: str, chosen: Sequence[Window], lines: Lines, tool: int, *, bead_area_mm2: float) -> Print:
-    """The part program of the windows: each line as long and as fast as in the part (of one longer than two
-    plateaus the ends), each pause and gap as long, along x; the nozzle goes on through a gap."""
+def program(
+    name: str, chosen: Sequence[PartWindow], lines: PrintedLines, tool: int, *, bead_area_mm2: float
+) -> tuple[str, float]:
+    """The part program of the windows, and how long it prints in s: each line as long and as fast as in the
+    part (of one longer than two plateaus the ends), each pause and gap as long, along x; the nozzle goes on
+    through a gap."""
     text = [f"; verifies {name}, T{tool}: {', '.join(window.event for window in chosen)}"]
     text += ["; filament_diameter = 1.75", "G21", "G90", "M83", f"T{tool}", "G0 X0 Y0 Z0.3 F600"]
     x = y = duration = 0.0
@@ -123,7 +118,7 @@ def program(name: str, chosen: Sequence[Window], lines: Lines, tool: int, *, bea
         x, y = (0.0, y + BESIDE_MM) if x > TRACK_MM else (x + BESIDE_MM, y)
         text += [f"G0 X{x:.4f} Y{y:.4f} F600", f"G4 P{1000 * REST_S:.0f}"]
         duration += REST_S
-    return Print("\n".join(text) + "\n", tuple(chosen), duration)
+    return "\n".join(text) + "\n", duration
 
 
 def _shortened(length_mm: float, speed: float) -> float:
@@ -132,7 +127,13 @@ def _shortened(length_mm: float, speed: float) -> float:
 
 
 def next_command(
-    extruder: Identified, u: np.ndarray, y: np.ndarray, r: np.ndarray, *, drive: Drive, sample_time_s: float
+    extruder: IdentifiedExtruder,
+    u: np.ndarray,
+    y: np.ndarray,
+    r: np.ndarray,
+    *,
+    drive: Drive,
+    sample_time_s: float,
 ) -> np.ndarray:
     """The command (T,) in mm after a print of the part with u (T,) whose flow was measured as y (T,), NaN
     where it was not seen: u + SHARE P^-1 Q (r - y) with P the chain's gain, time constant and delays, and Q a

@@ -15,15 +15,15 @@ import numpy as np
 
 from pipeline.deposition.toolpath.gcode_words import (
     CHAINED,
-    Refusal,
+    LineRefusal,
+    ProgramWords,
     Refusals,
-    Words,
     chunks,
     no_program,
     text_bytes,
 )
 
-__all__ = ["Accounted", "Kind", "Moves", "Program", "Refusal", "Told", "parse"]
+__all__ = ["Accounted", "Kind", "Moves", "PartProgram", "LineRefusal", "OtherWord", "parse"]
 
 # EXTRUDE travels with E > 0, WIPE with E < 0; RETRACT, UNRETRACT and PRIME (more than was retracted before)
 # move E alone; TOOL changes the tool
@@ -55,7 +55,7 @@ class Moves(NamedTuple):
     acceleration: np.ndarray
 
 
-class Told(NamedTuple):
+class OtherWord(NamedTuple):
     """A word that is no move, told once: how often it stands there, its first line, and what becomes of it,
     "" where nothing is known of it."""
 
@@ -76,7 +76,7 @@ class Accounted(NamedTuple):
     refused: int
 
 
-class Program(NamedTuple):
+class PartProgram(NamedTuple):
     """The moves; words without meaning for them, in their order (other_line (M,), other_word (M,)); refusals,
     one a kind; what drives the extrusion (E, U, A, M42 P4, ..., or nothing: "") and how many lines there are.
 
@@ -87,13 +87,13 @@ class Program(NamedTuple):
     moves: Moves
     other_line: np.ndarray
     other_word: np.ndarray
-    refusals: list[Refusal]
+    refusals: list[LineRefusal]
     extruder: str
     lines: int
     flow: np.ndarray
     volumetric: np.ndarray
     diameter_mm: dict[int, float]
-    told: list[Told]
+    told: list[OtherWord]
     accounted: Accounted
     refused_line: np.ndarray
 
@@ -154,7 +154,7 @@ class Place(NamedTuple):
     shift: float = 0.0
 
 
-class State:
+class ProgramState:
     """What the lines so far leave in force for the next ones."""
 
     def __init__(self) -> None:
@@ -219,14 +219,14 @@ def _longer(column: np.ndarray, room: int) -> np.ndarray:
     return longer
 
 
-def parse(text: str | bytes, *, extruder: str = "") -> Program:
+def parse(text: str | bytes, *, extruder: str = "") -> PartProgram:
     """The moves of a program, with all that was not understood beside them. `extruder` names what drives the
     extrusion where the program leaves it open ("U", "M42 P4", ...).
 
     Raises ValueError, in one sentence, for what is no G-code text at all: binary, empty, or without a single
     G, M or T word that can be read; and for an extruder that the program does not have.
     """
-    data, refusals, state = text_bytes(text), Refusals(), State()
+    data, refusals, state = text_bytes(text), Refusals(), ProgramState()
     lines, state.cubic = data.count(b"\n"), CUBIC in data[:4096]
     out, gmt = Gathered(lines), np.frombuffer(b"GMT", np.uint8)
     for words in chunks(data, refusals):
@@ -245,7 +245,7 @@ def parse(text: str | bytes, *, extruder: str = "") -> Program:
     other_line = np.fromiter((line for line, _ in others), int, len(others))
     other_word = np.array([word for _, word in others], object)
     refused = np.unique(np.array(refusals.lines, int))
-    return Program(
+    return PartProgram(
         moves, other_line, other_word, refusals.grouped(), _shown(driver), lines, flow, volumetric,
         _said(data) | {tool: d for tool, d in state.diameter.items() if d > 0},
         _told(others, out, driver), _accounted(lines, out.filled, moves.line, other_line, refused), refused,
@@ -255,7 +255,7 @@ def parse(text: str | bytes, *, extruder: str = "") -> Program:
 # ---- words -> commands
 
 
-def _commands(words: Words, state: State, refusals: Refusals) -> Commands:
+def _commands(words: ProgramWords, state: ProgramState, refusals: Refusals) -> Commands:
     """G and M begin a command, but behind an M word that takes the whole line, and so does the word that
     leads a line."""
     line, letter, value = words[:3]
@@ -296,7 +296,9 @@ def _pin_modes(letter: np.ndarray, value: np.ndarray, leads: np.ndarray) -> np.n
     return modes
 
 
-def _with_words(commands: Commands, block, letter, value, state: State, refusals: Refusals) -> Commands:
+def _with_words(
+    commands: Commands, block, letter, value, state: ProgramState, refusals: Refusals
+) -> Commands:
     """The commands with their words; what stands twice, beside a word that takes none, or is not supported
     is refused."""
     line, key, word, words, lead = commands
@@ -365,7 +367,7 @@ def _none(word: dict[str, np.ndarray], letters: str) -> np.ndarray:
 # ---- commands -> moves
 
 
-def _gather(commands: Commands, state: State, refusals: Refusals, out: Gathered) -> None:
+def _gather(commands: Commands, state: ProgramState, refusals: Refusals, out: Gathered) -> None:
     """The moves of a chunk of commands behind those before, with all that may turn out to drive E."""
     line, key, word, words, lead = commands
     if not len(key):
@@ -408,7 +410,7 @@ def _gather(commands: Commands, state: State, refusals: Refusals, out: Gathered)
     _words_left(commands, motion, selects | firmware, out)
 
 
-def _tools(key, word, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _tools(key, word, state: ProgramState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The tool in use, which commands select one, and which of them change it."""
     selects = (key >= T) & (key < T + 10 * TOOLS) | np.isin(key, (M + 60, M + 1350)) & np.isfinite(word["T"])
     asked = np.clip(np.nan_to_num(word["T"]), 0, T).astype(int)
@@ -432,7 +434,7 @@ def _place(value, adds, names, homes, sets, start: Place) -> tuple[np.ndarray, n
     return np.append(start.named + start.shift, after[:-1]), after, end
 
 
-def _driven(commands: Commands, motion, relative, bare, tool, state: State) -> dict[str, np.ndarray]:
+def _driven(commands: Commands, motion, relative, bare, tool, state: ProgramState) -> dict[str, np.ndarray]:
     """E of each command by each letter that may drive the extrusion. E counts for each tool apart; G91 makes
     it relative too, until an M82."""
     _, key, word, _, _ = commands
@@ -456,7 +458,7 @@ def _driven(commands: Commands, motion, relative, bare, tool, state: State) -> d
     return columns
 
 
-def _switched(key, word, state: State, refusals: Refusals, line) -> dict[str, np.ndarray]:
+def _switched(key, word, state: ProgramState, refusals: Refusals, line) -> dict[str, np.ndarray]:
     """Whether each switch is on, by its name; M42 by its pin."""
     columns = {}
     for name, (on, off) in SWITCHES.items():
@@ -485,7 +487,7 @@ def _pin(number: float) -> str:
     return f"M42 P{number:g}" if number >= 0 else "M42"
 
 
-def _pace(key, word, motion, dwell, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pace(key, word, motion, dwell, state: ProgramState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Feed in mm/s with M220's factor on it, acceleration in mm/s^2, and what each dwell takes in s."""
     plain = _held(word["F"] / 60, motion & (word["F"] > 0), state.feed)
     events, factor = key == M + 2200, np.ones(len(key))
@@ -504,7 +506,7 @@ def _pace(key, word, motion, dwell, state: State) -> tuple[np.ndarray, np.ndarra
     return plain * factor, acceleration, np.where(dwell, np.maximum(seconds, 0.0), 0.0)
 
 
-def _flow(key, word, tool, state: State) -> tuple[np.ndarray, np.ndarray]:
+def _flow(key, word, tool, state: ProgramState) -> tuple[np.ndarray, np.ndarray]:
     """M221's factor on E, and whether E counts mm^3 (M200), for the tool of each command."""
     flow, volumetric = np.ones(len(key)), np.zeros(len(key), bool)
     named = np.where(np.isfinite(word["T"]), word["T"], tool)
@@ -625,16 +627,16 @@ def _kinds(what: np.ndarray, planar: np.ndarray, vertical: np.ndarray, e: np.nda
     return kind
 
 
-def _told(others: list[tuple[int, str]], out: Gathered, driver: tuple[str, ...]) -> list[Told]:
+def _told(others: list[tuple[int, str]], out: Gathered, driver: tuple[str, ...]) -> list[OtherWord]:
     """Every word that is no move, once, the most frequent first."""
     counts = collections.Counter(word for _, word in others)
     first: dict[str, int] = {}
     for line, word in others:
         first.setdefault(word, line)
-    told = [Told(word, count, first[word], BECOMES.get(word, "")) for word, count in counts.items()]
-    told += [Told(_name(key), count, line, APPLIED[key]) for key, (count, line) in out.applied.items()]
+    told = [OtherWord(word, count, first[word], BECOMES.get(word, "")) for word, count in counts.items()]
+    told += [OtherWord(_name(key), count, line, APPLIED[key]) for key, (count, line) in out.applied.items()]
     told += [
-        Told(c, count, line, "beside moves: neither a place nor what drives the extrusion")
+        OtherWord(c, count, line, "beside moves: neither a place nor what drives the extrusion")
         for c, (count, line) in out.beside.items()
         if c not in driver
     ]
@@ -668,7 +670,12 @@ def _said(data: bytes) -> dict[int, float]:
 
 
 def _arcs(
-    commands: Commands, start: np.ndarray, end: np.ndarray, arc: np.ndarray, state: State, refusals: Refusals
+    commands: Commands,
+    start: np.ndarray,
+    end: np.ndarray,
+    arc: np.ndarray,
+    state: ProgramState,
+    refusals: Refusals,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centre (N, 2), signed angle, length (N,) of all commands; the length of a refused arc is
     NaN. I J point to the centre from the start; R is the radius, < 0 the long way round; P counts

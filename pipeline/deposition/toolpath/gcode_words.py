@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 
-class Refusal(NamedTuple):
+class LineRefusal(NamedTuple):
     """Commands that were left out for one reason, because they could not be read or ask for what is not
     supported: the first line, the reason found there, and how many lines."""
 
@@ -29,19 +29,19 @@ class Refusals:
     """What was refused so far: by kind of reason its first line and sentence, and all lines' numbers."""
 
     def __init__(self) -> None:
-        self.kinds: dict[str, Refusal] = {}
+        self.kinds: dict[str, LineRefusal] = {}
         self.lines: list[int] = []
 
     def add(self, lines: Sequence[int], why: str) -> None:
         if not len(lines):
             return
         kind = why.partition(", found")[0].translate(NUMBERS)
-        held = self.kinds.get(kind, Refusal(lines[0], why, 0))
+        held = self.kinds.get(kind, LineRefusal(lines[0], why, 0))
         first = (lines[0], why) if lines[0] < held.line else held[:2]
-        self.kinds[kind] = Refusal(*first, held.count + len(lines))
+        self.kinds[kind] = LineRefusal(*first, held.count + len(lines))
         self.lines += lines
 
-    def grouped(self) -> list[Refusal]:
+    def grouped(self) -> list[LineRefusal]:
         """One refusal a kind by its first line; the sentence says how many more lines are like it."""
         more = [
             one._replace(why=f"{one.why} (and {one.count - 1:,} more such)") if one.count > 1 else one
@@ -50,7 +50,7 @@ class Refusals:
         return sorted(more)
 
 
-class Words(NamedTuple):
+class ProgramWords(NamedTuple):
     """The words of some lines, all (W,): line from 1, letter as its capital's code, value; words of odd lines
     that mean nothing to moves as (line, word); and how many lines hold more than comments."""
 
@@ -117,7 +117,7 @@ def text_bytes(text: str | bytes) -> bytes:
     return data if data.endswith(b"\n") or not data else data + b"\n"
 
 
-def chunks(data: bytes, refusals: Refusals) -> Iterator[Words]:
+def chunks(data: bytes, refusals: Refusals) -> Iterator[ProgramWords]:
     """The words of the program, some CHUNK bytes of whole lines at a time. Raises ValueError where no line
     of the first ENOUGH that hold anything has a G, M or T word that can be read."""
     at, first, found, filled = 0, 1, False, 0
@@ -169,7 +169,7 @@ def _shorter(body: bytes, first: int, refusals: Refusals) -> tuple[bytes, int]:
     return b"\n".join(lines) if long else body, len(long)
 
 
-def _chunk(body: bytes, first: int, refusals: Refusals) -> tuple[Words, int]:
+def _chunk(body: bytes, first: int, refusals: Refusals) -> tuple[ProgramWords, int]:
     """Words of a chunk of whole lines, and the number of its lines."""
     columns, odd, count = _regular(body, first)
     line, extra, others = columns[0], [], []
@@ -187,7 +187,7 @@ def _chunk(body: bytes, first: int, refusals: Refusals) -> tuple[Words, int]:
         columns = [np.append(a, np.array(b, a.dtype)) for a, b in zip(columns, more, strict=True)]
         order = np.argsort(columns[0], kind="stable")
         columns = [column[order] for column in columns]
-    return Words(*columns, others, filled), count
+    return ProgramWords(*columns, others, filled), count
 
 
 def _regular(body: bytes, first: int) -> tuple[list[np.ndarray], np.ndarray, int]:

@@ -33,7 +33,7 @@ class Motion(NamedTuple):
     turn: np.ndarray
 
 
-class Signal(NamedTuple):
+class MotionSignal(NamedTuple):
     """The plan at t = 0, Ts, 2 Ts, ... to its end: position (T, 3) in mm, speed (T,) in mm/s (0 where E moves
     alone), the move (T,) and the share (T,) of its way that is done; e_rate (T,) in mm/s, the mean from each
     instant to the next, so that its sum times Ts is all of E."""
@@ -159,7 +159,7 @@ def _look_ahead(cap: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return v[:-1], v[1:]
 
 
-def sampled(motion: Motion, moves: Moves, *, sample_time_s: float, rates_only: bool = False) -> Signal:
+def sampled(motion: Motion, moves: Moves, *, sample_time_s: float, rates_only: bool = False) -> MotionSignal:
     """The plan at t = 0, Ts, 2 Ts, ..., the last at most one Ts before its end; with `rates_only` no more
     than `rate` needs, move and share, the other columns empty. Raises ValueError where that is more than MOST
     samples."""
@@ -183,8 +183,8 @@ def sampled(motion: Motion, moves: Moves, *, sample_time_s: float, rates_only: b
         if not rates_only:
             position[some], speed[some] = places, speeds
     if rates_only:
-        return Signal(np.zeros(0), position, speed, np.zeros(0), move, share)
-    signal = Signal(np.arange(count) * sample_time_s, position, speed, np.zeros(0), move, share)
+        return MotionSignal(np.zeros(0), position, speed, np.zeros(0), move, share)
+    signal = MotionSignal(np.arange(count) * sample_time_s, position, speed, np.zeros(0), move, share)
     return signal._replace(e_rate=rate(signal, moves.e, sample_time_s=sample_time_s))
 
 
@@ -224,7 +224,7 @@ def _on_arc(moves: Moves, move: np.ndarray, share: np.ndarray) -> np.ndarray:
     return centre + radius[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
 
 
-def rate(signal: Signal, amount: np.ndarray, *, sample_time_s: float) -> np.ndarray:
+def rate(signal: MotionSignal, amount: np.ndarray, *, sample_time_s: float) -> np.ndarray:
     """Mean rate (T,) from each instant to the next of an amount (N,) that each move spends evenly along its
     way (E, volume, printed length); sums exactly.
 

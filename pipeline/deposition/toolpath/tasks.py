@@ -20,7 +20,7 @@ TINY_S = 1e-6
 STEP_S = 0.02
 
 
-class Lines(NamedTuple):
+class PrintedLines(NamedTuple):
     """Every printed line (L,): its number in the program, its move, its tool, the run that it belongs to,
     begin and end in s, length in mm, cruising speed in mm/s. Where the gantry takes STEP_S or longer from
     rest to that speed, the line begins in the middle, early_s after it sets out, and ends late_s before it
@@ -59,7 +59,7 @@ class Tasks(NamedTuple):
     pause_s: np.ndarray
 
 
-def printed_lines(moves: Moves, motion: Motion, *, corner_deg: float, longest_pause_s: float) -> Lines:
+def printed_lines(moves: Moves, motion: Motion, *, corner_deg: float, longest_pause_s: float) -> PrintedLines:
     """The printed lines, joined to runs where nothing but a halt in place of at
     most `longest_pause_s` lies between two of one tool.
 
@@ -93,7 +93,7 @@ def printed_lines(moves: Moves, motion: Motion, *, corner_deg: float, longest_pa
     # the flow's step lies in the middle of its ramp, as the training routine has it
     rests = np.stack([first, last | corner])
     early, late = np.where(rests & (slowing >= STEP_S / 2), slowing, 0.0)
-    return Lines(
+    return PrintedLines(
         moves.line[at],
         at,
         moves.tool[at],
@@ -111,7 +111,7 @@ def printed_lines(moves: Moves, motion: Motion, *, corner_deg: float, longest_pa
     )
 
 
-def sequence(lines: Lines, *, end_s: float) -> Tasks:
+def sequence(lines: PrintedLines, *, end_s: float) -> Tasks:
     """The tasks in their order: No-Flow, then for each run Start, Steady-State, (Corner, Steady-State)...,
     Stop, and No-Flow or, to another tool, Dwell.
 
@@ -146,7 +146,7 @@ def sequence(lines: Lines, *, end_s: float) -> Tasks:
     return Tasks(*columns)
 
 
-def refuse(lines: Lines, moves: Moves, *, halts: Collection[int], switch_s: float) -> None:
+def refuse(lines: PrintedLines, moves: Moves, *, halts: Collection[int], switch_s: float) -> None:
     """Raises ValueError, with the line number, where a program would have
     to go from Steady-State to No-Flow without a Stop:
 

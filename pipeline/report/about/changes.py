@@ -93,7 +93,7 @@ def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
     ]
     streams = deposition_moves(sources)
     cases = setpoint_change.changes(sources)
-    return [
+    loops = [
         LoopChange("temperature", temperature, _both([move for _, move in mine])),
         LoopChange("deposition", [_moved(move) for move in streams if move.moved], _both(streams)),
         LoopChange(
@@ -102,6 +102,7 @@ def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
             sum(change.text not in ("first run", "new") for _, change in cases),
         ),
     ]
+    return [loop for loop in loops if loop.loop in sources.verdicts]
 
 
 def _both(moves: Sequence[Move]) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.deposition.marks import MARK, real
+from pipeline.report.deposition.marks import KIND, MARK, real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.card import (
     Card,
@@ -28,7 +28,7 @@ from pipeline.verdict.verdict import PASSED, Missing, Verdict
 MOVES = "Plunger command to flow at the nozzle"
 # how long a stretch of a part is drawn, s
 STRETCH_S = 6.0
-STYLES = {"basis": "line dd", "priority": "line", "superposition": "line dash", "on_off": "line bl"}
+STYLES = {"basis": "line", "priority": "line dd", "superposition": "line dd dash", "on_off": "line bl"}
 
 Read = Callable[[Structure, str], float | None]
 
@@ -76,7 +76,7 @@ def shown(winner: str) -> list[str]:
 
 
 def _note(name: str) -> str:
-    return {"basis": "data-driven", "on_off": "yardstick"}.get(name, "the paper’s")
+    return "yardstick" if KIND[name] == "baseline" else KIND[name]
 
 
 # ---- the figures

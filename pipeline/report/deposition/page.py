@@ -67,7 +67,7 @@ def render(sources: Sources) -> str:
         verdict=judged,
         heads_of_rules=HEADS,
         claim=headline.claim(sources, ("deposition",)),
-        verdict_mark=MARK.get(judged.winner, "data_driven"),
+        verdict_mark=MARK.get(judged.winner, "model_based"),
         beforehand=_beforehand(sources),
         real=real(sources),
         no_scores=parts if isinstance(parts, Missing) else None,
@@ -134,7 +134,7 @@ def _answer(structure: Structure, move: Move | None) -> dict[str, Any]:
             if name in scores and not structure.unknown()
             else Missing("not measured", "no score"),
         )
-        for name, css in ((OURS, "dd"), (LIBRARY, "mb"), ("ilc", "acc"))
+        for name, css in ((OURS, "mb"), (LIBRARY, "dd"), ("ilc", "acc"))
     ]
     chosen = scores.get(structure.chosen)
     line = chosen.worst_line if chosen and not structure.unknown() else None
@@ -152,7 +152,7 @@ def _answer(structure: Structure, move: Move | None) -> dict[str, Any]:
                 "bad": name in scores and scores[name].error > limit and not structure.unknown(),
                 "best": name == best,
             }
-            for css, name in (("dd", OURS), ("mb", LIBRARY))
+            for css, name in (("mb", OURS), ("dd", LIBRARY))
         ],
         "whole": percent(scores["ilc"].error, 2) if "ilc" in scores else "none",
         "strip": charts.strip(question, shown, (9, 25, 17)),

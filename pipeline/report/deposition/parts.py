@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.deposition.marks import MARK, PAPER, real
+from pipeline.report.deposition.marks import CSS, MARK, PAPER, real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
@@ -32,7 +32,6 @@ CLASSES = (
     ("more", "over1"),
     ("far more", "over2"),
 )
-CSS = {"priority": "mb", "basis": "dd", "on_off": "bl", "ilc": "dd", "superposition": "mb"}
 
 
 def _streams(table: Table) -> list[tuple[str, str]]:

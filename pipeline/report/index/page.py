@@ -38,7 +38,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         decision=headline.decision(loops, quick=sources.quick),
         state=headline.state(loops),
         data=data(sources),
-        claim=f"{headline.claim(sources)} {drifts(judged)}",
+        claim=f"{headline.claim(sources, list(verdicts))} {drifts(judged)}",
         cards=shown,
         picture=picture,
         change=told,
@@ -51,12 +51,13 @@ def render(sources: Sources, judged: Judgement) -> str:
 
 
 def cards(sources: Sources, judged: Judgement, verdicts: Mapping[str, Verdict]) -> list[Card]:
-    """Temperature, deposition, setpoint."""
-    return [
-        temperature_card.card(sources, judged, verdicts["temperature"]),
-        deposition_card.card(sources, verdicts["deposition"]),
-        setpoint_card.card(sources, verdicts["setpoint"]),
-    ]
+    """Temperature, deposition, setpoint, without a loop that is switched off."""
+    drawn = {
+        "temperature": lambda verdict: temperature_card.card(sources, judged, verdict),
+        "deposition": lambda verdict: deposition_card.card(sources, verdict),
+        "setpoint": lambda verdict: setpoint_card.card(sources, verdict),
+    }
+    return [drawn[loop](verdict) for loop, verdict in verdicts.items()]
 
 
 def deciding(
@@ -86,8 +87,9 @@ def steps(shown: Sequence[Card], first: str) -> list[tuple[str, CardStep]]:
 
 def data(sources: Sources) -> str:
     """On whose data the loops were judged: simulated machines, or which recordings."""
-    made = [name for name in headline.NAMES if headline.simulated(sources, name)]
-    if len(made) == len(headline.NAMES):
+    names = list(sources.verdicts)
+    made = [name for name in names if headline.simulated(sources, name)]
+    if len(made) == len(names):
         return "Simulated machines; no recording was read."
     table = sources.tables["record"]
     read = [] if isinstance(table, Missing) or not sources.recorded else list(np.unique(table["recording"]))
@@ -95,9 +97,7 @@ def data(sources: Sources) -> str:
     more = f" and {len(read) - 2} more" if len(read) > 2 else ""
     told = {"temperature": f"temperature {count(len(read), 'recording')} ({listed}{more})" if read else ""}
     theirs = [
-        told.get(name) or f"{name} recordings of datasets/raw/{name}"
-        for name in headline.NAMES
-        if name not in made
+        told.get(name) or f"{name} recordings of datasets/raw/{name}" for name in names if name not in made
     ]
     simulated = [f"{' and '.join(made)} simulated"] if made else []
     text = "; ".join([*theirs, *simulated])

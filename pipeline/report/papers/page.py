@@ -8,12 +8,13 @@ made and whether its method has changed since. No verdict, choice or export read
 
 from collections.abc import Mapping, Sequence
 
+from pipeline.papers import made
 from pipeline.report.papers import deposition, setpoint, study, temperature
 from pipeline.report.papers.relearned import sentences
 from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS, Paper, read
 from pipeline.report.shared import page
 from pipeline.report.shared.sources import Sources
-from pipeline.store import artifacts, made
+from pipeline.store import artifacts
 from pipeline.verdict.verdict import Missing
 
 # glyph of a verdict, by the states that the pages know

@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.store import artifacts, made
+from pipeline.papers import made
+from pipeline.store import artifacts
 from pipeline.verdict.digits import number
 from pipeline.verdict.verdict import Missing
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from pipeline.setpoint.workflow.tables import harm_bar
+from pipeline.setpoint.agents.criteria import harm_bar
 from pipeline.verdict.decide import questions
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.temperature import comparison

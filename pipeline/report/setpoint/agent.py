@@ -12,15 +12,8 @@ from markupsafe import Markup
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import (
-    BEST_FLOW,
-    BEST_TEMPERATURE,
-    FLOW_BAND,
-    PHASES,
-    ROTATION,
-    SETTLED_BY,
-    TEMPERATURE_BAND,
-)
+from pipeline.setpoint.agents.criteria import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, PHASES, ROTATION
 from pipeline.verdict.digits import THIN, number, percent, quantity
 from pipeline.verdict.evidence import Table, lookup
 from pipeline.verdict.setpoint import AGENT, BASELINE, PAPER, Board, Case, case_text, role

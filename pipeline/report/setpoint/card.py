@@ -19,7 +19,8 @@ from pipeline.report.shared.card import (
     of_verdict,
 )
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, FLOW_BAND
+from pipeline.setpoint.agents.criteria import BEYOND, FLOW_BAND
+from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.verdict.digits import THIN, band, count
 from pipeline.verdict.evidence import lookup
 from pipeline.verdict.setpoint import (

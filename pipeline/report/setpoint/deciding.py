@@ -10,14 +10,9 @@ from markupsafe import Markup
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import (
-    BEST_FLOW,
-    BEST_TEMPERATURE,
-    DOES_NOTHING,
-    FLOW_BAND,
-    SETTLED_BY,
-    TEMPERATURE_BAND,
-)
+from pipeline.setpoint.agents.criteria import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND
+from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 from pipeline.verdict.digits import THIN, count, number, shortened
 from pipeline.verdict.evidence import Table
 from pipeline.verdict.setpoint import Board, Case, case_text, role, worst

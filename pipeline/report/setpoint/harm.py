@@ -9,7 +9,8 @@ from markupsafe import Markup
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING
+from pipeline.setpoint.agents.criteria import BEYOND
+from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.verdict.digits import THIN, band, number
 from pipeline.verdict.setpoint import Board, Case, Harm, bars, case_text, harm_of, role, share_text
 from pipeline.verdict.verdict import Figure, Missing

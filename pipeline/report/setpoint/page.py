@@ -14,7 +14,8 @@ from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import BEYOND
+from pipeline.setpoint.agents.criteria import BEYOND
+from pipeline.setpoint.controllers import KINDS
 from pipeline.verdict.digits import THIN, band, count, number, percent, quantity
 from pipeline.verdict.evidence import lookup
 from pipeline.verdict.setpoint import (
@@ -81,7 +82,8 @@ def render(sources: Sources) -> str:
         heads_of_rules=HEADS
         if judged_scores is None
         else (
-            *HEADS[:2],
+            HEADS[0],
+            {"model-based": "Model\u2011based"}.get(KINDS.get(judged_scores.baseline(), ""), HEADS[1]),
             role(judged_scores, judged_scores.baseline()) if judged_scores.baseline() else HEADS[2],
         ),
         second=judged_scores is not None

@@ -11,7 +11,7 @@ from markupsafe import Markup
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import ALPHA
+from pipeline.setpoint.published import ALPHA
 from pipeline.verdict.digits import THIN, band, number, percent, quantity, short
 from pipeline.verdict.evidence import Table, lookup
 from pipeline.verdict.setpoint import CLASS_BORDERS, accuracy, share_text

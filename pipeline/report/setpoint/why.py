@@ -10,7 +10,8 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import BEST_FLOW, BEST_TEMPERATURE, FLOW_BAND, TEMPERATURE_BAND
+from pipeline.setpoint.agents.criteria import FLOW_BAND, TEMPERATURE_BAND
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 from pipeline.verdict.digits import THIN, count, number
 from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import Missing

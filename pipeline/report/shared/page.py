@@ -15,7 +15,7 @@ from pipeline.report.shared.pictures import PictureColumn
 from pipeline.report.shared.sources import QUICK_LOOK, SourceFile, Sources
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
-from pipeline.temperature.workflow.contestants import CONTESTANTS
+from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.verdict import digits
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 
@@ -83,12 +83,25 @@ def environment() -> jinja2.Environment:
     return templates
 
 
+# the loop that a page is about
+LOOP_OF = {
+    "temperature": "temperature",
+    "identification": "temperature",
+    "certificate": "temperature",
+    "deposition": "deposition",
+    "setpoint": "setpoint",
+}
+
+
 def render(template: str, *, sources: Sources | None = None, **values) -> str:
     """A whole page; at its foot the table of the files that the pages of this run are made from."""
     # the nightly job writes its page after the others
     nightly = values["here"] == "nightly" or artifacts.exists("reports/nightly.html")
     quick = artifacts.read_json(QUICK_LOOK) if artifacts.exists(QUICK_LOOK) else None
-    frame = {"beside": [("nightly", "Nightly")] if nightly else [], "quick": quick, "sources": sources}
+    # the pages of a loop that is switched off say so, and no page leads to them
+    off = [] if sources is None else [key for key, loop in LOOP_OF.items() if loop not in sources.verdicts]
+    beside = [("nightly", "Nightly")] if nightly else []
+    frame = {"beside": beside, "quick": quick, "sources": sources, "off": off}
     return printable_page(environment().get_template(template).render(**frame, **values))
 
 

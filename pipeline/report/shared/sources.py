@@ -9,17 +9,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.deposition.workflow.tables import (
-    FILMED,
-    LESSONS,
-    LIBRARY,
-    LINES,
-    SCORES,
-    SIGNALS,
-    TASKS,
-    TRIALS,
-)
-from pipeline.setpoint.workflow.tables import (
+from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
+from pipeline.setpoint.tables import (
     AGENT_CURVE,
     CLASSIFIED,
     CLASSIFIER_CURVE,
@@ -30,10 +21,10 @@ from pipeline.setpoint.workflow.tables import (
     WINDOWS,
 )
 from pipeline.store import artifacts
-from pipeline.temperature.workflow import tables as schemas
-from pipeline.temperature.workflow.settings import Plant
+from pipeline.temperature import tables as schemas
+from pipeline.temperature.settings import Plant
 from pipeline.verdict import night
-from pipeline.verdict.evidence import Evidence, Table
+from pipeline.verdict.evidence import OFF, Evidence, Table, switched_off
 from pipeline.verdict.files import QUICK_LOOK
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import LOOPS, Missing, Verdict
@@ -93,7 +84,7 @@ class Sources(NamedTuple):
         """The verdict of each loop that is on, as the stage `verdict` stored it, with what the last night
         measured."""
         loops = {loop: verdict for loop, verdict in self.stored.items() if loop in LOOPS}
-        return night.verdicts(self.evidence, loops, self.nightly)
+        return loops if self.nightly is None else night.verdicts(self.evidence, loops, self.nightly)
 
     @property
     def model(self) -> Verdict:
@@ -152,9 +143,15 @@ def collect(
     tables: dict[str, Any] = {}
     for stage, path in metrics.items():
         figures[stage] = _read(read, path, stage, stage, "metrics", artifacts.read_json)
-        if isinstance(figures[stage], Missing):
+        if switched_off(figures[stage]):
+            figures[stage] = OFF
+            del read[path]
+        elif isinstance(figures[stage], Missing):
             absent[path] = figures[stage]
     for name, stage, file, kind, reader in _tables(declared.machine):
+        if figures.get(stage) is OFF:
+            tables[name] = OFF
+            continue
         path = f"{folders[stage]}/{file}"
         tables[name] = _read(read, path, name, stage, kind, reader)
         if name == "printer_pid" and not tables[name]:

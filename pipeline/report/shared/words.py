@@ -1,7 +1,7 @@
 """The words of the pages, each explained once, as a process engineer would."""
 
 from pipeline.report.shared.sources import Sources
-from pipeline.temperature.workflow.contestants import CONTESTANTS
+from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.verdict.digits import THIN
 
 INDEX = (

@@ -21,9 +21,9 @@ from pipeline.verdict.decide import (
 )
 from pipeline.verdict.digits import count
 from pipeline.verdict.night import Drift, drift, in_production
-from pipeline.verdict.pairs import PairSentence, pair_sentence
+from pipeline.verdict.pairs import PairSentence, pair_names, pair_sentence
 from pipeline.verdict.temperature import comparison, of_controller
-from pipeline.verdict.verdict import Answers, Figure, Question, Verdict
+from pipeline.verdict.verdict import OPEN, Answers, Figure, Question, Verdict
 
 
 class Judgement(NamedTuple):
@@ -50,8 +50,11 @@ class Judgement(NamedTuple):
 
 def judgement(sources: Sources) -> Judgement:
     """What the pages say of the verdict, and the figures that stand behind it."""
-    evidence, verdict = sources.evidence, sources.verdicts[LOOP]
-    figures, drifted = evidence.figures, drift(sources.nightly)
+    evidence, drifted = sources.evidence, drift(sources.nightly)
+    figures = evidence.figures
+    # of a loop that is switched off the pages still know the names
+    off = Verdict(LOOP, OPEN, "", "", "", "", "", None, subject=pair_names(figures)[0])
+    verdict = sources.verdicts.get(LOOP, off)
     asked = questions(evidence.rules, comparison(figures))
     held = standings(evidence, drifted.answer)
     subject, beside = verdict.subject, rival(figures, verdict.subject)

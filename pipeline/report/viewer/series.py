@@ -14,6 +14,7 @@ from pipeline.report.setpoint.deciding import Clog, clog
 from pipeline.report.shared.charts import stretches
 from pipeline.report.shared.page import MARKS
 from pipeline.report.shared.sources import Sources
+from pipeline.setpoint.controllers import KINDS
 from pipeline.verdict.controllers import heading
 from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import Missing
@@ -310,18 +311,11 @@ def _signals(sources: Sources) -> ViewerTable:
 
 
 def _setpoint_marks(sources: Sources) -> Callable[[str], str]:
-    """Learned agents, filters on a model, and the others, by the scoreboard."""
-    board = sources.tables["scoreboard"]
-    if isinstance(board, Missing):
+    """The mark of a controller by its kind; none without a scoreboard."""
+    if isinstance(sources.tables["scoreboard"], Missing):
         return lambda name: ""
-    kinds = dict(zip(board["controller"].tolist(), board["kind"].tolist(), strict=True))
-
-    def mark(name: str) -> str:
-        if kinds.get(name) in ("agent", "paper"):
-            return "dd"
-        return "mb" if "Bayes" in name else "bl"
-
-    return mark
+    marks = {"data-driven": "dd", "model-based": "mb", "reference": "mb"}
+    return lambda name: marks.get(KINDS.get(name, ""), "bl")
 
 
 def _decisions(sources: Sources) -> ViewerTable:

@@ -27,6 +27,8 @@ TEMPLATES = Path(__file__).with_name("templates")
 PARTS = ("law.h", "law.c", "supervisor.h", "supervisor.c")
 COPIED = ("test_controller.c", "Makefile")
 WIDTH = 110
+# of several columns least_squares takes at most INPUTS, which gcc does not see: of one it warns of a second
+ONE_INPUT = '#if defined(__GNUC__)\n#pragma GCC diagnostic ignored "-Warray-bounds"\n#endif\n\n'
 
 
 def files(exported: Exported, certificate: Certificate, golden: str) -> dict[str, str]:
@@ -128,7 +130,7 @@ def define(name: str, value: float | int | str) -> str:
 # ---- machine.h
 
 
-class Sizes(NamedTuple):
+class ArrayLengths(NamedTuple):
     """Lengths of the arrays: `watched` states of a governor's member, `instants` it looks ahead an output;
     `watch` states of the supervisor's observer, `theta` ways in which a plant may differ, `bank` of
     hypotheses, `ring` of past samples."""
@@ -146,7 +148,7 @@ class Sizes(NamedTuple):
     signals: int
 
 
-def sizes(exported: Exported) -> Sizes:
+def sizes(exported: Exported) -> ArrayLengths:
     m, p = exported.controller.law.D.shape
     laws = [one for one in (exported.controller, exported.fallback) if one is not None]
     memory = max([1, *(len(one.law.A) for one in laws)])
@@ -157,7 +159,7 @@ def sizes(exported: Exported) -> Sizes:
         governed = (f, q // 2, family.above.shape[1] // p)
     watch, bank = exported.supervision.watch, exported.supervision.bank
     supervised = (len(watch.A), len(watch.prior), len(bank.form), innovations.RING, max(m, p))
-    return Sizes(m, p, memory, *governed, *supervised)
+    return ArrayLengths(m, p, memory, *governed, *supervised)
 
 
 def governor_of(exported: Exported) -> Governor | None:
@@ -207,6 +209,8 @@ def machine_header(exported: Exported, certificate_sha256: str) -> str:
 def tables(exported: Exported) -> str:
     """Laws, target, governor and supervisor in numbers."""
     text = "/* The numbers of one controller. Generated; do not edit. Included by controller.c only. */\n\n"
+    if len(exported.machine.inputs) == 1:
+        text += ONE_INPUT
     text += _aiming(exported) + _governing(exported)
     text += "\n/* ---- the law */\n\n" + _law("the_law", exported.controller)
     text += "\n/* ---- the safe mode PI */\n\n" + define("HAS_FALLBACK", int(exported.fallback is not None))
@@ -286,7 +290,7 @@ def _governing(exported: Exported) -> str:
     return text + "".join(table(f"governor_{name}", values) for name, values in halves.items())
 
 
-def _no_members(at: Sizes) -> dict[str, np.ndarray]:
+def _no_members(at: ArrayLengths) -> dict[str, np.ndarray]:
     """The tables of `member_halves` where nothing is governed."""
     f, n, p, m, h = at.members, at.watched, at.outputs, at.inputs, at.outputs * at.instants
     shapes = {

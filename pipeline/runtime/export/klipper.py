@@ -35,14 +35,6 @@ HORIZON_S, LONGEST = 600.0, 2000  # of the step response that is fitted, in s an
 STRANGE = 0.1  # of the largest excursion: a response further off is not that of a block and a sensor
 
 
-class Pid(NamedTuple):
-    """Klipper's pid_Kp in 1/255 of full duty per degC, pid_Ki per degC and s, pid_Kd times s per degC."""
-
-    Kp: float
-    Ki: float
-    Kd: float
-
-
 class Mpc(NamedTuple):
     """Kalico's model: block heat capacity in J/K, ambient transfer in W/K, sensor responsiveness in K/s/K;
     `error` is how far its step response is from ours, as a share of the largest excursion."""
@@ -69,7 +61,7 @@ def settings(
             "control; name one of them"
         )
     heater, sensor = exported.machine.inputs[0], exported.machine.outputs[0]
-    made = pid(exported)
+    Kp, Ki = pi_gains(exported)
     lines = [
         f"# {heater.name} and {sensor.name}, by SIMC from the model of controller {exported.name}",
         f"# plant {exported.plant_sha256}",
@@ -77,9 +69,9 @@ def settings(
         *(["# Rehearsal: the plant was simulated; print with none of these"] if exported.simulated else []),
         f"[{section}]",
         "control: pid",
-        f"pid_Kp: {made.Kp:.4g}  # 1/255 of full duty per degC",
-        f"pid_Ki: {made.Ki:.4g}  # 1/255 of full duty per degC and s",
-        f"pid_Kd: {made.Kd:.4g}  # SIMC's rule for a first-order model has no derivative",
+        f"pid_Kp: {Kp:.4g}  # 1/255 of full duty per degC",
+        f"pid_Ki: {Ki:.4g}  # 1/255 of full duty per degC and s",
+        "pid_Kd: 0  # SIMC's rule for a first-order model has no derivative",
         f"max_power: {heater.high / 100:g}",
     ]
     for option, value in (("min_temp", sensor.low), ("max_temp", sensor.high)):
@@ -130,8 +122,9 @@ def one_heater(exported: Exported) -> None:
         )
 
 
-def pid(exported: Exported) -> Pid:
-    """SIMC's PI in Klipper's units. Raises ValueError where the heater does not warm the sensor."""
+def pi_gains(exported: Exported) -> tuple[float, float]:
+    """SIMC's PI in Klipper's units: pid_Kp in 1/255 of full duty per degC, pid_Ki per degC and s. Raises
+    ValueError if the heater does not warm the sensor."""
     model, limits = strictly_proper(exported.model), exported.controller.limits
     T = exported.machine.sample_time_s
     pairs = baseline.pairing(
@@ -143,7 +136,7 @@ def pid(exported: Exported) -> Pid:
             "identified model; Klipper's PID heats, look at the record"
         )
     Kp = PID_PARAM_BASE / 100.0 * float(pairs.gain[0])
-    return Pid(Kp, Kp / (float(pairs.reset[0]) * T), 0.0)
+    return Kp, Kp / (float(pairs.reset[0]) * T)
 
 
 def _horizon(sample_time_s: float) -> int:

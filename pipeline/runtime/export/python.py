@@ -16,7 +16,7 @@ from pipeline.runtime.export.sources import LIBRARIES, Place, gathered
 from pipeline.runtime.machine import Exported, check, check_certificate
 
 HOME = standalone.__name__
-ENTRIES: list[Place] = [("pipeline.runtime.supervisor", "Supervised")]
+ENTRIES: list[Place] = [("pipeline.runtime.supervised", "Supervised")]
 REPLACED: dict[Place, Place] = {
     ("pipeline.temperature.controllers.controller", "_triangular"): (HOME, "_triangular")
 }
@@ -28,6 +28,8 @@ ORDER = [
     "pipeline.temperature.controllers.controller",
     "pipeline.runtime.innovations",
     "pipeline.runtime.supervisor",
+    "pipeline.runtime.supervised",
+    "pipeline.runtime.signals",
     "pipeline.runtime.machine",
 ]
 LINE = 100
@@ -77,15 +79,20 @@ def text(exported: Exported, certificate: Certificate) -> str:
     """The file. Raises ValueError where the certificate was not passed, or is of another controller."""
     check(exported)
     check_certificate(exported, certificate)
+    return code(exported, sha256(certificate))
+
+
+def code(exported: Exported, certificate_sha256: str) -> str:
+    """The file, whatever its certificate says."""
     stored = Stored([], set())
     rebuilt = stored.expression(exported, "")
     entries = ENTRIES + sorted((kind.__module__, kind.__name__) for kind in stored.types)
-    code = gathered(entries, REPLACED, ORDER)
+    definitions = gathered(entries, REPLACED, ORDER)
     return "\n".join(
         [
-            _head(exported, sha256(certificate)),
+            _head(exported, certificate_sha256),
             "# ---- the project's own definitions\n\n",
-            code + "\n\n",
+            definitions + "\n\n",
             "# ---- this controller\n\n",
             _arrays(b"".join(stored.parts)),
             f"EXPORTED = {rebuilt}\n",

@@ -1,7 +1,7 @@
 """Golden vectors: what the object does on its own model, with noise, changed references, faults, hand-overs.
 
 A script says what happens to machine and controller at each sample. `played` runs it with any object that has
-the calls of supervisor.Supervised; the C test runs the same script with the exported code. Both close the
+the calls of supervised.Supervised; the C test runs the same script with the exported code. Both close the
 loop themselves: outputs fed to a law that is unstable by itself would tell rounding errors apart, no more.
 
     x(t+1) = A x + B (share u + extra) + b,   y = C x + d + add, or what `reading` says
@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.runtime.machine import Exported
+from pipeline.runtime.supervised import Supervised
 from pipeline.runtime.supervisor import KINDS, MODES
 from pipeline.temperature.plant import Plant, hold_output, strictly_proper
 
@@ -21,6 +22,8 @@ WATCH, STEP, HAND_OVER, RESTORE, ACKNOWLEDGE, BEGIN = range(6)
 # readings that are none of the plant's: no number at all, and the one before once more
 LOST, REPEATED = np.inf, -np.inf
 TOLERANCE = 1e-9  # of each input's range
+# largest share of an input's range by which readings moved by UNSURE may move an input: a law's own gains
+OWN_GAINS = 1e-6
 UNSURE = 1e-9  # degC: what no reading is known to, and more than rounding of any forecast
 
 
@@ -47,7 +50,7 @@ class Played(NamedTuple):
     causes: np.ndarray
 
 
-class Start(NamedTuple):
+class EpisodeStart(NamedTuple):
     """Where an episode begins: the model's state x (n,), the inputs u (m,) that hold it, outputs y (p,)."""
 
     x: np.ndarray
@@ -55,7 +58,7 @@ class Start(NamedTuple):
     y: np.ndarray
 
 
-def start(exported: Exported) -> Start:
+def start(exported: Exported) -> EpisodeStart:
     """The model at rest in the middle of its outputs' limits; where none is declared, at a third of the
     inputs' range."""
     model, machine = strictly_proper(exported.model), exported.machine
@@ -64,9 +67,9 @@ def start(exported: Exported) -> Start:
     third = low + (high - low) / 3
     if np.isfinite(bottom).all() and np.isfinite(top).all():
         x, u = hold_output(model, (bottom + top) / 2)
-        return Start(x, np.clip(u, low, high), model.C @ x + model.d)
+        return EpisodeStart(x, np.clip(u, low, high), model.C @ x + model.d)
     x = np.linalg.lstsq(np.eye(model.n) - model.A, model.B @ third + model.b, rcond=None)[0]
-    return Start(x, third, model.C @ x + model.d)
+    return EpisodeStart(x, third, model.C @ x + model.d)
 
 
 def script(exported: Exported, *, episodes: int, steps: int, rng: np.random.Generator) -> Script:
@@ -156,7 +159,7 @@ def fault(made: Script, kind: str, when: slice, exported: Exported, rng: np.rand
         made.t_s[when.start :] += 500.0 * T
 
 
-def played(make: Any, model: Plant, at: Start, script: Script) -> Played:
+def played(make: Any, model: Plant, at: EpisodeStart, script: Script) -> Played:
     """The script run on `model` with the object that `make()` gives."""
     plant = strictly_proper(model)
     T, m = script.manual.shape
@@ -200,7 +203,7 @@ def _before(one: Any, make: Any, do: int, y: np.ndarray) -> Any:
     return one
 
 
-def as_csv(at: Start, script: Script, done: Played) -> str:
+def as_csv(at: EpisodeStart, script: Script, done: Played) -> str:
     """golden.csv: the start in its first line, then a line a sample, numbers as they read back bit by bit."""
     lines = [",".join(map(repr, np.r_[at.x, at.u, at.y].tolist()))]
     columns = [script.do, script.told, done.mode, done.causes]
@@ -212,19 +215,13 @@ def as_csv(at: Start, script: Script, done: Played) -> str:
     return "\n".join(lines) + "\n"
 
 
-class Determined(NamedTuple):
-    """What an episode did, and by how much at most, as a share of an input's range, the object asked for
-    something else when its readings moved by UNSURE; infinite where a mode or a cause was another."""
+def play_often(exported: Exported, make: Any, script: Script, *, replays: int = 3) -> tuple[Played, float]:
+    """An episode, and by how much, as a share of an input's range, the object asks for something else when
+    its readings move by UNSURE up or down, in `replays` episodes more; infinite if a mode or a cause differs.
+    Ends with the first difference above OWN_GAINS.
 
-    done: Played
-    differs: float
-
-
-def determined(exported: Exported, make: Any, script: Script, *, replays: int = 3) -> Determined:
-    """Plays an episode, and `replays` times more with readings that differ by UNSURE up or down.
-
-    Where a law swings between its governor and its limits, the loop itself may magnify rounding, twofold a
-    sample. There the object disagrees with itself, and nobody can agree with it: not on another CPU, and not
+    If a law swings between its governor and its limits, the loop itself may magnify rounding, twofold a
+    sample. Then the object disagrees with itself, and nobody can agree with it: not on another CPU, and not
     in C.
     """
     at, rng = start(exported), np.random.default_rng(0)
@@ -235,11 +232,9 @@ def determined(exported: Exported, make: Any, script: Script, *, replays: int = 
         other = played(make, exported.model, at, script._replace(add=script.add + shift))
         same = np.array_equal(one.mode, other.mode) and np.array_equal(one.causes, other.causes)
         differs = max(differs, float((np.abs(one.u - other.u) / span).max()) if same else np.inf)
-    return Determined(one, differs)
-
-
-# largest share of an input's range by which readings moved by UNSURE may move an input: a law's own gains
-OWN_GAINS = 1e-6
+        if differs > OWN_GAINS:
+            break
+    return one, differs
 
 
 def golden(
@@ -247,15 +242,15 @@ def golden(
 ) -> str:
     """golden.csv of a controller: what its object does in `episodes` that do not magnify rounding, as
     `replays` of each show."""
-    from pipeline.runtime.supervisor import Supervised
-
     rng, scripts, done = np.random.default_rng(seed), [], []
     for _ in range(10 * episodes):
         asked = episode(exported, steps, rng)
-        found = determined(exported, lambda: Supervised(exported, rehearsal=True), asked, replays=replays)
-        if found.differs <= OWN_GAINS:
+        one, differs = play_often(
+            exported, lambda: Supervised(exported, rehearsal=True), asked, replays=replays
+        )
+        if differs <= OWN_GAINS:
             scripts.append(asked)
-            done.append(found.done)
+            done.append(one)
         if len(done) == episodes:
             return as_csv(start(exported), joined(scripts), joined(done))
     raise ValueError(

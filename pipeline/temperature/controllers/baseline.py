@@ -78,7 +78,10 @@ def pairing(
     """Pairs whose full ranges heat fastest (the largest product of slopes, which no unit changes), one input
     an output, and SIMC on k = slope tau, tau and theta of each pair's step response:
 
-    K_c = tau / (k (tau_c + theta)), T_i = min(tau, 4 (tau_c + theta)), tau_c = max(theta, one sample)
+    K_c = tau / (k (tau_c + theta))
+    T_i = min(tau, 4 (tau_c + theta))
+    tau_c = max(theta, one sample)
+
     (Skogestad 2003, table 1). A held input is late by half a sample, which theta counts; it is no less than
     one. tau_c is longer where a standard deviation of the sensor's noise (p,) would otherwise move the input
     by more than `NOISE_SHARE` of its range: so quick a loop is no longer what the record shows.
@@ -236,8 +239,8 @@ def _settings(fitted: list[Rise], inputs: np.ndarray, per_gain: np.ndarray, tuni
 
 
 def pi_law(pairs: Pairing, *, inputs: int) -> Law:
-    """u = u_target + K_c (r + xi - y) on each pair, xi(t+1) = xi + (r - y) / T_i with each zone's own T_i;
-    no other memory."""
+    """u = u_target + K_c (r + xi - y) on each pair
+    xi(t+1) = xi + (r - y) / T_i with each zone's own T_i; no other memory."""
     p = len(pairs.inputs)
     to_input = np.zeros((inputs, p))
     to_input[pairs.inputs, np.arange(p)] = pairs.gain

@@ -39,8 +39,8 @@ class Tuples(NamedTuple):
 
 
 def window_shift(m: int, p: int, N: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, B_u, B_y with w(t+1) = A w + B_u u + B_y y for the window w =
-    [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)]."""
+    """A, B_u, B_y with w(t+1) = A w + B_u u + B_y y
+    for the window w = [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)]."""
     A = scipy.linalg.block_diag(np.eye(N * m, k=-m), np.eye(N * p, k=-p))
     B_u, B_y = np.zeros((N * (m + p), m)), np.zeros((N * (m + p), p))
     B_u[:m], B_y[N * m : N * m + p] = np.eye(m), np.eye(p)
@@ -106,11 +106,14 @@ def tuples_with_reference(
 
 
 class Regression(NamedTuple):
-    """What the data say, whatever the weights: in the coordinates v =
-    [W s; u / u_scale] with q = len(W) whitened states,
+    """What the data say, whatever the weights, in the coordinates v = [W s; u / u_scale] with q = len(W)
+    whitened states:
 
-    E[svec(s s')(t+1) | v] = svec(v v')' (skron(step)' + G), E[svec(e e') | v] = svec(v v')' G_e, E[svec(u u')
-    | v] = svec(v v')' G_u, E[s(t+1) | v] = step v, E[e | v] = output v.
+    E[svec(s s')(t+1) | v] = svec(v v')' (skron(step)' + G)
+    E[svec(e e') | v] = svec(v v')' G_e
+    E[svec(u u') | v] = svec(v v')' G_u
+    E[s(t+1) | v] = step v
+    E[e | v] = output v
 
     W maps the raw window and a constant, [w; 1], on the whitened state. `unknowns`
     half-vector entries are identifiable of `entries` in the published form, and as many
@@ -401,8 +404,10 @@ def _kernel(
     iterations: int,
     change: float,
 ) -> Kernel:
-    """Gains in the machine's units. The reference enters the value as 2 v'H_vr r, H_vr = -output'Q + gamma
-    step'P_sr F, P_sr = [I -K'] H_vr: exact for every r."""
+    """Gains in the machine's units. The reference enters the value as 2 v'H_vr r, exact for every r:
+
+    H_vr = -output'Q + gamma step'P_sr F
+    P_sr = [I -K'] H_vr"""
     q = len(data.W)
     closed = np.hstack([np.eye(q), -K.T])
     u = data.u_scale[:, None]

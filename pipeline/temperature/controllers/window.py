@@ -1,9 +1,10 @@
 """The indirect data-driven route: a long VARX window learned from the record is the state of a predictor, and
 the Riccati equation does the rest.
 
-y(t) = Theta [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)] + theta_0 + e(t). Nothing is assumed
-about the order of the plant; noise costs little, because the long window averages it as a Kalman
-filter would (Chiuso 2007 on VARX and subspace methods).
+y(t) = Theta [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)] + theta_0 + e(t)
+
+Nothing is assumed about the order of the plant; noise costs little, because the long window averages it as a
+Kalman filter would (Chiuso 2007 on VARX and subspace methods).
 """
 
 from collections.abc import Sequence

@@ -70,8 +70,8 @@ def response(u: np.ndarray, time_constant_s: float, delay_s: float, sample_time_
     """Unit-gain response (T,) from rest to u (T,) held between samples, u(0) held for ever
     before: exact for any delay, whole samples or not.
 
-    x(t+1) = a x(t) + (1 - c) u(t-k) + (c - a) u(t-k-1), with delay = (k + f)
-    samples, a = exp(-Ts/tau), c = exp(-(1-f) Ts/tau).
+    x(t+1) = a x(t) + (1 - c) u(t-k) + (c - a) u(t-k-1)
+    with delay = (k + f) samples, a = exp(-Ts/tau), c = exp(-(1-f) Ts/tau).
     """
     whole, fraction = divmod(delay_s / sample_time_s, 1.0)
     k = int(whole)

@@ -36,8 +36,10 @@ DEFAULTS = FitSettings()
 
 
 class Predictor(NamedTuple):
-    """x(t+1) = F x + G v, ŷ = C x + H v, with one initial state a segment: F (n,
-    n), G (n, r), C (p, n), H (p, r), x0 list of (n,)."""
+    """x(t+1) = F x + G v
+    ŷ = C x + H v
+
+    with one initial state a segment: F (n, n), G (n, r), C (p, n), H (p, r), x0 list of (n,)."""
 
     F: np.ndarray
     G: np.ndarray
@@ -152,8 +154,8 @@ def _filtered(blocks: list[tuple[int, complex]], s: np.ndarray, numerator: list[
 
 
 def _mixing(c: np.ndarray, blocks: list[tuple[int, complex]]) -> np.ndarray:
-    """M (n, n) with sensitivity = M f for the output whose row of C is c: [c_k] for a real mode, [[c_k,
-    -c_k+1], [c_k+1, c_k]] for a pair."""
+    """M (n, n) with sensitivity = M f for the output whose row of C is c: [c_k] for a real mode,
+    [[c_k, -c_k+1], [c_k+1, c_k]] for a pair."""
     M = np.zeros((len(c), len(c)))
     for k, eigenvalue in blocks:
         M[k, k] = c[k]
@@ -339,8 +341,12 @@ def free_entries(p: int, m: int, feedthrough: bool | tuple[bool, ...], *, offset
 
 
 def prediction_form(plant: Plant, x0: Sequence[np.ndarray]) -> Predictor:
-    """The one-step predictor of a plant: v = [u; 1; y], F = A - K C, G
-    = [B - K D, b - K d, K], H = [D, d, 0]."""
+    """The one-step predictor of a plant:
+
+    v = [u; 1; y]
+    F = A - K C
+    G = [B - K D, b - K d, K]
+    H = [D, d, 0]"""
     A, B, C, D, b, d, K, _ = plant
     G = np.hstack([B - K @ D, (b - K @ d)[:, None], K])
     return Predictor(A - K @ C, G, C, np.hstack([D, d[:, None], np.zeros((plant.p, plant.p))]), list(x0))

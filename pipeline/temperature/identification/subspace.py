@@ -20,8 +20,8 @@ Segments = Sequence[np.ndarray]
 
 
 class Lagged(NamedTuple):
-    """Triangular factor of the lagged record, columns [u(t) if feed-through, w(t-1), ..., w(t-past), u(t) if
-    not, y(t)], w = [u; y] shifted and scaled.
+    """Triangular factor of the lagged record, w = [u; y] shifted and scaled, with the columns
+    [u(t) if feed-through, w(t-1), ..., w(t-past), u(t) if not, y(t)].
 
     R'R is the second moment of those columns about their mean (with an offset) or about zero (without); means
     (past+1, m+p) holds the mean of w(t-lag) over the rows.
@@ -79,8 +79,8 @@ def gapless(u: Segments, y: Segments) -> tuple[list[np.ndarray], list[np.ndarray
 def lagged_moments(w: np.ndarray, past: int) -> np.ndarray:
     """Sum over t = past..L-1 of z z', z = [w(t); w(t-1); ...; w(t-past)], for w (L, q).
 
-    Only the first block row is a product over the samples; the rest follows from the shift S(i+1, j+1) = S(i,
-    j) + w(past-1-i) w(past-1-j)' - w(L-1-i) w(L-1-j)'.
+    Only the first block row is a product over the samples; the rest follows from the shift
+    S(i+1, j+1) = S(i, j) + w(past-1-i) w(past-1-j)' - w(L-1-i) w(L-1-j)'.
     """
     L, q = w.shape
     S = np.empty((past + 1, q, past + 1, q))

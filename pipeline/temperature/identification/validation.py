@@ -227,8 +227,12 @@ def bootstrap_spread(
     """`count` plants re-identified on records rebuilt from block-resampled one-step errors (Kuensch 1989),
     each with finite poles inside the unit circle.
 
-    The record is rebuilt by x(t+1) = A x + B u + b + K e*, y* = C x + D u + d + e* under the recorded inputs;
-    blocks are two windows long, so that colour that the model missed is kept. `order` (without delays) may
+    The record is rebuilt under the recorded inputs by
+
+    x(t+1) = A x + B u + b + K e*
+    y* = C x + D u + d + e*
+
+    Blocks are two windows long, so that colour that the model missed is kept. `order` (without delays) may
     differ from the identified one, to give plants that no controller was designed on.
     """
     plant, past, block_errors = (

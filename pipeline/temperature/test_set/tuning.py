@@ -60,7 +60,7 @@ class SearchSettings(NamedTuple):
     exploration: float = 2.0
 
 
-class Result(NamedTuple):
+class SearchResult(NamedTuple):
     """The weights theta (d,) that the search recommends, their cost as it
     was evaluated, and everything that was evaluated."""
 
@@ -80,11 +80,12 @@ def fitness(
     x0: np.ndarray,
     k=0.0,
 ) -> float:
-    """F = sum_{t=0..l} gamma^t (|y(t) - r|^2 + |u(t)|^2) of u = -K_x x -
-    K_r r - k with the state known and r constant (37).
+    """F = sum_{t=0..l} gamma^t (|y(t) - r|^2 + |u(t)|^2)
 
-    K_x (m, n), K_r (m, p), k (m,), reference r (p,) in °C, x0 (n,), steps = l >= 0: l + 1 terms. With z = [x;
-    1] the loop is z(t+1) = M z(t), so that all z come from log2(l) products, Z <- [Z, M^i Z]. Raises
+    of u = -K_x x - K_r r - k with the state known and r constant (37).
+
+    K_x (m, n), K_r (m, p), k (m,), reference r (p,) in °C, x0 (n,), steps = l >= 0: l + 1 terms. With
+    z = [x; 1] the loop is z(t+1) = M z(t), so that all z come from log2(l) products, Z <- [Z, M^i Z]. Raises
     ValueError where the closed loop is unstable.
     """
     A_cl = plant.A - plant.B @ K_x
@@ -106,8 +107,10 @@ def fitness(
 
 
 class _Surrogate(NamedTuple):
-    """A Gaussian process and its data: k(x, x') = variance kappa(s), s = sum_j ((x_j -
-    x'_j) / length_j)^2; kappa(s) -> kappa, kappa'."""
+    """A Gaussian process and its data; kappa(s) -> kappa, kappa'.
+
+    k(x, x') = variance kappa(s)
+    s = sum_j ((x_j - x'_j) / length_j)^2"""
 
     points: np.ndarray  # (k, d)
     weights: np.ndarray  # (k,)  K^-1 y
@@ -209,8 +212,9 @@ def _log_improvement(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _expected_improvement(mean, std, *, best: float):
-    """a = -log E[max(best - f, 0)] = -log(std h(z)), z = (best - mean) / std; the
-    logarithm keeps a slope where the improvement is flat."""
+    """a = -log E[max(best - f, 0)] = -log(std h(z)), z = (best - mean) / std
+
+    The logarithm keeps a slope where the improvement is flat."""
     z = (best - mean) / std
     log_h, ratio = _log_improvement(z)
     return -(np.log(std) + log_h), ratio / std, (ratio * z - 1) / std
@@ -393,11 +397,11 @@ def _extended(history: History, theta: np.ndarray, value: float, reason: str) ->
     )
 
 
-def _recommended(search: _Search, history: History, kernel) -> Result:
+def _recommended(search: _Search, history: History, kernel) -> SearchResult:
     """The candidate of least cost; as published the one of least posterior mean (43).
 
-    (43) is taken over the candidates: over the whole box the mean is least where no data hold it up (BAAM: F
-    = 155,000-208,000 there, 153,000-154,000 so).
+    (43) is taken over the candidates: over the whole box the mean is least where no data hold it up
+    (BAAM: F = 155,000-208,000 there, 153,000-154,000 so).
     """
     worked = np.flatnonzero(np.isfinite(history.cost))
     if not worked.size:
@@ -411,7 +415,7 @@ def _recommended(search: _Search, history: History, kernel) -> Result:
         points = search.points(history.theta[worked])
         merit = _posterior(_surrogate(points, _standardised(merit), kernel), points)[0]
     best = worked[np.argmin(merit)]
-    return Result(history.theta[best], float(history.cost[best]), history)
+    return SearchResult(history.theta[best], float(history.cost[best]), history)
 
 
 def _checked(
@@ -459,7 +463,7 @@ def minimise(
     rng: np.random.Generator,
     on_step: Callable[[History], None] | None = None,
     start: History | None = None,
-) -> Result:
+) -> SearchResult:
     """The weights of least cost among the candidates evaluated between lower (d,) and upper (d,).
 
     `cost(theta)` takes weights (d,); a ValueError from it, or a number that is not finite, is a failure of
@@ -500,13 +504,13 @@ def minimise(
 
 def polished(
     cost: Callable[[np.ndarray], float],
-    found: Result,
+    found: SearchResult,
     lower: np.ndarray,
     upper: np.ndarray,
     *,
     evaluations: int,
     side: float = 1 / 8,
-) -> Result:
+) -> SearchResult:
     """The best of `found` after a pattern search of so many `evaluations` more (Hooke and Jeeves 1961): one
     log-weight after the other a step up and down, the step first `side` of its range and halved where none of
     them is better.
@@ -530,4 +534,4 @@ def polished(
             point, best = there, value
             left = [way, *(other for other in ways if other is not way)]
     theta = history.theta[np.nanargmin(history.cost)]
-    return Result(theta, best, history)
+    return SearchResult(theta, best, history)

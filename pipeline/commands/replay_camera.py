@@ -1,0 +1,50 @@
+"""`beadline replay` of recorded frames: the loop of `beadline shadow`, where CONTROLLER's folder holds the
+classifier and the filter that evaluate_setpoint judged."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.commands.shadow import deploy
+from pipeline.runtime.export import setpoint
+from pipeline.runtime.setpoint_checks import BELIEF
+from pipeline.setpoint.agents.bayes import Filter
+from pipeline.setpoint.agents.files import restore_agents
+from pipeline.store import artifacts
+
+
+def ready(folder: Path) -> deploy.Ready:
+    """The loop that evaluate_setpoint judged, without the levels of a camera, which were not exported. Raises
+    ValueError where the folder's numbers are others, and where a stage has not run."""
+    judged = deploy.ready(None)
+    for name, arrays in setpoint.weights(deploy.trained().model, _decider(judged)).items():
+        _check(folder / name, setpoint.FILES[name][0], arrays)
+    return judged
+
+
+def _decider(judged: deploy.Ready) -> setpoint.Decider:
+    """The filter of the default, or our agent with that by which it sees."""
+    name, parameters = judged.deployed.name, judged.deployed.parameters
+    if name == BELIEF:
+        return setpoint.BeliefAgent(
+            restore_agents("datasets/train_agent/weights.safetensors").belief, parameters
+        )
+    if not isinstance(parameters, Filter):
+        raise ValueError(
+            f"datasets/evaluate_setpoint/choice.json: expected a controller with a filter, found {name!r}, "
+            "so what was exported is not what it judged; export again with ./run dvc repro export_controllers"
+        )
+    return parameters
+
+
+def _check(path: Path, schema: str, judged: Mapping[str, np.ndarray]) -> None:
+    """Raises ValueError naming the first array of a file that is not as it was judged."""
+    found, _ = artifacts.read_weights(path, schema)
+    for name in sorted({*found, *judged}):
+        if name in found and name in judged and np.array_equal(found[name], judged[name]):
+            continue
+        raise ValueError(
+            f"{path}: expected the numbers that evaluate_setpoint judged, found others in {name}; make the "
+            "folder again with ./run dvc repro export_controllers, or replay in the project it was made in"
+        )

@@ -1,0 +1,98 @@
+"""What the frames of a trial say before any flow is worked out: the bead's width in every frame, and how late
+the camera is."""
+
+import itertools
+from collections.abc import Collection, Iterator, Sequence
+from typing import NamedTuple, Protocol
+
+import cv2
+import numpy as np
+
+from pipeline.deposition.camera import bead, latency, line
+from pipeline.deposition.camera.bead import Bead
+from pipeline.deposition.camera.latency import Gantry, Latency
+from pipeline.deposition.camera.pose import Mounting, pose
+
+# frames measured together
+TOGETHER = 16
+# readings along the line and bands across it, from which the pictures' motion is told: px of one reading
+STEP_PX, BANDS = 4, 16
+
+
+class TrialFrames(Protocol):
+    """(time_s, picture) of each frame, in the order of time; walked as often as needed."""
+
+    time_s: np.ndarray
+
+    def __iter__(self) -> Iterator[tuple[float, np.ndarray]]: ...
+
+    def chosen(self, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
+        """(number, picture) of those with these numbers."""
+        ...
+
+
+class Readings(NamedTuple):
+    """The readings of F frames: time_s (F,) as stamped, columns (m,), widths (F, m) in px of the picture as
+    it is measured (0 bare, NaN unread), reasons (F,) why a frame has no usable bead, and the camera's latency
+    as this recording tells it."""
+
+    time_s: np.ndarray
+    columns: np.ndarray
+    widths: np.ndarray
+    reasons: list[str]
+    latency: Latency
+
+    @classmethod
+    def from_values(cls, values: tuple) -> "Readings":
+        """Of five plain values, the latency as (latency_s, deviation_s)."""
+        *rest, late = values
+        return cls(*rest, Latency(*late))
+
+
+def measure_beads(
+    frames: TrialFrames, gantry: Gantry, mounting: Mounting
+) -> Iterator[tuple[float, np.ndarray, Bead]]:
+    """(time, picture as it is measured, bead) of each frame, a few at a time: memory stays flat, and what a
+    frame costs beyond its decoding is shared."""
+    turn, rest = pose(mounting, frames.time_s, gantry, frames.chosen), iter(frames)
+    while batch := list(itertools.islice(rest, TOGETHER)):
+        times, pictures = zip(*batch, strict=True)
+        pictures = [picture if turn is None else line.turned(picture, turn) for picture in pictures]
+        beads = bead.measure_all(
+            pictures,
+            columns=(mounting.columns[0], min(mounting.columns[1], pictures[0].shape[1])),
+            longest_blur_px=mounting.longest_blur_px,
+            sign=mounting.sign,
+        )
+        yield from zip(times, pictures, beads, strict=True)
+
+
+def read(frames: TrialFrames, gantry: Gantry, mounting: Mounting) -> Readings:
+    """The readings of a trial's frames; `gantry` is its place as recorded."""
+    first, last = mounting.columns
+    bands = (max((last - first) // STEP_PX, 1), BANDS)
+    times, beads, signals = [], [], []
+    for time, picture, measured in measure_beads(frames, gantry, mounting):
+        times.append(time)
+        beads.append(measured)
+        strip = picture[:, first : min(last, picture.shape[1])]
+        signals.append(cv2.resize(strip, bands, interpolation=cv2.INTER_AREA).astype(np.float32))
+    time_s = np.array(times)
+    return Readings(
+        time_s,
+        beads[0].columns if beads else np.zeros(0),
+        np.array([one.widths for one in beads]),
+        [one.reason for one in beads],
+        _latency(time_s, signals, mounting, gantry),
+    )
+
+
+def _latency(
+    time_s: np.ndarray, signals: Sequence[np.ndarray], mounting: Mounting, gantry: Gantry
+) -> Latency:
+    known = np.isfinite(gantry[1])
+    if known.sum() < 3 or not signals:
+        return latency.UNTOLD
+    step_mm = mounting.mm_per_px * (mounting.columns[1] - mounting.columns[0]) / signals[0].shape[1]
+    known_gantry = (gantry[0][known], gantry[1][known])
+    return latency.estimate(time_s, np.array(signals), known_gantry, step_mm=step_mm)

@@ -1,0 +1,185 @@
+"""A trial measured from its pictures: readings of its frames and signals of its recording -> the flow that a
+law learns from, on the clock of its routine."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.signal
+
+from pipeline.deposition.camera import flow
+from pipeline.deposition.camera.latency import Latency
+from pipeline.deposition.camera.pose import Mounting
+from pipeline.deposition.camera.readings import Readings
+from pipeline.deposition.extruder import Routine
+from pipeline.deposition.learning.ilc import Trial
+
+# a recording may begin and end so much later and earlier than its routine
+SLACK_S = 0.2
+
+
+class MeasuredTrial(NamedTuple):
+    """One trial measured from its frames: the trial as a law sees it, the flow with its uncertainty, the
+    number of frames, frames without a usable bead by reason, and the camera's latency: as these frames tell
+    it, and as it was corrected."""
+
+    trial: Trial
+    flow: flow.Flow
+    frames: int
+    rejected: dict[str, int]
+    latency: Latency
+    of_camera: Latency
+
+
+def measure_trial(
+    readings: Readings,
+    signals: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    routine: Routine,
+    mounting: Mounting,
+    *,
+    scale: tuple[float, float],
+    view: flow.View,
+    latency: Latency,
+    nozzle_mm: float,
+    contact_angle_deg: float,
+    width_deviation_mm: float,
+) -> MeasuredTrial:
+    """The trial of one recording: readings of its frames, and signals {name: (time_s (n,), values (n,))} on
+    clocks of their own. scale is (px_per_mm, offset_px) of the widths. Raises ValueError if no frame shows a
+    bead, and for signals that do not cover the routine."""
+    px_per_mm, offset_px = scale
+    widths_mm = (mounting.true_px(readings.widths) - offset_px) / px_per_mm
+    widths_mm = np.where(readings.widths == 0, 0.0, widths_mm)
+    late = clock_shift(*signals["position_mm"], routine)
+    shifted = {name: (time_s - late, values) for name, (time_s, values) in signals.items()}
+    at = on_routine_clock(shifted, routine)
+    _check_beads(readings)
+    sections = flow.sections(
+        np.interp(readings.time_s - late - latency.latency_s, *shifted["position_mm"]),
+        readings.columns, widths_mm, view=view,
+        nozzle_radius_mm=nozzle_mm / 2, contact_angle_deg=contact_angle_deg,
+    )  # fmt: skip
+    estimate = flow.estimate(
+        routine.time_s, at["position_mm"], sections, nozzle_radius_mm=nozzle_mm / 2, shapes=routine.r[None],
+        contact_angle_deg=contact_angle_deg, width_deviation_mm=width_deviation_mm,
+    )  # fmt: skip
+    # within a pause only its volume was measured: a law learns nothing there
+    y = np.where(estimate.observable, estimate.flow, np.nan)
+    trial = Trial(at["command_mm"], y, at.get("flow_mm3_per_s"))
+    rejected = counts(readings.reasons)
+    return MeasuredTrial(trial, estimate, len(readings.time_s), rejected, readings.latency, latency)
+
+
+def counts(reasons: Sequence[str]) -> dict[str, int]:
+    """How many frames have no usable bead, by reason."""
+    return {reason: list(reasons).count(reason) for reason in dict.fromkeys(reasons) if reason}
+
+
+def _check_beads(readings: Readings) -> None:
+    if not len(readings.time_s):
+        raise ValueError("expected frames but none could be read; record the trial again")
+    if not (readings.widths > 0).any():
+        rejected = counts(readings.reasons)
+        reasons = ", ".join(f"{reason} in {count}" for reason, count in sorted(rejected.items()))
+        raise ValueError(
+            f"none of {len(readings.time_s)} frames shows a usable bead ({reasons}); "
+            "check light, focus, calibration and camera.columns, or record the trial again"
+        )
+
+
+def on_routine_clock(
+    signals: Mapping[str, tuple[np.ndarray, np.ndarray]], routine: Routine
+) -> dict[str, np.ndarray]:
+    """The signals (T,) of a recording at the samples of its routine. Raises ValueError if the recording is
+    too short, has gaps, or shows another travel."""
+    for name, (time_s, _) in signals.items():
+        if len(time_s) == 0 or time_s[0] > SLACK_S or time_s[-1] < routine.time_s[-1] - SLACK_S:
+            span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s" if len(time_s) else "nothing"
+            raise ValueError(
+                f"expected {name} from 0 to {routine.time_s[-1]:.2f} s, as its routine has it, found {span}; "
+                "record the whole trial, from its start"
+            )
+    at = {name: np.interp(routine.time_s, *signal) for name, signal in signals.items()}
+    for name in ("position_mm", "command_mm"):
+        if gaps := int(np.count_nonzero(~np.isfinite(at[name]))):
+            raise ValueError(
+                f"expected {name} at every moment but {gaps} of {len(routine.time_s)} are missing; "
+                "record the trial again"
+            )
+    expected, travelled = np.ptp(routine.position), np.ptp(at["position_mm"])
+    if not 0.9 * expected < travelled < 1.1 * expected:
+        raise ValueError(
+            f"expected the gantry to travel {expected:.4g} mm, as its routine has it, "
+            f"found {travelled:.4g} mm; check topic and unit of its position, or record the trial again"
+        )
+    return at
+
+
+def clock_shift(time_s: np.ndarray, position: np.ndarray, routine: Routine) -> float:
+    """How much later than its routine a recording's clock runs, in s: the shift with the least
+
+        sum_t (|v(t)| - v_routine(t))^2
+
+    of the gantry's speed v; 0 for a record shorter than the routine. A recorder begins before the routine
+    does, and a clock of the calendar is counted from its whole second.
+    """
+    Ts = float(routine.time_s[1] - routine.time_s[0])
+    spare = round(SLACK_S / Ts)
+    grid = np.arange(time_s[0], time_s[-1] + Ts / 2, Ts) if np.isfinite(position).all() else np.zeros(0)
+    if len(grid) < max(len(routine.time_s) - spare, 2):
+        return 0.0
+    speed = np.pad(np.abs(np.gradient(np.interp(grid, time_s, position), Ts)), spare)
+    both = scipy.signal.correlate(speed, routine.speed, "valid", method="fft")
+    own = np.convolve(speed**2, np.ones(len(routine.speed)), "valid")
+    return float(time_s[0]) + (int(np.argmin(own - 2 * both)) - spare) * Ts
+
+
+# ---- figures
+
+
+def latency_figures(measured: Sequence[MeasuredTrial]) -> dict[str, float | None]:
+    """How late the camera is, as it was corrected in the last trial, and its standard deviation, s; None if
+    the pictures do not tell it: then flow near corners and pauses may err by all of it."""
+    last = measured[-1].of_camera
+    known = np.isfinite(last.deviation_s)
+    return {
+        "latency_s": last.latency_s if known else None,
+        "latency_deviation_s": last.deviation_s if known else None,
+    }
+
+
+def flow_errors(measured: Sequence[MeasuredTrial], routine: Routine) -> dict[str, float]:
+    """How well pictures measure the flow, over all trials: r.m.s. error in % of the steady flow, in the
+    whole trial and around its pause, and frames without a bead."""
+    errors = np.array([one.flow.flow - one.trial.truth for one in measured]) / routine.r.max()
+    near = (routine.time_s > routine.pause_s[0] - 0.3) & (routine.time_s < routine.pause_s[1] + 0.3)
+    trial, corner = (100 * np.sqrt(np.mean(part**2, axis=1)) for part in (errors, errors[:, near]))
+    frames = sum(one.frames for one in measured)
+    rejected = sum(sum(one.rejected.values()) for one in measured)
+    return {
+        "flow_error_percent": float(np.median(trial)),
+        "flow_error_corner_percent": float(np.median(corner)),
+        "rejected_percent": 100 * rejected / frames,
+    }
+
+
+def filmed_rows(measured: Mapping[tuple[str, int], Sequence[MeasuredTrial]]) -> dict[str, list]:
+    """Columns of filmed.parquet: one row a measured trial, by (material, number of the routine)."""
+    rows = [
+        {
+            "material": material,
+            "routine": index,
+            "trial": number,
+            "frames": one.frames,
+            "rejected": sum(one.rejected.values()),
+            "reasons": ", ".join(f"{reason} {count}" for reason, count in sorted(one.rejected.items())),
+            "deviation_mm3_per_s": float(np.median(one.flow.deviation)),
+            "observable": float(np.mean(one.flow.observable)),
+            "outliers": one.flow.outliers,
+        }
+        for (material, index), trials in measured.items()
+        for number, one in enumerate(trials)
+    ]
+    names = ("material", "routine", "trial", "frames", "rejected", "reasons")
+    names += ("deviation_mm3_per_s", "observable", "outliers")
+    return {name: [row[name] for row in rows] for name in names}

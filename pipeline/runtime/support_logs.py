@@ -1,0 +1,42 @@
+"""Logs and plants from which the support of a controller is made: honest logs are those of the judging half
+under this controller; plants drawn anew from the spread forecast."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.runtime.certificate import EvidenceRecord
+from pipeline.runtime.machine import Exported
+from pipeline.runtime.replay import GaplessLog
+from pipeline.temperature.controllers.governor import Limits
+from pipeline.temperature.plant import Plant
+from pipeline.temperature.test_set import panel
+
+FORECASTING, HONEST_LOGS = 24, 200  # plants, and logs at most
+
+
+def forecasting_plants(
+    family: Sequence[Plant], spread: panel.Spread, rng: np.random.Generator
+) -> list[Plant]:
+    return panel.padded(panel.drawn(family, FORECASTING, spread, cells=False, rng=rng))
+
+
+def honest_logs(made: Exported, half: panel.Cases, limits: Limits) -> list[GaplessLog]:
+    """Logs of cases of the judging half under the controller as deployed, from the hold on."""
+    aims = panel.aims(made.controller.law, panel.rests(made.model, half, limits), half)
+    run, noise = panel.rolled_out(made.controller, half, aims), panel.noise_of(half)[: half.hold]
+    logs = []
+    for case in np.unique(np.linspace(0, len(half.plant) - 1, HONEST_LOGS).astype(int)):
+        plant, still = half.plants[half.plant[case]], np.ones((half.hold, 1))
+        held = plant.C @ half.x0[case] + plant.d + noise[:, case]
+        parts = (still * half.u0[case], run.u[:, case]), (held, run.measured[:, case]), (
+            still * run.r[0, case], run.r[:, case],
+        )  # fmt: skip
+        logs.append(GaplessLog(*(np.concatenate(part) for part in parts)))
+    return logs
+
+
+def recorded_logs(record: EvidenceRecord) -> list[GaplessLog]:
+    """The pieces of the machine's own record, which are on support whatever the plants say."""
+    pieces = zip([*record.u, *record.newest_u], [*record.y, *record.newest_y], strict=True)
+    return [GaplessLog(u, y, y) for u, y in pieces]

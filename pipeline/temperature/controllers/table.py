@@ -1,0 +1,233 @@
+"""The table of controllers: every controller of the temperature comparison, the simplest first.
+
+A new controller is a file of its own beside this one and a row in CONTROLLERS. Tuning, evaluation and
+certificate design controllers from this table; pages take heading, mark, kind and explanation from it. A
+method is imported when it is designed: a page loads none.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from pipeline.temperature.controllers.problem import Design, DesignProblem
+
+Values = Mapping[str, float]
+
+
+class TuningParameter(NamedTuple):
+    """What a search may set, between low and high, from the declared start; times the problem's effect where
+    `of_effect`."""
+
+    name: str
+    low: float
+    start: float
+    high: float
+    of_effect: bool = False
+
+
+EFFORT = TuningParameter("effort_weight", 0.3, 5.0, 3e3, of_effect=True)
+OBSERVER = TuningParameter("observer_tau", 0.01, 1.0, 100.0, of_effect=True)
+INTEGRAL = TuningParameter("integral", 0.004, 0.04, 0.4)
+
+
+class TemperatureController(NamedTuple):
+    """A controller of the comparison: how it is designed, and what the pages say of it.
+
+    `heading` and `method` stand above its column, `explanation` among the words of the page, below `word` if
+    the heading alone would say too little. `design` returns None if the record does not allow the controller,
+    and raises ValueError if the machine does not: the page shows that sentence in its column. `parameters`
+    are what its search may set; without any nothing is searched. `learned_from` says whose need of samples is
+    its own: the identified plant, the window, or the kernel.
+
+    `kind` is declared here and nowhere guessed from a name: model-based (a model is identified and then
+    inverted or optimised), data-driven (the law is learned from the record without such a model), baseline,
+    or reference. `role`: the pair that is answered for itself is model_based against data_driven. A yardstick
+    is shown beside the others and is never the best. `mark` is the class of its mark; one without takes the
+    next free shape.
+    """
+
+    name: str
+    heading: str
+    method: str
+    explanation: str
+    design: Callable[[DesignProblem, Values], Design | None]
+    kind: Literal["model-based", "data-driven", "baseline", "reference"]
+    parameters: tuple[TuningParameter, ...] = ()
+    learned_from: Literal["plant", "window", "kernel", ""] = ""
+    role: Literal["data_driven", "model_based", "indirect", "baseline", "yardstick", ""] = ""
+    word: str = ""
+    mark: Literal["dd", "mb", "bl", ""] = ""
+    hollow: bool = False
+
+
+def in_file(file: str, function: str = "design") -> Callable[[DesignProblem, Values], Design | None]:
+    """The function of a file in pipeline/temperature/controllers, loaded when it first designs."""
+    return functools.partial(_design, f"pipeline.temperature.controllers.{file}", function)
+
+
+def _design(module: str, function: str, problem: DesignProblem, values: Values) -> Design | None:
+    return getattr(importlib.import_module(module), function)(problem, values)
+
+
+CONTROLLERS = (
+    TemperatureController(
+        "hold",
+        "Hold",
+        "do nothing",
+        "The inputs stay as they were handed over.",
+        in_file("designs", "hold"),
+        "baseline",
+    ),
+    # only where a recording is a Klipper log
+    TemperatureController(
+        "printer_pid",
+        "Printer",
+        "its own PID",
+        "Klipper’s PID with the gains of the printer’s configuration, as its log has them, at our sample "
+        "time. It is not tuned and aims at no target: it starts at the input of the hold, and its "
+        "integral rests while the duty is at a limit.",
+        in_file("designs", "printer_pid"),
+        "baseline",
+        word="The printer’s own PID",
+    ),
+    TemperatureController(
+        "pi_simc",
+        "PI, SIMC",
+        "PI per zone",
+        "One PI controller a zone by SIMC’s rule from the identified model, with the same steady input, "
+        "limits, governor and hand-over as the others.",
+        in_file("designs", "pi"),
+        "baseline",
+        learned_from="plant",
+        role="baseline",
+        mark="bl",
+    ),
+    TemperatureController(
+        "pi",
+        "PI, tuned",
+        "PI per zone",
+        "The same, its gains and reset times tuned by the same search as the others, which keeps the least "
+        "margins of tune_weights; SIMC’s rule need not, so that it may be the cheaper one.",
+        in_file("designs", "pi"),
+        "baseline",
+        (TuningParameter("gain_factor", 0.02, 1.0, 10.0), TuningParameter("reset_factor", 0.1, 1.0, 20.0)),
+        learned_from="plant",
+        mark="bl",
+        hollow=True,
+    ),
+    TemperatureController(
+        "subspace_lqg",
+        "subspace + LQG",
+        "model-based",
+        "A plant model is identified from the record; an observer estimates its state, "
+        "and the Riccati equation gives the gains.",
+        in_file("designs", "subspace_lqg"),
+        "model-based",
+        (EFFORT, OBSERVER, INTEGRAL),
+        learned_from="plant",
+        role="model_based",
+        word="subspace + LQG, model-based",
+        mark="mb",
+    ),
+    TemperatureController(
+        "varx_riccati",
+        "VARX + Riccati",
+        "data-driven, indirect",
+        "A long window of past inputs and outputs predicts the next output; the Riccati equation does the "
+        "rest. No order, no state to choose.",
+        in_file("designs", "varx_riccati"),
+        "model-based",
+        (EFFORT, INTEGRAL),
+        learned_from="window",
+        role="indirect",
+        word="VARX + Riccati, data-driven and indirect",
+        mark="dd",
+        hollow=True,
+    ),
+    TemperatureController(
+        "learned_kernel",
+        "learned kernel",
+        "data-driven, Algorithm 2",
+        "Algorithm 2 of the study: the value of state and action is fitted to the record directly, "
+        "and the gain is read off it. Its state is what the window predicts.",
+        in_file("designs", "learned_kernel"),
+        "data-driven",
+        (EFFORT, INTEGRAL),
+        learned_from="kernel",
+        role="data_driven",
+        word="learned kernel, Algorithm 2, data-driven and direct",
+        mark="dd",
+    ),
+    TemperatureController(
+        "exact_model",
+        "Exact model",
+        "told the truth",
+        "The model-based controller, told the true plant. The plants that it is judged on differ from that "
+        "one too, so that it is a yardstick and no bound: another may be cheaper.",
+        in_file("designs", "exact_model"),
+        "reference",
+        (EFFORT, OBSERVER, INTEGRAL),
+        role="yardstick",
+        mark="mb",
+        hollow=True,
+    ),
+)
+BY_NAME = {controller.name: controller for controller in CONTROLLERS}
+PAIR = ("subspace_lqg", "learned_kernel")
+INDIRECT = "varx_riccati"
+KERNEL_UNDETERMINED = "the record does not determine the kernel (learn_kernel says why)"
+UNTUNED = "it could not be tuned: no candidate of its search kept the least margins of tune_weights"
+
+
+def bounds(
+    controller: TemperatureController, problem: DesignProblem
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lowest, start and highest of each parameter (d,)."""
+    scale = [problem.effect if one.of_effect else 1.0 for one in controller.parameters]
+    table = np.array([(one.low, one.start, one.high) for one in controller.parameters]).T * scale
+    return table[0], table[1], table[2]
+
+
+def parameters(controller: TemperatureController, theta: Iterable[float]) -> dict[str, float]:
+    """The values theta (d,) by the names of the controller's parameters."""
+    return dict(zip([one.name for one in controller.parameters], theta, strict=True))
+
+
+def design_controllers(
+    problem: DesignProblem, tuned: Mapping[str, Mapping[str, Any]]
+) -> tuple[dict[str, Design], dict[str, str]]:
+    """Every controller that the record and the machine allow, at its tuned parameters, and by name why others
+    are refused. Raises ValueError if there is none but doing nothing."""
+    designs, refused = {}, {}
+    for controller in CONTROLLERS:
+        values: dict[str, Any] = {
+            one.name: tuned.get(controller.name, {}).get(one.name) for one in controller.parameters
+        }
+        untuned = None in values.values()
+        if untuned:
+            values = parameters(controller, bounds(controller, problem)[1])
+        try:
+            design = controller.design(problem, values)
+        except ValueError as reason:
+            refused[controller.name] = str(reason)
+            continue
+        if design is None:
+            if controller.role == "data_driven":
+                refused[controller.name] = KERNEL_UNDETERMINED
+        elif untuned:
+            refused[controller.name] = UNTUNED
+        else:
+            designs[controller.name] = design
+    if set(designs) <= {"hold"}:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
+        raise ValueError(
+            f"expected a controller that can be designed, found none: {reasons}; record the machine longer, "
+            "or change its inputs in section plant of params.yaml"
+        )
+    return designs, refused

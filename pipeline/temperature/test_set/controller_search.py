@@ -1,0 +1,107 @@
+"""The search for the parameters of one controller: every controller has the same search, budget and cost, on
+the same training half of the panel, as it would be deployed."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.temperature.controllers import table
+from pipeline.temperature.controllers.controller import Rest
+from pipeline.temperature.controllers.problem import Design, DesignProblem, weights
+from pipeline.temperature.settings import TuneWeights
+from pipeline.temperature.test_set import comparison, panel, scorecard, tuning
+from pipeline.temperature.test_set.cases import CaseConditions, play
+
+# of a parameter's range, in logarithms: so near to an end the search is called bound by it
+AT_BOUND = 0.02
+# of the cost, for a parameter moved from its start by its whole range: of two candidates as good as each
+# other the one nearer to the start is taken, so that a direction in which the cost is flat has one end
+NEARER = 0.05
+# of the candidates, the last, by a pattern search from the best: without it two seeds end 6 % apart
+POLISHED = 1 / 3
+
+
+def search(
+    name: str, settings: TuneWeights, problem: DesignProblem, setting: CaseConditions
+) -> tuple[str, tuning.SearchResult | str]:
+    """The name and the best parameters of a controller; a sentence if it cannot be designed, an empty one if
+    the record does not allow it."""
+    controller = table.BY_NAME[name]
+    low, start, high = table.bounds(controller, problem)
+    try:
+        design = controller.design(problem, table.parameters(controller, start))
+    except ValueError as reason:
+        return name, str(reason)
+    if design is None:
+        return name, ""
+    rests = panel.rests(design.model, setting.rehearsal.training, setting.limits)
+
+    def cost(theta: np.ndarray) -> float:
+        candidate = controller.design(problem, table.parameters(controller, theta))
+        if candidate is None:
+            raise ValueError("the record does not allow this candidate")
+        far = np.log(theta / start) / np.log(high / low)
+        return _cost(candidate, rests, settings, setting) * (1 + NEARER * float(far @ far))
+
+    first = tuning.History(start[None], *_first(cost, start))
+    initial, evaluations = settings.practical_initial, settings.practical_evaluations
+    last = min(round(POLISHED * evaluations), evaluations - initial)
+    try:
+        result = tuning.minimise(
+            cost,
+            low,
+            high,
+            tuning.SearchSettings(initial, evaluations - last),
+            rng=np.random.default_rng(settings.seed),
+            start=first,
+        )
+        return name, tuning.polished(cost, result, low, high, evaluations=last)
+    except ValueError as reason:  # every candidate failed: the others go on
+        return name, str(reason)
+
+
+def _first(cost, start: np.ndarray) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
+    """The declared start as the first candidate."""
+    try:
+        value, reason = cost(start), ""
+    except ValueError as failure:
+        value, reason = np.nan, str(failure)
+    return np.array([value]), (reason,), np.array([value])
+
+
+def _cost(design: Design, rests: Sequence[Rest], settings: TuneWeights, setting: CaseConditions) -> float:
+    """The declared cost of a candidate. Raises ValueError if its margins on the identified plant, its
+    inputs a sample late, are below the least: figures in simulation are no reason to give robustness away."""
+    margin = scorecard.margins([setting.late], design.law, grid=80)[0]
+    least_delay_s = setting.faster * settings.least_delay_margin_s
+    if not (margin.disk >= settings.least_disk_margin and margin.delay_s >= least_delay_s):
+        raise ValueError(
+            f"on the identified plant, its inputs a sample late, the disk margin is {margin.disk:.2f} and "
+            f"the delay margin {margin.delay_s:.2f} s, where {settings.least_disk_margin:g} and "
+            f"{least_delay_s:g} s are the least"
+        )
+    training = setting.rehearsal.training
+    figures = play(design, rests, training, setting)[1]
+    costs = panel.costs(figures, setting.allowance)
+    return comparison.mean_and_worst(costs, training.plant, weight=settings.worst_case)
+
+
+def tuned_values(name: str, result: tuning.SearchResult, problem: DesignProblem) -> dict[str, Any]:
+    """The parameters by name, the weights that they stand for, the cost, and which of them lie at a bound."""
+    controller = table.BY_NAME[name]
+    low, _, high = table.bounds(controller, problem)
+    share = np.log(result.theta / low) / np.log(high / low)
+    values: dict[str, Any] = table.parameters(controller, result.theta.tolist())
+    names = list(values)
+    if "effort_weight" in values:
+        values["q"], values["r"] = (weight.tolist() for weight in weights(problem, values))
+    return values | {
+        "cost": result.cost,
+        "cost_at_start": None if np.isnan(result.history.cost[0]) else float(result.history.cost[0]),
+        "failed": int(np.isnan(result.history.cost).sum()),
+        "evaluations": len(result.history.cost),
+        "at_bound": [
+            key for key, place in zip(names, share, strict=True) if not AT_BOUND < place < 1 - AT_BOUND
+        ],
+    }

@@ -1,0 +1,316 @@
+"""Controllers as they would be deployed, on plants that nobody learned or tuned on: figures of each, which is
+best, what tells model-based and data-driven apart, and which plant decides."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.temperature.controllers import table
+from pipeline.temperature.controllers.problem import Design
+from pipeline.temperature.settings import Plant as Machine
+from pipeline.temperature.settings import TemperatureRules
+from pipeline.temperature.test_set import comparison, panel, scorecard
+from pipeline.temperature.test_set.cases import CaseConditions, play
+
+FIGURES = {
+    "settled_error": "settled_error_degC",
+    "settling": "settling_s",
+    "overshoot": "overshoot_degC",
+    "at_limits": "at_limits_percent",
+    "energy": "energy_percent",
+    "cost": "cost",
+    "rms": "rms_degC",
+}
+CONVENTION = (
+    "Q = R = I, discounted {gamma:g} a step, unclipped, without integrator and governor, from a plant at "
+    "rest, noise-free, against the Riccati law of the same plant that knows the state"
+)
+
+
+OF_SEARCH = ("at_bound", "evaluations", "cost", "cost_at_start", "failed", "q", "r")  # and no parameters
+
+
+class ControllerOutcome(NamedTuple):
+    """One controller over all cases, its margins on every plant, its gaps in percent on the plants (None if
+    weights mean nothing to it), and the rollout."""
+
+    figures: panel.Figures
+    costs: np.ndarray
+    margins: list[scorecard.Margins]
+    gaps: np.ndarray | None
+    rollout: panel.Rollout
+
+
+def evaluate(name: str, design: Design, setting: CaseConditions) -> tuple[str, ControllerOutcome]:
+    """One controller on the judging half, with its name."""
+    cases = setting.rehearsal.judging
+    rollout, figures = play(design, panel.rests(design.model, cases, setting.limits), cases, setting)
+    margins = [] if design.holds else scorecard.margins(cases.plants, design.law, grid=80)
+    return name, ControllerOutcome(
+        figures, panel.costs(figures, setting.allowance), margins, _gaps(design, setting), rollout
+    )
+
+
+def _gaps(design: Design, setting: CaseConditions) -> np.ndarray | None:
+    """J / J* - 1 in percent on every plant, by CONVENTION; inf if the loop is unstable there."""
+    if design.plain is None:
+        return None
+    try:
+        law = design.plain()
+    except ValueError:  # no minimum at the yardstick's weights, though there is one at its own
+        return None
+    cases, (p, m) = setting.rehearsal.judging, (design.model.p, design.model.m)
+    first = np.flatnonzero(cases.kind == "constant")[:1]
+    rows = first + cases.each * np.arange(len(cases.plants))
+    scenarios = scorecard.Panel(
+        cases.plants,
+        np.arange(len(cases.plants)),
+        cases.x0[rows],
+        cases.u0[rows],
+        np.repeat(cases.references[cases.asked[rows[0], 0]].H.T, len(rows), axis=0),
+        np.zeros(len(rows)),
+        np.zeros(len(rows), int),
+        np.zeros(len(rows)),
+        cases.steps,
+        cases.hold,
+    )
+    yardstick = scorecard.Yardstick(np.ones(p), np.ones(m), setting.gamma)
+    run = scorecard.simulate(scenarios, law)
+    J, best = scorecard.cost(scenarios, run, yardstick), scorecard.optimum(scenarios, yardstick)
+    gaps = 100.0 * scorecard.regret(J, best)
+    return np.where(np.isfinite(gaps) & (gaps < 1e6), gaps, np.inf)
+
+
+# ---- figures of one controller
+
+
+def _columns(one: ControllerOutcome, setting: CaseConditions) -> dict[str, np.ndarray]:
+    """The figures of FIGURES by column of the table, in its units."""
+    f = one.figures
+    return {
+        "settled_error_degC": f.settled_error,
+        "settling_s": f.settling * setting.sample_time_s,
+        "overshoot_degC": f.overshoot,
+        "at_limits_percent": f.at_limits,
+        "energy_percent": f.energy,
+        "cost": one.costs,
+        "rms_degC": f.rms,
+    }
+
+
+def summarise(
+    one: ControllerOutcome, setting: CaseConditions, tuned: Mapping[str, Any], *, seed: int, resamples: int
+) -> dict[str, Any]:
+    """The figures of a controller over all cases, with the parameters that its search found."""
+    cases, columns = setting.rehearsal.judging, _columns(one, setting)
+    figures = {}
+    for name, column in FIGURES.items():
+        band = comparison.banded(columns[column], cases.plant, seed=seed, resamples=resamples)
+        figures[name] = {
+            **{key: _number(getattr(band, key)) for key in ("median", "q90", "low", "high", "worst")},
+            "worst_case": _case(cases, band.worst_case),
+        }
+    constant = ~np.isnan(one.figures.settling)
+    crossing, noise = one.figures.crossing, setting.rehearsal.noise.max()
+    return {
+        **figures,
+        "never_settled_percent": 100.0 * float(np.isinf(one.figures.settling[constant]).mean()),
+        "crossings": {
+            "cases": int((crossing > 3 * noise).sum()),
+            "of": len(crossing),
+            "worst_degC": _number(max(float(crossing.max()), 0.0)),
+        },
+        "gap": _gap(one, setting),
+        "margins": _margin_figures(one.margins),
+        "stable": {"count": sum(margin.stable for margin in one.margins), "of": len(one.margins)},
+        "tuned": {key: value for key, value in tuned.items() if key not in OF_SEARCH},
+        "at_bound": tuned.get("at_bound", []),
+        "evaluations": tuned.get("evaluations", 0),
+    }
+
+
+def _gap(one: ControllerOutcome, setting: CaseConditions) -> dict[str, Any] | None:
+    if one.gaps is None:
+        return None
+    median, q90 = np.quantile(one.gaps, [0.5, 0.9], method="nearest")
+    return {
+        "median_percent": _number(median),
+        "q90_percent": _number(q90),
+        "convention": CONVENTION.format(gamma=setting.gamma),
+    }
+
+
+def _margin_figures(margins: list[scorecard.Margins]) -> dict[str, Any] | None:
+    """The worst disk margin in `scorecard.Margins`, unlimited delay margins as null."""
+    if not margins:
+        return None
+    result = {}
+    for key in ("disk", "delay_s"):
+        values = np.array([getattr(margin, key) for margin in margins])
+        result[key] = {
+            "median": _number(np.quantile(values, 0.5, method="nearest")),
+            "worst": _number(values.min()),
+        }
+    return result
+
+
+def _case(cases: panel.Cases, index: int) -> dict[str, Any]:
+    return {
+        "case": index,
+        "plant": int(cases.plant[index]),
+        "kind": str(cases.kind[index]),
+        "start_degC": float(cases.starts[cases.start[index]].mean()),
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) and abs(value) < 1e6 else None
+
+
+# ---- the comparison
+
+
+def passes(figures: Mapping[str, Any], rules: TemperatureRules) -> bool:
+    """Whether a controller's figures hold the rules that a simulation can check, at the 90 % quantile over
+    all cases; stable on every plant, and margins of the median one."""
+    limits = {
+        "settled_error": rules.settled_error_degC,
+        "settling": rules.settling_s,
+        "overshoot": rules.overshoot_degC,
+        "at_limits": rules.at_limits_percent,
+    }
+    quantiles = all(
+        figures[name]["q90"] is not None and figures[name]["q90"] <= limit for name, limit in limits.items()
+    )
+    margins, stable = figures["margins"], figures["stable"]
+    robust = margins is None or (
+        stable["count"] == stable["of"]
+        and (margins["disk"]["median"] or 0.0) >= rules.disk_margin
+        and (margins["delay_s"]["median"] is None or margins["delay_s"]["median"] >= rules.delay_margin_s)
+    )
+    return quantiles and robust and figures["crossings"]["cases"] == 0
+
+
+def decide(
+    results: Mapping[str, ControllerOutcome],
+    entrants: list[str],
+    summary: Mapping[str, Any],
+    rules: TemperatureRules,
+    setting: CaseConditions,
+    seed: int,
+) -> dict[str, Any]:
+    """Best, the pair, and the plant that decides, with both answers without it."""
+    block = setting.rehearsal.judging.plant
+    costs = {name: results[name].costs for name in entrants}
+    able = {name: passes(summary["contestants"][name], rules) for name in entrants}
+    choice = comparison.chosen(costs, block, able, seed=seed)
+    a, b = table.PAIR
+    b = b if b in costs else table.INDIRECT
+    one, two = a, b
+    if not (a in costs and b in costs):
+        one, two = entrants[max(len(entrants) - 2, 0)], entrants[-1]
+    index = comparison.deciding_plant(costs[one], costs[two], block)
+    rest = block != index
+    without = {name: values[rest] for name, values in costs.items()}
+    again = comparison.chosen(without, block[rest], able, seed=seed)
+    pair = _pair(a, b, costs, block, summary, seed)
+    mine = np.flatnonzero(block == index)
+    worst = mine[
+        np.abs(np.log(np.maximum(costs[one][mine], 1e-9) / np.maximum(costs[two][mine], 1e-9))).argmax()
+    ]
+    return {
+        "best": choice.best,
+        "best_reason": {
+            "passes": able,
+            "leading": comparison.chosen(costs, block, dict.fromkeys(entrants, True), seed=seed).best,
+            "nearest": choice.nearest,
+            "improvement_percent": choice.against.improvement_percent if choice.against else None,
+            "p": choice.against.p if choice.against else None,
+        },
+        "pair": pair,
+        "deciding": {
+            **_case(setting.rehearsal.judging, int(worst)),
+            "best_without": again.best,
+            "pair_without": _pair(a, b, without, block[rest], summary, seed)["winner"]
+            if pair["p"] is not None
+            else None,
+        },
+    }
+
+
+def _pair(
+    a: str, b: str, costs: Mapping[str, np.ndarray], block: np.ndarray, summary, seed: int
+) -> dict[str, Any]:
+    """The pair's answer; without figures if one of the two is refused."""
+    if a not in costs or b not in costs:
+        return {"a": a, "b": b, "winner": None, "difference": None, "low": None, "high": None, "p": None,
+                "plants": len(np.unique(block)), "figures": {}}  # fmt: skip
+    figures = summary["contestants"]
+    return {
+        **comparison.pair(a, b, costs, block, seed=seed)._asdict(),
+        "plants": len(np.unique(block)),
+        "figures": {
+            name: [figures[one][name]["q90"] for one in (a, b)]
+            for name in ("settling", "overshoot", "settled_error", "cost")
+        },
+    }
+
+
+# ---- tables
+
+
+def typical_case(results: Mapping[str, ControllerOutcome], entrants: Sequence[str]) -> int:
+    """The case of median cost under the first entrant that does something."""
+    costs = results[next((name for name in entrants if name != "hold"), entrants[0])].costs
+    return int(np.argsort(costs, kind="stable")[len(costs) // 2])
+
+
+def case_columns(
+    results: Mapping[str, ControllerOutcome], setting: CaseConditions, zones: Sequence[str]
+) -> dict[str, Any]:
+    """The cases as columns: one row a controller and case."""
+    cases, count = setting.rehearsal.judging, len(results)
+    columns = [_columns(one, setting) for one in results.values()]
+    crossing = np.concatenate([np.maximum(one.figures.crossing, 0.0) for one in results.values()])
+    limited = np.isfinite(np.concatenate(setting.output_limits)).any()
+    return {
+        "contestant": [name for name in results for _ in cases.plant],
+        "case": np.tile(np.arange(len(cases.plant)), count).astype(np.int32),
+        "plant": np.tile(cases.plant, count).astype(np.int32),
+        "kind": np.tile(cases.kind, count).tolist(),
+        "start_degC": np.tile(cases.starts.mean(axis=1)[cases.start], count),
+        "settled_zone": [zones[zone] for one in results.values() for zone in one.figures.settled_zone],
+        **{
+            name: np.concatenate([np.where(np.isfinite(c[name]), c[name], np.nan) for c in columns])
+            for name in columns[0]
+        },
+        "crossing_degC": crossing if limited else np.full(len(crossing), np.nan),
+    }
+
+
+def trajectory_columns(
+    results: Mapping[str, ControllerOutcome],
+    shown: Mapping[str, int],
+    setting: CaseConditions,
+    machine: Machine,
+) -> dict[str, Any]:
+    """The cases {label: number} under every controller, as columns."""
+    time_s = setting.sample_time_s * np.arange(setting.rehearsal.judging.steps)
+    parts = [
+        (name, label, one.rollout, case) for name, one in results.items() for label, case in shown.items()
+    ]
+    columns: dict[str, Any] = {
+        "contestant": [name for name, *_ in parts for _ in time_s],
+        "case_name": [label for _, label, *_ in parts for _ in time_s],
+        "time_s": np.tile(time_s, len(parts)),
+    }
+    for k, output in enumerate(machine.outputs):
+        columns[output.name] = np.concatenate([run.y[:, case, k] for *_, run, case in parts])
+        columns[f"{output.name}_reference"] = np.concatenate([run.r[:, case, k] for *_, run, case in parts])
+    for k, signal in enumerate(machine.inputs):
+        columns[f"{signal.name}_command"] = np.concatenate(
+            [run.wished[:, case, k] for *_, run, case in parts]
+        )
+        columns[f"{signal.name}_applied"] = np.concatenate([run.u[:, case, k] for *_, run, case in parts])
+    return columns

@@ -1,0 +1,242 @@
+"""Certify every controller of the temperature loop that a verdict could name, and prepare the files of each:
+reads what evaluate_temperature read and wrote, and of the setpoint loop what train_classifier, train_agent
+and evaluate_setpoint wrote. No limit of section `report` enters: what is measured is compared with the limits
+by the stages verdict and export_controllers (pipeline/runtime/certified.py).
+
+Writes datasets/certify: temperature/<controller>/ (measured.json, controller.json, arrays.safetensors,
+support.safetensors, c/, python/; the place of the certificate's SHA-256 is marked), setpoint/, and
+certified.json, which says which controllers were measured and why others were not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from pydantic import Field
+
+import stages
+from pipeline.store import artifacts, params
+from pipeline.store.params import Section
+from pipeline.temperature import tables
+from pipeline.temperature.settings import Plant
+from stages.evaluate_temperature import EvaluationInputs, load_problem
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from pipeline.runtime.certificate import EvidenceRecord, Rules
+    from pipeline.runtime.certificate_evidence import WindowModels
+    from pipeline.runtime.signals import Machine
+    from pipeline.temperature.controllers.problem import Design
+    from pipeline.temperature.plant import Plant as PlantModel
+
+RECORD = "datasets/ingest/record.parquet"
+FALLBACK = "pi_simc"  # the safe mode "pi"; if the machine allows none, the inputs are held
+# stands in the exported files for the SHA-256 of the certificate, which depends on the limits
+PLACE = "@certificate@"
+NO_FEED_FORWARD = (
+    "The machine declares disturbances ({names}), which an exported controller cannot read yet: none is "
+    "certified. Remove plant.disturbances to certify controllers that do without them."
+)
+NOT_ASKED = "Not asked: loops.{} is false."
+
+
+class Certify(Section):
+    """Section `certify`: the seed of everything that is drawn, how many plants of the record's window
+    models each controller meets, and how often the record is resampled for the bands of learned gains."""
+
+    seed: int = Field(ge=0, le=2**31)
+    plants: int = Field(ge=20, le=100_000)
+    resamples: int = Field(ge=20, le=10_000)
+
+
+class Common(NamedTuple):
+    """What is made once for all controllers: the machine, the record, what it shows by itself, and the
+    rules."""
+
+    machine: Machine
+    record: EvidenceRecord
+    rules: Rules
+    models: WindowModels
+    generator: np.random.Generator  # as the window models left it: every controller goes on with a copy
+    plants: list[PlantModel]  # which forecast a recording
+
+
+def main() -> None:
+    with artifacts.stage("certify") as out:
+        settings, loops = params.load(Certify, "certify"), params.load(params.Loops, "loops")
+        temperature: dict[str, Any] = {}
+        setpoint = {"controller": "", **_not_measured(NOT_ASKED.format("setpoint"))}
+        if loops.temperature:
+            temperature = certify_temperature(out / "temperature", settings)
+        if loops.setpoint:
+            setpoint = certify_setpoint(out / "setpoint", settings.seed)
+        artifacts.write_json(out / "certified.json", {"temperature": temperature, "setpoint": setpoint})
+
+
+# ---- temperature
+
+
+def certify_temperature(folder: Path, settings: Certify) -> dict[str, dict[str, Any]]:
+    """By controller: whether it was measured, why not, and the largest differences between what was judged
+    and what would be exported."""
+    from joblib import delayed
+    from tqdm import tqdm
+
+    from pipeline.store.execution import run_all
+    from pipeline.temperature.controllers.table import CONTROLLERS, design_controllers
+
+    loaded = load_problem()  # whose rules are not used here
+    designs, refused = design_controllers(loaded.problem, loaded.weights)
+    names = [one.name for one in CONTROLLERS if one.kind != "reference"]
+    found = {name: _not_measured(refused[name]) for name in names if name in refused}
+    names = [name for name in names if name in designs and not designs[name].holds]
+    if disturbances := [one.name for one in loaded.machine.disturbances]:
+        why = NO_FEED_FORWARD.format(names=", ".join(disturbances))
+        return found | {name: _not_measured(why) for name in names}
+    common = prepare(loaded, settings)
+    certify = delayed(certify_controller)
+    calls = [certify(folder / name, name, designs, loaded, common) for name in names]
+    results = run_all(calls, params.load(params.Execution, "execution"))
+    return found | dict(tqdm(results, total=len(calls), desc="certify: controllers", mininterval=2))
+
+
+def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
+    """What no controller changes."""
+    import numpy as np
+
+    from pipeline.runtime import certificate_evidence, certify, support_logs
+    from pipeline.runtime.certificate import EvidenceRecord
+    from pipeline.temperature.identification.segments import segments, without_gaps
+    from pipeline.temperature.test_set import cases
+
+    declared, family = loaded.machine, loaded.problem.family
+    machine, schema = wire(declared), tables.record(declared.acting, declared.outputs)
+    names = ([signal.name for signal in side] for side in (declared.inputs, declared.outputs))
+    pieces = without_gaps(*segments(artifacts.read_table(RECORD, schema), *names))
+    parts = certify.split_newest(*pieces)
+    record = EvidenceRecord(machine.inputs, machine.outputs, machine.sample_time_s, *parts)
+    setting, rng = loaded.setting, np.random.default_rng(settings.seed)
+    half = setting.rehearsal.judging
+    rules = certify.require(half, record, setting.settled, settings.plants, settings.resamples)
+    models = certificate_evidence.window_models(machine, record, rules, rng)
+    if loaded.simulated:
+        spread = cases.spread_of(loaded.panel)
+    else:
+        spread = cases.spread_around(loaded.panel, loaded.problem.plant)
+    plants = support_logs.forecasting_plants(family, spread, np.random.default_rng(settings.seed))
+    return Common(machine, record, rules, models, rng, plants)
+
+
+def wire(declared: Plant) -> Machine:
+    """Section `plant` as a controller knows it."""
+    from pipeline.runtime.signals import Machine, Signal
+    from pipeline.temperature.test_set import cases
+
+    low, high = cases.output_limits(declared)
+    return Machine(
+        tuple(Signal(one.name, one.unit, one.low, one.high) for one in declared.inputs),
+        tuple(
+            Signal(one.name, one.unit, float(least), float(most))
+            for one, least, most in zip(declared.outputs, low, high, strict=True)
+        ),
+        declared.sample_time_s,
+    )
+
+
+def certify_controller(
+    folder: Path, name: str, designs: dict[str, Design], loaded: EvaluationInputs, common: Common
+) -> tuple[str, dict[str, Any]]:
+    """Measures one controller and writes its folder; its name, and what certified.json says of it."""
+    from pipeline.runtime import assembly, certified, certify, checks, machine, support, support_logs
+    from pipeline.runtime.export import c, python, vectors
+    from pipeline.runtime.support_file import write_support
+    from pipeline.temperature.controllers.table import BY_NAME
+
+    setting, problem, half = loaded.setting, loaded.problem, loaded.setting.rehearsal.judging
+    design, fallback, family = designs[name], designs.get(FALLBACK), problem.family
+    route = assembly.gain_route(problem, BY_NAME[name].learned_from, loaded.weights.get(name, {}))
+    try:
+        made = assembly.assemble(
+            name, design, fallback, common.machine, setting, family, simulated=loaded.simulated
+        )
+        machine.check(made)
+        difference = checks.judged_difference(made, half, *judged_trajectory(name, loaded.machine))
+        checks.check_same(made, difference)
+        measured = certify.measure(
+            made,
+            family[1:],
+            common.record,
+            common.rules,
+            common.models,
+            common.generator,
+            learning=route,
+            delay_share=setting.faster,
+        )
+        honest = support_logs.honest_logs(made, half, setting.limits)
+        recorded = support_logs.recorded_logs(common.record)
+        within = support.support(common.plants, honest, setting.rehearsal.noise, recorded)
+        sources = c.code(made, PLACE) | {"golden.csv": vectors.golden(made)}
+        checks.check_compiled(made, sources)
+        code = python.code(made, PLACE)
+        differences = {"judged": difference, "python": checks.python_difference(made, code)}
+    except ValueError as reason:
+        return name, _not_measured(str(reason))
+    certified.write(folder, measured)
+    machine.write_controller(folder, made)
+    write_support(folder, within, measured.draft.controller_sha256)
+    for file, text in sources.items():
+        artifacts.write_text(folder / "c" / file, text)
+    artifacts.write_text(folder / "python" / "controller.py", code)
+    return name, {"measured": True, "why": "", "largest_difference": differences}
+
+
+def _not_measured(why: str) -> dict[str, Any]:
+    return {"measured": False, "why": why, "largest_difference": {}}
+
+
+def judged_trajectory(name: str, declared: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Outputs and references (steps, p) in °C, and applied inputs (steps, m) in percent, of the case that
+    decided the comparison."""
+    import numpy as np
+
+    schema = tables.trajectories(declared.inputs, declared.outputs)
+    played = artifacts.read_table("datasets/evaluate_temperature/trajectories.parquet", schema)
+    rows = (played["contestant"] == name) & (played["case_name"] == "deciding")
+    outputs, inputs = [one.name for one in declared.outputs], [one.name for one in declared.inputs]
+    y, r, u = (
+        np.stack([played[column][rows] for column in columns], axis=1)
+        for columns in (outputs, [f"{o}_reference" for o in outputs], [f"{i}_applied" for i in inputs])
+    )
+    return y, r, u
+
+
+# ---- setpoint
+
+
+def certify_setpoint(folder: Path, seed: int) -> dict[str, Any]:
+    """The files of the default controller, which have no certificate, and how far they are from the
+    networks."""
+    from pipeline.runtime import setpoint_checks
+    from pipeline.setpoint.agents.files import restore_agents
+    from pipeline.setpoint.controllers import build_controllers
+    from pipeline.setpoint.settings import EvaluateSetpoint
+    from pipeline.setpoint.simulation.recorded import window_tables
+    from pipeline.setpoint.tables import WINDOW_PARTS, WINDOWS
+    from pipeline.setpoint.vision.files import restore_classifier
+
+    model = restore_classifier(
+        "datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet"
+    )
+    columns = artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS)
+    learned = window_tables(columns, WINDOW_PARTS)["learn"]
+    agents = restore_agents("datasets/train_agent/weights.safetensors")
+    baselines = params.load(EvaluateSetpoint, "evaluate_setpoint").baselines
+    default = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
+    built = build_controllers(baselines, agents, learned).get(default)
+    decides = setpoint_checks.decider(default, built and built.parameters, agents.belief, agents.belief_dqn)
+    return setpoint_checks.write(folder, default, model, decides, seed)
+
+
+if __name__ == "__main__":
+    stages.run(main, "certify")
