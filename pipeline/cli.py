@@ -28,18 +28,16 @@ def accept(_: argparse.Namespace) -> None:
     from pipeline.report.shared.sources import machine
 
     metrics = {
-        path.stem: artifacts.read_json(path)
-        for path in sorted(Path("reports/metrics").glob("*.json"))
-        if path.stem not in ("report", "nightly")
+        path.parent.name: artifacts.read_json(path)
+        for path in sorted(Path("datasets").glob("[a-z]*/figures.json"))
+        if path.parent.name != "report"
     }
     if not metrics:
-        raise ValueError(
-            "reports/metrics: expected the figures of a run, found none; run ./run dvc repro first"
-        )
+        raise ValueError("datasets: expected the figures of a run, found none; run ./run dvc repro first")
     files = sorted(
         path
         for path in Path("datasets").rglob("*")
-        if path.is_file() and path.parts[1] not in {"memo"} and not path.parts[1].startswith(".")
+        if path.is_file() and path.parts[1] not in {"memo", "report"} and not path.parts[1].startswith(".")
     )
     hashes = {path.as_posix(): artifacts.sha256(path) for path in [*files, Path("pipeline"), Path("stages")]}
     run = {
@@ -71,9 +69,9 @@ def _shown() -> dict:
     """What the pages show: figures with their bands, the verdict of each loop, which controller of the
     temperature loop the verdict names, and the curves; nothing if no page was made. Raises ValueError if the
     pages are of another run."""
-    if not artifacts.exists("reports/metrics/report.json"):
+    if not artifacts.exists("datasets/report/figures.json"):
         return {"figures": {}, "winner": None, "verdicts": {}, "curves": {}}
-    report = artifacts.read_metrics("report")
+    report = artifacts.read_figures("report")
     stale = [
         path
         for path, recorded in report["read"].items()

@@ -10,99 +10,71 @@ import subprocess
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ruamel.yaml import YAML
 
-from pipeline.deposition.settings import TrainIlc
-from pipeline.report.shared.sources import QUICK_LOOK
-from pipeline.setpoint.settings import EvaluateSetpoint
+import stages
 from pipeline.store import artifacts, params, params_text
-from pipeline.temperature.settings import Panel, TuneWeights
-from stages.evaluate_temperature import EvaluateTemperature
-from stages.identify_plant import IdentifyPlant
+from pipeline.verdict.settings import QUICK_LOOK
 
 SIZES, FOLDER = Path("params.quick.yaml"), Path("quick")
 # the sections whose sizes a quick look may set; what a machine is and what is good enough stay as they are
-SECTIONS: Mapping[str, type[params.Section]] = {
-    "evaluate_setpoint": EvaluateSetpoint,
-    "evaluate_temperature": EvaluateTemperature,
-    "identify_plant": IdentifyPlant,
-    "panel": Panel,
-    "train_ilc": TrainIlc,
-    "tune_weights": TuneWeights,
-}
+SECTIONS = (
+    "evaluate_setpoint", "evaluate_temperature", "identify_plant", "panel", "train_ilc", "tune_weights",
+)  # fmt: skip
 # what takes minutes of training, taken from a full run that git keeps; frames are only rendered to train on
 KEPT, TRAINED = Path("datasets/kept"), ("train_classifier", "train_agent")
-# and what leaves the house only from a full run
-LEFT_OUT = ("render_frames", *TRAINED, "export_controllers")
-# read where it lies; of the code the pages show the digest
+# certificates and exports come from a full run only
+LEFT_OUT = ("render_frames", *TRAINED, "certify", "export_controllers")
+# folders that are only read; of the code the pages show the digest
 LINKED = ("datasets/raw", "datasets/parts", "datasets/papers", "datasets/published", "pipeline", "stages")
 
-
-class Took(NamedTuple):
-    """Seconds of one stage: on the wall, and of this process's CPU (its workers' not among them)."""
-
-    stage: str
-    wall_s: float
-    cpu_s: float
-
-
-class Sizes(NamedTuple):
-    """Both params files with the smaller values in place, by file name; and (key, value here, value of a full
-    run) of each."""
-
-    files: dict[str, dict[str, Any]]
-    smaller: list[tuple[str, str, str]]
+Files = dict[str, dict[str, Any]]  # {name of a params file: its sections}
 
 
 def quick() -> str:
-    """Makes FOLDER anew, or leaves it as it was where a stage fails. What to print: the verdict of each loop,
+    """Makes FOLDER anew, or leaves it as it was if a stage fails. What to print: the verdict of each loop,
     the page, and seconds by stage.
 
-    Raises ValueError for a key of SIZES that no full run has or may be made smaller, and for kept files that
-    are not whole; a stage that refuses its input ends the process as it does under DVC.
+    Raises ValueError for a key of SIZES that no full run has or that may not be made smaller, and for kept
+    files that are not whole; a stage that refuses its input ends the process as it does under DVC.
     """
     begun = time.perf_counter()
-    sizes, root = smaller_sizes(), Path.cwd()
-    order = stages(sizes)
+    files, smaller = smaller_sizes()
+    root, rows = Path.cwd(), []
     with _fresh() as folder:
-        _furnish(folder, sizes, root)
+        loops = _furnish(folder, files, smaller, root)
         with contextlib.chdir(folder):
-            took = [_timed(name) for name in order]
-            report = artifacts.read_metrics("report")
+            for name, is_on in chosen_stages(files, loops, root / "dvc.yaml").items():
+                rows.append(_run(name, is_on=is_on))
+            report = artifacts.read_figures("report")
         for name in ("pipeline", "stages"):
             (folder / name).unlink()
-    return summary(report["verdicts"], took, time.perf_counter() - begun)
+    return summary(report["verdicts"], rows, time.perf_counter() - begun)
 
 
 # ---- sizes
 
 
-def smaller_sizes(path: Path = Path(params.FILE), sizes: Path = SIZES) -> Sizes:
-    """params.yaml at `path` and its neighbour with the values of `sizes` in place. Raises ValueError with a
-    line for each key that is unknown, of another section than SECTIONS, or out of bounds."""
-    whole = params.files(path)
-    files, found, problems = copy.deepcopy(whole), [], []
+def smaller_sizes(
+    path: Path = Path(params.FILE), sizes: Path = SIZES
+) -> tuple[Files, list[tuple[str, str, str]]]:
+    """Both params files with the smaller values in place, by file name; and (key, value here, value of a full
+    run) of each. Raises ValueError for a section that is none of SECTIONS; other problems are those of the
+    files that come out of it."""
+    files, rows = copy.deepcopy(params.files(path)), []
     for section, keys in params.files(sizes)[str(sizes)].items():
         if section not in SECTIONS:
-            problems.append(
+            raise ValueError(
                 f"{sizes}: {section} is no section that a quick look makes smaller; "
                 f"those are {', '.join(SECTIONS)}"
             )
-            continue
         for dotted, value in _leaves(section, keys):
-            home = params.home(dotted, path)
-            if not home or dotted == section:
-                problems.append(
-                    f"{sizes}: {dotted} is unknown; remove it, or write a key of {path} or its neighbour"
-                )
-                continue
+            home = params.home(dotted, path) or params.home(section, path)
             before = _put(files[home], dotted.split("."), value)
-            found.append((dotted, _shown(value), _shown(before)))
-    if problems:
-        raise ValueError("\n".join(problems))
-    return Sizes({Path(name).name: sections for name, sections in files.items()}, found)
+            rows.append((dotted, _shown(value), _shown(before)))
+    return {Path(name).name: sections for name, sections in files.items()}, rows
 
 
 def _leaves(dotted: str, value: Any) -> Iterator[tuple[str, Any]]:
@@ -115,11 +87,11 @@ def _leaves(dotted: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _put(sections: dict[str, Any], keys: Sequence[str], value: Any) -> Any:
-    """Sets the value at these keys; what stood there."""
+    """Sets the value at these keys, which need not be known; what stood there."""
     *parents, last = keys
     for parent in parents:
-        sections = sections[parent]
-    before, sections[last] = sections[last], value
+        sections = sections.setdefault(parent, {})
+    before, sections[last] = sections.get(last), value
     return before
 
 
@@ -127,15 +99,16 @@ def _shown(value: Any) -> str:
     return params_text.written(value, flow=True).removesuffix("...\n").strip()
 
 
-def _check(folder: Path) -> None:
-    """Raises ValueError where a value of SIZES is out of its bounds, as the stage would, by the name of the
-    file that has it."""
-    for section, model in SECTIONS.items():
-        try:
-            params.load(model, section, folder / params.FILE)
-        except ValueError as error:
-            told = str(error).replace(f"{folder}/{params.EXPERT}", f"{SIZES} or {params.EXPERT}")
-            raise ValueError(told.replace(f"{folder}/{params.FILE}", f"{SIZES} or {params.FILE}")) from None
+def _check(folder: Path) -> dict[str, bool]:
+    """Section `loops` of the files in the folder. Raises ValueError with a line for each problem of a
+    section, as a stage does, by the names of the files that may have it."""
+    try:
+        return stages.check_parameters(folder / params.FILE)
+    except ValueError as error:
+        sentences = str(error)
+        for name in (params.EXPERT, params.FILE):
+            sentences = sentences.replace(f"{folder}/{name}", f"{SIZES} or {name}")
+        raise ValueError(sentences) from None
 
 
 # ---- the folder
@@ -166,45 +139,53 @@ def _fresh() -> Generator[Path]:
             shutil.rmtree(left, ignore_errors=True)
 
 
-def stages(sizes: Sizes) -> list[str]:
-    """The stages of dvc.yaml in its order, each after those whose results it reads, without LEFT_OUT. A
-    classifier of somebody's own frames cannot be kept here: their setpoint loop is left out."""
-    names = YAML(typ="safe").load(Path("dvc.yaml").read_text(encoding="utf-8"))["stages"]
-    skipped = {*LEFT_OUT, *(() if _rendered(sizes) else ("evaluate_setpoint",))}
-    return [name for name in names if name not in skipped]
+def chosen_stages(files: Files, loops: Mapping[str, bool], pipeline: Path) -> dict[str, bool]:
+    """{stage: whether its loop is on} in the order of dvc.yaml, in which each stands behind those whose
+    results it reads, without LEFT_OUT. A classifier of somebody's own frames cannot be kept here: their
+    setpoint loop is left out."""
+    entries = YAML(typ="safe").load(pipeline.read_text(encoding="utf-8"))["stages"]
+    skipped = {*LEFT_OUT, *(() if _renders(files) else ("evaluate_setpoint",))}
+    switches = {f"loops.{loop}": is_on for loop, is_on in loops.items()}
+    chosen = {}
+    for name, entry in entries.items():
+        keys = [key for key in entry.get("params", ()) if isinstance(key, str)]
+        is_on = all(switches.get(key, True) for key in keys)
+        if not is_on or name not in skipped:
+            chosen[name] = is_on
+    return chosen
 
 
-def _source(sizes: Sizes, section: str) -> Any:
-    return next(
-        (keys[section]["source"] for keys in sizes.files.values() if "source" in keys.get(section, {})), ""
-    )
+def _source(files: Files, section: str) -> Any:
+    return next((keys[section]["source"] for keys in files.values() if "source" in keys.get(section, {})), "")
 
 
-def _rendered(sizes: Sizes) -> bool:
-    return _source(sizes, "train_classifier") != "recordings"
+def _renders(files: Files) -> bool:
+    return _source(files, "train_classifier") != "recordings"
 
 
-def _furnish(folder: Path, sizes: Sizes, root: Path) -> None:
-    """Params, links to what is only read, the kept artifacts, and what every page says of a quick look."""
-    for name, sections in sizes.files.items():
+def _furnish(folder: Path, files: Files, smaller: list[tuple[str, str, str]], root: Path) -> dict[str, bool]:
+    """Params, links to what is only read, the kept artifacts, and what every page says of a quick look; the
+    loops that are on."""
+    for name, sections in files.items():
         artifacts.write_text(folder / name, params_text.written(sections))
-    _check(folder)
+    loops = _check(folder)
     (folder / "datasets").mkdir()
     for name in LINKED:
         (folder / name).symlink_to(root / name)
     notes = ["Nothing is exported and no controller gets a certificate."]
-    if _source(sizes, "train_ilc") != "recordings":
+    if loops["deposition"] and _source(files, "train_ilc") != "recordings":
         notes.append("The deposition loop learns from its measured flow: nothing is filmed.")
-    if _rendered(sizes):
+    if not _renders(files):
+        notes.append(
+            "The setpoint loop is left out: its classifier learns from your recordings in a full run."
+        )
+    elif loops["setpoint"]:
         commit = _copy_kept(folder)
         notes.append(
             f"Classifier and agents are those of a full run, of commit {commit}: nothing is trained."
         )
-    else:
-        notes.append(
-            "The setpoint loop is left out: its classifier learns from your recordings in a full run."
-        )
-    artifacts.write_json(folder / QUICK_LOOK, {"notes": notes, "smaller": sizes.smaller})
+    artifacts.write_json(folder / QUICK_LOOK, {"notes": notes, "smaller": smaller})
+    return loops
 
 
 # ---- what is kept
@@ -222,7 +203,7 @@ def _copy_kept(folder: Path) -> str:
             raise ValueError(
                 f"{KEPT / name}: expected SHA-256 {digest[:8]} of kept.json; git checkout {KEPT}"
             )
-        target = folder / (name if name.startswith("reports/") else f"datasets/{name}")
+        target = folder / "datasets" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(KEPT / name, target)
     return str(kept.get("commit"))
@@ -237,7 +218,6 @@ def keep() -> str:
         for path in sorted(Path("datasets", stage).rglob("*"))
         if path.is_file() and "live" not in path.parts
     ]
-    figures = [Path("reports/metrics", f"{stage}.json") for stage in TRAINED]
     absent = [
         stage for stage in TRAINED if not artifacts.exists(Path("datasets", stage, "weights.safetensors"))
     ]
@@ -245,10 +225,9 @@ def keep() -> str:
         raise ValueError(
             f"datasets/{absent[0]}: expected what training left, found none; ./run dvc repro {absent[0]}"
         )
-    for name in (*TRAINED, "reports"):
+    for name in TRAINED:
         shutil.rmtree(KEPT / name, ignore_errors=True)
     names = {path.relative_to("datasets").as_posix(): path for path in found}
-    names |= {path.as_posix(): path for path in figures}
     for name, path in names.items():
         (KEPT / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, KEPT / name)
@@ -264,18 +243,26 @@ def keep() -> str:
 # ---- the stages
 
 
-def _timed(name: str) -> Took:
-    """Runs one stage, its imports among its seconds."""
+def _run(name: str, *, is_on: bool) -> tuple[str, float, float]:
+    """Runs one stage. Its name and its seconds, imports among them: on the wall, and of this process's CPU
+    (its workers' not among them)."""
     wall, cpu = time.perf_counter(), time.process_time()
-    importlib.import_module(f"stages.{name}").main()
-    return Took(name, time.perf_counter() - wall, time.process_time() - cpu)
+    if is_on:
+        importlib.import_module(f"stages.{name}").main()
+    else:
+        stages.leave_out(name)
+    return name, time.perf_counter() - wall, time.process_time() - cpu
 
 
-def summary(verdicts: Mapping[str, Mapping[str, Any]], took: Sequence[Took], whole_s: float) -> str:
+def summary(
+    verdicts: Mapping[str, Mapping[str, Any]], rows: Sequence[tuple[str, float, float]], whole_s: float
+) -> str:
     """Seconds by stage, a sentence a loop, and where the page lies."""
-    rows = [f"{one.stage:<22}{one.wall_s:>7.1f} s {one.cpu_s:>7.1f} s CPU" for one in took]
-    told = [f"{loop}: {of['decision']} {of['lead']}".rstrip() for loop, of in verdicts.items()]
+    lines = [f"{name:<22}{wall_s:>7.1f} s {cpu_s:>7.1f} s CPU" for name, wall_s, cpu_s in rows]
+    sentences = [
+        f"{loop}: {verdict['decision']} {verdict['lead']}".rstrip() for loop, verdict in verdicts.items()
+    ]
     page = f"{FOLDER}/reports/index.html"
     return "\n".join(
-        [*rows, f"{'whole':<22}{whole_s:>7.1f} s", *told, f"{page}: a quick look, not a full run"]
+        [*lines, f"{'whole':<22}{whole_s:>7.1f} s", *sentences, f"{page}: a quick look, not a full run"]
     )

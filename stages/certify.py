@@ -86,7 +86,7 @@ def certify_temperature(folder: Path, settings: Certify) -> dict[str, dict[str, 
     from pipeline.store.execution import run_all
     from pipeline.temperature.controllers.table import CONTROLLERS, design_controllers
 
-    loaded = load_problem()  # whose rules are not used here
+    loaded = load_problem()
     designs, refused = design_controllers(loaded.problem, loaded.weights)
     names = [one.name for one in CONTROLLERS if one.kind != "reference"]
     found = {name: _not_measured(refused[name]) for name in names if name in refused}

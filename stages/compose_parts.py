@@ -16,6 +16,15 @@ if TYPE_CHECKING:
     from pipeline.deposition.parts.composition import LearnedLibrary
     from pipeline.deposition.parts.part import ComposedPart
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "*.*.*.rms_percent_of_on_off",
+    "*.*.*.worst_line_volume_percent",
+    "*.*.chosen",
+    "*.*.forecast",
+    "*.*.judged.judged",
+)
+
 
 def main() -> None:
     import numpy as np
@@ -59,7 +68,7 @@ def main() -> None:
         reports = {part.name: report_with_measured(part, folder) for part in parts}
         reports |= {name: {"refused": why} for name, why in refused.items()}
         artifacts.write_json(out / "conformance.json", reports)
-        artifacts.write_metrics("compose_parts", part_report.figures(scored) | {"refused": refused})
+        artifacts.write_metrics("compose_parts", part_report.figures(scored) | {"refused": refused}, METRICS)
 
 
 def compose_part(

@@ -22,6 +22,18 @@ if TYPE_CHECKING:
     from pipeline.setpoint.simulation.recorded import WindowTable
 
 CLASSIFIER, AGENTS = "datasets/train_classifier", "datasets/train_agent/weights.safetensors"
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "default",
+    "worst",
+    "margin*",
+    "cases.*.settled",
+    "cases.*.stay",
+    "cases.*.recovered",
+    "harm.*.beyond_25*",
+    "*.paper.*.stay",
+    "*.recorded.*.stay",
+)
 
 
 def main() -> None:
@@ -58,7 +70,7 @@ def main() -> None:
         artifacts.write_table(out / "decisions.parquet", DECISIONS, decisions)
         artifacts.write_json(out / "choice.json", scoreboard.choice_record(choice))
         figures = scoreboard.metrics(groups, contest, choice, rollouts)
-        artifacts.write_metrics("evaluate_setpoint", figures)
+        artifacts.write_metrics("evaluate_setpoint", figures, METRICS)
 
 
 # ---- on the simulators

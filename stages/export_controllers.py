@@ -22,6 +22,9 @@ MARKED = ("c/machine.h", "c/README.txt", "python/controller.py")  # which hold t
 VERDICT, CERTIFY = Path("datasets/verdict/temperature.json"), Path("datasets/certify")
 COMPOSED = ("datasets/compose_parts/signals.parquet", "datasets/compose_parts/lines.parquet")
 
+# figures of control that git keeps and that runs are compared by
+METRICS = ("*.contestant", "*.certificate.verdict", "*.largest_difference")
+
 
 def main() -> None:
     with artifacts.stage("export_controllers") as out:
@@ -36,7 +39,7 @@ def main() -> None:
         if loops.deposition:
             exported["deposition"] = name_composed()
         artifacts.write_json(out / "exported.json", exported)
-        artifacts.write_metrics("export_controllers", exported)
+        artifacts.write_metrics("export_controllers", exported, METRICS)
 
 
 def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:

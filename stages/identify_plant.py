@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pipeline.store.tables import Schema
+    from pipeline.temperature.identification.judgement import ModelJudgement
     from pipeline.temperature.identification.model_choice import Identified
-    from pipeline.temperature.identification.trust import Holdout, Steps
-    from pipeline.temperature.identification.validation import Excitation, Residuals
+    from pipeline.temperature.identification.trust import Steps
     from pipeline.temperature.plant import Plant
 
     Segments = list[np.ndarray]
@@ -55,15 +55,18 @@ class RecordSegments(NamedTuple):
     notes: list[str]
 
 
-class ModelJudgement(NamedTuple):
-    """The chosen model on the last part of the record, and what the first part excites; `still` (p,): its fit
-    with the inputs held."""
-
-    holdout: Holdout
-    residuals: Residuals
-    excitation: Excitation
-    samples: int
-    still: np.ndarray
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "order",
+    "samples*",
+    "fit_holdout",
+    "fit_holdout_ahead",
+    "fit_holdout_band",
+    "whiteness_passed",
+    "excitation.rank",
+    "excitation.condition",
+    "largest_pole",
+)
 
 
 def main() -> None:
@@ -76,7 +79,7 @@ def main() -> None:
         artifacts.write_arrays(out / "spread.parquet", "spread", 1, stored(spread))
         for name, (schema, columns) in page_tables.items():
             artifacts.write_table(out / f"{name}.parquet", schema, columns)
-        artifacts.write_metrics("identify_plant", figures)
+        artifacts.write_metrics("identify_plant", figures, METRICS)
 
 
 def identify(
@@ -87,6 +90,7 @@ def identify(
     import numpy as np
 
     from pipeline.temperature.identification import model_choice, trust, validation
+    from pipeline.temperature.identification.judgement import judge
     from pipeline.temperature.identification.segments import split
     from pipeline.temperature.plant import at_disturbances, observability
 
@@ -106,7 +110,8 @@ def identify(
         chosen = model_choice.identify(
             *first, sample_time_s=machine.sample_time_s, settings=choices, names=acting
         )
-    judgement = judge_model(settings, chosen, first, last)
+    rng = np.random.default_rng(settings.seed)
+    judgement = judge(chosen, first, last, ahead_steps=settings.ahead_steps, rng=rng)
     fitted = model_choice.refit(record.u, record.y, chosen, names=acting)
     if not (observed := observability(fitted.plant)).passed:
         raise ValueError(f"{path}: {observed.reason}")
@@ -151,35 +156,6 @@ def read_record(settings: IdentifyPlant, machine: Machine, path: str) -> RecordS
     high = [i.high for i in machine.inputs] + unlimited
     u, clipped = model_choice.within_limits(u, (low, high), names=acting)
     return RecordSegments(u, y, tuple(recordings), recorded, clipped)
-
-
-def judge_model(
-    settings: IdentifyPlant,
-    chosen: Identified,
-    first: tuple[Segments, Segments],
-    last: tuple[Segments, Segments],
-) -> ModelJudgement:
-    import numpy as np
-
-    from pipeline.temperature.identification import trust, validation
-
-    holdout = trust.holdout(
-        chosen.plant,
-        *last,
-        settings.ahead_steps,
-        block=2 * chosen.past,
-        rng=np.random.default_rng(settings.seed),
-        drift=chosen.drift,
-    )
-    closed = chosen.feedback is not None and chosen.feedback.closed
-    lags = trust.residual_lags(last[0])
-    return ModelJudgement(
-        holdout,
-        validation.residual_tests(chosen.plant, *last, lags=lags, closed=closed),
-        validation.excitation(first[0], chosen.past),
-        sum(map(len, last[0])),
-        trust.fit_of_held_inputs(chosen.plant, *last),
-    )
 
 
 # ---- tables and figures

@@ -34,6 +34,10 @@ class Ingest(Section):
     strict: bool
 
 
+# figures of control that git keeps and that runs are compared by
+METRICS = ("recordings", "samples", "segments", "findings")
+
+
 def main() -> None:
     with artifacts.stage("ingest") as out:
         from pipeline.reading import recording_folders
@@ -63,7 +67,7 @@ def main() -> None:
         inputs = [signal.name for signal in machine.inputs]
         pids = recording_folders.printer_pids(folder, results, wish.sources, inputs)
         artifacts.write_json(out / "printer_pid.json", pids)
-        artifacts.write_metrics("ingest", figures)
+        artifacts.write_metrics("ingest", figures, METRICS)
 
 
 def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, Mapped]) -> RecordingWish:

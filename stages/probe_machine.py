@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 # what stands where there is nothing to simulate
 RECORDED = "the record of this machine is what lies in datasets/raw/temperature; nothing is simulated"
 
+# figures of control that git keeps and that runs are compared by
+METRICS = ("samples", "excitation_*", "limited_share")
+
 
 def main() -> None:
     with artifacts.stage("probe_machine") as out:
@@ -29,7 +32,7 @@ def main() -> None:
             run, metrics = probe_study(settings, machine)
             time_s, signals = recorded_signals(machine, run)
             artifacts.write_recording(out / "probing.mcap", time_s, signals)
-        artifacts.write_metrics("probe_machine", metrics)
+        artifacts.write_metrics("probe_machine", metrics, METRICS)
 
 
 def probe_study(settings: GenerateProbing, machine: Plant) -> tuple[Probe, dict[str, Any]]:

@@ -2,48 +2,37 @@
 deposition.html, setpoint.html), certificate.html, papers.html, viewer.html with its columns in reports/data,
 runs.html (this run beside the accepted one) and words.html.
 
-It reads the metrics and tables of every stage and reports/accepted.json. A missing file is shown as missing.
+It reads the figures and tables of every stage and reports/accepted.json. A missing file is shown as missing.
 Every file read is hashed, and the pages carry the hashes. The drift on page one is that of the last night
 (reports/metrics/nightly.json). The nightly job writes that file after the pages, so it is no dependency.
 """
 
 import hashlib
+from typing import TYPE_CHECKING
 
 import stages
-from pipeline.report.about import page as about_page
-from pipeline.report.certificate import page as certificate_page
-from pipeline.report.deposition import page as deposition_page
-from pipeline.report.identification import page as identification_page
-from pipeline.report.index import page as index_page
-from pipeline.report.papers import page as papers_page
-from pipeline.report.runs import curves
-from pipeline.report.runs import page as runs_page
-from pipeline.report.setpoint import page as setpoint_page
-from pipeline.report.shared.page import LOOP_OF
-from pipeline.report.shared.sources import Declared, Sources, collect, digest
-from pipeline.report.temperature import page as temperature_page
-from pipeline.report.temperature.judgement import Judgement, judgement, shown
-from pipeline.report.viewer import page as viewer_page
 from pipeline.store import artifacts, params
-from pipeline.temperature.settings import Plant
-from pipeline.verdict.settings import ReportRules
+
+if TYPE_CHECKING:
+    from pipeline.report.shared.sources import Sources
+    from pipeline.report.temperature.judgement import Judgement
 
 # what the pages show of each stage: its figures, and its folder of tables
-METRICS = {
-    "probe_machine": "reports/metrics/probe_machine.json",
-    "generate_probing": "reports/metrics/generate_probing.json",
-    "ingest": "reports/metrics/ingest.json",
-    "identify_plant": "reports/metrics/identify_plant.json",
-    "learn_kernel": "reports/metrics/learn_kernel.json",
-    "tune_weights": "reports/metrics/tune_weights.json",
-    "evaluate_temperature": "reports/metrics/evaluate_temperature.json",
-    "train_ilc": "reports/metrics/train_ilc.json",
-    "segment_library": "reports/metrics/segment_library.json",
-    "compose_parts": "reports/metrics/compose_parts.json",
-    "train_classifier": "reports/metrics/train_classifier.json",
-    "train_agent": "reports/metrics/train_agent.json",
-    "evaluate_setpoint": "reports/metrics/evaluate_setpoint.json",
-    "export_controllers": "reports/metrics/export_controllers.json",
+FIGURES = {
+    "probe_machine": "datasets/probe_machine/figures.json",
+    "generate_probing": "datasets/generate_probing/figures.json",
+    "ingest": "datasets/ingest/figures.json",
+    "identify_plant": "datasets/identify_plant/figures.json",
+    "learn_kernel": "datasets/learn_kernel/figures.json",
+    "tune_weights": "datasets/tune_weights/figures.json",
+    "evaluate_temperature": "datasets/evaluate_temperature/figures.json",
+    "train_ilc": "datasets/train_ilc/figures.json",
+    "segment_library": "datasets/segment_library/figures.json",
+    "compose_parts": "datasets/compose_parts/figures.json",
+    "train_classifier": "datasets/train_classifier/figures.json",
+    "train_agent": "datasets/train_agent/figures.json",
+    "evaluate_setpoint": "datasets/evaluate_setpoint/figures.json",
+    "export_controllers": "datasets/export_controllers/figures.json",
 }
 FOLDERS = {
     "ingest": "datasets/ingest",
@@ -58,6 +47,26 @@ FOLDERS = {
     "evaluate_setpoint": "datasets/evaluate_setpoint",
     "export_controllers": "datasets/export_controllers",
 }
+# the figures of control that DVC compares: each loop's verdict and the figures of its controller
+METRICS = (
+    "temperature",
+    "settled_error_degC",
+    "settling_s",
+    "overshoot_degC",
+    "disk_margin",
+    "delay_margin_s",
+    "cost",
+    "deposition",
+    "flow_error_percent",
+    "line_volume_percent",
+    "learned_percent",
+    "setpoint",
+    "settled_percent",
+    "stay_percent",
+    "disturbed_percent",
+    "right_70_150_percent",
+    "bands",
+)
 # what the papers print, and ours beside it, which the second pipeline makes
 PAPERS = {
     "temperature": ("datasets/papers/temperature.toml", "datasets/papers/temperature.json"),
@@ -80,8 +89,16 @@ MADE = (
 )
 
 
-def of_loops(sources: Sources, judged: Judgement) -> dict[str, str]:
+def of_loops(sources: "Sources", judged: "Judgement") -> dict[str, str]:
     """The pages of each loop; one sentence in their place if it is switched off."""
+    from pipeline.report.about import page as about_page
+    from pipeline.report.certificate import page as certificate_page
+    from pipeline.report.deposition import page as deposition_page
+    from pipeline.report.identification import page as identification_page
+    from pipeline.report.setpoint import page as setpoint_page
+    from pipeline.report.shared.page import LOOP_OF
+    from pipeline.report.temperature import page as temperature_page
+
     pages = {
         "temperature": lambda: temperature_page.render(sources, judged),
         "identification": lambda: identification_page.render(sources),
@@ -96,9 +113,20 @@ def of_loops(sources: Sources, judged: Judgement) -> dict[str, str]:
 
 
 def main() -> None:
+    from pipeline.report.about import page as about_page
+    from pipeline.report.index import page as index_page
+    from pipeline.report.papers import page as papers_page
+    from pipeline.report.runs import curves, figures
+    from pipeline.report.runs import page as runs_page
+    from pipeline.report.shared.sources import Declared, collect, digest
+    from pipeline.report.temperature.judgement import judgement, shown
+    from pipeline.report.viewer import page as viewer_page
+    from pipeline.temperature.settings import Plant
+    from pipeline.verdict.settings import ReportRules
+
     with artifacts.stage("report"):
         declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
-        sources = collect(declared, METRICS, FOLDERS, "reports/accepted.json", ("pipeline", "stages"))
+        sources = collect(declared, FIGURES, FOLDERS, "reports/accepted.json", ("pipeline", "stages"))
         judged = judgement(sources)
         told = {
             "verdict": judged.verdict.metrics(),
@@ -130,6 +158,7 @@ def main() -> None:
         artifacts.write_metrics(
             "report",
             {
+                **figures.headline({**sources.measured, "report": told}),
                 **told,
                 "bytes": {name: len(text.encode()) for name, text in pages.items()},
                 "pictures": {name: text.count('role="img"') for name, text in pages.items()},
@@ -138,6 +167,7 @@ def main() -> None:
                 "parameters": digest(declared.everything),
                 "code": sources.code,
             },
+            METRICS,
         )
 
 

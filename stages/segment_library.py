@@ -9,6 +9,15 @@ from pipeline.deposition.settings import Printer
 from pipeline.deposition.tables import LESSONS, LIBRARY
 from pipeline.store import artifacts, params
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "columns",
+    "materials.*.chain.residual_percent",
+    "materials.*.chain.held_out_percent",
+    "materials.*.learned_percent",
+    "checks.*.percent",
+)
+
 
 class SegmentLibrary(params.Section):
     """Section `segment_library`."""
@@ -34,7 +43,7 @@ def main() -> None:
         artifacts.write_json(out / "learned.json", rest)
         figures = {"columns": len(learned.library.columns)} | rest
         figures["materials"] = [material_figures(material) for material in rest["materials"]]
-        artifacts.write_metrics("segment_library", figures)
+        artifacts.write_metrics("segment_library", figures, METRICS)
 
 
 def material_figures(material: dict[str, Any]) -> dict[str, Any]:

@@ -96,6 +96,10 @@ class TrainAgent(Section):
     belief_dqn: BeliefDqn
 
 
+# figures of control that git keeps and that runs are compared by
+METRICS = ("*.settled*", "*.stay", "*.overshoot_p95", "*.median_steps", "*.runs")
+
+
 def main() -> None:
     with artifacts.stage("train_agent") as out:
         settings = params.load(TrainAgent, "train_agent")
@@ -109,7 +113,7 @@ def main() -> None:
         artifacts.write_learning_curve(
             out / "live", trained.curve, of="agent", step="update", figures=("reward",)
         )
-        artifacts.write_metrics("train_agent", metrics(settings, trained))
+        artifacts.write_metrics("train_agent", metrics(settings, trained), METRICS)
 
 
 class TrainedAgents(NamedTuple):

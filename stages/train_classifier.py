@@ -27,6 +27,18 @@ CHECKPOINTS = Path("datasets/memo/train_classifier")
 VISION = Path(__file__).parents[1] / "pipeline/setpoint/vision"
 CODE = (VISION / "classifier.py", VISION / "vision_transformer.py")
 TRANSFORMER, CNN = "vision transformer", "convolutional network"
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "*_accuracy",
+    "right_70_150",
+    "images",
+    "windows",
+    "ece_*",
+    "conformal.coverage",
+    "conformal.held",
+    "out_of_distribution.false_alarms",
+    "out_of_distribution.*.found",
+)
 
 
 def main() -> None:
@@ -61,7 +73,7 @@ def main() -> None:
         else:
             camera = fit_recorded_camera(recordings.surroundings, recordings.segment, length=settings.window)
         camera_files.store_camera(out / camera_files.CAMERA_FILE, camera)
-        artifacts.write_metrics("train_classifier", figures(settings, model, judged, curves, read))
+        artifacts.write_metrics("train_classifier", figures(settings, model, judged, curves, read), METRICS)
 
 
 # ---- frames

@@ -29,6 +29,17 @@ Sections = tuple[TrainIlc, Printer, Camera]
 # trial sequences and measured trials by (material, number of the routine), models and figures by material
 Results = tuple[dict[tuple[str, int], list], dict[tuple[str, int], list], dict[str, dict], dict[str, dict]]
 
+# figures of control that git keeps and that runs are compared by
+METRICS = (
+    "*.gamma*",
+    "*.*.last_ratio",
+    "*.*.best_ratio",
+    "*.*.trials",
+    "*.*.saturated",
+    "*.pixels.flow_error*",
+    "*.pixels.rejected_percent",
+)
+
 
 def main() -> None:
     import numpy as np
@@ -64,10 +75,9 @@ def main() -> None:
             camera, kinds = camera.straight(), ("flow", "pixels") if settings.pixel_trials else ("flow",)
             # workers of a cluster work in other folders
             place, sections = (out / "recordings").resolve(), (settings, printer, camera)
-            calls = [(place, sections, index, kind) for index in range(len(prospects)) for kind in kinds]
-            work = run_all([delayed(simulate)(*call) for call in calls], execution)
-            title = "train_ilc: materials, in flow and in pictures"
-            results = list(tqdm(work, total=len(calls), desc=title))
+            jobs = [(place, sections, index, kind) for index in range(len(prospects)) for kind in kinds]
+            work = run_all([delayed(simulate)(*job) for job in jobs], execution)
+            results = list(tqdm(work, total=len(jobs), desc="train_ilc: materials, in flow and in pictures"))
             paths = sorted((out / "recordings").glob("*.mcap"))
         sequences, measured, models, figures = training.join([({}, {}, {}, prospects), *results])
         artifacts.write_table(out / "trials.parquet", TRIALS, training.trial_rows(sequences))
@@ -77,7 +87,7 @@ def main() -> None:
         frames = (out / "frames").resolve()
         rows = run_all([delayed(show_frames)(path.resolve(), frames, camera) for path in paths], execution)
         artifacts.write_json(frames / "frames.json", [row for of_path in rows for row in of_path])
-        artifacts.write_metrics("train_ilc", figures)
+        artifacts.write_metrics("train_ilc", figures, METRICS)
 
 
 def simulate(folder: Path, sections: Sections, index: int, kind: str) -> Results:
@@ -176,9 +186,9 @@ def learn_from_recordings(
             for one in groups.get(key, []):
                 earlier = [other.latency for path, other in values.items() if path != one.path]
                 measured.append(measure_trial(one, values[one.path], earlier, routine, printer, camera))
-            number, law = len(measured), "model_inverse" if measured else "on_off"
+            trials, number = [one.trial for one in measured], len(measured)
+            law = "model_inverse" if measured else "on_off"
             with artifacts.about(f"{folder}: material {material.name}, routine {index}"):
-                trials = [one.trial for one in measured]
                 sequence, u, of_step = training.resume(trials, routine, material.nominal, laws)
             name = f"{material.name}_routine_{index}_trial_{number:02d}"
             known = trial_conditions(printer, camera, material, routine, number, law, scale)

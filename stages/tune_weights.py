@@ -153,6 +153,10 @@ def candidates(results: Mapping[str, SearchResult]) -> dict[str, Sequence]:
     return {column.name: [row[column.name] for row in rows] for column in tables.TUNING.columns}
 
 
+# figures of control that git keeps and that runs are compared by
+METRICS = ("contestants.*.cost*", "contestants.*.failed")
+
+
 def main() -> None:
     with artifacts.stage("tune_weights") as out:
         from pipeline.temperature.test_set.controller_search import tuned_values
@@ -175,7 +179,7 @@ def main() -> None:
             for name, values in tuned.items()
         }
         reasons = {name: reason for name, reason in refused.items() if reason}
-        artifacts.write_metrics("tune_weights", {"contestants": figures, "refused": reasons})
+        artifacts.write_metrics("tune_weights", {"contestants": figures, "refused": reasons}, METRICS)
 
 
 if __name__ == "__main__":

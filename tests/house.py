@@ -1,49 +1,64 @@
-"""The rules of the house on the syntax tree: imports, open files, and the dvc.yaml that the stages ask
-for."""
+"""The rules of the house on the syntax tree: who may know whom, who opens files, what dvc.yaml must name."""
 
 import ast
 import functools
-import graphlib
 import re
-import typing
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import yaml
 
 from pipeline.store import params
 
+ROOT = Path(__file__).resolve().parents[1]
 LOOPS = ("temperature", "deposition", "setpoint")
+# what other rooms may read of a loop, of runtime and of nightly: settings, schemas, tables of controllers
+PLAIN = {
+    "settings",
+    "tables",
+    "controllers",
+    "controllers/table",
+    "agents/criteria",
+    "published",
+    "records",
+    "made",
+}
+# room -> rooms that it may know beside itself; own: the methods of its loop, files: what saves networks
+MAY_KNOW: dict[str, set[str]] = {
+    "statistics": set(),
+    "store": set(),
+    "reading": {"store", "statistics"},
+    "methods": {"statistics"},
+    "plain": {"own", "store", "statistics", "verdict"},
+    "files": {"own", "store", "statistics"},
+    "verdict": {"plain", "store", "statistics"},
+    "runtime": {"verdict", "methods", "plain", "store", "statistics"},
+    "report": {"verdict", "plain", "store", "statistics"},
+    "papers": {"methods", "plain", "files", "store", "statistics", "stages"},
+}
+# who may know every room; room -> who alone may know it
+WHOLE = {"stages", "cli", "quick", "commands", "nightly", "around_dvc"}
+ONLY = {
+    "report": {"stages", "cli"},
+    "commands": {"cli", "quick", "nightly"},
+    "stages": {"papers", "quick", "cli", "commands"},
+}
+ROOMS = {*LOOPS, *MAY_KNOW, *WHOLE, "__init__"} - {"methods", "plain", "files", "stages"}
 NUMERICS = {"numpy", "scipy", "control", "sklearn", "cv2", "jax", "equinox", "optax", "jaxtyping"}
-LANGUAGE = {
-    "__future__",
-    "abc",
-    "bisect",
-    "collections",
-    "dataclasses",
-    "enum",
-    "fractions",
-    "functools",
+NUMERICS |= {"__future__", "abc", "bisect", "collections", "dataclasses", "enum", "fractions", "functools"}
+NUMERICS |= {
     "heapq",
     "itertools",
     "math",
     "numbers",
-}
-LANGUAGE |= {"operator", "re", "string", "types", "typing", "warnings"}
-FORMATS = {"csv", "h5py", "json", "mcap", "orjson", "pandas", "pickle", "pyarrow", "yaml"}
-READS = {
-    "read_text",
-    "read_bytes",
-    "load",
-    "loadtxt",
-    "genfromtxt",
-    "fromfile",
-    "memmap",
-    "read_csv",
-    "read_parquet",
-    "read_table",
-    "open",
+    "operator",
+    "re",
+    "string",
+    "types",
+    "typing",
+    "warnings",
 }
 WRITES = {
     "write_text",
@@ -54,21 +69,24 @@ WRITES = {
     "savez_compressed",
     "savetxt",
     "tofile",
-    "to_csv",
-    "to_parquet",
-    "dump",
 }
-EDGE_CALLS = {"artifacts", "params", "recordings"}
-# what takes a second to import, or needs a device
-HEAVY = {"jax", "equinox", "optax", "cv2", "sklearn", "control", "pandas", "pyarrow", "mcap", "joblib"}
-# all that may lie directly in pipeline/
-ROOMS = {*LOOPS, "store", "reading", "runtime", "report", "nightly", "papers"}
-LOOSE = {"__init__", "around_dvc", "statistics", "cli", "quick"}
-# around_dvc imports the standard library alone: artifacts takes longer than it may;
-# params_text dumps to a text
-WRITERS = {"pipeline/store/artifacts.py", "pipeline/around_dvc.py", "pipeline/store/params_text.py"}
+WRITES |= {"to_csv", "to_parquet", "dump"}
+READS = {"read_text", "read_bytes", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "open"}
+READS |= {"read_csv", "read_parquet", "read_table"}
+EDGE = {"artifacts", "params", "recordings"}
+FRAME = "stages/__init__.py"
+# the frame of a stage and around_dvc import the standard library alone; params_text dumps to a text
+WRITERS = {"pipeline/store/artifacts.py", "pipeline/store/params_text.py", "pipeline/around_dvc.py", FRAME}
 # MT19937: R's generator, with which the script of a paper draws
 GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64", "MT19937"}
+# the one file of metrics, with a column a value; the figures of other stages are outs
+HEADLINE = "reports/metrics/report.json"
+# memos (results are the same whatever is in them), and what the night and the quick look say beside a run
+UNTRACKED = ("datasets/memo", "reports/metrics/nightly.json", "reports/quick_look.json")
+# the second pipeline: results that no recording changes, and no stage of the root asks for
+PAPERS = "datasets/papers/dvc.yaml"
+# a stage depends on these rooms whole, and on at most 8 files or folders of a loop's methods
+SHARED, MOST_METHODS = {"store", "reading", "verdict", "runtime", "report"}, 8
 
 
 # ---- the syntax tree
@@ -80,47 +98,38 @@ class File(NamedTuple):
 
     @property
     def room(self) -> str:
-        """stages, store, reading, report, nightly, runtime, statistics, cli; of a loop temperature its
-        methods, temperature/workflow, and tables, settings and contestants apart; runtime likewise."""
+        """stages, store, ..., cli; of a loop `temperature`, `temperature/plain`, `temperature/files`."""
         parts = self.name.removesuffix(".py").split("/")
         if parts[0] != "pipeline" or len(parts) < 2:
             return parts[0]
-        if parts[1] in (*LOOPS, "runtime") and parts[2:3] == ["workflow"]:
-            return (
-                f"{parts[1]}/{parts[3]}"
-                if parts[3:] in (["tables"], ["settings"], ["contestants"])
-                else f"{parts[1]}/workflow"
-            )
-        return "nightly/settings" if parts[1:] == ["nightly", "settings"] else parts[1]
+        plain = parts[1] in (*LOOPS, "runtime", "nightly", "papers") and "/".join(parts[2:]) in PLAIN
+        files = parts[1] in LOOPS and parts[-1] == "files"
+        return parts[1] + ("/plain" if plain else "/files" if files else "")
 
 
 def parsed(path: Path) -> ast.Module:
     return _parsed(path.read_text(encoding="utf-8"))
 
 
-# every stage imports the same edge; nothing changes a tree
+# every stage imports the same rooms; nothing changes a tree
 _parsed = functools.cache(ast.parse)
 
 
 def files(root: Path, *folders: str) -> Iterator[File]:
-    for folder in folders:
-        for path in sorted((root / folder).rglob("*.py")):
-            yield File(path.relative_to(root).as_posix(), parsed(path))
+    for path in [path for folder in folders for path in sorted((root / folder).rglob("*.py"))]:
+        yield File(path.relative_to(root).as_posix(), parsed(path))
 
 
 @functools.cache
 def imports(tree: ast.AST) -> list[tuple[int, str]]:
     """(line, dotted name) of each import; `from a import b` is a.b. A relative import begins with a dot."""
-    found = []
+    names = []
     for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            found += [(node.lineno, alias.name) for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            found += [
-                (node.lineno, "." * node.level + f"{node.module or ''}.{alias.name}".strip("."))
-                for alias in node.names
-            ]
-    return found
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            of = node.module or "" if isinstance(node, ast.ImportFrom) else ""
+            begin = "." * node.level if isinstance(node, ast.ImportFrom) else ""
+            names += [(node.lineno, begin + f"{of}.{alias.name}".strip(".")) for alias in node.names]
+    return names
 
 
 def project_file(root: Path, name: str) -> str | None:
@@ -135,167 +144,169 @@ def project_file(root: Path, name: str) -> str | None:
 
 @functools.cache
 def calls(tree: ast.AST) -> list[tuple[ast.Call, str, str]]:
-    """(call, receiver, function) of each call: artifacts.write_text(...) is ("artifacts", "write_text"),
-    open(...) ("", "open")."""
-    found = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call):
-            *receiver, function = ast.unparse(node.func).rsplit(".", 1)
-            found.append((node, "".join(receiver), function))
-    return found
+    """(call, receiver, function) of each call: artifacts.write_text(...) is ("artifacts", "write_text")."""
+    nodes = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    names = [ast.unparse(node.func).rpartition(".") for node in nodes]
+    return [(node, receiver, function) for node, (receiver, _, function) in zip(nodes, names, strict=True)]
 
 
 # ---- who may know whom
 
 
 def may_know(room: str, target: str) -> bool:
-    """The five rules: whether a file of `room` may import a file of `target`."""
-    loop = room.split("/")[0]
-    if room == "statistics":
-        return False
-    if room in LOOPS:  # 1: methods know numerics, their own loop's methods and statistics
-        return target in (room, "statistics")
-    if loop in LOOPS:  # 2: a workflow knows its own loop and what every stage stands on
-        light = room.endswith(("/tables", "/settings"))
-        own = (loop, f"{loop}/tables", f"{loop}/settings", f"{loop}/contestants")
-        return target in ("store", "reading", "statistics", *own) or (
-            target == f"{loop}/workflow" and not light
-        )
-    if room == "report":  # 3: pages know what a table, a setting and a contestant is, and do not compute
-        described = target.endswith(("/tables", "/settings", "/contestants"))
-        return target in ("store", "statistics", "report") or described
-    if room == "runtime":  # 4: beside a machine run the methods
-        return target in (*LOOPS, "store", "statistics", "runtime")
-    if room == "runtime/settings":
-        return target in ("store", "runtime/settings")
-    if room == "runtime/workflow":  # what is exported and replayed is read as the loops' stages left it
-        return target.split("/")[0] in (*LOOPS, "store", "reading", "statistics", "runtime")
-    if room == "papers":  # the second pipeline plays the methods, and the root's stages on fresh records
-        return target.split("/")[0] in (*LOOPS, "store", "statistics", "papers", "stages")
-    if room in ("store", "reading"):  # 5: below the loops
-        return target in ("store", "reading", "statistics")
-    return True  # nightly, cli and stages
+    """Whether a file of `room` may import a file of `target`."""
+    (own, _, kind), (other, _, part) = room.partition("/"), target.partition("/")
+    if target in ONLY and room != target:
+        return room in ONLY[target]
+    if room == target or room in WHOLE:
+        return True
+    allowed = MAY_KNOW[kind or ("methods" if own in LOOPS else own)]
+    if own == other:  # methods do not know settings, tables and files of their loop
+        return "own" in allowed or own not in LOOPS
+    return (part or ("methods" if other in LOOPS else other)) in allowed
 
 
 def forbidden_imports(root: Path) -> list[str]:
     sentences = []
     for file in files(root, "pipeline", "stages"):
-        numerics = file.room in LOOPS or file.room == "statistics"
         for line, name in imports(file.tree):
-            target = project_file(root, name)
-            room = File(target, file.tree).room if target and target != "pipeline/__init__.py" else ""
-            reason = ""
-            if name.startswith("."):
-                reason = "write the whole name"
-            elif (room == "stages" and file.room != "papers") or name.split(".")[0] == "tests":
-                reason = "nothing imports a stage or a test"
-            elif room and not may_know(file.room, room):
-                reason = f"{file.room} must not know {room}"
-            elif numerics and not target and name.split(".")[0] not in NUMERICS | LANGUAGE:
-                reason = f"{file.room} knows arrays, nothing of files, clocks, processes or figures"
-            elif file.room.endswith("/settings") and name.split(".")[0] in HEAVY:
-                reason = "a settings class imports nothing heavy"
-            elif file.room == "stages" and name.split(".")[0] in FORMATS:
-                reason = "only artifacts opens artifacts"
-            if reason:
+            target, library = project_file(root, name), name.split(".")[0]
+            room = File(target, file.tree).room if target and not target.endswith("/__init__.py") else ""
+            reasons = {
+                "write the whole name": name.startswith("."),
+                "nothing imports a test or a benchmark": library in ("tests", "benchmarks"),
+                f"{file.room} must not know {room}": room and not may_know(file.room, room),
+                f"{file.room} knows arrays, nothing of files, clocks, processes or figures": not target
+                and file.room in (*LOOPS, "statistics")
+                and library not in NUMERICS,
+            }
+            if reason := next((reason for reason, holds in reasons.items() if holds), ""):
                 sentences.append(f"{file.name}:{line} imports {name}: {reason}")
     return sentences
 
 
 def misplaced(root: Path) -> list[str]:
-    """Files and folders of pipeline/ that are no room of the house."""
-    return [
-        f"pipeline/{path.name}: which room is it of?"
-        for path in sorted((root / "pipeline").iterdir())
-        if path.name != "__pycache__" and path.stem not in (ROOMS if path.is_dir() else LOOSE)
+    """Files and folders of pipeline/ that are no room of the house; a folder of workflows is none."""
+    names = [path for path in sorted((root / "pipeline").iterdir()) if path.name != "__pycache__"]
+    workflows = sorted((root / "pipeline").glob("*/workflow/"))
+    return [f"pipeline/{path.name}: which room is it of?" for path in names if path.stem not in ROOMS] + [
+        f"{path.relative_to(root).as_posix()}: a stage is one file; its methods lie in the loop"
+        for path in workflows
     ]
 
 
+def doubles(root: Path) -> dict[str, list[str]]:
+    """Names of classes that stand in more than one module, with the modules."""
+    modules = defaultdict(list)
+    for file in files(root, "pipeline", "stages"):
+        for name in {node.name for node in ast.walk(file.tree) if isinstance(node, ast.ClassDef)}:
+            modules[name].append(file.name)
+    return {name: places for name, places in sorted(modules.items()) if len(places) > 1}
+
+
+# ---- files, randomness, the frame of a stage
+
+
 def forbidden_files(root: Path) -> list[str]:
-    """Files that loops and stages open by themselves, and files that the edge writes without artifacts."""
+    """Files that methods and stages open by themselves, and those that others write without artifacts."""
     sentences = []
     for file in files(root, "pipeline", "stages"):
         forbidden = WRITES | READS if file.room in (*LOOPS, "statistics", "stages") else WRITES
         for call, receiver, function in calls(file.tree):
-            modes = call.args[:1] if receiver else call.args[1:2]
-            modes += [keyword.value for keyword in call.keywords if keyword.arg == "mode"]
-            opened_to_write = function == "open" and any(
+            modes = [
+                *call.args[not receiver :][:1],
+                *(key.value for key in call.keywords if key.arg == "mode"),
+            ]
+            to_write = any(
                 isinstance(mode, ast.Constant) and set(str(mode.value)) & set("wax+") for mode in modes
             )
-            if (
-                file.name not in WRITERS
-                and receiver not in EDGE_CALLS
-                and (function in forbidden or opened_to_write)
-            ):
-                sentences.append(
-                    f"{file.name}:{call.lineno} {ast.unparse(call.func)}: only artifacts opens artifacts"
-                )
+            if file.name in WRITERS or receiver in EDGE:
+                continue
+            if function in forbidden or (function == "open" and to_write):
+                name = ast.unparse(call.func)
+                sentences.append(f"{file.name}:{call.lineno} {name}: only artifacts opens artifacts")
     return sentences
 
 
 def forbidden_randomness(root: Path) -> list[str]:
-    sentences = []
-    for file in files(root, "pipeline", "stages"):
-        for call, receiver, function in calls(file.tree):
-            if receiver in ("np.random", "numpy.random") and (
-                function not in GENERATORS or (function == "default_rng" and not call.args)
-            ):
-                sentences.append(
-                    f"{file.name}:{call.lineno} {ast.unparse(call)}: "
-                    "the stage makes a seeded generator and hands it on"
-                )
-    return sentences
+    return [
+        f"{file.name}:{call.lineno} {ast.unparse(call)}: the stage makes a seeded generator and hands it on"
+        for file in files(root, "pipeline", "stages")
+        for call, receiver, function in calls(file.tree)
+        if receiver in ("np.random", "numpy.random")
+        and (function not in GENERATORS or (function == "default_rng" and not call.args))
+    ]
 
 
 def unframed(root: Path) -> list[str]:
-    """Reads of a stage outside `with artifacts.stage(...)`. Bad input there ends in a traceback, not in one
-    sentence."""
-    sentences = []
-    for file in files(root, "stages"):
-        mains = [node for node in file.tree.body if isinstance(node, ast.FunctionDef) and node.name == "main"]
-        for statement in [statement for main in mains for statement in main.body]:
-            framed = isinstance(statement, ast.With) and ast.unparse(statement.items[0]).startswith(
-                "artifacts.stage("
-            )
-            for call, receiver, _ in calls(statement):
-                if not framed and receiver in EDGE_CALLS:
-                    sentences.append(
-                        f"{file.name}:{call.lineno} {ast.unparse(call)}: "
-                        "move it into `with artifacts.stage(...)`"
-                    )
-    return sentences
+    """Reads of a stage outside `with artifacts.stage(...)`: bad input there ends in a traceback."""
+    return [
+        f"{file.name}:{call.lineno} {ast.unparse(call)}: move it into `with artifacts.stage(...)`"
+        for file in files(root, "stages")
+        for main in file.tree.body
+        if isinstance(main, ast.FunctionDef) and main.name == "main"
+        for statement in main.body
+        if not ast.unparse(statement).startswith("with artifacts.stage(")
+        for call, receiver, _ in calls(statement)
+        if receiver in EDGE
+    ]
 
 
 # ---- dvc.yaml
 
 
-def modules(root: Path, name: str) -> set[str]:
-    """The file itself and every file of the project that it imports, directly or not, without empty
-    __init__.py."""
-    reached, todo = set(), [name]
+def stages(root: Path) -> list[str]:
+    return sorted(path.stem for path in (root / "stages").glob("*.py") if path.stem != "__init__")
+
+
+def reached(root: Path, name: str) -> dict[str, ast.Module]:
+    """The file itself and all files that it imports, directly or not, without empty __init__.py. Of another
+    stage only its imports, and the definitions that are used."""
+    trees, todo = {}, [(name, "*")]
     while todo:
-        here = todo.pop()
-        if here not in reached and (root / here).stat().st_size:
-            reached.add(here)
-            todo += [
-                target for _, module in imports(parsed(root / here)) if (target := project_file(root, module))
-            ]
-    return reached
+        file, wanted = here = todo.pop()
+        if here in trees or not (root / file).stat().st_size:
+            continue
+        trees[here] = tree = parsed(root / file) if wanted == "*" else _used(parsed(root / file), wanted)
+        names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+        for dotted in [dotted for _, dotted in imports(tree)]:
+            if target := project_file(root, dotted):
+                part, last = (
+                    dotted.count(".") == 2 and dotted.startswith("stages."),
+                    dotted.rpartition(".")[2],
+                )
+                todo.append((target, "*" if not part else last if last in names else ""))
+    files = {file: [tree for (one, _), tree in trees.items() if one == file] for file, _ in trees}
+    return {
+        file: ast.Module([node for tree in some for node in tree.body], []) for file, some in files.items()
+    }
 
 
-def data_files(root: Path, modules: set[str]) -> set[str]:
-    """Templates and the like beside the modules: a file, or a folder without modules."""
-    data = set()
-    for folder in {(root / name).parent for name in modules}:
-        for path in folder.iterdir():
-            inside = [
-                file
-                for file in (path, *path.rglob("*"))
-                if file.is_file() and "__pycache__" not in file.parts
-            ]
-            if inside and not path.name.startswith(".") and all(file.suffix != ".py" for file in inside):
-                data.add(path.relative_to(root).as_posix())
-    return data
+def _used(tree: ast.Module, name: str) -> ast.Module:
+    """The imports of a file, and the definition of a name with those that it uses."""
+    definitions: dict[str, ast.stmt] = {}
+    for node in tree.body:
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", node)]
+        for target in targets:
+            definitions[getattr(target, "name", getattr(target, "id", ""))] = node
+    kept, todo = {""}, [name]
+    while todo:
+        one = todo.pop()
+        if one in definitions and one not in kept:
+            kept.add(one)
+            todo += [node.id for node in ast.walk(definitions[one]) if isinstance(node, ast.Name)]
+    nodes = [definitions[one] for one in kept - {""}]
+    return ast.Module(
+        [node for node in tree.body if node in nodes or isinstance(node, ast.Import | ast.ImportFrom)], []
+    )
+
+
+def beside(root: Path, code: Iterable[str]) -> set[str]:
+    """Templates, rules and the like: files that are no modules, in the folders of modules or below."""
+    folders = {(root / name).parent for name in code}
+    found = {path for folder in folders for path in (*folder.glob("*"), *folder.glob("templates/**/*"))}
+    names = {path.relative_to(root).as_posix() for path in found if path.is_file() and path.suffix != ".py"}
+    return {name for name in names if "/." not in name and "__pycache__" not in name}
 
 
 def literal(file: str, call: ast.Call, position: int) -> str:
@@ -303,254 +314,155 @@ def literal(file: str, call: ast.Call, position: int) -> str:
     assert isinstance(argument, ast.Constant), (
         f"{file}:{call.lineno} {ast.unparse(call)}: write the name out, so that one can grep for it"
     )
-    return argument.value
+    return str(argument.value)
 
 
-def loads(name: str, tree: ast.AST) -> Iterator[tuple[str, str]]:
-    """(model, key): the sections that params.load reads, and with model "" the keys that params.value
-    reads."""
-    for call, receiver, function in calls(tree):
-        if receiver == "params" and function == "load":
-            yield ast.unparse(call.args[0]), literal(name, call, 1)
-        elif receiver == "params" and function == "value":
-            yield "", literal(name, call, 0)
+def keys(root: Path, code: dict[str, ast.Module]) -> set[str]:
+    """The parameters that change what modules write, as dvc.yaml has them: "key" or "FILE: key".
+
+    How work is spread over processes changes nothing, and the frame of a stage refuses sections that it does
+    not use. What stands in no file is asked for where a person looks first.
+    """
+    asked: set[str] = set()
+    for name, tree in [(name, tree) for name, tree in code.items() if name != FRAME]:
+        for call, receiver, function in calls(tree):
+            if receiver == "params" and function == "value":
+                asked.add(literal(name, call, 0))
+            elif receiver == "params" and function == "load":
+                section = literal(name, call, 1)
+                part = _fields(code, ast.unparse(call.args[0]))
+                asked |= {f"{section}.{field}" for field in part} or {section}
+            elif (receiver, function) == ("stages", "run"):
+                asked |= {f"loops.{ast.literal_eval(keyword.value)}" for keyword in call.keywords}
+    asked.discard("execution")
+    held: dict[str, set[str]] = {}
+    for file in (params.FILE, params.EXPERT, params.PAPERS):
+        sections = yaml.safe_load((root / file).read_text()) if (root / file).exists() else {}
+        inner = {f"{name}.{key}" for name, of in sections.items() if isinstance(of, dict) for key in of}
+        held[file] = asked & {*sections, *inner}
+    others = {f"{file}: {key}" for file in (params.EXPERT, params.PAPERS) for key in held[file]}
+    return others | held[params.FILE] | (asked - held[params.EXPERT] - held[params.PAPERS])
 
 
-def paths(stage: str, name: str, tree: ast.Module) -> tuple[set[str], set[str]]:
-    """Literal paths in datasets/ and reports/ that are read; those that are written."""
-    written, read = set(), set()
-    targets = {
-        id(call.args[0]) for call, _, function in calls(tree) if function.startswith("write_") and call.args
-    }
-    for node in ast.walk(tree):
-        if isinstance(node, ast.JoinedStr) and re.match(r"f['\"](datasets|reports)/", ast.unparse(node)):
-            raise AssertionError(
-                f"{name}:{node.lineno} {ast.unparse(node)}: write the path out, so that one can grep for it"
-            )
-        if isinstance(node, ast.Constant) and re.fullmatch(r"(datasets|reports)/[\w./-]+", str(node.value)):
-            (written if id(node) in targets else read).add(node.value.rstrip("/"))
-    read |= {
-        f"reports/metrics/{literal(name, call, 0)}.json"
-        for call, _, function in calls(tree)
-        if function == "read_metrics"
-    }
-    # a memo is no artifact: whatever is in it, the results are the same
-    return {path for path in read if not path.startswith(("datasets/memo", f"datasets/{stage}/"))}, written
-
-
-@functools.cache
-def _sections(owner: Path, *contents: bytes) -> dict[str, Any]:
-    """The sections by file of params.yaml and params.expert.yaml, which hold `contents`."""
-    return params.files(owner)
-
-
-def tracked(root: Path, keys: set[str]) -> list[Any]:
-    """Keys as DVC lists them, each under the files in which it stands: those of params.yaml bare, those of
-    params.expert.yaml below its name."""
-    owner, expert = root / params.FILE, root / params.EXPERT
-    contents = [path.read_bytes() for path in (owner, expert) if path.exists()]
-    by_file = _sections(owner, *contents) if owner.exists() else {}
-    present = {
-        name: sorted(key for key in keys if key in _flattened(sections)) for name, sections in by_file.items()
-    }
-    methods = present.get(str(expert), [])
-    # what stands nowhere is asked for where a person looks first
-    return sorted({*present.get(str(owner), []), *(keys - {*methods})}) + (
-        [{params.EXPERT: methods}] if methods else []
-    )
-
-
-def _flattened(sections: dict[str, Any]) -> set[str]:
-    """Sections, and the keys of each as section.key."""
+def _fields(code: dict[str, ast.Module], model: str) -> set[str]:
+    """The fields of a class that reads a part of its section; none of one that reads it whole."""
+    nodes = [node for tree in code.values() for node in tree.body if getattr(node, "name", "") == model]
     return {
-        *sections,
-        *(f"{section}.{key}" for section, keys in sections.items() if isinstance(keys, dict) for key in keys),
+        item.target.id
+        for node in nodes
+        if isinstance(node, ast.ClassDef)
+        and any(ast.unparse(key) == "extra='ignore'" for key in node.keywords)
+        for item in node.body
+        if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)
     }
 
 
-def expected(root: Path, stage: str) -> dict[str, Any]:
-    """The entry of dvc.yaml: deps, params, outs and metrics are what stages/<stage>.py imports and opens,
-    directly or through what it imports."""
-    name = f"stages/{stage}.py"
-    code = modules(root, name)
-    read, written, keys = set(), set(), set()
-    for module in code:
-        # how work is spread over processes changes no byte of what comes out
-        keys |= {key for _, key in loads(module, parsed(root / module)) if key != "execution"}
-    tree = parsed(root / name)
-    # paths stand in the stage's file, where one can grep for them; imported functions take them as arguments
-    opened = paths(stage, name, tree)
-    read, written = read | opened[0], written | opened[1]
-    # a stage that hashes whole folders of code, or reads the parameters whole, depends on them whole
-    read |= {
-        node.value
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Constant) and node.value in ("pipeline", "stages")
-    }
-    reads_all_parameters = any(
-        (receiver, function) == ("params", "read") for _, receiver, function in calls(tree)
-    )
-    read |= {params.FILE, params.EXPERT} if reads_all_parameters else set()
-    frames = [
-        item
-        for node in ast.walk(tree)
-        if isinstance(node, ast.With)
-        for item in node.items
-        if ast.unparse(item).startswith("artifacts.stage(")
-    ]
-    writes_figures = any(function == "write_metrics" for *_, function in calls(tree))
-    if writes_figures or any(frame.optional_vars for frame in frames):
-        written.add(f"datasets/{stage}")
-    for call, _, function in calls(tree):
-        assert function not in ("stage", "write_metrics") or literal(name, call, 0) == stage, (
+def paths(name: str, tree: ast.Module) -> tuple[set[str], set[str]]:
+    """Literal paths in datasets/ and reports/ that a module reads; those that it writes."""
+    written, read = set(), set()
+    targets = {id(call.args[0]) for call, _, verb in calls(tree) if verb.startswith("write_") and call.args}
+    for node in ast.walk(tree):
+        text = ast.unparse(node) if isinstance(node, ast.JoinedStr) else ""
+        assert not re.match(r"f['\"](datasets|reports)/", text), (
+            f"{name}:{node.lineno} {text}: write the path out, so that one can grep for it"
+        )
+        if isinstance(node, ast.Constant) and re.fullmatch(r"(datasets|reports)/[\w./-]+", str(node.value)):
+            (written if id(node) in targets else read).add(str(node.value).rstrip("/"))
+    figures = [call for call, _, verb in calls(tree) if verb == "read_figures"]
+    return read | {f"datasets/{literal(name, call, 0)}/figures.json" for call in figures}, written
+
+
+def covered(path: str, deps: Iterable[str]) -> bool:
+    """Whether a path is one of the deps, or lies in one."""
+    return any(f"{path}/".startswith(f"{dep}/") for dep in deps)
+
+
+def expected(root: Path, name: str) -> dict[str, set[str]]:
+    """What a stage imports and opens, directly or through what it imports: code, deps, params, outs, metrics.
+    Paths stand in stages and in verdict; other modules take them as arguments."""
+    code, stage = reached(root, name), Path(name).stem
+    tree, read = code[name], set()
+    for file in [file for file in code if file.startswith(("stages/", "pipeline/verdict/")) or file == name]:
+        read |= paths(file, code[file])[0]
+        if any((receiver, verb) == ("params", "read") for _, receiver, verb in calls(code[file])):
+            read |= {params.FILE, params.EXPERT}
+    read = {path for path in read if not path.startswith((*UNTRACKED, f"datasets/{stage}/"))}
+    for call, _, verb in calls(tree):
+        assert verb not in ("stage", "write_metrics") or literal(name, call, 0) == stage, (
             f"{name}:{call.lineno} the stage's name is {stage}"
         )
-    metrics = [f"reports/metrics/{stage}.json"] if writes_figures else []
-    entry = {
-        "cmd": f"python -m stages.{stage}",
-        "deps": [
-            dep
-            for dep in (name, *sorted(code - {name}), *sorted(data_files(root, code)))
-            if dep.split("/")[0] not in read
-        ]
-        + sorted(read),
-        "params": tracked(root, keys),
+    measures = any(verb == "write_metrics" for *_, verb in calls(tree))
+    written = paths(name, tree)[1]
+    if measures or re.search(r"artifacts\.stage\(.*\) as ", ast.unparse(tree)):
+        written.add(f"datasets/{stage}")
+    wanted: dict[str, set[str]] = {
+        "code": {*code} | beside(root, code),
+        "deps": {path for path in read if not covered(path, read - {path})},
+        "params": keys(root, code),
         # DVC deletes outs before a stage unless they persist; the last good artifacts must outlive a failure
-        "outs": [{path: {"persist": True}} for path in sorted(written)],
-        "metrics": [{path: {"cache": False, "persist": True}} for path in metrics],
+        "outs": {f"{path} persist" for path in written},
+        "metrics": set(),
     }
-    return {key: value for key, value in entry.items() if value}
+    if measures:
+        metric = f"reports/metrics/{stage}.json"
+        wanted["metrics" if metric == HEADLINE else "outs"].add(f"{metric} uncached persist")
+    return wanted
 
 
-# the second pipeline: results that no recording changes, and no stage of the root asks for
-PAPERS = "datasets/papers/dvc.yaml"
-METHODS = {*LOOPS, "statistics", "papers", "stages"}
-
-
-def expected_of_paper(root: Path, stage: str) -> dict[str, Any]:
-    """The entry of datasets/papers/dvc.yaml: deps and params are what pipeline/papers/<stage>.py imports and
-    opens, files and no folder of code. It has no outs: DVC joins pipelines by their outs, and the root's
-    `dvc repro` would start it."""
+def expected_of_paper(root: Path, stage: str) -> dict[str, set[str]]:
+    """How a file is read and a figure written is no method. A stage of the second pipeline has no outs: DVC
+    joins pipelines by their outs, and the root's `dvc repro` would start it."""
+    wanted = expected(root, f"pipeline/papers/{stage}.py")
+    methods = {*LOOPS, "statistics", "papers", "stages"}
+    rooms = {path: File(path, ast.Module([], [])).room for path in wanted["code"]}
+    code = {path for path, room in rooms.items() if room.split("/")[0] in methods and room != "papers/plain"}
+    # `relearned` plays the root's stages in a folder of its own
     name = f"pipeline/papers/{stage}.py"
-    # how a file is read and a figure written is no method
-    code = modules(root, name)
-    methods = {path for path in code if File(path, parsed(root / path)).room.split("/")[0] in METHODS}
-    keys = {key for module in code for _, key in loads(module, parsed(root / module)) if key != "execution"}
-    own = {key for key in keys if key in params.PAPERS_SECTIONS}
-    read, _ = paths(stage, name, parsed(root / name))
-    read -= {f"datasets/papers/{stage}.json", params.PAPERS}
-    entry = {
-        "cmd": f"python -m pipeline.papers.{stage}",
-        "wdir": "../..",
-        "deps": [name, *sorted(methods - {name}), *sorted(read)],
-        "params": tracked(root, keys - own) + ([{params.PAPERS: sorted(own)}] if own else []),
-    }
-    return {key: value for key, value in entry.items() if value}
+    read = paths(name, parsed(root / name))[0] - {f"datasets/papers/{stage}.json", params.PAPERS}
+    read = {path for path in read if not path.startswith(UNTRACKED)}
+    keys = {key for key in wanted["params"] if not key.startswith("loops.")}
+    return {"code": code, "deps": read, "params": keys, "outs": set(), "metrics": set()}
 
 
-def second_pipeline(root: Path) -> dict[str, Any]:
-    """The stages of the papers: the modules with a `main`."""
-    names = sorted(
-        path.stem
-        for path in (root / "pipeline/papers").glob("*.py")
-        if any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in parsed(path).body)
-    )
-    return {"stages": {stage: expected_of_paper(root, stage) for stage in names}}
-
-
-def stages(root: Path) -> list[str]:
-    return sorted(path.stem for path in (root / "stages").glob("*.py") if path.stem != "__init__")
-
-
-def pipeline(root: Path) -> dict[str, Any]:
-    """All stages, each after those whose results it reads."""
-    entries = {stage: expected(root, stage) for stage in stages(root)}
-    made = {
-        path: stage
-        for stage, entry in entries.items()
-        for kind in ("outs", "metrics")
-        for out in entry.get(kind, [])
-        for path in out
-    }
-    order = {
-        stage: [made[out] for out in made for dep in entry["deps"] if f"{dep}/".startswith(f"{out}/")]
-        for stage, entry in entries.items()
-    }
-    ordered = {stage: entries[stage] for stage in graphlib.TopologicalSorter(order).static_order()}
-    curves = [
-        stage
-        for stage in ordered
-        if any(
-            function == "write_learning_curve" for *_, function in calls(parsed(root / f"stages/{stage}.py"))
-        )
-    ]
-    return {"stages": ordered} | (
-        {"plots": [{f"datasets/{stage}/live/plots/metrics": {"x": "step"}} for stage in curves]}
-        if curves
-        else {}
-    )
-
-
-def differences(entries: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
-    """Sentences on the differences between dvc.yaml and what the stages ask for. The order of entries and
-    `desc` are free."""
-
-    def flat(entry, kind):
-        value = entry.get(kind, [])
-        return (
-            {value}
-            if isinstance(value, str)
-            else {
-                yaml.safe_dump(item, default_flow_style=True, width=999).replace("\n...", "").strip()
-                for item in value
-            }
-        )
-
-    sentences = [
-        f"{stage}: stage is {'missing' if stage in wanted else 'not in stages/'}"
-        for stage in sorted(entries.keys() ^ wanted.keys())
-    ]
-    for stage in entries.keys() & wanted.keys():
-        for kind in sorted((entries[stage].keys() | wanted[stage].keys()) - {"desc"}):
-            have, want = flat(entries[stage], kind), flat(wanted[stage], kind)
-            sentences += [f"{stage}: {kind} lacks {item}" for item in sorted(want - have)] + [
-                f"{stage}: {kind} has {item}" for item in sorted(have - want)
-            ]
-    return sentences
-
-
-# ---- bounds
-
-
-def unbounded(kind: Any, place: str, limits: tuple = ()) -> list[str]:
-    """The places in a type where a number has no lower or no upper bound, or a key has a default other
-    than None."""
-    if typing.get_origin(kind) is Annotated:
-        kind, *extra = typing.get_args(kind)
-        limits = (*limits, *(limit for item in extra for limit in getattr(item, "metadata", [item])))
-        return unbounded(kind, place, limits)
-    if isinstance(kind, type) and issubclass(kind, params.Section):
-        fields = kind.model_fields.items()
-        # left out is not there: None, an empty list and false are no values
-        defaults = [
-            f"{place}.{name} has a default"
-            for name, field in fields
-            if not field.is_required() and field.default not in (None, [], False)
-        ]
-        return defaults + [
-            item
-            for name, field in fields
-            for item in unbounded(field.annotation, f"{place}.{name}", tuple(field.metadata))
-        ]
-    if kind in (int, float):
-        has = {
-            name
-            for limit in limits
-            for name in ("ge", "gt", "le", "lt")
-            if getattr(limit, name, None) is not None
+def differences(stage: str, entry: dict[str, Any], wanted: dict[str, set[str]]) -> list[str]:
+    """What an entry of dvc.yaml lacks, and what it has that the stage does not read or write."""
+    deps = set(entry["deps"])
+    code = {dep for dep in deps if dep.split("/")[0] in ("pipeline", "stages")}
+    have = {"deps": deps - {dep for dep in code if any(covered(path, [dep]) for path in wanted["code"])}}
+    want = {"deps": wanted["deps"] | {path for path in wanted["code"] if not covered(path, code)}}
+    have["params"], want["params"] = set(), wanted["params"]
+    for item in entry.get("params", []):
+        for file, names in item.items() if isinstance(item, dict) else [("", [item])]:
+            have["params"] |= {f"{file}: {name}" if file else name for name in names}
+    for kind in ("outs", "metrics"):
+        outs = [out if isinstance(out, dict) else {out: {}} for out in entry.get(kind, [])]
+        want[kind] = wanted[kind]
+        have[kind] = {
+            path + " uncached" * (not options.get("cache", True)) + " persist" * options.get("persist", False)
+            for out in outs
+            for path, options in out.items()
         }
-        sides = ["no lower bound"] * (not has & {"ge", "gt"}) + ["no upper bound"] * (not has & {"le", "lt"})
-        return [f"{place} has {side}" for side in sides]
-    union = typing.get_origin(kind) in (typing.Union, typing.get_origin(int | None))
-    arguments = [] if typing.get_origin(kind) is typing.Literal else typing.get_args(kind)
-    return [item for argument in arguments for item in unbounded(argument, place, limits if union else ())]
+    return [
+        f"{stage}: {kind} {word} {item}"
+        for kind in have
+        for word, items in (("lacks", want[kind] - have[kind]), ("has", have[kind] - want[kind]))
+        for item in sorted(items)
+    ]
+
+
+def coarse(stage: str, deps: Iterable[str]) -> list[str]:
+    """Shared rooms that are not named whole, and loops that are, or of which there are too many methods: a
+    comment in pipeline/setpoint would cost a quarter of an hour."""
+    parts = [dep.split("/") for dep in deps if dep.startswith("pipeline/")]
+    sentences = [
+        f"{stage}: name {'/'.join(part[:2])} whole" for part in parts if part[1] in SHARED and part[2:]
+    ]
+    for loop in LOOPS:
+        methods = [
+            part
+            for part in parts
+            if part[1] == loop and part[2:] not in (["settings.py"], ["tables.py"], ["workflow"])
+        ]
+        if ["pipeline", loop] in methods or len(methods) > MOST_METHODS:
+            sentences.append(f"{stage}: name at most {MOST_METHODS} files or folders of pipeline/{loop}")
+    return sentences

@@ -58,7 +58,7 @@ def run(tree: Path, stage: str, monkeypatch) -> int:
         inside.chdir(tree)
         inside.setattr(sys, "argv", [stage])
         try:
-            runpy.run_module(f"stages.{stage}", run_name="__main__")
+            runpy.run_module(f"stages.{stage}", run_name="__main__", alter_sys=True)
         except SystemExit as ended:
             return ended.code
     return 0

@@ -1,5 +1,6 @@
 """The quick look: its sizes, its folder, what is kept for it, and that its pages say what they are."""
 
+import contextlib
 import errno
 import os
 import shutil
@@ -14,15 +15,16 @@ import yaml
 
 from pipeline import quick
 from pipeline.report.shared.headline import Loop, decision
-from pipeline.report.shared.sources import QUICK_LOOK
 from pipeline.setpoint.agents.files import restore_agents
 from pipeline.setpoint.frames.files import CAMERA_FILE, restore_camera
 from pipeline.setpoint.simulation.recorded import window_tables
-from pipeline.setpoint.tables import WINDOWS
+from pipeline.setpoint.tables import WINDOW_PARTS, WINDOWS
 from pipeline.setpoint.vision.files import restore_classifier
 from pipeline.store import artifacts, params
+from pipeline.verdict.settings import QUICK_LOOK
 from pipeline.verdict.verdict import words_for
 
+ALL_ON = dict.fromkeys(params.Loops.model_fields, True)
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
     *("certificate", "deposition", "identification", "index", "papers", "runs"),
@@ -117,7 +119,7 @@ def test_the_same_inputs_give_the_same_bytes_and_take_the_place_of_the_last(look
 KILLED = """
 import time
 from pipeline import quick
-quick._timed = lambda name: time.sleep(60)
+quick._run = lambda name, **_: time.sleep(60)
 quick.quick()
 """
 
@@ -143,11 +145,11 @@ def test_a_killed_quick_look_shows_nothing_and_the_next_starts_clean(looked, mon
 def test_a_stage_that_fails_leaves_the_last_quick_look(checkout, capsys):
     (checkout / "quick").mkdir()
     (checkout / "quick/page.html").write_text("of the last quick look")
-    expert = checkout / params.EXPERT
-    expert.write_text(expert.read_text().replace("samples: 600\n", "samples: -1\n"))
+    owner = checkout / params.FILE
+    owner.write_text(owner.read_text().replace("  source: simulated", "  source: recordings", 1))
     with pytest.raises(SystemExit) as ended:
         quick.quick()
-    assert ended.value.code == 1 and "generate_probing.samples is -1" in capsys.readouterr().err
+    assert ended.value.code == 1 and capsys.readouterr().err.startswith("ingest: ")
     assert written(checkout / "quick") == {"page.html": b"of the last quick look"}
     assert not list(checkout.glob(".quick.*")) and Path.cwd() == checkout
 
@@ -186,21 +188,29 @@ def test_a_quick_look_beside_another_leaves_its_folder_alone(checkout):
 
 
 def test_the_sizes_replace_values_of_a_full_run_and_none_grows():
-    sizes = quick.smaller_sizes(ROOT / params.FILE, ROOT / quick.SIZES)
-    smaller = {name: (yaml.safe_load(here), yaml.safe_load(whole)) for name, here, whole in sizes.smaller}
+    files, rows = quick.smaller_sizes(ROOT / params.FILE, ROOT / quick.SIZES)
+    smaller = {name: (yaml.safe_load(here), yaml.safe_load(whole)) for name, here, whole in rows}
     assert smaller["panel.judging.plants"] < (60, 60) and "train_ilc.pixel_trials" in smaller
     for name, (here, whole) in smaller.items():
         count = len if isinstance(here, list) else int
         assert count(here) < count(whole), name
-    assert sizes.files[params.EXPERT]["panel"]["judging"]["plants"] == smaller["panel.judging.plants"][0]
-    assert sizes.files[params.FILE] == params.files(ROOT / params.FILE)[str(ROOT / params.FILE)]
+    assert files[params.EXPERT]["panel"]["judging"]["plants"] == smaller["panel.judging.plants"][0]
+    assert files[params.FILE] == params.files(ROOT / params.FILE)[str(ROOT / params.FILE)]
 
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("panel: {judging: {plant: 6}}", "params.quick.yaml: panel.judging.plant is unknown"),
-        ("panel: 6", "params.quick.yaml: panel is unknown"),
+        (
+            "panel: {judging: {plant: 6}}",
+            "params.quick.yaml or params.expert.yaml: panel.judging.plant is unknown; did you mean plants?",
+        ),
+        (
+            "panel: {plants: 6}",
+            "params.quick.yaml or params.expert.yaml: panel.plants is unknown; remove it, or use noise_degC",
+        ),
+        ("panel: 6", "params.quick.yaml or params.expert.yaml: panel must be a section with keys below it"),
+        ("panl: {}", "params.quick.yaml: panl is no section that a quick look makes smaller"),
         (
             "report: {disk_margin: 0.1}",
             "params.quick.yaml: report is no section that a quick look makes smaller",
@@ -228,19 +238,39 @@ def test_a_classifier_of_recorded_frames_is_not_replaced_by_the_kept_one(checkou
     head, tail = whole.split("train_classifier:", 1)
     Path(params.FILE).write_text(f"{head}train_classifier:{tail.replace('simulated ', 'recordings', 1)}")
     Path("dvc.yaml").write_text((ROOT / "dvc.yaml").read_text())
-    sizes = quick.smaller_sizes()
-    assert "evaluate_setpoint" not in quick.stages(sizes)
+    files, smaller = quick.smaller_sizes()
+    assert "evaluate_setpoint" not in quick.chosen_stages(files, ALL_ON, Path("dvc.yaml"))
     Path("look").mkdir()
-    quick._furnish(Path("look"), sizes, checkout)
+    quick._furnish(Path("look"), files, smaller, checkout)
     assert not Path("look/datasets/train_classifier").exists()
     assert "The setpoint loop is left out" in Path("look", QUICK_LOOK).read_text()
 
 
+def test_of_a_loop_that_is_off_nothing_is_kept_and_no_stage_runs(checkout):
+    owner = Path(params.FILE)
+    owner.write_text(owner.read_text().replace("setpoint: true", "setpoint: false"))
+    Path("look").mkdir()
+    files, smaller = quick.smaller_sizes()
+    loops = quick._furnish(Path("look"), files, smaller, checkout)
+    assert loops == {"temperature": True, "deposition": True, "setpoint": False}
+    assert not Path("look/datasets/train_classifier").exists()
+    assert "of a full run, of commit" not in Path("look", QUICK_LOOK).read_text()
+    with contextlib.chdir("look"):
+        quick._run("evaluate_setpoint", is_on=False)
+        assert artifacts.read_figures("evaluate_setpoint") == {"asked": False}
+
+
 def test_every_stage_but_training_and_export_runs_after_what_it_reads(monkeypatch):
     monkeypatch.chdir(ROOT)
-    order = quick.stages(quick.smaller_sizes())
+    files, _ = quick.smaller_sizes()
+    order = list(quick.chosen_stages(files, ALL_ON, Path("dvc.yaml")))
     every = {path.stem for path in Path("stages").glob("*.py")} - {"__init__"}
-    assert set(order) == every - {"render_frames", "train_classifier", "train_agent", "export_controllers"}
+    assert set(order) == every - set(quick.LEFT_OUT)
+    off = quick.chosen_stages(files, ALL_ON | {"setpoint": False}, Path("dvc.yaml"))
+    assert [name for name, is_on in off.items() if not is_on] == [
+        *("render_frames", "train_classifier", "train_agent", "evaluate_setpoint")
+    ]
+    assert off["report"] and off["train_ilc"]
     wires = yaml.safe_load(Path("dvc.yaml").read_text())["stages"]
     for at, name in enumerate(order):
         read = {dep.split("/")[1] for dep in wires[name]["deps"] if dep.startswith("datasets/")}

@@ -302,5 +302,5 @@ def _stages_of(path: str | Path) -> dict[str, Any]:
 
 
 def _metrics(stage: Mapping[str, Any]) -> list[str]:
-    entries = stage.get("metrics", [])
+    entries = [*stage.get("outs", []), *stage.get("metrics", [])]
     return [name for entry in entries for name in (entry if isinstance(entry, dict) else [entry])]

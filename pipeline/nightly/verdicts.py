@@ -15,8 +15,10 @@ from pipeline.verdict import night as verdict_night
 from pipeline.verdict import verdict
 from pipeline.verdict.files import read_evidence
 from pipeline.verdict.verdict import Verdict
+from stages.verdict import certificates
 
-STORED, REPORT = "datasets/verdict", "reports/metrics/report.json"
+STORED = "datasets/verdict"
+REPORT = "datasets/report/figures.json"
 
 
 def read_verdicts(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], Night]:
@@ -26,7 +28,8 @@ def read_verdicts(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], 
     loops = [name for name, loop in settings.loops.items() if loop.judge != "cases"]
     if not loops:
         return {}, night
-    evidence = read_evidence()  # as the pages do
+    evidence = read_evidence()
+    evidence = evidence._replace(certified=certificates(evidence.rules))
     stored, tonight, named = verdict.read(STORED), _read_json(METRICS), settings.holdout.controller
     by_loop = verdict_night.verdicts(evidence, stored, tonight)
     night = _make_pages_agree(by_loop, night)

@@ -67,9 +67,9 @@ def relearn(drawn: Mapping[str, int], changes: Mapping[str, Any]) -> dict:
                         stage.main()
                 except SystemExit:
                     raise ValueError(f"a relearning failed: {said.getvalue().strip()}") from None
-        metrics = folder / "reports" / "metrics"
         judged, tuned = (
-            artifacts.read_json(metrics / f"{name}.json") for name in ("evaluate_temperature", "tune_weights")
+            artifacts.read_json(folder / "datasets" / name / "figures.json")
+            for name in ("evaluate_temperature", "tune_weights")
         )
         return judged | {"tuned_cost": {key: one["cost"] for key, one in tuned["contestants"].items()}}
 

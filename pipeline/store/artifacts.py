@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fnmatch
-import hashlib
 import json
 import math
 import os
@@ -20,7 +18,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipeline.store import params, tables
 from pipeline.store.printable import printable
@@ -224,19 +222,22 @@ def write_metrics(stage: str, figures: Mapping, metrics: Sequence[str] = ("*",))
     fresh = _fresh.get()
     write_json((fresh if fresh else DATASETS / stage) / "figures.json", figures)
     patterns = [tuple(pattern.split(".")) for pattern in metrics]
-    write_json(REPORTS / "metrics" / f"{stage}.json", _matching(_plain(stage, "", figures), patterns))
+    write_json(REPORTS / "metrics" / f"{stage}.json", matching(_plain(stage, "", figures), patterns))
 
 
-def _matching(figures: Mapping, patterns: Sequence[Sequence[str]]) -> dict:
-    """The figures and sections that a pattern takes, in their order."""
-    chosen = {}
-    for key, value in figures.items():
-        rests = [rest for first, *rest in patterns if fnmatch.fnmatchcase(key, first)]
+def matching(figures: Mapping | list, patterns: Sequence[Sequence[str]]) -> dict | list:
+    """The figures and sections that a pattern takes, in their order. A place in a list is a key."""
+    from fnmatch import fnmatchcase
+
+    listed = isinstance(figures, list)
+    chosen: dict[Any, Any] = {}
+    for key, value in enumerate(figures) if listed else figures.items():
+        rests = [rest for first, *rest in patterns if fnmatchcase(str(key), first)]
         if not all(rests):
             chosen[key] = value
-        elif isinstance(value, Mapping) and (inner := _matching(value, rests)):
+        elif isinstance(value, Mapping | list) and (inner := matching(value, rests)):
             chosen[key] = inner
-    return chosen
+    return list(chosen.values()) if listed else chosen
 
 
 def read_metrics(stage: str) -> dict:
@@ -427,6 +428,8 @@ def write_recording(
 def sha256(path: str | Path) -> str:
     """Digest of a file, or of a folder by relative names and contents. Dot files and __pycache__ do not
     count."""
+    import hashlib
+
     path = Path(path)
     if not path.is_dir():
         with path.open("rb") as stream:
@@ -511,7 +514,7 @@ def _tidy(name: str) -> None:
         if ending[2] == ".old" and not (DATASETS / name).exists():
             left.rename(DATASETS / name)
         else:
-            shutil.rmtree(left)
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def _alive(pid: int) -> bool:

@@ -6,8 +6,6 @@ key of it in one. A path to params.yaml means both files: the other one lies bes
 own begin with x_.
 """
 
-import difflib
-import hashlib
 import json
 import re
 import types
@@ -195,6 +193,8 @@ def home(dotted: str, path: str | Path = FILE) -> str:
 def digest(model: Section) -> str:
     """SHA-256 of the section's canonical JSON. Equal parameters have equal digests, whatever their order and
     spelling in the file."""
+    import hashlib
+
     canonical = json.dumps(model.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()
 
@@ -377,6 +377,8 @@ def _shown(value: Any) -> str:
 
 def _nearest(name: Any, names) -> str:
     """The name that is most like `name`, "" where none is."""
+    import difflib
+
     matches = difflib.get_close_matches(str(name), [str(other) for other in names], n=1, cutoff=0.6)
     return next(iter(matches), "")
 

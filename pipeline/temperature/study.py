@@ -17,19 +17,27 @@ from pipeline.temperature.controllers.kernel import (
 )
 from pipeline.temperature.plant import baam
 from pipeline.temperature.probing import study_probe, study_signal
-from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, Figures
-from pipeline.temperature.test_set.scorecard import Panel, Yardstick, cost, optimum, panel, regret, simulate
+from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, PublishedFigures
+from pipeline.temperature.test_set.scorecard import (
+    CommonCost,
+    Scenarios,
+    cost,
+    optimum,
+    panel,
+    regret,
+    simulate,
+)
 from pipeline.temperature.test_set.tuning import SearchResult, fitness
 from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
 
 OUTPUTS, INPUTS = 5, 7
-YARDSTICK = Yardstick(np.ones(OUTPUTS), np.ones(INPUTS), GAMMA)
+YARDSTICK = CommonCost(np.ones(OUTPUTS), np.ones(INPUTS), GAMMA)
 AMPLITUDES, BANDWIDTH, VARIANCE = np.arange(100.0, 0.0, -10.0), 1.65, 1.5
 
 
 def study_panel(
     references: np.ndarray, *, noise: float = 0.0, seeds: tuple[int, ...] = (0,), hold: int = 0
-) -> Panel:
+) -> Scenarios:
     """The study's machine, held at 20 °C in every cell by its steady
     input, for each reference (k, 5); 1,000 steps."""
     return panel(
@@ -44,7 +52,7 @@ def study_panel(
     )
 
 
-def gap(law: Law, scenarios: Panel) -> np.ndarray:
+def gap(law: Law, scenarios: Scenarios) -> np.ndarray:
     """J / J* - 1 of each scenario, unclipped, Q = R = I."""
     run = simulate(scenarios, law)
     return regret(cost(scenarios, run, YARDSTICK), optimum(scenarios, YARDSTICK))
@@ -167,7 +175,7 @@ def rows(
 
 
 def metrics(
-    as_published: dict[str, Figures],
+    as_published: dict[str, PublishedFigures],
     exact: Exact,
     noise_free: NoiseFree,
     table: dict[str, list],
@@ -265,7 +273,7 @@ def scaled_weights(scale: float = 0.4) -> ScaledWeights:
     law = observer_law(plant, other, observer_gain(plant, TAU))
     run = simulate(scenarios, law)
     J = [
-        cost(scenarios, run, Yardstick(np.full(5, factor), np.full(7, factor), GAMMA)).J[0]
+        cost(scenarios, run, CommonCost(np.full(5, factor), np.full(7, factor), GAMMA)).J[0]
         for factor in (1.0, scale)
     ]
     return ScaledWeights(float(100 * (J[1] / J[0] - 1)), float(np.abs(one.K_x - other.K_x).max()))

@@ -212,7 +212,7 @@ class Verdict(NamedTuple):
         return f"{self.decision} {self.lead}".strip()
 
     def metrics(self) -> dict[str, str | bool | None]:
-        """What reports/metrics/report.json keeps of it."""
+        """What datasets/report/figures.json keeps of it."""
         return {name: getattr(self, name) for name in WRITTEN}
 
     @classmethod

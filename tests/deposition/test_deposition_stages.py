@@ -117,13 +117,13 @@ def test_a_cluster_films_the_same_trials(first_run, project, cluster):
 
 
 def test_the_simulated_loop_learns_composes_and_repeats_to_the_byte(finished, capsys):
-    metrics = json.loads(Path("reports/metrics/train_ilc.json").read_text())["A"]
+    metrics = json.loads(Path("datasets/train_ilc/figures.json").read_text())["A"]
     # the bars of the learning loop at trial 2, on a machine that is not the nominal model
     assert metrics["model_inverse"]["ratio_trial_2"] <= 0.20 and metrics["pixels"]["ratio_trial_2"] <= 0.20
     assert metrics["gamma"] == pytest.approx(0.7555, abs=0.01), (
         "gamma of the paper's law hardly depends on K and tau"
     )
-    scores = json.loads(Path("reports/metrics/compose_parts.json").read_text())
+    scores = json.loads(Path("datasets/compose_parts/figures.json").read_text())
     for part in ("dashes", "fig9"):
         one = scores[part]["A"]
         assert one["on_off"]["rms_percent_of_on_off"] == pytest.approx(100.0)
@@ -187,7 +187,7 @@ def test_trial_after_trial_the_loop_closes_through_the_folder(project, capsys):
     # on-off first; by the third command of a machine that nobody knows the flow error is below a fifth
     assert min(errors[2:]) <= 0.20 * errors[0]
     stage("train_ilc")
-    metrics = json.loads(Path("reports/metrics/train_ilc.json").read_text())["A"]
+    metrics = json.loads(Path("datasets/train_ilc/figures.json").read_text())["A"]
     assert (
         metrics["routine_0"]["next"] == "A_routine_0_trial_04"
         and metrics["routine_1"]["next"] == "A_routine_1_trial_00"
@@ -195,7 +195,7 @@ def test_trial_after_trial_the_loop_closes_through_the_folder(project, capsys):
     stage("segment_library")
     stage("compose_parts")
     assert (
-        json.loads(Path("reports/metrics/compose_parts.json").read_text())["fig9"]["A"]["chosen"] == "basis"
+        json.loads(Path("datasets/compose_parts/figures.json").read_text())["fig9"]["A"]["chosen"] == "basis"
     )
 
 
@@ -302,7 +302,7 @@ def test_a_part_that_cannot_be_composed_is_listed_and_the_others_go_on(finished,
     )
     Path("datasets/parts/picture.gcode").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 8)
     stage("compose_parts")
-    refused = json.loads(Path("reports/metrics/compose_parts.json").read_text())["refused"]
+    refused = json.loads(Path("datasets/compose_parts/figures.json").read_text())["refused"]
     assert "T7" in refused["other"] and "line 6" in refused["other"] and "picture.gcode" in refused["picture"]
     for name in ("dashes", "fig9"):
         Path(f"datasets/parts/{name}.gcode").unlink()
@@ -367,7 +367,7 @@ def test_every_command_that_is_learned_with_obeys_the_declared_drive(project):
     moves = np.where(first, commands, np.diff(commands, prepend=0.0))
     assert 5.9 < np.abs(commands).max() <= 6.0
     assert 0.999 * step < np.abs(moves).max() <= step * (1 + 1e-9)
-    figures = json.loads(Path("reports/metrics/train_ilc.json").read_text())["A"]
+    figures = json.loads(Path("datasets/train_ilc/figures.json").read_text())["A"]
     assert figures["model_inverse"]["saturated"] > 0
     declare({"train_ilc.source": "recordings"})
     stage("train_ilc")
@@ -482,12 +482,12 @@ def test_a_clock_that_jumped_changes_no_byte_of_what_is_composed(finished, year)
 
 
 def test_the_metrics_hold_forecast_truth_and_whether_it_is_judged(finished):
-    figures = json.loads(Path("reports/metrics/compose_parts.json").read_text())
+    figures = json.loads(Path("datasets/compose_parts/figures.json").read_text())
     for part in figures.values():
         for stream in (one for one in part.values() if "chosen" in one):
             told, chosen = stream["forecast"], stream[stream["chosen"]]
             assert 0 <= told["low"] <= told["median"] <= told["high"]
             assert stream["true"] == chosen["rms_percent_of_on_off"]
             assert stream["judged"]["judged"] is True or stream["judged"]["reason"]
-    known = json.loads(Path("reports/metrics/segment_library.json").read_text())["materials"][0]
+    known = json.loads(Path("datasets/segment_library/figures.json").read_text())["materials"][0]
     assert "members" not in known["chain"] and "by_place" not in known["missed"]

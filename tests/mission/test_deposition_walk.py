@@ -97,7 +97,7 @@ def test_the_flow_from_frames_is_the_foreign_extruders(walk, lessons):
 
 
 def test_the_latency_of_the_camera_is_found_from_its_frames(walk):
-    figures = json.loads((walk.folder / "reports/metrics/train_ilc.json").read_text())["A"]["pixels"]
+    figures = json.loads((walk.folder / "datasets/train_ilc/figures.json").read_text())["A"]["pixels"]
     assert figures["latency_s"] == pytest.approx(0.04, abs=0.005)
 
 

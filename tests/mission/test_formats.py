@@ -73,7 +73,7 @@ def test_a_recording_is_inspected_begun_and_ingested_in_every_format(name, begun
 
 def fit_percent(folder: Path) -> float:
     """How well the identified plant forecasts the part of the record that it has not seen."""
-    metrics = json.loads((folder / "reports/metrics/identify_plant.json").read_text())
+    metrics = json.loads((folder / "datasets/identify_plant/figures.json").read_text())
     (fit,) = metrics["fit_holdout"].values()
     return fit
 

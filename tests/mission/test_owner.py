@@ -170,7 +170,7 @@ def owner_project(made_once) -> Path:
 
 @pytest.fixture
 def verdict(owner_project) -> dict[str, Any]:
-    told = json.loads((owner_project / "reports/metrics/report.json").read_text(encoding="utf-8"))
+    told = json.loads((owner_project / "datasets/report/figures.json").read_text(encoding="utf-8"))
     return told["verdicts"]["temperature"]
 
 
@@ -186,7 +186,7 @@ def test_the_owner_of_version_0_2_gets_a_verdict_on_their_printer_and_pages_that
 
 @pytest.mark.full
 def test_the_printer_s_own_controller_is_among_the_judged(owner_project):
-    figures = json.loads((owner_project / "reports/metrics/evaluate_temperature.json").read_text())
+    figures = json.loads((owner_project / "datasets/evaluate_temperature/figures.json").read_text())
     assert {"printer_pid", "subspace_lqg", "hold"} <= set(figures["contestants"])
 
 

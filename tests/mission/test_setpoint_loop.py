@@ -68,7 +68,7 @@ def simulated(made_once) -> Project:
 
 @pytest.mark.full
 def test_frames_become_a_classifier_an_agent_and_a_verdict(simulated):
-    report = json.loads((simulated.folder / "reports/metrics/report.json").read_text())
+    report = json.loads((simulated.folder / "datasets/report/figures.json").read_text())
     choice = json.loads((simulated.folder / "datasets/evaluate_setpoint/choice.json").read_text())
     verdict = report["verdicts"]["setpoint"]
     assert verdict["subject"] == choice["name"]

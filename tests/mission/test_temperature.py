@@ -29,7 +29,7 @@ pytestmark = pytest.mark.xdist_group("toy_temperature")
 
 
 def metrics(folder: Path, stage: str) -> dict:
-    return json.loads((folder / "reports/metrics" / f"{stage}.json").read_text(encoding="utf-8"))
+    return json.loads((folder / "datasets" / stage / "figures.json").read_text(encoding="utf-8"))
 
 
 # ---- the study's machine

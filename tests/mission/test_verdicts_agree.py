@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.store import artifacts
 from tests.mission.conftest import Project
 
 LOOPS = ("temperature", "deposition", "setpoint")
@@ -14,12 +15,16 @@ LOOPS = ("temperature", "deposition", "setpoint")
 
 @pytest.fixture(scope="session")
 def cloned(made_once, root) -> Project:
-    """A clone as git has it, with its figures and no other result, and the pages made of them."""
+    """A clone as git has it, with the figures of the accepted run and no other result, and the pages made of
+    them."""
 
     def make(folder: Path) -> None:
         project = Project(folder).make()
-        shutil.copytree(root / "reports/metrics", folder / "reports/metrics")
-        shutil.copy(root / "reports/accepted.json", folder / "reports")
+        accepted = root / "reports/accepted.json"
+        (folder / "reports").mkdir(exist_ok=True)
+        shutil.copy(accepted, folder / "reports")
+        for stage, figures in json.loads(accepted.read_text(encoding="utf-8"))["metrics"].items():
+            artifacts.write_json(folder / "datasets" / stage / "figures.json", figures)
         project.run("python", "-m", "stages.report")
 
     return Project(made_once("cloned", make))
@@ -27,7 +32,7 @@ def cloned(made_once, root) -> Project:
 
 @pytest.fixture
 def report(cloned) -> dict:
-    return json.loads((cloned.folder / "reports/metrics/report.json").read_text(encoding="utf-8"))
+    return json.loads((cloned.folder / "datasets/report/figures.json").read_text(encoding="utf-8"))
 
 
 def words(text: str) -> str:
@@ -44,7 +49,7 @@ def test_page_one_says_the_verdicts_of_report_json(cloned, report):
 
 def test_the_controller_that_page_one_names_is_the_one_that_was_exported(cloned, report):
     """Ready, or passed, means a file: one certified controller, and it is the one that is named."""
-    exported = json.loads((cloned.folder / "reports/metrics/export_controllers.json").read_text())
+    exported = json.loads((cloned.folder / "datasets/export_controllers/figures.json").read_text())
     verdict = report["verdicts"]["temperature"]
     assert verdict["state"] == "passed"
     assert exported["temperature"]["contestant"] == verdict["winner"]

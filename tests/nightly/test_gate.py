@@ -263,7 +263,6 @@ def written(rng) -> dict[str, str]:
                 change(stages)
         expected[loop] = worst([state for state, _ in changes])
     for stage in (*made.metrics(), *made.deposition_metrics(), *made_setpoint.metrics()):
-        Path(f"reports/metrics/{stage}.json").unlink(missing_ok=True)
         Path(f"datasets/{stage}/figures.json").unlink(missing_ok=True)
     for stage, figures in stages.items():
         artifacts.write_metrics(stage, figures)
@@ -381,7 +380,7 @@ def test_a_champion_of_the_heaters_has_a_passed_certificate_of_its_own(
 def page_sources() -> Sources:
     """What the stage `report` reads."""
     declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
-    return collect(declared, report.METRICS, report.FOLDERS, "reports/accepted.json", ())
+    return collect(declared, report.FIGURES, report.FOLDERS, "reports/accepted.json", ())
 
 
 @pytest.mark.parametrize("key", ["", "watched", "alarms"])
@@ -402,7 +401,7 @@ def test_the_report_keeps_the_verdict_of_each_loop_as_the_night_reads_it(project
     made_anew = []
     monkeypatch.setattr(verdicts, "dvc", lambda *command, **_: made_anew.append(command))
     by_loop, tonight = verdicts.read_verdicts(settings(), TONIGHT)
-    kept = artifacts.read_metrics("report")
+    kept = artifacts.read_figures("report")
     assert kept["verdicts"] == {loop: verdict.metrics() for loop, verdict in by_loop.items()}
     assert kept["verdict"] == by_loop["temperature"].metrics()
     assert made_anew == [] and tonight == TONIGHT

@@ -106,7 +106,7 @@ def record(tree: Path) -> dict[str, np.ndarray]:
 
 
 def metrics(tree: Path, stage: str) -> dict:
-    return artifacts.read_json(tree / f"reports/metrics/{stage}.json")
+    return artifacts.read_json(tree / f"datasets/{stage}/figures.json")
 
 
 @pytest.fixture(scope="module")

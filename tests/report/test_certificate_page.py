@@ -41,7 +41,7 @@ def test_a_passed_certificate_of_a_simulated_plant_is_a_simulation(project):
 
 def test_a_certificate_of_recordings_says_no_more_than_page_one(project):
     made_certificate.write(evidence="recorded")
-    shown = SimpleNamespace(metrics={"export_controllers": artifacts.read_metrics("export_controllers")})
+    shown = SimpleNamespace(metrics={"export_controllers": artifacts.read_figures("export_controllers")})
     ready = Verdict("temperature", PASSED, "Ready for a supervised trial.", "", "", "", "", "pi")
     line = exported.lines(shown, ready)[0]
     assert (line.state, line.word, line.why) == (PASSED, "May run.", "")
@@ -99,7 +99,7 @@ def test_a_refused_certificate_names_its_first_failed_rule_and_no_file(project):
     assert "Certificate refused." in first and "temperature/controller.json" not in first
 
 
-@pytest.mark.parametrize("lost", [made_certificate.PATH, "reports/metrics/export_controllers.json"])
+@pytest.mark.parametrize("lost", [made_certificate.PATH, "datasets/export_controllers/figures.json"])
 def test_where_nothing_was_exported_both_pages_say_so(project, lost):
     Path(lost).unlink()
     main()

@@ -361,7 +361,7 @@ def test_what_is_missing_or_broken_is_said_in_its_place(project, render_only, pa
 
 
 def test_before_the_stages_ran_the_page_and_the_card_say_so(project):
-    for path in [*ARTIFACTS, *(f"reports/metrics/{stage}.json" for stage in made.deposition_metrics())]:
+    for path in [*ARTIFACTS, *(f"datasets/{stage}/figures.json" for stage in made.deposition_metrics())]:
         Path(path).unlink()
     text = page()
     assert (

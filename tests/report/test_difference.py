@@ -112,7 +112,7 @@ def test_a_run_whose_pages_are_older_than_its_figures_is_not_accepted(accepted, 
     with pytest.raises(SystemExit):
         cli.main()
     assert (
-        "the pages are of another run than reports/metrics/evaluate_temperature.json; run ./run dvc repro"
+        "the pages are of another run than datasets/evaluate_temperature/figures.json; run ./run dvc repro"
         in capsys.readouterr().err
     )
 

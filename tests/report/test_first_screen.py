@@ -55,11 +55,7 @@ def one_missing():
 
 
 def nothing():
-    for path in [
-        *Path("datasets").rglob("*.parquet"),
-        *Path("datasets").rglob("*.json"),
-        *Path("reports/metrics").glob("*.json"),
-    ]:
+    for path in [*Path("datasets").rglob("*.parquet"), *Path("datasets").rglob("*.json")]:
         path.unlink()
 
 
@@ -74,7 +70,7 @@ def long_sentences():
             "drift": {"alarms": [{"loop": "temperature", "cause": LONG}]},
         },
     )
-    Path("reports/metrics/evaluate_temperature.json").write_text("{")
+    Path("datasets/evaluate_temperature/figures.json").write_text("{")
 
 
 STATES = (

@@ -159,8 +159,7 @@ def test_a_hold_out_too_short_to_predict_over_leaves_that_open_and_keeps_the_res
 
 
 def test_nothing_identified_reads_as_open_never_as_passed(project):
-    metrics = Path("reports/metrics/identify_plant.json")
-    for path in [*FOLDER.glob("*.parquet"), FOLDER / "figures.json", metrics]:
+    for path in [*FOLDER.glob("*.parquet"), Path("datasets/identify_plant/figures.json")]:
         path.unlink()
     text = page()
     assert (

@@ -40,7 +40,7 @@ def test_a_contestant_that_the_pages_do_not_know_stands_in_the_scorecard_under_i
 @pytest.fixture
 def refused(project):
     why = "PI needs an input for each of the 5 outputs; found 3 inputs"
-    compared = artifacts.read_metrics("evaluate_temperature")
+    compared = artifacts.read_figures("evaluate_temperature")
     del compared["contestants"]["pi"]
     artifacts.write_metrics("evaluate_temperature", compared | {"refused": {"pi": why}})
     main()

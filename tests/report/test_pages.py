@@ -59,12 +59,12 @@ class Page(HTMLParser):
 
 
 def figures():
-    return json.loads(Path("reports/metrics/report.json").read_text())
+    return json.loads(Path("datasets/report/figures.json").read_text())
 
 
 def change(stage, **values):
     """Metrics of a stage with some dotted keys changed."""
-    found = artifacts.read_metrics(stage)
+    found = artifacts.read_figures(stage)
     for dotted, value in values.items():
         *path, last = dotted.split("__")
         place = found
@@ -76,7 +76,7 @@ def change(stage, **values):
 
 def change_all(**changed):
     """The same figures for every contestant, so that no other one passes in the place of the best."""
-    compared = artifacts.read_metrics("evaluate_temperature")
+    compared = artifacts.read_figures("evaluate_temperature")
     for name in compared["contestants"]:
         compared["contestants"][name] |= changed
     artifacts.write_metrics("evaluate_temperature", compared)
@@ -84,9 +84,9 @@ def change_all(**changed):
 
 def test_equal_inputs_give_equal_bytes(project):
     main()
-    first = [path.read_bytes() for path in (*PAGES, Path("reports/metrics/report.json"))]
+    first = [path.read_bytes() for path in (*PAGES, Path("datasets/report/figures.json"))]
     main()
-    assert first == [path.read_bytes() for path in (*PAGES, Path("reports/metrics/report.json"))]
+    assert first == [path.read_bytes() for path in (*PAGES, Path("datasets/report/figures.json"))]
 
 
 def test_the_title_of_page_one_is_the_verdict(project):
@@ -124,12 +124,12 @@ def test_a_failed_rule_fails_the_verdict_and_its_row_only(project):
         "datasets/tune_weights/weights.json",
         "datasets/ingest/record.parquet",
         "datasets/ingest/quality.parquet",
-        "reports/metrics/probe_machine.json",
-        "reports/metrics/ingest.json",
-        "reports/metrics/identify_plant.json",
-        "reports/metrics/learn_kernel.json",
-        "reports/metrics/tune_weights.json",
-        "reports/metrics/evaluate_temperature.json",
+        "datasets/probe_machine/figures.json",
+        "datasets/ingest/figures.json",
+        "datasets/identify_plant/figures.json",
+        "datasets/learn_kernel/figures.json",
+        "datasets/tune_weights/figures.json",
+        "datasets/evaluate_temperature/figures.json",
     ],
 )
 @pytest.mark.parametrize("how", ["missing", "broken"])
@@ -152,11 +152,7 @@ def test_an_artifact_that_is_missing_or_broken_is_said_so_in_its_place(
 
 
 def test_with_nothing_at_all_the_pages_are_there_and_every_place_says_not_measured(project):
-    for path in [
-        *Path("datasets").rglob("*.parquet"),
-        *Path("datasets").rglob("*.json"),
-        *Path("reports/metrics").glob("*.json"),
-    ]:
+    for path in [*Path("datasets").rglob("*.parquet"), *Path("datasets").rglob("*.json")]:
         path.unlink()
     main()
     page = Page(INDEX).text
@@ -169,7 +165,7 @@ def test_a_kernel_that_was_refused_is_shown_as_failed_with_its_sentence(project)
     change(
         "learn_kernel", refused="the record does not determine the kernel; record longer", samples_needed=None
     )
-    compared = artifacts.read_metrics("evaluate_temperature")
+    compared = artifacts.read_figures("evaluate_temperature")
     del compared["contestants"]["learned_kernel"]
     compared["pair"] = compared["pair"] | {"b": "varx_riccati"}
     artifacts.write_metrics("evaluate_temperature", compared)
@@ -297,7 +293,9 @@ def test_first_run_equal_runs_and_a_moved_figure(project):
     accepted = made.accepted(
         figures=figures()["figures"],
         winner="subspace_lqg",
-        metrics={path.stem: artifacts.read_json(path) for path in Path("reports/metrics").glob("*.json")},
+        metrics={
+            path.parent.name: artifacts.read_json(path) for path in Path("datasets").glob("*/figures.json")
+        },
         params=made.params.read("params.yaml"),
         hashes={str(p): artifacts.sha256(p) for p in Path("datasets").rglob("*") if p.is_file()}
         | {f: artifacts.sha256(f) for f in ("pipeline", "stages")},
@@ -371,7 +369,9 @@ def test_a_page_needs_no_simulator_and_starts_fast():
         "pipeline.temperature.plant",
     )
     said = (
-        "import sys, stages.report, pipeline.report.nightly.page, pipeline.report.runs.commits; "
+        "import sys, pathlib, importlib, pipeline.report.runs.commits\n"
+        "for page in pathlib.Path('pipeline/report').glob('*/page.py'):\n"
+        "    importlib.import_module('.'.join(page.with_suffix('').parts))\n"
         f"print([name for name in {heavy!r} if name in sys.modules])"
     )
     done = subprocess.run(

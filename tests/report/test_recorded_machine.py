@@ -89,7 +89,7 @@ def test_the_next_experiment_stands_beside_its_limits_or_says_why_there_is_none(
     assert "zone_1 100 88.0 to 118 0 to 140" in text and "stay beside it" in text
     assert "Nothing is written to add to a running controller: PI needs an input" in text
     assert "What the next experiment would excite" in Page(TEMPERATURE).text
-    figures = artifacts.read_metrics("generate_probing")
+    figures = artifacts.read_figures("generate_probing")
     reason = "without its controller zone_1 may reach 266 degC within 400 s"
     figures["next_experiment"] = {"written": False, "reason": reason}
     artifacts.write_metrics("generate_probing", figures)
@@ -119,7 +119,7 @@ def test_a_run_is_not_compared_with_the_accepted_run_of_another_machine(recorded
 def test_a_figure_without_bound_is_a_word_on_every_page(recorded):
     huge = dict.fromkeys(("median", "q90", "low", "high", "worst"), 637429062676764819456.0)
     change("evaluate_temperature", contestants__pi__overshoot=huge, contestants__pi__cost=huge)
-    compared = artifacts.read_metrics("evaluate_temperature")
+    compared = artifacts.read_figures("evaluate_temperature")
     compared["contestants"]["pi"]["gap"] |= {"median_percent": 5e24, "q90_percent": 5e24}
     artifacts.write_metrics("evaluate_temperature", compared)
     main()

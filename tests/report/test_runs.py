@@ -222,3 +222,45 @@ def test_a_page_of_two_commits_overflows_nothing_and_leads_nowhere_else(git, cap
     page = loaded(browser, tmp_path / "reports", path.stem, width=390)
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     page.context.close()
+
+
+# ---- what git keeps of a run
+
+
+def test_the_headline_is_a_run_in_few_values_and_gives_its_figures_back():
+    whole = {Path(path).stem: data for path, data in metrics().items()}
+    whole["report"]["verdicts"]["temperature"]["subject"] = "pi_simc"
+    kept = figures.headline(whole)
+    assert {name: value for name, value in kept.items() if name != "bands"} == {
+        "temperature": "pass: pi_simc",
+        "settling_s": 26.0,
+        "disk_margin": 0.5,
+        "cost": 3.0,
+        "deposition": "undecided",
+        "flow_error_percent": 2.5,
+        "line_volume_percent": 2.0,
+        "learned_percent": 2.0,
+        "setpoint": "fail",
+        "settled_percent": 75.0,
+        "stay_percent": 71.0,
+        "disturbed_percent": 0.5,
+        "right_70_150_percent": 82.5,
+    }
+    again = figures.measured({"report": json.loads(json.dumps(kept))})
+    assert again.figures == figures.measured(whole).figures
+    assert again.controllers["temperature"] == "pi_simc" and again.verdicts["setpoint"] == "fail"
+
+
+def test_a_figure_without_an_end_is_infinite_again():
+    figure = {"median": None, "low": 20.0, "high": None}
+    report = {"figures": {"pi": {"settling": figure}}, "verdict": {"winner": "pi"}}
+    kept = figures.headline({"report": report})
+    assert kept["settling_s"] is None and kept["bands"]["temperature"] == {"settling": [None, 20.0, None]}
+    assert figures.measured({"report": kept}).figures["temperature"]["settling"].value == float("inf")
+
+
+def test_a_run_of_today_stands_beside_one_whose_metrics_were_all_figures(git, capsys):
+    today = figures.headline({Path(path).stem: data for path, data in metrics(40.0).items()})
+    git(Made("a", metrics(26.0)), Made("b", {"reports/metrics/report.json": today}))
+    command("main~1", "main")
+    assert "26 s 23–29 40 s 36–44 +14 s · worse" in Page(Path(capsys.readouterr().out.strip())).text

@@ -11,6 +11,7 @@ import yaml
 from pipeline.report.setpoint import agent as setpoint_agent
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
+from pipeline.setpoint.agents.criteria import harm_bar
 from pipeline.setpoint.simulation.simulator import reward
 from pipeline.setpoint.tables import PATHS
 from pipeline.store import artifacts, params
@@ -78,7 +79,7 @@ def test_what_may_be_claimed_stands_in_the_verdict_and_on_page_one(project):
     Path("params.yaml").write_text(yaml.safe_dump(sections))
     shared = "the folder has too few prints to keep them apart"
     for apart in (True, False):
-        figures = artifacts.read_metrics("train_classifier")
+        figures = artifacts.read_figures("train_classifier")
         figures["data"]["windows_apart"] = apart
         artifacts.write_metrics("train_classifier", figures)
         assert (shared in page()) is not apart
@@ -160,7 +161,7 @@ def test_what_is_missing_or_broken_is_said_in_its_place(project, paths, how):
 
 
 def test_before_the_stages_ran_the_page_and_the_card_say_so(project):
-    for path in [*ARTIFACTS, *(f"reports/metrics/{stage}.json" for stage in made_setpoint.metrics())]:
+    for path in [*ARTIFACTS, *(f"datasets/{stage}/figures.json" for stage in made_setpoint.metrics())]:
         Path(path).unlink()
     text = page()
     assert "Undecided (simulation). No controller was chosen." in text
@@ -212,7 +213,7 @@ def test_the_card_sets_the_default_beside_another_and_doing_nothing_where_each_f
 
 
 def test_how_a_figure_moved_since_the_accepted_run_is_said(project):
-    accepted = made.accepted(metrics={"evaluate_setpoint": artifacts.read_metrics("evaluate_setpoint")})
+    accepted = made.accepted(metrics={"evaluate_setpoint": artifacts.read_figures("evaluate_setpoint")})
     cases = accepted["metrics"]["evaluate_setpoint"]["our agent"]["paper"]
     cases["accuracy 0.7"]["settled"] = 97.0
     cases["accuracy 0.9"] = {
@@ -319,7 +320,7 @@ def test_the_default_is_the_baseline_that_is_shown_and_judged_though_another_is_
 
 def test_windows_of_all_flows_are_held_against_no_bar(project):
     """The rule asks for flows from 70 to 150 %; an image's bar is of all flows."""
-    figures = artifacts.read_metrics("train_classifier") | {"window_accuracy": 0.5, "image_accuracy": 0.5}
+    figures = artifacts.read_figures("train_classifier") | {"window_accuracy": 0.5, "image_accuracy": 0.5}
     artifacts.write_metrics("train_classifier", figures)
     main()
     assert len(re.findall(r'class="num bad">50.0', PAGE.read_text())) == 1

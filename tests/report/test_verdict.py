@@ -429,7 +429,7 @@ def test_a_page_of_any_comparison_prints_no_number_beyond_meaning_and_never_says
     words_of_numbers_are_readable(shown)
     first = Page(INDEX).text
     assert not re.search(r"\b(nan|inf|None)\b|\b[Dd]eploy\b", first)
-    decision = artifacts.read_metrics("report")["verdict"]["decision"]
+    decision = artifacts.read_figures("report")["verdict"]["decision"]
     assert shown.count(decision.rstrip(".")) >= 2 and decision in first  # title and head
 
 

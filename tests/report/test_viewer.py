@@ -469,7 +469,7 @@ def million(tmp_path_factory):
         declared = Declared(
             params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read("params.yaml")
         )
-        sources = collect(declared, report.METRICS, report.FOLDERS, "accepted.json", ("pipeline",))
+        sources = collect(declared, report.FIGURES, report.FOLDERS, "accepted.json", ("pipeline",))
         made_page = viewer_page.render(sources, judgement(sources))
         artifacts.write_text("reports/viewer.html", made_page.text)
         artifacts.write_folder("reports/data", made_page.files)

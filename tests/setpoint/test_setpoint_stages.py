@@ -188,7 +188,7 @@ def check_classifier(source: str) -> dict:
         for name in courses
     }
     assert {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()} == expected
-    figures = artifacts.read_metrics("train_classifier")
+    figures = artifacts.read_figures("train_classifier")
     for name in ("image_accuracy", "window_accuracy", "svc_image_accuracy", "ece_image", "ece_window"):
         assert 0 <= figures[name] <= 1
     assert figures["source"] == source
@@ -517,7 +517,7 @@ def test_more_than_the_prints_can_promise_is_refused_with_what_would_do(users, c
 def check_agents() -> None:
     course = artifacts.read_table("datasets/train_agent/agents.parquet", AGENT_CURVE)
     assert {"li_2025", "belief_dqn"} == set(course["agent"])
-    figures = artifacts.read_metrics("train_agent")
+    figures = artifacts.read_figures("train_agent")
     assert 0 <= figures["phase3"]["settled"] <= 100
 
 
@@ -527,7 +527,7 @@ def check_judgement() -> None:
     assert {"paper", "recorded", "pixels"} == set(board["simulator"])
     for name, schema in (("paths", PATHS), ("decisions", DECISIONS)):
         assert len(artifacts.read_table(out / f"{name}.parquet", schema)["step"])
-    figures = artifacts.read_metrics("evaluate_setpoint")
+    figures = artifacts.read_figures("evaluate_setpoint")
     assert figures["default"] == json.loads((out / "choice.json").read_text())["name"]
     assert figures["default"] in set(board["controller"])
 

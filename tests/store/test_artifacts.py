@@ -320,6 +320,7 @@ FIGURES = {
     "machine": "ab12",
     "cases": {"gain 0.6": {"settled": 97.5, "stay": 90.0}, "clog": {"settled": 50.0, "runs": [1, 2]}},
     "harm": {"perfect": {"beyond_25": 0.0}},
+    "parts": [{"name": "a", "volume": 1.5}, {"name": "b", "volume": 2.5}],
 }
 
 
@@ -330,6 +331,7 @@ FIGURES = {
         (("cases.*.settled",), {"cases": {"gain 0.6": {"settled": 97.5}, "clog": {"settled": 50.0}}}),
         (("harm", "cases.clog.r*"), {"cases": {"clog": {"runs": [1, 2]}}, "harm": FIGURES["harm"]}),
         (("cases.gain 0*.stay", "settled"), {"cases": {"gain 0.6": {"stay": 90.0}}}),
+        (("parts.*.volume",), {"parts": [{"volume": 1.5}, {"volume": 2.5}]}),
         ((), {}),
     ],
 )

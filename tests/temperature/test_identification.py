@@ -5,8 +5,8 @@ import pytest
 
 from pipeline.temperature.identification.model_choice import Settings, identify, refit, within_limits
 from pipeline.temperature.identification.order import (
-    Candidate,
-    Structure,
+    ModelStructure,
+    OrderCandidate,
     dead_time,
     folds,
     slow_window,
@@ -528,10 +528,10 @@ def test_a_refined_plant_of_an_integrator_stays_in_the_circle_and_loses_nothing_
 
 
 def test_a_refined_fit_is_taken_for_a_gain_about_the_mean_in_most_blocks():
-    structure = Structure(10, (False,), True, (0,))
+    structure = ModelStructure(10, (False,), True, (0,))
 
     def row(kind, errors, about_mean):
-        return Candidate(2, structure, kind, 5, 1.0, errors, about_mean)
+        return OrderCandidate(2, structure, kind, 5, 1.0, errors, about_mean)
 
     start = row("subspace", (0.2,) * 5, (0.1,) * 5)
     steady = row("prediction", (0.18,) * 5, (0.09, 0.092, 0.091, 0.095, 0.09))

@@ -94,7 +94,7 @@ def test_limits_that_no_file_tells_are_left_to_a_person_and_asked_for_by_the_sta
     init(monkeypatch, "rig.csv", "--copy")
     assert "low and high of temperature_1: between which °C the machine must stay" in capsys.readouterr().out
     with pytest.raises(SystemExit):
-        runpy.run_module("stages.ingest", run_name="__main__")
+        runpy.run_module("stages.ingest", run_name="__main__", alter_sys=True)
     asked = capsys.readouterr().err
     assert "plant.outputs: temperature_1 should have low and high" in asked
 
@@ -263,14 +263,14 @@ def test_the_record_is_the_print_without_a_conversion(printer):
     assert len(record["time_s"]) == len(lines)
     temperatures = [float(line.rpartition("extruder:")[2].split("temp=")[1].split()[0]) for line in lines]
     np.testing.assert_array_equal(record["temperature_extruder"], temperatures)
-    findings = artifacts.read_json(printer / "reports/metrics/ingest.json")
+    findings = artifacts.read_json(printer / "datasets/ingest/figures.json")
     assert findings["quarantined"] == 0
 
 
 def test_the_plant_of_the_print_has_both_heaters_and_their_pace(printer):
     settings = params.load(IdentifyPlant, "identify_plant", printer / "params.yaml")
     assert settings.max_order == 4
-    figures = artifacts.read_json(printer / "reports/metrics/identify_plant.json")
+    figures = artifacts.read_json(printer / "datasets/identify_plant/figures.json")
     assert set(figures["fit_holdout"]) == {"temperature_bed", "temperature_extruder"}
     # one-minute predictions: the printer's PID holds the bed within its noise, where a fit says little
     assert figures["fit_holdout_ahead"]["temperature_extruder"] > 50
@@ -287,7 +287,7 @@ def test_the_printers_own_pid_is_judged_beside_the_others_and_swings_as_its_log_
     file.write_text(yaml.safe_dump(sections))
     run(printer, "learn_kernel", "tune_weights", "evaluate_temperature")
     file.write_text(before)
-    figures = artifacts.read_json(printer / "reports/metrics/evaluate_temperature.json")
+    figures = artifacts.read_json(printer / "datasets/evaluate_temperature/figures.json")
     judged = figures["contestants"]["printer_pid"]
     lines = [line for line in (printer / "klippy.log").read_text().splitlines() if line.startswith("Stats")]
     duty = np.array([float(line.rpartition("pwm=")[2].split()[0]) for line in lines[600:800]])
@@ -302,7 +302,7 @@ def test_the_printers_own_pid_is_judged_beside_the_others_and_swings_as_its_log_
 
 def test_what_to_play_next_on_the_printer_is_forecast_within_its_limits_or_left_out_with_a_reason(printer):
     machine = params.load(Plant, "plant", printer / "params.yaml")
-    figures = artifacts.read_json(printer / "reports/metrics/generate_probing.json")
+    figures = artifacts.read_json(printer / "datasets/generate_probing/figures.json")
     for key, file in (("next_experiment", "next_experiment"), ("closed_loop", "next_experiment_closed_loop")):
         told = figures[key]
         assert (printer / f"datasets/generate_probing/{file}.csv").exists() == told["written"]

@@ -1,4 +1,5 @@
-"""Metrics of a run -> the figures of the three loops with their bands. No file, no page."""
+"""Figures of a run -> those of the three loops with their bands, and the headline that git keeps. No file, no
+page."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +12,32 @@ from pipeline.verdict.temperature import comparison
 from pipeline.verdict.verdict import Figure, Question
 
 LOOPS = ("temperature", "deposition", "setpoint")
-Metrics = Mapping[str, Any]  # {stage: its file of reports/metrics}; another commit's may hold anything
+# {stage: its figures}; of another commit its files of reports/metrics, which may hold anything
+Metrics = Mapping[str, Any]
+# figure -> its name in the headline: with its unit, and short, as `dvc exp show` has a column for each
+HEADLINE = {
+    "temperature": {
+        "settled_error": "settled_error_degC",
+        "settling": "settling_s",
+        "overshoot": "overshoot_degC",
+        "disk": "disk_margin",
+        "delay_s": "delay_margin_s",
+        "cost": "cost",
+    },
+    "deposition": {
+        "flow_error": "flow_error_percent",
+        "line_volume": "line_volume_percent",
+        "learned": "learned_percent",
+    },
+    "setpoint": {
+        "settled": "settled_percent",
+        "stay": "stay_percent",
+        "harm": "disturbed_percent",
+        "right_70_150": "right_70_150_percent",
+    },
+}
+ENDS = ("median", "low", "high")
+WORDS = {"passed": "pass", "failed": "fail"}
 
 
 class RunFigures(NamedTuple):
@@ -47,9 +73,45 @@ def asked(rules: ReportRules, metrics: Metrics) -> dict[str, list[Question]]:
     }
 
 
+def headline(metrics: Metrics) -> dict[str, Any]:
+    """A run in few values. Each loop has its verdict with the controller that it is about ("pass: pi") and
+    that controller's figures, null for infinite. `bands` has all figures as [value, low, high]. DVC shows no
+    lists, so they take no columns."""
+    verdicts, figures = section(section(metrics, "report"), "verdicts"), measured(metrics).figures
+    values: dict[str, Any] = {}
+    for loop, names in HEADLINE.items():
+        verdict = section(verdicts, loop)
+        state, subject = WORDS.get(str(verdict.get("state")), "undecided"), verdict.get("subject")
+        values[loop] = f"{state}: {subject}" if subject else state
+        values |= {name: _ends(figures[loop][key])[0] for key, name in names.items() if key in figures[loop]}
+    bands = {loop: {key: _ends(found) for key, found in figures[loop].items()} for loop in LOOPS}
+    return values | {"bands": bands}
+
+
+def _ends(figure: Figure) -> list[float | None]:
+    return [end if math.isfinite(end) else None for end in (figure.value, figure.low, figure.high)]
+
+
+def _of_headline(report: Mapping[str, Any]) -> RunFigures:
+    """What `headline` wrote."""
+    words = {loop: str(report.get(loop) or "").partition(": ") for loop in LOOPS}
+    figures = {
+        loop: {
+            key: found
+            for key, ends in section(report["bands"], loop).items()
+            if (found := figure(dict(zip(ENDS, ends, strict=False)) if isinstance(ends, list) else None))
+        }
+        for loop in LOOPS
+    }
+    controllers = {loop: words[loop][2] for loop in ("temperature", "setpoint")}
+    return RunFigures(figures, controllers, {loop: state for loop, (state, *_) in words.items() if state})
+
+
 def measured(metrics: Metrics) -> RunFigures:
     """The figures of one run."""
     report, heat = section(metrics, "report"), section(metrics, "evaluate_temperature")
+    if "bands" in report:
+        return _of_headline(report)
     camera = section(metrics, "evaluate_setpoint")
     bands = section(report, "figures")
     names = (section(report, "verdict").get("winner"), heat.get("best"))

@@ -1,6 +1,6 @@
 """Two runs side by side: figures of the three loops with their bands, parameters that differ, curves."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from pipeline.report.temperature.judgement import Judgement
 from pipeline.verdict.controllers import heading
 from pipeline.verdict.digits import MINUS, THIN, band, count, declared, quantity, short, with_unit
 from pipeline.verdict.settings import ReportRules
-from pipeline.verdict.verdict import FAILED, Figure, Missing, Question, row_places, state
+from pipeline.verdict.verdict import FAILED, Figure, Question, row_places, state
 
 # the stages that give the figures
 MEASURED_BY = ("evaluate_temperature", "compose_parts", "train_ilc", "evaluate_setpoint", "train_classifier")
@@ -34,8 +34,12 @@ class Run(NamedTuple):
 
 def render(sources: Sources, judged: Judgement, metrics: Mapping[str, Any]) -> str:
     """The text of runs.html: this run beside the accepted one. `metrics` are those of the report itself."""
-    now = {stage: found for stage, found in sources.metrics.items() if not isinstance(found, Missing)}
-    this = Run("This run", {**now, "report": metrics}, sources.declared.everything, curves(sources.tables))
+    this = Run(
+        "This run",
+        {**sources.measured, "report": metrics},
+        sources.declared.everything,
+        curves(sources.tables),
+    )
     told = changes(sources, judged)
     day = accepted_on(sources)
     return page.render(
@@ -94,7 +98,7 @@ def _parts(a: Run | None, b: Run, rules: ReportRules) -> dict[str, Any]:
     before, now = measured(a.metrics) if a else RunFigures({}, {}, {}), measured(b.metrics)
     another = a is not None and _signals(a) != _signals(b)
     loops = []
-    for loop in LOOPS:
+    for loop in loops_of(b):
         rows = [
             _row(one, before.figures.get(loop, {}).get(one.key), now.figures.get(loop, {}).get(one.key))
             for one in questions[loop]
@@ -110,9 +114,20 @@ def _parts(a: Run | None, b: Run, rules: ReportRules) -> dict[str, Any]:
         "compared": a is not None,
         "parameters": differing[:MOST_PARAMETERS],
         "more": max(len(differing) - MOST_PARAMETERS, 0),
-        "panels": _panels(a.curves if a else {}, b.curves),
+        "panels": _panels(*(curves_of(run.curves if run else {}, loops_of(b)) for run in (a, b))),
         "kept": bool(a and a.curves),
     }
+
+
+def loops_of(run: Run) -> list[str]:
+    """The loops that are on."""
+    switches = run.parameters.get("loops")
+    return [loop for loop in LOOPS if not isinstance(switches, dict) or switches.get(loop) is not False]
+
+
+def curves_of(drawn: Mapping[str, Curve], loops: Sequence[str]) -> dict[str, Curve]:
+    """The curves of these loops: their names begin with the loop."""
+    return {name: curve for name, curve in drawn.items() if name.partition(":")[0].lower() in loops}
 
 
 def _signals(run: Run) -> list[set]:

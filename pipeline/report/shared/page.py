@@ -12,11 +12,12 @@ import jinja2
 from markupsafe import Markup, escape
 
 from pipeline.report.shared.pictures import PictureColumn
-from pipeline.report.shared.sources import QUICK_LOOK, SourceFile, Sources
+from pipeline.report.shared.sources import SourceFile, Sources
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
 from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.verdict import digits
+from pipeline.verdict.settings import QUICK_LOOK
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 
 GLYPHS = {
@@ -181,13 +182,13 @@ def files(sources: Sequence[SourceFile]) -> Markup:
     return Markup('<p class="src">From {}.</p>').format(linked(sources)) if sources else Markup("")
 
 
-def linked(sources: Sequence[SourceFile], *, short: bool = False) -> Markup:
-    """The links to these files, with commas between them; `short`: without their folder."""
+def linked(sources: Sequence[SourceFile]) -> Markup:
+    """The links to these files, with commas between them."""
     return Markup(", ").join(
         placed(
             source.link,
             source.path,
-            verbatim(source.path.rsplit("/", 1)[1] if short else source.path.split("/", 1)[1]),
+            verbatim(source.path.split("/", 1)[1]),
             f"{source.path}, SHA-256 {source.sha256[:8]}",
         )
         for source in sources

@@ -25,8 +25,7 @@ from pipeline.temperature import tables as schemas
 from pipeline.temperature.settings import Plant
 from pipeline.verdict import night
 from pipeline.verdict.evidence import OFF, Evidence, Table, switched_off
-from pipeline.verdict.files import QUICK_LOOK
-from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.settings import QUICK_LOOK, ReportRules
 from pipeline.verdict.verdict import LOOPS, Missing, Verdict
 from pipeline.verdict.verdict import read as read_verdicts
 
@@ -114,6 +113,11 @@ class Sources(NamedTuple):
             for kind, signals in (("inputs", machine.inputs), ("outputs", machine.outputs))
         )
 
+    @property
+    def measured(self) -> dict[str, dict]:
+        """The figures of the stages that could be read."""
+        return {stage: found for stage, found in self.metrics.items() if not isinstance(found, Missing)}
+
     def zone(self, place: int) -> str:
         """A zone by its number; of a user's machine by the name of its output."""
         return self.declared.machine.outputs[place].name if self.recorded else f"zone {place + 1}"
@@ -135,14 +139,14 @@ def collect(
     accepted: str,
     code: tuple[str, ...],
 ) -> Sources:
-    """Reads the metrics files and the folders of stages, {stage: path} each. What is missing or broken is no
-    error here: its place on the page says so."""
+    """Reads the files of figures and the folders of stages, {stage: path} each. What is missing or broken is
+    no error here: its place on the page says so."""
     read: dict[str, SourceFile] = {}
     absent: dict[str, Missing] = {}
     figures: dict[str, Any] = {}
     tables: dict[str, Any] = {}
     for stage, path in metrics.items():
-        figures[stage] = _read(read, path, stage, stage, "metrics", artifacts.read_json)
+        figures[stage] = _read(read, path, stage, stage, "figures", artifacts.read_json)
         if switched_off(figures[stage]):
             figures[stage] = OFF
             del read[path]

@@ -17,6 +17,7 @@ from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.viewer import packed, series
 from pipeline.verdict.controllers import heading
 from pipeline.verdict.digits import THIN, number, short
+from pipeline.verdict.evidence import OFF
 from pipeline.verdict.verdict import Missing
 
 VENDOR = Path(__file__).parent / "vendor"
@@ -41,6 +42,8 @@ def render(sources: Sources, judged: Judgement) -> Viewer:
     entries, rows = [], []
     for shown in series.tables(sources):
         table = sources.tables["every_lesson" if shown.name == "lessons" else shown.name]
+        if table is OFF:
+            continue
         if isinstance(table, Missing):
             rows.append(
                 {

@@ -8,7 +8,7 @@ import scipy.optimize
 import scipy.signal
 
 
-class Pid(NamedTuple):
+class SimcPid(NamedTuple):
     """u = Kp e + Ki integral of e + Kd de/dt: Kp in units of u by units of y, Ki by second, Kd seconds."""
 
     Kp: float
@@ -16,7 +16,7 @@ class Pid(NamedTuple):
     Kd: float
 
 
-def simc_pid(gain: float, time_constant_s: float, delay_s: float, *, sample_time_s: float) -> Pid:
+def simc_pid(gain: float, time_constant_s: float, delay_s: float, *, sample_time_s: float) -> SimcPid:
     """PID of a first-order model with delay, SIMC with a third of the delay as derivative time (Grimholt and
     Skogestad 2018, iSIMC), series form rewritten as parallel:
 
@@ -26,7 +26,7 @@ def simc_pid(gain: float, time_constant_s: float, delay_s: float, *, sample_time
     theta = max(delay_s + sample_time_s / 2, sample_time_s)
     tau = max(time_constant_s, sample_time_s)
     K_c, tau_I, tau_D = tau / (gain * 2 * theta), min(tau, 8 * theta), theta / 3
-    return Pid(K_c * (1 + tau_D / tau_I), K_c / tau_I, K_c * tau_D)
+    return SimcPid(K_c * (1 + tau_D / tau_I), K_c / tau_I, K_c * tau_D)
 
 
 class StepModels(NamedTuple):
