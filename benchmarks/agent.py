@@ -16,19 +16,20 @@ import optax
 
 from benchmarks import results
 from benchmarks.results import Row
-from pipeline.setpoint.agents import agent, belief_agent, judging
-from pipeline.setpoint.score import Score
+from pipeline.setpoint.agents import agent, belief_agent, trials
+from pipeline.setpoint.agents.score import RunScore
+from pipeline.setpoint.evaluation import judging
 from pipeline.setpoint.simulation.recorded import recorded_windows
 from pipeline.setpoint.simulation.simulator import paper_windows, rollout
-from pipeline.setpoint.workflow import train_agent
-from pipeline.setpoint.workflow.settings import Li2025, TrainAgent
 from pipeline.store import params
+from stages import train_agent
+from stages.train_agent import Li2025, TrainAgent
 from tests.setpoint.synthetic import synthetic_table
 
 UPDATES = 500  # of each timing
 
 
-def figures(score: Score) -> dict[str, float]:
+def figures(score: RunScore) -> dict[str, float]:
     shares = {name: round(getattr(score, name).percent, 2) for name in ("settled", "stay", "recovered")}
     return shares | {
         name: round(getattr(score, name), 2)
@@ -48,7 +49,7 @@ def one_seed(settings: TrainAgent, runs: int, segment_mean_decisions: float) -> 
         "kept_round": trained.best_round,
     }
     agents = trained.agents
-    row["claims"] = train_agent.claims(settings, agents.li_2025)
+    row["claims"] = train_agent.paper_claims(settings, agents.li_2025)
     published = agent.greedy(agent.paper_encoder(settings.li_2025.history))
     on_belief = agent.greedy(belief_agent.belief_encoder(agents.belief))
     before = belief_agent.BeliefNetwork(agents.belief.filter.evidence.shape[0], jax.random.key(0))
@@ -61,7 +62,7 @@ def one_seed(settings: TrainAgent, runs: int, segment_mean_decisions: float) -> 
     cases = judging.cases(recorded_windows(judge), runs=runs, segment_mean_decisions=segment_mean_decisions)
     for name, (controller, network) in controllers.items():
         row[name] = {
-            case: figures(judging.evaluate(controller, network, *of, jax.random.key(1000 + settings.seed)))
+            case: figures(trials.evaluate(controller, network, *of, jax.random.key(1000 + settings.seed)))
             for case, of in cases.items()
         }
     windows, conditions = cases["accuracy 0.7"]
@@ -69,7 +70,7 @@ def one_seed(settings: TrainAgent, runs: int, segment_mean_decisions: float) -> 
         lambda leaf: leaf[(conditions.flow == 30.0) & (conditions.temperature == 190.0)], conditions
     )
     row["ours from 30 %, 190 °C"] = figures(
-        judging.evaluate(on_belief, agents.belief_dqn, windows, coldest, jax.random.key(2000 + settings.seed))
+        trials.evaluate(on_belief, agents.belief_dqn, windows, coldest, jax.random.key(2000 + settings.seed))
     )
     return row
 
@@ -86,10 +87,10 @@ def speeds(settings: Li2025) -> dict[str, Any]:
         jax.tree_util.Partial(agent.anywhere, jnp.asarray(1.0)),
         jax.tree_util.Partial(agent.ellipse, a, b),
     )
-    train_state = agent.TrainState(network, network, optimiser.init(network))
+    train_state = agent.DqnState(network, network, optimiser.init(network))
     controller = agent.greedy(encoder)
     problem = agent.DqnProblem(encoder, env, optimiser, agent.dqn_target, train_agent.dqn_settings(settings))
-    conditions = jax.tree.map(lambda leaf: leaf[:1024], judging.starts(49, accuracy=1.0))
+    conditions = jax.tree.map(lambda leaf: leaf[:1024], trials.starts(49, accuracy=1.0))
     act = jax.jit(lambda memory, observation: controller.act(network, memory, observation, None))
     observation = agent.begin(
         paper_windows(), jax.tree.map(lambda leaf: leaf[0], conditions), jax.random.key(0)

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 
-from pipeline.setpoint import score
-from pipeline.setpoint.agents import bayes, judging
+from pipeline.setpoint.agents import bayes, score, trials
 from pipeline.setpoint.agents.baselines import Proportional, proportional
 from pipeline.setpoint.simulation.simulator import paper_windows, rollout
 
@@ -19,7 +18,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot  # noqa: E402  a figure without a screen
 
 windows = paper_windows()
-starts = judging.starts(4, accuracy=0.7)  # 21 wrong starts, four times each
+starts = trials.starts(4, accuracy=0.7)  # 21 wrong starts, four times each
 key = jax.random.key(1)
 
 # %% Three controllers. Each is a pair of pure functions: start() -> memory, act(parameters, memory, ...).

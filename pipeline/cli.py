@@ -16,7 +16,11 @@ from pipeline.temperature.settings import Plant
 from stages.ingest import Ingest
 
 if TYPE_CHECKING:
-    from pipeline.setpoint.workflow.shadow.deploy import Ready
+    from collections.abc import Sequence
+
+    from pipeline.commands.shadow.deploy import Ready
+    from pipeline.nightly.records import ChampionState, Night
+    from pipeline.nightly.settings import Nightly
 
 
 def accept(_: argparse.Namespace) -> None:
@@ -188,7 +192,7 @@ def compose(arguments: argparse.Namespace) -> None:
 def calibrate_tip(arguments: argparse.Namespace) -> None:
     """A picture of the nozzle's camera into a page on which a click gives the
     tip; with --tip, what the front end makes of it."""
-    from pipeline.setpoint.workflow.calibrate_tip import calibrate
+    from pipeline.commands.calibrate_tip import calibrate
 
     sections = params.read()
     try:
@@ -222,16 +226,16 @@ def calibrate_camera(arguments: argparse.Namespace) -> None:
 def shadow(arguments: argparse.Namespace) -> None:
     """Watch a printer's camera: what the controller would do in each window and why,
     as MCAP and a local page. Nothing is sent."""
-    from pipeline.setpoint.workflow.shadow import deploy
+    from pipeline.commands.shadow import deploy
 
     _watch(arguments, deploy.ready(str(arguments.levels or "")))
 
 
 def _watch(arguments: argparse.Namespace, ready: "Ready") -> None:
     """Watches a source of frames with the loop that is ready."""
-    from pipeline.setpoint.workflow import shadow as watching
-    from pipeline.setpoint.workflow.shadow import deploy
-    from pipeline.setpoint.workflow.watch_sources import shown_place, source
+    from pipeline.commands import shadow as watching
+    from pipeline.commands.shadow import deploy
+    from pipeline.reading.watch_sources import shown_place, source
 
     asked = deploy.asked(
         arguments.flow, arguments.temperature, arguments.tip, once=arguments.once, settings=ready
@@ -249,14 +253,14 @@ def record_levels(arguments: argparse.Namespace) -> None:
     and a page."""
     from functools import partial
 
+    from pipeline.commands import record_levels as levels
+    from pipeline.commands.shadow import deploy
+    from pipeline.commands.training_print import numbers
+    from pipeline.reading.watch_sources import RecordingSource
+    from pipeline.setpoint.recordings import read_options
+    from pipeline.setpoint.settings import SetpointMaterial
     from pipeline.setpoint.vision.calibrated_classifier import read_frames
     from pipeline.setpoint.vision.window_flow import window_flow
-    from pipeline.setpoint.workflow import record_levels as levels
-    from pipeline.setpoint.workflow.frame_folder import read_options
-    from pipeline.setpoint.workflow.settings import SetpointMaterial
-    from pipeline.setpoint.workflow.shadow import deploy
-    from pipeline.setpoint.workflow.training_print import numbers
-    from pipeline.setpoint.workflow.watch_sources import Recording
 
     eye = deploy.trained()
     options, fitted = read_options(eye.view), eye.model.calibration
@@ -269,7 +273,7 @@ def record_levels(arguments: argparse.Namespace) -> None:
         deploy.pixel(arguments.tip) if arguments.tip else options.tip_px,
     )
     place = arguments.source
-    source = levels.source_of(place, lambda path: Recording(path, options.topics))
+    source = levels.source_of(place, lambda path: RecordingSource(path, options.topics))
     levels_eye = levels.Eye(
         partial(read_frames, eye.model), partial(window_flow, fitted=fitted.flow), eye.view.window,
         eye.view.least_score, eye.digest, eye.view.false_alarms, material,
@@ -281,8 +285,8 @@ def record_levels(arguments: argparse.Namespace) -> None:
 def training_print(arguments: argparse.Namespace) -> None:
     """The G-code of a print from which the classifier learns: flows and temperatures in steps,
     with a layer at 100 % between; and a table of which setting holds from which line on."""
-    from pipeline.setpoint.workflow import training_print as printing
-    from pipeline.setpoint.workflow.shadow.deploy import pixel
+    from pipeline.commands import training_print as printing
+    from pipeline.commands.shadow.deploy import pixel
 
     def one(flag: str) -> float:
         return printing.numbers(str(getattr(arguments, flag[2:].replace("-", "_"))), flag, 1)[0]
@@ -291,7 +295,7 @@ def training_print(arguments: argparse.Namespace) -> None:
         x, y = printing.numbers(getattr(arguments, flag[2:]), flag, 2)
         return x, y
 
-    asked = printing.Print(
+    asked = printing.TrainingPrint(
         flows=printing.numbers(arguments.flows, "--flows"),
         temperatures=printing.numbers(arguments.temperatures, "--temperatures"),
         bed=pair("--bed"), height=one("--height"), size=pair("--size"), nozzle=one("--nozzle"),
@@ -329,12 +333,19 @@ def replay(arguments: argparse.Namespace) -> None:
         arguments.controller, arguments.recording, arguments.out, replaying.temperatures(arguments.reference)
     )
     inputs, outputs = ([one.name for one in side] for side in (made.machine.inputs, made.machine.outputs))
-    shown = page.Shown(
+    shown = page.ReplayData(
         done.time_s, done.applied, done.asked, done.measured, done.reference, done.off, inputs, outputs, told
     )
     artifacts.write_text(arguments.out / "index.html", page.render(shown))
     print(f"{arguments.recording}: {told['samples']} samples. {page.decision(told)}")
     print(f"written: {arguments.out}/index.html, replay.mcap, layout.json, replay.json")
+
+
+def render_night(nights: "Sequence[Night]", state: "ChampionState", settings: "Nightly") -> str:
+    """The page of a night: of every night that is remembered, and of what is in production."""
+    from pipeline.report.nightly import page
+
+    return page.render(nights, state, settings)
 
 
 def version() -> str:
@@ -608,7 +619,7 @@ def main() -> None:
     _add_training_print(commands)
     _add_export(commands)
     _add_replay(commands)
-    nights.add(commands)
+    nights.add(commands, render_night)
     for name, command in commands.choices.items():
         _tell(name, command)
     arguments = parser.parse_args()

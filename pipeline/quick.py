@@ -15,8 +15,8 @@ from typing import Any
 from ruamel.yaml import YAML
 
 import stages
-from pipeline.report.shared.sources import QUICK_LOOK
 from pipeline.store import artifacts, params, params_text
+from pipeline.verdict.settings import QUICK_LOOK
 
 SIZES, FOLDER = Path("params.quick.yaml"), Path("quick")
 # the sections whose sizes a quick look may set; what a machine is and what is good enough stay as they are

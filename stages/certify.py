@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 RECORD = "datasets/ingest/record.parquet"
 FALLBACK = "pi_simc"  # the safe mode "pi"; if the machine allows none, the inputs are held
-# stands in the exported files for the SHA-256 of the certificate, which depends on the limits
-PLACE = "@certificate@"
 NO_FEED_FORWARD = (
     "The machine declares disturbances ({names}), which an exported controller cannot read yet: none is "
     "certified. Remove plant.disturbances to certify controllers that do without them."
@@ -86,7 +84,7 @@ def certify_temperature(folder: Path, settings: Certify) -> dict[str, dict[str, 
     from pipeline.store.execution import run_all
     from pipeline.temperature.controllers.table import CONTROLLERS, design_controllers
 
-    loaded = load_problem()  # whose rules are not used here
+    loaded = load_problem()
     designs, refused = design_controllers(loaded.problem, loaded.weights)
     names = [one.name for one in CONTROLLERS if one.kind != "reference"]
     found = {name: _not_measured(refused[name]) for name in names if name in refused}
@@ -176,9 +174,9 @@ def certify_controller(
         honest = support_logs.honest_logs(made, half, setting.limits)
         recorded = support_logs.recorded_logs(common.record)
         within = support.support(common.plants, honest, setting.rehearsal.noise, recorded)
-        sources = c.code(made, PLACE) | {"golden.csv": vectors.golden(made)}
+        sources = c.code(made, certified.PLACE) | {"golden.csv": vectors.golden(made)}
         checks.check_compiled(made, sources)
-        code = python.code(made, PLACE)
+        code = python.code(made, certified.PLACE)
         differences = {"judged": difference, "python": checks.python_difference(made, code)}
     except ValueError as reason:
         return name, _not_measured(str(reason))
@@ -218,22 +216,23 @@ def certify_setpoint(folder: Path, seed: int) -> dict[str, Any]:
     """The files of the default controller, which have no certificate, and how far they are from the
     networks."""
     from pipeline.runtime import setpoint_checks
-    from pipeline.setpoint.workflow import contestants
-    from pipeline.setpoint.workflow.agent_files import restore_agents
-    from pipeline.setpoint.workflow.classifier_files import restore_classifier
-    from pipeline.setpoint.workflow.settings import EvaluateSetpoint
-    from pipeline.setpoint.workflow.tables import WINDOWS
-    from pipeline.setpoint.workflow.windows import window_tables
+    from pipeline.setpoint.agents.files import restore_agents
+    from pipeline.setpoint.controllers import build_controllers
+    from pipeline.setpoint.settings import EvaluateSetpoint
+    from pipeline.setpoint.simulation.recorded import window_tables
+    from pipeline.setpoint.tables import WINDOW_PARTS, WINDOWS
+    from pipeline.setpoint.vision.files import restore_classifier
 
     model = restore_classifier(
         "datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet"
     )
-    windows = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
+    columns = artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS)
+    learned = window_tables(columns, WINDOW_PARTS)["learn"]
     agents = restore_agents("datasets/train_agent/weights.safetensors")
     baselines = params.load(EvaluateSetpoint, "evaluate_setpoint").baselines
-    specs = contestants.controllers(contestants.Problem(baselines, agents, windows["learn"]))
     default = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
-    decides = setpoint_checks.decider(default, specs, agents)
+    built = build_controllers(baselines, agents, learned).get(default)
+    decides = setpoint_checks.decider(default, built and built.parameters, agents.belief, agents.belief_dqn)
     return setpoint_checks.write(folder, default, model, decides, seed)
 
 

@@ -71,7 +71,6 @@ class EvaluationInputs(NamedTuple):
 
     machine: Plant
     panel: Panel
-    rules: TemperatureRules
     setting: CaseConditions
     problem: DesignProblem
     weights: dict[str, dict[str, Any]]
@@ -90,10 +89,9 @@ def load_problem() -> EvaluationInputs:
         params.load(TuneWeights, "tune_weights"),
         simulated=simulated,
     )
-    rules = resolve(params.load(TemperatureRules, "report"), panel, setting.rehearsal)
     weights = read_weights("datasets/tune_weights/weights.json").contestants
     tuned = {name: values.model_dump() for name, values in weights.items()}
-    return EvaluationInputs(machine, panel, rules, setting, problem, tuned, simulated)
+    return EvaluationInputs(machine, panel, setting, problem, tuned, simulated)
 
 
 def resolve(rules: TemperatureRules, panel: Panel, rehearsal: Rehearsal) -> TemperatureRules:
@@ -107,14 +105,14 @@ def resolve(rules: TemperatureRules, panel: Panel, rehearsal: Rehearsal) -> Temp
 
 
 def compare(
-    settings: EvaluateTemperature, loaded: EvaluationInputs, execution: Execution
+    settings: EvaluateTemperature, loaded: EvaluationInputs, rules: TemperatureRules, execution: Execution
 ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """Every controller on the judging half of the panel: the cases and two of them as trajectories, both as
     columns, and the summary."""
     from pipeline.temperature.controllers.table import BY_NAME
     from pipeline.temperature.test_set import evaluation
 
-    machine, setting, rules = loaded.machine, loaded.setting, loaded.rules
+    machine, setting = loaded.machine, loaded.setting
     outcomes, refused = evaluate_all(loaded.problem, loaded.weights, setting, execution)
     entrants = [name for name in outcomes if BY_NAME[name].role != "yardstick"]
     summary: dict[str, Any] = {
@@ -203,7 +201,8 @@ def main() -> None:
     with artifacts.stage("evaluate_temperature") as out:
         settings = params.load(EvaluateTemperature, "evaluate_temperature")
         execution, loaded = params.load(Execution, "execution"), load_problem()
-        cases, trajectories, summary = compare(settings, loaded, execution)
+        rules = resolve(params.load(TemperatureRules, "report"), loaded.panel, loaded.setting.rehearsal)
+        cases, trajectories, summary = compare(settings, loaded, rules, execution)
         artifacts.write_table(out / "cases.parquet", tables.CASES, cases)
         drawn = tables.trajectories(loaded.machine.inputs, loaded.machine.outputs)
         artifacts.write_table(out / "trajectories.parquet", drawn, trajectories)

@@ -23,7 +23,7 @@ from pipeline.temperature.settings import (
 if TYPE_CHECKING:
     import numpy as np
 
-    from pipeline.temperature.experiment import Dither, Experiment, Family, Lesson, Limits, Wish
+    from pipeline.temperature.experiment import Dither, Experiment, ExperimentLimits, Family, Lesson, Wish
     from pipeline.temperature.plant import Plant as Model
 
 EXCITED = 12  # lags over which the experiment's excitation is counted
@@ -81,7 +81,18 @@ def design(
     lacking = [o.name for o in machine.outputs if o.low is None or o.high is None]
     if lacking:
         return refuse(settings, f"declare low and high of {', '.join(lacking)} under plant.outputs")
-    limits, wish = experiment_limits(settings, machine), experiment_wish(settings, machine)
+    low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
+    y_low, y_high = np.array([(o.low, o.high) for o in machine.outputs], float).T
+    limits = experiment.ExperimentLimits(low, high, settings.rate_percent_per_step, y_low, y_high)
+    centre = given_centre(settings, machine)
+    wish = experiment.Wish(
+        np.array([o.reference for o in machine.outputs], float),
+        settings.amplitude_percent,
+        settings.samples,
+        settings.signal,
+        settings.shortest_steps,
+        None if centre is None else np.array(centre),
+    )
     names = experiment.Names([i.name for i in machine.inputs], [o.name for o in machine.outputs])
     doubt = forecast.Doubt(settings.doubt_input_gain, settings.doubt_ambient_degC, settings.doubt_delay_steps)
     try:
@@ -118,33 +129,9 @@ def refuse(settings: GenerateProbing, reason: str) -> tuple[Columns, Columns, di
     return {}, {}, {"source": settings.source, "next_experiment": none, "closed_loop": none}
 
 
-def experiment_limits(settings: GenerateProbing, machine: Plant) -> Limits:
-    import numpy as np
-
-    from pipeline.temperature.experiment import Limits
-
-    low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
-    y_low, y_high = np.array([(o.low, o.high) for o in machine.outputs], float).T
-    return Limits(low, high, settings.rate_percent_per_step, y_low, y_high)
-
-
-def experiment_wish(settings: GenerateProbing, machine: Plant) -> Wish:
-    import numpy as np
-
-    from pipeline.temperature.experiment import Wish
-
-    centre = given_centre(settings, machine)
-    return Wish(
-        np.array([o.reference for o in machine.outputs], float),
-        settings.amplitude_percent,
-        settings.samples,
-        settings.signal,
-        settings.shortest_steps,
-        None if centre is None else np.array(centre),
-    )
-
-
-def design_dither(family: Family, wish: Wish, limits: Limits, seed: int) -> tuple[Dither | None, str]:
+def design_dither(
+    family: Family, wish: Wish, limits: ExperimentLimits, seed: int
+) -> tuple[Dither | None, str]:
     """What may be added to the commands of a PI a zone, tuned by SIMC; None with the reason if the machine
     has none."""
     import numpy as np
@@ -180,10 +167,11 @@ def by_signal(signals: Sequence[PlantSignal], values: np.ndarray) -> dict[str, f
 
 
 def plan_figures(
-    machine: Plant, limits: Limits, family: Family, plan: Experiment, gamma: float
+    machine: Plant, limits: ExperimentLimits, family: Family, plan: Experiment, gamma: float
 ) -> dict[str, Any]:
     import numpy as np
 
+    from pipeline.temperature.experiment import expected_gap_percent
     from pipeline.temperature.probing import excitation
 
     inputs, outputs, begin = machine.inputs, machine.outputs, family.begin
@@ -223,21 +211,8 @@ def plan_figures(
         "level_percent_per_band": excitation(plan.u, 1).level,
         "information": plan.lesson.information,
         "expected_error_percent": expected_errors(machine, family, plan.lesson),
-        "expected_gap_percent": expected_gap_percent(family, plan.lesson, gamma),
+        "expected_gap_percent": expected_gap_percent(family.model, plan.lesson, gamma),
     }
-
-
-def expected_gap_percent(family: Family, lesson: Lesson, gamma: float) -> float | None:
-    """None if no controller of the perturbed model holds the machine."""
-    import numpy as np
-
-    from pipeline.temperature.experiment import expected_gap
-
-    try:
-        gap = expected_gap(family.model, lesson, gamma)
-    except (ValueError, np.linalg.LinAlgError):
-        return None
-    return 100 * gap if np.isfinite(gap) else None
 
 
 def expected_errors(machine: Plant, family: Family, lesson: Lesson) -> dict[str, Any]:

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pipeline.store.tables import Schema
+    from pipeline.temperature.identification.judgement import ModelJudgement
     from pipeline.temperature.identification.model_choice import Identified
-    from pipeline.temperature.identification.trust import Holdout, Steps
-    from pipeline.temperature.identification.validation import Excitation, Residuals
+    from pipeline.temperature.identification.trust import Steps
     from pipeline.temperature.plant import Plant
 
     Segments = list[np.ndarray]
@@ -53,17 +53,6 @@ class RecordSegments(NamedTuple):
     recordings: tuple[int, ...]
     recorded: int
     notes: list[str]
-
-
-class ModelJudgement(NamedTuple):
-    """The chosen model on the last part of the record, and what the first part excites; `still` (p,): its fit
-    with the inputs held."""
-
-    holdout: Holdout
-    residuals: Residuals
-    excitation: Excitation
-    samples: int
-    still: np.ndarray
 
 
 # figures of control that git keeps and that runs are compared by
@@ -101,6 +90,7 @@ def identify(
     import numpy as np
 
     from pipeline.temperature.identification import model_choice, trust, validation
+    from pipeline.temperature.identification.judgement import judge
     from pipeline.temperature.identification.segments import split
     from pipeline.temperature.plant import at_disturbances, observability
 
@@ -120,7 +110,8 @@ def identify(
         chosen = model_choice.identify(
             *first, sample_time_s=machine.sample_time_s, settings=choices, names=acting
         )
-    judgement = judge_model(settings, chosen, first, last)
+    rng = np.random.default_rng(settings.seed)
+    judgement = judge(chosen, first, last, ahead_steps=settings.ahead_steps, rng=rng)
     fitted = model_choice.refit(record.u, record.y, chosen, names=acting)
     if not (observed := observability(fitted.plant)).passed:
         raise ValueError(f"{path}: {observed.reason}")
@@ -165,35 +156,6 @@ def read_record(settings: IdentifyPlant, machine: Machine, path: str) -> RecordS
     high = [i.high for i in machine.inputs] + unlimited
     u, clipped = model_choice.within_limits(u, (low, high), names=acting)
     return RecordSegments(u, y, tuple(recordings), recorded, clipped)
-
-
-def judge_model(
-    settings: IdentifyPlant,
-    chosen: Identified,
-    first: tuple[Segments, Segments],
-    last: tuple[Segments, Segments],
-) -> ModelJudgement:
-    import numpy as np
-
-    from pipeline.temperature.identification import trust, validation
-
-    holdout = trust.holdout(
-        chosen.plant,
-        *last,
-        settings.ahead_steps,
-        block=2 * chosen.past,
-        rng=np.random.default_rng(settings.seed),
-        drift=chosen.drift,
-    )
-    closed = chosen.feedback is not None and chosen.feedback.closed
-    lags = trust.residual_lags(last[0])
-    return ModelJudgement(
-        holdout,
-        validation.residual_tests(chosen.plant, *last, lags=lags, closed=closed),
-        validation.excitation(first[0], chosen.past),
-        sum(map(len, last[0])),
-        trust.fit_of_held_inputs(chosen.plant, *last),
-    )
 
 
 # ---- tables and figures

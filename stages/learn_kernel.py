@@ -17,8 +17,8 @@ from pipeline.temperature.settings import Panel, Plant, Tracking
 if TYPE_CHECKING:
     import numpy as np
 
-    from pipeline.temperature.controllers.window import Window
-    from pipeline.temperature.judging import Candidate, Sufficiency
+    from pipeline.temperature.controllers.window import WindowModel
+    from pipeline.temperature.judging import KernelCandidate, Sufficiency
 
 
 class LearnKernel(Section):
@@ -62,14 +62,14 @@ def main() -> None:
         from pipeline.temperature import judging
         from pipeline.temperature.controllers import window
         from pipeline.temperature.identification import model_choice
-        from pipeline.temperature.test_set.scorecard import Yardstick
+        from pipeline.temperature.test_set.scorecard import CommonCost
 
         settings, machine = params.load(LearnKernel, "learn_kernel"), params.load(Plant, "plant")
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
         simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
         inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
         q, r = np.full(len(outputs), tracking.yardstick_q), np.full(len(inputs), tracking.yardstick_r)
-        yardstick = Yardstick(q, r, tracking.gamma)
+        yardstick = CommonCost(q, r, tracking.gamma)
         u, y = read_record(machine)
         with artifacts.about(RECORD):
             model_choice.check_inputs(u, offset=settings.offset, names=inputs)
@@ -104,7 +104,7 @@ def main() -> None:
 
 
 def figures(
-    long: Window, enough: Sufficiency, candidates: list[Candidate], best: Candidate
+    long: WindowModel, enough: Sufficiency, candidates: list[KernelCandidate], best: KernelCandidate
 ) -> dict[str, Any]:
     kernel = best.learned
     return {

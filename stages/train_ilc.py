@@ -75,10 +75,9 @@ def main() -> None:
             camera, kinds = camera.straight(), ("flow", "pixels") if settings.pixel_trials else ("flow",)
             # workers of a cluster work in other folders
             place, sections = (out / "recordings").resolve(), (settings, printer, camera)
-            calls = [(place, sections, index, kind) for index in range(len(prospects)) for kind in kinds]
-            work = run_all([delayed(simulate)(*call) for call in calls], execution)
-            title = "train_ilc: materials, in flow and in pictures"
-            results = list(tqdm(work, total=len(calls), desc=title))
+            jobs = [(place, sections, index, kind) for index in range(len(prospects)) for kind in kinds]
+            work = run_all([delayed(simulate)(*job) for job in jobs], execution)
+            results = list(tqdm(work, total=len(jobs), desc="train_ilc: materials, in flow and in pictures"))
             paths = sorted((out / "recordings").glob("*.mcap"))
         sequences, measured, models, figures = training.join([({}, {}, {}, prospects), *results])
         artifacts.write_table(out / "trials.parquet", TRIALS, training.trial_rows(sequences))
@@ -187,9 +186,9 @@ def learn_from_recordings(
             for one in groups.get(key, []):
                 earlier = [other.latency for path, other in values.items() if path != one.path]
                 measured.append(measure_trial(one, values[one.path], earlier, routine, printer, camera))
-            number, law = len(measured), "model_inverse" if measured else "on_off"
+            trials, number = [one.trial for one in measured], len(measured)
+            law = "model_inverse" if measured else "on_off"
             with artifacts.about(f"{folder}: material {material.name}, routine {index}"):
-                trials = [one.trial for one in measured]
                 sequence, u, of_step = training.resume(trials, routine, material.nominal, laws)
             name = f"{material.name}_routine_{index}_trial_{number:02d}"
             known = trial_conditions(printer, camera, material, routine, number, law, scale)

@@ -14,25 +14,36 @@ from pipeline.store import params
 
 ROOT = Path(__file__).resolve().parents[1]
 LOOPS = ("temperature", "deposition", "setpoint")
-# what other rooms may read of a loop, of runtime and of nightly: settings, schemas, tables of controllers
-PLAIN = {"settings", "tables", "controllers", "controllers/table", "agents/criteria", "published", "records"}
+# what other rooms may read: of a loop constants and its table of controllers, which its methods may read too;
+# of a loop and of other rooms settings, schemas and records
+CONSTANTS = {"controllers", "controllers/table", "agents/criteria", "published"}
+PLAIN = {"settings", "tables", "records", "made"}
+# of a loop, what saves and loads networks, frames and recordings
+FILES = {"files", "recordings"}
+# methods that pose the temperature loop's cases, from its settings
+POSE = {f"pipeline/temperature/test_set/{name}.py" for name in ("cases", "controller_search", "evaluation")}
 # room -> rooms that it may know beside itself; own: the methods of its loop, files: what saves networks
 MAY_KNOW: dict[str, set[str]] = {
     "statistics": set(),
     "store": set(),
     "reading": {"store", "statistics"},
-    "methods": {"statistics"},
-    "plain": {"own", "store", "statistics", "verdict"},
-    "files": {"own", "store", "statistics"},
-    "verdict": {"plain", "store", "statistics"},
-    "runtime": {"verdict", "methods", "plain", "store", "statistics"},
-    "report": {"verdict", "plain", "store", "statistics"},
-    "papers": {"methods", "plain", "files", "store", "statistics", "stages"},
+    "methods": {"constants", "statistics"},
+    "plain": {"own", "constants", "store", "statistics", "verdict"},
+    "constants": {"own", "store", "statistics"},
+    "files": {"own", "plain", "constants", "store", "statistics", "reading"},
+    "verdict": {"plain", "constants", "store", "statistics"},
+    "runtime": {"verdict", "methods", "plain", "constants", "store", "statistics"},
+    "report": {"verdict", "plain", "constants", "store", "statistics"},
+    "papers": {"methods", "plain", "constants", "files", "store", "statistics", "stages"},
 }
 # who may know every room; room -> who alone may know it
 WHOLE = {"stages", "cli", "quick", "commands", "nightly", "around_dvc"}
-ONLY = {"report": {"stages", "cli"}, "commands": {"cli", "quick", "nightly"}, "stages": {"papers", "quick"}}
-ROOMS = {*LOOPS, *MAY_KNOW, *WHOLE, "__init__"} - {"methods", "plain", "files", "stages"}
+ONLY = {
+    "report": {"stages", "cli"},
+    "commands": {"cli", "quick", "nightly"},
+    "stages": {"papers", "quick", "cli", "commands"},
+}
+ROOMS = {*LOOPS, *MAY_KNOW, *WHOLE, "__init__"} - {"methods", "plain", "constants", "files", "stages"}
 NUMERICS = {"numpy", "scipy", "control", "sklearn", "cv2", "jax", "equinox", "optax", "jaxtyping"}
 NUMERICS |= {"__future__", "abc", "bisect", "collections", "dataclasses", "enum", "fractions", "functools"}
 NUMERICS |= {
@@ -64,10 +75,13 @@ EDGE = {"artifacts", "params", "recordings"}
 FRAME = "stages/__init__.py"
 # the frame of a stage and around_dvc import the standard library alone; params_text dumps to a text
 WRITERS = {"pipeline/store/artifacts.py", "pipeline/store/params_text.py", "pipeline/around_dvc.py", FRAME}
+WRITERS |= {"pipeline/runtime/checks.py"}  # into a temporary folder that is compiled
 # MT19937: R's generator, with which the script of a paper draws
 GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64", "MT19937"}
 # the one file of metrics, with a column a value; the figures of other stages are outs
 HEADLINE = "reports/metrics/report.json"
+# memos (results are the same whatever is in them), and what the night and the quick look say beside a run
+UNTRACKED = ("datasets/memo", "reports/metrics/nightly.json", "reports/quick_look.json")
 # the second pipeline: results that no recording changes, and no stage of the root asks for
 PAPERS = "datasets/papers/dvc.yaml"
 # a stage depends on these rooms whole, and on at most 8 files or folders of a loop's methods
@@ -83,13 +97,14 @@ class File(NamedTuple):
 
     @property
     def room(self) -> str:
-        """stages, store, ..., cli; of a loop `temperature`, `temperature/plain`, `temperature/files`."""
-        parts = self.name.removesuffix(".py").split("/")
-        if parts[0] != "pipeline" or len(parts) < 2:
-            return parts[0]
-        plain = parts[1] in (*LOOPS, "runtime", "nightly") and "/".join(parts[2:]) in PLAIN
-        files = parts[1] in LOOPS and parts[-1] == "files"
-        return parts[1] + ("/plain" if plain else "/files" if files else "")
+        """stages, store, ..., cli; of a loop `temperature`, `temperature/plain`, .../constants, .../files."""
+        top, room, *rest = [*self.name.removesuffix(".py").split("/"), "", ""]
+        if top != "pipeline" or not room:
+            return top
+        path, loop = "/".join(rest).rstrip("/"), room in LOOPS
+        kinds = {"constants": loop and path in CONSTANTS, "files": loop and path.rpartition("/")[2] in FILES}
+        kinds["plain"] = room in (*LOOPS, "runtime", "nightly", "papers") and path in PLAIN
+        return next((f"{room}/{kind}" for kind, holds in kinds.items() if holds), room)
 
 
 def parsed(path: Path) -> ast.Module:
@@ -143,12 +158,12 @@ def may_know(room: str, target: str) -> bool:
     (own, _, kind), (other, _, part) = room.partition("/"), target.partition("/")
     if target in ONLY and room != target:
         return room in ONLY[target]
-    if room == target or room in WHOLE:
+    if room == target or room in WHOLE or (own == other and own not in LOOPS):
         return True
-    allowed = MAY_KNOW[kind or ("methods" if own in LOOPS else own)]
-    if own == other:  # methods do not know settings, tables and files of their loop
-        return "own" in allowed or own not in LOOPS
-    return (part or ("methods" if other in LOOPS else other)) in allowed
+    allowed, wanted = MAY_KNOW[kind or ("methods" if own in LOOPS else own)], part or other
+    if own in LOOPS and other in LOOPS:  # loops never meet
+        return own == other and (part or "own") in allowed
+    return ("methods" if wanted in LOOPS else wanted) in allowed
 
 
 def forbidden_imports(root: Path) -> list[str]:
@@ -160,7 +175,8 @@ def forbidden_imports(root: Path) -> list[str]:
             reasons = {
                 "write the whole name": name.startswith("."),
                 "nothing imports a test or a benchmark": library in ("tests", "benchmarks"),
-                f"{file.room} must not know {room}": room and not may_know(file.room, room),
+                f"{file.room} must not know {room}": room
+                and not (may_know(file.room, room) or (file.name in POSE and room == "temperature/plain")),
                 f"{file.room} knows arrays, nothing of files, clocks, processes or figures": not target
                 and file.room in (*LOOPS, "statistics")
                 and library not in NUMERICS,
@@ -244,16 +260,46 @@ def stages(root: Path) -> list[str]:
     return sorted(path.stem for path in (root / "stages").glob("*.py") if path.stem != "__init__")
 
 
-def modules(root: Path, name: str) -> set[str]:
-    """The file itself and all files that it imports, directly or not, without empty __init__.py."""
-    reached, todo = set(), [name]
+def reached(root: Path, name: str) -> dict[str, ast.Module]:
+    """The file itself and all files that it imports, directly or not, without empty __init__.py. Of another
+    stage only its imports, and the definitions that are used."""
+    trees, todo = {}, [(name, "*")]
     while todo:
-        here = todo.pop()
-        if here not in reached and (root / here).stat().st_size:
-            reached.add(here)
-            names = [module for _, module in imports(parsed(root / here))]
-            todo += [target for module in names if (target := project_file(root, module))]
-    return reached
+        file, wanted = here = todo.pop()
+        if here in trees or not (root / file).stat().st_size:
+            continue
+        trees[here] = tree = parsed(root / file) if wanted == "*" else _used(parsed(root / file), wanted)
+        names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+        for dotted in [dotted for _, dotted in imports(tree)]:
+            if target := project_file(root, dotted):
+                part, last = (
+                    dotted.count(".") == 2 and dotted.startswith("stages."),
+                    dotted.rpartition(".")[2],
+                )
+                todo.append((target, "*" if not part else last if last in names else ""))
+    files = {file: [tree for (one, _), tree in trees.items() if one == file] for file, _ in trees}
+    return {
+        file: ast.Module([node for tree in some for node in tree.body], []) for file, some in files.items()
+    }
+
+
+def _used(tree: ast.Module, name: str) -> ast.Module:
+    """The imports of a file, and the definition of a name with those that it uses."""
+    definitions: dict[str, ast.stmt] = {}
+    for node in tree.body:
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", node)]
+        for target in targets:
+            definitions[getattr(target, "name", getattr(target, "id", ""))] = node
+    kept, todo = {""}, [name]
+    while todo:
+        one = todo.pop()
+        if one in definitions and one not in kept:
+            kept.add(one)
+            todo += [node.id for node in ast.walk(definitions[one]) if isinstance(node, ast.Name)]
+    nodes = [definitions[one] for one in kept - {""}]
+    return ast.Module(
+        [node for node in tree.body if node in nodes or isinstance(node, ast.Import | ast.ImportFrom)], []
+    )
 
 
 def beside(root: Path, code: Iterable[str]) -> set[str]:
@@ -272,40 +318,50 @@ def literal(file: str, call: ast.Call, position: int) -> str:
     return str(argument.value)
 
 
-def keys(root: Path, code: Iterable[str]) -> set[str]:
+def keys(root: Path, code: dict[str, ast.Module]) -> set[str]:
     """The parameters that change what modules write, as dvc.yaml has them: "key" or "FILE: key".
 
     How work is spread over processes changes nothing, and the frame of a stage refuses sections that it does
     not use. What stands in no file is asked for where a person looks first.
     """
-    asked = set()
-    for name in [name for name in code if name != FRAME]:
-        for call, receiver, function in calls(parsed(root / name)):
-            if receiver == "params" and function in ("load", "value"):
-                asked.add(literal(name, call, function == "load"))
+    asked: set[str] = set()
+    for name, tree in [(name, tree) for name, tree in code.items() if name != FRAME]:
+        for call, receiver, function in calls(tree):
+            if receiver == "params" and function == "value":
+                asked.add(literal(name, call, 0))
+            elif receiver == "params" and function == "load":
+                section = literal(name, call, 1)
+                part = _fields(code, ast.unparse(call.args[0]))
+                asked |= {f"{section}.{field}" for field in part} or {section}
             elif (receiver, function) == ("stages", "run"):
                 asked |= {f"loops.{ast.literal_eval(keyword.value)}" for keyword in call.keywords}
     asked.discard("execution")
     held: dict[str, set[str]] = {}
     for file in (params.FILE, params.EXPERT, params.PAPERS):
         sections = yaml.safe_load((root / file).read_text()) if (root / file).exists() else {}
-        inner = {
-            f"{name}.{key}"
-            for name, entries in sections.items()
-            if isinstance(entries, dict)
-            for key in entries
-        }
+        inner = {f"{name}.{key}" for name, of in sections.items() if isinstance(of, dict) for key in of}
         held[file] = asked & {*sections, *inner}
     others = {f"{file}: {key}" for file in (params.EXPERT, params.PAPERS) for key in held[file]}
     return others | held[params.FILE] | (asked - held[params.EXPERT] - held[params.PAPERS])
 
 
-def paths(name: str, tree: ast.Module) -> tuple[set[str], set[str]]:
-    """Literal paths in datasets/ and reports/ that a stage reads; those that it writes."""
-    written, read, stage = set(), set(), Path(name).stem
-    targets = {
-        id(call.args[0]) for call, _, function in calls(tree) if function.startswith("write_") and call.args
+def _fields(code: dict[str, ast.Module], model: str) -> set[str]:
+    """The fields of a class that reads a part of its section; none of one that reads it whole."""
+    nodes = [node for tree in code.values() for node in tree.body if getattr(node, "name", "") == model]
+    return {
+        item.target.id
+        for node in nodes
+        if isinstance(node, ast.ClassDef)
+        and any(ast.unparse(key) == "extra='ignore'" for key in node.keywords)
+        for item in node.body
+        if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)
     }
+
+
+def paths(name: str, tree: ast.Module) -> tuple[set[str], set[str]]:
+    """Literal paths in datasets/ and reports/ that a module reads; those that it writes."""
+    written, read = set(), set()
+    targets = {id(call.args[0]) for call, _, verb in calls(tree) if verb.startswith("write_") and call.args}
     for node in ast.walk(tree):
         text = ast.unparse(node) if isinstance(node, ast.JoinedStr) else ""
         assert not re.match(r"f['\"](datasets|reports)/", text), (
@@ -313,15 +369,8 @@ def paths(name: str, tree: ast.Module) -> tuple[set[str], set[str]]:
         )
         if isinstance(node, ast.Constant) and re.fullmatch(r"(datasets|reports)/[\w./-]+", str(node.value)):
             (written if id(node) in targets else read).add(str(node.value).rstrip("/"))
-    for call, _, function in calls(tree):
-        if function == "read_figures":
-            read.add(f"datasets/{literal(name, call, 0)}/figures.json")
-        assert function not in ("stage", "write_metrics") or literal(name, call, 0) == stage, (
-            f"{name}:{call.lineno} the stage's name is {stage}"
-        )
-    # a memo is no artifact: whatever is in it, the results are the same
-    read = {path for path in read if not path.startswith(("datasets/memo", f"datasets/{stage}/"))}
-    return {path for path in read if not covered(path, read - {path})}, written
+    figures = [call for call, _, verb in calls(tree) if verb == "read_figures"]
+    return read | {f"datasets/{literal(name, call, 0)}/figures.json" for call in figures}, written
 
 
 def covered(path: str, deps: Iterable[str]) -> bool:
@@ -331,25 +380,32 @@ def covered(path: str, deps: Iterable[str]) -> bool:
 
 def expected(root: Path, name: str) -> dict[str, set[str]]:
     """What a stage imports and opens, directly or through what it imports: code, deps, params, outs, metrics.
-    Paths stand in its own file; imported functions take them as arguments."""
-    code, tree, stage = modules(root, name), parsed(root / name), Path(name).stem
-    read, written = paths(name, tree)
-    functions = {(receiver, function) for _, receiver, function in calls(tree)}
-    if ("params", "read") in functions:
-        read |= {params.FILE, params.EXPERT}
-    figures = {function for _, function in functions} & {"write_metrics"}
-    if figures or re.search(r"artifacts\.stage\(.*\) as ", ast.unparse(tree)):
+    Paths stand in stages and in verdict; other modules take them as arguments."""
+    code, stage = reached(root, name), Path(name).stem
+    tree, read = code[name], set()
+    for file in [file for file in code if file.startswith(("stages/", "pipeline/verdict/")) or file == name]:
+        read |= paths(file, code[file])[0]
+        if any((receiver, verb) == ("params", "read") for _, receiver, verb in calls(code[file])):
+            read |= {params.FILE, params.EXPERT}
+    read = {path for path in read if not path.startswith((*UNTRACKED, f"datasets/{stage}/"))}
+    for call, _, verb in calls(tree):
+        assert verb not in ("stage", "write_metrics") or literal(name, call, 0) == stage, (
+            f"{name}:{call.lineno} the stage's name is {stage}"
+        )
+    measures = any(verb == "write_metrics" for *_, verb in calls(tree))
+    written = paths(name, tree)[1]
+    if measures or re.search(r"artifacts\.stage\(.*\) as ", ast.unparse(tree)):
         written.add(f"datasets/{stage}")
-    # DVC deletes outs before a stage unless they persist; the last good artifacts must outlive a failure
-    metric = f"reports/metrics/{stage}.json"
     wanted: dict[str, set[str]] = {
-        "code": code | beside(root, code),
-        "deps": read,
+        "code": {*code} | beside(root, code),
+        "deps": {path for path in read if not covered(path, read - {path})},
         "params": keys(root, code),
+        # DVC deletes outs before a stage unless they persist; the last good artifacts must outlive a failure
         "outs": {f"{path} persist" for path in written},
         "metrics": set(),
     }
-    if figures:
+    if measures:
+        metric = f"reports/metrics/{stage}.json"
         wanted["metrics" if metric == HEADLINE else "outs"].add(f"{metric} uncached persist")
     return wanted
 
@@ -359,11 +415,14 @@ def expected_of_paper(root: Path, stage: str) -> dict[str, set[str]]:
     joins pipelines by their outs, and the root's `dvc repro` would start it."""
     wanted = expected(root, f"pipeline/papers/{stage}.py")
     methods = {*LOOPS, "statistics", "papers", "stages"}
-    code = {path for path in wanted["code"] if File(path, ast.Module([], [])).room.split("/")[0] in methods}
-    # `relearned` plays the root's stages with parameters of its own
-    own = {f"datasets/papers/{stage}.json", params.PAPERS, params.FILE, params.EXPERT}
+    rooms = {path: File(path, ast.Module([], [])).room for path in wanted["code"]}
+    code = {path for path, room in rooms.items() if room.split("/")[0] in methods and room != "papers/plain"}
+    # `relearned` plays the root's stages in a folder of its own
+    name = f"pipeline/papers/{stage}.py"
+    read = paths(name, parsed(root / name))[0] - {f"datasets/papers/{stage}.json", params.PAPERS}
+    read = {path for path in read if not path.startswith(UNTRACKED)}
     keys = {key for key in wanted["params"] if not key.startswith("loops.")}
-    return {"code": code, "deps": wanted["deps"] - own, "params": keys, "outs": set(), "metrics": set()}
+    return {"code": code, "deps": read, "params": keys, "outs": set(), "metrics": set()}
 
 
 def differences(stage: str, entry: dict[str, Any], wanted: dict[str, set[str]]) -> list[str]:
@@ -401,9 +460,7 @@ def coarse(stage: str, deps: Iterable[str]) -> list[str]:
     ]
     for loop in LOOPS:
         methods = [
-            part
-            for part in parts
-            if part[1] == loop and part[2:] not in (["settings.py"], ["tables.py"], ["workflow"])
+            part for part in parts if part[1] == loop and part[2:] not in (["settings.py"], ["tables.py"])
         ]
         if ["pipeline", loop] in methods or len(methods) > MOST_METHODS:
             sentences.append(f"{stage}: name at most {MOST_METHODS} files or folders of pipeline/{loop}")

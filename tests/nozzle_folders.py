@@ -7,9 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from pipeline.reading import frame_folder
+from pipeline.reading.frame_mcap import Topics
 from pipeline.setpoint.frames import key_area, nozzle_scene
-from pipeline.setpoint.workflow import frame_folder
-from pipeline.setpoint.workflow.frame_mcap import Topics
+from pipeline.setpoint.material import PLA
+from pipeline.setpoint.recordings import FrontEnd
 from pipeline.store.params import Execution
 
 LEAST = 10.0
@@ -18,7 +20,7 @@ FLOWS, SHOTS = (60.0, 100.0, 150.0), 3
 
 
 @functools.cache
-def scenes(prints: int = 2) -> tuple[nozzle_scene.Frames, ...]:
+def scenes(prints: int = 2) -> tuple[nozzle_scene.RenderedFrames, ...]:
     """Three segments, one of each class, for each print."""
     rng = np.random.default_rng(5)
     return tuple(
@@ -73,10 +75,9 @@ def folder(path: Path, prints: int = 2) -> Path:
 def read(
     path: Path, *, tip=None, topics: Topics = ANY, jobs: int = 1, memo: Path | None = None
 ) -> frame_folder.NozzleFrames:
-    how = frame_folder.ReadOptions(tip_px=tip, least_score=LEAST, topics=topics)
-    return frame_folder.read_folder(
-        path, how, Execution(backend="loky", jobs=jobs, scheduler=""), memo=memo or path.parent / "memo"
-    )
+    front_end = FrontEnd(LEAST, (memo or path.parent / "memo").resolve())
+    how = frame_folder.ReadOptions(tip, front_end, topics, PLA)
+    return frame_folder.read_folder(path, how, Execution(backend="loky", jobs=jobs, scheduler=""))
 
 
 def expected() -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pipeline import cli
-from pipeline.setpoint import score
+from pipeline.setpoint.agents import score
 from pipeline.store import artifacts
 from tests import readme
 

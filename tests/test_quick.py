@@ -15,13 +15,13 @@ import yaml
 
 from pipeline import quick
 from pipeline.report.shared.headline import Loop, decision
-from pipeline.report.shared.sources import QUICK_LOOK
-from pipeline.setpoint.workflow.agent_files import restore_agents
-from pipeline.setpoint.workflow.camera_files import FILE, restore_camera
-from pipeline.setpoint.workflow.classifier_files import restore_classifier
-from pipeline.setpoint.workflow.tables import WINDOWS
-from pipeline.setpoint.workflow.windows import window_tables
+from pipeline.setpoint.agents.files import restore_agents
+from pipeline.setpoint.frames.files import CAMERA_FILE, restore_camera
+from pipeline.setpoint.simulation.recorded import window_tables
+from pipeline.setpoint.tables import WINDOW_PARTS, WINDOWS
+from pipeline.setpoint.vision.files import restore_classifier
 from pipeline.store import artifacts, params
+from pipeline.verdict.settings import QUICK_LOOK
 from pipeline.verdict.verdict import words_for
 
 ALL_ON = dict.fromkeys(params.Loops.model_fields, True)
@@ -288,9 +288,9 @@ def test_what_is_kept_is_whole_and_read_by_the_code_of_today():
     assert sum((kept / name).stat().st_size for name in there) < 4e6
     model = kept / "train_classifier"
     restore_classifier(str(model / "weights.safetensors"), str(model / "calibration.parquet"))
-    restore_camera(str(model / FILE))
+    restore_camera(str(model / CAMERA_FILE))
     assert {"learn", "choose", "judge"} <= set(
-        window_tables(artifacts.read_table(model / "windows.parquet", WINDOWS))
+        window_tables(artifacts.read_table(model / "windows.parquet", WINDOWS), WINDOW_PARTS)
     )
     assert len(restore_agents(str(kept / "train_agent/weights.safetensors")).li_2025) == 4
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.nightly.decision import FIRST, KEPT, PROMOTED, Evidence, decide
-from pipeline.nightly.settings import Rule
-from pipeline.report.shared.night import Alarm
+from pipeline.nightly.decision import FIRST, KEPT, PROMOTED, CaseCosts, decide
+from pipeline.nightly.records import Alarm
+from pipeline.nightly.settings import PromotionRule
 from pipeline.statistics import blocks_needed, paired
 
-RULE = Rule(
+RULE = PromotionRule(
     level=0.01,
     least_improvement_percent=5,
     worst_case_percent=5,
@@ -62,8 +62,8 @@ def test_costs_that_are_none_are_refused():
 GAIN_ALARM = Alarm("temperature", "gain", "shift.csv", "the gain from heater_1 has changed", 6.0)
 
 
-def _evidence(cost: float, **guards: float) -> Evidence:
-    return Evidence(
+def _evidence(cost: float, **guards: float) -> CaseCosts:
+    return CaseCosts(
         "panel",
         {f"case {k}": (f"plant {k}", cost * (1 + k)) for k in range(8)},
         {"worst_case": 10.0, "unstable_plants": 0.0} | guards,

@@ -1,5 +1,5 @@
-"""What `beadline first-experiment` does: a staircase for a machine of which there is no record, from its
-params alone, for an operator who stays beside it. There is no model, and so no forecast."""
+"""`beadline first-experiment`: a staircase for a machine without a record, from its params alone, for an
+operator who stays beside it. There is no model, and so no forecast."""
 
 from typing import NamedTuple
 
@@ -13,24 +13,18 @@ LEVELS = (0.05, 0.10, 0.15, 0.20, 0.10)
 MARGIN = 0.25
 
 
-class Step(NamedTuple):
-    """The levels of all inputs, {name: percent}, and the input that moves; "" where all rest."""
-
-    moves: str
-    levels: dict[str, float]
-
-
 class Staircase(NamedTuple):
-    """Steps, each held for hold_s, and the temperature in °C of each output at which the operator stops."""
+    """Steps, each kept for hold_s, and the temperature in °C of each output at which the operator stops. A
+    step is the input that moves, "" if all rest, and the levels of all inputs, {name: percent}."""
 
-    steps: list[Step]
+    steps: list[tuple[str, dict[str, float]]]
     hold_s: float
     stop_degC: dict[str, float]
 
 
 def staircase(machine: Plant, hold_s: float) -> Staircase:
-    """One input after another up its levels, the others at rest. Raises ValueError where an output has no
-    limits, or the hold is shorter than ten samples."""
+    """One input after another up its levels, the others at rest. Raises ValueError if an output has no
+    limits, or if the hold is shorter than ten samples."""
     check_output_limits(machine, "recordings")
     if not hold_s >= 10 * machine.sample_time_s:
         raise ValueError(
@@ -38,13 +32,11 @@ def staircase(machine: Plant, hold_s: float) -> Staircase:
             f"{10 * machine.sample_time_s:g} s; hold longer"
         )
     rest = {signal.name: signal.low if signal.low > 0 else min(0.0, signal.high) for signal in machine.inputs}
-    steps = [Step("", rest)]
+    steps = [("", rest)]
     for signal in machine.inputs:
         top = signal.high - rest[signal.name]
-        steps += [
-            Step(signal.name, rest | {signal.name: rest[signal.name] + share * top}) for share in LEVELS
-        ]
-        steps.append(Step("", rest))
+        steps += [(signal.name, rest | {signal.name: rest[signal.name] + share * top}) for share in LEVELS]
+        steps.append(("", rest))
     stop = {o.name: _number(o.high) - MARGIN * (_number(o.high) - _number(o.low)) for o in machine.outputs}
     return Staircase(steps, hold_s, stop)
 
@@ -61,7 +53,7 @@ def columns(plan: Staircase) -> dict[str, np.ndarray]:
         "step": np.arange(1, count + 1),
         "start_s": plan.hold_s * np.arange(count),
         "hold_s": np.full(count, plan.hold_s),
-        **{name: np.array([step.levels[name] for step in plan.steps]) for name in plan.steps[0].levels},
+        **{name: np.array([levels[name] for _, levels in plan.steps]) for name in plan.steps[0][1]},
         **{f"{name}_stop_degC": np.full(count, stop) for name, stop in plan.stop_degC.items()},
     }
 
@@ -76,11 +68,11 @@ def instructions(plan: Staircase, file: str) -> str:
         f"Record every input and every temperature all the time. Hold each step for {plan.hold_s:g} s, or "
         "shorter where no temperature moves any more.",
     ]
-    for k, step in enumerate(plan.steps, 1):
-        if step.moves:
-            what = f"{step.moves} to {step.levels[step.moves]:g} percent"
+    for k, (moves, levels) in enumerate(plan.steps, 1):
+        if moves:
+            what = f"{moves} to {levels[moves]:g} percent"
         else:
-            rest = ", ".join(f"{name} {level:g}" for name, level in step.levels.items())
+            rest = ", ".join(f"{name} {level:g}" for name, level in levels.items())
             what = f"all inputs at rest, in percent: {rest}"
         lines.append(f"{k}. {what}")
     return "\n".join(

@@ -1,4 +1,4 @@
-"""What `beadline init` does: recordings of a new machine -> the values of the params files that fit it.
+"""`beadline init`: recordings of a new machine -> the values of the params files that fit it.
 
 The mapping and the signals are those that `inspect` proposes. Times follow from the slowest and the fastest
 output's time constant, temperatures from what was recorded. What a rehearsal asks, and how fast it must
@@ -53,7 +53,7 @@ ABSOLUTE_ZERO_DEGC = -273.15
 MOVES_PERCENT, PROBING_SAMPLES = (1.0, 20.0), (300, 100_000)
 
 
-class Scale(NamedTuple):
+class MachinePace(NamedTuple):
     """The machine's pace and range: time constants in s by output, the sample time that suits them, the
     lowest and highest temperature of the record, and the standard deviation of each input."""
 
@@ -120,7 +120,7 @@ def _widest(recordings: Sequence[Inspected]) -> Proposal:
 # ---- pace and range
 
 
-def _scale(paths: Sequence[Path], proposal: Proposal) -> Scale:
+def _scale(paths: Sequence[Path], proposal: Proposal) -> MachinePace:
     inputs = [s.name for s in proposal.signals if s.role == "input"]
     outputs = [s for s in proposal.signals if s.role == "output"]
     sources = [Source(s.name, s.source, s.unit, s.scale, s.offset) for s in proposal.signals]
@@ -147,7 +147,9 @@ def _scale(paths: Sequence[Path], proposal: Proposal) -> Scale:
     lows = [np.nanmin(np.concatenate(segments)) for segments in y.values()]
     highs = [np.nanmax(np.concatenate(segments)) for segments in y.values()]
     rows = np.vstack(u)
-    return Scale(constants, sample_time, float(np.min(lows)), float(np.max(highs)), rows.std(axis=0).tolist())
+    return MachinePace(
+        constants, sample_time, float(np.min(lows)), float(np.max(highs)), rows.std(axis=0).tolist()
+    )
 
 
 def _gap_s(sample_time_s: float) -> float:
@@ -157,7 +159,7 @@ def _gap_s(sample_time_s: float) -> float:
 # ---- values
 
 
-def _values(proposal: Proposal, scale: Scale) -> dict[str, list[str]]:
+def _values(proposal: Proposal, scale: MachinePace) -> dict[str, list[str]]:
     """The lines of each key."""
     outputs = [s for s in proposal.signals if s.role == "output"]
     # a machine that is only ever warmed by 20 °C may not overshoot by five
@@ -196,7 +198,7 @@ def loops_to_run(recorded: Sequence[str], path: str | Path = params.FILE) -> dic
     return lines
 
 
-def _next_experiment(scale: Scale) -> dict[str, list[str]]:
+def _next_experiment(scale: MachinePace) -> dict[str, list[str]]:
     """A random binary sequence at the machine's pace, no wider than the inputs moved; its centre is left to
     the identified model.
 
@@ -217,7 +219,7 @@ def _next_experiment(scale: Scale) -> dict[str, list[str]]:
     }
 
 
-def _open_questions(proposal: Proposal, scale: Scale, *, timed: bool) -> list[str]:
+def _open_questions(proposal: Proposal, scale: MachinePace, *, timed: bool) -> list[str]:
     """What a person must decide; `timed`: the sample time was recorded or given."""
     questions = []
     if proposal.how != "names and ranges":

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.commands.shadow import deploy
 from pipeline.runtime.export import setpoint
 from pipeline.runtime.setpoint_checks import BELIEF
 from pipeline.setpoint.agents.bayes import Filter
-from pipeline.setpoint.workflow.agent_files import restore_agents
-from pipeline.setpoint.workflow.shadow import deploy
+from pipeline.setpoint.agents.files import restore_agents
 from pipeline.store import artifacts
 
 

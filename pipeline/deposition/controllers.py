@@ -9,6 +9,8 @@ Kinds: a data-driven command was learned trial by trial, on training routines or
 signals; a model-based one inverts the identified chain of the extruder; on-off control is the baseline. A
 command that was learned on the very part is the reference: no other composer knows the part beforehand."""
 
+import importlib
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 
@@ -20,6 +22,9 @@ class DepositionController(NamedTuple):
     kind: Literal["model-based", "data-driven", "baseline", "reference"]
     explanation: str
     flow: str = ""  # meaning of its column in signals.parquet; a law has none
+    # "file.function" of pipeline/deposition/parts: library, share of a part, drive -> command (T,) in mm,
+    # without learning on the part; on-off control and full-part ILC are made by `evaluation`
+    command: str = ""
 
 
 # in the order of every page
@@ -41,15 +46,15 @@ COMPOSERS = (
     ),
     DepositionController(
         "priority", "Library, priority", "data-driven", "the paper’s rule",
-        "the same of the library by the priority rule",
+        "the same of the library by the priority rule", "composition.by_priority",
     ),
     DepositionController(
         "superposition", "Library, superposition", "data-driven", "overlaps are added",
-        "the same of the library by superposition",
+        "the same of the library by superposition", "composition.by_superposition",
     ),
     DepositionController(
         "basis", "Basis functions", "model-based", "identified chain, inverted",
-        "the same of the basis functions",
+        "the same of the basis functions", "composition.by_basis_functions",
     ),
     DepositionController(
         "ilc", "Learned whole", "reference", "trials of this very part",
@@ -57,3 +62,9 @@ COMPOSERS = (
     ),
 )  # fmt: skip
 CONTROLLERS = {controller.name: controller for controller in (*LAWS, *COMPOSERS)}
+
+
+def command(name: str) -> Callable:
+    """The function that makes the command of a composer."""
+    file, _, function = CONTROLLERS[name].command.partition(".")
+    return getattr(importlib.import_module(f"pipeline.deposition.parts.{file}"), function)

@@ -3,6 +3,7 @@
 Other columns are another version: raise the number with them.
 """
 
+from pipeline.deposition.controllers import COMPOSERS
 from pipeline.store.tables import BOOL, COUNT, FLOAT, INDEX, NONE, TEXT, Column, Schema, list_of
 
 TRIALS = Schema(
@@ -108,18 +109,9 @@ SIGNALS = Schema(
         Column("wanted_mm3_per_s", FLOAT, "mm^3/s", "wanted flow"),
         Column("command_mm", FLOAT, "mm", "plunger command of the composer that was chosen"),
         Column("predicted_mm3_per_s", FLOAT, "mm^3/s", "flow that the identified chain predicts for it"),
-        Column(
-            "on_off_mm3_per_s", FLOAT, "mm^3/s", "true flow of on-off control; predicted on a real machine"
-        ),
-        Column("priority_mm3_per_s", FLOAT, "mm^3/s", "the same of the library by the priority rule"),
-        Column("superposition_mm3_per_s", FLOAT, "mm^3/s", "the same of the library by superposition"),
-        Column("basis_mm3_per_s", FLOAT, "mm^3/s", "the same of the basis functions"),
-        Column(
-            "ilc_mm3_per_s",
-            FLOAT,
-            "mm^3/s",
-            "the same after full-part ILC; missing on a real machine",
-            nullable=True,
+        *(
+            Column(f"{one.name}_mm3_per_s", FLOAT, "mm^3/s", one.flow, nullable=one.kind == "reference")
+            for one in COMPOSERS
         ),
     ),
 )

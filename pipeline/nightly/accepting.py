@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pipeline.nightly import champion, guarding, remembered, screening, watch
 from pipeline.nightly.processes import check_attached, commit, dvc
-from pipeline.nightly.settings import Loop, Nightly
-from pipeline.report.nightly.production import DRIFT_ACCEPTED
+from pipeline.nightly.records import DRIFT_ACCEPTED
+from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.store import artifacts, params
 
 
@@ -39,7 +39,7 @@ def accept(loop: str, why: str) -> str:
         return f"{loop}: the champion is held against {', '.join(recordings)} from now on; commit {made[:12]}"
 
 
-def _refer(loop: Loop, folder: Path, recordings: list[str]) -> None:
+def _refer(loop: NightlyLoop, folder: Path, recordings: list[str]) -> None:
     """Writes the champion's reference from these recordings, and hands the folder to DVC."""
     reference = screening.reference(loop, folder, only=recordings)
     if reference is None:

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.stats
 
 from pipeline.nightly import drift
-from pipeline.nightly.drift import Cause, Changes, Machine, Record, Scale, Segments
+from pipeline.nightly.drift import DriftCause, DriftRecord, MachineChanges, ProductionModel, Scatter, Segments
 
 OWN = 0.05  # share of its errors that a cause must explain of the champion's own records, to be taken up
 VERSION = 2
@@ -32,8 +32,8 @@ class Baseline(NamedTuple):
     logarithm of the variance of the noise (nights, p), its deviation, and the weighted error a sample
     (nights,)."""
 
-    scale: Scale
-    changes: Changes
+    scale: Scatter
+    changes: MachineChanges
     values: np.ndarray
     deviations: np.ndarray
     explained: np.ndarray
@@ -41,11 +41,11 @@ class Baseline(NamedTuple):
     noise_deviation: np.ndarray
     misfit: np.ndarray
 
-    def usual(self, causes: Sequence[Cause]) -> dict[Cause, float]:
+    def usual(self, causes: Sequence[DriftCause]) -> dict[DriftCause, float]:
         """What each cause explains of an honest record at most."""
         return dict(zip(causes, self.explained.max(axis=0).tolist(), strict=True))
 
-    def written(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """As reference.json has it."""
         cap = np.where(np.isfinite(self.changes.cap), self.changes.cap, 1e9)
         return {
@@ -58,20 +58,20 @@ class Baseline(NamedTuple):
     def read(cls, fields: dict[str, Any]) -> "Baseline":
         known = fields["scale"]
         variance, level, mean_level = (np.array(known[name]) for name in ("variance", "level", "mean_level"))
-        scale = Scale(variance, float(known["ambient"]), level, mean_level)
-        changes = Changes(**{name: np.array(value) for name, value in fields["changes"].items()})
+        scale = Scatter(variance, float(known["ambient"]), level, mean_level)
+        changes = MachineChanges(**{name: np.array(value) for name, value in fields["changes"].items()})
         changes = changes._replace(cap=np.where(changes.cap < 1e8, changes.cap, np.inf))
         return cls(scale, changes, *(np.array(fields[name]) for name in cls._fields[2:]))
 
 
-def _lists(fields: Scale | Changes) -> dict[str, Any]:
+def _lists(fields: Scatter | MachineChanges) -> dict[str, Any]:
     return {name: np.asarray(value).tolist() for name, value in fields._asdict().items()}
 
 
-def measured(machine: Machine, nights: Sequence[Segments], floors: Floors) -> Baseline:
+def measured(machine: ProductionModel, nights: Sequence[Segments], floors: Floors) -> Baseline:
     """The baseline of a champion's nights. Raises ValueError where they are too short."""
     plant, together = machine.plant, [pair for night in nights for pair in night]
-    loose, none = _loose(machine, together), Changes.none(plant.m, plant.p)
+    loose, none = _loose(machine, together), MachineChanges.none(plant.m, plant.p)
     record = drift.record(machine, together, loose)
     errors = drift.left(record, none)
     causes = drift.causes(plant)
@@ -93,13 +93,15 @@ def measured(machine: Machine, nights: Sequence[Segments], floors: Floors) -> Ba
     )
 
 
-def rested(machine: Machine, segments: Segments, scale: Scale, changes: Changes) -> Record:
+def rested(
+    machine: ProductionModel, segments: Segments, scale: Scatter, changes: MachineChanges
+) -> DriftRecord:
     """A record in the surroundings that it was made in."""
     there, room = drift.room_of(machine, segments, scale, changes)
     return drift.record(machine, segments, there, room._replace(another_season=False))
 
 
-def misfit(record: Record, changes: Changes) -> float:
+def misfit(record: DriftRecord, changes: MachineChanges) -> float:
     """Weighted squared error a sample: near 1 on a record like the champion's own."""
     e = drift.left(record, changes)
     return float(e @ e) / max(sum(int(one.measured.sum()) for one in record.segments), 1)
@@ -116,20 +118,24 @@ def noise(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.log(whole), parts.std(axis=0, ddof=1) / np.sqrt(drift.BLOCKS) / whole
 
 
-def _loose(machine: Machine, together: Segments) -> Scale:
+def _loose(machine: ProductionModel, together: Segments) -> Scatter:
     """The scale before any night is known: errors as large as they are."""
     plant = machine.plant
-    scale = Scale(np.ones(plant.p), 30.0, np.full(plant.p, 5.0), np.zeros(plant.p))
+    scale = Scatter(np.ones(plant.p), 30.0, np.full(plant.p, 5.0), np.zeros(plant.p))
     for _ in range(2):
         record = drift.record(machine, together, scale)
-        errors = drift.by_output(record, drift.left(record, Changes.none(plant.m, plant.p)))
+        errors = drift.by_output(record, drift.left(record, MachineChanges.none(plant.m, plant.p)))
         scale = scale._replace(variance=np.maximum(np.nanmean(errors**2, axis=0), 1e-8))
     return scale
 
 
 def _scale(
-    machine: Machine, nights: Sequence[Segments], loose: Scale, changes: Changes, floors: Floors
-) -> Scale:
+    machine: ProductionModel,
+    nights: Sequence[Segments],
+    loose: Scatter,
+    changes: MachineChanges,
+    floors: Floors,
+) -> Scatter:
     """How honest nights scatter, from these. Of a few nights a standard deviation is small by chance:
     Student's quantile for it, and the new night's own share."""
     records = [rested(machine, night, loose, changes) for night in nights]
@@ -138,7 +144,7 @@ def _scale(
     wider = scipy.stats.t.ppf(0.841, count - 1) * np.sqrt(1 + 1 / count) if count > 1 else 1.0
     spread = (lambda v: wider * np.std(v, axis=0, ddof=1)) if count > 1 else (lambda v: np.zeros_like(v[0]))
     errors = [drift.by_output(record, drift.left(record, changes)) for record in records]
-    return Scale(
+    return Scatter(
         np.maximum(np.nanmean(np.concatenate(errors) ** 2, axis=0), 1e-8),
         float(np.hypot(spread(np.array(airs)), floors.ambient)),
         np.hypot(spread(np.array(own)), floors.level),

@@ -10,9 +10,8 @@ from typing import NamedTuple
 
 from pipeline.nightly import champion
 from pipeline.nightly.processes import check_attached, commit, contains, git
+from pipeline.nightly.records import CANDIDATE, KEPT, PROMOTED, Champion, ChampionState, HistoryLine, Night
 from pipeline.nightly.settings import Nightly
-from pipeline.report.nightly.production import Champion, ChampionState, HistoryLine
-from pipeline.report.nightly.record import CANDIDATE, KEPT, PROMOTED, Night
 
 
 class Waiting(NamedTuple):

@@ -75,7 +75,7 @@ def _middle(away: np.ndarray, contrast: float) -> float:
     return float((weight * np.arange(len(weight))).sum() / max(weight.sum(), 1e-9))
 
 
-class Change(NamedTuple):
+class CameraChange(NamedTuple):
     """What has changed, in words, its key for the night after, and by how many sigmas."""
 
     key: str
@@ -83,7 +83,7 @@ class Change(NamedTuple):
     sigmas: float
 
 
-class Moves(NamedTuple):
+class CameraMoves(NamedTuple):
     """How far each of FIGURES has moved: in its own unit, as a share in percent, and in sigmas."""
 
     by: dict[str, float]
@@ -93,7 +93,7 @@ class Moves(NamedTuple):
 
 def changes(
     now: FrameStats, before: Sequence[FrameStats], *, moved_px: float, contrast_percent: float
-) -> tuple[Shift, list[Change]]:
+) -> tuple[Shift, list[CameraChange]]:
     """What the camera's figures say, the cause named: moved, other light, other ink, out of focus. The bead's
     width is the process's own affair. Changes that do not matter are left out, however sure."""
     usual = np.stack([stats.mean for stats in before])
@@ -103,15 +103,15 @@ def changes(
         name: 100 * by[name] / abs(reference) if reference else 0.0
         for name, reference in zip(FIGURES, moved.reference, strict=True)
     }
-    moves = Moves(by, share, dict(zip(FIGURES, moved.sigmas, strict=True)))
+    moves = CameraMoves(by, share, dict(zip(FIGURES, moved.sigmas, strict=True)))
     causes = [*_camera_moved(moves, moved_px), *_light_or_ink(moves, contrast_percent)]
     if abs(share["sharpness_per_px"]) >= 2 * contrast_percent and not causes:
         words = f"the edges are {share['sharpness_per_px']:+.0f} % as steep: the focus has changed"
-        causes.append(Change("focus", words, moves.sigmas["sharpness_per_px"]))
+        causes.append(CameraChange("focus", words, moves.sigmas["sharpness_per_px"]))
     return moved, causes
 
 
-def _camera_moved(moves: Moves, moved_px: float) -> list[Change]:
+def _camera_moved(moves: CameraMoves, moved_px: float) -> list[CameraChange]:
     row, tilt = moves.by["row_px"], moves.by["tilt_px"]
     if not max(abs(row), abs(tilt)) >= moved_px:
         return []
@@ -119,10 +119,10 @@ def _camera_moved(moves: Moves, moved_px: float) -> list[Change]:
         f"the camera has moved: the line lies {row:+.1f} px lower and tilts by {tilt:+.1f} px across the "
         "picture; calibrate it again"
     )
-    return [Change("camera", words, max(moves.sigmas["row_px"], moves.sigmas["tilt_px"], key=abs))]
+    return [CameraChange("camera", words, max(moves.sigmas["row_px"], moves.sigmas["tilt_px"], key=abs))]
 
 
-def _light_or_ink(moves: Moves, contrast_percent: float) -> list[Change]:
+def _light_or_ink(moves: CameraMoves, contrast_percent: float) -> list[CameraChange]:
     """Background and contrast that change alike: the light. Contrast alone: the ink."""
     background, contrast = moves.percent["background"], moves.percent["contrast"]
     light, ink = abs(background) >= contrast_percent, abs(contrast) >= contrast_percent
@@ -131,16 +131,16 @@ def _light_or_ink(moves: Moves, contrast_percent: float) -> list[Change]:
         words = (
             f"the light has changed: background {background:+.0f} % and contrast {contrast:+.0f} % together"
         )
-        return [Change("light", words, moves.sigmas["contrast"])]
+        return [CameraChange("light", words, moves.sigmas["contrast"])]
     if ink:
         words = (
             f"the ink looks different: contrast {contrast:+.0f} %, background {background:+.0f} %: another "
             "ink, or another surface under it"
         )
-        return [Change("ink", words, moves.sigmas["contrast"])]
+        return [CameraChange("ink", words, moves.sigmas["contrast"])]
     if light:
         words = f"the background has changed by {background:+.0f} %: another surface, or stray light"
-        return [Change("background", words, moves.sigmas["background"])]
+        return [CameraChange("background", words, moves.sigmas["background"])]
     return []
 
 
@@ -166,7 +166,7 @@ def line_contrast(scores: np.ndarray, *, together: float) -> Contrast:
     return Contrast(np.array([middle]), np.array([max(spread * np.sqrt(together / len(scores)), 1e-6)]))
 
 
-def contrast_changes(now: Contrast, before: Sequence[Contrast], *, percent: float) -> list[Change]:
+def contrast_changes(now: Contrast, before: Sequence[Contrast], *, percent: float) -> list[CameraChange]:
     """The line stands out less, or more, than in the prints before, by at least `percent`."""
     moved = shift(
         now.mean,
@@ -179,10 +179,12 @@ def contrast_changes(now: Contrast, before: Sequence[Contrast], *, percent: floa
         f"the line stands out by {moved.value[0]:.0f} gray levels where {moved.reference[0]:.0f} were usual "
         f"({by:+.0f} %): light, focus or material"
     )
-    return [Change("contrast", words, float(moved.sigmas[0]))] if abs(by) >= percent else []
+    return [CameraChange("contrast", words, float(moved.sigmas[0]))] if abs(by) >= percent else []
 
 
-def balance_changes(now: np.ndarray, before: np.ndarray, *, together: float, points: float) -> list[Change]:
+def balance_changes(
+    now: np.ndarray, before: np.ndarray, *, together: float, points: float
+) -> list[CameraChange]:
     """Of counts (4,) of KINDS against those of the prints before (prints, 4): the kind that has moved most
     surely by at least `points`; frames without a line go before classes."""
     balance = class_balance(now, before, together=together)
@@ -200,7 +202,7 @@ def balance_changes(now: np.ndarray, before: np.ndarray, *, together: float, poi
         f"{balance.value[k]:.0f} % of the frames {KINDS[k]} where {balance.reference[k]:.0f} % were usual: "
         f"{why}"
     )
-    return [Change("balance", words, float(balance.sigmas[k]))]
+    return [CameraChange("balance", words, float(balance.sigmas[k]))]
 
 
 def class_balance(now: np.ndarray, before: np.ndarray, *, together: float) -> Shift:

@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from pipeline.nightly.processes import dvc, fresh_index, git, names
-from pipeline.report.nightly.production import (
+from pipeline.nightly.records import (
     DRIFT_ACCEPTED,
     ROLLED_BACK,
     Champion,
@@ -38,7 +38,7 @@ def of_branch(branch: str) -> ChampionState:
 
 def write(state: ChampionState) -> None:
     """champion.json; on the disk, with the pointers and the files that it speaks of, before this returns."""
-    artifacts.write_json(FILE, state.written())
+    artifacts.write_json(FILE, state.to_json())
     for path in (*map(Path, paths()), *_files(FOLDER), *_cached(state)):
         if path.exists():
             _sync(path)
@@ -65,7 +65,7 @@ def _cached(state: ChampionState) -> list[Path]:
 
 def write_state(state: ChampionState, place: Path) -> None:
     """champion.json and the pointers of what it names, and no others, below `place`."""
-    artifacts.write_json(place / FILE, state.written())
+    artifacts.write_json(place / FILE, state.to_json())
     for pointer in (place / FOLDER).glob("*.dvc"):
         if pointer.stem not in state.folders:
             pointer.unlink()

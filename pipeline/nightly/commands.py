@@ -1,12 +1,17 @@
 """`./run beadline nightly | rollback`: exit status for a scheduler, one line for a person."""
 
 import argparse
+import functools
 import sys
+from typing import TYPE_CHECKING
 
 from pipeline.store.printable import printable
 
+if TYPE_CHECKING:
+    from pipeline.nightly.reporting import Render
 
-def nightly(arguments: argparse.Namespace) -> None:
+
+def nightly(arguments: argparse.Namespace, *, render: "Render") -> None:
     """The nightly job: new recordings, dvc repro, judge, promote or keep. Exit status 0: promoted, kept, or
     nothing new; 1: the night or one loop failed; a loop that failed keeps its controller, the others are
     judged; 3: drift alarm; 4: done, but recordings were set aside; 75: refused, another night is at work."""
@@ -20,7 +25,7 @@ def nightly(arguments: argparse.Namespace) -> None:
         return
     if arguments.merge:
         print(printable(merging.merge(arguments.merge)))
-    status, summary = reporting.watchdog() if arguments.watch else night.nightly()
+    status, summary = reporting.watchdog() if arguments.watch else night.nightly(render)
     print(printable(summary), file=sys.stderr if status else sys.stdout)
     sys.exit(status)
 
@@ -33,7 +38,8 @@ def rollback(arguments: argparse.Namespace) -> None:
     print(printable(night.rollback(arguments.of, arguments.loop)))
 
 
-def add(commands) -> None:
+def add(commands, render: "Render") -> None:
+    """Adds the commands; `render` makes the page of a night."""
     command = commands.add_parser("nightly", help=nightly.__doc__, description=nightly.__doc__)
     command.add_argument(
         "--watch",
@@ -52,7 +58,7 @@ def add(commands) -> None:
         metavar=("LOOP", "WHY"),
         help="take what the alarm of LOOP saw for how things are from now on",
     )
-    command.set_defaults(run=nightly)
+    command.set_defaults(run=functools.partial(nightly, render=render))
     command = commands.add_parser("rollback", help=rollback.__doc__, description=rollback.__doc__)
     command.add_argument(
         "of",

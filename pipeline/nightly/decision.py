@@ -5,14 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.nightly.settings import Rule
-from pipeline.report.nightly.record import FIRST, KEPT, PROMOTED, Guard, LoopDecision
-from pipeline.report.shared.night import Alarm
+from pipeline.nightly.records import FIRST, KEPT, PROMOTED, Alarm, Guard, LoopDecision
+from pipeline.nightly.settings import PromotionRule
 from pipeline.statistics import Paired, blocks_needed, paired
 from pipeline.verdict.digits import THIN, beyond_meaning
 
 
-class Evidence(NamedTuple):
+class CaseCosts(NamedTuple):
     """What the judge measured of one controller: {case: (block, cost)}, {guard: figure, less is better}, and
     the name of the panel, which two must share to be compared."""
 
@@ -22,9 +21,9 @@ class Evidence(NamedTuple):
 
 
 def decide(
-    champion: Evidence | None,
-    challenger: Evidence,
-    rule: Rule,
+    champion: CaseCosts | None,
+    challenger: CaseCosts,
+    rule: PromotionRule,
     *,
     allowed: Mapping[str, float],
     alarms: Sequence[Alarm],
@@ -62,7 +61,7 @@ def decide(
     return LoopDecision(PROMOTED, [better, "no guard is worse"], test, guards)
 
 
-def _first(challenger: Evidence) -> LoopDecision:
+def _first(challenger: CaseCosts) -> LoopDecision:
     """Where there is no champion, a challenger that is fit becomes one."""
     failing = [case for case, (_, cost) in challenger.cases.items() if not np.isfinite(cost)]
     reasons = _unfit(challenger)
@@ -77,7 +76,7 @@ def _first(challenger: Evidence) -> LoopDecision:
     return LoopDecision(KEPT, [start + "; ".join(reasons)], guards=guards)
 
 
-def _unfit(challenger: Evidence) -> list[str]:
+def _unfit(challenger: CaseCosts) -> list[str]:
     return [
         f"{name} is {figure:g}; none is allowed"
         for name, figure in challenger.guards.items()
@@ -104,7 +103,7 @@ def _chance(test: Paired) -> str:
     return "p < 0.0001" if test.p < 1e-4 else f"p = {test.p:.2g}"
 
 
-def _against(test: Paired, rule: Rule) -> list[str]:
+def _against(test: Paired, rule: PromotionRule) -> list[str]:
     if test.blocks < blocks_needed(rule.level):
         return [
             f"{test.blocks} blocks cannot tell at level {rule.level:g}; "
@@ -127,7 +126,7 @@ def _against(test: Paired, rule: Rule) -> list[str]:
     return []
 
 
-def _guards(champion: Evidence, challenger: Evidence, allowed: Mapping[str, float]) -> list[str]:
+def _guards(champion: CaseCosts, challenger: CaseCosts, allowed: Mapping[str, float]) -> list[str]:
     sentences = []
     for name, before in champion.guards.items():
         now = challenger.guards.get(name, np.inf)

@@ -48,7 +48,7 @@ MOST = 3  # causes of one record
 Segments = Sequence[tuple[np.ndarray, np.ndarray]]
 
 
-class Cause(NamedTuple):
+class DriftCause(NamedTuple):
     """One way in which a machine can change: kind, and the number of the input (gain, time
     constant, delay, saturation) or output (offset, late sensor); -1 for all."""
 
@@ -56,7 +56,7 @@ class Cause(NamedTuple):
     channel: int
 
 
-class Changes(NamedTuple):
+class MachineChanges(NamedTuple):
     """Of a machine against the model: share of each gain (m,), of each rate (m,), delay in samples (m,), the
     most that acts of each input (m,), then offset in °C (p,) and lateness in samples (p,) of each output."""
 
@@ -68,7 +68,7 @@ class Changes(NamedTuple):
     late: np.ndarray
 
     @classmethod
-    def none(cls, m: int, p: int) -> "Changes":
+    def none(cls, m: int, p: int) -> "MachineChanges":
         zeros = np.zeros(m)
         return cls(zeros, zeros, zeros, np.full(m, np.inf), np.zeros(p), np.zeros(p))
 
@@ -83,7 +83,7 @@ FIELD = {
 }
 
 
-class Scale(NamedTuple):
+class Scatter(NamedTuple):
     """What honest records scatter by: variance (p,) of the one-step errors, standard deviation of the air
     around between nights, and (p,) of each output's level between nights; mean level of each output in °C
     (p,)."""
@@ -94,7 +94,7 @@ class Scale(NamedTuple):
     mean_level: np.ndarray
 
 
-class Surroundings(NamedTuple):
+class RoomAir(NamedTuple):
     """How restless a record is: standard deviation in °C of the course of the air within it, and of what
     draughts take from one sample to the next, in percent of each input; then whether the air may be farther
     from the champion's nights than those are from each other."""
@@ -110,39 +110,39 @@ class Surroundings(NamedTuple):
 
 
 # from a closed room to an open door; the record itself says which (empirical Bayes)
-RESTLESS = Surroundings(5.0, 0.0)
+RESTLESS = RoomAir(5.0, 0.0)
 ROOMS = (
-    Surroundings(CALM, 0.0), Surroundings(1.0, 0.0), RESTLESS,
-    Surroundings(1.0, 0.5), Surroundings(1.0, 2.0),
+    RoomAir(CALM, 0.0), RoomAir(1.0, 0.0), RESTLESS,
+    RoomAir(1.0, 0.5), RoomAir(1.0, 2.0),
 )  # fmt: skip
 
 
-class Fit(NamedTuple):
+class CauseFit(NamedTuple):
     """Of one cause, as if it alone had changed: `value` in the unit of `Changes`, its standard deviation, and
     the fall of the weighted squared error that it explains."""
 
-    cause: Cause
+    cause: DriftCause
     value: float
     deviation: float
     explained: float
 
 
-def causes(plant: Plant) -> list[Cause]:
+def causes(plant: Plant) -> list[DriftCause]:
     """Every cause that a record is asked for: those of inputs with all together last, those of outputs."""
     inputs = [
-        Cause(kind, j)
+        DriftCause(kind, j)
         for kind in ("gain", "time constant", "delay")
         for j in (*range(plant.m), *([-1] if plant.m > 1 else []))
     ]
     return [
         *inputs,
-        *(Cause("saturation", j) for j in range(plant.m)),
-        *(Cause("offset", i) for i in range(plant.p)),
-        *(Cause("late sensor", i) for i in range(plant.p) if plant.p > 1),
+        *(DriftCause("saturation", j) for j in range(plant.m)),
+        *(DriftCause("offset", i) for i in range(plant.p)),
+        *(DriftCause("late sensor", i) for i in range(plant.p) if plant.p > 1),
     ]
 
 
-def with_change(changes: Changes, cause: Cause, value: float) -> Changes:
+def with_change(changes: MachineChanges, cause: DriftCause, value: float) -> MachineChanges:
     """`changes` with that of one cause moved by `value`; a saturation is set to it."""
     name = FIELD[cause.kind]
     moved = getattr(changes, name).copy()
@@ -199,7 +199,7 @@ def shifted(values: np.ndarray, samples: float) -> np.ndarray:
     return (1 - share) * values[low] + share * values[high]
 
 
-class Machine:
+class ProductionModel:
     """The champion's model, ready to be asked: a plant that is stable over the record, its observer's
     gain K (n, p), and what it has already worked out."""
 
@@ -239,7 +239,7 @@ class Machine:
         return values - x @ self.plant.C.T
 
 
-class Segment(NamedTuple):
+class RecordSegment(NamedTuple):
     """Of a record: u (T, m), y (T, p), where y was measured (T, p), the answers of inputs worked out so
     far, its own nuisances with the rows that hold them to their spread, and their orthonormal basis."""
 
@@ -251,21 +251,23 @@ class Segment(NamedTuple):
     basis: np.ndarray
 
 
-class Record(NamedTuple):
+class DriftRecord(NamedTuple):
     """Segments held against a machine at a scale, in a room, by an observer of gain K; `basis` is that of the
     outputs' levels, which all segments share, and `common` (N, p) those levels before they were made
     orthonormal."""
 
-    machine: Machine
-    scale: Scale
-    room: Surroundings
+    machine: ProductionModel
+    scale: Scatter
+    room: RoomAir
     K: np.ndarray
-    segments: list[Segment]
+    segments: list[RecordSegment]
     basis: np.ndarray
     common: np.ndarray
 
 
-def record(machine: Machine, segments: Segments, scale: Scale, room: Surroundings = RESTLESS) -> Record:
+def record(
+    machine: ProductionModel, segments: Segments, scale: Scatter, room: RoomAir = RESTLESS
+) -> DriftRecord:
     """A record ready to be asked. Raises ValueError where it is too short."""
     plant = machine.plant
     long = [(u, y) for u, y in segments if len(y) >= 4 * plant.n + 8]
@@ -276,12 +278,12 @@ def record(machine: Machine, segments: Segments, scale: Scale, room: Surrounding
         )
     scale = _in(scale, room)
     K, none = machine.gain(room.draught, scale.variance), np.zeros((0, 0))
-    made, bare = [], Record(machine, scale, room, K, [], none, none)
+    made, bare = [], DriftRecord(machine, scale, room, K, [], none, none)
     for u, y in long:
         measured = np.isfinite(y)
         nuisance = _weighted(bare, _own_nuisances(machine, len(y), scale, room.course), measured)
         columns = _held(nuisance, plant.n)
-        made.append(Segment(u, y, measured, {}, columns, np.linalg.qr(columns)[0]))
+        made.append(RecordSegment(u, y, measured, {}, columns, np.linalg.qr(columns)[0]))
     bare, level = bare._replace(segments=made), np.diag(scale.level)
     parts = [
         _weighted(bare, np.broadcast_to(level, (len(one.y), *level.shape)), one.measured) for one in made
@@ -290,14 +292,14 @@ def record(machine: Machine, segments: Segments, scale: Scale, room: Surrounding
     return bare._replace(basis=np.linalg.qr(_held(common, 0))[0], common=common)
 
 
-def _in(scale: Scale, room: Surroundings) -> Scale:
+def _in(scale: Scatter, room: RoomAir) -> Scatter:
     """The scale where the air is restless, or of another season: outputs follow it alike, but not exactly."""
     ambient = max(scale.ambient, SEASON) if room.another_season else scale.ambient
     apart = np.hypot(UNLIKE * room.course, 0.5 * UNLIKE * SEASON if room.another_season else 0.0)
     return scale._replace(ambient=ambient, level=np.hypot(scale.level, apart))
 
 
-def _own_nuisances(machine: Machine, T: int, scale: Scale, course: float) -> np.ndarray:
+def _own_nuisances(machine: ProductionModel, T: int, scale: Scatter, course: float) -> np.ndarray:
     """(T, p, n + 1 + COURSE): what the state at the start does, then level and courses of the air around,
     which warms like inputs that would raise every steady output by 1 °C."""
     plant = machine.plant
@@ -316,7 +318,7 @@ def _own_nuisances(machine: Machine, T: int, scale: Scale, course: float) -> np.
     return np.concatenate([start / size, np.stack([level, *courses], axis=2)], axis=2)
 
 
-def _weighted(record: Record, values: np.ndarray, measured: np.ndarray) -> np.ndarray:
+def _weighted(record: DriftRecord, values: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """values (T, p, k) in °C as one-step errors in their own standard deviation, (T p, k); what was not
     measured counts nothing."""
     T, p, k = values.shape
@@ -331,7 +333,7 @@ def _held(columns: np.ndarray, free: int) -> np.ndarray:
     return np.vstack([columns, np.diag(np.concatenate([np.full(free, 1e-6), np.ones(k - free)]))])
 
 
-def _freed(record: Record, parts: Sequence[np.ndarray]) -> np.ndarray:
+def _freed(record: DriftRecord, parts: Sequence[np.ndarray]) -> np.ndarray:
     """parts (T p, k) of each segment free of its own nuisances, one below the other."""
     freed = []
     for one, part in zip(record.segments, parts, strict=True):
@@ -341,7 +343,7 @@ def _freed(record: Record, parts: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(freed)
 
 
-def predicted(machine: Machine, one: Segment, changes: Changes) -> np.ndarray:
+def predicted(machine: ProductionModel, one: RecordSegment, changes: MachineChanges) -> np.ndarray:
     """y-hat (T, p) of a segment with these changes."""
     plant = machine.plant
     y = np.tile(plant.C @ np.linalg.solve(np.eye(plant.n) - plant.A, plant.b) + plant.d, (len(one.u), 1))
@@ -359,7 +361,7 @@ def predicted(machine: Machine, one: Segment, changes: Changes) -> np.ndarray:
     return y + changes.offset
 
 
-def left(record: Record, changes: Changes) -> np.ndarray:
+def left(record: DriftRecord, changes: MachineChanges) -> np.ndarray:
     """The one-step errors (N,) under these changes, in their own standard deviation and free of every
     nuisance, with what those cost."""
     freed = _freed(record, _errors(record, changes))[:, 0]
@@ -368,7 +370,7 @@ def left(record: Record, changes: Changes) -> np.ndarray:
     return padded - Q @ (Q.T @ padded)
 
 
-def _errors(record: Record, changes: Changes) -> list[np.ndarray]:
+def _errors(record: DriftRecord, changes: MachineChanges) -> list[np.ndarray]:
     """(T p, 1) of each segment before any nuisance is taken off."""
     parts = []
     for one in record.segments:
@@ -389,7 +391,7 @@ def _bridged(error: np.ndarray, measured: np.ndarray) -> np.ndarray:
     return error
 
 
-def by_output(record: Record, rest: np.ndarray) -> np.ndarray:
+def by_output(record: DriftRecord, rest: np.ndarray) -> np.ndarray:
     """(samples, p) in °C of errors (N,) that `left` gave; NaN where nothing was measured."""
     parts, at, p = [], 0, record.machine.plant.p
     for one in record.segments:
@@ -400,8 +402,8 @@ def by_output(record: Record, rest: np.ndarray) -> np.ndarray:
 
 
 def room_of(
-    machine: Machine, segments: Segments, scale: Scale, changes: Changes
-) -> tuple[Scale, Surroundings]:
+    machine: ProductionModel, segments: Segments, scale: Scatter, changes: MachineChanges
+) -> tuple[Scatter, RoomAir]:
     """The surroundings under which what is left of the record is likeliest, and the scale there: of draughts
     the one-step errors are larger than the champion's own, and the record itself says by how much."""
     likeliest = (np.inf, scale, RESTLESS)
@@ -420,14 +422,14 @@ def room_of(
     return likeliest[1], likeliest[2]
 
 
-def _log_determinant(record: Record) -> float:
+def _log_determinant(record: DriftRecord) -> float:
     """log det of the errors' covariance by what the nuisances add to it."""
     R = [np.linalg.qr(one.columns, mode="r") for one in record.segments]
     R.append(np.linalg.qr(_held(record.common, 0), mode="r"))
     return float(sum(2 * np.log(np.abs(np.diag(one))).sum() for one in R))
 
 
-def levels(record: Record, changes: Changes) -> tuple[float, np.ndarray]:
+def levels(record: DriftRecord, changes: MachineChanges) -> tuple[float, np.ndarray]:
     """°C by which the air around differs from what the model knows, and each output's own level (p,)."""
     errors, k = _errors(record, changes), record.common.shape[1]
     freed = _freed(record, errors)[:, 0]
@@ -442,21 +444,21 @@ def levels(record: Record, changes: Changes) -> tuple[float, np.ndarray]:
     return float(np.average(airs, weights=weights)) * record.scale.ambient, share * record.scale.level
 
 
-def air_deviation(record: Record) -> float:
+def air_deviation(record: DriftRecord) -> float:
     """Standard deviation in °C of the air's level that `levels` gives."""
     n, longest = record.machine.plant.n, max(record.segments, key=lambda one: len(one.y))
     known = np.linalg.inv(longest.columns.T @ longest.columns)[n, n]
     return float(np.sqrt(known)) * record.scale.ambient
 
 
-def _padded(values: np.ndarray, one: Segment) -> np.ndarray:
+def _padded(values: np.ndarray, one: RecordSegment) -> np.ndarray:
     return np.concatenate([values, np.zeros(len(one.columns) - len(values))])
 
 
 # ---- one cause
 
 
-def _limits(cause: Cause) -> tuple[float, float]:
+def _limits(cause: DriftCause) -> tuple[float, float]:
     delay = (-0.25 * LONGEST_DELAY, float(LONGEST_DELAY))
     return {
         "gain": GAIN_LIMITS, "time constant": RATE_LIMITS, "offset": OFFSET_LIMITS,
@@ -464,7 +466,9 @@ def _limits(cause: Cause) -> tuple[float, float]:
     }[cause.kind]  # fmt: skip
 
 
-def fitted(record: Record, changes: Changes, cause: Cause, start: np.ndarray | None = None) -> Fit:
+def fitted(
+    record: DriftRecord, changes: MachineChanges, cause: DriftCause, start: np.ndarray | None = None
+) -> CauseFit:
     """The change of one cause that explains most beside `changes` (Gauss and Newton's steps); `start` (N,)
     are the errors left without it."""
     before = left(record, changes) if start is None else start
@@ -490,7 +494,7 @@ def fitted(record: Record, changes: Changes, cause: Cause, start: np.ndarray | N
         psi = e - left(record, with_change(changes, cause, value + step))
         if done:
             break
-    return Fit(cause, value, _deviation(psi / step, e), whole - J)
+    return CauseFit(cause, value, _deviation(psi / step, e), whole - J)
 
 
 def _deviation(psi: np.ndarray, e: np.ndarray) -> float:
@@ -505,14 +509,14 @@ def _blocks(values: np.ndarray) -> list[np.ndarray]:
     return np.array_split(values, BLOCKS)
 
 
-def _capped(record: Record, changes: Changes, cause: Cause, before: np.ndarray) -> Fit:
+def _capped(record: DriftRecord, changes: MachineChanges, cause: DriftCause, before: np.ndarray) -> CauseFit:
     """The level above which an input has no effect: the best of a fine grid, then Newton's steps."""
     j = cause.channel
     u = np.concatenate([one.u[:, j] for one in record.segments])
     low, high = float(u.min()), float(u.max())
     whole = float(before @ before)
     if high - low < 1e-6:
-        return Fit(cause, high, 1.0, 0.0)
+        return CauseFit(cause, high, 1.0, 0.0)
     grid = np.linspace(high, low - 0.5 * (high - low), 25)[1:]
 
     def cost(level: float) -> float:
@@ -528,7 +532,7 @@ def _capped(record: Record, changes: Changes, cause: Cause, before: np.ndarray) 
     e = left(record, with_change(changes, cause, level))
     step = 0.05 * (high - low)
     psi = (left(record, with_change(changes, cause, level - step)) - e) / step
-    return Fit(cause, level, _deviation(psi, e), max(whole - J, 0.0))
+    return CauseFit(cause, level, _deviation(psi, e), max(whole - J, 0.0))
 
 
 def above(segments: Segments, j: int, level: float) -> float:
@@ -536,7 +540,7 @@ def above(segments: Segments, j: int, level: float) -> float:
     return 100 * float(np.mean(np.concatenate([u[:, j] for u, _ in segments]) > level))
 
 
-def moved(record: Record, changes: Changes, now: Changes) -> np.ndarray:
+def moved(record: DriftRecord, changes: MachineChanges, now: MachineChanges) -> np.ndarray:
     """°C (p,) by which the outputs' level differs between two states of the machine under the record's
     inputs."""
     parts = [
@@ -546,7 +550,7 @@ def moved(record: Record, changes: Changes, now: Changes) -> np.ndarray:
     return np.abs(np.concatenate(parts).mean(axis=0))
 
 
-def alone(record: Record, changes: Changes) -> list[Fit]:
+def alone(record: DriftRecord, changes: MachineChanges) -> list[CauseFit]:
     """Every cause, each as if it alone had changed."""
     before = left(record, changes)
     return [fitted(record, changes, cause, before) for cause in causes(record.machine.plant)]
@@ -555,12 +559,12 @@ def alone(record: Record, changes: Changes) -> list[Fit]:
 # ---- the causes that explain the record
 
 
-class Named(NamedTuple):
+class NamedCause(NamedTuple):
     """A change that explains the record, with the rivals that it cannot be told from; `sigmas` is how sure
     it is that something changed."""
 
-    fit: Fit
-    rivals: list[Fit]
+    fit: CauseFit
+    rivals: list[CauseFit]
     sigmas: float
 
 
@@ -568,13 +572,13 @@ class Explanation(NamedTuple):
     """Of a record: the causes that are named, the largest first, what the others seem beside them, all
     changes together, and the errors (N,) left."""
 
-    named: list[Named]
-    others: list[Fit]
-    changes: Changes
+    named: list[NamedCause]
+    others: list[CauseFit]
+    changes: MachineChanges
     left: np.ndarray
 
 
-def explain(record: Record, changes: Changes, usual: Mapping[Cause, float]) -> Explanation:
+def explain(record: DriftRecord, changes: MachineChanges, usual: Mapping[DriftCause, float]) -> Explanation:
     """Names what changed beside `changes`, one cause after the other; `usual` is what each cause explains of
     the champion's own records at most, which is no change of the machine."""
     now, fits, found = changes, alone(record, changes), []
@@ -595,7 +599,7 @@ def explain(record: Record, changes: Changes, usual: Mapping[Cause, float]) -> E
             for k, fit in enumerate(fits)
             if k != best and worth[best] - worth[k] < RIVALS * _colour(fits[best])
         ]
-        found.append(Named(fits[best], rivals, np.sqrt(worth[best])))
+        found.append(NamedCause(fits[best], rivals, np.sqrt(worth[best])))
         now = with_change(now, fits[best].cause, fits[best].value)
         before = left(record, now)
         taken = {named.fit.cause for named in found}
@@ -606,8 +610,12 @@ def explain(record: Record, changes: Changes, usual: Mapping[Cause, float]) -> E
 
 
 def explain_segments(
-    machine: Machine, segments: Segments, scale: Scale, changes: Changes, usual: Mapping[Cause, float]
-) -> tuple[Record, Explanation]:
+    machine: ProductionModel,
+    segments: Segments,
+    scale: Scatter,
+    changes: MachineChanges,
+    usual: Mapping[DriftCause, float],
+) -> tuple[DriftRecord, Explanation]:
     """A record explained in the surroundings that it was made in: asked first in restless ones, which
     cost the least to take for calm. What only another season's air tells from a change of the machine is
     decided by what explains more."""
@@ -625,13 +633,13 @@ def explain_segments(
     return min((same, within), (asked, explained), key=_cost)
 
 
-def _cost(told: tuple[Record, Explanation]) -> float:
+def _cost(told: tuple[DriftRecord, Explanation]) -> float:
     record, explained = told
     unlikely = float(explained.left @ explained.left) + _log_determinant(record)
     return unlikely + CAUSE * len(explained.named)
 
 
-def _rather_transport(fits: Sequence[Fit], worth: np.ndarray, best: int) -> int:
+def _rather_transport(fits: Sequence[CauseFit], worth: np.ndarray, best: int) -> int:
     """The delay of an input where a late sensor explains no more: transport is the commoner cause."""
     for k, fit in enumerate(fits):
         if fit.cause.kind == "delay" and worth[best] - worth[k] < RIVALS * _colour(fits[best]):
@@ -639,21 +647,23 @@ def _rather_transport(fits: Sequence[Fit], worth: np.ndarray, best: int) -> int:
     return best
 
 
-def _from_none(fit: Fit) -> float:
+def _from_none(fit: CauseFit) -> float:
     """Sigmas of a change from none; a cap has none to be measured from."""
     if fit.cause.kind == "saturation":
         return np.sqrt(fit.explained)
     return fit.value / fit.deviation
 
 
-def _colour(fit: Fit) -> float:
+def _colour(fit: CauseFit) -> float:
     """Variance of the estimate in that of white errors, from 1 on."""
     if fit.cause.kind == "saturation":
         return 1.0
     return max(1.0, fit.explained * (fit.deviation / max(abs(fit.value), 1e-12)) ** 2)
 
 
-def _polished(record: Record, changes: Changes, found: list[Named]) -> tuple[list[Named], Changes]:
+def _polished(
+    record: DriftRecord, changes: MachineChanges, found: list[NamedCause]
+) -> tuple[list[NamedCause], MachineChanges]:
     """Several causes fitted beside each other, in turns."""
     fits = [named.fit for named in found]
     for _ in range(3):

@@ -12,7 +12,7 @@ from pathlib import Path
 import yaml
 
 from pipeline.nightly.processes import LITERAL, changed, names
-from pipeline.nightly.settings import Loop, Nightly
+from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.reading import excluded
 from pipeline.reading.signatures import METADATA
 from pipeline.store import artifacts, params
@@ -109,7 +109,7 @@ def digest(digests: Mapping[str, str]) -> str:
     return total.hexdigest()
 
 
-def recordings(digests: Mapping[str, str], loop: Loop) -> dict[str, str]:
+def recordings(digests: Mapping[str, str], loop: NightlyLoop) -> dict[str, str]:
     """{path: digest} of the recordings below a loop's folder, of all that was found; notes and files of dvc
     are none, nor is what is excluded. A bag of ROS 2 is one recording, as `ingest` reads it, under the path
     of its folder."""
@@ -190,7 +190,7 @@ def _holds(pointer: Path, name: str) -> bool:
 
 
 def after_quarantine(
-    digests: Mapping[str, str], quarantined: Collection[str], loops: Mapping[str, Loop], hashes: Hashes
+    digests: Mapping[str, str], quarantined: Collection[str], loops: Mapping[str, NightlyLoop], hashes: Hashes
 ) -> dict[str, str]:
     """`digests` once these recordings are set aside: without those that were moved, and with the lists of
     those that stayed. Of what has come meanwhile nothing."""

@@ -9,11 +9,11 @@ import joblib
 import numpy as np
 
 from pipeline.deposition.tables import SCORES
-from pipeline.nightly.decision import Evidence
-from pipeline.nightly.settings import HoldOut, Loop, Nightly, Rule
+from pipeline.nightly.decision import CaseCosts
+from pipeline.nightly.settings import HoldOut, Nightly, NightlyLoop, PromotionRule
 from pipeline.reading import recording_folders
 from pipeline.reading.isolated import Budget
-from pipeline.setpoint.workflow import tables
+from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
 from pipeline.temperature.controllers import table, window
@@ -34,11 +34,11 @@ class Judge(NamedTuple):
     or champion/<loop>); of the temperature loop, on the contestant of that name, `declared` where it is left
     out. `allowed(champion)`: how much worse each guard may be."""
 
-    measure: Callable[..., Evidence]
-    allowed: Callable[[Evidence], dict[str, float]]
+    measure: Callable[..., CaseCosts]
+    allowed: Callable[[CaseCosts], dict[str, float]]
 
 
-def judge(loop: Loop, settings: Nightly) -> Judge:
+def judge(loop: NightlyLoop, settings: Nightly) -> Judge:
     if loop.judge == "cases":
         name = loop.cases.removeprefix("datasets/")
         return Judge(lambda folder, _="": _cases(folder / name)[0], lambda _: _cases(Path(loop.cases))[1])
@@ -52,7 +52,7 @@ def judge(loop: Loop, settings: Nightly) -> Judge:
     return Judge(_temperature(settings), lambda champion: _allowed(champion, settings.rule))
 
 
-def _cases(path: Path) -> tuple[Evidence, dict[str, float]]:
+def _cases(path: Path) -> tuple[CaseCosts, dict[str, float]]:
     """{"panel": name, "cases": {case: {"block": name, "cost": number}}, "guards":
     {guard: {"value": number, "allowed": number}}}."""
     declared = artifacts.read_json(path)
@@ -63,7 +63,7 @@ def _cases(path: Path) -> tuple[Evidence, dict[str, float]]:
         }
         guards = {name: float(guard["value"]) for name, guard in declared["guards"].items()}
         allowed = {name: float(guard["allowed"]) for name, guard in declared["guards"].items()}
-        evidence = Evidence(str(declared["panel"]), cases, guards)
+        evidence = CaseCosts(str(declared["panel"]), cases, guards)
     except KeyError as error:
         raise ValueError(f"{path}: {_EXPECTED}, found no {error}; let its stage write it") from None
     except (TypeError, AttributeError, ValueError) as error:
@@ -82,7 +82,7 @@ def _cases(path: Path) -> tuple[Evidence, dict[str, float]]:
 _EXPECTED = "expected panel, cases with block and cost, and guards with value and allowed"
 
 
-def _deposition(folder: Path) -> Evidence:
+def _deposition(folder: Path) -> CaseCosts:
     """Of each part program and material, none of which was trained on: the error of the flow that the chosen
     composer leaves, as its stage scored it. Guard: the worst line."""
     table = artifacts.read_table(folder / "compose_parts/scores.parquet", SCORES)
@@ -95,10 +95,10 @@ def _deposition(folder: Path) -> Evidence:
         for k in rows
     }
     worst = np.nanmax([table["worst_line_volume_percent"][k] for k in rows], initial=0.0)
-    return Evidence(joblib.hash(sorted(cases)), cases, {"worst_line_volume_percent": float(worst)})
+    return CaseCosts(joblib.hash(sorted(cases)), cases, {"worst_line_volume_percent": float(worst)})
 
 
-def _setpoint(folder: Path) -> Evidence:
+def _setpoint(folder: Path) -> CaseCosts:
     """Of each case of each simulator that counts: the share of runs that the chosen controller does not
     settle, plus one point. Guards: the worst case, and the slowest."""
     table = _scoreboard(folder / "evaluate_setpoint/scoreboard.parquet")
@@ -109,7 +109,7 @@ def _setpoint(folder: Path) -> Evidence:
         for k in rows
     }
     slow = np.nanmax([table["p90_steps"][k] for k in rows], initial=0.0)
-    return Evidence(
+    return CaseCosts(
         joblib.hash(sorted(lost)),
         {name: (name, cost) for name, cost in lost.items()},
         {"worst_unsettled_percent": max(lost.values(), default=np.nan), "slowest_p90_steps": float(slow)},
@@ -125,7 +125,7 @@ def _scoreboard(path: Path) -> Mapping[str, np.ndarray]:
 # ---- the temperature loop
 
 
-def _allowed(champion: Evidence, rule: Rule) -> dict[str, float]:
+def _allowed(champion: CaseCosts, rule: PromotionRule) -> dict[str, float]:
     holdout = champion.guards.get("holdout_error_degC", 0.0)
     return {
         "worst_case": champion.guards["worst_case"] * rule.worst_case_percent / 100,
@@ -161,7 +161,7 @@ DESIGNED_FROM = {
 }
 
 
-def _temperature(settings: Nightly) -> Callable[..., Evidence]:
+def _temperature(settings: Nightly) -> Callable[..., CaseCosts]:
     """Closed loop on every plant of the frozen panel, as deployed; prediction on the hold-out recordings."""
     frozen = frozen_panel(settings.holdout)
     own = declared(settings.holdout)
@@ -219,7 +219,7 @@ def _questions(holdout: HoldOut, machine: Machine) -> panel.Questions:
     )
 
 
-def _closed_loop(frozen: FrozenPanel, folder: Path, contestant: str, rule: Rule) -> Evidence:
+def _closed_loop(frozen: FrozenPanel, folder: Path, contestant: str, rule: PromotionRule) -> CaseCosts:
     result = judged(frozen, folder, contestant)
     asked = frozen.rehearsal.judging
     references = [asked.references[index].H[0, 0] for index in asked.asked[:, 0]]
@@ -240,7 +240,7 @@ def _closed_loop(frozen: FrozenPanel, folder: Path, contestant: str, rule: Rule)
     }
     predictor = _predictor(folder, contestant, frozen.machine)
     error = _prediction_error(predictor, frozen.records)
-    return Evidence(
+    return CaseCosts(
         frozen.name, evidence, guards | ({"holdout_error_degC": error} if error is not None else {})
     )
 

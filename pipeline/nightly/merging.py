@@ -25,8 +25,8 @@ from pipeline.nightly.processes import (
     identity,
     names,
 )
+from pipeline.nightly.records import ChampionState
 from pipeline.reading import excluded
-from pipeline.report.nightly.production import ChampionState
 
 PLACE = STATE / "merge"
 # made by nights: where both sides have them anew ours stay, and the next night makes them again

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.nightly import baseline, drift
 from pipeline.nightly.baseline import Baseline
-from pipeline.nightly.drift import Machine, Segments
+from pipeline.nightly.drift import ProductionModel, Segments
 
 BETTER = 30.0  # by which the mean squared error must fall
 HONEST = 2.0  # of the largest of the champion's own records: what an honest one may leave
@@ -34,7 +34,12 @@ class Mistake(NamedTuple):
 
 
 def found(
-    machine: Machine, segments: Segments, own: Baseline, *, inputs: Sequence[str], outputs: Sequence[str]
+    machine: ProductionModel,
+    segments: Segments,
+    own: Baseline,
+    *,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
 ) -> Mistake | None:
     """The mistake that was made in writing a record; None where it is what it says, or where a change of the
     machine explains it as well. Raises ValueError where the record is too short."""
@@ -46,7 +51,7 @@ def found(
     if left > honest or as_is < BETTER * left:
         return None
     samples = sum(int(one.measured.sum()) for one in asked.segments)
-    every_delay = drift.Cause("delay", -1)  # which is a shifted clock by another name
+    every_delay = drift.DriftCause("delay", -1)  # which is a shifted clock by another name
     explained = [fit.explained for fit in drift.alone(asked, own.changes) if fit.cause != every_delay]
     if as_is - max(explained) / samples < AS_MUCH * left:
         return None
@@ -54,7 +59,7 @@ def found(
 
 
 def _best(
-    machine: Machine, segments: Segments, own: Baseline, inputs: Sequence[str], outputs: Sequence[str]
+    machine: ProductionModel, segments: Segments, own: Baseline, inputs: Sequence[str], outputs: Sequence[str]
 ) -> tuple[float, str, Segments]:
     """Of every mistake: what is left with it undone, its words, and the record undone; the least first."""
 

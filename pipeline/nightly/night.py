@@ -6,15 +6,17 @@ aside; 75: another night is at work.
 
 import datetime
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import stages
 from pipeline.nightly import (
     branches,
     champion,
     guarding,
     inputs,
+    records,
     remembered,
     reporting,
     reproducing,
@@ -22,12 +24,9 @@ from pipeline.nightly import (
     watch,
 )
 from pipeline.nightly.processes import STATE, changed, check_attached, commit, dvc, git
+from pipeline.nightly.records import ROLLED_BACK, ChampionState, Lineage, LoopDecision, Night
 from pipeline.nightly.remembered import METRICS, DriftMemory, Remembered
-from pipeline.nightly.reproducing import Reproduced
-from pipeline.nightly.settings import Loop, Nightly
-from pipeline.report.nightly import record
-from pipeline.report.nightly.production import ROLLED_BACK, ChampionState, Lineage
-from pipeline.report.nightly.record import LoopDecision, Night
+from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.store import artifacts, params
 
 OK, FAILED, BUSY = reporting.OK, reporting.FAILED, reporting.BUSY
@@ -51,12 +50,12 @@ class Job(NamedTuple):
     restarted: bool = False
 
 
-class Work(NamedTuple):
+class NightWork(NamedTuple):
     """A night under way: its record, what it is made from {path: digest}, new recordings {loop: {path:
     digest}}, the memory of drift, and what is in production.
 
-    `moved` are inputs that changed while the stages ran. `lost` is {loop: why its stages failed}. `done`: no
-    further step follows.
+    `moved` are inputs that changed while the stages ran. `lost` is {loop: why its stages failed}, `off` are
+    the loops that section `loops` switches off. `done`: no further step follows.
     """
 
     night: Night
@@ -66,34 +65,36 @@ class Work(NamedTuple):
     state: ChampionState = ChampionState()
     moved: tuple[str, ...] = ()
     lost: Mapping[str, str] = {}
+    off: tuple[str, ...] = ()
     done: bool = False
 
-    def ended(self, outcome: str, *reasons: str) -> "Work":
+    def ended(self, outcome: str, *reasons: str) -> "NightWork":
         return self._replace(night=self.night.ended(outcome, *reasons), done=True)
 
-    def failed(self, error: Exception) -> "Work":
+    def failed(self, error: Exception) -> "NightWork":
         """The night after what ended it. A night that has made its commit stays what it was, and is repeated
         in the morning after."""
         why = reporting.told(error, self.night.run)
         if self.night.commit:
             return self._replace(night=self.night._replace(unpushed=True).noted(why), done=True)
         nothing = self.night._replace(decisions={}, promoted=(), branch="")
-        return self._replace(night=nothing).ended(record.FAILED, why)
+        return self._replace(night=nothing).ended(records.FAILED, why)
 
 
-def nightly(now: datetime.datetime | None = None) -> tuple[int, str]:
-    """Exit status and the one-line summary of a night. Whatever happens, somebody is told."""
+def nightly(render: reporting.Render, now: datetime.datetime | None = None) -> tuple[int, str]:
+    """Exit status and the one-line summary of a night; `render` makes its page. Somebody learns of the night,
+    whatever happens."""
     started = now or datetime.datetime.now(datetime.UTC)
     try:
         with guarding.locked():
-            return _night(started)
+            return _night(started, render)
     except guarding.BusyError as busy:
         return BUSY, f"nightly: refused: {busy}"
     except Exception as error:  # nothing may end a night without a word
         return reporting.last_resort(error, started)
 
 
-def _night(now: datetime.datetime) -> tuple[int, str]:
+def _night(now: datetime.datetime, render: reporting.Render) -> tuple[int, str]:
     clock = time.monotonic()
     last, aside = remembered.opened()
     night = Night(last.night + 1, f"night-{last.night + 1:04d}", watch.stamp(now))
@@ -104,33 +105,33 @@ def _night(now: datetime.datetime) -> tuple[int, str]:
         )
     overdue = watch.overdue(now, last.success, settings.watch_h) if last.success and settings else ""
     job = Job(settings, last, inputs.Hashes(last.hashes)) if settings else None
-    work, mended = _mended(Work(night, last.drift), [*aside, *refused])
+    work, mended = _mended(NightWork(night, last.drift), [*aside, *refused])
     if mended:
         guarding.RUNNING.touch()
     if job and not work.done:
         work = _worked(job, work)
-    if work.night.outcome == record.FAILED:
+    if work.night.outcome == records.FAILED:
         guarding.RESERVE.unlink(missing_ok=True)  # on a full disk, what follows is written from it
     night = work.night._replace(seconds=round(time.monotonic() - clock, 1))
     night = night.noted(f"watch: {overdue}") if overdue else night
     tonight = _to_remember(job, work) if job else last._replace(night=night.number)
-    told = reporting.report(night, tonight, settings)
+    status, summary = reporting.report(night, tonight, settings, render)
     if mended:
         guarding.RUNNING.unlink(missing_ok=True)
-    return told
+    return status, summary
 
 
 # ---- the night, step by step
 
 
-def _mended(work: Work, broken: Sequence[str]) -> tuple[Work, bool]:
+def _mended(work: NightWork, broken: Sequence[str]) -> tuple[NightWork, bool]:
     """What a killed night left, put right; whether that could be done. The night ends where a file that it
     works by is broken, which its sentences say."""
     whole, broken = True, list(broken)
     try:
         guarding.unmerged()
     except Exception as error:
-        return work.ended(record.FAILED, *broken, reporting.told(error, work.night.run)), False
+        return work.ended(records.FAILED, *broken, reporting.told(error, work.night.run)), False
     for mend in (guarding.broken_champion, guarding.mend):
         try:
             said = mend()
@@ -142,10 +143,10 @@ def _mended(work: Work, broken: Sequence[str]) -> tuple[Work, bool]:
             broken += said
         else:
             work = work._replace(night=work.night.noted(*said))
-    return (work.ended(record.FAILED, *dict.fromkeys(broken)) if broken else work), whole
+    return (work.ended(records.FAILED, *dict.fromkeys(broken)) if broken else work), whole
 
 
-def _worked(job: Job, work: Work) -> Work:
+def _worked(job: Job, work: NightWork) -> NightWork:
     """The night itself. Each step returns the work with more in it; one that fails ends the night, which
     keeps what the steps before it came to."""
     steps = (
@@ -156,7 +157,7 @@ def _worked(job: Job, work: Work) -> Work:
         if work.done:
             break
         try:
-            work = step(_sound(job, work.lost), work)
+            work = step(_without(job, (*work.lost, *work.off)), work)
         except Exception as error:  # refused in a sentence, or a mistake of this program
             work = work.failed(error)
             # until the stages have run nothing is changed, and after that production may be
@@ -164,7 +165,7 @@ def _worked(job: Job, work: Work) -> Work:
     return work
 
 
-def _undone(work: Work, *undo: Callable[[], list[str]]) -> Work:
+def _undone(work: NightWork, *undo: Callable[[], list[str]]) -> NightWork:
     """What a failed night changed is put back, production last."""
     for back in (*undo, champion.as_committed):
         try:
@@ -174,33 +175,44 @@ def _undone(work: Work, *undo: Callable[[], list[str]]) -> Work:
     return work
 
 
-def _sound(job: Job, lost: Mapping[str, str]) -> Job:
-    """The job without the loops whose stages failed: nothing of them is judged or committed."""
-    if not lost:
+def _without(job: Job, names: Collection[str]) -> Job:
+    """The job without these loops: nothing of them is judged or committed."""
+    if not names:
         return job
-    loops = {name: loop for name, loop in job.settings.loops.items() if name not in lost}
+    loops = {name: loop for name, loop in job.settings.loops.items() if name not in names}
     return job._replace(settings=job.settings.model_copy(update={"loops": loops}))
 
 
-def _ready(job: Job, work: Work) -> Work:
+def _ready(job: Job, work: NightWork) -> NightWork:
+    """Checks every section of the parameters before a stage runs, and leaves out the loops that are switched
+    off."""
     guarding.ready(job.settings.least_free_mb)
     branches.check(job.settings)
+    switches = stages.check_parameters()
+    off = tuple(name for name in job.settings.loops if not switches.get(name, True))
+    if not off:
+        return work
+    alarms = tuple(alarm for alarm in work.memory.alarms if alarm.loop not in off)
+    night = work.night.noted(f"no part of the night, by section loops: {', '.join(off)}")
+    work = work._replace(off=off, memory=work.memory._replace(alarms=alarms), night=night)
+    if len(off) == len(job.settings.loops):
+        return work.ended(records.NOTHING_NEW, "section loops switches off every loop")
     return work
 
 
-def _unchanged(job: Job, work: Work) -> Work:
+def _unchanged(job: Job, work: NightWork) -> NightWork:
     """Reads what the night is made from; the night ends where that is what the last one was made from."""
     digests = inputs.contents(job.hashes, _places(job.settings))
     work = work._replace(digests=digests)
     if not _nothing_new(digests, job.last):
         return work
     return work.ended(
-        record.QUARANTINED if work.night.quarantined else record.NOTHING_NEW,
+        records.QUARANTINED if work.night.quarantined else records.NOTHING_NEW,
         "no recording, parameter or code has changed since the last night",
     )
 
 
-def _compared(job: Job, work: Work) -> Work:
+def _compared(job: Job, work: NightWork) -> NightWork:
     """The recordings of each loop whose content was not there the night before."""
     new = {
         name: _new(work.digests, loop, job.last.recordings.get(name, {}))
@@ -212,7 +224,7 @@ def _compared(job: Job, work: Work) -> Work:
     return work._replace(new=new, night=night.noted(*filter(None, unused)))
 
 
-def _screened(job: Job, work: Work) -> Work:
+def _screened(job: Job, work: NightWork) -> NightWork:
     """New recordings held against the champions; the night ends where all that was new is quarantined."""
     from pipeline.nightly import screening  # it takes seconds to import, and so does what judges
 
@@ -220,25 +232,24 @@ def _screened(job: Job, work: Work) -> Work:
     screened = screening.look(job.settings, state.champions, work.new, work.memory, night=night.number)
     quarantined = {**night.quarantined, **screened.drift.quarantined}
     digests = inputs.after_quarantine(work.digests, quarantined, job.settings.loops, job.hashes)
-    work = Work(
-        night._replace(screened=True, drift=screened.drift, quarantined=quarantined),
-        screened.memory,
-        digests,
-        work.new,
-        state,
+    work = work._replace(
+        night=night._replace(screened=True, drift=screened.drift, quarantined=quarantined),
+        memory=screened.memory,
+        digests=digests,
+        state=state,
     )
     if _nothing_new(digests, job.last):
-        return work.ended(record.QUARANTINED, "all that was new is quarantined")
+        return work.ended(records.QUARANTINED, "all that was new is quarantined")
     return work
 
 
-def _learned(job: Job, work: Work) -> Work:
+def _learned(job: Job, work: NightWork) -> NightWork:
     """Runs the stages, and judges what they made. What a refused run changed is put back."""
     guarding.remember_before()
     try:
         # the pages of tonight show tonight's drift, and judge by it
         artifacts.write_json(METRICS, work.night.metrics(work.state))
-        reproduced = _reproduce(job.settings, work.night.run)
+        lost, notes = _reproduce(job.settings, work.night.run)
         # what came or changed meanwhile may be in some stages and not in others, and
         # nobody has looked whether it is fit to learn from
         now = inputs.contents(job.hashes, _places(job.settings))
@@ -250,23 +261,23 @@ def _learned(job: Job, work: Work) -> Work:
             )
         if moved:
             return work._replace(moved=moved)
-        work = work._replace(lost=reproduced.lost, night=work.night.noted(*reproduced.notes))
-        return _with_lost(_judge(_sound(job, work.lost), work))
+        work = work._replace(lost=lost, night=work.night.noted(*notes))
+        return _with_lost(_judge(_without(job, work.lost), work))
     except Exception as error:
         return _undone(work.failed(error), guarding.back_to_before)
 
 
-def _with_lost(work: Work) -> Work:
+def _with_lost(work: NightWork) -> NightWork:
     """The night's record with the loops whose stages failed, told first; their champions stay."""
     lost = {
-        name: LoopDecision(record.FAILED, [f"its champion stays: {why}"]) for name, why in work.lost.items()
+        name: LoopDecision(records.FAILED, [f"its champion stays: {why}"]) for name, why in work.lost.items()
     }
     night = work.night._replace(decisions={**lost, **work.night.decisions})
     reasons = [f"{name}: {decision.decision}, {decision.reasons[0]}" for name, decision in lost.items()]
     return work._replace(night=night.ended(night.outcome, *reasons, *night.reasons))
 
 
-def _put_back(job: Job, work: Work) -> Work:
+def _put_back(job: Job, work: NightWork) -> NightWork:
     """Where inputs changed while the stages ran: all as it was before the night, and nothing decided."""
     if not work.moved:
         return work
@@ -277,12 +288,12 @@ def _put_back(job: Job, work: Work) -> Work:
     return work._replace(night=night.without_measurement(), memory=job.last.drift)
 
 
-def _restarted(job: Job, work: Work) -> Work:
+def _restarted(job: Job, work: NightWork) -> NightWork:
     """The whole night once more, by the parameters as they are now."""
     if not work.moved:
         return work
     again = job._replace(settings=params.load(Nightly, "nightly"), restarted=True)
-    return _worked(again, Work(work.night, work.memory))._replace(done=True)
+    return _worked(again, NightWork(work.night, work.memory))._replace(done=True)
 
 
 def _places(settings: Nightly) -> list[str]:
@@ -295,7 +306,7 @@ def _nothing_new(digests: Mapping[str, str], last: Remembered) -> bool:
     return inputs.digest(digests) == last.inputs and not last.unpushed
 
 
-def _new(digests: Mapping[str, str], loop: Loop, before: Mapping[str, str]) -> dict[str, str]:
+def _new(digests: Mapping[str, str], loop: NightlyLoop, before: Mapping[str, str]) -> dict[str, str]:
     """The recordings of a loop whose content was not there the night before."""
     return {
         name: content
@@ -304,7 +315,7 @@ def _new(digests: Mapping[str, str], loop: Loop, before: Mapping[str, str]) -> d
     }
 
 
-def _unused(loop: Loop, recordings: Sequence[str]) -> str:
+def _unused(loop: NightlyLoop, recordings: Sequence[str]) -> str:
     """That new recordings of a loop are not learned from, and what would change that; empty where they
     are."""
     section, _, key = SOURCES.get(loop.judge, "").partition(".")
@@ -319,7 +330,8 @@ def _unused(loop: Loop, recordings: Sequence[str]) -> str:
     )
 
 
-def _reproduce(settings: Nightly, run: str) -> Reproduced:
+def _reproduce(settings: Nightly, run: str) -> tuple[Mapping[str, str], Sequence[str]]:
+    """{loop: why its stages failed}, and notes."""
     for loop in settings.loops.values():
         # large recordings are DVC's: the pointer beside the folder moves with it
         if loop.recordings and Path(f"{loop.recordings}.dvc").exists():
@@ -332,7 +344,7 @@ def _reproduce(settings: Nightly, run: str) -> Reproduced:
 # ---- champion and challenger
 
 
-def _judge(job: Job, work: Work) -> Work:
+def _judge(job: Job, work: NightWork) -> NightWork:
     """Each loop's challenger before the rules of its page and against its champion, and what is promoted."""
     from pipeline.nightly import promoting
 
@@ -359,7 +371,7 @@ def _lineage(settings: Nightly, made_from: Mapping[str, str]) -> Lineage:
 # ---- the commit, which is the promotion
 
 
-def _committed(job: Job, work: Work) -> Work:
+def _committed(job: Job, work: NightWork) -> NightWork:
     """The night's commit: of HEAD; or on a branch beside what waits there, where promotions wait."""
     settings = job.settings
     work = work._replace(night=work.night.noted(*_uncommitted(settings)))
@@ -410,7 +422,7 @@ def _tracked(settings: Nightly, *, promoted: bool) -> list[str]:
     ]
 
 
-def _pushed(job: Job, work: Work) -> Work:
+def _pushed(job: Job, work: NightWork) -> NightWork:
     """The artifacts to the remote; where promotions wait on a branch, production as it was."""
     settings, night = job.settings, work.night
     if settings.remote:
@@ -425,7 +437,7 @@ def _pushed(job: Job, work: Work) -> Work:
     return work._replace(night=night)
 
 
-def _freed(job: Job, work: Work) -> Work:
+def _freed(job: Job, work: NightWork) -> NightWork:
     """DVC's cache within nightly.keep_gb."""
     return work._replace(night=work.night.noted(*retention.freed(job.settings.keep_gb)))
 
@@ -433,10 +445,10 @@ def _freed(job: Job, work: Work) -> Work:
 # ---- what is remembered
 
 
-def _to_remember(job: Job, work: Work) -> Remembered:
+def _to_remember(job: Job, work: NightWork) -> Remembered:
     night, last = work.night, job.last
     known = job.settings.model_dump(mode="json")
-    if night.outcome == record.FAILED:
+    if night.outcome == records.FAILED:
         # a recording of a failed night is new again the next one, and must not count as two
         return last._replace(
             night=night.number, unpushed=night.unpushed, hashes=job.hashes.now or last.hashes, settings=known
@@ -447,7 +459,11 @@ def _to_remember(job: Job, work: Work) -> Remembered:
         # a night that lost a loop is repeated
         inputs=None if night.lost else inputs.digest(work.digests),
         unpushed=night.unpushed,
-        recordings={name: inputs.recordings(work.digests, loop) for name, loop in job.settings.loops.items()},
+        # those of a loop that is switched off are no news when it is switched on
+        recordings={
+            name: last.recordings.get(name, {}) if name in work.off else inputs.recordings(work.digests, loop)
+            for name, loop in job.settings.loops.items()
+        },
         drift=work.memory,
         hashes=job.hashes.now,
         settings=known,

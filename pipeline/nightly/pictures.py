@@ -9,15 +9,15 @@ import numpy as np
 
 from pipeline.nightly import camera_drift
 from pipeline.nightly.inputs import quarantine
-from pipeline.nightly.settings import Drift
+from pipeline.nightly.records import Alarm, LoopDrift
+from pipeline.nightly.settings import DriftLimits
 from pipeline.reading import trial_files
 from pipeline.reading.excluded import readable
-from pipeline.report.shared.night import Alarm, LoopDrift
 from pipeline.store import params
 
 if TYPE_CHECKING:
     from pipeline.deposition.settings import Camera
-    from pipeline.setpoint.workflow.settings import TrainClassifier
+    from pipeline.setpoint.settings import TrainClassifier
 
 FRAMES = 40  # pictures of a recording that are looked at
 
@@ -56,7 +56,7 @@ def _frame_stats(trial: trial_files.TrialRecording) -> camera_drift.FrameStats:
 
 
 def trials_drift(
-    limits: Drift, loop: str, paths: Sequence[str], reference: Mapping[str, Any], pending: set[str]
+    limits: DriftLimits, loop: str, paths: Sequence[str], reference: Mapping[str, Any], pending: set[str]
 ) -> LoopDrift:
     """Of new trials: those that cannot be read are set aside, the others' pictures held against those of
     `reference`."""
@@ -99,7 +99,7 @@ class PrintFigures(NamedTuple):
     segment_frames: float
     contrast: camera_drift.Contrast
 
-    def written(self) -> list[Any]:
+    def to_json(self) -> list[Any]:
         """As the champion's reference.json keeps it."""
         contrast = [self.contrast.mean.tolist(), self.contrast.deviation.tolist()]
         return [self.name, self.counts.tolist(), self.segment_frames, *contrast]
@@ -107,22 +107,20 @@ class PrintFigures(NamedTuple):
 
 def of_prints(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[Any]]:
     """What reference.json keeps of the last `most` prints below `folder`; `only` those named."""
-    return [figures.written() for figures in _print_figures(folder, most, only)]
+    return [figures.to_json() for figures in _print_figures(folder, most, only)]
 
 
 def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[PrintFigures]:
-    from pipeline.setpoint.workflow import frame_folder
-    from pipeline.setpoint.workflow.settings import SetpointMaterial, TrainClassifier
+    from pipeline.reading import frame_folder
+    from pipeline.setpoint.recordings import read_options
+    from pipeline.setpoint.settings import SetpointMaterial, TrainClassifier
 
     settings = params.load(TrainClassifier, "train_classifier")
     if settings.source != "recordings":
         return []
     material = params.load(SetpointMaterial, "setpoint_material").material()
     frames = frame_folder.read_folder(
-        folder,
-        frame_folder.read_options(settings, material),
-        params.load(params.Execution, "execution"),
-        memo=Path("datasets/memo/train_classifier"),
+        folder, read_options(settings, material), params.load(params.Execution, "execution")
     )
     prints = []
     numbered = [(number, name) for number, name in enumerate(frames.prints) if not only or name in only]
@@ -138,35 +136,35 @@ def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[Pr
     return prints
 
 
-class NewPrints(NamedTuple):
-    """The loop's folder of recordings, the new files in it, and the champion's reference.json."""
-
-    folder: str
-    paths: Sequence[str]
-    reference: Mapping[str, Any]
-
-
-def prints_drift(limits: Drift, loop: str, new: NewPrints, pending: set[str]) -> LoopDrift:
-    """Of new prints: files that cannot be read are set aside. Classes, frames without a line, and the line's
-    contrast are held against the prints of the champion's reference."""
-    from pipeline.setpoint.workflow.settings import TrainClassifier
+def prints_drift(
+    limits: DriftLimits,
+    loop: str,
+    folder: str,
+    paths: Sequence[str],
+    reference: Sequence[Sequence[Any]],
+    pending: set[str],
+) -> LoopDrift:
+    """Drift of the new prints `paths` in the loop's folder of recordings. A file that cannot be read is set
+    aside. Classes, frames without a line, and the line's contrast are compared with the prints that the
+    champion's reference.json has under "camera"."""
+    from pipeline.setpoint.settings import TrainClassifier
 
     drifted = LoopDrift.none(loop)
     settings = params.load(TrainClassifier, "train_classifier")
     if settings.source != "recordings":
         return drifted
-    for path in new.paths:
+    for path in paths:
         if reason := _unreadable(path, settings):
             drifted.quarantined[path] = quarantine(path, loop, reason)
     before = [
         PrintFigures(name, np.array(counts), together, camera_drift.Contrast(np.array(mean), np.array(std)))
-        for name, counts, together, mean, std in new.reference.get("camera", [])
+        for name, counts, together, mean, std in reference
     ]
     if not before:
         return drifted
     names = {figures.name for figures in before}
     try:
-        prints = [figures for figures in _print_figures(Path(new.folder), 10**6) if figures.name not in names]
+        prints = [figures for figures in _print_figures(Path(folder), 10**6) if figures.name not in names]
     except ValueError as error:  # what the stage will refuse as well, and say so
         drifted.notes.append(str(error))
         return drifted
@@ -182,13 +180,14 @@ def prints_drift(limits: Drift, loop: str, new: NewPrints, pending: set[str]) ->
 
 def _unreadable(path: str, settings: "TrainClassifier") -> str:
     """Why a print's file cannot be read; empty where it can."""
-    from pipeline.setpoint.workflow import frame_csv, frame_folder, frame_mcap
+    from pipeline.reading import frame_csv, frame_mcap
+    from pipeline.setpoint.recordings import read_options
 
     try:
         if path.lower().endswith(".csv"):
             frame_csv.read_log(Path(path))
         elif path.lower().endswith(".mcap"):
-            frame_mcap.open_film(Path(path), frame_folder.read_options(settings).topics)
+            frame_mcap.open_film(Path(path), read_options(settings).topics)
     except ValueError as error:
         return str(error)
     return ""
@@ -199,9 +198,9 @@ def _unreadable(path: str, settings: "TrainClassifier") -> str:
 
 def with_alarms(
     drifted: LoopDrift,
-    limits: Drift,
+    limits: DriftLimits,
     path: str,
-    causes: Sequence[camera_drift.Change],
+    causes: Sequence[camera_drift.CameraChange],
     pending: set[str],
     consequences: Sequence[str] = (),
 ) -> LoopDrift:

@@ -2,35 +2,30 @@
 which nothing runs; one that passes goes in production where it is better than the champion, or there is none.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.nightly import champion, judge, reporting, screening
+from pipeline.nightly import champion, judge, records, reporting, screening, verdicts
 from pipeline.nightly.decision import decide
-from pipeline.nightly.processes import STATE, dvc
+from pipeline.nightly.records import (
+    CANDIDATE,
+    KEPT,
+    Champion,
+    ChampionMetrics,
+    ChampionState,
+    Lineage,
+    LoopDecision,
+    Night,
+    candidate_of,
+)
 from pipeline.nightly.reproducing import wiring
-from pipeline.nightly.settings import Loop, Nightly
-from pipeline.report.nightly import record
-from pipeline.report.nightly.production import Champion, ChampionMetrics, ChampionState, Lineage, candidate_of
-from pipeline.report.nightly.record import CANDIDATE, KEPT, LoopDecision, Night
-from pipeline.report.shared.sources import Declared, Sources, collect
-from pipeline.store import artifacts, params
-from pipeline.temperature.settings import Plant
-from pipeline.verdict.night import verdicts as verdicts_of_night
-from pipeline.verdict.settings import ReportRules
+from pipeline.nightly.settings import Nightly, NightlyLoop
+from pipeline.store import artifacts
 from pipeline.verdict.verdict import PASSED, Verdict
 
-# stages whose figures the pages show; those before `learn_kernel` have no tables there
-MEASURED = (
-    "probe_machine", "generate_probing", "learn_kernel", "ingest", "identify_plant", "tune_weights",
-    "evaluate_temperature", "train_ilc", "segment_library", "compose_parts",
-    "train_classifier", "train_agent", "evaluate_setpoint", "export_controllers",
-)  # fmt: skip
-REPORT = "datasets/report/figures.json"
-ACCEPTED = "reports/accepted.json"
 # artifacts that only some contestants are designed from, and that a record may not determine
 OPTIONAL = {f"datasets/{path}" for path in judge.DESIGNED_FROM.values()}
 # the certified controller of the temperature loop, installed beside what it was designed from
@@ -52,16 +47,16 @@ def judged(
     """The night with a decision on each loop; what is in production, and the candidates beside it. Their
     files lie in champion/<loop> and champion/<loop>.candidate by then. Raises ValueError where no loop can be
     judged."""
-    verdicts, night = verdicts_of(settings, night)
+    by_loop, night = verdicts.read_verdicts(settings, night)
     made_from = lineage()  # with the lock of the pages, where they were made anew
     decisions: dict[str, LoopDecision] = {}
     for name in settings.loops:
-        verdict = verdicts.get(name)
+        verdict = by_loop.get(name)
         try:
             decision, metrics = decided(settings, name, night, state, verdict)
         except reporting.REFUSALS as error:  # what cannot be judged stops no other loop
             why = reporting.told(error, night.run)
-            decision = LoopDecision(record.FAILED, [f"it cannot be judged, and its champion stays: {why}"])
+            decision = LoopDecision(records.FAILED, [f"it cannot be judged, and its champion stays: {why}"])
             metrics = None
         decisions[name] = decision = decision._replace(verdict=verdict)
         if decision.promotes or decision.decision == CANDIDATE:
@@ -73,60 +68,14 @@ def judged(
             and verdict.state == PASSED
         ):
             state = _without_candidate(state, name)
-    if all(decision.decision == record.FAILED for decision in decisions.values()):
+    if all(decision.decision == records.FAILED for decision in decisions.values()):
         whys = (f"{name}: {decision.reasons[0]}" for name, decision in decisions.items())
         raise ValueError("; ".join(whys))
     promoted = tuple(name for name, decision in decisions.items() if decision.promotes)
     night = night._replace(decisions=decisions, promoted=promoted)
-    outcome = record.PROMOTED if promoted else CANDIDATE if night.candidates else KEPT
+    outcome = records.PROMOTED if promoted else CANDIDATE if night.candidates else KEPT
     reasons = (f"{name}: {reason}" for name, decision in decisions.items() for reason in decision.reasons)
     return night.ended(outcome, *reasons), state
-
-
-# ---- the pages
-
-
-def verdicts_of(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], Night]:
-    """The verdict of each loop that has a page, from the files that the pages are made of; the night with a
-    note where the pages are of other files. A loop that is judged by a file of costs has none: its rules are
-    the guards of that file. Where nightly.holdout.controller names a contestant, the temperature loop's
-    verdict is about that one."""
-    loops = [name for name, loop in settings.loops.items() if loop.judge != "cases"]
-    if not loops:
-        return {}, night
-    sources, named = page_sources(), settings.holdout.controller
-    each = sources.verdicts
-    night = _as_the_pages_say(each, night)
-    if named != judge.PAGE:
-        each = verdicts_of_night(sources.evidence, sources.stored, sources.nightly, named=named)
-    return {name: each[name] for name in loops}, night
-
-
-def page_sources() -> Sources:
-    """What the stage `report` reads."""
-    declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
-    return collect(
-        declared,
-        {stage: f"datasets/{stage}/figures.json" for stage in MEASURED},
-        {stage: f"datasets/{stage}" for stage in MEASURED},
-        ACCEPTED,
-        (),
-    )
-
-
-def _as_the_pages_say(pages: Mapping[str, Verdict], night: Night) -> Night:
-    """Makes the pages anew where they were made before drift or production changed, so that they say what the
-    night goes by."""
-    if not artifacts.exists(REPORT):
-        return night
-    shown = artifacts.read_json(REPORT).get("verdicts") or {}
-    if all(shown.get(loop) == verdict.metrics() for loop, verdict in pages.items()):
-        return night
-    try:
-        dvc("repro", "--single-item", "--force", "report", log=STATE / "logs" / f"{night.run}-report.log")
-    except ValueError as error:
-        return night.noted(f"the pages are not of tonight ({error}); run ./run dvc repro --force report")
-    return night
 
 
 # ---- one loop
@@ -177,7 +126,7 @@ def decided(
     return JudgedLoop(decision, _metrics(challenger))
 
 
-def there(loop: Loop) -> list[str]:
+def there(loop: NightlyLoop) -> list[str]:
     """The artifacts of a loop without the optional ones that its record did not determine."""
     return [path for path in loop.artifacts if path not in OPTIONAL or Path(path).is_file()]
 
@@ -196,13 +145,13 @@ def _kept(reason: str) -> JudgedLoop:
     return JudgedLoop(LoopDecision(KEPT, [reason]))
 
 
-def _metrics(evidence: judge.Evidence) -> ChampionMetrics:
+def _metrics(evidence: judge.CaseCosts) -> ChampionMetrics:
     mean_cost = float(np.mean([cost for _, cost in evidence.cases.values()]))
     guards = {name: figure for name, figure in evidence.guards.items() if np.isfinite(figure)}
     return ChampionMetrics(evidence.panel, mean_cost if np.isfinite(mean_cost) else None, guards)
 
 
-def uncertified(loop: Loop, contestant: str) -> str:
+def uncertified(loop: NightlyLoop, contestant: str) -> str:
     """Why a challenger of the temperature loop that passes the page's rules has no certificate; empty where
     it has one, and where the project has no stage that certifies."""
     if not _asks_for_one(loop):
@@ -219,12 +168,12 @@ def uncertified(loop: Loop, contestant: str) -> str:
     return ""
 
 
-def certified(loop: Loop) -> list[str]:
+def certified(loop: NightlyLoop) -> list[str]:
     """The files of a certified controller that are there, for the champion's folder."""
     return [path for path in CERTIFIED if _asks_for_one(loop) and Path(path).is_file()]
 
 
-def _asks_for_one(loop: Loop) -> bool:
+def _asks_for_one(loop: NightlyLoop) -> bool:
     """Whether a loop's champion needs a certificate: that of the temperature loop, where the project has the
     stage that certifies."""
     wired = loop.judge == "temperature" and Path("dvc.yaml").is_file()
@@ -243,7 +192,7 @@ def _candidate(
         evidence = judging.measure(Path("datasets"), verdict.subject)
     except ValueError as reason:
         return JudgedLoop(decision._replace(reasons=[why, f"not measured: {reason}"]))
-    guards = {name: record.Guard(None, figure, None) for name, figure in evidence.guards.items()}
+    guards = {name: records.Guard(None, figure, None) for name, figure in evidence.guards.items()}
     return JudgedLoop(decision._replace(guards=guards), _metrics(evidence))
 
 

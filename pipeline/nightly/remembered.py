@@ -10,11 +10,10 @@ from typing import Any, NamedTuple, TypeVar
 
 import pydantic
 
+from pipeline.nightly import records
 from pipeline.nightly.processes import STATE
+from pipeline.nightly.records import Alarm, Night
 from pipeline.nightly.settings import Nightly
-from pipeline.report.nightly import record
-from pipeline.report.nightly.record import Night
-from pipeline.report.shared.night import Alarm, alarm_of, written
 from pipeline.store import artifacts
 
 LAST, NIGHTS, METRICS = STATE / "last.json", STATE / "nights.json", Path("reports/metrics/nightly.json")
@@ -42,18 +41,18 @@ class DriftMemory(NamedTuple):
 
     @classmethod
     def read(cls, fields: Mapping[str, Any]) -> "DriftMemory":
-        alarms = tuple(map(alarm_of, fields.get("alarms", ())))
+        alarms = tuple(map(Alarm.read, fields.get("alarms", ())))
         pending = tuple(fields.get("pending", ()))
         return cls(
             pending, alarms, fields.get("drifted", {}), fields.get("night", 0), fields.get("recent", {})
         )
 
-    def written(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         if self == DriftMemory():
             return {}
         fields = self._asdict() | {
             "pending": list(self.pending),
-            "alarms": [written(alarm) for alarm in self.alarms],
+            "alarms": [alarm.to_json() for alarm in self.alarms],
         }
         return {key: value for key, value in fields.items() if key != "recent" or value}
 
@@ -75,7 +74,7 @@ class Remembered(NamedTuple):
 
     @classmethod
     def read(cls, fields: Mapping[str, Any]) -> "Remembered":
-        """Raises one of MISSHAPEN where the file is not what `written` gave."""
+        """Raises one of MISSHAPEN where the file is not what `to_json` gave."""
         read = cls(
             night=fields["night"],
             success=fields.get("success"),
@@ -92,8 +91,8 @@ class Remembered(NamedTuple):
             raise ValueError(f"expected size, time, inode and digest of {odd[0]}")
         return pydantic.TypeAdapter(cls).validate_python(read)
 
-    def written(self) -> dict[str, Any]:
-        fields = self._asdict() | {"drift": self.drift.written()}
+    def to_json(self) -> dict[str, Any]:
+        fields = self._asdict() | {"drift": self.drift.to_json()}
         return fields if self.settings else {key: fields[key] for key in fields if key != "settings"}
 
     def known(self) -> Nightly | None:
@@ -143,7 +142,7 @@ def last() -> Remembered:
         rows, committed = nights(), _file(METRICS, _of_metrics, Remembered())
     except ValueError:  # neither is the memory itself
         rows, committed = [], Remembered()
-    successes = [night.when for night in rows if night.outcome != record.FAILED]
+    successes = [night.when for night in rows if night.outcome != records.FAILED]
     number = max(committed.night, *(night.number for night in rows)) if rows else committed.night
     return Remembered(night=number, success=max([committed.success or "", *successes]) or None)
 
@@ -187,10 +186,10 @@ def set_aside(path: Path) -> str:
 
 
 def remember(night: Remembered) -> None:
-    artifacts.write_json(LAST, night.written())
+    artifacts.write_json(LAST, night.to_json())
 
 
 def add(night: Night) -> None:
     """One more night for the page."""
-    rows = [*_file(NIGHTS, _rows, []), night.written()]
+    rows = [*_file(NIGHTS, _rows, []), night.to_json()]
     artifacts.write_json(NIGHTS, rows[-LONGEST_HISTORY:])

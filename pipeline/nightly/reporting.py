@@ -10,15 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.nightly import champion, guarding, remembered, watch
+from pipeline.nightly import champion, guarding, records, remembered, watch
 from pipeline.nightly.processes import STATE
+from pipeline.nightly.records import ChampionState, Night
 from pipeline.nightly.remembered import METRICS, Remembered
 from pipeline.nightly.settings import Nightly
-from pipeline.report.nightly import record
-from pipeline.report.nightly.record import Night
 from pipeline.store import artifacts, params
 
 OK, FAILED, DRIFTED, QUARANTINED, BUSY = 0, 1, 3, 4, 75
+# every night that is remembered, what is in production, and the settings -> the page. The caller brings it,
+# so that the night knows no page
+Render = Callable[[Sequence[Night], ChampionState, Nightly], str]
 PAGE = Path("reports/nightly.html")
 # what ends a night in a sentence; anything else is a mistake of this program, whose traceback is in the log
 REFUSALS = (ValueError, OSError, MemoryError, np.linalg.LinAlgError)
@@ -55,8 +57,9 @@ def settings_or_known(last: Remembered, run: str) -> tuple[Nightly | None, list[
 # ---- the report
 
 
-def report(night: Night, tonight: Remembered, settings: Nightly | None) -> tuple[int, str]:
-    """State, page, alarm or heartbeat; the exit status and the summary. `tonight` is what is remembered."""
+def report(night: Night, tonight: Remembered, settings: Nightly | None, render: Render) -> tuple[int, str]:
+    """State, page, alarm or heartbeat; the exit status and the summary. `tonight` is what is remembered,
+    `render` makes the page."""
     troubles: list[str] = []
 
     def attempt(part: Callable[[], None]) -> bool:
@@ -67,17 +70,19 @@ def report(night: Night, tonight: Remembered, settings: Nightly | None) -> tuple
             troubles.append(told(error, night.run))
             return False
 
-    if night.outcome not in (record.FAILED, record.NOTHING_NEW) and not night.commit:
+    if night.outcome not in (records.FAILED, records.NOTHING_NEW) and not night.commit:
         attempt(lambda: artifacts.write_json(METRICS, night.metrics(champion.read())))
     attempt(lambda: remembered.remember(tonight))
     attempt(lambda: remembered.add(night))
     shown = night.noted(*troubles)
-    made = night.outcome == record.NOTHING_NEW or (settings and attempt(lambda: _page(shown, settings)))
+    made = night.outcome == records.NOTHING_NEW or (
+        settings and attempt(lambda: _write_page(shown, settings, render))
+    )
     if not made:
         attempt(lambda: artifacts.write_text(PAGE, plain_page(night, troubles)))
     status = FAILED if troubles else exit_status(night)
     routes = watch.routes(settings)
-    if status == OK or (status in (DRIFTED, QUARANTINED) and night.outcome != record.FAILED):
+    if status == OK or (status in (DRIFTED, QUARANTINED) and night.outcome != records.FAILED):
         troubles += watch.beat(routes)
     if status != OK:
         kind, reasons = _alarm(night, status, troubles)
@@ -85,7 +90,7 @@ def report(night: Night, tonight: Remembered, settings: Nightly | None) -> tuple
             "night": night.run,
             "when": night.when,
             "status": status,
-            "drift": night.drift_written(),
+            "drift": night.drift_row(),
             "quarantined": dict(night.quarantined),
             "log": f".beadline/logs/{night.run}.log",
         }
@@ -93,11 +98,9 @@ def report(night: Night, tonight: Remembered, settings: Nightly | None) -> tuple
     return status, summary(night, troubles)
 
 
-def _page(night: Night, settings: Nightly) -> None:
-    from pipeline.report.nightly import page
-
+def _write_page(night: Night, settings: Nightly, render: Render) -> None:
     nights = [*(earlier for earlier in remembered.nights() if earlier.number != night.number), night]
-    artifacts.write_text(PAGE, page.render(nights, champion.read(), watch.shown(settings)))
+    artifacts.write_text(PAGE, render(nights, champion.read(), watch.shown(settings)))
 
 
 def plain_page(night: Night, troubles: Sequence[str]) -> str:
@@ -115,7 +118,7 @@ def plain_page(night: Night, troubles: Sequence[str]) -> str:
 
 def exit_status(night: Night) -> int:
     """What a scheduler is told: the gravest of what the night met."""
-    if night.outcome == record.FAILED or night.unpushed or night.lost:
+    if night.outcome == records.FAILED or night.unpushed or night.lost:
         return FAILED
     if night.drift.alarms:
         return DRIFTED
@@ -129,7 +132,7 @@ def _alarm(night: Night, status: int, troubles: Sequence[str]) -> tuple[str, lis
         lost = [f"{name}: {night.decisions[name].reasons[0]}" for name in night.lost]
         own = (
             night.reasons
-            if night.outcome == record.FAILED
+            if night.outcome == records.FAILED
             else (*lost, *(night.notes if night.unpushed else ()))
         )
         return "failed", list(dict.fromkeys([*own, *troubles, *drift, *aside]))
@@ -146,7 +149,7 @@ def summary(night: Night, troubles: Sequence[str]) -> str:
     parts += [f"candidate {one}" for one in waiting]
     if alarms:
         parts.append(f"drift: {'; '.join(alarms)}")
-    if not (night.promoted or alarms) or night.lost or night.outcome == record.FAILED:
+    if not (night.promoted or alarms) or night.lost or night.outcome == records.FAILED:
         parts += ["; ".join(rest)] if (rest := [why for why in night.reasons if why not in waiting]) else []
     if night.quarantined:
         parts.append("quarantined: " + "; ".join(night.quarantined.values()))
@@ -169,7 +172,7 @@ def last_resort(error: Exception, now: datetime.datetime) -> tuple[int, str]:
     settings, _ = settings_or_known(last, "nightly")
     details = {"night": "nightly", "when": watch.stamp(now), "status": FAILED}
     troubles = watch.wake("failed", [why], details, watch.routes(settings))
-    night = Night(last.night + 1, "nightly", watch.stamp(now)).ended(record.FAILED, why)
+    night = Night(last.night + 1, "nightly", watch.stamp(now)).ended(records.FAILED, why)
     try:
         artifacts.write_text(PAGE, plain_page(night, troubles))
     except Exception as unwritten:

@@ -9,7 +9,7 @@ import yaml
 
 from pipeline.nightly import guarding
 from pipeline.nightly.processes import STATE, TooLongError, dvc, sentence
-from pipeline.nightly.settings import Loop
+from pipeline.nightly.settings import NightlyLoop
 
 
 class Wiring(NamedTuple):
@@ -29,14 +29,7 @@ class Wiring(NamedTuple):
         }
 
 
-class Reproduced(NamedTuple):
-    """What a run of the stages came to: {loop: why its stages failed}, and notes."""
-
-    lost: Mapping[str, str] = {}
-    notes: tuple[str, ...] = ()
-
-
-def wiring(loops: Mapping[str, Loop]) -> Wiring:
+def wiring(loops: Mapping[str, NightlyLoop]) -> Wiring:
     """Read off dvc.yaml."""
     stages = yaml.safe_load(Path("dvc.yaml").read_text(encoding="utf-8")).get("stages", {})
     made = {out: name for name, stage in stages.items() for out in _outs(stage)}
@@ -77,14 +70,16 @@ def _upstream(stage: str, reads: Mapping[str, set[str]]) -> frozenset[str]:
 # ---- the run
 
 
-def reproduce(loops: Mapping[str, Loop], run: str, *, limit_s: float) -> Reproduced:
-    """Runs the stages. Of a loop whose stages failed all is as it was before the night. Raises ValueError
-    where every loop failed, or a stage of none, or dvc itself, and where
-    they take longer than `limit_s`."""
+def reproduce(
+    loops: Mapping[str, NightlyLoop], run: str, *, limit_s: float
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """{loop: why its stages failed}, and notes. The files of a loop whose stages failed are as they were
+    before the night. Raises ValueError if every loop failed, a stage of no loop, or dvc itself, and if the
+    stages take longer than `limit_s`."""
     log = STATE / "logs" / f"{run}.log"
     try:
         dvc("repro", "--keep-going", log=log, limit_s=limit_s)
-        return Reproduced()
+        return {}, ()
     except TooLongError:
         raise  # no stage is to blame by what it printed
     except ValueError:
@@ -106,7 +101,7 @@ def reproduce(loops: Mapping[str, Loop], run: str, *, limit_s: float) -> Reprodu
         for stage in wires.upstream
         if stage not in theirs and wires.loops(stage) & lost.keys() and wires.upstream[stage] & {*failed}
     ]
-    return Reproduced(lost, (*notes, *_once_more(shared, run, limit_s)))
+    return lost, (*notes, *_once_more(shared, run, limit_s))
 
 
 def _failed(wires: Wiring) -> list[str]:

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.nightly import champion, pictures, temperature_drift
+from pipeline.nightly.records import LoopDrift, NightDrift
 from pipeline.nightly.remembered import DriftMemory
-from pipeline.nightly.settings import Loop, Nightly
+from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.nightly.temperature_drift import REFERENCE
-from pipeline.report.shared.night import LoopDrift, NightDrift
 from pipeline.store import artifacts, params
 
 
@@ -53,30 +53,30 @@ def look(
 
 def _loop_drift(
     settings: Nightly, name: str, paths: Sequence[str], memory: DriftMemory, *, has_champion: bool
-) -> temperature_drift.Screened:
-    """Drift of one loop by its new recordings; none where there is no new one, or nothing to hold it
-    against."""
+) -> tuple[LoopDrift, dict[str, Any] | None]:
+    """Drift of one loop by its new recordings, and what the next night must remember of it. Both are empty if
+    there is no new recording, or nothing to compare it with."""
     loop, own, pending = settings.loops[name], champion.FOLDER / name, set(memory.pending)
-    none = temperature_drift.Screened(LoopDrift.none(name), None)
+    none = LoopDrift.none(name)
     if not paths:
-        return none
+        return none, None
     if loop.judge == "temperature" and loop.recordings and _recorded():
         return temperature_drift.look(
             settings.drift, name, loop.recordings, paths, own if has_champion else None, pending,
             memory.recent.get(name, {}),
         )  # fmt: skip
     if loop.judge == "deposition":
-        return none._replace(drift=pictures.trials_drift(settings.drift, name, paths, _read(own), pending))
+        return pictures.trials_drift(settings.drift, name, paths, _read(own), pending), None
     if loop.judge == "setpoint":
-        prints = pictures.NewPrints(loop.recordings, paths, _read(own))
-        return none._replace(drift=pictures.prints_drift(settings.drift, name, prints, pending))
-    return none
+        reference = _read(own).get("camera", [])
+        return pictures.prints_drift(settings.drift, name, loop.recordings, paths, reference, pending), None
+    return none, None
 
 
 # ---- the champion's own recordings
 
 
-def reference(loop: Loop, folder: Path, only: Sequence[str] = ()) -> dict[str, Any] | None:
+def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict[str, Any] | None:
     """What the recordings that a challenger was made of say of its own model, for
     champion/<loop>/reference.json: a night's figures mean something only beside those of nights
     that are known to be good; `only` these recordings, or prints, where any are named. None

@@ -20,7 +20,7 @@ Inside = AfterValidator(_in_the_project)
 Path = Annotated[str, Field(min_length=1, max_length=300), Inside]
 
 
-class Loop(Section):
+class NightlyLoop(Section):
     """One control loop: the files that are its controller, and where the judge finds its evidence: a
     panel of its own (temperature), what its stage scored on cases that nothing was trained on
     (deposition, setpoint), or a file of costs by case."""
@@ -45,7 +45,7 @@ class Loop(Section):
         return self
 
 
-class Rule(Section):
+class PromotionRule(Section):
     """Better beyond noise, by a margin worth a change, and no guard worse by more than is allowed."""
 
     level: float = Field(gt=0, le=0.2)
@@ -75,7 +75,7 @@ class HoldOut(Section):
     steps: int = Field(ge=60, le=20000)
 
 
-class Drift(Section):
+class DriftLimits(Section):
     """What matters of each figure, and how sure the night must be. A change of the machine is an alarm where
     its estimate, pooled over nights, is past its limit by `limit_sigmas`; a picture or the closed loop where
     it leaves its band by `alarm_sigmas` at once, or by `watch_sigmas` two nights running."""
@@ -109,10 +109,10 @@ class Nightly(Section):
     webhook: str = Field(max_length=1000)
     heartbeat: str = Field(max_length=1000)
     keep_gb: float = Field(ge=0, le=1e6)
-    loops: dict[Annotated[str, Field(min_length=1, max_length=40)], Loop]
-    rule: Rule
+    loops: dict[Annotated[str, Field(min_length=1, max_length=40)], NightlyLoop]
+    rule: PromotionRule
     holdout: HoldOut
-    drift: Drift
+    drift: DriftLimits
 
     @pydantic.model_validator(mode="after")
     def _loop(self):

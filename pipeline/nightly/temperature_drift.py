@@ -9,11 +9,10 @@ import numpy as np
 
 from pipeline.nightly import baseline, drift, judge, mistakes, pictures
 from pipeline.nightly.baseline import Baseline
-from pipeline.nightly.camera_drift import Change
-from pipeline.nightly.drift import Cause, Explanation, Fit, Machine, Record, Segments
+from pipeline.nightly.camera_drift import CameraChange
+from pipeline.nightly.drift import CauseFit, DriftCause, DriftRecord, Explanation, ProductionModel, Segments
 from pipeline.nightly.inputs import quarantine
-from pipeline.nightly.settings import Drift, Loop
-from pipeline.report.shared.night import (
+from pipeline.nightly.records import (
     Alarm,
     ClosedLoopChange,
     InnovationChange,
@@ -21,6 +20,7 @@ from pipeline.report.shared.night import (
     ParameterChange,
     RecordingFigures,
 )
+from pipeline.nightly.settings import DriftLimits, NightlyLoop
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant
 
@@ -42,11 +42,11 @@ SETTLED = 5.0
 PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures are known
 
 
-class Reference(NamedTuple):
+class ProductionReference(NamedTuple):
     """What the champion's own recordings said of its model, and their closed-loop figures; `digest` is that
     of reference.json, by which the memory of the nights knows it again."""
 
-    machine: Machine
+    machine: ProductionModel
     own: Baseline
     loop: list[dict[str, list[list[float]]]]
     digest: str
@@ -59,7 +59,7 @@ class Estimate(NamedTuple):
     deviation: float
 
 
-class Found(NamedTuple):
+class RecordingChange(NamedTuple):
     """A change of one recording: kind and channel for a machine to read, words for a person, the estimate and
     the limit that it is held against."""
 
@@ -75,7 +75,7 @@ class Found(NamedTuple):
         return f"{kind} of {self.channel}" if self.channel else kind
 
 
-class Night(NamedTuple):
+class NightChanges(NamedTuple):
     """Of one night, by the key of the change: what it named, and where it named nothing in calm air, what
     each change would be as if it alone had come about."""
 
@@ -83,20 +83,13 @@ class Night(NamedTuple):
     seeming: dict[str, Estimate]
 
 
-Nights = list[Night]  # the last one last
-
-
-class Screened(NamedTuple):
-    """The loop's drift, and what the next night must remember of this one (see `DriftMemory.recent`)."""
-
-    drift: LoopDrift
-    recent: dict[str, Any] | None
+Nights = list[NightChanges]  # the last one last
 
 
 # ---- the champion's own recordings
 
 
-def reference(loop: Loop, folder: Path, only: Sequence[str] = ()) -> dict[str, Any] | None:
+def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict[str, Any] | None:
     """champion/<loop>/reference.json of the model below `folder`, from the loop's recordings, or `only` those
     named; None where they are none, or too short."""
     machine = params.load(Plant, "plant")
@@ -111,25 +104,25 @@ def reference(loop: Loop, folder: Path, only: Sequence[str] = ()) -> dict[str, A
             for part, other in zip(np.array_split(u, PIECES), np.array_split(y, PIECES), strict=True)
         ]
     try:
-        own = baseline.measured(Machine(judge.identified(folder), _samples(nights)), nights, floors)
+        own = baseline.measured(ProductionModel(judge.identified(folder), _samples(nights)), nights, floors)
     except ValueError:
         return None
     return {
         "schema": "reference",
         "version": baseline.VERSION,
         "samples": _samples(nights),
-        "own": own.written(),
+        "own": own.to_json(),
         "loop": [_closed_loop(night, machine) for night in nights],
     }
 
 
-def _read_reference(folder: Path) -> Reference | None:
+def _read_reference(folder: Path) -> ProductionReference | None:
     path = folder / REFERENCE
     fields = artifacts.read_json(path) if path.exists() else {}
     if fields.get("version") != baseline.VERSION:
         return None
-    machine = Machine(judge.identified(folder), fields["samples"])
-    return Reference(machine, Baseline.read(fields["own"]), fields["loop"], artifacts.sha256(path))
+    machine = ProductionModel(judge.identified(folder), fields["samples"])
+    return ProductionReference(machine, Baseline.read(fields["own"]), fields["loop"], artifacts.sha256(path))
 
 
 def _last(segments: Segments) -> Segments:
@@ -150,7 +143,7 @@ def _samples(nights: Sequence[Segments]) -> int:
 # ---- a night's recordings
 
 
-class Named(NamedTuple):
+class SignalNames(NamedTuple):
     """Names of the machine's signals."""
 
     inputs: list[str]
@@ -158,19 +151,20 @@ class Named(NamedTuple):
 
 
 def look(
-    limits: Drift,
+    limits: DriftLimits,
     name: str,
     folder: str,
     new: Sequence[str],
     champion: Path | None,
     pending: set[str],
     recent: Mapping[str, Any],
-) -> Screened:
-    """Drift of loop `name` by its new recordings below `folder`, against the champion's; `recent` is what the
-    nights before named. What cannot be read, or is not what it says, is set aside."""
+) -> tuple[LoopDrift, dict[str, Any] | None]:
+    """Drift of loop `name` by its new recordings below `folder`, against the champion's, and what the next
+    night must remember of this one (see `DriftMemory.recent`); `recent` is what the nights before named. A
+    recording that cannot be read, or is not what it says, is set aside."""
     drifted = LoopDrift.none(name)
     if not Path(folder).is_dir():
-        return Screened(drifted, None)
+        return drifted, None
     machine, broken = params.load(Plant, "plant"), {}
     records = judge.record_segments(Path(folder), machine, broken=broken)
     for path, reason in broken.items():
@@ -182,14 +176,14 @@ def look(
         if path not in drifted.quarantined and records.get(path.removeprefix(f"{folder}/"))
     ]
     if champion is None or not good:
-        return Screened(drifted, None)
+        return drifted, None
     held = _read_reference(champion)
     if held is None:
         drifted.notes.append(
             f"{name}: the champion has no reference of its own recordings that this version reads: drift was "
             "not measured; the next promotion makes one"
         )
-        return Screened(drifted, None)
+        return drifted, None
     nights = _nights(recent, held.digest)
     for path in good:
         segments = _last(records[path.removeprefix(f"{folder}/")])
@@ -198,10 +192,10 @@ def look(
         except ValueError as error:
             drifted.notes.append(f"{path}: {error}")
     recent = {
-        "nights": [_written(night.named) for night in nights],
-        "seeming": [_written(night.seeming) for night in nights],
+        "nights": [_rounded(night.named) for night in nights],
+        "seeming": [_rounded(night.seeming) for night in nights],
     }
-    return Screened(drifted, {"reference": held.digest, **recent})
+    return drifted, {"reference": held.digest, **recent}
 
 
 def _nights(recent: Mapping[str, Any], digest: str) -> Nights:
@@ -210,29 +204,31 @@ def _nights(recent: Mapping[str, Any], digest: str) -> Nights:
         return []
     named = recent.get("nights", [])
     seeming = recent.get("seeming", [{}] * len(named))
-    return [Night(_estimates(one), _estimates(other)) for one, other in zip(named, seeming, strict=True)]
+    return [
+        NightChanges(_estimates(one), _estimates(other)) for one, other in zip(named, seeming, strict=True)
+    ]
 
 
 def _estimates(night: Mapping[str, Sequence[float]]) -> dict[str, Estimate]:
     return {key: Estimate(*pair) for key, pair in night.items()}
 
 
-def _written(night: Mapping[str, Estimate]) -> dict[str, list[float]]:
+def _rounded(night: Mapping[str, Estimate]) -> dict[str, list[float]]:
     return {key: [round(float(part), 6) for part in estimate] for key, estimate in night.items()}
 
 
 def _one(
-    limits: Drift,
+    limits: DriftLimits,
     drifted: LoopDrift,
     path: str,
     segments: Segments,
-    held: Reference,
+    held: ProductionReference,
     machine: Plant,
     nights: Nights,
     pending: set[str],
 ) -> LoopDrift:
     """The loop's drift with what one recording says; it joins `nights`."""
-    names = Named([i.name for i in machine.inputs], [o.name for o in machine.outputs])
+    names = SignalNames([i.name for i in machine.inputs], [o.name for o in machine.outputs])
     mistake = mistakes.found(held.machine, segments, held.own, inputs=names.inputs, outputs=names.outputs)
     if mistake:
         reason = (
@@ -243,7 +239,7 @@ def _one(
         segments = mistake.undone
     measured = _measure(limits, segments, held, machine, names)
     drifted.figures[path] = measured.figures
-    nights.append(Night({found.key: found.estimate for found in measured.found}, measured.seeming))
+    nights.append(NightChanges({found.key: found.estimate for found in measured.found}, measured.seeming))
     del nights[:-POOLED]
     singly = [
         (found, _past_limit([night.named.get(found.key) for night in nights], found.limit))
@@ -283,7 +279,9 @@ def _past_limit(estimates: Sequence[Estimate | None], limit: float) -> float:
     return float(largest)
 
 
-def together(limits: Drift, nights: Nights, held: Reference, names: Named) -> list[Found]:
+def together(
+    limits: DriftLimits, nights: Nights, held: ProductionReference, names: SignalNames
+) -> list[RecordingChange]:
     """What the last nights name together where the last one by itself names nothing: the change whose mean
     over two or more of them, weighted by what each knows, explains most (fixed effects; Basseville and
     Nikiforov 1993, ch. 2.4). Empty where none is TOGETHER sigmas from none."""
@@ -325,17 +323,19 @@ def _worth(estimate: Estimate) -> float:
 # ---- one recording
 
 
-class Measured(NamedTuple):
+class RecordingDrift(NamedTuple):
     """Of one recording: figures for the page, what changed, what each change would be where none is named,
     and what the closed loop does otherwise beyond what those changes and the air around bring."""
 
     figures: RecordingFigures
-    found: list[Found]
+    found: list[RecordingChange]
     seeming: dict[str, Estimate]
-    loop: list[Change]
+    loop: list[CameraChange]
 
 
-def _measure(limits: Drift, segments: Segments, held: Reference, machine: Plant, names: Named) -> Measured:
+def _measure(
+    limits: DriftLimits, segments: Segments, held: ProductionReference, machine: Plant, names: SignalNames
+) -> RecordingDrift:
     own, asked = held.own, drift.causes(held.machine.plant)
     record, explained = drift.explain_segments(
         held.machine, segments, own.scale, own.changes, own.usual(asked)
@@ -350,10 +350,12 @@ def _measure(limits: Drift, segments: Segments, held: Reference, machine: Plant,
     figures = RecordingFigures(
         _parameters(record, explained, held, names), noise, loop.figures, loop.not_applicable
     )
-    return Measured(figures, [*found, *louder], _seeming(record, explained, held, names), loop.causes)
+    return RecordingDrift(figures, [*found, *louder], _seeming(record, explained, held, names), loop.causes)
 
 
-def _seeming(record: Record, explained: Explanation, held: Reference, names: Named) -> dict[str, Estimate]:
+def _seeming(
+    record: DriftRecord, explained: Explanation, held: ProductionReference, names: SignalNames
+) -> dict[str, Estimate]:
     """What each change would be as if it alone had come about, where none is named and the air is calm: what
     restless air does to a level is much the same every night, and no mean takes it away. A cap has no size
     to take a mean of."""
@@ -363,12 +365,12 @@ def _seeming(record: Record, explained: Explanation, held: Reference, names: Nam
     return {_key(fit.cause, names): _amount(fit, held, ()) for fit in fits}
 
 
-def _name(cause: Cause, names: Named) -> str:
+def _name(cause: DriftCause, names: SignalNames) -> str:
     of = names.outputs if cause.kind in ("offset", "late sensor") else names.inputs
     return of[cause.channel] if cause.channel >= 0 else "every input"
 
 
-def _amount(fit: Fit, held: Reference, segments: Segments) -> Estimate:
+def _amount(fit: CauseFit, held: ProductionReference, segments: Segments) -> Estimate:
     """A fit in the unit of its limit: percent, s, °C, or percent of the record."""
     cause, value, deviation = fit.cause, fit.value, fit.deviation
     if cause.kind == "saturation":
@@ -392,8 +394,13 @@ def _amount(fit: Fit, held: Reference, segments: Segments) -> Estimate:
 
 
 def _found(
-    limits: Drift, named: drift.Named, record: Record, held: Reference, segments: Segments, names: Named
-) -> Found:
+    limits: DriftLimits,
+    named: drift.NamedCause,
+    record: DriftRecord,
+    held: ProductionReference,
+    segments: Segments,
+    names: SignalNames,
+) -> RecordingChange:
     """What is said of a named change, and of what the record cannot tell it from."""
     told = []
     for fit in (named.fit, *named.rivals):
@@ -401,14 +408,16 @@ def _found(
     return _likeliest(told)
 
 
-def _said(limits: Drift, cause: Cause, estimate: Estimate, names: Named, cap: float = np.nan) -> Found:
+def _said(
+    limits: DriftLimits, cause: DriftCause, estimate: Estimate, names: SignalNames, cap: float = np.nan
+) -> RecordingChange:
     """A change in words; `cap` in percent is the level of a saturation."""
     name = _name(cause, names)
     words = _words(cause, estimate.amount, name, cap)
-    return Found(_kind(cause), name, words, estimate, _limit(limits, cause))
+    return RecordingChange(_kind(cause), name, words, estimate, _limit(limits, cause))
 
 
-def _likeliest(told: Sequence[Found]) -> Found:
+def _likeliest(told: Sequence[RecordingChange]) -> RecordingChange:
     """Rivals, the likeliest first, as one: where one of them is far past its own limit and the likeliest is
     not, it is said first."""
     first = max(told, key=_past)
@@ -420,27 +429,27 @@ def _likeliest(told: Sequence[Found]) -> Found:
     return first._replace(kind=" or ".join(kinds), words=", or ".join(one.words for one in told) + rest)
 
 
-def _past(found: Found) -> float:
+def _past(found: RecordingChange) -> float:
     """The change in units of its limit."""
     return abs(found.estimate.amount) / found.limit
 
 
-def _limit(limits: Drift, cause: Cause) -> float:
+def _limit(limits: DriftLimits, cause: DriftCause) -> float:
     return {
         "gain": limits.parameter_percent, "time constant": limits.time_constant_percent,
         "delay": limits.delay_s, "offset": limits.offset_degC, "saturation": limits.at_limits_points,
     }[_kind(cause)]  # fmt: skip
 
 
-def _key(cause: Cause, names: Named) -> str:
+def _key(cause: DriftCause, names: SignalNames) -> str:
     return f"{_kind(cause)} of {_name(cause, names)}"
 
 
-def _kind(cause: Cause) -> str:
+def _kind(cause: DriftCause) -> str:
     return "delay" if cause.kind == "late sensor" else cause.kind
 
 
-def _words(cause: Cause, amount: float, name: str, cap: float) -> str:
+def _words(cause: DriftCause, amount: float, name: str, cap: float) -> str:
     kind = cause.kind
     if kind == "gain":
         return f"the gain from {name} has changed by {amount:+.1f} %"
@@ -459,19 +468,23 @@ def _words(cause: Cause, amount: float, name: str, cap: float) -> str:
     return f"{name} {verb} {abs(amount):.1f} s {word} than it did"
 
 
-def _air(limits: Drift, air: float, record: Record, held: Reference) -> Found:
+def _air(limits: DriftLimits, air: float, record: DriftRecord, held: ProductionReference) -> RecordingChange:
     word = "warmer" if air > 0 else "colder"
     words = (
         f"it is {abs(air):.0f} °C {word} around the machine than on the champion's own nights, or every "
         "sensor reads so much from what it did"
     )
     deviation = float(np.hypot(drift.air_deviation(record), held.own.scale.ambient))
-    return Found("ambient", "", words, Estimate(air, deviation), limits.ambient_degC)
+    return RecordingChange("ambient", "", words, Estimate(air, deviation), limits.ambient_degC)
 
 
 def _noise(
-    limits: Drift, record: Record, explained: Explanation, held: Reference, names: Named
-) -> tuple[dict[str, InnovationChange], list[Found]]:
+    limits: DriftLimits,
+    record: DriftRecord,
+    explained: Explanation,
+    held: ProductionReference,
+    names: SignalNames,
+) -> tuple[dict[str, InnovationChange], list[RecordingChange]]:
     """Noise of each output, and by how many degrees of its steady level it is off what the champion's nights
     had; then the noises that have changed."""
     value, deviation = baseline.noise(drift.by_output(record, explained.left))
@@ -489,12 +502,12 @@ def _noise(
         # of a logarithm of a variance
         estimate = Estimate(percent, 50 * float(ratio[i] * noise.deviation[i]))
         if abs(percent) > 0.5 * limits.noise_percent and abs(sigmas) >= drift.SURE:
-            found.append(Found("noise", output, words, estimate, limits.noise_percent))
+            found.append(RecordingChange("noise", output, words, estimate, limits.noise_percent))
     return figures, found
 
 
 def _parameters(
-    record: Record, explained: Explanation, held: Reference, names: Named
+    record: DriftRecord, explained: Explanation, held: ProductionReference, names: SignalNames
 ) -> dict[str, ParameterChange]:
     """{cause: change in percent, half of its 90 % band, sigmas} of gains and time constants: what was named,
     and what the others seem beside it."""
@@ -547,15 +560,15 @@ class LoopChanges(NamedTuple):
     """Of the closed loop: figures by name, what has changed, and why it was not asked, if it was not."""
 
     figures: dict[str, ClosedLoopChange]
-    causes: list[Change]
+    causes: list[CameraChange]
     not_applicable: str = ""
 
 
 def _loop(
-    limits: Drift,
+    limits: DriftLimits,
     now: Mapping[str, list[list[float]]],
-    held: Reference,
-    names: Named,
+    held: ProductionReference,
+    names: SignalNames,
     effect: np.ndarray,
     *,
     asked: bool,
@@ -580,12 +593,12 @@ def _loop(
             if beyond > 0:
                 words = f"closed loop: {name} {sentence.format(f'{by:+.2g}')}"
                 sigmas = float(moved.sigmas[k]) * beyond / abs(by) if asked else float(moved.sigmas[k])
-                causes.append(Change(f"{key} of {name}", words, sigmas))
+                causes.append(CameraChange(f"{key} of {name}", words, sigmas))
     return LoopChanges(figures, causes)
 
 
 def _asked(
-    limits: Drift, held: Reference, names: Named, effect: np.ndarray
+    limits: DriftLimits, held: ProductionReference, names: SignalNames, effect: np.ndarray
 ) -> dict[str, tuple[str, float, np.ndarray]]:
     """By figure of the closed loop: its sentence, what matters, and what the machine's changes may bring."""
     plant = held.machine.plant

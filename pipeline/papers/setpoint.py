@@ -17,11 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from pipeline.papers import files
-from pipeline.setpoint import score
-from pipeline.setpoint.agents import agent, judging
+from pipeline.setpoint.agents import agent, score, trials
 from pipeline.setpoint.published import PHASES, ROTATION
 from pipeline.setpoint.simulation.simulator import (
-    Conditions,
+    EpisodeConditions,
     Trajectory,
     nominal,
     paper_windows,
@@ -29,9 +28,9 @@ from pipeline.setpoint.simulation.simulator import (
     rollout,
 )
 from pipeline.setpoint.vision.vision_transformer import PAPER, parameters, vision_transformer
-from pipeline.setpoint.workflow import train_agent
-from pipeline.setpoint.workflow.settings import TrainAgent
 from pipeline.store import params
+from stages import train_agent
+from stages.train_agent import TrainAgent
 
 COMMAND = "./run dvc repro datasets/papers/dvc.yaml:setpoint"
 MEMO = Path("datasets/memo/train_agent")
@@ -54,7 +53,7 @@ WAITS_S, MELTS_S = (3.0, 6.0), (0.0, 2.0, 4.0)
 RHO = 0.7
 
 
-class Agents(NamedTuple):
+class PhaseNetworks(NamedTuple):
     """The networks after each phase, the fourth with the class right with probability 0.7 and with 0.3, and
     the mean reward of a step of each phase."""
 
@@ -62,7 +61,7 @@ class Agents(NamedTuple):
     rewards: list[np.ndarray]
 
 
-def trained(settings: TrainAgent) -> Agents:
+def trained(settings: TrainAgent) -> PhaseNetworks:
     """The paper's agent, and the one whose phase 4 takes rho for the probability of a wrong class."""
     other = settings.model_copy(update={"li_2025": settings.li_2025.model_copy(update={"accuracy": 1 - RHO})})
     MEMO.mkdir(parents=True, exist_ok=True)
@@ -71,21 +70,21 @@ def trained(settings: TrainAgent) -> Agents:
     )
     by_name = {f"phase_{i + 1}": network for i, network in enumerate(as_read.networks)}
     by_name["phase_4_rho_wrong"] = otherwise.networks[-1]
-    return Agents(by_name, [np.asarray(part) for part in as_read.rewards])
+    return PhaseNetworks(by_name, [np.asarray(part) for part in as_read.rewards])
 
 
-def asked() -> tuple[Conditions, dict[str, slice]]:
+def asked() -> tuple[EpisodeConditions, dict[str, slice]]:
     """Everything that each agent is asked, as one batch, and where in it."""
     parts, places, end = [], {}, 0
 
-    def add(name: str, part: Conditions) -> None:
+    def add(name: str, part: EpisodeConditions) -> None:
         nonlocal end
         parts.append(part)
         places[name] = slice(end, end + part.flow.shape[0])
         end += part.flow.shape[0]
 
     for accuracy in (1.0, RHO, 1 - RHO):
-        add(f"starts_{100 * accuracy:.0f}", judging.starts(20, accuracy=accuracy))
+        add(f"starts_{100 * accuracy:.0f}", trials.starts(20, accuracy=accuracy))
     for name, (flow, temperature) in SINGLE.items():
         for accuracy in (1.0, RHO):
             add(f"{name}_{100 * accuracy:.0f}", nominal(np.full(RUNS, flow), temperature, accuracy=accuracy))
@@ -134,8 +133,8 @@ def starts(path: Trajectory, place: slice) -> dict[str, Any]:
     by_start = {
         f"{flow:g}, {temperature:g}": 100.0
         * float(settled[(q[:, 0] == flow) & (np.abs(u[:, 0] - temperature) < 1e-3)].mean())
-        for temperature in judging.START_TEMPERATURES
-        for flow in judging.START_FLOWS
+        for temperature in trials.START_TEMPERATURES
+        for flow in trials.START_FLOWS
     }
     return {
         "runs": told.runs,
@@ -192,7 +191,7 @@ def reward_figures() -> dict[str, float]:
     return {name: float(reward(jnp.array(q), jnp.array(u), a=a, b=b)) for name, (q, u) in points.items()}
 
 
-def rewards_of(agents: Agents, episode: int) -> dict[str, Any]:
+def rewards_of(agents: PhaseNetworks, episode: int) -> dict[str, Any]:
     """Figure 6: the mean reward of a step times the steps of an episode, 50 means a phase."""
     phases = [
         [round(episode * float(part.mean()), 3) for part in np.array_split(values, 50)]
@@ -209,13 +208,13 @@ def seeds(settings: TrainAgent, count: int = TRAINING_SEEDS) -> dict[str, Any]:
     """Settled in percent at accuracy 0.7 after phase 4, by training seed 0, 1, ...; each judged from 21
     starts, 100 runs a start."""
     controller = agent.greedy(agent.paper_encoder(settings.li_2025.history))
-    conditions, settled = judging.starts(RUNS, accuracy=RHO), []
+    conditions, settled = trials.starts(RUNS, accuracy=RHO), []
     MEMO.mkdir(parents=True, exist_ok=True)
     for seed in range(count):
         own = settings.model_copy(update={"seed": seed})
         network = train_agent.published_agent(own, MEMO, lambda *_: None).networks[-1]
         key = jax.random.key(1000 + seed)
-        score = judging.evaluate(controller, network, paper_windows(), conditions, key)
+        score = trials.evaluate(controller, network, paper_windows(), conditions, key)
         settled.append(round(score.settled.percent, 2))
     return {"settled": settled, "least": min(settled), "most": max(settled), "seeds": len(settled)}
 
@@ -250,7 +249,7 @@ def arithmetic() -> dict[str, Any]:
     }
 
 
-def sizes(networks: Agents) -> dict[str, Any]:
+def sizes(networks: PhaseNetworks) -> dict[str, Any]:
     """Parameters of the networks, and what table 1 lists."""
     classifier = vision_transformer(PAPER, np.random.default_rng(0))
     return {

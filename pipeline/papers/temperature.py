@@ -150,14 +150,14 @@ def value_iteration(data: Squares, weights: Weights, stop: float = STOP) -> tupl
 # ---- runs
 
 
-class Run(NamedTuple):
+class StudyRun(NamedTuple):
     """y (1001, 5) in °C, J (1001,) as the script sums it: entry k holds k + 1 stages."""
 
     y: np.ndarray
     J: np.ndarray
 
 
-def data_driven(q: np.ndarray, K: np.ndarray) -> Run:
+def data_driven(q: np.ndarray, K: np.ndarray) -> StudyRun:
     """Section 6.3: seven steps under -K_data x, then the learned gain K (7, 77); u'Ru with R = I, and not
     discounted; y(0) is taken for 50 °C."""
     plant = baam()
@@ -169,7 +169,7 @@ def data_driven(q: np.ndarray, K: np.ndarray) -> Run:
         x = plant.A @ x + plant.B @ u[t]
     y[0] = 50.0
     late = GAMMA ** np.maximum(np.arange(1001) - 1, 0)
-    return Run(y, np.cumsum(late * ((y - REFERENCE) ** 2 @ q) + (u**2).sum(axis=1)))
+    return StudyRun(y, np.cumsum(late * ((y - REFERENCE) ** 2 @ q) + (u**2).sum(axis=1)))
 
 
 class Observed(NamedTuple):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from pipeline.reading.formats import Columns
+from pipeline.reading.formats import FileColumns
 from pipeline.reading.mcap_columns import Topic, mcap_columns, resolve, topics
 from pipeline.reading.signals import Note
 from pipeline.reading.signatures import METADATA
@@ -66,12 +66,12 @@ def _text(value: object) -> str:
 
 def read_bag(
     path: Path, sources: Sequence[str], time: str
-) -> tuple[list[Columns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
+) -> tuple[list[FileColumns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
     """What `mcap_columns` gives, of all parts of a bag one behind the other."""
     parts = bag_parts(path)
     by_part = [topics(part) for part in parts]
     places = {source: resolve(path, source, merged(by_part)) for source in sources}
-    pieces: dict[str, list[Columns]] = {}
+    pieces: dict[str, list[FileColumns]] = {}
     counts: dict[str, int] = {}
     notes: list[Note] = []
     for part, names in zip(parts, by_part, strict=True):
@@ -91,7 +91,7 @@ def read_bag(
     return columns, places, counts, notes + _apart(pieces)
 
 
-def _apart(pieces: dict[str, list[Columns]]) -> list[Note]:
+def _apart(pieces: dict[str, list[FileColumns]]) -> list[Note]:
     """A note where parts of a bag stand farther apart than they last: a recorder goes on at once in the next
     part."""
     for topic, groups in pieces.items():
@@ -125,7 +125,7 @@ def merged(by_part: Sequence[dict[str, Topic]]) -> dict[str, Topic]:
     return union
 
 
-def joined(path: Path, groups: Sequence[Columns]) -> Columns:
+def joined(path: Path, groups: Sequence[FileColumns]) -> FileColumns:
     """One topic's columns of several parts. Raises ValueError for parts that overlap in time."""
     groups = sorted(groups, key=lambda group: group.time[0])
     for before, after in itertools.pairwise(groups):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.reading.formats import OTHER_DEVICE_RUN, Columns, check_clock
+from pipeline.reading.formats import OTHER_DEVICE_RUN, FileColumns, check_clock
 from pipeline.reading.signals import Note
 
 HOUR_S = 3600
@@ -25,12 +25,12 @@ LEAST_STAMPS, ALIKE_SHARE, TURNS_SHARE = 4, 0.9, 0.8
 class Mended(NamedTuple):
     """Columns whose time runs forward, and the indices of the rows at which the clock had started over."""
 
-    columns: Columns
+    columns: FileColumns
     restarts: np.ndarray
     notes: list[Note]
 
 
-def mended(path: Path, group: Columns, *, may_restart: bool) -> Mended:
+def mended(path: Path, group: FileColumns, *, may_restart: bool) -> Mended:
     """The columns on a clock that runs forward.
 
     An hour that the end of summer time repeats on a clock without zone is counted on. One that starts over
@@ -53,7 +53,7 @@ def mended(path: Path, group: Columns, *, may_restart: bool) -> Mended:
     return _forward(path, group, restarts, notes)
 
 
-def mended_topics(path: Path, groups: Sequence[Columns], *, one_clock: bool) -> list[Mended]:
+def mended_topics(path: Path, groups: Sequence[FileColumns], *, one_clock: bool) -> list[Mended]:
     """`mended` for the groups of a recording, which start over together.
 
     Each must have started over as often. Where they have not `one_clock`, the recorder's, the stretches
@@ -77,7 +77,7 @@ def mended_topics(path: Path, groups: Sequence[Columns], *, one_clock: bool) -> 
     ]
 
 
-def _forward(path: Path, group: Columns, restarts: np.ndarray, notes: list[Note]) -> Mended:
+def _forward(path: Path, group: FileColumns, restarts: np.ndarray, notes: list[Note]) -> Mended:
     """Stamps that share a second spread, late rows sorted back, repeats dropped; checked."""
     time = _spread(group, restarts, notes)
     order = _forward_rows(group._replace(time=time), notes)
@@ -86,7 +86,7 @@ def _forward(path: Path, group: Columns, restarts: np.ndarray, notes: list[Note]
     return Mended(columns, np.searchsorted(order, restarts), notes)
 
 
-def _rows(group: Columns, order: np.ndarray) -> Columns:
+def _rows(group: FileColumns, order: np.ndarray) -> FileColumns:
     values = {name: column[order] for name, column in group.values.items()}
     place = group.place
     return group._replace(time=group.time[order], values=values, place=lambda i: place(int(order[i])))
@@ -110,7 +110,7 @@ def _few(rows: int, of: int) -> bool:
     return rows <= max(1 if of >= FEW_ROWS_OF else 0, FEW_SHARE * of)
 
 
-def _summer_time(group: Columns, notes: list[Note]) -> np.ndarray:
+def _summer_time(group: FileColumns, notes: list[Note]) -> np.ndarray:
     """The times with an hour added behind each fall by an hour, on a calendar without zone."""
     time = group.time
     if time.dtype != np.int64 or group.zone:
@@ -155,7 +155,7 @@ def _falls(time: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.diff(time) < 0) + 1
 
 
-def _restart_note(group: Columns, rows: np.ndarray) -> Note:
+def _restart_note(group: FileColumns, rows: np.ndarray) -> Note:
     message = f"the clock starts over {len(rows)} times: segments begin there"
     return _note("restart", rows, group.place, message)
 
@@ -173,7 +173,7 @@ def _going_on(times: Sequence[np.ndarray], restarts: Sequence[np.ndarray]) -> li
     return shifted
 
 
-def _agree(groups: Sequence[Columns], restarts: Sequence[np.ndarray]) -> bool:
+def _agree(groups: Sequence[FileColumns], restarts: Sequence[np.ndarray]) -> bool:
     """Whether the stretches of all groups begin and end within a few intervals of each other."""
     near = AGREE_INTERVALS * max(_interval(group.time) for group in groups)
     ends = np.array(
@@ -185,7 +185,7 @@ def _agree(groups: Sequence[Columns], restarts: Sequence[np.ndarray]) -> bool:
     return bool((np.ptp(ends, axis=0) <= near).all())
 
 
-def _spread(group: Columns, restarts: np.ndarray, notes: list[Note]) -> np.ndarray:
+def _spread(group: FileColumns, restarts: np.ndarray, notes: list[Note]) -> np.ndarray:
     """Times of rows that share a stamp of whole seconds, spread evenly over it.
 
     Nearly every second must hold as many rows, and the rows must not be exact repeats nor take turns between
@@ -223,7 +223,7 @@ def _spread(group: Columns, restarts: np.ndarray, notes: list[Note]) -> np.ndarr
     return time + (place * width[stamp] / shares[stamp]).astype(time.dtype)
 
 
-def _repeats(group: Columns) -> np.ndarray:
+def _repeats(group: FileColumns) -> np.ndarray:
     """Mask (n - 1,) of the rows that are the row before once more."""
     same = group.time[1:] == group.time[:-1]
     for column in group.values.values():
@@ -232,7 +232,7 @@ def _repeats(group: Columns) -> np.ndarray:
     return same
 
 
-def _take_turns(group: Columns, place: np.ndarray, rows: int) -> bool:
+def _take_turns(group: FileColumns, place: np.ndarray, rows: int) -> bool:
     """Whether some column goes up at one place of each stamp and down at another."""
     for column in group.values.values():
         change = np.diff(column)
@@ -246,7 +246,7 @@ def _take_turns(group: Columns, place: np.ndarray, rows: int) -> bool:
     return False
 
 
-def _forward_rows(group: Columns, notes: list[Note]) -> np.ndarray:
+def _forward_rows(group: FileColumns, notes: list[Note]) -> np.ndarray:
     """Indices of the rows in the order of time, without those whose time another one has. All rows where too
     many would move or be left out."""
     time, rows = group.time, np.arange(len(group.time))

@@ -75,7 +75,7 @@ def read_plain(
     types |= {len(layout.names) + i: pa.null() for i in range(extra)}
     parts = Growing([np.int64 if pa.types.is_timestamp(types[place]) else float for place in read])
     try:
-        text = _Text(path, layout, bool(zone))
+        text = _ArrowText(path, layout, bool(zone))
         for batch in _batches(text, layout, types, extra, first_row):
             columns = [
                 _plain_numbers(batch.column(f"{place}"), types[place], place == clock) for place in read
@@ -110,7 +110,7 @@ def _extra_columns(path: Path, layout: CsvLayout) -> int | None:
 
 
 def _batches(
-    text: "_Text", layout: CsvLayout, types: dict[int, pa.DataType], extra: int, first_row: bool
+    text: "_ArrowText", layout: CsvLayout, types: dict[int, pa.DataType], extra: int, first_row: bool
 ) -> Iterator[pa.RecordBatch]:
     """Batches with columns called by their places. Raises _NotPlain and ArrowInvalid."""
     shown = [*types, *([0] if first_row else [])]
@@ -160,7 +160,7 @@ def _plain_numbers(column: pa.Array, kind: pa.DataType, is_clock: bool) -> np.nd
     return values
 
 
-class _Text:
+class _ArrowText:
     """The rows of data as UTF-8, a block at a time. `strange` turns true at zeros, and at bytes of another
     encoding; the text ends there."""
 

@@ -26,8 +26,8 @@ from pipeline.reading.csv_rows import (
     sound_rows,
 )
 from pipeline.reading.formats import (
-    Column,
-    Columns,
+    FileColumn,
+    FileColumns,
     Growing,
     check_no_counter,
     check_no_day_fractions,
@@ -55,7 +55,7 @@ FIELDS_AT_ONCE = 20_000
 MOST_SHOWN, FEWEST_SHOWN = 200, 20
 
 
-def csv_columns(path: Path) -> list[Column]:
+def csv_columns(path: Path) -> list[FileColumn]:
     """The columns of a text file. A column is of type "number" by its first rows."""
     layout = csv_layout(path)
     most = min(MOST_SHOWN, max(FEWEST_SHOWN, FIELDS_AT_ONCE // len(layout.names)))
@@ -73,14 +73,16 @@ def csv_columns(path: Path) -> list[Column]:
         # totals may stand behind a short table
         numeric = fields and len(words) <= min(LONGEST_TAIL, len(fields) // 10)
         columns.append(
-            Column(
+            FileColumn(
                 name, "number" if numeric else f"text such as {words[0][:20]!r}" if words else "empty", unit
             )
         )
     return columns
 
 
-def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") -> tuple[Columns, list[Note]]:
+def read_csv(
+    path: Path, wanted: Sequence[str], time: str, decimal: str = ""
+) -> tuple[FileColumns, list[Note]]:
     """The wanted columns, NaN where a field is empty. `decimal` is the declared decimal mark, "" to find it.
 
     Raises ValueError with the line for text, a row of another length, a missing column, and numbers that may
@@ -96,7 +98,7 @@ def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") ->
         check_one_signal(path, name, ((at, owner) for at, owner in owners if owner.strip() != name))
     layout = _decided(path, layout, [*wanted, *([] if clock is None else [clock])])
     notes = list(layout.notes)
-    clocks = None if clock is None else _Clock(path, layout, clock)
+    clocks = None if clock is None else _CsvClock(path, layout, clock)
     plain = None
     if clocks is None:
         plain = read_plain(path, layout, places, None, None)
@@ -122,7 +124,7 @@ def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") ->
         check_no_day_fractions(path, clocks.name, times, layout.units[clocks.place])
         if not time:
             check_no_counter(path, clocks.name, times)
-    columns_forward, turned = forward(Columns("rows", times, values, place, zone))
+    columns_forward, turned = forward(FileColumns("rows", times, values, place, zone))
     return columns_forward, notes + turned
 
 
@@ -131,7 +133,7 @@ def _rows_one_by_one(
     layout: CsvLayout,
     places: Sequence[int],
     wanted: Sequence[str],
-    clocks: "_Clock | None",
+    clocks: "_CsvClock | None",
     notes: list[Note],
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """{column: values (n,)} and the line (n,) of each row: the slow way, which knows every word and names the
@@ -209,7 +211,7 @@ def _line_of(path: Path, layout: CsvLayout) -> Callable[[int], str]:
 # ---- the clock
 
 
-class _Clock:
+class _CsvClock:
     """The column of the time, read a part of the file at a time: numbers, or text that names instants. The
     date may stand in another column."""
 

@@ -101,7 +101,7 @@ _OTHER_FORMATS = {
 }
 
 
-class Columns(NamedTuple):
+class FileColumns(NamedTuple):
     """Columns on one clock.
 
     `time` is time_s (n,), or time_ns (n,) on a calendar. `place(i)` names the place of sample i in the file.
@@ -115,7 +115,7 @@ class Columns(NamedTuple):
     zone: str = "UTC"
 
 
-class Column(NamedTuple):
+class FileColumn(NamedTuple):
     """A column of a file; `unit` is empty if the file does not give it."""
 
     name: str
@@ -354,7 +354,7 @@ def check_no_day_fractions(path: Path, name: str, time: np.ndarray, written: str
 # ---- which way the time runs
 
 
-def forward(columns: Columns) -> tuple[Columns, list[Note]]:
+def forward(columns: FileColumns) -> tuple[FileColumns, list[Note]]:
     """The columns from the oldest sample on. Columns with the newest first are reversed; nothing else is
     sorted."""
     last = len(columns.time) - 1
@@ -372,7 +372,7 @@ def forward(columns: Columns) -> tuple[Columns, list[Note]]:
     ]
 
 
-def check_clock(path: Path, group: Columns) -> None:
+def check_clock(path: Path, group: FileColumns) -> None:
     """Raises ValueError with the place if a time is missing, repeated or before the one ahead of it."""
     time = group.time
     if np.issubdtype(time.dtype, np.floating) and not np.isfinite(time).all():
@@ -403,7 +403,7 @@ def check_clock(path: Path, group: Columns) -> None:
     )
 
 
-def _remedy(group: Columns, steps_s: np.ndarray, back: np.ndarray) -> str:
+def _remedy(group: FileColumns, steps_s: np.ndarray, back: np.ndarray) -> str:
     """The remedy for a clock that stands still or runs backwards, by the way it does."""
     if steps_s[back[0]] == 0:
         return "name a finer clock, or give each device or tag that writes here a column of its own"

@@ -56,7 +56,7 @@ ENCODINGS = (
 )
 
 
-class Picture(NamedTuple):
+class ImageMessage(NamedTuple):
     """A message's picture: `encoding` and the layout of its rows. With height 0 it is compressed, and
     `encoding` is its format ("jpeg", "png")."""
 
@@ -69,7 +69,7 @@ class Picture(NamedTuple):
     data: memoryview
 
 
-Read = Callable[[bytes | memoryview], Picture]
+Read = Callable[[bytes | memoryview], ImageMessage]
 
 
 def is_image(channel: Channel) -> bool:
@@ -81,7 +81,7 @@ def is_image(channel: Channel) -> bool:
 
 
 def reader(channel: Channel) -> Read:
-    """A function from one message of the channel to its Picture, without a copy and without decoding.
+    """A function from one message of the channel to its ImageMessage, without a copy and without decoding.
 
     The function raises UnreadableMessage for a message that does not fit its type. Raises ValueError for a
     channel without images.
@@ -100,7 +100,7 @@ def reader(channel: Channel) -> Read:
         fields = [tuple(field.split(":")) for field in _ROS[_kind(channel)].split(", ")]
         parse = functools.partial(_ros, fields=fields, aligned=channel.encoding == "cdr")
 
-    def read(message: bytes | memoryview) -> Picture:
+    def read(message: bytes | memoryview) -> ImageMessage:
         try:
             return parse(memoryview(plain(message)))
         except (struct.error, UnicodeDecodeError, IndexError) as error:
@@ -118,7 +118,7 @@ def _kind(channel: Channel) -> str:
 # ---- messages -> pictures
 
 
-def _ros(message: memoryview, fields: list[tuple[str, ...]], aligned: bool) -> Picture:
+def _ros(message: memoryview, fields: list[tuple[str, ...]], aligned: bool) -> ImageMessage:
     """The picture of a ROS message. ROS 2 is `aligned`; ROS 1 is not, and has a counter ahead of a header's
     stamp."""
     order, pos = "<", 0
@@ -152,7 +152,7 @@ def _ros(message: memoryview, fields: list[tuple[str, ...]], aligned: bool) -> P
     return _picture(values, values["stamp"])
 
 
-def _protobuf(message: memoryview, read: Callable[[memoryview], Message]) -> Picture:
+def _protobuf(message: memoryview, read: Callable[[memoryview], Message]) -> ImageMessage:
     values = {field.name: value for field, value in read(message).ListFields()}
     numbers = {name: values.get(name, 0) for name in ("width", "height", "step")}
     texts = {name: values.get(name, "") for name in ("encoding", "format")}
@@ -166,7 +166,7 @@ def _protobuf(message: memoryview, read: Callable[[memoryview], Message]) -> Pic
     return _picture(picture, int(since[0]) * 10**9 + int(since[1]))
 
 
-def _json(message: memoryview) -> Picture:
+def _json(message: memoryview) -> ImageMessage:
     try:
         values = orjson.loads(message)
         stamp = values["timestamp"]
@@ -180,13 +180,13 @@ def _word(text: bytes | memoryview) -> str:
     return bytes(text).rstrip(b"\0").decode()
 
 
-def _picture(values: dict, stamp_ns: int) -> Picture:
+def _picture(values: dict, stamp_ns: int) -> ImageMessage:
     data = values.get("data", memoryview(b""))
     if not isinstance(data, memoryview):
         raise UnreadableMessage("a number where its type says bytes")
     if "width" not in values or not values.get("encoding", ""):
-        return Picture(stamp_ns, values.get("format", ""), 0, 0, 0, False, data)
-    return Picture(
+        return ImageMessage(stamp_ns, values.get("format", ""), 0, 0, 0, False, data)
+    return ImageMessage(
         stamp_ns,
         values["encoding"],
         values["height"],
@@ -200,7 +200,7 @@ def _picture(values: dict, stamp_ns: int) -> Picture:
 # ---- pictures -> frames
 
 
-def gray(picture: Picture) -> np.ndarray:
+def gray(picture: ImageMessage) -> np.ndarray:
     """The gray frame (height, width), uint8 or uint16; of mono8 a view of the message. Raises
     UnreadableMessage."""
     if not picture.height:
@@ -221,7 +221,7 @@ def gray(picture: Picture) -> np.ndarray:
     return cv2.cvtColor(rows.reshape(len(rows), picture.width, size) if size > 1 else rows, conversion)
 
 
-def _rows(picture: Picture, size: int) -> np.ndarray:
+def _rows(picture: ImageMessage, size: int) -> np.ndarray:
     """(height, width size) bytes, without the padding at the end of each row."""
     row = picture.width * size
     step = picture.step or row
@@ -259,7 +259,7 @@ def _size(data: bytes) -> tuple[int, int]:
     return 0, 0
 
 
-def _decoded(picture: Picture) -> np.ndarray:
+def _decoded(picture: ImageMessage) -> np.ndarray:
     check_size(picture.data)
     # without ANYDEPTH 16 bits would be cut down to 8
     try:

@@ -11,8 +11,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from pipeline.reading.formats import Columns
-from pipeline.reading.image_messages import READABLE, Picture, gray, is_image, reader
+from pipeline.reading.formats import FileColumns
+from pipeline.reading.image_messages import READABLE, ImageMessage, gray, is_image, reader
 from pipeline.reading.mcap_columns import Topic
 from pipeline.reading.mcap_files import McapFile, Messages
 from pipeline.reading.mcap_messages import Decode, UnreadableMessage, decoder, decompress, plain
@@ -106,7 +106,7 @@ def _metadata(record: bytes) -> tuple[str, dict[str, str]]:
 # ---- numbers
 
 
-def columns(walk: Walk, topic: Topic, names: Sequence[str], time: str) -> tuple[Columns, int]:
+def columns(walk: Walk, topic: Topic, names: Sequence[str], time: str) -> tuple[FileColumns, int]:
     """The numbers `names` of a topic, its channels one behind the other, and the count of messages that do
     not fit their schema.
 
@@ -146,7 +146,7 @@ def columns(walk: Walk, topic: Topic, names: Sequence[str], time: str) -> tuple[
     pieces.sort(key=lambda piece: piece[0][0])
     values = np.concatenate([rows for _, rows in pieces])
     place = f"of {topic.name}"
-    return Columns(
+    return FileColumns(
         topic.name,
         np.concatenate([times for times, _ in pieces]),
         dict(zip(names, values.T, strict=False)),
@@ -187,10 +187,10 @@ def _rows(decode: Decode, data: Sequence[bytes], width: int) -> tuple[np.ndarray
 # ---- frames
 
 
-def frame_times(walk: Walk, topic: Topic) -> Columns:
+def frame_times(walk: Walk, topic: Topic) -> FileColumns:
     """The pictures' times in ns, the channels one behind the other in the order of their first pictures."""
     times = [time for number in walk.picture_order() for time in walk.picture_ns[number]]
-    return Columns(
+    return FileColumns(
         topic.name,
         np.array(times, np.uint64).astype(np.int64),
         {},
@@ -235,8 +235,8 @@ class Frames:
                 )
             yield time, frame
 
-    def pictures(self) -> Iterator[tuple[float, Picture]]:
-        """(time_s, Picture) as they were recorded: encoded bytes, or rows."""
+    def pictures(self) -> Iterator[tuple[float, ImageMessage]]:
+        """(time_s, ImageMessage) as they were recorded: encoded bytes, or rows."""
         self.unreadable, self._first = 0, ""
         with self.path.open("rb", buffering=0) as stream:
             for number, read, offsets in self._channels:

@@ -13,13 +13,20 @@ import numpy as np
 from pipeline.reading.bag_folders import bag_parts, joined, merged
 from pipeline.reading.clocks import Mended, mended_topics
 from pipeline.reading.csv_files import csv_columns, csv_layout, read_csv
-from pipeline.reading.formats import Column, Columns, check_clock, file_format, is_time_name, time_column
+from pipeline.reading.formats import (
+    FileColumn,
+    FileColumns,
+    check_clock,
+    file_format,
+    is_time_name,
+    time_column,
+)
 from pipeline.reading.mcap_columns import Topic, survey
 from pipeline.reading.other_formats import LOADERS
 from pipeline.reading.parquet_files import parquet_columns, read_parquet
 from pipeline.reading.proposals import (
     CLOCK_SAMPLES,
-    Signal,
+    RecordedSignal,
     has_bare_field,
     propose,
     sampled,
@@ -39,8 +46,8 @@ _NO_TIME = (
 )
 _NOTHING = "# no number could be read, so nothing is proposed; see the findings, and copy the recording again"
 # words, columns with the prefix of their sources, units, notes
-_Content = tuple[list[str], list[tuple[Columns, str]], dict[str, str], list[Note]]
-_Read = Callable[[Sequence[str], str], tuple[Columns, list[Note]]]
+_Content = tuple[list[str], list[tuple[FileColumns, str]], dict[str, str], list[Note]]
+_Read = Callable[[Sequence[str], str], tuple[FileColumns, list[Note]]]
 
 
 class Inspected(NamedTuple):
@@ -49,8 +56,8 @@ class Inspected(NamedTuple):
 
     kind: str
     lines: list[str]
-    groups: list[tuple[Columns, str]]
-    signals: list[Signal]
+    groups: list[tuple[FileColumns, str]]
+    signals: list[RecordedSignal]
     notes: list[Note]
     time: str
 
@@ -98,7 +105,7 @@ def look(path: Path) -> Inspected:
     else:
         lines, groups, units, notes = _file(path, kind)
     signals = [
-        Signal(prefix + name, units.get(name, ""), finite(values), limits.get(name))
+        RecordedSignal(prefix + name, units.get(name, ""), finite(values), limits.get(name))
         for group, prefix in groups
         for name, values in group.values.items()
     ]
@@ -124,7 +131,7 @@ def _file(path: Path, kind: str) -> _Content:
     return lines, groups, units, notes
 
 
-def _table(path: Path, columns: Sequence[Column], has_clock: bool, read: _Read) -> _Content:
+def _table(path: Path, columns: Sequence[FileColumn], has_clock: bool, read: _Read) -> _Content:
     """Words, columns, units and notes of a table, which `read` reads; `has_clock`: a clock of its own."""
     names = [column.name for column in columns]
     numeric = [column.name for column in columns if column.type == "number" and column.name]
@@ -182,7 +189,7 @@ def _table(path: Path, columns: Sequence[Column], has_clock: bool, read: _Read) 
     return lines, [(group._replace(values=values), "")], {c.name: c.unit for c in columns}, notes
 
 
-def _clock_name(path: Path, columns: Sequence[Column]) -> str:
+def _clock_name(path: Path, columns: Sequence[FileColumn]) -> str:
     """The column that is read as the time, "" for none."""
     try:
         return time_column(path, [column.name for column in columns], "")
@@ -190,7 +197,7 @@ def _clock_name(path: Path, columns: Sequence[Column]) -> str:
         return ""
 
 
-def _unit_note(clock: str, group: Columns) -> list[Note]:
+def _unit_note(clock: str, group: FileColumns) -> list[Note]:
     """A note on a clock that would have minutes between its samples, as one in ms has without its unit, or
     more of them a second than a log of temperatures holds, as one in hours has."""
     time = group.time[:CLOCK_SAMPLES]
@@ -245,7 +252,7 @@ def _content(topic: Topic) -> str:
 # ---- clocks and ranges
 
 
-def _clock(path: Path, group: Columns) -> list[str]:
+def _clock(path: Path, group: FileColumns) -> list[str]:
     count = len(group.time)
     try:
         check_clock(path, group)

@@ -27,7 +27,7 @@ _DEEPEST, MOST_PARTS = 8, 20_000
 _MOST_DIMENSIONS = 32
 
 
-class _Part(NamedTuple):
+class _MatlabPart(NamedTuple):
     """A variable or a part of one: its numbers, or words on what it is."""
 
     name: str
@@ -119,7 +119,7 @@ def _common_length(arrays: dict[str, np.ndarray]) -> int:
 # ---- variables
 
 
-def _parts(path: Path, stream: BinaryIO) -> Iterator[_Part]:
+def _parts(path: Path, stream: BinaryIO) -> Iterator[_MatlabPart]:
     """The parts of every variable. Raises ValueError with the place of a variable that cannot be read."""
     size, unpacked, count = path.stat().st_size, 0, 0
     order = {b"IM": "<", b"MI": ">"}.get(stream.read(128)[126:128], "<")
@@ -188,7 +188,7 @@ def _numbers(element: _Element | None, order: str) -> np.ndarray:
     return np.frombuffer(element.data, kind)
 
 
-def _variable(data: memoryview, order: str, above: str, depth: int) -> Iterator[_Part]:
+def _variable(data: memoryview, order: str, above: str, depth: int) -> Iterator[_MatlabPart]:
     """The parts of a matrix; `above` is the name of what holds it."""
     elements = _elements(data, order)
     flags = _numbers(next(elements, None), order)
@@ -203,12 +203,12 @@ def _variable(data: memoryview, order: str, above: str, depth: int) -> Iterator[
     elif kind in (_CELL, _STRUCTURE, _OBJECT) and depth < _DEEPEST:
         yield from _inner(elements, order, name, kind, depth)
     elif kind == _TEXT:
-        yield _Part(name, None, f"a text of {np.prod(shape, dtype=float):.0f} characters")
+        yield _MatlabPart(name, None, f"a text of {np.prod(shape, dtype=float):.0f} characters")
     else:
-        yield _Part(name, None, _CLASSES.get(kind, f"of class {kind}"))
+        yield _MatlabPart(name, None, _CLASSES.get(kind, f"of class {kind}"))
 
 
-def _numeric(name: str, numbers: np.ndarray, shape: tuple[int, ...], is_complex: bool) -> _Part:
+def _numeric(name: str, numbers: np.ndarray, shape: tuple[int, ...], is_complex: bool) -> _MatlabPart:
     count = 1
     for size in shape:
         count *= size
@@ -217,14 +217,16 @@ def _numeric(name: str, numbers: np.ndarray, shape: tuple[int, ...], is_complex:
     if count > MOST_VALUES:
         raise _Broken(f"{name} has {count} numbers, more than the {MOST_VALUES} that are read")
     if len(shape) > _MOST_DIMENSIONS:
-        return _Part(name, None, f"an array of {len(shape)} dimensions")
+        return _MatlabPart(name, None, f"an array of {len(shape)} dimensions")
     if is_complex:
-        return _Part(name, None, "complex numbers")
+        return _MatlabPart(name, None, "complex numbers")
     words = f"one number, {float(numbers[0]):g}" if count == 1 else f"{count} numbers"
-    return _Part(name, numbers.astype(float).reshape(shape, order="F"), words)
+    return _MatlabPart(name, numbers.astype(float).reshape(shape, order="F"), words)
 
 
-def _inner(elements: Iterator[_Element], order: str, name: str, kind: int, depth: int) -> Iterator[_Part]:
+def _inner(
+    elements: Iterator[_Element], order: str, name: str, kind: int, depth: int
+) -> Iterator[_MatlabPart]:
     """The parts of a cell array or of a structure, whose fields follow each other in every entry."""
     fields: list[str] = []
     if kind != _CELL:

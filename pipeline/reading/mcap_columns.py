@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.reading.formats import Columns, Growing, seconds
+from pipeline.reading.formats import FileColumns, Growing, seconds
 from pipeline.reading.mcap_files import McapFile, Messages
 from pipeline.reading.mcap_messages import (
     Channel,
@@ -135,7 +135,7 @@ def _element(field: str, fields: Sequence[str]) -> bool:
 
 def mcap_columns(
     path: Path, sources: Sequence[str], time: str
-) -> tuple[list[Columns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
+) -> tuple[list[FileColumns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
     """The columns of each topic that `sources` need, {source: (topic, field)}, {topic: count of its
     messages}, and notes.
 
@@ -304,7 +304,7 @@ def _join(
     parts: dict[int, Growing],
     notes: list[Note],
     bad: dict[str, int],
-) -> Columns:
+) -> FileColumns:
     """The topic's channels one behind the other. Two channels at the same time are two devices under one
     name, and refused."""
     pieces = []
@@ -343,7 +343,7 @@ def _join(
         values = [np.concatenate(arrays) for arrays in zip(*(piece[2] for piece in pieces), strict=True)]
     else:
         _, time, values = pieces[0]
-    return Columns(need.topic, time, dict(zip(need.fields, values, strict=True)), _place(need.topic))
+    return FileColumns(need.topic, time, dict(zip(need.fields, values, strict=True)), _place(need.topic))
 
 
 def _place(topic: str) -> Callable[[int], str]:
@@ -357,7 +357,7 @@ class Survey(NamedTuple):
     """Every topic of a file, the columns of those with numbers, and notes on damage and on what is unread."""
 
     topics: dict[str, Topic]
-    columns: list[Columns]
+    columns: list[FileColumns]
     notes: list[Note]
 
 

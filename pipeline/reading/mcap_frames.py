@@ -16,7 +16,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from pipeline.reading import image_messages
-from pipeline.reading.formats import CALENDAR_S, Columns, check_clock
+from pipeline.reading.formats import CALENDAR_S, FileColumns, check_clock
 from pipeline.reading.image_topics import Frames, Walk, columns, frame_times
 from pipeline.reading.mcap_columns import Topic
 from pipeline.reading.mcap_files import McapFile
@@ -210,7 +210,7 @@ def read_frames(
         raise ValueError(
             f"{path}: no picture of {camera.name} can be read ({damage(path)}); copy the recording again"
         )
-    groups: dict[str, Columns] = {}
+    groups: dict[str, FileColumns] = {}
     for topic in topics:
         fields = list(dict.fromkeys(field for _, at, field in places.values() if at == topic))
         groups[topic], dropped = columns(walk, topics_of_file[topic], fields, clock)
@@ -277,7 +277,7 @@ def _values(path: Path, source: Source, recorded: np.ndarray, notes: list[Note])
     return np.where(np.isfinite(recorded), recorded * source.scale + source.offset, np.nan)
 
 
-def _start(path: Path, groups: Sequence[Columns], notes: list[Note]) -> int:
+def _start(path: Path, groups: Sequence[FileColumns], notes: list[Note]) -> int:
     """The instant in ns from which time is counted: 0, or the first whole second of a calendar.
 
     Every clock is checked to run forward.

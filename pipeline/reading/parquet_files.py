@@ -10,8 +10,8 @@ import pyarrow.parquet as pq
 
 from pipeline.reading.arrow_arrays import numbers
 from pipeline.reading.formats import (
-    Column,
-    Columns,
+    FileColumn,
+    FileColumns,
     Growing,
     check_no_counter,
     check_no_day_fractions,
@@ -69,7 +69,7 @@ def _is_numeric(kind: pa.DataType) -> bool:
     )
 
 
-def parquet_columns(path: Path) -> list[Column]:
+def parquet_columns(path: Path) -> list[FileColumn]:
     """The columns of a Parquet file. The parts of a structure are "a.b"."""
     columns = []
     for name, field in _leaves(_parquet(path).schema_arrow, ""):
@@ -82,7 +82,9 @@ def parquet_columns(path: Path) -> list[Column]:
             if pa.types.is_duration(field.type)
             else str(field.type)
         )
-        columns.append(Column(name, kind, (field.metadata or {}).get(b"unit", b"").decode(errors="replace")))
+        columns.append(
+            FileColumn(name, kind, (field.metadata or {}).get(b"unit", b"").decode(errors="replace"))
+        )
     return columns
 
 
@@ -103,7 +105,7 @@ def _leaves(fields: pa.Schema | pa.StructType, prefix: str) -> Iterator[tuple[st
             yield prefix + field.name, field
 
 
-def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns, list[Note]]:
+def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[FileColumns, list[Note]]:
     """The wanted columns, NaN for null. Raises ValueError for a column that is missing or holds no numbers,
     and for a damaged file."""
     file, columns = _parquet(path), parquet_columns(path)
@@ -149,7 +151,7 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
     if remark:
         notes.append(Note("clock", "", 1, remark))
     table_columns, turned = forward(
-        Columns("rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone)
+        FileColumns("rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone)
     )
     return table_columns, notes + turned
 

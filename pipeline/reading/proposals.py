@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.reading.formats import Columns
+from pipeline.reading.formats import FileColumns
 from pipeline.reading.quality import ROOM_KELVIN, quantisation_step
 
 # levels and steps are looked up in so many values of a signal
@@ -58,7 +58,7 @@ _UNITS = (
 )
 
 
-class Signal(NamedTuple):
+class RecordedSignal(NamedTuple):
     """A column: its source, the unit that the file gives, its finite numbers, the limits that the file gives,
     and its role in the proposal."""
 
@@ -97,7 +97,9 @@ class Proposal(NamedTuple):
     beside: list[str]
 
 
-def propose(signals: Sequence[Signal], groups: Sequence[tuple[Columns, str]], time: str) -> Proposal:
+def propose(
+    signals: Sequence[RecordedSignal], groups: Sequence[tuple[FileColumns, str]], time: str
+) -> Proposal:
     """The proposal for the signals of a recording, which have the clocks of `groups`."""
     taken = [signal._replace(role=_role(signal)) for signal in signals]
     how = "names and ranges"
@@ -209,13 +211,13 @@ def sampled(values: np.ndarray) -> np.ndarray:
     return values[:: max(1, len(values) // LOOKED_AT)]
 
 
-def _is_switch(signal: Signal) -> bool:
+def _is_switch(signal: RecordedSignal) -> bool:
     """Whether a signal has the values 0 and 1 alone."""
     few = sampled(signal.values)
     return bool(((few == 0) | (few == 1)).all()) and bool(np.isin(signal.values, (0.0, 1.0)).all())
 
 
-def _has_no_role(signal: Signal) -> bool:
+def _has_no_role(signal: RecordedSignal) -> bool:
     name, finite = words(signal.source), signal.values
     return bool(
         re.search(_STAMP, name)
@@ -226,7 +228,7 @@ def _has_no_role(signal: Signal) -> bool:
     )
 
 
-def _role(signal: Signal) -> str:
+def _role(signal: RecordedSignal) -> str:
     name, unit = words(signal.source), signal.unit.casefold()
     if _has_no_role(signal):
         return ""
@@ -243,7 +245,7 @@ def _role(signal: Signal) -> str:
     return "input" if unit in ("%", "percent") or re.search(_INPUT, name) else ""
 
 
-def _behaviour(signal: Signal) -> str:
+def _behaviour(signal: RecordedSignal) -> str:
     """The role by the values alone. Commands rest and jump between few levels, or stay near two of them;
     measurements do neither. A counter has no role, nor has a table of a few rows."""
     finite = signal.values
@@ -266,7 +268,7 @@ def _bimodality(values: np.ndarray) -> float:
     return float((np.mean(z**3) ** 2 + 1) / np.mean(z**4))
 
 
-def _beside(taken: Sequence[Signal]) -> list[str]:
+def _beside(taken: Sequence[RecordedSignal]) -> list[str]:
     """Temperatures of devices that have no duty, where others of the same recording have one: the board's own
     sensor beside heaters. Names are "device.temp" and "device.pwm"."""
     heated = {s.source.rpartition(".")[0] for s in taken if s.source.endswith(".pwm")}
@@ -288,7 +290,9 @@ def _stem(source: str, pattern: str) -> str:
 # ---- names, units, limits
 
 
-def _proposed(signal: Signal, target: Signal | None, names: set[str], *, guessed: bool) -> Proposed:
+def _proposed(
+    signal: RecordedSignal, target: RecordedSignal | None, names: set[str], *, guessed: bool
+) -> Proposed:
     unit, scale, offset = _conversion(signal)
     low = high = reference = None
     if signal.limits is not None and np.isfinite(signal.limits).all():
@@ -310,7 +314,7 @@ def _input_limits(ours: np.ndarray, *, guessed: bool) -> tuple[float, float]:
     return (low, high) if guessed else (min(0.0, low), 100.0)
 
 
-def _reference(ours: np.ndarray, target: Signal | None, scale: float, offset: float) -> float:
+def _reference(ours: np.ndarray, target: RecordedSignal | None, scale: float, offset: float) -> float:
     """The set-point that was held longest, or the median where there is none."""
     held = target.values if target is not None else np.empty(0)
     held = held[held > 0]
@@ -320,7 +324,7 @@ def _reference(ours: np.ndarray, target: Signal | None, scale: float, offset: fl
     return float(np.round(np.median(ours))) + 0.0
 
 
-def _name(signal: Signal, names: set[str]) -> str:
+def _name(signal: RecordedSignal, names: set[str]) -> str:
     """heater_1, temperature_bed, ...; a motor or fan keeps its own name in letters, digits and _."""
     bare = words(signal.source)
     own = re.sub(r"\W+", "_", bare, flags=re.ASCII).strip("_")
@@ -342,7 +346,7 @@ def _name(signal: Signal, names: set[str]) -> str:
     return name
 
 
-def _conversion(signal: Signal) -> tuple[str, float, float]:
+def _conversion(signal: RecordedSignal) -> tuple[str, float, float]:
     bare, unit = words(signal.source), signal.unit.casefold()
     finite = signal.values
     low, high = finite.min(), finite.max()
@@ -380,7 +384,7 @@ def _yaml(source: str) -> str:
     )
 
 
-def _sample_time(groups: Sequence[tuple[Columns, str]]) -> float:
+def _sample_time(groups: Sequence[tuple[FileColumns, str]]) -> float:
     """The largest of the clocks' median intervals, to two digits."""
     medians = []
     for group, _ in groups:

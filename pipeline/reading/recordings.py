@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.reading.bag_folders import read_bag
 from pipeline.reading.clocks import mended_topics
 from pipeline.reading.csv_files import read_csv
-from pipeline.reading.formats import CALENDAR_S, Columns, file_format
+from pipeline.reading.formats import CALENDAR_S, FileColumns, file_format
 from pipeline.reading.inspection import inspect
 from pipeline.reading.mcap_columns import mcap_columns
 from pipeline.reading.mcap_records import check_magic
@@ -116,7 +116,7 @@ def _check_sources(path: Path, sources: Sequence[Source]) -> None:
             )
 
 
-def _clocks(columns: Sequence[Columns], notes: list[Note]) -> dict[str, np.ndarray]:
+def _clocks(columns: Sequence[FileColumns], notes: list[Note]) -> dict[str, np.ndarray]:
     """{topic: time_s (n,)}, all counted from one instant."""
     first = min(group.time[0] for group in columns)
     on_calendar = columns[0].time.dtype == np.int64
@@ -137,7 +137,7 @@ def _clocks(columns: Sequence[Columns], notes: list[Note]) -> dict[str, np.ndarr
 
 
 def _signal(
-    path: Path, source: Source, time: np.ndarray, group: Columns, recorded: np.ndarray, notes: list[Note]
+    path: Path, source: Source, time: np.ndarray, group: FileColumns, recorded: np.ndarray, notes: list[Note]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Time and values in the signal's unit. A signal that has a value in less than half of the rows, spread
     among them, has its own clock: those rows."""

@@ -8,8 +8,8 @@ import numpy as np
 
 from pipeline.reading.formats import (
     INDEX_NAMES,
-    Column,
-    Columns,
+    FileColumn,
+    FileColumns,
     check_no_day_fractions,
     column_places,
     every,
@@ -45,16 +45,16 @@ class WholeTable(NamedTuple):
     others: dict[str, str]
     stamps: dict[str, np.ndarray]
 
-    def columns(self) -> list[Column]:
+    def columns(self) -> list[FileColumn]:
         """The columns as `inspect` lists them."""
         return [
-            *(Column(name, "number", self.units.get(name, "")) for name in self.values),
-            *(Column(name, "time", "") for name in self.stamps),
-            *(Column(name, kind, "") for name, kind in self.others.items()),
+            *(FileColumn(name, "number", self.units.get(name, "")) for name in self.values),
+            *(FileColumn(name, "time", "") for name in self.stamps),
+            *(FileColumn(name, kind, "") for name, kind in self.others.items()),
         ]
 
 
-def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> tuple[Columns, list[Note]]:
+def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> tuple[FileColumns, list[Note]]:
     """The wanted columns on the clock that `time` names: "" for the table's own, a column, or "every 1 s".
 
     Raises ValueError for a column that is missing or holds no numbers, and for a table without rows.
@@ -79,7 +79,7 @@ def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> t
         clock, zone, remark = _clock(path, table, names, time)
         notes += [Note("clock", "", 1, remark)] if remark else []
     values = {name: table.values[name] for name in wanted}
-    columns, turned = forward(Columns("rows", clock, values, table.place, zone))
+    columns, turned = forward(FileColumns("rows", clock, values, table.place, zone))
     return columns, notes + turned
 
 

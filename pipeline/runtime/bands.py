@@ -24,7 +24,7 @@ from pipeline.temperature.controllers.controller import (
     watched,
 )
 from pipeline.temperature.controllers.kernel import Tuples, regress, value_iteration, window_shift, windows
-from pipeline.temperature.controllers.window import Window, observer_form, predictor
+from pipeline.temperature.controllers.window import WindowModel, observer_form, predictor
 from pipeline.temperature.plant import Plant, hold_output, observability_matrix
 from pipeline.temperature.test_set.panel import padded
 from pipeline.temperature.tracking import gains
@@ -66,8 +66,8 @@ class Predictors(NamedTuple):
     covariance: np.ndarray
     N: int
 
-    def window(self, index: int) -> Window:
-        return Window(
+    def window(self, index: int) -> WindowModel:
+        return WindowModel(
             self.Theta[index], self.theta_0[index], self.covariance[index], self.N, 0, np.zeros((0, 3))
         )
 
@@ -211,7 +211,9 @@ def gain(u: Segments, y: Segments, learning: GainRoute) -> np.ndarray:
     return _gain(data, of, taken[0], learned.window(0), learning)
 
 
-def _gain(data: Rows, of: Moments, counts: np.ndarray, learned: Window, learning: GainRoute) -> np.ndarray:
+def _gain(
+    data: Rows, of: Moments, counts: np.ndarray, learned: WindowModel, learning: GainRoute
+) -> np.ndarray:
     """[K K_r] (m, N (m+p) + p) of one resample, whose window model is `learned`."""
     Q, R = np.diag(learning.q), np.diag(learning.r)
     if learning.route == "window":
@@ -222,7 +224,7 @@ def _gain(data: Rows, of: Moments, counts: np.ndarray, learned: Window, learning
     return np.hstack([solution.K, solution.K_r])
 
 
-def _predicted(learned: Window, data: Rows, of: Moments, counts: np.ndarray) -> Tuples:
+def _predicted(learned: WindowModel, data: Rows, of: Moments, counts: np.ndarray) -> Tuples:
     """window.predicted_tuples of resampled rows: the state is what the window predicts of the next two
     outputs, and the moments come from the blocks."""
     m, p, width = data.u.shape[1], data.y.shape[1], data.w.shape[1]

@@ -13,12 +13,10 @@ import numpy as np
 from pipeline.runtime.export import setpoint
 from pipeline.runtime.export.setpoint import BeliefAgent, Decider
 from pipeline.setpoint.agents.bayes import Filter
-from pipeline.setpoint.agents.belief_agent import belief_encoder
+from pipeline.setpoint.agents.belief_agent import Belief, BeliefNetwork, belief_encoder
 from pipeline.setpoint.published import FLOW_MOVES
 from pipeline.setpoint.simulation.simulator import TEMPERATURE_LIMITS, Observation
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, read_frames
-from pipeline.setpoint.workflow.agent_files import Agents
-from pipeline.setpoint.workflow.contestants import ControllerSpec
 
 BELIEF = "our agent"  # sees what its own filter believes
 FRAMES = 64  # drawn key areas on which reader and network are compared
@@ -29,11 +27,11 @@ WHY = (
 )
 
 
-def decider(name: str, specs: dict[str, ControllerSpec], agents: Agents) -> Decider | None:
-    """What the default controller decides by; None if it has no filter."""
+def decider(name: str, parameters: Any, belief: Belief, network: BeliefNetwork) -> Decider | None:
+    """What the default controller decides by: our agent by `belief` and `network`, another by its parameters;
+    None if these are no filter."""
     if name == BELIEF:
-        return BeliefAgent(agents.belief, agents.belief_dqn)
-    parameters = specs[name].parameters if name in specs else None
+        return BeliefAgent(belief, network)
     return parameters if isinstance(parameters, Filter) else None
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.runtime.certificate import EvidenceRecord
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.replay import GaplessLog
-from pipeline.temperature.controllers.governor import Limits
+from pipeline.temperature.controllers.governor import ActuatorLimits
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.test_set import panel
 
@@ -16,12 +16,12 @@ FORECASTING, HONEST_LOGS = 24, 200  # plants, and logs at most
 
 
 def forecasting_plants(
-    family: Sequence[Plant], spread: panel.Spread, rng: np.random.Generator
+    family: Sequence[Plant], spread: panel.PlantSpread, rng: np.random.Generator
 ) -> list[Plant]:
     return panel.padded(panel.drawn(family, FORECASTING, spread, cells=False, rng=rng))
 
 
-def honest_logs(made: Exported, half: panel.Cases, limits: Limits) -> list[GaplessLog]:
+def honest_logs(made: Exported, half: panel.Cases, limits: ActuatorLimits) -> list[GaplessLog]:
     """Logs of cases of the judging half under the controller as deployed, from the hold on."""
     aims = panel.aims(made.controller.law, panel.rests(made.model, half, limits), half)
     run, noise = panel.rolled_out(made.controller, half, aims), panel.noise_of(half)[: half.hold]

@@ -1,5 +1,5 @@
-"""The table of controllers of the setpoint loop, in the order of simplicity: of two that are alike within noise
-the first is the default. Pages and verdicts read names and kinds here; importing this needs no jax.
+"""The table of controllers of the setpoint loop, in the order of simplicity: of two that are alike within
+noise the first is the default. Pages and verdicts read names and kinds here; importing this needs no jax.
 
 A new controller is a file in pipeline/setpoint/agents/ with a function `build`, its row in CONTROLLERS, and a
 section of settings in `settings.Baselines` if it has any.
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pipeline.setpoint.agents.files import Agents
     from pipeline.setpoint.settings import Baselines
     from pipeline.setpoint.simulation.recorded import WindowTable
-    from pipeline.setpoint.simulation.simulator import Controller
+    from pipeline.setpoint.simulation.simulator import SetpointController
 
 Kind = Literal["model-based", "data-driven", "baseline", "reference"]
 
@@ -21,13 +21,13 @@ class ControllerRow(NamedTuple):
     name: str  # as it stands in artifacts and on pages
     kind: Kind
     group: Literal["agent", "baseline", "paper"]  # column `kind` of scoreboard.parquet, as first written
-    build: str  # "file.function" of pipeline/setpoint/agents: settings, agents, windows -> controller, parameters
+    build: str  # "file.function" of pipeline/setpoint/agents: settings, agents, windows -> what is built
     settings: str = ""  # the section of evaluate_setpoint.baselines that it is built with
 
 
 class BuiltController(NamedTuple):
     group: str  # of its row
-    controller: "Controller"
+    controller: "SetpointController"
     parameters: Any  # a pytree of numbers or arrays
 
 
@@ -65,8 +65,8 @@ def build_controllers(
     windows: "WindowTable | None",
     rows: Sequence[ControllerRow] = CONTROLLERS,
 ) -> dict[str, BuiltController]:
-    """The controllers of these rows by name, in the table's order, without those that cannot be built, such as
-    a phase that was not trained. Numbers of a baseline are float32, so that all of one controller are one
+    """The controllers of these rows by name, in the table's order, without those that cannot be built, such
+    as a phase that was not trained. Numbers of a baseline are float32, so that all of one controller are one
     program."""
     import importlib
 

@@ -11,10 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.setpoint.published import BEST_TEMPERATURE
+
 UNDER, GOOD, OVER = range(3)
 
 
-class Material(NamedTuple):
+class PrintedMaterial(NamedTuple):
     """Best temperature in °C and the range that may be commanded; the flow that is good, and the flow that
     may be commanded, in percent of nominal. The best flow is 100 %."""
 
@@ -48,7 +50,7 @@ class Material(NamedTuple):
         """The inverse of published_temperature."""
         return _carried(published, PLA._degrees(), self._degrees())
 
-    def _flow(self, flow: np.ndarray, one: "Material", other: "Material") -> np.ndarray:
+    def _flow(self, flow: np.ndarray, one: "PrintedMaterial", other: "PrintedMaterial") -> np.ndarray:
         flow = np.asarray(flow, float)
         positive = np.where(flow > 0, flow, 1.0)
         carried = np.exp(_carried(np.log(positive), np.log(one._percents()), np.log(other._percents())))
@@ -77,4 +79,4 @@ def _carried(x: np.ndarray, knots: np.ndarray, to: np.ndarray) -> np.ndarray:
 
 
 # as Li and Pattinson 2025 printed it; 20 and 310 %, 180 and 240 °C are the edges of the published figures
-PLA = Material(210.0, (180.0, 240.0), (90.0, 110.0), (20.0, 310.0))
+PLA = PrintedMaterial(BEST_TEMPERATURE, (180.0, 240.0), (90.0, 110.0), (20.0, 310.0))

@@ -3,9 +3,7 @@ Plain numbers, so that a page can name them without a simulator."""
 
 import math
 
-from pipeline.setpoint.material import PLA
-
-BEST_FLOW, BEST_TEMPERATURE = 100.0, PLA.best_temperature_degC  # q* in percent of nominal, u* in °C
+BEST_FLOW, BEST_TEMPERATURE = 100.0, 210.0  # q* in percent of nominal, u* in °C
 ROTATION = math.pi * 70 / 180  # theta of table 2
 PHASES = (
     (40.0, 20.0),

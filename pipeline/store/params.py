@@ -242,11 +242,12 @@ def files(path: str | Path = FILE) -> dict[str, dict]:
 def _section(section: str, path: str | Path) -> dict:
     sections = read(path)
     if section not in sections:
+        from pipeline.store import params_text
+
         expert = Path(path).with_name(EXPERT)
         if not expert.exists():
-            raise ValueError(
-                f"{path}: section {section} is missing, and so is {expert}; {RESTORE.format(expert)}"
-            )
+            remedy = params_text.RESTORE.format(expert)
+            raise ValueError(f"{path}: section {section} is missing, and so is {expert}; {remedy}")
         raise ValueError(
             f"{_files_of(files(path), section)}: section {section} is missing; "
             f"add {section}: with its keys below it"
@@ -282,7 +283,6 @@ def _files_of(sections: dict[str, dict], section: str, location: Sequence = ()) 
 
 # ---- the sentences
 
-RESTORE = "run from the root of the project, or restore it with git checkout {}"
 _NO_SECTION = "must be a section with keys below it but is {}; indent its keys by two spaces"
 _BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 _COMPARISONS = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}

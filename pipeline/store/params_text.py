@@ -17,8 +17,7 @@ from ruamel.yaml.composer import MaxDepthExceededError
 from ruamel.yaml.error import MarkedYAMLError, StreamMark, YAMLError
 from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode, SequenceNode
 
-from pipeline.store.params import RESTORE
-
+RESTORE = "run from the root of the project, or restore it with git checkout {}"
 # the project's own files are 6 levels deep
 DEEPEST, LONGEST_NUMBER, LARGEST = 50, 30, 200_000
 _TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("bool", "null", "int", "float", "str", "map", "seq")}

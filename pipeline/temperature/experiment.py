@@ -25,7 +25,7 @@ from pipeline.temperature.forecast import (
     Band,
     Doubt,
     Extremes,
-    Loop,
+    ForecastLoop,
     Start,
     ambient,
     answers,
@@ -56,7 +56,7 @@ STEPS = 6  # halvings of each search for an amplitude
 FAIR = 0.4  # of the wanted amplitudes: a shorter experiment is tried below it
 
 
-class Limits(NamedTuple):
+class ExperimentLimits(NamedTuple):
     """Of the inputs low and high (m,) in percent and rate in percent a step; of the outputs y_low and y_high
     (p,) in °C."""
 
@@ -249,7 +249,7 @@ def shaped(raw: np.ndarray, ramp: int, step: float) -> np.ndarray:
 # ---- centre and amplitudes
 
 
-def caps(family: Family, reach: Answers, wish: Wish, limits: Limits) -> np.ndarray:
+def caps(family: Family, reach: Answers, wish: Wish, limits: ExperimentLimits) -> np.ndarray:
     """Amplitudes (m,) that are wanted: the asked one, or what moves an output by half of what its limits
     leave beside band and ambient; 0 where they leave nothing."""
     spare = limits.y_high - limits.y_low - 2 * (family.band.width + family.doubt.ambient_degC)
@@ -259,7 +259,7 @@ def caps(family: Family, reach: Answers, wish: Wish, limits: Limits) -> np.ndarr
 
 
 def programme(
-    family: Family, reach: Answers, wish: Wish, limits: Limits, cap: np.ndarray, least: float | None
+    family: Family, reach: Answers, wish: Wish, limits: ExperimentLimits, cap: np.ndarray, least: float | None
 ) -> tuple[np.ndarray, float] | None:
     """Centre (m,) and share of the wanted amplitudes by a linear programme; None where no centre is within
     the limits even without a signal.
@@ -304,7 +304,9 @@ def programme(
     return np.clip(found.x[:m], limits.low, limits.high), float(found.x[-1])
 
 
-def centres(family: Family, reach: Answers, wish: Wish, limits: Limits, cap: np.ndarray) -> list[np.ndarray]:
+def centres(
+    family: Family, reach: Answers, wish: Wish, limits: ExperimentLimits, cap: np.ndarray
+) -> list[np.ndarray]:
     """Centres (m,) to try in this order: the one that is given; else that of the linear programme, what holds
     the references by the model, and the last inputs."""
     if wish.centre is not None:
@@ -330,12 +332,12 @@ def _extremes(family: Family, reach: Answers, centre: np.ndarray, amplitude: np.
     )
 
 
-def within(extremes: Extremes, limits: Limits) -> bool:
+def within(extremes: Extremes, limits: ExperimentLimits) -> bool:
     return bool((extremes.highest <= limits.y_high).all() and (extremes.lowest >= limits.y_low).all())
 
 
 def safe_amplitude(
-    family: Family, reach: Answers, centre: np.ndarray, limits: Limits, cap: np.ndarray
+    family: Family, reach: Answers, centre: np.ndarray, limits: ExperimentLimits, cap: np.ndarray
 ) -> np.ndarray:
     """The largest amplitudes (m,) found that stay within the limits: a common share of `cap` first, then each
     input as far as it can beyond that; 0 where even the centre alone leaves them."""
@@ -422,10 +424,19 @@ def expected_gap(model: Plant, taught: Lesson, gamma: float) -> float:
     return float(sum(designed(other) / best - 1 for other in others))
 
 
+def expected_gap_percent(model: Plant, lesson: Lesson, gamma: float) -> float | None:
+    """`expected_gap` in percent; None if no controller of the perturbed model holds the machine."""
+    try:
+        gap = expected_gap(model, lesson, gamma)
+    except (ValueError, np.linalg.LinAlgError):
+        return None
+    return 100 * gap if np.isfinite(gap) else None
+
+
 # ---- the experiment
 
 
-def design(family: Family, wish: Wish, limits: Limits, rng: np.random.Generator) -> Experiment:
+def design(family: Family, wish: Wish, limits: ExperimentLimits, rng: np.random.Generator) -> Experiment:
     """The longest experiment that is safe and moves the machine by a fair share of what is wanted; of
     shorter ones the one that teaches most where none does."""
     if reason := _nothing_left(family, limits):
@@ -457,7 +468,7 @@ def design(family: Family, wish: Wish, limits: Limits, rng: np.random.Generator)
     return best if best.written else best._replace(reason=reason)
 
 
-def _nothing_left(family: Family, limits: Limits) -> str:
+def _nothing_left(family: Family, limits: ExperimentLimits) -> str:
     """Why no experiment can be forecast: the model itself misses the record by what the limits are apart;
     empty where it does not."""
     spare = limits.y_high - limits.y_low - 2 * family.band.width
@@ -470,14 +481,18 @@ def _nothing_left(family: Family, limits: Limits) -> str:
     )
 
 
-def ramp_samples(limits: Limits, samples: int) -> int:
+def ramp_samples(limits: ExperimentLimits, samples: int) -> int:
     """Samples of the ramp: the widest range of an input within the rate, half of the experiment at most."""
     needed = np.ceil((limits.high - limits.low).max() / limits.rate)
     return int(max(min(needed, samples / 2), 1))
 
 
 def _designed(
-    family: Family, reach: Answers, wish: Wish, limits: Limits, shapes: tuple[np.ndarray, np.ndarray, int]
+    family: Family,
+    reach: Answers,
+    wish: Wish,
+    limits: ExperimentLimits,
+    shapes: tuple[np.ndarray, np.ndarray, int],
 ) -> Experiment:
     """The experiment of one length; shapes: ramp (T,), signal (T, m), and where the ramp ends."""
     ramp, played, rise = shapes
@@ -523,7 +538,7 @@ def _teaches_little(family: Family, amplitude: np.ndarray, taught: Lesson) -> st
     )
 
 
-def _left(family: Family, reach: Answers, centre: np.ndarray, limits: Limits) -> Experiment:
+def _left(family: Family, reach: Answers, centre: np.ndarray, limits: ExperimentLimits) -> Experiment:
     """The refusal of an experiment whose centre alone leaves a limit, with the output that leaves it most."""
     still = np.zeros(family.model.m)
     extremes = _extremes(family, reach, centre, still)
@@ -551,7 +566,9 @@ def _left(family: Family, reach: Answers, centre: np.ndarray, limits: Limits) ->
 # ---- around the running controller
 
 
-def dither(family: Family, law: Law, wish: Wish, limits: Limits, rng: np.random.Generator) -> Dither:
+def dither(
+    family: Family, law: Law, wish: Wish, limits: ExperimentLimits, rng: np.random.Generator
+) -> Dither:
     """The signal to add to the commands of a controller such as `law` that holds the references, or the
     nearest that the inputs can hold; its amplitudes are halved until the forecast around the family stays
     within the limits."""
@@ -560,7 +577,7 @@ def dither(family: Family, law: Law, wish: Wish, limits: Limits, rng: np.random.
     step = limits.rate / max(wish.amplitude, limits.rate / 2)
     played = shaped(signal(rng, samples, wish, family.pace), rise, step)
     target = feasible_target(family.model, wish.reference, limits.low, limits.high)
-    loop = Loop(aimed(law, target.y, target.u, target.y), target.y, limits.low, limits.high)
+    loop = ForecastLoop(aimed(law, target.y, target.u, target.y), target.y, limits.low, limits.high)
     noise = family.band.noise * rng.standard_normal((samples, family.model.p))
     disturbance = ambient(family.doubt, np.arange(samples), family.pace.fastest)
     wanted = np.full(m, min(wish.amplitude, *((limits.high - limits.low) / 2)))

@@ -214,7 +214,7 @@ def _bounds(
 # ---- around a running controller
 
 
-class Loop(NamedTuple):
+class ForecastLoop(NamedTuple):
     """A controller at work: its law, aimed at reference r (p,), and the inputs' limits low and high (m,)."""
 
     law: Law
@@ -225,7 +225,7 @@ class Loop(NamedTuple):
 
 def closed_loop(
     family: Sequence[Plant],
-    loop: Loop,
+    loop: ForecastLoop,
     dither: np.ndarray,
     noise: np.ndarray,
     *,
@@ -270,7 +270,11 @@ def _padded(plant: Plant, n: int) -> Plant:
 
 
 def _run(
-    plants: Sequence[Plant], loop: Loop, driven: tuple[np.ndarray, ...], late: int, stop: Extremes | None
+    plants: Sequence[Plant],
+    loop: ForecastLoop,
+    driven: tuple[np.ndarray, ...],
+    late: int,
+    stop: Extremes | None,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Highest and lowest (p,), and the largest limited share, of plants of one order, run side by side."""
     law, r = loop.law, loop.reference
@@ -305,7 +309,7 @@ def _run(
     return highest, lowest, float(limited.max() / len(dither))
 
 
-def _at_rest(plant: Plant, loop: Loop) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _at_rest(plant: Plant, loop: ForecastLoop) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """State, memory, integrator and input of a plant that the law holds with its outputs as near the
     reference as its integrator can bring them."""
     law, r = loop.law, loop.reference

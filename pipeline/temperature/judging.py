@@ -9,7 +9,15 @@ import numpy as np
 from pipeline.temperature.controllers import kernel
 from pipeline.temperature.controllers import window as window_route
 from pipeline.temperature.plant import Plant
-from pipeline.temperature.test_set.scorecard import Panel, Yardstick, cost, optimum, panel, regret, simulate
+from pipeline.temperature.test_set.scorecard import (
+    CommonCost,
+    Scenarios,
+    cost,
+    optimum,
+    panel,
+    regret,
+    simulate,
+)
 
 
 class Sufficiency(NamedTuple):
@@ -32,7 +40,7 @@ class CheckRun(NamedTuple):
     reference: np.ndarray
     steps: int
 
-    def on(self, model: Plant) -> Panel:
+    def on(self, model: Plant) -> Scenarios:
         return panel(
             [model],
             starts=[self.start],
@@ -48,8 +56,8 @@ class CheckRun(NamedTuple):
 def sufficiency(
     u: Sequence[np.ndarray],
     y: Sequence[np.ndarray],
-    learned: window_route.Window,
-    yardstick: Yardstick,
+    learned: window_route.WindowModel,
+    yardstick: CommonCost,
     check: CheckRun,
     *,
     allowed: float,
@@ -79,7 +87,7 @@ def sufficiency(
     return Sufficiency(half_gap, learned.samples, int(needed))
 
 
-class Candidate(NamedTuple):
+class KernelCandidate(NamedTuple):
     """One state that Algorithm 2 was tried on: the regression, the gap of its gain on the window's model, and
     the reason of a refusal. The gap of a refused candidate is infinite."""
 
@@ -92,13 +100,13 @@ class Candidate(NamedTuple):
 def kernel_candidates(
     u: Sequence[np.ndarray],
     y: Sequence[np.ndarray],
-    long: window_route.Window,
-    yardstick: Yardstick,
+    long: window_route.WindowModel,
+    yardstick: CommonCost,
     check: CheckRun,
     *,
     largest: int,
     offset: bool,
-) -> list[Candidate]:
+) -> list[KernelCandidate]:
     """Algorithm 2 on windows of 1 to `largest` samples and on the predicted state, all from one record. The
     model of the long window judges each.
 
@@ -118,9 +126,9 @@ def kernel_candidates(
             learned = kernel.regress(features())
             law = kernel.controller(learned, yardstick.gamma, model).design(yardstick.q, yardstick.r, 0.0)
         except ValueError as refusal:
-            candidates.append(Candidate(state, None, float("inf"), str(refusal)))
+            candidates.append(KernelCandidate(state, None, float("inf"), str(refusal)))
             continue
         run = simulate(scenarios, law)
         gap = float(regret(cost(scenarios, run, yardstick), best)[0])
-        candidates.append(Candidate(state, learned, gap if np.isfinite(gap) else float("inf"), ""))
+        candidates.append(KernelCandidate(state, learned, gap if np.isfinite(gap) else float("inf"), ""))
     return candidates

@@ -48,7 +48,7 @@ PRINTED = {
 }
 
 
-class Figures(NamedTuple):
+class PublishedFigures(NamedTuple):
     """J100 and J1000 in the study's own count, and ||r - y|| of the sample it prints as its last, in °C."""
 
     J100: float
@@ -56,7 +56,7 @@ class Figures(NamedTuple):
     error: float
 
 
-def model_based(weights: tuple[np.ndarray, np.ndarray], K0: np.ndarray) -> Figures:
+def model_based(weights: tuple[np.ndarray, np.ndarray], K0: np.ndarray) -> PublishedFigures:
     """Section 6.1: Algorithm 1 from the draw K0 (7, 11), observer (6), (8) from 50 °C, plant from 20 °C. J
     sums stages 0, 0, 1, ..., 98 of the observer's state."""
     plant, (q, r) = baam(), weights
@@ -71,7 +71,7 @@ def model_based(weights: tuple[np.ndarray, np.ndarray], K0: np.ndarray) -> Figur
         estimate = plant.A @ estimate + plant.B @ u + L @ (y[t] - predicted)
         x = plant.A @ x + plant.B @ u
     counted = np.concatenate([stages[:1], stages[:-1]]) * GAMMA ** np.arange(1000)
-    return Figures(counted[:100].sum(), counted.sum(), np.linalg.norm(REFERENCE - y[99]))
+    return PublishedFigures(counted[:100].sum(), counted.sum(), np.linalg.norm(REFERENCE - y[99]))
 
 
 def kernel_gains(
@@ -88,7 +88,7 @@ def kernel_gains(
     return [np.column_stack([kernel.K, kernel.k + kernel.K_r @ r]) for kernel in learned]
 
 
-def data_driven(q: np.ndarray, K: np.ndarray) -> Figures:
+def data_driven(q: np.ndarray, K: np.ndarray) -> PublishedFigures:
     """Section 6.3 on the study's own start-up, K (7, 73) on [w; constant] in data / 1000. J weighs u with R =
     I whatever R the gain was learned with."""
     plant, N, scale = baam(), 6, 1000.0
@@ -104,10 +104,10 @@ def data_driven(q: np.ndarray, K: np.ndarray) -> Figures:
     y[0] = 50.0
     late = GAMMA ** np.maximum(np.arange(1001) - 1, 0)
     stages = late * ((y - REFERENCE) ** 2 @ q) + (u**2).sum(axis=1)
-    return Figures(stages[:101].sum(), stages.sum(), np.linalg.norm(REFERENCE - y[99]))
+    return PublishedFigures(stages[:101].sum(), stages.sum(), np.linalg.norm(REFERENCE - y[99]))
 
 
-def figures(K0: np.ndarray, u: np.ndarray, y: np.ndarray) -> dict[str, Figures]:
+def figures(K0: np.ndarray, u: np.ndarray, y: np.ndarray) -> dict[str, PublishedFigures]:
     """All four columns of the study, from its draws."""
     K_identity, K_tuned = kernel_gains(u, y, [IDENTITY, TUNED_DATA])
     return {

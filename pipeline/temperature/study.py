@@ -17,19 +17,27 @@ from pipeline.temperature.controllers.kernel import (
 )
 from pipeline.temperature.plant import baam
 from pipeline.temperature.probing import study_probe, study_signal
-from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, Figures
-from pipeline.temperature.test_set.scorecard import Panel, Yardstick, cost, optimum, panel, regret, simulate
+from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, PublishedFigures
+from pipeline.temperature.test_set.scorecard import (
+    CommonCost,
+    Scenarios,
+    cost,
+    optimum,
+    panel,
+    regret,
+    simulate,
+)
 from pipeline.temperature.test_set.tuning import SearchResult, fitness
 from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
 
 OUTPUTS, INPUTS = 5, 7
-YARDSTICK = Yardstick(np.ones(OUTPUTS), np.ones(INPUTS), GAMMA)
+YARDSTICK = CommonCost(np.ones(OUTPUTS), np.ones(INPUTS), GAMMA)
 AMPLITUDES, BANDWIDTH, VARIANCE = np.arange(100.0, 0.0, -10.0), 1.65, 1.5
 
 
 def study_panel(
     references: np.ndarray, *, noise: float = 0.0, seeds: tuple[int, ...] = (0,), hold: int = 0
-) -> Panel:
+) -> Scenarios:
     """The study's machine, held at 20 °C in every cell by its steady
     input, for each reference (k, 5); 1,000 steps."""
     return panel(
@@ -44,7 +52,7 @@ def study_panel(
     )
 
 
-def gap(law: Law, scenarios: Panel) -> np.ndarray:
+def gap(law: Law, scenarios: Scenarios) -> np.ndarray:
     """J / J* - 1 of each scenario, unclipped, Q = R = I."""
     run = simulate(scenarios, law)
     return regret(cost(scenarios, run, YARDSTICK), optimum(scenarios, YARDSTICK))
@@ -167,7 +175,7 @@ def rows(
 
 
 def metrics(
-    as_published: dict[str, Figures],
+    as_published: dict[str, PublishedFigures],
     exact: Exact,
     noise_free: NoiseFree,
     table: dict[str, list],
@@ -229,15 +237,11 @@ def tuning_objective(theta: np.ndarray) -> float:
     )
 
 
-class TuningParts(NamedTuple):
+def tuning_parts(theta: np.ndarray) -> tuple[float, float]:
     """What tuning_objective adds up, each in its own unit: discounted r.m.s. error e in °C and effort u in
-    percent, F = sum_t gamma^t (5 e^2 + 7 u^2)."""
+    percent:
 
-    tracking_degC: float
-    effort_percent: float
-
-
-def tuning_parts(theta: np.ndarray) -> TuningParts:
+    F = sum_t gamma^t (5 e^2 + 7 u^2)"""
     plant, discount = baam(), GAMMA ** np.arange(101)
     best = gains(plant, np.diag(theta[:5]), np.diag(theta[5:]), GAMMA)
     x, squares = np.full(plant.n, 20.0), np.empty((101, 2))
@@ -246,29 +250,25 @@ def tuning_parts(theta: np.ndarray) -> TuningParts:
         squares[t] = ((plant.C @ x + plant.D @ u + plant.d - REFERENCE) ** 2).mean(), (u**2).mean()
         x = plant.A @ x + plant.B @ u + plant.b
     error, effort = np.sqrt(discount @ squares / discount.sum())
-    return TuningParts(float(error), float(effort))
+    return float(error), float(effort)
 
 
-class ScaledWeights(NamedTuple):
-    """Q = R = 0.4 I beside Q = R = I: the change of the index when each is computed with its own weights, in
-    percent, and the largest difference of the gains."""
-
-    change_percent: float
-    gain_difference: float
-
-
-def scaled_weights(scale: float = 0.4) -> ScaledWeights:
-    """Why indices with different weights say nothing: scaling all weights changes the printed index by as
-    much, and the controller not at all."""
+def scaled_weights(scale: float = 0.4) -> dict[str, float]:
+    """Q = R = scale I beside Q = R = I: the change of the index when each is computed with its own weights,
+    in percent, and the largest difference of the gains. Indices with different weights say nothing: scaling
+    all weights changes the printed index by as much, and the controller not at all."""
     plant, scenarios = baam(), study_panel(REFERENCE[None])
     one, other = (gains(plant, factor * np.eye(5), factor * np.eye(7), GAMMA) for factor in (1.0, scale))
     law = observer_law(plant, other, observer_gain(plant, TAU))
     run = simulate(scenarios, law)
     J = [
-        cost(scenarios, run, Yardstick(np.full(5, factor), np.full(7, factor), GAMMA)).J[0]
+        cost(scenarios, run, CommonCost(np.full(5, factor), np.full(7, factor), GAMMA)).J[0]
         for factor in (1.0, scale)
     ]
-    return ScaledWeights(float(100 * (J[1] / J[0] - 1)), float(np.abs(one.K_x - other.K_x).max()))
+    return {
+        "change_percent": float(100 * (J[1] / J[0] - 1)),
+        "gain_difference": float(np.abs(one.K_x - other.K_x).max()),
+    }
 
 
 def candidates(result: SearchResult) -> dict[str, list | np.ndarray]:
@@ -295,11 +295,12 @@ def parity_metrics(result: SearchResult) -> dict:
     """What a search for the least (37) ends at, beside its known optimum, Q = R = I, and the weights that it
     recommends."""
     optimum = np.ones(OUTPUTS + INPUTS)
+    tracking_degC, effort_percent = tuning_parts(optimum)
     return {
         "best_cost_perfect_state": result.cost,
         "optimum": tuning_objective(optimum),
         "scaled_weights": scaled_weights(),
-        "trade": {"optimum": tuning_parts(optimum)},
+        "trade": {"optimum": {"tracking_degC": tracking_degC, "effort_percent": effort_percent}},
         "q": result.theta[:OUTPUTS],
         "r": result.theta[OUTPUTS:],
     }

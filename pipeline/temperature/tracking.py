@@ -58,7 +58,7 @@ class Law(NamedTuple):
     conditional: bool = False
 
 
-class Controller(NamedTuple):
+class ControllerDesign(NamedTuple):
     """One way to control. `design(q, r, integral)` gives its law for weights diag(q), diag(r); `integral` is
     the outer integrator's share of the error a step, 0 in the unclipped run. Its feasible targets are
     computed on `model`.
@@ -234,7 +234,7 @@ def observer_law(plant: Plant, gains: Gains, L: np.ndarray, *, integral: float =
     )
 
 
-def model_based(plant: Plant, gamma: float, *, tau: float) -> Controller:
+def model_based(plant: Plant, gamma: float, *, tau: float) -> ControllerDesign:
     """Riccati gains of an identified model, and an observer that stands its errors (robust_observer_gain),
     started where inputs may have brought it. Feed-through counts as one sample of delay."""
     plant = strictly_proper(plant)
@@ -244,16 +244,16 @@ def model_based(plant: Plant, gamma: float, *, tau: float) -> Controller:
     )
 
 
-def exact_model(plant: Plant, gamma: float, *, tau: float) -> Controller:
+def exact_model(plant: Plant, gamma: float, *, tau: float) -> ControllerDesign:
     """The paper's controller, told the true plant: Riccati gains and (8)."""
     return _observed("exact_model", plant, gamma, observer_gain(plant, tau))
 
 
-def _observed(name: str, plant: Plant, gamma: float, L: np.ndarray) -> Controller:
+def _observed(name: str, plant: Plant, gamma: float, L: np.ndarray) -> ControllerDesign:
     def design(q: np.ndarray, r: np.ndarray, integral: float) -> Law:
         return observer_law(plant, gains(plant, np.diag(q), np.diag(r), gamma), L, integral=integral)
 
-    return Controller(name, design, plant)
+    return ControllerDesign(name, design, plant)
 
 
 def started_reached(law: Law, plant: Plant, *, forgets: float = 0.01) -> Law:

@@ -4,30 +4,28 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from pipeline.deposition.tables import SCORES
-from pipeline.setpoint.workflow.tables import SCOREBOARD
+from pipeline.setpoint.tables import SCOREBOARD
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant
 from pipeline.temperature.tables import DYNAMICS, RESIDUALS
 from pipeline.verdict.evidence import OFF, Evidence, switched_off
-from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.settings import QUICK_LOOK, ReportRules
 from pipeline.verdict.verdict import Missing
 
-# what `beadline quick` writes before the verdict: what is smaller than in a full run
-QUICK_LOOK = "reports/quick_look.json"
 # stages whose figures the rules may ask for
-STAGES = (
-    "ingest",
-    "identify_plant",
-    "learn_kernel",
-    "tune_weights",
-    "evaluate_temperature",
-    "train_ilc",
-    "segment_library",
-    "compose_parts",
-    "train_classifier",
-    "train_agent",
-    "evaluate_setpoint",
-)
+FIGURES = {
+    "ingest": "datasets/ingest/figures.json",
+    "identify_plant": "datasets/identify_plant/figures.json",
+    "learn_kernel": "datasets/learn_kernel/figures.json",
+    "tune_weights": "datasets/tune_weights/figures.json",
+    "evaluate_temperature": "datasets/evaluate_temperature/figures.json",
+    "train_ilc": "datasets/train_ilc/figures.json",
+    "segment_library": "datasets/segment_library/figures.json",
+    "compose_parts": "datasets/compose_parts/figures.json",
+    "train_classifier": "datasets/train_classifier/figures.json",
+    "train_agent": "datasets/train_agent/figures.json",
+    "evaluate_setpoint": "datasets/evaluate_setpoint/figures.json",
+}
 TABLES = {
     "residuals": ("datasets/identify_plant/residuals.parquet", RESIDUALS),
     "dynamics": ("datasets/identify_plant/dynamics.parquet", DYNAMICS),
@@ -40,8 +38,8 @@ TABLES = {
 
 def read_evidence(certified: Mapping[str, Mapping[str, Any]] | None = None) -> Evidence:
     """What the stages that ran wrote; a Missing in the place of each file that is not there, or broken."""
-    figures = {stage: _read(f"datasets/{stage}/figures.json", stage, artifacts.read_json) for stage in STAGES}
-    off = {stage for stage in STAGES if switched_off(figures[stage])}
+    figures = {stage: _read(path, stage, artifacts.read_json) for stage, path in FIGURES.items()}
+    off = {stage for stage in FIGURES if switched_off(figures[stage])}
     places = {name: (path, path.split("/")[1], _reader(schema)) for name, (path, schema) in TABLES.items()}
     return Evidence(
         {**figures, **dict.fromkeys(off, OFF)},

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from pipeline.setpoint.agents.criteria import BEYOND, harm_bar
 from pipeline.setpoint.controllers import KINDS
-from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, harm_bar
+from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.verdict.digits import THIN, band, count, number, quantity
 from pipeline.verdict.evidence import Evidence, lookup
 from pipeline.verdict.rules import Reading, Row, at_path, judge, rows

@@ -10,15 +10,7 @@ import pytest
 from pipeline.deposition.drive import UNLIMITED, Drive, follows, obeyed
 from pipeline.deposition.learning import ilc, training
 from pipeline.deposition.parts import basis, composition, evaluation
-from pipeline.deposition.parts.composition import (
-    BASIS,
-    PRIORITY,
-    PartSettings,
-    commands,
-    compose,
-    priority,
-    superposition,
-)
+from pipeline.deposition.parts.composition import PartSettings, commands, compose, priority, superposition
 from pipeline.deposition.parts.conformance import conform
 from pipeline.deposition.parts.library import Basis, Library
 from pipeline.deposition.parts.library import learned as learned_command
@@ -100,7 +92,7 @@ def test_the_prediction_of_each_composer_is_near_its_true_error():
                         error, rel=0.15, abs=1.5
                     )  # predicted from trials alone
             chosen = [p for p in made.predictions if p.chosen and p.material == stream.material]
-            assert len(chosen) == 1 and stream.composer == chosen[0].composer == BASIS
+            assert len(chosen) == 1 and stream.composer == chosen[0].composer == "basis"
 
 
 def test_short_lines_need_superposition_and_long_ones_do_not():
@@ -277,7 +269,7 @@ def test_every_composed_command_follows_and_beats_one_that_is_obeyed_as_it_comes
             slewed = obeyed(free[composer], drive, sample_time_s=TS)
             near, cut = (percent_of_on_off(PLANT, v, stream.r) for v in (u, slewed))
             print(part, composer, near, cut)
-            if composer != PRIORITY:
+            if composer != "priority":
                 assert near < 0.9 * cut, composer
 
 

@@ -20,10 +20,10 @@ import scipy.stats
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
 from pipeline.setpoint.simulation import actuation
 from pipeline.setpoint.simulation.recorded import WindowTable
-from pipeline.setpoint.simulation.simulator import Controller, Observation
+from pipeline.setpoint.simulation.simulator import Observation, SetpointController
 
 DECISIONS, WINDOW_S, HEATER_S = 200, 1.0, 15.0
-LIMITS = actuation.Limits(
+LIMITS = actuation.SetpointLimits(
     np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([100.0, 60.0])
 )
 START_FLOWS, START_TEMPERATURES = (30.0, 60.0, 80.0, 120.0, 150.0, 200.0, 300.0), (190.0, 210.0, 230.0)
@@ -216,7 +216,7 @@ class Runs(NamedTuple):
 
 
 def loop(
-    printer: Printer, controller: Controller, parameters: Any, case: Case, n: int, *, seed: int,
+    printer: Printer, controller: SetpointController, parameters: Any, case: Case, n: int, *, seed: int,
     camera: Camera | None = None,
 ) -> Runs:  # fmt: skip
     """n runs of a controller as deployed: limits, waits and holds are deployment's. The chances of printer

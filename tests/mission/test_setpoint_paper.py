@@ -11,8 +11,8 @@ import pytest
 from pipeline.setpoint.agents.agent import QNetwork
 from pipeline.setpoint.published import PHASES, ROTATION
 from pipeline.setpoint.vision.vision_transformer import PAPER, parameters, vision_transformer
-from pipeline.setpoint.workflow.settings import TrainAgent
 from pipeline.store import params
+from stages.train_agent import TrainAgent
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,11 @@ from pathlib import Path
 import pytest
 import yaml
 
+from pipeline.cli import render_night
 from pipeline.nightly import accepting, branches, champion, inputs, merging, night, processes, remembered
+from pipeline.nightly.records import Champion, ChampionState, Installed
 from pipeline.nightly.settings import Nightly
 from pipeline.reading import excluded
-from pipeline.report.nightly.production import Champion, ChampionState, Installed
 from pipeline.store import artifacts, params
 from tests.nightly.toy_nights import ROOT, SETTINGS, Project, entered
 
@@ -56,7 +57,7 @@ def test_three_promotions_without_a_merge_are_all_in_the_history_that_the_printe
     before, head = by_branch.production(), by_branch.head()
     for k, values in enumerate(BETTER):
         by_branch.record(f"shift_{k}", values)
-        status, summary = night.nightly()
+        status, summary = night.nightly(render_night)
         assert status == night.OK and "promoted toy on branch nightly" in summary, summary
         # in production is what was there, and the night judges against that
         assert by_branch.production() == before and by_branch.head() == head
@@ -98,14 +99,14 @@ def settings():
 @pytest.mark.slow
 def test_a_challenger_no_better_than_the_one_that_waits_is_not_put_before_it(by_branch):
     by_branch.record("good", BETTER[0] + BETTER[1])  # 10.35
-    assert "promoted toy" in night.nightly()[1]
+    assert "promoted toy" in night.nightly(render_night)[1]
     by_branch.record("poor", [11.0] * 3)  # 10.48: better than 11, and no better than what waits
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK and "no better than that of night-0002, which waits on the branch" in summary
     assert "on branch nightly waits night-0002 (toy)" in summary and "promoted" not in summary
     assert runs(champion.of_branch("nightly")) == ["night-0001", "night-0002"]
     (by_branch.folder / "datasets/raw/toy/poor.csv").unlink()
-    assert "that of night-0002, byte for byte, which waits" in night.nightly()[1]
+    assert "that of night-0002, byte for byte, which waits" in night.nightly(render_night)[1]
     assert by_branch.champion()["run"] == "night-0001" == champion.read().champions["toy"].run
 
 
@@ -126,9 +127,9 @@ def test_promotions_of_two_loops_wait_beside_each_other(by_branch):
     score(9.0)
     by_branch.run("git", "add", "-f", "datasets/other")
     by_branch.run("git", "commit", "-qm", "its first score")
-    assert "promoted other" in night.nightly()[1]
+    assert "promoted other" in night.nightly(render_night)[1]
     by_branch.record("good", BETTER[0])
-    assert "promoted toy" in night.nightly()[1]
+    assert "promoted toy" in night.nightly(render_night)[1]
     waits = champion.of_branch("nightly").champions
     assert {name: one.run for name, one in waits.items()} == {"other": "night-0002", "toy": "night-0003"}
     assert "toy is night-0003, other is night-0002" in merging.merge("nightly")
@@ -141,13 +142,13 @@ def test_promotions_of_two_loops_wait_beside_each_other(by_branch):
 @pytest.mark.slow
 def test_the_branch_only_moves_forward_though_its_promotion_was_squashed_or_production_went_on(by_branch):
     by_branch.record("shift_0", BETTER[0])
-    night.nightly()
+    night.nightly(render_night)
     tip = processes.git("rev-parse", "nightly")
     (by_branch.folder / "notes.md").write_text("production went on")
     by_branch.run("git", "add", "notes.md")
     by_branch.run("git", "commit", "-qm", "notes")
     by_branch.record("shift_1", BETTER[1])
-    night.nightly()
+    night.nightly(render_night)
     head, then = by_branch.head(), processes.git("rev-parse", "nightly")
     assert processes.contains(then, tip) and processes.contains(then, head)
     assert processes.git("show", "nightly:notes.md") == "production went on"
@@ -157,7 +158,7 @@ def test_the_branch_only_moves_forward_though_its_promotion_was_squashed_or_prod
     by_branch.run("git", "commit", "-qm", "squashed")
     assert not branches.waiting(settings()).champions
     by_branch.record("shift_2", BETTER[2])
-    assert "promoted toy" in night.nightly()[1]
+    assert "promoted toy" in night.nightly(render_night)[1]
     last = processes.git("rev-parse", "nightly")
     assert processes.contains(last, then) and processes.contains(last, by_branch.head())
     assert runs(champion.of_branch("nightly")) == ["night-0001", "night-0002", "night-0003", "night-0004"]
@@ -170,7 +171,7 @@ def test_a_fresh_clone_knows_what_waits_on_the_remote(by_branch, tmp_path):
         installed=there.installed._replace(folder=there.installed.folder | {"md5": "0.dir"})
     )
     artifacts.write_json(
-        champion.FILE, champion.in_production(waits, "toy", there, event="promoted").written()
+        champion.FILE, champion.in_production(waits, "toy", there, event="promoted").to_json()
     )
     processes.commit([str(champion.FILE)], "waits", branch="nightly")
     by_branch.run("git", "checkout", "-q", "--", ".")
@@ -292,7 +293,7 @@ def test_a_merge_that_was_killed_half_way_is_done_by_the_next_one_and_stops_no_n
                 merging.merge("other")
         assert by_branch.head() == head and by_branch.production() == before
     assert merging.PLACE.exists()
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK, summary
     assert "other is merged" in merging.merge("other") and not merging.PLACE.exists()
     assert by_branch.head() == processes.git("rev-parse", "other") and by_branch.production() == before
@@ -320,7 +321,7 @@ def test_a_detached_head_is_refused_in_a_sentence_unless_promotions_go_to_a_bran
     project.run("git", "checkout", "-q", "--detach")
     project.record("second", [9.0] * 3)
     before = project.production()
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert (
         status == night.FAILED and "found a detached HEAD, where the night's commit would be lost" in summary
     )
@@ -329,17 +330,17 @@ def test_a_detached_head_is_refused_in_a_sentence_unless_promotions_go_to_a_bran
         with pytest.raises(ValueError, match="found a detached HEAD"):
             by_hand()
     project.set(promotion="branch")
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK and "on branch nightly waits" in summary and project.production() == before
     assert runs(champion.of_branch("nightly"))[-1] == champion.of_branch("nightly").champions["toy"].run
 
 
 def test_the_branch_of_promotions_cannot_be_the_one_in_production(by_branch):
     by_branch.set(promotion="branch", branch="main")
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED and "nightly.branch: expected a branch apart from" in summary
     by_branch.set(promotion="branch", branch="a..b")
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED and "nightly.branch: expected the name of a branch, found 'a..b'" in summary
 
 
@@ -348,11 +349,11 @@ def test_a_branch_that_is_checked_out_in_another_worktree_is_not_moved_under_it(
     place = by_branch.folder.parent / "elsewhere"
     by_branch.run("git", "worktree", "add", "-q", str(place), "nightly")
     by_branch.record("second", BETTER[0])
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED and f"found nightly, which is checked out in {place}" in summary
     assert by_branch.run("git", "-C", str(place), "status", "--porcelain").stdout == ""
     shutil.rmtree(place)  # git still lists it
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK and "promoted toy on branch nightly" in summary
 
 
@@ -368,7 +369,7 @@ def test_nothing_is_rolled_back_while_something_is_half_done_in_git(project, wor
     for by_hand in (lambda: night.rollback("", ""), lambda: accepting.accept("toy", "meant")):
         with pytest.raises(ValueError, match=f"a {word} is under way in git"):
             by_hand()
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED and f"a {word} is under way in git" in summary
     project.run("git", word, "--abort")
     assert project.head() == head and project.production() == production
@@ -385,7 +386,7 @@ def test_what_lay_uncommitted_is_told_and_remembered_by_its_whole_name(project):
     lock = project.folder / "dvc.lock"
     lock.write_text(lock.read_text() + "\n")
     project.record("second", [9.0] * 3)
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK, summary
     names = ["dvc.yaml", "evaluate.py", "judge it.py", "learn.py", "params.yaml"]
     assert project.champion()["lineage"]["uncommitted"] == names
@@ -472,12 +473,12 @@ def test_two_rollbacks_put_the_files_of_the_first_champion_back_bit_by_bit(proje
     first = project.production()
     for k in range(2):
         project.record(f"shift_{k}", BETTER[k])
-        assert "promoted toy" in night.nightly()[1]
+        assert "promoted toy" in night.nightly(render_night)[1]
     assert "toy is night-0002 again" in night.rollback("", "")
     assert "toy is night-0001 again" in night.rollback("", "")
     assert project.production() == first and project.dirty() == []
     project.set(watch_h=40)
-    assert "was rolled back by hand" in night.nightly()[1]
+    assert "was rolled back by hand" in night.nightly(render_night)[1]
 
 
 def test_champion_pointer_and_files_are_on_the_disk_before_the_commit(project, monkeypatch):
@@ -543,7 +544,7 @@ def test_a_recording_that_git_or_dvc_keeps_stays_is_excluded_and_alarms_once(pro
     project.run("git", "add", "-A")
     project.run("git", "commit", "-qm", "a recording")
     (raw / "dropped.mcap").write_bytes(BROKEN)
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.QUARANTINED and f"kept.mcap ({kept_by} keeps it" not in summary
     assert (
         f"({kept_by} keeps it: it stays, and is listed in datasets/raw/deposition/excluded.yaml)" in summary
@@ -555,13 +556,13 @@ def test_a_recording_that_git_or_dvc_keeps_stays_is_excluded_and_alarms_once(pro
     assert excluded.readable([raw / "kept.mcap", raw / "other.mcap"], raw) == [raw / "other.mcap"]
     # the list is committed with the recordings, and no night speaks of it again
     assert project.dirty() == []
-    assert "nothing new" in night.nightly()[1]
+    assert "nothing new" in night.nightly(render_night)[1]
     change_params(project, watch_h=40)
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK and "kept.mcap" not in summary
     # mended, it is a new recording, and looked at again
     (raw / "kept.mcap").write_bytes(BROKEN + b" mended")
-    assert night.nightly()[0] == night.QUARANTINED
+    assert night.nightly(render_night)[0] == night.QUARANTINED
 
 
 def test_who_keeps_a_recording_goes_by_its_own_name_and_not_by_a_pattern(project):
@@ -811,9 +812,9 @@ def test_a_new_recording_reruns_in_a_night_only_the_stages_that_read_it(project)
     (project.folder / "datasets/raw/other/first.csv").write_text("1")
     project.run("git", "add", "-A")
     project.run("git", "commit", "-qm", "two chains")
-    night.nightly()
+    night.nightly(render_night)
     project.record("second", [11.0] * 3)  # the mean is as before
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK, summary
     log = (project.folder / f".beadline/logs/{remembered.nights()[-1].run}.log").read_text()
     assert re.findall(r"Running stage '(\w+)'", log) == ["learn"]

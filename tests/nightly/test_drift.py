@@ -49,8 +49,8 @@ def record(
 
 
 @pytest.fixture(scope="module")
-def machine() -> drift.Machine:
-    return drift.Machine(MODEL, SAMPLES)
+def machine() -> drift.ProductionModel:
+    return drift.ProductionModel(MODEL, SAMPLES)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def own(machine) -> Baseline:
     return baseline.measured(machine, nights, baseline.Floors(0.03, 0.25))
 
 
-def explained(machine, own, *segments) -> tuple[drift.Record, drift.Explanation]:
+def explained(machine, own, *segments) -> tuple[drift.DriftRecord, drift.Explanation]:
     return drift.explain_segments(machine, segments, own.scale, own.changes, own.usual(CAUSES))
 
 
@@ -93,7 +93,7 @@ def test_what_changed_is_named_and_measured(machine, own, truth, spoilt, kind, c
     for seed in (2, 3):
         _, told = explained(machine, own, record(truth, seed, **spoilt))
         fit = told.named[0].fit
-        assert fit.cause == drift.Cause(kind, channel)
+        assert fit.cause == drift.DriftCause(kind, channel)
         assert fit.value == pytest.approx(value, abs=within)
         assert len(told.named) == 1
 
@@ -101,8 +101,8 @@ def test_what_changed_is_named_and_measured(machine, own, truth, spoilt, kind, c
 def test_two_changes_of_one_record_are_both_named(machine, own):
     both = record(two_zones(gain=(0.9, 1.0)), 4, given=lambda u: late(u, (0, 5)))
     named = {named.fit.cause: named.fit.value for named in explained(machine, own, both)[1].named}
-    assert named[drift.Cause("gain", 0)] == pytest.approx(-0.1, abs=0.01)
-    assert named[drift.Cause("delay", 1)] == pytest.approx(5.0, abs=0.3)
+    assert named[drift.DriftCause("gain", 0)] == pytest.approx(-0.1, abs=0.01)
+    assert named[drift.DriftCause("delay", 1)] == pytest.approx(5.0, abs=0.3)
 
 
 def a_sine(degC: float) -> np.ndarray:
@@ -125,7 +125,7 @@ def test_the_air_of_another_season_is_told_from_a_gain(machine, own):
 
 def test_a_change_below_what_matters_is_measured_as_that(machine, own):
     fit = explained(machine, own, record(two_zones(gain=(0.97, 1.0)), 16))[1].named[0].fit
-    assert fit.cause == drift.Cause("gain", 0) and fit.value == pytest.approx(-0.03, abs=0.003)
+    assert fit.cause == drift.DriftCause("gain", 0) and fit.value == pytest.approx(-0.03, abs=0.003)
     assert fit.deviation < 0.003  # so that 3 % are known to be no 4 %
 
 
@@ -148,14 +148,14 @@ def test_one_heater_and_one_sensor_tell_a_gain_and_leave_the_air_in_doubt():
         rng = np.random.default_rng([seed, 1])
         return u, simulate(truth, u, x0)[1] + offset + NOISE * rng.standard_normal((SAMPLES, 1))
 
-    one = drift.Machine(lag, SAMPLES)
+    one = drift.ProductionModel(lag, SAMPLES)
     known = baseline.measured(one, [[shift(lag, k)] for k in range(4)], baseline.Floors(0.03, 0.25))
     asked = drift.causes(lag)
     told = [
         drift.explain_segments(one, [record], known.scale, known.changes, known.usual(asked))
         for record in (shift(lag._replace(B=0.9 * lag.B), 40), shift(lag, 41, 1.5))
     ]
-    assert [named.fit.cause for named in told[0][1].named] == [drift.Cause("gain", 0)]
+    assert [named.fit.cause for named in told[0][1].named] == [drift.DriftCause("gain", 0)]
     # a sensor alone cannot tell its own offset from the air around: that is the air's
     assert told[1][1].named == []
     assert drift.levels(told[1][0], told[1][1].changes)[0] == pytest.approx(1.5, abs=0.2)
@@ -175,11 +175,11 @@ def test_a_baseline_takes_up_what_its_own_records_hold_to_be_otherwise(machine):
     drifted = baseline.measured(machine, nights, baseline.Floors(0.03, 0.25))
     assert explained(machine, drifted, record(two_zones(gain=(0.9, 1.0)), 30))[1].named == []
     fit = explained(machine, drifted, record(two_zones(), 31))[1].named[0].fit
-    assert fit.cause == drift.Cause("gain", 0) and fit.value == pytest.approx(1 / 0.9 - 1, abs=0.01)
+    assert fit.cause == drift.DriftCause("gain", 0) and fit.value == pytest.approx(1 / 0.9 - 1, abs=0.01)
 
 
 def test_a_baseline_comes_back_from_its_file(own):
-    again = Baseline.read(own.written())
+    again = Baseline.read(own.to_json())
     for name in ("scale", "changes"):
         for before, after in zip(getattr(own, name), getattr(again, name), strict=True):
             np.testing.assert_array_equal(before, after)

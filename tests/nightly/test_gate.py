@@ -10,21 +10,33 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.cli import render_night
 from pipeline.deposition.tables import SCORES
-from pipeline.nightly import champion, judge, night, promoting, reporting, screening
-from pipeline.nightly.decision import Evidence
-from pipeline.nightly.reproducing import Reproduced
+from pipeline.nightly import champion, judge, night, promoting, reporting, screening, verdicts
+from pipeline.nightly.decision import CaseCosts
+from pipeline.nightly.records import (
+    CANDIDATE,
+    FIRST,
+    KEPT,
+    PROMOTED,
+    Champion,
+    ChampionState,
+    Installed,
+    Lineage,
+    Night,
+)
 from pipeline.nightly.settings import Nightly
 from pipeline.report.index import page as index_page
 from pipeline.report.nightly import page as nightly_page
-from pipeline.report.nightly.production import Champion, ChampionState, Installed, Lineage
-from pipeline.report.nightly.record import CANDIDATE, FIRST, KEPT, PROMOTED, Night
+from pipeline.report.shared.sources import Declared, Sources, collect
 from pipeline.report.temperature.judgement import judgement
 from pipeline.store import artifacts, params
+from pipeline.temperature.settings import Plant
 from pipeline.verdict.digits import typeset
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Verdict
 from stages import report
+from stages import verdict as stage_verdict
 from tests.conftest import ROOT
 from tests.nightly.toy_nights import Project, entered
 from tests.report import made, made_certificate, made_setpoint
@@ -46,6 +58,7 @@ def passing(tmp_path_factory):
     folder = tmp_path_factory.mktemp("passing")
     with contextlib.chdir(folder):
         populate(folder)
+        stage_verdict.main()
     return folder, {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
@@ -63,7 +76,7 @@ def project(passing, monkeypatch):
 
     def measure(folder, contestant=""):
         cost = 2.0 if Path(folder).parts[0] == "champion" else 1.0
-        return Evidence("panel", {f"case {k}": (f"plant {k}", cost) for k in range(8)}, {"worst_case": cost})
+        return CaseCosts("panel", {f"case {k}": (f"plant {k}", cost) for k in range(8)}, {"worst_case": cost})
 
     monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(measure, lambda _: {"worst_case": 0.1}))
     monkeypatch.setattr(screening, "reference", lambda *_: None)
@@ -253,6 +266,7 @@ def written(rng) -> dict[str, str]:
         Path(f"datasets/{stage}/figures.json").unlink(missing_ok=True)
     for stage, figures in stages.items():
         artifacts.write_metrics(stage, figures)
+    stage_verdict.main()
     return expected
 
 
@@ -281,7 +295,7 @@ def test_page_and_night_never_disagree(project, seed):
         candidates={loop: other("night-0005") for loop in LOOPS if rng.random() < 0.5},
     )
     tonight, after = promoting.judged(asked, TONIGHT, before, lineage=Lineage)
-    sources = promoting.page_sources()
+    sources = page_sources()
     index = words(index_page.render(sources, judgement(sources)))
     page = nightly_page.render([tonight], after, asked)
     summary = reporting.summary(tonight, [])
@@ -363,28 +377,37 @@ def test_a_champion_of_the_heaters_has_a_passed_certificate_of_its_own(
     assert all(tonight.decisions[loop].promotes for loop in LOOPS if loop != "temperature")
 
 
-def test_the_night_reads_what_the_pages_are_made_of():
-    assert {stage: f"datasets/{stage}/figures.json" for stage in promoting.MEASURED} == {
-        stage: report.FIGURES[stage] for stage in promoting.MEASURED
-    }
-    assert set(promoting.MEASURED) == set(report.FIGURES) >= set(report.FOLDERS)
-    assert all(folder == f"datasets/{stage}" for stage, folder in report.FOLDERS.items())
+def page_sources() -> Sources:
+    """What the stage `report` reads."""
+    declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
+    return collect(declared, report.FIGURES, report.FOLDERS, "reports/accepted.json", ())
+
+
+@pytest.mark.parametrize("key", ["", "watched", "alarms"])
+def test_the_night_goes_by_the_verdicts_that_the_pages_show(project, key):
+    drift(key)(None)
+    by_loop, _ = verdicts.read_verdicts(settings(), TONIGHT)
+    assert by_loop == page_sources().verdicts and by_loop.keys() == LOOPS.keys()
+
+
+def test_a_loop_whose_verdict_is_missing_is_never_promoted(project):
+    Path("datasets/verdict/deposition.json").unlink()
+    with pytest.raises(ValueError, match=r"^datasets/verdict/deposition\.json: expected the verdict"):
+        verdicts.read_verdicts(settings(), TONIGHT)
 
 
 def test_the_report_keeps_the_verdict_of_each_loop_as_the_night_reads_it(project, monkeypatch):
     made.main()
     made_anew = []
-    monkeypatch.setattr(promoting, "dvc", lambda *command, **_: made_anew.append(command))
-    verdicts, tonight = promoting.verdicts_of(settings(), TONIGHT)
+    monkeypatch.setattr(verdicts, "dvc", lambda *command, **_: made_anew.append(command))
+    by_loop, tonight = verdicts.read_verdicts(settings(), TONIGHT)
     kept = artifacts.read_figures("report")
-    assert kept["verdicts"] == {loop: verdict.metrics() for loop, verdict in verdicts.items()}
-    assert {name: kept["verdict"][name] for name in kept["verdict"]} == verdicts["temperature"].metrics() | {
-        "rehearsal": False
-    }
+    assert kept["verdicts"] == {loop: verdict.metrics() for loop, verdict in by_loop.items()}
+    assert kept["verdict"] == by_loop["temperature"].metrics()
     assert made_anew == [] and tonight == TONIGHT
     # the drift that they were made with is over since: they are made anew, so that both say the same
     drift("alarms")(None)
-    promoting.verdicts_of(settings(), TONIGHT)
+    verdicts.read_verdicts(settings(), TONIGHT)
     assert made_anew == [("repro", "--single-item", "--force", "report")]
 
 
@@ -395,9 +418,9 @@ def test_pages_that_cannot_be_made_anew_are_told_and_the_night_goes_on(project, 
     def refused(*_, **__):
         raise ValueError("dvc repro failed: no room")
 
-    monkeypatch.setattr(promoting, "dvc", refused)
-    verdicts, tonight = promoting.verdicts_of(settings(), TONIGHT)
-    assert verdicts["temperature"].state == FAILED
+    monkeypatch.setattr(verdicts, "dvc", refused)
+    by_loop, tonight = verdicts.read_verdicts(settings(), TONIGHT)
+    assert by_loop["temperature"].state == FAILED
     assert tonight.notes == (
         "the pages are not of tonight (dvc repro failed: no room); run ./run dvc repro --force report",
     )
@@ -406,13 +429,14 @@ def test_pages_that_cannot_be_made_anew_are_told_and_the_night_goes_on(project, 
 def test_a_contestant_that_is_named_to_run_must_pass_itself(project):
     stages = made.metrics()
     own = stages["evaluate_temperature"]["contestants"]["varx_riccati"]
-    assert promoting.verdicts_of(settings(controller="varx_riccati"), TONIGHT)[0]["temperature"].winner == (
+    assert verdicts.read_verdicts(settings(controller="varx_riccati"), TONIGHT)[0]["temperature"].winner == (
         "varx_riccati"
     )
     own["overshoot"] = made.figure(9.0, 8.0, 10.0)
     artifacts.write_metrics("evaluate_temperature", stages["evaluate_temperature"])
+    stage_verdict.main()
     by_page, named = (
-        promoting.verdicts_of(settings(controller=name), TONIGHT)[0]["temperature"]
+        verdicts.read_verdicts(settings(controller=name), TONIGHT)[0]["temperature"]
         for name in ("page", "varx_riccati")
     )
     assert (by_page.state, by_page.winner) == (PASSED, "subspace_lqg")
@@ -425,13 +449,13 @@ def test_a_contestant_that_is_named_to_run_must_pass_itself(project):
     assert tonight.decisions["temperature"].decision == CANDIDATE
     assert after.candidates["temperature"].contestant == "varx_riccati"
     # one that was not judged at all is open
-    lost = promoting.verdicts_of(settings(controller="printer_pid"), TONIGHT)[0]["temperature"]
+    lost = verdicts.read_verdicts(settings(controller="printer_pid"), TONIGHT)[0]["temperature"]
     assert lost.state == OPEN and lost.subject == "printer_pid" and "was not judged" in lost.reason
 
 
 def test_what_runs_stays_where_the_page_finds_nobody_better_beyond_the_bands(project):
     """The page's incumbent is the champion's contestant, where there is one."""
-    assert promoting.verdicts_of(settings(), TONIGHT)[0]["temperature"].winner == "subspace_lqg"
+    assert verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"].winner == "subspace_lqg"
     present = other()._replace(contestant="varx_riccati")
     state = ChampionState({"temperature": present})
     artifacts.write_json(NIGHTLY, TONIGHT.metrics(state))
@@ -445,10 +469,10 @@ def test_the_champion_and_the_challenger_are_each_judged_as_their_own_contestant
 
     def measure(folder, contestant=""):
         asked.append((str(folder), contestant))
-        return Evidence("panel", {f"case {k}": (f"plant {k}", 1.0) for k in range(8)}, {"worst_case": 1.0})
+        return CaseCosts("panel", {f"case {k}": (f"plant {k}", 1.0) for k in range(8)}, {"worst_case": 1.0})
 
     monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(measure, lambda _: {}))
-    verdict = promoting.verdicts_of(settings(), TONIGHT)[0]["temperature"]
+    verdict = verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"]
     for present in (other()._replace(contestant="pi_simc"), other()):
         state = ChampionState({"temperature": present})
         promoting.decided(settings(), "temperature", TONIGHT, state, verdict)
@@ -462,7 +486,7 @@ def test_the_champion_and_the_challenger_are_each_judged_as_their_own_contestant
 
 
 def test_the_same_files_as_another_contestant_are_another_challenger(project):
-    verdict = promoting.verdicts_of(settings(), TONIGHT)[0]["temperature"]
+    verdict = verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"]
     files = Installed({"md5": "0"}, champion.md5_of(LOOPS["temperature"]))
     decisions = {
         contestant: promoting.decided(
@@ -490,7 +514,7 @@ def test_the_same_files_as_another_contestant_are_another_challenger(project):
 
 
 def test_a_champion_that_would_lack_what_it_is_designed_from_is_not_promoted(project):
-    verdict = promoting.verdicts_of(settings(), TONIGHT)[0]["temperature"]._replace(subject="pi_simc")
+    verdict = verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"]._replace(subject="pi_simc")
     decided = promoting.decided(settings(), "temperature", TONIGHT, ChampionState(), verdict).decision
     assert decided.decision == KEPT and decided.reasons == [
         "pi_simc is designed from datasets/identify_plant/spread.parquet, which the champion would lack; add "
@@ -520,7 +544,7 @@ def played(tmp_path, monkeypatch):
     copy = Project(tmp_path / "toy")
     own = {"judge": "deposition", "cases": "", "recordings": "", "artifacts": ["datasets/compose_parts/x"]}
     copy.set(loops={"deposition": own})
-    evidence = Evidence("panel", {f"case {k}": (f"part {k}", 1.0) for k in range(8)}, {"worst": np.inf})
+    evidence = CaseCosts("panel", {f"case {k}": (f"part {k}", 1.0) for k in range(8)}, {"worst": np.inf})
     monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(lambda *_: evidence, lambda _: {"worst": 1.0}))
     monkeypatch.setattr(screening, "reference", lambda *_: None)
     return copy
@@ -540,16 +564,16 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
             # the pages that the stages make show the drift of this very night
             assert artifacts.read_json(NIGHTLY)["run"] == run == f"night-{number:04d}"
             artifact.write_text(files)
-            return Reproduced()
+            return {}, ()
 
         monkeypatch.setattr(night, "_reproduce", reproduced)
         verdict = Verdict("deposition", state, *words_of[state], "", "", "", "basis", subject="basis")
         verdict = verdict._replace(rehearsal=True)
         monkeypatch.setattr(
-            promoting, "verdicts_of", lambda settings, night: ({"deposition": verdict}, night)
+            verdicts, "read_verdicts", lambda settings, night: ({"deposition": verdict}, night)
         )
         Path("learn.py").write_text(f"# night {number}\n")
-        status, summary = night.nightly()
+        status, summary = night.nightly(render_night)
         assert status == night.OK, summary
         return summary, json.loads(played.run("git", "show", "HEAD:champion.json").stdout)
 

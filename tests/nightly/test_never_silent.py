@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.cli import render_night
 from pipeline.nightly import champion, guarding, night, remembered, reporting, reproducing, retention, watch
 from pipeline.nightly.settings import Nightly
 from pipeline.report.nightly import page
@@ -104,7 +105,7 @@ def told(project: Project, *words: str) -> None:
     """Status 1, alarm, command and page all name these; the champion is that of the first night."""
     before, woken = project.production(), project.folder / "woken.json"
     woken.unlink(missing_ok=True)
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED
     alarm, page_text = json.loads(woken.read_text()), html.unescape(Path("reports/nightly.html").read_text())
     assert alarm["kind"] == "failed" and alarm == json.loads(watch.ALARM.read_text())
@@ -116,7 +117,7 @@ def told(project: Project, *words: str) -> None:
 
 def works_again(project: Project, run: str) -> None:
     project.record("better", [9.0, 9.0, 9.0])
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK and "promoted toy" in summary, summary
     assert project.champion()["run"] == run
 
@@ -191,7 +192,7 @@ def test_a_broken_champion_json_is_put_back_and_told(project, committed):
     if committed:
         project.run("git", "commit", "-qam", "a merge that went wrong")
     before = project.production()
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED and "champion.json is not whole JSON" in summary
     assert "put back to" in summary and json.loads(Path("woken.json").read_text())["kind"] == "failed"
     assert "champion.json" in Path("reports/nightly.html").read_text()
@@ -225,11 +226,11 @@ def test_a_broken_file_is_named_and_somebody_is_woken_by_what_was_last_known(pro
     else:
         Path(file).write_bytes(content)
     if not words:  # nothing is wrong with an empty dvc.lock: all is made anew
-        assert night.nightly()[0] == night.OK
+        assert night.nightly(render_night)[0] == night.OK
         return
     told(project, *words)
     Path(file).write_bytes(whole)
-    assert night.nightly()[0] == night.OK
+    assert night.nightly(render_night)[0] == night.OK
 
 
 def test_broken_parameters_of_a_fresh_clone_wake_by_the_environment(project, monkeypatch):
@@ -244,7 +245,7 @@ def test_markers_of_a_merge_that_were_committed_are_mended_by_the_command_that_i
     whole = Path("dvc.lock").read_bytes()
     Path("dvc.lock").write_bytes(b"<<<<<<< HEAD\n" + whole)
     project.run("git", "commit", "-qam", "half a merge")
-    summary = night.nightly()[1]
+    summary = night.nightly(render_night)[1]
     command = summary[summary.index("git checkout") : summary.index(" -- dvc.lock")] + " -- dvc.lock"
     project.run(*command.split())
     assert Path("dvc.lock").read_bytes() == whole
@@ -284,7 +285,7 @@ def test_an_error_at_any_edge_of_the_night_is_told(project, monkeypatch, module,
     with monkeypatch.context() as edge:
         edge.setattr(module, name, broken)
         told(project, "RuntimeError: a bug at the edge")
-    assert night.nightly()[0] == night.OK
+    assert night.nightly(render_night)[0] == night.OK
 
 
 def test_a_commit_that_fails_leaves_the_champion_of_the_commit_before(project, monkeypatch):
@@ -319,7 +320,7 @@ def test_a_loop_that_fails_stops_no_other_and_is_told(two):
     bad = Path("datasets/raw/other/bad.csv")
     bad.write_text("x")
     two.record("better", [9.0, 9.0, 9.0])
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED and "promoted toy" in summary
     assert "other: failed, its champion stays" in summary and "bad.csv: expected numbers" in summary
     alarm = json.loads(Path("woken.json").read_text())
@@ -332,12 +333,12 @@ def test_a_loop_that_fails_stops_no_other_and_is_told(two):
     assert Path("datasets/pages.txt").read_text() == "1 4"
     assert "Failed: other. Promoted: toy." in Path("reports/nightly.html").read_text()
     # told every night until it is mended
-    assert night.nightly()[0] == night.FAILED
+    assert night.nightly(render_night)[0] == night.FAILED
     bad.unlink()
     Path("datasets/raw/other/good.csv").write_text("7")
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK and "promoted other" in summary
-    assert "nothing new" in night.nightly()[1]
+    assert "nothing new" in night.nightly(render_night)[1]
 
 
 def test_a_loop_that_cannot_be_judged_stops_no_other_and_is_told(two):
@@ -346,7 +347,7 @@ def test_a_loop_that_cannot_be_judged_stops_no_other_and_is_told(two):
     Path("other.py").write_text(stage.replace("1 + abs(mean - 10)", "mean - mean"))
     two.run("git", "commit", "-qam", "costs of 0")
     two.record("better", [9.0, 9.0, 9.0])
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED and "promoted toy" in summary
     assert (
         "other: it cannot be judged, and its champion stays: datasets/other/cases.json: expected" in summary
@@ -354,11 +355,11 @@ def test_a_loop_that_cannot_be_judged_stops_no_other_and_is_told(two):
     assert "found case 0 costs 0" in summary and "found case 0 costs 0" in Path("woken.json").read_text()
     assert two.production_of("other") == before and two.champion()["run"] == "night-0003"
     assert "Failed: other. Promoted: toy." in Path("reports/nightly.html").read_text()
-    assert night.nightly()[0] == night.FAILED  # told every night until it is mended
+    assert night.nightly(render_night)[0] == night.FAILED  # told every night until it is mended
     Path("other.py").write_text(stage)
     two.run("git", "commit", "-qam", "costs again")
     Path("datasets/raw/other/good.csv").write_text("7")
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK and "promoted other" in summary
 
 
@@ -368,7 +369,7 @@ def test_the_stages_of_a_later_loop_run_where_an_earlier_one_fails_half_way(two)
     two.record("better", [9.0, 9.0, 9.0])  # `learn` goes well, and what follows from it does not
     Path("evaluate.py").write_text("raise SystemExit('evaluate: the disk of cases is gone')")
     Path("datasets/raw/other/good.csv").write_text("7")
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED and "promoted other" in summary and "toy: failed" in summary
     assert "evaluate: the disk of cases is gone" in summary
     assert two.production() == before and two.champion()["run"] == "night-0001"
@@ -382,7 +383,7 @@ def test_the_stages_of_a_later_loop_run_where_an_earlier_one_fails_half_way(two)
 def test_a_page_that_fails_alone_fails_the_night(two):
     (two.folder / "pages.py").write_text("raise SystemExit('pages: broken')")
     two.record("better", [9.0, 9.0, 9.0])
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED and "pages: broken" in summary and two.champion()["run"] == "night-0001"
 
 
@@ -405,7 +406,7 @@ def test_killed_at_random_moments_of_a_night_that_loses_a_loop_both_champions_ar
     Path("datasets/raw/other/bad.csv").write_text("x")
     began = time.monotonic()
     two.record("warm", [10.9])
-    night.nightly()
+    night.nightly(render_night)
     whole_s = time.monotonic() - began
     for k, share in enumerate(rng.uniform(0.02, 1.0, 8)):
         two.record(f"kill {k}", [9.9 - 0.1 * k, 10.1 + 0.05 * k])
@@ -414,7 +415,7 @@ def test_killed_at_random_moments_of_a_night_that_loses_a_loop_both_champions_ar
         time.sleep(share * whole_s)
         child.send_signal(signal.SIGKILL)
         child.communicate()
-        status, summary = night.nightly()
+        status, summary = night.nightly(render_night)
         assert status == night.FAILED and "bad.csv" in summary and "mistake" not in summary, summary
         assert champion.md5s(Path("champion/toy")) == two.champion()["files"]
         assert two.production_of("other") == other
@@ -514,7 +515,7 @@ def test_an_alarm_that_is_sent_on_to_another_url_has_not_arrived(tmp_path, monke
 def test_where_no_alarm_can_be_written_the_command_reads_it_all_the_same(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path(".beadline").write_text("a file in the place of the folder")
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED and summary.startswith(
         "nightly: nightly failed | .beadline: expected the folder in which nights are remembered, "
         "found a file; move it away, and run it again"
@@ -582,10 +583,10 @@ def test_an_alarm_command_that_hangs_is_ended_and_does_not_tell_its_arguments(tm
 def test_the_heartbeat_beats_after_a_good_night_and_not_after_a_failed_one(project, monkeypatch, quick):
     server = Server()
     monkeypatch.setenv("BEADLINE_HEARTBEAT", server.url)  # the environment wins over the parameters
-    assert "nothing new" in night.nightly()[1]
+    assert "nothing new" in night.nightly(render_night)[1]
     assert [method for method, _, _ in server.asked] == ["GET"]
     Path("dvc.lock").write_text("<<<<<<< HEAD\n")
-    assert night.nightly()[0] == night.FAILED and len(server.asked) == 1
+    assert night.nightly(render_night)[0] == night.FAILED and len(server.asked) == 1
     assert "s3cret" not in Path("reports/nightly.html").read_text()
 
 
@@ -593,7 +594,7 @@ def test_urls_of_the_parameters_are_not_printed(project, quick):
     url = "http://127.0.0.1:9/hook/s3cret"
     project.set(webhook=url, heartbeat=url, alarm="no-such-command --token t0ken")
     project.record("bad", ["x"])
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED and "nightly.webhook: http://127.0.0.1: Connection refused" in summary
     shown = summary + Path("reports/nightly.html").read_text()
     assert "s3cret" not in shown and "t0ken" not in shown and "no-such-command" in shown
@@ -629,7 +630,7 @@ def test_a_recording_that_is_not_used_says_which_parameter_would_use_it(project)
     Path("params.yaml").write_text(json.dumps(sections))
     Path("datasets/raw/deposition").mkdir()
     Path("datasets/raw/deposition/trial.mcap").write_bytes(b"x")
-    night.nightly()
+    night.nightly(render_night)
     sentence = (
         "datasets/raw/deposition/trial.mcap is not used, for train_ilc.source is simulated; set "
         "train_ilc.source: recordings in params.yaml to learn from what is recorded"
@@ -655,7 +656,7 @@ def test_of_a_full_cache_earlier_runs_go_and_champions_and_accepted_runs_stay(pr
     runs = []
     for k, values in enumerate(([12.0], [12.5], [13.0], [13.5])):  # worse, each: an earlier run more
         project.record(f"run {k}", values)
-        assert night.nightly()[0] == night.OK
+        assert night.nightly(render_night)[0] == night.OK
         if k == 0:
             Path("reports/accepted.json").write_text("{}")
             project.run("git", "add", "-f", "reports/accepted.json")
@@ -684,14 +685,14 @@ def test_of_a_full_cache_earlier_runs_go_and_champions_and_accepted_runs_stay(pr
     # what was removed can be made again
     for k in (2, 3):
         (project.folder / f"datasets/raw/toy/run {k}.csv").unlink()
-    assert night.nightly()[0] == night.OK and outs() == runs[1]
+    assert night.nightly(render_night)[0] == night.OK and outs() == runs[1]
 
 
 def test_what_somebody_made_today_is_not_removed(project):
     project.record("second", [12.0])
-    night.nightly()
+    night.nightly(render_night)
     project.record("third", [13.0])
-    night.nightly()
+    night.nightly(render_night)
     before = sorted(retention.CACHE.rglob("*"))
     retention.freed(1e-9)
     assert sorted(retention.CACHE.rglob("*")) == before

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.cli import render_night
 from pipeline.nightly import (
     champion,
     guarding,
@@ -26,7 +27,7 @@ from pipeline.nightly import (
     screening,
     watch,
 )
-from pipeline.report.nightly.production import Champion
+from pipeline.nightly.records import Champion
 from tests.nightly.toy_nights import Project, entered
 
 TOMORROW = datetime.timedelta(days=1)
@@ -51,14 +52,14 @@ def test_a_night_without_new_data_plays_no_stage_and_commits_nothing(project, st
     assert project.head() == head and project.dirty() == []
     # it is done in seconds because it starts no DVC that plays stages
     started.clear()
-    assert "nothing new" in night.nightly()[1]
+    assert "nothing new" in night.nightly(render_night)[1]
     assert started and not [command for command in started if "repro" in command]
 
 
 def test_a_better_challenger_is_promoted_and_the_champion_before_it_comes_back_bit_by_bit(project, started):
     before, name = project.production(), project.champion()["folder"]["md5"]
     project.record("second", [9.0, 9.0, 9.0])  # the mean of all is 10, the truth
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK and "promoted toy" in summary
     assert project.production() != before and project.champion()["run"] == "night-0002"
     assert project.champion()["files"] == champion.md5s(project.folder / "champion/toy")
@@ -77,7 +78,7 @@ def test_a_better_challenger_is_promoted_and_the_champion_before_it_comes_back_b
     (project.folder / "learn.py").write_text(
         (project.folder / "learn.py").read_text() + "# other code, same model\n"
     )
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert (
         status == night.OK
         and "was rolled back by hand" in summary
@@ -89,7 +90,7 @@ def test_a_better_challenger_is_promoted_and_the_champion_before_it_comes_back_b
 def test_a_worse_challenger_changes_nothing_but_the_report(project):
     before = project.production()
     project.record("second", [30.0])
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK and "kept" in summary and "no better" in summary
     assert (
         project.production() == before and project.champion()["run"] == "night-0001" and project.dirty() == []
@@ -107,7 +108,7 @@ def test_a_night_with_bad_data_leaves_the_last_good_run_and_the_next_night_works
         (project.folder / name).read_bytes() for name in ("dvc.lock", "datasets/learn/model.json")
     )
     bad = project.record("bad", ["x"])
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED and "bad.csv: expected numbers, found none; mend the file" in summary
     assert (project.folder / "dvc.lock").read_bytes() == lock and (
         project.folder / "datasets/learn/model.json"
@@ -115,7 +116,7 @@ def test_a_night_with_bad_data_leaves_the_last_good_run_and_the_next_night_works
     assert "bad.csv" in (project.folder / "reports/nightly.html").read_text()
     bad.unlink()
     project.record("second", [9.0, 9.0, 9.0])
-    assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
+    assert night.nightly(render_night)[0] == night.OK and project.champion()["run"] == "night-0003"
 
 
 @pytest.mark.parametrize(("times", "versioned_by"), [(1, "git"), (2, "git"), (1, "dvc")])
@@ -138,7 +139,7 @@ def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(
         return reproduced
 
     monkeypatch.setattr(night, "_reproduce", meanwhile)
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     if times == 1:
         assert status == night.OK, summary
         assert status == night.OK and "promoted toy" in summary
@@ -150,14 +151,14 @@ def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(
         assert sorted(project.champion()["lineage"]["recordings"]["toy"]) == [
             f"datasets/raw/toy/{name}.csv" for name in ("first", "late_0", "second")
         ]
-        assert "nothing new" in night.nightly()[1]
+        assert "nothing new" in night.nightly(render_night)[1]
         return
     assert (
         status == night.FAILED
         and "datasets/raw/toy/late_1.csv changed again while the stages ran; start the night when" in summary
     )
     assert (project.folder / "dvc.lock").read_bytes() == lock and project.champion()["run"] == "night-0001"
-    assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
+    assert night.nightly(render_night)[0] == night.OK and project.champion()["run"] == "night-0003"
 
 
 def test_a_recording_that_comes_while_others_are_judged_is_looked_at_tonight_or_new_the_next_night(
@@ -177,11 +178,11 @@ def test_a_recording_that_comes_while_others_are_judged_is_looked_at_tonight_or_
 
     monkeypatch.setattr(screening, "look", looked)
     monkeypatch.setattr(night, "_judge", judged)
-    assert night.nightly()[0] == night.OK
+    assert night.nightly(render_night)[0] == night.OK
     tonight = remembered.nights()[-1].new_recordings["toy"]
     assert tonight == ["datasets/raw/toy/second.csv", "datasets/raw/toy/while_looking.csv"]
     monkeypatch.setattr(night, "_judge", judge)
-    assert night.nightly()[0] == night.OK
+    assert night.nightly(render_night)[0] == night.OK
     assert remembered.nights()[-1].new_recordings == {"toy": ["datasets/raw/toy/while_judging.csv"]}
 
 
@@ -210,7 +211,7 @@ def test_code_that_changes_while_the_stages_run_ends_the_night(project, monkeypa
 
     project.record("second", [9.0])
     monkeypatch.setattr(night, "_reproduce", meanwhile)
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert (
         status == night.FAILED
         and "learn.py changed while the stages ran" in summary
@@ -223,7 +224,7 @@ def test_an_empty_folder_is_a_failed_night_with_its_cause(project):
     shutil.rmtree(project.folder / "datasets/raw/toy")
     (project.folder / "datasets/raw/toy").mkdir()
     before = project.production()
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.FAILED and "datasets/raw/toy" in summary
     assert project.production() == before and project.champion()["run"] == "night-0001"
 
@@ -233,10 +234,10 @@ def test_a_second_night_at_the_same_time_is_refused_and_changes_nothing(project)
     descriptor = os.open(project.folder / ".beadline/lock", os.O_RDWR | os.O_CREAT)
     fcntl.flock(descriptor, fcntl.LOCK_EX)
     project.record("second", [9.0, 9.0, 9.0])
-    assert night.nightly()[0] == night.BUSY
+    assert night.nightly(render_night)[0] == night.BUSY
     assert project.champion()["run"] == "night-0001"
     os.close(descriptor)
-    assert night.nightly()[0] == night.OK
+    assert night.nightly(render_night)[0] == night.OK
 
 
 @pytest.mark.slow
@@ -253,15 +254,15 @@ def test_on_a_full_disk_the_champion_stays_and_the_cause_is_reported(project, mo
     before = project.production()
     with monkeypatch.context() as broken:
         broken.setattr(champion.shutil, "copyfile", full)
-        status, summary = night.nightly()
+        status, summary = night.nightly(render_night)
     assert status == night.FAILED and "No space left on device" in summary
     assert project.production() == before and project.champion()["run"] == "night-0001"
-    assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
+    assert night.nightly(render_night)[0] == night.OK and project.champion()["run"] == "night-0003"
 
 
 def test_too_little_room_ends_the_night_before_it_begins(project):
     project.set(least_free_mb=1e7)
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert (
         status == night.FAILED
         and "nightly.least_free_mb" in summary
@@ -273,7 +274,7 @@ def test_too_little_room_ends_the_night_before_it_begins(project):
 def test_a_clock_that_was_set_back_is_said_and_does_not_make_the_last_success_older(project):
     success = remembered.last().success
     project.record("second", [9.0, 9.0, 9.0])
-    status, summary = night.nightly(datetime.datetime.fromisoformat(success) - 0.5 * TOMORROW)
+    status, summary = night.nightly(render_night, datetime.datetime.fromisoformat(success) - 0.5 * TOMORROW)
     assert (
         status == night.OK
         and "the clock was set back" in summary
@@ -285,13 +286,15 @@ def test_a_clock_that_was_set_back_is_said_and_does_not_make_the_last_success_ol
 def test_one_night_by_a_clock_of_another_century_does_not_hold_the_watchdog_for_good(project):
     today = datetime.datetime.fromisoformat(remembered.last().success) + TOMORROW
     for _ in range(2):
-        night.nightly(datetime.datetime(2100, 1, 1, tzinfo=datetime.UTC))
+        night.nightly(render_night, datetime.datetime(2100, 1, 1, tzinfo=datetime.UTC))
         assert remembered.last().success.startswith("2100")
-        assert night.nightly(today)[0] == night.OK
+        assert night.nightly(render_night, today)[0] == night.OK
         status, summary = reporting.watchdog(today)
         assert status == night.OK and f"the last success was at {today.isoformat()}" in summary
-    night.nightly(datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC))
-    assert night.nightly(today)[0] == night.OK and remembered.last().success == today.isoformat()
+    night.nightly(render_night, datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC))
+    assert (
+        night.nightly(render_night, today)[0] == night.OK and remembered.last().success == today.isoformat()
+    )
 
 
 def test_a_promotion_that_was_killed_before_its_commit_never_was(project):
@@ -305,7 +308,7 @@ def test_a_promotion_that_was_killed_before_its_commit_never_was(project):
     guarding.RUNNING.touch()
     assert project.production() != before
     (project.folder / "datasets/learn/model.json").write_text("11.0")
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK and "the night before was killed" in summary
     assert (
         project.production() == before
@@ -320,7 +323,7 @@ def test_gits_lock_left_by_a_killed_night_does_not_stop_the_next_one(project):
     (project.folder / ".git/index.lock").touch()
     (project.folder / ".git/refs/heads/main.lock").touch()
     project.record("second", [9.0, 9.0, 9.0])
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert (
         status == night.OK
         and "was left by a killed git" in summary
@@ -333,10 +336,14 @@ def test_a_lock_of_a_git_that_died_by_day_leaves_no_promotion_staged_backwards(p
     lock = project.folder / ".git/index.lock"
     lock.touch()  # as old as a git that may be at work
     project.record("second", [9.0] * 3)
-    assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0002" and lock.exists()
+    assert (
+        night.nightly(render_night)[0] == night.OK
+        and project.champion()["run"] == "night-0002"
+        and lock.exists()
+    )
     os.utime(lock, (time.time() - 7200,) * 2)
     project.record("third", [10.0])
-    _, summary = night.nightly()
+    _, summary = night.nightly(render_night)
     assert "index.lock was left by a killed git and is removed" in summary and not lock.exists()
     assert not [line for line in project.dirty() if "champion" in line]
 
@@ -347,7 +354,7 @@ def test_what_a_killed_dvc_left_half_written_stops_no_night(project, content):
     rwlock = project.folder / ".dvc/tmp/rwlock"
     rwlock.write_text(content)
     project.record("second", [9.0] * 3)
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK and "rwlock was left half written by a killed DVC and is removed" in summary
     assert project.champion()["run"] == "night-0002" and json.loads(rwlock.read_text()) is not None
 
@@ -356,7 +363,7 @@ def test_a_commit_leaves_alone_what_the_user_has_staged(project):
     (project.folder / "mine.txt").write_text("half done")
     project.run("git", "add", "mine.txt")
     project.record("second", [9.0, 9.0, 9.0])
-    assert night.nightly()[0] == night.OK
+    assert night.nightly(render_night)[0] == night.OK
     assert project.dirty() == ["A  mine.txt"]
 
 
@@ -365,7 +372,7 @@ def test_a_promotion_on_a_branch_waits_for_a_person(project):
     before = project.production()
     project.set(promotion="branch")
     project.record("second", [9.0, 9.0, 9.0])
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK and "git merge nightly" in summary
     assert project.production() == before and project.champion()["run"] == "night-0001"
     project.run("git", "add", "-A")
@@ -379,11 +386,11 @@ def test_a_promotion_on_a_branch_waits_for_a_person(project):
 def test_nights_of_two_branches_are_merged_by_one_command(project):
     project.run("git", "checkout", "-q", "-b", "other")
     project.record("other", [9.5, 9.5, 9.5])
-    assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0002"
+    assert night.nightly(render_night)[0] == night.OK and project.champion()["run"] == "night-0002"
     project.run("git", "checkout", "-q", "main")
     project.run(sys.executable, "-m", "dvc", "checkout", "-q")
     project.record("mine", [9.4, 9.4, 9.4])
-    assert night.nightly()[0] == night.OK
+    assert night.nightly(render_night)[0] == night.OK
     assert project.run("git", "merge", "other", check=False).returncode != 0  # by itself git cannot
     project.run("git", "merge", "--abort")
     merged = project.beadline("nightly", "--merge", "other")
@@ -413,7 +420,7 @@ def test_the_watchdog_wakes_somebody_when_the_last_success_is_old(project):
 def test_a_failed_night_wakes_somebody_and_an_alarm_that_fails_does_not_hide_it(project):
     project.set(alarm="no-such-command", webhook="http://127.0.0.1:9/none")
     project.record("bad", ["x"])
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert (
         status == night.FAILED
         and "bad.csv" in summary
@@ -454,7 +461,7 @@ def test_artifacts_are_pushed_to_a_remote_and_a_fresh_clone_pulls_the_champion(p
     project.run("git", "commit", "-qam", "a remote")
     project.set(remote="store")
     project.record("second", [9.0, 9.0, 9.0])
-    assert night.nightly()[0] == night.OK
+    assert night.nightly(render_night)[0] == night.OK
     project.run("git", "commit", "-qam", "parameters")
     project.run("git", "clone", "-q", str(project.folder), str(tmp_path / "clone"))
     clone = Project(tmp_path / "clone")
@@ -471,7 +478,7 @@ def test_killed_at_twenty_random_moments_the_champion_is_whole_and_the_next_nigh
     project.run("git", "commit", "-qm", "a stage that takes a while")
     began = time.monotonic()
     project.record("warm", [11.0])
-    night.nightly()
+    night.nightly(render_night)
     whole_s = time.monotonic() - began
     for k, share in enumerate(rng.uniform(0.02, 1.0, 20)):
         before = project.champion()
@@ -482,7 +489,7 @@ def test_killed_at_twenty_random_moments_the_champion_is_whole_and_the_next_nigh
         child.communicate()
         now = project.champion()
         assert now["run"] == before["run"] or now["run"] > before["run"]
-        status, summary = night.nightly()
+        status, summary = night.nightly(render_night)
         assert status == night.OK, f"after a kill at {share:.2f} of a night: {summary}"
         present = project.champion()
         assert champion.md5s(project.folder / "champion/toy") == present["files"] and project.dirty() == []

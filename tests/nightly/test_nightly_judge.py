@@ -8,12 +8,11 @@ import yaml
 
 from pipeline.deposition.tables import SCORES
 from pipeline.nightly import judge, promoting
-from pipeline.nightly.decision import FIRST, KEPT, PROMOTED, Evidence, decide
-from pipeline.nightly.settings import HoldOut, Loop, Nightly
+from pipeline.nightly.decision import FIRST, KEPT, PROMOTED, CaseCosts, decide
+from pipeline.nightly.records import Champion, ChampionState, Installed, Night
+from pipeline.nightly.settings import HoldOut, Nightly, NightlyLoop
 from pipeline.report.nightly import page as nightly_page
-from pipeline.report.nightly.production import Champion, ChampionState, Installed
-from pipeline.report.nightly.record import Night
-from pipeline.setpoint.workflow import tables
+from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
 from pipeline.temperature.controllers import window
@@ -167,7 +166,7 @@ def test_a_part_s_chosen_composer_is_its_case(project):
     }  # fmt: skip
     artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, columns)
     evidence = judge.judge(
-        Loop(artifacts=["x"], judge="deposition", cases="", recordings=""), project
+        NightlyLoop(artifacts=["x"], judge="deposition", cases="", recordings=""), project
     ).measure(Path("datasets"))
     assert evidence.cases == {"a, A": ("a, A", 1.0), "b, A": ("b, A", 2.0)} and evidence.guards == {
         "worst_line_volume_percent": 0.5
@@ -196,9 +195,9 @@ def test_a_setpoint_case_costs_the_runs_that_do_not_settle(project):
     }
     artifacts.write_table("datasets/evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD, filler | named)
     artifacts.write_json("datasets/evaluate_setpoint/choice.json", {"name": "ours"})
-    evidence = judge.judge(Loop(artifacts=["x"], judge="setpoint", cases="", recordings=""), project).measure(
-        Path("datasets")
-    )
+    evidence = judge.judge(
+        NightlyLoop(artifacts=["x"], judge="setpoint", cases="", recordings=""), project
+    ).measure(Path("datasets"))
     assert {name: cost for name, (_, cost) in evidence.cases.items()} == {
         "paper: calm": 2.0,
         "recorded: clog": 6.0,
@@ -208,7 +207,7 @@ def test_a_setpoint_case_costs_the_runs_that_do_not_settle(project):
     older = {column.name: (filler | named)[column.name] for column in tables.SCOREBOARD_1.columns}
     artifacts.write_table("datasets/evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD_1, older)
     assert (
-        judge.judge(Loop(artifacts=["x"], judge="setpoint", cases="", recordings=""), project).measure(
+        judge.judge(NightlyLoop(artifacts=["x"], judge="setpoint", cases="", recordings=""), project).measure(
             Path("datasets")
         )
         == evidence
@@ -219,7 +218,9 @@ def test_a_file_of_cases_that_lacks_its_costs_is_refused(project):
     artifacts.write_json(
         "datasets/cases.json", {"panel": "a", "cases": {"one": {"block": "b"}}, "guards": {}}
     )
-    loop = Loop(artifacts=["datasets/cases.json"], judge="cases", cases="datasets/cases.json", recordings="")
+    loop = NightlyLoop(
+        artifacts=["datasets/cases.json"], judge="cases", cases="datasets/cases.json", recordings=""
+    )
     with pytest.raises(
         ValueError,
         match="expected panel, cases with block and cost, and guards with value and allowed, found no 'cost'",
@@ -244,19 +245,21 @@ def test_a_file_of_cases_that_says_nothing_promotes_nothing(project, cases, guar
     guards = f'{{"unstable": {{"value": {guard}, "allowed": 0}}}}'
     text = f'{{"panel": "a", "cases": {cases}, "guards": {guards}}}'
     artifacts.write_text("datasets/cases.json", text)
-    loop = Loop(artifacts=["datasets/cases.json"], judge="cases", cases="datasets/cases.json", recordings="")
+    loop = NightlyLoop(
+        artifacts=["datasets/cases.json"], judge="cases", cases="datasets/cases.json", recordings=""
+    )
     with pytest.raises(ValueError, match=f"^datasets/cases.json: expected .*{found}"):
         judge.judge(loop, project).measure(Path("datasets"))
 
 
 def test_what_costs_the_same_is_no_better_by_nothing_and_not_by_minus_nothing(project):
-    same = Evidence("a", {f"case {k}": (f"plant {k}", 1.0 + k) for k in range(8)}, {})
+    same = CaseCosts("a", {f"case {k}": (f"plant {k}", 1.0 + k) for k in range(8)}, {})
     made = decide(same, same, project.rule, allowed={}, alarms=[], seed=1)
     assert made.reasons == ["the challenger is no better: its cases cost 0.0 % more (0.0 to 0.0 %)"]
 
 
 def test_a_first_champion_needs_a_case_and_a_count_of_unstable_plants(project):
-    fit = Evidence("a", {"one": ("b", 1.0)}, {"unstable_plants": 0.0})
+    fit = CaseCosts("a", {"one": ("b", 1.0)}, {"unstable_plants": 0.0})
     for challenger, decision in (
         (fit, FIRST),
         (fit._replace(cases={}), KEPT),
@@ -272,8 +275,8 @@ def test_a_guard_may_be_worse_by_the_percentage_that_is_declared_and_no_more(pro
     settings = project.model_copy(
         update={"rule": project.rule.model_copy(update={"worst_case_percent": 5.0})}
     )
-    judged = judge.judge(Loop(artifacts=["x"], judge=loop, cases="", recordings=""), settings)
-    champion = Evidence("a", {f"part {k}": (f"part {k}", 2.0) for k in range(8)}, {"worst": 2.0})
+    judged = judge.judge(NightlyLoop(artifacts=["x"], judge=loop, cases="", recordings=""), settings)
+    champion = CaseCosts("a", {f"part {k}": (f"part {k}", 2.0) for k in range(8)}, {"worst": 2.0})
     allowed = judged.allowed(champion)
     assert allowed == {"worst": pytest.approx(0.1)}
     better = champion._replace(cases={name: (block, 1.0) for name, (block, _) in champion.cases.items()})
@@ -292,7 +295,7 @@ def test_a_guard_may_be_worse_by_the_percentage_that_is_declared_and_no_more(pro
 def test_the_temperature_loop_allows_its_worst_case_and_its_hold_out_a_percentage(project):
     rule = project.rule.model_copy(update={"worst_case_percent": 5.0, "holdout_error_percent": 10.0})
     settings = project.model_copy(update={"rule": rule})
-    champion = Evidence("a", {}, {"worst_case": 40.0, "holdout_error_degC": 0.5})
+    champion = CaseCosts("a", {}, {"worst_case": 40.0, "holdout_error_degC": 0.5})
     allowed = judge.judge(project.loops["temperature"], settings).allowed(champion)
     assert allowed == {
         "worst_case": pytest.approx(2.0),
@@ -375,11 +378,11 @@ def test_no_case_costs_nothing_and_what_a_champion_did_not_measure_may_not_be_wo
         "worst_line_volume_percent": [0.2],
     }  # fmt: skip
     artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, columns)
-    loop = Loop(artifacts=["x"], judge="deposition", cases="", recordings="")
+    loop = NightlyLoop(artifacts=["x"], judge="deposition", cases="", recordings="")
     evidence = judge.judge(loop, project).measure(Path("datasets"))
     assert evidence.cases == {"a, A": ("a, A", 1e-3)}
     assert evidence.guards == {"worst_line_volume_percent": 0.2}
-    champion = Evidence("a", {}, {"worst_case": 40.0})  # its hold-out was not measured: nothing may be worse
+    champion = CaseCosts("a", {}, {"worst_case": 40.0})  # its hold-out was not measured: nothing may be worse
     allowed = judge.judge(project.loops["temperature"], project).allowed(champion)
     assert allowed["holdout_error_degC"] == 0.0
 
@@ -409,7 +412,7 @@ def test_a_controller_is_designed_for_what_it_was_tuned_for_not_for_the_nights_c
 
 def test_figures_beyond_meaning_are_words_in_the_night_s_sentences(project):
     champion, useless = (
-        Evidence("a", {f"case {k}": (f"plant {k}", cost) for k in range(8)}, {"worst_case": cost})
+        CaseCosts("a", {f"case {k}": (f"plant {k}", cost) for k in range(8)}, {"worst_case": cost})
         for cost in (1.0, np.inf)
     )
     decided = decide(champion, useless, project.rule, allowed={}, alarms=[], seed=1)

@@ -7,24 +7,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.cli import render_night
 from pipeline.deposition.tables import SCORES
 from pipeline.nightly import (
     accepting,
     champion,
     inputs,
     night,
-    promoting,
     remembered,
     reporting,
     screening,
+    verdicts,
     watch,
 )
+from pipeline.nightly.records import Alarm, LoopDrift, Night, NightDrift
 from pipeline.nightly.remembered import DriftMemory
-from pipeline.nightly.reproducing import Reproduced
 from pipeline.nightly.settings import Nightly
-from pipeline.report.nightly.record import Night
-from pipeline.report.shared.night import Alarm, LoopDrift, NightDrift
-from pipeline.setpoint.workflow import tables
+from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
 from pipeline.verdict.verdict import PASSED, Verdict
 from tests.nightly.toy_nights import Project, entered
@@ -46,7 +45,7 @@ def project(empty, tmp_path, monkeypatch):
     pass."""
     copy = entered(empty, tmp_path / "toy", monkeypatch)
     monkeypatch.setattr(
-        promoting, "verdicts_of", lambda settings, night: (dict(map(passing, settings.loops)), night)
+        verdicts, "read_verdicts", lambda settings, night: (dict(map(passing, settings.loops)), night)
     )
     Path("dvc.lock").write_text("schema: '2.0'\nstages: {}\n")
     return copy
@@ -57,9 +56,9 @@ def passing(loop: str) -> tuple[str, Verdict]:
     return loop, Verdict(loop, PASSED, *said, winner="ours", subject="ours", rehearsal=True)
 
 
-def played(*_: None) -> Reproduced:
+def played(*_: None) -> tuple[dict, tuple]:
     """Stages that did what they were played to do."""
-    return Reproduced()
+    return {}, ()
 
 
 def deposition(cost: float, guard: float) -> None:
@@ -119,7 +118,7 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
         monkeypatch.setattr(night, "_reproduce", lambda *_, of=(cost, guard): played(score(*of)))
         project.record(f"night {k}", [10.0])
         Path("learn.py").write_text(f"# night {k}\n")  # something is new
-        status, summary = night.nightly()
+        status, summary = night.nightly(render_night)
         decided = remembered.nights()[-1].decisions[loop]
         assert status == night.OK and decided.decision == decision and reason in " ".join(decided.reasons), (
             summary,
@@ -131,6 +130,42 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
     assert present.rehearsal and present.contestant == "ours"
     metrics = present.metrics
     assert metrics and metrics.mean_cost == pytest.approx(8.0 + 0.35 + (1.0 if loop == "setpoint" else 0.0))
+
+
+def test_a_loop_that_is_switched_off_is_no_part_of_the_night(project, monkeypatch):
+    own = {loop: {"judge": loop, "cases": "", "recordings": "", "artifacts": LOOPS[loop]} for loop in LOOPS}
+    alarm = Alarm("setpoint", "setpoint: ink", "a print", "the ink looks different", 9.0)
+    monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0), setpoint(10.0, 2.0)))
+    remembered.remember(
+        remembered.Remembered(drift=DriftMemory(alarms=(alarm,)), recordings={"setpoint": {}})
+    )
+    project.set(loops_on={"setpoint": False}, loops=own)
+    status, summary = night.nightly(render_night)
+    tonight = remembered.nights()[-1]
+    assert status == night.OK and tonight.promoted == ("deposition",), summary
+    assert "no part of the night, by section loops: setpoint" in summary
+    assert list(tonight.decisions) == list(champion.read().champions) == ["deposition"]
+    assert not tonight.drift.alarms
+    # switched on, the night has it again
+    project.set(loops=own)
+    status, summary = night.nightly(render_night)
+    assert status == night.OK and "promoted setpoint" in summary and "no part" not in summary
+    # without any there is nothing to do
+    project.set(loops_on=dict.fromkeys(own, False), loops=own)
+    monkeypatch.setattr(night, "_reproduce", lambda *_: pytest.fail("no stage is asked"))
+    status, summary = night.nightly(render_night)
+    assert status == night.OK and "section loops switches off every loop" in summary
+
+
+def test_every_section_of_the_parameters_is_checked_before_the_first_stage(project, monkeypatch):
+    own = {"judge": "deposition", "cases": "", "recordings": "", "artifacts": LOOPS["deposition"]}
+    project.set(loops={"deposition": own})
+    written = Path("params.yaml").read_text()
+    Path("params.yaml").write_text(written.replace('"max_order"', '"max_ordre"'))
+    monkeypatch.setattr(night, "_reproduce", lambda *_: pytest.fail("no stage is asked"))
+    status, summary = night.nightly(render_night)
+    assert status == night.FAILED and "max_ordre" in summary and "max_order" in summary
+    assert "max_ordre" in Path("reports/nightly.html").read_text()
 
 
 def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(project, monkeypatch):
@@ -151,13 +186,13 @@ def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(
     said = json.loads(Path("params.yaml").read_text())
     Path("params.yaml").write_text(json.dumps(said | {"camera": camera}))
     monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0)))
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.OK, summary
     broken = Path("datasets/raw/deposition/trial_7.mcap")
     broken.parent.mkdir(parents=True)
     broken.write_bytes(b"\x89MCAP0\r\n half a file")
     Path("learn.py").write_text("# something else is new\n")
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     assert status == night.QUARANTINED == 4 and "trial_7.mcap" in summary, summary
     assert not broken.exists() and (inputs.QUARANTINE / "deposition/trial_7.mcap").read_bytes().endswith(
         b"half a file"
@@ -189,7 +224,7 @@ def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project,
         }
     )
     monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0)))
-    assert night.nightly()[0] == night.OK
+    assert night.nightly(render_night)[0] == night.OK
     with pytest.raises(
         ValueError,
         match="expected a loop with a champion and a drift alarm, found none; loops with an alarm: none",
@@ -226,7 +261,7 @@ def test_an_alarm_of_the_setpoint_camera_changes_nothing_for_another_loop(projec
     }
     project.set(loops=both)
     monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0), setpoint(10.0, 2.0)))
-    assert night.nightly()[0] == night.OK
+    assert night.nightly(render_night)[0] == night.OK
     raised = Alarm(
         "setpoint", "setpoint: contrast", "print_8.csv", "the line stands out by 25 gray levels", 9.0
     )
@@ -234,7 +269,7 @@ def test_an_alarm_of_the_setpoint_camera_changes_nothing_for_another_loop(projec
     remembered.remember(remembered.last()._replace(drift=memory))
     monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(5.0, 2.0), setpoint(5.0, 2.0)))
     Path("learn.py").write_text("# something is new\n")
-    status, summary = night.nightly()
+    status, summary = night.nightly(render_night)
     tonight = remembered.nights()[-1]
     # the setpoint loop, whose camera it is, keeps its champion; the other is promoted as on any night
     assert status == night.DRIFTED and tonight.promoted == ("deposition",), summary

@@ -4,10 +4,8 @@ import json
 
 import pytest
 
+from pipeline.nightly.records import Alarm, ChampionState, Night
 from pipeline.nightly.remembered import DriftMemory, Remembered
-from pipeline.report.nightly.production import ChampionState
-from pipeline.report.nightly.record import Night
-from pipeline.report.shared.night import Alarm
 from tests.report.test_nightly_page import ALARM, FIRST, STATE
 
 CAUSE = {"cause": "the gain has changed", "sigmas": 9.0, "consequences": ["it settles elsewhere"]}
@@ -29,21 +27,21 @@ LAST = {
 
 @pytest.mark.parametrize(("record", "fields"), [(ChampionState, STATE), (Night, FIRST), (Night, ALARM)])
 def test_what_a_record_writes_is_read_and_written_byte_for_byte(record, fields):
-    written = json.dumps(record.read(fields).written())
-    assert json.dumps(record.read(json.loads(written)).written()) == written
+    written = json.dumps(record.read(fields).to_json())
+    assert json.dumps(record.read(json.loads(written)).to_json()) == written
     assert record.read(json.loads(written)) == record.read(fields)
 
 
 def test_what_a_night_remembers_is_read_and_written_byte_for_byte():
     last = Remembered.read(json.loads(json.dumps(LAST)))
-    assert json.dumps(last.written()) == json.dumps(LAST)
+    assert json.dumps(last.to_json()) == json.dumps(LAST)
     assert last.drift.drifted == {"toy": ["datasets/raw/toy/fifth.csv"]}
 
 
 def test_an_alarm_that_lacks_fields_is_remembered_with_empty_ones():
     memory = DriftMemory.read({"alarms": [{"loop": "deposition"}]})
     assert memory.alarms == (Alarm("deposition", "", "", "", 0.0),) and memory.drifted == {}
-    assert DriftMemory.read({}).written() == {}
+    assert DriftMemory.read({}).to_json() == {}
 
 
 @pytest.mark.parametrize("lacking", ["champions", "history"])

@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from pipeline.nightly import drift, inputs, screening, temperature_drift
+from pipeline.nightly.records import Alarm
 from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly
-from pipeline.report.shared.night import Alarm
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
 from pipeline.temperature.identification import model_choice as identification
@@ -181,7 +181,7 @@ def test_what_nights_agree_in_is_pooled_and_what_was_held_against_another_refere
     turned = [estimates[0], estimates[1], temperature_drift.Estimate(-4.3, 0.3)]
     assert temperature_drift._past_limit(turned, 4.0) == pytest.approx(1.0)
     memory = look(nights.a_night(1, 620, gain=(0.97, 1.0))).memory
-    again = DriftMemory.read(json.loads(json.dumps(memory.written())))
+    again = DriftMemory.read(json.loads(json.dumps(memory.to_json())))
     assert again == memory and "gain of heater_1" in again.recent["temperature"]["nights"][0]
     other = memory._replace(recent={"temperature": memory.recent["temperature"] | {"reference": "another"}})
     assert len(look(nights.a_night(1, 621), memory).memory.recent["temperature"]["nights"]) == 2
@@ -191,14 +191,16 @@ def test_what_nights_agree_in_is_pooled_and_what_was_held_against_another_refere
 def known(made):
     """Limits, reference and names that a night of the champion is held against."""
     held = temperature_drift._read_reference(made / "champion/temperature")
-    names = temperature_drift.Named(["heater_1", "heater_2"], ["sensor_1", "sensor_2"])
+    names = temperature_drift.SignalNames(["heater_1", "heater_2"], ["sensor_1", "sensor_2"])
     return params.load(Nightly, "nightly").drift, held, names
 
 
 def seeming(**estimates):
     """A night that named nothing."""
     changes = {name.replace("_of_", " of "): estimate for name, estimate in estimates.items()}
-    return temperature_drift.Night({}, {key: temperature_drift.Estimate(*e) for key, e in changes.items()})
+    return temperature_drift.NightChanges(
+        {}, {key: temperature_drift.Estimate(*e) for key, e in changes.items()}
+    )
 
 
 def test_what_each_night_leaves_unnamed_several_name_together(look, made):
@@ -209,7 +211,7 @@ def test_what_each_night_leaves_unnamed_several_name_together(look, made):
     assert found.key == "offset of sensor_2" and "sensor_2 reads -1.3 °C" in found.words
     assert found.estimate == pytest.approx((-1.3, 0.33 / 2**0.5))
     # of two nights that do not agree nothing is left, and a night that named something else is no witness
-    turned, other = seeming(offset_of_sensor_2=(1.3, 0.33)), temperature_drift.Night({}, {})
+    turned, other = seeming(offset_of_sensor_2=(1.3, 0.33)), temperature_drift.NightChanges({}, {})
     assert temperature_drift.together(limits, [turned, faint], held, names) == []
     assert temperature_drift.together(limits, [other, faint], held, names) == []
     assert temperature_drift.together(limits, [faint, faint, other], held, names) == []
@@ -227,7 +229,7 @@ def test_an_offset_that_no_single_night_is_sure_of_is_found_by_the_second(look, 
 
     first = look(reads_low(630))
     assert first.drift.alarms == [] and first.memory.recent["temperature"]["nights"] == [{}]
-    second = look(reads_low(631), DriftMemory.read(json.loads(json.dumps(first.memory.written()))))
+    second = look(reads_low(631), DriftMemory.read(json.loads(json.dumps(first.memory.to_json()))))
     (alarm,) = second.drift.alarms
     assert (alarm.kind, alarm.channel) == ("offset", "sensor_2"), alarm
     # the memory of an older version knows what nights named, not what they left unnamed

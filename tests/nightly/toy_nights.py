@@ -57,7 +57,8 @@ stages:
 """
 
 # the project's own keys, so that a new one is here at once; what a toy needs otherwise stands below
-SETTINGS = params.read(ROOT / "params.yaml")["nightly"] | {
+SECTIONS = params.read(ROOT / "params.yaml")
+SETTINGS = SECTIONS["nightly"] | {
     "promotion": "at_once", "branch": "nightly", "remote": "", "longest_h": 0.1, "least_free_mb": 1,
     "watch_h": 36, "alarm": "", "webhook": "", "heartbeat": "", "keep_gb": 0,
     "loops": {
@@ -97,6 +98,7 @@ class Project:
             "learn.py": LEARN,
             "evaluate.py": EVALUATE,
             "dvc.yaml": DVC,
+            "params.expert.yaml": "{}\n",
             ".gitignore": "/reports/*.html\n",
         }.items():
             (self.folder / name).write_text(text)
@@ -106,9 +108,11 @@ class Project:
         self.run("git", "commit", "-q", "-m", "the project")
         return self
 
-    def set(self, **changes) -> None:
-        """params.yaml with these keys of section nightly changed; JSON is YAML."""
-        (self.folder / "params.yaml").write_text(json.dumps({"nightly": SETTINGS | changes}, indent=1))
+    def set(self, loops_on: dict[str, bool] | None = None, **changes) -> None:
+        """params.yaml with these keys of section nightly changed; JSON is YAML. `loops_on`: section loops."""
+        sections = SECTIONS | {"nightly": SETTINGS | changes}
+        sections["loops"] = sections["loops"] | (loops_on or {})
+        (self.folder / "params.yaml").write_text(json.dumps(sections, indent=1))
 
     def record(self, name: str, values: list[float]) -> Path:
         path = self.folder / "datasets/raw/toy" / f"{name}.csv"

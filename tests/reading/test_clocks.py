@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.reading.clocks import mended
-from pipeline.reading.formats import Columns
+from pipeline.reading.formats import FileColumns
 from pipeline.reading.recordings import Source, read, resample
 from tests.mcap_writing import Written
 
@@ -131,7 +131,7 @@ def test_many_rows_with_the_time_of_another_are_refused(tmp_path):
 
 def test_a_clock_that_falls_by_more_than_half_of_all_counts_is_refused_in_one_sentence():
     time = np.array([2**63 - 2, 2**63 - 1, -(2**63), 1 - 2**63])
-    group = Columns("/zone", time, {"T": np.arange(4.0)}, lambda i: f"message {i + 1}")
+    group = FileColumns("/zone", time, {"T": np.arange(4.0)}, lambda i: f"message {i + 1}")
     with pytest.raises(ValueError, match="message 3 is at .* which is before the sample ahead of it"):
         mended(Path("rig.mcap"), group, may_restart=False)
 

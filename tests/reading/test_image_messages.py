@@ -8,7 +8,7 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 
-from pipeline.reading.image_messages import Picture, gray, image, is_image, reader
+from pipeline.reading.image_messages import ImageMessage, gray, image, is_image, reader
 from pipeline.reading.image_messages import header as header_of
 from pipeline.reading.mcap_messages import Channel
 from pipeline.reading.ros_messages import UnreadableMessage
@@ -122,12 +122,12 @@ def rows(
     *,
     step: int = 0,
     big_endian: bool = False,
-) -> Picture:
-    return Picture(0, encoding, height, width, step, big_endian, memoryview(bytes(data)))
+) -> ImageMessage:
+    return ImageMessage(0, encoding, height, width, step, big_endian, memoryview(bytes(data)))
 
 
-def encoded(data: np.ndarray | bytes) -> Picture:
-    return Picture(0, "png", 0, 0, 0, False, memoryview(bytes(data)))
+def encoded(data: np.ndarray | bytes) -> ImageMessage:
+    return ImageMessage(0, "png", 0, 0, 0, False, memoryview(bytes(data)))
 
 
 # ---- messages

@@ -164,7 +164,7 @@ def test_nothing_identified_reads_as_open_never_as_passed(project):
     text = page()
     assert (
         "Do not trust this model yet." in text
-        and "identify_plant.json of identify_plant is not there. Run ./run dvc repro identify_plant." in text
+        and "figures.json of identify_plant is not there. Run ./run dvc repro identify_plant." in text
     )
     assert "passed" not in re.search(r"Rule State Weakest(.*?)Fits on the hold-out", text)[1]
 

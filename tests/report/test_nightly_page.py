@@ -3,10 +3,9 @@ narrow, light and dark; hostile names do nothing."""
 
 import pytest
 
+from pipeline.nightly.records import ChampionState, Night
 from pipeline.nightly.settings import Nightly
 from pipeline.report.nightly import page as nightly_page
-from pipeline.report.nightly.production import ChampionState
-from pipeline.report.nightly.record import Night
 from pipeline.store import params
 from tests.conftest import ROOT
 from tests.report.conftest import MACHINE

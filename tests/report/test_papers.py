@@ -16,14 +16,14 @@ from pipeline.papers.study_draws import read_published
 from pipeline.report.papers import page, rows, setpoint
 from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow import train_agent
-from pipeline.setpoint.workflow.settings import TrainAgent
 from pipeline.store import params
 from pipeline.temperature import published
 from pipeline.temperature.controllers.kernel import exact_gains
 from pipeline.temperature.plant import baam
 from pipeline.temperature.tracking import gains
 from pipeline.verdict.verdict import Missing
+from stages import train_agent
+from stages.train_agent import TrainAgent
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEDS = {

@@ -11,8 +11,9 @@ import yaml
 from pipeline.report.setpoint import agent as setpoint_agent
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
+from pipeline.setpoint.agents.criteria import harm_bar
 from pipeline.setpoint.simulation.simulator import reward
-from pipeline.setpoint.workflow.tables import PATHS, harm_bar
+from pipeline.setpoint.tables import PATHS
 from pipeline.store import artifacts, params
 from pipeline.verdict import setpoint as setpoint_verdict
 from pipeline.verdict.verdict import Figure, Question

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.report.setpoint import deciding
-from pipeline.setpoint.workflow.tables import SCOREBOARD
+from pipeline.setpoint.tables import SCOREBOARD
 from pipeline.store import artifacts
 from tests.report import made_setpoint
 from tests.report.made import main

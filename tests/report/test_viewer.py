@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from pipeline.report.shared import page as shared_page
-from pipeline.report.shared.sources import Declared, Source, collect, linked
+from pipeline.report.shared.sources import Declared, SourceFile, collect, linked
 from pipeline.report.temperature.judgement import judgement
 from pipeline.report.viewer import packed
 from pipeline.report.viewer import page as viewer_page
-from pipeline.report.viewer.series import Event, Key, Line, Shown
+from pipeline.report.viewer.series import Event, Key, SeriesLine, ViewerTable
 from pipeline.store import artifacts, params
 from pipeline.temperature import tables
 from pipeline.temperature.settings import Plant
@@ -44,13 +44,13 @@ def columns(text):
 # ---- the files
 
 
-SHOWN = Shown(
+SHOWN = ViewerTable(
     "toy",
     "Toy",
     "",
     ("time_s", "time", "s"),
     (Key("who", "Who"), Key("trial", "Trial")),
-    (Line("y", "y", "degC", "y", "Y"), Line("r", "r", "degC", "y", "Y", beside="y")),
+    (SeriesLine("y", "y", "degC", "y", "Y"), SeriesLine("r", "r", "degC", "y", "Y", beside="y")),
     books=1,
 )
 
@@ -133,7 +133,7 @@ def test_a_small_table_is_copied_beside_the_page_and_a_large_one_linked(tmp_path
     path = Path("datasets/ingest/record.parquet")
     path.parent.mkdir(parents=True)
     path.write_bytes(b"x" * 1000)
-    read = {path.as_posix(): Source("record", path.as_posix(), "ingest", "record 1", "0")}
+    read = {path.as_posix(): SourceFile("record", path.as_posix(), "ingest", "record 1", "0")}
     [source] = linked(read).values()
     assert source.link == "data/ingest.record.parquet" and packed.size_of(source) == "1 kB"
     for bound in ("LARGEST_COPY", "LARGEST_COPIES"):

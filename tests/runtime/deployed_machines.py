@@ -12,7 +12,13 @@ from pipeline.runtime.signals import Machine, Signal
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline, printer_pid
 from pipeline.temperature.controllers.controller import Deployed, compact, deployed
-from pipeline.temperature.controllers.governor import Governor, Limits, OutputLimits, Strength, governor
+from pipeline.temperature.controllers.governor import (
+    ActuatorLimits,
+    Governor,
+    OutputLimits,
+    Strength,
+    governor,
+)
 from pipeline.temperature.controllers.window import controller, learn
 from pipeline.temperature.plant import Plant, baam, plant
 from pipeline.temperature.tracking import Law, still_law
@@ -41,11 +47,11 @@ def block_and_sensor(*, zones: int, sample_time_s: float = 1.0) -> Plant:
     )
 
 
-def limits_of(zones: int, *, rate: float = np.inf) -> Limits:
-    return Limits(np.zeros(zones), np.full(zones, 100.0), np.full(zones, rate))
+def limits_of(zones: int, *, rate: float = np.inf) -> ActuatorLimits:
+    return ActuatorLimits(np.zeros(zones), np.full(zones, 100.0), np.full(zones, rate))
 
 
-def guard(model: Plant, limits: Limits, high: float = 250.0) -> Governor:
+def guard(model: Plant, limits: ActuatorLimits, high: float = 250.0) -> Governor:
     outputs = OutputLimits(np.zeros(model.p), np.full(model.p, high), np.full(model.p, 3 * NOISE), 0.05)
     return governor([model], limits, outputs, STRENGTH)
 
@@ -63,7 +69,7 @@ def _windowed(model: Plant) -> tuple[Law, Plant]:
     return compact(made.design(np.ones(model.p), np.full(model.m, 0.1), 0.05), learned.N), made.model
 
 
-def _law(kind: str, model: Plant, limits: Limits) -> tuple[Law, Plant]:
+def _law(kind: str, model: Plant, limits: ActuatorLimits) -> tuple[Law, Plant]:
     if kind in ("lqg", "slow", "tight", "study"):
         made = tracking.model_based(model, 0.99, tau=1.0)
         effort = 1e-4 if kind == "tight" else 0.1
@@ -78,7 +84,7 @@ def _law(kind: str, model: Plant, limits: Limits) -> tuple[Law, Plant]:
     return still_law(model.m, model.p), model
 
 
-def _pi(model: Plant, limits: Limits) -> Law:
+def _pi(model: Plant, limits: ActuatorLimits) -> Law:
     made = baseline.controller(model, (limits.low, limits.high), horizon=300)
     return made.design(np.ones(model.p), np.ones(model.m), 0.0)
 
@@ -113,7 +119,7 @@ def exported(
     )
 
 
-def _deployed(law: Law, limits: Limits, watched: Governor | None, *, holds: bool = False) -> Deployed:
+def _deployed(law: Law, limits: ActuatorLimits, watched: Governor | None, *, holds: bool = False) -> Deployed:
     return deployed(law, limits, integral_limit=INTEGRAL_LIMIT, governor=watched, holds=holds)
 
 

@@ -12,7 +12,7 @@ from pipeline.runtime.machine import Exported, plants_sha256
 from pipeline.runtime.signals import Machine, Signal
 from pipeline.temperature import plant, tracking
 from pipeline.temperature.controllers import controller, kernel, window
-from pipeline.temperature.controllers.governor import Limits
+from pipeline.temperature.controllers.governor import ActuatorLimits
 from pipeline.temperature.plant import Plant, hold_output, simulate
 
 REFERENCE = np.array([180.0, 170.0])
@@ -56,7 +56,7 @@ RULES = Rules(
     reach=1.5,
 )
 ALLOWED = {"settled_error_degC": 0.5, "disk_margin": 0.4, "delay_margin_s": 1.0}
-LIMITS = Limits(np.zeros(2), np.full(2, 100.0), np.full(2, np.inf))
+LIMITS = ActuatorLimits(np.zeros(2), np.full(2, 100.0), np.full(2, np.inf))
 
 
 def designed(of: Plant, *, effort: float = 0.3, integral: float = 0.05) -> Exported:

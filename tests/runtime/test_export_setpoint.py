@@ -16,11 +16,9 @@ from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
 from pipeline.setpoint.simulation.simulator import TEMPERATURE_LIMITS, Observation
 from pipeline.setpoint.vision import classifier, window_flow
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
-from pipeline.setpoint.vision.calibration import Calibration, Familiar
+from pipeline.setpoint.vision.calibration import ClassifierCalibration, Familiar
 from pipeline.setpoint.vision.vision_transformer import SMALL, convolutional, vision_transformer
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
-from pipeline.setpoint.workflow.agent_files import Agents
-from pipeline.setpoint.workflow.contestants import ControllerSpec
 from pipeline.store import artifacts
 
 WINDOWS, FRAMES = 1000, 2
@@ -42,7 +40,7 @@ def model() -> CalibratedClassifier:
     flow = FlowCalibration(0.8 * knots + 0.02, np.linspace(0.8, 1.4, len(knots)), 0.3)
     familiar = Familiar(np.zeros((3, FEATURES)), np.eye(FEATURES))
     network = vision_transformer(SMALL, np.random.default_rng(1))
-    return CalibratedClassifier(network, Calibration(1.3, 0.2, 0.1, familiar, 9.0, flow))
+    return CalibratedClassifier(network, ClassifierCalibration(1.3, 0.2, 0.1, familiar, 9.0, flow))
 
 
 def written(model: CalibratedClassifier, folder: Path) -> tuple[dict, dict]:
@@ -132,7 +130,7 @@ def our_agent() -> setpoint.BeliefAgent:
     both |= {"transition": jnp.array([[0.98, 0.02], [0.01, 0.99]]), "after_jump": jnp.eye(2)}
     both |= {"gains": jnp.array([1.0, 0.6]), "window_repeat_probability": jnp.array([0.3, 0.1])}
     two = one._replace(**both, prior=jnp.tile(one.prior, (2, 1)) / 2)
-    costs = belief_agent.Costs(10.0, 1.0, 0.02)
+    costs = belief_agent.StepCosts(10.0, 1.0, 0.02)
     values = jnp.asarray(belief_agent.observed_values(costs, 0.8), jnp.float32)
     network = belief_agent.BeliefNetwork(2, jax.random.key(3))
     rng = np.random.default_rng(5)
@@ -195,22 +193,17 @@ def test_from_key_areas_on_our_agent_decides_as_exported(model, our_agent, tmp_p
 
 def test_the_stage_exports_what_was_chosen(model, our_agent, tmp_path):
     """Our agent with its network where it is the default, the filter where a filter is, nothing else."""
-    agents = Agents((), our_agent.belief, our_agent.network)
-    specs = {
-        setpoint_checks.BELIEF: ControllerSpec(
-            "agent", agent.greedy(agent.paper_encoder()), our_agent.network
-        ),
-        "Bayes": ControllerSpec("baseline", bayes.bayes(1), bayes.class_filter(**CLASS_FILTER)),
-        "proportional": ControllerSpec("baseline", bayes.bayes(1), ()),
+    parameters = {
+        setpoint_checks.BELIEF: our_agent.network,
+        "Bayes": bayes.class_filter(**CLASS_FILTER),
+        "proportional": (),
     }
-    default = {
-        name: setpoint_checks.write(
-            tmp_path / name, name, model, setpoint_checks.decider(name, specs, agents), 1
-        )
-        for name in specs
-    }
-    learned, filtered, none = default.values()
-    files = [{path.name for path in (tmp_path / name).glob("*")} for name in specs]
+    found = []
+    for name, values in parameters.items():
+        decides = setpoint_checks.decider(name, values, our_agent.belief, our_agent.network)
+        found.append(setpoint_checks.write(tmp_path / name, name, model, decides, 1))
+    learned, filtered, none = found
+    files = [{path.name for path in (tmp_path / name).glob("*")} for name in parameters]
     both = {"agent.safetensors", "agent_reader.py"}
     assert both < files[0] and files[0] - both == files[1]
     assert learned["largest_difference"]["values"] < SINGLE

@@ -10,15 +10,15 @@ from pipeline.runtime.replay import GaplessLog
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline, controller, governor, window
 from pipeline.temperature.controllers.controller import Deployed, RunningController, compact, deployed
-from pipeline.temperature.controllers.governor import Limits
+from pipeline.temperature.controllers.governor import ActuatorLimits
 from pipeline.temperature.plant import Plant, baam
 from pipeline.temperature.study import data_sets
 from pipeline.temperature.test_set import panel
 
-LIMITS = Limits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
+LIMITS = ActuatorLimits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
 SLOW = LIMITS._replace(rate=np.full(7, 4.0))
 REFERENCE = np.array([150.0, 160.0, 170.0, 175.0, 180.0])
-SPREAD = panel.Spread(0.15, 0.2, 0.005, 0.5, 8.0)
+SPREAD = panel.PlantSpread(0.15, 0.2, 0.005, 0.5, 8.0)
 NOISE = np.full(5, 0.1)
 
 
@@ -80,7 +80,7 @@ def by_the_object(made: Deployed, model: Plant, of: GaplessLog, hold: int) -> np
         )
         xi = controller._integrated(made, before.xi, (y_star - of.y[t])[None], u, wished[None])
         z = controller._remembered(made, before.z, u, of.y[t][None], of.r[t][None])
-        running._state = controller.State(z, xi, u, x)
+        running._state = controller.ControllerState(z, xi, u, x)
     return asked
 
 
@@ -190,5 +190,5 @@ def test_a_log_too_short_for_a_forecast_says_so():
 
 
 def test_what_honest_logs_leave_is_no_less_than_the_sensors_noise():
-    explained_whole = support.Forecasts(np.arange(4), np.zeros((3, 4, 5)), np.zeros((4, 5)))
+    explained_whole = support.FamilyForecasts(np.arange(4), np.zeros((3, 4, 5)), np.zeros((4, 5)))
     np.testing.assert_allclose(support._rest([explained_whole], NOISE), NOISE, rtol=1e-6)

@@ -14,16 +14,16 @@ from mcap.reader import make_reader
 
 from pipeline import cli
 from pipeline.commands import replay_camera
+from pipeline.commands.shadow import deploy
+from pipeline.reading.frame_mcap import Topics
 from pipeline.runtime.export import setpoint
 from pipeline.setpoint.agents import bayes, belief_agent
+from pipeline.setpoint.agents.files import Agents
 from pipeline.setpoint.frames import nozzle_scene
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
-from pipeline.setpoint.vision.calibration import Calibration, Familiar
+from pipeline.setpoint.vision.calibration import ClassifierCalibration, Familiar
 from pipeline.setpoint.vision.vision_transformer import SMALL, vision_transformer
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
-from pipeline.setpoint.workflow.agent_files import Agents
-from pipeline.setpoint.workflow.frame_mcap import Topics
-from pipeline.setpoint.workflow.shadow import deploy
 from pipeline.store import artifacts
 from tests.setpoint.test_shadow import FRAMES, deployed
 
@@ -31,12 +31,12 @@ NARROW, WINDOWS = 55.0, 3
 
 
 @functools.cache
-def trained() -> deploy.Trained:
+def trained() -> deploy.TrainedClassifier:
     knots = np.log(np.array(KNOTS_PERCENT) / 100)
     flow = FlowCalibration(knots, np.ones(len(knots)), 0.5)
     network = vision_transformer(SMALL, np.random.default_rng(1))
-    fitted = Calibration(1.3, 0.5, 0.15, Familiar(np.zeros((3, 2)), np.eye(2)), 9.0, flow)
-    return deploy.Trained(CalibratedClassifier(network, fitted), "", None)  # ty: ignore[invalid-argument-type]
+    fitted = ClassifierCalibration(1.3, 0.5, 0.15, Familiar(np.zeros((3, 2)), np.eye(2)), 9.0, flow)
+    return deploy.TrainedClassifier(CalibratedClassifier(network, fitted), "", None)  # ty: ignore[invalid-argument-type]
 
 
 @pytest.fixture

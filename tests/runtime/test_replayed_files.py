@@ -30,7 +30,7 @@ def folder(tmp_path, monkeypatch):
     folder = tmp_path / "controller"
     machine.write(folder, of, passed(of))
     plants = panel.padded(
-        panel.drawn([of.model], 8, panel.Spread(0.15, 0.2, 0.0, 0.0, 5.0), cells=False, rng=rng)
+        panel.drawn([of.model], 8, panel.PlantSpread(0.15, 0.2, 0.0, 0.0, 5.0), cells=False, rng=rng)
     )
     logs = [rolled(seed) for seed in range(4)]
     within = support.support(plants, [], np.full(2, 0.1), logs)

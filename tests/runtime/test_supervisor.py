@@ -10,7 +10,7 @@ from pipeline.runtime.signals import Machine, Signal
 from pipeline.runtime.supervised import Supervised
 from pipeline.runtime.supervisor import SAFE, supervision
 from pipeline.temperature.controllers import baseline, controller
-from pipeline.temperature.controllers.governor import Limits
+from pipeline.temperature.controllers.governor import ActuatorLimits
 from pipeline.temperature.plant import plant
 from pipeline.temperature.test_set.panel import delayed
 
@@ -28,7 +28,7 @@ WIRED = Machine(
 def exported(**changed) -> Exported:
     made = baseline.controller(MODEL, (LOW, HIGH), horizon=400, noise_degC=np.full(2, NOISE))
     law = made.design(np.ones(2), np.ones(2), 0.0)
-    deployed = controller.deployed(law, Limits(LOW, HIGH, np.full(2, np.inf)), integral_limit=1.0)
+    deployed = controller.deployed(law, ActuatorLimits(LOW, HIGH, np.full(2, np.inf)), integral_limit=1.0)
     watched = supervision(MODEL, [MODEL], WIRED, np.full(2, NOISE), **changed)
     return Exported("pi", WIRED, deployed, made.model, deployed, watched, True, "", "")
 

@@ -3,11 +3,17 @@
 import numpy as np
 
 from pipeline.setpoint.deployment import pixels
-from pipeline.setpoint.deployment.pixels import Machine
+from pipeline.setpoint.deployment.pixels import MachineDynamics
 
 
 def step_response(
-    machine: Machine, *, flow: tuple, temperature: tuple, before_s: float, after_s: float, tick_s: float
+    machine: MachineDynamics,
+    *,
+    flow: tuple,
+    temperature: tuple,
+    before_s: float,
+    after_s: float,
+    tick_s: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Flow and temperature (T,) of a machine at rest whose flow and target step from the first to the second
     value: the record to measure the wait from."""

@@ -11,11 +11,11 @@ from pipeline.setpoint.agents import bayes, belief_agent
 from pipeline.setpoint.agents.agent import (
     DqnProblem,
     DqnSettings,
+    DqnState,
     EnvSpec,
     PublishedTraining,
     QNetwork,
-    Replay,
-    TrainState,
+    ReplayRows,
     _mean_gradient,
     _packed,
     _unpacked,
@@ -32,7 +32,7 @@ from pipeline.setpoint.agents.agent import (
     weights,
     with_weights,
 )
-from pipeline.setpoint.agents.judging import evaluate, starts
+from pipeline.setpoint.agents.trials import evaluate, starts
 from pipeline.setpoint.simulation import simulator
 from pipeline.setpoint.simulation.simulator import STAND, Observation, begin, nominal, paper_windows
 from tests.setpoint.synthetic import synthetic_table
@@ -41,7 +41,7 @@ SMALL = DqnSettings(gamma=0.99, tau=0.005, batch=64, capacity=512, environments=
 PUBLISHED = PublishedTraining(
     dqn=SMALL, learning_rate=1e-4, updates=(20, 20), accuracy=0.7, explore=1.0, explore_again=0.3, least=0.05
 )
-COSTS = belief_agent.Costs(scale=10.0, outside=0.5, move=0.1)
+COSTS = belief_agent.StepCosts(scale=10.0, outside=0.5, move=0.1)
 FILTER = {
     "accuracies": [0.7],
     "gains": [1.0, 0.7],
@@ -103,8 +103,8 @@ def test_both_first_layers_as_one_product_are_the_two_layers():
 
 def one_row(network, reward, after, masked=False):
     doubled = jax.tree.map(lambda w: 2 * w, network)
-    train_state = TrainState(network, doubled, optax.sgd(0.0).init(network))
-    row = Replay(
+    train_state = DqnState(network, doubled, optax.sgd(0.0).init(network))
+    row = ReplayRows(
         jnp.zeros((1, 35)),
         after[None],
         jnp.array([[4, STAND]], jnp.int8),
@@ -164,7 +164,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others():
 
 def test_transitions_survive_the_replay_buffer():
     rng = np.random.default_rng(0)
-    rows = Replay(
+    rows = ReplayRows(
         *(jnp.asarray(rng.normal(size=(6, 35)), jnp.float32) for _ in range(2)),
         jnp.asarray(rng.integers(0, 5, (6, 2)), jnp.int8),
         jnp.asarray(rng.normal(size=(6, 2)), jnp.float32),
@@ -183,7 +183,7 @@ def test_a_phase_does_not_depend_on_how_long_the_longest_is():
         Partial(anywhere, jnp.asarray(1.0)),
         Partial(ellipse, jnp.asarray(40.0), jnp.asarray(20.0)),
     )
-    train_state = TrainState(network, network, optimiser.init(network))
+    train_state = DqnState(network, network, optimiser.init(network))
     problem = DqnProblem(paper_encoder(), env, optimiser, dqn_target, SMALL)
     (one, rewards), (other, rewards_alike) = (
         phase(train_state, jax.random.key(1), problem, updates=12, longest=longest, epsilon=(1.0, 0.1))
@@ -299,7 +299,7 @@ def test_untrained_it_settles_the_papers_simulator_from_every_start(prior_belief
 @pytest.mark.slow
 def test_training_with_disturbances_is_reproducible_and_keeps_the_start_where_it_is_no_better(prior_belief):
     table = synthetic_table(np.random.default_rng(1), segments=5, windows=4)
-    disturbances = belief_agent.Disturbances(
+    disturbances = belief_agent.EpisodeDisturbances(
         recorded_share=0.5,
         longest_segment=30.0,
         accuracy=0.6,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from pipeline.setpoint.agents import agent, bayes, camera_watch, judging
+from pipeline.setpoint.agents import agent, bayes, camera_watch, trials
 from pipeline.setpoint.agents.baselines import (
     Proportional,
     SequentialTest,
@@ -20,6 +20,7 @@ from pipeline.setpoint.agents.baselines import (
     sequential_test,
     temperature_move,
 )
+from pipeline.setpoint.evaluation import judging
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
 from pipeline.setpoint.simulation.recorded import recorded_windows
 from pipeline.setpoint.simulation.simulator import FLOW_LIMITS, STAND, Observation, nominal, paper_windows
@@ -627,7 +628,7 @@ def test_the_paper_s_windows_show_the_codes_that_their_evidence_says():
 
 
 def score(controller, parameters, windows, conditions, seed=0):
-    return judging.evaluate(
+    return trials.evaluate(
         controller,
         jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), parameters),
         windows,
@@ -653,7 +654,7 @@ def test_the_trial_s_figures_come_out():
     """Section 2 of the notes, 21 starts x 100 runs at accuracy 0.7: settled, stay,
     median; deviations of 2,100 runs are 1 point at most, the rest is how the trial's
     controllers were set, which the notes do not say."""
-    paper, rough = paper_windows(), judging.starts(100, accuracy=0.7)
+    paper, rough = paper_windows(), trials.starts(100, accuracy=0.7)
     exact = score(bayes.bayes(1), bayes.class_filter(**EXACT), paper, rough)
     assert exact.settled.percent >= 99.5
     assert exact.stay.percent >= 99

@@ -19,7 +19,7 @@ from pipeline.setpoint.simulation.actuation import (
     STILL,
     TABLE,
     TIP,
-    Limits,
+    SetpointLimits,
     Waits,
     at_rest,
     decide,
@@ -28,10 +28,10 @@ from pipeline.setpoint.simulation.actuation import (
     still,
     wait_after,
 )
-from pipeline.setpoint.simulation.simulator import Action, Controller
+from pipeline.setpoint.simulation.simulator import Action, SetpointController
 
 RULES = {"least_frames": 8, "correlation": 0.45, "foreign_above": 5.0, "conformal_level": 0.2}
-LIMITS = Limits(
+LIMITS = SetpointLimits(
     np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([60.0, 30.0])
 )
 UNDER = np.array([0.9, 0.08, 0.02])
@@ -271,7 +271,7 @@ def test_a_camera_that_repeats_its_reading_to_the_last_bit_stands_still():
 def test_a_controller_remembers_what_is_evidence_and_is_asked_whether_the_camera_is_strange(
     reason, remembers
 ):
-    asked = Controller(
+    asked = SetpointController(
         lambda: jnp.int32(0),
         lambda parameters, memory, observation, key: (memory + 1, Action(jnp.int32(0), jnp.int32(0))),
         lambda parameters, memory: memory >= parameters,

@@ -5,19 +5,24 @@ import collections
 import numpy as np
 import pytest
 
-from pipeline.setpoint.agents import baselines, judging
-from pipeline.setpoint.agents.judging import Choice
-from pipeline.setpoint.score import Outcomes
-from pipeline.setpoint.workflow import evaluate_setpoint
-from pipeline.setpoint.workflow.contestants import CONTESTANTS, ControllerSpec, Problem, controllers
-from pipeline.setpoint.workflow.settings import EvaluateSetpoint
-from pipeline.setpoint.workflow.tables import SCOREBOARD
+from pipeline.setpoint.agents import baselines, trials
+from pipeline.setpoint.agents.score import Outcomes
+from pipeline.setpoint.controllers import CONTROLLERS, BuiltController, build_controllers
+from pipeline.setpoint.evaluation import contest as contests
+from pipeline.setpoint.evaluation import judging, scoreboard
+from pipeline.setpoint.evaluation.contest import Contest
+from pipeline.setpoint.evaluation.judging import DefaultChoice
+from pipeline.setpoint.evaluation.pixel_rollouts import PixelRollouts
+from pipeline.setpoint.settings import EvaluateSetpoint
+from pipeline.setpoint.tables import SCOREBOARD
 from pipeline.store import artifacts, params
+from stages import evaluate_setpoint
 from tests.setpoint.synthetic import synthetic_table
 
-NO_PIXELS = evaluate_setpoint.PixelRollouts({}, None, ())
+NO_PIXELS = PixelRollouts({}, None, ())
 CLOGGED = "recorded, sticky, half clog"
 SIMPLE = ("do nothing", "filtered proportional", "sequential test")
+ROWS = [row for row in CONTROLLERS if row.name in SIMPLE]
 
 
 @pytest.fixture(scope="module")
@@ -26,23 +31,28 @@ def settings(root) -> EvaluateSetpoint:
     return declared.model_copy(update={"runs": 1, "redraws": 3, "rounds": 2})
 
 
+def limits_of(settings: EvaluateSetpoint) -> dict[str, float]:
+    harmed = settings.most_harmed
+    return contests.harm_limits(perfect=harmed.perfect_percent, in_band=harmed.in_band_percent)
+
+
 def test_harm_is_barred_from_good_starts_with_the_camera_right_stuck_or_blind(settings):
-    limits = evaluate_setpoint.bars(settings)
+    limits = limits_of(settings)
     assert limits == {"perfect": 1.0, "in band": 2.0, "in band, stuck 30": 2.0, "in band, blind 30": 2.0}
 
 
 def test_what_is_told_is_of_other_segments_and_the_default_s_harm_stands_by_case(settings, tmp_path):
-    problem = Problem(settings.baselines, agents=None, windows=None)
-    specs = controllers(problem, [line for line in CONTESTANTS if line.name in SIMPLE])
+    specs = build_controllers(settings.baselines, None, None, ROWS)
+    groups = dict.fromkeys(SIMPLE, "baseline")
     choose, judge = (synthetic_table(np.random.default_rng(k), segments=6, windows=2) for k in (1, 2))
-    choice = evaluate_setpoint.chosen(specs, choose, settings)
-    contest = evaluate_setpoint.contest(specs, judge, settings, choice.name)
+    choice = evaluate_setpoint.choose_default(specs, choose, settings)
+    contest = evaluate_setpoint.simulate_contest(specs, judge, settings, choice.name)
     assert contest.redraws == {name: 6 if name == choice.name else 3 for name in SIMPLE}
-    told = evaluate_setpoint.told(choice, contest)
+    told = contests.with_figures(choice, contest)
     check_margin(told, contest)
-    board = evaluate_setpoint.scoreboard(specs, contest, NO_PIXELS)
+    board = scoreboard.scoreboard(groups, contest, NO_PIXELS)
     artifacts.write_table(tmp_path / "scoreboard.parquet", SCOREBOARD, board)
-    figures = evaluate_setpoint.metrics(specs, contest, told, NO_PIXELS)
+    figures = scoreboard.metrics(groups, contest, told, NO_PIXELS)
     assert figures["default"] == choice.name
     assert set(figures["cases"]) == {case for case in contest.scores[choice.name] if judging.counts(case)}
     for case, shares in figures["cases"].items():
@@ -63,8 +73,10 @@ def test_what_is_told_is_of_other_segments_and_the_default_s_harm_stands_by_case
 
 
 def test_where_nothing_else_may_run_the_choice_is_written_without_a_margin(tmp_path):
-    alone = judging.Choice("do nothing", 0.0, "accuracy 1", *3 * (float("nan"),), {"ours": "harms"}, "Alone.")
-    artifacts.write_json(tmp_path / "choice.json", evaluate_setpoint.choice_record(alone))
+    alone = judging.DefaultChoice(
+        "do nothing", 0.0, "accuracy 1", *3 * (float("nan"),), {"ours": "harms"}, "Alone."
+    )
+    artifacts.write_json(tmp_path / "choice.json", scoreboard.choice_record(alone))
     read = artifacts.read_json(tmp_path / "choice.json")
     assert [read[name] for name in ("margin", "margin_low", "margin_high")] == [None] * 3
     assert (read["name"], read["worst"], read["refused"]) == ("do nothing", 0.0, {"ours": "harms"})
@@ -85,28 +97,26 @@ def check_margin(told, contest):
 
 
 def test_the_number_of_cores_changes_nothing_and_the_runs_drawn_are_among_those_judged(settings, monkeypatch):
-    specs = controllers(
-        Problem(settings.baselines, agents=None, windows=None),
-        [line for line in CONTESTANTS if line.name in SIMPLE],
-    )
+    specs = build_controllers(settings.baselines, None, None, ROWS)
+    groups = dict.fromkeys(SIMPLE, "baseline")
     table = synthetic_table(np.random.default_rng(2), segments=6, windows=2)
     several = settings.model_copy(update={"runs": 2, "redraws": 2, "rounds": 1})
-    contests = []
+    both = []
     for cores in (1, 3):
         monkeypatch.setattr(evaluate_setpoint.os, "cpu_count", lambda cores=cores: cores)
-        contests.append(evaluate_setpoint.contest(specs, table, several, "do nothing"))
-    one, three = contests
+        both.append(evaluate_setpoint.simulate_contest(specs, table, several, "do nothing"))
+    one, three = both
     assert list(one.scores) == list(three.scores) == list(specs)
-    rows = [evaluate_setpoint.scoreboard(specs, contest, NO_PIXELS) for contest in contests]
+    rows = [scoreboard.scoreboard(groups, contest, NO_PIXELS) for contest in both]
     np.testing.assert_equal(*rows)
-    choice = judging.Choice("sequential test", 0.0, CLOGGED, *3 * (0.0,), {}, "")
-    columns = evaluate_setpoint.paths(specs, one, choice, NO_PIXELS)
-    np.testing.assert_equal(columns, evaluate_setpoint.paths(specs, three, choice, NO_PIXELS))
+    choice = judging.DefaultChoice("sequential test", 0.0, CLOGGED, *3 * (0.0,), {}, "")
+    columns = scoreboard.paths(groups, one, choice, NO_PIXELS)
+    np.testing.assert_equal(columns, scoreboard.paths(groups, three, choice, NO_PIXELS))
     check_the_case_that_decides(columns, one)
     for name in SIMPLE:
         drawn = one.paths[name]["accuracy 0.7"]
-        assert set(drawn.flow[:, 0]) == set(judging.START_FLOWS)
-        starts = judging.starts(1, accuracy=0.7)
+        assert set(drawn.flow[:, 0]) == set(trials.START_FLOWS)
+        starts = trials.starts(1, accuracy=0.7)
         np.testing.assert_array_equal(drawn.flow[:, 0], starts.flow)
         np.testing.assert_array_equal(drawn.temperature[:, 0], starts.temperature)
     assert (np.ptp(one.paths["do nothing"]["recorded, fresh"].flow, axis=1) < 1e-3).all()
@@ -135,19 +145,19 @@ def check_the_case_that_decides(columns, contest):
 
 def test_a_case_that_decides_and_is_kept_of_everybody_is_kept_once_and_to_the_end(settings):
     """Runs are made up: every controller rests at 100 %."""
-    specs = {name: ControllerSpec("baseline", baselines.nothing(), name) for name in SIMPLE}
+    groups = dict.fromkeys(SIMPLE, "baseline")
     rest = judging.Runs(np.full((21, 201), 100.0), np.full((21, 201), 210.0))
     kept = {name: dict.fromkeys(("accuracy 0.7", "recorded, fresh"), rest) for name in SIMPLE}
-    contest = evaluate_setpoint.Contest({}, {name: judged(0.5) for name in SIMPLE}, {}, kept)
-    choice = judging.Choice("do nothing", 0.0, "recorded, fresh", *3 * (0.0,), {}, "")
-    columns = evaluate_setpoint.paths(specs, contest, choice, NO_PIXELS)
+    contest = Contest({}, {name: judged(0.5) for name in SIMPLE}, {}, kept)
+    choice = judging.DefaultChoice("do nothing", 0.0, "recorded, fresh", *3 * (0.0,), {}, "")
+    columns = scoreboard.paths(groups, contest, choice, NO_PIXELS)
     assert len(columns["step"]) == len(SIMPLE) * 21 * (101 + 201)
 
 
 def judged(share, worst="clog"):
     """So much of the runs is kept in the worst case, and all in another."""
     runs = np.arange(20) < 20 * share
-    return judging.Judged({"other": np.ones((1, 20), bool), worst: runs[None]}, {})
+    return judging.JudgedRuns({"other": np.ones((1, 20), bool), worst: runs[None]}, {})
 
 
 def test_beside_the_default_stand_doing_nothing_the_strongest_rule_and_our_strongest_agent():
@@ -156,20 +166,19 @@ def test_beside_the_default_stand_doing_nothing_the_strongest_rule_and_our_stron
         "default": "baseline", "paper": "paper", "weak agent": "agent", "agent": "agent",
     }  # fmt: skip
     shares = dict(zip(kinds, (0.1, 0.4, 0.6, 0.9, 0.8, 0.7, 0.5, 0.6), strict=True))
-    specs = {name: ControllerSpec(kind, None, None) for name, kind in kinds.items()}
-    contest = evaluate_setpoint.Contest({}, {name: judged(share) for name, share in shares.items()}, {}, {})
-    choice = judging.Choice("default", 80.0, "clog", *3 * (0.0,), {"harmful": "harms"}, "")
-    who = evaluate_setpoint.compared(specs, contest, choice)
+    contest = Contest({}, {name: judged(share) for name, share in shares.items()}, {}, {})
+    choice = judging.DefaultChoice("default", 80.0, "clog", *3 * (0.0,), {"harmful": "harms"}, "")
+    who = scoreboard.compared(kinds, contest, choice)
     assert who == ["do nothing", "quick", "default", "agent"]
     # where no other rule may run, the strongest of those stands there
     choice = choice._replace(refused={"harmful": "harms", "quick": "harms", "slow": "harms"})
-    assert evaluate_setpoint.compared(specs, contest, choice) == ["do nothing", "harmful", "default", "agent"]
+    assert scoreboard.compared(kinds, contest, choice) == ["do nothing", "harmful", "default", "agent"]
 
 
 def test_who_cannot_win_any_more_runs_in_one_round_only(settings, monkeypatch):
     """Runs are made up: of 21 from wrong starts, so many are kept; "nearly" loses one run of a round."""
     kept = {"do nothing": 0, "slow": 5, "good": 20, "better": 21, "nearly": 21}
-    specs = {name: ControllerSpec("baseline", baselines.nothing(), name) for name in kept}
+    specs = {name: BuiltController("baseline", baselines.nothing(), name) for name in kept}
     asked = collections.Counter()
 
     def runs(controller, name, case, part, keys):
@@ -185,16 +194,16 @@ def test_who_cannot_win_any_more_runs_in_one_round_only(settings, monkeypatch):
         monkeypatch.setattr(judging, made_of_runs, lambda of: of)
     table = synthetic_table(np.random.default_rng(1), segments=2, windows=1)
     longer = settings.model_copy(update={"redraws": 8, "rounds": 3})
-    choice = evaluate_setpoint.chosen(specs, table, longer)
-    cases = 13 + len(evaluate_setpoint.bars(longer))
+    choice = evaluate_setpoint.choose_default(specs, table, longer)
+    cases = 13 + len(limits_of(longer))
     # the runs are paired: one lost in each of eight redraws is told at once, one in one of them never
     once = dict.fromkeys(("do nothing", "slow", "good"), cases)
     assert asked == once | dict.fromkeys(("better", "nearly"), 3 * cases)
-    assert isinstance(choice, Choice)
+    assert isinstance(choice, DefaultChoice)
     assert choice.name == "better"
 
 
 def test_the_table_is_in_the_order_of_simplicity():
-    names = [line.name for line in CONTESTANTS]
+    names = [row.name for row in CONTROLLERS]
     order = ("do nothing", "filtered proportional", "sequential test", "Bayes, robust", "our agent")
     assert [name for name in names if name in order] == list(order)

@@ -62,7 +62,7 @@ def test_the_p_value_is_rarely_small_where_nothing_is_foreign():
 
 
 def test_the_score_by_hand():
-    plain = familiar.Camera(np.array([1.0, 0.0]), np.array([2.0, 1.0]), np.eye(2), np.zeros(3))
+    plain = familiar.KnownCamera(np.array([1.0, 0.0]), np.array([2.0, 1.0]), np.eye(2), np.zeros(3))
     # z = (2, -1): 4 + 1, and (16 + 1) / 2
     assert familiar.score(plain, np.array([[5.0, -1.0]])).tolist() == [13.5]
     assert familiar.p_value(plain, np.array([[5.0, -1.0]])).tolist() == [0.25]

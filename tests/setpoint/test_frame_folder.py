@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.reading import frame_images
+from pipeline.reading.frame_csv import read_log, stretches
+from pipeline.reading.frame_folder import figures
 from pipeline.setpoint.frames import key_area
-from pipeline.setpoint.workflow import frame_images
-from pipeline.setpoint.workflow.frame_csv import read_log, stretches
-from pipeline.setpoint.workflow.frame_folder import figures
 from tests.nozzle_folders import FLOWS, SHOTS, expected, folder, images, notes, read, rows, scenes, table
 
 COUNT = 2 * len(FLOWS) * SHOTS

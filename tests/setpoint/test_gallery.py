@@ -1,6 +1,7 @@
 """Real frames for the page: which are chosen, with what share and reason, and the picture of each; and the
 camera of a folder."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -8,12 +9,16 @@ import numpy as np
 import pytest
 
 from pipeline.setpoint.frames import familiar
-from pipeline.setpoint.vision import calibrated_classifier
-from pipeline.setpoint.workflow import camera_files, frame_folder, gallery, known_camera
-from tests.nozzle_folders import ANY, FLOWS, LEAST, SHOTS, folder, read, rows, scenes
+from pipeline.setpoint.frames import files as camera_files
+from pipeline.setpoint.material import PLA
+from pipeline.setpoint.settings import TrainClassifier
+from pipeline.setpoint.vision import calibrated_classifier, gallery
+from pipeline.store import artifacts, params
+from stages import train_classifier
+from tests.nozzle_folders import FLOWS, SHOTS, folder, read, rows, scenes
 
+ROOT = Path(__file__).parents[2]
 COUNT = 2 * len(FLOWS) * SHOTS
-OPTIONS = frame_folder.ReadOptions(tip_px=None, least_score=LEAST, topics=ANY)
 
 
 @pytest.fixture
@@ -29,6 +34,13 @@ def model(monkeypatch):
     return SimpleNamespace(calibration=SimpleNamespace(foreign_above=20.0))
 
 
+def page_rows(model, frames, prints, folder):
+    """The rows of frames.json, and the pictures beside it."""
+    settings = params.load(TrainClassifier, "train_classifier", ROOT / params.FILE)
+    train_classifier.write_frames(folder, settings, model, frames, prints, PLA)
+    return artifacts.read_json(folder / "frames.json")
+
+
 def made(tmp_path):
     """Two prints; of the second, the first picture is flat."""
     raw = folder(tmp_path / "raw")
@@ -38,9 +50,9 @@ def made(tmp_path):
 
 def test_each_frame_is_in_one_group_and_shares_are_of_the_judged_prints(tmp_path, model):
     frames = made(tmp_path)
-    judged = gallery.write_gallery(model, frames, np.array([1]), OPTIONS, tmp_path)
+    judged = page_rows(model, frames, np.array([1]), tmp_path)
     assert {row["source"].split(": ")[1].split("/")[0][-6:] for row in judged} == {"print1"}
-    shown = gallery.grouped(model, frames)
+    shown = gallery.group_frames(model, frames)
     mine = frames.print_number == 1
     shares = {row["group"]: row["share"] for row in judged}
     assert shares == {g: (shown.group[mine] == g).mean() for g in shares}
@@ -57,7 +69,7 @@ def test_each_frame_is_in_one_group_and_shares_are_of_the_judged_prints(tmp_path
 
 def test_a_frame_far_from_what_was_learned_is_shown_as_foreign(tmp_path, model):
     frames = made(tmp_path)
-    shown = gallery.write_gallery(model, frames, np.array([0, 1]), OPTIONS, tmp_path)
+    shown = page_rows(model, frames, np.array([0, 1]), tmp_path)
     foreign = [row for row in shown if row["group"] == "foreign"]
     assert len(foreign) == 1
     assert foreign[0]["reason"] == "foreign: further from what was learned than allowed"
@@ -66,7 +78,7 @@ def test_a_frame_far_from_what_was_learned_is_shown_as_foreign(tmp_path, model):
 
 def test_the_picture_is_that_of_the_frame_with_its_key_area(tmp_path, model):
     frames = made(tmp_path)
-    for row in gallery.write_gallery(model, frames, np.array([0, 1]), OPTIONS, tmp_path):
+    for row in page_rows(model, frames, np.array([0, 1]), tmp_path):
         picture = cv2.imread(str(tmp_path / row["file"]), cv2.IMREAD_GRAYSCALE)
         k = frames.source.index(row["source"])
         scene = scenes()[k // SHOTS]
@@ -83,7 +95,7 @@ def test_the_picture_is_that_of_the_frame_with_its_key_area(tmp_path, model):
 def test_where_all_are_right_there_is_no_wrong_group(tmp_path, model):
     frames = made(tmp_path)
     only_good = frames._replace(label=np.where(frames.label >= 0, 1, frames.label))
-    shown = gallery.write_gallery(model, only_good, np.array([1]), OPTIONS, tmp_path)
+    shown = page_rows(model, only_good, np.array([1]), tmp_path)
     assert "wrong" not in {row["group"] for row in shown}
 
 
@@ -100,10 +112,12 @@ def test_a_folder_s_camera_is_known_from_its_windows_and_another_s_frames_are_fo
     rng = np.random.default_rng(0)
     many = 240
     measured = rng.normal(3.0, 0.1, (5 * many, len(familiar.NAMES))).astype(np.float32)
-    film = SimpleNamespace(surroundings=measured, segment=np.repeat(np.arange(4), 5 * many // 4))
-    camera = known_camera.recorded(film, length=5)  # 4 stretches are too few: windows then
+    segment = np.repeat(np.arange(4), 5 * many // 4)
+    camera = familiar.fit_recorded_camera(
+        measured, segment, length=5
+    )  # 4 stretches are too few: windows then
     assert len(camera.scores) == many // 2
-    windows, _ = known_camera.window_medians(film, length=5)
+    windows, _ = familiar.window_medians(measured, segment, length=5)
     assert familiar.foreign(camera, windows, false_alarms=0.01).mean() <= 0.02
     assert familiar.foreign(camera, windows + 1.0, false_alarms=0.01).all()
 

@@ -5,23 +5,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pipeline.setpoint.agents import baselines, judging
-from pipeline.setpoint.agents.judging import (
-    DOES_NOTHING,
-    START_FLOWS,
-    START_TEMPERATURES,
-    Camera,
+from pipeline.setpoint.agents import baselines
+from pipeline.setpoint.agents.criteria import NO_CONTROL
+from pipeline.setpoint.agents.score import judge, outcomes, summary
+from pipeline.setpoint.agents.trials import START_FLOWS, START_TEMPERATURES, starts
+from pipeline.setpoint.evaluation import judging
+from pipeline.setpoint.evaluation.judging import (
+    CameraFault,
     Case,
-    Judged,
+    JudgedRuns,
     all_cases,
     choose,
     lead,
-    starts,
     still_in,
 )
-from pipeline.setpoint.score import judge, outcomes, summary
 from pipeline.setpoint.simulation.recorded import recorded_windows
-from pipeline.setpoint.simulation.simulator import STAND, Action, Controller, nominal
+from pipeline.setpoint.simulation.simulator import STAND, Action, SetpointController, nominal
 from pipeline.statistics import effective_runs, redrawn_mean, redrawn_share, shared_variance, wilson
 from tests.setpoint.synthetic import synthetic_flow_table, synthetic_table
 
@@ -235,7 +234,7 @@ def windows_at(source, flows, persistence, u=0.3):
 def test_a_camera_shows_what_the_recorded_one_shows_at_the_flow_that_it_makes_of_the_true_one():
     recorded = recorded_windows(TABLE)
     flows = np.array([60.0, 95.0, 100.0, 120.0])
-    camera = judging.shown_by(recorded, Camera(scale=1.1, exponent=0.5))
+    camera = judging.shown_by(recorded, CameraFault(scale=1.1, exponent=0.5))
     expected = windows_at(recorded, 110 * np.sqrt(flows / 100), 1.0)
     for a, b in zip(windows_at(camera, flows, 10.0), expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5)
@@ -309,13 +308,13 @@ def test_asking_runs_each_case_on_each_redraw_from_one_key():
     assert idle.flow.shape == (63,)
     assert not idle.beyond.any()
     assert idle.stay.all()
-    always = Controller(lambda: (), lambda p, m, o, key: (m, Action(jnp.int32(4), jnp.int32(STAND))))
+    always = SetpointController(lambda: (), lambda p, m, o, key: (m, Action(jnp.int32(4), jnp.int32(STAND))))
     assert judging.ask(always, (), asked["perfect"], recorded, keys).beyond.all()
     # one of +10 % a decision until the camera goes blind for good in decision 20: 20 moves at most
-    rising = Controller(
+    rising = SetpointController(
         lambda: (), lambda p, m, o, key: (m, Action(jnp.where(o.step < 22, STAND, 4), jnp.int32(STAND)))
     )
-    for camera, harmed in ((Camera(blind_for=200), False), (Camera(), True)):
+    for camera, harmed in ((CameraFault(blind_for=200), False), (CameraFault(), True)):
         of = judging.ask(rising, (), Case(asked["perfect"].conditions, camera), recorded, keys)
         assert of.beyond[:, 0].all() == of.beyond[:, 0].any() == harmed
     test = baselines.sequential_test(), baselines.SequentialTest(0.75, 2.9, 5.3)
@@ -340,16 +339,16 @@ def spread(share):
 def contestant(calm, clog, harmed=None, seed=0):
     kept = {"calm": blocks(calm, seed=seed), "clog": blocks(clog, seed=seed)}
     good = np.zeros((24, 20), bool) if harmed is None else harmed
-    return Judged(kept, {"in band": good, "in band, another camera": np.ones((24, 20), bool)})
+    return JudgedRuns(kept, {"in band": good, "in band, another camera": np.ones((24, 20), bool)})
 
 
-ORDER = (DOES_NOTHING, "simple", "filter", "agent")
+ORDER = (NO_CONTROL, "simple", "filter", "agent")
 BARS = {"in band": 2.0}
 IDLE = contestant(0.0, 0.0)
 
 
 def test_the_default_is_the_best_in_its_worst_case_and_the_margin_is_said():
-    judged = {DOES_NOTHING: IDLE, "simple": contestant(1.0, 0.6), "filter": contestant(0.97, 0.96)}
+    judged = {NO_CONTROL: IDLE, "simple": contestant(1.0, 0.6), "filter": contestant(0.97, 0.96)}
     choice = choose(judged, simplest_first=ORDER, bars=BARS)
     assert (choice.name, choice.case) == ("filter", "clog")
     assert choice.margin == pytest.approx(choice.worst - 100 * judged["simple"].kept["clog"].mean())
@@ -366,7 +365,7 @@ def test_the_default_is_the_best_in_its_worst_case_and_the_margin_is_said():
 def test_within_noise_the_simpler_runs_whatever_the_order_of_the_table():
     # the agent loses 18 of 480 runs, the filter 24 others
     close = {
-        name: Judged({"clog": kept}, IDLE.harmed)
+        name: JudgedRuns({"clog": kept}, IDLE.harmed)
         for name, kept in (("agent", ~spread(18 / 480)), ("filter", ~spread(24 / 480)[::-1, ::-1]))
     }
     assert judging.worst_case(close["agent"])[0] > judging.worst_case(close["filter"])[0]
@@ -378,8 +377,8 @@ def test_within_noise_the_simpler_runs_whatever_the_order_of_the_table():
     # the same difference where redraws tell the two apart
     both = blocks(0.9, seed=3)
     far = {
-        "agent": Judged({"clog": both | blocks(0.7, seed=4)}, close["agent"].harmed),
-        "filter": Judged({"clog": both}, close["agent"].harmed),
+        "agent": JudgedRuns({"clog": both | blocks(0.7, seed=4)}, close["agent"].harmed),
+        "filter": JudgedRuns({"clog": both}, close["agent"].harmed),
     }
     assert choose(far, simplest_first=ORDER, bars=BARS).name == "agent"
 
@@ -388,7 +387,7 @@ def test_what_is_told_apart_by_less_than_counts_is_alike():
     """On every redraw the agent loses one run of 100 less than the filter: sure, and too little."""
     all_but = {lost: np.arange(100) >= lost * np.ones((24, 1)) for lost in (4, 7, 8)}
     good = {"in band": np.zeros((24, 100), bool)}
-    of = {lost: Judged({"clog": kept}, good) for lost, kept in all_but.items()}
+    of = {lost: JudgedRuns({"clog": kept}, good) for lost, kept in all_but.items()}
     one = lead(of[7], of[8])
     assert 0 < one.low <= one.value == pytest.approx(1.0)
     assert choose({"filter": of[8], "agent": of[7]}, simplest_first=ORDER, bars=BARS).name == "filter"
@@ -400,8 +399,8 @@ def test_two_alike_are_told_apart_by_chance_no_oftener_than_said_however_many_ca
     rng, names = np.random.default_rng(11), [f"accuracy {n}" for n in range(13)]
     sure, told = np.ones((12, 21), bool), 0
     for _ in range(400):
-        of = Judged({name: sure if n else rng.random((12, 21)) < 0.5 for n, name in enumerate(names)}, {})
-        other = Judged({name: rng.random((12, 21)) < 0.5 for name in names}, {})
+        of = JudgedRuns({name: sure if n else rng.random((12, 21)) < 0.5 for n, name in enumerate(names)}, {})
+        other = JudgedRuns({name: rng.random((12, 21)) < 0.5 for name in names}, {})
         told += lead(of, other).low > 0
     assert told / 400 <= 0.025
 
@@ -411,7 +410,7 @@ def test_an_interval_of_segments_makes_a_tie_of_what_runs_alone_would_tell_apart
     filter_runs, agent_runs = np.ones((24, 25), bool), np.ones((24, 25), bool)
     filter_runs[::2, :5] = False
     agent_runs[1::2, :3] = False
-    of = {name: Judged({"clog": runs}, {"in band": np.zeros((24, 25), bool)}) for name, runs in
+    of = {name: JudgedRuns({"clog": runs}, {"in band": np.zeros((24, 25), bool)}) for name, runs in
           (("agent", agent_runs), ("filter", filter_runs))}  # fmt: skip
     assert choose(of, simplest_first=ORDER, bars=BARS).name == "filter"
     alone = np.subtract(agent_runs, filter_runs, dtype=float).ravel()
@@ -420,7 +419,7 @@ def test_an_interval_of_segments_makes_a_tie_of_what_runs_alone_would_tell_apart
 
 def test_whoever_does_harm_is_no_candidate_and_the_sentence_says_why():
     judged = {
-        DOES_NOTHING: IDLE,
+        NO_CONTROL: IDLE,
         "simple": contestant(0.8, 0.8),
         "agent": contestant(1.0, 1.0, harmed=spread(0.05)),
     }
@@ -442,11 +441,11 @@ def test_whoever_does_harm_is_no_candidate_and_the_sentence_says_why():
 
 def test_where_nothing_helps_or_all_do_harm_nothing_is_done():
     judged = {name: contestant(1.0, 1.0, harmed=spread(0.5)) for name in ("simple", "agent")}
-    choice = choose({DOES_NOTHING: IDLE} | judged, simplest_first=ORDER, bars=BARS)
-    assert choice.name == DOES_NOTHING
+    choice = choose({NO_CONTROL: IDLE} | judged, simplest_first=ORDER, bars=BARS)
+    assert choice.name == NO_CONTROL
     assert set(choice.refused) == {"simple", "agent"}
-    idle = choose({DOES_NOTHING: IDLE, "agent": contestant(0.5, 0.0)}, simplest_first=ORDER, bars=BARS)
-    assert idle.name == DOES_NOTHING
+    idle = choose({NO_CONTROL: IDLE, "agent": contestant(0.5, 0.0)}, simplest_first=ORDER, bars=BARS)
+    assert idle.name == NO_CONTROL
     assert (
         "no controller does better beyond noise, the best is agent 0.0 % in its own (clog)" in idle.sentence
     )
@@ -457,7 +456,7 @@ def test_where_nothing_helps_or_all_do_harm_nothing_is_done():
 
 
 def test_controllers_judged_on_different_cases_or_without_a_place_are_not_compared():
-    other = Judged({"calm": blocks(1.0)}, contestant(1, 1).harmed)
+    other = JudgedRuns({"calm": blocks(1.0)}, contestant(1, 1).harmed)
     for wrong in (other, contestant(1, 1)._replace(harmed={})):
         with pytest.raises(ValueError, match="expected every controller judged on the same cases, found"):
             choose({"simple": contestant(1, 1), "agent": wrong}, simplest_first=ORDER, bars=BARS)
@@ -478,7 +477,7 @@ def test_the_race_is_left_by_who_cannot_win_any_more_and_by_nobody_else():
     rng = np.random.default_rng(6)
     better = rng.random((24, 20)) < 0.6
     both = {"a": better, "b": better & (rng.random((24, 20)) < 0.85)}
-    pair = {name: Judged({"accuracy 0.7": kept}, judged["simple"].harmed) for name, kept in both.items()}
+    pair = {name: JudgedRuns({"accuracy 0.7": kept}, judged["simple"].harmed) for name, kept in both.items()}
     assert still_in(pair, BARS) == ["a"]
     # the harmful is better than all, and ends nobody's race
     assert still_in({name: judged[name] for name in ("simple", "harmful")}, BARS) == ["simple"]
@@ -486,7 +485,7 @@ def test_the_race_is_left_by_who_cannot_win_any_more_and_by_nobody_else():
 
 def test_two_are_compared_on_the_redraws_that_both_have():
     of = contestant(0.97, 0.96, seed=2)
-    early = Judged({case: kept[:8] for case, kept in of.kept.items()}, of.harmed)
+    early = JudgedRuns({case: kept[:8] for case, kept in of.kept.items()}, of.harmed)
     assert lead(of, early) == (0, 0, 0)
 
 
@@ -497,8 +496,8 @@ def test_alike_in_the_worst_case_is_not_alike_where_another_is_better_on_average
     good = {"in band": np.zeros((24, 20), bool)}
     one_more = sticky.copy()
     one_more[-1, 0] = True
-    plain = Judged({"accuracy 0.7": ~spread(0.3), "recorded, sticky": sticky}, good)
-    filter_ = Judged({"accuracy 0.7": ~spread(0.1), "recorded, sticky": one_more}, good)
+    plain = JudgedRuns({"accuracy 0.7": ~spread(0.3), "recorded, sticky": sticky}, good)
+    filter_ = JudgedRuns({"accuracy 0.7": ~spread(0.1), "recorded, sticky": one_more}, good)
     judged = {"simple": plain, "filter": filter_}
     assert lead(filter_, plain).low <= 0
     average = judging.lead_on_average(filter_, plain)
@@ -507,8 +506,8 @@ def test_alike_in_the_worst_case_is_not_alike_where_another_is_better_on_average
     assert choice.name == "filter"
     assert "over the cases on average filter keeps 10" in choice.sentence
     assert still_in(judged, BARS) == ["filter"]
-    assert choose({DOES_NOTHING: plain, "filter": filter_}, simplest_first=ORDER, bars=BARS).name == (
-        DOES_NOTHING
+    assert choose({NO_CONTROL: plain, "filter": filter_}, simplest_first=ORDER, bars=BARS).name == (
+        NO_CONTROL
     )
     # better by less than counts
     near = filter_._replace(kept={**filter_.kept, "accuracy 0.7": ~spread(0.28)})
@@ -529,12 +528,12 @@ def test_a_case_that_is_surely_lost_is_no_tie_where_a_worse_one_is_in_doubt():
     sticky = np.repeat([[True], [False]], 12, axis=0) & np.ones((24, 20), bool)
     good = {"in band": np.zeros((24, 20), bool)}
     paper = ~spread(0.3)
-    simple = Judged({"accuracy 0.7": paper, "recorded, sticky": sticky}, good)
-    filter_ = Judged({"accuracy 0.7": ~spread(0.05), "recorded, sticky": ~spread(0.02)[::-1]}, good)
+    simple = JudgedRuns({"accuracy 0.7": paper, "recorded, sticky": sticky}, good)
+    filter_ = JudgedRuns({"accuracy 0.7": ~spread(0.05), "recorded, sticky": ~spread(0.02)[::-1]}, good)
     judged = {"simple": simple, "filter": filter_}
     assert judging.worst_case(simple)[1] == "recorded, sticky"
     assert lead(filter_, simple).low > 0
     assert choose(judged, simplest_first=ORDER, bars=BARS).name == "filter"
-    doubt = {"simple": Judged({"recorded, sticky": sticky}, good),
-             "filter": Judged({"recorded, sticky": ~spread(0.02)[::-1]}, good)}  # fmt: skip
+    doubt = {"simple": JudgedRuns({"recorded, sticky": sticky}, good),
+             "filter": JudgedRuns({"recorded, sticky": ~spread(0.02)[::-1]}, good)}  # fmt: skip
     assert lead(doubt["filter"], doubt["simple"]).value > 40

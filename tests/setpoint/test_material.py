@@ -4,12 +4,13 @@ import numpy as np
 import pydantic
 import pytest
 
+from pipeline.reading import frame_folder
 from pipeline.setpoint import published
 from pipeline.setpoint.frames import nozzle_scene
-from pipeline.setpoint.material import PLA, Material
+from pipeline.setpoint.material import PLA, PrintedMaterial
+from pipeline.setpoint.recordings import FrontEnd
+from pipeline.setpoint.settings import SetpointMaterial
 from pipeline.setpoint.simulation import simulator
-from pipeline.setpoint.workflow import frame_folder
-from pipeline.setpoint.workflow.settings import SetpointMaterial
 from pipeline.store.params import Execution
 from tests.nozzle_folders import ANY, LEAST, SHOTS, folder, read
 
@@ -35,7 +36,7 @@ def test_the_published_material_is_what_the_scenes_and_the_simulator_are_of():
         PLA.temperature_range_degC,
     )
     assert nozzle_scene.BORDERS == PLA.good_flow_percent
-    assert isinstance(PLA, Material)
+    assert isinstance(PLA, PrintedMaterial)
 
 
 def test_the_published_material_stands_for_itself_to_the_bit():
@@ -75,9 +76,9 @@ def test_frames_of_a_folder_are_read_as_of_the_published_material(tmp_path):
         **{**DECLARED, "good_flow_percent": (50.0, 120.0), "flow_limits_percent": (20.0, 310.0)}
     )
     raw = folder(tmp_path / "raw")
-    options = frame_folder.ReadOptions(None, LEAST, ANY, petg.material())
+    options = frame_folder.ReadOptions(None, FrontEnd(LEAST, tmp_path / "memo"), ANY, petg.material())
     here = Execution(backend="loky", jobs=1, scheduler="")
-    found = frame_folder.read_folder(raw, options, here, memo=tmp_path / "memo")
+    found = frame_folder.read_folder(raw, options, here)
     plain = read(raw)
     # 60 and 100 % are good for it, 150 % is over; 210 degC stand 10 below the range, as 170 do for PLA
     own = np.tile(np.repeat([60.0, 100.0, 150.0], SHOTS), 2)

@@ -1,24 +1,18 @@
 """Of a user's folder: which prints the classifier learns from, and whose windows stand for the camera."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from pipeline.setpoint.frames import nozzle_scene
-from pipeline.setpoint.workflow import parts
-from pipeline.setpoint.workflow.render_frames import PARTS, LabelledFrames
-from pipeline.setpoint.workflow.settings import TrainClassifier
-from pipeline.setpoint.workflow.tables import WINDOW_PARTS
-from pipeline.store import params
+from pipeline.setpoint.frames.rendered import LabelledFrames
+from pipeline.setpoint.tables import FRAME_PARTS, WINDOW_PARTS
+from pipeline.setpoint.vision import parts
 
-ROOT = Path(__file__).resolve().parents[2]
 WINDOW = 4
 
 
-def settings() -> TrainClassifier:
-    found = params.load(TrainClassifier, "train_classifier", ROOT / params.FILE)
-    return found.model_copy(update={"window": WINDOW})
+def split_windows(given: dict[str, LabelledFrames]):
+    return parts.split_windows(given, WINDOW_PARTS, window=WINDOW, rng=np.random.default_rng([0, 1]))
 
 
 def prints(first: int, count: int, frames: int = WINDOW) -> LabelledFrames:
@@ -34,7 +28,7 @@ def prints(first: int, count: int, frames: int = WINDOW) -> LabelledFrames:
 
 
 def folder(learned: int, frames: int = WINDOW) -> dict[str, LabelledFrames]:
-    counts = dict(zip(PARTS, (learned, 4, 8, 8), strict=True))
+    counts = dict(zip(FRAME_PARTS, (learned, 4, 8, 8), strict=True))
     begins = np.cumsum([0, *counts.values()])
     return {
         part: prints(int(at), count, frames)
@@ -48,8 +42,8 @@ def numbers(frames: LabelledFrames) -> set[int]:
 
 def test_where_prints_suffice_windows_are_of_none_that_the_classifier_has():
     given = folder(60)
-    by_part, windows, apart = parts.with_windows(settings(), given)
-    assert apart and tuple(by_part) == PARTS and tuple(windows) == WINDOW_PARTS
+    by_part, windows, apart = split_windows(given)
+    assert apart and tuple(by_part) == FRAME_PARTS and tuple(windows) == WINDOW_PARTS
     several = [numbers(frames) for frames in (*by_part.values(), *windows.values())]
     assert sum(map(len, several)) == len(set.union(*several)) == 80
     # two thirds stay, the others are shared alike
@@ -62,21 +56,21 @@ def test_where_prints_suffice_windows_are_of_none_that_the_classifier_has():
 
 @pytest.mark.parametrize("given", [folder(20), folder(2), folder(60, frames=WINDOW - 1)])
 def test_where_they_do_not_the_classifier_keeps_all_and_it_is_said(given):
-    given |= {part: prints(100 + 20 * k, 4) for k, part in enumerate(PARTS[1:])}
-    by_part, windows, apart = parts.with_windows(settings(), given)
+    given |= {part: prints(100 + 20 * k, 4) for k, part in enumerate(FRAME_PARTS[1:])}
+    by_part, windows, apart = split_windows(given)
     assert not apart and by_part is given
     assert [windows[part] is given[of] for part, of in zip(
         WINDOW_PARTS, ("calibration", "held_out", "judged"), strict=True)] == [True] * 3  # fmt: skip
 
 
-@pytest.mark.parametrize("part", PARTS[1:])
+@pytest.mark.parametrize("part", FRAME_PARTS[1:])
 def test_a_part_without_a_window_is_refused_in_one_sentence(part):
     given = folder(4)
     given[part] = prints(200, 4, frames=WINDOW - 1)
     with pytest.raises(
         ValueError, match=f"expected 4 frames in a row at one class .* for {part}, found none"
     ):
-        parts.with_windows(settings(), given)
+        split_windows(given)
     given[part] = prints(200, 4)._replace(valid=np.zeros(12 * WINDOW, bool))
     with pytest.raises(ValueError, match=f"for {part}, found none in 48; record longer stretches"):
-        parts.with_windows(settings(), given)
+        split_windows(given)

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from pipeline.setpoint import settings
 from pipeline.setpoint.deployment import deployment, pixels
-from pipeline.setpoint.deployment.pixels import Loop, Machine, at_rest, calm, run, tick
+from pipeline.setpoint.deployment.pixels import MachineDynamics, PixelLoop, at_rest, calm, run, tick
 from pipeline.setpoint.frames import familiar
 from pipeline.setpoint.simulation import actuation
-from pipeline.setpoint.simulation.actuation import ACTS, Limits, Waits
-from pipeline.setpoint.simulation.simulator import Action, Controller
-from pipeline.setpoint.workflow import camera_files, known_camera, settings
+from pipeline.setpoint.simulation.actuation import ACTS, SetpointLimits, Waits
+from pipeline.setpoint.simulation.simulator import Action, SetpointController
 from pipeline.store import params
+from stages.render_frames import RenderFrames, render_camera
 from tests.setpoint.step_response import settling_s, step_response
 
-MACHINE = Machine(heater_s=15.0, heater_delay_s=2.0, melt_s=1.2, softening_per_degC=0.02)
-LIMITS = Limits(
+MACHINE = MachineDynamics(heater_s=15.0, heater_delay_s=2.0, melt_s=1.2, softening_per_degC=0.02)
+LIMITS = SetpointLimits(
     np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([120.0, 40.0])
 )
 JUDGE = functools.partial(
@@ -98,7 +99,7 @@ def _classify(images, temperature):
     return np.stack([under, np.clip(1 - under - over, 0, 1), over], axis=1), np.where(width > 0, 0.0, 9.0)
 
 
-LOOP = Loop(
+LOOP = PixelLoop(
     machine=MACHINE,
     classify=_classify,
     frames=8,
@@ -141,8 +142,8 @@ def _filtered(parameters, memory, observation, key):
     return memory, Action(2 + size * jnp.sign(memory).astype(int), 2 + towards)
 
 
-FILTERED = Controller(lambda: jnp.zeros(()), _filtered)
-BANG = Controller(
+FILTERED = SetpointController(lambda: jnp.zeros(()), _filtered)
+BANG = SetpointController(
     lambda: jnp.zeros(()),
     lambda parameters, memory, observation, key: (memory + 1, Action(jnp.int32(4), jnp.int32(4))),
 )
@@ -268,16 +269,15 @@ def test_a_camera_that_moved_is_held_for_that_and_one_that_shook_a_little_is_not
 @pytest.fixture(scope="module")
 def camera():
     """That of rendered segments, seen in one window each."""
-    settings_of = params.load(settings.RenderFrames, "render_frames")
-    return known_camera.drawn(
-        settings_of.model_copy(update={"camera_segments": 240}), params.load(params.Execution, "execution")
-    )
+    declared = params.load(RenderFrames, "render_frames").model_copy(update={"camera_segments": 240})
+    measures = render_camera(declared, params.load(params.Execution, "execution"))
+    return familiar.fit_camera(measures, np.arange(240), false_alarms=familiar.FALSE_ALARMS)
 
 
 def test_pictures_of_another_kind_are_held_and_those_of_the_known_camera_are_not(camera):
     """Two windows as they are rendered, then two through a lens so far out of focus as none of the segments;
     where no camera is known, those are acted on."""
-    foreign = functools.partial(familiar.foreign, camera, false_alarms=camera_files.FALSE_ALARMS)
+    foreign = functools.partial(familiar.foreign, camera, false_alarms=familiar.FALSE_ALARMS)
     loop = CALM_LIGHT._replace(foreign=foreign)
     blurred = calm(6)._replace(blur_px=np.full(6, 6.0), burst_at=np.full(6, 2), burst_for=np.full(6, 2))
     got = run(FILTERED, None, SIX, loop, blurred, decisions=4, rng=np.random.default_rng(3))

@@ -7,14 +7,14 @@ from functools import partial
 import numpy as np
 import pytest
 
+from pipeline.commands import record_levels
+from pipeline.commands.levels_files import restore_levels
+from pipeline.commands.record_levels import Eye, Protocol
+from pipeline.commands.shadow.decide import Mind
+from pipeline.commands.shadow.deploy import of_camera
+from pipeline.reading.watch_sources import CameraFrame, Folder
 from pipeline.setpoint import levels
-from pipeline.setpoint.material import Material
-from pipeline.setpoint.workflow import record_levels
-from pipeline.setpoint.workflow.levels_files import restore_levels
-from pipeline.setpoint.workflow.record_levels import Eye, Protocol
-from pipeline.setpoint.workflow.shadow.decide import Mind
-from pipeline.setpoint.workflow.shadow.deploy import of_camera
-from pipeline.setpoint.workflow.watch_sources import Folder, Shown
+from pipeline.setpoint.material import PrintedMaterial
 from tests.setpoint.test_shadow import ASKED, FRAMES, TIP, by_width, deployed, fill, picture
 
 FLOWS, HOLD, RATE = (60.0, 80.0, 100.0, 125.0, 160.0), 6.0, 10
@@ -27,14 +27,14 @@ def half_width(flow: float) -> float:
     return 6.6 * (flow / 100) ** 0.8
 
 
-def film(seed: int, flows=FLOWS, told: bool = False, see=half_width) -> list[Shown]:
+def film(seed: int, flows=FLOWS, told: bool = False, see=half_width) -> list[CameraFrame]:
     rng = np.random.default_rng(seed)
     frames = []
     for k, flow in enumerate(flows):
         for i in range(int(HOLD * RATE)):
             shown = picture(1000 * seed + len(frames), see(flow) * np.exp(0.04 * rng.standard_normal()))
             time_s = k * HOLD + i / RATE
-            frames.append(Shown(str(len(frames)), time_s, shown, flow if told else np.nan))
+            frames.append(CameraFrame(str(len(frames)), time_s, shown, flow if told else np.nan))
     return frames
 
 
@@ -43,7 +43,7 @@ class Given:
 
     waits_for, lacks, ended, rest_s = "", "a picture", True, 0.0
 
-    def __init__(self, frames: list[Shown]):
+    def __init__(self, frames: list[CameraFrame]):
         self.left = frames
 
     def frames(self):
@@ -91,7 +91,7 @@ def test_a_folder_of_pictures_is_a_recording(tmp_path, recorded):
 def test_levels_of_another_material_are_kept_as_what_they_stand_for(tmp_path, recorded):
     """Held at other flows that stand for the same ones of the published material, the same pictures give the
     same correction; what a person is told is of what was printed."""
-    other = Material(250.0, (220.0, 280.0), (85.0, 120.0), (20.0, 310.0))
+    other = PrintedMaterial(250.0, (220.0, 280.0), (85.0, 120.0), (20.0, 310.0))
     flows = tuple(float(other.own_flow(np.array(flow))) for flow in FLOWS)
     degrees = []
 
@@ -126,7 +126,9 @@ def test_levels_go_to_a_file_and_back_and_not_to_another_classifier(recorded, tm
 
 def test_the_watch_corrects_what_it_sees_and_says_so(recorded):
     """The same window of a bead at 100 %: without levels it is over, with them good."""
-    window = [Shown(str(k), k / RATE, picture(9000 + k, half_width(100.0) * 1.05)) for k in range(FRAMES)]
+    window = [
+        CameraFrame(str(k), k / RATE, picture(9000 + k, half_width(100.0) * 1.05)) for k in range(FRAMES)
+    ]
     plain = Mind(deployed()).decide(window, ASKED, 0.0, [])
     corrected = partial(of_camera, deployed().window_flow, recorded[0].levels)
     with_levels = Mind(deployed(window_flow=corrected)).decide(window, ASKED, 0.0, [])

@@ -12,35 +12,38 @@ import numpy as np
 import pytest
 import yaml
 
+from pipeline.setpoint.agents.files import AGENTS_SCHEMA, Agents, restore_agents, store_agents
+from pipeline.setpoint.frames import files as camera_files
 from pipeline.setpoint.frames import nozzle_scene
-from pipeline.setpoint.simulation.recorded import WindowTable
-from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, classify
-from pipeline.setpoint.vision.calibration import Calibration, Familiar
-from pipeline.setpoint.vision.vision_transformer import SMALL as SMALL_SIZE
-from pipeline.setpoint.vision.vision_transformer import named_arrays, vision_transformer
-from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
-from pipeline.setpoint.workflow import camera_files, parts, render_frames, train_agent, train_classifier
-from pipeline.setpoint.workflow.agent_files import AGENTS_SCHEMA, Agents, restore_agents, store_agents
-from pipeline.setpoint.workflow.classifier_files import (
-    CLASSIFIER_SCHEMA,
-    restore_classifier,
-    store_classifier,
-)
-from pipeline.setpoint.workflow.settings import TrainAgent, TrainClassifier
-from pipeline.setpoint.workflow.tables import (
+from pipeline.setpoint.frames.files import restore_frames
+from pipeline.setpoint.frames.rendered import flow_edges, standing_out
+from pipeline.setpoint.material import PLA
+from pipeline.setpoint.settings import TrainClassifier
+from pipeline.setpoint.simulation.recorded import WindowTable, window_rows, window_tables
+from pipeline.setpoint.tables import (
     AGENT_CURVE,
     CLASSIFIED,
     CLASSIFIER_CURVE,
     DECISIONS,
+    FRAME_PARTS,
     PATHS,
     RELIABILITY,
     SCOREBOARD,
+    WINDOW_PARTS,
     WINDOWS,
 )
-from pipeline.setpoint.workflow.windows import WINDOW_PARTS, edges, window_rows, window_tables
+from pipeline.setpoint.vision import files
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, classify
+from pipeline.setpoint.vision.calibration import ClassifierCalibration, Familiar
+from pipeline.setpoint.vision.files import CLASSIFIER_SCHEMA, restore_classifier, store_classifier
+from pipeline.setpoint.vision.vision_transformer import SMALL as SMALL_SIZE
+from pipeline.setpoint.vision.vision_transformer import named_arrays, vision_transformer
+from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.store import artifacts, params
 from pipeline.store.artifacts import read_weights, write_weights
 from pipeline.store.params import Execution
+from stages import train_agent, train_classifier
+from stages.train_agent import TrainAgent
 from tests.nozzle_folders import SHOTS, folder, rows, table
 from tests.setpoint.synthetic import synthetic_table
 
@@ -123,11 +126,11 @@ def stored(project) -> Path:
     """A project with a classifier that has learned nothing, and made-up windows; to be spoiled."""
     knots = np.log(np.array(KNOTS_PERCENT) / 100)
     flow = FlowCalibration(knots, np.ones(len(knots)), 0.5)
-    known = Calibration(1.0, 0.1, 0.2, Familiar(np.zeros((3, 4)), np.eye(4)), 9.0, flow)
+    known = ClassifierCalibration(1.0, 0.1, 0.2, Familiar(np.zeros((3, 4)), np.eye(4)), 9.0, flow)
     out = project / "datasets/train_classifier"
     store_classifier(
         out,
-        params.load(TrainClassifier, "train_classifier"),
+        params.load(TrainClassifier, "train_classifier").size,
         CalibratedClassifier(vision_transformer(SMALL_SIZE, np.random.default_rng(0)), known),
     )
     tables = {part: synthetic_table(np.random.default_rng(1), segments=1, windows=2) for part in WINDOW_PARTS}
@@ -177,7 +180,7 @@ def check_classifier(source: str) -> dict:
     expected |= {f"frames/{row['file']}" for row in frames}
     # real frames stand by what became of them; these folders are too small to know a camera by
     assert all(("group" in row) == (source == "recordings") for row in frames)
-    expected |= {camera_files.FILE} if source == "simulated" else set()
+    expected |= {camera_files.CAMERA_FILE} if source == "simulated" else set()
     courses = {f"{figure}.tsv" for figure in ("training_loss", "held_out_loss", "held_out_accuracy")}
     expected |= {
         f"live/plots/metrics/{learner}/{name}"
@@ -208,9 +211,8 @@ def test_on_rendered_frames_every_artifact_is_written_with_its_schema(simulated,
     assert course["epoch"].tolist() == [1, 2] * 2
 
 
-def _parts(settings: TrainClassifier) -> parts.Parts:
-    execution = params.load(Execution, "execution")
-    return parts.parts(settings, "datasets/render_frames", "datasets/raw/setpoint", execution)
+def _parts(settings: TrainClassifier) -> tuple:
+    return train_classifier.load_parts(settings, params.load(Execution, "execution"), PLA)
 
 
 def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(
@@ -218,7 +220,7 @@ def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(
 ):
     p, write, epochs = params.load(TrainClassifier, "train_classifier"), write_weights, []
     shutil.copytree(simulated / "datasets/render_frames", "datasets/render_frames")
-    found = _parts(p).frames
+    found = _parts(p)[0]
 
     def killing(path, name, arrays, about):
         write(path, name, arrays, about)
@@ -226,20 +228,21 @@ def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(
         if len(epochs) == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(train_classifier, "write_weights", killing)
+    monkeypatch.setattr(files, "write_weights", killing)
     with pytest.raises(KeyboardInterrupt):
-        train_classifier.trained(p, found)
-    once = train_classifier.trained(p, found)
+        train_classifier.train(p, found)
+    once = train_classifier.train(p, found)
     assert sorted(epochs) == [1, 1, 2, 2], (
         "each epoch of both networks, which learn at once, was learned once"
     )
     # a damaged checkpoint is begun anew
     for path in Path("datasets/memo/train_classifier").glob("*.safetensors"):
         path.write_bytes(path.read_bytes()[:1000])
-    twice = train_classifier.trained(p, found)
+    twice = train_classifier.train(p, found)
     assert sorted(epochs) == [1, 1, 1, 1, 2, 2, 2, 2]
     whole, _ = read_weights(simulated / "datasets/train_classifier/weights.safetensors", CLASSIFIER_SCHEMA)
-    for arrays in (named_arrays(once.network), named_arrays(twice.network)):
+    for curves in (once, twice):
+        arrays = named_arrays(curves[train_classifier.TRANSFORMER].best)
         assert arrays.keys() == whole.keys()
         for name, values in whole.items():
             np.testing.assert_array_equal(arrays[name], values, err_msg=name)
@@ -250,14 +253,14 @@ def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(
 
 def test_rendered_parts_share_no_segment_and_every_bin_has_a_window_in_every_part(simulated, monkeypatch):
     monkeypatch.chdir(simulated)
-    found = render_frames.restore_frames(Path("datasets/render_frames"))
-    assert tuple(found) == (*render_frames.PARTS, *WINDOW_PARTS)
+    found = restore_frames(Path("datasets/render_frames"), (*FRAME_PARTS, *WINDOW_PARTS))
     segments = [set(frames.segment.tolist()) for frames in found.values()]
     assert sum(map(len, segments)) == len(set.union(*segments)) == 15 * (3 + 1 + 2 + 2) + 3
     for part, frames in found.items():
         assert len(frames.valid) == len(frames.images) == len(frames.score), part
         np.testing.assert_array_equal(frames.label, nozzle_scene.label(frames.flow))
-    tables = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
+    table = artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS)
+    tables = window_tables(table, WINDOW_PARTS)
     bins = len(tables["judge"].flow_edges) - 1
     for part, recorded in tables.items():
         assert set(recorded.flow_bin.tolist()) == set(range(bins)), part
@@ -277,9 +280,9 @@ def test_rendering_again_gives_the_same_bytes_whatever_the_workers(simulated, pr
 
 
 def test_how_far_a_line_must_stand_out_is_decided_after_rendering(simulated):
-    frames = render_frames.restore_frames(simulated / "datasets/render_frames")["judged"]
+    frames = restore_frames(simulated / "datasets/render_frames", ["judged"])["judged"]
     assert (frames.score[frames.valid] < 10).any()
-    strict = render_frames.standing_out(frames, 10.0)
+    strict = standing_out(frames, 10.0)
     np.testing.assert_array_equal(strict.valid, frames.valid & (frames.score >= 10))
     assert not strict.images[~strict.valid].any()
     assert all(reason.startswith("no fresh line: ") for reason in strict.reasons[~strict.valid])
@@ -311,7 +314,7 @@ def test_the_calibrated_classifier_survives_being_stored(simulated, project):
         for name in ("weights.safetensors", "calibration.parquet")
     ]
     found = restore_classifier(*names)
-    store_classifier(Path("again"), params.load(TrainClassifier, "train_classifier"), found)
+    store_classifier(Path("again"), params.load(TrainClassifier, "train_classifier").size, found)
     for name in names:
         assert Path("again", Path(name).name).read_bytes() == Path(name).read_bytes()
     images = np.random.default_rng(1).integers(0, 256, (5, 16, 48), np.uint8)
@@ -330,12 +333,12 @@ def test_window_tables_survive_being_written(simulated, tmp_path):
         for k, part in enumerate(WINDOW_PARTS)
     }
     artifacts.write_table(tmp_path / "windows.parquet", WINDOWS, window_rows(made))
-    found = window_tables(artifacts.read_table(tmp_path / "windows.parquet", WINDOWS))
+    found = window_tables(artifacts.read_table(tmp_path / "windows.parquet", WINDOWS), WINDOW_PARTS)
     for part, one in made.items():
         for name, a, b in zip(WindowTable._fields, one, found[part], strict=True):
             np.testing.assert_array_equal(a, b, err_msg=name)
     columns = artifacts.read_table(simulated / "datasets/train_classifier/windows.parquet", WINDOWS)
-    again = window_rows(window_tables(columns))
+    again = window_rows(window_tables(columns, WINDOW_PARTS))
     for name, values in columns.items():
         np.testing.assert_array_equal(again[name], values, err_msg=name)
 
@@ -344,10 +347,11 @@ def test_bins_of_the_flow_by_hand():
     # no bin without a window in any set: [20, 30) .. [60, 70) are one, 100 and 105
     # are two, and what lies above the last stays with it
     np.testing.assert_array_equal(
-        edges([np.array([60.0, 100.0, 106.0]), np.array([25.0, 101.0, 140.0])]), [20.0, 70.0, 102.5, 310.0]
+        flow_edges([np.array([60.0, 100.0, 106.0]), np.array([25.0, 101.0, 140.0])]),
+        [20.0, 70.0, 102.5, 310.0],
     )
     # one set has nothing above the other's: one bin
-    np.testing.assert_array_equal(edges([np.array([15.0]), np.array([320.0])]), [15.0, 320.0])
+    np.testing.assert_array_equal(flow_edges([np.array([15.0]), np.array([320.0])]), [15.0, 320.0])
 
 
 def test_agents_survive_being_stored(project, tmp_path):
@@ -357,7 +361,9 @@ def test_agents_survive_being_stored(project, tmp_path):
     from pipeline.setpoint.agents.belief_agent import BeliefNetwork
 
     settings = params.load(TrainAgent, "train_agent").belief_dqn
-    belief = train_agent.belief(settings, synthetic_table(np.random.default_rng(0), segments=3, windows=2))
+    belief = train_agent.filter_belief(
+        settings, synthetic_table(np.random.default_rng(0), segments=3, windows=2)
+    )
     keys = jax.random.split(jax.random.key(3), 5)
     networks = tuple(QNetwork(key) for key in keys[:4])
     on_belief = BeliefNetwork(belief.filter.evidence.shape[0], keys[4])
@@ -448,7 +454,7 @@ def test_on_a_user_s_folder_every_artifact_is_written_and_no_print_is_in_two_par
     assert figures["data"]["windows_apart"] is False
     assert figures["data"]["window_prints"] == {"learn": 3, "choose": 2, "judge": 3}
     p = params.load(TrainClassifier, "train_classifier")
-    found = _parts(p).frames
+    found = _parts(p)[0]
     prints = [set(part.print_number.tolist()) for part in found.values()]
     assert sum(map(len, prints)) == len(set.union(*prints)) == PRINTS
     for path in Path("datasets/memo").rglob("*.safetensors"):

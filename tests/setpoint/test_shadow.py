@@ -20,16 +20,18 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from pipeline.commands import shadow
+from pipeline.commands.shadow import decision_log
+from pipeline.commands.shadow.decide import DeployedLoop, WatchOptions
+from pipeline.commands.shadow.windows import FrameWindows
+from pipeline.reading import watch_sources
+from pipeline.reading.watch_sources import CameraFrame, Folder, RecordingSource
 from pipeline.setpoint.agents import bayes
 from pipeline.setpoint.deployment import deployment
-from pipeline.setpoint.material import PLA, Material
+from pipeline.setpoint.material import PLA, PrintedMaterial
 from pipeline.setpoint.simulation import actuation
 from pipeline.setpoint.vision.calibrated_classifier import FrameReadings
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration, window_flow
-from pipeline.setpoint.workflow import decision_log, shadow, watch_sources
-from pipeline.setpoint.workflow.shadow.decide import Asked, Deployed
-from pipeline.setpoint.workflow.shadow.windows import Windows
-from pipeline.setpoint.workflow.watch_sources import Folder, Recording, Shown
 from pipeline.store import artifacts
 from tests.nozzle_folders import ANY
 
@@ -57,9 +59,9 @@ def by_width(images: np.ndarray, temperature: np.ndarray) -> FrameReadings:
     return FrameReadings(prob, np.zeros(len(rows)), log_flow, np.full(len(rows), 0.08))
 
 
-def deployed(**changes) -> Deployed:
+def deployed(**changes) -> DeployedLoop:
     parameters = bayes.class_filter(accuracy=0.8, hazard=0.02, move_cost=0.2, outside_cost=2.0)
-    limits = actuation.Limits(
+    limits = actuation.SetpointLimits(
         np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([40.0, 40.0])
     )
 
@@ -69,7 +71,7 @@ def deployed(**changes) -> Deployed:
         )
 
     knots = np.log(np.array(KNOTS_PERCENT) / 100)
-    made = Deployed(
+    made = DeployedLoop(
         read=by_width,
         window_flow=partial(window_flow, fitted=FlowCalibration(knots, np.ones(len(knots)), 0.5)),
         known=None,
@@ -86,7 +88,7 @@ def deployed(**changes) -> Deployed:
     return made._replace(**changes)
 
 
-ASKED = Asked(flow=100.0, temperature=210.0, tip=TIP, once=True)
+ASKED = WatchOptions(flow=100.0, temperature=210.0, tip=TIP, once=True)
 
 
 def fill(folder: Path, pictures, *, period_s: float = 0.05, begin: int = 0) -> None:
@@ -105,7 +107,9 @@ def rows(out: Path) -> list[dict]:
     return found
 
 
-def watch(source, out: Path, *, asked: Asked = ASKED, deployed_as: Deployed | None = None, stopped=None):
+def watch(
+    source, out: Path, *, asked: WatchOptions = ASKED, deployed_as: DeployedLoop | None = None, stopped=None
+):
     late = time.monotonic() + 300
     return shadow.watch(
         source, deployed_as or deployed(), asked, out, place="the camera",
@@ -175,7 +179,7 @@ def test_the_controller_is_told_what_the_print_did_and_never_more(tmp_path):
         jax.debug.callback(lambda move: heard.append(float(move)), observation.flow_move)
         return inner.act(parameters, memory, observation, key)
 
-    frames = [Shown(str(k), k * 0.1, picture(k), 80.0 if k < 20 else 95.0) for k in range(60)]
+    frames = [CameraFrame(str(k), k * 0.1, picture(k), 80.0 if k < 20 else 95.0) for k in range(60)]
 
     class Given:
         waits_for, lacks, ended, rest_s = "", "a picture", True, 0.0
@@ -202,7 +206,7 @@ def test_a_move_is_cut_to_the_limits(tmp_path):
 
 
 # twice as thick a line is good, and a hotter nozzle
-OTHER = Material(250.0, (220.0, 280.0), (85.0, 120.0), (20.0, 310.0))
+OTHER = PrintedMaterial(250.0, (220.0, 280.0), (85.0, 120.0), (20.0, 310.0))
 
 
 def test_another_material_is_seen_and_answered_as_what_it_stands_for(tmp_path):
@@ -245,7 +249,7 @@ def test_the_published_material_is_itself():
 def test_once_ends_where_a_camera_has_shown_a_window_and_where_nothing_is_there(tmp_path, monkeypatch):
     class Camera(watch_sources.Snapshots):
         def frames(self):
-            yield Shown("snapshot", 0.1 * (self.count + 1), picture(self.count))
+            yield CameraFrame("snapshot", 0.1 * (self.count + 1), picture(self.count))
             self.count += 1
 
     assert watch(Camera("http://127.0.0.1:9/", 100.0), tmp_path / "a").decisions == 1
@@ -280,7 +284,7 @@ def test_where_there_was_no_window_it_says_why(tmp_path, monkeypatch):
                 writer.add_message(writer.register_channel(name, "json", schema), 1, b"{}", 1)
             writer.finish()
         assert f"0 frames, no window of them: it lacks a topic with images; it holds {topics};" in said(
-            Recording(path, ANY)
+            RecordingSource(path, ANY)
         )
 
 
@@ -297,12 +301,12 @@ def test_a_decision_that_changes_nothing_is_told_apart_from_one_that_is_held(tmp
 # ---- which frames make a window
 
 
-def shown(*times: float) -> list[Shown]:
-    return [Shown(f"at {t:g}", t, "no picture") for t in times]
+def shown(*times: float) -> list[CameraFrame]:
+    return [CameraFrame(f"at {t:g}", t, "no picture") for t in times]
 
 
-def windows_of(frames: list[Shown], length: int = 4) -> tuple[list[list[float]], list[str]]:
-    windows = Windows(length, settle_s=6.0)
+def windows_of(frames: list[CameraFrame], length: int = 4) -> tuple[list[list[float]], list[str]]:
+    windows = FrameWindows(length, settle_s=6.0)
     full = [[one.time_s for one in window] for frame in frames if (window := windows.add(frame))]
     return full, windows.taken_notes()
 
@@ -327,7 +331,7 @@ def test_a_frame_that_is_late_is_left_out_and_a_clock_set_back_is_followed():
 def test_ten_thousand_notes_are_told_in_few():
     notes = windows_of(shown(5.0, *([4.0, 4.0, 5.0] * 3000)))[1]
     assert len(notes) == 21 and "notes before these" in notes[0]
-    windows = Windows(4, settle_s=6.0)
+    windows = FrameWindows(4, settle_s=6.0)
     windows.notes = [""] * 21
     assert windows.taken_notes()[0] == "1 note before these"
 
@@ -437,8 +441,8 @@ def test_a_full_disk_costs_no_decision(tmp_path, monkeypatch, capsys):
 DRIVER = """
     import sys, time
     from pathlib import Path
-    from pipeline.setpoint.workflow import shadow
-    from pipeline.setpoint.workflow.watch_sources import source
+    from pipeline.commands import shadow
+    from pipeline.reading.watch_sources import source
     from tests.nozzle_folders import ANY
     from tests.setpoint.test_shadow import ASKED, deployed
     with shadow.until_told() as stopped:
@@ -507,7 +511,7 @@ def test_a_recording_is_watched_while_another_process_writes_it(tmp_path):
             Path(f"{path}.go").touch()
         return time.monotonic() > late
 
-    watched = watch(Recording(path, ANY), out, stopped=stopped)
+    watched = watch(RecordingSource(path, ANY), out, stopped=stopped)
     process.wait(timeout=300)
     assert before_the_footer and before_the_footer[0] != b"\x89MCAP0\r\n"
     assert (watched.frames, watched.decisions) == (60, 60 // FRAMES)
@@ -553,7 +557,7 @@ def test_the_nozzle_video_is_watched_at_the_rate_of_its_camera(tmp_path):
     out = tmp_path / "out"
     watched = watch(
         Folder(tmp_path / "in"), out, deployed_as=deployed(read=rule, window=20),
-        asked=Asked(100.0, 210.0, (299.0, 188.0), once=False),
+        asked=WatchOptions(100.0, 210.0, (299.0, 188.0), once=False),
         stopped=lambda: len(there) == 5 or time.monotonic() > late,
     )  # fmt: skip
     process.wait(timeout=300)
@@ -566,11 +570,9 @@ def test_the_nozzle_video_is_watched_at_the_rate_of_its_camera(tmp_path):
 def test_nothing_in_the_watch_could_send():
     """The modules of the watch import nothing that opens a connection, a port or a process; the one that
     reads snapshots names no method and no body."""
-    folder = ROOT / "pipeline/setpoint/workflow"
     files = [
-        *sorted((folder / "shadow").glob("*.py")),
-        folder / "decision_log.py",
-        folder / "watch_sources.py",
+        *sorted((ROOT / "pipeline/commands/shadow").glob("*.py")),
+        ROOT / "pipeline/reading/watch_sources.py",
     ]
     for path in files:
         tree = ast.parse(path.read_text())

@@ -14,8 +14,8 @@ from pipeline.setpoint.simulation.simulator import (
     FLOW_MOVES,
     TEMPERATURE_MOVES,
     Action,
-    Controller,
     Observation,
+    SetpointController,
     begin,
     first_history,
     flow_class,
@@ -32,13 +32,13 @@ from tests.setpoint.synthetic import synthetic_flow_table, synthetic_table
 STEPS, N = 30, 2000  # one shape, so that everything runs in one compiled program
 
 
-def scripted() -> Controller:
+def scripted() -> SetpointController:
     """Moves that its parameters (T, 2) say, whatever it sees; its memory counts."""
 
     def act(moves, t, observation, key):
         return t + 1, Action(moves[t, 0], moves[t, 1])
 
-    return Controller(lambda: jnp.zeros((), jnp.int32), act)
+    return SetpointController(lambda: jnp.zeros((), jnp.int32), act)
 
 
 SCRIPTED = scripted()
@@ -383,7 +383,7 @@ def test_nothing_is_sent_and_no_clock_runs_while_the_camera_is_blind():
             jnp.where((observation.step == 4) | (observation.step == 5), 4, 2), jnp.int32(2)
         )
 
-    watcher = Controller(lambda: (), act)
+    watcher = SetpointController(lambda: (), act)
     conditions = machine(100.0, 210.0, blind_from=5, blind_for=4)
     run = jax.tree.map(
         np.asarray, rollout(watcher, (), paper_windows(), conditions, jax.random.key(0), steps=STEPS)

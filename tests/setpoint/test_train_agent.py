@@ -5,19 +5,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pipeline.setpoint.agents import agent
-from pipeline.setpoint.agents.agent import Published, QNetwork
+from pipeline.setpoint.agents import agent, claims
+from pipeline.setpoint.agents.agent import PublishedAgent, QNetwork
 from pipeline.setpoint.simulation.simulator import (
     Action,
-    Controller,
+    SetpointController,
     Trajectory,
     nominal,
     paper_windows,
     rollout,
 )
-from pipeline.setpoint.workflow import train_agent
-from pipeline.setpoint.workflow.settings import TrainAgent
 from pipeline.store import params
+from stages import train_agent
+from stages.train_agent import TrainAgent
 
 
 @pytest.fixture
@@ -38,10 +38,10 @@ def test_history_and_lambda_are_swept(settings):
     assert [network.vision.in_features for network in trained.networks] == [7 + 3] * 4
     assert {agent.history_of(network) for network in trained.networks} == {7}
     conditions = nominal(np.full(2, 100.0), 190.0, accuracy=1.0)._replace(flow_actions=jnp.full(2, 4.0))
-    up = Controller(lambda: (), lambda p, m, o, key: (m, Action(jnp.int32(2), jnp.int32(3))))
+    up = SetpointController(lambda: (), lambda p, m, o, key: (m, Action(jnp.int32(2), jnp.int32(3))))
     path = rollout(up, (), paper_windows(), conditions, jax.random.key(0), steps=10)
     np.testing.assert_array_equal(np.flatnonzero(np.diff(path.target[0])), [0, 4, 8])
-    told = train_agent.claims(swept, trained.networks)
+    told = train_agent.paper_claims(swept, trained.networks)
     assert told["300 %, 230 °C"]["printed"] == {"rests_at": 95.0, "least": 75.0, "most": 130.0}
     assert all(np.isfinite(claim["measured"]["rests_at"]) for claim in told.values())
 
@@ -52,7 +52,7 @@ def test_the_published_agent_is_trained_once_for_all_windows(settings, tmp_path,
     def train(key, how, *, on_step):
         calls.append(how)
         network = QNetwork(key, how.history)
-        return Published((network,) * 4, (jnp.arange(5.0),) * 4)
+        return PublishedAgent((network,) * 4, (jnp.arange(5.0),) * 4)
 
     monkeypatch.setattr(agent, "train_published", train)
     first = train_agent.published_agent(settings, tmp_path, print)
@@ -64,7 +64,7 @@ def test_the_published_agent_is_trained_once_for_all_windows(settings, tmp_path,
     train_agent.published_agent(of(settings, history=9), tmp_path, print)
     train_agent.published_agent(settings.model_copy(update={"seed": 5}), tmp_path, print)
     assert len(calls) == 3
-    monkeypatch.setattr(train_agent, "PUBLISHED_CODE", ("agent.py",))
+    monkeypatch.setattr(train_agent, "PUBLISHED_CODE", ("agents/agent.py",))
     train_agent.published_agent(settings, tmp_path, print)
     assert len(calls) == 4
     for path in tmp_path.glob("*.safetensors"):
@@ -78,18 +78,21 @@ def test_a_start_is_told_as_the_paper_tells_it(settings, monkeypatch):
     """By hand: one run crosses 100 %, falls to 75, rises to 130 and rests at 95; it is cold for a while."""
     q = np.array([300, 200, 105, 75, 130, 95, 95, 95, 95, 95, 95.0])
     u = np.array([230, 220, 210, 200, 200, 205, 210, 210, 210, 210, 210.0])
+    started = []
 
     def path(controller, network, windows, conditions, key, *, steps):
-        assert (conditions.flow == 300).all() and (conditions.accuracy == jnp.float32(0.7)).all()
+        started.append((float(conditions.flow[0]), float(conditions.accuracy[0])))
         empty = [None] * (len(Trajectory._fields) - 2)
         return Trajectory(np.tile(q, (100, 1)), np.tile(u, (100, 1)), *empty)
 
-    monkeypatch.setattr(train_agent, "rollout", path)
-    monkeypatch.setattr(train_agent, "RESTING", 4)
-    told = train_agent._single_start(settings, QNetwork(jax.random.key(0)), 300.0, 230.0, 0.7)
+    monkeypatch.setattr(claims, "rollout", path)
+    monkeypatch.setattr(claims, "RESTING", 4)
+    networks = [QNetwork(jax.random.key(0))] * 4
+    told = train_agent.paper_claims(settings, networks)["300 %, 230 °C"]["measured"]
     assert told == {"rests_at": 95, "least": 75, "most": 130, "flow_range": 0, "temperature_range": 5}
+    assert started[0] == (300.0, pytest.approx(0.7))
     q[2:] = 200
-    assert train_agent._single_start(settings, QNetwork(jax.random.key(0)), 300.0, 230.0, 0.7)["most"] is None
+    assert train_agent.paper_claims(settings, networks)["300 %, 230 °C"]["measured"]["most"] is None
 
 
 def test_what_the_paper_does_not_print_is_named(settings):

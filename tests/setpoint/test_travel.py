@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.setpoint.frames import key_area, nozzle_scene, travel
-from pipeline.setpoint.workflow.frame_images import find_key_areas
+from pipeline.setpoint.frames.front_end import find_key_areas
 
 N = 12
 

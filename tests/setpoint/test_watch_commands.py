@@ -13,23 +13,24 @@ import pytest
 from mcap.reader import make_reader
 
 from pipeline import cli
+from pipeline.commands.levels_files import LEVELS_FILE, RecordedLevels, store_levels
 from pipeline.setpoint.agents.agent import QNetwork
 from pipeline.setpoint.agents.belief_agent import BeliefNetwork
+from pipeline.setpoint.agents.files import Agents, store_agents
+from pipeline.setpoint.frames.files import CAMERA_FILE, store_camera
 from pipeline.setpoint.levels import Levels, LevelWindows
+from pipeline.setpoint.settings import TrainClassifier
+from pipeline.setpoint.simulation.recorded import window_rows
+from pipeline.setpoint.tables import WINDOW_PARTS, WINDOWS
 from pipeline.setpoint.vision import calibration
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
-from pipeline.setpoint.vision.calibration import Calibration, Familiar
+from pipeline.setpoint.vision.calibration import ClassifierCalibration, Familiar
+from pipeline.setpoint.vision.files import store_classifier
 from pipeline.setpoint.vision.vision_transformer import SMALL, vision_transformer
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
-from pipeline.setpoint.workflow import train_agent
-from pipeline.setpoint.workflow.agent_files import Agents, store_agents
-from pipeline.setpoint.workflow.camera_files import FILE, store_camera
-from pipeline.setpoint.workflow.classifier_files import store_classifier
-from pipeline.setpoint.workflow.levels_files import LEVELS_FILE, RecordedLevels, store_levels
-from pipeline.setpoint.workflow.settings import TrainAgent, TrainClassifier
-from pipeline.setpoint.workflow.tables import WINDOWS
-from pipeline.setpoint.workflow.windows import WINDOW_PARTS, window_rows
 from pipeline.store import artifacts, params
+from stages import train_agent
+from stages.train_agent import TrainAgent
 from tests.setpoint.synthetic import synthetic_flow_table
 from tests.setpoint.test_shadow import TIP, picture
 
@@ -78,14 +79,14 @@ def make() -> None:
     bands = calibration.appearance(np.zeros((1, 16, 48), np.uint8)).shape[1]
     features = network.head.classes.W.shape[0] + bands
     knots = np.log(np.array(KNOTS_PERCENT) / 100)
-    known = Calibration(
+    known = ClassifierCalibration(
         1.0, 0.1, 0.2, Familiar(np.zeros((3, features)), np.eye(features)), 1e9,
         FlowCalibration(knots, np.ones(len(knots)), 0.5),
     )  # fmt: skip
     store_classifier(
         folder, params.load(TrainClassifier, "train_classifier"), CalibratedClassifier(network, known)
     )
-    store_camera(folder / FILE, None)
+    store_camera(folder / CAMERA_FILE, None)
     tables = {
         part: synthetic_flow_table(np.random.default_rng(1), segments=80, windows=3) for part in WINDOW_PARTS
     }

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.reading import watch_sources
+from pipeline.reading.frame_mcap import Topics
 from pipeline.reading.growing_mcap import GrowingMcap
-from pipeline.setpoint.workflow import watch_sources
-from pipeline.setpoint.workflow.frame_mcap import Topics
-from pipeline.setpoint.workflow.watch_sources import COPY, Folder, Recording, Snapshots, shown_place, source
+from pipeline.reading.watch_sources import COPY, Folder, RecordingSource, Snapshots, shown_place, source
 from tests.mcap_writing import LZ4, NO, ZSTD, Written, chunks
 from tests.nozzle_folders import ANY
 
@@ -118,7 +118,7 @@ def recording(count: int, compression=ZSTD, **options) -> bytes:
 def test_a_recording_is_read_as_it_grows_however_it_is_cut(tmp_path, compression):
     content = recording(20, compression, chunk_size=20_000)
     path, shown = tmp_path / "a.mcap", []
-    here = Recording(path, ANY)
+    here = RecordingSource(path, ANY)
     assert list(here.frames()) == []
     assert "is not there yet" in here.waits_for
     before_the_end = 0
@@ -139,7 +139,7 @@ def test_room_that_is_not_filled_yet_is_waited_for(tmp_path):
     content = recording(10, NO)
     half = chunks(content)[0][2]
     (tmp_path / "a.mcap").write_bytes(content[:half] + bytes(5000))
-    here = Recording(tmp_path / "a.mcap", ANY)
+    here = RecordingSource(tmp_path / "a.mcap", ANY)
     assert len(list(here.frames())) == 10
     assert not here.ended and here.damage == []
     (tmp_path / "a.mcap").write_bytes(content)
@@ -153,7 +153,7 @@ def test_a_damaged_chunk_is_left_out_and_told(tmp_path, compression):
     places = chunks(bytes(content))
     content[(places[1][1] + places[1][2]) // 2] ^= 1
     (tmp_path / "a.mcap").write_bytes(content)
-    here = Recording(tmp_path / "a.mcap", ANY)
+    here = RecordingSource(tmp_path / "a.mcap", ANY)
     shown = list(here.frames())
     assert 20 < len(shown) < 40 and here.ended
     assert len(here.damage) == 1 and "was left out" in here.damage[0]
@@ -164,7 +164,7 @@ def test_a_length_that_is_garbled_costs_a_chunk_not_the_watch(tmp_path):
     start = chunks(bytes(content))[1][0]
     content[start + 7] = 0x7F
     (tmp_path / "a.mcap").write_bytes(content)
-    here = Recording(tmp_path / "a.mcap", ANY)
+    here = RecordingSource(tmp_path / "a.mcap", ANY)
     assert 20 < len(list(here.frames())) < 40
     assert "are no records" in here.damage[0]
 
@@ -172,7 +172,7 @@ def test_a_length_that_is_garbled_costs_a_chunk_not_the_watch(tmp_path):
 def test_a_recording_that_is_begun_anew_is_read_anew(tmp_path):
     path = tmp_path / "a.mcap"
     path.write_bytes(recording(20))
-    here = Recording(path, ANY)
+    here = RecordingSource(path, ANY)
     assert len(list(here.frames())) == 20
     path.write_bytes(recording(5))
     assert len(list(here.frames())) == 5
@@ -182,7 +182,7 @@ def test_a_recording_that_is_begun_anew_is_read_anew(tmp_path):
 def test_what_is_no_recording_is_refused(tmp_path):
     (tmp_path / "a.mcap").write_text("t_s,u\n1,2\n")
     with pytest.raises(ValueError, match=r"a.mcap: the bytes at offset 0 should be MCAP's"):
-        list(Recording(tmp_path / "a.mcap", ANY).frames())
+        list(RecordingSource(tmp_path / "a.mcap", ANY).frames())
 
 
 def test_of_two_cameras_one_is_looked_at(tmp_path):
@@ -191,7 +191,7 @@ def test_of_two_cameras_one_is_looked_at(tmp_path):
         channel = made.topic(name, "json", "foxglove.CompressedImage", "jsonschema", b"{}")
         made.message(channel, 1.0, {"timestamp": {"sec": 0, "nsec": 0}, "format": "png", "data": ""})
     (tmp_path / "a.mcap").write_bytes(made.bytes())
-    here = Recording(tmp_path / "a.mcap", Topics("/bed", "", {}))
+    here = RecordingSource(tmp_path / "a.mcap", Topics("/bed", "", {}))
     assert [one.name for one in here.frames()] == ["/bed 1"]
     assert "/cam holds images too" in here.damage[0]
 
@@ -207,7 +207,7 @@ def test_a_number_that_no_printer_is_told_is_no_setpoint(tmp_path):
     made.message(told, 1.2, b"{")
     made.message(camera, 2.0, {"timestamp": {"sec": 0, "nsec": 0}, "format": "png", "data": "!"})
     (tmp_path / "a.mcap").write_bytes(made.bytes())
-    here = Recording(tmp_path / "a.mcap", ANY)
+    here = RecordingSource(tmp_path / "a.mcap", ANY)
     (shown,) = here.frames()
     assert (shown.flow, shown.temperature) == (90.0, 210.0)
     assert shown.frame.startswith("the image cannot be read: ")
@@ -384,7 +384,7 @@ def test_a_file_that_is_no_recording_is_refused(tmp_path):
 
 def test_the_kind_of_a_source_is_told_by_its_name(tmp_path):
     assert isinstance(source("http://127.0.0.1/", ANY, rate_hz=5.0), Snapshots)
-    assert isinstance(source(str(tmp_path / "A.MCAP"), ANY, rate_hz=5.0), Recording)
+    assert isinstance(source(str(tmp_path / "A.MCAP"), ANY, rate_hz=5.0), RecordingSource)
     assert isinstance(source(str(tmp_path), ANY, rate_hz=5.0), Folder)
     assert shown_place("http://me:secret@cam/a?b") == "http://cam/a?b"
     assert shown_place("C:/a") == "C:/a"

@@ -11,9 +11,9 @@ import pytest
 from pipeline.temperature import study, tracking
 from pipeline.temperature.controllers import baseline, window
 from pipeline.temperature.controllers.controller import (
+    ControllerState,
     Deployed,
     RunningController,
-    State,
     aim,
     batch_step,
     compact,
@@ -25,16 +25,16 @@ from pipeline.temperature.controllers.controller import (
     sinusoid,
     watched,
 )
-from pipeline.temperature.controllers.governor import Governor, Limits, OutputLimits, governor
+from pipeline.temperature.controllers.governor import ActuatorLimits, Governor, OutputLimits, governor
 from pipeline.temperature.plant import Plant, baam, hold_state
 from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.published import REFERENCE
 from pipeline.temperature.test_set import panel
 from pipeline.temperature.tracking import Law
 
-LIMITS = Limits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
+LIMITS = ActuatorLimits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
 SLOW = LIMITS._replace(rate=np.full(7, 3.0))
-SPREAD = panel.Spread(input_gain=0.15, slower=0.2, extra_heat_loss=0.005, delayed=0.5, ambient_degC=8.0)
+SPREAD = panel.PlantSpread(input_gain=0.15, slower=0.2, extra_heat_loss=0.005, delayed=0.5, ambient_degC=8.0)
 ONE5, ONE7 = np.ones(5), np.ones(7)
 
 
@@ -89,7 +89,7 @@ HEATER = make_plant([[0.95]], [[0.5]], [[1.0]])
 def test_back_calculation_ends_the_wind_up_of_the_integrator(aimed_high: float):
     """100 °C would need 10 percent, the input has 5, for 200 samples; then 30 °C, which 3 percent hold."""
     law = tracking.model_based(HEATER, 0.99, tau=1.0).design(np.ones(1), np.ones(1), 0.1)
-    narrow = Limits(np.zeros(1), np.full(1, 5.0), np.full(1, np.inf))
+    narrow = ActuatorLimits(np.zeros(1), np.full(1, 5.0), np.full(1, np.inf))
     aims = [
         aim(law, rest(HEATER, constant(r), narrow._replace(high=np.full(1, aimed_high))), constant(r))
         for r in ([100.0], [30.0])
@@ -200,7 +200,7 @@ def test_references_are_what_their_formulas_say():
 
 def test_a_limit_binds_from_a_hundredth_of_a_degree_on():
     one = make_plant([[0.9]], [[1.0]], [[1.0]])  # 10 °C a percent
-    limits = Limits(np.zeros(1), np.full(1, 10.0), np.full(1, np.inf))
+    limits = ActuatorLimits(np.zeros(1), np.full(1, 10.0), np.full(1, np.inf))
     for beyond, binding in ((0.006, ()), (0.014, ((0, 10.0),))):
         assert rest(one, constant(np.array([100.0 + beyond])), limits).binding == binding
 
@@ -306,7 +306,9 @@ def every_kind() -> panel.Questions:
     "name, count, governed, limits",
     [("lqg", 50, True, SLOW), ("varx", 50, True, LIMITS), ("pi", 100, False, SLOW)],
 )
-def test_the_object_asks_for_what_the_panel_judged(name: str, count: int, governed: bool, limits: Limits):
+def test_the_object_asks_for_what_the_panel_judged(
+    name: str, count: int, governed: bool, limits: ActuatorLimits
+):
     """200 cases in all, of every kind."""
     model, law = laws()[name]
     plants = panel.drawn([baam()], -(-count // 9), SPREAD, cells=True, rng=np.random.default_rng(4))
@@ -423,4 +425,4 @@ def test_a_state_of_another_controller_is_refused(governed: bool):
 def test_a_state_is_four_arrays():
     controller = RunningController(deployed(lqg(baam()), LIMITS, integral_limit=1.0), baam())
     controller.watch(np.full(7, 0.4), np.full(5, 150.0), REFERENCE)
-    assert tuple(controller.saved()) == State._fields
+    assert tuple(controller.saved()) == ControllerState._fields

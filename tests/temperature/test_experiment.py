@@ -11,7 +11,7 @@ from pipeline import cli
 from pipeline.store import artifacts, params
 from pipeline.temperature import experiment, forecast, tracking
 from pipeline.temperature.controllers import baseline
-from pipeline.temperature.experiment import Limits, Names, Wish
+from pipeline.temperature.experiment import ExperimentLimits, Names, Wish
 from pipeline.temperature.plant import hold_output, plant, simulate
 from pipeline.temperature.settings import GenerateProbing, Plant, Tracking
 from stages import generate_probing
@@ -52,7 +52,7 @@ def record_of(truth, y0, samples=1500, noise=0.1, moves=8.0, feedback=0.0):
 
 
 def limits(low, high):
-    return Limits(np.zeros(1), np.full(1, 100.0), 5.0, np.array([low]), np.array([high]))
+    return ExperimentLimits(np.zeros(1), np.full(1, 100.0), 5.0, np.array([low]), np.array([high]))
 
 
 def wish(reference, samples=1500, **more):

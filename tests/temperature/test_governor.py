@@ -10,8 +10,8 @@ from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline
 from pipeline.temperature.controllers.controller import Deployed, deployed
 from pipeline.temperature.controllers.governor import (
+    ActuatorLimits,
     Governor,
-    Limits,
     OutputLimits,
     Strength,
     corrected,
@@ -28,10 +28,10 @@ from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.published import REFERENCE
 from pipeline.temperature.test_set import panel
 
-LIMITS = Limits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
-SPREAD = panel.Spread(input_gain=0.15, slower=0.2, extra_heat_loss=0.005, delayed=0.5, ambient_degC=8.0)
+LIMITS = ActuatorLimits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
+SPREAD = panel.PlantSpread(input_gain=0.15, slower=0.2, extra_heat_loss=0.005, delayed=0.5, ambient_degC=8.0)
 NOISE = 0.1
-ONE = Limits(np.zeros(1), np.full(1, 10.0), np.full(1, np.inf))
+ONE = ActuatorLimits(np.zeros(1), np.full(1, 10.0), np.full(1, np.inf))
 HEATER = make_plant([[0.95]], [[0.5]], [[1.0]])
 
 
@@ -48,7 +48,7 @@ def heater_guard(strength: Strength, *, high: float = 100.0, rate: float = np.in
     return governor(family, ONE._replace(rate=np.full(1, rate)), outputs, strength)
 
 
-def law(name: str) -> tracking.Controller:
+def law(name: str) -> tracking.ControllerDesign:
     if name == "pi":
         return baseline.controller(baam(), (LIMITS.low, LIMITS.high), horizon=600)
     return tracking.model_based(baam(), 0.99, tau=1.0)
@@ -106,7 +106,7 @@ def test_a_command_that_touches_no_row_is_left_as_it_is():
 def test_one_row_is_met_by_the_least_change():
     """Two inputs that heat one output by 2 and 1: the nearest command lies along (2, 1)."""
     plant = make_plant([[0.9]], [[2.0, 1.0]], [[1.0]])
-    limits = Limits(np.zeros(2), np.full(2, 50.0), np.full(2, np.inf))
+    limits = ActuatorLimits(np.zeros(2), np.full(2, 50.0), np.full(2, np.inf))
     outputs = OutputLimits(np.full(1, -np.inf), np.full(1, 100.0), np.zeros(1), 1e3)
     family = governor([plant], limits, outputs, Strength(1.0, 1.0, 0.0))
     memory = started(family, np.full((1, 1), 50.0))
@@ -132,7 +132,7 @@ def test_a_zone_that_its_own_heater_cannot_warm_is_not_warmed_by_its_neighbours(
     plant = make_plant(
         np.diag([0.95, 0.95]), np.array([[0.3, 0.1], [0.1, 0.3]]), np.eye(2), b=np.array([0.1, 0.1])
     )
-    limits = Limits(np.zeros(2), np.array([20.0, 2.5]), np.full(2, np.inf))
+    limits = ActuatorLimits(np.zeros(2), np.array([20.0, 2.5]), np.full(2, np.inf))
     outputs = OutputLimits(np.full(2, -np.inf), np.full(2, 80.0), np.full(2, 0.3), 0.5)
     family = governor([plant], limits, outputs, Strength(1.0, 1.0, 0.0))
     memory = started(family, np.array([[50.0, 37.0]]))
@@ -270,7 +270,7 @@ def test_dead_time_does_not_make_it_hunt():
     slow = make_plant(
         A, np.eye(delay + 1)[:, -1:], np.eye(delay + 1)[:1], b=np.r_[22 * share, np.zeros(delay)]
     )
-    limits = Limits(np.zeros(1), np.full(1, 100.0), np.full(1, np.inf))
+    limits = ActuatorLimits(np.zeros(1), np.full(1, 100.0), np.full(1, np.inf))
     # no part of it is quicker: a dead time that is a chain of states has no other speed
     spread = SPREAD._replace(input_gain=0.3, slower=0.0, extra_heat_loss=0.0005, ambient_degC=3.0)
     plants = panel.drawn([slow], 10, spread, cells=False, rng=np.random.default_rng(7))

@@ -11,8 +11,8 @@ from pipeline.temperature import tracking
 from pipeline.temperature.controllers import governor as governing
 from pipeline.temperature.controllers.controller import RunningController, deployed
 from pipeline.temperature.controllers.governor import (
+    ActuatorLimits,
     Governor,
-    Limits,
     OutputLimits,
     Strength,
     corrected,
@@ -111,7 +111,7 @@ def level(of: Blocks) -> float:
 def guard(of: Blocks, high: float) -> Governor:
     """Limits with three standard deviations of margin; inputs act 0.85 to 1.15 times as declared."""
     k = of.zones
-    limits = Limits(np.zeros(k), np.full(k, 100.0), np.full(k, np.inf))
+    limits = ActuatorLimits(np.zeros(k), np.full(k, 100.0), np.full(k, np.inf))
     outputs = OutputLimits(np.full(k, -np.inf), np.full(k, high), np.full(k, MARGIN), 0.5)
     return governor([model(of)], limits, outputs, Strength(0.85, 1.15, 0.1))
 
@@ -165,7 +165,7 @@ def controlled(of: Blocks, *, effort: float, gain: float, lag: float, watched: b
     target, k, rng = np.full(of.zones, level(of)), of.zones, np.random.default_rng(5)
     known = model(of)
     design = tracking.model_based(known, 0.99, tau=1.0).design(np.ones(k), np.full(k, effort), 0.05)
-    limits = Limits(np.zeros(k), np.full(k, 100.0), np.full(k, np.inf))
+    limits = ActuatorLimits(np.zeros(k), np.full(k, 100.0), np.full(k, np.inf))
     watch = guard(of, level(of) + 3.0) if watched else None
     running = RunningController(deployed(design, limits, integral_limit=1.0, governor=watch), known)
     rest = np.full(k, ROOM + 0.3 * (level(of) - ROOM))

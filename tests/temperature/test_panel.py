@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from pipeline.temperature.controllers.controller import Limits, constant, deployed, ramp, sinusoid
+from pipeline.temperature.controllers.controller import ActuatorLimits, constant, deployed, ramp, sinusoid
 from pipeline.temperature.plant import baam, plant, simulate
 from pipeline.temperature.published import GAMMA, REFERENCE, TAU
 from pipeline.temperature.test_set import panel
-from pipeline.temperature.test_set.panel import Allowance, Cases, Figures, Questions, Rollout, Spread
+from pipeline.temperature.test_set.panel import Allowance, Cases, Figures, PlantSpread, Questions, Rollout
 from pipeline.temperature.test_set.scorecard import closed_loop
 from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law, still_law
 
-SPREAD = Spread(input_gain=0.15, slower=0.2, extra_heat_loss=0.005, delayed=0.5, ambient_degC=8.0)
-ANYTHING = Limits(np.full(7, -np.inf), np.full(7, np.inf), np.full(7, np.inf))
+SPREAD = PlantSpread(input_gain=0.15, slower=0.2, extra_heat_loss=0.005, delayed=0.5, ambient_degC=8.0)
+ANYTHING = ActuatorLimits(np.full(7, -np.inf), np.full(7, np.inf), np.full(7, np.inf))
 
 
 def static(gain: float) -> Law:
@@ -168,7 +168,7 @@ def test_a_sequence_asks_its_references_for_equal_times_a_ramp_ends_at_and_a_sin
         sequence=np.array([[50.0], [70.0], [60.0]]),
     )
     law = still_law(1, 1)
-    limits = Limits(np.zeros(1), np.full(1, 1000.0), np.full(1, np.inf))
+    limits = ActuatorLimits(np.zeros(1), np.full(1, 1000.0), np.full(1, np.inf))
     r, target, feed = panel.schedule(cases, panel.aims(law, panel.rests(machine, cases, limits), cases))
     by_kind = {kind: r[:, k, 0] for k, kind in enumerate(cases.kind)}
     t = np.arange(90)
@@ -191,7 +191,7 @@ def test_a_run_by_hand():
     10, 5 + 80, 42.5 + 56, 49.25 + 50.6."""
     machine = plant([[0.5]], [[1.0]], [[1.0]])
     cases = asked([machine], [[10.0]], [[100.0]], steps=4, hold=3)
-    limits, law = Limits(np.zeros(1), np.full(1, 80.0), np.full(1, np.inf)), static(0.4)
+    limits, law = ActuatorLimits(np.zeros(1), np.full(1, 80.0), np.full(1, np.inf)), static(0.4)
     run = panel.rolled_out(
         deployed(law, limits, integral_limit=1.0),
         cases,
@@ -205,7 +205,7 @@ def test_a_run_by_hand():
 def test_doing_nothing_leaves_every_plant_where_it_was_held():
     cases = asked([baam()], [np.full(5, 60.0)], [REFERENCE], steps=200, noise=0.5, cells=True)
     law = still_law(7, 5)
-    limits = Limits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
+    limits = ActuatorLimits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
     run = panel.rolled_out(
         deployed(law, limits, integral_limit=1.0, holds=True),
         cases,
@@ -220,7 +220,7 @@ def test_a_law_without_integral_action_settles_on_its_target_from_any_hold():
     """Nothing of the hand-over stays with it."""
     cases = asked([baam()], [np.full(5, 20.0), np.full(5, 90.0)], [REFERENCE], steps=2000, cells=True)
     law = observer_law(baam(), gains(baam(), np.eye(5), np.eye(7), GAMMA), observer_gain(baam(), TAU))
-    limits = Limits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
+    limits = ActuatorLimits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
     run = panel.rolled_out(
         deployed(law, limits, integral_limit=1.0),
         cases,
@@ -238,7 +238,7 @@ def test_what_runs_within_its_limits_is_the_closed_loop_of_which_the_margins_are
     )
     controller = deployed(law, ANYTHING, integral_limit=np.inf)
     cases = asked([baam()], [np.full(5, 20.0)], [REFERENCE], steps=40, hold=1, cells=True)
-    limits = Limits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
+    limits = ActuatorLimits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
     aims = panel.aims(law, panel.rests(baam(), cases, limits), cases)
     moved = cases._replace(x0=cases.x0 + np.r_[np.ones(6), np.zeros(7)])
     difference = panel.rolled_out(controller, moved, aims).y - panel.rolled_out(controller, cases, aims).y
@@ -261,7 +261,7 @@ def figures_of(y, cases: Cases, *, wished=None, r=None, target=None, band=1.0, s
     r = np.broadcast_to(np.array(r, float), (1, 1, len(y))).T
     target = r if target is None else np.broadcast_to(np.array(target, float), (1, 1, len(y))).T
     wished = np.zeros_like(y) if wished is None else np.array(wished, float)[:, None, None]
-    limits = Limits(np.zeros(1), np.full(1, 100.0), np.full(1, np.inf))
+    limits = ActuatorLimits(np.zeros(1), np.full(1, 100.0), np.full(1, np.inf))
     return panel.figures(
         Rollout(y, r, target, wished, np.clip(wished, 0, 100), y),
         cases,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.temperature.controllers.controller import Limits, Rest, aim, constant, deployed
+from pipeline.temperature.controllers.controller import ActuatorLimits, Rest, aim, constant, deployed
 from pipeline.temperature.controllers.printer_pid import HeaterPid, controller, law
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.test_set import panel
@@ -12,7 +12,10 @@ from pipeline.temperature.test_set.scorecard import closed_loop, law_response
 BED = HeaterPid(input=1, output=0, Kp=21.2, Ki=0.30, Kd=372.0, most_percent=100.0, smooth_s=1.0)
 HOT = HeaterPid(input=0, output=1, Kp=8.7, Ki=0.42, Kd=44.7, most_percent=100.0, smooth_s=1.0)
 LIMITS = np.zeros(2), np.full(2, 100.0)
-ANY_RATE, UNLIMITED = np.full(2, np.inf), Limits(np.full(2, -np.inf), np.full(2, np.inf), np.full(2, np.inf))
+ANY_RATE, UNLIMITED = (
+    np.full(2, np.inf),
+    ActuatorLimits(np.full(2, -np.inf), np.full(2, np.inf), np.full(2, np.inf)),
+)
 AMBIENT = 24.0
 # it aims at no target, so that where the machine would rest says nothing to it
 NOWHERE = Rest(np.full((2, 1), np.nan), np.full((2, 1), np.nan), np.full(2, np.nan), ())
@@ -78,7 +81,7 @@ def warm_up(machine: Plant, *, noise: float, steps: int = 900, to=(60.0, 200.0))
     )
 
 
-def run_of(cases: panel.Cases, made, limits: Limits) -> panel.Rollout:
+def run_of(cases: panel.Cases, made, limits: ActuatorLimits) -> panel.Rollout:
     aims = [aim(made, NOWHERE, reference) for reference in (*cases.references, constant(cases.starts[0]))]
     return panel.rolled_out(deployed(made, limits, integral_limit=1.0), cases, aims)
 
@@ -109,7 +112,7 @@ def by_the_formula(
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_the_law_warms_the_heaters_as_klippers_formula_does(sample_time_s, noise):
     cases = warm_up(heaters(sample_time_s), noise=noise)
-    run = run_of(cases, law((BED, HOT), sample_time_s=sample_time_s), Limits(*LIMITS, ANY_RATE))
+    run = run_of(cases, law((BED, HOT), sample_time_s=sample_time_s), ActuatorLimits(*LIMITS, ANY_RATE))
     y, u = by_the_formula(cases, sample_time_s, panel.noise_of(cases)[:, 0])
     assert (u == 100).mean() > 0.05  # the way up is at the limit
     # rounding, some 1e-12 a step, over 900 steps of a loop that forgets
@@ -121,7 +124,7 @@ def test_where_klipper_holds_the_integral_before_the_duty_and_we_after_it_they_p
     """A heater too weak for its target: its integral goes up to its limit."""
     machine = heaters(0.9)
     cases = warm_up(machine, noise=0.0, to=(140.0, 200.0))
-    run = run_of(cases, law((BED, HOT), sample_time_s=0.9), Limits(*LIMITS, ANY_RATE))
+    run = run_of(cases, law((BED, HOT), sample_time_s=0.9), ActuatorLimits(*LIMITS, ANY_RATE))
     y, _ = by_the_formula(cases, 0.9, np.zeros((1 + cases.steps, 2)))
     np.testing.assert_allclose(run.y[:, 0], y, atol=0.1)  # a tenth of the band that counts as settled
 

@@ -110,7 +110,7 @@ def test_the_governor_is_the_same_in_other_units_of_the_inputs(family):
     allowed = []
     for unit in (1.0, 10.0):
         guarded = [panel.delayed(family[0]._replace(B=family[0].B / unit), late) for late in (False, True)]
-        limits = governor.Limits(np.zeros(1), np.full(1, 100.0 * unit), np.full(1, np.inf))
+        limits = governor.ActuatorLimits(np.zeros(1), np.full(1, 100.0 * unit), np.full(1, np.inf))
         outputs = governor.OutputLimits(np.full(1, -np.inf), np.full(1, 40.4), noise, 0.5)
         made = governor.governor(guarded, limits, outputs, governor.Strength(0.7, 1.4, 0.15))
         memory = governor.started(made, y)

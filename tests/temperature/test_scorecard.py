@@ -14,9 +14,9 @@ from pipeline.temperature.plant import Plant, baam, plant
 from pipeline.temperature.published import GAMMA, REFERENCE, TAU
 from pipeline.temperature.study import data_sets
 from pipeline.temperature.test_set.scorecard import (
+    CommonCost,
     Cost,
     PanelRun,
-    Yardstick,
     closed_loop,
     cost,
     disturbances,
@@ -30,7 +30,7 @@ from pipeline.temperature.test_set.scorecard import (
 from pipeline.temperature.tracking import Law, aimed, gains, observer_gain, observer_law
 
 I5, I7 = np.eye(5), np.eye(7)
-YARDSTICK = Yardstick(np.ones(5), np.ones(7), GAMMA)
+YARDSTICK = CommonCost(np.ones(5), np.ones(7), GAMMA)
 
 
 def static(gain: float) -> Law:
@@ -143,7 +143,7 @@ def test_a_run_by_hand():
     np.testing.assert_allclose(run.u[:, 0, 0], [36.0, 23.6, 22.36], rtol=1e-12)
     error = np.array([90.0, 59.0, 55.9])
     expected = (0.9 ** np.arange(3)) @ (2 * error**2 + 3 * run.u[:, 0, 0] ** 2)
-    assert cost(cases, run, Yardstick(np.array([2.0]), np.array([3.0]), 0.9)).J[0] == pytest.approx(
+    assert cost(cases, run, CommonCost(np.array([2.0]), np.array([3.0]), 0.9)).J[0] == pytest.approx(
         expected, rel=1e-12
     )
 
@@ -183,9 +183,9 @@ def test_nothing_is_cheaper_than_the_optimum_and_the_observer_is_nearly_as_cheap
 @pytest.mark.parametrize(
     "other",
     [
-        Yardstick(2 * np.ones(5), np.ones(7), GAMMA),
-        Yardstick(np.ones(5), 2 * np.ones(7), GAMMA),
-        Yardstick(np.ones(5), np.ones(7), 0.95),
+        CommonCost(2 * np.ones(5), np.ones(7), GAMMA),
+        CommonCost(np.ones(5), 2 * np.ones(7), GAMMA),
+        CommonCost(np.ones(5), np.ones(7), 0.95),
     ],
 )
 def test_costs_under_different_weights_are_refused(other):

@@ -2,11 +2,12 @@
 functions; the one whose forecast is least at its upper end is taken."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.deposition import controllers
 from pipeline.deposition.drive import Drive, at_limit, follows, obeyed
 from pipeline.deposition.parts import basis, forecast
 from pipeline.deposition.parts.chain import Chain, averaged, identify, simulate
@@ -30,7 +31,8 @@ from pipeline.deposition.toolpath.gcode import Kind, Moves, PartProgram
 from pipeline.deposition.toolpath.motion import Motion, rate, sampled
 from pipeline.deposition.toolpath.tasks import PrintedLines, Tasks, halting, printed_lines, refuse, sequence
 
-COMPOSERS = PRIORITY, SUPERPOSITION, BASIS = "priority", "superposition", "basis"
+# composers that know nothing of the part beforehand
+COMPOSERS = tuple(row.name for row in controllers.COMPOSERS if row.command)
 # rest before the first line and after the last: longer than any lead
 MARGIN_S = 2.0
 # a long job is judged by its first minutes of each material
@@ -243,21 +245,30 @@ def superposition(
     return u
 
 
-def _command(composer: str, library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
-    """u (T,) in mm of one composer for one tool's share of a part, which the drive can follow."""
+def by_basis_functions(library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
+    """u (T,) in mm of the basis functions for one tool's share of a part, which the drive can follow."""
+    extruder = share.material.chain.extruder
+    return basis.compose(extruder, share.r, sample_time_s=library.sample_time_s, drive=drive)
+
+
+def by_priority(library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
+    """u (T,) in mm of the library by the priority rule, as the drive can follow it."""
+    return _by_library(priority, library, share, drive)
+
+
+def by_superposition(library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
+    """u (T,) in mm of the library by superposition, as the drive can follow it."""
+    return _by_library(superposition, library, share, drive)
+
+
+def _by_library(
+    rule: Callable[..., np.ndarray], library: Library, share: ToolShare, drive: Drive
+) -> np.ndarray:
     material, Ts = share.material, library.sample_time_s
-    if composer == BASIS:
-        return basis.compose(material.chain.extruder, share.r, sample_time_s=Ts, drive=drive)
-    by = priority if composer == PRIORITY else superposition
-    u = by(
-        library,
-        material.material,
-        material.nozzle_mm,
-        share.tasks,
-        share.lines,
-        share.tool,
+    u = rule(
+        library, material.material, material.nozzle_mm, share.tasks, share.lines, share.tool,
         samples=len(share.r),
-    )
+    )  # fmt: skip
     if follows(u, drive, sample_time_s=Ts):
         return u
     return basis.reached(material.chain.extruder, u, _sent_ahead(share, Ts), drive, Ts)
@@ -280,7 +291,7 @@ def commands(
         if (one.material, one.nozzle_mm) == (stream.material, stream.nozzle_mm)
     )
     share = ToolShare(stream.tool, material, stream.r, composed.tasks, composed.lines)
-    return {name: _command(name, learned.library, share, drive) for name in COMPOSERS}
+    return {name: controllers.command(name)(learned.library, share, drive) for name in COMPOSERS}
 
 
 def _judge(library: Library, share: ToolShare, drive: Drive) -> dict[str, tuple[float, float, float]]:
@@ -294,7 +305,9 @@ def _judge(library: Library, share: ToolShare, drive: Drive) -> dict[str, tuple[
 
     on_off = flows(_on_off(excerpt, drive, Ts))
     return {
-        name: forecast.error_percent(flows(_command(name, library, excerpt, drive)), on_off, excerpt.r)
+        name: forecast.error_percent(
+            flows(controllers.command(name)(library, excerpt, drive)), on_off, excerpt.r
+        )
         for name in COMPOSERS
     }
 
@@ -408,7 +421,11 @@ def _material(
 
 def _stream(library: Library, share: ToolShare, unshaped: np.ndarray, composer: str, drive: Drive) -> Stream:
     """The share by one composer: its command, and the flows that the chain predicts for it and for on-off."""
-    material, u, Ts = share.material, _command(composer, library, share, drive), library.sample_time_s
+    material, u, Ts = (
+        share.material,
+        controllers.command(composer)(library, share, drive),
+        library.sample_time_s,
+    )
     y, on_off = (
         simulate([material.chain.extruder], command[None], sample_time_s=Ts)[0, 0]
         for command in (u, _on_off(share, drive, Ts))

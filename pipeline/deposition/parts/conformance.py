@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.deposition import reachable
+from pipeline.deposition.controllers import CONTROLLERS
 from pipeline.deposition.drive import Drive, at_limit, demand, obeyed
 from pipeline.deposition.extruder import Extruder
 from pipeline.deposition.parts import basis, forecast
 from pipeline.deposition.parts.chain import IdentifiedExtruder
 from pipeline.deposition.parts.chain import forecast as predicted_flow
 from pipeline.deposition.parts.composition import (
-    BASIS,
     EXCERPT_S,
     MARGIN_S,
     Composed,
@@ -113,7 +113,8 @@ def conform(
         ramps[stream.tool] = ramp_that_would_do(material.chain.extruder, some, **settings)
     refused = [*refusals]
     by_library = np.isin(
-        composed.tasks.tool, [stream.tool for stream in composed.streams if stream.composer != BASIS]
+        composed.tasks.tool,
+        [stream.tool for stream in composed.streams if CONTROLLERS[stream.composer].kind == "data-driven"],
     )
     for k in np.flatnonzero(by_library & ~(composed.error_percent <= largest_error_percent)):
         speed, pause = composed.tasks.speed[k], composed.tasks.pause_s[k]

@@ -18,7 +18,7 @@ NOT_READY = "Certificate passed, not ready."
 REFUSED, NONE = "Certificate refused.", "No certificate."
 
 
-class Line(NamedTuple):
+class ExportedLine(NamedTuple):
     """One loop: whether a certificate passed, in words; the controller, the folder or the file to load with
     its SHA-256, how many files there are, the certificate's SHA-256, and why there is no more."""
 
@@ -33,7 +33,7 @@ class Line(NamedTuple):
     why: str
 
 
-def lines(sources: Sources, verdict: Verdict) -> list[Line] | Missing:
+def lines(sources: Sources, verdict: Verdict) -> list[ExportedLine] | Missing:
     """One a loop, or why there are none. A certificate says no more than the temperature loop's `verdict` on
     page one: it may run where that is passed, for this controller."""
     metrics = sources.metrics.get(STAGE) or Missing(OPEN, f"{STAGE} has not run")
@@ -42,10 +42,10 @@ def lines(sources: Sources, verdict: Verdict) -> list[Line] | Missing:
     return [_line(loop, metrics, verdict) for loop in LOOPS]
 
 
-def _line(loop: str, metrics: Mapping[str, Any], verdict: Verdict) -> Line:
+def _line(loop: str, metrics: Mapping[str, Any], verdict: Verdict) -> ExportedLine:
     fields = lookup(metrics, loop, what=f"{loop} loop")
     if isinstance(fields, Missing):
-        return Line(loop, OPEN, NONE, "", "", "", "", "", fields.sentence())
+        return ExportedLine(loop, OPEN, NONE, "", "", "", "", "", fields.sentence())
     shown, files = fields.get("certificate"), dict(fields.get("files") or {})
     first = next(iter(files), "")
     main = next((path for path in files if path.endswith("controller.json")), first)
@@ -58,7 +58,7 @@ def _line(loop: str, metrics: Mapping[str, Any], verdict: Verdict) -> Line:
     if word == MAY_RUN and not (verdict.state == PASSED and verdict.winner == name):
         state, word = OPEN, NOT_READY
         why = f"Page one says: {verdict.decision} {verdict.lead}".strip()
-    return Line(
+    return ExportedLine(
         loop,
         state,
         word,
@@ -71,7 +71,7 @@ def _line(loop: str, metrics: Mapping[str, Any], verdict: Verdict) -> Line:
     )
 
 
-def link(sources: Sources, line: Line) -> str:
+def link(sources: Sources, line: ExportedLine) -> str:
     """Where a page finds the file: the copy of it in reports/data; "" where it is not there, or too large."""
     source = sources.read.get(line.file)
     if source is not None:
@@ -81,7 +81,7 @@ def link(sources: Sources, line: Line) -> str:
     return f"data/{line.loop}.{path.name}" if small else ""
 
 
-def copies(sources: Sources, lines: Sequence[Line] | Missing) -> dict[str, bytes]:
+def copies(sources: Sources, lines: Sequence[ExportedLine] | Missing) -> dict[str, bytes]:
     """Name in reports/data -> bytes of each file to load that `link` leads to."""
     found = {} if isinstance(lines, Missing) else {link(sources, line): line.file for line in lines}
     return {place.removeprefix("data/"): Path(path).read_bytes() for place, path in found.items() if place}

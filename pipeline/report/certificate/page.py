@@ -2,13 +2,13 @@
 and the files that leave the house."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pipeline.report.certificate import exported
 from pipeline.report.shared import charts, page, words
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.controllers import BY_NAME, heading
 from pipeline.verdict.digits import number, with_unit
@@ -18,30 +18,6 @@ from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 WORDS = ("verdict", "margin_disk", "margin_delay", "spread", "step", "hash")
 MOST_BANDS = 40  # gains that are listed, those that are surest of all inputs first
 CIRCLE = np.linspace(0, 2 * np.pi, 181)
-
-
-class RuleRow(NamedTuple):
-    """A rule: its state, what was found, the limit, and the sentence."""
-
-    name: str
-    state: str
-    found: str
-    limit: str
-    sentence: str
-
-
-class Head(NamedTuple):
-    """What the page says first."""
-
-    state: str
-    decision: str
-    lead: str
-    reason: str
-    remedy: str
-    claim: str = ""
-    changed: str = ""
-    rules: Sequence[Any] = ()
-    heads: Sequence[Any] = ()
 
 
 def render(sources: Sources, verdict: Verdict) -> str:
@@ -69,33 +45,79 @@ def render(sources: Sources, verdict: Verdict) -> str:
     )
 
 
-def head(shown: Mapping[str, Any] | Missing, lines: Sequence[exported.Line] | Missing) -> Head:
+def head(
+    shown: Mapping[str, Any] | Missing, lines: Sequence[exported.ExportedLine] | Missing
+) -> dict[str, Any]:
     """Passed or refused, and the first rule that failed."""
     if isinstance(lines, Missing):
-        return Head("open", "No certificate.", "", lines.sentence(), "")
+        return {
+            "state": "open",
+            "decision": "No certificate.",
+            "lead": "",
+            "reason": lines.sentence(),
+            "remedy": "",
+            "claim": "",
+            "changed": "",
+            "rules": (),
+            "heads": (),
+        }
     mine = next(line for line in lines if line.loop == "temperature")
     state = {PASSED: "passed", FAILED: "failed"}.get(mine.state, "open")
     if isinstance(shown, Missing) or mine.state == OPEN:
-        return Head(state, mine.word, "", mine.why, "")
+        return {
+            "state": state,
+            "decision": mine.word,
+            "lead": "",
+            "reason": mine.why,
+            "remedy": "",
+            "claim": "",
+            "changed": "",
+            "rules": (),
+            "heads": (),
+        }
     if mine.state == FAILED:
         rule = str(shown.get("first_failed") or "").replace("_", " ")
-        return Head(
-            state, mine.word, f"First failed rule: {rule}.", mine.why, "Nothing of this loop is exported."
-        )
+        return {
+            "state": state,
+            "decision": mine.word,
+            "lead": f"First failed rule: {rule}.",
+            "reason": mine.why,
+            "remedy": "Nothing of this loop is exported.",
+            "claim": "",
+            "changed": "",
+            "rules": (),
+            "heads": (),
+        }
     limits = "It holds for this plant, these units and this sample time, and nothing else."
     if shown.get("evidence") == "simulated":
         limits += " The plant is simulated: not for a real machine."
-    return Head(state, f"{mine.word} {mine.name[:1].upper()}{mine.name[1:]}.", "", limits, "")
+    return {
+        "state": state,
+        "decision": f"{mine.word} {mine.name[:1].upper()}{mine.name[1:]}.",
+        "lead": "",
+        "reason": limits,
+        "remedy": "",
+        "claim": "",
+        "changed": "",
+        "rules": (),
+        "heads": (),
+    }
 
 
-def rule_rows(shown: Mapping[str, Any]) -> list[RuleRow]:
+def rule_rows(shown: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The rules in the order in which they were asked."""
     rows = []
     for rule in shown["rules"]:
         state = OPEN if not rule.get("asked", True) else PASSED if rule["passed"] else FAILED
         found, limit = (_figure(rule.get(key), rule.get("unit") or "") for key in ("found", "limit"))
         rows.append(
-            RuleRow(rule["name"].replace("_", " "), state, found, f"{_side(rule)}{limit}", rule["sentence"])
+            {
+                "name": rule["name"].replace("_", " "),
+                "state": state,
+                "found": found,
+                "limit": f"{_side(rule)}{limit}",
+                "sentence": rule["sentence"],
+            }
         )
     return rows
 
@@ -149,7 +171,7 @@ def poles(sources: Sources, shown: Mapping[str, Any] | Missing) -> Picture:
         )
     largest = max(one["radius"] for one in shown["poles"])
     columns = [
-        Column(name, small, "", [_circle(shown["poles"], near=near, largest=largest)])
+        PictureColumn(name, small, "", [_circle(shown["poles"], near=near, largest=largest)])
         for name, small, near in (
             ("The unit circle", "real part right, imaginary part up", False),
             ("The slowest", "enlarged", True),

@@ -6,9 +6,19 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.deposition.marks import MARK, real
+from pipeline.report.deposition.marks import KIND, MARK, real
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.card import Card, Cell, Deciding, Entrant, Row, Step, best_of, note_of, of_verdict
+from pipeline.report.shared.card import (
+    Card,
+    CardCell,
+    CardRow,
+    CardStep,
+    Deciding,
+    Entrant,
+    best_of,
+    note_of,
+    of_verdict,
+)
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.deposition import LIBRARY, NAMES, OURS, Structure, structures, worst
 from pipeline.verdict.digits import THIN, band, count, decimals, number, percent
@@ -18,7 +28,7 @@ from pipeline.verdict.verdict import PASSED, Missing, Verdict
 MOVES = "Plunger command to flow at the nozzle"
 # how long a stretch of a part is drawn, s
 STRETCH_S = 6.0
-STYLES = {"basis": "line dd", "priority": "line", "superposition": "line dash", "on_off": "line bl"}
+STYLES = {"basis": "line", "priority": "line dd", "superposition": "line dd dash", "on_off": "line bl"}
 
 Read = Callable[[Structure, str], float | None]
 
@@ -66,7 +76,7 @@ def shown(winner: str) -> list[str]:
 
 
 def _note(name: str) -> str:
-    return {"basis": "data-driven", "on_off": "yardstick"}.get(name, "the paper’s")
+    return "yardstick" if KIND[name] == "baseline" else KIND[name]
 
 
 # ---- the figures
@@ -89,7 +99,7 @@ def _above(part: Structure, name: str) -> float | None:
 def _row(
     title: str, parts: Sequence[Structure], names: Sequence[str], read: Read, limit: float, sign: str,
     unit: str,
-) -> Row:  # fmt: skip
+) -> CardRow:  # fmt: skip
     """The largest figure of each composer, the range over all streams beside it."""
     each = {name: [value for part in parts if (value := read(part, name)) is not None] for name in names}
     most = [max(values) if values else None for values in each.values()]
@@ -98,25 +108,25 @@ def _row(
         _cell(values, unit, best=max(values, default=None) == best is not None, limit=limit)
         for values in each.values()
     ]
-    return Row(title, f"{sign}{'' if sign == '±' else ' '}{limit:g}{THIN}{unit}", cells)
+    return CardRow(title, f"{sign}{'' if sign == '±' else ' '}{limit:g}{THIN}{unit}", cells)
 
 
-def _cell(values: Sequence[float], unit: str, *, best: bool, limit: float) -> Cell:
+def _cell(values: Sequence[float], unit: str, *, best: bool, limit: float) -> CardCell:
     if not values:
-        return Cell("not measured")
+        return CardCell("not measured")
     low, high = min(values), max(values)
     places = min(decimals(low, high, value=high), 1)
-    return Cell(f"{number(high, places)}{THIN}{unit}", band(low, high, places), best, bad=high > limit)
+    return CardCell(f"{number(high, places)}{THIN}{unit}", band(low, high, places), best, bad=high > limit)
 
 
-def _step(sources: Sources, verdict: Verdict) -> Step:
+def _step(sources: Sources, verdict: Verdict) -> CardStep:
     if not verdict.winner:
-        return Step("Run the stages of this loop.", "./run dvc repro compose_parts")
+        return CardStep("Run the stages of this loop.", "./run dvc repro compose_parts")
     if verdict.state != PASSED and verdict.remedy:
-        return Step(f"{verdict.remedy.rstrip('.')}; then run it again.", "./run dvc repro")
+        return CardStep(f"{verdict.remedy.rstrip('.')}; then run it again.", "./run dvc repro")
     if real(sources):
-        return Step("Compose the commands of a part.", "./run beadline compose PART.gcode")
-    return Step("Compose a part of your own.", "./run beadline compose PART.gcode --verify")
+        return CardStep("Compose the commands of a part.", "./run beadline compose PART.gcode")
+    return CardStep("Compose a part of your own.", "./run beadline compose PART.gcode --verify")
 
 
 # ---- the part that decides

@@ -2,7 +2,7 @@
 and after, what the camera saw and what was measured from it."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from pipeline.report.deposition.marks import real
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import THIN, count, number, percent, short
 from pipeline.verdict.evidence import Table, lookup
@@ -58,8 +58,8 @@ def _trials(table: Table, material: str, law: str) -> Table:
     return {name: values[rows] for name, values in table.items()}
 
 
-def _columns(laws: list[str], draw: Callable[[str, int], list[Markup]]) -> list[Column]:
-    return [Column(*LAWS[law][:2], LAWS[law][3], draw(law, i)) for i, law in enumerate(laws)]
+def _columns(laws: list[str], draw: Callable[[str, int], list[Markup]]) -> list[PictureColumn]:
+    return [PictureColumn(*LAWS[law][:2], LAWS[law][3], draw(law, i)) for i, law in enumerate(laws)]
 
 
 # ---- error against trial
@@ -229,7 +229,7 @@ def commands(sources: Sources) -> Picture:
 
     heads = {0: "on\u2011off control", 1: "after one update", last: "the last"}
     shown = [
-        Column(f"Trial {trial}", heads[trial], "", draw(trial, i))
+        PictureColumn(f"Trial {trial}", heads[trial], "", draw(trial, i))
         for i, trial in enumerate(dict.fromkeys((0, min(1, last), last)))
     ]
     return Picture(
@@ -324,7 +324,9 @@ def corner(sources: Sources) -> Picture:
             panels.append(panel)
         return panels
 
-    shown = [Column(story.head, story.small, story.mark, draw(story, i)) for i, story in enumerate(stories)]
+    shown = [
+        PictureColumn(story.head, story.small, story.mark, draw(story, i)) for i, story in enumerate(stories)
+    ]
     after = [
         f"{LAWS[law][0][:1].lower()}{LAWS[law][0][1:]} {percent(errors[law, True], 2)}"
         for law in laws
@@ -392,35 +394,22 @@ def _corner_panel(
 # ---- what the camera saw
 
 
-class Frame(NamedTuple):
-    """A picture as the page shows it; `foot` is its recording, and the topic with its time."""
-
-    uri: Markup
-    head: str
-    figure: str
-    bad: bool
-    foot: tuple[str, str]
-    alt: str
-
-
-class Frames(NamedTuple):
-    missing: Missing | None = None
-    shown: Sequence[Frame] = ()
-    origin: Markup = Markup("")
-
-
-def frames(sources: Sources) -> Frames:
+def frames(sources: Sources) -> dict[str, Any]:
     """Frames with the measured edges drawn in, and those that were rejected with the reason."""
     pictures = sources.tables["frames"]
     if isinstance(pictures, Missing):
-        return Frames(pictures)
+        return {"missing": pictures}
     # the corner tells most, then what was rejected
     order = {"start": 0, "steady line": 1, "corner": 2, "rejected": 3}
     rows = sorted(pictures, key=lambda row: (row["material"], row["trial"], order.get(row["place"], 9)))
-    return Frames(None, [_frame(row) for row in rows], page.origin(sources.source("frames")))
+    return {
+        "missing": None,
+        "shown": [_frame(row) for row in rows],
+        "origin": page.origin(sources.source("frames")),
+    }
 
 
-def _frame(row: dict[str, Any]) -> Frame:
+def _frame(row: dict[str, Any]) -> dict[str, Any]:
     """A row of the index of frames, in words."""
     of, at = f"aterial {row['material']}, trial {row['trial']}", number(row["time_s"], 2)
     if row["reason"]:
@@ -428,14 +417,14 @@ def _frame(row: dict[str, Any]) -> Frame:
     else:
         width = number(row["width_mm"], 3)
         figure, judged = f"{width}{THIN}mm wide", f"the bead’s edges found, {width} mm apart"
-    return Frame(
-        Markup("{}").format(row["uri"]),
-        f"M{of}, {row['place']}",
-        figure,
-        bad=bool(row["reason"]),
-        foot=(row["recording"], f"{row['topic']} at {at}{THIN}s"),
-        alt=f"Frame of m{of}, at {at} s, {judged}",
-    )
+    return {
+        "uri": Markup("{}").format(row["uri"]),
+        "head": f"M{of}, {row['place']}",
+        "figure": figure,
+        "bad": bool(row["reason"]),
+        "foot": (row["recording"], f"{row['topic']} at {at}{THIN}s"),
+        "alt": f"Frame of m{of}, at {at} s, {judged}",
+    }
 
 
 def measured(sources: Sources) -> Picture:
@@ -471,7 +460,7 @@ def measured(sources: Sources) -> Picture:
         return panels
 
     shown = [
-        Column(f"Material {material}", "first and last filmed trial", "", draw(material, i))
+        PictureColumn(f"Material {material}", "first and last filmed trial", "", draw(material, i))
         for i, material in enumerate(materials)
     ]
     below = (
@@ -590,17 +579,11 @@ class Filmed(NamedTuple):
     delay: str
 
 
-class Camera(NamedTuple):
-    missing: Missing | None = None
-    rows: Sequence[Filmed] = ()
-    untold: str = ""
-
-
-def camera(sources: Sources) -> Camera:
+def camera(sources: Sources) -> dict[str, Any]:
     """By material: frames read and rejected, uncertainty, and what the calibration left."""
     filmed, models = sources.tables["filmed"], sources.tables["models"]
     if isinstance(filmed, Missing):
-        return Camera(filmed)
+        return {"missing": filmed, "untold": ""}
     by_material = pd.DataFrame(filmed).groupby("material", sort=False).agg(
         trials=("trial", "size"),
         frames=("frames", "sum"),
@@ -611,7 +594,7 @@ def camera(sources: Sources) -> Camera:
         outliers=("outliers", "sum"),
     )  # fmt: skip
     rows = [_filmed(row, models, sources) for row in by_material.itertuples()]
-    return Camera(None, rows, ", ".join(row.material for row in rows if row.untold))
+    return {"missing": None, "rows": rows, "untold": ", ".join(row.material for row in rows if row.untold)}
 
 
 def _filmed(row: Any, models: dict[str, Any] | Missing, sources: Sources) -> Filmed:

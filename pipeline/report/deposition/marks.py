@@ -5,17 +5,21 @@ from pipeline.report.shared.sources import Sources
 
 # what stands below a heading
 PAPER = {row.name: row.explanation for row in COMPOSERS}
-# marks of the other pages: circle data-driven, square model-based,
-# ring baseline; hollow: a second of its kind
-MARK = {
-    "basis": "data_driven",
-    "priority": "model_based",
-    "superposition": "exact_model",
-    "on_off": "baseline",
-    "ilc": "kernel",
+# marks of the other pages by kind, the second of a kind hollow: circle data-driven, square model-based and
+# the reference, ring baseline
+_MARKS = {
+    "model-based": ("model_based", "exact_model"),
+    "data-driven": ("data_driven", "kernel"),
+    "baseline": ("baseline",),
+    "reference": ("exact_model",),
 }
-# what the two columns of its rules are, and the mark of the second
-HEADS = ("Data\u2011driven", "The paper", "model_based")
+_OF_KIND = {kind: [row.name for row in COMPOSERS if row.kind == kind] for kind in _MARKS}
+MARK = {row.name: _MARKS[row.kind][_OF_KIND[row.kind].index(row.name)] for row in COMPOSERS}
+KIND = {row.name: row.kind for row in COMPOSERS}
+# line of a chart by kind
+CSS = {row.name: {"data-driven": "dd", "baseline": "bl"}.get(row.kind, "mb") for row in COMPOSERS}
+# what the two columns of its rules are, the mark of the second and that of the first
+HEADS = ("Model\u2011based", "Data\u2011driven", "data_driven", "model_based")
 
 
 def real(sources: Sources) -> bool:

@@ -3,7 +3,6 @@ what that took, and the pictures behind it."""
 
 import itertools
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +15,7 @@ from pipeline.report.deposition import parts as deposition_parts
 from pipeline.report.deposition.marks import HEADS, MARK, PAPER, real
 from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Change, Move
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.deposition import LIBRARY, NAMES, NOT_JUDGED, OURS, Score, Structure, gamma, structures
 from pipeline.verdict.digits import THIN, number, percent, short
@@ -68,7 +67,7 @@ def render(sources: Sources) -> str:
         verdict=judged,
         heads_of_rules=HEADS,
         claim=headline.claim(sources, ("deposition",)),
-        verdict_mark=MARK.get(judged.winner, "data_driven"),
+        verdict_mark=MARK.get(judged.winner, "model_based"),
         beforehand=_beforehand(sources),
         real=real(sources),
         no_scores=parts if isinstance(parts, Missing) else None,
@@ -122,32 +121,7 @@ def _beforehand(sources: Sources) -> str:
 # ---- the first screen: a row for each structure and material
 
 
-class Reading(NamedTuple):
-    """The flow error of one composer, and its forecast, in words."""
-
-    css: str
-    name: str
-    value: str
-    band: str
-    bad: bool
-    best: bool
-
-
-class Answer(NamedTuple):
-    """A row of the first screen: one material of one part."""
-
-    part: str
-    material: str
-    state: str
-    cells: list[Reading]
-    whole: str
-    strip: Markup
-    line: str
-    line_bad: bool
-    change: Change
-
-
-def _answer(structure: Structure, move: Move | None) -> Answer:
+def _answer(structure: Structure, move: Move | None) -> dict[str, Any]:
     """The basis functions beside the library on one scale, the strip's limit in its middle; the
     worst line's volume of the composer that was chosen."""
     scores, limit = structure.scores, structure.asked.flow_error_percent
@@ -160,32 +134,34 @@ def _answer(structure: Structure, move: Move | None) -> Answer:
             if name in scores and not structure.unknown()
             else Missing("not measured", "no score"),
         )
-        for name, css in ((OURS, "dd"), (LIBRARY, "mb"), ("ilc", "acc"))
+        for name, css in ((OURS, "mb"), (LIBRARY, "dd"), ("ilc", "acc"))
     ]
     chosen = scores.get(structure.chosen)
     line = chosen.worst_line if chosen and not structure.unknown() else None
     best = "" if structure.unknown() else structure.best()
-    return Answer(
-        structure.part,
-        structure.material,
-        structure.state(),
-        [
-            Reading(
-                css,
-                NAMES[name],
-                _value(structure, name),
-                _interval(scores[name]) if name in scores and not structure.unknown() else "",
-                bad=name in scores and scores[name].error > limit and not structure.unknown(),
-                best=name == best,
-            )
-            for css, name in (("dd", OURS), ("mb", LIBRARY))
+    return {
+        "part": structure.part,
+        "material": structure.material,
+        "state": structure.state(),
+        "cells": [
+            {
+                "css": css,
+                "name": NAMES[name],
+                "value": _value(structure, name),
+                "band": _interval(scores[name]) if name in scores and not structure.unknown() else "",
+                "bad": name in scores and scores[name].error > limit and not structure.unknown(),
+                "best": name == best,
+            }
+            for css, name in (("mb", OURS), ("dd", LIBRARY))
         ],
-        whole=percent(scores["ilc"].error, 2) if "ilc" in scores else "none",
-        strip=charts.strip(question, shown, (9, 25, 17)),
-        line=NOT_JUDGED if structure.unknown() else "no line" if line is None else f"±{percent(line, 2)}",
-        line_bad=line is not None and line > structure.asked.line_volume_percent,
-        change=Change("first run") if move is None else Change(move.text(), move.moved, move.word == "worse"),
-    )
+        "whole": percent(scores["ilc"].error, 2) if "ilc" in scores else "none",
+        "strip": charts.strip(question, shown, (9, 25, 17)),
+        "line": NOT_JUDGED if structure.unknown() else "no line" if line is None else f"±{percent(line, 2)}",
+        "line_bad": line is not None and line > structure.asked.line_volume_percent,
+        "change": Change("first run")
+        if move is None
+        else Change(move.text(), move.moved, move.word == "worse"),
+    }
 
 
 def _value(structure: Structure, name: str) -> str:
@@ -215,70 +191,54 @@ def _forecast(score: Score) -> str:
     return f"forecast {percent(score.low, 2)} to {percent(score.high, 2)}"
 
 
-class Cell(NamedTuple):
-    """One composer on one structure: error, forecast and worst line in words, and what is marked."""
-
-    value: str = "not measured"
-    band: str = ""
-    line: str = ""
-    best: bool = False
-    bad: bool = False
-    line_bad: bool = False
-    chosen: bool = False
-
-
-class Composer(NamedTuple):
-    """The head of a composer's column."""
-
-    mark: str
-    name: str
-    method: str
-
-
-class BoardRow(NamedTuple):
-    part: str
-    material: str
-    cells: list[Cell]
-
-
-class Scoreboard(NamedTuple):
-    """Structures and materials down, composers across; both limits in words."""
-
-    heads: list[Composer]
-    rows: list[BoardRow]
-    limit: str
-    line: str
-
-
 BOARD = ("basis", "priority", "superposition", "on_off", "ilc")
 
 
-def scoreboard(parts: list[Structure], asked: ReportRules) -> Scoreboard:
+def scoreboard(parts: list[Structure], asked: ReportRules) -> dict[str, Any]:
     """True error, what was forecast, and the worst line's volume."""
-    return Scoreboard(
-        [Composer(MARK[name], NAMES[name], PAPER[name]) for name in BOARD],
-        [BoardRow(part.part, part.material, [_cell(part, name) for name in BOARD]) for part in parts],
-        f"{asked.flow_error_percent:g}{THIN}%",
-        f"±{asked.line_volume_percent:g}{THIN}%",
-    )
+    return {
+        "heads": [{"mark": MARK[name], "name": NAMES[name], "method": PAPER[name]} for name in BOARD],
+        "rows": [
+            {"part": part.part, "material": part.material, "cells": [_cell(part, name) for name in BOARD]}
+            for part in parts
+        ],
+        "limit": f"{asked.flow_error_percent:g}{THIN}%",
+        "line": f"±{asked.line_volume_percent:g}{THIN}%",
+    }
 
 
-def _cell(structure: Structure, name: str) -> Cell:
+def _cell(structure: Structure, name: str) -> dict[str, Any]:
     score = structure.scores.get(name)
     if score is None:
-        return Cell()
+        return {
+            "value": "not measured",
+            "band": "",
+            "line": "",
+            "best": False,
+            "bad": False,
+            "line_bad": False,
+            "chosen": False,
+        }
     line, asked = score.worst_line, structure.asked
     if structure.unknown() and name != "on_off":
-        return Cell(NOT_JUDGED, chosen=name == structure.chosen)
-    return Cell(
-        percent(score.error, 2),
-        _forecast(score),
-        "no line long enough" if line is None else f"worst line {percent(line, 2)}",
-        best=name == structure.best(),
-        bad=score.error > asked.flow_error_percent and name != "on_off",
-        line_bad=line is not None and line > asked.line_volume_percent and name != "on_off",
-        chosen=name == structure.chosen,
-    )
+        return {
+            "value": NOT_JUDGED,
+            "band": "",
+            "line": "",
+            "best": False,
+            "bad": False,
+            "line_bad": False,
+            "chosen": name == structure.chosen,
+        }
+    return {
+        "value": percent(score.error, 2),
+        "band": _forecast(score),
+        "line": "no line long enough" if line is None else f"worst line {percent(line, 2)}",
+        "best": name == structure.best(),
+        "bad": score.error > asked.flow_error_percent and name != "on_off",
+        "line_bad": line is not None and line > asked.line_volume_percent and name != "on_off",
+        "chosen": name == structure.chosen,
+    }
 
 
 def declared(sources: Sources) -> list[tuple[str, list[tuple[str, str]]]]:
@@ -317,7 +277,7 @@ def signals(sources: Sources) -> Picture:
             "signals", title, table if isinstance(table, Missing) else sources.tables["learned"]
         )
     Ts = _step(sources)
-    shown: list[Column] = []
+    shown: list[PictureColumn] = []
     leads: dict[str, float] = {}
     materials = [str(name) for name in dict.fromkeys(table["material"])][:MATERIALS]
     for i, material in enumerate(materials):
@@ -328,7 +288,7 @@ def signals(sources: Sources) -> Picture:
                 continue
             leads[task] = max(leads.get(task, 0.0), Ts * float(table["lead"][rows].max()))
             panels.append(_panel(table, rows, task, material, Ts, titled=i == 0 and not panels))
-        shown.append(Column(f"Material {material}", "", "", panels))
+        shown.append(PictureColumn(f"Material {material}", "", "", panels))
     text = ", ".join(f"{task} {number(seconds, 2)}{THIN}s" for task, seconds in leads.items())
     return Picture(
         "signals",
@@ -407,29 +367,12 @@ class Tested(NamedTuple):
     bad: bool
 
 
-class Assumption(NamedTuple):
-    """One claim of the paper, a cell for each material."""
-
-    number: int
-    name: str
-    what: str
-    cells: list[Tested]
-    holds: bool
-
-
-class Assumptions(NamedTuple):
-    missing: Missing | None = None
-    rows: Sequence[Assumption] = ()
-    materials: Sequence[str] = ()
-    limit: str = ""
-
-
-def assumptions(sources: Sources) -> Assumptions:
+def assumptions(sources: Sources) -> dict[str, Any]:
     """The paper's assumptions 1 to 4: what was found of each, by material, against the largest predicted
     error that compose_parts lets pass."""
     checks = lookup(sources.tables["learned"], "checks", what="the check of the assumptions")
     if isinstance(checks, Missing):
-        return Assumptions(checks)
+        return {"missing": checks}
     limit = sources.declared.everything.get("compose_parts", {}).get("largest_error_percent", 20)
     tests = pd.DataFrame(checks, columns=["assumption", "claim", "material", "percent"])
     by_claim = tests.set_index(["assumption", "claim", "material"])["percent"].astype(float)
@@ -441,36 +384,25 @@ def assumptions(sources: Sources) -> Assumptions:
             Tested("not tested" if math.isnan(value) else percent(value, 2), value > limit)
             for value in percents
         ]
-        rows.append(Assumption(place, name, what, cells, holds=not any(cell.bad for cell in cells)))
-    return Assumptions(None, rows, list(measured.columns), f"{limit:g}{THIN}%")
+        rows.append(
+            {
+                "number": place,
+                "name": name,
+                "what": what,
+                "cells": cells,
+                "holds": not any(cell.bad for cell in cells),
+            }
+        )
+    return {"missing": None, "rows": rows, "materials": list(measured.columns), "limit": f"{limit:g}{THIN}%"}
 
 
-class Machine(NamedTuple):
-    """The head of a column of the chains: whose machine, and as known from where."""
-
-    material: str
-    word: str
-
-
-class Parameter(NamedTuple):
-    title: str
-    cells: list[str]
-
-
-class Chains(NamedTuple):
-    missing: Missing | None = None
-    rows: Sequence[Parameter] = ()
-    heads: Sequence[Machine] = ()
-    fit: str = ""
-
-
-def chains(sources: Sources) -> Chains:
+def chains(sources: Sources) -> dict[str, Any]:
     """Parameters of each machine: as known beforehand, as identified,
     and, where it is simulated, as it truly is."""
     models, learned = sources.tables["models"], lookup(sources.tables["learned"], "materials")
     for missing in (learned, models):
         if isinstance(missing, Missing):
-            return Chains(missing)
+            return {"missing": missing}
     heads, values = [], []
     for material in learned[:MATERIALS]:
         name = str(material["material"])
@@ -481,13 +413,15 @@ def chains(sources: Sources) -> Chains:
             ("true", true),
         ):
             if extruder:
-                heads.append(Machine(name, word))
+                heads.append({"material": name, "word": word})
                 values.append(extruder)
     rows = [
-        Parameter(
-            title,
-            ["none" if extruder.get(key) is None else short(float(extruder[key]), 3) for extruder in values],
-        )
+        {
+            "title": title,
+            "cells": [
+                "none" if extruder.get(key) is None else short(float(extruder[key]), 3) for extruder in values
+            ],
+        }
         for key, title in CHAIN
         if any(extruder.get(key) for extruder in values)
     ]
@@ -497,51 +431,30 @@ def chains(sources: Sources) -> Chains:
         for material in learned[:MATERIALS]
         if material["chain"].get("held_out_percent") is not None
     ]
-    return Chains(None, rows, heads, "; ".join(fits))
+    return {"missing": None, "rows": rows, "heads": heads, "fit": "; ".join(fits)}
 
 
-class Signal(NamedTuple):
-    """One column of the library, in words."""
-
-    task: str
-    material: str
-    nozzle: str
-    speed: str
-    pause: str
-    lead: str
-    length: str
-    extreme: str
-
-
-class Columns(NamedTuple):
-    """The columns that are shown, and how many more there are."""
-
-    missing: Missing | None = None
-    rows: Sequence[Signal] = ()
-    more: int = 0
-
-
-def columns(sources: Sources) -> Columns:
+def columns(sources: Sources) -> dict[str, Any]:
     """The matrix (3), a row for each of its columns."""
     table = sources.tables["library"]
     if isinstance(table, Missing):
-        return Columns(table)
+        return {"missing": table}
     library = pd.DataFrame(table)
     rows = [_signal(row, _step(sources)) for row in library.head(MOST).itertuples()]
-    return Columns(None, rows, max(len(library) - MOST, 0))
+    return {"missing": None, "rows": rows, "more": max(len(library) - MOST, 0)}
 
 
-def _signal(row: Any, Ts: float) -> Signal:
+def _signal(row: Any, Ts: float) -> dict[str, Any]:
     """A row of the library, sampled every Ts seconds."""
     command = np.asarray(row.signal_mm, float)
     extreme = float(command[np.argmax(np.abs(command))]) if len(command) else 0.0
-    return Signal(
-        row.task,
-        row.material,
-        nozzle=f"{row.nozzle_mm:g}",
-        speed=f"{row.speed_mm_per_s:g}",
-        pause=f"{row.pause_s:g}" if row.pause_s else "",
-        lead=f"{number(Ts * row.lead, 2)} ({row.lead})",
-        length=f"{number(Ts * row.length, 2)} ({row.length})",
-        extreme=short(extreme, 3) if extreme else "0",
-    )
+    return {
+        "task": row.task,
+        "material": row.material,
+        "nozzle": f"{row.nozzle_mm:g}",
+        "speed": f"{row.speed_mm_per_s:g}",
+        "pause": f"{row.pause_s:g}" if row.pause_s else "",
+        "lead": f"{number(Ts * row.lead, 2)} ({row.lead})",
+        "length": f"{number(Ts * row.length, 2)} ({row.length})",
+        "extreme": short(extreme, 3) if extreme else "0",
+    }

@@ -1,16 +1,15 @@
 """The parts of the deposition page: each one coloured by its flow error, the flow of every composer over its
 worst stretch, its lines, what limits it, and what was refused."""
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.deposition.marks import MARK, PAPER, real
+from pipeline.report.deposition.marks import CSS, MARK, PAPER, real
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.deposition import NAMES, asked_of_the_drive
 from pipeline.verdict.digits import MINUS, THIN, count, number, percent, short, shortened
@@ -33,7 +32,6 @@ CLASSES = (
     ("more", "over1"),
     ("far more", "over2"),
 )
-CSS = {"priority": "mb", "basis": "dd", "on_off": "bl", "ilc": "dd", "superposition": "mb"}
 
 
 def _streams(table: Table) -> list[tuple[str, str]]:
@@ -74,7 +72,7 @@ def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Pi
             f"{percent(max(100 - right - lack, 0.0), 2)} with more"
         )
         panel = _drawn(mine, error, prints, alt)
-        shown.append(Column(NAMES[name], PAPER[name], MARK[name], [panel, _shares(error[prints])]))
+        shown.append(PictureColumn(NAMES[name], PAPER[name], MARK[name], [panel, _shares(error[prints])]))
     return Picture(
         f"part-{i}",
         part,
@@ -221,7 +219,7 @@ def stretches(sources: Sources) -> Picture:
         if any(np.isfinite(stretch.flows[name]).any() for stretch in worst_of_each)
     ]
     shown = [
-        Column(
+        PictureColumn(
             NAMES[name],
             PAPER[name],
             MARK[name],
@@ -310,48 +308,27 @@ def _panel(stretch: Stretch, name: str, *, first: bool, top: bool) -> Markup:
 # ---- the lines
 
 
-class Line(NamedTuple):
-    """A printed line in words: planned and predicted volume, and how far both signals are off."""
-
-    part: str
-    line: int
-    tool: str
-    duration: str
-    planned: str
-    predicted: str
-    on_off: str
-    error: str
-    bad: bool
-    short: bool
-
-
-class Lines(NamedTuple):
-    missing: Missing | None = None
-    rows: Sequence[Line] = ()
-    summary: str = ""
-
-
-def lines(sources: Sources) -> Lines:
+def lines(sources: Sources) -> dict[str, Any]:
     """The lines that are furthest from their volume, the worst first."""
     table = sources.tables["lines"]
     if isinstance(table, Missing):
-        return Lines(table)
+        return {"missing": table}
     allowed = sources.declared.rules.line_volume_percent
     printed = pd.DataFrame(table).fillna({"error_percent": 0.0})
     printed["off_percent"] = printed.error_percent.abs()
     rows = [
-        Line(
-            row.part,
-            row.line,
-            f"T{row.tool}",
-            duration=number(row.duration_s, 2),
-            planned=number(row.planned_mm3, 3),
-            predicted=number(row.predicted_mm3, 3),
-            on_off=_signed(100 * (row.on_off_mm3 / max(row.planned_mm3, 1e-12) - 1)),
-            error=_signed(row.error_percent),
-            bad=row.off_percent > allowed,
-            short=row.shorter_than_lead,
-        )
+        {
+            "part": row.part,
+            "line": row.line,
+            "tool": f"T{row.tool}",
+            "duration": number(row.duration_s, 2),
+            "planned": number(row.planned_mm3, 3),
+            "predicted": number(row.predicted_mm3, 3),
+            "on_off": _signed(100 * (row.on_off_mm3 / max(row.planned_mm3, 1e-12) - 1)),
+            "error": _signed(row.error_percent),
+            "bad": row.off_percent > allowed,
+            "short": row.shorter_than_lead,
+        }
         for row in printed.nlargest(WORST, "off_percent").itertuples()
     ]
     beyond, short_runs = int((printed.off_percent > allowed).sum()), int(printed.shorter_than_lead.sum())
@@ -361,7 +338,7 @@ def lines(sources: Sources) -> Lines:
         f"{count(short_runs, 'belongs', 'belong') if short_runs else 'none belongs'} to runs shorter than "
         "the lead of Stop."
     )
-    return Lines(None, rows, summary)
+    return {"missing": None, "rows": rows, "summary": summary}
 
 
 def _signed(value: float) -> str:
@@ -394,22 +371,17 @@ class Forecast(NamedTuple):
     ramp: str
 
 
-class Forecasts(NamedTuple):
-    missing: Missing | None = None
-    rows: Sequence[Forecast] = ()
-
-
-def forecasts(sources: Sources) -> Forecasts:
+def forecasts(sources: Sources) -> dict[str, Any]:
     """By part and material: composer, saturation and the ramp that would do, and lines that need a look."""
     conformance = sources.tables["conformance"]
     if isinstance(conformance, Missing):
-        return Forecasts(conformance)
+        return {"missing": conformance}
     rows = [
         _forecast(part, material, report)
         for part, report in conformance.items()
         for material in report.get("saturation", {})
     ]
-    return Forecasts(None, rows)
+    return {"missing": None, "rows": rows}
 
 
 def _forecast(part: str, material: str, report: dict[str, Any]) -> Forecast:
@@ -469,36 +441,32 @@ class Tool(NamedTuple):
     area: str = ""
 
 
-class Tools(NamedTuple):
-    missing: Missing | None = None
-    rows: Sequence[Tool] = ()
-    summary: str = ""
-
-
-def extruded(sources: Sources) -> Tools:
+def extruded(sources: Sources) -> dict[str, Any]:
     """By part and tool the volume that E asks for beside the declared bead's, or why E does not count."""
     conformance = sources.tables["conformance"]
     if isinstance(conformance, Missing):
-        return Tools(conformance)
+        return {"missing": conformance}
     told = [(part, report["program"]) for part, report in conformance.items() if "program" in report]
     if not told:
-        return Tools(Missing("not measured", "the conformance report is of an earlier version",
-                             "Run ./run dvc repro compose_parts"))  # fmt: skip
+        return {"missing": Missing("not measured", "the conformance report is of an earlier version",
+                             "Run ./run dvc repro compose_parts")}  # fmt: skip
     rows, shares = [], []
     for part, program in told:
         found = {f"T{one['tool']}": one for one in program["e_beside_declared_bead"]}
         rows += [_tool(part, tool, source, found.get(tool)) for tool, source in program["volumes"].items()]
         shares += [one["by_e_mm3"] / one["declared_mm3"] for one in found.values() if one["declared_mm3"] > 0]
     if not shares:
-        return Tools(
-            None, rows, "No line’s volume is E’s: each is its length times the declared bead’s area."
-        )
+        return {
+            "missing": None,
+            "rows": rows,
+            "summary": "No line’s volume is E’s: each is its length times the declared bead’s area.",
+        }
     times = " to ".join(dict.fromkeys(short(share, 3) for share in (min(shares), max(shares))))
     summary = (
         f"E gives the volumes of {len(shares)} of {count(len(rows), 'tool')}; it asks for {times} times the "
         "declared bead’s."
     )
-    return Tools(None, rows, summary)
+    return {"missing": None, "rows": rows, "summary": summary}
 
 
 def _tool(part: str, tool: str, source: str, one: dict[str, Any] | None) -> Tool:
@@ -516,37 +484,27 @@ def _tool(part: str, tool: str, source: str, one: dict[str, Any] | None) -> Tool
     )
 
 
-class Refusal(NamedTuple):
-    part: str
-    where: str
-    why: str
-
-
-class Refused(NamedTuple):
-    """What is shown of the refusals, how many more there are, and the words that were not understood."""
-
-    missing: Missing | None = None
-    rows: Sequence[Refusal] = ()
-    more: int = 0
-    unknown: str = ""
-
-
-def refused(sources: Sources) -> Refused:
+def refused(sources: Sources) -> dict[str, Any]:
     """Lines and whole parts that were refused, each with its sentence."""
     conformance = sources.tables["conformance"]
     if isinstance(conformance, Missing):
-        return Refused(conformance)
+        return {"missing": conformance}
     rows = []
     for part, report in conformance.items():
         why = report.get("refused", [])
         rows += (
-            [Refusal(part, "whole", why)]
+            [{"part": part, "where": "whole", "why": why}]
             if isinstance(why, str)
-            else [Refusal(part, f"line {line['line']}", str(line["why"])) for line in why]
+            else [{"part": part, "where": f"line {line['line']}", "why": str(line["why"])} for line in why]
         )
     unknown = [
         f"{part}: {count(report['unknown_words'], 'word')}"
         for part, report in conformance.items()
         if report.get("unknown_words")
     ]
-    return Refused(None, rows[:REFUSED], max(len(rows) - REFUSED, 0), ", ".join(unknown))
+    return {
+        "missing": None,
+        "rows": rows[:REFUSED],
+        "more": max(len(rows) - REFUSED, 0),
+        "unknown": ", ".join(unknown),
+    }

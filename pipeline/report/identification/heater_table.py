@@ -37,14 +37,6 @@ class PairRow(NamedTuple):
     Kd: Banded
 
 
-class OutputPairs(NamedTuple):
-    """An output's pairs, and in a sentence the inputs that have no such model with it."""
-
-    output: str
-    rows: list[PairRow]
-    gaps: str
-
-
 class PidRow(NamedTuple):
     """A PID of a heater in percent of duty, and as printer.cfg has it."""
 
@@ -54,20 +46,12 @@ class PidRow(NamedTuple):
     klipper: list[str]
 
 
-class HeaterTable(NamedTuple):
-    finding: str
-    outputs: list[OutputPairs]
-    printer: list[PidRow]
-    printer_note: str
-    missing: Missing | None = None
-
-
-def heater_table(sources: Sources) -> HeaterTable:
+def heater_table(sources: Sources) -> dict[str, Any]:
     """Every pair of the first-order table, output by output; of many inputs the strongest of each output."""
     table = sources.tables["first_order"]
     printer, note = _printer_rows(sources, table)
     if isinstance(table, Missing):
-        return HeaterTable("", [], printer, note, table)
+        return {"finding": "", "outputs": [], "printer": printer, "printer_note": note, "missing": table}
     gaps = _gaps(table, _horizon(sources))
     outputs = [_output_pairs(table, gaps, output.name) for output in sources.declared.machine.outputs]
     fitted = sum(not gap for gap in gaps)
@@ -76,10 +60,10 @@ def heater_table(sources: Sources) -> HeaterTable:
         f"{count(fitted, every, every).capitalize()} {'has' if fitted == 1 else 'have'} a gain of known sign "
         "and a time constant that the record shows. Bold: the input that moves an output furthest."
     )
-    return HeaterTable(finding, outputs, printer, note)
+    return {"finding": finding, "outputs": outputs, "printer": printer, "printer_note": note, "missing": None}
 
 
-def _output_pairs(table: Table, gaps: list[str], output: str) -> OutputPairs:
+def _output_pairs(table: Table, gaps: list[str], output: str) -> dict[str, Any]:
     mine = sorted(np.flatnonzero(table["output"] == output), key=lambda k: -abs(table["gain"][k]))
     known = [k for k in mine if table["seen"][k]]
     fitted = [k for k in mine if not gaps[k]]
@@ -92,7 +76,7 @@ def _output_pairs(table: Table, gaps: list[str], output: str) -> OutputPairs:
     ]
     left = sum(not gaps[k] for k in mine) - len(fitted)
     sentences += [f"{count(left, 'weaker input is', 'weaker inputs are')} not shown"] if left else []
-    return OutputPairs(output, rows, "; ".join(sentences))
+    return {"output": output, "rows": rows, "gaps": "; ".join(sentences)}
 
 
 def shortened_list(names: list[str]) -> str:

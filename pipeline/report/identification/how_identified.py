@@ -102,52 +102,43 @@ def _listed(items: Sequence[str]) -> str:
 # ---- gains that physics forbids
 
 
-class FlaggedRow(NamedTuple):
-    """A gain that physics forbids, with its band; `certain` where all of the band is forbidden."""
-
-    output: str
-    input: str
-    gain: str
-    band: str
-    reason: str
-    certain: bool
-
-
-class Flagged(NamedTuple):
-    finding: str
-    rows: list[FlaggedRow]
-    missing: Missing | None = None
-
-
-def flagged(sources: Sources) -> Flagged:
+def flagged(sources: Sources) -> dict[str, Any]:
     """Gains of heaters with a sign or a size that physics forbids."""
     gains = lookup(sources.metrics["identify_plant"], "forbidden_gains", what="the check of signs and sizes")
     if isinstance(gains, Missing):
-        return Flagged("", [], gains)
+        return {"finding": "", "rows": [], "missing": gains}
     machine = sources.declared.machine
     heaters = [signal.name for signal in machine.inputs if signal.heats]
     if not heaters:
         reason = "no input is declared to heat, so no sign is known to be wrong"
-        return Flagged(
-            "", [], Missing("not applicable", reason, "Set heats: true for heaters in plant.inputs")
-        )
+        return {
+            "finding": "",
+            "rows": [],
+            "missing": Missing("not applicable", reason, "Set heats: true for heaters in plant.inputs"),
+        }
     if not gains:
-        return Flagged(f"None: every effect of {_listed(heaters)} is one that a heater can have.", [])
-    return Flagged(
-        f"{flagged_sentence(gains)} {flagged_remedy(gains)}", [_flagged_row(gain) for gain in gains]
-    )
+        return {
+            "finding": f"None: every effect of {_listed(heaters)} is one that a heater can have.",
+            "rows": [],
+            "missing": None,
+        }
+    return {
+        "finding": f"{flagged_sentence(gains)} {flagged_remedy(gains)}",
+        "rows": [_flagged_row(gain) for gain in gains],
+        "missing": None,
+    }
 
 
-def _flagged_row(gain: dict[str, Any]) -> FlaggedRow:
+def _flagged_row(gain: dict[str, Any]) -> dict[str, Any]:
     places = decimals(gain["low"], gain["high"], value=gain["gain"])
-    return FlaggedRow(
-        output=gain["output"],
-        input=gain["input"],
-        gain=number(gain["gain"], places),
-        band=band(gain["low"], gain["high"], places),
-        reason=gain["reason"],
-        certain=gain["certain"],
-    )
+    return {
+        "output": gain["output"],
+        "input": gain["input"],
+        "gain": number(gain["gain"], places),
+        "band": band(gain["low"], gain["high"], places),
+        "reason": gain["reason"],
+        "certain": gain["certain"],
+    }
 
 
 # ---- what was chosen
@@ -200,12 +191,7 @@ class FitRow(NamedTuple):
     feedthrough: str
 
 
-class FitTable(NamedTuple):
-    finding: str
-    rows: list[FitRow]
-
-
-def fit_table(sources: Sources, fits: Sequence[Fit]) -> FitTable:
+def fit_table(sources: Sources, fits: Sequence[Fit]) -> dict[str, Any]:
     """Every output with and without a free mean: what another ambient or operating point costs."""
     metrics = sources.metrics["identify_plant"]
     rows = []
@@ -228,7 +214,7 @@ def fit_table(sources: Sources, fits: Sequence[Fit]) -> FitTable:
         finding = "A free mean gains nothing beyond noise: the level did not move up to the hold-out."
     else:
         finding = ""
-    return FitTable(finding, rows)
+    return {"finding": finding, "rows": rows}
 
 
 def _cost(simulated: Figure | Missing, free: Figure | Missing) -> tuple[str, bool]:

@@ -2,15 +2,15 @@
 excitation that it was learned from."""
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.identification.how_identified import left_out_words, loop_state
-from pipeline.report.identification.model_errors import Cell, Matrix, Room, blank, matrix, room
+from pipeline.report.identification.model_errors import Room, blank, matrix, room
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import evidence
 from pipeline.verdict.digits import DASH, THIN, band, count, decimals, number, short
@@ -23,7 +23,7 @@ MOST_DOTS = 600  # of the cloud of poles
 # ---- step responses
 
 
-def steps(sources: Sources) -> Matrix:
+def steps(sources: Sources) -> dict[str, Any]:
     """Response of each output to a step of each input, with the
     spread's band, and gain, time constant and delay."""
     table, dynamics, title = (
@@ -37,7 +37,7 @@ def steps(sources: Sources) -> Matrix:
     size = room(len(sources.declared.machine.inputs))
     scales = {o.name: _reach(table, table["output"] == o.name) for o in sources.declared.machine.outputs}
 
-    def cell(output: str, name: str) -> tuple[float, Callable[[], Cell]]:
+    def cell(output: str, name: str) -> tuple[float, Callable[[], dict[str, Any]]]:
         mine = (table["output"] == output) & (table["input"] == name)
         row = int(np.flatnonzero((dynamics["output"] == output) & (dynamics["input"] == name))[0])
         strength = float(np.abs(table["response"][mine]).max())
@@ -63,15 +63,16 @@ def steps(sources: Sources) -> Matrix:
         f"cut where it leaves the panel. τ: 1.5 times the way from 28.3 to 63.2{THIN}% of the largest "
         f"excursion; delay: what is left of the time to 63.2{THIN}%.{more}"
     )
-    return Matrix(
-        "steps",
-        title,
-        text,
-        rows,
-        caption,
-        page.origin(sources.source("steps", "dynamics"), y="response"),
-        size.across,
-    )
+    return {
+        "id": "steps",
+        "title": title,
+        "finding": text,
+        "rows": rows,
+        "caption": caption,
+        "origin": page.origin(sources.source("steps", "dynamics"), y="response"),
+        "across": size.across,
+        "missing": None,
+    }
 
 
 def _members(sources: Sources) -> str:
@@ -94,7 +95,9 @@ def _reach(table: Table, rows: np.ndarray) -> charts.Axis:
     return charts.linear(min(low, 0.0), max(high, 0.0) or 1e-12, ticks=3)
 
 
-def _response(table: Table, rows: np.ndarray, dynamics: Table, row: int, y: charts.Axis, size: Room) -> Cell:
+def _response(
+    table: Table, rows: np.ndarray, dynamics: Table, row: int, y: charts.Axis, size: Room
+) -> dict[str, Any]:
     time, sure = table["time_s"][rows], bool(dynamics["seen"][row])
     end = float(time[-1])
     frame = charts.Frame(
@@ -117,24 +120,24 @@ def _response(table: Table, rows: np.ndarray, dynamics: Table, row: int, y: char
     )
     if not sure:
         alt = f"{output} after {name}: sign not known, {_span(peak)} °C per %"
-        return Cell(
-            name,
-            _span(gain),
-            charts.panel(frame, layers, alt=alt, css=size.css, units=("s", "°C")),
-            "sign not known",
-        )
+        return {
+            "head": name,
+            "figure": _span(gain),
+            "panel": charts.panel(frame, layers, alt=alt, css=size.css, units=("s", "°C")),
+            "foot": "sign not known",
+        }
     tau, delay = (f"{short(float(dynamics[key][row]), 2)}{THIN}s" for key in ("time_constant_s", "delay_s"))
     turns = gain[0] / peak[0] < 0.8
     figure = f"{number(peak[0], _places(peak))} ({_span(peak)})" + (
         f", then {number(gain[0], _places(gain))}" if turns else ""
     )
     alt = f"{output} after {name}: {figure} °C per %; time constant {tau}, delay {delay}"
-    return Cell(
-        name,
-        figure,
-        charts.panel(frame, layers, alt=alt, css=size.css, units=("s", "°C")),
-        f"τ {tau}, delay {delay}",
-    )
+    return {
+        "head": name,
+        "figure": figure,
+        "panel": charts.panel(frame, layers, alt=alt, css=size.css, units=("s", "°C")),
+        "foot": f"τ {tau}, delay {delay}",
+    }
 
 
 def _places(values: tuple[float, float, float]) -> int:
@@ -180,7 +183,7 @@ def order(sources: Sources) -> Picture:
         "order",
         title,
         text,
-        [Column(c.head, c.small, "", c.panels) for c in shown],
+        [PictureColumn(c.head, c.small, "", c.panels) for c in shown],
         caption if tried else "",
         page.origin(sources.source("order")),
     )
@@ -228,7 +231,7 @@ def poles(sources: Sources) -> Picture:
             f"{head}: {int(mine.sum())} poles, the largest of size {number(slowest, 4)}, "
             f"{'inside' if slowest < 1 else 'on or outside'} the unit circle"
         )
-        shown.append(Column(head, small, "", [charts.panel(frame, layers, alt=alt)]))
+        shown.append(PictureColumn(head, small, "", [charts.panel(frame, layers, alt=alt)]))
     plants = int(table["member"].max())
     text = (
         f"{count(int(mine.sum()), 'pole').capitalize()}, the largest of size {number(slowest, 4)}: "
@@ -355,7 +358,7 @@ def excitation(sources: Sources) -> Picture:
             f"{short(float(level.max()), 2)} % in {len(level)} bands"
         )
         shown.append(
-            Column(
+            PictureColumn(
                 signal.name,
                 small,
                 "",

@@ -2,13 +2,13 @@
 hold-out, with themselves, and with the inputs."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import THIN, count, number, short
 from pipeline.verdict.evidence import Table, lookup
@@ -16,15 +16,6 @@ from pipeline.verdict.identification import Fit, percent_of
 from pipeline.verdict.verdict import Missing
 
 MOST_INPUTS = 7  # panels in a row of a matrix; a machine with more shows the strongest
-
-
-class Cell(NamedTuple):
-    """A panel of a matrix: what it is, its figure above, its figures below."""
-
-    head: str
-    figure: str
-    panel: Markup
-    foot: str
 
 
 class Room(NamedTuple):
@@ -47,28 +38,17 @@ def room(panels: int) -> Room:
     return Room(across, width, height, "mb wide" if across < 6 else "mb")
 
 
-class OutputRow(NamedTuple):
-    """An output and its panels, one an input."""
-
-    output: str
-    cells: list[Cell]
-
-
-class Matrix(NamedTuple):
-    """Outputs x inputs, a row of panels for each output; in the place of what cannot be drawn, the reason."""
-
-    id: str
-    title: str
-    finding: str
-    rows: list[OutputRow]
-    caption: str
-    origin: Markup
-    across: int
-    missing: Missing | None = None
-
-
-def blank(id: str, title: str, missing: Missing) -> Matrix:
-    return Matrix(id, title, "", [], "", Markup(""), 0, missing)
+def blank(id: str, title: str, missing: Missing) -> dict[str, Any]:
+    return {
+        "id": id,
+        "title": title,
+        "finding": "",
+        "rows": [],
+        "caption": "",
+        "origin": Markup(""),
+        "across": 0,
+        "missing": missing,
+    }
 
 
 # ---- the hold-out
@@ -88,7 +68,9 @@ def holdout(sources: Sources, fits: Sequence[Fit], ahead: str) -> Picture:
         small = ", ".join(
             f"{name} {part.state if isinstance(part, Missing) else percent_of(part)}" for name, part in parts
         )
-        shown.append(Column(fit.name, f"fit: {small}", "", _stretch(sources, table, fit.name, small, points)))
+        shown.append(
+            PictureColumn(fit.name, f"fit: {small}", "", _stretch(sources, table, fit.name, small, points))
+        )
     segments = len(np.unique(table["segment"]))
     masked = sum(int((~np.isfinite(table[f"{fit.name}_measured"])).sum()) for fit in fits)
     text = (
@@ -187,7 +169,7 @@ def whiteness(sources: Sources) -> Picture:
     for name in names:
         passed = bool(table["passed"][mine[name]].all())
         panel = _stems(table, mine[name], y, room(len(names)), f"{name}, errors with themselves")
-        shown.append(Column(name, "passed: noise" if passed else "failed: not noise", "", [panel]))
+        shown.append(PictureColumn(name, "passed: noise" if passed else "failed: not noise", "", [panel]))
     bad = [name for name in names if not table["passed"][mine[name]].all()]
     text = (
         "Yes: the one-step errors of every output are noise, by Ljung and Box’s test at 99 %."
@@ -203,7 +185,7 @@ def whiteness(sources: Sources) -> Picture:
     return Picture("white", title, text, shown, caption, page.origin(sources.source("residuals")))
 
 
-def cross(sources: Sources) -> Matrix:
+def cross(sources: Sources) -> dict[str, Any]:
     """Correlation of each output's one-step errors with each input."""
     table, title = sources.tables["residuals"], "Do the errors still follow an input?"
     if isinstance(table, Missing):
@@ -212,14 +194,17 @@ def cross(sources: Sources) -> Matrix:
     y = _correlations(table, other)
     strength = np.nan_to_num(np.abs(table["correlation"]) / np.maximum(table["band"], 1e-300))
 
-    def cell(output: str, name: str) -> tuple[float, Callable[[], Cell]]:
+    def cell(output: str, name: str) -> tuple[float, Callable[[], dict[str, Any]]]:
         mine = other & (table["output"] == output) & (table["against"] == name)
         passed = bool(table["passed"][mine].all())
 
-        def draw() -> Cell:
-            return Cell(
-                name, "" if passed else "failed", _stems(table, mine, y, size, f"{output} after {name}"), ""
-            )
+        def draw() -> dict[str, Any]:
+            return {
+                "head": name,
+                "figure": "" if passed else "failed",
+                "panel": _stems(table, mine, y, size, f"{output} after {name}"),
+                "foot": "",
+            }
 
         return float(strength[mine & (table["lag"] >= 0)].max(initial=0)), draw
 
@@ -250,9 +235,16 @@ def cross(sources: Sources) -> Matrix:
         "the test widens it for the number of lags. Left of zero, pale: feedback from errors to inputs, "
         f"no fault of the model.{more}"
     )
-    return Matrix(
-        "followed", title, text, rows, caption, page.origin(sources.source("residuals")), size.across
-    )
+    return {
+        "id": "followed",
+        "title": title,
+        "finding": text,
+        "rows": rows,
+        "caption": caption,
+        "origin": page.origin(sources.source("residuals")),
+        "across": size.across,
+        "missing": None,
+    }
 
 
 def _correlations(table: Table, rows: np.ndarray) -> charts.Axis:
@@ -292,15 +284,15 @@ def _stems(table: Table, rows: np.ndarray, y: charts.Axis, size: Room, name: str
 
 
 def matrix(
-    sources: Sources, cell: Callable[[str, str], tuple[float, Callable[[], Cell]]]
-) -> tuple[list[OutputRow], str]:
+    sources: Sources, cell: Callable[[str, str], tuple[float, Callable[[], dict[str, Any]]]]
+) -> tuple[list[dict[str, Any]], str]:
     """Rows of cells; where the machine has many inputs, of each output the strongest ones, in their order."""
     machine = sources.declared.machine
     rows = []
     for output in machine.outputs:
         cells = [cell(output.name, i.name) for i in machine.inputs]
         largest = sorted(sorted(range(len(cells)), key=lambda k: -cells[k][0])[:MOST_INPUTS])
-        rows.append(OutputRow(output.name, [cells[k][1]() for k in largest]))
+        rows.append({"output": output.name, "cells": [cells[k][1]() for k in largest]})
     left = len(machine.inputs) - MOST_INPUTS
     return (
         rows,

@@ -2,7 +2,7 @@
 and what it would teach."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import THIN, number, short
@@ -10,46 +10,30 @@ from pipeline.verdict.evidence import lookup
 from pipeline.verdict.verdict import Missing
 
 
-class Row(NamedTuple):
-    """An output: its temperatures in the middle, forecast lowest to highest, and limits, in °C."""
-
-    output: str
-    target: str
-    forecast: str
-    limits: str
-
-
-class NextExperiment(NamedTuple):
-    """Sentences on the file that replaces the controller's commands and on the one added to them; a row an
-    output where the first is written."""
-
-    missing: Missing | None
-    sentences: list[str]
-    rows: list[Row]
-
-
-def next_experiment(sources: Sources) -> NextExperiment:
+def next_experiment(sources: Sources) -> dict[str, Any]:
     """Of the stage generate_probing."""
     metrics = sources.metrics["generate_probing"]
     told, added = lookup(metrics, "next_experiment"), lookup(metrics, "closed_loop")
     for part in (told, added):
         if isinstance(part, Missing):
-            return NextExperiment(part, [], [])
+            return {"missing": part, "sentences": [], "rows": []}
     if not told["written"]:
-        return NextExperiment(
-            None, [f"No experiment is written: {_celsius(told['reason'])}.", _around(added)], []
-        )
+        return {
+            "missing": None,
+            "sentences": [f"No experiment is written: {_celsius(told['reason'])}.", _around(added)],
+            "rows": [],
+        }
     rows = [
-        Row(
-            output=output.name,
-            target=_degrees(told["target_degC"].get(output.name)),
-            forecast=_range(told["lowest_degC"].get(output.name), told["highest_degC"].get(output.name)),
-            limits=_range(*(told["limit_degC"][output.name][end] for end in ("low", "high"))),
-        )
+        {
+            "output": output.name,
+            "target": _degrees(told["target_degC"].get(output.name)),
+            "forecast": _range(told["lowest_degC"].get(output.name), told["highest_degC"].get(output.name)),
+            "limits": _range(*(told["limit_degC"][output.name][end] for end in ("low", "high"))),
+        }
         for output in sources.declared.machine.outputs
         if output.name in told["limit_degC"]
     ]
-    return NextExperiment(None, [_played(told), _taught(told), _around(added)], rows)
+    return {"missing": None, "sentences": [_played(told), _taught(told), _around(added)], "rows": rows}
 
 
 def _played(told: Mapping[str, Any]) -> str:

@@ -2,10 +2,9 @@
 pictures behind it, and what the record lost on the way."""
 
 import math
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
 from pipeline.report.identification import (
     heater_table,
@@ -99,31 +98,7 @@ def _judged_on(sources: Sources) -> str:
 # ---- a row for each output
 
 
-class FitCell(NamedTuple):
-    """A fit with its band; `missing` where it was not measured."""
-
-    css: str
-    name: str
-    state: str
-    missing: Missing | None
-    value: str
-    band: str
-
-
-class Answer(NamedTuple):
-    """An output's row: its fits, the yardstick, the picture of what is missed, and the change."""
-
-    name: str
-    note: str
-    state: str
-    cells: list[FitCell]
-    held: str
-    strip: Markup
-    change: str
-    moved: bool
-
-
-def answer(sources: Sources, fit: Fit, ahead: str) -> Answer:
+def answer(sources: Sources, fit: Fit, ahead: str) -> dict[str, Any]:
     """Fits with bands, the yardstick, the share that is missed as a strip, what the
     residuals say, and the change since the accepted run."""
     question = Question(0, "", fit.name, "%", least_fit(), True, "")
@@ -143,28 +118,37 @@ def answer(sources: Sources, fit: Fit, ahead: str) -> Answer:
     ]
     before = _accepted(sources, fit.name)
     change, moved = since(before, fit.simulated)
-    return Answer(
-        name=fit.name,
-        note=_residual_note(sources, fit.name),
-        state=next(
+    return {
+        "name": fit.name,
+        "note": _residual_note(sources, fit.name),
+        "state": next(
             (wanted for wanted in (FAILED, UNDECIDED) if wanted in states),
             PASSED if states == [PASSED, PASSED] else "not measured",
         ),
-        cells=[
+        "cells": [
             _fit_cell("dd", "Simulation", fit.simulated, states[0]),
             _fit_cell("mb", ahead[:1].upper() + ahead[1:], fit.ahead, states[1]),
         ],
-        held=_value(fit.held),
-        strip=charts.strip(Question(0, "", fit.name, "%", 100 - least_fit(), False, ""), shown, (11, 23, 23)),
-        change=change,
-        moved=moved,
-    )
+        "held": _value(fit.held),
+        "strip": charts.strip(
+            Question(0, "", fit.name, "%", 100 - least_fit(), False, ""), shown, (11, 23, 23)
+        ),
+        "change": change,
+        "moved": moved,
+    }
 
 
-def _fit_cell(css: str, name: str, fit: Figure | Missing, outcome: str) -> FitCell:
+def _fit_cell(css: str, name: str, fit: Figure | Missing, outcome: str) -> dict[str, Any]:
     missing = fit if isinstance(fit, Missing) else None
     bands = "" if isinstance(fit, Missing) else band(fit.low, fit.high, _places(fit), unit="%")
-    return FitCell(css, name, outcome.replace(" ", "-"), missing, _value(fit), bands)
+    return {
+        "css": css,
+        "name": name,
+        "state": outcome.replace(" ", "-"),
+        "missing": missing,
+        "value": _value(fit),
+        "band": bands,
+    }
 
 
 def _places(fit: Figure) -> int:
@@ -258,18 +242,7 @@ def _sentence(text: str) -> str:
 # ---- tables
 
 
-class Candidate(NamedTuple):
-    """An order that was tried: its singular value, free numbers, error, and how far above the best."""
-
-    order: int
-    chosen: bool
-    value: str
-    parameters: str
-    error: str
-    above: str
-
-
-def candidates(sources: Sources) -> list[Candidate]:
+def candidates(sources: Sources) -> list[dict[str, Any]]:
     """The order table with its rule: what each order keeps, costs and leaves unexplained."""
     table = sources.tables["order"]
     if isinstance(table, Missing):
@@ -283,42 +256,29 @@ def candidates(sources: Sources) -> list[Candidate]:
         error, value, edge = (float(table[name][k]) for name in ("error", "singular_value", "noise_edge"))
         above = 100 * (error / best - 1) if best > 0 else 0.0
         rows.append(
-            Candidate(
-                order=int(table["order"][k]),
-                chosen=bool(table["chosen"][k]),
-                value=short(value, 3),
-                parameters=number(float(table["parameters"][k]), 0) if tried[k] else "",
-                error=quantity(100 * error, "%", 2)
-                if tried[k]
-                else "not tried"
-                if value > edge
-                else "within noise",
-                above="" if not tried[k] else "the best" if above == 0 else percent(above, 2),
-            )
+            {
+                "order": int(table["order"][k]),
+                "chosen": bool(table["chosen"][k]),
+                "value": short(value, 3),
+                "parameters": number(float(table["parameters"][k]), 0) if tried[k] else "",
+                "error": (
+                    quantity(100 * error, "%", 2)
+                    if tried[k]
+                    else "not tried"
+                    if value > edge
+                    else "within noise"
+                ),
+                "above": "" if not tried[k] else "the best" if above == 0 else percent(above, 2),
+            }
         )
     return rows
 
 
-class Loss(NamedTuple):
-    """A signal: samples, how many are masked (bad: more than a tenth), and what was flagged."""
-
-    name: str
-    samples: str
-    masked: str
-    bad: bool
-    flags: str
-
-
-class Losses(NamedTuple):
-    missing: Missing | None
-    rows: list[Loss]
-
-
-def losses(sources: Sources) -> Losses:
+def losses(sources: Sources) -> dict[str, Any]:
     """For each signal: samples, how many are masked, and what was flagged."""
     table = sources.tables["record"]
     if isinstance(table, Missing):
-        return Losses(table, [])
+        return {"missing": table, "rows": []}
     flags = lookup(sources.metrics["ingest"], "findings")
     rows = []
     for signal in [*sources.declared.machine.inputs, *sources.declared.machine.outputs]:
@@ -326,16 +286,16 @@ def losses(sources: Sources) -> Losses:
         mine = {} if isinstance(flags, Missing) else flags.get(signal.name, {})
         share = f" ({short(100 * masked / total, 2)}{THIN}%)" if masked else ""
         rows.append(
-            Loss(
-                name=signal.name,
-                samples=number(total, 0),
-                masked=f"{number(masked, 0)}{share}",
-                bad=masked > 0.1 * total,
-                flags=", ".join(f"{kind} {number(number_of, 0)}" for kind, number_of in mine.items())
+            {
+                "name": signal.name,
+                "samples": number(total, 0),
+                "masked": f"{number(masked, 0)}{share}",
+                "bad": masked > 0.1 * total,
+                "flags": ", ".join(f"{kind} {number(number_of, 0)}" for kind, number_of in mine.items())
                 or ("not measured" if isinstance(flags, Missing) else "none"),
-            )
+            }
         )
-    return Losses(None, rows)
+    return {"missing": None, "rows": rows}
 
 
 def used(sources: Sources) -> list[tuple[str, str]]:

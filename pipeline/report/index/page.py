@@ -2,7 +2,7 @@
 accepted run, what to do next, and which file to load."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from pipeline.report.certificate import exported
 from pipeline.report.deposition import card as deposition_card
 from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.shared import headline, page, words
-from pipeline.report.shared.card import Card, Deciding, Step
+from pipeline.report.shared.card import Card, CardStep, Deciding
 from pipeline.report.shared.difference import accepted_on
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import card as temperature_card
@@ -22,20 +22,6 @@ from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 
 # the gravest first
 GRAVEST = (FAILED, OPEN, PASSED)
-
-
-class File(NamedTuple):
-    """What leaves the house of one loop: the file to load with its digest, and its certificate; `link` leads
-    to a copy beside the pages, "" where there is none."""
-
-    loop: str
-    name: str
-    path: str
-    sha256: str
-    state: str
-    word: str
-    certificate: str
-    link: str
 
 
 def render(sources: Sources, judged: Judgement) -> str:
@@ -93,7 +79,7 @@ def _graveness(verdict: Verdict) -> str:
     return verdict.state if verdict.state in (FAILED, PASSED) else OPEN
 
 
-def steps(shown: Sequence[Card], first: str) -> list[tuple[str, Step]]:
+def steps(shown: Sequence[Card], first: str) -> list[tuple[str, CardStep]]:
     """(loop, what to do next), that of the loop that decides first."""
     ordered = sorted(shown, key=lambda card: card.loop != first)
     return [(card.loop, card.step) for card in ordered]
@@ -126,21 +112,21 @@ def drifts(judged: Judgement) -> str:
     return f"Drift: temperature {word[:1].lower()}{word[1:].rstrip('.')}, not measured in the others."
 
 
-def files(sources: Sources, verdict: Verdict) -> list[File] | Missing:
+def files(sources: Sources, verdict: Verdict) -> list[dict[str, Any]] | Missing:
     """What leaves the house, a line a loop."""
     lines = exported.lines(sources, verdict)
     if isinstance(lines, Missing):
         return lines
     return [
-        File(
-            line.loop,
-            line.name,
-            line.file,
-            line.sha256,
-            line.state,
-            line.word,
-            line.certificate,
-            exported.link(sources, line),
-        )
+        {
+            "loop": line.loop,
+            "name": line.name,
+            "path": line.file,
+            "sha256": line.sha256,
+            "state": line.state,
+            "word": line.word,
+            "certificate": line.certificate,
+            "link": exported.link(sources, line),
+        }
         for line in lines
     ]

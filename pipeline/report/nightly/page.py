@@ -7,12 +7,10 @@ from typing import Any
 
 from markupsafe import Markup
 
+from pipeline.nightly import records
+from pipeline.nightly.records import PLANT, Champion, ChampionState, Guard, HistoryLine, LoopDecision, Night
 from pipeline.nightly.settings import Nightly
-from pipeline.report.nightly import record
-from pipeline.report.nightly.production import Champion, ChampionState, HistoryLine
-from pipeline.report.nightly.record import Guard, LoopDecision, Night
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.night import PLANT
 from pipeline.statistics import Paired
 from pipeline.verdict.controllers import heading
 from pipeline.verdict.digits import beyond_meaning, count, number, quantity, short
@@ -70,7 +68,7 @@ def _when(text: str) -> str:
 
 
 def _watch(nights: Sequence[Night], settings: Nightly) -> dict[str, str]:
-    good = [night for night in nights if night.outcome != record.FAILED]
+    good = [night for night in nights if night.outcome != records.FAILED]
     return {
         "last": _when(good[-1].when) if good else "never",
         "run": good[-1].run if good else "",
@@ -84,14 +82,14 @@ def _head(night: Night) -> tuple[str, str]:
     """The decision in a sentence, and whether it is as it should be."""
     drifted, promoted = _drifted(night), ", ".join(night.promoted)
     where = f" on branch {night.branch}, not yet in production" if night.branch else ""
-    if night.outcome == record.FAILED:
+    if night.outcome == records.FAILED:
         return "The night failed; the champions stay.", FAILED
     if drifted:
         what = "The machine has drifted" if drifted == [PLANT] else f"Drift of {', '.join(drifted)}"
         return (
             f"{what}; promoted{where}: {promoted}." if promoted else f"{what}; the champions stay."
         ), FAILED
-    if night.outcome == record.QUARANTINED:
+    if night.outcome == records.QUARANTINED:
         return "Bad recordings are set aside; the champions stay.", FAILED
     candidates = ", ".join(night.candidates)
     head = f"Promoted{where}: {promoted}." if promoted else "The champions stay."
@@ -112,7 +110,7 @@ def _drifted(night: Night) -> list[str]:
 
 def _verdict(night: Night) -> dict[str, Any]:
     head, kind = _head(night)
-    drifted = [] if night.outcome == record.FAILED else _drifted(night)
+    drifted = [] if night.outcome == records.FAILED else _drifted(night)
     causes = [alarm.cause for alarm in night.drift.alarms]
     reasons = (
         # of the loops that did not drift is said what is said on any night
@@ -138,11 +136,11 @@ def _remedy(night: Night, drifted: Sequence[str]) -> str:
             f"lasts. Look at the machine; where the change is meant to stay: {' and '.join(commands)}."
         )
     remedy = {
-        record.FAILED: (
+        records.FAILED: (
             "Nothing of what is in production has changed. "
             f"The log is .beadline/logs/{night.run}.log; mend the cause, and the next night works."
         ),
-        record.PROMOTED: (
+        records.PROMOTED: (
             f"To put it into production: ./run beadline nightly --merge {night.branch}."
             if night.branch
             else "To go back: ./run beadline rollback."
@@ -368,8 +366,8 @@ def _pictures(nights: Sequence[Night], settings: Nightly) -> list[dict[str, Any]
 
 def _row(night: Night) -> dict[str, Any]:
     causes = [alarm.cause for alarm in night.drift.alarms]
-    state = OPEN if night.outcome in (record.NOTHING_NEW, record.CANDIDATE) else PASSED
-    if night.outcome == record.FAILED or night.lost or night.quarantined or causes:
+    state = OPEN if night.outcome in (records.NOTHING_NEW, records.CANDIDATE) else PASSED
+    if night.outcome == records.FAILED or night.lost or night.quarantined or causes:
         state = FAILED
     reasons = "; ".join([*_reasons(night), *night.quarantined.values()])
     return {

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.papers.figures import HEIGHT, WIDTH, Curve, Drawn, axis, plot
+from pipeline.report.papers.figures import HEIGHT, WIDTH, PaperCurve, PaperFigure, axis, plot
 from pipeline.report.shared import charts
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import number
@@ -14,44 +14,46 @@ from pipeline.verdict.digits import number
 SHORT = {"Start": "Start", "Stop": "Stop", "Corner": "C", "Steady-State": "S-S", "No-Flow": "N-F"}
 
 
-def pictures(results: Mapping[str, Any], sources: Sources) -> list[Drawn]:
+def pictures(results: Mapping[str, Any], sources: Sources) -> list[PaperFigure]:
     """Figures 3 to 6, matrix (3), 9, 10 and 12. Figures 1, 2, 7 and 8 are diagrams, 11 is a photograph."""
     learning, library = results["learning"], results["library"]
     return [
-        Drawn(
+        PaperFigure(
             "Figure 3",
             f"Flow at trials {', '.join(_trials(learning))}",
             [_flow(learning, name) for name in ("A", "B")],
             "Of the steady flow. Grey: wanted. Dotted, dashed, solid: these trials.",
         ),
-        Drawn(
+        PaperFigure(
             "Figure 4",
             "R.m.s. error at each trial",
             [_errors(learning), _delays(learning)],
             "The second panel is not in the paper: A with a delay that the law’s model lacks.",
         ),
-        Drawn("Figure 5", "Input at trial 31", [_inputs(learning)], "Ramps and pause stand out."),
-        Drawn(
+        PaperFigure("Figure 5", "Input at trial 31", [_inputs(learning)], "Ramps and pause stand out."),
+        PaperFigure(
             "Figure 6",
             "The input of A, cut",
             [_cut(library)],
             "Tinted: the signal of a task. The rest is level.",
         ),
-        Drawn(
+        PaperFigure(
             "Matrix (3)",
             "Our library",
             [],
             f"Lead and K in samples, {number(results['settings']['rate_hz'], 0)} a second.",
             _matrix(library),
         ),
-        Drawn("Figure 9", "Sequence of tasks", [], "Exactly the paper’s.", _sequence(results["figure_9"])),
-        Drawn(
+        PaperFigure(
+            "Figure 9", "Sequence of tasks", [], "Exactly the paper’s.", _sequence(results["figure_9"])
+        ),
+        PaperFigure(
             "Figure 10",
             "Sequenced basis signals",
             [_sequenced(results["figure_9"]), _printed(results["figure_9"])],
             "Strokes: where a task begins. Our gantry hardly slows at a corner: its signal is nearly level.",
         ),
-        Drawn(
+        PaperFigure(
             "Figure 12",
             "Tic-tac-toe with all five tasks",
             [_map(results["five_tasks"]["path"])],
@@ -68,8 +70,8 @@ def _trials(learning: Mapping[str, Any]) -> list[str]:
 def _flow(learning: Mapping[str, Any], name: str) -> Markup:
     time, of = learning["time_s"], learning[name]["flow"]
     curves = [
-        Curve(time, learning["wanted"], "line bl"),
-        *(Curve(time, y, css) for css, y in zip(("ref", "line dash", "line"), of.values(), strict=True)),
+        PaperCurve(time, learning["wanted"], "line bl"),
+        *(PaperCurve(time, y, css) for css, y in zip(("ref", "line dash", "line"), of.values(), strict=True)),
     ]
     return plot(
         curves,
@@ -81,8 +83,8 @@ def _flow(learning: Mapping[str, Any], name: str) -> Markup:
 def _errors(learning: Mapping[str, Any]) -> Markup:
     rows = {name: learning[name]["ratio"] for name in ("A", "B")}
     curves = [
-        Curve(range(len(rows["A"])), rows["A"], "line", "A"),
-        Curve(range(len(rows["B"])), rows["B"], "line dash"),
+        PaperCurve(range(len(rows["A"])), rows["A"], "line", "A"),
+        PaperCurve(range(len(rows["B"])), rows["B"], "line dash"),
     ]
     return plot(
         curves,
@@ -96,7 +98,7 @@ def _errors(learning: Mapping[str, Any]) -> Markup:
 def _delays(learning: Mapping[str, Any]) -> Markup:
     styles = ("line", "line dash", "line bl")
     curves = [
-        Curve(range(len(rows)), rows, css)
+        PaperCurve(range(len(rows)), rows, css)
         for css, rows in zip(styles, learning["delays"].values(), strict=True)
     ]
     told = ", ".join(
@@ -113,8 +115,8 @@ def _delays(learning: Mapping[str, Any]) -> Markup:
 def _inputs(learning: Mapping[str, Any]) -> Markup:
     time = learning["time_s"]
     curves = [
-        Curve(time, learning["B"]["command"], "line bl", "B"),
-        Curve(time, learning["A"]["command"], "line"),
+        PaperCurve(time, learning["B"]["command"], "line bl", "B"),
+        PaperCurve(time, learning["A"]["command"], "line"),
     ]
     return plot(
         curves,
@@ -187,7 +189,10 @@ def _sequenced(part: Mapping[str, Any]) -> Markup:
 
 def _printed(part: Mapping[str, Any]) -> Markup:
     return plot(
-        [Curve(part["time_s"], part["wanted"], "line bl"), Curve(part["time_s"], part["flow"], "line")],
+        [
+            PaperCurve(part["time_s"], part["wanted"], "line bl"),
+            PaperCurve(part["time_s"], part["flow"], "line"),
+        ],
         title="normalised flow, against s",
         alt=f"The flow misses the wanted one by {number(part['worst_percent'], 1)} % of what on-off does",
     )

@@ -12,7 +12,7 @@ from pipeline.report.shared import charts
 WIDTH, HEIGHT = 360, 200
 
 
-class Drawn(NamedTuple):
+class PaperFigure(NamedTuple):
     """A figure of a paper drawn from our data: its place there, what is seen, the panels, how to read them,
     and a table of ours (heads, rows) where the figure is one."""
 
@@ -23,7 +23,7 @@ class Drawn(NamedTuple):
     table: tuple[list[str], list[list[str]]] | None = None
 
 
-class Curve(NamedTuple):
+class PaperCurve(NamedTuple):
     """x, y, class of the line, and its name at the right end."""
 
     x: Sequence[float] | np.ndarray
@@ -39,7 +39,7 @@ def axis(low: float, high: float, *, ticks: int = 4) -> charts.Axis:
 
 
 def plot(
-    curves: Sequence[Curve],
+    curves: Sequence[PaperCurve],
     *,
     title: str,
     alt: str,
@@ -70,13 +70,13 @@ def plot(
 
 
 def plane(
-    paths: Sequence[Curve],
+    paths: Sequence[PaperCurve],
     *,
     title: str,
     alt: str,
     across: charts.Axis,
     up: charts.Axis,
-    way: Curve | None = None,
+    way: PaperCurve | None = None,
 ) -> Markup:
     """Lines over a plane, and a way over it from a ring to a dot."""
     frame = charts.Frame(across, up, WIDTH, 240, left=52, below=22, above=24, right=14)

@@ -7,13 +7,11 @@ made and whether its method has changed since. No verdict, choice or export read
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 from pipeline.papers import made
 from pipeline.report.papers import deposition, setpoint, study, temperature
-from pipeline.report.papers.figures import Drawn
 from pipeline.report.papers.relearned import sentences
-from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS, Paper, Row, read
+from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS, Paper, read
 from pipeline.report.shared import page
 from pipeline.report.shared.sources import Sources
 from pipeline.store import artifacts
@@ -28,28 +26,6 @@ PICTURES = {
 }
 
 
-class Shown(NamedTuple):
-    """A paper as the page shows it: its anchor, the places that do not hold or cannot be judged, rows,
-    pictures, the files that they are from, and when ours were made."""
-
-    key: str
-    paper: Paper
-    brief: list[tuple[str, list[str]]]
-    rows: list[Row]
-    pictures: list[Drawn]
-    files: Sequence[str]
-    made: str
-
-
-class Count(NamedTuple):
-    """A line of the table at the top."""
-
-    key: str
-    title: str
-    rows: int
-    counts: list[int]
-
-
 def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mapping[str, str]) -> str:
     """The page of the papers in `files`, {key: (printed, results)}; `others` are the files of the stages
     reproduce_study and relearned."""
@@ -61,18 +37,32 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
             continue
         pictures = PICTURES[key](paper.results, sources)
         shown.append(
-            Shown(key, paper, brief(paper), paper.rows, pictures, (printed, results), made.sentence(key))
+            {
+                "key": key,
+                "paper": paper,
+                "brief": brief(paper),
+                "rows": paper.rows,
+                "pictures": pictures,
+                "files": (printed, results),
+                "made": made.sentence(key),
+            }
         )
+    papers = [one["paper"] for one in shown]
     counts = [
-        Count(one.key, one.paper.title, len(one.rows), [one.paper.count(verdict) for verdict in VERDICTS])
-        for one in shown
+        {
+            "key": paper.key,
+            "title": paper.title,
+            "rows": len(paper.rows),
+            "counts": [paper.count(verdict) for verdict in VERDICTS],
+        }
+        for paper in papers
     ]
     return page.render(
         "papers.html",
         here="papers",
         sources=sources,
         title="Three papers beside us",
-        decision=decision([one.paper for one in shown]),
+        decision=decision(papers),
         verdicts=VERDICTS,
         counts=counts,
         papers=shown,

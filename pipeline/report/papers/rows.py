@@ -41,7 +41,7 @@ class Entry(NamedTuple):
     verdict: str
 
 
-class Row(NamedTuple):
+class PaperRow(NamedTuple):
     """A table, a figure or a number of a paper: its place there, what it says, printed and ours as text, the
     verdict, how it is counted and why they part, and the lines of a table."""
 
@@ -62,7 +62,7 @@ class Paper(NamedTuple):
     title: str
     cite: str
     told: str
-    rows: list[Row]
+    rows: list[PaperRow]
     results: Mapping[str, Any]
     command: str
 
@@ -100,7 +100,7 @@ def read(printed: str, results: str, metrics: Mapping[str, Any]) -> "Paper | Mis
 # ---- a row
 
 
-def _row(one: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -> Row:
+def _row(one: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -> PaperRow:
     place = f"{place}, {one.get('at')}"
     rule = one["rule"]
     if rule not in RULES:
@@ -119,7 +119,7 @@ def _row(one: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -
         shown = _shown(ours, unit, one.get("ours_places", places))
     verdict = _verdict(one, ours, entries)
     why = _filled(one.get("why", ""), found, metrics, printed, place)
-    return Row(one["at"], one["what"], printed, shown, verdict, why, entries)
+    return PaperRow(one["at"], one["what"], printed, shown, verdict, why, entries)
 
 
 def _entry(line: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -> Entry:

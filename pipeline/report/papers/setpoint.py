@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.papers.figures import Curve, Drawn, plane, plot
+from pipeline.report.papers.figures import PaperCurve, PaperFigure, plane, plot
 from pipeline.report.shared import charts
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import number
@@ -16,7 +16,7 @@ CLASSES = ("insufficient", "optimal", "excessive")
 FLOW, TEMPERATURE = charts.linear(0, 320), charts.linear(180, 240)
 
 
-def pictures(results: Mapping[str, Any], sources: Sources) -> list[Drawn]:
+def pictures(results: Mapping[str, Any], sources: Sources) -> list[PaperFigure]:
     """Figures 3 to 8 and the appendix. Figures 1, 2 (a), 3 (a) and 5 (a) are drawings."""
     agents, settings = results["agents"], results["settings"]
     right = f"class right in {number(settings['right_percent'], 0)} %"
@@ -25,24 +25,26 @@ def pictures(results: Mapping[str, Any], sources: Sources) -> list[Drawn]:
     waits = f"Solid: {six} s. Dashed: {three} s. Simulated, with a melt that follows in {melt} s."
     example = agents["phase_3"]["figure_3_100"]["run"]
     return [
-        Drawn("Figure 3 (b)", f"A run from {_start(settings, 'figure_3')}", _setpoints(example)),
-        Drawn("Figure 3 (c)", "Its scaled distributions", [_shares(example)], SHARES),
-        Drawn(
+        PaperFigure("Figure 3 (b)", f"A run from {_start(settings, 'figure_3')}", _setpoints(example)),
+        PaperFigure("Figure 3 (c)", "Its scaled distributions", [_shares(example)], SHARES),
+        PaperFigure(
             "Figure 3 (d)", "Reward of the three phases", [_ellipses(results)], "Where the reward is nought."
         ),
-        Drawn("Figure 4", "Waiting after a move", [_waits(agents["phase_4"]["waits"])], waits),
+        PaperFigure("Figure 4", "Waiting after a move", [_waits(agents["phase_4"]["waits"])], waits),
         *_vision(sources),
-        Drawn("Figure 6", "Reward of an episode through the four phases", [_rewards(results["learning"])]),
+        PaperFigure(
+            "Figure 6", "Reward of an episode through the four phases", [_rewards(results["learning"])]
+        ),
         *(_figure_7(agents, _start(settings, "figure_7"), right, *asked) for asked in FIGURE_7),
         *(_figure_8(agents["phase_4"], settings, right, *asked) for asked in FIGURE_8),
-        Drawn(
+        PaperFigure(
             "Figures A.1 to A.6, and 8",
             "Settled in per cent of the runs from each start",
             [],
             f"After phase 4, {right} of windows. The paper shows one run each on a printer.",
             _starts(agents["phase_4"]["starts_70"]["by_start"]),
         ),
-        Drawn("Section 2", "What had to be guessed", [], "", _guesses(results["guesses"])),
+        PaperFigure("Section 2", "What had to be guessed", [], "", _guesses(results["guesses"])),
     ]
 
 
@@ -67,10 +69,10 @@ def _start(settings: Mapping[str, Any], name: str) -> str:
 
 def _figure_7(
     agents: Mapping[str, Any], start: str, right: str, at: str, title: str, phase: str, place: str
-) -> Drawn:
+) -> PaperFigure:
     run = agents[phase][place]["run"]
     caption = f"The {right} of windows." if "errs" in title else "The class is always right."
-    return Drawn(at, f"{title}: from {start}", [*_setpoints(run), _way(run)], caption)
+    return PaperFigure(at, f"{title}: from {start}", [*_setpoints(run), _way(run)], caption)
 
 
 def _figure_8(
@@ -81,11 +83,11 @@ def _figure_8(
     title: str,
     start: str,
     place: str,
-) -> Drawn:
+) -> PaperFigure:
     run = of[place]["run"]
     told = f"One run in the simulator, {right}; theirs is one on a printer, with photographs."
     panels = [_shares(run), _way(run), *_setpoints(run)]
-    return Drawn(at, f"{title}, from {_start(settings, start)}", panels, f"{SHARES} {told}")
+    return PaperFigure(at, f"{title}, from {_start(settings, start)}", panels, f"{SHARES} {told}")
 
 
 def _setpoints(run: Mapping[str, Any]) -> list[Markup]:
@@ -93,14 +95,14 @@ def _setpoints(run: Mapping[str, Any]) -> list[Markup]:
     steps = range(len(flow))
     return [
         plot(
-            [Curve(steps, flow)],
+            [PaperCurve(steps, flow)],
             title="flow in %, against steps",
             alt=f"The flow goes from {number(flow[0], 0)} % to {number(flow[-1], 0)} %",
             levels=[(100.0, "")],
             height=160,
         ),
         plot(
-            [Curve(steps, temperature)],
+            [PaperCurve(steps, temperature)],
             title="temperature in °C, against steps",
             alt=f"It goes from {number(temperature[0], 1)} °C to {number(temperature[-1], 1)} °C",
             up=charts.linear(180, 240),
@@ -111,9 +113,9 @@ def _setpoints(run: Mapping[str, Any]) -> list[Markup]:
 
 
 def _way(run: Mapping[str, Any]) -> Markup:
-    rings = [Curve(*_ellipse(20.0, 10.0, scale), "ref") for scale in (1.0, 3.0)]
+    rings = [PaperCurve(*_ellipse(20.0, 10.0, scale), "ref") for scale in (1.0, 3.0)]
     frame_title = "temperature in °C, against flow in %"
-    way = Curve(run["flow"], run["temperature"], "line")
+    way = PaperCurve(run["flow"], run["temperature"], "line")
     return plane(
         rings,
         title=frame_title,
@@ -129,7 +131,7 @@ def _shares(run: Mapping[str, Any]) -> Markup:
     rows = np.asarray(run["shares"], float)
     steps, lane = range(len(rows)), 1.25
     lanes = charts.Axis(0.0, 3 * lane, tuple((i * lane + 0.5, name) for i, name in enumerate(CLASSES)))
-    curves = [Curve(steps, i * lane + rows[:, i]) for i in range(len(CLASSES))]
+    curves = [PaperCurve(steps, i * lane + rows[:, i]) for i in range(len(CLASSES))]
     optimal = 100 * float((rows[:, 1] == 1).mean())
     return plot(
         curves,
@@ -152,7 +154,7 @@ def _ellipse(a: float, b: float, scale: float = 1.0) -> tuple[list[float], list[
 def _ellipses(results: Mapping[str, Any]) -> Markup:
     axes = results["settings"]["semi_axes"]
     styles = ("line bl", "line dash", "line")
-    curves = [Curve(*_ellipse(axes[2 * i], axes[2 * i + 1]), css) for i, css in enumerate(styles)]
+    curves = [PaperCurve(*_ellipse(axes[2 * i], axes[2 * i + 1]), css) for i, css in enumerate(styles)]
     return plane(
         curves,
         title="temperature in °C, against flow in %",
@@ -166,7 +168,7 @@ def _waits(of: Mapping[str, Any]) -> Markup:
     six, three = of["wait_6_melt_4"], of["wait_3_melt_4"]
     steps = range(len(six["flow"]))
     return plot(
-        [Curve(steps, three["flow"], "line dash"), Curve(steps, six["flow"], "line")],
+        [PaperCurve(steps, three["flow"], "line dash"), PaperCurve(steps, six["flow"], "line")],
         title="flow in %, against steps",
         alt=f"Median steps to the band: {number(three['steps'], 0)} with the short wait, "
         f"{number(six['steps'], 0)} with the long one",
@@ -183,7 +185,7 @@ def _rewards(learning: Mapping[str, Any]) -> Markup:
     middles = np.cumsum(learning["updates"]) - np.array(learning["updates"]) / 2
     low = float(np.nanmin(y))
     return plot(
-        [Curve(x, y)],
+        [PaperCurve(x, y)],
         title="reward of an episode of 100 steps, against updates",
         alt=f"The reward ends phase 3 at {number(learning['phase_3']['ends'], 0)} and phase 4 at "
         f"{number(learning['phase_4']['ends'], 0)}",
@@ -191,7 +193,7 @@ def _rewards(learning: Mapping[str, Any]) -> Markup:
     )
 
 
-def _vision(sources: Sources) -> list[Drawn]:
+def _vision(sources: Sources) -> list[PaperFigure]:
     """Figure 5 (b, c) of the classifier of the last run."""
     course, classified = sources.tables["course"], sources.tables["classified"]
     out = []
@@ -200,18 +202,18 @@ def _vision(sources: Sources) -> list[Drawn]:
         epochs, loss = course["epoch"][mine].tolist(), course["training_loss"][mine].tolist()
         right = course["held_out_accuracy"][mine]
         out.append(
-            Drawn(
+            PaperFigure(
                 "Figure 5 (b)",
                 "Training of our small transformer",
                 [
                     plot(
-                        [Curve(epochs, loss)],
+                        [PaperCurve(epochs, loss)],
                         title="training loss, against epochs",
                         alt=f"The training loss falls from {number(loss[0], 2)} to {number(loss[-1], 2)}",
                         height=160,
                     ),
                     plot(
-                        [Curve(epochs, (100 * right).tolist())],
+                        [PaperCurve(epochs, (100 * right).tolist())],
                         title="right of pictures held out, in %, against epochs",
                         alt=f"At best {number(100 * float(np.nanmax(right)), 1)} % of them are right",
                         height=160,
@@ -226,7 +228,7 @@ def _vision(sources: Sources) -> list[Drawn]:
             ("Named right, in per cent, by temperature", _by_temperature(classified)),
         )
         told = "Of the last run, pictures that nothing was learned on."
-        out += [Drawn("Figure 5 (c)", title, [], told, table) for title, table in tables]
+        out += [PaperFigure("Figure 5 (c)", title, [], told, table) for title, table in tables]
     return out
 
 

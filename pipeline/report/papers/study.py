@@ -9,7 +9,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.temperature import evidence, trades
 from pipeline.verdict.digits import number, percent, short
 from pipeline.verdict.evidence import Table, lookup
@@ -19,7 +19,7 @@ from pipeline.verdict.verdict import Missing
 class StudyPart(NamedTuple):
     """All that the page shows of the study; `honest` and `weights` are pairs of title and figure."""
 
-    published: "Published"
+    published: dict[str, Any]
     honest: list[tuple[str, str]]
     findings: list[tuple[str, str]]
     pictures: list[Picture]
@@ -78,33 +78,12 @@ CONVENTIONS = {
 }
 
 
-class Reproduced(NamedTuple):
-    """A printed figure, ours, and how far apart they lie where that is more than a thousandth."""
-
-    printed: str
-    ours: str
-    off: str
-
-
-class Convention(NamedTuple):
-    """A column of the study and the way of counting that it takes."""
-
-    title: str
-    convention: str
-    cells: list[Reproduced]
-
-
-class Published(NamedTuple):
-    missing: Missing | None
-    rows: list[Convention]
-
-
-def _published(study: Any) -> Published:
+def _published(study: Any) -> dict[str, Any]:
     """The study's four columns, printed and reproduced, with the convention that it takes."""
     printed, reproduced = (lookup(study, key) for key in ("printed", "as_published"))
     gap = next((part for part in (printed, reproduced) if isinstance(part, Missing)), None)
     if gap:
-        return Published(gap, [])
+        return {"missing": gap, "rows": []}
     rows = []
     for key, (title, convention) in CONVENTIONS.items():
         if key in printed and key in reproduced:
@@ -112,15 +91,17 @@ def _published(study: Any) -> Published:
                 _reproduced(printed[key][name], reproduced[key][name], places)
                 for name, places in (("J100", 1), ("J1000", 1), ("error", 4))
             ]
-            rows.append(Convention(title, convention, cells))
-    return Published(None, rows)
+            rows.append({"title": title, "convention": convention, "cells": cells})
+    return {"missing": None, "rows": rows}
 
 
-def _reproduced(theirs: float, ours: float, places: int) -> Reproduced:
+def _reproduced(theirs: float, ours: float, places: int) -> dict[str, Any]:
     off = abs(ours / theirs - 1)
-    return Reproduced(
-        number(theirs, places), number(ours, places), percent(100 * off, 2) if off > 1e-3 else ""
-    )
+    return {
+        "printed": number(theirs, places),
+        "ours": number(ours, places),
+        "off": percent(100 * off, 2) if off > 1e-3 else "",
+    }
 
 
 def _honest(study: Any) -> list[tuple[str, str]]:
@@ -218,7 +199,7 @@ def _noise(table: Table | Missing) -> Picture:
     if isinstance(table, Missing):
         return placeholder("noise", title, table)
     shown = [
-        Column(
+        PictureColumn(
             f"{level:g} °C of noise",
             "in the data, and under the controller",
             "",

@@ -6,55 +6,55 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.papers.figures import HEIGHT, WIDTH, Curve, Drawn, axis, plot
+from pipeline.report.papers.figures import HEIGHT, WIDTH, PaperCurve, PaperFigure, axis, plot
 from pipeline.report.shared import charts
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import number
 
 
-def pictures(results: Mapping[str, Any], sources: Sources) -> list[Drawn]:
+def pictures(results: Mapping[str, Any], sources: Sources) -> list[PaperFigure]:
     """Figures 2 to 6, and what random starts do to Algorithm 1. Figure 1 is a drawing."""
     model, data = results["model_based"], results["data_driven"]
     return [
-        Drawn(
+        PaperFigure(
             "Figure 2",
             "Outputs, observer-based, Q = R = I",
             [_outputs(model["identity"], "line")],
             FROM_BELOW,
         ),
-        Drawn("Figure 3 (a)", "Performance index", [_index([("", model["identity"], "line")])]),
-        Drawn(
+        PaperFigure("Figure 3 (a)", "Performance index", [_index([("", model["identity"], "line")])]),
+        PaperFigure(
             "Figure 3 (b)",
             "Estimation error",
             [_estimate(model["identity"]["estimate"])],
             "The paper shows the lower line under the name of the upper one. Logarithmic here.",
         ),
-        Drawn(
+        PaperFigure(
             "Figure 4 (a)", "Outputs, observer-based, tuned", [_outputs(model["tuned"], "line")], FROM_BELOW
         ),
-        Drawn(
+        PaperFigure(
             "Figure 4 (b)",
             "Performance index before and after tuning",
             [_index([("Q = R = I", model["identity"], "line"), ("tuned", model["tuned"], "line dash")])],
             IN_ITS_OWN,
         ),
-        Drawn(
+        PaperFigure(
             "Figure 5 (a)",
             "Outputs, data-driven, Q = R = I",
             [_outputs(data["identity"], "line dd")],
             FROM_BELOW,
         ),
-        Drawn("Figure 5 (b)", "Performance index", [_index([("", data["identity"], "line dd")])]),
-        Drawn(
+        PaperFigure("Figure 5 (b)", "Performance index", [_index([("", data["identity"], "line dd")])]),
+        PaperFigure(
             "Figure 6 (a)", "Outputs, data-driven, tuned", [_outputs(data["tuned"], "line dd")], FROM_BELOW
         ),
-        Drawn(
+        PaperFigure(
             "Figure 6 (b)",
             "Performance index before and after tuning",
             [_index([("Q = R = I", data["identity"], "line dd"), ("tuned", data["tuned"], "line dd dash")])],
             IN_ITS_OWN,
         ),
-        Drawn(
+        PaperFigure(
             "Algorithm 1",
             "Policies until the gain is found, from random draws",
             [_starts(results["algorithm_1"])],
@@ -71,7 +71,7 @@ IN_ITS_OWN = "Each in the weights of its own, as the paper has it."
 def _outputs(column: Mapping[str, Any], css: str) -> Markup:
     lines, steps = column["curves"]["y"], range(1, 101)
     return plot(
-        [Curve(steps, line, css) for line in lines],
+        [PaperCurve(steps, line, css) for line in lines],
         title="outputs in °C, against steps",
         alt=f"Five outputs end within {number(column['farthest'], 2)} °C of their references",
     )
@@ -79,7 +79,7 @@ def _outputs(column: Mapping[str, Any], css: str) -> Markup:
 
 def _index(columns: list[tuple[str, Mapping[str, Any], str]]) -> Markup:
     curves = [
-        Curve(range(1, 101), np.asarray(column["curves"]["J"]) / 1000, css, name)
+        PaperCurve(range(1, 101), np.asarray(column["curves"]["J"]) / 1000, css, name)
         for name, column, css in columns
     ]
     ends = ", ".join(
@@ -97,8 +97,8 @@ def _index(columns: list[tuple[str, Mapping[str, Any], str]]) -> Markup:
 def _estimate(told: Mapping[str, Any]) -> Markup:
     steps = range(2, 101)
     curves = [
-        Curve(steps, told["state_curve"][1:], "line", "‖x̂ − x‖"),
-        Curve(steps, told["output_curve"][1:], "line dash", "‖C(x̂ − x)‖"),
+        PaperCurve(steps, told["state_curve"][1:], "line", "‖x̂ − x‖"),
+        PaperCurve(steps, told["output_curve"][1:], "line dash", "‖C(x̂ − x)‖"),
     ]
     return plot(
         curves,

@@ -13,7 +13,7 @@ from pipeline.verdict.digits import count
 WIDE, TALL = 880, 170
 
 
-class Shown(NamedTuple):
+class ReplayData(NamedTuple):
     """time_s (T,), by input applied and asked (T, m), by output measured and reference (T, p), off (T,) of
     support, names of both, and replay.json."""
 
@@ -28,7 +28,7 @@ class Shown(NamedTuple):
     told: Mapping[str, Any]
 
 
-def render(shown: Shown) -> str:
+def render(shown: ReplayData) -> str:
     """The text of index.html."""
     told = shown.told
     return page.render(
@@ -80,7 +80,7 @@ def rows(told: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _plot(shown: Shown, lines: Sequence[np.ndarray], name: str, unit: str) -> Markup:
+def _plot(shown: ReplayData, lines: Sequence[np.ndarray], name: str, unit: str) -> Markup:
     """What was (first) and what was asked for (second, dashed), off support in grey."""
     time = shown.time_s
     low, high = min(float(line.min()) for line in lines), max(float(line.max()) for line in lines)

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from pipeline.setpoint.workflow.tables import harm_bar
+from pipeline.setpoint.agents.criteria import harm_bar
 from pipeline.verdict.decide import questions
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.temperature import comparison
@@ -40,7 +40,7 @@ ENDS = ("median", "low", "high")
 WORDS = {"passed": "pass", "failed": "fail"}
 
 
-class Measured(NamedTuple):
+class RunFigures(NamedTuple):
     """{loop: {key: figure}}, and by loop whose figures they are and the verdict's words."""
 
     figures: Mapping[str, Mapping[str, Figure]]
@@ -92,7 +92,7 @@ def _ends(figure: Figure) -> list[float | None]:
     return [end if math.isfinite(end) else None for end in (figure.value, figure.low, figure.high)]
 
 
-def _of_headline(report: Mapping[str, Any]) -> Measured:
+def _of_headline(report: Mapping[str, Any]) -> RunFigures:
     """What `headline` wrote."""
     words = {loop: str(report.get(loop) or "").partition(": ") for loop in LOOPS}
     figures = {
@@ -104,10 +104,10 @@ def _of_headline(report: Mapping[str, Any]) -> Measured:
         for loop in LOOPS
     }
     controllers = {loop: words[loop][2] for loop in ("temperature", "setpoint")}
-    return Measured(figures, controllers, {loop: state for loop, (state, *_) in words.items() if state})
+    return RunFigures(figures, controllers, {loop: state for loop, (state, *_) in words.items() if state})
 
 
-def measured(metrics: Metrics) -> Measured:
+def measured(metrics: Metrics) -> RunFigures:
     """The figures of one run."""
     report, heat = section(metrics, "report"), section(metrics, "evaluate_temperature")
     if "bands" in report:
@@ -123,7 +123,7 @@ def measured(metrics: Metrics) -> Measured:
         "setpoint": setpoint(camera, section(metrics, "train_classifier")),
     }
     verdicts = {loop: section(section(report, "verdicts"), loop).get("decision") for loop in LOOPS}
-    return Measured(
+    return RunFigures(
         figures,
         {"temperature": winner, "setpoint": str(camera.get("default") or "")},
         {loop: str(decision) for loop, decision in verdicts.items() if decision},

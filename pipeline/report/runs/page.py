@@ -4,11 +4,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from markupsafe import Markup
 
 from pipeline.report.about.changes import ANOTHER, changes
 from pipeline.report.runs.curves import READERS, Curve, curves, restored
-from pipeline.report.runs.figures import LOOPS, Measured, asked, measured
+from pipeline.report.runs.figures import LOOPS, RunFigures, asked, measured
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.difference import accepted_on, changed_parameters, move
 from pipeline.report.shared.sources import Sources
@@ -31,31 +30,6 @@ class Run(NamedTuple):
     metrics: Mapping[str, Any]
     parameters: Mapping[str, Any]
     curves: Mapping[str, Curve] = {}
-
-
-class Cell(NamedTuple):
-    """A figure of one run: value, band, whether it is beyond its limit."""
-
-    text: str
-    band: str = ""
-    bad: bool = False
-
-
-class Row(NamedTuple):
-    """A figure of both runs."""
-
-    title: str
-    limit: str
-    cells: tuple[Cell, Cell]
-    change: str
-    moved: bool = False
-
-
-class Panel(NamedTuple):
-    """A curve of both runs."""
-
-    title: str
-    svg: Markup
 
 
 def render(sources: Sources, judged: Judgement, metrics: Mapping[str, Any]) -> str:
@@ -102,7 +76,7 @@ def render_two(a: Run, b: Run, rules: ReportRules) -> str:
     """The page of any two runs."""
     parts = _parts(a, b, rules)
     rows = [row for _, rows in parts["loops"] for row in rows]
-    moved = sum(row.moved for row in rows)
+    moved = sum(row["moved"] for row in rows)
     figures = count(moved, "figure")
     return page.render(
         "runs.html",
@@ -121,7 +95,7 @@ def render_two(a: Run, b: Run, rules: ReportRules) -> str:
 def _parts(a: Run | None, b: Run, rules: ReportRules) -> dict[str, Any]:
     """What the template shows of two runs."""
     questions = asked(rules, b.metrics)
-    before, now = measured(a.metrics) if a else Measured({}, {}, {}), measured(b.metrics)
+    before, now = measured(a.metrics) if a else RunFigures({}, {}, {}), measured(b.metrics)
     another = a is not None and _signals(a) != _signals(b)
     loops = []
     for loop in loops_of(b):
@@ -130,7 +104,7 @@ def _parts(a: Run | None, b: Run, rules: ReportRules) -> dict[str, Any]:
             for one in questions[loop]
         ]
         if another and loop == "temperature":
-            rows = [row._replace(change="another machine", moved=False) for row in rows]
+            rows = [row | {"change": "another machine", "moved": False} for row in rows]
         loops.append((_head(loop, before, now), rows))
     differing = list(changed_parameters(a.parameters, b.parameters)) if a else []
     return {
@@ -168,7 +142,7 @@ def _signals(run: Run) -> list[set]:
 # ---- figures
 
 
-def _head(loop: str, before: Measured, now: Measured) -> dict[str, Any]:
+def _head(loop: str, before: RunFigures, now: RunFigures) -> dict[str, Any]:
     """A loop, and by run whose figures they are with the verdict."""
     return {
         "loop": loop,
@@ -177,26 +151,26 @@ def _head(loop: str, before: Measured, now: Measured) -> dict[str, Any]:
     }
 
 
-def _row(question: Question, before: Figure | None, now: Figure | None) -> Row:
+def _row(question: Question, before: Figure | None, now: Figure | None) -> dict[str, Any]:
     bound = "at least" if question.at_least else "at most"
     limit = with_unit(question.limit, question.unit, declared(question.limit))
     text, moved = _change(question, before, now)
-    return Row(
-        question.title,
-        f"{bound} {limit}" if np.isfinite(question.limit) else "none",
-        (_cell(question, before), _cell(question, now)),
-        text,
-        moved,
-    )
+    return {
+        "title": question.title,
+        "limit": f"{bound} {limit}" if np.isfinite(question.limit) else "none",
+        "cells": (_cell(question, before), _cell(question, now)),
+        "change": text,
+        "moved": moved,
+    }
 
 
-def _cell(question: Question, figure: Figure | None) -> Cell:
+def _cell(question: Question, figure: Figure | None) -> dict[str, Any]:
     if figure is None:
-        return Cell("not measured")
+        return {"text": "not measured", "band": "", "bad": False}
     places = row_places(question, [figure])
     text = quantity(figure.value, question.unit, places, beyond=question.beyond)
     ends = band(figure.low, figure.high, places, beyond=question.beyond)
-    return Cell(text, ends or "no band", bad=state(question, figure) == FAILED)
+    return {"text": text, "band": ends or "no band", "bad": state(question, figure) == FAILED}
 
 
 def _change(question: Question, before: Figure | None, now: Figure | None) -> tuple[str, bool]:
@@ -217,11 +191,11 @@ def _change(question: Question, before: Figure | None, now: Figure | None) -> tu
 # ---- curves
 
 
-def _panels(before: Mapping[str, Curve], now: Mapping[str, Curve]) -> list[Panel]:
+def _panels(before: Mapping[str, Curve], now: Mapping[str, Curve]) -> list[dict[str, Any]]:
     return [_panel(name, before.get(name), now.get(name)) for name in dict.fromkeys([*now, *before])]
 
 
-def _panel(name: str, before: Curve | None, now: Curve | None) -> Panel:
+def _panel(name: str, before: Curve | None, now: Curve | None) -> dict[str, Any]:
     """This run's curve is solid, the accepted run's grey and dashed."""
     drawn = [(curve, css) for curve, css in ((before, "line thin dash"), (now, "line")) if curve]
     x, y = (np.concatenate([curve[end] for curve, _ in drawn]) for end in (2, 3))
@@ -236,7 +210,7 @@ def _panel(name: str, before: Curve | None, now: Curve | None) -> Panel:
         title=f"{up}{', log' if frame.y.log else ''}",
         across=across,
     )
-    return Panel(name, svg)
+    return {"title": name, "svg": svg}
 
 
 def _scale(values: np.ndarray) -> charts.Axis:

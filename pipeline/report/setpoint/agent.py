@@ -3,25 +3,17 @@ training of the agents, settled runs against the classifier's accuracy."""
 
 import math
 import re
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import (
-    BEST_FLOW,
-    BEST_TEMPERATURE,
-    FLOW_BAND,
-    PHASES,
-    ROTATION,
-    SETTLED_BY,
-    TEMPERATURE_BAND,
-)
+from pipeline.setpoint.agents.criteria import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, PHASES, ROTATION
 from pipeline.verdict.digits import THIN, number, percent, quantity
 from pipeline.verdict.evidence import Table, lookup
 from pipeline.verdict.setpoint import AGENT, BASELINE, PAPER, Board, Case, case_text, role
@@ -110,7 +102,9 @@ def _ways(sources: Sources, board: Board, table: Table, case: Case, i: int) -> P
         first = not columns
         panels = [_surface(name, flow, temperature, ends, css, first), _steps(name, flow, inside, css, first)]
         columns.append(
-            Column(name, "runs by default" if name == board.default else _kind(board, name), mark, panels)
+            PictureColumn(
+                name, "runs by default" if name == board.default else _kind(board, name), mark, panels
+            )
         )
     where = case_text(case, whole=True)
     return Picture(
@@ -259,7 +253,7 @@ def training(sources: Sources) -> Picture:
             f"mean reward of {values}"
         )
         columns.append(
-            Column(
+            PictureColumn(
                 _agent(agent),
                 "as published" if agent == "li_2025" else "ours",
                 "kernel" if agent == "li_2025" else "data_driven",
@@ -354,7 +348,7 @@ def by_accuracy(sources: Sources, board: Board | Missing) -> Picture:
 
 def _accuracy_panel(
     board: Board, cases: list[tuple[float, Case]], what: str, head: str, limit: float | None
-) -> tuple[Column, str]:
+) -> tuple[PictureColumn, str]:
     """The panel of one figure, which has a limit where it is a share of runs, and its values at the lowest
     accuracy in words."""
     names = [
@@ -390,7 +384,7 @@ def _accuracy_panel(
         units=("% right", "%" if limit else ""),
     )
     small = "of runs, in per cent" if limit else "median of the runs that settle"
-    return Column(head, small, "", [panel]), f"{head}: {values}"
+    return PictureColumn(head, small, "", [panel]), f"{head}: {values}"
 
 
 def _accuracies(cases: list[tuple[float, Case]]) -> charts.Axis:
@@ -429,29 +423,11 @@ def _names(frame: charts.Frame, ends: list[tuple[float, str]], *, right: bool = 
     return made
 
 
-class Phase(NamedTuple):
-    """What one training came to, in words."""
-
-    name: str
-    small: str
-    mark: str
-    settled: str
-    stay: str
-    steps: str
-    runs: str
-
-
-class Phases(NamedTuple):
-    missing: Missing | None = None
-    rows: Sequence[Phase] = ()
-    best_round: str = ""
-
-
-def phases(sources: Sources) -> Phases:
+def phases(sources: Sources) -> dict[str, Any]:
     """What training came to: settled, staying and steps, by what was trained."""
     metrics = sources.metrics["train_agent"]
     if isinstance(metrics, Missing):
-        return Phases(metrics)
+        return {"missing": metrics}
     rows = []
     for name, (head, small) in TAUGHT.items():
         figures = metrics.get(name)
@@ -459,18 +435,18 @@ def phases(sources: Sources) -> Phases:
             continue
         steps, runs, stay = (lookup(figures, key) for key in ("median_steps", "runs", "stay"))
         rows.append(
-            Phase(
-                head,
-                small,
-                "data_driven" if name.startswith("belief_dqn") else "kernel",
-                settled=percent(float(figures["settled"]), 3),
-                stay="not measured" if isinstance(stay, Missing) else percent(float(stay), 3),
-                steps="none settled" if isinstance(steps, Missing) else number(float(steps), 0),
-                runs="not said" if isinstance(runs, Missing) else f"{runs:,}",
-            )
+            {
+                "name": head,
+                "small": small,
+                "mark": "data_driven" if name.startswith("belief_dqn") else "kernel",
+                "settled": percent(float(figures["settled"]), 3),
+                "stay": "not measured" if isinstance(stay, Missing) else percent(float(stay), 3),
+                "steps": "none settled" if isinstance(steps, Missing) else number(float(steps), 0),
+                "runs": "not said" if isinstance(runs, Missing) else f"{runs:,}",
+            }
         )
     gap = None if rows else Missing("not measured", "train_agent.json holds no run")
-    return Phases(gap, rows, _best_round(metrics))
+    return {"missing": gap, "rows": rows, "best_round": _best_round(metrics)}
 
 
 def _best_round(metrics: dict[str, Any]) -> str:
@@ -505,17 +481,7 @@ CLAIMED = {
 RANGES = ("flow_range", "temperature_range")
 
 
-class Claim(NamedTuple):
-    """One figure of one start: what the paper prints, and what ours comes to; `first`: the start's first."""
-
-    start: str
-    first: bool
-    figure: str
-    printed: str
-    ours: str
-
-
-def claims(sources: Sources) -> list[Claim] | Missing:
+def claims(sources: Sources) -> list[dict[str, Any]] | Missing:
     """What Li and Pattinson (2025) tell of single starts beside our agent trained as they say."""
     found = lookup(sources.metrics["train_agent"], "claims")
     if isinstance(found, Missing):
@@ -529,13 +495,13 @@ def claims(sources: Sources) -> list[Claim] | Missing:
             words, unit = CLAIMED[key]
             value, ours = printed.get(key), measured.get(key)
             rows.append(
-                Claim(
-                    str(start),
-                    key == keys[0],
-                    words,
-                    "not printed" if value is None else quantity(float(value), unit, 0),
-                    "never near 100\u202f%" if ours is None else quantity(float(ours), unit, 0),
-                )
+                {
+                    "start": str(start),
+                    "first": key == keys[0],
+                    "figure": words,
+                    "printed": "not printed" if value is None else quantity(float(value), unit, 0),
+                    "ours": "never near 100\u202f%" if ours is None else quantity(float(ours), unit, 0),
+                }
             )
     return rows
 

@@ -7,7 +7,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import THIN, band, number, percent, quantity
 from pipeline.verdict.evidence import lookup
@@ -69,43 +69,28 @@ def place(row: Bin) -> str:
     return f"{row.low:g}–{row.high:g}{THIN}%"
 
 
-class Line(NamedTuple):
-    """A bin in words."""
-
-    place: str
-    beside: bool
-    right: str
-    band: str
-    ideal: str
-    covered: str
-    covered_band: str
-    windows: str
-
-
-class ByFlow(NamedTuple):
-    picture: Picture
-    rows: Sequence[Line] = ()
-    ideal: bool = False
-
-
-def by_flow(sources: Sources) -> ByFlow:
+def by_flow(sources: Sources) -> dict[str, Any]:
     """The chart, and its bins as a table, the worst first."""
     metrics = sources.metrics["train_classifier"]
     found = metrics if isinstance(metrics, Missing) else bins(metrics)
     if isinstance(found, Missing):
-        return ByFlow(placeholder("by-flow", TITLE, found))
+        return {"picture": placeholder("by-flow", TITLE, found), "rows": (), "ideal": False}
     ideal = any(row.ideal == row.ideal for row in found)
     rows = [
-        Line(
-            place(row),
-            row.beside,
-            quantity(row.right.value, "%", 0),
-            band(row.right.low, row.right.high, 0),
-            number(row.ideal, 0) if row.ideal == row.ideal else "not known",
-            row.covered.state if isinstance(row.covered, Missing) else quantity(row.covered.value, "%", 0),
-            "" if isinstance(row.covered, Missing) else band(row.covered.low, row.covered.high, 0),
-            f"{row.windows:,}",
-        )
+        {
+            "place": place(row),
+            "beside": row.beside,
+            "right": quantity(row.right.value, "%", 0),
+            "band": band(row.right.low, row.right.high, 0),
+            "ideal": number(row.ideal, 0) if row.ideal == row.ideal else "not known",
+            "covered": row.covered.state
+            if isinstance(row.covered, Missing)
+            else quantity(row.covered.value, "%", 0),
+            "covered_band": ""
+            if isinstance(row.covered, Missing)
+            else band(row.covered.low, row.covered.high, 0),
+            "windows": f"{row.windows:,}",
+        }
         for row in found
     ]
     caption = (
@@ -122,11 +107,11 @@ def by_flow(sources: Sources) -> ByFlow:
         "by-flow",
         TITLE,
         finding(found, lookup(metrics, "right_70_150"), lookup(metrics, "conformal.held")),
-        [Column("Windows named rightly", "in per cent, by true flow", "", [_chart(found)])],
+        [PictureColumn("Windows named rightly", "in per cent, by true flow", "", [_chart(found)])],
         caption,
         page.origin(sources.source("train_classifier")),
     )
-    return ByFlow(picture, rows, ideal)
+    return {"picture": picture, "rows": rows, "ideal": ideal}
 
 
 def finding(rows: Sequence[Bin], every: Any, held: Any) -> str:

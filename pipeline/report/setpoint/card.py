@@ -8,9 +8,19 @@ from markupsafe import Markup
 
 from pipeline.report.setpoint import deciding as deciding_case
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.card import Card, Cell, Deciding, Entrant, Row, Step, best_of, of_verdict
+from pipeline.report.shared.card import (
+    Card,
+    CardCell,
+    CardRow,
+    CardStep,
+    Deciding,
+    Entrant,
+    best_of,
+    of_verdict,
+)
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING, FLOW_BAND
+from pipeline.setpoint.agents.criteria import BEYOND, FLOW_BAND
+from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.verdict.digits import THIN, band, count
 from pipeline.verdict.evidence import lookup
 from pipeline.verdict.setpoint import (
@@ -56,7 +66,7 @@ def card(sources: Sources, verdict: Verdict) -> Card:
         rows=[
             _shares("Settles", scores, names, "settled", asked.settled_percent),
             _shares("Stays", scores, names, "stay", asked.stay_percent),
-            Row("Harm", "" if limit is None else f"≤ {limit:g}{THIN}%", _harm_cells(harms, limit)),
+            CardRow("Harm", "" if limit is None else f"≤ {limit:g}{THIN}%", _harm_cells(harms, limit)),
         ],
         basis=f"Worst case of each; small: 95{THIN}% interval{', by segment' if clustered else ''}. Harm: "
         f"good prints that leave ±{BEYOND[-1]}{THIN}%.",
@@ -96,29 +106,29 @@ def _notes(sources: Sources, scores: Board, names: Sequence[str]) -> list[tuple[
     ]  # fmt: skip
 
 
-def _shares(title: str, scores: Board, names: Sequence[str], what: str, limit: float) -> Row:
+def _shares(title: str, scores: Board, names: Sequence[str], what: str, limit: float) -> CardRow:
     figures = [worst(scores, name, what)[0] for name in names]
     best = best_of([f.value if isinstance(f, Figure) else None for f in figures], at_least=True)
-    return Row(title, f"≥ {limit:g}{THIN}%", [_share(f, best, bad=_below(f, limit)) for f in figures])
+    return CardRow(title, f"≥ {limit:g}{THIN}%", [_share(f, best, bad=_below(f, limit)) for f in figures])
 
 
 def _below(figure: Figure | Missing, limit: float) -> bool:
     return isinstance(figure, Figure) and figure.high < limit
 
 
-def _share(figure: Figure | Missing, best: float | None, *, bad: bool) -> Cell:
+def _share(figure: Figure | Missing, best: float | None, *, bad: bool) -> CardCell:
     if isinstance(figure, Missing):
-        return Cell(figure.state)
-    return Cell(share_text(figure), band(figure.low, figure.high, 1), figure.value == best, bad)
+        return CardCell(figure.state)
+    return CardCell(share_text(figure), band(figure.low, figure.high, 1), figure.value == best, bad)
 
 
-def _harm_cells(harms: Sequence[Harm | Missing], limit: float | None) -> list[Cell]:
+def _harm_cells(harms: Sequence[Harm | Missing], limit: float | None) -> list[CardCell]:
     """The harm of each in the case that decides for it; where another limit holds in that case, with it."""
     best = best_of([h.figure.value if isinstance(h, Harm) else None for h in harms], at_least=False)
     cells = []
     for harm in harms:
         if isinstance(harm, Missing):
-            cells.append(Cell(harm.state))
+            cells.append(CardCell(harm.state))
             continue
         cell = _share(harm.figure, best, bad=harm.state == FAILED)
         own = "" if harm.limit == limit else f"; ≤ {harm.limit:g}{THIN}%"
@@ -138,17 +148,17 @@ def _beside(scores: Board, names: Sequence[str]) -> str:
     return f"{text} Of {names[1]}: {within(place)}, {share_text(figure)} settle and stay."
 
 
-def _step(sources: Sources, verdict: Verdict) -> Step:
+def _step(sources: Sources, verdict: Verdict) -> CardStep:
     if not verdict.winner:
-        return Step("Run the stages of this loop.", "./run dvc repro evaluate_setpoint")
+        return CardStep("Run the stages of this loop.", "./run dvc repro evaluate_setpoint")
     if verdict.rehearsal:
-        return Step(
+        return CardStep(
             "Print the training print and put its frames into datasets/raw/setpoint.",
             "./run beadline training-print training.gcode",
         )
     if verdict.state == PASSED:
-        return Step("Watch a print without steering it.", "./run beadline shadow FRAMES")
-    return Step(f"{verdict.remedy.split('To try: ')[-1].split('. ')[0].rstrip('.')}.", "./run dvc repro")
+        return CardStep("Watch a print without steering it.", "./run beadline shadow FRAMES")
+    return CardStep(f"{verdict.remedy.split('To try: ')[-1].split('. ')[0].rstrip('.')}.", "./run dvc repro")
 
 
 # ---- the cases of the rule that decides

@@ -8,16 +8,11 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import (
-    BEST_FLOW,
-    BEST_TEMPERATURE,
-    DOES_NOTHING,
-    FLOW_BAND,
-    SETTLED_BY,
-    TEMPERATURE_BAND,
-)
+from pipeline.setpoint.agents.criteria import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND
+from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 from pipeline.verdict.digits import THIN, count, number, shortened
 from pipeline.verdict.evidence import Table
 from pipeline.verdict.setpoint import Board, Case, case_text, role, worst
@@ -130,8 +125,8 @@ def picture(sources: Sources, board: Board | Missing) -> Picture:
         case_text(case, whole=True),
         told,
         [
-            Column("Flow", "per cent, against decisions", "", [flow]),
-            Column("Runs inside", "per cent of them, against decisions", "", [share]),
+            PictureColumn("Flow", "per cent, against decisions", "", [flow]),
+            PictureColumn("Runs inside", "per cent of them, against decisions", "", [share]),
         ],
         f"One run from each of {starts}, on one redraw of the segments. {reading(found.runs)} Dashed: "
         f"{BEST_FLOW - FLOW_BAND:g}–{BEST_FLOW + FLOW_BAND:g}{THIN}%. Inside: there, and "

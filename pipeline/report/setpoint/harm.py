@@ -1,16 +1,16 @@
 """What controllers do to prints that were good, and what that buys: harm against recovery."""
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import BEYOND, DOES_NOTHING
+from pipeline.setpoint.agents.criteria import BEYOND
+from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.verdict.digits import THIN, band, number
 from pipeline.verdict.setpoint import Board, Case, Harm, bars, case_text, harm_of, role, share_text
 from pipeline.verdict.verdict import Figure, Missing
@@ -22,40 +22,16 @@ CLOG, HALF_CLOG = ("recorded", "recorded, sticky, clog"), ("recorded", "recorded
 AXES = (5.0, 10.0, 20.0, 50.0, 100.0)
 
 
-class Contestant(NamedTuple):
-    """One controller: its harm where it is nearest to its bar, and what it recovers, in words."""
-
-    name: str
-    mark: str
-    default: bool
-    harm: str
-    harm_band: str
-    bad: bool
-    where: str
-    recovered: str
-    recovered_band: str
-    steps: str
-    back: str
-    back_band: str
-    why: str
-
-
-class Harms(NamedTuple):
-    picture: Picture
-    rows: Sequence[Contestant] = ()
-    clustered: str = ""
-
-
-def harms(sources: Sources, board: Board | Missing) -> Harms:
+def harms(sources: Sources, board: Board | Missing) -> dict[str, Any]:
     """The chart, and the contestants as a table: those that may run first."""
     if isinstance(board, Missing):
-        return Harms(placeholder("harm", TITLE, board))
+        return {"picture": placeholder("harm", TITLE, board), "rows": (), "clustered": ""}
     limits = bars(sources.evidence, board)
     found = {name: harm_of(board, name, limits) for name in board.names}
     known = {name: harm for name, harm in found.items() if isinstance(harm, Harm)}
     if not known:
         gap = Missing("not measured", "no run from a good start", "Run ./run dvc repro evaluate_setpoint")
-        return Harms(placeholder("harm", TITLE, gap))
+        return {"picture": placeholder("harm", TITLE, gap), "rows": (), "clustered": ""}
     rows = [_row(board, name, harm) for name, harm in known.items()]
     clog = case_text(CLOG, whole=True)
     caption = (
@@ -68,11 +44,15 @@ def harms(sources: Sources, board: Board | Missing) -> Harms:
         "harm",
         TITLE,
         _finding(board, known, limits),
-        [Column("Runs recovered from a clog", "in per cent, against harm", "", [_chart(board, known)])],
+        [
+            PictureColumn(
+                "Runs recovered from a clog", "in per cent, against harm", "", [_chart(board, known)]
+            )
+        ],
         caption,
         page.origin(sources.source("scoreboard", "choice")),
     )
-    return Harms(picture, rows, clustered(board))
+    return {"picture": picture, "rows": rows, "clustered": clustered(board)}
 
 
 def clustered(board: Board) -> str:
@@ -98,25 +78,25 @@ def _recovered(board: Board, name: str, what: str = "recovered", case: Case = CL
     return Missing("not measured", "this case was not run") if cell is None else getattr(cell, what)
 
 
-def _row(board: Board, name: str, harm: Harm) -> Contestant:
+def _row(board: Board, name: str, harm: Harm) -> dict[str, Any]:
     share, back = _recovered(board, name), _recovered(board, name, "back", HALF_CLOG)
     cell = board.cells.get((name, CLOG))
     steps = math.nan if cell is None else cell.recovery_steps
-    return Contestant(
-        name,
-        role(board, name),
-        name == board.default,
-        share_text(harm.figure),
-        band(harm.figure.low, harm.figure.high, 1),
-        bad=harm.state == "failed",
-        where=f"{start_text(harm.case)}, ≤\u00a0{harm.limit:g}{THIN}%",
-        recovered=share_text(share),
-        recovered_band=band(share.low, share.high, 1) if isinstance(share, Figure) else "",
-        steps="" if math.isnan(steps) else f"in {number(steps, 0)} decisions",
-        back=share_text(back),
-        back_band=band(back.low, back.high, 1) if isinstance(back, Figure) else "",
-        why="may not run" if name in board.refused else "",
-    )
+    return {
+        "name": name,
+        "mark": role(board, name),
+        "default": name == board.default,
+        "harm": share_text(harm.figure),
+        "harm_band": band(harm.figure.low, harm.figure.high, 1),
+        "bad": harm.state == "failed",
+        "where": f"{start_text(harm.case)}, ≤\u00a0{harm.limit:g}{THIN}%",
+        "recovered": share_text(share),
+        "recovered_band": band(share.low, share.high, 1) if isinstance(share, Figure) else "",
+        "steps": "" if math.isnan(steps) else f"in {number(steps, 0)} decisions",
+        "back": share_text(back),
+        "back_band": band(back.low, back.high, 1) if isinstance(back, Figure) else "",
+        "why": "may not run" if name in board.refused else "",
+    }
 
 
 def _finding(board: Board, known: dict[str, Harm], limits: dict[Case, float]) -> str:

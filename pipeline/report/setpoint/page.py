@@ -2,9 +2,7 @@
 case, and what the camera's classifier is worth."""
 
 import re
-from typing import NamedTuple
-
-from markupsafe import Markup
+from typing import Any, NamedTuple
 
 from pipeline.report.deposition.page import flat
 from pipeline.report.setpoint import agent as setpoint_agent
@@ -15,9 +13,9 @@ from pipeline.report.setpoint import harm as setpoint_harm
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.shared import charts, page, words
-from pipeline.report.shared.difference import Change
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import BEYOND
+from pipeline.setpoint.agents.criteria import BEYOND
+from pipeline.setpoint.controllers import KINDS
 from pipeline.verdict.digits import THIN, band, count, number, percent, quantity
 from pipeline.verdict.evidence import lookup
 from pipeline.verdict.setpoint import (
@@ -84,7 +82,8 @@ def render(sources: Sources) -> str:
         heads_of_rules=HEADS
         if judged_scores is None
         else (
-            *HEADS[:2],
+            HEADS[0],
+            {"model-based": "Model\u2011based"}.get(KINDS.get(judged_scores.baseline(), ""), HEADS[1]),
             role(judged_scores, judged_scores.baseline()) if judged_scores.baseline() else HEADS[2],
         ),
         second=judged_scores is not None
@@ -138,25 +137,16 @@ def choice_sentence(sources: Sources) -> str:
     return text.replace("+-", "±")
 
 
-class Head(NamedTuple):
-    """A controller of the first screen; `default`: it is the one that runs."""
-
-    name: str
-    default: bool
-    mark: str
-    css: str
-
-
-def heads(scores: Board | None) -> list[Head]:
+def heads(scores: Board | None) -> list[dict[str, Any]]:
     """The two controllers of the first screen: what learned, and a baseline: the default or the best."""
     pair = ("", "") if scores is None else (scores.learned(), scores.baseline())
     return [
-        Head(
-            name or "none",
-            bool(name) and scores is not None and name == scores.default,
-            role(scores, name) if name else fallback,
-            css,
-        )
+        {
+            "name": name or "none",
+            "default": bool(name) and scores is not None and name == scores.default,
+            "mark": role(scores, name) if name else fallback,
+            "css": css,
+        }
         for name, fallback, css in zip(pair, ("data_driven", "baseline"), ("dd", "mb"), strict=True)
     ]
 
@@ -164,31 +154,7 @@ def heads(scores: Board | None) -> list[Head]:
 # ---- the first screen: a row for each case that counts
 
 
-class Reading(NamedTuple):
-    """Runs of one controller that settle in one case, in words."""
-
-    css: str
-    name: str
-    value: str = "not measured"
-    band: str = ""
-    bad: bool = False
-
-
-class Answer(NamedTuple):
-    """A row of the first screen: one case; `decides`: the worst of the default."""
-
-    simulator: str
-    case: str
-    state: str
-    cells: list[Reading]
-    strip: Markup
-    stay: str
-    stay_bad: bool
-    change: Change
-    decides: bool
-
-
-def answers(sources: Sources, scores: Board) -> list[Answer]:
+def answers(sources: Sources, scores: Board) -> list[dict[str, Any]]:
     """Runs that settle and stay of what learned and of a baseline, the worst case of the default first; the
     strip shows the runs that are lost, as a share of those that may be."""
     pair = (scores.learned(), scores.baseline())
@@ -208,20 +174,20 @@ def answers(sources: Sources, scores: Board) -> list[Answer]:
         own = scores.cells.get((mine, case))
         states = [state(lost, _lost(own)), state(gone, _lost(own, "stay"))] if own else [OPEN] * 2
         rows.append(
-            Answer(
-                SIMULATORS.get(case[0], case[0]),
-                case_text(case),
-                next((verdict for verdict in states if verdict != PASSED), PASSED),
-                [
+            {
+                "simulator": SIMULATORS.get(case[0], case[0]),
+                "case": case_text(case),
+                "state": next((verdict for verdict in states if verdict != PASSED), PASSED),
+                "cells": [
                     _reading(name, cell, lost, css)
                     for name, cell, css in zip(pair, cells, ("dd", "mb"), strict=True)
                 ],
-                strip=charts.strip(lost, shown),
-                stay=_stay(own),
-                stay_bad=states[1] == FAILED,
-                change=setpoint_change.change(sources, case, own),
-                decides=case == lowest,
-            )
+                "strip": charts.strip(lost, shown),
+                "stay": _stay(own),
+                "stay_bad": states[1] == FAILED,
+                "change": setpoint_change.change(sources, case, own),
+                "decides": case == lowest,
+            }
         )
     return rows
 
@@ -256,11 +222,17 @@ def _lost(cell: Cell | None, what: str = "settled") -> Figure | Missing:
     )
 
 
-def _reading(name: str, cell: Cell | None, lost: Question, css: str) -> Reading:
+def _reading(name: str, cell: Cell | None, lost: Question, css: str) -> dict[str, Any]:
     if cell is None or isinstance(cell.settled, Missing):
-        return Reading(css, name)
+        return {"css": css, "name": name, "value": "not measured", "band": "", "bad": False}
     interval = band(cell.settled.low, cell.settled.high, 1)
-    return Reading(css, name, share_text(cell.settled), interval, state(lost, _lost(cell)) == FAILED)
+    return {
+        "css": css,
+        "name": name,
+        "value": share_text(cell.settled),
+        "band": interval,
+        "bad": state(lost, _lost(cell)) == FAILED,
+    }
 
 
 def _stay(cell: Cell | None) -> str:
@@ -270,44 +242,17 @@ def _stay(cell: Cell | None) -> str:
 # ---- the scoreboard
 
 
-class Share(NamedTuple):
-    """A line of a cell: a share of runs with its interval."""
-
-    text: str
-    band: str
-    bad: bool
-
-
 class BoardCell(NamedTuple):
     """One controller in one case, in words; bold in its own worst case."""
 
-    lines: list[Share]
+    lines: list[dict[str, Any]]
     steps: str = ""
     more: str = ""
     tip: str = ""
     bold: bool = False
 
 
-class BoardRow(NamedTuple):
-    name: str
-    mark: str
-    default: bool
-    kind: str
-    cells: list[BoardCell]
-
-
-class SimulatorBoard(NamedTuple):
-    """The scoreboard of one simulator; `counts`: its cases count for the choice."""
-
-    id: str
-    name: str
-    heads: list[str]
-    rows: list[BoardRow]
-    counts: bool
-    runs: str
-
-
-def boards(sources: Sources, scores: Board) -> list[SimulatorBoard]:
+def boards(sources: Sources, scores: Board) -> list[dict[str, Any]]:
     """A table for each simulator: controllers down, cases across; vermillion where the whole interval lies
     beyond a limit, bold in a controller's own worst case."""
     asked = sources.declared.rules
@@ -323,23 +268,29 @@ def boards(sources: Sources, scores: Board) -> list[SimulatorBoard]:
         runs = sorted({cell.runs for cell in cells})
         names = [name for name in scores.names if any((name, case) in scores.cells for case in cases)]
         tables.append(
-            SimulatorBoard(
-                f"board-{simulator}",
-                SIMULATORS.get(simulator, simulator),
-                [case_text(case) for case in cases],
-                [_row(scores, name, cases, limits) for name in names],
-                counts=any(cell.counts for cell in cells),
-                runs=f"{runs[0]:,}" if len(runs) == 1 else f"{runs[0]:,} to {runs[-1]:,}",
-            )
+            {
+                "id": f"board-{simulator}",
+                "name": SIMULATORS.get(simulator, simulator),
+                "heads": [case_text(case) for case in cases],
+                "rows": [_row(scores, name, cases, limits) for name in names],
+                "counts": any(cell.counts for cell in cells),
+                "runs": f"{runs[0]:,}" if len(runs) == 1 else f"{runs[0]:,} to {runs[-1]:,}",
+            }
         )
     return tables
 
 
-def _row(scores: Board, name: str, cases: list[Case], limits: dict[str, float]) -> BoardRow:
+def _row(scores: Board, name: str, cases: list[Case], limits: dict[str, float]) -> dict[str, Any]:
     """One controller's row in the cases of one simulator."""
     _, lowest = worst(scores, name, "lasting")
     cells = [_cell(scores.cells.get((name, case)), limits, bold=case == lowest) for case in cases]
-    return BoardRow(name, role(scores, name), name == scores.default, scores.kinds[name], cells)
+    return {
+        "name": name,
+        "mark": role(scores, name),
+        "default": name == scores.default,
+        "kind": scores.kinds[name],
+        "cells": cells,
+    }
 
 
 def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> BoardCell:
@@ -351,11 +302,11 @@ def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> BoardCe
         if isinstance(share, Figure):
             failed = state(Question(0, "", "", "%", limits[what], True, ""), share) == FAILED
             text = f"{word}{quantity(share.value, '%', 1)}"
-            lines.append(Share(text, band(share.low, share.high, 1), failed))
+            lines.append({"text": text, "band": band(share.low, share.high, 1), "bad": failed})
     for points, share in zip(BEYOND, cell.beyond, strict=False):
         if isinstance(share, Figure):
             text = f"beyond {points}: {quantity(share.value, '%', 1)}"
-            lines.append(Share(text, band(share.low, share.high, 1), bad=False))
+            lines.append({"text": text, "band": band(share.low, share.high, 1), "bad": False})
     steps = (
         "none settles"
         if cell.median != cell.median
@@ -368,21 +319,7 @@ def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> BoardCe
     return BoardCell(lines, steps, more.strip(", "), tip, bold)
 
 
-class Worst(NamedTuple):
-    """Somebody's worst case, and the start from which fewest settle there, in words."""
-
-    name: str
-    mark: str
-    default: bool
-    kind: str
-    case: str
-    value: str
-    band: str
-    mean: str
-    start: str
-
-
-def worsts(scores: Board) -> list[Worst]:
+def worsts(scores: Board) -> list[dict[str, Any]]:
     """Everybody's worst case, the best first, with the start from which fewest settle there."""
     rows = []
     for name in scores.names:
@@ -396,16 +333,16 @@ def worsts(scores: Board) -> list[Worst]:
         flow, degrees, settled = cell.worst_start
         kinds = {BASELINE: "no learning", "agent": "ours, learned"}
         rows.append(
-            Worst(
-                name,
-                role(scores, name),
-                name == scores.default,
-                kinds.get(scores.kinds[name], "as published"),
-                case_text(case, whole=True),
-                share_text(figure),
-                band(figure.low, figure.high, 1),
-                mean=percent(sum(shares) / len(shares), 3),
-                start=f"{flow:g}{THIN}%, {degrees:g}{THIN}°C: {number(settled, 0)}{THIN}% settle",
-            )
+            {
+                "name": name,
+                "mark": role(scores, name),
+                "default": name == scores.default,
+                "kind": kinds.get(scores.kinds[name], "as published"),
+                "case": case_text(case, whole=True),
+                "value": share_text(figure),
+                "band": band(figure.low, figure.high, 1),
+                "mean": percent(sum(shares) / len(shares), 3),
+                "start": f"{flow:g}{THIN}%, {degrees:g}{THIN}°C: {number(settled, 0)}{THIN}% settle",
+            }
         )
     return rows

@@ -2,7 +2,6 @@
 training, frames with key areas, what was held and foreign."""
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,9 +9,9 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import ALPHA
+from pipeline.setpoint.published import ALPHA
 from pipeline.verdict.digits import THIN, band, number, percent, quantity, short
 from pipeline.verdict.evidence import Table, lookup
 from pipeline.verdict.setpoint import CLASS_BORDERS, accuracy, share_text
@@ -47,7 +46,7 @@ def reliability(sources: Sources) -> Picture:
         else:
             gap = Missing("not measured", f"no diagram of {method}")
             panel = Markup('<div class="hole">{}</div>').format(page.missing(gap))
-        columns.append(Column(head, small, "", [panel]))
+        columns.append(PictureColumn(head, small, "", [panel]))
     text = (
         "Some of the calibration errors were not measured."
         if any(isinstance(value, Missing) for value in errors)
@@ -99,7 +98,7 @@ def confusion(sources: Sources) -> Picture:
         right[degrees] = 100 * float(np.trace(counts)) / max(counts.sum(), 1)
         swapped += int(counts[0, 2] + counts[2, 0])
         columns.append(
-            Column(
+            PictureColumn(
                 f"{degrees:g}{THIN}°C",
                 f"{counts.sum():,} frames, {number(right[degrees], 1)}{THIN}% right",
                 "",
@@ -191,19 +190,21 @@ def distributions(sources: Sources) -> Picture:
     recorded, published = "Recorded windows", "The paper’s simulator"
     worst, places = int(np.argmin(right)), _places(mine)
     columns = [
-        Column(
+        PictureColumn(
             recorded,
             "of this classifier, segments only judged on",
             "",
             [_scaled_shares(frame, recorded, flow, scaled, title="scaled share")],
         ),
-        Column(
+        PictureColumn(
             published,
             "mean of (7), without its noise",
             "",
             [_scaled_shares(frame, published, steps, ideal, title="")],
         ),
-        Column("Named rightly", "windows, in per cent", "", [_right(frame, flow, right, places[worst])]),
+        PictureColumn(
+            "Named rightly", "windows, in per cent", "", [_right(frame, flow, right, places[worst])]
+        ),
     ]
     rest = float(np.mean(np.delete(right, worst))) if len(right) > 1 else float(right[0])
     return Picture(
@@ -291,7 +292,7 @@ def learning_curves(sources: Sources) -> Picture:
         )
         alt = f"{learner}: {number(highest, 1)} % of the watched images are named rightly at best"
         panels = [_losses(learner, mine, x), _accuracies(mine["epoch"], share, x, limit, svc, alt)]
-        columns.append(Column(learner[:1].upper() + learner[1:], "", "", panels))
+        columns.append(PictureColumn(learner[:1].upper() + learner[1:], "", "", panels))
     return Picture(
         "course",
         title,
@@ -345,22 +346,6 @@ def _accuracies(
 # ---- tables and frames
 
 
-class Accuracy(NamedTuple):
-    """A share that is named rightly, with its interval, in words."""
-
-    text: str
-    band: str
-    bad: bool
-
-
-class Yardstick(NamedTuple):
-    """A classifier: its accuracy on an image and on a window."""
-
-    name: str
-    mark: str
-    cells: list[Accuracy]
-
-
 class Foreign(NamedTuple):
     """How one kind of foreign picture was detected, in words."""
 
@@ -372,18 +357,11 @@ class Foreign(NamedTuple):
     alarms: str
 
 
-class Yardsticks(NamedTuple):
-    missing: Missing | None = None
-    rows: Sequence[Yardstick] = ()
-    conformal: str = ""
-    foreign: Sequence[Foreign] = ()
-
-
-def yardsticks(sources: Sources) -> Yardsticks:
+def yardsticks(sources: Sources) -> dict[str, Any]:
     """The transformer beside the simpler ways, an image and a window."""
     metrics = sources.metrics["train_classifier"]
     if isinstance(metrics, Missing):
-        return Yardsticks(metrics)
+        return {"missing": metrics}
     rows = []
     for name, head in (
         ("", "Vision transformer"),
@@ -394,16 +372,16 @@ def yardsticks(sources: Sources) -> Yardsticks:
         for of, limit in (("image", sources.declared.rules.image_accuracy), ("window", 0.0)):
             share = accuracy(metrics, f"{name}_{of}".strip("_"))
             cells.append(
-                Accuracy(
-                    share_text(share),
-                    band(share.low, share.high, 1) if isinstance(share, Figure) else "",
-                    bad=isinstance(share, Figure) and not name and share.value < 100 * limit,
-                )
+                {
+                    "text": share_text(share),
+                    "band": band(share.low, share.high, 1) if isinstance(share, Figure) else "",
+                    "bad": isinstance(share, Figure) and not name and share.value < 100 * limit,
+                }
             )
-        rows.append(Yardstick(head, "baseline" if name else "data_driven", cells))
+        rows.append({"name": head, "mark": "baseline" if name else "data_driven", "cells": cells})
     sets = lookup(metrics, "conformal")
     foreign = lookup(metrics, "out_of_distribution")
-    return Yardsticks(None, rows, _conformal(sets), _foreign(foreign))
+    return {"missing": None, "rows": rows, "conformal": _conformal(sets), "foreign": _foreign(foreign)}
 
 
 def _conformal(sets: Any) -> str:
@@ -472,32 +450,6 @@ def data(sources: Sources) -> list[tuple[str, str]]:
     return rows
 
 
-class Frame(NamedTuple):
-    """A picture as the page shows it."""
-
-    uri: Markup
-    head: str
-    figure: str
-    bad: bool
-    foot: str
-    alt: str
-
-
-class Group(NamedTuple):
-    """Frames of one kind, with a heading and the share of all; both empty where there is one kind only."""
-
-    head: str
-    share: str
-    shown: Sequence[Frame]
-
-
-class Frames(NamedTuple):
-    missing: Missing | None = None
-    groups: Sequence[Group] = ()
-    lead: str = ""
-    origin: Markup = Markup("")
-
-
 # kinds of real frames in the order of the page
 GROUPS = {
     "accepted": "Accepted, and named rightly",
@@ -511,27 +463,32 @@ RECORDED = (
 )
 
 
-def frames(sources: Sources) -> Frames:
+def frames(sources: Sources) -> dict[str, Any]:
     """Frames with key area and direction drawn in, of a rejected one the reason; where the classifier learned
     from recordings real ones: accepted, wrong, rejected and foreign, each with its share."""
     index = sources.tables["nozzle_frames"]
     if isinstance(index, Missing):
-        return Frames(index)
+        return {"missing": index, "lead": ""}
     table: list[Any] = list(index)
     recorded = [row for row in table if row.get("group") in GROUPS]
     origin = page.origin(sources.source("nozzle_frames"))
     if not recorded:
-        return Frames(None, [Group("", "", [_frame(row) for row in table])], RENDERED, origin)
+        return {
+            "missing": None,
+            "groups": [{"head": "", "share": "", "shown": [_frame(row) for row in table]}],
+            "lead": RENDERED,
+            "origin": origin,
+        }
     groups = []
     for kind, head in GROUPS.items():
         mine = [row for row in recorded if row["group"] == kind]
         share = percent(100 * mine[0]["share"], 2) if mine and mine[0].get("share") is not None else ""
         if mine:
-            groups.append(Group(head, share, [_frame(row) for row in mine]))
-    return Frames(None, groups, RECORDED, origin)
+            groups.append({"head": head, "share": share, "shown": [_frame(row) for row in mine]})
+    return {"missing": None, "groups": groups, "lead": RECORDED, "origin": origin}
 
 
-def _frame(row: dict[str, Any]) -> Frame:
+def _frame(row: dict[str, Any]) -> dict[str, Any]:
     """A row of the index of frames, in words."""
     reason, named, p, label = row.get("reason") or "", row.get("named"), row.get("p"), row.get("label")
     truth = CLASSES[label] if isinstance(label, int) and 0 <= label < 3 else "not known"
@@ -556,11 +513,11 @@ def _frame(row: dict[str, Any]) -> Frame:
     place = "" if row.get("place") in (*CLASSES, "rejected", *GROUPS) else str(row.get("place", ""))
     source = str(row.get("source") or "")
     source = source if len(source) <= LONGEST else "\u2026" + source[-LONGEST:]
-    return Frame(
-        Markup("{}").format(row["uri"]),
-        ", ".join(filter(None, (flow, heat))) or "Frame",
-        state,
-        bad=bool(reason) or wrong,
-        foot=", ".join(filter(None, (place, score, source))),
-        alt=f"Frame {row['file']}: {state}",
-    )
+    return {
+        "uri": Markup("{}").format(row["uri"]),
+        "head": ", ".join(filter(None, (flow, heat))) or "Frame",
+        "figure": state,
+        "bad": bool(reason) or wrong,
+        "foot": ", ".join(filter(None, (place, score, source))),
+        "alt": f"Frame {row['file']}: {state}",
+    }

@@ -2,8 +2,7 @@
 was sent, and where nothing was, with the reason."""
 
 import itertools
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -11,7 +10,8 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.workflow.tables import BEST_FLOW, BEST_TEMPERATURE, FLOW_BAND, TEMPERATURE_BAND
+from pipeline.setpoint.agents.criteria import FLOW_BAND, TEMPERATURE_BAND
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 from pipeline.verdict.digits import THIN, count, number
 from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import Missing
@@ -36,12 +36,6 @@ class Strip(NamedTuple):
     more: int
 
 
-class Strips(NamedTuple):
-    missing: Missing | None = None
-    shown: Sequence[Strip] = ()
-    origin: Markup = Markup("")
-
-
 class Held(NamedTuple):
     """Windows begin to end - 1, held for one reason."""
 
@@ -50,18 +44,22 @@ class Held(NamedTuple):
     reason: str
 
 
-def strips(sources: Sources) -> Strips:
+def strips(sources: Sources) -> dict[str, Any]:
     """The episodes in the order of the table."""
     table = sources.tables["decisions"]
     if isinstance(table, Missing):
-        return Strips(table)
+        return {"missing": table}
     episodes = itertools.islice(pd.DataFrame(table).groupby("episode", sort=False), EPISODES)
     shown = [
         _strip({str(column): values.to_numpy() for column, values in rows.items()}, str(name), i)
         for i, (name, rows) in enumerate(episodes)
     ]
     gap = Missing("not measured", "no episode was kept", "Run ./run dvc repro evaluate_setpoint")
-    return Strips(None if shown else gap, shown, page.origin(sources.source("decisions")))
+    return {
+        "missing": None if shown else gap,
+        "shown": shown,
+        "origin": page.origin(sources.source("decisions")),
+    }
 
 
 def reason(why: str) -> str:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
-from pipeline.report.shared.sources import Source
+from pipeline.report.shared.sources import SourceFile
 from pipeline.verdict.verdict import PASSED, Verdict
 
 # letters of a reason that a card has room for in the widest font
@@ -22,7 +22,7 @@ class Entrant(NamedTuple):
     note: str
 
 
-class Cell(NamedTuple):
+class CardCell(NamedTuple):
     """A figure with its band in words; `best` of its row, `bad` where it failed."""
 
     text: str
@@ -31,15 +31,15 @@ class Cell(NamedTuple):
     bad: bool = False
 
 
-class Row(NamedTuple):
+class CardRow(NamedTuple):
     """One figure of every controller of the card, and the rule's limit."""
 
     title: str
     limit: str
-    cells: Sequence[Cell]
+    cells: Sequence[CardCell]
 
 
-class Step(NamedTuple):
+class CardStep(NamedTuple):
     """What to do next: a sentence, and the command."""
 
     sentence: str
@@ -70,11 +70,11 @@ class Card(NamedTuple):
     lead: str
     reason: str
     entrants: Sequence[Entrant]
-    rows: Sequence[Row]
+    rows: Sequence[CardRow]
     basis: str
     beside: str
-    step: Step
-    sources: Sequence[Source]
+    step: CardStep
+    sources: Sequence[SourceFile]
     missing: str = ""
 
 
@@ -89,7 +89,7 @@ def first_sentence(text: str, room: int = ROOM) -> str:
     return sentence if len(sentence) <= room else sentence[: room - 1].rstrip() + "…"
 
 
-def of_verdict(verdict: Verdict, moves: str, step: Step, **rest: Any) -> Card:
+def of_verdict(verdict: Verdict, moves: str, step: CardStep, **rest: Any) -> Card:
     """The card of a loop with this verdict."""
     return Card(
         verdict.loop,

@@ -11,12 +11,13 @@ from collections.abc import Sequence
 import jinja2
 from markupsafe import Markup, escape
 
-from pipeline.report.shared.pictures import Column
-from pipeline.report.shared.sources import QUICK_LOOK, Source, Sources
+from pipeline.report.shared.pictures import PictureColumn
+from pipeline.report.shared.sources import SourceFile, Sources
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
 from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.verdict import digits
+from pipeline.verdict.settings import QUICK_LOOK
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 
 GLYPHS = {
@@ -113,7 +114,7 @@ def glyph(state: str) -> Markup:
     )
 
 
-def widest(columns: Sequence[Column]) -> int:
+def widest(columns: Sequence[PictureColumn]) -> int:
     """Width in px for which the widest chart of these columns was drawn."""
     panels = "".join(str(panel) for column in columns for panel in column.panels)
     return max(map(int, re.findall(r'style="--w:(\d+)px"', panels)), default=208)
@@ -165,7 +166,7 @@ def in_viewer(table: str, **place: str | Sequence[str]) -> Markup:
     return Markup('<a class="in-viewer" href="viewer.html#{}">Open in the viewer</a>').format(state)
 
 
-def origin(sources: list[Source], **place: str | Sequence[str]) -> Markup:
+def origin(sources: list[SourceFile], **place: str | Sequence[str]) -> Markup:
     """Where the figures beside it are from: artifact and hash; the whole hash stands at the foot of the page.
     A time series is linked to its place in the viewer, which `place` tells."""
     if not sources:
@@ -176,12 +177,12 @@ def origin(sources: list[Source], **place: str | Sequence[str]) -> Markup:
     return files(sources)
 
 
-def files(sources: Sequence[Source]) -> Markup:
+def files(sources: Sequence[SourceFile]) -> Markup:
     """The artifacts by name: a click gives the file, the title its digest."""
     return Markup('<p class="src">From {}.</p>').format(linked(sources)) if sources else Markup("")
 
 
-def linked(sources: Sequence[Source]) -> Markup:
+def linked(sources: Sequence[SourceFile]) -> Markup:
     """The links to these files, with commas between them."""
     return Markup(", ").join(
         placed(

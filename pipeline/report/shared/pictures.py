@@ -7,7 +7,7 @@ from markupsafe import Markup
 from pipeline.verdict.verdict import Missing
 
 
-class Column(NamedTuple):
+class PictureColumn(NamedTuple):
     """Panels below one head."""
 
     head: str
@@ -23,7 +23,7 @@ class Picture(NamedTuple):
     id: str
     title: str
     finding: str
-    columns: list[Column]
+    columns: list[PictureColumn]
     caption: str
     origin: Markup
     missing: Missing | None = None

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
-from pipeline.setpoint.workflow.tables import (
+from pipeline.setpoint.tables import (
     AGENT_CURVE,
     CLASSIFIED,
     CLASSIFIER_CURVE,
@@ -25,8 +25,7 @@ from pipeline.temperature import tables as schemas
 from pipeline.temperature.settings import Plant
 from pipeline.verdict import night
 from pipeline.verdict.evidence import OFF, Evidence, Table, switched_off
-from pipeline.verdict.files import QUICK_LOOK
-from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.settings import QUICK_LOOK, ReportRules
 from pipeline.verdict.verdict import LOOPS, Missing, Verdict
 from pipeline.verdict.verdict import read as read_verdicts
 
@@ -40,7 +39,7 @@ class Declared(NamedTuple):
     everything: dict[str, Any]
 
 
-class Source(NamedTuple):
+class SourceFile(NamedTuple):
     """One file that the pages show: what it is called here (a table's name, or the stage of metrics), the
     stage that wrote it, name and version of its schema, the digest of its bytes, and where it is found from
     the pages.
@@ -63,7 +62,7 @@ class Sources(NamedTuple):
     declared: Declared
     metrics: Mapping[str, dict | Missing]
     tables: Mapping[str, Table | Missing]
-    read: Mapping[str, Source]
+    read: Mapping[str, SourceFile]
     absent: Mapping[str, Missing]
     accepted: dict | Missing | None
     code: str
@@ -123,7 +122,7 @@ class Sources(NamedTuple):
         """A zone by its number; of a user's machine by the name of its output."""
         return self.declared.machine.outputs[place].name if self.recorded else f"zone {place + 1}"
 
-    def source(self, *names: str) -> list[Source]:
+    def source(self, *names: str) -> list[SourceFile]:
         """Those of the files that could be read."""
         return [source for name in names for source in self.read.values() if source.name == name]
 
@@ -142,7 +141,7 @@ def collect(
 ) -> Sources:
     """Reads the files of figures and the folders of stages, {stage: path} each. What is missing or broken is
     no error here: its place on the page says so."""
-    read: dict[str, Source] = {}
+    read: dict[str, SourceFile] = {}
     absent: dict[str, Missing] = {}
     figures: dict[str, Any] = {}
     tables: dict[str, Any] = {}
@@ -168,7 +167,7 @@ def collect(
     for name, stage in (("frames", "train_ilc"), ("nozzle_frames", "train_classifier")):
         for frame in [] if isinstance(tables[name], Missing) else tables[name]:
             path = frame["path"]
-            read[path] = Source("frame", path, stage, "JPEG", artifacts.sha256(path))
+            read[path] = SourceFile("frame", path, stage, "JPEG", artifacts.sha256(path))
     before = (
         _read(read, accepted, "accepted", "accept", "accepted", read_accepted)
         if artifacts.exists(accepted)
@@ -192,7 +191,7 @@ def collect(
 LARGEST_COPY, LARGEST_COPIES = 4_000_000, 10_000_000
 
 
-def linked(read: Mapping[str, Source]) -> dict[str, Source]:
+def linked(read: Mapping[str, SourceFile]) -> dict[str, SourceFile]:
     """The same with the link to each file: where it lies below reports/; else a copy in reports/data, so that
     the folder of the pages is whole by itself, where the file is small; else its place below datasets/."""
     room, taken, found = LARGEST_COPIES, set(), {}
@@ -338,7 +337,7 @@ def _frames(path: str) -> list[dict[str, Any]]:
 
 
 def _read(
-    read: dict[str, Source], path: str, name: str, stage: str, schema: str, reader: Callable[[str], Any]
+    read: dict[str, SourceFile], path: str, name: str, stage: str, schema: str, reader: Callable[[str], Any]
 ) -> Any:
     if not artifacts.exists(path):
         return Missing(
@@ -348,7 +347,7 @@ def _read(
         content = reader(path)
     except ValueError as error:
         return Missing("failed", str(error))
-    read[path] = Source(name, path, stage, schema, artifacts.sha256(path))
+    read[path] = SourceFile(name, path, stage, schema, artifacts.sha256(path))
     return content
 
 

@@ -7,7 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.card import Card, Cell, Deciding, Entrant, Row, Step, note_of, of_verdict
+from pipeline.report.shared.card import (
+    Card,
+    CardCell,
+    CardRow,
+    CardStep,
+    Deciding,
+    Entrant,
+    note_of,
+    of_verdict,
+)
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.deciding import degrees, runs_of, until_settled
 from pipeline.report.temperature.judgement import Judgement, named_before
@@ -63,7 +72,7 @@ def contestants(sources: Sources, judged: Judgement) -> dict[str, str]:
     return names | ({third: runs_now if third == runs else "yardstick"} if third else {})
 
 
-def _row(question: Question, judged: Judgement, names: Sequence[str]) -> Row:
+def _row(question: Question, judged: Judgement, names: Sequence[str]) -> CardRow:
     figures = [judged.answers.get(name, {}).get(question.key, NOT_JUDGED) for name in names]
     places = places_of(question, figures[:2])
     # doing nothing is no contestant: it never overshoots
@@ -81,7 +90,7 @@ def _row(question: Question, judged: Judgement, names: Sequence[str]) -> Row:
     )
     # a row in which all are alike has no best one
     led = len({worded(question, value, places) for value in values}) > 1
-    return Row(
+    return CardRow(
         question.title.split(", ")[0],
         limit,
         [
@@ -91,28 +100,28 @@ def _row(question: Question, judged: Judgement, names: Sequence[str]) -> Row:
     )
 
 
-def _cell(question: Question, figure: Figure | Missing, places: int, best: float, *, leads: bool) -> Cell:
+def _cell(question: Question, figure: Figure | Missing, places: int, best: float, *, leads: bool) -> CardCell:
     if isinstance(figure, Missing):
-        return Cell(figure.state, bad=figure.state == FAILED)
+        return CardCell(figure.state, bad=figure.state == FAILED)
     text = worded(question, figure.value, places)
     best_one = (
         leads and math.isfinite(best) and text == worded(question, best, places) and text != OFF_THE_SCALE
     )
     bad = math.isfinite(question.limit) and state(question, figure) == FAILED
-    return Cell(text, banded(question, figure, places), best_one, bad)
+    return CardCell(text, banded(question, figure, places), best_one, bad)
 
 
-def _step(sources: Sources, verdict: Verdict) -> Step:
+def _step(sources: Sources, verdict: Verdict) -> CardStep:
     if not verdict.winner and verdict.state not in (PASSED, FAILED):
-        return Step("Run the stages of this loop.", "./run dvc repro evaluate_temperature")
+        return CardStep("Run the stages of this loop.", "./run dvc repro evaluate_temperature")
     if not sources.recorded:
-        return Step("Record your own machine.", "./run beadline init RECORDING.csv --copy")
+        return CardStep("Record your own machine.", "./run beadline init RECORDING.csv --copy")
     if verdict.state == PASSED:
         folder = "datasets/export_controllers/temperature"
-        return Step(
+        return CardStep(
             "Replay it on a recording before a trial.", f"./run beadline replay {folder} RECORDING.csv"
         )
-    return Step("Record the next experiment.", "./run beadline first-experiment")
+    return CardStep("Record the next experiment.", "./run beadline first-experiment")
 
 
 def deciding(sources: Sources, judged: Judgement) -> Deciding | Missing:

@@ -6,7 +6,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Column
+from pipeline.report.shared.pictures import PictureColumn
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import count, number, percent, short
 from pipeline.verdict.evidence import Table
@@ -15,14 +15,16 @@ from pipeline.verdict.verdict import Missing
 # ---- orders, for the page of the identification
 
 
-def _holed(head: str, small: str, missing: Missing, mark: str = "") -> Column:
-    return Column(head, small, mark, [Markup('<div class="hole">{}</div>').format(page.missing(missing))])
+def _holed(head: str, small: str, missing: Missing, mark: str = "") -> PictureColumn:
+    return PictureColumn(
+        head, small, mark, [Markup('<div class="hole">{}</div>').format(page.missing(missing))]
+    )
 
 
 _SMALL = {"width": 270, "height": 160, "left": 44}
 
 
-def singular(sources: Sources) -> Column:
+def singular(sources: Sources) -> PictureColumn:
     head, small = "Singular values", "of the identification, by order; log"
     table = sources.tables["order"]
     if isinstance(table, Missing):
@@ -45,10 +47,10 @@ def singular(sources: Sources) -> Column:
     last_value = values[order == last]
     size = short(float(last_value[0])) if len(last_value) else "none"
     alt = f"Order {last} is chosen: its singular value {size}, noise alone reaches {short(edge)}"
-    return Column(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
+    return PictureColumn(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
 
 
-def left_out(sources: Sources) -> Column:
+def left_out(sources: Sources) -> PictureColumn:
     head, small = "Error of each order", "on blocks left out, share of the outputs’ variation"
     table = sources.tables["order"]
     if isinstance(table, Missing):
@@ -77,7 +79,7 @@ def left_out(sources: Sources) -> Column:
         ]
         outcome = f"order {at:g} leaves {percent(100 * least, 2)} of the variation unexplained"
     alt = f"Error on left-out blocks by order: {outcome}"
-    return Column(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
+    return PictureColumn(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
 
 
 # ---- the course of a search
@@ -93,7 +95,7 @@ def dots_and_line(rows: Table) -> str:
     )
 
 
-def progress(rows: Table, head: str, small: str, level: Any, *, excess: bool) -> Column:
+def progress(rows: Table, head: str, small: str, level: Any, *, excess: bool) -> PictureColumn:
     """The candidates of one search beside a level: of the default weights, or with `excess` of the known
     optimum, above which the costs are then drawn in per cent."""
     if not len(rows["cost"]) or isinstance(level, Missing):
@@ -138,4 +140,4 @@ def progress(rows: Table, head: str, small: str, level: Any, *, excess: bool) ->
         if excess
         else f"the best costs {short(end)}, the default weights {short(level)}"
     )
-    return Column(head, small, "", [charts.panel(frame, layers, alt=alt, css="mb")])
+    return PictureColumn(head, small, "", [charts.panel(frame, layers, alt=alt, css="mb")])

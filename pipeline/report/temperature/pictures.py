@@ -8,7 +8,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.verdict.controllers import YARDSTICKS, heading, in_a_sentence, kind
@@ -69,7 +69,7 @@ def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
             if who in runs
             else [_hole(without.get(who, "no trajectory was recorded"))]
         )
-        shown.append(Column(heading(who), kind(who), who, panels))
+        shown.append(PictureColumn(heading(who), kind(who), who, panels))
     return Picture(
         name,
         title,
@@ -204,14 +204,16 @@ def plants(sources: Sources) -> Picture:
             f"{count(len(both), 'plant')}."
         )
         shown.append(
-            Column("The pair", "mean cost on each plant, a line a plant", "", [_slopes(both, a, b, finding)])
+            PictureColumn(
+                "The pair", "mean cost on each plant, a line a plant", "", [_slopes(both, a, b, finding)]
+            )
         )
     drawn_names = [
         name for name in names(sources.metrics) if name in set(cases["contestant"]) and name not in YARDSTICKS
     ]
     if not drawn_names:
         return placeholder("plants", title, Missing("not measured", "no case has a cost"))
-    shown.append(Column("All contestants", "cost of every case", "", [_boxes(cases, drawn_names)]))
+    shown.append(PictureColumn("All contestants", "cost of every case", "", [_boxes(cases, drawn_names)]))
     return Picture(
         "plants",
         title,

@@ -1,14 +1,14 @@
 """The figures of the temperature page that show the data: what was excited, the record
 signal by signal, and what was found strange in it."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import THIN, count, number, short
 from pipeline.verdict.evidence import Table, lookup
@@ -45,7 +45,7 @@ def excitation(sources: Sources) -> Picture:
             "in eight bands from 0 to π rad a step"
         )
         shown.append(
-            Column(
+            PictureColumn(
                 name,
                 "",
                 "",
@@ -101,7 +101,9 @@ def record(sources: Sources) -> Picture:
         f"{number(len(time), 0)} samples of {recordings}; {masks}. {_quarantined(sources.metrics['ingest'])}"
     )
     heads = (("Inputs", f"{machine.inputs[0].unit}, as applied"), ("Outputs", "°C, as measured"))
-    shown = [Column(head, small, "", panels) for (head, small), panels in zip(heads, halves, strict=True)]
+    shown = [
+        PictureColumn(head, small, "", panels) for (head, small), panels in zip(heads, halves, strict=True)
+    ]
     return Picture(
         "record",
         title,
@@ -168,49 +170,31 @@ def _signal(
     return charts.panel(frame, layers, alt=alt, css="mb", title=title, x_ticks=last, units=("s", unit))
 
 
-class Flaw(NamedTuple):
-    """What was found strange in a recording, and where."""
-
-    recording: str
-    signal: str
-    kind: str
-    place: str
-    samples: str
-    message: str
-    bad: bool
-
-
-class Flaws(NamedTuple):
-    """The first findings, how many more there are, and why there are none to show."""
-
-    rows: list[Flaw]
-    more: int
-    missing: Missing | None
-
-
-def flaws(sources: Sources, most: int = 40) -> Flaws:
+def flaws(sources: Sources, most: int = 40) -> dict[str, Any]:
     """The quality findings, those of quarantined recordings first."""
     table = sources.tables["quality"]
     if isinstance(table, Missing):
-        return Flaws([], 0, table)
+        return {"rows": [], "more": 0, "missing": table}
     quality = pd.DataFrame(table)
     quality = quality.assign(used=quality["kind"] != "quarantined", start=quality["start_s"].fillna(0.0))
     quality = quality.sort_values(["used", "recording", "signal", "kind", "start"])
     rows = [
-        Flaw(
-            recording=str(row["recording"]),
-            signal=str(row["signal"]) or "whole recording",
-            kind=str(row["kind"]),
-            place=""
-            if np.isnan(row["start_s"])
-            else f"{_seconds(row['start_s'])} to {_seconds(row['end_s'])}{THIN}s",
-            samples=number(float(row["count"]), 0),
-            message=str(row["message"]),
-            bad=row["kind"] == "quarantined",
-        )
+        {
+            "recording": str(row["recording"]),
+            "signal": str(row["signal"]) or "whole recording",
+            "kind": str(row["kind"]),
+            "place": (
+                ""
+                if np.isnan(row["start_s"])
+                else f"{_seconds(row['start_s'])} to {_seconds(row['end_s'])}{THIN}s"
+            ),
+            "samples": number(float(row["count"]), 0),
+            "message": str(row["message"]),
+            "bad": row["kind"] == "quarantined",
+        }
         for row in quality.head(most).to_dict("records")
     ]
-    return Flaws(rows, max(len(quality) - most, 0), None)
+    return {"rows": rows, "more": max(len(quality) - most, 0), "missing": None}
 
 
 def _seconds(value: float) -> str:

@@ -2,8 +2,8 @@
 quantile, and what stands below it: the gap with its convention, bounds that bind, who was refused."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.judgement import Judgement
@@ -33,45 +33,7 @@ ORDER = (
 )
 
 
-class Head(NamedTuple):
-    """A contestant above its column."""
-
-    mark: str
-    name: str
-    kind: str
-
-
-class Cell(NamedTuple):
-    """The 90 % quantile, and in small type its band, the median and the worst case; `title` says more."""
-
-    value: str
-    notes: Sequence[str] = ()
-    bad: bool = False
-    best: bool = False
-    title: str = ""
-
-
-class Row(NamedTuple):
-    """A figure of every contestant, with the word that explains it and the rule's limit."""
-
-    key: str
-    title: str
-    word: str
-    limit: str
-    cells: list[Cell]
-
-
-class Scorecard(NamedTuple):
-    """Rows are figures, columns contestants. `below` are sentences that stand under the table."""
-
-    missing: Missing | None
-    heads: list[Head]
-    rows: list[Row]
-    caption: str
-    below: list[str]
-
-
-def scorecard(sources: Sources, judgement: Judgement, words: Mapping[str, str]) -> Scorecard:
+def scorecard(sources: Sources, judgement: Judgement, words: Mapping[str, str]) -> dict[str, Any]:
     """Every contestant that was judged, in the order of simplicity, and those that were refused."""
     metrics = sources.metrics
     compared = comparison(metrics)
@@ -79,16 +41,16 @@ def scorecard(sources: Sources, judgement: Judgement, words: Mapping[str, str]) 
     if not judged:
         gap = metrics["evaluate_temperature"]
         why = gap if isinstance(gap, Missing) else Missing("not measured", "No contestant was judged")
-        return Scorecard(why, [], [], "", [])
+        return {"missing": why, "heads": [], "rows": [], "caption": "", "below": []}
     asked = {question.key: question for question in (*judgement.asked, *UNRULED)}
     rows = [_row(sources, asked[key], judged, judgement, words.get(key, "")) for key in ORDER if key in asked]
-    return Scorecard(
-        None,
-        [Head(name, heading(name), kind(name)) for name in judged],
-        rows,
-        _caption(sources),
-        [*filter(None, [_gap(compared, judged), _at_bound(compared, judged)]), *_refused(sources)],
-    )
+    return {
+        "missing": None,
+        "heads": [{"mark": name, "name": heading(name), "kind": kind(name)} for name in judged],
+        "rows": rows,
+        "caption": _caption(sources),
+        "below": [*filter(None, [_gap(compared, judged), _at_bound(compared, judged)]), *_refused(sources)],
+    }
 
 
 def _caption(sources: Sources) -> str:
@@ -114,7 +76,9 @@ def setting(compared: Mapping[str, Any]) -> str:
     return ", ".join(filter(None, parts)) or "its panel"
 
 
-def _row(sources: Sources, question: Question, names: list[str], judgement: Judgement, word: str) -> Row:
+def _row(
+    sources: Sources, question: Question, names: list[str], judgement: Judgement, word: str
+) -> dict[str, Any]:
     figures = [judgement.answers[name][question.key] for name in names]
     values = [
         figure.value
@@ -131,7 +95,7 @@ def _row(sources: Sources, question: Question, names: list[str], judgement: Judg
     if not limit and math.isfinite(question.limit):
         sign = "≥" if question.at_least else "≤"
         limit = f"{sign} {with_unit(question.limit, question.unit, declared(question.limit))}"
-    return Row(question.key, question.title, word, limit, cells)
+    return {"key": question.key, "title": question.title, "word": word, "limit": limit, "cells": cells}
 
 
 def _competes(name: str) -> bool:
@@ -139,9 +103,17 @@ def _competes(name: str) -> bool:
     return name != "hold" and name not in YARDSTICKS
 
 
-def _cell(sources: Sources, question: Question, name: str, figure: Figure | Missing, *, best: bool) -> Cell:
+def _cell(
+    sources: Sources, question: Question, name: str, figure: Figure | Missing, *, best: bool
+) -> dict[str, Any]:
     if isinstance(figure, Missing):
-        return Cell(figure.state, bad=figure.state == FAILED, title=figure.sentence())
+        return {
+            "value": figure.state,
+            "notes": (),
+            "bad": figure.state == FAILED,
+            "best": False,
+            "title": figure.sentence(),
+        }
     own = entry(comparison(sources.metrics), "contestants", name)
     held = state(question, figure) if math.isfinite(question.limit) else ""
     places = places_of(question, [figure])
@@ -154,13 +126,13 @@ def _cell(sources: Sources, question: Question, name: str, figure: Figure | Miss
         notes.insert(0, figure.note.split(" samples")[0])
     else:
         notes = [banded(question, figure, places), *_beside(question, own, places), *notes]
-    return Cell(
-        text,
-        [note for note in notes if note],
-        bad=held == FAILED,
-        best=best and _competes(name),
-        title=_worst_title(own, question.key),
-    )
+    return {
+        "value": text,
+        "notes": [note for note in notes if note],
+        "bad": held == FAILED,
+        "best": best and _competes(name),
+        "title": _worst_title(own, question.key),
+    }
 
 
 def _beside(question: Question, own: Any, places: int) -> list[str]:
@@ -269,18 +241,11 @@ def infeasible(sources: Sources) -> list[str]:
 # ---- what was tuned and declared
 
 
-class Weights(NamedTuple):
-    """A line of tuned values for each contestant."""
-
-    missing: Missing | None
-    rows: list[tuple[str, str]]
-
-
-def weights(sources: Sources) -> Weights:
+def weights(sources: Sources) -> dict[str, Any]:
     """The tuned values of every contestant, from the weights that were stored."""
     table = sources.tables["weights"]
     if isinstance(table, Missing):
-        return Weights(table, [])
+        return {"missing": table, "rows": []}
     tuned = entry(table, "contestants") or {}
     rows = [
         (
@@ -295,7 +260,7 @@ def weights(sources: Sources) -> Weights:
         if isinstance(tuned.get(name), Mapping)
     ]
     gap = None if rows else Missing("not measured", "no contestant was tuned")
-    return Weights(gap, rows)
+    return {"missing": gap, "rows": rows}
 
 
 def _listed(value: Any) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Column
+from pipeline.report.shared.pictures import PictureColumn
 from pipeline.verdict.digits import THIN, count, short
 from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import Missing
@@ -27,12 +27,12 @@ def search(rows: Table, trade: Any) -> Search:
     return Search(points, points[_best(points)], _marks(points, rows["chosen"][worked], trade))
 
 
-def searched(tried: Search, head: str, small: str) -> Column:
+def searched(tried: Search, head: str, small: str) -> PictureColumn:
     """A search as a picture; in its place that nothing worked."""
     if not len(tried.points):
         gap = page.missing(Missing("not measured", "no candidate of the search worked"))
-        return Column(head, small, "", [Markup('<div class="hole">{}</div>').format(gap)])
-    return Column(head, small, "", [_searched(*tried, head)])
+        return PictureColumn(head, small, "", [Markup('<div class="hole">{}</div>').format(gap)])
+    return PictureColumn(head, small, "", [_searched(*tried, head)])
 
 
 def _marks(points: np.ndarray, chosen: np.ndarray, trade: Any) -> dict[str, tuple[float, float]]:

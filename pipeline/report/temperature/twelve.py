@@ -2,9 +2,7 @@
 the limit, and how the figure moved since the accepted run."""
 
 import math
-from typing import NamedTuple
-
-from markupsafe import Markup
+from typing import Any
 
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.sources import Sources
@@ -15,43 +13,12 @@ from pipeline.verdict.verdict import PASSED, UNJUDGED, Figure, Missing, Question
 from pipeline.verdict.wording import banded, places_of, worded
 
 
-class Cell(NamedTuple):
-    """The answer of one controller: its figure and band in words, or what is missing."""
-
-    css: str
-    name: str
-    state: str
-    mark: str
-    missing: Missing | None = None
-    value: str = ""
-    band: str = ""
-
-
-class Answer(NamedTuple):
-    """A row of the answers. `moved` and `worse` since the accepted run; `quiet`: both contestants pass, and
-    nothing moved."""
-
-    n: int
-    key: str
-    title: str
-    word: str
-    sub: str
-    cells: list[Cell]
-    limit: str
-    state: str
-    strip: Markup
-    change: str
-    moved: bool
-    worse: bool
-    quiet: bool
-
-
-def rows(sources: Sources, judged: Judgement) -> list[Answer]:
+def rows(sources: Sources, judged: Judgement) -> list[dict[str, Any]]:
     unmoved = "other machine" if sources.another_machine else "first run"
     return [_row(question, judged, unmoved) for question in judged.asked]
 
 
-def _row(question: Question, judged: Judgement, unmoved: str) -> Answer:
+def _row(question: Question, judged: Judgement, unmoved: str) -> dict[str, Any]:
     """`unmoved`: why nothing is compared, where nothing is."""
     pair = [(name, judged.answers[name][question.key]) for name in (judged.subject, judged.rival)]
     places = places_of(question, [figure for _, figure in pair])
@@ -65,21 +32,21 @@ def _row(question: Question, judged: Judgement, unmoved: str) -> Answer:
         if math.isfinite(question.limit)
         else "not resolved"
     )
-    return Answer(
-        question.answer,
-        question.key,
-        question.title,
-        words.explaining(question.key),
-        SUB.get(question.key, ""),
-        [_cell(question, name, figure, places) for name, figure in pair],
-        limit="none" if question.key == "crossings" else limit,
-        state=mine,
-        strip=charts.strip(question, [(heading(name), page.MARKS.get(name, "bl"), f) for name, f in pair]),
-        change=move.text() if move else unmoved,
-        moved=moved,
-        worse=moved and move.word == "worse" and mine != PASSED,
-        quiet=mine == other == PASSED and not moved,
-    )
+    return {
+        "n": question.answer,
+        "key": question.key,
+        "title": question.title,
+        "word": words.explaining(question.key),
+        "sub": SUB.get(question.key, ""),
+        "cells": [_cell(question, name, figure, places) for name, figure in pair],
+        "limit": "none" if question.key == "crossings" else limit,
+        "state": mine,
+        "strip": charts.strip(question, [(heading(name), page.MARKS.get(name, "bl"), f) for name, f in pair]),
+        "change": move.text() if move else unmoved,
+        "moved": moved,
+        "worse": moved and move.word == "worse" and mine != PASSED,
+        "quiet": mine == other == PASSED and not moved,
+    }
 
 
 def _state(question: Question, figure: Figure | Missing) -> str:
@@ -90,16 +57,23 @@ def _state(question: Question, figure: Figure | Missing) -> str:
 SUB = {"at_limits": "clipped commands", "disk": "median plant", "delay_s": "median plant"}
 
 
-def _cell(question: Question, name: str, figure: Figure | Missing, places: int) -> Cell:
-    cell = Cell(page.MARKS.get(name, "bl"), heading(name), _state(question, figure), name)
+def _cell(question: Question, name: str, figure: Figure | Missing, places: int) -> dict[str, Any]:
+    cell = {
+        "css": page.MARKS.get(name, "bl"),
+        "name": heading(name),
+        "state": _state(question, figure),
+        "mark": name,
+        "missing": None,
+        "value": "",
+        "band": "",
+    }
     if isinstance(figure, Missing):
-        return cell._replace(missing=figure)
-    return cell._replace(
-        value=worded(question, figure.value, places),
-        band=figure.note.split(" samples")[0].replace(" of ", " / ")
-        if question.key in ("data", "crossings")
-        else banded(question, figure, places),
-    )
+        return cell | {"missing": figure}
+    fraction = figure.note.split(" samples")[0].replace(" of ", " / ")
+    return cell | {
+        "value": worded(question, figure.value, places),
+        "band": fraction if question.key in ("data", "crossings") else banded(question, figure, places),
+    }
 
 
 def drift_state(judged: Judgement) -> str:

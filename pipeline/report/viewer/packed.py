@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.report.shared.sources import Source
-from pipeline.report.viewer.series import UNITS, Shown, runs
+from pipeline.report.shared.sources import SourceFile
+from pipeline.report.viewer.series import UNITS, ViewerTable, runs
 from pipeline.verdict.digits import number
 from pipeline.verdict.evidence import Table
 
@@ -30,7 +30,7 @@ class Packed(NamedTuple):
     files: dict[str, str]
 
 
-def packed(shown: Shown, table: Table, room: int) -> Packed:
+def packed(shown: ViewerTable, table: Table, room: int) -> Packed:
     """Every book (what is loaded together) that fits into `room` bytes, and the number of those that do not.
 
     A column's values are float32, rounded to nearest; x is exact: a start and a step where that gives the
@@ -88,7 +88,7 @@ def packed(shown: Shown, table: Table, room: int) -> Packed:
     return Packed(entry, files)
 
 
-def _marks(shown: Shown, values: list[list[str]]) -> dict[str, str]:
+def _marks(shown: ViewerTable, values: list[list[str]]) -> dict[str, str]:
     """The mark of each value of the key that has marks."""
     places = [i for i, key in enumerate(shown.keys) if key.name == shown.who]
     return {value: shown.marks(value) for i in places for value in values[i]}
@@ -104,7 +104,7 @@ def _codes(key: tuple[str, ...], values: list[list[str]]) -> list[int]:
 
 
 def _book(
-    shown: Shown, table: Table, name: str, mine: list, values: list[list[str]]
+    shown: ViewerTable, table: Table, name: str, mine: list, values: list[list[str]]
 ) -> tuple[dict[str, str], list[list]]:
     """The files of one book, and [codes of the keys, rows, start, step] of each of its runs; without start
     and step where x is a column of its own."""
@@ -159,7 +159,7 @@ def column_file(name: str, parts: list[np.ndarray]) -> str:
     return f'beadlineSeries({json.dumps(name)},{size},{json.dumps(at, separators=(",", ":"))},"{text}");\n'
 
 
-def size_of(source: Source) -> str:
+def size_of(source: SourceFile) -> str:
     """Size of the file in words."""
     size = Path(source.path).stat().st_size
     return f"{number(size / 1e6, 1)} MB" if size >= 1e5 else f"{number(size / 1e3, 0)} kB"

@@ -24,19 +24,6 @@ VENDOR = Path(__file__).parent / "vendor"
 LIBRARY = "uPlot.js"
 
 
-class Row(NamedTuple):
-    """A table as the page lists it: what it is, and where it can be had whole."""
-
-    title: str
-    note: str
-    rows: str
-    link: str
-    size: str
-    source: str
-    missing: Missing | None
-    left_out: str
-
-
 class Viewer(NamedTuple):
     """The text of viewer.html, and the files of the folder data/ beside it."""
 
@@ -58,7 +45,18 @@ def render(sources: Sources, judged: Judgement) -> Viewer:
         if table is OFF:
             continue
         if isinstance(table, Missing):
-            rows.append(Row(shown.title, shown.note, "", "", "", "", table, ""))
+            rows.append(
+                {
+                    "title": shown.title,
+                    "note": shown.note,
+                    "rows": "",
+                    "link": "",
+                    "size": "",
+                    "source": "",
+                    "missing": table,
+                    "left_out": "",
+                }
+            )
             continue
         source = sources.source(shown.name)[0]
         link, size = source.link, packed.size_of(source)
@@ -69,7 +67,18 @@ def render(sources: Sources, judged: Judgement) -> Viewer:
             entries.append(found.entry | {"link": link, "size": size, "path": source.path})
         left_out = _left_out(found.entry)
         count = number(found.entry["rows"], 0)
-        rows.append(Row(shown.title, shown.note, count, link, size, source.path, None, left_out))
+        rows.append(
+            {
+                "title": shown.title,
+                "note": shown.note,
+                "rows": count,
+                "link": link,
+                "size": size,
+                "source": source.path,
+                "missing": None,
+                "left_out": left_out,
+            }
+        )
     script = page.environment().get_template("viewer.js").render().strip()
     text = page.render(
         "viewer.html",
@@ -122,28 +131,18 @@ def start(sources: Sources, judged: Judgement) -> dict[str, Any]:
     return place
 
 
-class Still(NamedTuple):
-    """A picture that needs no script; `missing` in its place."""
-
-    text: str
-    picture: Markup
-    names: list[str]
-    origin: Markup = Markup("")
-    missing: Missing | None = None
-
-
 STYLES = {"dd": "line dd", "mb": "line", "bl": "line bl"}
 
 
-def still(sources: Sources, judged: Judgement) -> Still:
+def still(sources: Sources, judged: Judgement) -> dict[str, Any]:
     """The output furthest from its reference in the deciding case, a numbered line a contestant."""
     table = sources.tables["trajectories"]
     if isinstance(table, Missing):
-        return Still("", Markup(""), [], missing=table)
+        return {"text": "", "picture": Markup(""), "names": [], "origin": Markup(""), "missing": table}
     runs, zone = runs_of(sources, judged, table)
     if not runs:
         gap = Missing("not measured", "no trajectory of the deciding case was recorded")
-        return Still("", Markup(""), [], missing=gap)
+        return {"text": "", "picture": Markup(""), "names": [], "origin": Markup(""), "missing": gap}
     label = sources.zone([o.name for o in sources.declared.machine.outputs].index(zone))
     seconds, time = until_settled(table, runs, zone), table["time_s"]
     early = {who: rows[time[rows] <= seconds] for who, rows in runs.items()}
@@ -173,4 +172,10 @@ def still(sources: Sources, judged: Judgement) -> Still:
     shown = f"The first {short(seconds, 2)} s. " if seconds < float(time.max()) else ""
     alt, units = f"{text} {'; '.join(names)}", ("s", "°C")
     picture = charts.panel(frame, layers, alt=alt, css="mb", title=f"{label}, °C", units=units)
-    return Still(f"{text} {shown}".strip(), picture, names, page.files(sources.source("trajectories")))
+    return {
+        "text": f"{text} {shown}".strip(),
+        "picture": picture,
+        "names": names,
+        "origin": page.files(sources.source("trajectories")),
+        "missing": None,
+    }

@@ -14,6 +14,7 @@ from pipeline.report.setpoint.deciding import Clog, clog
 from pipeline.report.shared.charts import stretches
 from pipeline.report.shared.page import MARKS
 from pipeline.report.shared.sources import Sources
+from pipeline.setpoint.controllers import KINDS
 from pipeline.verdict.controllers import heading
 from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import Missing
@@ -31,7 +32,7 @@ class Key(NamedTuple):
     one: bool = True
 
 
-class Line(NamedTuple):
+class SeriesLine(NamedTuple):
     """A column of numbers. Lines of one `panel` share axes. `beside`: the line that this one is drawn with
     (a reference); `steps`: a value holds until the next; `group`: the heading it is chosen under."""
 
@@ -54,7 +55,7 @@ class Event(NamedTuple):
     panel: str = ""
 
 
-class Shown(NamedTuple):
+class ViewerTable(NamedTuple):
     """A table of the viewer. `name` is that of the pages' source; `books`: so many leading keys tell apart
     what is loaded together; `who`: the key whose values have marks; `events` of the rows of one run."""
 
@@ -63,7 +64,7 @@ class Shown(NamedTuple):
     note: str
     x: tuple[str, str, str]
     keys: tuple[Key, ...]
-    lines: tuple[Line, ...]
+    lines: tuple[SeriesLine, ...]
     books: int = 0
     who: str = ""
     marks: Callable[[str], str] = lambda name: ""
@@ -75,7 +76,7 @@ def counted(word: str) -> Callable[[str], str]:
     return lambda value: f"{word} {value}"
 
 
-def tables(sources: Sources) -> list[Shown]:
+def tables(sources: Sources) -> list[ViewerTable]:
     """All tables that the viewer knows, whether they could be read or not."""
     machine = sources.declared.machine
     inputs = [(signal.name, signal.unit) for signal in machine.inputs]
@@ -97,18 +98,22 @@ def tables(sources: Sources) -> list[Shown]:
 # ---- temperature
 
 
-def _trajectories(inputs: Sequence[tuple[str, str]], outputs: Sequence[tuple[str, str, str]]) -> Shown:
+def _trajectories(inputs: Sequence[tuple[str, str]], outputs: Sequence[tuple[str, str, str]]) -> ViewerTable:
     lines = []
     for name, unit, label in outputs:
         lines += [
-            Line(name, label, unit, name, "Temperature"),
-            Line(f"{name}_reference", f"{label} reference", unit, name, "Temperature", beside=name),
+            SeriesLine(name, label, unit, name, "Temperature"),
+            SeriesLine(f"{name}_reference", f"{label} reference", unit, name, "Temperature", beside=name),
         ]
     for name, unit in inputs:
-        lines.append(Line(f"{name}_applied", f"{name} given", unit, name, "Command as given", steps=True))
+        lines.append(
+            SeriesLine(f"{name}_applied", f"{name} given", unit, name, "Command as given", steps=True)
+        )
     for name, unit in inputs:
-        lines.append(Line(f"{name}_command", f"{name} asked", unit, name, "Command as asked", steps=True))
-    return Shown(
+        lines.append(
+            SeriesLine(f"{name}_command", f"{name} asked", unit, name, "Command as asked", steps=True)
+        )
+    return ViewerTable(
         "trajectories",
         "Temperature: contestants at work",
         "True temperatures, references and commands of two cases under every contestant, as deployed.",
@@ -145,10 +150,10 @@ def _jumps(rows: Table, outputs: Sequence[tuple[str, str, str]]) -> list[Event]:
 
 def _record(
     sources: Sources, inputs: Sequence[tuple[str, str]], outputs: Sequence[tuple[str, str, str]]
-) -> Shown:
+) -> ViewerTable:
     acting = [(signal.name, signal.unit) for signal in sources.declared.machine.acting]
-    lines = [Line(name, label, unit, name, "Temperature") for name, unit, label in outputs]
-    lines += [Line(name, name, unit, name, "Command", steps=True) for name, unit in acting]
+    lines = [SeriesLine(name, label, unit, name, "Temperature") for name, unit, label in outputs]
+    lines += [SeriesLine(name, name, unit, name, "Command", steps=True) for name, unit in acting]
     quality = sources.tables["quality"]
 
     def events(rows: Table) -> list[Event]:
@@ -167,7 +172,7 @@ def _record(
             ]
         return found
 
-    return Shown(
+    return ViewerTable(
         "record",
         "Temperature: the record",
         "What was recorded, before anything is left out; masked samples stand as they were recorded.",
@@ -179,31 +184,31 @@ def _record(
     )
 
 
-def _holdout(outputs: Sequence[tuple[str, str, str]]) -> Shown:
+def _holdout(outputs: Sequence[tuple[str, str, str]]) -> ViewerTable:
     kinds = ("measured", "simulated", "ahead")
-    return Shown(
+    return ViewerTable(
         "holdout",
         "Temperature: the model on the hold-out",
         "Measured, simulated from the inputs alone, and predicted some steps ahead.",
         ("time_s", "time since the hold-out began", "s"),
         (Key("segment", "Stretch of the record", counted("stretch")),),
         tuple(
-            Line(f"{name}_{kind}", f"{label} {kind}", unit, name, kind.capitalize())
+            SeriesLine(f"{name}_{kind}", f"{label} {kind}", unit, name, kind.capitalize())
             for kind in kinds
             for name, unit, label in outputs
         ),
     )
 
 
-def _steps() -> Shown:
+def _steps() -> ViewerTable:
     ends = (("response", "response"), ("low", "band, lower end"), ("high", "band, upper end"))
-    return Shown(
+    return ViewerTable(
         "steps",
         "Temperature: step responses of the model",
         "Answer to one per cent more of an input, from rest, and its 90 % band.",
         ("time_s", "time since the step", "s"),
         (Key("output", "Output"), Key("input", "Input", one=False)),
-        tuple(Line(name, label, "degC per percent", "response", "Response") for name, label in ends),
+        tuple(SeriesLine(name, label, "degC per percent", "response", "Response") for name, label in ends),
     )
 
 
@@ -226,7 +231,7 @@ def law_mark(name: str) -> str:
     return LAWS[name.removesuffix("_nominal")][2] if name.removesuffix("_nominal") in LAWS else ""
 
 
-def _trials() -> Shown:
+def _trials() -> ViewerTable:
     figures = (
         ("rms_true", "error of the true flow, r.m.s.", "mm^3/s"),
         ("rms_measured", "error of the measured flow, r.m.s.", "mm^3/s"),
@@ -234,30 +239,30 @@ def _trials() -> Shown:
         ("peak_over_steady", "largest command over the steady one", "1"),
         ("saturated", "share of time at a limit of the drive", "1"),
     )
-    return Shown(
+    return ViewerTable(
         "trials",
         "Deposition: error trial by trial",
         "What each training routine came to, trial by trial.",
         ("trial", "updates before the trial", ""),
         (MATERIAL, ROUTINE, Key("law", "Law", law_in_words, one=False)),
-        tuple(Line(name, label, unit, name, "Figure") for name, label, unit in figures),
+        tuple(SeriesLine(name, label, unit, name, "Figure") for name, label, unit in figures),
         who="law",
         marks=law_mark,
     )
 
 
-def _lessons() -> Shown:
-    return Shown(
+def _lessons() -> ViewerTable:
+    return ViewerTable(
         "lessons",
         "Deposition: every trial",
         "Wanted, measured and true flow and the plunger's command of every trial of every routine.",
         ("time_s", "time since the trial began", "s"),
         (MATERIAL, ROUTINE, Key("law", "Law", law_in_words), Key("trial", "Trial", counted("trial"))),
         (
-            Line("true_mm3_per_s", "true flow", "mm^3/s", "flow", "Flow"),
-            Line("wanted_mm3_per_s", "wanted flow", "mm^3/s", "flow", "Flow", beside="true_mm3_per_s"),
-            Line("measured_mm3_per_s", "measured flow", "mm^3/s", "flow", "Flow"),
-            Line("command_mm", "plunger command", "mm", "command", "Command"),
+            SeriesLine("true_mm3_per_s", "true flow", "mm^3/s", "flow", "Flow"),
+            SeriesLine("wanted_mm3_per_s", "wanted flow", "mm^3/s", "flow", "Flow", beside="true_mm3_per_s"),
+            SeriesLine("measured_mm3_per_s", "measured flow", "mm^3/s", "flow", "Flow"),
+            SeriesLine("command_mm", "plunger command", "mm", "command", "Command"),
         ),
         books=2,
         who="law",
@@ -275,11 +280,11 @@ COMPOSERS = (
 )
 
 
-def _signals(sources: Sources) -> Shown:
-    lines = [Line("wanted_mm3_per_s", "wanted flow", "mm^3/s", "flow", "Flow")]
-    lines += [Line(f"{name}_mm3_per_s", label, "mm^3/s", "flow", "Flow") for name, label in COMPOSERS]
-    lines += [Line("command_mm", "plunger command", "mm", "command", "Command")]
-    lines += [Line(f"{axis}_mm", f"gantry {axis}", "mm", "gantry", "Gantry") for axis in "xy"]
+def _signals(sources: Sources) -> ViewerTable:
+    lines = [SeriesLine("wanted_mm3_per_s", "wanted flow", "mm^3/s", "flow", "Flow")]
+    lines += [SeriesLine(f"{name}_mm3_per_s", label, "mm^3/s", "flow", "Flow") for name, label in COMPOSERS]
+    lines += [SeriesLine("command_mm", "plunger command", "mm", "command", "Command")]
+    lines += [SeriesLine(f"{axis}_mm", f"gantry {axis}", "mm", "gantry", "Gantry") for axis in "xy"]
     tasks = sources.tables["tasks"]
 
     def events(rows: Table) -> list[Event]:
@@ -291,7 +296,7 @@ def _signals(sources: Sources) -> Shown:
             for i in np.flatnonzero(mine)
         ]
 
-    return Shown(
+    return ViewerTable(
         "signals",
         "Deposition: parts",
         "Wanted flow, flow under every composer, command and gantry of every composed part.",
@@ -306,21 +311,14 @@ def _signals(sources: Sources) -> Shown:
 
 
 def _setpoint_marks(sources: Sources) -> Callable[[str], str]:
-    """Learned agents, filters on a model, and the others, by the scoreboard."""
-    board = sources.tables["scoreboard"]
-    if isinstance(board, Missing):
+    """The mark of a controller by its kind; none without a scoreboard."""
+    if isinstance(sources.tables["scoreboard"], Missing):
         return lambda name: ""
-    kinds = dict(zip(board["controller"].tolist(), board["kind"].tolist(), strict=True))
-
-    def mark(name: str) -> str:
-        if kinds.get(name) in ("agent", "paper"):
-            return "dd"
-        return "mb" if "Bayes" in name else "bl"
-
-    return mark
+    marks = {"data-driven": "dd", "model-based": "mb", "reference": "mb"}
+    return lambda name: marks.get(KINDS.get(name, ""), "bl")
 
 
-def _decisions(sources: Sources) -> Shown:
+def _decisions(sources: Sources) -> ViewerTable:
     def events(rows: Table) -> list[Event]:
         return [
             Event(float(time), float(time), f"{'held: ' if held else ''}{' '.join(str(why).split())}")
@@ -328,15 +326,15 @@ def _decisions(sources: Sources) -> Shown:
         ]
 
     shares = (("p_under", "too little"), ("p_good", "good"), ("p_over", "too much"))
-    return Shown(
+    return ViewerTable(
         "decisions",
         "Setpoint: decisions and what was believed",
         "Flow, temperature and setpoints window by window, with the camera's calibrated class shares.",
         ("time_s", "time since the start", "s"),
         (Key("episode", "Episode"), Key("controller", "Controller")),
         (
-            Line("flow_percent", "true flow", "percent", "flow", "Flow and temperature"),
-            Line(
+            SeriesLine("flow_percent", "true flow", "percent", "flow", "Flow and temperature"),
+            SeriesLine(
                 "flow_setpoint_percent",
                 "flow setpoint",
                 "percent",
@@ -344,15 +342,17 @@ def _decisions(sources: Sources) -> Shown:
                 "Flow and temperature",
                 steps=True,
             ),
-            Line("temperature_degC", "nozzle temperature", "degC", "temperature", "Flow and temperature"),
-            Line(
+            SeriesLine(
+                "temperature_degC", "nozzle temperature", "degC", "temperature", "Flow and temperature"
+            ),
+            SeriesLine(
                 "target_degC", "target temperature", "degC", "temperature", "Flow and temperature", steps=True
             ),
-            *(Line(name, f"belief: {label}", "1", "belief", "Belief") for name, label in shares),
-            Line("distance", "distance from what was learned", "1", "distance", "Camera"),
-            Line("frames", "frames that count", "1", "frames", "Camera"),
-            Line("flow_move_percent", "move of the flow setpoint", "percent", "flow move", "Moves"),
-            Line("temperature_move_degC", "move of the target", "degC", "temperature move", "Moves"),
+            *(SeriesLine(name, f"belief: {label}", "1", "belief", "Belief") for name, label in shares),
+            SeriesLine("distance", "distance from what was learned", "1", "distance", "Camera"),
+            SeriesLine("frames", "frames that count", "1", "frames", "Camera"),
+            SeriesLine("flow_move_percent", "move of the flow setpoint", "percent", "flow move", "Moves"),
+            SeriesLine("temperature_move_degC", "move of the target", "degC", "temperature move", "Moves"),
         ),
         who="controller",
         marks=_setpoint_marks(sources),
@@ -360,7 +360,7 @@ def _decisions(sources: Sources) -> Shown:
     )
 
 
-def _paths(sources: Sources) -> Shown:
+def _paths(sources: Sources) -> ViewerTable:
     table = sources.tables["paths"]
 
     @functools.cache
@@ -372,7 +372,7 @@ def _paths(sources: Sources) -> Shown:
         text = "" if found is None else f"a clog leaves {found.left:.0f} % of the flow"
         return [] if found is None else [Event(found.step, found.step, text, "flow")]
 
-    return Shown(
+    return ViewerTable(
         "paths",
         "Setpoint: runs from every start",
         "True flow and nozzle temperature, decision by decision, of runs that were judged; of the case that "
@@ -385,8 +385,8 @@ def _paths(sources: Sources) -> Shown:
             Key("controller", "Controller", one=False),
         ),
         (
-            Line("flow_percent", "true flow", "percent", "flow", "Quantity"),
-            Line("temperature_degC", "nozzle temperature", "degC", "temperature", "Quantity"),
+            SeriesLine("flow_percent", "true flow", "percent", "flow", "Quantity"),
+            SeriesLine("temperature_degC", "nozzle temperature", "degC", "temperature", "Quantity"),
         ),
         who="controller",
         marks=_setpoint_marks(sources),
@@ -394,18 +394,18 @@ def _paths(sources: Sources) -> Shown:
     )
 
 
-def _agents() -> Shown:
-    return Shown(
+def _agents() -> ViewerTable:
+    return ViewerTable(
         "agents",
         "Setpoint: training of the agents",
         "Mean reward of a step while the agents learned, in the reward of each phase.",
         ("update", "updates done in all phases", ""),
         (Key("agent", "Agent", one=False), Key("phase", "Phase", counted("phase"), one=False)),
-        (Line("reward", "mean reward of a step", "1", "reward", "Figure"),),
+        (SeriesLine("reward", "mean reward of a step", "1", "reward", "Figure"),),
     )
 
 
-def runs(shown: Shown, table: Mapping[str, np.ndarray]) -> list[tuple[tuple[str, ...], np.ndarray]]:
+def runs(shown: ViewerTable, table: Mapping[str, np.ndarray]) -> list[tuple[tuple[str, ...], np.ndarray]]:
     """(values of the keys, rows in order) of every run, in the order in which they come first."""
     columns = [np.asarray(table[key.name]) for key in shown.keys]
     if not len(table[shown.x[0]]):

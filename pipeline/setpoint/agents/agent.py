@@ -7,7 +7,7 @@ one maximum and a one-step target of its own; step 100 ends an episode without e
 still looks ahead.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -27,11 +27,11 @@ from pipeline.setpoint.simulation.simulator import (
     STAND,
     TEMPERATURE_LIMITS,
     Action,
-    Conditions,
-    Controller,
+    EpisodeConditions,
+    MachineState,
     Observation,
-    State,
-    Windows,
+    SetpointController,
+    WindowSource,
     begin,
     first_history,
     nominal,
@@ -101,10 +101,10 @@ def paper_encoder(history: int = HISTORY) -> ObservationEncoder:
     return ObservationEncoder(Partial(first_history, history), Partial(encode))
 
 
-def greedy(encoder: ObservationEncoder) -> Controller:
+def greedy(encoder: ObservationEncoder) -> SetpointController:
     """The controller that takes the best action of each head; its parameters are the network. The simulator
     heeds the temperature's every 10th step."""
-    return Controller(encoder.start, Partial(_best_action, encoder.encode))
+    return SetpointController(encoder.start, Partial(_best_action, encoder.encode))
 
 
 def _best_action(encode, network, memory, observation, key):
@@ -116,7 +116,7 @@ def _best_action(encode, network, memory, observation, key):
 # ---- learning
 
 
-class TrainState(NamedTuple):
+class DqnState(NamedTuple):
     """Network, its target network (13), and the optimiser's state: all that goes from one phase to the next.
     The replay buffer does not: its rewards are of the old phase."""
 
@@ -137,7 +137,7 @@ class DqnSettings(NamedTuple):
     episode: int
 
 
-class Replay(NamedTuple):
+class ReplayRows(NamedTuple):
     """Transitions: x and what followed (n, d), action and reward of both heads (n, 2), and
     temperature_action_masked (n,): lambda's clock heeds no temperature action next.
 
@@ -152,24 +152,24 @@ class Replay(NamedTuple):
     temperature_action_masked: jax.Array
 
 
-def _packed(rows: Replay) -> jax.Array:
+def _packed(rows: ReplayRows) -> jax.Array:
     masked = rows.temperature_action_masked
     return jnp.concatenate([rows.x, rows.after, rows.action, rows.reward, masked[:, None]], axis=1)
 
 
-def _unpacked(table: jax.Array) -> Replay:
+def _unpacked(table: jax.Array) -> ReplayRows:
     d = (table.shape[1] - 5) // 2
     x, after, action, reward, masked = jnp.split(table, (d, 2 * d, 2 * d + 2, 2 * d + 4), axis=1)
-    return Replay(x, after, action.astype(jnp.int8), reward, masked[:, 0] > 0)
+    return ReplayRows(x, after, action.astype(jnp.int8), reward, masked[:, 0] > 0)
 
 
 class EnvSpec(NamedTuple):
     """Where experience comes from: windows, conditions(key) of a new
     episode, and rewards(state) -> (2,) of both heads."""
 
-    windows: Windows
-    conditions: Callable[[jax.Array], Conditions]
-    rewards: Callable[[State], jax.Array]
+    windows: WindowSource
+    conditions: Callable[[jax.Array], EpisodeConditions]
+    rewards: Callable[[MachineState], jax.Array]
 
 
 class DqnProblem(NamedTuple):
@@ -230,10 +230,10 @@ def _stepped(problem: DqnProblem, network, episodes, epsilon, u: jax.Array, key)
         )
 
     episodes = jax.lax.cond(over.any(), renewed, lambda going: going, (conditions, state, memory, after))
-    return episodes, Replay(x, after, action.astype(jnp.int8), rewards, masked)
+    return episodes, ReplayRows(x, after, action.astype(jnp.int8), rewards, masked)
 
 
-def _updated(train_state: TrainState, rows: Replay, problem: DqnProblem) -> TrainState:
+def _updated(train_state: DqnState, rows: ReplayRows, problem: DqnProblem) -> DqnState:
     """One step on (12) for a batch, then (13)."""
     network, target_network = train_state.network, train_state.target_network
     gamma, tau = problem.settings.gamma, problem.settings.tau
@@ -250,7 +250,7 @@ def _updated(train_state: TrainState, rows: Replay, problem: DqnProblem) -> Trai
     change, opt_state = problem.optimiser.update(gradient, train_state.opt_state)
     network = optax.apply_updates(network, change)
     target_network = jax.tree.map(lambda old, new: tau * new + (1 - tau) * old, target_network, network)
-    return TrainState(network, target_network, opt_state)
+    return DqnState(network, target_network, opt_state)
 
 
 def _mean_gradient(loss: Callable, network, *batch: jax.Array):
@@ -264,14 +264,14 @@ def _mean_gradient(loss: Callable, network, *batch: jax.Array):
 
 
 def phase(
-    train_state: TrainState,
+    train_state: DqnState,
     key: jax.Array,
     problem: DqnProblem,
     *,
     updates: int,
     longest: int,
     epsilon: tuple[float, float],
-) -> tuple[TrainState, jax.Array]:
+) -> tuple[DqnState, jax.Array]:
     """A whole phase as one program -> the train state after it and the mean reward of each step (updates,);
     epsilon falls in a line over the first third.
 
@@ -286,7 +286,7 @@ def phase(
 
 
 @eqx.filter_jit
-def _phase(train_state: TrainState, key, problem: DqnProblem, updates, epsilon, *, longest: int):
+def _phase(train_state: DqnState, key, problem: DqnProblem, updates, epsilon, *, longest: int):
     settings = problem.settings
     k_start, k_clock, key = jax.random.split(key, 3)
     n, capacity = settings.environments, settings.capacity
@@ -319,19 +319,19 @@ def _phase(train_state: TrainState, key, problem: DqnProblem, updates, epsilon, 
 # ---- the paper's four phases
 
 
-class Published(NamedTuple):
+class PublishedAgent(NamedTuple):
     """Networks after phases 1 to 4, and the mean reward of each step of each phase."""
 
     networks: tuple[QNetwork, ...]
     rewards: tuple[jax.Array, ...]
 
 
-def ellipse(a, b, state: State) -> jax.Array:
+def ellipse(a, b, state: MachineState) -> jax.Array:
     """(2,): the reward (14) of the state, the same for both heads."""
     return jnp.tile(reward(state.flow, state.temperature, a=a, b=b), 2)
 
 
-def anywhere(accuracy, key: jax.Array, *, flow_actions=LAMBDA) -> Conditions:
+def anywhere(accuracy, key: jax.Array, *, flow_actions=LAMBDA) -> EpisodeConditions:
     """A machine that does as it is told, from a flow and temperature uniform within the limits; flow_actions
     to one temperature action."""
     u = jax.random.uniform(key, (2,))
@@ -359,7 +359,7 @@ class PublishedTraining(NamedTuple):
     flow_actions: int = LAMBDA
 
 
-def train_published(key: jax.Array, settings: PublishedTraining, *, on_step=None) -> Published:
+def train_published(key: jax.Array, settings: PublishedTraining, *, on_step=None) -> PublishedAgent:
     """The four phases: reward shapes (40, 20), (40, 10), (20, 10) on windows that are always right, then the
     last shape with `accuracy`; Adam at one rate throughout.
 
@@ -369,7 +369,7 @@ def train_published(key: jax.Array, settings: PublishedTraining, *, on_step=None
     network, optimiser = QNetwork(k_network, settings.history), optax.adam(settings.learning_rate)
     encoder, windows = paper_encoder(settings.history), paper_windows()
     clock = jnp.float32(settings.flow_actions)
-    train_state = TrainState(network, network, optimiser.init(eqx.filter(network, eqx.is_array)))
+    train_state = DqnState(network, network, optimiser.init(eqx.filter(network, eqx.is_array)))
     networks, all_rewards = [], []
     for i, count in enumerate(settings.updates):
         a, b = PHASES[min(i, len(PHASES) - 1)]
@@ -388,7 +388,7 @@ def train_published(key: jax.Array, settings: PublishedTraining, *, on_step=None
         all_rewards.append(rewards)
         if on_step is not None:
             on_step(i + 1, train_state.network, rewards)
-    return Published(tuple(networks), tuple(all_rewards))
+    return PublishedAgent(tuple(networks), tuple(all_rewards))
 
 
 # ---- weights by name
@@ -427,3 +427,31 @@ def with_weights(network: eqx.Module, arrays: dict[str, np.ndarray]) -> eqx.Modu
             "the file; train again, or load them into the network that they were trained in"
         )
     return jax.tree.unflatten(jax.tree.structure(network), [jnp.asarray(arrays[name]) for name in own])
+
+
+# ---- rows of controllers.CONTROLLERS: settings, agents and recorded windows -> controller and parameters
+
+
+@cache  # one controller for all phases, so that what was compiled for it is found again
+def _published(history: int) -> SetpointController:
+    return greedy(paper_encoder(history))
+
+
+def _build_after_phase(number: int, agents: Any) -> tuple[SetpointController, QNetwork] | None:
+    """The agent of Li and Pattinson (2025) after so many of its phases; None if it was not trained so far."""
+    if number > len(agents.li_2025):
+        return None
+    network = agents.li_2025[number - 1]
+    return _published(history_of(network)), network
+
+
+def build_after_phase_3(
+    settings: Mapping[str, Any], agents: Any, windows: Any
+) -> tuple[SetpointController, QNetwork] | None:
+    return _build_after_phase(3, agents)
+
+
+def build_after_phase_4(
+    settings: Mapping[str, Any], agents: Any, windows: Any
+) -> tuple[SetpointController, QNetwork] | None:
+    return _build_after_phase(4, agents)

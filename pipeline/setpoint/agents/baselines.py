@@ -6,8 +6,9 @@ controller here moves the target to 210 °C in the largest steps that lambda's c
 then follows. The Bayes filters are in bayes.py.
 """
 
+from collections.abc import Mapping
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +21,8 @@ from pipeline.setpoint.simulation.simulator import (
     STAND,
     UNDER,
     Action,
-    Controller,
     Observation,
+    SetpointController,
 )
 
 
@@ -38,14 +39,14 @@ def temperature_move(observation: Observation) -> jax.Array:
 
 
 @cache
-def nothing() -> Controller:
+def nothing() -> SetpointController:
     """Never moves the flow, whatever it sees: what any other controller must be better than. Its parameters
     are ()."""
 
     def act(parameters, memory: tuple, observation: Observation, key: jax.Array) -> tuple[tuple, Action]:
         return memory, Action(jnp.int32(STAND), temperature_move(observation))
 
-    return Controller(lambda: (), act)
+    return SetpointController(lambda: (), act)
 
 
 class Proportional(NamedTuple):
@@ -57,7 +58,7 @@ class Proportional(NamedTuple):
 
 
 @cache  # one pair of functions, so that what was compiled for it is found again
-def proportional() -> Controller:
+def proportional() -> SetpointController:
     """a_q nearest to gain y, y += (p_0 - p_2 - y) / time_constant: Proportional parameters. After a move the
     filter forgets: what it saw was another flow."""
 
@@ -69,7 +70,7 @@ def proportional() -> Controller:
         remembered = jnp.where(move == STAND, y, y * (1.0 - 1.0 / parameters.time_constant))
         return remembered, Action(move, temperature_move(observation))
 
-    return Controller(lambda: jnp.zeros(()), act)
+    return SetpointController(lambda: jnp.zeros(()), act)
 
 
 class SequentialTest(NamedTuple):
@@ -82,12 +83,13 @@ class SequentialTest(NamedTuple):
 
 
 @cache
-def sequential_test() -> Controller:
+def sequential_test() -> SetpointController:
     """A running test of the three classes, 10 % against under or over where it leads good by the threshold
     (Wald 1945; capped as in Page's CUSUM, 1954).
 
-    S_i <- max(S_i + log P(x | i) - max_j (S_j + log P(x | j)), -cap): the cap is what lets a class come back,
-    once a move or a clog has made it true.
+        S_i <- max(S_i + log P(x | i) - max_j (S_j + log P(x | j)), -cap)
+
+    The cap lets a class come back, once a move or a clog has made it true.
     """
 
     def act(
@@ -105,4 +107,25 @@ def sequential_test() -> Controller:
         )
         return S, Action(move, temperature_move(observation))
 
-    return Controller(lambda: jnp.zeros(CLASSES), act)
+    return SetpointController(lambda: jnp.zeros(CLASSES), act)
+
+
+# ---- rows of controllers.CONTROLLERS: settings, agents and recorded windows -> controller and parameters
+
+
+def build_no_control(
+    settings: Mapping[str, float], agents: Any, windows: Any
+) -> tuple[SetpointController, tuple]:
+    return nothing(), ()
+
+
+def build_proportional(
+    settings: Mapping[str, float], agents: Any, windows: Any
+) -> tuple[SetpointController, Proportional]:
+    return proportional(), Proportional(**settings)
+
+
+def build_sequential_test(
+    settings: Mapping[str, float], agents: Any, windows: Any
+) -> tuple[SetpointController, SequentialTest]:
+    return sequential_test(), SequentialTest(**settings)

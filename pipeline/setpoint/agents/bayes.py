@@ -4,11 +4,13 @@ camera errs, and the move with the least expected loss.
 Its moves and the windows it shows tell the flow. The filter carries b(h, q), the belief that the
 flow is q, the camera errs in the manner of h, and the extruder follows its commands with the gain g_h:
 
-b(h, q) <- sum_h' T(h', h) [(1 - hazard) b(h', q - g_h' move) + hazard b'(h') prior(q)] the move; a
-clog or the like, with a small probability; another segment b(h, q) <- b(h, q) P(window | h, q,
-window before) / sum the window a = argmin_a sum b(h, q) loss(q + g_h a) + move_cost |a| loss(q) =
-|q - 100| + outside_cost where that is more than 10; a move costs move_fixed_cost more, so that a print that
-may well be good is left alone
+    b(h, q) <- sum_h' T(h', h) [(1 - hazard) b(h', q - g_h' move) + hazard b'(h') prior(q)]    the move
+    b(h, q) <- b(h, q) P(window | h, q, window before) / sum                                   the window
+    a = argmin_a sum b(h, q) loss(q + g_h a) + move_cost |a|                                   the next move
+    loss(q) = |q - 100| + (outside_cost if |q - 100| > 10)
+
+With the probability `hazard` the nozzle clogs or the like at a move; T leads to another segment. A move costs
+move_fixed_cost more, so that a print that may well be good is left alone.
 
 Manners of erring (`evidence`): anywhere with one probability, as in the paper's simulator; or as a
 trained classifier does by its recorded windows, seen through a segment that makes every bead look
@@ -24,9 +26,9 @@ the watch, to which such a camera is another, and 96 if told as well. Prints in 
 of the runs, and in 0.8 % with the table of the very segments that they are watched by.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,8 +46,8 @@ from pipeline.setpoint.simulation.simulator import (
     GOOD_BORDERS,
     UNDER,
     Action,
-    Controller,
     Observation,
+    SetpointController,
     flow_class,
     nominal,
     paper_windows,
@@ -119,7 +121,7 @@ def start_prior(*, known_start_share: float, known_start_std: float) -> np.ndarr
 
 
 @cache  # one pair of functions, so that what was compiled for it is found again
-def bayes(hypotheses: int) -> Controller:
+def bayes(hypotheses: int) -> SetpointController:
     """The filter and its greedy move, for Filter parameters of so many hypotheses."""
 
     def act(
@@ -131,7 +133,7 @@ def bayes(hypotheses: int) -> Controller:
             temperature_move(observation),
         )
 
-    return Controller(lambda: initial_state(hypotheses), act, strange)
+    return SetpointController(lambda: initial_state(hypotheses), act, strange)
 
 
 def filter_update(parameters: Filter, state: FilterState, observation: Observation) -> FilterState:
@@ -529,3 +531,20 @@ def class_filter(
         move_fixed_cost,
         jnp.asarray(_prior(known_start_share, known_start_std))[None],
     )
+
+
+# ---- rows of controllers.CONTROLLERS: settings, agents and recorded windows -> controller and parameters
+
+
+def build_class_filter(
+    settings: Mapping[str, float], agents: Any, windows: WindowTable
+) -> tuple[SetpointController, Filter]:
+    return bayes(1), class_filter(**settings)
+
+
+def build_robust_filter(
+    settings: Mapping[str, Any], agents: Any, windows: WindowTable
+) -> tuple[SetpointController, Filter]:
+    model = CameraErrorModel(**settings)
+    hypotheses = len(model.gains) * (len(model.accuracies) + model.width_bias_levels)
+    return bayes(hypotheses), watching_filter(windows, model)

@@ -8,7 +8,8 @@ Nothing tells the agent the classifier's accuracy, the actuator's gain or the se
 accuracies and gains are hypotheses of the filter.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,9 +24,9 @@ from pipeline.setpoint.agents.agent import (
     TEMPERATURE_SCALE,
     DqnProblem,
     DqnSettings,
+    DqnState,
     EnvSpec,
     ObservationEncoder,
-    TrainState,
     double_dqn_target,
     greedy,
     phase,
@@ -45,10 +46,11 @@ from pipeline.setpoint.simulation.simulator import (
     GOOD,
     STAND,
     TEMPERATURE_LIMITS,
-    Conditions,
+    EpisodeConditions,
+    MachineState,
     Observation,
-    State,
-    Windows,
+    SetpointController,
+    WindowSource,
     flow_class,
     nominal,
     paper_windows,
@@ -75,7 +77,7 @@ class Belief(NamedTuple):
     gamma: float
 
 
-class Costs(NamedTuple):
+class StepCosts(NamedTuple):
     """Of a step: |q - 100 %| / scale, `outside` where the class is not good, and `move` for every percent
     that the setpoint moved; in percent of flow where not bare."""
 
@@ -84,7 +86,7 @@ class Costs(NamedTuple):
     move: float
 
 
-def flow_reward(costs: Costs, flow: jax.Array, move: jax.Array) -> jax.Array:
+def flow_reward(costs: StepCosts, flow: jax.Array, move: jax.Array) -> jax.Array:
     """- |q - q*| / scale - outside [class not good] - move cost |a|: a median is sought where (14) seeks a
     mode, so far flows that are in doubt weigh as much as near ones."""
     return (
@@ -94,7 +96,7 @@ def flow_reward(costs: Costs, flow: jax.Array, move: jax.Array) -> jax.Array:
     )
 
 
-def rewards(costs: Costs, state: State) -> jax.Array:
+def rewards(costs: StepCosts, state: MachineState) -> jax.Array:
     """(2,) for the heads: the flow's and the temperature's. Neither
     moves the other, so neither is blamed for it."""
     return jnp.stack([flow_reward(costs, state.flow, state.flow_move), temperature_reward(state.temperature)])
@@ -106,7 +108,7 @@ def temperature_reward(temperature: jax.Array) -> jax.Array:
     return reward(BEST_FLOW, temperature, a=a, b=b)
 
 
-def observed_values(costs: Costs, gamma: float) -> np.ndarray:
+def observed_values(costs: StepCosts, gamma: float) -> np.ndarray:
     """Q (5, N) were the flow observed: Q(a, q) = r(q + a, a) + gamma max_a' Q(a',
     q + a), by value iteration on the filter's grid."""
     moves = np.array(FLOW_MOVES)[:, None]
@@ -232,7 +234,7 @@ class BeliefNetwork(eqx.Module):
 # ---- training
 
 
-class Disturbances(NamedTuple):
+class EpisodeDisturbances(NamedTuple):
     """What training episodes meet, each drawn uniformly: the share of episodes on recorded windows (the rest
     on the paper's) and how long a segment may last; from which accuracy, gain and clog up to 1, clogs in a
     share of the episodes and at any step; drift a step up to +- this."""
@@ -246,7 +248,7 @@ class Disturbances(NamedTuple):
     drift: float
 
 
-def paper_or_recorded(table: WindowTable) -> Windows:
+def paper_or_recorded(table: WindowTable) -> WindowSource:
     """The paper's windows where a segment lasts no time (persistence 0), recorded
     ones otherwise: one source for a world of both."""
     paper, recorded = paper_windows(), recorded_windows(table)
@@ -259,10 +261,10 @@ def paper_or_recorded(table: WindowTable) -> Windows:
         )
         return tuple(jnp.where(recorded_now, *pair) for pair in zip(*both, strict=True))
 
-    return Windows(draw, recorded.table)
+    return WindowSource(draw, recorded.table)
 
 
-def disturbed(disturbances: Disturbances, length: int, key: jax.Array) -> Conditions:
+def disturbed(disturbances: EpisodeDisturbances, length: int, key: jax.Array) -> EpisodeConditions:
     """Conditions of one episode; starts are uniform in the logarithm
     of the flow, as errors of extrusion are ratios."""
     u = jax.random.uniform(key, (10,))
@@ -285,8 +287,8 @@ class BeliefTraining(NamedTuple):
     """What a step costs, what episodes meet, and how deep Q-learning goes: `rounds` of `updates`; epsilon
     falls from `explore` to `least` in each."""
 
-    costs: Costs
-    disturbances: Disturbances
+    costs: StepCosts
+    disturbances: EpisodeDisturbances
     dqn: DqnSettings
     learning_rate: float
     updates: int
@@ -295,7 +297,7 @@ class BeliefTraining(NamedTuple):
     least: float
 
 
-class Trained(NamedTuple):
+class TrainedBeliefDqn(NamedTuple):
     """The network kept; validation: mean cost-less-reward a step of validation episodes before training and
     after each round, the best of which (best_round) it is; rewards of each training step."""
 
@@ -307,7 +309,7 @@ class Trained(NamedTuple):
 
 def train(
     key: jax.Array, of: Belief, table: WindowTable, settings: BeliefTraining, *, on_step=None
-) -> Trained:
+) -> TrainedBeliefDqn:
     """Double Q-learning in disturbed episodes on the paper's windows and on recorded ones, Adam with a rate
     that falls by a cosine to zero over all rounds.
 
@@ -322,7 +324,7 @@ def train(
         BeliefNetwork(of.filter.evidence.shape[0], k_network),
         optax.adam(optax.cosine_decay_schedule(settings.learning_rate, rounds * updates)),
     )
-    train_state = TrainState(network, network, optimiser.init(network))
+    train_state = DqnState(network, network, optimiser.init(network))
     episodes, controller = jax.vmap(env.conditions)(jax.random.split(k_judge, VALIDATION)), greedy(encoder)
 
     def judge(network):
@@ -351,7 +353,7 @@ def train(
         if on_step is not None:
             on_step(i + 1, train_state.network, validation[-1])
     best = int(np.argmax(validation))
-    return Trained(networks[best], tuple(validation), best, jnp.concatenate(all_rewards))
+    return TrainedBeliefDqn(networks[best], tuple(validation), best, jnp.concatenate(all_rewards))
 
 
 def _environment(table: WindowTable, settings: BeliefTraining) -> EnvSpec:
@@ -361,3 +363,16 @@ def _environment(table: WindowTable, settings: BeliefTraining) -> EnvSpec:
         Partial(disturbed, settings.disturbances, settings.dqn.episode),
         Partial(rewards, settings.costs),
     )
+
+
+def _strange(of: bayes.Filter, network: BeliefNetwork, memory: bayes.FilterState) -> jax.Array:
+    return bayes.strange(of, memory)
+
+
+def build(
+    settings: Mapping[str, Any], agents: Any, windows: WindowTable
+) -> tuple[SetpointController, BeliefNetwork]:
+    """The row of controllers.CONTROLLERS: the network on the belief of its filter, which also tells whether
+    the camera is another."""
+    controller = greedy(belief_encoder(agents.belief))
+    return controller._replace(strange=Partial(_strange, agents.belief.filter)), agents.belief_dqn

@@ -5,7 +5,7 @@ N(0, 2 b^2) where another segment begins, or goes anywhere (a clog), and the flo
 window is an outlier. s and b are the table's own deviations within and between segments. The other cameras'
 are some times as large:
 
-S <- log(e^S + RESTART) + log p_other(y | past) / p_own(y | past), 0 at the start
+    S <- log(e^S + RESTART) + log p_other(y | past) / p_own(y | past), 0 at the start
 
 Shiryaev and Roberts' sum that begins at once: a table of another camera is wrong from the first window on
 (fast initial response: Lucas and Crosier 1982). It takes no belief about the flow, as that would widen with

@@ -1,7 +1,8 @@
 """From the frames of a window to a setpoint that may be sent: what the frames say together, and why it acted.
 When to hold, limits and waits are `actuation`'s."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,15 +14,17 @@ from pipeline.setpoint.simulation.actuation import (
     FOREIGN,
     REASONS,
     TIP,
+    SetpointLimits,
     is_evidence,
     still,
 )
-from pipeline.setpoint.vision.calibration import hard_shares, window_probabilities
+from pipeline.setpoint.simulation.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS
+from pipeline.setpoint.vision.calibration import ClassifierCalibration, hard_shares, window_probabilities
 
 CLASSES = ("under", "good", "over")
 
 
-class Window(NamedTuple):
+class JudgedWindow(NamedTuple):
     """What E windows of frames say. `reason` indexes REASONS: 0 acts, all else holds.
 
     p (E, 3) soft shares, counts of which the paper makes its shares: shares (E, 3) and scaled (E, 3) of (4),
@@ -44,6 +47,26 @@ class Window(NamedTuple):
     spread: np.ndarray
 
 
+def deployed_limits(per_action: Sequence[float], per_minute: Sequence[float]) -> SetpointLimits:
+    """The published limits of setpoints, and what one action and one minute may change, (2,) each: flow in
+    percent and target in °C."""
+    ends = (np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True))
+    return SetpointLimits(*ends, np.array(per_action), np.array(per_minute))
+
+
+def window_judge(
+    fitted: ClassifierCalibration, *, least_frames: int, foreign_above: float
+) -> Callable[..., "JudgedWindow"]:
+    """`judge_window` by a classifier's calibration."""
+    return partial(
+        judge_window,
+        least_frames=least_frames,
+        correlation=fitted.correlation,
+        foreign_above=foreign_above,
+        conformal_level=fitted.level,
+    )
+
+
 def judge_window(
     probabilities: np.ndarray,
     valid: np.ndarray,
@@ -55,15 +78,18 @@ def judge_window(
     correlation: float,
     foreign_above: float,
     conformal_level: float,
-) -> Window:
+) -> JudgedWindow:
     """E windows of W frames each: class probabilities (E, W, 3), valid (E, W), out-of-distribution scores (E,
     W), tip moved (E,) -> what they say together.
 
     A frame counts when its key area is valid, its probabilities are a distribution and its score is at most
-    `foreign_above`. Of the m that count p = softmax( sum_i log p_i / (1 + (m - 1) correlation) ) frames of
-    one segment repeat each other (design effect; Kish 1965) w_c = #{i: argmax p_i = c}, p = w / m, p-hat = p
-    / max p Li and Pattinson 2025, eq. 1-4 members = {c: p_c >= conformal_level} split conformal set (Sadinle,
-    Lei, Wasserman 2019) Held: fewer than `least_frames` count (by what cost the most of them), the tip has
+    `foreign_above`. Of the m that count
+
+        p = softmax( sum_i log p_i / (1 + (m - 1) correlation) )    design effect of one segment: Kish 1965
+        w_c = #{i: argmax p_i = c},  p = w / m,  p-hat = p / max p  Li and Pattinson 2025, eq. 1-4
+        members = {c: p_c >= conformal_level}                       split conformal: Sadinle et al. 2019
+
+    Held: fewer than `least_frames` count (by what cost the most of them), the tip has
     moved, or the set is no single class.
 
     flows(frames that count (E, W)) -> flow_seen (E,), spread (E,), class probabilities (E, 3) is of a
@@ -100,7 +126,7 @@ def judge_window(
     few = np.where(sound.sum(axis=1) >= least_frames, FOREIGN, FEW)
     reason = np.where((members.sum(axis=1) != 1) & np.isnan(flow_seen), AMBIGUOUS, ACTS)
     reason = np.where(tip_moved, TIP, np.where(m < least_frames, few, reason))
-    return Window(
+    return JudgedWindow(
         p,
         shares,
         shares / shares.max(axis=1, keepdims=True),
@@ -125,11 +151,11 @@ def _median(scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def camera_seen(
-    window: Window,
+    window: JudgedWindow,
     last_seen: np.ndarray,
     looks: np.ndarray,
     foreign: Callable[[np.ndarray], np.ndarray] | None,
-) -> Window:
+) -> JudgedWindow:
     """E windows, held too where the picture stands still or is of no camera that is known.
 
     last_seen (E,) is the flow that the window before showed, NaN where there was none; looks (E, measures)
@@ -142,7 +168,7 @@ def camera_seen(
     return window._replace(reason=reason)
 
 
-def why(time_s: float, window: Window, i: int, change: np.ndarray) -> str:
+def why(time_s: float, window: JudgedWindow, i: int, change: np.ndarray) -> str:
     """One line of the strip "why it acted" for window i: time, what
     was seen, what was sent or why it was held."""
     frames = f"{time_s:6.1f} s: {window.valid[i]} frames valid, {window.used[i]} count"

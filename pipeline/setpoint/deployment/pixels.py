@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from pipeline.setpoint.deployment import deployment
-from pipeline.setpoint.deployment.deployment import Window
+from pipeline.setpoint.deployment.deployment import JudgedWindow
 from pipeline.setpoint.frames import familiar, key_area, nozzle_scene
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.simulation import actuation
-from pipeline.setpoint.simulation.actuation import ACTS, Limits, Waits
-from pipeline.setpoint.simulation.simulator import Controller, Observation
+from pipeline.setpoint.simulation.actuation import ACTS, SetpointLimits, Waits
+from pipeline.setpoint.simulation.simulator import Observation, SetpointController
 
 # of the nozzle, for the alarm that the camera moved: at least LOOKS frames of a window are looked at; what is
 # less alike, or hardly more than at home, is not the nozzle elsewhere
@@ -26,7 +26,7 @@ TEMPLATE_PX, REACH_PX, LOOKS, LIKENESS, ADVANTAGE = 80, 30, 5, 0.4, 0.12
 # ---- the machine
 
 
-class Machine(NamedTuple):
+class MachineDynamics(NamedTuple):
     """Heater: first order, heater_s, after heater_delay_s. Melt: melt_s at 210 °C is how long it empties,
     longer by `softening` per °C below."""
 
@@ -45,7 +45,7 @@ class Running(NamedTuple):
     coming: np.ndarray
 
 
-def at_rest(machine: Machine, flow: np.ndarray, temperature: np.ndarray, *, tick_s: float) -> Running:
+def at_rest(machine: MachineDynamics, flow: np.ndarray, temperature: np.ndarray, *, tick_s: float) -> Running:
     """Machines that have long been fed flow (E,) in percent at temperature (E,) in °C."""
     temperature = np.asarray(temperature, float)
     delay = round(machine.heater_delay_s / tick_s)
@@ -55,7 +55,7 @@ def at_rest(machine: Machine, flow: np.ndarray, temperature: np.ndarray, *, tick
 
 
 def tick(
-    machine: Machine,
+    machine: MachineDynamics,
     state: Running,
     feed: np.ndarray,
     target: np.ndarray,
@@ -66,9 +66,11 @@ def tick(
     """The next state and the mean flow (E,) out of the nozzle over a tick,
     for those that run (E,) bool; the others stand still.
 
-    T' = (target(t - delay) - T) / heater_s; V' = feed - V / tau(T), flow = V / tau, tau = melt_s
-    exp(-softening (T - 210)): what is fed leaves, later, and a melt that heats up lets go of what it holds.
-    Both exact for inputs held over the tick.
+        T' = (target(t - delay) - T) / heater_s
+        V' = feed - V / tau(T)    flow = V / tau    tau = melt_s exp(-softening (T - 210))
+
+    What is fed leaves, later, and a melt that heats up lets go of what it holds. Both are exact for inputs
+    that are constant over the tick.
     """
     tau = _melt_s(machine, state.temperature)
     stored = feed * tau + (state.stored - feed * tau) * np.exp(-tick_s / tau)
@@ -81,14 +83,14 @@ def tick(
     ), flow
 
 
-def _melt_s(machine: Machine, temperature: np.ndarray) -> np.ndarray:
+def _melt_s(machine: MachineDynamics, temperature: np.ndarray) -> np.ndarray:
     return machine.melt_s * np.exp(-machine.softening_per_degC * (temperature - 210.0))
 
 
 # ---- what befalls it
 
 
-class Disturbances(NamedTuple):
+class PixelDisturbances(NamedTuple):
     """Of E episodes, counted in decisions: the feed is multiplied by clog (E,) from clog_at (E,) on; the
     camera moves by shift_px (E, 2) at shift_at (E,); for burst_for (E,) decisions from burst_at (E,) the
     picture is blurred by blur_px (E,) and outshone by glare (E,) gray levels beside the nozzle."""
@@ -103,13 +105,13 @@ class Disturbances(NamedTuple):
     burst_for: np.ndarray
 
 
-def calm(episodes: int) -> Disturbances:
+def calm(episodes: int) -> PixelDisturbances:
     """Nothing befalls E episodes; `_replace` what is to."""
     zero, never = np.zeros(episodes), np.full(episodes, np.iinfo(int).max)
-    return Disturbances(zero + 1, never, np.zeros((episodes, 2)), never, zero, zero, never, zero)
+    return PixelDisturbances(zero + 1, never, np.zeros((episodes, 2)), never, zero, zero, never, zero)
 
 
-def _filmed(frames: np.ndarray, d: Disturbances, i: int, decision: int, tip: np.ndarray) -> np.ndarray:
+def _filmed(frames: np.ndarray, d: PixelDisturbances, i: int, decision: int, tip: np.ndarray) -> np.ndarray:
     """The frames (n, h, w) of episode i as a disturbed camera gives them."""
     burst = 0 <= decision - d.burst_at[i] < d.burst_for[i]
     h, w = frames.shape[1:]
@@ -142,13 +144,13 @@ class Episodes(NamedTuple):
     time_s: np.ndarray
     setpoint: np.ndarray
     sent: np.ndarray
-    windows: Window
+    windows: JudgedWindow
     segment: np.ndarray
     clipped: np.ndarray
     pictures: dict[tuple[int, int], np.ndarray]
 
 
-class Loop(NamedTuple):
+class PixelLoop(NamedTuple):
     """What is closed into a loop, and how it is deployed.
 
     The machine; the classifier classify(images (n, 16, 48), temperature (n,)) -> class probabilities (n, 3),
@@ -161,13 +163,13 @@ class Loop(NamedTuple):
     that is known (`familiar.foreign`); None where none is known.
     """
 
-    machine: Machine
+    machine: MachineDynamics
     classify: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
     frames: int
     frame_rate_hz: float
     waits: Waits
-    limits: Limits
-    judge: Callable[..., Window]
+    limits: SetpointLimits
+    judge: Callable[..., JudgedWindow]
     least_score: float
     tip_tolerance_px: float
     segment_mean_s: float
@@ -176,7 +178,7 @@ class Loop(NamedTuple):
 
 
 def _answer(
-    controller: Controller,
+    controller: SetpointController,
     parameters: Any,
     memory: Any,
     shown: Observation,
@@ -223,16 +225,16 @@ class _Step(NamedTuple):
     time_s: np.ndarray
     setpoint: np.ndarray
     sent: np.ndarray
-    window: Window
+    window: JudgedWindow
     segment: np.ndarray
 
 
 def run(
-    controller: Controller,
+    controller: SetpointController,
     parameters: Any,
     start: np.ndarray,
-    loop: Loop,
-    disturbances: Disturbances,
+    loop: PixelLoop,
+    disturbances: PixelDisturbances,
     *,
     decisions: int,
     rng: np.random.Generator,
@@ -295,7 +297,7 @@ def run(
     return _episodes(steps, *last, setpoints.clipped, pictures)
 
 
-def _judged(loop: Loop, areas: "_WindowAreas", temperature: np.ndarray) -> Window:
+def _judged(loop: PixelLoop, areas: "_WindowAreas", temperature: np.ndarray) -> JudgedWindow:
     """What the windows of E episodes say, at the temperatures (E, W) of their frames."""
     E = len(temperature)
     P, scores, *flows = loop.classify(areas.images.reshape(-1, *key_area.SHAPE), temperature.ravel())
@@ -317,14 +319,16 @@ def _episodes(
         time_s=np.stack(times, axis=1),
         setpoint=np.stack(values, axis=1),
         sent=np.stack(changes, axis=1),
-        windows=Window(*(np.stack(field, axis=1) for field in zip(*windows, strict=True))),
+        windows=JudgedWindow(*(np.stack(field, axis=1) for field in zip(*windows, strict=True))),
         segment=np.stack(segments, axis=1),
         clipped=clipped,
         pictures=pictures,
     )
 
 
-def _filmed_window(loop: Loop, state: Running, setpoint: np.ndarray, clog: np.ndarray, ticks: np.ndarray):
+def _filmed_window(
+    loop: PixelLoop, state: Running, setpoint: np.ndarray, clog: np.ndarray, ticks: np.ndarray
+):
     """The machines after a wait of ticks (E,) and a window of frames, at setpoints (E, 2) with the flow times
     clog (E,); flow and temperature (E, W) of each frame."""
     feed, target, tick_s = setpoint[:, 0] * clog, setpoint[:, 1], 1.0 / loop.frame_rate_hz
@@ -341,7 +345,12 @@ def _renew_segments(cameras: _Cameras, time_s: np.ndarray, segment_mean_s: float
 
 
 def _advance(
-    machine: Machine, state: Running, feed: np.ndarray, target: np.ndarray, ticks: np.ndarray, tick_s: float
+    machine: MachineDynamics,
+    state: Running,
+    feed: np.ndarray,
+    target: np.ndarray,
+    ticks: np.ndarray,
+    tick_s: float,
 ):
     """The state after ticks (E,), and the flow and temperature (E, most) of each tick."""
     flows, temperatures = np.zeros((2, len(feed), ticks.max(initial=0)))
@@ -377,8 +386,8 @@ def _window_areas(
     cameras: _Cameras,
     flow: np.ndarray,
     temperature: np.ndarray,
-    loop: Loop,
-    disturbances: Disturbances,
+    loop: PixelLoop,
+    disturbances: PixelDisturbances,
     decision: int,
     draw: frozenset,
 ) -> _WindowAreas:

@@ -24,6 +24,9 @@ OCTAVES = 5
 NEAR, REACH, START = 14, 28, 12
 # a frame's measures vary with its bead; a window's are the medians of a few
 FRAMES = 4
+# of windows of the known camera, the share that may be called foreign; pictures of other machines lie so far
+# off that it may be small
+FALSE_ALARMS = 0.01
 NAMES = (
     *(f"gray level, {p} %" for p in LEVELS),
     *(f"structure of {2**k} px" for k in range(OCTAVES)),
@@ -177,7 +180,7 @@ def median(rows: np.ndarray) -> np.ndarray:
     return np.median(rows, axis=0) if len(rows) else np.full(rows.shape[1], np.nan)
 
 
-class Camera(NamedTuple):
+class KnownCamera(NamedTuple):
     """How windows of a known camera look: mean and deviation (f,), whitening (f, f) with which the measures
     in deviations have unit covariance, and the scores (n,), rising, of windows of other segments."""
 
@@ -187,7 +190,7 @@ class Camera(NamedTuple):
     scores: np.ndarray
 
 
-def fit_camera(windows: np.ndarray, segment: np.ndarray, *, false_alarms: float) -> Camera:
+def fit_camera(windows: np.ndarray, segment: np.ndarray, *, false_alarms: float) -> KnownCamera:
     """The camera of windows (n, f) of segments (n,): every other segment gives mean and covariance (shrunk:
     Ledoit and Wolf 2004), the others the scores, one each, the largest of its windows'.
 
@@ -211,19 +214,19 @@ def fit_camera(windows: np.ndarray, segment: np.ndarray, *, false_alarms: float)
     covariance = LedoitWolf().fit((learned - mean) / deviation).covariance_
     L = np.linalg.cholesky(covariance + 1e-9 * np.eye(len(covariance)))
     whitening = scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True)
-    camera = Camera(mean, deviation, whitening, np.zeros(0))
+    camera = KnownCamera(mean, deviation, whitening, np.zeros(0))
     scores = score(camera, windows)
     return camera._replace(scores=np.sort([scores[segment == name].max() for name in names[1::2]]))
 
 
-def score(camera: Camera, windows: np.ndarray) -> np.ndarray:
+def score(camera: KnownCamera, windows: np.ndarray) -> np.ndarray:
     """(n,) how far windows (n, f) are from the camera's: z' C^-1 z + mean of z^4, z in deviations. The first
     is large where measures do not go together, the second where one alone is far outside."""
     z = (np.asarray(windows, float) - camera.mean) / camera.deviation
     return ((z @ camera.whitening.T) ** 2).sum(axis=1) + (z**4).mean(axis=1)
 
 
-def p_value(camera: Camera, windows: np.ndarray) -> np.ndarray:
+def p_value(camera: KnownCamera, windows: np.ndarray) -> np.ndarray:
     """(n,) how rarely a window of this camera is as unlike the others: (1 + those at least as far) / (1 + n),
     conformal (Vovk, Gammerman and Shafer 2005); at most a share p of new segments has p or less. NaN for a
     window without a valid frame."""
@@ -232,13 +235,41 @@ def p_value(camera: Camera, windows: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(far), (1 + beyond) / (1 + len(camera.scores)), np.nan)
 
 
-def foreign(camera: Camera, windows: np.ndarray, *, false_alarms: float) -> np.ndarray:
+def foreign(camera: KnownCamera, windows: np.ndarray, *, false_alarms: float) -> np.ndarray:
     """(n,) whether windows (n, f) are of no camera that is known; not where there is none to be judged."""
     return p_value(camera, windows) <= false_alarms
 
 
-def unlike(camera: Camera, window: np.ndarray) -> str:
+def unlike(camera: KnownCamera, window: np.ndarray) -> str:
     """In words what is furthest from what the camera's windows have."""
     z = (np.asarray(window, float) - camera.mean) / camera.deviation
     k = int(np.abs(z).argmax())
     return f"{NAMES[k]}: {abs(z[k]):.0f} deviations {'above' if z[k] > 0 else 'below'} the known camera's"
+
+
+def fit_recorded_camera(surroundings: np.ndarray, segment: np.ndarray, *, length: int) -> KnownCamera | None:
+    """The camera of frames with `surroundings` (n, measures), by windows of `length` of them in a row in one
+    stretch `segment` (n,) of constant settings. What errs together is such a stretch; if these are too few, a
+    window; None if those are too few as well."""
+    windows, stretch = window_medians(surroundings, segment, length=length)
+    for together in (stretch, np.arange(len(windows))):
+        try:
+            return fit_camera(windows, together, false_alarms=FALSE_ALARMS)
+        except ValueError:
+            continue
+    return None
+
+
+def window_medians(
+    surroundings: np.ndarray, segment: np.ndarray, *, length: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(measures of the windows (w, f), stretch of each (w,)), of those with a measured frame."""
+    rows, stretch = [], []
+    for number in np.unique(segment):
+        measures = surroundings[segment == number]
+        for start in range(0, len(measures) - length + 1, length):
+            rows.append(median(measures[start : start + length].astype(float)))
+            stretch.append(number)
+    windows = np.array(rows, float).reshape(-1, surroundings.shape[1])
+    sound = np.isfinite(windows).all(axis=1)
+    return windows[sound], np.array(stretch, int)[sound]

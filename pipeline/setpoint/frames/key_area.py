@@ -173,7 +173,7 @@ def find_all(
     return KeyAreas(images, *columns, reasons, np.array([not r for r in reasons], bool))
 
 
-class Drift(NamedTuple):
+class NozzleDrift(NamedTuple):
     """Where the nozzle is seen: offset (x, y) in px from the calibrated tip, how alike it looks there, a
     correlation of -1..1, and by how much more than at home."""
 
@@ -202,7 +202,7 @@ def nozzle_template(frame: np.ndarray, tip: tuple[float, float], *, size_px: int
 
 def drift(
     frames: Sequence[np.ndarray], template: np.ndarray, tip: tuple[float, float], *, reach_px: int
-) -> Drift:
+) -> NozzleDrift:
     """Where within reach_px of the calibrated tip the nozzle is, by the mean over the frames
     of the normalised cross-correlation: an alarm that the camera moved, never a new
     calibration. At home is within HOME_PX of the calibrated tip.
@@ -235,7 +235,7 @@ def drift(
     row, column = np.unravel_index(int(match.argmax()), match.shape)
     y, x = int(top - rows[0]), int(left - columns[0])
     home = match[max(y - HOME_PX, 0) : y + HOME_PX + 1, max(x - HOME_PX, 0) : x + HOME_PX + 1].max()
-    return Drift(
+    return NozzleDrift(
         (int(columns[0] + column - left), int(rows[0] + row - top)),
         float(match[row, column]),
         float(match[row, column] - home),

@@ -47,7 +47,7 @@ SHADING, SPECULAR_AT = (0.2, 0.4), (-0.6, 0.6)
 TRAVEL, REACH_PX = 60, 22.0
 
 
-class Segment(NamedTuple):
+class PrintedSegment(NamedTuple):
     """Conditions of one printed segment. direction_deg is the way the line leaves the tip
     (0 right, 90 down), tip the calibrated tip (x, y).
 
@@ -72,7 +72,7 @@ class Segment(NamedTuple):
     noise: float
 
 
-class Frames(NamedTuple):
+class RenderedFrames(NamedTuple):
     """frames (n, 350, 350) uint8 and their truth: flow (n,) in percent, temperature (n,) in degC, width_px
     (n,) of the bead as drawn, line (n,) whether there is one; direction_deg and tip of their segment."""
 
@@ -107,7 +107,7 @@ def label(flow: np.ndarray) -> np.ndarray:
     return (flow >= BORDERS[0]).astype(np.int64) + (flow > BORDERS[1])
 
 
-def draw_segment(rng: np.random.Generator) -> Segment:
+def draw_segment(rng: np.random.Generator) -> PrintedSegment:
     """The conditions of a new segment."""
     direction, miss = rng.uniform(*DIRECTION_DEG), TIP_PX * rng.standard_normal(2)
     middle = SIDE // 2
@@ -125,7 +125,7 @@ def draw_segment(rng: np.random.Generator) -> Segment:
         ground += contrast * rng.uniform(*OLDER_LEVEL) * _older(rng, across)
     nozzle, mask = _nozzle(rng, x, y)
     at = np.flatnonzero((np.abs(across) < REACH_PX) & (along > 0) & (mask == 0))
-    return Segment(
+    return PrintedSegment(
         direction_deg=direction % 360, tip=(middle + miss[0], middle + miss[1]),
         width_factor=1 + SEGMENT_SPREAD * rng.standard_normal(),
         ground=np.clip(ground, 0, 255).astype(np.uint8), texture=_texture(rng), nozzle=nozzle, mask=mask,
@@ -135,7 +135,9 @@ def draw_segment(rng: np.random.Generator) -> Segment:
     )  # fmt: skip
 
 
-def render(segment: Segment, flow: np.ndarray, temperature: np.ndarray, rng: np.random.Generator) -> Frames:
+def render(
+    segment: PrintedSegment, flow: np.ndarray, temperature: np.ndarray, rng: np.random.Generator
+) -> RenderedFrames:
     """n frames of one segment, each with its own flow (n,) in percent and temperature (n,) in degC (scalars
     for all frames alike: give at least one array)."""
     flow, temperature = np.broadcast_arrays(
@@ -162,7 +164,7 @@ def render(segment: Segment, flow: np.ndarray, temperature: np.ndarray, rng: np.
         soft = cv2.GaussianBlur(picture, (0, 0), segment.blur_px * focus[k])
         first = int(rng.integers(0, spare))
         frames[k] = cv2.add(soft, noise[first : first + SIDE * SIDE].reshape(SIDE, SIDE), dtype=cv2.CV_8U)
-    return Frames(
+    return RenderedFrames(
         frames,
         flow.copy(),
         temperature.copy(),
@@ -173,7 +175,7 @@ def render(segment: Segment, flow: np.ndarray, temperature: np.ndarray, rng: np.
     )
 
 
-def key_areas(frames: Frames, *, least_score: float) -> KeyAreas:
+def key_areas(frames: RenderedFrames, *, least_score: float) -> KeyAreas:
     """The key areas of one segment's frames, its direction known from G-code."""
     return find_all(frames.frames, frames.tip, least_score=least_score, directions_deg=frames.direction_deg)
 
@@ -285,7 +287,7 @@ def _grid() -> tuple[np.ndarray, np.ndarray]:
     return place[None, :], place[:, None]
 
 
-def _moved(segment: Segment, rng: np.random.Generator) -> np.ndarray:
+def _moved(segment: PrintedSegment, rng: np.random.Generator) -> np.ndarray:
     """The ground with its texture at a new place along the line."""
     travel, a = rng.uniform(-TRAVEL, TRAVEL), np.deg2rad(segment.direction_deg)
     x, y = round(TRAVEL + travel * np.cos(a)), round(TRAVEL + travel * np.sin(a))
@@ -294,7 +296,7 @@ def _moved(segment: Segment, rng: np.random.Generator) -> np.ndarray:
 
 def _lay(
     picture: np.ndarray,
-    segment: Segment,
+    segment: PrintedSegment,
     width: float,
     gloss: float,
     rng: np.random.Generator,

@@ -42,7 +42,7 @@ def still(flow_seen, last_seen):
 def decide(
     controller: Any, parameters: Any, memory: Any, observation: Any, reason: jax.Array, key: jax.Array
 ) -> tuple[Any, Any, jax.Array]:
-    """Memory, action and reason of one episode, of a `simulator.Controller` that sees an
+    """Memory, action and reason of one episode, of a `simulator.SetpointController` that sees an
     `simulator.Observation`. Memory stays as it was where the window is no evidence, and
     where the controller takes the camera for another than its table's the reason is TABLE. The action counts
     where the reason is ACTS; whoever sends it looks."""
@@ -56,7 +56,7 @@ def decide(
 # ---- what may be sent
 
 
-class Limits(NamedTuple):
+class SetpointLimits(NamedTuple):
     """Of (flow in percent, target temperature in °C), each (2,): the box, the largest change of one action
     and the travel allowed in any 60 s."""
 
@@ -77,7 +77,7 @@ class Setpoints(NamedTuple):
     clipped: Any
 
 
-def setpoints(start: np.ndarray, limits: Limits) -> Setpoints:
+def setpoints(start: np.ndarray, limits: SetpointLimits) -> Setpoints:
     """Setpoints at rest at start (E, 2). Raises ValueError where a start lies outside the box."""
     start = np.asarray(start, float)
     outside = ~((start >= limits.low) & (start <= limits.high)).all(axis=1)
@@ -101,7 +101,7 @@ def at_rest(value, *, remembered: int) -> Setpoints:
     )
 
 
-def moved(state: Setpoints, change, time_s, limits: Limits) -> Setpoints:
+def moved(state: Setpoints, change, time_s, limits: SetpointLimits) -> Setpoints:
     """The setpoints after the wanted change (..., 2) at time_s (...,), cut to the size of one action, to what
     is left of the last 60 s' travel, and to the box.
 

@@ -8,13 +8,15 @@ looks thin here looks thin there. Of a table with flows an error is drawn: that 
 in the same way, and about it that of any of the NEAREST windows recorded at flows like this one.
 """
 
+import collections
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint.simulation.simulator import GOOD_BORDERS, Conditions, Windows
+from pipeline.setpoint.simulation.simulator import GOOD_BORDERS, EpisodeConditions, WindowSource
 
 UNSEEN = np.array(np.nan)  # of a table of classes only
 DITHER = 1e-3  # of log flow_seen: a window drawn twice is not a picture that stands still
@@ -116,7 +118,7 @@ def smooth_mean(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.interp(x, at, (weight @ y) / np.maximum(weight.sum(axis=1), 1e-12))
 
 
-def recorded_windows(table: WindowTable) -> Windows:
+def recorded_windows(table: WindowTable) -> WindowSource:
     """The table as a source of windows: fresh where conditions.persistence is 1, sticky above."""
     _check(table)
     shares, bins = np.asarray(table.shares, np.float32), len(table.flow_edges) - 1
@@ -144,7 +146,7 @@ def recorded_windows(table: WindowTable) -> Windows:
         flow_edges=jnp.asarray(table.flow_edges, jnp.float32),
         seen=jnp.asarray([len(log_flow), len(bias)], jnp.int32),
     )
-    return Windows(_recorded_draw, ranked)
+    return WindowSource(_recorded_draw, ranked)
 
 
 def _errors(table: WindowTable) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -158,7 +160,7 @@ def _errors(table: WindowTable) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
 
 
 def _recorded_draw(
-    ranked: _Ranked, conditions: Conditions, flow, segment, u
+    ranked: _Ranked, conditions: EpisodeConditions, flow, segment, u
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     flow_bin = (flow >= ranked.flow_edges[1:-1]).sum()
     s = ranked.first_segment[flow_bin] + jnp.floor(segment * ranked.segments[flow_bin]).astype(jnp.int32)
@@ -227,3 +229,51 @@ def _check(table: WindowTable) -> None:
             f"recorded windows: expected flow bins 0 to {bins - 1}, "
             f"found {np.min(table.flow_bin)} to {np.max(table.flow_bin)}"
         )
+
+
+# ---- as columns of a table
+
+
+def window_rows(tables: Mapping[str, WindowTable]) -> dict[str, np.ndarray]:
+    """Tables by part as columns of schema WINDOWS; flows are missing of a classifier that names
+    classes only."""
+    columns = collections.defaultdict(list)
+    for part, table in tables.items():
+        columns["part"] += [part] * len(table.named)
+        columns["flow_percent"].append(np.broadcast_to(table.flow, len(table.named)))
+        columns["flow_bin"].append(table.flow_bin)
+        columns["flow_low_percent"].append(table.flow_edges[table.flow_bin])
+        columns["flow_high_percent"].append(table.flow_edges[table.flow_bin + 1])
+        columns["segment"].append(table.segment)
+        columns["named"].append(table.named)
+        columns["flow_seen_percent"].append(np.broadcast_to(table.flow_seen, len(table.named)))
+        columns["spread"].append(np.broadcast_to(table.spread, len(table.named)))
+        for c, name in enumerate(("under", "good", "over")):
+            columns[f"p_{name}"].append(table.shares[:, c])
+    return {name: values if name == "part" else np.concatenate(values) for name, values in columns.items()}
+
+
+def window_tables(columns: Mapping[str, np.ndarray], parts: Sequence[str]) -> dict[str, WindowTable]:
+    """The reverse of `window_rows`. Raises ValueError if one of the parts has no window."""
+    tables = {}
+    for part in parts:
+        rows = np.asarray(columns["part"] == part)
+        if not rows.any():
+            raise ValueError(
+                f"recorded windows: expected some of each part, {', '.join(parts)}, but found none of "
+                f"{part}; record them again with ./run dvc repro train_classifier"
+            )
+        bins, first = np.unique(columns["flow_bin"][rows], return_index=True)
+        low, high = (columns[f"flow_{end}_percent"][rows][first] for end in ("low", "high"))
+        shares = np.stack([columns[f"p_{name}"][rows] for name in ("under", "good", "over")], axis=1)
+        tables[part] = WindowTable(
+            shares,
+            columns["named"][rows],
+            np.searchsorted(bins, columns["flow_bin"][rows]),
+            columns["segment"][rows],
+            np.append(low, high[-1]),
+            columns["flow_seen_percent"][rows],
+            columns["spread"][rows],
+            columns["flow_percent"][rows],
+        )
+    return tables

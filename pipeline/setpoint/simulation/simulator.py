@@ -4,8 +4,9 @@ disturbances in mid-episode, and rollouts.
 One decision is one window of frames. At step t the controller sees an
 `Observation` and answers with an `Action`; then
 
-q_bar <- clip(q_bar + gain a_q, 20, 310), q = blockage q_bar, u_bar <- clip(u_bar + a_u, 180, 240) where t mod
-lambda = 0, u_hat += (u_bar - u_hat) / delta
+    q_bar <- clip(q_bar + gain a_q, 20, 310)    q = blockage q_bar
+    u_bar <- clip(u_bar + a_u, 180, 240)        if t mod lambda = 0
+    u_hat <- u_hat + (u_bar - u_hat) / delta
 
 What may be sent, how long to wait and when to hold is `actuation`'s, as in the loop through pixels. The
 commanded flow acts at once, or as fast as the melt lets it, and the class depends on the true flow q alone.
@@ -33,13 +34,13 @@ from pipeline.setpoint.published import (
     TEMPERATURE_MOVES,
 )
 from pipeline.setpoint.simulation import actuation
-from pipeline.setpoint.simulation.actuation import ACTS, FEW, Limits, Setpoints
+from pipeline.setpoint.simulation.actuation import ACTS, FEW, SetpointLimits, Setpoints
 
 STAND = 2  # the index of no move
 FLOW_LIMITS, TEMPERATURE_LIMITS = (20.0, 310.0), (180.0, 240.0)
 BLOCKAGE_LIMITS = (1 / 3, 3.0)  # beyond, no setpoint within its limits would bring the flow to 100 %
 GAIN_LIMITS = (0.5, 1.2)  # that a drifting gain keeps to
-LIMITS = Limits(  # of what is sent: the largest change of one action, and of 60 s
+LIMITS = SetpointLimits(  # of what is sent: the largest change of one action, and of 60 s
     *(np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True)),
     np.array([10.0, 20.0]),
     np.array([100.0, 60.0]),
@@ -84,7 +85,7 @@ def _never(parameters, memory) -> jax.Array:
     return jnp.zeros((), bool)
 
 
-class Controller(NamedTuple):
+class SetpointController(NamedTuple):
     """start() -> memory; act(parameters, memory, observation, key) -> (memory, action); strange(parameters,
     memory) -> whether the camera is none that the controller knows, so that it should hold. All pure, for one
     episode: vmap over episodes, scan over steps."""
@@ -94,7 +95,7 @@ class Controller(NamedTuple):
     strange: Callable[[Any, Any], jax.Array] = _never
 
 
-class Conditions(NamedTuple):
+class EpisodeConditions(NamedTuple):
     """One episode's start and machine: scalars, or arrays (n,) with one entry an episode.
 
     flow (percent) and temperature (°C) at the start; accuracy rho of the paper's windows; persistence:
@@ -131,7 +132,7 @@ class Conditions(NamedTuple):
     flow_actions: jax.Array
 
 
-class State(NamedTuple):
+class MachineState(NamedTuple):
     """sent: what the moves reach, (q_bar before blockage, u_bar), and the moves of the last minute; gain and
     blockage now, clogged by what comes and goes; flow: the true q; flow_move: percent that was sent since the
     controller last saw a window; segment in [0, 1): the recorded conditions that persist, as a rank among
@@ -157,12 +158,14 @@ class State(NamedTuple):
         return self.sent.value[..., 1]
 
 
-class Windows(NamedTuple):
+class WindowSource(NamedTuple):
     """draw(table, conditions, flow, segment, u) -> shares (3,), named, flow_seen (percent; NaN where the
     camera shows classes only): a window at the true flow, from uniform numbers u (3,) and the arrays of
     `table`."""
 
-    draw: Callable[[Any, Conditions, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]
+    draw: Callable[
+        [Any, EpisodeConditions, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, jax.Array]
+    ]
     table: Any = ()
 
 
@@ -185,14 +188,14 @@ def flow_class(flow: jax.Array) -> jax.Array:
     return jnp.where(flow < GOOD_BORDERS[0], UNDER, jnp.where(flow > GOOD_BORDERS[1], OVER, GOOD))
 
 
-def nominal(flow, temperature, *, accuracy: float) -> Conditions:
+def nominal(flow, temperature, *, accuracy: float) -> EpisodeConditions:
     """Conditions of a machine that does as it is told, from starts flow (n,) and
     temperature (n,); `_replace` what an episode is to meet."""
     flow = jnp.asarray(flow, float)
     one, zero = jnp.ones_like(flow), jnp.zeros_like(flow)
     ones = dict.fromkeys(("persistence", "gain", "clog", "seen"), one)
-    values = dict.fromkeys(Conditions._fields, zero) | ones
-    return Conditions(
+    values = dict.fromkeys(EpisodeConditions._fields, zero) | ones
+    return EpisodeConditions(
         **values
         | {
             "flow": flow,
@@ -204,13 +207,15 @@ def nominal(flow, temperature, *, accuracy: float) -> Conditions:
     )
 
 
-def paper_windows() -> Windows:
+def paper_windows() -> WindowSource:
     """(7): the class is right with probability rho, else one of the others; p_i = clip(exp(-alpha |i - x0|) +
     N(0, sigma^2), 0, 1) for i != x0, 1 at x0; over their sum. It shows classes only."""
-    return Windows(_paper_draw)
+    return WindowSource(_paper_draw)
 
 
-def _paper_draw(table, conditions: Conditions, flow, segment, u) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _paper_draw(
+    table, conditions: EpisodeConditions, flow, segment, u
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     wrong = u[0] >= conditions.accuracy
     shift = 1 + (u[0] - conditions.accuracy >= (1.0 - conditions.accuracy) / 2)
     x0 = jnp.where(wrong, (flow_class(flow) + shift) % CLASSES, flow_class(flow))
@@ -228,18 +233,22 @@ def _normal(u: jax.Array) -> jax.Array:
     return jnp.sqrt(2.0) * jax.lax.erf_inv(jnp.clip(2.0 * u - 1.0, -1.0 + 1e-6, 1.0 - 1e-6))
 
 
-def begin(windows: Windows, conditions: Conditions, key: jax.Array) -> tuple[State, Observation]:
+def begin(
+    windows: WindowSource, conditions: EpisodeConditions, key: jax.Array
+) -> tuple[MachineState, Observation]:
     """The state and first observation of one episode (scalar conditions)."""
     return _begun(windows, conditions, jax.random.uniform(key, (CHANCES,)))
 
 
-def _begun(windows: Windows, conditions: Conditions, u: jax.Array) -> tuple[State, Observation]:
+def _begun(
+    windows: WindowSource, conditions: EpisodeConditions, u: jax.Array
+) -> tuple[MachineState, Observation]:
     flow, temperature = (
         jnp.clip(conditions.flow, *FLOW_LIMITS),
         jnp.clip(conditions.temperature, *TEMPERATURE_LIMITS),
     )
     zero, none = jnp.zeros_like(flow), jnp.zeros_like(flow, jnp.int32)
-    state = State(
+    state = MachineState(
         sent=actuation.at_rest(jnp.stack([flow, temperature]), remembered=REMEMBERED),
         gain=conditions.gain,
         blockage=zero + 1.0,
@@ -259,8 +268,8 @@ def _begun(windows: Windows, conditions: Conditions, u: jax.Array) -> tuple[Stat
 
 
 def stepped(
-    windows: Windows, conditions: Conditions, state: State, action: Action, u: jax.Array
-) -> tuple[State, Observation]:
+    windows: WindowSource, conditions: EpisodeConditions, state: MachineState, action: Action, u: jax.Array
+) -> tuple[MachineState, Observation]:
     """One decision of one episode: the action, the limits and lags, whatever befalls the machine, and the
     next window. The reward is `reward(state.flow, state.temperature, ...)`.
 
@@ -295,7 +304,9 @@ def stepped(
     return state, _observation(state)
 
 
-def _sent(conditions: Conditions, state: State, action: Action) -> tuple[Setpoints, jax.Array, jax.Array]:
+def _sent(
+    conditions: EpisodeConditions, state: MachineState, action: Action
+) -> tuple[Setpoints, jax.Array, jax.Array]:
     """What is sent of an action, the wait after it in s, and the flow's executed move in percent as
     commanded. The flow is limited where it arrives: a move of a reaches gain a."""
     acts = state.reason == ACTS
@@ -317,7 +328,9 @@ def _sent(conditions: Conditions, state: State, action: Action) -> tuple[Setpoin
     )
 
 
-def _blocked(conditions: Conditions, state: State, t: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _blocked(
+    conditions: EpisodeConditions, state: MachineState, t: jax.Array, u: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Blockage, and whether a clog that comes and goes is there."""
     jump = jnp.where(u[3] < conditions.jump_rate, conditions.jump_size * _normal(u[4]), 0.0)
     comes = ~state.clogged & (u[7] < conditions.clog_rate)
@@ -332,7 +345,9 @@ def _blocked(conditions: Conditions, state: State, t: jax.Array, u: jax.Array) -
     return jnp.clip(blockage, *BLOCKAGE_LIMITS), (state.clogged | comes) & ~goes
 
 
-def _watched(windows: Windows, conditions: Conditions, state: State, u: jax.Array) -> State:
+def _watched(
+    windows: WindowSource, conditions: EpisodeConditions, state: MachineState, u: jax.Array
+) -> MachineState:
     """The state with the window that the camera shows now, and whether that holds."""
     fresh = windows.draw(windows.table, conditions, conditions.seen * state.flow, state.segment, u)
     stuck = _lasts(state.step, conditions.stuck_from, conditions.stuck_for)
@@ -346,7 +361,7 @@ def _lasts(step: jax.Array, begins: jax.Array, decisions: jax.Array) -> jax.Arra
     return (step >= begins) & (step < begins + decisions)
 
 
-def _observation(state: State) -> Observation:
+def _observation(state: MachineState) -> Observation:
     return Observation(*state.shown, state.flow_move, state.temperature, state.sent.value[1], state.acted)
 
 
@@ -368,10 +383,10 @@ def paper_state(history: jax.Array, observation: Observation) -> jax.Array:
 
 
 def rollout(
-    controller: Controller,
+    controller: SetpointController,
     parameters: Any,
-    windows: Windows,
-    conditions: Conditions,
+    windows: WindowSource,
+    conditions: EpisodeConditions,
     key: jax.Array,
     *,
     steps: int,
@@ -388,18 +403,20 @@ def rollout(
 
 
 @eqx.filter_jit
-def _first(windows: Windows, conditions: Conditions, u: jax.Array) -> tuple[State, Observation]:
+def _first(
+    windows: WindowSource, conditions: EpisodeConditions, u: jax.Array
+) -> tuple[MachineState, Observation]:
     return jax.vmap(_begun, (None, 0, 0))(windows, conditions, u[0])
 
 
 @eqx.filter_jit
 def _rolled(
-    controller: Controller,
+    controller: SetpointController,
     parameters: Any,
-    windows: Windows,
-    conditions: Conditions,
+    windows: WindowSource,
+    conditions: EpisodeConditions,
     keys: jax.Array,
-    first: tuple[State, Observation],
+    first: tuple[MachineState, Observation],
     u: jax.Array,
 ) -> Trajectory:
     def decide(carry, chance):

@@ -9,7 +9,7 @@ import scipy.special
 
 from pipeline.setpoint.vision import calibration
 from pipeline.setpoint.vision.calibration import (
-    Calibration,
+    ClassifierCalibration,
     ClassifierOutputs,
     Reliability,
     WindowFlow,
@@ -23,7 +23,7 @@ BINS = 10  # of reliability diagrams
 
 class CalibratedClassifier(NamedTuple):
     network: Classifier
-    calibration: Calibration
+    calibration: ClassifierCalibration
 
 
 class FrameReadings(NamedTuple):
@@ -80,7 +80,9 @@ class WindowPredictions(NamedTuple):
     any_valid: np.ndarray
 
 
-def window_predictions(fitted: Calibration, frames: ClassifierOutputs, *, length: int) -> WindowPredictions:
+def window_predictions(
+    fitted: ClassifierCalibration, frames: ClassifierOutputs, *, length: int
+) -> WindowPredictions:
     """Predictions of the windows of `length` frames of one segment and class; 1/3 each for those without a
     valid frame."""
     rows = calibration.windows(frames.segment, frames.label, length=length).rows
@@ -101,7 +103,7 @@ def window_predictions(fitted: Calibration, frames: ClassifierOutputs, *, length
 
 
 def reliabilities(
-    fitted: Calibration, frames: ClassifierOutputs, *, length: int
+    fitted: ClassifierCalibration, frames: ClassifierOutputs, *, length: int
 ) -> dict[tuple[str, str], Reliability]:
     """By (image or window, method): before and after calibration; of windows the paper's hard counts, the
     mean, summed logarithms, and what follows from the flow seen."""

@@ -15,7 +15,7 @@ import scipy.special
 import scipy.stats
 
 from pipeline.setpoint.simulation.recorded import WindowTable
-from pipeline.setpoint.vision.classifier import Labelled, Prediction
+from pipeline.setpoint.vision.classifier import ClassifierPrediction, Labelled
 from pipeline.setpoint.vision.window_flow import FlowCalibration, WindowFlow, fit_flow, window_flow
 from pipeline.statistics import Share
 
@@ -202,7 +202,7 @@ class WindowTruth(NamedTuple):
 JUDGED_PERCENT = tuple(np.arange(70.0, 151.0, 5.0))
 
 
-class ByFlow(NamedTuple):
+class FlowShare(NamedTuple):
     """Of windows with a true flow from `flow_low` to `flow_high` percent: how many, and the share for which
     something holds, in percent, with its 95 % interval by segment; NaN where there is none."""
 
@@ -214,13 +214,13 @@ class ByFlow(NamedTuple):
     high: float
 
 
-def by_flow(happened: np.ndarray, truth: WindowTruth) -> list[ByFlow]:
+def by_flow(happened: np.ndarray, truth: WindowTruth) -> list[FlowShare]:
     """The share of True (w,) in each bin of JUDGED_PERCENT."""
     rows = []
     for low, high in itertools.pairwise(JUDGED_PERCENT):
         here = (truth.flow_percent >= low) & (truth.flow_percent < high)
         share = share_by_segment(happened[here], truth.segment[here])
-        rows.append(ByFlow(low, high, int(here.sum()), *share))
+        rows.append(FlowShare(low, high, int(here.sum()), *share))
     return rows
 
 
@@ -417,7 +417,9 @@ class ClassifierOutputs(NamedTuple):
     valid: np.ndarray
 
 
-def classifier_outputs(prediction: Prediction, data: Labelled, valid: np.ndarray) -> ClassifierOutputs:
+def classifier_outputs(
+    prediction: ClassifierPrediction, data: Labelled, valid: np.ndarray
+) -> ClassifierOutputs:
     """The head's features with the appearance of the key areas beside them;
     frames that the front end rejected are not valid."""
     return ClassifierOutputs(
@@ -433,7 +435,7 @@ def classifier_outputs(prediction: Prediction, data: Labelled, valid: np.ndarray
     )
 
 
-class Calibration(NamedTuple):
+class ClassifierCalibration(NamedTuple):
     """What turns outputs into decisions: temperature of images, correlation of the classes of a window's
     frames (for summed logarithms), level of a window's conformal set, the distance that is foreign, and what
     turns the flows of frames into that of a window."""
@@ -453,7 +455,7 @@ def calibrate(
     length: int,
     promise: Promise,
     false_alarms: float,
-) -> Calibration:
+) -> ClassifierCalibration:
     """Everything fitted on segments `unseen` in training, but for the familiar features, which are those
     `learned`; windows have `length` frames."""
     v = unseen.valid
@@ -469,7 +471,7 @@ def calibrate(
     level = conditional_level(window_flow(*of_frames, flow).prob, truth, promise)
     familiar = fit_familiar(learned.features[learned.valid], learned.label[learned.valid])
     distance = mahalanobis(familiar, unseen.features[v])
-    return Calibration(
+    return ClassifierCalibration(
         T, correlation, level, familiar, foreign_above(distance, false_alarms=false_alarms), flow
     )
 

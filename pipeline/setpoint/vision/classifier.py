@@ -382,7 +382,7 @@ def _judged(state: TrainState, loss: Array, outputs: tuple, truth: list[Array]) 
 # ---- prediction
 
 
-class Prediction(NamedTuple):
+class ClassifierPrediction(NamedTuple):
     """Logits (n, 3), the features that the last layers saw (n, f), log(flow / 100 %) (n,) and its deviation
     (n,), all float32."""
 
@@ -402,7 +402,7 @@ def _predict(network: Classifier, key_area: Array, temperature_degC: Array) -> t
 
 def predict(
     network: Classifier, key_area: np.ndarray, temperature_degC: np.ndarray, *, batch: int | None = None
-) -> Prediction:
+) -> ClassifierPrediction:
     """Logits, features and flow of key areas (n, 16, 48) at temperatures (n,), from the mean features of each
     area's four mirror images: a bead has no left, right, head or tail.
 
@@ -421,5 +421,5 @@ def predict(
         parts.append([np.asarray(a)[:k] for a in _predict(network, x, u)])
     if not parts:
         shapes = (0, CLASSES), (0, network.head.classes.W.shape[0]), (0,), (0,)
-        return Prediction(*(np.zeros(shape, np.float32) for shape in shapes))
-    return Prediction(*(np.concatenate(p) for p in zip(*parts, strict=True)))
+        return ClassifierPrediction(*(np.zeros(shape, np.float32) for shape in shapes))
+    return ClassifierPrediction(*(np.concatenate(p) for p in zip(*parts, strict=True)))

@@ -182,7 +182,7 @@ class ConvolutionalNetwork(eqx.Module):
         return x.mean(axis=(1, 2))
 
 
-class Head(eqx.Module):
+class ClassifierHead(eqx.Module):
     """relu of the image's and of the temperature's layer, concatenated, then one layer to the
     classes: 33,363 parameters at the paper's size."""
 
@@ -218,7 +218,7 @@ class Classifier(eqx.Module):
     log deviation, from the same features."""
 
     body: VisionTransformer | ConvolutionalNetwork
-    head: Head
+    head: ClassifierHead
     flow_head: FlowHead
 
     def features(self, key_area: Array, temperature_degC: Array) -> Float[Array, "n features"]:
@@ -247,14 +247,14 @@ def vision_transformer(size: Size, rng: np.random.Generator) -> Classifier:
     """A classifier with random weights: PAPER, SMALL, or a size of one's own."""
     return Classifier(
         VisionTransformer(size, rng),
-        Head(size.width, size.image_features, size.temperature_features, rng),
+        ClassifierHead(size.width, size.image_features, size.temperature_features, rng),
         FlowHead(size.image_features + size.temperature_features, rng),
     )
 
 
 def convolutional(rng: np.random.Generator) -> Classifier:
     """The small CNN with random weights."""
-    return Classifier(ConvolutionalNetwork(rng), Head(84, 32, 16, rng), FlowHead(48, rng))
+    return Classifier(ConvolutionalNetwork(rng), ClassifierHead(84, 32, 16, rng), FlowHead(48, rng))
 
 
 def parameters(tree) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.optimize
 
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
-from pipeline.temperature.tracking import Controller, Law
+from pipeline.temperature.tracking import ControllerDesign, Law
 
 RISEN = 0.8  # of the largest excursion: up to there a response is fitted; later a slow tail would be tau
 LEVEL = 0.9  # of the band over a family that may not hold zero where a sign is certain
@@ -270,9 +270,9 @@ def controller(
     family: Sequence[Plant] = (),
     noise_degC: np.ndarray | None = None,
     tuning: Tuning = SIMC,
-) -> Controller:
+) -> ControllerDesign:
     """PI a zone, tuned by SIMC; the weights mean nothing to it. `limits` low and high (m,), the rest as in
     `pairing`."""
     pairs = pairing(plant, *limits, horizon=horizon, family=family, noise_degC=noise_degC, tuning=tuning)
     law = pi_law(pairs, inputs=plant.m)
-    return Controller("baseline", lambda q, r, integral: law, strictly_proper(plant))
+    return ControllerDesign("baseline", lambda q, r, integral: law, strictly_proper(plant))

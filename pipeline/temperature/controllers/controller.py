@@ -22,8 +22,8 @@ import numpy as np
 import scipy.linalg
 
 from pipeline.temperature.controllers.governor import (
+    ActuatorLimits,
     Governor,
-    Limits,
     corrected,
     governed,
     observed,
@@ -88,7 +88,7 @@ class Rest(NamedTuple):
     binding: tuple[tuple[int, float], ...]
 
 
-def rest(model: Plant, reference: Reference, limits: Limits, *, tolerance: float = 0.01) -> Rest:
+def rest(model: Plant, reference: Reference, limits: ActuatorLimits, *, tolerance: float = 0.01) -> Rest:
     """The steady input of the constant part by a bounded quadratic programme (tracking.feasible_target), and
     of what moves by the regulator equations X F = A X + B U, C X = H (Francis 1977)."""
     target = feasible_target(model, reference.H[:, 0], limits.low, limits.high)
@@ -177,7 +177,7 @@ class Deployed(NamedTuple):
     `holds`: it does nothing, and goes on with the input that it was handed."""
 
     law: Law
-    limits: Limits
+    limits: ActuatorLimits
     integral_limit: float
     back: np.ndarray
     shift: int
@@ -186,7 +186,12 @@ class Deployed(NamedTuple):
 
 
 def deployed(
-    law: Law, limits: Limits, *, integral_limit: float, governor: Governor | None = None, holds: bool = False
+    law: Law,
+    limits: ActuatorLimits,
+    *,
+    integral_limit: float,
+    governor: Governor | None = None,
+    holds: bool = False,
 ) -> Deployed:
     back = np.linalg.pinv(-law.K_r) if np.any(law.K_r) else np.zeros(law.K_r.T.shape)
     return Deployed(law, limits, integral_limit, back, _shift(law.A), governor, holds)
@@ -222,7 +227,7 @@ def _shift(A: np.ndarray) -> int:
     return k if k and np.array_equal(A, np.eye(len(A), k=k)) else 0
 
 
-class State(NamedTuple):
+class ControllerState(NamedTuple):
     """All that a controller remembers, to be saved and restored: z (s, q), xi (s, p), the input u (s, m)
     applied last, and the memory x (f, s, n) of the governor's family; s cases at once, one on a machine."""
 
@@ -232,19 +237,23 @@ class State(NamedTuple):
     x: np.ndarray
 
 
-def watched(controller: Deployed, state: State | None, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> State:
+def watched(
+    controller: Deployed, state: ControllerState | None, u: np.ndarray, y: np.ndarray, r: np.ndarray
+) -> ControllerState:
     """The state after one sample in manual: inputs u (s, m) applied, outputs y (s, p) measured before, and
     reference r (s, p). The first one starts it."""
     law, family = controller.law, controller.governor
     if state is None:
         z = u @ law.start_u.T + y @ law.start_y.T + law.start
         x = np.zeros((0, len(u), 0)) if family is None else started(family, y)
-        state = State(z, np.zeros(y.shape), u, x)
+        state = ControllerState(z, np.zeros(y.shape), u, x)
     x = state.x if family is None else observed(family, state.x, u, y)
-    return State(_remembered(controller, state.z, u, y, r), state.xi, u, x)
+    return ControllerState(_remembered(controller, state.z, u, y, r), state.xi, u, x)
 
 
-def handed_over(controller: Deployed, state: State, y: np.ndarray, here: Sequence[Aim]) -> State:
+def handed_over(
+    controller: Deployed, state: ControllerState, y: np.ndarray, here: Sequence[Aim]
+) -> ControllerState:
     """The state in which the law takes over from manual without a bump: xi starts where the law, aimed at
     where the machine is (`here`, an Aim of each case's y), would go on with the input of manual, up to
     `integral_limit`. A conditional law starts its integral action at that input; one without integral action
@@ -261,8 +270,13 @@ def handed_over(controller: Deployed, state: State, y: np.ndarray, here: Sequenc
 
 
 def batch_step(
-    controller: Deployed, state: State, y: np.ndarray, r: np.ndarray, feed: np.ndarray, y_star: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, State]:
+    controller: Deployed,
+    state: ControllerState,
+    y: np.ndarray,
+    r: np.ndarray,
+    feed: np.ndarray,
+    y_star: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, ControllerState]:
     """Inputs (s, m) to apply, inputs wished, and the state a sample on, from measured y, reference r, target
     y_star (s, p) and feed w (s, m)."""
     law, limits = controller.law, controller.limits
@@ -278,7 +292,7 @@ def batch_step(
         u = governed(family, x, u, y_star, low, high)
         x = predicted(family, x, u)
     xi = _integrated(controller, state.xi, y_star - y, u, wished)
-    return u, wished, State(_remembered(controller, state.z, u, y, r), xi, u, x)
+    return u, wished, ControllerState(_remembered(controller, state.z, u, y, r), xi, u, x)
 
 
 def _integrated(controller: Deployed, xi, error, u, wished):
@@ -335,10 +349,10 @@ def _finite(values: np.ndarray, count: int, what: str) -> np.ndarray:
 
 
 def _shapes(controller: Deployed) -> dict[str, tuple[int, ...]]:
-    """The shapes of State on one machine."""
+    """The shapes of ControllerState on one machine."""
     (m, p), family = controller.law.D.shape, controller.governor
     x = (0, 1, 0) if family is None else (len(family.start), 1, family.start.shape[2] + 4 * p)
-    return dict(zip(State._fields, ((1, len(controller.law.A)), (1, p), (1, m), x), strict=True))
+    return dict(zip(ControllerState._fields, ((1, len(controller.law.A)), (1, p), (1, m), x), strict=True))
 
 
 class RunningController:
@@ -361,7 +375,7 @@ class RunningController:
         self._keeps = np.hstack([law.B_u, law.B_y, law.B_r, *([] if controller.shift else [law.A])])
         self._rated = bool(np.isfinite(controller.limits.rate).any())
         self._aims: dict[bytes, tuple[Rest, Aim]] = {}
-        self._state: State | None = None
+        self._state: ControllerState | None = None
         self._reference: Reference | None = None
         self._w, self._t = np.zeros(0), 0
 
@@ -399,7 +413,7 @@ class RunningController:
             u = governed(family, x, u[None], y_star[None], low[None], high[None])[0]
             x = predicted(family, x, u[None])
         xi = _integrated(controller, state.xi, (y_star - y)[None], u[None], wished[None])
-        self._state = State(self._kept(state.z[0], u, y, now)[None], xi, u[None], x)
+        self._state = ControllerState(self._kept(state.z[0], u, y, now)[None], xi, u[None], x)
         return u.copy()
 
     def saved(self) -> dict[str, np.ndarray]:
@@ -412,7 +426,7 @@ class RunningController:
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Goes on from what another of the same law and governor `saved`. Raises ValueError where its arrays
         are not those of this law and governor, or not finite."""
-        mine = {name: np.array(arrays[name]) for name in State._fields if name in arrays}
+        mine = {name: np.array(arrays[name]) for name in ControllerState._fields if name in arrays}
         given, expected = {name: part.shape for name, part in mine.items()}, _shapes(self.controller)
         if given != expected:
             raise ValueError(
@@ -424,13 +438,13 @@ class RunningController:
                 f"the controller expects finite numbers to be restored from but {', '.join(lost)} has some "
                 "that are not; restore an older save, or start with watch"
             )
-        self._state = State(**mine)
+        self._state = ControllerState(**mine)
         self._reference = None
         if "w" in arrays:
             reference = Reference(*(np.array(arrays[name]) for name in Reference._fields))
             self._moved(self._turned(reference, int(arrays["t"])), np.array(arrays["w"]))
 
-    def _remembers(self) -> State:
+    def _remembers(self) -> ControllerState:
         if self._state is None:
             raise ValueError("the controller has seen no sample; call watch with each sample in manual first")
         return self._state

@@ -23,7 +23,7 @@ from pipeline.temperature.plant import Plant, markov_parameters
 from pipeline.temperature.tracking import reached_state, riccati
 
 
-class Limits(NamedTuple):
+class ActuatorLimits(NamedTuple):
     """low (m,) <= u <= high (m,) in percent, and at most `rate` (m,) percent a step; inf: none."""
 
     low: np.ndarray
@@ -120,7 +120,7 @@ WEAK = 0.05
 
 def governor(
     family: Sequence[Plant],
-    limits: Limits,
+    limits: ActuatorLimits,
     outputs: OutputLimits,
     strength: Strength,
     *,
@@ -157,7 +157,7 @@ def governor(
     )
 
 
-def _near(plant: Plant, limits: Limits, overshoot: float, strength: Strength) -> np.ndarray:
+def _near(plant: Plant, limits: ActuatorLimits, overshoot: float, strength: Strength) -> np.ndarray:
     """How far (p,) in °C an output that has arrived at its target may be predicted beyond it.
 
     `overshoot` where one sample can do much. Where it can do little, the law's own small moves are as large
@@ -226,7 +226,7 @@ def _watching(
     }
 
 
-def _ahead(plant: Plant, limits: Limits, strength: Strength, at: np.ndarray) -> dict[str, np.ndarray]:
+def _ahead(plant: Plant, limits: ActuatorLimits, strength: Strength, at: np.ndarray) -> dict[str, np.ndarray]:
     """The rows of a Governor of one member. A rate limit slows the stop: inputs go from u to the limit on a
     straight line that the slowest of them needs. An input that helps is taken to act less than one that
     hurts, by what `each` leaves open."""
@@ -298,7 +298,7 @@ def observed(family: Governor, memory: np.ndarray, u: np.ndarray, y: np.ndarray)
     return predicted(family, corrected(family, memory, y), u)
 
 
-class Evidence(NamedTuple):
+class GovernorEvidence(NamedTuple):
     """Of each member, case and output (f, s, p): the share of the way from strongest to weakest that the
     inputs are at least, by least squares, and at most; and whether the member counts (f, s)."""
 
@@ -308,7 +308,7 @@ class Evidence(NamedTuple):
     counts: np.ndarray
 
 
-def evidence(family: Governor, memory: np.ndarray) -> Evidence:
+def evidence(family: Governor, memory: np.ndarray) -> GovernorEvidence:
     """What the innovations tell: least squares, every innovation up to `doubt` off in the direction that
     matters. A member does not count where the best member's squares are a quarter of its own, and its own
     more than noise."""
@@ -320,7 +320,7 @@ def evidence(family: Governor, memory: np.ndarray) -> Evidence:
     rest = (own - middle * (2 * product - middle * square)).sum(axis=2)
     counts = rest <= CONTRADICTED * rest.min(axis=0) + (family.doubt**2).sum()
     least, most = (np.clip((product + off) * share, 0.0, 1.0) for off in (-doubt, doubt))
-    return Evidence(least, middle, most, counts)
+    return GovernorEvidence(least, middle, most, counts)
 
 
 # ---- what it allows

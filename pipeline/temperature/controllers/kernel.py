@@ -15,7 +15,7 @@ import scipy.linalg.lapack
 
 from pipeline.temperature.controllers.half_vector import ROOT2, quadratic_gram, skron, smat, svec
 from pipeline.temperature.plant import Plant, observability_matrix
-from pipeline.temperature.tracking import Controller, Gains, Law, stein
+from pipeline.temperature.tracking import ControllerDesign, Gains, Law, stein
 
 # ---- data -> regression
 
@@ -449,14 +449,14 @@ def window_law(K: np.ndarray, K_r: np.ndarray, k: np.ndarray, N: int, *, integra
     )
 
 
-def controller(learned: Regression, gamma: float, model: Plant) -> Controller:
+def controller(learned: Regression, gamma: float, model: Plant) -> ControllerDesign:
     """Algorithm 2; its feasible targets are computed on `model`."""
 
     def design(q: np.ndarray, r: np.ndarray, integral: float) -> Law:
         solution = value_iteration(learned, np.diag(q), np.diag(r), gamma)
         return window_law(solution.K, solution.K_r, solution.k, learned.N, integral=integral)
 
-    return Controller("kernel", design, model)
+    return ControllerDesign("kernel", design, model)
 
 
 # ---- the exact kernel, for truth

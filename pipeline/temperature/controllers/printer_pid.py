@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.temperature.plant import Plant, strictly_proper
-from pipeline.temperature.tracking import Controller, Law
+from pipeline.temperature.tracking import ControllerDesign, Law
 
 # Klipper reads a heater's thermistor so often (klippy/extras/adc_temperature.py, REPORT_TIME)
 KLIPPER_S = 0.3
@@ -39,14 +39,14 @@ class HeaterPid(NamedTuple):
 
 def controller(
     pids: tuple[HeaterPid, ...], plant: Plant, limits: tuple[np.ndarray, np.ndarray]
-) -> Controller:
+) -> ControllerDesign:
     """The PIDs of all heaters; weights and the outer integrator mean nothing to it. `limits` low and high
     (m,) in percent. Raises ValueError where the heaters' PIDs are not the whole control of the machine."""
     plant = strictly_proper(plant)
     pids = tuple(sorted(pids, key=lambda pid: pid.output))
     _check(pids, plant, limits)
     made = law(pids, sample_time_s=plant.sample_time_s)
-    return Controller("printer_pid", lambda q, r, integral: made, plant)
+    return ControllerDesign("printer_pid", lambda q, r, integral: made, plant)
 
 
 def _check(pids: tuple[HeaterPid, ...], plant: Plant, limits: tuple[np.ndarray, np.ndarray]) -> None:

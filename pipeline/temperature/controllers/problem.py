@@ -10,10 +10,10 @@ import numpy as np
 from pipeline.temperature.plant import markov_parameters
 
 if TYPE_CHECKING:
-    from pipeline.temperature.controllers.governor import Limits
+    from pipeline.temperature.controllers.governor import ActuatorLimits
     from pipeline.temperature.controllers.kernel import Regression
     from pipeline.temperature.controllers.printer_pid import HeaterPid
-    from pipeline.temperature.controllers.window import Window
+    from pipeline.temperature.controllers.window import WindowModel
     from pipeline.temperature.plant import Plant
     from pipeline.temperature.tracking import Law
 
@@ -28,10 +28,10 @@ class DesignProblem(NamedTuple):
 
     plant: Plant
     family: list[Plant]
-    window: Window
+    window: WindowModel
     kernel: Regression | None
     truth: Plant | None
-    limits: Limits
+    limits: ActuatorLimits
     gamma: float
     exact_tau: float
     horizon: int

@@ -16,10 +16,10 @@ import scipy.linalg.lapack
 from pipeline.temperature.controllers.kernel import Tuples, window_law, window_shift, windows
 from pipeline.temperature.plant import Plant, observability_matrix
 from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.tracking import Controller, Law, gains
+from pipeline.temperature.tracking import ControllerDesign, Law, gains
 
 
-class Window(NamedTuple):
+class WindowModel(NamedTuple):
     """Theta (p, N (m+p)), theta_0 (p,), the innovation's covariance (p, p), and the table by which N was
     chosen: (past, parameters, criterion) rows."""
 
@@ -38,7 +38,7 @@ def learn(
     longest: int,
     offset: bool = False,
     gain_spread: float = 0.0,
-) -> Window:
+) -> WindowModel:
     """Least-squares VARX on segments u (T, m), y (T, p), its window N <= `longest` chosen by Akaike's
     criterion on the samples that the longest one leaves.
 
@@ -88,7 +88,7 @@ def learn(
     by_lag = solution[offset:].reshape(N, m + p, p)
     Theta[:, : N * m] = by_lag[:, :m].transpose(2, 0, 1).reshape(p, N * m)
     Theta[:, N * m :] = by_lag[:, m:].transpose(2, 0, 1).reshape(p, N * p)
-    return Window(
+    return WindowModel(
         Theta, solution[0] if offset else np.zeros(p), rest.T @ rest / (samples - k), N, samples, table
     )
 
@@ -128,7 +128,7 @@ def _criterion(
     return N, k * p, samples * logdet + 2 * k * p
 
 
-def predictor(window: Window, sample_time_s: float = 1.0) -> Plant:
+def predictor(window: WindowModel, sample_time_s: float = 1.0) -> Plant:
     """The window as a plant in innovation form: x = w, A = shift + B_y Theta, B = B_u, C = Theta, K = B_y."""
     p = len(window.Theta)
     A, B_u, B_y = window_shift(window.Theta.shape[1] // window.N - p, p, window.N)
@@ -143,7 +143,7 @@ def predictor(window: Window, sample_time_s: float = 1.0) -> Plant:
     )
 
 
-def observer_form(window: Window, sample_time_s: float = 1.0) -> tuple[Plant, np.ndarray]:
+def observer_form(window: WindowModel, sample_time_s: float = 1.0) -> tuple[Plant, np.ndarray]:
     """The same predictor with N p states instead of N (m+p), and T (N p, N (m+p)) with x = T w.
 
     x_i(t) = sum_{l >= i} A_l y(t - l + i - 1) + B_l u(t - l + i - 1), y = x_1 + theta_0, so that
@@ -168,7 +168,7 @@ def observer_form(window: Window, sample_time_s: float = 1.0) -> tuple[Plant, np
     return make_plant(A, B, C, b=b, d=window.theta_0, K=of_y, sample_time_s=sample_time_s), T
 
 
-def law(window: Window, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral: float = 0.0) -> Law:
+def law(window: WindowModel, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral: float = 0.0) -> Law:
     """Optimal tracking (3) of the predictor: u = -K w - K_r r - k on
     the window of past inputs and outputs."""
     model, T = observer_form(window)
@@ -176,9 +176,9 @@ def law(window: Window, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral:
     return window_law(K_x @ T, K_r, k, window.N, integral=integral)
 
 
-def controller(window: Window, gamma: float) -> Controller:
+def controller(window: WindowModel, gamma: float) -> ControllerDesign:
     """VARX window and Riccati."""
-    return Controller(
+    return ControllerDesign(
         "window",
         lambda q, r, integral: law(window, np.diag(q), np.diag(r), gamma, integral=integral),
         observer_form(window)[0],
@@ -186,7 +186,7 @@ def controller(window: Window, gamma: float) -> Controller:
 
 
 def predicted_tuples(
-    window: Window,
+    window: WindowModel,
     u: Sequence[np.ndarray],
     y: Sequence[np.ndarray],
     *,
@@ -233,7 +233,7 @@ def predicted_tuples(
     )
 
 
-def stored(window: Window) -> dict[str, tuple[np.ndarray, str, str]]:
+def stored(window: WindowModel) -> dict[str, tuple[np.ndarray, str, str]]:
     """The window as named arrays with unit and meaning, for an artifact; `restored` reads them back."""
     return {
         "Theta": (
@@ -249,5 +249,5 @@ def stored(window: Window) -> dict[str, tuple[np.ndarray, str, str]]:
     }
 
 
-def restored(arrays: dict[str, np.ndarray]) -> Window:
-    return Window(**{**arrays, "N": int(arrays["N"]), "samples": int(arrays["samples"])})
+def restored(arrays: dict[str, np.ndarray]) -> WindowModel:
+    return WindowModel(**{**arrays, "N": int(arrays["N"]), "samples": int(arrays["samples"])})

@@ -16,7 +16,7 @@ from pipeline.temperature.identification.order import (
     VALIDATED_STEPS,
     WORTH_REFINING,
     Fit,
-    Structure,
+    ModelStructure,
     Validation,
     beyond_chance,
     fit,
@@ -54,7 +54,7 @@ def tracked(error: np.ndarray, rate: float, ahead: int = 1) -> np.ndarray:
 
 
 def chosen_rate(
-    u: Segments, y: Segments, structure: Structure, order: int, kind: Fit, validation: Validation
+    u: Segments, y: Segments, structure: ModelStructure, order: int, kind: Fit, validation: Validation
 ) -> float:
     """The rate of the drift, 0 for none: of `SLOWER` the one with the least error a window ahead on the
     left-out blocks or recordings, where it takes `WORTH_REFINING` off the error without it, beyond chance.

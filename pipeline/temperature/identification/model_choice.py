@@ -35,9 +35,9 @@ from pipeline.temperature.identification.drift import chosen_rate
 from pipeline.temperature.identification.order import (
     WORK,
     WORTH_THE_NOISE,
-    Candidate,
     Fit,
-    Structure,
+    ModelStructure,
+    OrderCandidate,
     Validation,
     cross_validate,
     dead_time,
@@ -94,7 +94,7 @@ class Identified(NamedTuple):
     fit: str
     singular_values: np.ndarray
     noise_edge: float
-    order_table: list[Candidate]
+    order_table: list[OrderCandidate]
     x0: list[np.ndarray]
     rows: int
     dropped_rows: int
@@ -128,15 +128,15 @@ class Settings(NamedTuple):
 DEFAULTS = Settings()
 
 
-class Choice(NamedTuple):
+class ModelChoice(NamedTuple):
     """The class of model that one fit on all of the record is made of; `exact`: the record is noise-free;
     `table`: the candidates that were compared."""
 
-    structure: Structure
+    structure: ModelStructure
     order: int
     fit: Fit
     exact: bool
-    table: list[Candidate]
+    table: list[OrderCandidate]
 
 
 def name_of(names: Sequence[str], letter: str, j: int) -> str:
@@ -255,14 +255,14 @@ def refit(
     past, offset, table = identified.past, identified.offset, identified.order_table
     settings = Settings(order=identified.order, past=past, offset=offset)
     record = _prepared(u, y, settings, limits, names)
-    structure = Structure(past, identified.feedthrough, offset, identified.delays)
+    structure = ModelStructure(past, identified.feedthrough, offset, identified.delays)
     data = (
         None
         if table
         else lagged(record.u, record.y, past, feedthrough=any(structure.feedthrough), offset=offset)
     )
     exact = data is not None and windows(data)[1]
-    choice = Choice(structure, identified.order, identified.fit, exact, table)
+    choice = ModelChoice(structure, identified.order, identified.fit, exact, table)
     fitted = _fit_all(record.u, record.y, choice, identified.plant.sample_time_s, max_radius)
     fitted = fitted._replace(feedback=identified.feedback, drift=identified.drift, reasons=identified.reasons)
     return _with_remarks(fitted, record._replace(notes=[*record.notes, *identified.reasons]), names)
@@ -297,7 +297,7 @@ def _prepared(u, y, settings: Settings, limits, names) -> _Record:
     return _Record(u, y, cut, notes, recordings)
 
 
-def _chosen(record: _Record, settings: Settings) -> tuple[Choice, list[str], ClosedLoop | None]:
+def _chosen(record: _Record, settings: Settings) -> tuple[ModelChoice, list[str], ClosedLoop | None]:
     """What the rules choose, a sentence for each choice that a user should know of, and whether the inputs
     answer the outputs (None of a noise-free record)."""
     u, y = record.u, record.y
@@ -310,8 +310,10 @@ def _chosen(record: _Record, settings: Settings) -> tuple[Choice, list[str], Clo
         # under feedback, u(t) holds what noise did to y(t): a row of D would be the controller's inverse
         shows = none if closed else feedthrough_shows(u, y, pasts[0], settings.offset)
         direct = [none, shows] if any(shows) else [none]
-    structure = Structure(pasts[0], direct[-1], settings.offset, (0,) * u[0].shape[1])
-    choice = Choice(structure, settings.order, settings.refinement.replace("none", "subspace"), False, [])
+    structure = ModelStructure(pasts[0], direct[-1], settings.offset, (0,) * u[0].shape[1])
+    choice = ModelChoice(
+        structure, settings.order, settings.refinement.replace("none", "subspace"), False, []
+    )
     validated, notes = settings.refinement == "validated", []
     # a rank beyond max_order is a nonlinearity without noise: the order is then a choice, as with noise
     if exact and (rank := _exact_rank(u, y, structure)) <= settings.max_order:
@@ -320,12 +322,12 @@ def _chosen(record: _Record, settings: Settings) -> tuple[Choice, list[str], Clo
             "and the order is a rank"
         )
         kind = choice.fit.replace("validated", "subspace")
-        choice = Choice(structure, settings.order or rank, kind, True, [])
+        choice = ModelChoice(structure, settings.order or rank, kind, True, [])
     elif settings.order is None or validated:
         structures = [structure._replace(past=n, feedthrough=d) for n in pasts for d in direct]
         validation = _validation(record, settings, feedback)
         best, table = _best_candidate(u, y, structures, settings, validation)
-        choice = Choice(best.structure, best.order, best.fit if validated else choice.fit, False, table)
+        choice = ModelChoice(best.structure, best.order, best.fit if validated else choice.fit, False, table)
     return choice, notes + _reasons(choice, direct, closed), feedback
 
 
@@ -334,7 +336,7 @@ def _validation(record: _Record, settings: Settings, feedback: ClosedLoop | None
     return Validation(settings.blocks, record.recordings, closed, settings.max_radius)
 
 
-def _reasons(choice: Choice, direct: list[tuple[bool, ...]], closed: bool) -> list[str]:
+def _reasons(choice: ModelChoice, direct: list[tuple[bool, ...]], closed: bool) -> list[str]:
     """A sentence for feed-through and feedback, where the record raises the question."""
     notes = []
     if len(direct) > 1:
@@ -350,7 +352,7 @@ def _reasons(choice: Choice, direct: list[tuple[bool, ...]], closed: bool) -> li
     return notes
 
 
-def _exact_rank(u: Segments, y: Segments, structure: Structure) -> int:
+def _exact_rank(u: Segments, y: Segments, structure: ModelStructure) -> int:
     """The order of a noise-free record: singular values that are more than rounding, at least 1."""
     data = lagged(
         u, y, structure.past, feedthrough=any(structure.feedthrough), offset=structure.offset, exact=True
@@ -373,8 +375,8 @@ def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
 
 
 def _best_candidate(
-    u: Segments, y: Segments, structures: list[Structure], settings: Settings, validation: Validation
-) -> tuple[Candidate, list[Candidate]]:
+    u: Segments, y: Segments, structures: list[ModelStructure], settings: Settings, validation: Validation
+) -> tuple[OrderCandidate, list[OrderCandidate]]:
     """The candidate that the rules take, and the table: structures and orders of the subspace fit, then
     refined fits of the best candidate of each structure, as many as `WORK` allows."""
     singular_values, table = {}, []
@@ -411,7 +413,7 @@ def _best_candidate(
     entrants = []
     for start in _shortlist(u, table):
         values = singular_values[start.structure.past, start.structure.feedthrough]
-        refined: list[Candidate] = []
+        refined: list[OrderCandidate] = []
         for kind in kinds:
             # on a long record the fit that may only win by a fifth is tried where the other gains nothing
             if refined and _work(u, start) > WORK / 20 and _better_fit(start, refined) is not start:
@@ -425,8 +427,8 @@ def _best_candidate(
 
 
 def _with_slow_window(
-    u: Segments, y: Segments, structures: list[Structure], settings: Settings
-) -> list[Structure]:
+    u: Segments, y: Segments, structures: list[ModelStructure], settings: Settings
+) -> list[ModelStructure]:
     """The structures, and the longest of them with a window that spans the slowest mode that it shows, where
     that is longer by half: criteria of one step ahead stop where a slow mode still gains them nothing."""
     first = max(structures, key=lambda structure: structure.past)
@@ -445,10 +447,10 @@ def _with_slow_window(
     return [*longer.values(), *structures]
 
 
-def _shortlist(u: Segments, table: list[Candidate]) -> list[Candidate]:
+def _shortlist(u: Segments, table: list[OrderCandidate]) -> list[OrderCandidate]:
     """The best candidate of each structure, the best first: as many as `WORK` allows, at least one, and none
     whose error is more than half above the best's."""
-    of: dict[Structure, list[Candidate]] = {}
+    of: dict[ModelStructure, list[OrderCandidate]] = {}
     for row in table:
         of.setdefault(row.structure, []).append(row)
     first = simplest(table)
@@ -463,12 +465,12 @@ def _shortlist(u: Segments, table: list[Candidate]) -> list[Candidate]:
     return taken
 
 
-def _work(u: Segments, row: Candidate) -> float:
+def _work(u: Segments, row: OrderCandidate) -> float:
     """What one step of refinement costs, in products."""
     return float(sum(map(len, u))) * (row.order * (row.order + u[0].shape[1])) ** 2
 
 
-def _better_fit(start: Candidate, refined: list[Candidate]) -> Candidate:
+def _better_fit(start: OrderCandidate, refined: list[OrderCandidate]) -> OrderCandidate:
     """The subspace candidate, or its best refined fit among those worth their cost."""
     return min(
         (row for row in refined if worth_refining(start, row)),
@@ -478,7 +480,7 @@ def _better_fit(start: Candidate, refined: list[Candidate]) -> Candidate:
 
 
 def _candidates(
-    data: Lagged, sub: Subspace, structure: Structure, settings: Settings
+    data: Lagged, sub: Subspace, structure: ModelStructure, settings: Settings
 ) -> tuple[Sequence[int], set[tuple[int, ...]]]:
     """Orders and dead times worth trying: those asked for, or those that stand out of the noise."""
     delays = {structure.delays}
@@ -493,7 +495,7 @@ def _candidates(
 
 
 def _fit_all(
-    u: Segments, y: Segments, choice: Choice, sample_time_s: float, max_radius: float | None
+    u: Segments, y: Segments, choice: ModelChoice, sample_time_s: float, max_radius: float | None
 ) -> Identified:
     """One fit of the chosen model on all of the record."""
     structure, order, kind, exact, table = choice
@@ -619,7 +621,7 @@ def _check_length(u: Segments, y: Segments, order: int | None, past: int | None)
 def rows(identified: Identified) -> dict[str, list]:
     """The table by which the order was chosen, as columns: every candidate,
     or the singular values alone where they decided."""
-    structure = Structure(identified.past, identified.feedthrough, identified.offset, identified.delays)
+    structure = ModelStructure(identified.past, identified.feedthrough, identified.offset, identified.delays)
     shown_rows = [row for row in identified.order_table if row.structure == structure]
     tried = {
         row.order: row for row in shown_rows if row.fit == identified.fit or row.order != identified.order

@@ -55,7 +55,7 @@ SMALLEST = 1e-9  # share of an output's variation below which an error is roundi
 LARGEST_RADIUS = 1.0 - 1e-6
 
 
-class Structure(NamedTuple):
+class ModelStructure(NamedTuple):
     """What is fixed before an order is: window (samples), which outputs have direct feed-through (p,),
     offset, and the dead time of each input (samples)."""
 
@@ -76,13 +76,13 @@ class Validation(NamedTuple):
     max_radius: float | None = None
 
 
-class Candidate(NamedTuple):
+class OrderCandidate(NamedTuple):
     """One row of the order table: the model's class, and its error on each left-out block (share of each
     output's variation about the block mean, 1 = no better); about_mean: with the mean of the error taken
     off."""
 
     order: int
-    structure: Structure
+    structure: ModelStructure
     fit: str
     parameters: int
     singular_value: float
@@ -384,12 +384,19 @@ def _refined(
     """`refine` with every pole within `radius`, from a start whose predictor may not be stable."""
     if kind == "prediction" and np.abs(np.linalg.eigvals(start.A - start.K @ start.C)).max() >= 1:
         start = kalman_gain(start, u, y)
-    return refine(start, u, y, kind, settings._replace(max_radius=radius * (1 + 1e-12))).plant
+    return refine(start, u, y, kind, settings._replace(max_radius=radius * (1 + 1e-12)))[0]
 
 
 def cross_validate(
-    u, y, orders, structure: Structure, kinds: tuple[Fit, ...], *, singular_values, validation: Validation
-) -> list[Candidate]:
+    u,
+    y,
+    orders,
+    structure: ModelStructure,
+    kinds: tuple[Fit, ...],
+    *,
+    singular_values,
+    validation: Validation,
+) -> list[OrderCandidate]:
     """The order table's rows for one structure: each order and fit, identified without a block and judged
     on it, for each block or recording.
 
@@ -425,7 +432,7 @@ def cross_validate(
     # a dead time must be worth a state
     more = m * sum(structure.feedthrough) + p * structure.offset + (m + p) * sum(map(bool, structure.delays))
     return [
-        Candidate(
+        OrderCandidate(
             order,
             structure,
             kind,
@@ -444,7 +451,7 @@ def slow_window(plant: Plant, longest: int) -> int:
     return int(min(np.ceil(-1.0 / np.log(max(slowest, 1e-3))), longest))
 
 
-def simplest(table: list[Candidate], worth: float = WORTH_A_STATE) -> Candidate:
+def simplest(table: list[OrderCandidate], worth: float = WORTH_A_STATE) -> OrderCandidate:
     """The row with the fewest parameters whose error is within `worth` of the best row's.
 
     Not within one standard error: five blocks of which one holds a disturbance have so wide a one that models
@@ -457,7 +464,7 @@ def simplest(table: list[Candidate], worth: float = WORTH_A_STATE) -> Candidate:
     )
 
 
-def worth_refining(start: Candidate, refined: Candidate) -> bool:
+def worth_refining(start: OrderCandidate, refined: OrderCandidate) -> bool:
     """Whether a refined fit takes `WORTH_REFINING` off the error of its start, and off the error about the
     mean too, beyond chance: Student's t of the blocks' paired gains, one-sided at `CHANCE`.
 

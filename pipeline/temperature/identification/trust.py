@@ -11,7 +11,7 @@ from pipeline.temperature.identification.drift import simulated_with_drift
 from pipeline.temperature.identification.first_order import StepModels, of_step_responses, simc_pid
 from pipeline.temperature.identification.subspace import Segments
 from pipeline.temperature.identification.validation import (
-    Excitation,
+    RecordExcitation,
     Residuals,
     predicted_ahead,
     simulated,
@@ -430,7 +430,7 @@ def fit_figures(judged: Holdout, outputs: Sequence[str]) -> dict[str, dict | Non
 
 
 def outcome_figures(
-    tests: Residuals, excited: Excitation, outputs: Sequence[str], inputs: Sequence[str]
+    tests: Residuals, excited: RecordExcitation, outputs: Sequence[str], inputs: Sequence[str]
 ) -> dict[str, dict]:
     """Which tests passed, and how far the inputs excite."""
     lags = excited.full // len(inputs)

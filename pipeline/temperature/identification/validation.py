@@ -35,7 +35,7 @@ ROUNDING = 1e-8
 ADDS = 0.1  # of the error: what the inputs must take off that of the free response for a fit to be theirs
 
 
-class Spread(NamedTuple):
+class PlantBootstrap(NamedTuple):
     """Step responses (steps, p, m) of the nominal plant and their bands over a family, at `level`; poles of
     every member, a list of (n,) arrays."""
 
@@ -64,7 +64,7 @@ class Residuals(NamedTuple):
     independence_passed: np.ndarray
 
 
-class Excitation(NamedTuple):
+class RecordExcitation(NamedTuple):
     """Rank and condition of the covariance of `past` lags of all inputs (each scaled to unit power), and of
     each input alone; full is the rank wanted."""
 
@@ -177,7 +177,7 @@ def residual_tests(
     )
 
 
-def excitation(u: Segments, past: int) -> Excitation:
+def excitation(u: Segments, past: int) -> RecordExcitation:
     """Rank and condition of the lagged inputs, and of each alone, about their mean; levels (m,) is the
     standard deviation of each input."""
     complete = [a for a in u if np.isfinite(a).all() and len(a) > past]
@@ -200,7 +200,7 @@ def excitation(u: Segments, past: int) -> Excitation:
 
     rank, condition = rank_and_condition(stacked.reshape(len(stacked), -1))
     alone = [rank_and_condition(stacked[:, j]) for j in range(stacked.shape[1])]
-    return Excitation(
+    return RecordExcitation(
         rank,
         stacked.shape[1] * past,
         condition,
@@ -327,7 +327,7 @@ def spread_bands(
     *,
     level: float = 0.99,
     left_out: Sequence[Plant] = (),
-) -> Spread:
+) -> PlantBootstrap:
     """Bands of the step responses and the poles over a family of plants; with few members the band is their
     range.
 
@@ -342,12 +342,12 @@ def spread_bands(
         deviation = np.sqrt((blocks - 1) * others.var(axis=0))
         reach = scipy.stats.t.ppf((1 + level) / 2, blocks - 1) * deviation
         low, high = np.minimum(low, own - reach), np.maximum(high, own + reach)
-    return Spread(own, low, high, [np.linalg.eigvals(plant.A) for plant in family], level)
+    return PlantBootstrap(own, low, high, [np.linalg.eigvals(plant.A) for plant in family], level)
 
 
 def advice(
     tests: Residuals,
-    excited: Excitation,
+    excited: RecordExcitation,
     fit_percent: np.ndarray,
     *,
     outputs: Sequence[str],

@@ -36,7 +36,7 @@ class CaseConditions(NamedTuple):
 
     rehearsal: Rehearsal
     late: plant.Plant
-    limits: governor.Limits
+    limits: governor.ActuatorLimits
     output_limits: tuple[np.ndarray, np.ndarray]
     governor: governor.Governor
     integral_limit: float
@@ -135,10 +135,10 @@ def play(
     return rollout, figures
 
 
-def input_limits(machine: Machine) -> governor.Limits:
+def input_limits(machine: Machine) -> governor.ActuatorLimits:
     low, high = np.array([(i.low, i.high) for i in machine.inputs], float).T
     rate = np.array([i.rate_percent_per_s or np.inf for i in machine.inputs]) * machine.sample_time_s
-    return governor.Limits(low, high, rate)
+    return governor.ActuatorLimits(low, high, rate)
 
 
 def output_limits(machine: Machine) -> tuple[np.ndarray, np.ndarray]:
@@ -159,8 +159,8 @@ def watchdog(
     return governor.governor(guarded, input_limits(machine), limits, strength)
 
 
-def spread_of(settings: Panel) -> panel.Spread:
-    return panel.Spread(
+def spread_of(settings: Panel) -> panel.PlantSpread:
+    return panel.PlantSpread(
         settings.input_gain,
         settings.slower,
         settings.extra_heat_loss_per_step,
@@ -169,7 +169,7 @@ def spread_of(settings: Panel) -> panel.Spread:
     )
 
 
-def spread_around(settings: Panel, identified: plant.Plant) -> panel.Spread:
+def spread_around(settings: Panel, identified: plant.Plant) -> panel.PlantSpread:
     """The declared spread, with no more heat lost than is little beside what somebody's machine loses."""
     spread, slowest = spread_of(settings), 1 - np.abs(np.linalg.eigvals(identified.A)).max()
     return spread._replace(extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)))
@@ -229,13 +229,13 @@ def _half(
     *,
     cells: bool,
     steps: int,
-    declared: panel.Spread,
-    limits: governor.Limits | None = None,
+    declared: panel.PlantSpread,
+    limits: governor.ActuatorLimits | None = None,
 ) -> panel.Cases:
     """One half of the panel: cases of `steps` at most, on plants that lie around those of `around` as
     `declared` says; starts are held within `limits`."""
     rng = np.random.default_rng(half.seed)
-    scaled = panel.Spread(*(half.spread * value for value in declared))._replace(
+    scaled = panel.PlantSpread(*(half.spread * value for value in declared))._replace(
         delayed=min(half.spread * declared.delayed, 1.0)
     )
     plants = panel.drawn(around, half.plants, scaled, cells=cells, rng=rng)
@@ -258,10 +258,10 @@ HOLDABLE = (1.0, 0.75, 0.5, 0.25, 0.1)  # shares of it that are tried
 
 
 def _ambient(
-    spread: panel.Spread,
+    spread: panel.PlantSpread,
     scale: scenario_defaults.MachineScale,
     identified: plant.Plant,
-    limits: governor.Limits,
+    limits: governor.ActuatorLimits,
     references: np.ndarray,
 ) -> float:
     """By how many °C the ambient of a plant may differ: as the panel says, at most AMBIENT_SHARE of the
@@ -313,7 +313,8 @@ def from_record(
     spread = spread_around(settings, identified)
     spread = spread._replace(ambient_degC=_ambient(spread, scale, identified, limits, asked.references))
     lower = asked.references[-1]
-    swing = asked.references.mean(axis=0), asked.sinusoid.amplitude_degC, float(asked.sinusoid.period_steps)
+    amplitude_degC, period_steps = asked.sinusoid
+    swing = asked.references.mean(axis=0), amplitude_degC, float(period_steps)
     questions = panel.Questions(
         asked.starts, asked.references, (lower, asked.ramp_degC_per_step), swing, asked.sequence
     )

@@ -11,7 +11,7 @@ from pipeline.statistics import Paired, paired
 LEVEL = 0.05
 
 
-class Choice(NamedTuple):
+class ControllerChoice(NamedTuple):
     """`best` is None where nobody passes; `nearest` is the cheapest of the others that pass, None where
     there is none, and `against` the test of the best one against it."""
 
@@ -22,21 +22,21 @@ class Choice(NamedTuple):
 
 def chosen(
     costs: Mapping[str, np.ndarray], plant: np.ndarray, passes: Mapping[str, bool], *, seed: int
-) -> Choice:
+) -> ControllerChoice:
     """The first of those that pass, in the order of `costs` (simplest first), that no more complex one beats:
     one replaces it where its costs (s,) are lower beyond chance, paired by plant, one-sided at LEVEL."""
     able = [name for name in costs if passes[name]]
     if not able:
-        return Choice(None, None, None)
+        return ControllerChoice(None, None, None)
     best = able[0]
     for name in able[1:]:
         if between(costs[best], costs[name], plant, seed=seed).p < LEVEL:
             best = name
     others = [name for name in able if name != best]
     if not others:
-        return Choice(best, None, None)
+        return ControllerChoice(best, None, None)
     nearest = min(others, key=lambda name: float(costs[name].mean()))
-    return Choice(best, nearest, between(costs[nearest], costs[best], plant, seed=seed))
+    return ControllerChoice(best, nearest, between(costs[nearest], costs[best], plant, seed=seed))
 
 
 def between(champion: np.ndarray, challenger: np.ndarray, plant: np.ndarray, *, seed: int) -> Paired:
@@ -81,7 +81,7 @@ def deciding_plant(a: np.ndarray, b: np.ndarray, plant: np.ndarray) -> int:
     return int(np.unique(plant)[(np.sign(by_plant.sum() or 1.0) * by_plant).argmax()])
 
 
-class Band(NamedTuple):
+class QuantileBand(NamedTuple):
     """Median and 90 % quantile over all cases, the 90 % band of that quantile with plants resampled as
     blocks, the worst, and the case that has it; inf where a run never settles."""
 
@@ -93,7 +93,7 @@ class Band(NamedTuple):
     worst_case: int
 
 
-def banded(values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int = 200) -> Band:
+def banded(values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int = 200) -> QuantileBand:
     """Of a figure (s,); NaN where it does not apply. Less is better."""
     applies = np.flatnonzero(~np.isnan(values))
     values, plant = values[applies], plant[applies]
@@ -105,7 +105,9 @@ def banded(values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int =
     ]
     low, high = np.quantile(quantiles, [0.05, 0.95], method="nearest")
     worst = int(np.argmax(values))
-    return Band(float(median), float(q90), float(low), float(high), float(values[worst]), int(applies[worst]))
+    return QuantileBand(
+        float(median), float(q90), float(low), float(high), float(values[worst]), int(applies[worst])
+    )
 
 
 def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> float:

@@ -63,7 +63,7 @@ def _gaps(design: Design, setting: CaseConditions) -> np.ndarray | None:
     cases, (p, m) = setting.rehearsal.judging, (design.model.p, design.model.m)
     first = np.flatnonzero(cases.kind == "constant")[:1]
     rows = first + cases.each * np.arange(len(cases.plants))
-    scenarios = scorecard.Panel(
+    scenarios = scorecard.Scenarios(
         cases.plants,
         np.arange(len(cases.plants)),
         cases.x0[rows],
@@ -75,7 +75,7 @@ def _gaps(design: Design, setting: CaseConditions) -> np.ndarray | None:
         cases.steps,
         cases.hold,
     )
-    yardstick = scorecard.Yardstick(np.ones(p), np.ones(m), setting.gamma)
+    yardstick = scorecard.CommonCost(np.ones(p), np.ones(m), setting.gamma)
     run = scorecard.simulate(scenarios, law)
     J, best = scorecard.cost(scenarios, run, yardstick), scorecard.optimum(scenarios, yardstick)
     gaps = 100.0 * scorecard.regret(J, best)

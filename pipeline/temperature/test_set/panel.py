@@ -13,9 +13,9 @@ import numpy as np
 import scipy.linalg
 
 from pipeline.temperature.controllers.controller import (
+    ActuatorLimits,
     Aim,
     Deployed,
-    Limits,
     Reference,
     Rest,
     aim,
@@ -34,7 +34,7 @@ from pipeline.temperature.tracking import Law, reached_state
 RESTLESS = 1e-8  # reciprocal condition of I - A below which a plant has no rest of its own
 
 
-class Spread(NamedTuple):
+class PlantSpread(NamedTuple):
     """How far plants lie from the nominal one: input gains 1 +- input_gain each; A' = I + (A - I) / (1 + d),
     B' = B / (1 + d), d within +- slower, in the modes of heat; A - l I, l from 0 to extra_heat_loss a step;
     all inputs one step late in a share `delayed`; the ambient +- ambient_degC."""
@@ -106,7 +106,7 @@ def _of_heat(eigenvalue: complex) -> bool:
 
 
 def drawn(
-    nominal: Sequence[Plant], count: int, spread: Spread, *, cells: bool, rng: np.random.Generator
+    nominal: Sequence[Plant], count: int, spread: PlantSpread, *, cells: bool, rng: np.random.Generator
 ) -> list[Plant]:
     """`count` plants around the nominal ones in turn."""
     plants = []
@@ -128,7 +128,7 @@ def drawn(
     return plants
 
 
-def corners(nominal: Sequence[Plant], spread: Spread) -> tuple[list[Plant], Strength]:
+def corners(nominal: Sequence[Plant], spread: PlantSpread) -> tuple[list[Plant], Strength]:
     """The family that the governor guards: each plant in time and a sample late, and within what range its
     inputs act."""
     family = [delayed(plant, late) for plant in nominal for late in (False, True)]
@@ -201,7 +201,7 @@ def asked(
     steps: int,
     hold: int,
     cells: bool,
-    limits: Limits | None = None,
+    limits: ActuatorLimits | None = None,
 ) -> Cases:
     """The questions put to every plant. Where states are `cells`, a start holds every cell at one
     temperature, otherwise every output, or what comes nearest within `limits`; noise (p,) in °C."""
@@ -248,7 +248,9 @@ def asked(
     )
 
 
-def _held(plant: Plant, y: np.ndarray, cells: bool, limits: Limits | None) -> tuple[np.ndarray, np.ndarray]:
+def _held(
+    plant: Plant, y: np.ndarray, cells: bool, limits: ActuatorLimits | None
+) -> tuple[np.ndarray, np.ndarray]:
     """State and input of a plant of `delayed` held at outputs y (p,), or at cells of y[0] °C; where inputs
     would have to leave `limits`, at rest under the nearest within."""
     n = plant.n - plant.m
@@ -289,7 +291,7 @@ class Rollout(NamedTuple):
     measured: np.ndarray
 
 
-def rests(model: Plant, cases: Cases, limits: Limits) -> list[Rest]:
+def rests(model: Plant, cases: Cases, limits: ActuatorLimits) -> list[Rest]:
     """Where a plant rests under each reference of the cases, then at each start."""
     return [rest(model, reference, limits) for reference in _wanted(cases)]
 
@@ -381,7 +383,7 @@ def figures(
     rollout: Rollout,
     cases: Cases,
     *,
-    limits: Limits,
+    limits: ActuatorLimits,
     low: np.ndarray,
     high: np.ndarray,
     band: float,

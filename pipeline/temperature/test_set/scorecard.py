@@ -14,7 +14,7 @@ from pipeline.temperature.plant import Plant, hold_output, hold_state
 from pipeline.temperature.tracking import Gains, Law, gains
 
 
-class Panel(NamedTuple):
+class Scenarios(NamedTuple):
     """Scenarios, one a row: plant[i] of `plants` (all of one order), held at x0 by u0, reference r, sensor
     noise of `noise` °C drawn from `seed`.
 
@@ -34,7 +34,7 @@ class Panel(NamedTuple):
     hold: int
 
 
-class Yardstick(NamedTuple):
+class CommonCost(NamedTuple):
     """The weights diag(q), diag(r) and the discount under which every J of one comparison is computed."""
 
     q: np.ndarray
@@ -46,7 +46,7 @@ class Cost(NamedTuple):
     """J of each scenario, together with the yardstick that it was computed with."""
 
     J: np.ndarray
-    yardstick: Yardstick
+    yardstick: CommonCost
 
 
 class PanelRun(NamedTuple):
@@ -66,7 +66,7 @@ def panel(
     steps: int,
     hold: int,
     cells: bool,
-) -> Panel:
+) -> Scenarios:
     """Every plant x start x reference x noise level, once without noise and once a seed with it.
 
     A start is a temperature in °C at which the plant is held by its steady input: of every cell where the
@@ -84,7 +84,7 @@ def panel(
                         for seed in (seeds if level > 0 else seeds[:1])
                     ]
     index, x0, u0, r, level, seed, start = (np.array(column) for column in zip(*rows, strict=True))
-    return Panel(
+    return Scenarios(
         list(plants),
         index,
         x0,
@@ -98,7 +98,7 @@ def panel(
     )
 
 
-def disturbances(panel: Panel) -> np.ndarray:
+def disturbances(panel: Scenarios) -> np.ndarray:
     """Sensor noise (hold + steps, scenarios, p): each scenario draws from its
     own seed, so that every controller sees the same."""
     unit = {
@@ -110,7 +110,7 @@ def disturbances(panel: Panel) -> np.ndarray:
     )
 
 
-def simulate(panel: Panel, law: Law) -> PanelRun:
+def simulate(panel: Scenarios, law: Law) -> PanelRun:
     """Every scenario at once under one law with its own feed-forward; nothing limits the inputs, and xi stays
     zero."""
     A, B, C, b, d = (
@@ -138,14 +138,14 @@ def simulate(panel: Panel, law: Law) -> PanelRun:
     return PanelRun(y, u)
 
 
-def cost(panel: Panel, run: PanelRun, yardstick: Yardstick) -> Cost:
+def cost(panel: Scenarios, run: PanelRun, yardstick: CommonCost) -> Cost:
     """(3) of every scenario: discounted, on true outputs and applied inputs."""
     error = run.y - panel.r
     stage = error**2 @ yardstick.q + run.u**2 @ yardstick.r
     return Cost(yardstick.gamma ** np.arange(len(stage)) @ stage, yardstick)
 
 
-def optimum(panel: Panel, yardstick: Yardstick) -> Cost:
+def optimum(panel: Scenarios, yardstick: CommonCost) -> Cost:
     """J* of every scenario: the Riccati law of its own plant, which knows the state, unclipped."""
     best = [
         gains(plant, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma) for plant in panel.plants
@@ -153,7 +153,7 @@ def optimum(panel: Panel, yardstick: Yardstick) -> Cost:
     return cost(panel, _state_feedback(panel, best), yardstick)
 
 
-def _state_feedback(panel: Panel, best: Sequence[Gains]) -> PanelRun:
+def _state_feedback(panel: Scenarios, best: Sequence[Gains]) -> PanelRun:
     plants = [panel.plants[i] for i in panel.plant]
     A, B, C, b, d = (
         np.stack([getattr(plant, name) for plant in plants]) for name in ("A", "B", "C", "b", "d")

@@ -1,0 +1,62 @@
+"""The verdict of each loop that the night obeys: that of the run, with the drift of tonight and with the
+controllers that are in production."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.nightly import judge
+from pipeline.nightly.processes import STATE, dvc
+from pipeline.nightly.records import Night
+from pipeline.nightly.remembered import METRICS
+from pipeline.nightly.settings import Nightly
+from pipeline.store import artifacts
+from pipeline.verdict import night as verdict_night
+from pipeline.verdict import verdict
+from pipeline.verdict.files import read_evidence
+from pipeline.verdict.verdict import Verdict
+from stages.verdict import certificates
+
+STORED = "datasets/verdict"
+REPORT = "datasets/report/figures.json"
+
+
+def read_verdicts(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], Night]:
+    """The verdict of each loop that has a page, as pages say it; the night with a note if they are of other
+    files. A loop that is judged by a file of costs has none: its rules are the guards of that file. If
+    nightly.holdout.controller names a controller, the temperature loop's verdict is about that one."""
+    loops = [name for name, loop in settings.loops.items() if loop.judge != "cases"]
+    if not loops:
+        return {}, night
+    evidence = read_evidence()
+    evidence = evidence._replace(certified=certificates(evidence.rules))
+    stored, tonight, named = verdict.read(STORED), _read_json(METRICS), settings.holdout.controller
+    by_loop = verdict_night.verdicts(evidence, stored, tonight)
+    night = _make_pages_agree(by_loop, night)
+    if named != judge.PAGE:
+        by_loop = verdict_night.verdicts(evidence, stored, tonight, named=named)
+    if lacking := [name for name in loops if name not in by_loop]:
+        raise ValueError(
+            f"{STORED}/{lacking[0]}.json: expected the verdict of this run, found none; "
+            "run ./run dvc repro verdict, or switch the loop off in section loops"
+        )
+    return {name: by_loop[name] for name in loops}, night
+
+
+def _read_json(path: str | Path) -> Any:
+    return artifacts.read_json(path) if artifacts.exists(path) else None
+
+
+def _make_pages_agree(pages: Mapping[str, Verdict], night: Night) -> Night:
+    """Makes the pages anew if they were made before drift or production changed, so that they say what the
+    night goes by."""
+    if not artifacts.exists(REPORT):
+        return night
+    shown = artifacts.read_json(REPORT).get("verdicts") or {}
+    if all(shown.get(loop) == verdict.metrics() for loop, verdict in pages.items()):
+        return night
+    try:
+        dvc("repro", "--single-item", "--force", "report", log=STATE / "logs" / f"{night.run}-report.log")
+    except ValueError as error:
+        return night.noted(f"the pages are not of tonight ({error}); run ./run dvc repro --force report")
+    return night

@@ -1,0 +1,118 @@
+"""What Li and Pattinson (2025) claim of their agent on their simulator, beside what trained ones come to."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pipeline.setpoint.agents import agent, belief_agent, trials
+from pipeline.setpoint.agents.score import RunScore
+from pipeline.setpoint.simulation.simulator import nominal, paper_windows, rollout
+
+# runs from each single start, and decisions at the end over which a run has come to rest
+CLAIM_RUNS, RESTING = 100, 20
+
+
+def simulated_figures(
+    agents: Any, key: jax.Array, runs: int, history: int, flow_actions: int
+) -> dict[str, dict[str, Any]]:
+    """Figures of the networks after three phases and after the last, and of the belief DQN, from the 21
+    starts, `runs` times each, with the class always right and right with probability 0.7."""
+    right, noisy = (trials.starts(runs, accuracy=accuracy) for accuracy in (1.0, 0.7))
+    published = agent.greedy(agent.paper_encoder(history))
+    on_belief = agent.greedy(belief_agent.belief_encoder(agents.belief))
+    cases = {"phase3": (agents.li_2025[2], right)}
+    if len(agents.li_2025) > 3:
+        cases |= {"phase4": (agents.li_2025[3], noisy), "phase4_at_1": (agents.li_2025[3], right)}
+    cases |= {"phase3_at_0.7": (agents.li_2025[2], noisy)}
+    simulated = {
+        name: (published, network, starts._replace(flow_actions=flow_actions * jnp.ones_like(starts.flow)))
+        for name, (network, starts) in cases.items()
+    } | {
+        "belief_dqn": (on_belief, agents.belief_dqn, right),
+        "belief_dqn_at_0.7": (on_belief, agents.belief_dqn, noisy),
+    }
+    return {
+        name: _figures(trials.evaluate(controller, network, paper_windows(), conditions, key))
+        for name, (controller, network, conditions) in simulated.items()
+    }
+
+
+def compare_starts(
+    networks: Sequence[agent.QNetwork],
+    key: jax.Array,
+    *,
+    accuracy: float,
+    history: int,
+    flow_actions: int,
+    steps: int,
+) -> dict[str, dict[str, Any]]:
+    """What Li and Pattinson (2025) print of single starts (sections 3.3 and 3.4, figures 7 and 8), beside
+    what CLAIM_RUNS runs of ours come to: medians, in percent of flow and °C. `accuracy` is the last phase's.
+
+    rests_at: mean flow of the last decisions; least and most: of the flow after it first came within 10 % of
+    100 %; flow_range and temperature_range: from least to most over the second half of the run.
+    """
+    last = networks[-1]
+    printed = {
+        "300 %, 230 °C": ({"rests_at": 95.0, "least": 75.0, "most": 130.0}, last, 300.0, 230.0, accuracy),
+        "30 %, 190 °C": ({"rests_at": 100.0, "most": 130.0}, last, 30.0, 190.0, accuracy),
+    } | {
+        f"232 %, 190 °C after phase {number}": (claim, networks[number - 1], 232.0, 190.0, 1.0)
+        for number, claim in (
+            (1, {}),
+            (2, {"temperature_range": 0.0}),
+            (3, {"flow_range": 0.0, "temperature_range": 0.0}),
+        )
+    }
+    controller, n = agent.greedy(agent.paper_encoder(history)), CLAIM_RUNS
+    compared = {}
+    for name, (claim, network, flow, temperature, right) in printed.items():
+        conditions = nominal(np.full(n, flow), temperature, accuracy=right)
+        conditions = conditions._replace(flow_actions=flow_actions * jnp.ones(n))
+        path = rollout(controller, network, paper_windows(), conditions, key, steps=steps)
+        compared[name] = {
+            "printed": claim,
+            "measured": measure_runs(np.asarray(path.flow, float), np.asarray(path.temperature, float)),
+        }
+    return compared
+
+
+def measure_runs(flow: np.ndarray, temperature: np.ndarray) -> dict[str, float | None]:
+    """The medians of `compare_starts` of runs (n, steps + 1)."""
+    q, u = flow, temperature
+    since = np.maximum.accumulate(np.abs(q - 100.0) <= 10.0 + 1e-3, axis=1)
+    came, half = since.any(axis=1), (q.shape[1] - 1) // 2
+    least, most = (
+        float(np.median(bound(np.where(since, q, fill), axis=1)[came])) if came.any() else None
+        for bound, fill in ((np.min, np.inf), (np.max, -np.inf))
+    )
+    return {
+        "rests_at": float(np.median(q[:, -RESTING:].mean(axis=1))),
+        "least": least,
+        "most": most,
+        "flow_range": float(np.median(np.ptp(q[:, half:], axis=1))),
+        "temperature_range": float(np.median(np.ptp(u[:, half:], axis=1))),
+    }
+
+
+def parameters(network: Any) -> int:
+    """How many numbers a network has."""
+    return sum(np.size(leaf) for leaf in jax.tree.leaves(network))
+
+
+def _figures(score: RunScore) -> dict[str, Any]:
+    steps = {
+        name: float(value) if np.isfinite(value) else None
+        for name, value in (("median_steps", score.median_steps), ("p90_steps", score.p90_steps))
+    }
+    return {
+        "runs": score.runs,
+        "settled": score.settled.percent,
+        "settled_low": score.settled.low,
+        "stay": score.stay.percent,
+        "overshoot_p95": score.overshoot_p95,
+        **steps,
+    }

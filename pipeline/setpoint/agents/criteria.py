@@ -1,0 +1,22 @@
+"""By what a run of a controller of setpoints is judged: plain numbers, so that a page can name them without a
+simulator."""
+
+FLOW_BAND, TEMPERATURE_BAND = 10.0, 5.0  # about 100 % and 210 °C
+SETTLED_BY, DWELL_UNTIL, STEPS = (
+    90,
+    100,
+    200,
+)  # inside from some step <= 90 until 100; never out from 100 to 200 is staying
+CLOG_STEP, RECOVERED_UNTIL = 60, 120
+BEYOND = (10, 15, 25)  # points of flow past which a run from a good start counts as harmed
+NO_CONTROL = "do nothing"  # the controller that leaves every print alone
+BACK_BAND = 15.0  # within which a half clogged nozzle shall be brought back
+
+
+def harm_bar(case: str, *, perfect: float, in_band: float) -> float | None:
+    """Percent of runs from good starts that may leave +-25 % in this case: with the camera right, stuck or
+    blind. None where nobody is barred: of a camera of another make, or with moved borders, no rule can know
+    better, and harm is only told."""
+    if case == "perfect":
+        return perfect
+    return in_band if case == "in band" or case.startswith(("in band, stuck", "in band, blind")) else None

@@ -1,0 +1,148 @@
+"""What a run of a controller of setpoints is worth, by its true flow and temperature: settled, staying,
+recovered, harmed; and how sure a share of runs is."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.setpoint.agents.criteria import (
+    BACK_BAND,
+    BEYOND,
+    CLOG_STEP,
+    DWELL_UNTIL,
+    FLOW_BAND,
+    RECOVERED_UNTIL,
+    SETTLED_BY,
+    STEPS,
+    TEMPERATURE_BAND,
+)
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
+from pipeline.statistics import Share, redrawn_share, wilson
+
+# float32 sums of moves end a hair outside a border that they are on
+ROUNDING = 1e-3
+
+
+class Outcomes(NamedTuple):
+    """n runs, each (n,) unless said. flow and temperature at the start; entered: the step from which the run
+    is inside 90-110 % and 210 +- 5 °C until 100, 101 where it is outside then.
+
+    settled: entered by 90; stay: settled, and never out from 100 to 200; recovered: inside from some step
+    <= 90 until 120, and recovery the step since CLOG_STEP; back: within +-15 % likewise; beyond (n, 3):
+    farther than BEYOND from 100 % at some step; overshoot: points of flow past 100 % on the far side of the
+    start, before step 60; flow_error: mean |q - 100 %| over steps 100 to 200.
+    """
+
+    flow: np.ndarray
+    temperature: np.ndarray
+    entered: np.ndarray
+    settled: np.ndarray
+    stay: np.ndarray
+    recovered: np.ndarray
+    recovery: np.ndarray
+    back: np.ndarray
+    beyond: np.ndarray
+    overshoot: np.ndarray
+    flow_error: np.ndarray
+
+
+class RunScore(NamedTuple):
+    """n runs. Shares of all runs as `Outcomes` says, `beyond` one for each of BEYOND.
+
+    median_steps and p90_steps of the settled runs until they are inside for good (NaN where none settled);
+    overshoot_p95, the 95th percentile; flow_error, the mean; worst_start names the start with the fewest
+    settled, with its percent; recovery_steps, the median of the recovered (NaN where there is none).
+    """
+
+    runs: int
+    settled: Share
+    stay: Share
+    recovered: Share
+    median_steps: float
+    p90_steps: float
+    overshoot_p95: float
+    flow_error: float
+    worst_start: tuple[float, float, float]
+    back: Share
+    recovery_steps: float
+    beyond: tuple[Share, ...]
+
+
+def judge(flow: np.ndarray, temperature: np.ndarray) -> RunScore:
+    """The score of n trajectories of at least 200 decisions that share nothing, by their true flow (percent)
+    and temperature (°C), each (n, 201 or more).
+
+    Raises ValueError for shorter ones.
+    """
+    return summary(outcomes(flow, temperature))
+
+
+def outcomes(flow: np.ndarray, temperature: np.ndarray) -> Outcomes:
+    """What became of each of n trajectories (n, 201 or more). Raises ValueError for shorter ones."""
+    flow, temperature = np.asarray(flow, float), np.asarray(temperature, float)
+    if flow.shape[1] <= STEPS:
+        raise ValueError(
+            f"judge: expected trajectories of {STEPS} decisions, found {flow.shape[1] - 1}; "
+            f"roll out with steps={STEPS}"
+        )
+    off = np.abs(flow - BEST_FLOW)
+    warm = np.abs(temperature - BEST_TEMPERATURE) <= TEMPERATURE_BAND + ROUNDING
+    inside = (off <= FLOW_BAND + ROUNDING) & warm
+    entered, recovery = _inside_since(inside, DWELL_UNTIL), _inside_since(inside, RECOVERED_UNTIL)
+    settled = entered <= SETTLED_BY
+    past = np.sign(BEST_FLOW - flow[:, :1]) * (flow[:, :CLOG_STEP] - BEST_FLOW)
+    farthest = off[:, : STEPS + 1].max(axis=1)
+    return Outcomes(
+        flow=flow[:, 0],
+        temperature=temperature[:, 0],
+        entered=entered,
+        settled=settled,
+        stay=settled & inside[:, DWELL_UNTIL : STEPS + 1].all(axis=1),
+        recovered=recovery <= SETTLED_BY,
+        recovery=recovery - CLOG_STEP,
+        back=_inside_since((off <= BACK_BAND + ROUNDING) & warm, RECOVERED_UNTIL) <= SETTLED_BY,
+        beyond=farthest[:, None] > np.array(BEYOND) + ROUNDING,
+        overshoot=past.max(axis=1).clip(0),
+        flow_error=off[:, DWELL_UNTIL : STEPS + 1].mean(axis=1),
+    )
+
+
+def summary(of: Outcomes, *, redraws: int = 1, shared: float = 0.0) -> RunScore:
+    """The score of runs that are `redraws` equal blocks, one after the other, each on a redraw of segments
+    of its own, where a block's runs have the share `shared` of their variance in common
+    (`statistics.shared_variance`). With one redraw the runs share nothing, and the intervals are Wilson's."""
+
+    def share(happened: np.ndarray) -> Share:
+        return wilson(happened) if redraws == 1 else redrawn_share(happened.reshape(redraws, -1), shared)
+
+    median, p90 = np.percentile(of.entered[of.settled], [50, 90]) if of.settled.any() else (np.nan, np.nan)
+    return RunScore(
+        runs=len(of.flow),
+        settled=share(of.settled),
+        stay=share(of.stay),
+        recovered=share(of.recovered),
+        median_steps=float(median),
+        p90_steps=float(p90),
+        overshoot_p95=float(np.percentile(of.overshoot, 95)),
+        flow_error=float(of.flow_error.mean()),
+        worst_start=_worst_start(of.flow, of.temperature, of.settled),
+        back=share(of.back),
+        recovery_steps=float(np.median(of.recovery[of.recovered])) if of.recovered.any() else float("nan"),
+        beyond=tuple(share(column) for column in of.beyond.T),
+    )
+
+
+def _inside_since(inside: np.ndarray, until: int) -> np.ndarray:
+    """The first step (n,) from which each run is inside through step
+    `until`; until + 1 where it is outside then."""
+    out = ~inside[:, until::-1]
+    return np.where(out.any(axis=1), until + 1 - out.argmax(axis=1), 0)
+
+
+def _worst_start(
+    flow: np.ndarray, temperature: np.ndarray, settled: np.ndarray
+) -> tuple[float, float, float]:
+    pairs, which = np.unique(np.stack([flow, temperature], axis=1), axis=0, return_inverse=True)
+    percent = 100.0 * np.bincount(which.ravel(), weights=settled) / np.bincount(which.ravel())
+    worst = int(percent.argmin())
+    return float(pairs[worst, 0]), float(pairs[worst, 1]), float(percent[worst])

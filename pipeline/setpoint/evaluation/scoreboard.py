@@ -1,0 +1,274 @@
+"""The contest as tables and figures: columns of schemas SCOREBOARD, PATHS and DECISIONS. `groups` has the
+group of each controller by name, which stands in column `kind`."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pipeline.setpoint.agents.criteria import BEYOND, NO_CONTROL, STEPS
+from pipeline.setpoint.agents.score import RunScore
+from pipeline.setpoint.deployment import deployment, pixels
+from pipeline.setpoint.evaluation import judging
+from pipeline.setpoint.evaluation.contest import Contest
+from pipeline.setpoint.evaluation.judging import DefaultChoice
+from pipeline.setpoint.evaluation.pixel_rollouts import DWELL, PixelRollouts
+from pipeline.setpoint.simulation import actuation
+from pipeline.statistics import Share, wilson
+
+# the cases of which runs of every controller are kept beside the deciding one, and so many decisions of them
+PATHS_OF, PATH_STEPS = ("accuracy 0.7", "recorded, fresh"), 100
+
+
+def simulator(case: str) -> str:
+    """Whose windows a case has: paper or recorded; harm, recorded ones from good starts."""
+    if not judging.counts(case):
+        return "harm"
+    return "recorded" if case.startswith("recorded") else "paper"
+
+
+def scoreboard(groups: Mapping[str, str], contest: Contest, rollouts: PixelRollouts) -> dict[str, list]:
+    """Columns of schema SCOREBOARD."""
+    rows = [
+        _score_row(name, groups[name], case, score, contest.redraws[name])
+        for name, by_case in contest.scores.items()
+        for case, score in by_case.items()
+    ]
+    return _columns(
+        rows + [_pixel_row(name, groups[name], "calm", episodes) for name, episodes in rollouts.calm.items()]
+    )
+
+
+def _score_row(name: str, kind: str, case: str, score: RunScore, redraws: int) -> dict[str, Any]:
+    clogged = case.endswith("clog")
+    shares: dict[str, Share | None] = {
+        "settled": score.settled,
+        "stay": score.stay,
+        "recovered": score.recovered if clogged else None,
+        "back": score.back if clogged else None,
+    }
+    harmed = score.beyond if not judging.counts(case) else [None] * len(BEYOND)
+    shares |= {f"beyond_{points}": share for points, share in zip(BEYOND, harmed, strict=True)}
+    return {
+        "controller": name,
+        "kind": kind,
+        "simulator": simulator(case),
+        "case": case,
+        "counts": judging.counts(case),
+        "runs": score.runs,
+        "redraws": 1 if simulator(case) == "paper" else redraws,
+        **{column: value for key, share in shares.items() for column, value in _ends(key, share).items()},
+        "median_steps": score.median_steps,
+        "p90_steps": score.p90_steps,
+        "recovery_steps": score.recovery_steps if clogged else np.nan,
+        "overshoot_p95_percent": score.overshoot_p95,
+        "flow_error_percent": score.flow_error,
+        "worst_start_flow_percent": score.worst_start[0],
+        "worst_start_temperature_degC": score.worst_start[1],
+        "worst_start_settled_percent": score.worst_start[2],
+    }
+
+
+def _ends(key: str, share: Share | None) -> dict[str, float]:
+    """The three columns of a share, missing where it is none."""
+    values = (np.nan,) * 3 if share is None else share
+    return dict(zip((f"{key}_percent", f"{key}_low_percent", f"{key}_high_percent"), values, strict=True))
+
+
+def _columns(rows: list[dict[str, Any]]) -> dict[str, list]:
+    return {name: [row[name] for row in rows] for name in rows[0]}
+
+
+def compared(groups: Mapping[str, str], contest: Contest, choice: DefaultChoice) -> list[str]:
+    """Who is set beside the default in its worst case, in the contestants' order: doing nothing, the
+    strongest simple rule and the strongest agent of ours. The strongest keeps most in its own worst case;
+    who may not run gives way to who may."""
+    names = {choice.name, NO_CONTROL}
+    for kind in ("baseline", "agent"):
+        others = [name for name in contest.judged if groups[name] == kind and name not in names]
+        others.sort(key=lambda name: (name in choice.refused, -judging.worst_case(contest.judged[name])[0]))
+        names |= {*others[:1]}
+    return [name for name in contest.judged if name in names]
+
+
+def paths(
+    groups: Mapping[str, str], contest: Contest, choice: DefaultChoice, rollouts: PixelRollouts
+) -> dict[str, Any]:
+    """Columns of schema PATHS: one run from each of the 21 starts, of those judged. Of every controller
+    PATH_STEPS decisions of the cases PATHS_OF; of those that are compared STEPS of the choice's case, which
+    decides. And the runs through pixels."""
+    pieces = []
+    for case in dict.fromkeys((*PATHS_OF, choice.case)):
+        names = contest.paths if case in PATHS_OF else compared(groups, contest, choice)
+        last = STEPS if case == choice.case else PATH_STEPS
+        for name in names:
+            flow, temperature = (np.asarray(a[:, : last + 1], float) for a in contest.paths[name][case])
+            pieces.append(((name, simulator(case), case), flow, temperature))
+    for name, episodes in rollouts.calm.items():
+        pieces.append(((name, "pixels", "calm"), episodes.flow, episodes.temperature))
+    texts = {
+        name: [words[i] for words, flow, _ in pieces for _ in range(flow.size)]
+        for i, name in enumerate(("controller", "simulator", "case"))
+    }
+    places = [np.indices(flow.shape) for _, flow, _ in pieces]
+    return texts | {
+        "start": np.concatenate([start.ravel() for start, _ in places]),
+        "step": np.concatenate([step.ravel() for _, step in places]),
+        "flow_percent": np.concatenate([flow.ravel() for _, flow, _ in pieces]),
+        "temperature_degC": np.concatenate([temperature.ravel() for _, _, temperature in pieces]),
+    }
+
+
+def _pixel_row(name: str, kind: str, case: str, episodes: pixels.Episodes) -> dict[str, Any]:
+    """A row of schema SCOREBOARD: settled is inside to the end from at least DWELL decisions before it."""
+    since, runs, last = pixels.settled_since(episodes), len(episodes.flow), episodes.flow.shape[1] - 1
+    settled = since <= last - DWELL
+    share = wilson(settled)
+    past = np.sign(100.0 - episodes.flow[:, :1]) * (episodes.flow - 100.0)
+    starts = episodes.setpoint[:, 0]
+    worst = starts[int(since.argmax())]
+    nothing: dict[str, float] = {}
+    for key in ("stay", "recovered", "back", *(f"beyond_{points}" for points in BEYOND)):
+        nothing |= _ends(key, None)
+    return {
+        "controller": name,
+        "kind": kind,
+        "simulator": "pixels",
+        "case": case,
+        "counts": False,
+        "runs": runs,
+        "redraws": 1,
+        **_ends("settled", share),
+        **nothing,
+        "median_steps": float(np.median(since[settled])) if settled.any() else np.nan,
+        "p90_steps": float(np.percentile(since[settled], 90)) if settled.any() else np.nan,
+        "recovery_steps": np.nan,
+        "overshoot_p95_percent": float(np.percentile(past.max(axis=1).clip(0), 95)),
+        "flow_error_percent": float(np.abs(episodes.flow[:, -DWELL:] - 100.0).mean()),
+        "worst_start_flow_percent": float(worst[0]),
+        "worst_start_temperature_degC": float(worst[1]),
+        "worst_start_settled_percent": 100.0 * float(settled[(starts == worst).all(axis=1)].mean()),
+    }
+
+
+def decisions(name: str, rollouts: PixelRollouts) -> dict[str, list]:
+    """Columns of schema DECISIONS: the two disturbed episodes."""
+    rows, episodes = [], rollouts.disturbed
+    if episodes is None:
+        return {}
+    for i, words in enumerate(rollouts.words):
+        for d in range(episodes.time_s.shape[1]):
+            window = deployment.JudgedWindow(*(field[:, d] for field in episodes.windows))
+            prob, score, sent = window.p[i], window.score[i], episodes.sent[i, d]
+            rows.append(
+                {
+                    "episode": words,
+                    "controller": name,
+                    "step": d,
+                    "time_s": episodes.time_s[i, d],
+                    "flow_percent": episodes.flow[i, d],
+                    "temperature_degC": episodes.temperature[i, d],
+                    "flow_setpoint_percent": episodes.setpoint[i, d, 0],
+                    "target_degC": episodes.setpoint[i, d, 1],
+                    "p_under": prob[0],
+                    "p_good": prob[1],
+                    "p_over": prob[2],
+                    "frames": int(window.used[i]),
+                    "distance": score if np.isfinite(score) else np.nan,
+                    "flow_move_percent": sent[0],
+                    "temperature_move_degC": sent[1],
+                    "held": bool(window.reason[i] != actuation.ACTS),
+                    "why": deployment.why(episodes.time_s[i, d], window, i, sent),
+                }
+            )
+    return _columns(rows)
+
+
+def metrics(
+    groups: Mapping[str, str], contest: Contest, choice: DefaultChoice, rollouts: PixelRollouts
+) -> dict[str, Any]:
+    """By controller, simulator and case; then the default, its cases and what it does to good prints."""
+    figures: dict[str, Any] = {
+        name: {
+            source: {
+                case: _figures(case, score) for case, score in by_case.items() if simulator(case) == source
+            }
+            for source in dict.fromkeys(map(simulator, by_case))
+        }
+        for name, by_case in contest.scores.items()
+    }
+    for name, episodes in rollouts.calm.items():
+        row = _pixel_row(name, groups[name], "calm", episodes)
+        figures[name]["pixels"] = {
+            "calm": {
+                "settled": row["settled_percent"],
+                "median_steps": _plain(row["median_steps"]),
+                "overshoot_p95": row["overshoot_p95_percent"],
+                "flow_error": row["flow_error_percent"],
+            }
+        }
+    default = contest.scores[choice.name]
+    return figures | {
+        "default": choice.name,
+        "worst": choice.worst,
+        "case": choice.case,
+        "margin": _plain(choice.margin),
+        "margin_low": _plain(choice.margin_low),
+        "margin_high": _plain(choice.margin_high),
+        "sentence": choice.sentence,
+        "cases": {case: _shares(case, score) for case, score in default.items() if judging.counts(case)},
+        "harm": {case: _harm(score) for case, score in default.items() if not judging.counts(case)},
+    }
+
+
+def _shares(case: str, score: RunScore) -> dict[str, float | int | None]:
+    """Of a case of the default: low and high are the ends of the 95 % interval of the runs that stay."""
+    figures: dict[str, float | int | None] = {
+        "runs": score.runs,
+        "settled": score.settled.percent,
+        "stay": score.stay.percent,
+        "low": score.stay.low,
+        "high": score.stay.high,
+    }
+    if case.endswith("clog"):
+        figures |= {
+            "recovered": score.recovered.percent,
+            "recovery_steps": _plain(score.recovery_steps),
+            "back_within_15": score.back.percent,
+        }
+    return figures
+
+
+def _harm(score: RunScore) -> dict[str, float | int]:
+    """Percent of runs from good starts that leave +-10, 15 and 25 % within 200 decisions, with intervals."""
+    named = {f"beyond_{points}": share for points, share in zip(BEYOND, score.beyond, strict=True)}
+    return (
+        {"runs": score.runs}
+        | {name: share.percent for name, share in named.items()}
+        | {f"{name}_low": share.low for name, share in named.items()}
+        | {f"{name}_high": share.high for name, share in named.items()}
+    )
+
+
+def _figures(case: str, score: RunScore) -> dict[str, float | None]:
+    if not judging.counts(case):
+        return {f"beyond_{points}": share.percent for points, share in zip(BEYOND, score.beyond, strict=True)}
+    return {
+        "settled": score.settled.percent,
+        "stay": score.stay.percent,
+        "median_steps": _plain(score.median_steps),
+        "overshoot_p95": score.overshoot_p95,
+        "clog_recovered": score.recovered.percent if case.endswith("clog") else None,
+        "flow_error": score.flow_error,
+    }
+
+
+def choice_record(choice: DefaultChoice) -> dict[str, Any]:
+    """What choice.json holds: null where there is no figure, as of a margin where nothing else may run."""
+    return {
+        name: _plain(value) if isinstance(value, float) else value for name, value in choice._asdict().items()
+    }
+
+
+def _plain(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

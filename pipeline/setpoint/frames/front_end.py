@@ -1,0 +1,137 @@
+"""Frames of one film -> key areas: the crop round the tip, the direction of the line as far as it is known or
+can be seen in the motion of the ground, and why a frame has none."""
+
+import itertools
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.setpoint.frames import familiar, key_area, travel
+
+# of so many frames the first accepted one is measured as the known camera's are: four of a window
+MEASURED = 5
+# frames among which the ground's motion is sought at a time
+IN_A_ROW = 20
+# cameras of 10 and 12 bits may leave the upper ones of 16 empty; a picture as dark as that
+# has fewer than 16 of 256 gray levels in any case
+FILLED_BITS = 12
+NO_TIP, UNUSABLE, SEVERAL = "no tip is known", "the frame cannot be used", "several lines"
+REMEDIES = {
+    NO_TIP: "find it with ./run beadline calibrate-tip IMAGE, and set tip_px in params.yaml",
+    UNUSABLE: "find the tip of these pictures with ./run beadline calibrate-tip IMAGE, and set tip_px in "
+    "params.yaml",
+    SEVERAL: "write travel_direction_deg, the way the line leaves the tip in the picture, beside the frames, "
+    "or take frames at 10 a second and more, in which the motion can be seen",
+}
+
+
+class FrameKeyAreas(NamedTuple):
+    """What the front end made of n frames: images (n, 16, 48) uint8, zeros where rejected; angle_deg,
+    miss_px, score, padded_share (n,), NaN where nothing was looked at; tip (n, 2) in px; surroundings (n,
+    measures) float32 of the first accepted of every MEASURED frames, NaN of the others; n reasons, empty
+    where there is a key area; n digests of what the frame held."""
+
+    images: np.ndarray
+    angle_deg: np.ndarray
+    miss_px: np.ndarray
+    score: np.ndarray
+    padded_share: np.ndarray
+    tip: np.ndarray
+    surroundings: np.ndarray
+    reasons: list[str]
+    digests: list[str]
+
+
+def find_key_areas(
+    frames: Iterable[np.ndarray | str], tips: np.ndarray, directions_deg: np.ndarray, *, least_score: float
+) -> FrameKeyAreas:
+    """What the front end makes of n frames of one film, or of a text that says why there is none; digests are
+    left empty. A direction that is not known (NaN) is sought in the motion of the ground, where frames follow
+    one another, IN_A_ROW of them in memory at a time."""
+    areas: list[key_area.KeyArea] = []
+    surroundings = np.full((len(tips), len(familiar.NAMES)), np.nan, np.float32)
+    walking, measured = zip(frames, tips, directions_deg, strict=True), -1
+    while some := list(itertools.islice(((_cropped(f, tip), d) for f, tip, d in walking), IN_A_ROW)):
+        first = len(areas)
+        areas += _found([one for one, _ in some], [float(d) for _, d in some], least_score)
+        for i in range(first, len(areas)):
+            cropped, area = some[i - first][0], areas[i]
+            if i // MEASURED > measured and not area.reason and not isinstance(cropped, str):
+                surroundings[i] = familiar.surroundings(cropped.gray, area.angle_deg, area.miss_px)
+                measured = i // MEASURED
+    images = np.array([area.image for area in areas], np.uint8).reshape(-1, *key_area.SHAPE)
+    figures = (
+        np.array([getattr(area, name) for area in areas], float)
+        for name in ("angle_deg", "miss_px", "score", "padded_share")
+    )
+    reasons = [area.reason for area in areas]
+    tip = np.where(np.isfinite(tips), tips, np.nan).reshape(-1, 2)
+    return FrameKeyAreas(images, *figures, tip, surroundings, reasons, [""] * len(areas))
+
+
+def _found(
+    crops: Sequence[key_area.Crop | str], directions_deg: Sequence[float], least_score: float
+) -> list[key_area.KeyArea]:
+    """Key areas of crops that follow one another: along the direction told, or the motion of the ground where
+    it can be seen, else of the only line there is."""
+    moving = _motion(crops, directions_deg)
+    areas = []
+    for i, (one, told) in enumerate(zip(crops, directions_deg, strict=True)):
+        if isinstance(one, str):
+            empty = np.zeros(key_area.SHAPE, np.uint8)
+            areas.append(key_area.KeyArea(empty, np.nan, np.nan, np.nan, np.nan, one))
+        elif np.isfinite(told):
+            areas.append(key_area.find_in(one, least_score=least_score, direction_deg=told))
+        elif np.isfinite(moving[i][0]):
+            areas.append(
+                key_area.find_in(
+                    one, least_score=least_score, direction_deg=moving[i][0], leeway_deg=travel.LEEWAY_DEG
+                )
+            )
+        else:
+            area = key_area.find_in(one, least_score=least_score)
+            several = area.reason.startswith(SEVERAL)
+            areas.append(area._replace(reason=f"{area.reason} ({moving[i][1]})") if several else area)
+    return areas
+
+
+def _motion(
+    crops: Sequence[key_area.Crop | str], directions_deg: Sequence[float]
+) -> dict[int, tuple[float, str]]:
+    """{place: (direction or NaN, why not)} of the frames of which nobody told the direction, as far as they
+    follow one another."""
+    unknown = [
+        i
+        for i, (one, told) in enumerate(zip(crops, directions_deg, strict=True))
+        if not isinstance(one, str) and not np.isfinite(told)
+    ]
+    out: dict[int, tuple[float, str]] = {}
+    for run in np.split(np.array(unknown, int), np.flatnonzero(np.diff(unknown) > 1) + 1):
+        motion = travel.travel([crops[i].gray for i in run])
+        out |= dict(
+            zip(run.tolist(), zip(motion.direction_deg.tolist(), motion.reasons, strict=True), strict=True)
+        )
+    return out
+
+
+def _cropped(frame: np.ndarray | str, tip: np.ndarray) -> key_area.Crop | str:
+    """The crop round the tip (x, y), or the reason why there is none."""
+    reason = frame if isinstance(frame, str) else _shallow(frame)
+    if reason or isinstance(frame, str) or not np.isfinite(tip).all():
+        return reason or NO_TIP
+    try:
+        return key_area.crop(frame, (float(tip[0]), float(tip[1])))
+    except ValueError as error:
+        return f"{UNUSABLE}: {error}"
+
+
+def _shallow(frame: np.ndarray) -> str:
+    """Why a frame of 16 bits is not used of which a camera filled the
+    lower ones alone: the front end would see black."""
+    if frame.dtype != np.uint16 or frame.max() >= 1 << FILLED_BITS:
+        return ""
+    return (
+        f"{UNUSABLE}: its 16 bits hold {frame.max()} at most, as of a camera of fewer bits; "
+        "write its gray levels over all of 0 to 65535"
+    )

@@ -1,0 +1,115 @@
+"""Rendered nozzle frames with their labels. Workers run it, so it knows no learner."""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.setpoint.frames import familiar, nozzle_scene
+
+# bins of the true flow in percent: fine where controllers must find
+# 100 %, wide where any window says the same
+FLOW_EDGES = np.concatenate(
+    [[20.0, 35, 50, 60, 70], np.arange(75, 125, 2.5), np.arange(125, 150, 5.0), np.arange(150, 311, 40.0)]
+)
+# in which a controller stays, and would see one window's chance again and again
+FINE = (75.0, 125.0)
+# a line that stands out less than its darker flank is none, whatever the least score; of windows by which a
+# camera is known, the score in gray levels below which a frame is not measured
+LEAST_SCORE, CAMERA_SCORE = 0.0, 10.0
+
+
+class LabelledFrames(NamedTuple):
+    """n frames: key areas (n, 16, 48) uint8, class and true flow in percent (n,), temperature (n,) in °C,
+    print and segment (n,), valid (n,) and the reason why not; score (n,) in gray levels of the line's
+    ridge."""
+
+    images: np.ndarray
+    label: np.ndarray
+    flow: np.ndarray
+    temperature: np.ndarray
+    print_number: np.ndarray
+    segment: np.ndarray
+    valid: np.ndarray
+    reasons: np.ndarray
+    score: np.ndarray
+
+    def take(self, rows: np.ndarray) -> "LabelledFrames":
+        return LabelledFrames(*(a[rows] for a in self))
+
+    def labelled(self) -> tuple[np.ndarray, ...]:
+        """Of the valid ones what a learner needs: images, temperature, class, flow, segment."""
+        some = self.take(self.valid)
+        return some.images, some.temperature, some.label, some.flow, some.segment
+
+
+def filmed(seed: Sequence[int], flow: np.ndarray, frames: int) -> LabelledFrames:
+    """A segment at each flow (n,) in percent, with the temperatures in turn."""
+    temperature = np.resize(nozzle_scene.TEMPERATURES, len(flow))
+    rng = np.random.default_rng(seed)
+    scene = nozzle_scene.filmed(rng, flow, temperature, frames=frames, least_score=LEAST_SCORE)
+    reasons = np.array(scene.reasons, object)
+    truth = scene.label, scene.flow, scene.temperature, scene.segment, scene.segment
+    return LabelledFrames(scene.images, *truth, scene.valid, reasons, scene.score)
+
+
+def swept(seed: Sequence[int], windows: float, frames: int) -> LabelledFrames:
+    """One segment's conditions, all at one temperature, over all bins of the
+    flow: windows of `frames` frames with a flow each.
+
+    windows: how many in each bin within FINE on average; elsewhere no more than one.
+    """
+    rng = np.random.default_rng(seed)
+    segment, degrees = nozzle_scene.draw_segment(rng), rng.choice(nozzle_scene.TEMPERATURES)
+    flows = []
+    for low, high in itertools.pairwise(FLOW_EDGES):
+        count = int((windows if FINE[0] <= low < FINE[1] else min(windows, 1.0)) + rng.random())
+        flows.append(rng.uniform(low, high, count))
+    flow = np.repeat(np.concatenate(flows), frames)
+    scene = nozzle_scene.render(segment, flow, degrees, rng)
+    areas = nozzle_scene.key_areas(scene, least_score=LEAST_SCORE)
+    number, reasons = np.zeros(len(flow), int), np.array(areas.reasons, object)
+    truth = nozzle_scene.label(flow), flow, scene.temperature, number, number
+    return LabelledFrames(areas.images, *truth, areas.valid, reasons, areas.score)
+
+
+def joined(several: Sequence[LabelledFrames]) -> LabelledFrames:
+    """One behind the other, their prints and segments numbered on."""
+    shift, pieces = 0, []
+    for one in several:
+        pieces.append(one._replace(print_number=one.print_number + shift, segment=one.segment + shift))
+        shift += int(one.segment.max(initial=0)) + 1
+    return LabelledFrames(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
+
+
+def standing_out(frames: LabelledFrames, least_score: float) -> LabelledFrames:
+    """The frames, those not valid whose line stands out by less than least_score gray levels."""
+    faint = frames.valid & ~(frames.score >= least_score)
+    reasons = frames.reasons.copy()
+    reasons[faint] = f"no fresh line: it stands out by less than {least_score:g} gray levels"
+    images = np.where(faint[:, None, None], np.uint8(0), frames.images)
+    return frames._replace(images=images, valid=frames.valid & ~faint, reasons=reasons)
+
+
+def camera_window(seed: Sequence[int]) -> np.ndarray:
+    """(measures,) of a few frames of one new segment at one flow, over the whole range: how the camera that
+    renders looks."""
+    rng = np.random.default_rng(seed)
+    flow = np.full(familiar.FRAMES + 1, np.exp(rng.uniform(*np.log(nozzle_scene.FLOWS))))
+    segment, degrees = nozzle_scene.draw_segment(rng), rng.choice(nozzle_scene.TEMPERATURES)
+    scene = nozzle_scene.render(segment, flow, degrees, rng)
+    areas = nozzle_scene.key_areas(scene, least_score=CAMERA_SCORE)
+    return familiar.of_window(scene.frames, np.array(scene.tip), areas)
+
+
+def flow_edges(flows: Sequence[np.ndarray]) -> np.ndarray:
+    """FLOW_EDGES, of which those are left out that would leave a bin
+    without a window in any of several sets of flows (w,)."""
+    bounds = [min(FLOW_EDGES[0], *(float(flow.min()) for flow in flows))]
+    for edge in FLOW_EDGES[1:-1]:
+        if all(((flow >= bounds[-1]) & (flow < edge)).any() for flow in flows):
+            bounds.append(edge)
+    while len(bounds) > 1 and not all((flow >= bounds[-1]).any() for flow in flows):
+        bounds.pop()
+    return np.array([*bounds, max(FLOW_EDGES[-1], *(float(flow.max()) for flow in flows))])

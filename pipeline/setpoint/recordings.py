@@ -1,0 +1,160 @@
+"""Recordings of nozzle frames as this loop reads them: the options of reading/frame_folder.py by section
+`train_classifier`, and the front end, which takes from a memo what it made of the same frames by the same
+code."""
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import joblib
+import numpy as np
+
+from pipeline.reading import frame_folder
+from pipeline.reading.frame_folder import NozzleFrames, ReadOptions
+from pipeline.reading.frame_mcap import Topics
+from pipeline.setpoint.frames import familiar, front_end, key_area
+from pipeline.setpoint.frames.front_end import FrameKeyAreas
+from pipeline.setpoint.frames.rendered import LabelledFrames
+from pipeline.setpoint.material import PLA, PrintedMaterial
+from pipeline.setpoint.settings import TrainClassifier
+from pipeline.store import artifacts
+from pipeline.store.params import Execution
+from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema, bytes_of
+
+MEMO = Path("datasets/memo/train_classifier")
+HERE = Path(__file__).parents[1]
+# the code that decides what an entry of the memo holds
+CODE = (
+    "setpoint/recordings.py", "setpoint/frames/front_end.py", "setpoint/frames/key_area.py",
+    "setpoint/frames/travel.py", "setpoint/frames/familiar.py", "reading/mcap_frames.py",
+    "reading/frame_images.py", "reading/frame_mcap.py", "reading/image_messages.py",
+    "reading/image_topics.py",
+)  # fmt: skip
+KEY_AREAS = Schema(
+    "key_areas",
+    2,
+    (
+        Column(
+            "image", bytes_of(key_area.SHAPE[0] * key_area.SHAPE[1]), NONE, "16 x 48 gray levels, row by row"
+        ),
+        Column("angle_deg", FLOAT, "deg", "direction of the line, 0 right, 90 down", nullable=True),
+        Column("miss_px", FLOAT, "px", "by which the line passes beside the tip", nullable=True),
+        Column("score", FLOAT, NONE, "ridge in gray levels", nullable=True),
+        Column("padded_share", FLOAT, NONE, "share of the crop outside the frame", nullable=True),
+        Column("tip_x_px", FLOAT, "px", "where the tip was taken to be", nullable=True),
+        Column("tip_y_px", FLOAT, "px", "where the tip was taken to be", nullable=True),
+        Column(
+            "surroundings",
+            bytes_of(4 * len(familiar.NAMES)),
+            NONE,
+            "measures of familiar.NAMES, single precision, NaN where not taken",
+        ),
+        Column("reason", TEXT, NONE, "why there is no key area; empty where there is one"),
+        Column("digest", TEXT, NONE, "of the frame: equal frames have equal ones"),
+    ),
+)
+
+
+def read_options(
+    settings: TrainClassifier, material: PrintedMaterial = PLA, memo: Path = MEMO
+) -> ReadOptions:
+    """As section `train_classifier` says, of a material."""
+    mapping = {name: (m.source, m.unit, m.scale, m.offset) for name, m in settings.topics.mapping.items()}
+    topics = Topics(settings.topics.image, settings.topics.time, mapping)
+    stated = settings.constants.hotend
+    return ReadOptions(
+        settings.tip_px,
+        FrontEnd(settings.least_score, memo.resolve()),
+        topics,
+        material,
+        np.nan if stated is None else stated,
+    )
+
+
+def read_parts(
+    folder: Path,
+    settings: TrainClassifier,
+    window_parts: Sequence[str],
+    execution: Execution,
+    material: PrintedMaterial = PLA,
+) -> tuple[dict[str, LabelledFrames], dict[str, LabelledFrames], dict[str, Any], NozzleFrames]:
+    """The frames of a user's folder by part of `settings.prints`; those whose windows stand for the camera,
+    by part of `window_parts`; what was read, counted; and all of it. Frames without a known class or
+    temperature are in no part."""
+    # here, as who only reads needs no learner
+    from pipeline.setpoint.vision.parts import deal_prints, split_windows
+
+    frames = frame_folder.read_folder(folder, read_options(settings, material), execution)
+    frame_folder.check(folder, frames)
+    usable = (frames.label >= 0) & np.isfinite(frames.temperature)
+    truth = frames.label, frames.flow, frames.temperature, frames.print_number, frames.segment
+    reasons = np.array(frames.reasons, object)
+    labelled = LabelledFrames(frames.images, *truth, frames.valid, reasons, frames.score).take(usable)
+    with artifacts.about(folder):
+        shares = {part: float(n) for part, n in settings.prints.model_dump().items()}
+        dealt = deal_prints(labelled, shares, np.random.default_rng(settings.seed))
+        rng = np.random.default_rng([settings.seed, 1])
+        by_part, windows, apart = split_windows(dealt, window_parts, window=settings.window, rng=rng)
+    prints = {part: len(np.unique(of.print_number)) for part, of in windows.items()}
+    read = frame_folder.figures(frames) | {"windows_apart": apart, "window_prints": prints}
+    return by_part, windows, read, frames
+
+
+class FrontEnd(NamedTuple):
+    """front_end.py with the least score of a line in gray levels, and the folder of its memo."""
+
+    least_score: float
+    memo: Path
+
+    @property
+    def remedies(self) -> dict[str, str]:
+        return front_end.REMEDIES
+
+    def find(
+        self, frames: Iterable[np.ndarray | str], tips: np.ndarray, directions_deg: np.ndarray
+    ) -> FrameKeyAreas:
+        return front_end.find_key_areas(frames, tips, directions_deg, least_score=self.least_score)
+
+    def remember(self, what: tuple[Any, ...], count: int, find: Callable[[], FrameKeyAreas]) -> FrameKeyAreas:
+        """find() of `count` frames, or what it gave of the same `what` before. An entry is named by the hash
+        of all that decides what it holds."""
+        code = [artifacts.sha256(HERE / name) for name in CODE]
+        entry = self.memo / f"{joblib.hash((what, self.least_score, code))}.parquet"
+        areas = read_memo(entry, count)
+        if areas is None:
+            areas = find()
+            write_memo(entry, areas)
+        return areas
+
+
+def write_memo(entry: Path, areas: FrameKeyAreas) -> None:
+    columns = {
+        "image": [image.tobytes() for image in areas.images],
+        **{name: getattr(areas, name) for name in ("angle_deg", "miss_px", "score", "padded_share")},
+        "tip_x_px": areas.tip[:, 0],
+        "tip_y_px": areas.tip[:, 1],
+        "surroundings": [row.astype("<f4").tobytes() for row in areas.surroundings],
+        "reason": areas.reasons,
+        "digest": areas.digests,
+    }
+    artifacts.write_table(entry, KEY_AREAS, columns)
+
+
+def read_memo(entry: Path, count: int) -> FrameKeyAreas | None:
+    """An entry of so many frames that is whole, which the checksums of its pages tell."""
+    try:
+        table = artifacts.read_table(entry, KEY_AREAS)
+    except ValueError:
+        return None
+    if len(table["image"]) != count:
+        return None
+    images = np.frombuffer(b"".join(table["image"]), np.uint8).reshape(-1, *key_area.SHAPE)
+    measures = np.frombuffer(b"".join(table["surroundings"]), "<f4").reshape(-1, len(familiar.NAMES))
+    return FrameKeyAreas(
+        images=images,
+        **{name: table[name] for name in ("angle_deg", "miss_px", "score", "padded_share")},
+        tip=np.column_stack([table["tip_x_px"], table["tip_y_px"]]),
+        surroundings=measures,
+        reasons=table["reason"].tolist(),
+        digests=table["digest"].tolist(),
+    )

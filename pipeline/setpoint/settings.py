@@ -1,0 +1,204 @@
+"""Sections of the params files that the setpoint loop's stages read."""
+
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from pipeline.store.params import Mapped, Section
+
+if TYPE_CHECKING:
+    from pipeline.setpoint.material import PrintedMaterial
+
+# as far as pixels.py looks for the nozzle's tip, in px: a number of its own, since that module imports much
+REACH_PX = 30
+
+
+Degrees = Annotated[float, Field(ge=100, le=500)]
+Percent = Annotated[float, Field(ge=1, le=1000)]
+
+
+class SetpointMaterial(Section):
+    """Section `setpoint_material`: what is printed (material.Material)."""
+
+    best_temperature_degC: float = Field(ge=100, le=500)
+    temperature_range_degC: tuple[Degrees, Degrees]
+    good_flow_percent: tuple[Percent, Percent]
+    flow_limits_percent: tuple[Percent, Percent]
+
+    @model_validator(mode="after")
+    def _in_order(self):
+        low, high = self.temperature_range_degC
+        if not low < self.best_temperature_degC < high:
+            raise ValueError(
+                f"has best_temperature_degC {self.best_temperature_degC:g} but temperature_range_degC "
+                f"[{low:g}, {high:g}]; the best lies between the two"
+            )
+        ends = (self.flow_limits_percent[0], *self.good_flow_percent, self.flow_limits_percent[1])
+        if not ends[0] < ends[1] < 100 < ends[2] < ends[3]:
+            raise ValueError(
+                f"has good_flow_percent [{ends[1]:g}, {ends[2]:g}] and flow_limits_percent [{ends[0]:g}, "
+                f"{ends[3]:g}]; 100 lies between the first two, and they between the limits"
+            )
+        return self
+
+    def material(self) -> "PrintedMaterial":
+        from pipeline.setpoint.material import PrintedMaterial
+
+        return PrintedMaterial(**self.model_dump())
+
+
+class Counts(Section):
+    """A number for each of the four parts of the classifier's frames."""
+
+    learned: int = Field(ge=1, le=10_000)
+    held_out: int = Field(ge=1, le=10_000)
+    calibration: int = Field(ge=1, le=10_000)
+    judged: int = Field(ge=1, le=10_000)
+
+
+class Recipe(Section):
+    """How a network of one size is trained."""
+
+    epochs: int = Field(ge=1, le=10_000)
+    cycle_epochs: int = Field(ge=1, le=10_000)
+    warmup_epochs: float = Field(ge=0, le=1000)
+    batch: int = Field(ge=1, le=100_000)
+    learning_rate: float = Field(gt=0, le=1)
+    weight_decay: float = Field(ge=0, le=1)
+    smoothing: float = Field(ge=0, lt=1)
+    averaging: float = Field(ge=0, lt=1)
+    patience: int = Field(ge=1, le=10_000)
+
+
+class RecordedTopics(Section):
+    """Topics of a user's MCAP recordings, as frame_mcap.Topics says."""
+
+    image: str = Field(max_length=300)
+    time: str = Field(max_length=300)
+    mapping: dict[str, Mapped]
+
+
+class Constants(Section):
+    """What a folder's CSV files do not say because it never changed: the nozzle's temperature in degC."""
+
+    hotend: float | None = Field(ge=0, le=600)
+
+
+class TrainClassifier(Section):
+    """Section `train_classifier`."""
+
+    source: Literal["simulated", "recordings"]
+    seed: int = Field(ge=0, le=2**31)
+    size: Literal["small", "paper"]
+    augmentation: Literal["along_bead", "adr"]
+    prints: Counts
+    window: int = Field(ge=1, le=1000)
+    least_score: float = Field(ge=0, le=255)
+    tip_px: tuple[Annotated[float, Field(ge=0, le=100_000)], Annotated[float, Field(ge=0, le=100_000)]] | None
+    constants: Constants
+    topics: RecordedTopics
+    small: Recipe
+    paper: Recipe
+    cnn: Recipe
+    coverage: float = Field(gt=0.5, lt=1)
+    confidence: float = Field(gt=0.5, lt=1)
+    coverage_by_flow: float = Field(gt=0.5, lt=1)
+    false_alarms: float = Field(gt=0, lt=0.5)
+
+
+class RobustFilter(Section):
+    """The section of bayes.CameraErrorModel."""
+
+    accuracies: list[Annotated[float, Field(gt=0.34, lt=1)]] = Field(min_length=1, max_length=20)
+    gains: list[Annotated[float, Field(gt=0, le=10)]] = Field(min_length=1, max_length=20)
+    width_bias_levels: int = Field(ge=1, le=51)
+    width_bias_std: float = Field(gt=0, le=1)
+    floor: float = Field(gt=0, lt=1)
+    smoothing: float = Field(gt=0, le=100)
+    segment_mean_decisions: float = Field(ge=1, le=10_000)
+    mode_switch_probability: float = Field(gt=0, lt=1)
+    window_repeat_probability: float = Field(ge=0, lt=1)
+    hazard: float = Field(ge=0, lt=1)
+    move_cost: float = Field(ge=0, le=10)
+    outside_cost: float = Field(ge=0, le=1000)
+    move_fixed_cost: float = Field(ge=0, le=100)
+    known_start_share: float = Field(ge=0, lt=1)
+    known_start_std: float = Field(gt=0, le=1)
+    border_std: float = Field(ge=0, le=100)
+
+    def hypotheses(self) -> int:
+        return len(self.gains) * (len(self.accuracies) + self.width_bias_levels)
+
+
+class ProportionalSettings(Section):
+    gain: float = Field(gt=0, le=1000)
+    time_constant: float = Field(ge=1, le=1000)
+
+
+class SequentialTestSettings(Section):
+    accuracy: float = Field(gt=0.34, lt=1)
+    threshold: float = Field(gt=0, le=100)
+    cap: float = Field(gt=0, le=100)
+
+
+class ClassFilter(Section):
+    accuracy: float = Field(gt=0.34, lt=1)
+    hazard: float = Field(ge=0, lt=1)
+    move_cost: float = Field(ge=0, le=10)
+    outside_cost: float = Field(ge=0, le=1000)
+    move_fixed_cost: float = Field(ge=0, le=100)
+    known_start_share: float = Field(ge=0, lt=1)
+    known_start_std: float = Field(gt=0, le=1)
+
+
+class Baselines(Section):
+    """Settings of the controllers without learning, tuned on windows and seeds that nothing is judged on."""
+
+    proportional: ProportionalSettings
+    filtered_proportional: ProportionalSettings
+    sequential_test: SequentialTestSettings
+    bayes_exact: ClassFilter
+    bayes_leak: ClassFilter
+    bayes_robust: RobustFilter
+
+
+class Pixels(Section):
+    """The closed loop through rendered frames; none with 0 starts."""
+
+    starts: int = Field(ge=0, le=21)
+    runs: int = Field(ge=1, le=1000)
+    decisions: int = Field(ge=20, le=1000)
+    frame_rate_hz: float = Field(gt=0, le=1000)
+    wait_s: float = Field(ge=0, le=600)
+    idle_wait_s: float = Field(ge=0, le=600)
+    tip_tolerance_px: float = Field(ge=8, le=REACH_PX)
+    per_action: tuple[Annotated[float, Field(gt=0, le=1000)], Annotated[float, Field(gt=0, le=1000)]]
+    per_minute: tuple[Annotated[float, Field(gt=0, le=10_000)], Annotated[float, Field(gt=0, le=10_000)]]
+    segment_mean_s: float = Field(gt=0, le=1e6)
+    least_frames: int = Field(ge=1, le=1000)
+    heater_s: float = Field(gt=0, le=1000)
+    heater_delay_s: float = Field(ge=0, le=1000)
+    melt_s: float = Field(gt=0, le=1000)
+    softening_per_degC: float = Field(ge=0, le=1)
+
+
+class MostHarmed(Section):
+    """Of runs from good starts those that may leave +-25 %, or a controller is no candidate: from 100 %, and
+    from 92.5 to 107.5 % with a camera that is right, stuck or blind for a while."""
+
+    perfect_percent: float = Field(ge=0, le=100)
+    in_band_percent: float = Field(ge=0, le=100)
+
+
+class EvaluateSetpoint(Section):
+    """Section `evaluate_setpoint`. Segments are redrawn `redraws` times a round, in each of which whoever may
+    still become the default runs `runs` times from each of 21 starts, in every case."""
+
+    seed: int = Field(ge=0, le=2**31)
+    runs: int = Field(ge=1, le=10_000)
+    redraws: int = Field(ge=2, le=1000)
+    rounds: int = Field(ge=1, le=100)
+    most_harmed: MostHarmed
+    segment_mean_decisions: float = Field(ge=1, le=10_000)
+    baselines: Baselines
+    pixels: Pixels

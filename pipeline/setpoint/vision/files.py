@@ -1,0 +1,105 @@
+"""What train_classifier leaves: the classifier with its calibration, to two files and back."""
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from pipeline.setpoint.vision import calibration
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
+from pipeline.setpoint.vision.calibration import ClassifierCalibration
+from pipeline.setpoint.vision.classifier import TrainState
+from pipeline.setpoint.vision.vision_transformer import (
+    PAPER,
+    SMALL,
+    from_named_arrays,
+    named_arrays,
+    vision_transformer,
+)
+from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
+from pipeline.store import artifacts
+from pipeline.store.artifacts import read_weights, write_weights
+
+SIZES = {"small": SMALL, "paper": PAPER}
+CLASSIFIER_SCHEMA, CALIBRATION = "classifier 2", ("classifier_calibration", 2)
+
+
+def store_classifier(folder: Path, size: str, model: CalibratedClassifier) -> None:
+    """weights.safetensors, and calibration.parquet with all that was fitted after training."""
+    write_weights(
+        folder / "weights.safetensors", CLASSIFIER_SCHEMA, named_arrays(model.network), {"size": size}
+    )
+    fitted = model.calibration
+    numbers = {
+        "temperature": (np.array(fitted.temperature), "1", "logits of single images are divided by it"),
+        "correlation": (
+            np.array(fitted.correlation),
+            "1",
+            "of a window's frames; summed logarithms are divided by 1 + (m - 1) times it",
+        ),
+        "level": (np.array(fitted.level), "1", "classes of at least this share are in the conformal set"),
+        "foreign_above": (
+            np.array(fitted.foreign_above),
+            "1",
+            "squared Mahalanobis distance above which a frame is foreign",
+        ),
+        "means": (fitted.familiar.means, "1", "mean features of the three classes"),
+        "whitening": (fitted.familiar.whitening, "1", "inverse Cholesky factor of their covariance"),
+        "flow_shown": (
+            fitted.flow.shown,
+            "1",
+            "log(flow / 100 %) that frames show on average at the flows of calibration.KNOTS_PERCENT",
+        ),
+        "flow_scale": (fitted.flow.scale, "1", "deviations of frames are multiplied by it there"),
+        "flow_correlation": (np.array(fitted.flow.correlation), "1", "of the errors of a window's frames"),
+    }
+    artifacts.write_arrays(folder / "calibration.parquet", *CALIBRATION, numbers)
+
+
+def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedClassifier:
+    """What `store_classifier` wrote."""
+    arrays, about = read_weights(weights_path, CLASSIFIER_SCHEMA)
+    if about.get("size") not in SIZES:
+        raise ValueError(
+            f"{weights_path} should say its size, {' or '.join(SIZES)}, but says {about.get('size')}; "
+            f"{artifacts.remedy(weights_path)}"
+        )
+    with artifacts.about(weights_path):
+        network = from_named_arrays(
+            vision_transformer(SIZES[about["size"]], np.random.default_rng(0)), arrays
+        )
+    knots = (len(KNOTS_PERCENT),)
+    fitted = artifacts.read_arrays(
+        calibration_path, *CALIBRATION, shapes={"flow_shown": knots, "flow_scale": knots}
+    )
+    numbers = (float(fitted[name]) for name in ("temperature", "correlation", "level"))
+    return CalibratedClassifier(
+        network,
+        ClassifierCalibration(
+            *numbers,
+            calibration.Familiar(fitted["means"], fitted["whitening"]),
+            float(fitted["foreign_above"]),
+            FlowCalibration(fitted["flow_shown"], fitted["flow_scale"], float(fitted["flow_correlation"])),
+        ),
+    )
+
+
+def train_from_checkpoint(train: Callable, state: TrainState, name: str, checkpoint: Path) -> TrainState:
+    """train(state, on_step=...) from the checkpoint, if there is one; it is written after each epoch."""
+    with contextlib.suppress(ValueError):  # there is none yet, or it is damaged: from the beginning
+        state = from_named_arrays(state, read_weights(checkpoint, CLASSIFIER_SCHEMA)[0])
+    words = f"train_classifier: {name}"
+    with tqdm(
+        total=len(state.history), initial=int(state.epoch), desc=words, unit="epoch", mininterval=2
+    ) as bar:
+
+        def on_step(state: TrainState) -> None:
+            epoch = int(state.epoch)
+            arrays = named_arrays(state)
+            write_weights(checkpoint, CLASSIFIER_SCHEMA, arrays, {"epoch": str(epoch)})
+            bar.set_postfix(held_out=f"{float(state.history[epoch - 1, 2]):.3f}", refresh=False)
+            bar.update()
+
+        return train(state, on_step=on_step)
