@@ -29,7 +29,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "reading": {"store", "statistics"},
     "methods": {"constants", "statistics"},
     "plain": {"own", "constants", "store", "statistics", "verdict"},
-    "constants": {"own", "store", "statistics"},
+    "constants": {"own", "plain", "files", "store", "statistics"},
     "files": {"own", "plain", "constants", "store", "statistics", "reading"},
     "verdict": {"plain", "constants", "store", "statistics"},
     "runtime": {"verdict", "methods", "plain", "constants", "store", "statistics"},
@@ -41,7 +41,7 @@ WHOLE = {"stages", "cli", "quick", "commands", "nightly", "around_dvc"}
 ONLY = {
     "report": {"stages", "cli"},
     "commands": {"cli", "quick", "nightly"},
-    "stages": {"papers", "quick", "cli", "commands"},
+    "stages": {"papers", "quick", "cli", "commands", "nightly"},
 }
 ROOMS = {*LOOPS, *MAY_KNOW, *WHOLE, "__init__"} - {"methods", "plain", "constants", "files", "stages"}
 NUMERICS = {"numpy", "scipy", "control", "sklearn", "cv2", "jax", "equinox", "optax", "jaxtyping"}
@@ -451,6 +451,9 @@ def differences(stage: str, entry: dict[str, Any], wanted: dict[str, set[str]]) 
     ]
 
 
+BESIDE = (["settings.py"], ["tables.py"], ["controllers.py"])
+
+
 def coarse(stage: str, deps: Iterable[str]) -> list[str]:
     """Shared rooms that are not named whole, and loops that are, or of which there are too many methods: a
     comment in pipeline/setpoint would cost a quarter of an hour."""
@@ -459,9 +462,7 @@ def coarse(stage: str, deps: Iterable[str]) -> list[str]:
         f"{stage}: name {'/'.join(part[:2])} whole" for part in parts if part[1] in SHARED and part[2:]
     ]
     for loop in LOOPS:
-        methods = [
-            part for part in parts if part[1] == loop and part[2:] not in (["settings.py"], ["tables.py"])
-        ]
+        methods = [part for part in parts if part[1] == loop and part[2:] not in BESIDE]
         if ["pipeline", loop] in methods or len(methods) > MOST_METHODS:
             sentences.append(f"{stage}: name at most {MOST_METHODS} files or folders of pipeline/{loop}")
     return sentences

@@ -11,15 +11,8 @@ from tests import house
 from tests.house import ROOT
 
 PIPELINE, SECOND = (yaml.safe_load((ROOT / file).read_text()) for file in ("dvc.yaml", house.PAPERS))
-# until the rooms of the loops are merged
-LATER = pytest.mark.xfail(strict=True, reason="workflow folders still stand in the loops")
-RULES = [
-    *(
-        pytest.param(rule, marks=LATER)
-        for rule in (house.misplaced, house.forbidden_imports, house.forbidden_files)
-    ),
-    *(house.forbidden_randomness, house.unframed),
-]
+RULES = [house.misplaced, house.forbidden_imports, house.forbidden_files]
+RULES += [house.forbidden_randomness, house.unframed]
 
 
 # ---- the house as it stands
@@ -30,7 +23,6 @@ def test_the_house_keeps_the_rule(rule):
     assert rule(ROOT) == []
 
 
-@LATER
 def test_few_class_names_stand_in_two_modules():
     assert len(house.doubles(ROOT)) <= 40, house.doubles(ROOT)
 
