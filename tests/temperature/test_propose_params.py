@@ -126,6 +126,7 @@ def test_limits_that_no_file_tells_are_left_to_a_person_and_asked_for_by_the_sta
     (tree / "rig.csv").write_text("time_s,heater_1_pct,zone_1_C\n" + rows)
     init(monkeypatch, "rig.csv", "--copy")
     assert "low and high of temperature_1: between which °C the machine must stay" in capsys.readouterr().out
+    monkeypatch.delitem(sys.modules, "stages.ingest")
     with pytest.raises(SystemExit):
         runpy.run_module("stages.ingest", run_name="__main__", alter_sys=True)
     asked = capsys.readouterr().err
