@@ -31,7 +31,7 @@ PAGES = (
     *("setpoint", "temperature", "viewer", "words"),
 )
 # the first stages and the pages: what is missing between has its place there
-SHORT = ("probe_machine", "ingest", "report")
+SHORT = ("probe_machine", "ingest", "verdict", "report")
 
 
 def lay_out(folder: Path, stages: tuple[str, ...] = SHORT) -> Path:
