@@ -37,13 +37,30 @@ def test_a_method_that_changes_makes_its_file_old_and_no_other(copy):
     assert made.changed("deposition") == made.changed("temperature") == []
     assert made.sentence("deposition").endswith("the method has not changed since.")
     method = copy / "pipeline/deposition/learning/ilc.py"
-    method.write_text(method.read_text() + "\n# another method\n")
+    method.write_text(method.read_text() + "\nANOTHER = 'method'\n")
     assert made.changed("deposition") == ["pipeline/deposition/learning/ilc.py"]
     assert made.changed("temperature") == []
     assert (
         "the method has changed since: pipeline/deposition/learning/ilc.py. "
         "./run dvc repro datasets/papers/dvc.yaml:deposition makes it anew." in made.sentence("deposition")
     )
+
+
+METHOD = '"""Words."""\nimport numpy as np\n\n\ndef law(x):\n    """More."""\n    return 2 * x\n'
+
+
+@pytest.mark.parametrize(
+    ("source", "same"),
+    [
+        (METHOD.replace("import numpy as np", "from pipeline.deposition import drive"), True),
+        (METHOD.replace("Words", "Other words").replace("    return", "    # why\n    return"), True),
+        (METHOD.replace("2 * x", "3 * x"), False),
+        (METHOD.replace("law(x)", "law(x, y=1)"), False),
+        (METHOD.replace("return 2", "import math\n    return 2"), True),
+    ],
+)
+def test_moved_imports_and_other_words_are_the_same_method(source, same):
+    assert (made.code_digest(source) == made.code_digest(METHOD)) == same
 
 
 def test_a_parameter_is_part_of_what_a_file_was_made_of(copy):
@@ -69,7 +86,7 @@ def test_the_release_check_names_what_is_older_than_its_method(copy):
     command = ["python", ".ci/release.py"]
     assert subprocess.run(command, cwd=copy, capture_output=True).returncode == 0
     method = copy / "pipeline/setpoint/agents/agent.py"
-    method.write_text(method.read_text() + "\n")
+    method.write_text(method.read_text() + "\nANOTHER = 1\n")
     ended = subprocess.run(command, cwd=copy, capture_output=True, text=True)
     assert (
         ended.returncode == 1
