@@ -114,7 +114,8 @@ def measured(metrics: Metrics) -> RunFigures:
         return _of_headline(report)
     camera = section(metrics, "evaluate_setpoint")
     bands = section(report, "figures")
-    names = (section(report, "verdict").get("winner"), heat.get("best"))
+    subject = section(section(report, "verdicts"), "temperature").get("subject")
+    names = (section(report, "verdict").get("winner"), subject, heat.get("best"))
     winner = next((name for name in names if isinstance(name, str) and name in bands), "")
     heated = {str(key): figure(ends) for key, ends in section(bands, winner).items()}
     figures = {
