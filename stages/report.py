@@ -67,6 +67,7 @@ METRICS = (
     "right_70_150_percent",
     "bands",
 )
+VERDICTS = "datasets/verdict"
 # what the papers print, and ours beside it, which the second pipeline makes
 PAPERS = {
     "temperature": ("datasets/papers/temperature.toml", "datasets/papers/temperature.json"),
@@ -126,7 +127,9 @@ def main() -> None:
 
     with artifacts.stage("report"):
         declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
-        sources = collect(declared, FIGURES, FOLDERS, "reports/accepted.json", ("pipeline", "stages"))
+        sources = collect(
+            declared, FIGURES, FOLDERS, "reports/accepted.json", ("pipeline", "stages"), VERDICTS
+        )
         judged = judgement(sources)
         told = {
             "verdict": judged.verdict.metrics(),

@@ -1,5 +1,6 @@
 """Figures, a few tables, certificates and the rules -> datasets/verdict: temperature.json, deposition.json,
-setpoint.json, and identification.json on the model of the temperature loop.
+setpoint.json, identification.json on the model of the temperature loop, and certificates.json, which says
+which certificates pass.
 
 A verdict says who should run, the first rule that failed or is undecided, and what to do (pipeline/verdict,
 rules.toml). Pages, export, README and the nightly job read it. A loop that is switched off has none.
@@ -17,13 +18,14 @@ CERTIFIED = "datasets/certify/certified.json"
 def main() -> None:
     from pipeline.verdict import loops
     from pipeline.verdict.files import read_evidence
-    from pipeline.verdict.verdict import write
+    from pipeline.verdict.verdict import CERTIFICATES, write
 
     with artifacts.stage("verdict") as out:
         evidence = read_evidence()
         evidence = evidence._replace(certified=certificates(evidence.rules))
         verdicts = loops.verdicts(evidence)
         write(loops.with_model(evidence, verdicts), out)
+        artifacts.write_json(out / CERTIFICATES, evidence.certified)
         figures = {loop: verdict.metrics() for loop, verdict in verdicts.items()}
         artifacts.write_metrics("verdict", figures, METRICS)
 

@@ -275,8 +275,8 @@ def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[Design, cas
 
 def _tuned(path: Path, name: str, machine: Machine) -> tuple[dict[str, float], dict[str, Any]]:
     """The tuned parameters of a controller, and what they were tuned for. A champion's file may be of another
-    version, which wrote other keys beside them. Raises ValueError for a file without these parameters, and for
-    one of another machine."""
+    version, which wrote other keys beside them. Raises ValueError for a file without these parameters, and
+    for one of another machine."""
     stored = artifacts.read_json(path)
     tuned = stored.get("contestants")
     if not tuned:

@@ -15,7 +15,6 @@ from pipeline.verdict import night as verdict_night
 from pipeline.verdict import verdict
 from pipeline.verdict.files import read_evidence
 from pipeline.verdict.verdict import Verdict
-from stages.verdict import certificates
 
 STORED = "datasets/verdict"
 REPORT = "datasets/report/figures.json"
@@ -28,8 +27,7 @@ def read_verdicts(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], 
     loops = [name for name, loop in settings.loops.items() if loop.judge != "cases"]
     if not loops:
         return {}, night
-    evidence = read_evidence()
-    evidence = evidence._replace(certified=certificates(evidence.rules))
+    evidence = read_evidence(verdict.read_certificates(STORED))
     stored, tonight, named = verdict.read(STORED), _read_json(METRICS), settings.holdout.controller
     by_loop = verdict_night.verdicts(evidence, stored, tonight)
     night = _make_pages_agree(by_loop, night)

@@ -237,6 +237,7 @@ WRITTEN = ("state", "decision", "lead", "reason", "remedy", "rule", "winner", "s
 # ---- the files of the stage `verdict`
 
 LOOPS = ("temperature", "deposition", "setpoint")
+CERTIFICATES = "certificates.json"
 
 
 def write(verdicts: Mapping[str, Verdict], folder: str | Path) -> None:
@@ -255,6 +256,13 @@ def read(folder: str | Path, names: Sequence[str] = LOOPS) -> dict[str, Verdict]
     return {
         loop: _decode(artifacts.read_json(path)) for loop, path in files.items() if artifacts.exists(path)
     }
+
+
+def read_certificates(folder: str | Path) -> dict[str, dict[str, dict[str, Any]]]:
+    """{loop: {controller: {"passed", "why"}}} by the limits of the run, which the stage wrote beside the
+    verdicts; {} if it has not run."""
+    path = Path(folder) / CERTIFICATES
+    return artifacts.read_json(path) if artifacts.exists(path) else {}
 
 
 def _encode(rule: Rule) -> dict[str, Any]:

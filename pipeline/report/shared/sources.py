@@ -26,8 +26,10 @@ from pipeline.temperature.settings import Plant
 from pipeline.verdict import night
 from pipeline.verdict.evidence import OFF, Evidence, Table, switched_off
 from pipeline.verdict.settings import QUICK_LOOK, ReportRules
-from pipeline.verdict.verdict import LOOPS, Missing, Verdict
+from pipeline.verdict.verdict import LOOPS, Missing, Verdict, read_certificates
 from pipeline.verdict.verdict import read as read_verdicts
+
+VERDICTS = "datasets/verdict"
 
 
 class Declared(NamedTuple):
@@ -56,7 +58,8 @@ class SourceFile(NamedTuple):
 class Sources(NamedTuple):
     """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what
     was; `absent`: what was not, by path; `accepted`: the accepted run, or None; `nightly`: what the last
-    night measured, None before the first; `quick`: the run is a quick look; `stored`: its verdicts.
+    night measured, None before the first; `quick`: the run is a quick look; `stored`: its verdicts;
+    `certified`: which certificates pass.
     """
 
     declared: Declared
@@ -69,13 +72,20 @@ class Sources(NamedTuple):
     nightly: dict | Missing | None = None
     quick: bool = False
     stored: Mapping[str, Verdict] = {}
+    certified: Mapping[str, Any] = {}
 
     @property
     def evidence(self) -> Evidence:
         """What the figures of a verdict are found in."""
         declared = self.declared
         return Evidence(
-            self.metrics, self.tables, declared.machine, declared.rules, declared.everything, self.quick
+            self.metrics,
+            self.tables,
+            declared.machine,
+            declared.rules,
+            declared.everything,
+            self.quick,
+            self.certified,
         )
 
     @property
@@ -138,6 +148,7 @@ def collect(
     folders: Mapping[str, str],
     accepted: str,
     code: tuple[str, ...],
+    verdicts: str = VERDICTS,
 ) -> Sources:
     """Reads the files of figures and the folders of stages, {stage: path} each. What is missing or broken is
     no error here: its place on the page says so."""
@@ -180,10 +191,10 @@ def collect(
     )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
     read = linked(read)
-    stored = read_verdicts("datasets/verdict", (*LOOPS, "identification"))
+    stored = read_verdicts(verdicts, (*LOOPS, "identification"))
     return Sources(
         declared, figures, tables, read, absent, before, folders_of_code, night,
-        quick=artifacts.exists(QUICK_LOOK), stored=stored,
+        quick=artifacts.exists(QUICK_LOOK), stored=stored, certified=read_certificates(verdicts),
     )  # fmt: skip
 
 
