@@ -136,12 +136,13 @@ def quick(arguments: argparse.Namespace) -> None:
 
 
 def init(arguments: argparse.Namespace) -> None:
-    """Recordings of a new machine into params.yaml: mapping, plant, panel and
-    rules that fit its pace; and what a person must still decide."""
+    """Recordings of a new machine into params.yaml: mapping, plant, panel and rules that fit its pace, the
+    loops that they serve; and what a person must still decide."""
     from pipeline.commands import propose_params
 
     initialised = propose_params.proposed(arguments.recordings, sample_time=arguments.time)
-    changed = propose_params.write(initialised.values, force=arguments.force)
+    values = propose_params.loops_to_run(["temperature"]) | initialised.values
+    changed = propose_params.write(values, force=arguments.force)
     if arguments.copy:
         propose_params.copy(arguments.recordings)
     print(propose_params.summary(initialised, changed, arguments.recordings, arguments.copy))

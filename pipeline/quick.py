@@ -16,7 +16,7 @@ from ruamel.yaml import YAML
 
 import stages
 from pipeline.store import artifacts, params, params_text
-from pipeline.verdict.files import QUICK_LOOK
+from pipeline.verdict.settings import QUICK_LOOK
 
 SIZES, FOLDER = Path("params.quick.yaml"), Path("quick")
 # the sections whose sizes a quick look may set; what a machine is and what is good enough stay as they are

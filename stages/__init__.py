@@ -108,7 +108,7 @@ def _digest(path: str | Path) -> int:
     modules = sorted({module.partition(":")[0] for module in SECTIONS.values()})
     code = [Path(__file__), *(ROOT / f"{module.replace('.', '/')}.py" for module in modules)]
     files = [Path(path), Path(path).with_name("params.expert.yaml"), *code]
-    return zlib.crc32(b"\0".join(file.read_bytes() for file in files))
+    return zlib.crc32(b"\0".join(file.read_bytes() if file.is_file() else b"" for file in files))
 
 
 def model(section: str) -> Any:

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 RECORD = "datasets/ingest/record.parquet"
 FALLBACK = "pi_simc"  # the safe mode "pi"; if the machine allows none, the inputs are held
-# stands in the exported files for the SHA-256 of the certificate, which depends on the limits
-PLACE = "@certificate@"
 NO_FEED_FORWARD = (
     "The machine declares disturbances ({names}), which an exported controller cannot read yet: none is "
     "certified. Remove plant.disturbances to certify controllers that do without them."
@@ -176,9 +174,9 @@ def certify_controller(
         honest = support_logs.honest_logs(made, half, setting.limits)
         recorded = support_logs.recorded_logs(common.record)
         within = support.support(common.plants, honest, setting.rehearsal.noise, recorded)
-        sources = c.code(made, PLACE) | {"golden.csv": vectors.golden(made)}
+        sources = c.code(made, certified.PLACE) | {"golden.csv": vectors.golden(made)}
         checks.check_compiled(made, sources)
-        code = python.code(made, PLACE)
+        code = python.code(made, certified.PLACE)
         differences = {"judged": difference, "python": checks.python_difference(made, code)}
     except ValueError as reason:
         return name, _not_measured(str(reason))

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from pipeline.setpoint.evaluation.pixel_rollouts import PixelRollouts
     from pipeline.setpoint.simulation.recorded import WindowTable
 
-CLASSIFIER, AGENTS = "datasets/train_classifier", "datasets/train_agent/weights.safetensors"
+WEIGHTS = "datasets/train_classifier/weights.safetensors"
+CALIBRATION = "datasets/train_classifier/calibration.parquet"
+AGENTS = "datasets/train_agent/weights.safetensors"
 # figures of control that git keeps and that runs are compared by
 METRICS = (
     "default",
@@ -47,13 +49,13 @@ def main() -> None:
         from pipeline.setpoint.simulation.recorded import window_tables
         from pipeline.setpoint.vision.files import restore_classifier
 
-        model = restore_classifier(f"{CLASSIFIER}/weights.safetensors", f"{CLASSIFIER}/calibration.parquet")
-        table = artifacts.read_table(f"{CLASSIFIER}/windows.parquet", WINDOWS)
+        model = restore_classifier(WEIGHTS, CALIBRATION)
+        table = artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS)
         windows = window_tables(table, WINDOW_PARTS)
         controllers = build_controllers(settings.baselines, restore_agents(AGENTS), windows["learn"])
         room = judging.room([windows["choose"], windows["judge"]])  # one program for both
         choice = choose_default(controllers, windows["choose"], settings, room=room)
-        camera = restore_camera(f"{CLASSIFIER}/known_camera.parquet")
+        camera = restore_camera("datasets/train_classifier/known_camera.parquet")
         with ThreadPoolExecutor(1) as beside:
             running = beside.submit(
                 simulate_pixels, controllers, choice.name, settings, pixel_loop(model, settings, view, camera)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import stages
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import TemperatureRules
-from stages.certify import NOT_ASKED, PLACE
+from stages.certify import NOT_ASKED
 
 if TYPE_CHECKING:
     from pipeline.runtime.certificate import Certificate
@@ -139,11 +139,12 @@ def summarise(decided: "Certificate") -> dict[str, Any]:
 
 def copy(source: Path, folder: Path, certificate_sha256: str) -> None:
     """The prepared files, with the SHA-256 in its marked places."""
+    from pipeline.runtime.certified import fill
+
     for path in files_below(source):
         name = path.relative_to(source).as_posix()
         if name in MARKED:
-            text = path.read_text(encoding="utf-8").replace(PLACE, certificate_sha256)
-            artifacts.write_text(folder / name, text)
+            artifacts.write_text(folder / name, fill(path, certificate_sha256))
         elif name != "measured.json":
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, folder / name)

@@ -46,10 +46,10 @@ def main() -> None:
         settings, machine = params.load(Ingest, "ingest"), params.load(Plant, "plant")
         source = params.value("generate_probing.source", one_of=("simulated", "recordings"))
         check_output_limits(machine, source)
-        # what probe_machine wrote has our own names
-        folder, mapping = Path("datasets/probe_machine"), {}
+        # what probe_machine wrote has our own names, and lies beside its figures
+        folder, mapping, ignored = Path("datasets/probe_machine"), {}, ["figures.json"]
         if source == "recordings":
-            folder, mapping = Path("datasets/raw/temperature"), settings.mapping
+            folder, mapping, ignored = Path("datasets/raw/temperature"), settings.mapping, []
         wish = recording_wish(settings, machine, mapping)
         results = recording_folders.read_folder(
             folder,
@@ -57,6 +57,7 @@ def main() -> None:
             params.load(Execution, "execution"),
             memo=Path("datasets/memo/ingest"),
             budget=Budget(settings.longest_s, settings.largest_mb),
+            ignored=ignored,
         )
         strict = settings.strict or "--strict" in sys.argv
         record, quality, figures = recording_folders.join(results, wish, strict=strict)

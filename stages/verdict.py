@@ -42,7 +42,9 @@ def certificates(rules: Any) -> dict[str, dict[str, dict[str, Any]]]:
     )
     setpoint = artifacts.read_json(CERTIFIED).get("setpoint", {})
     refused = (
-        {setpoint["controller"]: {"passed": False, "why": setpoint["why"]}} if setpoint.get("why") else {}
+        {setpoint["controller"]: {"passed": False, "why": setpoint["why"]}}
+        if setpoint.get("controller") and not setpoint.get("measured", True)
+        else {}
     )
     return {"temperature": temperature, "setpoint": refused}
 

@@ -14,38 +14,36 @@ from pipeline.store import params
 
 ROOT = Path(__file__).resolve().parents[1]
 LOOPS = ("temperature", "deposition", "setpoint")
-# what other rooms may read of a loop, of runtime and of nightly: settings, schemas, tables of controllers
-PLAIN = {
-    "settings",
-    "tables",
-    "controllers",
-    "controllers/table",
-    "agents/criteria",
-    "published",
-    "records",
-    "made",
-}
+# what other rooms may read: of a loop constants and its table of controllers, which its methods may read too;
+# of a loop and of other rooms settings, schemas and records
+CONSTANTS = {"controllers", "controllers/table", "agents/criteria", "published"}
+PLAIN = {"settings", "tables", "records", "made"}
+# of a loop, what saves and loads networks, frames and recordings
+FILES = {"files", "recordings"}
+# methods that pose the temperature loop's cases, from its settings
+POSE = {f"pipeline/temperature/test_set/{name}.py" for name in ("cases", "controller_search", "evaluation")}
 # room -> rooms that it may know beside itself; own: the methods of its loop, files: what saves networks
 MAY_KNOW: dict[str, set[str]] = {
     "statistics": set(),
     "store": set(),
     "reading": {"store", "statistics"},
-    "methods": {"statistics"},
-    "plain": {"own", "store", "statistics", "verdict"},
-    "files": {"own", "store", "statistics"},
-    "verdict": {"plain", "store", "statistics"},
-    "runtime": {"verdict", "methods", "plain", "store", "statistics"},
-    "report": {"verdict", "plain", "store", "statistics"},
-    "papers": {"methods", "plain", "files", "store", "statistics", "stages"},
+    "methods": {"constants", "statistics"},
+    "plain": {"own", "constants", "store", "statistics", "verdict"},
+    "constants": {"own", "plain", "files", "store", "statistics"},
+    "files": {"own", "plain", "constants", "store", "statistics", "reading"},
+    "verdict": {"plain", "constants", "store", "statistics"},
+    "runtime": {"verdict", "methods", "plain", "constants", "store", "statistics"},
+    "report": {"verdict", "plain", "constants", "store", "statistics"},
+    "papers": {"methods", "plain", "constants", "files", "store", "statistics", "stages"},
 }
 # who may know every room; room -> who alone may know it
 WHOLE = {"stages", "cli", "quick", "commands", "nightly", "around_dvc"}
 ONLY = {
     "report": {"stages", "cli"},
     "commands": {"cli", "quick", "nightly"},
-    "stages": {"papers", "quick", "cli", "commands"},
+    "stages": {"papers", "quick", "cli", "commands", "nightly"},
 }
-ROOMS = {*LOOPS, *MAY_KNOW, *WHOLE, "__init__"} - {"methods", "plain", "files", "stages"}
+ROOMS = {*LOOPS, *MAY_KNOW, *WHOLE, "__init__"} - {"methods", "plain", "constants", "files", "stages"}
 NUMERICS = {"numpy", "scipy", "control", "sklearn", "cv2", "jax", "equinox", "optax", "jaxtyping"}
 NUMERICS |= {"__future__", "abc", "bisect", "collections", "dataclasses", "enum", "fractions", "functools"}
 NUMERICS |= {
@@ -77,6 +75,7 @@ EDGE = {"artifacts", "params", "recordings"}
 FRAME = "stages/__init__.py"
 # the frame of a stage and around_dvc import the standard library alone; params_text dumps to a text
 WRITERS = {"pipeline/store/artifacts.py", "pipeline/store/params_text.py", "pipeline/around_dvc.py", FRAME}
+WRITERS |= {"pipeline/runtime/checks.py"}  # into a temporary folder that is compiled
 # MT19937: R's generator, with which the script of a paper draws
 GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64", "MT19937"}
 # the one file of metrics, with a column a value; the figures of other stages are outs
@@ -98,13 +97,14 @@ class File(NamedTuple):
 
     @property
     def room(self) -> str:
-        """stages, store, ..., cli; of a loop `temperature`, `temperature/plain`, `temperature/files`."""
-        parts = self.name.removesuffix(".py").split("/")
-        if parts[0] != "pipeline" or len(parts) < 2:
-            return parts[0]
-        plain = parts[1] in (*LOOPS, "runtime", "nightly", "papers") and "/".join(parts[2:]) in PLAIN
-        files = parts[1] in LOOPS and parts[-1] == "files"
-        return parts[1] + ("/plain" if plain else "/files" if files else "")
+        """stages, store, ..., cli; of a loop `temperature`, `temperature/plain`, .../constants, .../files."""
+        top, room, *rest = [*self.name.removesuffix(".py").split("/"), "", ""]
+        if top != "pipeline" or not room:
+            return top
+        path, loop = "/".join(rest).rstrip("/"), room in LOOPS
+        kinds = {"constants": loop and path in CONSTANTS, "files": loop and path.rpartition("/")[2] in FILES}
+        kinds["plain"] = room in (*LOOPS, "runtime", "nightly", "papers") and path in PLAIN
+        return next((f"{room}/{kind}" for kind, holds in kinds.items() if holds), room)
 
 
 def parsed(path: Path) -> ast.Module:
@@ -158,12 +158,12 @@ def may_know(room: str, target: str) -> bool:
     (own, _, kind), (other, _, part) = room.partition("/"), target.partition("/")
     if target in ONLY and room != target:
         return room in ONLY[target]
-    if room == target or room in WHOLE:
+    if room == target or room in WHOLE or (own == other and own not in LOOPS):
         return True
-    allowed = MAY_KNOW[kind or ("methods" if own in LOOPS else own)]
-    if own == other:  # methods do not know settings, tables and files of their loop
-        return "own" in allowed or own not in LOOPS
-    return (part or ("methods" if other in LOOPS else other)) in allowed
+    allowed, wanted = MAY_KNOW[kind or ("methods" if own in LOOPS else own)], part or other
+    if own in LOOPS and other in LOOPS:  # loops never meet
+        return own == other and (part or "own") in allowed
+    return ("methods" if wanted in LOOPS else wanted) in allowed
 
 
 def forbidden_imports(root: Path) -> list[str]:
@@ -175,7 +175,8 @@ def forbidden_imports(root: Path) -> list[str]:
             reasons = {
                 "write the whole name": name.startswith("."),
                 "nothing imports a test or a benchmark": library in ("tests", "benchmarks"),
-                f"{file.room} must not know {room}": room and not may_know(file.room, room),
+                f"{file.room} must not know {room}": room
+                and not (may_know(file.room, room) or (file.name in POSE and room == "temperature/plain")),
                 f"{file.room} knows arrays, nothing of files, clocks, processes or figures": not target
                 and file.room in (*LOOPS, "statistics")
                 and library not in NUMERICS,
@@ -450,6 +451,9 @@ def differences(stage: str, entry: dict[str, Any], wanted: dict[str, set[str]]) 
     ]
 
 
+BESIDE = (["settings.py"], ["tables.py"], ["controllers.py"])
+
+
 def coarse(stage: str, deps: Iterable[str]) -> list[str]:
     """Shared rooms that are not named whole, and loops that are, or of which there are too many methods: a
     comment in pipeline/setpoint would cost a quarter of an hour."""
@@ -458,11 +462,7 @@ def coarse(stage: str, deps: Iterable[str]) -> list[str]:
         f"{stage}: name {'/'.join(part[:2])} whole" for part in parts if part[1] in SHARED and part[2:]
     ]
     for loop in LOOPS:
-        methods = [
-            part
-            for part in parts
-            if part[1] == loop and part[2:] not in (["settings.py"], ["tables.py"], ["workflow"])
-        ]
+        methods = [part for part in parts if part[1] == loop and part[2:] not in BESIDE]
         if ["pipeline", loop] in methods or len(methods) > MOST_METHODS:
             sentences.append(f"{stage}: name at most {MOST_METHODS} files or folders of pipeline/{loop}")
     return sentences

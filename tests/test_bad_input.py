@@ -57,8 +57,9 @@ def run(tree: Path, stage: str, monkeypatch) -> int:
     with monkeypatch.context() as inside:
         inside.chdir(tree)
         inside.setattr(sys, "argv", [stage])
+        inside.delitem(sys.modules, f"stages.{stage}", raising=False)
         try:
-            runpy.run_module(f"stages.{stage}", run_name="__main__")
+            runpy.run_module(f"stages.{stage}", run_name="__main__", alter_sys=True)
         except SystemExit as ended:
             return ended.code
     return 0

@@ -15,13 +15,13 @@ import yaml
 
 from pipeline import quick
 from pipeline.report.shared.headline import Loop, decision
-from pipeline.report.shared.sources import QUICK_LOOK
 from pipeline.setpoint.agents.files import restore_agents
 from pipeline.setpoint.frames.files import CAMERA_FILE, restore_camera
 from pipeline.setpoint.simulation.recorded import window_tables
 from pipeline.setpoint.tables import WINDOW_PARTS, WINDOWS
 from pipeline.setpoint.vision.files import restore_classifier
 from pipeline.store import artifacts, params
+from pipeline.verdict.settings import QUICK_LOOK
 from pipeline.verdict.verdict import words_for
 
 ALL_ON = dict.fromkeys(params.Loops.model_fields, True)
@@ -31,7 +31,7 @@ PAGES = (
     *("setpoint", "temperature", "viewer", "words"),
 )
 # the first stages and the pages: what is missing between has its place there
-SHORT = ("probe_machine", "ingest", "report")
+SHORT = ("probe_machine", "ingest", "verdict", "report")
 
 
 def lay_out(folder: Path, stages: tuple[str, ...] = SHORT) -> Path:

@@ -25,6 +25,9 @@ from pipeline.temperature.test_set.time_scale import time_constant
 RAW = Path("datasets/raw/temperature")
 # what the files hold before anybody has touched them: the study's machine
 SHIPPED: dict[str, Any] = {
+    "loops.temperature": True,
+    "loops.deposition": True,
+    "loops.setpoint": True,
     "plant.sample_time_s": 1.0,
     "plant.inputs": [
         {"name": name, "unit": "percent", "low": 0, "high": 100}
@@ -177,6 +180,24 @@ def _values(proposal: Proposal, scale: MachinePace) -> dict[str, list[str]]:
     }
 
 
+def loops_to_run(recorded: Sequence[str], path: str | Path = params.FILE) -> dict[str, list[str]]:
+    """The lines of section `loops`: on for each loop that has recordings: these, those that section
+    train_ilc or train_classifier names as its source, and those below datasets/raw. Once the temperature
+    loop has recordings the switches are the owner's, and stay."""
+    sections = params.read(path)
+    if sections["generate_probing"]["source"] == "recordings":
+        return {}
+    sources = {"deposition": "train_ilc", "setpoint": "train_classifier"}
+    lines = {}
+    for loop in params.Loops.model_fields:
+        source = (sections.get(sources.get(loop, "")) or {}).get("source")
+        files = (file for file in (RAW.parent / loop).rglob("*") if file.is_file())
+        has_files = any(file.name != "README.md" and not file.name.startswith(".") for file in files)
+        runs = loop in recorded or source == "recordings" or has_files
+        lines[f"loops.{loop}"] = ["true" if runs else "false"]
+    return lines
+
+
 def _next_experiment(scale: MachinePace) -> dict[str, list[str]]:
     """A random binary sequence at the machine's pace, no wider than the inputs moved; its centre is left to
     the identified model.
@@ -308,6 +329,9 @@ def copy(paths: Sequence[Path], folder: Path = RAW) -> list[Path]:
 def summary(initialised: Initialised, changed: Sequence[str], paths: Sequence[Path], copied: bool) -> str:
     """What was written, and what is left to a person."""
     lines = [f"written: {', '.join(changed)}" if changed else "nothing to change: the files say so already"]
+    off = [loop for loop, on in params.load(params.Loops, "loops").model_dump().items() if not on]
+    if off:
+        lines.append(f"off: {' and '.join(off)}, without recordings; loops in params.yaml switches a loop on")
     lines += ["to decide:", *(f"  {question}" for question in initialised.open_questions)]
     if not copied and any(RAW.resolve() not in path.resolve().parents for path in paths):
         lines.append(f"  put the recordings into {RAW} (or give --copy)")

@@ -21,7 +21,6 @@ from pipeline.temperature.controllers.problem import Design
 from pipeline.temperature.settings import Panel, Tracking, TuneWeights
 from pipeline.temperature.settings import Plant as Machine
 from pipeline.temperature.test_set import cases, evaluation, panel
-from stages.evaluate_temperature import read_weights
 from stages.ingest import Ingest, recording_wish
 from stages.tune_weights import read_models
 
@@ -262,26 +261,43 @@ def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[Design, cas
     setting = cases.conditions(
         frozen.tuning, machine, tracking, frozen.settings, frozen.rehearsal, models["family"]
     )
-    path = folder / "tune_weights/weights.json"
-    stored = read_weights(path)
-    contestant = table.BY_NAME[name]
-    tuned = stored.contestants[name].model_dump() if name in stored.contestants else {}
-    values = {one.name: tuned.get(one.name) for one in contestant.parameters}
-    if lacking := [key for key, value in values.items() if value is None]:
-        raise ValueError(
-            f"{path}: expected {', '.join(lacking)} of {name}, found none; let tune_weights tune it, or name "
-            f"one of {', '.join(stored.contestants)} in "
-            "nightly.holdout.controller"
-        )
+    values, tuned_for = _tuned(folder / "tune_weights/weights.json", name, machine)
     # what it was tuned for, not what it is judged by
     problem = cases.design_problem(models, tracking, setting, None)._replace(
-        horizon=int(stored.design.get("horizon_steps", frozen.settings.steps)),
-        noise=np.array(stored.design.get("noise_degC", frozen.rehearsal.noise), float),
+        horizon=int(tuned_for.get("horizon_steps", frozen.settings.steps)),
+        noise=np.array(tuned_for.get("noise_degC", frozen.rehearsal.noise), float),
     )
-    design = contestant.design(problem, values)
+    design = table.BY_NAME[name].design(problem, values)
     if design is None:
         raise ValueError(f"{folder}: expected what {name} is designed from, found that its record has none")
     return design, setting
+
+
+def _tuned(path: Path, name: str, machine: Machine) -> tuple[dict[str, float], dict[str, Any]]:
+    """The tuned parameters of a controller, and what they were tuned for. A champion's file may be of another
+    version, which wrote other keys beside them. Raises ValueError for a file without these parameters, and for
+    one of another machine."""
+    stored = artifacts.read_json(path)
+    tuned = stored.get("contestants")
+    if not tuned:
+        raise ValueError(
+            f"{path}: expected contestants with their tuned parameters, found {', '.join(stored) or 'none'}, "
+            f"as in a file of an older version; {artifacts.remedy(path)}"
+        )
+    own = tuned.get(name, {})
+    for key, signals, what in (("q", machine.outputs, "outputs"), ("r", machine.inputs, "inputs")):
+        if len(own.get(key, signals)) != len(signals):
+            raise ValueError(
+                f"{path}: contestants.{name}.{key} has {len(own[key])} weights but the machine in "
+                f"params.yaml has {len(signals)} {what}; {artifacts.remedy(path)}"
+            )
+    values = {one.name: own.get(one.name) for one in table.BY_NAME[name].parameters}
+    if lacking := [key for key, value in values.items() if not (value and 0 < value < np.inf)]:
+        raise ValueError(
+            f"{path}: expected {', '.join(lacking)} of {name}, found none; let tune_weights tune it, or name "
+            f"one of {', '.join(tuned)} in nightly.holdout.controller"
+        )
+    return values, stored.get("design", {})
 
 
 def _models(folder: Path, name: str, machine: Machine) -> dict[str, Any]:

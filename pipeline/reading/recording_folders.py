@@ -59,10 +59,17 @@ class RecordingTable(NamedTuple):
 
 
 def read_folder(
-    folder: Path, wish: RecordingWish, execution: Execution, *, memo: Path, budget: Budget
+    folder: Path,
+    wish: RecordingWish,
+    execution: Execution,
+    *,
+    memo: Path,
+    budget: Budget,
+    ignored: Collection[str] = (),
 ) -> list[RecordingTable]:
-    """Every recording below `folder`, in the order of names, on as many workers as `execution` says. A
-    recording that needs more than its budget is quarantined. Raises ValueError if there is none."""
+    """Every recording below `folder` but files named `ignored`, in the order of names, on as many workers as
+    `execution` says. A recording that needs more than its budget is quarantined. Raises ValueError if there
+    is none."""
     check_plain_files(folder)
     bags = {path.parent for path in folder.rglob("metadata.yaml") if is_bag(path.parent)} - {folder}
     files = sorted(
@@ -71,6 +78,7 @@ def read_folder(
         if (path in bags or (path.is_file() and not bags & set(path.parents)))
         and not path.name.startswith(".")
         and path.suffix.lower() not in {".md", ".yaml", ".dvc"}
+        and path.name not in ignored
         and path.name.lower() not in {"readme.txt", "license.txt", "source.txt", "notes.txt"}
     )
     files = excluded.readable(files, folder)

@@ -15,6 +15,8 @@ from pipeline.runtime.certificate import RULES, Certificate, RuleResult, at_leas
 from pipeline.store import artifacts
 
 MEASURED, CERTIFIED = "measured.json", "certified.json"
+# stands in the exported files for the SHA-256 of the certificate, which depends on the limits
+PLACE = "@certificate@"
 # signals, samples, evidence, loop: the rules of a group are all asked if every group before it passed
 GROUPS = (RULES[:4], RULES[4:7], RULES[7:12], RULES[12:])
 
@@ -156,6 +158,11 @@ def write(folder: Path, measured: MeasuredController) -> None:
 def read(folder: Path) -> MeasuredController:
     about = artifacts.read_json(folder / MEASURED)
     return MeasuredController(rebuilt(about["draft"]), about["figures"])
+
+
+def fill(path: Path, certificate_sha256: str) -> str:
+    """The text of a prepared file with the SHA-256 in its marked place."""
+    return path.read_text(encoding="utf-8").replace(PLACE, certificate_sha256)
 
 
 def results(

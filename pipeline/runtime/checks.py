@@ -27,22 +27,33 @@ def judged_difference(
 ) -> float:
     """The largest difference in percent between the commands of `made`, a sample at a time, and the commands
     `applied` (steps, m) that the judged controller gave in one case, with outputs y (steps, p) in °C under
-    references r (steps, p). The case is found by how it begins; of several the nearest counts."""
+    references r (steps, p). The case is found by its first outputs and its references; of several the nearest
+    counts."""
     return min(
         (
             float(np.abs(commands(made, cases, case) - applied).max())
             for case in range(len(cases.plant))
-            if _begins(cases, case, y[0], r[0])
+            if _is_case(cases, case, y[0], r)
         ),
         default=np.inf,
     )
 
 
-def _begins(cases: panel.Cases, case: int, y: np.ndarray, r: np.ndarray) -> bool:
-    plant, reference = cases.plants[cases.plant[case]], cases.references[cases.asked[case, 0]]
-    at = plant.C @ cases.x0[case] + plant.d
-    pairs = (at, y), (reference.H @ reference.w0, r)
-    return all(np.allclose(one, other, rtol=0, atol=1e-9) for one, other in pairs)
+def _is_case(cases: panel.Cases, case: int, y: np.ndarray, r: np.ndarray) -> bool:
+    """Whether a case begins at outputs y (p,) and has references r (steps, p)."""
+    plant = cases.plants[cases.plant[case]]
+    begins = np.allclose(plant.C @ cases.x0[case] + plant.d, y, rtol=0, atol=1e-9)
+    return begins and np.allclose(references(cases, case), r, rtol=0, atol=1e-9)
+
+
+def references(cases: panel.Cases, case: int) -> np.ndarray:
+    """References (steps, p) of one case, one after the other."""
+    r = np.empty((cases.steps, len(cases.starts[0])))
+    for number, first in zip(cases.asked[case], cases.begin[case], strict=True):
+        if first < cases.steps:
+            reference = cases.references[number]
+            r[first:] = reference.states(cases.steps - first) @ reference.H.T
+    return r
 
 
 def commands(made: Exported, cases: panel.Cases, case: int) -> np.ndarray:
@@ -108,7 +119,7 @@ def check_compiled(made: Exported, files: Mapping[str, str]) -> None:
         for name, text in files.items():
             (Path(folder) / name).write_text(text, encoding="utf-8")
         # without -Werror: a warning of some compiler is no fault of the controller
-        command = ["make", "-s", "test", f"CC={compiler}", "STRICT=-std=c99"]
+        command = ["make", "-s", "test", f"CC={compiler}", "STRICT=-std=c99", "CFLAGS=-O0"]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
     if done.returncode:
         lines = (done.stderr or done.stdout).strip().splitlines() or ["no output"]

@@ -237,15 +237,11 @@ def tuning_objective(theta: np.ndarray) -> float:
     )
 
 
-class TuningParts(NamedTuple):
+def tuning_parts(theta: np.ndarray) -> tuple[float, float]:
     """What tuning_objective adds up, each in its own unit: discounted r.m.s. error e in °C and effort u in
-    percent, F = sum_t gamma^t (5 e^2 + 7 u^2)."""
+    percent:
 
-    tracking_degC: float
-    effort_percent: float
-
-
-def tuning_parts(theta: np.ndarray) -> TuningParts:
+    F = sum_t gamma^t (5 e^2 + 7 u^2)"""
     plant, discount = baam(), GAMMA ** np.arange(101)
     best = gains(plant, np.diag(theta[:5]), np.diag(theta[5:]), GAMMA)
     x, squares = np.full(plant.n, 20.0), np.empty((101, 2))
@@ -254,20 +250,13 @@ def tuning_parts(theta: np.ndarray) -> TuningParts:
         squares[t] = ((plant.C @ x + plant.D @ u + plant.d - REFERENCE) ** 2).mean(), (u**2).mean()
         x = plant.A @ x + plant.B @ u + plant.b
     error, effort = np.sqrt(discount @ squares / discount.sum())
-    return TuningParts(float(error), float(effort))
+    return float(error), float(effort)
 
 
-class ScaledWeights(NamedTuple):
-    """Q = R = 0.4 I beside Q = R = I: the change of the index when each is computed with its own weights, in
-    percent, and the largest difference of the gains."""
-
-    change_percent: float
-    gain_difference: float
-
-
-def scaled_weights(scale: float = 0.4) -> ScaledWeights:
-    """Why indices with different weights say nothing: scaling all weights changes the printed index by as
-    much, and the controller not at all."""
+def scaled_weights(scale: float = 0.4) -> dict[str, float]:
+    """Q = R = scale I beside Q = R = I: the change of the index when each is computed with its own weights,
+    in percent, and the largest difference of the gains. Indices with different weights say nothing: scaling
+    all weights changes the printed index by as much, and the controller not at all."""
     plant, scenarios = baam(), study_panel(REFERENCE[None])
     one, other = (gains(plant, factor * np.eye(5), factor * np.eye(7), GAMMA) for factor in (1.0, scale))
     law = observer_law(plant, other, observer_gain(plant, TAU))
@@ -276,7 +265,10 @@ def scaled_weights(scale: float = 0.4) -> ScaledWeights:
         cost(scenarios, run, CommonCost(np.full(5, factor), np.full(7, factor), GAMMA)).J[0]
         for factor in (1.0, scale)
     ]
-    return ScaledWeights(float(100 * (J[1] / J[0] - 1)), float(np.abs(one.K_x - other.K_x).max()))
+    return {
+        "change_percent": float(100 * (J[1] / J[0] - 1)),
+        "gain_difference": float(np.abs(one.K_x - other.K_x).max()),
+    }
 
 
 def candidates(result: SearchResult) -> dict[str, list | np.ndarray]:
@@ -303,11 +295,12 @@ def parity_metrics(result: SearchResult) -> dict:
     """What a search for the least (37) ends at, beside its known optimum, Q = R = I, and the weights that it
     recommends."""
     optimum = np.ones(OUTPUTS + INPUTS)
+    tracking_degC, effort_percent = tuning_parts(optimum)
     return {
         "best_cost_perfect_state": result.cost,
         "optimum": tuning_objective(optimum),
         "scaled_weights": scaled_weights(),
-        "trade": {"optimum": tuning_parts(optimum)},
+        "trade": {"optimum": {"tracking_degC": tracking_degC, "effort_percent": effort_percent}},
         "q": result.theta[:OUTPUTS],
         "r": result.theta[OUTPUTS:],
     }

@@ -4,20 +4,12 @@ Other columns are another version: raise the number with them.
 """
 
 from collections.abc import Sequence
-from typing import Protocol
 
 from pipeline.store.tables import BOOL, COUNT, FLOAT, INDEX, NONE, TEXT, Column, Schema
+from pipeline.temperature.settings import PlantSignal
 
 
-class _Signal(Protocol):
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def unit(self) -> str: ...
-
-
-def record(inputs: Sequence[_Signal], outputs: Sequence[_Signal]) -> Schema:
+def record(inputs: Sequence[PlantSignal], outputs: Sequence[PlantSignal]) -> Schema:
     """The table that ingest writes: one row a sample. A masked value stays as
     recorded; the flag beside it says not to use it."""
     columns = [
@@ -59,7 +51,7 @@ QUALITY = Schema(
 )
 
 
-def trajectories(inputs: Sequence[_Signal], outputs: Sequence[_Signal]) -> Schema:
+def trajectories(inputs: Sequence[PlantSignal], outputs: Sequence[PlantSignal]) -> Schema:
     """Two cases of the comparison under every contestant, as deployed: true outputs with their references,
     commands, and the inputs that the machine was given."""
     columns = [
@@ -162,7 +154,7 @@ ORDER = Schema(
 )
 
 
-def holdout(outputs: Sequence[_Signal]) -> Schema:
+def holdout(outputs: Sequence[PlantSignal]) -> Schema:
     """The part of the record that judged the model: measured, simulated from its inputs alone, and predicted
     from outputs so many steps before."""
     columns = [

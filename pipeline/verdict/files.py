@@ -9,11 +9,9 @@ from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant
 from pipeline.temperature.tables import DYNAMICS, RESIDUALS
 from pipeline.verdict.evidence import OFF, Evidence, switched_off
-from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.settings import QUICK_LOOK, ReportRules
 from pipeline.verdict.verdict import Missing
 
-# what `beadline quick` writes before the verdict: what is smaller than in a full run
-QUICK_LOOK = "reports/quick_look.json"
 # stages whose figures the rules may ask for
 FIGURES = {
     "ingest": "datasets/ingest/figures.json",

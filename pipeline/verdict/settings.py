@@ -4,6 +4,9 @@ from pydantic import Field
 
 from pipeline.store import params
 
+# what `beadline quick` writes before the verdict: what is smaller than in a full run
+QUICK_LOOK = "reports/quick_look.json"
+
 
 class ReportRules(params.Section):
     """Section `report`: what a controller must hold to be ready; of the temperature loop at the 90 %

@@ -88,9 +88,11 @@ def lay_out(changes: dict[str, Any], parts: tuple[str, ...] = ("fig9",)) -> None
 
 
 def run_stage(name: str) -> None:
-    """What `./run dvc repro` runs. Raises Refused with the last line that the stage printed."""
+    """What `./run dvc repro` runs, verdicts before the pages that read them. Raises Refused with the last
+    line that the stage printed."""
     with _quiet():
-        importlib.import_module(f"stages.{name}").main()
+        for stage in ("verdict", "report") if name == "report" else (name,):
+            importlib.import_module(f"stages.{stage}").main()
 
 
 def beadline(*arguments: object) -> str:

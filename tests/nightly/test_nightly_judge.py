@@ -394,13 +394,13 @@ def test_a_controller_is_designed_for_what_it_was_tuned_for_not_for_the_nights_c
     path = "datasets/tune_weights/weights.json"
     stored = artifacts.read_json(path)
     designed_for = []
-    pi = judge.contestants.BY_NAME["pi_simc"]
+    pi = judge.table.BY_NAME["pi_simc"]
 
     def watched(problem, values):
         designed_for.append((problem.horizon, problem.noise.tolist()))
         return pi.design(problem, values)
 
-    monkeypatch.setitem(judge.contestants.BY_NAME, "pi_simc", pi._replace(design=watched))
+    monkeypatch.setitem(judge.table.BY_NAME, "pi_simc", pi._replace(design=watched))
     frozen = judge.frozen_panel(project.holdout)
     artifacts.write_json(path, stored | {"design": {"horizon_steps": 450, "noise_degC": [0.3] * 5}})
     judge.judged(frozen, Path("datasets"), "pi_simc")

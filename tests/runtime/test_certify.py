@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipeline.runtime import assembly, checks
+from pipeline.runtime import assembly, certified, checks
 from pipeline.runtime.export import c
 from pipeline.runtime.machine import Exported, check
 from pipeline.temperature.controllers.table import BY_NAME, design_controllers
@@ -81,7 +81,7 @@ def test_only_learned_gains_have_bands():
 
 def test_c_with_other_golden_vectors_is_refused():
     of = exported()
-    files = c.code(of, certify.PLACE) | {"golden.csv": "0.0\n1,2,3\n"}
+    files = c.code(of, certified.PLACE) | {"golden.csv": "0.0\n1,2,3\n"}
     if checks.find_compiler():
         with pytest.raises(ValueError, match="the exported C of lqg does not pass its golden vectors"):
             checks.check_compiled(of, files)

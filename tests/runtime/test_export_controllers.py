@@ -15,7 +15,6 @@ from pipeline.runtime import certificate, certified, machine
 from pipeline.runtime.export import c, python
 from pipeline.store import artifacts
 from stages import export_controllers
-from stages.certify import PLACE
 from tests.runtime.deployed_machines import exported, passed
 from tests.runtime.test_certificate import ALLOWED, decided, measure
 from tests.runtime.test_certify import made
@@ -42,9 +41,9 @@ def project(tmp_path, monkeypatch):
     )  # fmt: skip
     certified.write(folder, measured)
     machine.write_controller(folder, of)
-    for name, text in c.code(of, PLACE).items():
+    for name, text in c.code(of, certified.PLACE).items():
         artifacts.write_text(folder / "c" / name, text)
-    artifacts.write_text(folder / "python/controller.py", python.code(of, PLACE))
+    artifacts.write_text(folder / "python/controller.py", python.code(of, certified.PLACE))
     found = {"measured": True, "why": "", "largest_difference": {"judged": 0.0, "python": 0.0}}
     cooled = {"measured": False, "why": "It cannot be designed.", "largest_difference": {}}
     told = {"temperature": {"lqg": found, "pi": cooled}, "setpoint": SETPOINT}
@@ -73,7 +72,9 @@ def test_the_files_of_the_named_controller_are_copied_with_its_certificate(proje
     }
     read, shown = machine.read(folder)
     assert read.name == "lqg" and certificate.sha256(shown) == temperature["certificate"]["sha256"]
-    assert not any(PLACE.encode() in path.read_bytes() for path in folder.rglob("*") if path.is_file())
+    assert not any(
+        certified.PLACE.encode() in path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    )
     digest = certificate.sha256(shown)
     for name, text in c.code(read, digest).items():
         assert (folder / "c" / name).read_text(encoding="utf-8") == text

@@ -190,5 +190,5 @@ def test_a_log_too_short_for_a_forecast_says_so():
 
 
 def test_what_honest_logs_leave_is_no_less_than_the_sensors_noise():
-    explained_whole = support.Forecasts(np.arange(4), np.zeros((3, 4, 5)), np.zeros((4, 5)))
+    explained_whole = support.FamilyForecasts(np.arange(4), np.zeros((3, 4, 5)), np.zeros((4, 5)))
     np.testing.assert_allclose(support._rest([explained_whole], NOISE), NOISE, rtol=1e-6)

@@ -99,14 +99,13 @@ def judged(
     loaded = evaluate_temperature.EvaluationInputs(
         given.machine,
         panel,
-        rules,
         given.setting,
         given.problem,
         given.weights if weights is None else weights,
         simulated=True,
     )
     settings = section(EvaluateTemperature, "evaluate_temperature")
-    return Compared(*evaluate_temperature.compare(settings, loaded, execution))
+    return Compared(*evaluate_temperature.compare(settings, loaded, rules, execution))
 
 
 def written(result: Compared, machine: Plant, folder: Path) -> dict[str, bytes]:

@@ -27,22 +27,23 @@ def test_step_responses_of_first_order_with_delay_give_their_constants_back():
 
 
 def test_simc_by_hand():
-    pid = simc_pid(2.0, 40.0, 5.5, sample_time_s=1.0)
+    Kp, Ki, Kd = simc_pid(2.0, 40.0, 5.5, sample_time_s=1.0)
     # theta 6, K_c = 40 / (2 x 12) = 1.667, tau_I = min(40, 48), tau_D = 2
-    assert pid.Kp == pytest.approx(40 / 24 * (1 + 2 / 40))
-    assert pid.Ki == pytest.approx(40 / 24 / 40)
-    assert pid.Kd == pytest.approx(40 / 24 * 2)
+    assert Kp == pytest.approx(40 / 24 * (1 + 2 / 40))
+    assert Ki == pytest.approx(40 / 24 / 40)
+    assert Kd == pytest.approx(40 / 24 * 2)
 
 
 def test_simc_holds_a_first_order_plant_without_much_overshoot():
     K, tau, delay = 2.0, 60.0, 4
-    pid, x, integral, last = simc_pid(K, tau, delay, sample_time_s=1.0), 0.0, 0.0, None
+    Kp, Ki, Kd = simc_pid(K, tau, delay, sample_time_s=1.0)
+    x, integral, last = 0.0, 0.0, None
     u, y = [0.0] * (delay + 1), []
     for _ in range(400):
         y.append(x)
         e = 1.0 - x
-        integral += pid.Ki * e
-        u.append(pid.Kp * e + integral - pid.Kd * (0.0 if last is None else x - last))
+        integral += Ki * e
+        u.append(Kp * e + integral - Kd * (0.0 if last is None else x - last))
         last = x
         x += (K * u[-1 - delay] - x) / tau
     assert abs(y[-1] - 1) < 1e-3

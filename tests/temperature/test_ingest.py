@@ -449,3 +449,10 @@ def test_a_heater_that_is_no_signal_of_ours_and_another_format_have_no_pid(tmp_p
     recording(tmp_path / "a.csv", seed=0)
     results = [recording_folders.RecordingTable(name, {}, {}, "", False) for name in ("klippy.log", "a.csv")]
     assert recording_folders.printer_pids(tmp_path, results, JOB.sources, ["heater"]) == {}
+
+
+def test_the_figures_of_the_probing_are_no_recording(tmp_path):
+    raw = folder(tmp_path, 1)
+    (raw / "figures.json").write_text("{}")
+    results = read_folder(raw, JOB, INLINE, memo=tmp_path / "memo", budget=BUDGET, ignored=["figures.json"])
+    assert [result.name for result in results] == ["000.csv"]

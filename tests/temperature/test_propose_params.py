@@ -67,6 +67,39 @@ def test_a_klippy_log_fills_the_files_and_keeps_their_comments(tree, monkeypatch
     assert "where each should settle" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("file", "old", "new", "on"),
+    [
+        ("", "", "", {"temperature"}),
+        ("datasets/raw/setpoint/README.md", "", "", {"temperature"}),
+        ("datasets/raw/setpoint/print/frame.jpg", "", "", {"temperature", "setpoint"}),
+        ("datasets/raw/deposition/trial.mcap", "", "", {"temperature", "deposition"}),
+        ("", "train_ilc:", "train_ilc:\n  source: recordings", {"temperature", "deposition"}),
+    ],
+)
+def test_a_loop_without_recordings_is_switched_off(tree, monkeypatch, capsys, file, old, new, on):
+    if file:
+        (tree / file).parent.mkdir(parents=True)
+        (tree / file).touch()
+    text = (tree / "params.yaml").read_text()
+    if old:
+        head, tail = text.split(f"\n{old}", 1)
+        (tree / "params.yaml").write_text(f"{head}\n{new}{tail.replace('  source: simulated', '  #', 1)}")
+    init(monkeypatch, "klippy.log")
+    loops = params.load(params.Loops, "loops").model_dump()
+    assert {loop for loop, is_on in loops.items() if is_on} == on
+    told = capsys.readouterr().out
+    assert f"off: {' and '.join(loop for loop in loops if loop not in on)}, without recordings" in told
+
+
+def test_a_loop_that_its_owner_switches_on_stays_on(tree, monkeypatch):
+    init(monkeypatch, "klippy.log")
+    text = (tree / "params.yaml").read_text()
+    (tree / "params.yaml").write_text(text.replace("setpoint: false", "setpoint: true"))
+    init(monkeypatch, "klippy.log")
+    assert params.load(params.Loops, "loops").setpoint
+
+
 def test_a_second_run_changes_nothing_and_an_edited_value_is_not_overwritten(tree, monkeypatch, capsys):
     init(monkeypatch, "klippy.log")
     first = (tree / "params.yaml").read_bytes(), (tree / "params.expert.yaml").read_bytes()
@@ -93,8 +126,9 @@ def test_limits_that_no_file_tells_are_left_to_a_person_and_asked_for_by_the_sta
     (tree / "rig.csv").write_text("time_s,heater_1_pct,zone_1_C\n" + rows)
     init(monkeypatch, "rig.csv", "--copy")
     assert "low and high of temperature_1: between which °C the machine must stay" in capsys.readouterr().out
+    monkeypatch.delitem(sys.modules, "stages.ingest")
     with pytest.raises(SystemExit):
-        runpy.run_module("stages.ingest", run_name="__main__")
+        runpy.run_module("stages.ingest", run_name="__main__", alter_sys=True)
     asked = capsys.readouterr().err
     assert "plant.outputs: temperature_1 should have low and high" in asked
 

@@ -70,8 +70,8 @@ def test_both_routes_stand_sensor_noise_on_twenty_data_sets(noise, window_bar, k
 
 def test_scaling_all_weights_changes_the_index_and_not_the_controller():
     scaled = study.scaled_weights(0.4)
-    assert scaled.change_percent == pytest.approx(-60.0, abs=1e-9)  # J is linear in the weights
-    assert scaled.gain_difference < 1e-12  # rounding
+    assert scaled["change_percent"] == pytest.approx(-60.0, abs=1e-9)  # J is linear in the weights
+    assert scaled["gain_difference"] < 1e-12  # rounding
 
 
 def test_the_index_of_the_tuner_is_the_known_optimum_at_equal_weights_and_more_elsewhere():

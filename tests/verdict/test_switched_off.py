@@ -37,6 +37,6 @@ def test_a_loop_that_is_switched_off_has_no_verdict_and_no_card(project, on):
         page = Path(f"reports/{loop}.html").read_text()
         assert (f'href="{loop}.html"' in INDEX.read_text()) == (loop in on)
         assert ("This loop is switched off" in page) == (loop not in on)
-    decision = artifacts.read_metrics("report")["verdicts"]
+    decision = artifacts.read_figures("report")["verdicts"]
     assert tuple(decision) == on
     assert ("Plunger command to flow" in index) == ("deposition" in on)

@@ -12,11 +12,12 @@ import jinja2
 from markupsafe import Markup, escape
 
 from pipeline.report.shared.pictures import PictureColumn
-from pipeline.report.shared.sources import QUICK_LOOK, SourceFile, Sources
+from pipeline.report.shared.sources import SourceFile, Sources
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
 from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.verdict import digits
+from pipeline.verdict.settings import QUICK_LOOK
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 
 GLYPHS = {

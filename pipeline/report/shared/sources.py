@@ -25,8 +25,7 @@ from pipeline.temperature import tables as schemas
 from pipeline.temperature.settings import Plant
 from pipeline.verdict import night
 from pipeline.verdict.evidence import OFF, Evidence, Table, switched_off
-from pipeline.verdict.files import QUICK_LOOK
-from pipeline.verdict.settings import ReportRules
+from pipeline.verdict.settings import QUICK_LOOK, ReportRules
 from pipeline.verdict.verdict import LOOPS, Missing, Verdict
 from pipeline.verdict.verdict import read as read_verdicts
 

@@ -18,15 +18,6 @@ class ClosedLoop(NamedTuple):
     closed: bool
 
 
-class _Answers(NamedTuple):
-    """What the past of the inputs does not foretell of them (N, m), beside one-step errors of the outputs at
-    lags 1..k (N, k p), of a predictor told u(t), and at lag 0 (N, p), of one that is not."""
-
-    moved: np.ndarray
-    errors_before: np.ndarray
-    errors_now: np.ndarray
-
-
 def closed_loop(
     u: Segments, y: Segments, past: int, *, offset: bool = True, lags: int = 5, inputs: int | None = None
 ) -> ClosedLoop:
@@ -44,20 +35,25 @@ def closed_loop(
     p_value = np.ones(m)
     if answers is None:
         return ClosedLoop(p_value, False)
+    unforeseen, errors_before, errors_now = answers
     for j in range(m):
-        moved = answers.moved[:, j]
+        moved = unforeseen[:, j]
         clipped = _clipped(moved)
         if not np.any(clipped):
             continue
-        p_value[j] = _p_value(clipped, answers.errors_before)
-        at_once = _p_value(clipped, answers.errors_now)
-        if at_once < p_value[j] and not _jumps_with(answers.errors_now, moved - clipped):
+        p_value[j] = _p_value(clipped, errors_before)
+        at_once = _p_value(clipped, errors_now)
+        if at_once < p_value[j] and not _jumps_with(errors_now, moved - clipped):
             p_value[j] = at_once
     return ClosedLoop(p_value, bool((p_value < LEVEL_CLOSED / (2 * m)).any()))
 
 
-def _answers(u: Segments, y: Segments, past: int, *, offset: bool, lags: int) -> _Answers | None:
-    """None where no stretch is long enough to tell."""
+def _answers(
+    u: Segments, y: Segments, past: int, *, offset: bool, lags: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """What the past of the inputs does not foretell of them (N, m), beside one-step errors of the outputs at
+    lags 1..k (N, k p), of a predictor that knows u(t), and at lag 0 (N, p), of one that does not; None if no
+    stretch is long enough to tell."""
     m, runs = u[0].shape[1], [w for w in complete_runs(u, y) if len(w) > past + lags + 1]
     # the predictor that is told u(t) has m unknowns more
     if sum(len(w) - past for w in runs) < (past + 1) * sum(part[0].shape[1] for part in (u, y)) + m + 1:
@@ -76,7 +72,7 @@ def _answers(u: Segments, y: Segments, past: int, *, offset: bool, lags: int) ->
         parts[2].append(np.hstack([told[lags - k : len(told) - k] for k in range(1, lags + 1)]))
         parts[3].append((now_y - z @ of_untold)[lags:])
     now, history, before, at_once = (np.concatenate(part) for part in parts)
-    return _Answers(_unforeseen(now, history), before, at_once)
+    return _unforeseen(now, history), before, at_once
 
 
 def _unforeseen(now: np.ndarray, history: np.ndarray) -> np.ndarray:

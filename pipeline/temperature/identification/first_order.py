@@ -8,25 +8,24 @@ import scipy.optimize
 import scipy.signal
 
 
-class SimcPid(NamedTuple):
-    """u = Kp e + Ki integral of e + Kd de/dt: Kp in units of u by units of y, Ki by second, Kd seconds."""
-
-    Kp: float
-    Ki: float
-    Kd: float
-
-
-def simc_pid(gain: float, time_constant_s: float, delay_s: float, *, sample_time_s: float) -> SimcPid:
-    """PID of a first-order model with delay, SIMC with a third of the delay as derivative time (Grimholt and
+def simc_pid(
+    gain: float, time_constant_s: float, delay_s: float, *, sample_time_s: float
+) -> tuple[float, float, float]:
+    """Kp (units of u by units of y), Ki (by second) and Kd (seconds) of u = Kp e + Ki integral of e + Kd
+    de/dt: SIMC for a first-order model with delay, a third of the delay as derivative time (Grimholt and
     Skogestad 2018, iSIMC), series form rewritten as parallel:
 
-    K_c = tau / (K (tau_c + theta)), tau_I = min(tau, 4 (tau_c + theta)), tau_D = theta / 3, tau_c = theta.
+    K_c = tau / (K (tau_c + theta))
+    tau_I = min(tau, 4 (tau_c + theta))
+    tau_D = theta / 3
+    tau_c = theta
+
     The delay counts half a sample more, by which a held input is late, and as no less than one sample.
     """
     theta = max(delay_s + sample_time_s / 2, sample_time_s)
     tau = max(time_constant_s, sample_time_s)
     K_c, tau_I, tau_D = tau / (gain * 2 * theta), min(tau, 8 * theta), theta / 3
-    return SimcPid(K_c * (1 + tau_D / tau_I), K_c / tau_I, K_c * tau_D)
+    return K_c * (1 + tau_D / tau_I), K_c / tau_I, K_c * tau_D
 
 
 class StepModels(NamedTuple):

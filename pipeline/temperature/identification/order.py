@@ -384,7 +384,7 @@ def _refined(
     """`refine` with every pole within `radius`, from a start whose predictor may not be stable."""
     if kind == "prediction" and np.abs(np.linalg.eigvals(start.A - start.K @ start.C)).max() >= 1:
         start = kalman_gain(start, u, y)
-    return refine(start, u, y, kind, settings._replace(max_radius=radius * (1 + 1e-12))).plant
+    return refine(start, u, y, kind, settings._replace(max_radius=radius * (1 + 1e-12)))[0]
 
 
 def cross_validate(

@@ -48,15 +48,6 @@ class Predictor(NamedTuple):
     x0: list[np.ndarray]
 
 
-class Refined(NamedTuple):
-    """A refined plant, the initial state of each segment, and the sum of squared
-    weighted errors before the first and after each step."""
-
-    plant: Plant
-    x0: list[np.ndarray]
-    costs: list[float]
-
-
 def linear_recurrence(F: np.ndarray, g: np.ndarray, x0: np.ndarray) -> np.ndarray:
     """x (T+1, n) of x(t+1) = F x(t) + g(t) from x0, by doubling: pass k adds F^(2^k) times what lies 2^k
     samples back (Hillis and Steele 1986)."""
@@ -388,9 +379,9 @@ def refine(
     y: Sequence[np.ndarray],
     criterion: Criterion = "prediction",
     settings: FitSettings = DEFAULTS,
-) -> Refined:
-    """The plant moved to the least sum of weighted squared errors, one step ahead or in free
-    simulation, over every segment u (T, m), y (T, p).
+) -> tuple[Plant, list[float]]:
+    """The plant moved to the least sum of weighted squared errors, one step ahead or in free simulation, over
+    every segment u (T, m), y (T, p); and that sum before the first and after each step.
 
     Errors are weighted by the covariance of the starting model's (the full one for predictions, its diagonal
     for simulation). The predictor stays stable, and so does A within `max_radius` where given (it must hold
@@ -423,7 +414,7 @@ def refine(
         tolerance=settings.tolerance,
     )
     refined = _plant_of(best, problem, plant, ahead=ahead)
-    return Refined(refined._replace(D=np.where(rows[:, None], refined.D, plant.D)), best.x0, costs)
+    return refined._replace(D=np.where(rows[:, None], refined.D, plant.D)), costs
 
 
 def _check_start(plant: Plant, u: Sequence[np.ndarray], max_radius: float | None) -> None:

@@ -313,7 +313,8 @@ def from_record(
     spread = spread_around(settings, identified)
     spread = spread._replace(ambient_degC=_ambient(spread, scale, identified, limits, asked.references))
     lower = asked.references[-1]
-    swing = asked.references.mean(axis=0), asked.sinusoid.amplitude_degC, float(asked.sinusoid.period_steps)
+    amplitude_degC, period_steps = asked.sinusoid
+    swing = asked.references.mean(axis=0), amplitude_degC, float(period_steps)
     questions = panel.Questions(
         asked.starts, asked.references, (lower, asked.ramp_degC_per_step), swing, asked.sequence
     )

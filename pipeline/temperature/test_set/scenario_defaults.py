@@ -77,13 +77,6 @@ class Infeasible(NamedTuple):
     limit: str
 
 
-class Sinusoid(NamedTuple):
-    """About the middle of the two references: amplitude (p,) in °C, period in steps."""
-
-    amplitude_degC: np.ndarray
-    period_steps: int
-
-
 class CaseDefaults(NamedTuple):
     """What the cases of a rehearsal are: starts (k, p) at which the plant is held, references (j, p), both
     steady states within the limits of inputs and outputs by the model; settling_s the rule's limit, band_degC
@@ -98,7 +91,7 @@ class CaseDefaults(NamedTuple):
     band_degC: float
     steps: int
     ramp_degC_per_step: np.ndarray
-    sinusoid: Sinusoid
+    sinusoid: tuple[np.ndarray, int]  # about the middle of the two references: amplitude (p,) in °C, steps
     sequence: np.ndarray
     notes: tuple[str, ...]
 
@@ -201,7 +194,7 @@ def defaults(
         band_degC=band,
         steps=steps,
         ramp_degC_per_step=(first - lower) / steps,
-        sinusoid=Sinusoid(
+        sinusoid=(
             np.abs(first - lower) / 2 / np.hypot(1, 2 * np.pi / PERIOD),
             max(round(PERIOD * slowest / sample_time_s), 4),
         ),
