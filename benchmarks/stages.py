@@ -13,6 +13,7 @@ One more recording: ten CSV files of 600 samples were read before, and `dvc repr
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -142,8 +143,11 @@ def imports_s(clone: Clone, stage: str) -> float:
 
 
 def loop_of(stage: str, root: Path = ROOT) -> str:
-    """The loop whose workflow has a file of this name; "" for a stage of no loop."""
-    return next((loop for loop in LOOPS if (root / f"pipeline/{loop}/workflow/{stage}.py").exists()), "")
+    """The loop that the stage names where it is run; "" for a stage of no loop."""
+    named = re.search(
+        r'stages\.run\(.*loop="(\w*)"', (root / f"stages/{stage}.py").read_text(encoding="utf-8")
+    )
+    return named[1] if named else ""
 
 
 def by_loop(rows: list[dict[str, Any]], whole_s: float) -> dict[str, float]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pipeline.runtime.certificate import Certificate
 
 MARKED = ("c/machine.h", "c/README.txt", "python/controller.py")  # which hold the certificate's SHA-256
-VERDICT, CERTIFY = Path("datasets/verdict/temperature.json"), Path("datasets/certify")
+VERDICTS, CERTIFY = Path("datasets/verdict"), Path("datasets/certify")
 COMPOSED = ("datasets/compose_parts/signals.parquet", "datasets/compose_parts/lines.parquet")
 
 # figures of control that git keeps and that runs are compared by
@@ -47,7 +47,7 @@ def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
     its controller is refused, that certificate alone."""
     from pipeline.runtime import certificate, certified
 
-    verdict = artifacts.read_json(VERDICT)
+    verdict = artifacts.read_json(VERDICTS / "temperature.json")
     name = verdict["winner"] or verdict.get("refused")
     if name is None or name == "hold":
         why = f"Not exported: {verdict['decision']} {verdict['lead']}"

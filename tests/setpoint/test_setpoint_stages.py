@@ -175,6 +175,7 @@ def check_classifier(source: str) -> dict:
     frames = artifacts.read_json(out / "frames/frames.json")
     expected = {f"{name}.parquet" for name in (*TABLES, "calibration")} | {
         "weights.safetensors",
+        "figures.json",
         "frames/frames.json",
     }
     expected |= {f"frames/{row['file']}" for row in frames}

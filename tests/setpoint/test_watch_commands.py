@@ -83,15 +83,14 @@ def make() -> None:
         1.0, 0.1, 0.2, Familiar(np.zeros((3, features)), np.eye(features)), 1e9,
         FlowCalibration(knots, np.ones(len(knots)), 0.5),
     )  # fmt: skip
-    store_classifier(
-        folder, params.load(TrainClassifier, "train_classifier"), CalibratedClassifier(network, known)
-    )
+    view = params.load(TrainClassifier, "train_classifier")
+    store_classifier(folder, view.size, CalibratedClassifier(network, known))
     store_camera(folder / CAMERA_FILE, None)
     tables = {
         part: synthetic_flow_table(np.random.default_rng(1), segments=80, windows=3) for part in WINDOW_PARTS
     }
     artifacts.write_table(folder / "windows.parquet", WINDOWS, window_rows(tables))
-    belief = train_agent.belief(params.load(TrainAgent, "train_agent").belief_dqn, tables["learn"])
+    belief = train_agent.filter_belief(params.load(TrainAgent, "train_agent").belief_dqn, tables["learn"])
     keys = jax.random.split(jax.random.key(3), 5)
     networks = tuple(QNetwork(key) for key in keys[:4])
     on_belief = BeliefNetwork(belief.filter.evidence.shape[0], keys[4])
