@@ -183,6 +183,8 @@ def conditions(machine: Plant, setting: CaseConditions, rules: TemperatureRules)
 METRICS = (
     "plants",
     "cases",
+    "limits.settling_s",
+    "limits.delay_margin_s",
     "contestants.*.settled_error.q90",
     "contestants.*.settling.q90",
     "contestants.*.overshoot.q90",
