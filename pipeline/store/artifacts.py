@@ -240,11 +240,6 @@ def matching(figures: Mapping | list, patterns: Sequence[Sequence[str]]) -> dict
     return list(chosen.values()) if listed else chosen
 
 
-def read_metrics(stage: str) -> dict:
-    """The metrics that the stage wrote with `write_metrics`."""
-    return read_json(REPORTS / "metrics" / f"{stage}.json")
-
-
 def read_figures(stage: str) -> dict:
     """All figures that the stage wrote with `write_metrics`."""
     return read_json(DATASETS / stage / "figures.json")

@@ -61,9 +61,6 @@ class Question(NamedTuple):
 
 
 Answers = Mapping[str, Figure | Missing]
-ROLES = {"data_driven": "data-driven", "model_based": "model-based", "baseline": "baseline"}
-# the largest number below 1: what a figure may be at most that must be less than 1
-BELOW_ONE = math.nextafter(1.0, 0.0)
 
 
 def state(question: Question, figure: Figure | Missing) -> str:

@@ -309,11 +309,11 @@ def test_broken_json_is_refused_with_its_place(project):
         match=r"reports/metrics/ingest.json is not whole JSON \(.*line 2.*\); make it again with ./run dvc "
         r"repro ingest",
     ):
-        artifacts.read_metrics("ingest")
+        artifacts.read_json("reports/metrics/ingest.json")
     with pytest.raises(
         ValueError, match=r"reports/metrics/report.json is missing; make it again with ./run dvc repro report"
     ):
-        artifacts.read_metrics("report")
+        artifacts.read_json("reports/metrics/report.json")
 
 
 FIGURES = {
@@ -339,7 +339,7 @@ def test_metrics_are_the_figures_that_match_a_pattern(project, metrics, chosen):
     with artifacts.stage("evaluate"):
         artifacts.write_metrics("evaluate", FIGURES, metrics)
     assert artifacts.read_figures("evaluate") == FIGURES
-    kept = artifacts.read_metrics("evaluate")
+    kept = artifacts.read_json("reports/metrics/evaluate.json")
     assert kept == chosen and list(kept) == list(chosen)
     assert set(everything(project)) == {"datasets/evaluate/figures.json", "reports/metrics/evaluate.json"}
 
@@ -466,7 +466,7 @@ def test_a_stage_that_ends_well_replaces_all_that_it_writes(project, last_good):
     contents = everything(project)
     assert set(contents) == set(last_good) - {"datasets/learn_kernel/obsolete.txt"}
     assert contents["datasets/learn_kernel/kernel.txt"] == contents["reports/index.html"] == b"new"
-    assert artifacts.read_metrics("learn_kernel") == {"rank": 56}
+    assert artifacts.read_json("reports/metrics/learn_kernel.json") == {"rank": 56}
 
 
 def test_a_stage_that_writes_only_a_report_has_no_folder(project):
