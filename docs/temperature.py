@@ -56,7 +56,7 @@ for name, gap in gaps.items():
     print(f"{name:15} {100 * gap:9.4f} % above the optimum")
 
 # %% As deployed: heaters give 0 to 100 %, and every law aims at the nearest temperatures that can be held.
-limits = controller.Limits(low, high, rate=np.full(machine.m, np.inf))
+limits = controller.ActuatorLimits(low, high, rate=np.full(machine.m, np.inf))
 questions = panel.Questions(np.full((1, machine.p), 20.0), references, None, None, None)
 true = panel.delayed(machine, late=False)
 cases = panel.asked([true], questions, noise=np.full(machine.p, 0.1), seed=1, steps=1000, hold=30, cells=True)

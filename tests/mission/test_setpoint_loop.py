@@ -61,6 +61,7 @@ def simulated(made_once) -> Project:
     def make(folder: Path) -> None:
         project = Project(folder).make().keep_stages(*STAGES).declare(SMALL | RENDERED).commit()
         project.run("dvc", "repro")
+        project.run("python", "-m", "stages.verdict")
         project.run("python", "-m", "stages.report")
 
     return Project(made_once("simulated_setpoint", make))

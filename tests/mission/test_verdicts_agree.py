@@ -25,6 +25,7 @@ def cloned(made_once, root) -> Project:
         shutil.copy(accepted, folder / "reports")
         for stage, figures in json.loads(accepted.read_text(encoding="utf-8"))["metrics"].items():
             artifacts.write_json(folder / "datasets" / stage / "figures.json", figures)
+        project.run("python", "-m", "stages.verdict")
         project.run("python", "-m", "stages.report")
 
     return Project(made_once("cloned", make))

@@ -787,10 +787,13 @@ def depending_on(place: str) -> set[str]:
         (
             "temperature",
             "ingest identify_plant learn_kernel generate_probing tune_weights evaluate_temperature "
-            "export_controllers report",
+            "certify verdict export_controllers report",
         ),
-        ("deposition", "train_ilc segment_library compose_parts export_controllers report"),
-        ("setpoint", "train_classifier train_agent evaluate_setpoint export_controllers report"),
+        ("deposition", "train_ilc segment_library compose_parts certify verdict export_controllers report"),
+        (
+            "setpoint",
+            "train_classifier train_agent evaluate_setpoint certify verdict export_controllers report",
+        ),
     ],
 )
 def test_a_new_recording_reruns_the_stages_of_its_own_loop_and_the_pages(loop, stages):

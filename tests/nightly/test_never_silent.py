@@ -18,7 +18,7 @@ from pipeline.nightly import champion, guarding, night, remembered, reporting, r
 from pipeline.nightly.settings import Nightly
 from pipeline.report.nightly import page
 from pipeline.store import params
-from tests.nightly.toy_nights import DVC, SETTINGS, Project, entered
+from tests.nightly.toy_nights import DVC, SECTIONS, SETTINGS, Project, entered
 
 OTHER = """
   other:
@@ -622,7 +622,9 @@ def test_the_watchdog_sees_broken_files(project, file):
 
 
 def test_a_recording_that_is_not_used_says_which_parameter_would_use_it(project):
-    sections = json.loads(Path("params.yaml").read_text()) | {"train_ilc": {"source": "simulated"}}
+    sections = json.loads(Path("params.yaml").read_text()) | {
+        "train_ilc": SECTIONS["train_ilc"] | {"source": "simulated"}
+    }
     sections["nightly"]["loops"]["deposition"] = {
         "artifacts": ["datasets/train_ilc/models.json"], "judge": "deposition", "cases": "",
         "recordings": "datasets/raw/deposition",

@@ -27,6 +27,7 @@ STAGES = (
     "learn_kernel",
     "tune_weights",
     "evaluate_temperature",
+    "verdict",
     "report",
 )
 

@@ -1,6 +1,7 @@
 """The small project as the working directory, its pages built once, and the browser."""
 
 import contextlib
+import importlib
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +10,10 @@ import pytest
 
 from tests.report import made
 
+PAGES = (
+    *("about", "certificate", "deposition", "identification", "index", "papers"),
+    *("runs", "setpoint", "temperature", "viewer"),
+)
 MACHINE = """window.beadline = {"machine": {"cpu": "Some CPU @ 3.00GHz", "cores": 2, "pins": "avx2", \
 "version": "0.1.0", "commit": "abc12345", "changed": true, "locked": "1", "date": "2026-11-22T07:00:00Z"}};
 """
@@ -43,16 +48,10 @@ def project(populated, tmp_path, monkeypatch):
 def render_only(monkeypatch):
     """render_only("deposition"): the stage report renders the pages of these modules alone, and leaves the
     others empty. Its verdicts and its figures are those of a whole run."""
-    from stages import report
-
     empty = SimpleNamespace(text="", files={})
 
     def render(*names):
-        modules = {
-            name.removesuffix("_page"): getattr(report, name)
-            for name in vars(report)
-            if name.endswith("_page")
-        }
+        modules = {name: importlib.import_module(f"pipeline.report.{name}.page") for name in PAGES}
         assert set(names) <= set(modules)
         for other in set(modules) - set(names):
             for function in [name for name in vars(modules[other]) if name.startswith("render")]:

@@ -104,4 +104,4 @@ def test_where_nothing_was_exported_both_pages_say_so(project, lost):
     Path(lost).unlink()
     main()
     assert "export_controllers is not there" in Page(PAGE).text
-    assert ("Nothing was exported." in Page(INDEX).text) == lost.startswith("reports")
+    assert ("Nothing was exported." in Page(INDEX).text) == lost.endswith("figures.json")

@@ -18,7 +18,7 @@ LOOPS = ("temperature", "deposition", "setpoint")
 
 
 def metrics(reports, stage):
-    return json.loads((reports / f"metrics/{stage}.json").read_text())
+    return json.loads((reports.parent / f"datasets/{stage}/figures.json").read_text())
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ def test_a_file_too_large_to_lie_beside_the_pages_is_named_and_not_linked():
 def test_the_file_to_load_is_copied_beside_the_pages_byte_for_byte_where_it_is_small(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = Path("datasets/export_controllers/temperature/controller.json")
-    line = exported.Line("temperature", "passed", "", "PI", path.as_posix(), "", "1 file", "", "")
+    line = exported.ExportedLine("temperature", "passed", "", "PI", path.as_posix(), "", "1 file", "", "")
     read = type("Read", (), {"read": {}})()
     # what was not exported, and what is not there, is no link
     for absent in (line, line._replace(file="")):

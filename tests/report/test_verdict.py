@@ -36,7 +36,6 @@ from pipeline.verdict.verdict import (
     share,
     state,
 )
-from stages import report
 from tests.report import made
 from tests.report.test_pages import INDEX, TEMPERATURE, Page
 
@@ -128,7 +127,10 @@ def test_one_engine_for_every_loop_the_first_rule_of_the_gravest_state_decides()
 
 def test_the_verdict_of_every_loop_has_the_same_fields(project, monkeypatch):
     caught = []
-    monkeypatch.setattr(report, "judgement", lambda sources: caught.append(sources) or judgement(sources))
+    monkeypatch.setattr(
+        "pipeline.report.temperature.judgement.judgement",
+        lambda sources: caught.append(sources) or judgement(sources),
+    )
     made.main()
     sources = caught[0]
     of_run = sources.evidence

@@ -161,7 +161,7 @@ def test_the_stage_reads_the_studys_draws_and_its_own_section_and_declares_no_ou
     assert [path for path in entry["deps"] if path.startswith(("datasets", "reports"))] == [
         "datasets/published"
     ]
-    assert entry["params"] == [{params.PAPERS: ["reproduce_study"]}]
+    assert entry["params"] == {f"{params.PAPERS}: reproduce_study"}
     assert "outs" not in entry and "metrics" not in entry
 
 
