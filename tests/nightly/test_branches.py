@@ -19,6 +19,7 @@ from pipeline.nightly.records import Champion, ChampionState, Installed
 from pipeline.nightly.settings import Nightly
 from pipeline.reading import excluded
 from pipeline.store import artifacts, params
+from pipeline.verdict import verdict
 from tests.nightly.toy_nights import ROOT, SETTINGS, Project, entered
 
 # each brings the mean of all nearer to 10, the truth: 10.7, 10.35, 9.875
@@ -520,6 +521,8 @@ def with_deposition(project: Project, **changes) -> Path:
     change_params(project)
     raw = project.folder / "datasets/raw/deposition"
     raw.mkdir(parents=True, exist_ok=True)
+    undecided = verdict.Verdict("deposition", verdict.OPEN, "Undecided (simulation).", "", "", "", "", None)
+    verdict.write({"deposition": undecided}, project.folder / "datasets/verdict")
     project.run("git", "add", "-A")
     project.run("git", "commit", "-qm", "another loop")
     return raw
@@ -789,7 +792,7 @@ def depending_on(place: str) -> set[str]:
             "ingest identify_plant learn_kernel generate_probing tune_weights evaluate_temperature "
             "certify verdict export_controllers report",
         ),
-        ("deposition", "train_ilc segment_library compose_parts certify verdict export_controllers report"),
+        ("deposition", "train_ilc segment_library compose_parts verdict export_controllers report"),
         (
             "setpoint",
             "train_classifier train_agent evaluate_setpoint certify verdict export_controllers report",

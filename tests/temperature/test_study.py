@@ -162,7 +162,7 @@ def test_the_stage_reads_the_studys_draws_and_its_own_section_and_declares_no_ou
         "datasets/published"
     ]
     assert entry["params"] == {f"{params.PAPERS}: reproduce_study"}
-    assert "outs" not in entry and "metrics" not in entry
+    assert not entry["outs"] and not entry.get("metrics")
 
 
 @pytest.mark.parametrize(

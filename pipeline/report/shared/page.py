@@ -182,13 +182,19 @@ def files(sources: Sequence[SourceFile]) -> Markup:
     return Markup('<p class="src">From {}.</p>').format(linked(sources)) if sources else Markup("")
 
 
-def linked(sources: Sequence[SourceFile]) -> Markup:
-    """The links to these files, with commas between them."""
+def linked(sources: Sequence[SourceFile], *, short: bool = False) -> Markup:
+    """The links to these files, with commas between them; `short`: figures by their stage, tables by their
+    name."""
+
+    def name(path: str) -> str:
+        stage, _, file = path.split("/", 1)[1].rpartition("/")
+        return f"{stage}/{file}" if not short else stage if file == "figures.json" else file
+
     return Markup(", ").join(
         placed(
             source.link,
             source.path,
-            verbatim(source.path.split("/", 1)[1]),
+            verbatim(name(source.path)),
             f"{source.path}, SHA-256 {source.sha256[:8]}",
         )
         for source in sources
