@@ -79,7 +79,7 @@ def code_digest(source: str) -> str:
         if isinstance(body, list):
             first = body[:1] if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) else []
             text = [one for one in first if isinstance(one, ast.Expr) and isinstance(one.value, ast.Constant)]
-            node.body = [
+            body[:] = [
                 one for one in body if one not in text and not isinstance(one, ast.Import | ast.ImportFrom)
             ]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
