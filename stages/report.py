@@ -130,6 +130,8 @@ def main() -> None:
         sources = collect(
             declared, FIGURES, FOLDERS, "reports/accepted.json", ("pipeline", "stages"), VERDICTS
         )
+        if not sources.verdicts:
+            raise ValueError(f"{VERDICTS} holds no verdict of a loop; run ./run dvc repro verdict")
         judged = judgement(sources)
         told = {
             "verdict": judged.verdict.metrics(),

@@ -63,6 +63,13 @@ def test_all_problems_of_all_sections_are_told_at_once(project):
     ]
 
 
+def test_a_machine_without_any_loop_is_refused(project):
+    for loop in params.Loops.model_fields:
+        change(project, "params.yaml", f"  {loop}: true", f"  {loop}: false")
+    with pytest.raises(ValueError, match=r"^params.yaml: loops switches every loop off; set temperature"):
+        stages.check_parameters()
+
+
 def test_a_misspelt_section_is_one_problem(project):
     change(project, "params.yaml", "\nreport:", "\nreprot:")
     with pytest.raises(ValueError, match=r"^params.yaml: reprot is no section; did you mean report\?$"):

@@ -75,6 +75,12 @@ class Loops(Section):
     deposition: bool
     setpoint: bool
 
+    @pydantic.model_validator(mode="after")
+    def _one_is_on(self):
+        if not any(self.model_dump().values()):
+            raise ValueError("switches every loop off; set temperature, deposition or setpoint to true")
+        return self
+
 
 class Mapped(Section):
     """Where a signal of a recording comes from: source times scale, plus offset."""

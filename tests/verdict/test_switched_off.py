@@ -7,6 +7,7 @@ import yaml
 
 from pipeline.store import artifacts, params
 from pipeline.verdict.verdict import LOOPS, read
+from stages import report
 from tests.report import made
 from tests.report.test_pages import INDEX, Page
 
@@ -40,3 +41,16 @@ def test_a_loop_that_is_switched_off_has_no_verdict_and_no_card(project, on):
     decision = artifacts.read_figures("report")["verdicts"]
     assert tuple(decision) == on
     assert ("Plunger command to flow" in index) == ("deposition" in on)
+
+
+def test_pages_without_a_verdict_are_refused_with_the_command_that_makes_one(project, capsys):
+    made.main()
+    last = INDEX.read_text()
+    for path in Path("datasets/verdict").glob("*.json"):
+        path.unlink()
+    with pytest.raises(SystemExit) as ended:
+        report.main()
+    assert ended.value.code == 1 and INDEX.read_text() == last
+    assert (
+        "datasets/verdict holds no verdict of a loop; run ./run dvc repro verdict" in capsys.readouterr().err
+    )
