@@ -94,7 +94,8 @@ def choose_default(
 
     redraws, harmed = settings.redraws, settings.most_harmed
     limits = contest.harm_limits(perfect=harmed.perfect_percent, in_band=harmed.in_band_percent)
-    cases = {name: case for name, case in all_cases(settings).items() if not case.good or name in limits}
+    every = judging.all_cases(settings.runs, segment_mean_decisions=settings.segment_mean_decisions)
+    cases = {name: case for name, case in every.items() if not case.good or name in limits}
     rng = np.random.default_rng([settings.seed, 0])
     redrawn = judging.redrawn(windows, settings.rounds * redraws, rng, room=room)
     outcomes: dict[str, Any] = {name: {} for name in controllers}
@@ -128,7 +129,8 @@ def simulate_contest(
 
     from pipeline.setpoint.evaluation import contest, judging
 
-    cases, redraws = all_cases(settings), settings.redraws
+    cases = judging.all_cases(settings.runs, segment_mean_decisions=settings.segment_mean_decisions)
+    redraws = settings.redraws
     rng = np.random.default_rng([settings.seed, 1])
     redrawn = judging.redrawn(windows, settings.rounds * redraws, rng, room=room)
     segments = [contest.one_round(redrawn, number, redraws) for number in range(settings.rounds)]
@@ -186,12 +188,6 @@ def each_controller(
         groups = pool.map(lambda group: {name: work(name) for name in group}, [*alike.values()][::-1])
         results = {name: result for group in groups for name, result in group.items()}
     return {name: results[name] for name in names}
-
-
-def all_cases(settings: EvaluateSetpoint) -> "dict[str, Case]":
-    from pipeline.setpoint.evaluation import judging
-
-    return judging.all_cases(settings.runs, segment_mean_decisions=settings.segment_mean_decisions)
 
 
 def progress(words: str, total: int) -> Any:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 MARKED = ("c/machine.h", "c/README.txt", "python/controller.py")  # which hold the certificate's SHA-256
 VERDICTS, CERTIFY = Path("datasets/verdict"), Path("datasets/certify")
+NOT_CERTIFIED = {"measured": False, "why": "Not exported: the stage certify did not measure it."}
 COMPOSED = ("datasets/compose_parts/signals.parquet", "datasets/compose_parts/lines.parquet")
 
 # figures of control that git keeps and that runs are compared by
@@ -54,7 +55,7 @@ def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
         if name:
             why = "Doing nothing is recommended: there is no controller to export."
         return describe(why=why, unit="percent")
-    source, one = CERTIFY / "temperature" / name, found[name]
+    source, one = CERTIFY / "temperature" / name, found.get(name, NOT_CERTIFIED)
     if not one["measured"]:
         return describe(name, why=one["why"], unit="percent")
     rules = params.load(TemperatureRules, "report")

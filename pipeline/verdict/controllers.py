@@ -11,7 +11,7 @@ def _by_role(role: str) -> str:
     return next(controller.name for controller in CONTROLLERS if controller.role == role)
 
 
-# the user asked to see model-based beside data-driven; the indirect one stands in where the kernel is refused
+# the pair that answers "model-based or data-driven?"; if the kernel is refused, a second model-based one
 MODEL_BASED, DATA_DRIVEN, INDIRECT = (_by_role(role) for role in ("model_based", "data_driven", "indirect"))
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from pipeline.temperature.controllers.table import BY_NAME
 from pipeline.verdict.controllers import DATA_DRIVEN, INDIRECT, MODEL_BASED, in_a_sentence
 from pipeline.verdict.digits import band, number
 from pipeline.verdict.evidence import Figures, entry
@@ -18,7 +19,8 @@ class PairSentence(NamedTuple):
 
 
 def pair_names(figures: Figures) -> tuple[str, str]:
-    """The model-based controller and the data-driven one; the indirect one where the kernel is refused."""
+    """The model-based controller and the data-driven one, or a second model-based one if the kernel is
+    refused."""
     pair = entry(comparison(figures), "pair")
     if isinstance(pair, Mapping) and {"a", "b"} <= pair.keys():
         return str(pair["a"]), str(pair["b"])
@@ -33,8 +35,10 @@ def pair_sentence(figures: Figures) -> PairSentence:
     a, b = pair_names(figures)
     reason_of = refused(figures).get(DATA_DRIVEN)
     instead = f"The learned kernel is refused: {reason_of}." if reason_of and b != DATA_DRIVEN else ""
-    kind = "data-driven" if b == DATA_DRIVEN else "data-driven, indirect"
-    head = f"Model-based against {kind}:"
+    compared = b not in BY_NAME or BY_NAME[b].kind == "data-driven"
+    head = (
+        "Model-based against data-driven:" if compared else "No data-driven controller; two model-based ones:"
+    )
     if not isinstance(pair, Mapping) or (pair.get("winner") is None and pair.get("difference") is None):
         gap = refused(figures).get(a) or refused(figures).get(b) or "not measured"
         return PairSentence(f"{head} {gap.rstrip('.')}.", None, instead)

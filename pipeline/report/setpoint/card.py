@@ -20,6 +20,7 @@ from pipeline.report.shared.card import (
 )
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import BEYOND, FLOW_BAND
+from pipeline.setpoint.controllers import KINDS
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.verdict.digits import THIN, band, count
 from pipeline.verdict.evidence import lookup
@@ -95,12 +96,11 @@ def accepted(sources: Sources) -> str:
 
 def _notes(sources: Sources, scores: Board, names: Sequence[str]) -> list[tuple[str, str]]:
     before = accepted(sources)
-    kinds = {BASELINE: "rule", "agent": "data-driven", "paper": "the paper’s"}
     return [
         (
             name,
             "as before" if name == before else "closest" if i == 0
-            else "yardstick" if name == DOES_NOTHING else kinds.get(scores.kinds[name], "rule"),
+            else KINDS.get(name, "baseline"),
         )
         for i, name in enumerate(names)
     ]  # fmt: skip

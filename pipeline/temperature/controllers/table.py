@@ -138,7 +138,7 @@ CONTROLLERS = (
     TemperatureController(
         "varx_riccati",
         "VARX + Riccati",
-        "data-driven, indirect",
+        "model-based, least squares",
         "A long window of past inputs and outputs predicts the next output; the Riccati equation does the "
         "rest. No order, no state to choose.",
         in_file("designs", "varx_riccati"),
@@ -146,8 +146,8 @@ CONTROLLERS = (
         (EFFORT, INTEGRAL),
         learned_from="window",
         role="indirect",
-        word="VARX + Riccati, data-driven and indirect",
-        mark="dd",
+        word="VARX + Riccati, model-based by least squares",
+        mark="mb",
         hollow=True,
     ),
     TemperatureController(
@@ -174,8 +174,6 @@ CONTROLLERS = (
         "reference",
         (EFFORT, OBSERVER, INTEGRAL),
         role="yardstick",
-        mark="mb",
-        hollow=True,
     ),
 )
 BY_NAME = {controller.name: controller for controller in CONTROLLERS}

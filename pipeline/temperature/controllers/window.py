@@ -1,5 +1,5 @@
-"""The indirect data-driven route: a long VARX window learned from the record is the state of a predictor, and
-the Riccati equation does the rest.
+"""Model-based by least squares: a long VARX window fitted to the record is the state of a predictor, and the
+Riccati equation gives the gains.
 
 y(t) = Theta [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)] + theta_0 + e(t)
 
