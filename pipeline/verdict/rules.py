@@ -173,7 +173,13 @@ def judge(
     limit = words.get("limit_words") or _text(question.limit, row.unit)
     places = {"name": row.name, "value": text, **words, "limit": limit, "undecided": undecided}
     sentence = row.passes if row.passes and rule.state == PASSED else fails
-    return rule._replace(reason=sentence.format(**places), remedy=remedy.format(**places))
+    try:
+        return rule._replace(reason=sentence.format(**places), remedy=remedy.format(**places))
+    except (KeyError, IndexError, ValueError) as error:
+        raise ValueError(
+            f"{PATH.name}: a sentence of the rule {row.name} has no place for {error}; it may use "
+            f"{', '.join(f'{{{place}}}' for place in sorted(places))}"
+        ) from None
 
 
 def _text(value: float, unit: str) -> str:

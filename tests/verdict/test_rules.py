@@ -127,3 +127,11 @@ def test_if_nobody_who_passes_is_certified_nothing_is_ready_and_the_certificate_
     assert (verdict.winner, verdict.rule) == (None, "certificate") and verdict.state not in (PASSED, FAILED)
     assert verdict.lead == "First undecided rule: certificate." and verdict.subject in names
     assert verdict.reason.startswith("The disk margin is 0.2.")
+
+
+def test_a_sentence_with_an_unknown_place_is_refused_by_the_name_of_its_rule(project, add, capsys):
+    add((ENERGY % 0.001).replace("{value}", "{watts}"))
+    with pytest.raises(SystemExit):
+        made.main()
+    said = capsys.readouterr().err
+    assert "a sentence of the rule energy has no place for 'watts'; it may use " in said and "{value}" in said
