@@ -159,7 +159,7 @@ def certify_controller(
             name, design, fallback, common.machine, setting, family, simulated=loaded.simulated
         )
         machine.check(made)
-        difference = checks.judged_difference(made, half, *judged_trajectory(name, loaded.machine))
+        difference = checks.judged_difference(made, half, *judged_commands(name, loaded.machine))
         checks.check_same(made, difference)
         measured = certify.measure(
             made,
@@ -193,20 +193,15 @@ def _not_measured(why: str) -> dict[str, Any]:
     return {"measured": False, "why": why, "largest_difference": {}}
 
 
-def judged_trajectory(name: str, declared: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Outputs and references (steps, p) in °C, and applied inputs (steps, m) in percent, of the case that
-    decided the comparison."""
+def judged_commands(name: str, declared: Plant) -> tuple[int, np.ndarray]:
+    """The number of the case that decided the comparison, and the applied inputs (steps, m) in percent."""
     import numpy as np
 
     schema = tables.trajectories(declared.inputs, declared.outputs)
     played = artifacts.read_table("datasets/evaluate_temperature/trajectories.parquet", schema)
     rows = (played["contestant"] == name) & (played["case_name"] == "deciding")
-    outputs, inputs = [one.name for one in declared.outputs], [one.name for one in declared.inputs]
-    y, r, u = (
-        np.stack([played[column][rows] for column in columns], axis=1)
-        for columns in (outputs, [f"{o}_reference" for o in outputs], [f"{i}_applied" for i in inputs])
-    )
-    return y, r, u
+    case = artifacts.read_figures("evaluate_temperature")["deciding"]["case"]
+    return case, np.stack([played[f"{one.name}_applied"][rows] for one in declared.inputs], axis=1)
 
 
 # ---- setpoint

@@ -1,6 +1,6 @@
 """Compare every temperature controller, tuned, as it would be deployed, on plants that nobody learned or
 tuned on: reads what the temperature stages wrote; writes datasets/evaluate_temperature: cases.parquet,
-trajectories.parquet and summary.json."""
+trajectories.parquet and figures.json."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import stages
 from pipeline.store import artifacts, params
 from pipeline.store.params import Execution, Section
 from pipeline.temperature import tables
-from pipeline.temperature.settings import Panel, Plant, TemperatureRules, Tracking, TuneWeights
+from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights
 from stages.tune_weights import load_design_problem
 
 if TYPE_CHECKING:
     from pipeline.temperature.controllers.problem import DesignProblem
-    from pipeline.temperature.test_set.cases import CaseConditions, Rehearsal
+    from pipeline.temperature.test_set.cases import CaseConditions
     from pipeline.temperature.test_set.evaluation import ControllerOutcome
 
 
@@ -66,8 +66,8 @@ def read_weights(path: str | Path) -> Weights:
 
 
 class EvaluationInputs(NamedTuple):
-    """What every controller is designed from and compared by: sections, the rules with what the record says
-    of them, the conditions of all cases, the problem, and the tuned parameters by controller."""
+    """What every controller is designed from and compared by: sections, the conditions of all cases, the
+    problem, and the tuned parameters by controller."""
 
     machine: Plant
     panel: Panel
@@ -94,18 +94,8 @@ def load_problem() -> EvaluationInputs:
     return EvaluationInputs(machine, panel, setting, problem, tuned, simulated)
 
 
-def resolve(rules: TemperatureRules, panel: Panel, rehearsal: Rehearsal) -> TemperatureRules:
-    """The rules with a settling time: as declared, else as the record says, else the panel's; and with a fast
-    machine's delay margin (cases.faster)."""
-    from pipeline.temperature.test_set.cases import faster
-
-    settling_s = rules.settling_s or rehearsal.settling_s or panel.settling_s
-    delay_margin_s = faster(panel, rehearsal) * rules.delay_margin_s
-    return rules.model_copy(update={"settling_s": settling_s, "delay_margin_s": delay_margin_s})
-
-
 def compare(
-    settings: EvaluateTemperature, loaded: EvaluationInputs, rules: TemperatureRules, execution: Execution
+    settings: EvaluateTemperature, loaded: EvaluationInputs, execution: Execution
 ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """Every controller on the judging half of the panel: the cases and two of them as trajectories, both as
     columns, and the summary."""
@@ -116,7 +106,7 @@ def compare(
     outcomes, refused = evaluate_all(loaded.problem, loaded.weights, setting, execution)
     entrants = [name for name in outcomes if BY_NAME[name].role != "yardstick"]
     summary: dict[str, Any] = {
-        **conditions(machine, setting, rules),
+        **conditions(machine, loaded.panel, setting),
         "contestants": {
             name: evaluation.summarise(
                 outcome,
@@ -130,7 +120,7 @@ def compare(
         "order": entrants,
         "refused": refused,
     }
-    summary |= evaluation.decide(outcomes, entrants, summary, rules, setting, settings.seed)
+    summary |= evaluation.decide(outcomes, entrants, summary, setting, settings.seed)
     typical = evaluation.typical_case(outcomes, entrants)
     drawn = {"typical": typical, "deciding": summary["deciding"]["case"]}
     return (
@@ -161,7 +151,8 @@ def evaluate_all(
     return {name: outcomes[name] for name in designs}, refused
 
 
-def conditions(machine: Plant, setting: CaseConditions, rules: TemperatureRules) -> dict[str, Any]:
+def conditions(machine: Plant, panel: Panel, setting: CaseConditions) -> dict[str, Any]:
+    """What the cases have in common; `pace` resolves the limits that depend on the machine's own pace."""
     rehearsal = setting.rehearsal
     return {
         "simulated": rehearsal.source == "declared",
@@ -173,7 +164,11 @@ def conditions(machine: Plant, setting: CaseConditions, rules: TemperatureRules)
         "settled_steps": setting.settled,
         "sample_time_s": setting.sample_time_s,
         "band_degC": rehearsal.band_degC,
-        "limits": rules.model_dump() | {"source": rehearsal.source},
+        "pace": {
+            "settling_s": rehearsal.settling_s or panel.settling_s,
+            "delay_margin_share": setting.faster,
+            "source": rehearsal.source,
+        },
         "outputs_limited": all(o.low is not None and o.high is not None for o in machine.outputs),
         "infeasible": rehearsal.infeasible,
     }
@@ -183,8 +178,6 @@ def conditions(machine: Plant, setting: CaseConditions, rules: TemperatureRules)
 METRICS = (
     "plants",
     "cases",
-    "limits.settling_s",
-    "limits.delay_margin_s",
     "contestants.*.settled_error.q90",
     "contestants.*.settling.q90",
     "contestants.*.overshoot.q90",
@@ -203,12 +196,10 @@ def main() -> None:
     with artifacts.stage("evaluate_temperature") as out:
         settings = params.load(EvaluateTemperature, "evaluate_temperature")
         execution, loaded = params.load(Execution, "execution"), load_problem()
-        rules = resolve(params.load(TemperatureRules, "report"), loaded.panel, loaded.setting.rehearsal)
-        cases, trajectories, summary = compare(settings, loaded, rules, execution)
+        cases, trajectories, summary = compare(settings, loaded, execution)
         artifacts.write_table(out / "cases.parquet", tables.CASES, cases)
         drawn = tables.trajectories(loaded.machine.inputs, loaded.machine.outputs)
         artifacts.write_table(out / "trajectories.parquet", drawn, trajectories)
-        artifacts.write_json(out / "summary.json", summary)
         artifacts.write_metrics("evaluate_temperature", summary, METRICS)
 
 

@@ -87,6 +87,8 @@ def test_a_signal_to_run_reaches_dvc(copy, number):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        # a job in the background of a shell ignores SIGINT, and so does what it starts
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as started:
         assert started.stdout is not None
         # the process of the shell became the one of uv, and that, here, the one of DVC

@@ -1,7 +1,7 @@
 """A controller's files -> evidence: the temperature loop on a frozen panel of plants that nothing was learned
 from; any loop from a file of costs by case."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -100,7 +100,7 @@ def _deposition(folder: Path) -> CaseCosts:
 def _setpoint(folder: Path) -> CaseCosts:
     """Of each case of each simulator that counts: the share of runs that the chosen controller does not
     settle, plus one point. Guards: the worst case, and the slowest."""
-    table = _scoreboard(folder / "evaluate_setpoint/scoreboard.parquet")
+    table = artifacts.read_table(folder / "evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD)
     chosen = artifacts.read_json(folder / "evaluate_setpoint/choice.json")
     rows = [k for k, name in enumerate(table["controller"]) if name == chosen["name"] and table["counts"][k]]
     lost = {
@@ -113,12 +113,6 @@ def _setpoint(folder: Path) -> CaseCosts:
         {name: (name, cost) for name, cost in lost.items()},
         {"worst_unsettled_percent": max(lost.values(), default=np.nan), "slowest_p90_steps": float(slow)},
     )
-
-
-def _scoreboard(path: Path) -> Mapping[str, np.ndarray]:
-    """The scoreboard; of a champion of an earlier version as it was written."""
-    schema = tables.SCOREBOARD_1 if artifacts.version(path) == 1 else tables.SCOREBOARD
-    return artifacts.read_table(path, schema)
 
 
 # ---- the temperature loop

@@ -27,7 +27,7 @@ def read_verdicts(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], 
     loops = [name for name, loop in settings.loops.items() if loop.judge != "cases"]
     if not loops:
         return {}, night
-    evidence = read_evidence(verdict.read_certificates(STORED))
+    evidence = read_evidence(STORED)
     stored, tonight, named = verdict.read(STORED), _read_json(METRICS), settings.holdout.controller
     by_loop = verdict_night.verdicts(evidence, stored, tonight)
     night = _make_pages_agree(by_loop, night)

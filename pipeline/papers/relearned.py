@@ -24,7 +24,11 @@ import numpy as np
 
 from pipeline.papers import files
 from pipeline.store import artifacts, params
+from pipeline.temperature.settings import TemperatureRules
+from pipeline.temperature.tables import CASES
+from pipeline.temperature.test_set.best import with_best
 from stages import evaluate_temperature, identify_plant, ingest, learn_kernel, probe_machine, tune_weights
+from stages.evaluate_temperature import EvaluateTemperature
 
 COMMAND = "./run dvc repro datasets/papers/dvc.yaml:relearned"
 STAGES = (probe_machine, ingest, identify_plant, learn_kernel, tune_weights, evaluate_temperature)
@@ -67,10 +71,14 @@ def relearn(drawn: Mapping[str, int], changes: Mapping[str, Any]) -> dict:
                         stage.main()
                 except SystemExit:
                     raise ValueError(f"a relearning failed: {said.getvalue().strip()}") from None
-        judged, tuned = (
+        compared, tuned = (
             artifacts.read_json(folder / "datasets" / name / "figures.json")
             for name in ("evaluate_temperature", "tune_weights")
         )
+        cases = artifacts.read_table(folder / "datasets" / "evaluate_temperature" / "cases.parquet", CASES)
+        rules = params.load(TemperatureRules, "report", folder / params.FILE)
+        seed = params.load(EvaluateTemperature, "evaluate_temperature", folder / params.FILE).seed
+        judged = with_best(compared, cases, rules.model_dump(), seed)
         return judged | {"tuned_cost": {key: one["cost"] for key, one in tuned["contestants"].items()}}
 
 

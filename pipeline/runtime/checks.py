@@ -22,38 +22,10 @@ SAME = 1e-9  # of an input's range, by which commands in another order of sums m
 COMPILERS = ("cc", "gcc", "clang")
 
 
-def judged_difference(
-    made: Exported, cases: panel.Cases, y: np.ndarray, r: np.ndarray, applied: np.ndarray
-) -> float:
+def judged_difference(made: Exported, cases: panel.Cases, case: int, applied: np.ndarray) -> float:
     """The largest difference in percent between the commands of `made`, a sample at a time, and the commands
-    `applied` (steps, m) that the judged controller gave in one case, with outputs y (steps, p) in °C under
-    references r (steps, p). The case is found by its first outputs and its references; of several the nearest
-    counts."""
-    return min(
-        (
-            float(np.abs(commands(made, cases, case) - applied).max())
-            for case in range(len(cases.plant))
-            if _is_case(cases, case, y[0], r)
-        ),
-        default=np.inf,
-    )
-
-
-def _is_case(cases: panel.Cases, case: int, y: np.ndarray, r: np.ndarray) -> bool:
-    """Whether a case begins at outputs y (p,) and has references r (steps, p)."""
-    plant = cases.plants[cases.plant[case]]
-    begins = np.allclose(plant.C @ cases.x0[case] + plant.d, y, rtol=0, atol=1e-9)
-    return begins and np.allclose(references(cases, case), r, rtol=0, atol=1e-9)
-
-
-def references(cases: panel.Cases, case: int) -> np.ndarray:
-    """References (steps, p) of one case, one after the other."""
-    r = np.empty((cases.steps, len(cases.starts[0])))
-    for number, first in zip(cases.asked[case], cases.begin[case], strict=True):
-        if first < cases.steps:
-            reference = cases.references[number]
-            r[first:] = reference.states(cases.steps - first) @ reference.H.T
-    return r
+    `applied` (steps, m) that the judged controller gave in that case."""
+    return float(np.abs(commands(made, cases, case) - applied).max())
 
 
 def commands(made: Exported, cases: panel.Cases, case: int) -> np.ndarray:

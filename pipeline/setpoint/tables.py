@@ -171,9 +171,6 @@ _ERRORS = (
     Column("worst_start_settled_percent", FLOAT, "percent", "of runs from there", 0, 100),
 )
 
-# of a champion that an earlier version judged
-SCOREBOARD_1 = Schema("scoreboard", 1, (*_WHO, *_SETTLED, *_MEDIAN, *_ERRORS))
-
 SCOREBOARD = Schema(
     "scoreboard",
     2,

@@ -94,18 +94,6 @@ def read_table(path: str | Path, schema: Schema) -> dict[str, np.ndarray]:
     }
 
 
-def version(path: str | Path) -> int | None:
-    """The version of the schema that a table was written with; None if it is no such table."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        told = (pq.read_schema(path).metadata or {}).get(b"schema_version", b"").decode()
-    except (OSError, pa.ArrowException):
-        return None
-    return int(told) if told.isdigit() else None
-
-
 def write_arrays(
     path: str | Path, name: str, version: int, arrays: Mapping[str, tuple[np.ndarray, str, str]]
 ) -> None:

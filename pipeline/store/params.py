@@ -196,15 +196,6 @@ def home(dotted: str, path: str | Path = FILE) -> str:
     return ""
 
 
-def digest(model: Section) -> str:
-    """SHA-256 of the section's canonical JSON. Equal parameters have equal digests, whatever their order and
-    spelling in the file."""
-    import hashlib
-
-    canonical = json.dumps(model.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()
-
-
 def read(path: str | Path = FILE) -> dict:
     """Every section with its keys of both files, unchecked.
 

@@ -227,7 +227,7 @@ class TuneWeights(Section):
 
 
 class TemperatureRules(Section, extra="ignore"):
-    """Of section `report` what a rehearsal of the temperature loop is held against; settling_s null: as
+    """Of section `report` the limits that a simulation of the temperature loop can check; settling_s null: as
     panel.settling_s says on the study's machine, as the record says on another."""
 
     settled_error_degC: float = Field(gt=0, le=1000)

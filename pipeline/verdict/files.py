@@ -1,6 +1,6 @@
 """The evidence of a run, read from what its stages wrote."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from pipeline.deposition.tables import SCORES
@@ -10,7 +10,7 @@ from pipeline.temperature.settings import Plant
 from pipeline.temperature.tables import DYNAMICS, RESIDUALS
 from pipeline.verdict.evidence import OFF, Evidence, switched_off
 from pipeline.verdict.settings import QUICK_LOOK, ReportRules
-from pipeline.verdict.verdict import Missing
+from pipeline.verdict.verdict import Missing, read_certificates, read_comparison
 
 # stages whose figures the rules may ask for
 FIGURES = {
@@ -36,9 +36,12 @@ TABLES = {
 }
 
 
-def read_evidence(certified: Mapping[str, Mapping[str, Any]] | None = None) -> Evidence:
-    """What the stages that ran wrote; a Missing in the place of each file that is not there, or broken."""
+def read_evidence(stored: str = "") -> Evidence:
+    """What the stages that ran wrote; a Missing in the place of each file that is not there, or broken.
+    `stored` is the folder of the stage verdict, if what the limits make of it is there already."""
     figures = {stage: _read(path, stage, artifacts.read_json) for stage, path in FIGURES.items()}
+    if stored and isinstance(figures["evaluate_temperature"], dict):
+        figures["evaluate_temperature"] |= read_comparison(stored)
     off = {stage for stage in FIGURES if switched_off(figures[stage])}
     places = {name: (path, path.split("/")[1], _reader(schema)) for name, (path, schema) in TABLES.items()}
     return Evidence(
@@ -48,7 +51,7 @@ def read_evidence(certified: Mapping[str, Mapping[str, Any]] | None = None) -> E
         params.load(ReportRules, "report"),
         params.read(),
         artifacts.exists(QUICK_LOOK),
-        certified or {},
+        read_certificates(stored) if stored else {},
     )
 
 

@@ -203,15 +203,6 @@ def test_a_setpoint_case_costs_the_runs_that_do_not_settle(project):
         "recorded: clog": 6.0,
     }
     assert evidence.guards == {"worst_unsettled_percent": 6.0, "slowest_p90_steps": 30.0}
-    # a champion that an earlier version judged is read as it was written, on the panel that it ran
-    older = {column.name: (filler | named)[column.name] for column in tables.SCOREBOARD_1.columns}
-    artifacts.write_table("datasets/evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD_1, older)
-    assert (
-        judge.judge(NightlyLoop(artifacts=["x"], judge="setpoint", cases="", recordings=""), project).measure(
-            Path("datasets")
-        )
-        == evidence
-    )
 
 
 def test_a_file_of_cases_that_lacks_its_costs_is_refused(project):

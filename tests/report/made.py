@@ -429,7 +429,6 @@ def write(root, *, samples=400, recording="good.mcap"):
         tables.trajectories(machine.inputs, machine.outputs),
         trajectories(machine),
     )
-    artifacts.write_json(folder / "summary.json", comparison())
     deposition()
     made_setpoint.write()
 

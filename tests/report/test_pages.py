@@ -117,7 +117,6 @@ def test_a_failed_rule_fails_the_verdict_and_its_row_only(project):
     [
         "datasets/evaluate_temperature/cases.parquet",
         "datasets/evaluate_temperature/trajectories.parquet",
-        "datasets/evaluate_temperature/summary.json",
         "datasets/identify_plant/plant.parquet",
         "datasets/identify_plant/order.parquet",
         "datasets/identify_plant/holdout.parquet",

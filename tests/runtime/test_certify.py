@@ -16,15 +16,13 @@ from tests.temperature.test_evaluate_temperature import judged, small
 
 
 @cache
-def deciding(name: str) -> tuple[np.ndarray, ...]:
-    """Outputs, references and applied inputs of the case that decided the comparison."""
-    played = {key: np.asarray(values) for key, values in judged(small()).trajectories.items()}
+def deciding(name: str) -> tuple[int, np.ndarray]:
+    """Number and applied inputs of the case that decided the comparison."""
+    result = judged(small())
+    played = {key: np.asarray(values) for key, values in result.trajectories.items()}
     rows = (played["contestant"] == name) & (played["case_name"] == "deciding")
-    inputs, outputs = (
-        [one.name for one in side] for side in (small().machine.inputs, small().machine.outputs)
-    )
-    columns = outputs, [f"{one}_reference" for one in outputs], [f"{one}_applied" for one in inputs]
-    return tuple(np.stack([played[column][rows] for column in part], axis=1) for part in columns)
+    columns = [played[f"{one.name}_applied"][rows] for one in small().machine.inputs]
+    return result.summary["deciding"]["case"], np.stack(columns, axis=1)
 
 
 @cache
@@ -54,10 +52,13 @@ def test_a_law_that_was_changed_since_is_not_exported():
         checks.check_same(changed, difference)
 
 
-def test_a_case_that_none_of_the_judging_half_begins_like_is_not_the_judged_one():
-    y, r, applied = deciding("pi")
+def test_commands_of_another_case_are_not_those_that_were_judged():
+    case, applied = deciding("pi")
     half = small().setting.rehearsal.judging
-    assert checks.judged_difference(made("pi"), half, y + 1.0, r, applied) == np.inf
+    others = [row for row, plant in enumerate(half.plant) if plant != half.plant[case]]
+    difference = checks.judged_difference(made("pi"), half, others[0], applied)
+    with pytest.raises(ValueError, match="pi gives commands"):
+        checks.check_same(made("pi"), difference)
 
 
 def test_an_exported_machine_is_the_declared_one():

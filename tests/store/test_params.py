@@ -175,13 +175,6 @@ def test_one_key_of_another_section_is_bounded_too(load):
         params.value("learn_kernel.metod", one_of=("direct",))
 
 
-def test_the_digest_is_of_the_values_not_of_their_spelling(load):
-    one = params.digest(load(GOOD))
-    lines = GOOD.strip().splitlines()
-    assert params.digest(load("\n".join([lines[0], *reversed(lines[1:])]).replace("1e-3", "0.00100"))) == one
-    assert params.digest(load(GOOD.replace("horizon: 6", "horizon: 7"))) != one
-
-
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
@@ -362,14 +355,6 @@ def test_a_key_or_a_section_that_is_missing_says_where_it_is_looked_for(load):
         r"checkout params.expert.yaml$",
     ):
         load(OWNER, section="colours")
-
-
-def test_the_digest_is_the_same_wherever_a_key_stands_and_another_with_another_value_in_either_file(load):
-    one = params.digest(load(OWNER, expert=EXPERT))
-    assert one == params.digest(load(GOOD))
-    assert params.digest(load(OWNER.replace("window", "direct"), expert=EXPERT)) != one
-    assert params.digest(load(OWNER, expert=EXPERT.replace("horizon: 6", "horizon: 7"))) != one
-    assert params.digest(load(OWNER, expert=EXPERT.replace("0.9", "0.8"))) == one
 
 
 # ---- sections that nothing reads

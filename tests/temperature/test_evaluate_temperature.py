@@ -17,9 +17,9 @@ from pipeline.temperature.controllers.kernel import regress
 from pipeline.temperature.controllers.problem import DesignProblem
 from pipeline.temperature.controllers.table import BY_NAME, CONTROLLERS, PAIR
 from pipeline.temperature.plant import baam
-from pipeline.temperature.settings import Panel, Plant, TemperatureRules, Tracking, TuneWeights
+from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights
 from pipeline.temperature.study import data_sets
-from pipeline.temperature.test_set import cases, comparison, controller_search, evaluation
+from pipeline.temperature.test_set import best, cases, comparison, controller_search, evaluation
 from stages import evaluate_temperature, tune_weights
 from stages.evaluate_temperature import EvaluateTemperature
 
@@ -95,7 +95,6 @@ def judged(
 ) -> Compared:
     execution = execution or params.Execution(backend="loky", jobs=jobs, scheduler="")
     panel = section(Panel, "panel")
-    rules = evaluate_temperature.resolve(section(TemperatureRules, "report"), panel, given.setting.rehearsal)
     loaded = evaluate_temperature.EvaluationInputs(
         given.machine,
         panel,
@@ -105,7 +104,7 @@ def judged(
         simulated=True,
     )
     settings = section(EvaluateTemperature, "evaluate_temperature")
-    return Compared(*evaluate_temperature.compare(settings, loaded, rules, execution))
+    return Compared(*evaluate_temperature.compare(settings, loaded, execution))
 
 
 def written(result: Compared, machine: Plant, folder: Path) -> dict[str, bytes]:
@@ -113,7 +112,7 @@ def written(result: Compared, machine: Plant, folder: Path) -> dict[str, bytes]:
     artifacts.write_table(folder / "cases.parquet", tables.CASES, result.cases)
     shown = tables.trajectories(machine.inputs, machine.outputs)
     artifacts.write_table(folder / "trajectories.parquet", shown, result.trajectories)
-    artifacts.write_json(folder / "summary.json", result.summary)
+    artifacts.write_json(folder / "figures.json", result.summary)
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
@@ -129,13 +128,13 @@ def result(given):
 
 @pytest.fixture(scope="module")
 def stored(result, given, tmp_path_factory):
-    """cases.parquet and summary.json, read back."""
+    """cases.parquet and figures.json, read back, and what the limits of section report make of them."""
     folder = tmp_path_factory.mktemp("evaluate_temperature")
     written(result, given.machine, folder)
     rows = artifacts.read_table(folder / "cases.parquet", tables.CASES)
-    return {name: np.array(column) for name, column in rows.items()}, json.loads(
-        (folder / "summary.json").read_text()
-    )
+    seed = section(EvaluateTemperature, "evaluate_temperature").seed
+    summary = json.loads((folder / "figures.json").read_text())
+    return rows, best.with_best(summary, rows, params.read(FILE)["report"], seed)
 
 
 def of(rows, name: str) -> dict[str, np.ndarray]:
@@ -214,16 +213,16 @@ def test_best_pair_and_deciding_plant_follow_from_the_costs_of_the_rows(stored):
 
 def test_a_contestant_passes_by_its_ninety_percent_quantiles_and_breaks_a_rule_by_any_one_of_them(stored):
     _, summary = stored
-    rules = section(TemperatureRules, "report").model_copy(update={"settling_s": 1e6, "delay_margin_s": 1e-3})
+    limits = summary["limits"] | {"settling_s": 1e6, "delay_margin_s": 1e-3}
     good = summary["contestants"]["subspace_lqg"] | {"crossings": {"cases": 0}, "margins": None}
     good |= {name: {"q90": 0.0} for name in ("settled_error", "settling", "overshoot", "at_limits")}
-    assert evaluation.passes(good, rules)
+    assert best.passes(good, limits)
     for name in ("settled_error", "settling", "overshoot", "at_limits"):
         for beyond in (1e7, None):
-            assert not evaluation.passes(good | {name: {"q90": beyond}}, rules), name
-    assert not evaluation.passes(good | {"crossings": {"cases": 1}}, rules)
+            assert not best.passes(good | {name: {"q90": beyond}}, limits), name
+    assert not best.passes(good | {"crossings": {"cases": 1}}, limits)
     margins = {"disk": {"median": 0.01, "worst": 0.01}, "delay_s": {"median": None, "worst": None}}
-    assert not evaluation.passes(good | {"margins": margins}, rules)
+    assert not best.passes(good | {"margins": margins}, limits)
 
 
 def test_the_shown_trajectories_are_of_a_typical_and_of_the_deciding_case(stored, result, given):

@@ -1,5 +1,5 @@
-"""Controllers as they would be deployed, on plants that nobody learned or tuned on: figures of each, which is
-best, what tells model-based and data-driven apart, and which plant decides."""
+"""Controllers as they would be deployed, on plants that nobody learned or tuned on: figures of each, what
+tells model-based and data-driven apart, and which plant decides."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -9,7 +9,6 @@ import numpy as np
 from pipeline.temperature.controllers import table
 from pipeline.temperature.controllers.problem import Design
 from pipeline.temperature.settings import Plant as Machine
-from pipeline.temperature.settings import TemperatureRules
 from pipeline.temperature.test_set import comparison, panel, scorecard
 from pipeline.temperature.test_set.cases import CaseConditions, play
 
@@ -171,40 +170,16 @@ def _number(value: float) -> float | None:
 # ---- the comparison
 
 
-def passes(figures: Mapping[str, Any], rules: TemperatureRules) -> bool:
-    """Whether a controller's figures hold the rules that a simulation can check, at the 90 % quantile over
-    all cases; stable on every plant, and margins of the median one."""
-    limits = {
-        "settled_error": rules.settled_error_degC,
-        "settling": rules.settling_s,
-        "overshoot": rules.overshoot_degC,
-        "at_limits": rules.at_limits_percent,
-    }
-    quantiles = all(
-        figures[name]["q90"] is not None and figures[name]["q90"] <= limit for name, limit in limits.items()
-    )
-    margins, stable = figures["margins"], figures["stable"]
-    robust = margins is None or (
-        stable["count"] == stable["of"]
-        and (margins["disk"]["median"] or 0.0) >= rules.disk_margin
-        and (margins["delay_s"]["median"] is None or margins["delay_s"]["median"] >= rules.delay_margin_s)
-    )
-    return quantiles and robust and figures["crossings"]["cases"] == 0
-
-
 def decide(
     results: Mapping[str, ControllerOutcome],
     entrants: list[str],
     summary: Mapping[str, Any],
-    rules: TemperatureRules,
     setting: CaseConditions,
     seed: int,
 ) -> dict[str, Any]:
-    """Best, the pair, and the plant that decides, with both answers without it."""
+    """The pair, and the plant that decides, with the pair's answer without it."""
     block = setting.rehearsal.judging.plant
     costs = {name: results[name].costs for name in entrants}
-    able = {name: passes(summary["contestants"][name], rules) for name in entrants}
-    choice = comparison.chosen(costs, block, able, seed=seed)
     a, b = table.PAIR
     b = b if b in costs else table.INDIRECT
     one, two = a, b
@@ -213,25 +188,15 @@ def decide(
     index = comparison.deciding_plant(costs[one], costs[two], block)
     rest = block != index
     without = {name: values[rest] for name, values in costs.items()}
-    again = comparison.chosen(without, block[rest], able, seed=seed)
     pair = _pair(a, b, costs, block, summary, seed)
     mine = np.flatnonzero(block == index)
     worst = mine[
         np.abs(np.log(np.maximum(costs[one][mine], 1e-9) / np.maximum(costs[two][mine], 1e-9))).argmax()
     ]
     return {
-        "best": choice.best,
-        "best_reason": {
-            "passes": able,
-            "leading": comparison.chosen(costs, block, dict.fromkeys(entrants, True), seed=seed).best,
-            "nearest": choice.nearest,
-            "improvement_percent": choice.against.improvement_percent if choice.against else None,
-            "p": choice.against.p if choice.against else None,
-        },
         "pair": pair,
         "deciding": {
             **_case(setting.rehearsal.judging, int(worst)),
-            "best_without": again.best,
             "pair_without": _pair(a, b, without, block[rest], summary, seed)["winner"]
             if pair["p"] is not None
             else None,

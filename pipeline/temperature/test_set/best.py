@@ -1,0 +1,76 @@
+"""Costs of all cases and the limits of section `report` -> which controller of the temperature loop is best,
+and whether it still is without the plant that decides. The comparison itself knows no limit."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pipeline.temperature.test_set.comparison import chosen
+
+# limits that a simulation of the temperature loop can check, as the comparison resolves them
+CHECKED = ("settled_error_degC", "settling_s", "overshoot_degC", "at_limits_percent", "disk_margin",
+           "delay_margin_s")  # fmt: skip
+
+# what a changed limit can change in the figures of evaluate_temperature
+BY_LIMITS = ("limits", "best", "best_reason", "deciding")
+
+
+def with_best(
+    compared: Mapping[str, Any], table: Mapping[str, np.ndarray], declared: Mapping[str, Any], seed: int
+) -> dict[str, Any]:
+    """The figures of evaluate_temperature with `limits`, `best`, `best_reason` and, in `deciding`, the best
+    one without that plant. `table` has the cases, one row a controller and case; `declared` has the limits of
+    section `report`."""
+    order, limits = compared["order"], limits_of(compared["pace"], declared)
+    able = {name: passes(compared["contestants"][name], limits) for name in order}
+    rows = {name: table["contestant"] == name for name in order}
+    # a cost that is missing is without end
+    costs = {
+        name: np.where(np.isnan(table["cost"][at]), np.inf, table["cost"][at]) for name, at in rows.items()
+    }
+    plant = table["plant"][rows[order[0]]]
+    rest = plant != compared["deciding"]["plant"]
+    choice = chosen(costs, plant, able, seed=seed)
+    again = chosen({name: values[rest] for name, values in costs.items()}, plant[rest], able, seed=seed)
+    reason = {
+        "passes": able,
+        "leading": chosen(costs, plant, dict.fromkeys(order, True), seed=seed).best,
+        "nearest": choice.nearest,
+        "improvement_percent": choice.against.improvement_percent if choice.against else None,
+        "p": choice.against.p if choice.against else None,
+    }
+    deciding = {**compared["deciding"], "best_without": again.best}
+    return {**compared, "limits": limits, "best": choice.best, "best_reason": reason, "deciding": deciding}
+
+
+def limits_of(pace: Mapping[str, Any], declared: Mapping[str, Any]) -> dict[str, Any]:
+    """The limits for this machine. `pace` has the settling time that counts if none is declared, the share of
+    the declared delay margin that is asked of a fast machine, and in words where both come from."""
+    return {name: declared[name] for name in CHECKED} | {
+        "settling_s": declared["settling_s"] or pace["settling_s"],
+        "delay_margin_s": pace["delay_margin_share"] * declared["delay_margin_s"],
+        "source": pace["source"],
+    }
+
+
+def passes(figures: Mapping[str, Any], limits: Mapping[str, Any]) -> bool:
+    """Whether a controller's figures hold the rules that a simulation can check, at the 90 % quantile over
+    all cases; stable on every plant, and margins of the median one."""
+    quantiles = {
+        "settled_error": limits["settled_error_degC"],
+        "settling": limits["settling_s"],
+        "overshoot": limits["overshoot_degC"],
+        "at_limits": limits["at_limits_percent"],
+    }
+    held = all(
+        figures[name]["q90"] is not None and figures[name]["q90"] <= limit
+        for name, limit in quantiles.items()
+    )
+    margins, stable = figures["margins"], figures["stable"]
+    robust = margins is None or (
+        stable["count"] == stable["of"]
+        and (margins["disk"]["median"] or 0.0) >= limits["disk_margin"]
+        and (margins["delay_s"]["median"] is None or margins["delay_s"]["median"] >= limits["delay_margin_s"])
+    )
+    return held and robust and figures["crossings"]["cases"] == 0
