@@ -554,8 +554,6 @@ def together(folder: Path) -> Iterator[Path]:
 
 def _on_disk(path: Path) -> None:
     """Waits until a file, or the names in a folder, would outlast a power cut; some 5 ms each."""
-    if path.is_dir() and os.name == "nt":
-        return  # Windows opens no folder
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
