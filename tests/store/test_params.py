@@ -391,11 +391,6 @@ def test_a_key_or_a_section_that_is_missing_says_where_it_is_looked_for(load):
         ),
         ("", "trackng: {}", "params.expert.yaml: trackng is no section; did you mean tracking?"),
         (
-            "",
-            "reproduce_study: {}",
-            "params.expert.yaml: reproduce_study has moved to datasets/papers/params.yaml; delete it here",
-        ),
-        (
             "learn: {}",
             "panl: {}",
             "params.yaml: learn was renamed to learn_kernel\n"
