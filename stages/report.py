@@ -132,6 +132,8 @@ def main() -> None:
         )
         if not sources.verdicts:
             raise ValueError(f"{VERDICTS} holds no verdict of a loop; run ./run dvc repro verdict")
+        if "temperature" in sources.stored and "identification" not in sources.stored:
+            raise ValueError(f"{VERDICTS}/identification.json is missing; run ./run dvc repro verdict")
         judged = judgement(sources)
         told = {
             "verdict": judged.verdict.metrics(),
