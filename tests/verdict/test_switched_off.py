@@ -50,9 +50,7 @@ def test_a_loop_that_is_switched_off_has_no_verdict_and_no_card(project, on):
         ("identification", "datasets/verdict/identification.json is missing; run ./run dvc repro verdict"),
     ],
 )
-def test_pages_without_a_verdict_are_refused_with_the_command_that_makes_one(
-    project, capsys, files, sentence
-):
+def test_pages_without_a_verdict_name_the_command_that_makes_one(project, capsys, files, sentence):
     made.main()
     last = INDEX.read_text()
     for path in Path("datasets/verdict").glob(f"{files}.json"):
