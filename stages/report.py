@@ -32,6 +32,7 @@ FIGURES = {
     "train_classifier": "datasets/train_classifier/figures.json",
     "train_agent": "datasets/train_agent/figures.json",
     "evaluate_setpoint": "datasets/evaluate_setpoint/figures.json",
+    "verdict": "datasets/verdict/figures.json",
     "export_controllers": "datasets/export_controllers/figures.json",
 }
 FOLDERS = {

@@ -18,9 +18,10 @@ QUANTILES = ("settled_error", "settling", "overshoot", "at_limits", "energy", "c
 
 
 def comparison(figures: Figures) -> Mapping[str, Any]:
-    """The metrics of the comparison; {} where there are none."""
-    compared = figures.get("evaluate_temperature")
-    return compared if isinstance(compared, Mapping) else {}
+    """The figures of the comparison with what the limits make of them, which the stage `verdict` keeps; {}
+    where there are none."""
+    compared, judged = figures.get("evaluate_temperature"), entry(figures.get("verdict"), "comparison")
+    return {**compared, **(judged or {})} if isinstance(compared, Mapping) else {}
 
 
 def names(figures: Figures) -> list[str]:

@@ -134,7 +134,7 @@ def stored(result, given, tmp_path_factory):
     rows = artifacts.read_table(folder / "cases.parquet", tables.CASES)
     seed = section(EvaluateTemperature, "evaluate_temperature").seed
     summary = json.loads((folder / "figures.json").read_text())
-    return rows, best.with_best(summary, rows, params.read(FILE)["report"], seed)
+    return rows, summary | best.best_by_limits(summary, rows, params.read(FILE)["report"], seed)
 
 
 def of(rows, name: str) -> dict[str, np.ndarray]:
