@@ -60,6 +60,10 @@ def of_controller(figures: Figures, name: str, undeclared: Sequence[str] = ()) -
     """{key: figure} of one controller; `undeclared` are outputs without low and high."""
     own = entry(comparison(figures), "contestants", name)
     by_path = {key: row for key, row in rows(LOOP).items() if "." in row.figure}
+    if taken := [key for key in (*QUANTILES, "disk", "delay_s", "crossings", "data") if key in by_path]:
+        raise ValueError(
+            f"rules.toml: [{LOOP}.{taken[0]}] has the key of a figure of the page; give the row another key"
+        )
     if own is None:
         keys = (*QUANTILES, "disk", "delay_s", "crossings", *by_path)
         return dict.fromkeys(keys, _without(figures, name)) | {"data": data(figures, name)}
@@ -141,6 +145,8 @@ def data(figures: Figures, name: str) -> Figure | Missing:
         return _of(learned, entry(learned, "samples"), needed)
     if learned_from == "plant":
         return _model_data(figures)
+    if name in BY_NAME and BY_NAME[name].kind in ("model-based", "data-driven"):
+        return Missing(OPEN, f"the row of {heading(name)} in controllers/table.py has no learned_from")
     return Missing("not applicable", f"{heading(name)} learns nothing from the record")
 
 
