@@ -18,8 +18,8 @@ from pipeline.temperature import tables
 from pipeline.temperature.settings import Plant, check_output_limits
 
 if TYPE_CHECKING:
-    from pipeline.reading.recording_folders import RecordingWish
-    from pipeline.reading.signals import Source
+    from pipeline.recordings.recording_folders import RecordingWish
+    from pipeline.recordings.signals import Source
 
 
 class Ingest(Section):
@@ -40,8 +40,8 @@ METRICS = ("recordings", "samples", "segments", "findings")
 
 def main() -> None:
     with artifacts.stage("ingest") as out:
-        from pipeline.reading import recording_folders
-        from pipeline.reading.isolated import Budget
+        from pipeline.recordings import recording_folders
+        from pipeline.recordings.isolated import Budget
 
         settings, machine = params.load(Ingest, "ingest"), params.load(Plant, "plant")
         source = params.value("generate_probing.source", one_of=("simulated", "recordings"))
@@ -73,7 +73,7 @@ def main() -> None:
 
 def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, Mapped]) -> RecordingWish:
     """What to take from every recording of the machine."""
-    from pipeline.reading.recording_folders import RecordingWish
+    from pipeline.recordings.recording_folders import RecordingWish
 
     return RecordingWish(
         sources(machine, mapping),
@@ -91,7 +91,7 @@ def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, Mapped])
 def sources(machine: Plant, mapping: dict[str, Mapped]) -> tuple[Source, ...]:
     """Where a recording has the signals of the machine: by `mapping`, else under their own names. Raises
     ValueError for a mapping of no signal, or of another unit."""
-    from pipeline.reading.signals import Source, nearest_names
+    from pipeline.recordings.signals import Source, nearest_names
 
     signals = [*machine.acting, *machine.outputs]
     unknown = sorted(set(mapping) - {signal.name for signal in signals})

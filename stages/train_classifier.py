@@ -231,7 +231,7 @@ def write_frames(
     numbers, from which nothing was learned; rendered ones if there are no recordings."""
     import numpy as np
 
-    from pipeline.reading import frame_folder
+    from pipeline.recordings import frame_folder
     from pipeline.setpoint.recordings import read_options
     from pipeline.setpoint.vision import gallery
 

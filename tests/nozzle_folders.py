@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.reading import frame_folder
-from pipeline.reading.frame_mcap import Topics
+from pipeline.recordings import frame_folder
+from pipeline.recordings.frame_mcap import Topics
 from pipeline.setpoint.frames import key_area, nozzle_scene
 from pipeline.setpoint.material import PLA
 from pipeline.setpoint.recordings import FrontEnd

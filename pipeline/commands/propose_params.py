@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from pipeline.reading.formats import every
-from pipeline.reading.inspection import Inspected, look
-from pipeline.reading.proposals import Proposal, Proposed, mapping_lines, plant_lines, propose
-from pipeline.reading.recordings import Source, read
-from pipeline.reading.resampling import resample
+from pipeline.recordings.formats import every
+from pipeline.recordings.inspection import Inspected, look
+from pipeline.recordings.proposals import Proposal, Proposed, mapping_lines, plant_lines, propose
+from pipeline.recordings.recordings import Source, read
+from pipeline.recordings.resampling import resample
 from pipeline.store import artifacts, params
 from pipeline.store.params_text import replaced
 from pipeline.temperature.test_set.time_scale import time_constant

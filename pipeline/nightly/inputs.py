@@ -13,8 +13,8 @@ import yaml
 
 from pipeline.nightly.processes import LITERAL, changed, names
 from pipeline.nightly.settings import Nightly, NightlyLoop
-from pipeline.reading import excluded
-from pipeline.reading.signatures import METADATA
+from pipeline.recordings import excluded
+from pipeline.recordings.signatures import METADATA
 from pipeline.store import artifacts, params
 
 QUARANTINE = Path("datasets/quarantine")

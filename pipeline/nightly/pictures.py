@@ -11,8 +11,8 @@ from pipeline.nightly import camera_drift
 from pipeline.nightly.inputs import quarantine
 from pipeline.nightly.records import Alarm, LoopDrift
 from pipeline.nightly.settings import DriftLimits
-from pipeline.reading import trial_files
-from pipeline.reading.excluded import readable
+from pipeline.recordings import trial_files
+from pipeline.recordings.excluded import readable
 from pipeline.store import params
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def of_prints(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
 
 
 def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[PrintFigures]:
-    from pipeline.reading import frame_folder
+    from pipeline.recordings import frame_folder
     from pipeline.setpoint.recordings import read_options
     from pipeline.setpoint.settings import SetpointMaterial, TrainClassifier
 
@@ -180,7 +180,7 @@ def prints_drift(
 
 def _unreadable(path: str, settings: "TrainClassifier") -> str:
     """Why a print's file cannot be read; empty where it can."""
-    from pipeline.reading import frame_csv, frame_mcap
+    from pipeline.recordings import frame_csv, frame_mcap
     from pipeline.setpoint.recordings import read_options
 
     try:

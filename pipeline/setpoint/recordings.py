@@ -1,4 +1,4 @@
-"""Recordings of nozzle frames as this loop reads them: the options of reading/frame_folder.py by section
+"""Recordings of nozzle frames as this loop reads them: the options of recordings/frame_folder.py by section
 `train_classifier`, and the front end, which takes from a memo what it made of the same frames by the same
 code."""
 
@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import joblib
 import numpy as np
 
-from pipeline.reading import frame_folder
-from pipeline.reading.frame_folder import NozzleFrames, ReadOptions
-from pipeline.reading.frame_mcap import Topics
+from pipeline.recordings import frame_folder
+from pipeline.recordings.frame_folder import NozzleFrames, ReadOptions
+from pipeline.recordings.frame_mcap import Topics
 from pipeline.setpoint.frames import familiar, front_end, key_area
 from pipeline.setpoint.frames.front_end import FrameKeyAreas
 from pipeline.setpoint.frames.rendered import LabelledFrames
@@ -26,9 +26,9 @@ HERE = Path(__file__).parents[1]
 # the code that decides what an entry of the memo holds
 CODE = (
     "setpoint/recordings.py", "setpoint/frames/front_end.py", "setpoint/frames/key_area.py",
-    "setpoint/frames/travel.py", "setpoint/frames/familiar.py", "reading/mcap_frames.py",
-    "reading/frame_images.py", "reading/frame_mcap.py", "reading/image_messages.py",
-    "reading/image_topics.py",
+    "setpoint/frames/travel.py", "setpoint/frames/familiar.py", "recordings/mcap_frames.py",
+    "recordings/frame_images.py", "recordings/frame_mcap.py", "recordings/image_messages.py",
+    "recordings/image_topics.py",
 )  # fmt: skip
 KEY_AREAS = Schema(
     "key_areas",

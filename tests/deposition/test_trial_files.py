@@ -14,10 +14,10 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
-from pipeline.reading import image_messages, trial_files
-from pipeline.reading.mcap_frames import ENCODERS
-from pipeline.reading.recordings import read
-from pipeline.reading.trial_files import (
+from pipeline.recordings import image_messages, trial_files
+from pipeline.recordings.mcap_frames import ENCODERS
+from pipeline.recordings.recordings import read
+from pipeline.recordings.trial_files import (
     COMMAND,
     FLOW,
     POSITION,

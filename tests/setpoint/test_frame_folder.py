@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.reading import frame_images
-from pipeline.reading.frame_csv import read_log, stretches
-from pipeline.reading.frame_folder import figures
+from pipeline.recordings import frame_images
+from pipeline.recordings.frame_csv import read_log, stretches
+from pipeline.recordings.frame_folder import figures
 from pipeline.setpoint.frames import key_area
 from tests.nozzle_folders import FLOWS, SHOTS, expected, folder, images, notes, read, rows, scenes, table
 

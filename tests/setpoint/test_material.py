@@ -4,7 +4,7 @@ import numpy as np
 import pydantic
 import pytest
 
-from pipeline.reading import frame_folder
+from pipeline.recordings import frame_folder
 from pipeline.setpoint import published
 from pipeline.setpoint.frames import nozzle_scene
 from pipeline.setpoint.material import PLA, PrintedMaterial

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.reading import recording_folders
-from pipeline.reading.isolated import Budget, isolated
-from pipeline.reading.recording_folders import RecordingWish, count_work, join, read_folder
+from pipeline.recordings import recording_folders
+from pipeline.recordings.isolated import Budget, isolated
+from pipeline.recordings.recording_folders import RecordingWish, count_work, join, read_folder
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant
 from stages.ingest import Ingest, recording_wish
-from tests.reading.klipper_machine import EXTRUDER, print_log
-from tests.reading.test_bag_folders import bag
+from tests.recordings.klipper_machine import EXTRUDER, print_log
+from tests.recordings.test_bag_folders import bag
 from tests.temperature import long_readings
 
 MACHINE = Plant.model_validate(
@@ -160,7 +160,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from pipeline.store import artifacts
-from pipeline.reading import recording_folders
+from pipeline.recordings import recording_folders
 from tests.temperature.test_ingest import BUDGET, INLINE, JOB
 
 write_table, written = artifacts.write_table, []

@@ -17,8 +17,8 @@ from pipeline.temperature.settings import GenerateProbing, Panel, Plant, TuneWei
 from pipeline.temperature.test_set.time_scale import time_constant
 from stages.identify_plant import IdentifyPlant
 from stages.ingest import Ingest
-from tests.reading.klipper_machine import BED, EXTRUDER, print_log
-from tests.reading.test_real_record import project, run
+from tests.recordings.klipper_machine import BED, EXTRUDER, print_log
+from tests.recordings.test_real_record import project, run
 
 PRINT = [(0, 0, 60), (60, 200, 60), (600, 215, 70), (900, 205, 65), (1200, 220, 75), (1500, 200, 60),
          (1750, 0, 0)]  # fmt: skip

@@ -19,8 +19,8 @@ from pipeline.deposition.camera import bead, ladder, line
 from pipeline.deposition.camera.edges import BLOCK, FEWEST_BLOCKS
 from pipeline.deposition.camera.ladder import Ladder, Rung
 from pipeline.deposition.settings import Camera, Printer
-from pipeline.reading.image_topics import Frames, Walk, image_topic
-from pipeline.reading.mcap_columns import topics
+from pipeline.recordings.image_topics import Frames, Walk, image_topic
+from pipeline.recordings.mcap_columns import topics
 from pipeline.store import artifacts, params
 from pipeline.store.params_text import replaced
 

@@ -1,0 +1,439 @@
+"""The format of a recording, and what all formats share: columns on a clock, and which column is the time."""
+
+import collections
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.recordings.signals import Note, nearest_names
+from pipeline.recordings.signatures import is_bag, other_format
+
+# a number beyond the first of each row is no time in seconds but an epoch in ms, us, ns, or 100 ns as Windows
+# counts from 1601 (1e11 s is the year 5138)
+_EPOCHS = (
+    (5e17, 1e9, 0, "ns"),
+    (1e17, 1e7, 11_644_473_600, "100 ns since 1601"),
+    (1e14, 1e6, 0, "us"),
+    (1e11, 1e3, 0, "ms"),
+)
+# seconds since 1904, as LabVIEW counts, from 2015 to 2040
+_SINCE_1904_S, _LABVIEW = 2_082_844_800, (3.5e9, 4.3e9)
+# days since 1899-12-30 (since 1904 where the column says so) and since the year 0, from 1954 to 2119, and
+# 1970-01-01 in them
+_SERIAL_DAYS = ((20_000, 80_000, 25_569, "spreadsheets"), (713_000, 774_000, 719_529, "MATLAB"))
+# fractions of a day, and Julian dates from 1858 to 2132
+_DAYS = ((0, 2), (2_400_000, 2_500_000))
+# a clock that runs on for no more than so many samples before it falls back is not one clock
+OTHER_DEVICE_RUN = 8
+_TIME_NAMES = (
+    "t",
+    "time",
+    "elapsed",
+    "elapsed_time",
+    "relative_time",
+    "seconds",
+    "timestamp",
+    "time_stamp",
+    "stamp",
+    "ts",
+    "log_time",
+    "_time",
+    "datetime",
+    "date_time",
+    "zeitstempel",
+    "zeit",
+    "uhrzeit",
+    "x_value",
+    "epoch",
+    "unix_time",
+    "unixtime",
+    "uptime",
+    "runtime",
+    "timestring",
+    "tout",
+    "date",
+    "datum",
+    "index",
+)
+DATE_NAMES = ("date", "datum")
+# times from a start, which no date beside them belongs to
+_ELAPSED = ("elapsed", "elapsed_time", "relative_time", "uptime", "runtime")
+# what pandas calls the index of a table where nobody named it
+INDEX_NAMES = ("", "Unnamed: 0", "__index_level_0__", "index")
+_PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0,
+               "ms": 1e3, "msec": 1e3, "us": 1e6, "µs": 1e6,
+               "usec": 1e6, "ns": 1e9, "nsec": 1e9, "min": 1 / 60, "mins": 1 / 60, "minutes": 1 / 60,
+               "h": 1 / 3600, "hours": 1 / 3600,
+               "d": 1 / 86400, "days": 1 / 86400}  # fmt: skip
+
+# names that are a time and its unit in one
+_COUNTS = {"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds": "us", "nanoseconds": "ns"}
+
+_PARQUET = b"PAR1"
+_OTHER_FORMATS = {
+    b"\x1f\x8b": ("gzip", "unpack it with gunzip"),
+    b"PK\x03\x04": ("a zip file", "unpack it, or save the sheet as .xlsx or CSV"),
+    b"\x28\xb5\x2f\xfd": ("zstd", "unpack it with zstd -d"),
+    b"\x04\x22\x4d\x18": ("lz4", "unpack it with lz4 -d"),
+    b"BZh": ("bzip2", "unpack it with bunzip2"),
+    b"\xfd7zXZ": ("xz", "unpack it with unxz"),
+    b"#ROSBAG V": ("a ROS 1 bag", "convert it with: mcap convert FILE.bag FILE.mcap"),
+    b"SQLite format 3": ("SQLite (a rosbag2 .db3)", "convert it with: ros2 bag convert, storage mcap"),
+    b"\x89HDF": ("HDF5 or MATLAB 7.3", "save the signals as CSV or Parquet"),
+    b"MATLAB 7.3": ("a MATLAB 7.3 file (HDF5)", "save it with save(..., '-v7'), or write CSV with h5py"),
+    b"\x80\x04": ("a pickle", "save the signals as CSV or Parquet"),
+    b"<": ("HTML or XML", "save the signals as CSV or Parquet"),
+    b"{": ("JSON", "save the signals as CSV or Parquet"),
+    b"[{": ("JSON", "save the signals as CSV or Parquet"),
+    b"\x89PNG": ("a PNG picture", "name the recording"),
+    b"\xff\xd8\xff": ("a JPEG picture", "name the recording"),
+    b"GIF8": ("a GIF picture", "name the recording"),
+    b"%PDF": ("a PDF document", "export the numbers as CSV"),
+    b"\x7fELF": ("a program (ELF)", "name the recording"),
+    b"\x93NUMPY": ("a NumPy array", "save the signals as CSV or Parquet"),
+    b"TDSm": ("TDMS of LabVIEW", "export it as CSV"),
+    b"\xd0\xcf\x11\xe0": ("Excel 97 or a workbook with a password", "save it as .xlsx without one"),
+    b"ARROW1": ("an Arrow file", "write it as Parquet"),
+    b"PARE": ("an encrypted Parquet file", "write it without encryption"),
+}
+
+
+class FileColumns(NamedTuple):
+    """Columns on one clock.
+
+    `time` is time_s (n,), or time_ns (n,) on a calendar. `place(i)` names the place of sample i in the file.
+    `zone` is the calendar's zone, empty if the file does not give it.
+    """
+
+    name: str
+    time: np.ndarray
+    values: dict[str, np.ndarray]
+    place: Callable[[int], str]
+    zone: str = "UTC"
+
+
+class FileColumn(NamedTuple):
+    """A column of a file; `unit` is empty if the file does not give it."""
+
+    name: str
+    type: str
+    unit: str
+
+
+class Growing:
+    """Columns (n,) that grow in place as parts of a file come in. (Joining the parts at the end would need
+    twice the memory.)"""
+
+    def __init__(self, kinds: Sequence[type], expected: int = 0):
+        self.count = 0
+        self._columns = [np.empty(max(expected, 1), kind) for kind in kinds]
+
+    def expect(self, size: int) -> None:
+        """Room for `size` rows at once, so that growing moves nothing."""
+        if size > len(self._columns[0]):
+            self._resize(size)
+
+    def append(self, *parts: np.ndarray) -> None:
+        end = self.count + len(parts[0])
+        if end > len(self._columns[0]):
+            self._resize(end + end // 4)
+        for column, part in zip(self._columns, parts, strict=True):
+            column[self.count : end] = part
+        self.count = end
+
+    def _resize(self, size: int) -> None:
+        for column in self._columns:
+            column.resize(size, refcheck=False)
+
+    def finished(self) -> list[np.ndarray]:
+        self._resize(self.count)
+        return self._columns
+
+
+# ---- format
+
+
+def file_format(path: Path) -> str:
+    """ "mcap", "parquet", "csv", "bag" or a name of `LOADERS`, by the first bytes.
+    Text is "csv", but text named .mcap or .parquet is refused.
+
+    Raises ValueError for any other format.
+    """
+    if is_bag(path):
+        return "bag"
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder but should be one recording; name a file in it")
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(512)
+    except FileNotFoundError:
+        raise ValueError(f"{path} is missing; check the name, or put the recording there") from None
+    except OSError as error:
+        raise ValueError(f"{path} cannot be opened ({error.strerror}); make it readable") from None
+    if not start:
+        raise ValueError(
+            f"{path} is empty (0 bytes) but should be MCAP, Parquet or CSV; copy the recording again"
+        )
+    if b"MCAP0" in start[:8]:
+        return "mcap"
+    if start.startswith(_PARQUET):
+        return "parquet"
+    if kind := other_format(path, start):
+        return kind
+    for magic, (name, remedy) in _OTHER_FORMATS.items():
+        if start.startswith(magic):
+            raise ValueError(f"{path} is {name} but should be MCAP, Parquet or CSV; {remedy}")
+    if not start.strip(b"\0"):
+        raise ValueError(
+            f"{path} begins with {len(start)} zero bytes but should be MCAP, Parquet or CSV; "
+            "copy the recording again"
+        )
+    if path.suffix in (".mcap", ".parquet"):
+        raise ValueError(
+            f"{path}: the bytes at offset 0 are {start[:8].hex(' ')}, "
+            f"which begin no {path.suffix[1:]} file; copy the recording again as binary, "
+            "or, if it is text such as CSV, give it the suffix .csv"
+        )
+    return "csv"
+
+
+# ---- time
+
+
+def time_column(path: Path, names: Sequence[str], time: str) -> str:
+    """The column `time`, or the first with a name of a time. Raises ValueError with the names that there
+    are."""
+    if time:
+        if time not in names:
+            raise ValueError(f"{path}: there is no time column {time!r}; {nearest_names(time, names)}")
+        return time
+    ranked = [(rank, name) for name in names if (rank := _time_rank(name)) is not None]
+    # an index stands first in CSV, last in Parquet
+    index = [name for name in (names[0], names[-1]) if name in INDEX_NAMES]
+    if not ranked and index:
+        return index[0]
+    if not ranked:
+        shown = ", ".join(names[:12])
+        raise ValueError(
+            f"{path}: no column is called like a time (t_s, time, timestamp, ...) among {shown}; name it, "
+            "or write time: every 1.0 s"
+        )
+    return min(ranked)[1]
+
+
+def column_place(path: Path, names: Sequence[str], name: str) -> int:
+    if name not in names:
+        raise ValueError(
+            f"{path}: there is no column {name!r}; {nearest_names(name, [other for other in names if other])}"
+        )
+    if names.count(name) > 1:
+        raise ValueError(
+            f"{path}: {names.count(name)} columns are called {name!r}; give each a name of its own"
+        )
+    return names.index(name)
+
+
+def column_places(path: Path, names: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    """The places of the wanted columns, in one pass over the names. Raises ValueError for a name that is not
+    there, or there twice."""
+    counts = collections.Counter(names)
+    at = {name: i for i, name in enumerate(names)}
+    return [at[name] if counts[name] == 1 else column_place(path, names, name) for name in wanted]
+
+
+def is_time_name(name: str) -> bool:
+    """Whether a column of that name is likely to be the time."""
+    return _time_rank(name) is not None
+
+
+def _time_rank(name: str) -> tuple[bool, int] | None:
+    """The rank of a column as the time, None for no time. A name with a unit of time comes first."""
+    if name.strip() == "T":  # more often a temperature
+        return True, len(_TIME_NAMES)
+    base, unit = _time_unit(name)
+    if name.strip() == "T":  # more likely a temperature
+        return True, len(_TIME_NAMES)
+    return (not unit, _TIME_NAMES.index(base)) if base in _TIME_NAMES else None
+
+
+def _time_unit(name: str) -> tuple[str, str]:
+    """("time", "ms") of "Time [ms]", "time_ms" and the like. A time zone at the end is no part of the
+    name."""
+    plain = re.sub(r"[\s_.]*[(\[/_\s]\s*(utc|gmt|local)\s*[)\]]?$", "", name.strip().casefold())
+    if plain in _COUNTS:
+        return "time", _COUNTS[plain]
+    match = re.match(r"^(.*?)[\s_.]*[(\[/_\s]\s*(\w+)\s*[)\]]?$", plain)
+    if match and match[2] in _PER_SECOND:
+        return _word(match[1]), match[2]
+    return _word(plain), ""
+
+
+def _word(name: str) -> str:
+    return name if name in _TIME_NAMES else re.sub(r"\W+", "_", name).strip("_")
+
+
+def date_column(names: Sequence[str], clock: str) -> str | None:
+    """The column of the date beside that of the time of day, None beside a time from a start."""
+    if _time_unit(clock)[0] in _ELAPSED:
+        return None
+    return next((name for name in names if name != clock and _time_unit(name)[0] in DATE_NAMES), None)
+
+
+def seconds(name: str, numbers: np.ndarray, written: str = "") -> tuple[np.ndarray, str]:
+    """Time in seconds, and a remark if the unit was guessed.
+
+    The unit is that of the column's name, or the one `written` beside it, as in a row of units. Without one
+    it is seconds, or what the size of the numbers tells: an epoch, or a spreadsheet's days.
+    """
+    unit = _time_unit(name)[1] or written.strip(" ()[]").casefold()
+    if unit in _PER_SECOND:
+        return numbers / _PER_SECOND[unit], ""
+    finite = numbers[np.isfinite(numbers)]
+    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
+    for limit, per_second, epoch, unit in _EPOCHS:
+        if high > limit:
+            return (
+                numbers / per_second - epoch,
+                f"column {name} holds numbers up to {high:.3g} and was taken as an epoch in {unit}",
+            )
+    if _LABVIEW[0] < low and high < _LABVIEW[1] and np.median(np.abs(np.diff(finite))) < 3600:
+        return (
+            numbers - _SINCE_1904_S,
+            f"column {name} was taken as seconds since 1904, as LabVIEW counts them",
+        )
+    for first, last, epoch, program in _SERIAL_DAYS:
+        epoch = 24_107 if "1904" in name and program == "spreadsheets" else epoch
+        if (
+            first <= low
+            and high <= last
+            and len(finite) > 1
+            and (_time_unit(name)[0] in DATE_NAMES or _in_days(float(np.median(np.abs(np.diff(finite))))))
+        ):
+            remark = (
+                f"column {name} holds {low:.8g} to {high:.8g} and was taken as days, as {program} count them"
+            )
+            # to the microsecond, a double's resolution there
+            return np.round((numbers - epoch) * 86400, 6), remark
+    return numbers, ""
+
+
+def _in_days(interval: float) -> bool:
+    """Whether an interval is in days: up to 8 s, or whole seconds up to a minute. In seconds it would be
+    11 kHz, or a rate that no such machine has: 1 kHz would be 86.4 s."""
+    in_seconds = interval * 86400
+    return 0 < in_seconds < 8 or (in_seconds < 61 and abs(in_seconds - round(in_seconds)) < 0.02)
+
+
+def check_no_counter(path: Path, name: str, time: np.ndarray) -> None:
+    """Raises ValueError where an index that nobody named as the time counts the rows."""
+    if name in INDEX_NAMES and time[0] in (0, 1) and (np.diff(time) == 1).all():
+        raise ValueError(
+            f"{path}: no column is called like a time, and {name or 'the column without a name'} counts the "
+            "rows 0, 1, 2, ..., which is no time; write time: every 1.0 s with the sample time, or its name"
+        )
+
+
+def check_no_day_fractions(path: Path, name: str, time: np.ndarray, written: str = "") -> None:
+    """Raises ValueError where a time without a unit may be the fraction of a day that spreadsheets write for
+    a time of day, or a Julian date: as seconds, it would have more than 11,000 samples a second."""
+    if _time_unit(name)[1] or written.strip(" ()[]").casefold() in _PER_SECOND or len(time) < 3:
+        return
+    step = float(np.median(np.abs(np.diff(time))))
+    of_days = any(first <= time.min() and time.max() < last for first, last in _DAYS)
+    if of_days and 0 < step * 86400 < 8:
+        raise ValueError(
+            f"{path}: time {name} runs from {time.min():.6g} to {time.max():.6g} in steps of {step:.3g}, "
+            f"which may be seconds, or days with {step * 86400:.3g} s between samples; "
+            f"write its unit into its name, as in {name}_s or {name}_days"
+        )
+
+
+# ---- which way the time runs
+
+
+def forward(columns: FileColumns) -> tuple[FileColumns, list[Note]]:
+    """The columns from the oldest sample on. Columns with the newest first are reversed; nothing else is
+    sorted."""
+    last = len(columns.time) - 1
+    if last < 1 or not (np.diff(columns.time) < 0).all():
+        return columns, []
+    values = {name: column[::-1] for name, column in columns.values.items()}
+    turned = columns._replace(time=columns.time[::-1], values=values, place=lambda i: columns.place(last - i))
+    return turned, [
+        Note(
+            "clock",
+            "",
+            last + 1,
+            "the newest sample stands first: the rows were read from the last to the first",
+        )
+    ]
+
+
+def check_clock(path: Path, group: FileColumns) -> None:
+    """Raises ValueError with the place if a time is missing, repeated or before the one ahead of it."""
+    time = group.time
+    if np.issubdtype(time.dtype, np.floating) and not np.isfinite(time).all():
+        i = int(np.flatnonzero(~np.isfinite(time))[0])
+        missing = int((~np.isfinite(time)).sum())
+        raise ValueError(
+            f"{path}: {group.place(i)} should have a time but has none, the first of {missing}; "
+            "fill it in or remove the row"
+        )
+    if (time[1:] > time[:-1]).all():
+        return
+    steps = np.diff(time)
+    back = np.flatnonzero(time[1:] <= time[:-1])  # a step over half of all int64 would seem to run forward
+    i, count = int(back[0]), len(back)
+    unit = 1e9 if time.dtype == np.int64 else 1.0
+    start = time[0].item() if unit == 1e9 else 0
+    now, before = ((time[j].item() - start) / unit for j in (i + 1, i))
+    since = " after the first" if start else ""
+    problem = (
+        f"has the same time as the sample before it, {now:.9g} s{since}"
+        if steps[i] == 0
+        else f"is at {now:.9g} s{since}, which is before the sample ahead of it at {before:.9g} s"
+    )
+    times = f", the first of {count}" if count > 1 else ""
+    raise ValueError(
+        f"{path}: {group.place(i + 1)} {problem}{times}, but time should only run forward; "
+        f"{_remedy(group, steps / unit, back)}"
+    )
+
+
+def _remedy(group: FileColumns, steps_s: np.ndarray, back: np.ndarray) -> str:
+    """The remedy for a clock that stands still or runs backwards, by the way it does."""
+    if steps_s[back[0]] == 0:
+        return "name a finer clock, or give each device or tag that writes here a column of its own"
+    if len(back) > 0.9 * len(steps_s):
+        return "sort the rows by time, from the oldest on"
+    if len(back) >= 3 and len(steps_s) <= OTHER_DEVICE_RUN * (len(back) + 1):
+        return (
+            "two devices with clocks of their own seem to write under one name: "
+            "record each under a name of its own"
+        )
+    if len(back) == 1 and abs(steps_s[back[0]] + 3600) <= 3 * np.median(np.abs(steps_s)):
+        return (
+            "an hour is what the end of summer time takes away: write the times with their zone or in UTC, "
+            "or split the recording there"
+        )
+    if group.name == "rows":
+        return "split the recording where its clock was set back"
+    return "sort it with: mcap sort, or split it where its clock was set back"
+
+
+def every(time: str) -> float | None:
+    """The interval of "every 0.5 s", the time of a table without one; None for a column's name."""
+    match = re.fullmatch(r"every\s+([0-9.eE+-]+)\s*s", time.strip())
+    try:
+        interval = float(match[1]) if match else None
+    except ValueError:
+        return None
+    return interval if interval is not None and 0 < interval < np.inf else None
+
+
+# a clock that begins later than three years is one of the calendar; it is counted from the record's first
+# whole second, so that floats hold nanoseconds
+CALENDAR_S = 1e8
