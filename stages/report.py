@@ -32,6 +32,7 @@ FIGURES = {
     "train_classifier": "datasets/train_classifier/figures.json",
     "train_agent": "datasets/train_agent/figures.json",
     "evaluate_setpoint": "datasets/evaluate_setpoint/figures.json",
+    "verdict": "datasets/verdict/figures.json",
     "export_controllers": "datasets/export_controllers/figures.json",
 }
 FOLDERS = {
@@ -132,6 +133,8 @@ def main() -> None:
         )
         if not sources.verdicts:
             raise ValueError(f"{VERDICTS} holds no verdict of a loop; run ./run dvc repro verdict")
+        if "temperature" in sources.stored and "identification" not in sources.stored:
+            raise ValueError(f"{VERDICTS}/identification.json is missing; run ./run dvc repro verdict")
         judged = judgement(sources)
         told = {
             "verdict": judged.verdict.metrics(),

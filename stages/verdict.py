@@ -1,6 +1,7 @@
 """Figures, a few tables, certificates and the rules -> datasets/verdict: temperature.json, deposition.json,
 setpoint.json, identification.json on the model of the temperature loop, certificates.json, which says which
-certificates pass, and comparison.json, which says what the limits make of the temperature loop's comparison.
+certificates pass, and figures.json: the verdicts in short, and what the limits make of the temperature loop's
+comparison.
 
 A verdict says who should run, the first rule that failed or is undecided, and what to do (pipeline/verdict,
 rules.toml). Pages, export, README and the nightly job read it. A loop that is switched off has none.
@@ -12,43 +13,38 @@ import stages
 from pipeline.store import artifacts
 
 if TYPE_CHECKING:
-    from pipeline.verdict.evidence import Evidence, Figures
+    from pipeline.verdict.evidence import Evidence
 
 METRICS = ("*.state", "*.winner")
 CERTIFIED = "datasets/certify/certified.json"
 
 
 def main() -> None:
-    from pipeline.temperature.test_set.best import BY_LIMITS
     from pipeline.verdict import loops
     from pipeline.verdict.files import read_evidence
-    from pipeline.verdict.temperature import comparison
-    from pipeline.verdict.verdict import CERTIFICATES, COMPARISON, write
+    from pipeline.verdict.verdict import CERTIFICATES, write
 
     with artifacts.stage("verdict") as out:
         evidence = read_evidence()
-        figures, certified = judge_comparison(evidence), certificates(evidence.rules)
-        evidence = evidence._replace(figures=figures, certified=certified)
+        judged, certified = {"comparison": judge_comparison(evidence)}, certificates(evidence.rules)
+        evidence = evidence._replace(figures={**evidence.figures, "verdict": judged}, certified=certified)
         verdicts = loops.verdicts(evidence)
         write(loops.with_model(evidence, verdicts), out)
         artifacts.write_json(out / CERTIFICATES, evidence.certified)
-        compared = comparison(evidence.figures)
-        artifacts.write_json(out / COMPARISON, {key: compared[key] for key in BY_LIMITS if key in compared})
-        metrics = {loop: verdict.metrics() for loop, verdict in verdicts.items()}
-        artifacts.write_metrics("verdict", metrics, METRICS)
+        figures = {loop: verdict.metrics() for loop, verdict in verdicts.items()} | judged
+        artifacts.write_metrics("verdict", figures, METRICS)
 
 
-def judge_comparison(evidence: "Evidence") -> "Figures":
-    """The figures with what the limits make of the temperature loop's comparison, if there is one."""
+def judge_comparison(evidence: "Evidence") -> dict[str, Any]:
+    """What the limits make of the temperature loop's comparison; {} if there is none."""
     from pipeline.temperature.tables import CASES
-    from pipeline.temperature.test_set.best import with_best
+    from pipeline.temperature.test_set.best import best_by_limits
 
     compared, seed = evidence.figures["evaluate_temperature"], evidence.params["evaluate_temperature"]["seed"]
     if "pace" not in compared:
-        return evidence.figures
+        return {}
     cases = artifacts.read_table("datasets/evaluate_temperature/cases.parquet", CASES)
-    judged = with_best(compared, cases, evidence.rules.model_dump(), seed)
-    return {**evidence.figures, "evaluate_temperature": judged}
+    return best_by_limits(compared, cases, evidence.rules.model_dump(), seed)
 
 
 def certificates(rules: Any) -> dict[str, dict[str, dict[str, Any]]]:

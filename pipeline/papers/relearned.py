@@ -26,7 +26,7 @@ from pipeline.papers import files
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import TemperatureRules
 from pipeline.temperature.tables import CASES
-from pipeline.temperature.test_set.best import with_best
+from pipeline.temperature.test_set.best import best_by_limits
 from stages import evaluate_temperature, identify_plant, ingest, learn_kernel, probe_machine, tune_weights
 from stages.evaluate_temperature import EvaluateTemperature
 
@@ -78,8 +78,12 @@ def relearn(drawn: Mapping[str, int], changes: Mapping[str, Any]) -> dict:
         cases = artifacts.read_table(folder / "datasets" / "evaluate_temperature" / "cases.parquet", CASES)
         rules = params.load(TemperatureRules, "report", folder / params.FILE)
         seed = params.load(EvaluateTemperature, "evaluate_temperature", folder / params.FILE).seed
-        judged = with_best(compared, cases, rules.model_dump(), seed)
-        return judged | {"tuned_cost": {key: one["cost"] for key, one in tuned["contestants"].items()}}
+        judged = best_by_limits(compared, cases, rules.model_dump(), seed)
+        return (
+            compared
+            | judged
+            | {"tuned_cost": {key: one["cost"] for key, one in tuned["contestants"].items()}}
+        )
 
 
 def figures(runs: list[dict]) -> dict[str, Any]:

@@ -346,7 +346,12 @@ def _not_passed(
         words.failed if failed else words.undecided,
         f"First {'failed' if failed else 'undecided'} rule: {first.name}.",
         " ".join(filter(None, [why, who])),
-        " ".join(filter(None, [where, also, "Keep what runs on the machine now." if words is TRIAL else ""])),
+        " ".join(
+            filter(
+                None,
+                [first.remedy, where, also, "Keep what runs on the machine now." if words is TRIAL else ""],
+            )
+        ),
         next((group for group, (names, _) in groups().items() if first.name in names), first.name),
         None,
         note=pair_sentence(figures).text,
@@ -381,6 +386,7 @@ def _closest_limit(standing: Standing) -> str:
         and rule.question.limit
         and rule.question.key != "data"
         and isinstance(rule.figure, Figure)
+        and rule.state == PASSED
     ]
     if not asked:
         return ""

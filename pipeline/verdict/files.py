@@ -10,7 +10,7 @@ from pipeline.temperature.settings import Plant
 from pipeline.temperature.tables import DYNAMICS, RESIDUALS
 from pipeline.verdict.evidence import OFF, Evidence, switched_off
 from pipeline.verdict.settings import QUICK_LOOK, ReportRules
-from pipeline.verdict.verdict import Missing, read_certificates, read_comparison
+from pipeline.verdict.verdict import Missing, read_certificates
 
 # stages whose figures the rules may ask for
 FIGURES = {
@@ -39,10 +39,9 @@ TABLES = {
 def read_evidence(stored: str = "") -> Evidence:
     """What the stages that ran wrote; a Missing in the place of each file that is not there, or broken.
     `stored` is the folder of the stage verdict, if what the limits make of it is there already."""
-    figures = {stage: _read(path, stage, artifacts.read_json) for stage, path in FIGURES.items()}
-    if stored and isinstance(figures["evaluate_temperature"], dict):
-        figures["evaluate_temperature"] |= read_comparison(stored)
-    off = {stage for stage in FIGURES if switched_off(figures[stage])}
+    paths = FIGURES | ({"verdict": f"{stored}/figures.json"} if stored else {})
+    figures = {stage: _read(path, stage, artifacts.read_json) for stage, path in paths.items()}
+    off = {stage for stage in paths if switched_off(figures[stage])}
     places = {name: (path, path.split("/")[1], _reader(schema)) for name, (path, schema) in TABLES.items()}
     return Evidence(
         {**figures, **dict.fromkeys(off, OFF)},

@@ -50,7 +50,7 @@ class Row(params.Section):
 
     def limit(self, limits: ReportRules) -> float:
         """The limit that is declared; infinite where the key is null."""
-        declared = next(limit for limit in (self.at_least, self.at_most, self.below) if limit is not None)
+        (declared,) = [limit for limit in (self.at_least, self.at_most, self.below) if limit is not None]
         value = getattr(limits, declared) if isinstance(declared, str) else declared
         if value is None:
             return math.inf
@@ -70,14 +70,25 @@ class Row(params.Section):
         return text.format(limit=limit)
 
 
+# what a rule of each loop can keep from passing
+USES = {
+    "temperature": {"trial"},
+    "identification": {"design", "predict", "simulate"},
+    "deposition": {"simulation", "machine", "learning"},
+    "setpoint": {"control", "see"},
+}
 # limits of any size, for the keys alone
 _ANY = ReportRules.model_construct(None, **dict.fromkeys(ReportRules.model_fields, 1.0))
 
 
 @functools.cache
 def _rows(path: Path) -> dict[str, dict[str, Row]]:
-    with path.open("rb") as file:
-        loops = tomllib.load(file)
+    try:
+        loops = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(
+            f"{path.name}: {error}; mend the row, or restore it with git checkout {path}"
+        ) from None
     return {
         loop: {key: _row(path, loop, key, row) for key, row in each.items()} for loop, each in loops.items()
     }
@@ -87,15 +98,25 @@ def _row(path: Path, loop: str, key: str, fields: Mapping[str, Any]) -> Row:
     try:
         row = Row.model_validate(fields)
         row.limit(_ANY)
+        row.figure.format(controller="")
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise ValueError(f"{path.name}: [{loop}.{key}] {where}: {first['msg']}") from None
-    except (AttributeError, StopIteration):
+    except KeyError as error:
         raise ValueError(
-            f"{path.name}: [{loop}.{key}] expected at_least, at_most or below: a number, or a key of section "
-            f"report ({', '.join(ReportRules.model_fields)})"
+            f"{path.name}: [{loop}.{key}] figure: {{{error.args[0]}}} is unknown; write {{controller}}"
         ) from None
+    except (AttributeError, ValueError):
+        raise ValueError(
+            f"{path.name}: [{loop}.{key}] expected one of at_least, at_most and below: a number, or a key of "
+            f"section report ({', '.join(ReportRules.model_fields)})"
+        ) from None
+    if more := [use for use in row.needed_for if use not in USES.get(loop, ())]:
+        raise ValueError(
+            f"{path.name}: [{loop}.{key}] needed_for: {more[0]} is no use of this loop; expected "
+            f"{', '.join(sorted(USES.get(loop, ())))}"
+        )
     return row
 
 
@@ -112,7 +133,8 @@ def at_path(figures: Figures, path: str, *, at_least: bool) -> Figure | Missing:
     its band."""
     values = [value for value in map(_as_figure, _leaves(figures, path.split("."))) if value is not None]
     if not values:
-        return Missing(OPEN, f"{path} is not among what the stages measured")
+        keys = f"Its keys stand in datasets/{path.split('.')[0]}/figures.json"
+        return Missing(OPEN, f"{path} is not among what the stages measured", keys)
     return (min if at_least else max)(values, key=lambda figure: figure.value)
 
 

@@ -18,9 +18,10 @@ QUANTILES = ("settled_error", "settling", "overshoot", "at_limits", "energy", "c
 
 
 def comparison(figures: Figures) -> Mapping[str, Any]:
-    """The metrics of the comparison; {} where there are none."""
-    compared = figures.get("evaluate_temperature")
-    return compared if isinstance(compared, Mapping) else {}
+    """The figures of the comparison with what the limits make of them, which the stage `verdict` keeps; {}
+    where there are none."""
+    compared, judged = figures.get("evaluate_temperature"), entry(figures.get("verdict"), "comparison")
+    return {**compared, **(judged or {})} if isinstance(compared, Mapping) else {}
 
 
 def names(figures: Figures) -> list[str]:
@@ -59,6 +60,10 @@ def of_controller(figures: Figures, name: str, undeclared: Sequence[str] = ()) -
     """{key: figure} of one controller; `undeclared` are outputs without low and high."""
     own = entry(comparison(figures), "contestants", name)
     by_path = {key: row for key, row in rows(LOOP).items() if "." in row.figure}
+    if taken := [key for key in (*QUANTILES, "disk", "delay_s", "crossings", "data") if key in by_path]:
+        raise ValueError(
+            f"rules.toml: [{LOOP}.{taken[0]}] has the key of a figure of the page; give the row another key"
+        )
     if own is None:
         keys = (*QUANTILES, "disk", "delay_s", "crossings", *by_path)
         return dict.fromkeys(keys, _without(figures, name)) | {"data": data(figures, name)}
@@ -140,6 +145,8 @@ def data(figures: Figures, name: str) -> Figure | Missing:
         return _of(learned, entry(learned, "samples"), needed)
     if learned_from == "plant":
         return _model_data(figures)
+    if name in BY_NAME and BY_NAME[name].kind in ("model-based", "data-driven"):
+        return Missing(OPEN, f"the row of {heading(name)} in controllers/table.py has no learned_from")
     return Missing("not applicable", f"{heading(name)} learns nothing from the record")
 
 

@@ -234,7 +234,7 @@ WRITTEN = ("state", "decision", "lead", "reason", "remedy", "rule", "winner", "s
 # ---- the files of the stage `verdict`
 
 LOOPS = ("temperature", "deposition", "setpoint")
-CERTIFICATES, COMPARISON = "certificates.json", "comparison.json"
+CERTIFICATES = "certificates.json"
 
 
 def write(verdicts: Mapping[str, Verdict], folder: str | Path) -> None:
@@ -259,13 +259,6 @@ def read_certificates(folder: str | Path) -> dict[str, dict[str, dict[str, Any]]
     """{loop: {controller: {"passed", "why"}}} by the limits of the run, which the stage wrote beside the
     verdicts; {} if it has not run."""
     path = Path(folder) / CERTIFICATES
-    return artifacts.read_json(path) if artifacts.exists(path) else {}
-
-
-def read_comparison(folder: str | Path) -> dict[str, Any]:
-    """What the limits of the run make of the temperature loop's comparison (best.with_best), which the stage
-    wrote beside the verdicts; {} if it has not run."""
-    path = Path(folder) / COMPARISON
     return artifacts.read_json(path) if artifacts.exists(path) else {}
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.verdict import rules
+from pipeline.verdict.temperature import of_controller
 from pipeline.verdict.verdict import FAILED, PASSED, Figure, read
 from tests.report import made
 from tests.report.test_pages import DEPOSITION, IDENTIFICATION, SETPOINT, TEMPERATURE, Page
@@ -41,6 +42,7 @@ def test_one_more_row_decides_the_temperature_loop_and_stands_on_its_page(projec
     verdict = read("datasets/verdict")["temperature"]
     assert (verdict.state, verdict.winner, verdict.rule) == (FAILED, None, "energy")
     assert verdict.lead == "First failed rule: energy." and "the rule allows 0.001\u202f%." in verdict.reason
+    assert verdict.remedy.startswith("Lower the set point.")
     text = Page(TEMPERATURE).text
     assert "First failed rule: energy." in text and "Energy failed failed" in text
 
@@ -53,6 +55,20 @@ def test_one_more_row_that_passes_changes_nobody_s_verdict(project, add):
     verdict = read("datasets/verdict")["temperature"]
     assert (verdict.state, verdict.winner) == (before.state, before.winner) == (PASSED, "subspace_lqg")
     assert {line[0].name for line in verdict.rules} - {line[0].name for line in before.rules} == {"energy"}
+
+
+def test_a_row_with_the_key_of_a_figure_of_the_page_is_refused(project, add):
+    add((ENERGY % 40).replace("[temperature.energy_use]", "[temperature.energy]"))
+    with pytest.raises(ValueError, match=r"\[temperature.energy\] has the key of a figure of the page; give"):
+        of_controller(made.metrics(), "pi")
+
+
+def test_a_reservation_that_fails_is_not_the_one_that_is_closest_to_its_limit(project, add):
+    add((ENERGY % 0.001).replace('needed_for = ["trial"]\n', ""))
+    made.main()
+    verdict = read("datasets/verdict")["temperature"]
+    assert verdict.state == PASSED
+    assert "Closest to its limit: " in verdict.reason and "limit: energy" not in verdict.reason
 
 
 @pytest.mark.parametrize(
@@ -92,8 +108,15 @@ def test_of_several_figures_the_worst_decides():
     [
         ('name = "x"\nfigur = "a.b"\nat_most = 1', r"\[setpoint.mine\] figure: Field required"),
         ('name = "x"\nfigure = "a.b"\nat_most = 1\nunits = "s"', r"\[setpoint.mine\] units: Extra inputs"),
-        ('name = "x"\nfigure = "a.b"', r"\[setpoint.mine\] expected at_least, at_most or below"),
-        ('name = "x"\nfigure = "a.b"\nat_most = "settling"', r"\[setpoint.mine\] expected at_least"),
+        ('name = "x"\nfigure = "a.b"', r"\[setpoint.mine\] expected one of at_least, at_most and"),
+        ('name = "x"\nfigure = "a.b"\nat_most = "settling"', r"\[setpoint.mine\] expected one of at_least"),
+        ('name = "x"\nfigure = "a.b"\nat_most = 1\nat_least = 0', r"\[setpoint.mine\] expected one of at_l"),
+        ('name = "x"\nfigure = "a.{controler}"\nat_most = 1', r"figure: {controler} is unknown; write {con"),
+        (
+            'name = "x"\nfigure = "a.b"\nat_most = 1\nneeded_for = ["contrl"]',
+            r"\[setpoint.mine\] needed_for: contrl is no use of this loop; expected control, see",
+        ),
+        ('name = "x"\nname = "y"', r"more_rules.toml: Cannot overwrite a value .* git checkout"),
     ],
 )
 def test_a_row_with_a_mistake_is_refused_by_name(add, row, sentence):

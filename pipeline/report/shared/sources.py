@@ -26,7 +26,7 @@ from pipeline.temperature.settings import Plant
 from pipeline.verdict import night
 from pipeline.verdict.evidence import OFF, Evidence, Table, switched_off
 from pipeline.verdict.settings import QUICK_LOOK, ReportRules
-from pipeline.verdict.verdict import LOOPS, Missing, Verdict, read_certificates, read_comparison
+from pipeline.verdict.verdict import LOOPS, Missing, Verdict, read_certificates
 from pipeline.verdict.verdict import read as read_verdicts
 
 VERDICTS = "datasets/verdict"
@@ -189,9 +189,6 @@ def collect(
         if artifacts.exists(NIGHTLY)
         else None
     )
-    compared = figures.get("evaluate_temperature")
-    if isinstance(compared, dict) and compared:
-        figures["evaluate_temperature"] = compared | read_comparison(verdicts)
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
     read = linked(read)
     stored = read_verdicts(verdicts, (*LOOPS, "identification"))

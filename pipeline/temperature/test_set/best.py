@@ -12,16 +12,15 @@ from pipeline.temperature.test_set.comparison import chosen
 CHECKED = ("settled_error_degC", "settling_s", "overshoot_degC", "at_limits_percent", "disk_margin",
            "delay_margin_s")  # fmt: skip
 
-# what a changed limit can change in the figures of evaluate_temperature
-BY_LIMITS = ("limits", "best", "best_reason", "deciding")
 
-
-def with_best(
+def best_by_limits(
     compared: Mapping[str, Any], table: Mapping[str, np.ndarray], declared: Mapping[str, Any], seed: int
 ) -> dict[str, Any]:
-    """The figures of evaluate_temperature with `limits`, `best`, `best_reason` and, in `deciding`, the best
-    one without that plant. `table` has the cases, one row a controller and case; `declared` has the limits of
-    section `report`."""
+    """Of the figures of evaluate_temperature what a limit can change: `limits`, `best`, `best_reason` and, in
+    `deciding`, the best one without that plant.
+
+    `table` has the cases, one row a controller and case; `declared` has the limits of section `report`.
+    """
     order, limits = compared["order"], limits_of(compared["pace"], declared)
     able = {name: passes(compared["contestants"][name], limits) for name in order}
     rows = {name: table["contestant"] == name for name in order}
@@ -41,7 +40,7 @@ def with_best(
         "p": choice.against.p if choice.against else None,
     }
     deciding = {**compared["deciding"], "best_without": again.best}
-    return {**compared, "limits": limits, "best": choice.best, "best_reason": reason, "deciding": deciding}
+    return {"limits": limits, "best": choice.best, "best_reason": reason, "deciding": deciding}
 
 
 def limits_of(pace: Mapping[str, Any], declared: Mapping[str, Any]) -> dict[str, Any]:
