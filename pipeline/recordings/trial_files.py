@@ -3,31 +3,37 @@ simulated, the true flow; and the next trial's command.
 
 Written as any ROS 2 or Foxglove viewer opens it: CDR with the ros2msg texts embedded, in the order of time,
 chunks with CRCs. Read from that form or from a machine's own topics. Equal input gives equal bytes.
+
+A recording is read once: the readings of its frames are kept under a hash of its bytes, of the camera's
+settings and of the code that reads.
 """
 
 import math
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import joblib
 import numpy as np
 
 from pipeline.recordings.excluded import readable
-from pipeline.recordings.formats import file_format
-from pipeline.recordings.image_topics import Frames, image_topic
-from pipeline.recordings.mcap_columns import Topic, resolve, topics
-from pipeline.recordings.mcap_frames import (
+from pipeline.recordings.images import (
+    Frames,
     check_overlap,
     damage,
+    image_topic,
+    open_topics,
     read_frames,
     span_of,
     tables_of,
     write_frames,
 )
+from pipeline.recordings.mcap_files import Topic, resolve
 from pipeline.recordings.signals import Note, Source
-from pipeline.store.artifacts import write_csv
+from pipeline.store.artifacts import read_table, sha256, write_csv, write_table
 from pipeline.store.params import Mapped
+from pipeline.store.tables import BYTES, FLOAT, NONE, TEXT, Column, Schema
 
 SCHEMA, VERSION = "beadline.trial", "1"
 # what a trial has, where our own recordings have it
@@ -41,6 +47,21 @@ TYPES = {
     "/plunger": "beadline_msgs/msg/Plunger",
     "/true_flow": "beadline_msgs/msg/TrueFlow",
 }
+
+READINGS = Schema(
+    "trial_readings",
+    1,
+    (
+        Column("time_s", FLOAT, "s", "of the frame, as stamped"),
+        Column("reason", TEXT, NONE, "why the frame has no usable bead; empty if it has"),
+        Column("columns", BYTES, "px", "measured columns, 64-bit floats"),
+        Column("widths", BYTES, "px", "widths there, 64-bit floats; 0 bare, NaN unread"),
+        Column("latency_s", FLOAT, "s", "how late the frames are against the gantry, of the whole recording"),
+        Column("latency_deviation_s", FLOAT, "s", "its standard deviation; missing: not told", nullable=True),
+    ),
+)
+# the readings of F frames: time_s (F,), columns (m,), widths (F, m), reasons (F,), latency and its deviation
+Values = tuple[np.ndarray, np.ndarray, np.ndarray, list[str], tuple[float, float]]
 
 
 class TrialConditions(NamedTuple):
@@ -305,10 +326,6 @@ def read_trial(
             f"{path}: unreadable_share should be within 0 and 1 but is {unreadable_share:g}; "
             "give a share of the frames"
         )
-    if file_format(path) != "mcap":
-        raise ValueError(
-            f"{path} is a table but a trial should be an MCAP recording with frames; name the recording"
-        )
     try:
         return _read(path, sources, image, time or "log_time", unreadable_share)
     except OSError as error:
@@ -320,14 +337,13 @@ def read_trial(
 def _read(
     path: Path, sources: Sequence[Source], image: str, time: str, unreadable_share: float
 ) -> TrialRecording:
-    there = topics(path)
+    there = open_topics(path, "a trial")
     if not any(topic.count for topic in there.values()):
         raise ValueError(f"{path}: it has no whole message ({damage(path)}); copy the recording again")
-    camera = image_topic(path, there, image)
-    recording = read_frames(
-        path, camera, _places(path, sources, there), there, clock=time, unreadable_share=unreadable_share
+    camera, places = image_topic(path, there, image), _places(path, sources, there)
+    frames, signals, metadata, notes = read_frames(
+        path, camera, places, there, clock=time, unreadable_share=unreadable_share
     )
-    frames, signals, notes = recording.frames, recording.signals, recording.notes
     check_overlap(
         path, span_of(frames.time_s), {name: span_of(time_s) for name, (time_s, _) in signals.items()}
     )
@@ -343,7 +359,7 @@ def _read(
             )
         )
     return TrialRecording(
-        str(path), _conditions(path, recording.metadata.get(SCHEMA, {}), notes), signals, frames, notes
+        str(path), _conditions(path, metadata.get(SCHEMA, {}), notes), signals, frames, notes
     )
 
 
@@ -404,3 +420,58 @@ def _conditions(path: Path, metadata: dict[str, str], notes: list[Note]) -> Tria
             f"{path}: the trial's conditions cannot be read ({error}); "
             f"write numbers into the metadata record {SCHEMA}"
         ) from None
+
+
+# ---- readings that are kept
+
+
+def recall(
+    folder: Path,
+    recording: str,
+    settings: Mapping[str, Any],
+    code: Sequence[Path],
+    read: Callable[[], Values],
+) -> Values:
+    """The readings of a recording out of `folder`, else those that `read` makes, which are kept if there is a
+    frame. An entry is named by the hash of the recording, of the settings, and of the code that reads."""
+    what = ((sha256(recording), settings), [sha256(path) for path in code])
+    place = folder / f"{joblib.hash(what)}.parquet"
+    known = _remembered(place)
+    if known is not None:
+        return known
+    values = read()
+    if len(values[0]):
+        _remember(place, values)
+    return values
+
+
+def _remember(place: Path, values: Values) -> None:
+    time_s, columns, widths, reasons, (latency_s, deviation_s) = values
+    count = len(time_s)
+    table = {
+        "time_s": time_s,
+        "reason": np.array(reasons, object),
+        "columns": [columns.astype("<f8").tobytes()] * count,
+        "widths": [row.astype("<f8").tobytes() for row in widths],
+        "latency_s": np.full(count, latency_s),
+        "latency_deviation_s": np.full(count, deviation_s if np.isfinite(deviation_s) else np.nan),
+    }
+    write_table(place, READINGS, table)
+
+
+def _remembered(place: Path) -> Values | None:
+    """The readings of an entry; None if there is none, or if the checksums of its pages do not hold."""
+    try:
+        table = read_table(place, READINGS)
+    except ValueError:
+        return None
+    if not len(table["time_s"]):
+        return None
+    deviation_s = float(table["latency_deviation_s"][0])
+    return (
+        np.asarray(table["time_s"], float),
+        np.frombuffer(table["columns"][0], "<f8"),
+        np.stack([np.frombuffer(row, "<f8") for row in table["widths"]]),
+        [str(reason) for reason in table["reason"]],
+        (float(table["latency_s"][0]), deviation_s if np.isfinite(deviation_s) else np.inf),
+    )

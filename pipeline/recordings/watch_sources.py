@@ -22,11 +22,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from pipeline.recordings import image_messages
-from pipeline.recordings.frame_images import UNREADABLE, decode, read_image
-from pipeline.recordings.frame_mcap import Topics
-from pipeline.recordings.growing_mcap import GrowingMcap, Message
-from pipeline.recordings.mcap_messages import Channel, Decode, decoder, fields, plain
+from pipeline.recordings import images
+from pipeline.recordings.images import UNREADABLE, decode, read_image
+from pipeline.recordings.mcap_files import GrowingMcap, Message
+from pipeline.recordings.messages import Channel, Decode, decoder, fields, plain
+from pipeline.recordings.nozzle_frames import Topics
 
 PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 # a picture that is not whole and has not grown for so long is broken
@@ -181,7 +181,7 @@ class RecordingSource:
         self.sources = where.sources()
         self.signals: dict[str, float] = {}
         self.decoders: dict[int, tuple[list[str], Decode] | None] = {}
-        self.reads: dict[int, image_messages.Read] = {}
+        self.reads: dict[int, images.Read] = {}
         self.camera, self.others = where.image, set()
         self.before, self.count, self.others_held = b"", 0, set()
 
@@ -199,7 +199,7 @@ class RecordingSource:
     def frames(self) -> Iterator[CameraFrame]:
         try:
             for message in self.file.messages(lambda channel: True):
-                if not image_messages.is_image(message.channel):
+                if not images.is_image(message.channel):
                     self.others_held.add(message.channel.topic)
                     self._hold(message)
                 elif self._is_camera(message.channel):
@@ -226,7 +226,7 @@ class RecordingSource:
         name, stamp = f"{self.camera} {self.count}", message.log_time
         try:
             if message.channel.id not in self.reads:
-                self.reads[message.channel.id] = image_messages.reader(message.channel)
+                self.reads[message.channel.id] = images.reader(message.channel)
             picture = self.reads[message.channel.id](message.data)
             if self.where.time == "publish_time":
                 stamp = message.publish_time
@@ -234,7 +234,7 @@ class RecordingSource:
                 stamp = picture.stamp_ns
             digest = hashlib.blake2b(picture.data, digest_size=16).digest()
             copy, self.before = digest == self.before, digest
-            frame = COPY if copy else image_messages.gray(picture)
+            frame = COPY if copy else images.gray(picture)
         except ValueError as error:
             frame = f"{UNREADABLE}: {error}"
         number = self.signals.get("print_id", np.nan)
