@@ -51,10 +51,10 @@ from pipeline.store.artifacts import beside
 
 # the fields of each message in the order of the wire: b bytes, s text, I and B whole numbers
 _ROS = {
-    "sensor_msgs/Image": "header, frame_id:s, height:I, width:I, encoding:s, is_bigendian:B, step:I, data:b",
-    "sensor_msgs/CompressedImage": "header, frame_id:s, format:s, data:b",
-    "foxglove_msgs/RawImage": "stamp, frame_id:s, width:I, height:I, encoding:s, step:I, data:b",
-    "foxglove_msgs/CompressedImage": "stamp, frame_id:s, data:b, format:s",
+    "sensor_msgs/Image": "sec:I nsec:I frame_id:s height:I width:I encoding:s is_bigendian:B step:I data:b",
+    "sensor_msgs/CompressedImage": "sec:I nsec:I frame_id:s format:s data:b",
+    "foxglove_msgs/RawImage": "sec:I nsec:I frame_id:s width:I height:I encoding:s step:I data:b",
+    "foxglove_msgs/CompressedImage": "sec:I nsec:I frame_id:s data:b format:s",
 }
 # a picture of that many is 256 MB of 16 bits; the largest of cameras have some 1.5e8
 MOST_PIXELS = 1 << 27
@@ -136,8 +136,11 @@ def reader(channel: Channel) -> Read:
         read_message = message_reader(message_types(channel.schema), channel.schema_name)
         parse = functools.partial(_protobuf, read=read_message)
     else:
-        fields = [tuple(field.split(":")) for field in _ROS[_kind(channel)].split(", ")]
-        parse = functools.partial(_ros, fields=fields, aligned=channel.encoding == "cdr")
+        aligned = channel.encoding == "cdr"
+        # a header of ROS 1 begins with a counter
+        counted = "" if aligned or not _kind(channel).startswith("sensor_msgs") else "seq:I "
+        fields = [tuple(field.split(":")) for field in (counted + _ROS[_kind(channel)]).split()]
+        parse = functools.partial(_ros, fields=fields, aligned=aligned)
 
     def read(message: bytes | memoryview) -> ImageMessage:
         try:
@@ -158,8 +161,7 @@ def _kind(channel: Channel) -> str:
 
 
 def _ros(message: memoryview, fields: list[tuple[str, ...]], aligned: bool) -> ImageMessage:
-    """The picture of a ROS message. ROS 2 is `aligned`; ROS 1 is not, and has a counter ahead of a header's
-    stamp."""
+    """The picture of a ROS message. ROS 2 is `aligned`; ROS 1 is not."""
     order, pos = "<", 0
     if aligned:
         order = _ORDERS.get(bytes(message[:2]), "")
@@ -167,28 +169,23 @@ def _ros(message: memoryview, fields: list[tuple[str, ...]], aligned: bool) -> I
             raise UnreadableMessage(f"CDR representation 0x{message[:2].hex()} is not read")
         message = message[4:]
     word = struct.Struct(order + "I").unpack_from
-    values: dict = {"stamp": 0}
-    for name, *kind in fields:
-        if kind == ["B"]:
+    values: dict = {}
+    for name, kind in fields:
+        if kind == "B":
             values[name] = message[pos]
             pos += 1
             continue
         pos += -pos % 4 if aligned else 0
-        if not kind:
-            pos += 4 if name == "header" and not aligned else 0
-            values["stamp"] = word(message, pos)[0] * 10**9 + word(message, pos + 4)[0]
-            pos += 8
-            continue
         value = word(message, pos)[0]
         pos += 4
-        if kind != ["I"]:
-            end = pos + value
-            if end > len(message):
+        if kind != "I":
+            if pos + value > len(message):
                 raise UnreadableMessage(f"{name} of {value} bytes in a message of {len(message)}")
-            value = message[pos:end]
-            pos = end
-        values[name] = _word(value) if kind == ["s"] else value
-    return _picture(values, values["stamp"])
+            content = message[pos : pos + value]
+            pos += value
+            value = content if kind == "b" else bytes(content).rstrip(b"\0").decode()
+        values[name] = value
+    return _picture(values, values["sec"] * 10**9 + values["nsec"])
 
 
 def _protobuf(message: memoryview, read: Callable[[memoryview], Message]) -> ImageMessage:
@@ -208,10 +205,6 @@ def _json(message: memoryview) -> ImageMessage:
         return _picture(values, int(stamp["sec"]) * 10**9 + int(stamp["nsec"]))
     except (orjson.JSONDecodeError, KeyError, TypeError, ValueError, binascii.Error) as error:
         raise UnreadableMessage(f"a message that is no image in JSON ({error})") from None
-
-
-def _word(text: bytes | memoryview) -> str:
-    return bytes(text).rstrip(b"\0").decode()
 
 
 def _picture(values: dict, stamp_ns: int) -> ImageMessage:

@@ -73,6 +73,7 @@ def isolated(work: Callable[..., Any], *arguments: Any, shown: str | Path, budge
         reply = {}
     finally:
         # also where a person ends the run: a child at its work is not left behind
+        ended = (0, "")
         if reply.get("ready"):
             _waiting.append(child)
         else:
@@ -83,9 +84,7 @@ def isolated(work: Callable[..., Any], *arguments: Any, shown: str | Path, budge
         raise ValueError(reply["refused"])
     if "failed" in reply:
         raise OSError(reply["failed"])
-    if "memory" in reply:
-        raise ValueError(_out_of_memory(shown, budget))
-    raise ValueError(_ended(shown, budget, *ended))
+    raise ValueError(_sentence(shown, budget, "memory" in reply, *ended))
 
 
 def _take() -> Child:
@@ -136,21 +135,19 @@ def _end(child: Child) -> tuple[int, str]:
 # ---- the sentences
 
 
-def _out_of_memory(shown: str | Path, budget: Budget) -> str:
-    return (
-        f"{shown}: reading it needs more memory than the {budget.largest_mb:g} MB that a recording may take; "
-        "split the recording, or raise ingest.largest_mb in params.expert.yaml if it is as large as that"
-    )
-
-
-def _ended(shown: str | Path, budget: Budget, status: int, last: str) -> str:
+def _sentence(shown: str | Path, budget: Budget, no_memory: bool, status: int, last: str) -> str:
+    """Why a call gave nothing."""
     if status == -signal.SIGALRM:
         return (
             f"{shown}: reading it takes longer than the {budget.longest_s:g} s that a recording may take; "
             "split the recording, or raise ingest.longest_s in params.expert.yaml if it is as long as that"
         )
-    if any(words in last for words in OUT_OF_MEMORY):
-        return _out_of_memory(shown, budget)
+    if no_memory or any(words in last for words in OUT_OF_MEMORY):
+        return (
+            f"{shown}: reading it needs more memory than the {budget.largest_mb:g} MB that a recording may "
+            "take; split the recording, or raise ingest.largest_mb in params.expert.yaml if it is as large "
+            "as that"
+        )
     if status == -signal.SIGKILL:
         return (
             f"{shown}: the process that read it was killed, as a system does that runs out of memory; "
