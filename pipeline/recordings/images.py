@@ -42,6 +42,7 @@ from pipeline.recordings.mcap_files import (
     McapFile,
     Topic,
     TopicColumns,
+    resolve,
     topics,
     unpack_chunk,
 )
@@ -523,17 +524,18 @@ def open_topics(path: Path, what: str) -> dict[str, Topic]:
     return topics(path)
 
 
-def image_topic(path: Path, topics: dict[str, Topic], name: str) -> Topic:
+def image_topic(path: Path, topics: dict[str, Topic], name: str, place: str = "") -> Topic:
     """The topic `name`, or, if `name` is empty, the only topic with images. Raises ValueError with the topics
-    that there are."""
+    that there are, and with the setting `place` that names one."""
     images = [topic for topic in topics.values() if topic.channels and all(map(is_image, topic.channels))]
     chosen = [topic for topic in images if not name or topic.name == name]
     if len(chosen) == 1:
         return chosen[0]
+    place = f" ({place})" if place else ""
     if chosen:
         raise ValueError(
             f"{path}: {len(chosen)} topics have images ({', '.join(topic.name for topic in chosen)}); "
-            "name the one of the nozzle's camera"
+            f"name the one of the nozzle's camera{place}"
         )
     there = ", ".join(
         f"{topic.name} ({topic.channels[0].schema_name or 'no type'} in {topic.channels[0].encoding})"
@@ -541,34 +543,51 @@ def image_topic(path: Path, topics: dict[str, Topic], name: str) -> Topic:
     )
     what = f"topic {name} with images" if name else "image topic"
     raise ValueError(
-        f"{path}: there is no {what}; it has {there or 'no topic at all'}; images are read as {READABLE}"
+        f"{path}: there is no {what}; it has {there or 'no topic at all'}; "
+        f"images are read as {READABLE}{place}"
     )
 
 
 def read_frames(
     path: Path,
-    camera: Topic,
-    places: Mapping[str, tuple[Source, str, str]],
-    topics_of_file: Mapping[str, Topic],
+    sources: Iterable[Source],
     *,
+    what: str,
+    image: str,
     clock: str,
     unreadable_share: float,
+    optional: Collection[str] = (),
+    section: str = "",
 ) -> tuple[Frames, dict[str, tuple[np.ndarray, np.ndarray]], dict[str, dict[str, str]], list[Note]]:
-    """Frames of `camera`, the signals {name: (time_s (n,), values (n,))} of places {signal: (source, topic,
-    field)} on the same clock, metadata {record: {key: value}}, and notes on damage.
+    """Frames of the topic `image` (empty: the only one), the signals {name: (time_s (n,), values (n,))} of
+    `sources` on the same clock, metadata {record: {key: value}}, and notes on damage.
 
-    Raises ValueError if no picture can be read, or if a clock runs backwards.
+    Signals that are `optional` may have no topic. Raises ValueError, which names `what` the recording should
+    be and the `section` of params.yaml that maps it, for a topic or field that is not there, if no picture
+    can be read, and if a clock runs backwards.
     """
-    file = McapFile(path)
-    columns = TopicColumns(file, clock)
+    in_file = open_topics(path, what)
+    if not any(topic.count for topic in in_file.values()):
+        raise ValueError(f"{path}: it has no whole message ({damage(path)}); copy the recording again")
+    camera = image_topic(path, in_file, image, f"{section}.image" if section else "")
+    columns = TopicColumns(McapFile(path), clock)
+    places = {}
+    for source in sources:
+        name = source.signal
+        try:
+            places[name] = (source, *resolve(path, source.source, in_file))
+        except ValueError as error:
+            if name not in optional or source.source.partition(":")[0] in in_file:
+                there = f"it in {section}.mapping.{name}" if section else f"{name} to the topic that has it"
+                raise ValueError(f"{error}; map {there}") from None
     for topic in dict.fromkeys(topic for _, topic, _ in places.values()):
-        columns.want(topics_of_file[topic], [field for _, at, field in places.values() if at == topic])
+        columns.want(in_file[topic], [field for _, at, field in places.values() if at == topic])
     frames = Frames(columns, camera, unreadable_share)
     if not len(frames.time_ns):
         raise ValueError(
             f"{path}: no picture of {camera.name} can be read ({damage(path)}); copy the recording again"
         )
-    notes = file.notes() + columns.notes()
+    notes = columns.file.notes() + columns.notes()
     groups = {topic: columns.joined(topic, notes) for topic in columns.fields}
     pictures = FileColumns(camera.name, frames.time_ns, {}, lambda i: f"frame {i + 1} of {camera.name}")
     start_ns = _start(path, [*groups.values(), pictures], notes)
@@ -580,7 +599,7 @@ def read_frames(
         )
         for name, (source, topic, field) in places.items()
     }
-    return frames, signals, file.metadata, notes
+    return frames, signals, columns.file.metadata, notes
 
 
 def check_overlap(

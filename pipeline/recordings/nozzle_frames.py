@@ -40,7 +40,7 @@ from pipeline.recordings.images import (
     span_of,
 )
 from pipeline.recordings.instants import instants, month_first
-from pipeline.recordings.mcap_files import McapFile, Topic, TopicColumns, resolve
+from pipeline.recordings.mcap_files import McapFile, TopicColumns
 from pipeline.recordings.messages import UnreadableMessage
 from pipeline.recordings.signals import Note, Source, nearest_names
 from pipeline.store.artifacts import sha256
@@ -682,17 +682,17 @@ def open_film(
 ) -> tuple[Frames, dict[str, tuple[np.ndarray, np.ndarray]], list[Note]]:
     """Frames in the order of time, {signal: (time_s (n,), values (n,))} of those that the recording
     has, on one clock, and notes of what was damaged."""
-    in_file, camera = _camera(path, where.image)
-    places = {}
-    for name, source in where.sources().items():
-        try:
-            places[name] = (source, *resolve(path, source.source, in_file))
-        except ValueError as error:
-            # what was mapped on purpose must be there
-            if name in NEEDED or name in where.mapping:
-                raise ValueError(f"{error}; map it in {PLACE}.mapping.{name}") from None
-    clock = where.time or "log_time"
-    frames, signals, _, notes = read_frames(path, camera, places, in_file, clock=clock, unreadable_share=1.0)
+    frames, signals, _, notes = read_frames(
+        path,
+        where.sources().values(),
+        what="nozzle frames",
+        image=where.image,
+        clock=where.time or "log_time",
+        unreadable_share=1.0,
+        # what was mapped on purpose must be there
+        optional=set(UNITS) - set(NEEDED) - set(where.mapping),
+        section=PLACE,
+    )
     return frames, signals, notes
 
 
@@ -709,19 +709,10 @@ def frames_at(path: Path, where: Topics, places: Sequence[int]) -> dict[int, np.
     return found
 
 
-def _camera(path: Path, name: str) -> tuple[dict[str, Topic], Topic]:
-    """The topics of a recording, and the one with images."""
-    in_file = open_topics(path, "nozzle frames")
-    try:
-        return in_file, image_topic(path, in_file, name)
-    except ValueError as error:
-        raise ValueError(f"{error} ({PLACE}.image)") from None
-
-
 def middle_frame(path: Path, image: str) -> np.ndarray:
     """The frame (height, width) in the middle of a recording's image topic `image`, or of its
     only one where that is empty. Raises ValueError."""
-    _, camera = _camera(path, image)
+    camera = image_topic(path, open_topics(path, "a film"), image, f"{PLACE}.image")
     frames = Frames(TopicColumns(McapFile(path), "log_time"), camera, 1.0)
     for _, picture in itertools.islice(frames.pictures(), len(frames) // 2, None):
         with contextlib.suppress(UnreadableMessage):

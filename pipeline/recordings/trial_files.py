@@ -18,18 +18,7 @@ import joblib
 import numpy as np
 
 from pipeline.recordings.excluded import readable
-from pipeline.recordings.images import (
-    Frames,
-    check_overlap,
-    damage,
-    image_topic,
-    open_topics,
-    read_frames,
-    span_of,
-    tables_of,
-    write_frames,
-)
-from pipeline.recordings.mcap_files import Topic, resolve
+from pipeline.recordings.images import Frames, check_overlap, read_frames, span_of, tables_of, write_frames
 from pipeline.recordings.signals import Note, Source
 from pipeline.store.artifacts import read_table, sha256, write_csv, write_table
 from pipeline.store.params import Mapped
@@ -326,63 +315,37 @@ def read_trial(
             f"{path}: unreadable_share should be within 0 and 1 but is {unreadable_share:g}; "
             "give a share of the frames"
         )
-    try:
-        return _read(path, sources, image, time or "log_time", unreadable_share)
-    except OSError as error:
-        raise ValueError(
-            f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
-        ) from None
-
-
-def _read(
-    path: Path, sources: Sequence[Source], image: str, time: str, unreadable_share: float
-) -> TrialRecording:
-    there = open_topics(path, "a trial")
-    if not any(topic.count for topic in there.values()):
-        raise ValueError(f"{path}: it has no whole message ({damage(path)}); copy the recording again")
-    camera, places = image_topic(path, there, image), _places(path, sources, there)
-    frames, signals, metadata, notes = read_frames(
-        path, camera, places, there, clock=time, unreadable_share=unreadable_share
-    )
-    check_overlap(
-        path, span_of(frames.time_s), {name: span_of(time_s) for name, (time_s, _) in signals.items()}
-    )
-    first, last = span_of(signals[COMMAND.signal][0])
-    outside = int(np.count_nonzero((frames.time_s < first) | (frames.time_s > last)))
-    if outside:
-        notes.append(
-            Note(
-                "outside",
-                "",
-                outside,
-                f"{outside} of {len(frames.time_s)} frames lie before or after the command",
-            )
-        )
-    return TrialRecording(
-        str(path), _conditions(path, metadata.get(SCHEMA, {}), notes), signals, frames, notes
-    )
-
-
-def _places(
-    path: Path, sources: Sequence[Source], there: dict[str, Topic]
-) -> dict[str, tuple[Source, str, str]]:
-    """{signal: (source, topic, field)}; only the true flow, which no
-    machine knows, may be absent where its source is ours."""
     for needed in (POSITION, SPEED, COMMAND):
         if [source.signal for source in sources].count(needed.signal) != 1:
             raise ValueError(
                 f"{path}: the mapping should give {needed.signal} one source; "
                 "map the gantry's position and speed, and the command"
             )
-    places = {}
-    for source in sources:
-        if source == FLOW and FLOW.source.partition(":")[0] not in there:
-            continue
-        try:
-            places[source.signal] = (source, *resolve(path, source.source, there))
-        except ValueError as error:
-            raise ValueError(f"{error}; map {source.signal} to the topic that has it") from None
-    return places
+    # only the true flow, which no machine knows, may be absent if its source is ours
+    optional = {FLOW.signal} if FLOW in sources else ()
+    try:
+        frames, signals, metadata, notes = read_frames(
+            path,
+            sources,
+            what="a trial",
+            image=image,
+            clock=time or "log_time",
+            unreadable_share=unreadable_share,
+            optional=optional,
+        )
+    except OSError as error:
+        raise ValueError(
+            f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
+        ) from None
+    spans = {name: span_of(time_s) for name, (time_s, _) in signals.items()}
+    check_overlap(path, span_of(frames.time_s), spans)
+    first, last = spans[COMMAND.signal]
+    outside = int(np.count_nonzero((frames.time_s < first) | (frames.time_s > last)))
+    if outside:
+        message = f"{outside} of {len(frames.time_s)} frames lie before or after the command"
+        notes.append(Note("outside", "", outside, message))
+    conditions = _conditions(path, metadata.get(SCHEMA, {}), notes)
+    return TrialRecording(str(path), conditions, signals, frames, notes)
 
 
 def _conditions(path: Path, metadata: dict[str, str], notes: list[Note]) -> TrialConditions | None:
