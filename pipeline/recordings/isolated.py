@@ -14,7 +14,6 @@ import struct
 import subprocess
 import sys
 import tempfile
-import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -103,33 +102,22 @@ def _take() -> Child:
         # Arrow's own allocator takes a GiB at once, of which most is never used
         env=os.environ | {"PYTHONPATH": path, "ARROW_DEFAULT_MEMORY_POOL": "system"},
     )
-    child = Child(process, printed)
-    # at the end of the interpreter: closing its input ends a child that waits
-    weakref.finalize(process, _close, process.stdin, process.stdout)
-    return child
-
-
-def _close(*pipes: IO[bytes] | None) -> None:
-    for pipe in pipes:
-        if pipe is not None:
-            with contextlib.suppress(OSError):
-                pipe.close()
+    return Child(process, printed)
 
 
 def _end(child: Child) -> tuple[int, str]:
     """Ends a child; its exit status, and the last line that it printed."""
-    try:
+    with contextlib.suppress(subprocess.TimeoutExpired):
         # one that ended by itself has closed its pipes before it can be waited for
-        status = child.process.wait(timeout=1)
-    except subprocess.TimeoutExpired:
-        child.process.kill()
-        status = child.process.wait()
-    _close(child.process.stdin, child.process.stdout)
+        child.process.wait(timeout=1)
+    child.process.kill()
+    with contextlib.suppress(BrokenPipeError), child.process as process:
+        process.wait()
     with child.printed as printed:
         end = printed.seek(0, os.SEEK_END)
         printed.seek(max(0, end - 2000))
         lines = printed.read().decode(errors="replace").split("\n")
-    return status, next((line.strip() for line in reversed(lines) if line.strip()), "")
+    return child.process.returncode, next((line.strip() for line in reversed(lines) if line.strip()), "")
 
 
 # ---- the sentences

@@ -83,21 +83,22 @@ def check_magic(path: Path, start: bytes) -> None:
     copying."""
     if start[:8] == MAGIC:
         return
+    wanted, there = MAGIC.hex(" "), start[:8].hex(" ")
     converted = {
         b"\x89MCAP0\n": "CR LF to LF",
         b"\x89MCAP0\r\r\n": "LF to CR LF",
         b"\x89MCAP0\r\x0b": "CR LF",
         b"\x89MCAP0\r": "CR LF to CR",
     }
-    for damaged, how in converted.items():
-        if start.startswith(damaged):
-            raise ValueError(
-                f"{path}: the bytes at offset 0 should be {MAGIC.hex(' ')} but are "
-                f"{start[:8].hex(' ')}: line ends were converted ({how}), which destroys the whole file; "
-                "copy it again as binary (*.mcap binary in .gitattributes)"
-            )
+    how = next((how for damaged, how in converted.items() if start.startswith(damaged)), "")
+    if how:
+        raise ValueError(
+            f"{path}: the bytes at offset 0 should be {wanted} but are {there}: "
+            f"line ends were converted ({how}), which destroys the whole file; "
+            "copy it again as binary (*.mcap binary in .gitattributes)"
+        )
     raise ValueError(
-        f"{path}: the bytes at offset 0 should be MCAP's {MAGIC.hex(' ')} but are {start[:8].hex(' ')}; "
+        f"{path}: the bytes at offset 0 should be MCAP's {wanted} but are {there}; "
         "copy the recording again as binary"
     )
 
@@ -509,11 +510,11 @@ class GrowingMcap(_Definitions):
         while self.offset + RECORD_HEAD.size <= size:
             stream.seek(self.offset)
             opcode, length = RECORD_HEAD.unpack(stream.read(RECORD_HEAD.size))
-            if opcode == 0:  # room that the recorder has taken but not filled
+            sound = length <= LARGEST_CHUNK and (opcode <= Opcode.DATA_END or opcode >= 0x80)
+            # opcode 0: room that the recorder has taken but not filled
+            if opcode == 0 or (sound and self.offset + RECORD_HEAD.size + length > size):
                 return None
-            if length <= LARGEST_CHUNK and (opcode <= Opcode.DATA_END or opcode >= 0x80):
-                if self.offset + RECORD_HEAD.size + length > size:
-                    return None
+            if sound:
                 self.offset += RECORD_HEAD.size + length
                 return opcode, stream.read(length)
             resumed = _next_chunk(stream, self.offset + 1)

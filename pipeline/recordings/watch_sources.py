@@ -18,7 +18,7 @@ import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,22 +55,7 @@ class CameraFrame(NamedTuple):
     print_id: str = ""
 
 
-class FrameSource(Protocol):
-    """`frames` gives what came since it was last asked; `waits_for` says why nothing comes, "" where
-    something may; `lacks` what a source that is there has none of; `ended`: nothing more will come; `rest_s`:
-    how long to wait before the next look."""
-
-    waits_for: str
-    ended: bool
-    rest_s: float
-
-    @property
-    def lacks(self) -> str: ...
-
-    def frames(self) -> Iterator[CameraFrame]: ...
-
-
-def source(place: str, topics: Topics, *, rate_hz: float) -> FrameSource:
+def source(place: str, topics: Topics, *, rate_hz: float) -> "FrameSource":
     """The source that a path or an address names. Raises ValueError for an address that is none, and for a
     file that is no recording."""
     if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", place):
@@ -320,22 +305,14 @@ class _Answer(http.client.HTTPResponse):
         self.fp = io.BufferedReader(_Until(self.fp.detach(), time.monotonic() + TIMEOUT_S))
 
 
-class _Plain(http.client.HTTPConnection):
-    response_class = _Answer
+class _Timely(urllib.request.HTTPHandler, urllib.request.HTTPSHandler):
+    """Opens connections whose answers are given up when their time is over."""
 
-
-class _Secure(http.client.HTTPSConnection):
-    response_class = _Answer
-
-
-class _TimelyPlain(urllib.request.HTTPHandler):
     def http_open(self, req):
-        return self.do_open(_Plain, req)
+        return self.do_open(type("_Plain", (http.client.HTTPConnection,), {"response_class": _Answer}), req)
 
-
-class _TimelySecure(urllib.request.HTTPSHandler):
     def https_open(self, req):
-        return self.do_open(_Secure, req)
+        return self.do_open(type("_Secure", (http.client.HTTPSConnection,), {"response_class": _Answer}), req)
 
 
 class Snapshots:
@@ -360,7 +337,7 @@ class Snapshots:
             pair = f"{urllib.parse.unquote(parts.username)}:{urllib.parse.unquote(parts.password or '')}"
             self.headers["Authorization"] = f"Basic {base64.b64encode(pair.encode()).decode()}"
         self.opener = urllib.request.build_opener(
-            urllib.request.ProxyHandler({}), _SameHost(), _TimelyPlain(), _TimelySecure()
+            urllib.request.ProxyHandler({}), _SameHost(), _Timely()
         )
         self.period_s, self.rest_s, self.ended = 1 / rate_hz, 0.0, False
         self.waits_for, self.lacks = f"{self.shown} has not answered yet", "a picture"
@@ -420,3 +397,9 @@ def _decoded(data: bytes) -> np.ndarray:
 def _without_secret(parts: urllib.parse.SplitResult) -> str:
     """An address as it may be shown: no user, no password."""
     return parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl()
+
+
+# `frames` gives what came since it was last asked; `waits_for` says why nothing comes, "" if something may;
+# `lacks` what a source that is there has none of; `ended`: nothing more will come; `rest_s`: how long to wait
+# before the next look
+FrameSource = Folder | RecordingSource | Snapshots
