@@ -231,23 +231,23 @@ def _value(document, name: str, steps: tuple) -> float:
             value = value[step]
     except (KeyError, TypeError, IndexError):
         value = _by_prefix(document, name)
-    if value is None:
-        return np.nan
-    if isinstance(value, int | float):
-        try:
-            return float(value)
-        except OverflowError:
-            return np.inf
-    raise ValueError(
-        f"{name} should be a number but is {json.dumps(value)[:60]}; map another field, or write numbers"
-    )
+    if value is not None and not isinstance(value, int | float):
+        raise ValueError(
+            f"{name} should be a number but is {json.dumps(value)[:60]}; map another field, or write numbers"
+        )
+    try:
+        return np.nan if value is None else float(value)
+    except OverflowError:
+        return np.inf
 
 
 def _by_prefix(document, name: str):
     """The value of a path whose keys hold dots themselves, such as {"heater.1": 30}; None if there is
     none."""
-    if not isinstance(document, dict) or name in document:
-        return document.get(name) if isinstance(document, dict) else None
+    if not isinstance(document, dict):
+        return None
+    if name in document:
+        return document[name]
     inner = (
         _by_prefix(document[name[:i]], name[i + 1 :])
         for i, letter in enumerate(name)
@@ -403,24 +403,35 @@ def _element(of: str, path: str, parent: str, types: dict, version: int, room: l
 def ros_fields(items: Sequence[Item], sample: bytes | None, *, version: int) -> list[str]:
     """Paths of the numbers. Of a sequence they are those of the message `sample`, up to LONGEST_LISTED."""
     names: list[str] = []
-    sequences = []
+    lists: dict[str, list[str]] = {}
     for item in _readable(items):
         if item.kind == "sequence" and all(part.kind == "numbers" for part in item.items):
-            sequences.append(item)
+            start = len(item.path) + len("[]")
+            lists[item.path] = [part.path[start:] for part in item.items if not part.array]
         elif item.kind == "numbers" and item.array:
             names += [f"{item.path}[{i}]" for i in range(min(item.count, LONGEST_LISTED))]
         elif item.kind == "numbers" and not item.path.endswith("._"):
             names.append(item.path)
-    if sample is None or not sequences:
-        return names
+    return names + _elements(lists, sample, lambda paths: ros_decoder(items, paths, version=version))
+
+
+def _elements(
+    lists: dict[str, list[str]], sample: bytes | None, make_decoder: Callable[[list[str]], Decode]
+) -> list[str]:
+    """Paths of the numbers in the lists of a message {path: [path below each element]}, up to
+    LONGEST_LISTED."""
+    if sample is None or not lists:
+        return []
     try:
-        lengths = ros_decoder(items, [f"{item.path}[#]" for item in sequences], version=version)([sample])[0]
+        lengths = make_decoder([f"{path}[#]" for path in lists])([sample])[0]
     except UnreadableMessage:
-        return names
-    for item, length in zip(sequences, lengths, strict=True):
-        for i in range(min(int(length), LONGEST_LISTED)):
-            names += [part.path for part in _at(item.items, i) if not part.array]
-    return names
+        return []
+    return [
+        f"{path}[{i}]{part}"
+        for (path, parts), length in zip(lists.items(), np.nan_to_num(lengths), strict=True)
+        for i in range(min(int(length), LONGEST_LISTED))
+        for part in parts
+    ]
 
 
 def _readable(items: Sequence[Item]) -> list[Item]:
@@ -729,16 +740,7 @@ def protobuf_fields(types: Types, name: str, sample: bytes | None) -> list[str]:
             names.append(path)
         elif field is not None:
             lists.setdefault(single, []).append(part)
-    if sample is None or not lists:
-        return names
-    try:
-        lengths = protobuf_decoder(types, name, [f"{path}[#]" for path in lists])([sample])[0]
-    except UnreadableMessage:
-        return names
-    for (path, inner), length in zip(lists.items(), lengths, strict=True):
-        count = min(int(np.nan_to_num(length)), LONGEST_LISTED)
-        names += [f"{path}[{i}]{part}" for i in range(count) for part in inner]
-    return names
+    return names + _elements(lists, sample, lambda paths: protobuf_decoder(types, name, paths))
 
 
 def _leaves(message: Descriptor, prefix: str, depth: int) -> Iterator[tuple[str, FieldDescriptor | None]]:

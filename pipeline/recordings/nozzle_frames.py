@@ -531,41 +531,28 @@ def _columns(path: Path, layout: CsvLayout, notes: list[Note], hotend: float) ->
     needed is not there, and notes those that are lived without."""
     there = layout.names
     temperature = "target_hotend" if "target_hotend" in there or "hotend" not in there else "hotend"
-    stated = np.isfinite(hotend) and temperature not in there
-    if stated:
-        notes.append(
-            Note(
-                "columns",
-                "temperature",
-                1,
-                f"{path}: it has no temperature, so the stated {hotend:g} degC is its frames'",
-            )
-        )
+    stated = bool(np.isfinite(hotend)) and temperature not in there
     needed = ("img_path", "flow_rate") if stated else ("img_path", temperature, "flow_rate")
-    for name in needed:
-        if name not in there:
-            either = "target_hotend or hotend" if name == temperature else name
-            raise ValueError(
-                f"{path}: expected a column {either}, found none; {nearest_names(name, there)}; rename it, "
-                "or move the file out of the folder"
-            )
+    name = next((name for name in needed if name not in there), "")
+    if name:
+        either = "target_hotend or hotend" if name == temperature else name
+        raise ValueError(
+            f"{path}: expected a column {either}, found none; {nearest_names(name, there)}; rename it, "
+            "or move the file out of the folder"
+        )
     if ("nozzle_tip_x" in there) != ("nozzle_tip_y" in there):
         raise ValueError(
             f"{path}: expected both nozzle_tip_x and nozzle_tip_y, found one; add the other, "
             "or remove it and set the tip in params.yaml"
         )
-    if temperature == "hotend":
-        notes.append(
-            Note(
-                "columns",
-                "temperature",
-                1,
-                f"{path}: it has no target_hotend, so the measured hotend is the temperature",
-            )
-        )
     without = [f"{name} ({how})" for name, how in OPTIONAL.items() if name not in there]
-    if without:
-        notes.append(Note("columns", "", len(without), f"{path}: it is read without {', '.join(without)}"))
+    remarks = (
+        ("temperature", stated, f"it has no temperature, so the stated {hotend:g} degC is its frames'"),
+        ("temperature", temperature == "hotend",
+         "it has no target_hotend, so the measured hotend is the temperature"),
+        ("", len(without), f"it is read without {', '.join(without)}"),
+    )  # fmt: skip
+    notes += [Note("columns", name, int(n), f"{path}: {remark}") for name, n, remark in remarks if n]
     optional = [name for name in (*OPTIONAL, "nozzle_tip_y", *SETTINGS, LABELS) if name in there]
     return (*needed, *optional)
 
@@ -700,13 +687,8 @@ def frames_at(path: Path, where: Topics, places: Sequence[int]) -> dict[int, np.
     """{place: gray frame} of a recording's frames that can be decoded, counted from 0 in the order of time;
     the others are not kept."""
     frames, _, _ = open_film(path, where)
-    wanted, found = set(places), {}
-    for k, (_, frame) in enumerate(frames):
-        if k in wanted:
-            found[k] = np.array(frame)
-            if len(found) == len(wanted):
-                break
-    return found
+    first = enumerate(itertools.islice(frames, max(places, default=-1) + 1))
+    return {k: np.array(frame) for k, (_, frame) in first if k in places}
 
 
 def middle_frame(path: Path, image: str) -> np.ndarray:

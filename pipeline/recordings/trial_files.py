@@ -20,7 +20,7 @@ import numpy as np
 from pipeline.recordings.excluded import readable
 from pipeline.recordings.images import Frames, check_overlap, read_frames, span_of, tables_of, write_frames
 from pipeline.recordings.signals import Note, Source
-from pipeline.store.artifacts import read_table, sha256, write_csv, write_table
+from pipeline.store import artifacts
 from pipeline.store.params import Mapped
 from pipeline.store.tables import BYTES, FLOAT, NONE, TEXT, Column, Schema
 
@@ -138,7 +138,7 @@ def write_command(
     no ending. Raises ValueError as write_trial does."""
     tables = tables_of(path, time_s, [(COMMAND, command_mm)])
     write_frames(f"{path}.mcap", tables, TYPES, time_s, None, (SCHEMA, _metadata(path, conditions)))
-    write_csv(
+    artifacts.write_csv(
         f"{path}.csv",
         {
             "time_s": np.asarray(time_s, float),
@@ -397,7 +397,7 @@ def recall(
 ) -> Values:
     """The readings of a recording out of `folder`, else those that `read` makes, which are kept if there is a
     frame. An entry is named by the hash of the recording, of the settings, and of the code that reads."""
-    what = ((sha256(recording), settings), [sha256(path) for path in code])
+    what = ((artifacts.sha256(recording), settings), [artifacts.sha256(path) for path in code])
     place = folder / f"{joblib.hash(what)}.parquet"
     known = _remembered(place)
     if known is not None:
@@ -419,13 +419,13 @@ def _remember(place: Path, values: Values) -> None:
         "latency_s": np.full(count, latency_s),
         "latency_deviation_s": np.full(count, deviation_s if np.isfinite(deviation_s) else np.nan),
     }
-    write_table(place, READINGS, table)
+    artifacts.write_table(place, READINGS, table)
 
 
 def _remembered(place: Path) -> Values | None:
     """The readings of an entry; None if there is none, or if the checksums of its pages do not hold."""
     try:
-        table = read_table(place, READINGS)
+        table = artifacts.read_table(place, READINGS)
     except ValueError:
         return None
     if not len(table["time_s"]):

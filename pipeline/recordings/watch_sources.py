@@ -336,9 +336,7 @@ class Snapshots:
         if parts.username is not None:
             pair = f"{urllib.parse.unquote(parts.username)}:{urllib.parse.unquote(parts.password or '')}"
             self.headers["Authorization"] = f"Basic {base64.b64encode(pair.encode()).decode()}"
-        self.opener = urllib.request.build_opener(
-            urllib.request.ProxyHandler({}), _SameHost(), _Timely()
-        )
+        self.opener = urllib.request.build_opener(urllib.request.ProxyHandler({}), _SameHost(), _Timely())
         self.period_s, self.rest_s, self.ended = 1 / rate_hz, 0.0, False
         self.waits_for, self.lacks = f"{self.shown} has not answered yet", "a picture"
         self.count, self.before = 0, b""
