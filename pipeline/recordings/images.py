@@ -259,16 +259,6 @@ def _rows(picture: ImageMessage, size: int) -> np.ndarray:
     return np.frombuffer(picture.data, np.uint8, step * picture.height).reshape(picture.height, step)[:, :row]
 
 
-def check_size(data: bytes | memoryview) -> None:
-    """Raises UnreadableMessage if the header of a PNG or JPEG promises more pixels than are decoded: they
-    would take the memory before the first of them is read."""
-    height, width = _size(bytes(data[: 1 << 16]))
-    if height * width > MOST_PIXELS:
-        raise UnreadableMessage(
-            f"its header says {width} x {height} px; pictures of up to {MOST_PIXELS} px are read"
-        )
-
-
 def _size(data: bytes) -> tuple[int, int]:
     """Height and width by the header of a PNG or JPEG; (0, 0) if they do not stand in `data`."""
     if data.startswith(b"\x89PNG") and len(data) >= 24:
@@ -289,7 +279,12 @@ def _size(data: bytes) -> tuple[int, int]:
 
 def _decoded(data: bytes | memoryview, flags: int) -> np.ndarray | None:
     """The gray picture of encoded bytes, None if there is none. Raises UnreadableMessage."""
-    check_size(data)
+    height, width = _size(bytes(data[: 1 << 16]))
+    if height * width > MOST_PIXELS:
+        # they would take the memory before the first of them is read
+        raise UnreadableMessage(
+            f"its header says {width} x {height} px; pictures of up to {MOST_PIXELS} px are read"
+        )
     # without ANYDEPTH 16 bits would be cut down to 8
     flags |= cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
     with contextlib.suppress(cv2.error):
@@ -383,13 +378,14 @@ class Frames:
     It can be walked again and again, in the memory of a chunk; time_s (n,) is there beforehand. The file of
     `columns` is walked once before, for them too. A picture that cannot be decoded is left out:
     `unreadable` counts those of the last walk, `notes` describes them. Raises ValueError if they are more
-    than `unreadable_share` of all, and if the size changes.
+    than `unreadable_share` of all, and if the size changes. `start_ns` is the instant from which time is
+    counted.
     """
 
     def __init__(self, columns: TopicColumns, topic: Topic, unreadable_share: float):
         file = columns.file
         self.path, self.topic, self.unreadable = file.path, topic.name, 0
-        self._time, self._share, self._first, self._start_ns = columns.time, unreadable_share, "", 0
+        self._time, self._share, self._first, self.start_ns = columns.time, unreadable_share, "", 0
         readers = {channel.id: reader(channel) for channel in topic.channels}
         times: dict[int, list[int]] = {number: [] for number in readers}
         offsets: dict[int, list[int]] = {number: [] for number in readers}
@@ -413,14 +409,10 @@ class Frames:
         every = [time for number in numbers for time in times[number]]
         self.time_ns = np.array(every, np.uint64).astype(np.int64)
 
-    def count_from(self, start_ns: int) -> None:
-        """Counts time from an instant in ns."""
-        self._start_ns = start_ns
-
     @property
     def time_s(self) -> np.ndarray:
         """Of the pictures (n,), the channels one behind the other in the order of their first pictures."""
-        return (self.time_ns - self._start_ns) / 1e9
+        return (self.time_ns - self.start_ns) / 1e9
 
     def __len__(self) -> int:
         return self.count
@@ -453,12 +445,12 @@ class Frames:
                         try:
                             picture = read(message)
                         except UnreadableMessage as error:
-                            self._leave_out((log_time - self._start_ns) / 1e9, error)
+                            self._leave_out((log_time - self.start_ns) / 1e9, error)
                             continue
                         time = {"log_time": log_time, "publish_time": publish_time}.get(
                             self._time, picture.stamp_ns
                         )
-                        yield (time - self._start_ns) / 1e9, picture
+                        yield (time - self.start_ns) / 1e9, picture
 
     def chosen(self, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
         """(number, frame) of the pictures with these numbers; only they are decoded, and one that cannot be
@@ -591,7 +583,7 @@ def read_frames(
     groups = {topic: columns.joined(topic, notes) for topic in columns.fields}
     pictures = FileColumns(camera.name, frames.time_ns, {}, lambda i: f"frame {i + 1} of {camera.name}")
     start_ns = _start(path, [*groups.values(), pictures], notes)
-    frames.count_from(start_ns)
+    frames.start_ns = start_ns
     signals = {
         name: (
             (groups[topic].time - start_ns) / 1e9,

@@ -29,7 +29,6 @@ from pipeline.recordings.messages import (
     Channel,
     Decode,
     UnreadableMessage,
-    compressed,
     decoder,
     decompress,
     fields,
@@ -666,9 +665,20 @@ class TopicColumns:
         self.backwards: dict[str, int] = {}
 
     def want(self, topic: Topic, names: Sequence[str]) -> None:
-        """Takes the fields `names` of a topic from now on. Raises ValueError if it lacks the clock."""
+        """Takes the fields `names` of a topic from now on, and those that make its clock: none for log_time
+        and publish_time, one of seconds, or two of a stamp. Raises ValueError if it lacks them."""
         self.fields[topic.name] = list(dict.fromkeys(names))
-        self.clocks[topic.name] = _clock(self.file.path, topic, self.time)
+        candidates = [[]] if self.time in ("", "log_time", "publish_time") else [[self.time]]
+        candidates += [[f"{self.time}.{part}" for part in parts] for parts in _STAMPS]
+        clock = next((clock for clock in candidates if set(clock) <= set(topic.fields)), None)
+        if clock is None:
+            ends = tuple(f".{part}" for part, _ in _STAMPS)
+            stamps = [name.rpartition(".")[0] for name in topic.fields if name.endswith(ends)]
+            raise ValueError(
+                f"{self.file.path}: topic {topic.name} has no time {self.time!r}; "
+                f"{nearest_names(self.time, ['log_time', 'publish_time', *stamps])}"
+            )
+        self.clocks[topic.name] = clock
 
     def add(self, number: int, messages: Messages) -> None:
         """Decodes messages of a channel. Raises ValueError for a field that it lacks, and for text in place
@@ -750,24 +760,6 @@ class TopicColumns:
         ]
 
 
-def _clock(path: Path, topic: Topic, time: str) -> list[str]:
-    """Fields that make the clock: none for log_time and publish_time, one of seconds, or two of a stamp."""
-    if time in ("", "log_time", "publish_time"):
-        return []
-    if time in topic.fields:
-        return [time]
-    for parts in _STAMPS:
-        names = [f"{time}.{part}" for part in parts]
-        if set(names) <= set(topic.fields):
-            return names
-    ends = tuple(f".{part}" for part, _ in _STAMPS)
-    stamps = [name.rpartition(".")[0] for name in topic.fields if name.endswith(ends)]
-    raise ValueError(
-        f"{path}: topic {topic.name} has no time {time!r}; "
-        f"{nearest_names(time, ['log_time', 'publish_time', *stamps])}"
-    )
-
-
 def _stamps(clock: Sequence[str], stamps: np.ndarray) -> np.ndarray:
     """Times in ns (n,) of the clock's fields (n, 1 or 2)."""
     if len(clock) == 1:
@@ -780,8 +772,7 @@ def _stamps(clock: Sequence[str], stamps: np.ndarray) -> np.ndarray:
 def _decode(decode: Decode, data: list[bytes], width: int) -> tuple[np.ndarray, slice | list[int]]:
     """Numbers (n, width) of the messages that fit their schema, and which ones they are."""
     with contextlib.suppress(UnreadableMessage):
-        whole = [plain(message) for message in data] if any(map(compressed, data)) else data
-        return decode(whole), slice(None)
+        return decode([plain(message) for message in data]), slice(None)
     rows, sound = [np.empty((0, width))], []
     for i, message in enumerate(data):
         with contextlib.suppress(UnreadableMessage):

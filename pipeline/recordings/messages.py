@@ -115,14 +115,10 @@ def _kind(channel: Channel) -> str:
 # ---- compression of single messages
 
 
-def compressed(message: bytes) -> bool:
-    """Whether the message is a zstd or lz4 frame, as rosbag2 writes with compression mode `message`."""
-    return message[:4] in (_ZSTD, _LZ4)
-
-
 def plain(message: bytes) -> bytes:
-    """The message, decompressed if it is compressed."""
-    if not compressed(message):
+    """The message, decompressed if it is a zstd or lz4 frame, as rosbag2 writes with compression mode
+    `message`."""
+    if message[:4] not in (_ZSTD, _LZ4):
         return message
     return decompress("zstd" if message[:4] == _ZSTD else "lz4", message, None)
 
