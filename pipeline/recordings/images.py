@@ -570,8 +570,8 @@ def read_frames(
             places[name] = (source, *resolve(path, source.source, in_file))
         except ValueError as error:
             if name not in optional or source.source.partition(":")[0] in in_file:
-                there = f"it in {section}.mapping.{name}" if section else f"{name} to the topic that has it"
-                raise ValueError(f"{error}; map {there}") from None
+                remedy = f"it in {section}.mapping.{name}" if section else f"{name} to the topic that has it"
+                raise ValueError(f"{error}; map {remedy}") from None
     for topic in dict.fromkeys(topic for _, topic, _ in places.values()):
         columns.want(in_file[topic], [field for _, at, field in places.values() if at == topic])
     frames = Frames(columns, camera, unreadable_share)
@@ -580,7 +580,7 @@ def read_frames(
             f"{path}: no picture of {camera.name} can be read ({damage(path)}); copy the recording again"
         )
     notes = columns.file.notes() + columns.notes()
-    groups = {topic: columns.joined(topic, notes) for topic in columns.fields}
+    groups = {topic: columns.join(topic, notes) for topic in columns.fields}
     pictures = FileColumns(camera.name, frames.time_ns, {}, lambda i: f"frame {i + 1} of {camera.name}")
     start_ns = _start(path, [*groups.values(), pictures], notes)
     frames.start_ns = start_ns

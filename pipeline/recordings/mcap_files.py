@@ -82,7 +82,7 @@ def check_magic(path: Path, start: bytes) -> None:
     copying."""
     if start[:8] == MAGIC:
         return
-    wanted, there = MAGIC.hex(" "), start[:8].hex(" ")
+    expected, actual = MAGIC.hex(" "), start[:8].hex(" ")
     converted = {
         b"\x89MCAP0\n": "CR LF to LF",
         b"\x89MCAP0\r\r\n": "LF to CR LF",
@@ -92,12 +92,12 @@ def check_magic(path: Path, start: bytes) -> None:
     how = next((how for damaged, how in converted.items() if start.startswith(damaged)), "")
     if how:
         raise ValueError(
-            f"{path}: the bytes at offset 0 should be {wanted} but are {there}: "
+            f"{path}: the bytes at offset 0 should be {expected} but are {actual}: "
             f"line ends were converted ({how}), which destroys the whole file; "
             "copy it again as binary (*.mcap binary in .gitattributes)"
         )
     raise ValueError(
-        f"{path}: the bytes at offset 0 should be MCAP's {wanted} but are {there}; "
+        f"{path}: the bytes at offset 0 should be MCAP's {expected} but are {actual}; "
         "copy the recording again as binary"
     )
 
@@ -604,14 +604,14 @@ def topics(path: Path, samples: int | None = SAMPLES) -> dict[str, Topic]:
 
     Raises ValueError for a file that is no MCAP.
     """
-    file, seen = McapFile(path), _Fields({}, {})
+    file, sampled_fields = McapFile(path), _Fields({}, {})
     sampled: dict[int, int] = {}
     for batch in file.batches(lambda channel: samples is None or sampled.get(channel.id, 0) < samples):
         for number, messages in batch.items():
             data = messages.data[: None if samples is None else samples - sampled.get(number, 0)]
             sampled[number] = sampled.get(number, 0) + len(data)
             if number in file.channels and data:
-                seen.add(file.channels[number], data)
+                sampled_fields.add(file.channels[number], data)
         if (
             samples
             and file.promised
@@ -619,8 +619,10 @@ def topics(path: Path, samples: int | None = SAMPLES) -> dict[str, Topic]:
         ):
             break
     for number in set(file.channels) - set(sampled):
-        seen.add(file.channels[number], [])
-    return seen.topics(file.channels, file.counts if samples is None else file.promised or file.counts)
+        sampled_fields.add(file.channels[number], [])
+    return sampled_fields.topics(
+        file.channels, file.counts if samples is None else file.promised or file.counts
+    )
 
 
 def resolve(path: Path, source: str, topics: dict[str, Topic]) -> tuple[str, str]:
@@ -716,7 +718,7 @@ class TopicColumns:
         ):
             counts[channel.topic] = counts.get(channel.topic, 0) + int(count)
 
-    def joined(self, topic: str, notes: list[Note]) -> FileColumns:
+    def join(self, topic: str, notes: list[Note]) -> FileColumns:
         """The topic's channels one behind the other. Two channels at the same time are two devices under one
         name, and refused."""
         path, pieces = self.file.path, []
@@ -811,7 +813,7 @@ def mcap_columns(
                 "record each under a topic of its own"
             )
             notes.append(Note("mixed", "", count, message))
-    return [columns.joined(topic, notes) for topic in columns.fields], places, counts, notes
+    return [columns.join(topic, notes) for topic in columns.fields], places, counts, notes
 
 
 def _places(path: Path, sources: Sequence[str]) -> tuple[dict[str, tuple[str, str]], dict[str, Topic]]:
@@ -846,30 +848,30 @@ def survey(path: Path, most_fields: int) -> Survey:
 
     Raises ValueError for a file that is no MCAP.
     """
-    file, seen = McapFile(path), _Fields({}, {})
+    file, sampled_fields = McapFile(path), _Fields({}, {})
     columns = TopicColumns(file, "")
     waiting: dict[int, Messages] = {}  # the first messages of a channel, until there are SAMPLES
 
     def add(number: int, messages: Messages) -> None:
         channel = file.channels[number]
-        if number not in seen.names:
-            seen.add(channel, messages.data[:SAMPLES])
-            names = list(seen.names[number])[:most_fields]
-            if number in seen.unreadable or not names:
-                seen.unreadable.setdefault(number, "")
+        if number not in sampled_fields.names:
+            sampled_fields.add(channel, messages.data[:SAMPLES])
+            names = list(sampled_fields.names[number])[:most_fields]
+            if number in sampled_fields.unreadable or not names:
+                sampled_fields.unreadable.setdefault(number, "")
             elif channel.topic not in columns.fields:
                 columns.want(Topic(channel.topic, [], [], "", 0), names)
-        if number not in seen.unreadable:
+        if number not in sampled_fields.unreadable:
             try:
                 columns.add(number, messages)
             except ValueError as error:
-                seen.unreadable[number] = str(error)
+                sampled_fields.unreadable[number] = str(error)
 
-    for batch in file.batches(lambda channel: channel.id not in seen.unreadable):
+    for batch in file.batches(lambda channel: channel.id not in sampled_fields.unreadable):
         for number, messages in batch.items():
             if number not in file.channels or not messages.data:
                 continue
-            if number not in seen.names:
+            if number not in sampled_fields.names:
                 first = waiting.pop(number, Messages([], [], [], []))
                 messages = Messages(
                     first.log_time + messages.log_time,
@@ -883,14 +885,16 @@ def survey(path: Path, most_fields: int) -> Survey:
             add(number, messages)
     for number, messages in waiting.items():
         add(number, messages)
-    for number in set(file.channels) - set(seen.names):
-        seen.add(file.channels[number], [])
-    by_name = seen.topics(file.channels, file.counts)
+    for number in set(file.channels) - set(sampled_fields.names):
+        sampled_fields.add(file.channels[number], [])
+    by_name = sampled_fields.topics(file.channels, file.counts)
     notes, groups = file.notes() + columns.notes(), []
-    columns.parts = {number: part for number, part in columns.parts.items() if number not in seen.unreadable}
+    columns.parts = {
+        number: part for number, part in columns.parts.items() if number not in sampled_fields.unreadable
+    }
     for topic in dict.fromkeys(file.channels[number].topic for number in columns.parts):
         try:
-            groups.append(columns.joined(topic, notes))
+            groups.append(columns.join(topic, notes))
         except ValueError as error:
             notes.append(Note("unreadable", "", by_name[topic].count, str(error)))
     return Survey(by_name, groups, notes)

@@ -816,21 +816,20 @@ def _filler(message: Descriptor, wanted: dict[str, int]) -> Fill:
 
 def _number(field: FieldDescriptor, index: str | None) -> Callable[[Message], float]:
     """A function from a message to a field's number, element or length ("#"), NaN if it is absent."""
-    values = operator.attrgetter(field.name)
+    name, nan = field.name, np.nan
     if index == "#":
-        return lambda message: len(values(message))
+        return lambda message: len(getattr(message, name))
     if index is not None:
         place = int(index)
-        return lambda message: elements[place] if place < len(elements := values(message)) else np.nan
+        return lambda message: elements[place] if place < len(elements := getattr(message, name)) else nan
     if field.has_presence:
-        return lambda message: values(message) if message.HasField(field.name) else np.nan
-    return values
+        return lambda message: getattr(message, name) if message.HasField(name) else nan
+    return operator.attrgetter(name)
 
 
 def _submessage(name: str, index: str | None) -> Callable[[Message], Message | None]:
     """A function from a message to the one in a field, or to its element; None if it is absent."""
-    values = operator.attrgetter(name)
     if index is None:
-        return lambda message: values(message) if message.HasField(name) else None
+        return lambda message: getattr(message, name) if message.HasField(name) else None
     place = int(index)
-    return lambda message: elements[place] if place < len(elements := values(message)) else None
+    return lambda message: elements[place] if place < len(elements := getattr(message, name)) else None
