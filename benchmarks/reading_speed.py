@@ -106,7 +106,8 @@ def protobuf_s(count: int = 200_000) -> dict[str, float]:
     """Seconds for the numbers of `count` messages: ours, and the package with its fields named by hand."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-    from pipeline.recordings.protobuf_messages import decoder, message_types
+    from pipeline.recordings.messages import message_types
+    from pipeline.recordings.messages import protobuf_decoder as decoder
 
     file = descriptor_pb2.FileDescriptorProto(name="machine.proto", package="machine", syntax="proto3")
     state = file.message_type.add(name="State")

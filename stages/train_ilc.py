@@ -207,7 +207,7 @@ def learn_from_recordings(
 def read(recording: TrialRecording, camera: Camera, memo: Path | None = None) -> readings.Readings:
     """The readings of a recording's frames, out of the memo if it holds them."""
     from pipeline.deposition.camera import readings
-    from pipeline.recordings import trial_memo
+    from pipeline.recordings import trial_files
 
     def measure() -> readings.Readings:
         with artifacts.about(recording.path):
@@ -216,7 +216,7 @@ def read(recording: TrialRecording, camera: Camera, memo: Path | None = None) ->
     if memo is None:
         return measure()
     code = [PIPELINE / name for name in READERS]
-    values = trial_memo.recall(memo, recording.path, camera.looks, code, measure)
+    values = trial_files.recall(memo, recording.path, camera.looks, code, measure)
     return readings.Readings.from_values(values)
 
 

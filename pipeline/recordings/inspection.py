@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.recordings.bag_folders import bag_parts, joined, merged
 from pipeline.recordings.clocks import Mended, mended_topics
 from pipeline.recordings.csv_files import csv_columns, csv_layout, read_csv
 from pipeline.recordings.formats import (
@@ -21,7 +20,7 @@ from pipeline.recordings.formats import (
     is_time_name,
     time_column,
 )
-from pipeline.recordings.mcap_columns import Topic, survey
+from pipeline.recordings.mcap_files import Topic, bag_parts, joined, merged, survey
 from pipeline.recordings.other_formats import LOADERS
 from pipeline.recordings.parquet_files import parquet_columns, read_parquet
 from pipeline.recordings.proposals import (

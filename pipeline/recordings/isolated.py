@@ -14,7 +14,6 @@ import struct
 import subprocess
 import sys
 import tempfile
-import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -73,6 +72,7 @@ def isolated(work: Callable[..., Any], *arguments: Any, shown: str | Path, budge
         reply = {}
     finally:
         # also where a person ends the run: a child at its work is not left behind
+        ended = (0, "")
         if reply.get("ready"):
             _waiting.append(child)
         else:
@@ -83,9 +83,7 @@ def isolated(work: Callable[..., Any], *arguments: Any, shown: str | Path, budge
         raise ValueError(reply["refused"])
     if "failed" in reply:
         raise OSError(reply["failed"])
-    if "memory" in reply:
-        raise ValueError(_out_of_memory(shown, budget))
-    raise ValueError(_ended(shown, budget, *ended))
+    raise ValueError(_sentence(shown, budget, "memory" in reply, *ended))
 
 
 def _take() -> Child:
@@ -104,53 +102,40 @@ def _take() -> Child:
         # Arrow's own allocator takes a GiB at once, of which most is never used
         env=os.environ | {"PYTHONPATH": path, "ARROW_DEFAULT_MEMORY_POOL": "system"},
     )
-    child = Child(process, printed)
-    # at the end of the interpreter: closing its input ends a child that waits
-    weakref.finalize(process, _close, process.stdin, process.stdout)
-    return child
-
-
-def _close(*pipes: IO[bytes] | None) -> None:
-    for pipe in pipes:
-        if pipe is not None:
-            with contextlib.suppress(OSError):
-                pipe.close()
+    return Child(process, printed)
 
 
 def _end(child: Child) -> tuple[int, str]:
     """Ends a child; its exit status, and the last line that it printed."""
-    try:
+    with contextlib.suppress(subprocess.TimeoutExpired):
         # one that ended by itself has closed its pipes before it can be waited for
-        status = child.process.wait(timeout=1)
-    except subprocess.TimeoutExpired:
-        child.process.kill()
-        status = child.process.wait()
-    _close(child.process.stdin, child.process.stdout)
+        child.process.wait(timeout=1)
+    child.process.kill()
+    with contextlib.suppress(BrokenPipeError), child.process as process:
+        process.wait()
     with child.printed as printed:
         end = printed.seek(0, os.SEEK_END)
         printed.seek(max(0, end - 2000))
         lines = printed.read().decode(errors="replace").split("\n")
-    return status, next((line.strip() for line in reversed(lines) if line.strip()), "")
+    return child.process.returncode, next((line.strip() for line in reversed(lines) if line.strip()), "")
 
 
 # ---- the sentences
 
 
-def _out_of_memory(shown: str | Path, budget: Budget) -> str:
-    return (
-        f"{shown}: reading it needs more memory than the {budget.largest_mb:g} MB that a recording may take; "
-        "split the recording, or raise ingest.largest_mb in params.expert.yaml if it is as large as that"
-    )
-
-
-def _ended(shown: str | Path, budget: Budget, status: int, last: str) -> str:
+def _sentence(shown: str | Path, budget: Budget, no_memory: bool, status: int, last: str) -> str:
+    """Why a call gave nothing."""
     if status == -signal.SIGALRM:
         return (
             f"{shown}: reading it takes longer than the {budget.longest_s:g} s that a recording may take; "
             "split the recording, or raise ingest.longest_s in params.expert.yaml if it is as long as that"
         )
-    if any(words in last for words in OUT_OF_MEMORY):
-        return _out_of_memory(shown, budget)
+    if no_memory or any(words in last for words in OUT_OF_MEMORY):
+        return (
+            f"{shown}: reading it needs more memory than the {budget.largest_mb:g} MB that a recording may "
+            "take; split the recording, or raise ingest.largest_mb in params.expert.yaml if it is as large "
+            "as that"
+        )
     if status == -signal.SIGKILL:
         return (
             f"{shown}: the process that read it was killed, as a system does that runs out of memory; "

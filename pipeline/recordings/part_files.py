@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.recordings import recordings
 from pipeline.recordings.formats import file_format
-from pipeline.recordings.mcap_columns import topics
+from pipeline.recordings.mcap_files import topics
 from pipeline.recordings.parquet_files import parquet_columns
 from pipeline.recordings.plain_files import check_plain_file
 from pipeline.recordings.signals import Source

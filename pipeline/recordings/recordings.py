@@ -10,13 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.recordings.bag_folders import read_bag
 from pipeline.recordings.clocks import mended_topics
 from pipeline.recordings.csv_files import read_csv
 from pipeline.recordings.formats import CALENDAR_S, FileColumns, file_format
 from pipeline.recordings.inspection import inspect
-from pipeline.recordings.mcap_columns import mcap_columns
-from pipeline.recordings.mcap_records import check_magic
+from pipeline.recordings.mcap_files import check_magic, mcap_columns, read_bag
 from pipeline.recordings.other_formats import LOADERS
 from pipeline.recordings.parquet_files import read_parquet
 from pipeline.recordings.quality import flag

@@ -3,31 +3,26 @@ simulated, the true flow; and the next trial's command.
 
 Written as any ROS 2 or Foxglove viewer opens it: CDR with the ros2msg texts embedded, in the order of time,
 chunks with CRCs. Read from that form or from a machine's own topics. Equal input gives equal bytes.
+
+A recording is read once: the readings of its frames are kept under a hash of its bytes, of the camera's
+settings and of the code that reads.
 """
 
 import math
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import joblib
 import numpy as np
 
 from pipeline.recordings.excluded import readable
-from pipeline.recordings.formats import file_format
-from pipeline.recordings.image_topics import Frames, image_topic
-from pipeline.recordings.mcap_columns import Topic, resolve, topics
-from pipeline.recordings.mcap_frames import (
-    check_overlap,
-    damage,
-    read_frames,
-    span_of,
-    tables_of,
-    write_frames,
-)
+from pipeline.recordings.images import Frames, check_overlap, read_frames, span_of, tables_of, write_frames
 from pipeline.recordings.signals import Note, Source
-from pipeline.store.artifacts import write_csv
+from pipeline.store import artifacts
 from pipeline.store.params import Mapped
+from pipeline.store.tables import BYTES, FLOAT, NONE, TEXT, Column, Schema
 
 SCHEMA, VERSION = "beadline.trial", "1"
 # what a trial has, where our own recordings have it
@@ -41,6 +36,21 @@ TYPES = {
     "/plunger": "beadline_msgs/msg/Plunger",
     "/true_flow": "beadline_msgs/msg/TrueFlow",
 }
+
+READINGS = Schema(
+    "trial_readings",
+    1,
+    (
+        Column("time_s", FLOAT, "s", "of the frame, as stamped"),
+        Column("reason", TEXT, NONE, "why the frame has no usable bead; empty if it has"),
+        Column("columns", BYTES, "px", "measured columns, 64-bit floats"),
+        Column("widths", BYTES, "px", "widths there, 64-bit floats; 0 bare, NaN unread"),
+        Column("latency_s", FLOAT, "s", "how late the frames are against the gantry, of the whole recording"),
+        Column("latency_deviation_s", FLOAT, "s", "its standard deviation; missing: not told", nullable=True),
+    ),
+)
+# the readings of F frames: time_s (F,), columns (m,), widths (F, m), reasons (F,), latency and its deviation
+Values = tuple[np.ndarray, np.ndarray, np.ndarray, list[str], tuple[float, float]]
 
 
 class TrialConditions(NamedTuple):
@@ -128,7 +138,7 @@ def write_command(
     no ending. Raises ValueError as write_trial does."""
     tables = tables_of(path, time_s, [(COMMAND, command_mm)])
     write_frames(f"{path}.mcap", tables, TYPES, time_s, None, (SCHEMA, _metadata(path, conditions)))
-    write_csv(
+    artifacts.write_csv(
         f"{path}.csv",
         {
             "time_s": np.asarray(time_s, float),
@@ -305,68 +315,37 @@ def read_trial(
             f"{path}: unreadable_share should be within 0 and 1 but is {unreadable_share:g}; "
             "give a share of the frames"
         )
-    if file_format(path) != "mcap":
-        raise ValueError(
-            f"{path} is a table but a trial should be an MCAP recording with frames; name the recording"
-        )
-    try:
-        return _read(path, sources, image, time or "log_time", unreadable_share)
-    except OSError as error:
-        raise ValueError(
-            f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
-        ) from None
-
-
-def _read(
-    path: Path, sources: Sequence[Source], image: str, time: str, unreadable_share: float
-) -> TrialRecording:
-    there = topics(path)
-    if not any(topic.count for topic in there.values()):
-        raise ValueError(f"{path}: it has no whole message ({damage(path)}); copy the recording again")
-    camera = image_topic(path, there, image)
-    recording = read_frames(
-        path, camera, _places(path, sources, there), there, clock=time, unreadable_share=unreadable_share
-    )
-    frames, signals, notes = recording.frames, recording.signals, recording.notes
-    check_overlap(
-        path, span_of(frames.time_s), {name: span_of(time_s) for name, (time_s, _) in signals.items()}
-    )
-    first, last = span_of(signals[COMMAND.signal][0])
-    outside = int(np.count_nonzero((frames.time_s < first) | (frames.time_s > last)))
-    if outside:
-        notes.append(
-            Note(
-                "outside",
-                "",
-                outside,
-                f"{outside} of {len(frames.time_s)} frames lie before or after the command",
-            )
-        )
-    return TrialRecording(
-        str(path), _conditions(path, recording.metadata.get(SCHEMA, {}), notes), signals, frames, notes
-    )
-
-
-def _places(
-    path: Path, sources: Sequence[Source], there: dict[str, Topic]
-) -> dict[str, tuple[Source, str, str]]:
-    """{signal: (source, topic, field)}; only the true flow, which no
-    machine knows, may be absent where its source is ours."""
     for needed in (POSITION, SPEED, COMMAND):
         if [source.signal for source in sources].count(needed.signal) != 1:
             raise ValueError(
                 f"{path}: the mapping should give {needed.signal} one source; "
                 "map the gantry's position and speed, and the command"
             )
-    places = {}
-    for source in sources:
-        if source == FLOW and FLOW.source.partition(":")[0] not in there:
-            continue
-        try:
-            places[source.signal] = (source, *resolve(path, source.source, there))
-        except ValueError as error:
-            raise ValueError(f"{error}; map {source.signal} to the topic that has it") from None
-    return places
+    # only the true flow, which no machine knows, may be absent if its source is ours
+    optional = {FLOW.signal} if FLOW in sources else ()
+    try:
+        frames, signals, metadata, notes = read_frames(
+            path,
+            sources,
+            what="a trial",
+            image=image,
+            clock=time or "log_time",
+            unreadable_share=unreadable_share,
+            optional=optional,
+        )
+    except OSError as error:
+        raise ValueError(
+            f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
+        ) from None
+    spans = {name: span_of(time_s) for name, (time_s, _) in signals.items()}
+    check_overlap(path, span_of(frames.time_s), spans)
+    first, last = spans[COMMAND.signal]
+    outside = int(np.count_nonzero((frames.time_s < first) | (frames.time_s > last)))
+    if outside:
+        message = f"{outside} of {len(frames.time_s)} frames lie before or after the command"
+        notes.append(Note("outside", "", outside, message))
+    conditions = _conditions(path, metadata.get(SCHEMA, {}), notes)
+    return TrialRecording(str(path), conditions, signals, frames, notes)
 
 
 def _conditions(path: Path, metadata: dict[str, str], notes: list[Note]) -> TrialConditions | None:
@@ -404,3 +383,58 @@ def _conditions(path: Path, metadata: dict[str, str], notes: list[Note]) -> Tria
             f"{path}: the trial's conditions cannot be read ({error}); "
             f"write numbers into the metadata record {SCHEMA}"
         ) from None
+
+
+# ---- readings that are kept
+
+
+def recall(
+    folder: Path,
+    recording: str,
+    settings: Mapping[str, Any],
+    code: Sequence[Path],
+    read: Callable[[], Values],
+) -> Values:
+    """The readings of a recording out of `folder`, else those that `read` makes, which are kept if there is a
+    frame. An entry is named by the hash of the recording, of the settings, and of the code that reads."""
+    what = ((artifacts.sha256(recording), settings), [artifacts.sha256(path) for path in code])
+    place = folder / f"{joblib.hash(what)}.parquet"
+    known = _remembered(place)
+    if known is not None:
+        return known
+    values = read()
+    if len(values[0]):
+        _remember(place, values)
+    return values
+
+
+def _remember(place: Path, values: Values) -> None:
+    time_s, columns, widths, reasons, (latency_s, deviation_s) = values
+    count = len(time_s)
+    table = {
+        "time_s": time_s,
+        "reason": np.array(reasons, object),
+        "columns": [columns.astype("<f8").tobytes()] * count,
+        "widths": [row.astype("<f8").tobytes() for row in widths],
+        "latency_s": np.full(count, latency_s),
+        "latency_deviation_s": np.full(count, deviation_s if np.isfinite(deviation_s) else np.nan),
+    }
+    artifacts.write_table(place, READINGS, table)
+
+
+def _remembered(place: Path) -> Values | None:
+    """The readings of an entry; None if there is none, or if the checksums of its pages do not hold."""
+    try:
+        table = artifacts.read_table(place, READINGS)
+    except ValueError:
+        return None
+    if not len(table["time_s"]):
+        return None
+    deviation_s = float(table["latency_deviation_s"][0])
+    return (
+        np.asarray(table["time_s"], float),
+        np.frombuffer(table["columns"][0], "<f8"),
+        np.stack([np.frombuffer(row, "<f8") for row in table["widths"]]),
+        [str(reason) for reason in table["reason"]],
+        (float(table["latency_s"][0]), deviation_s if np.isfinite(deviation_s) else np.inf),
+    )

@@ -18,15 +18,15 @@ import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.recordings import image_messages
-from pipeline.recordings.frame_images import UNREADABLE, decode, read_image
-from pipeline.recordings.frame_mcap import Topics
-from pipeline.recordings.growing_mcap import GrowingMcap, Message
-from pipeline.recordings.mcap_messages import Channel, Decode, decoder, fields, plain
+from pipeline.recordings import images
+from pipeline.recordings.images import UNREADABLE, decode, read_image
+from pipeline.recordings.mcap_files import GrowingMcap, Message
+from pipeline.recordings.messages import Channel, Decode, decoder, fields, plain
+from pipeline.recordings.nozzle_frames import Topics
 
 PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 # a picture that is not whole and has not grown for so long is broken
@@ -55,22 +55,7 @@ class CameraFrame(NamedTuple):
     print_id: str = ""
 
 
-class FrameSource(Protocol):
-    """`frames` gives what came since it was last asked; `waits_for` says why nothing comes, "" where
-    something may; `lacks` what a source that is there has none of; `ended`: nothing more will come; `rest_s`:
-    how long to wait before the next look."""
-
-    waits_for: str
-    ended: bool
-    rest_s: float
-
-    @property
-    def lacks(self) -> str: ...
-
-    def frames(self) -> Iterator[CameraFrame]: ...
-
-
-def source(place: str, topics: Topics, *, rate_hz: float) -> FrameSource:
+def source(place: str, topics: Topics, *, rate_hz: float) -> "FrameSource":
     """The source that a path or an address names. Raises ValueError for an address that is none, and for a
     file that is no recording."""
     if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", place):
@@ -181,7 +166,7 @@ class RecordingSource:
         self.sources = where.sources()
         self.signals: dict[str, float] = {}
         self.decoders: dict[int, tuple[list[str], Decode] | None] = {}
-        self.reads: dict[int, image_messages.Read] = {}
+        self.reads: dict[int, images.Read] = {}
         self.camera, self.others = where.image, set()
         self.before, self.count, self.others_held = b"", 0, set()
 
@@ -199,7 +184,7 @@ class RecordingSource:
     def frames(self) -> Iterator[CameraFrame]:
         try:
             for message in self.file.messages(lambda channel: True):
-                if not image_messages.is_image(message.channel):
+                if not images.is_image(message.channel):
                     self.others_held.add(message.channel.topic)
                     self._hold(message)
                 elif self._is_camera(message.channel):
@@ -226,7 +211,7 @@ class RecordingSource:
         name, stamp = f"{self.camera} {self.count}", message.log_time
         try:
             if message.channel.id not in self.reads:
-                self.reads[message.channel.id] = image_messages.reader(message.channel)
+                self.reads[message.channel.id] = images.reader(message.channel)
             picture = self.reads[message.channel.id](message.data)
             if self.where.time == "publish_time":
                 stamp = message.publish_time
@@ -234,7 +219,7 @@ class RecordingSource:
                 stamp = picture.stamp_ns
             digest = hashlib.blake2b(picture.data, digest_size=16).digest()
             copy, self.before = digest == self.before, digest
-            frame = COPY if copy else image_messages.gray(picture)
+            frame = COPY if copy else images.gray(picture)
         except ValueError as error:
             frame = f"{UNREADABLE}: {error}"
         number = self.signals.get("print_id", np.nan)
@@ -320,22 +305,14 @@ class _Answer(http.client.HTTPResponse):
         self.fp = io.BufferedReader(_Until(self.fp.detach(), time.monotonic() + TIMEOUT_S))
 
 
-class _Plain(http.client.HTTPConnection):
-    response_class = _Answer
+class _Timely(urllib.request.HTTPHandler, urllib.request.HTTPSHandler):
+    """Opens connections whose answers are given up when their time is over."""
 
-
-class _Secure(http.client.HTTPSConnection):
-    response_class = _Answer
-
-
-class _TimelyPlain(urllib.request.HTTPHandler):
     def http_open(self, req):
-        return self.do_open(_Plain, req)
+        return self.do_open(type("_Plain", (http.client.HTTPConnection,), {"response_class": _Answer}), req)
 
-
-class _TimelySecure(urllib.request.HTTPSHandler):
     def https_open(self, req):
-        return self.do_open(_Secure, req)
+        return self.do_open(type("_Secure", (http.client.HTTPSConnection,), {"response_class": _Answer}), req)
 
 
 class Snapshots:
@@ -359,9 +336,7 @@ class Snapshots:
         if parts.username is not None:
             pair = f"{urllib.parse.unquote(parts.username)}:{urllib.parse.unquote(parts.password or '')}"
             self.headers["Authorization"] = f"Basic {base64.b64encode(pair.encode()).decode()}"
-        self.opener = urllib.request.build_opener(
-            urllib.request.ProxyHandler({}), _SameHost(), _TimelyPlain(), _TimelySecure()
-        )
+        self.opener = urllib.request.build_opener(urllib.request.ProxyHandler({}), _SameHost(), _Timely())
         self.period_s, self.rest_s, self.ended = 1 / rate_hz, 0.0, False
         self.waits_for, self.lacks = f"{self.shown} has not answered yet", "a picture"
         self.count, self.before = 0, b""
@@ -420,3 +395,9 @@ def _decoded(data: bytes) -> np.ndarray:
 def _without_secret(parts: urllib.parse.SplitResult) -> str:
     """An address as it may be shown: no user, no password."""
     return parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl()
+
+
+# `frames` gives what came since it was last asked; `waits_for` says why nothing comes, "" if something may;
+# `lacks` what a source that is there has none of; `ended`: nothing more will come; `rest_s`: how long to wait
+# before the next look
+FrameSource = Folder | RecordingSource | Snapshots

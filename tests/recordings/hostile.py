@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import zstandard
 
-from pipeline.recordings.mcap_records import MAGIC
+from pipeline.recordings.mcap_files import MAGIC
 from tests.mcap_writing import NO, Written, cdr, json_recording
 
 HEADER_ROWS = b"time_s,heater,zone\n"

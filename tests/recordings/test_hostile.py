@@ -9,13 +9,13 @@ import pytest
 
 from pipeline.recordings import isolated as children
 from pipeline.recordings import recording_folders
-from pipeline.recordings.image_messages import gray, reader
+from pipeline.recordings.images import gray, reader
 from pipeline.recordings.inspection import inspect
 from pipeline.recordings.isolated import Budget, isolated
-from pipeline.recordings.mcap_columns import topics
-from pipeline.recordings.mcap_files import McapFile
-from pipeline.recordings.mcap_messages import UnreadableMessage
-from pipeline.recordings.ros_messages import decoder, layout
+from pipeline.recordings.mcap_files import McapFile, topics
+from pipeline.recordings.messages import UnreadableMessage
+from pipeline.recordings.messages import ros_decoder as decoder
+from pipeline.recordings.messages import ros_layout as layout
 from pipeline.store import artifacts
 from pipeline.store.printable import printable
 from tests.recordings import damaging, hostile

@@ -8,10 +8,9 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 
-from pipeline.recordings.image_messages import ImageMessage, gray, image, is_image, reader
-from pipeline.recordings.image_messages import header as header_of
-from pipeline.recordings.mcap_messages import Channel
-from pipeline.recordings.ros_messages import UnreadableMessage
+from pipeline.recordings.images import ImageMessage, gray, image, is_image, reader
+from pipeline.recordings.images import header as header_of
+from pipeline.recordings.messages import Channel, UnreadableMessage
 from tests.mcap_writing import cdr
 
 # A picture of 2 rows, [1 2 3] and [4 5 6], each with a byte of padding, taken at 7.000000500 s by "cam"; and

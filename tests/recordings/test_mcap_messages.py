@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import zstandard
 
-from pipeline.recordings.mcap_messages import Channel, decoder, fields, plain
+from pipeline.recordings.messages import Channel, UnreadableMessage, decoder, fields, plain
 from pipeline.recordings.recordings import Source, read
-from pipeline.recordings.ros_messages import UnreadableMessage
 from tests.mcap_writing import Written, cdr
 from tests.recordings.test_protobuf_messages import DESCRIPTOR, MESSAGE
 

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2
 
-from pipeline.recordings.protobuf_messages import decoder, fields, message_types
-from pipeline.recordings.ros_messages import UnreadableMessage
+from pipeline.recordings.messages import UnreadableMessage, message_types
+from pipeline.recordings.messages import protobuf_decoder as decoder
+from pipeline.recordings.messages import protobuf_fields as fields
 
 # protoc --descriptor_set_out of: syntax = "proto3"; package machine;
 # message Zone { float celsius = 1; sint32 trim = 2; optional double limit = 3; }

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from pipeline.recordings.ros_messages import UnreadableMessage, decoder, fields, layout
+from pipeline.recordings.messages import UnreadableMessage
+from pipeline.recordings.messages import ros_decoder as decoder
+from pipeline.recordings.messages import ros_fields as fields
+from pipeline.recordings.messages import ros_layout as layout
 from tests.mcap_writing import cdr
 
 SEPARATOR = "=" * 80 + "\n"

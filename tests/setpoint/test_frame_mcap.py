@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.recordings.frame_folder import figures
-from pipeline.recordings.frame_mcap import UNITS, Topics, middle_frame, open_film
-from pipeline.recordings.mcap_frames import tables_of, write_frames
+from pipeline.recordings.images import tables_of, write_frames
+from pipeline.recordings.nozzle_frames import UNITS, Topics, figures, middle_frame, open_film
 from pipeline.recordings.recordings import inspect
 from pipeline.recordings.signals import Source
 from pipeline.setpoint.frames import key_area

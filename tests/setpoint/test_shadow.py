@@ -477,18 +477,18 @@ WRITER = """
     from pathlib import Path
     import numpy as np
     from mcap.writer import Writer
-    from pipeline.recordings import image_messages
+    from pipeline.recordings import images
     from tests.setpoint.test_shadow import picture
     with open(sys.argv[1], "wb") as stream:
         writer = Writer(stream, chunk_size=150_000)
         writer.start()
-        text = image_messages.IMAGE.encode()
+        text = images.IMAGE.encode()
         camera = writer.register_channel(
             "/cam", "cdr", writer.register_schema("sensor_msgs/msg/Image", "ros2msg", text))
         for k in range(60):
             stamp = round(k * 5e7)
-            head = image_messages.header(stamp, "nozzle")
-            writer.add_message(camera, stamp, image_messages.image(head, picture(k)), stamp)
+            head = images.header(stamp, "nozzle")
+            writer.add_message(camera, stamp, images.image(head, picture(k)), stamp)
             stream.flush()
             time.sleep(0.02)
         late = time.monotonic() + 300

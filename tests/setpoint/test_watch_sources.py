@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from pipeline.recordings import watch_sources
-from pipeline.recordings.frame_mcap import Topics
-from pipeline.recordings.growing_mcap import GrowingMcap
+from pipeline.recordings.mcap_files import GrowingMcap
+from pipeline.recordings.nozzle_frames import Topics
 from pipeline.recordings.watch_sources import COPY, Folder, RecordingSource, Snapshots, shown_place, source
 from tests.mcap_writing import LZ4, NO, ZSTD, Written, chunks
 from tests.nozzle_folders import ANY
