@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from pipeline.recordings.formats import every
-from pipeline.recordings.inspection import Inspected, look
+from pipeline.recordings.inspection import CODE, Inspected, look
 from pipeline.recordings.proposals import (
     BELOW_CUT_OFF_DEGC,
     Proposal,
@@ -113,10 +113,11 @@ def proposed(paths: Sequence[Path], *, sample_time: str = "") -> Initialised:
                 "give recordings of one machine"
             )
     kind = recordings[0].kind
+    codes = [note.message for recording in recordings for note in recording.notes if note.kind == CODE]
     scale = _scale(paths, proposal, step_s=KLIPPER_STEP_S if kind in KLIPPER_KINDS else 0.0)
     return Initialised(
         _values(proposal, scale),
-        _open_questions(proposal, scale, kind, timed=not proposal.time or bool(sample_time)),
+        [*codes, *_open_questions(proposal, scale, kind, timed=not proposal.time or bool(sample_time))],
     )
 
 

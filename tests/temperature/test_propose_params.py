@@ -14,6 +14,7 @@ from pipeline.store import artifacts, params
 from pipeline.store.params_text import replaced
 from pipeline.temperature import tables
 from pipeline.temperature.settings import GenerateProbing, Panel, Plant, TuneWeights, given_centre
+from pipeline.temperature.test_set import best
 from pipeline.temperature.test_set.time_scale import time_constant
 from stages.identify_plant import IdentifyPlant
 from stages.ingest import Ingest
@@ -405,7 +406,8 @@ def test_the_printers_own_pid_is_judged_beside_the_others_and_swings_as_its_log_
     assert duty.max() > 0.9 and duty.min() < 0.1
     assert judged["stable"]["of"] == 6 and judged["stable"]["count"] <= 3
     assert judged["at_limits"]["median"] > 10
-    assert not figures["best_reason"]["passes"]["printer_pid"]
+    limits = best.limits_of(figures["pace"], params.read(printer / "params.yaml")["report"])
+    assert not best.passes(judged, limits)
     # simpler than what is identified, after doing nothing
     assert figures["order"][:2] == ["hold", "printer_pid"]
     assert figures["contestants"]["subspace_lqg"]["stable"] == {"count": 6, "of": 6}
