@@ -48,7 +48,7 @@ _COUNTER = (
     r"time.?stamp|(^|[._])(stamp|time|clock|uptime|millis|micros|ticks?|counter|epoch)(_?(s|ms|us|ns))?$"
 )
 _STATUS = (
-    r"e[\s_-]?stop|emergency|alarm|fault|error|status|(^|[._\s])(state|mode|ok|ready)$|enabled?|door|lamp|"
+    r"e[\s_-]?stop|emergency|alarm|fault|error|status[^.]*$|(^|[._\s])(state|mode|ok|ready)$|enabled?|door|lamp|"
     r"interlock|warning|running|connected|valid|busy|homed|watchdog|heartbeat"
 )
 _SILENT = re.compile(rf"{_STAMP}|{_COUNTER}|{_STATUS}")
@@ -318,6 +318,7 @@ def _role_of_name(name: Name, signal: RecordedSignal) -> str:
     if kind == "electric" or (says(ELECTRIC, words) and not _is_current_value(words, signal.values)):
         return "" if moves else "electric"
     duty = kind == "percent" or says(DUTY, words) or bool(re.search(r"\b[a-z\d]+ y$", words))
+    duty = duty or (not warm and words.startswith("u "))
     if warm and not duty and not _is_given(words, signal.values):
         return _role_of_temperature(words)
     if moves or (says(ROOM, words) and not duty):
@@ -404,18 +405,26 @@ def _bimodality(values: np.ndarray) -> float:
 
 
 def _without_unheated(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
-    """Temperatures of devices without a duty, if others of the recording have one, are the board's own
-    sensors; a chamber's is the air around the machine. Names are "device.temp" and "device.pwm"."""
+    """The signals without temperatures that nothing heats: those of devices without a duty, if other devices
+    of the recording have one, are the board's own sensors; a chamber's without a heater is the air around the
+    machine. Names are "device.temp" and "device.pwm"."""
     heated = {s.source.rpartition(".")[0] for s in taken if s.source.endswith(".pwm")}
+    heats_chamber = any(s.role == "input" and _is_of_chamber(s) for s in taken)
+    inputs = any(s.role == "input" for s in taken)
 
     def role(signal: RecordedSignal) -> str:
         device, _, field = signal.source.rpartition(".")
-        if not heated or signal.role != "output" or field != "temp" or device in heated:
+        if signal.role != "output":
             return signal.role
-        words = split(device)
-        return "disturbance" if says(ROOM, words) or "chamber" in words else "beside"
+        if inputs and not heats_chamber and _is_of_chamber(signal):
+            return "disturbance"
+        return "beside" if heated and field == "temp" and device not in heated else "output"
 
     return [signal._replace(role=role(signal)) for signal in taken]
+
+
+def _is_of_chamber(signal: RecordedSignal) -> bool:
+    return "chamber" in split(signal.source).split()
 
 
 # ---- set-points
@@ -443,7 +452,7 @@ def _without_hidden_set_points(taken: Sequence[RecordedSignal]) -> list[Recorded
 
 
 def _numbers(source: str) -> tuple[str, ...]:
-    return tuple(re.findall(r"\d+", split(read_name(source).words)))
+    return tuple(re.findall(r"\d+", re.sub(r"\bpt 1000?\b", "", read_name(source).words)))
 
 
 def _plain_words(source: str) -> set[str]:
@@ -455,7 +464,8 @@ def _plain_words(source: str) -> set[str]:
 
 
 def _targets(taken: Sequence[RecordedSignal]) -> dict[str, RecordedSignal]:
-    """{output: its set-point}: of the same numbers, and with the most words in common."""
+    """{output: its set-point}: of the same numbers and with the most words in common, or the one that has most
+    words and numbers in common if no numbers are the same."""
     outputs = {s.source: (_numbers(s.source), _plain_words(s.source)) for s in taken if s.role == "output"}
     targets: dict[str, tuple[float, RecordedSignal]] = {}
     for signal in taken:
@@ -466,15 +476,15 @@ def _targets(taken: Sequence[RecordedSignal]) -> dict[str, RecordedSignal]:
         likeness = {
             source: len(words & others) / len(words | others) if words | others else 1.0
             for source, (own, others) in outputs.items()
-            if own == numbers
         }
-        best = max(likeness, key=lambda source: likeness[source], default="")
-        if not best and len(outputs) == 1:
-            best = next(iter(outputs))
-        if best and likeness.get(best, 0.0) == 0.0 and len(likeness) > 1 and words:
+        equal = [source for source, (own, _) in outputs.items() if own == numbers]
+        candidates = sorted(equal or outputs, key=lambda source: -likeness[source])
+        # without a word or a number in common only one candidate is no guess
+        if not candidates or (len(candidates) > 1 and likeness[candidates[0]] == 0.0):
             continue
-        if best and likeness.get(best, 0.0) >= targets.get(best, (-1.0, signal))[0]:
-            targets[best] = likeness.get(best, 0.0), signal
+        best = candidates[0]
+        if likeness[best] >= targets.get(best, (-1.0, signal))[0]:
+            targets[best] = likeness[best], signal
     return {source: signal for source, (_, signal) in targets.items()}
 
 

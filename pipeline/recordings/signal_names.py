@@ -34,8 +34,8 @@ _UNITS = {
     "degF": r"°\s?f|deg[ _]?f|fahrenheit|f",
     "percent": r"%|pct|percent|per ?cent|prozent|pour ?cent|per ?cento|por ?ciento",
     "speed": (
-        r"rpm|upm|[u1r]/min|min-1|min\^-1|min⁻¹|tr/min|t/mn|rev/min|giri/min|g/min|[cm]?m/s|m?m/min|mm/sec|kg/h|"
-        r"g/h|l/h|l/min|m[m³3]*/h|[cm]m[³3]/s|hz"
+        r"rpm|upm|[u1r]/min|min-1|min\^-1|min⁻¹|tr/min|t/mn|rev/min|giri/min|g/min|[cm]?m/s|m?m/min|mm/sec|"
+        r"kg/hr?|ft/min|ft/s|in/s|lbs?/hr?|g/s|g/h|l/h|l/min|m[m³3]*/h|[cm]m[³3]/s|hz"
     ),
     "electric": r"m?a|m?v|k?w|amp|amps|ampere|volt|volts|watt|watts|kva",
     "other": (
@@ -147,7 +147,7 @@ SPEED = _pattern(
     "drehz* *drehzahl* speed* *speed rpm upm umdreh* giri vitesse* velocid* velocit* vel *geschw* snelh* "
     "toerent* regime fan fans *fan *luefter* *geblaese* ventilat* ventilad* ventol* blower *durchsatz* "
     "throughput debit caudal portata flow *flow feed_rate feedrate avance *vorschub* obrot* sic fic u_min "
-    "tr_min line_speed n nist nsoll"
+    "tr_min line_speed n nist nsoll *rate kgph"
 )
 MOVER = _pattern(
     "screw* *schneck* vis husillo* tornillo vite motor* *motor moteur* motore *antrieb* drive feed* "
@@ -158,25 +158,28 @@ MOVER = _pattern(
 ROOM = _pattern(
     "room* *raum* umgeb* ambi* amb hallen* aussen* outdoor outside exter* estern* sala stanza habitacion "
     "omgeving environment* env enclosure werkstatt workshop coolant *wasser* water* eau agua acqua air "
-    "luft*"
+    "luft* umg tamb traum atelier taller salle officina"
 )
 DEVICE = _pattern(
     "mcu* cpu host *board* raspberry* rpi pi driver* stepper* cold_junction cjc cj vergleich* "
     "reference_junction intern* klemm* terminal* cabinet *schrank* armoire cuadro quadro gear* *getriebe* "
-    "*motor* moteur* oil *oel huile aceite olio *lager bearing* inverter *umrichter* psu battery"
+    "*motor* moteur* oil *oel huile aceite olio *lager bearing* inverter *umrichter* psu battery hydrau* "
+    "dew* taupunkt*"
 )
 # limits, settings, modes, counts; and quantities of which no temperature's model is made
 SETTING = _pattern(
     "*alarm* allarm* limit* *grenz* lim hihi lolo max* min maximum minimum kp ki kd tn tv xp gain "
     "*regelabw* deviation *abweich* ecart scarto desviacion error* fehler* auto* manu* mode modo "
     "*betriebsart* hand freigabe enable* schuss* shot* *zyklus* cycle_time cycles *zaehler* count* total* "
-    "*zeit laufzeit *dauer tempo tiempo hysteres* offset tolerance *tolerant*"
+    "*zeit laufzeit *dauer tempo tiempo hysteres* offset tolerance *tolerant* gesamt* cos_phi"
 )
 QUANTITY = _pattern(
     "*druck* press* *pressure* pression* presion* pic pi energ* kwh *feucht* *humid* rh umidita humedad "
     "*fuellst* niveau* nivel livello level position* pos *weg *hub stroke layer* progress* gewicht weight "
     "peso poids *torque* *moment* couple coppia *last *load* charge carga carico *auslast* vibra* visco* "
-    "dichte density laenge length breite width durchmesser diamet* dicke thickness kraft* *kraft force"
+    "dichte density laenge length breite width durchmesser diamet* dicke thickness kraft* *kraft force "
+    "override* factor complet* fortschritt* avancement progres* ausschuss verfuegbar* effic* wirkungsgrad "
+    "usage ram memory memavail disk rssi sysload oee"
 )
 ELECTRIC = _pattern("*current *strom ampere* amps courant corrent* corriente volt* *spannung* tension*")
 

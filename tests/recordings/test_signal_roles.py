@@ -2,14 +2,17 @@
 for. Each column is simulated as what it is: a zone under PI control, its set-point, its duty, a screw, a fan,
 the room's air."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from pipeline.recordings.inspection import look
 from pipeline.recordings.proposals import Proposal, propose, yaml_lines
 from pipeline.recordings.signal_names import read_name
+from pipeline.temperature.settings import Plant
 from tests.mcap_writing import Written
 
 # kind of a column -> its role in the proposal
@@ -189,6 +192,15 @@ def test_each_output_has_the_set_point_of_its_own_zone_and_a_number_of_its_own(t
         assert not signal.set_point or signal.reference == pytest.approx(
             180 if wanted == "sp1" else 150, abs=26
         )
+
+
+@pytest.mark.parametrize("header", HEADERS.values(), ids=HEADERS.keys())
+def test_the_proposal_of_a_vendors_file_is_a_plant_that_may_be_pasted(tmp_path, header):
+    proposed = yaml.safe_load("\n".join(yaml_lines(proposal_of(record(tmp_path / "machine.csv", header)))))
+    machine = Plant.model_validate_json(json.dumps(proposed["plant"]))
+    assert {signal.name for signal in [*machine.acting, *machine.outputs]} == set(
+        proposed["ingest"]["mapping"]
+    )
 
 
 def test_an_array_of_a_topic_has_the_topics_name_and_counts_from_one(tmp_path):
