@@ -59,6 +59,8 @@ _COMMON_WORDS = {
     "measured", "celsius", "degc", "deg", "c", "k", "f", "val", "sensor", "heat", "output", "cycle",
 }  # fmt: skip
 _TIMES = ("temps", "heure", "hora", "ora", "fecha")
+# an input of such a name can only warm; Klipper calls the hot end's heater "extruder"
+_HEATED = re.compile(r"\b(hot ?end|nozzle|barrel|bed)\b|^extruder.* pwm$")
 _TAKEN_NAMES = ("recording", "segment", "time_s")  # columns of the table of the record
 _TELLING = any_of(SET_POINT, TEMPERATURE, HEATER, DUTY, OUTPUT, PLACE, SPEED, MOVER, ACTUAL)
 # unit -> what makes °C of it
@@ -162,6 +164,8 @@ def yaml_lines(proposal: Proposal) -> list[str]:
         )
         lines += [f"    - {line}" for line in disturbances]
     lines += ["  outputs:" if outputs else "  outputs: []", *(f"    - {line}" for line in outputs)]
+    if any(signal.cut_off is not None for signal in proposal.signals):
+        lines.append(f"  # high is {BELOW_CUT_OFF_DEGC:g} °C below the firmware's cut-off (max_temp)")
     if any(signal.role == "output" and signal.low is None for signal in proposal.signals):
         lines.append("  # low and high of an output: between which °C the machine must stay; fill them in")
     return [*lines, f"  sample_time_s: {proposal.sample_time_s!r}"]
@@ -464,8 +468,8 @@ def _plain_words(source: str) -> set[str]:
 
 
 def _targets(taken: Sequence[RecordedSignal]) -> dict[str, RecordedSignal]:
-    """{output: its set-point}: of the same numbers and with the most words in common, or the one that has most
-    words and numbers in common if no numbers are the same."""
+    """{output: its set-point}: of the same numbers and with the most words in common. If no output has the same
+    numbers, words and numbers count alike."""
     outputs = {s.source: (_numbers(s.source), _plain_words(s.source)) for s in taken if s.role == "output"}
     targets: dict[str, tuple[float, RecordedSignal]] = {}
     for signal in taken:
@@ -503,9 +507,7 @@ def _proposed(signal: RecordedSignal, name: str, target: RecordedSignal | None, 
         if high is not None:
             cut_off, high = high, max(high - BELOW_CUT_OFF_DEGC, reference)
     words = read_name(telling_name(signal.source), signal.unit).words
-    heated = says(HEATER, words) or bool(
-        re.search(r"\b(hot ?end|nozzle|barrel|bed)\b|^extruder.* pwm$", words)
-    )
+    heated = says(HEATER, words) or _HEATED.search(words) is not None
     heats = signal.role == "input" and heated and not says(COOLER, words) and not says(SPEED, words)
     set_point = target.source if target is not None else ""
     return Proposed(
