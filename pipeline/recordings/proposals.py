@@ -468,7 +468,7 @@ def _plain_words(source: str) -> set[str]:
 
 
 def _targets(taken: Sequence[RecordedSignal]) -> dict[str, RecordedSignal]:
-    """{output: its set-point}: of the same numbers and with the most words in common. If no output has the same
+    """{output: its set-point}: of the same numbers, with the most words in common. If no output has the same
     numbers, words and numbers count alike."""
     outputs = {s.source: (_numbers(s.source), _plain_words(s.source)) for s in taken if s.role == "output"}
     targets: dict[str, tuple[float, RecordedSignal]] = {}
