@@ -29,6 +29,7 @@ from pipeline.recordings.signal_names import (
     TEMPERATURE,
     Name,
     any_of,
+    loop_letter,
     read_name,
     says,
     split,
@@ -269,11 +270,32 @@ def _with_roles(signals: Sequence[RecordedSignal]) -> tuple[list[RecordedSignal]
     if "output" not in roles:
         taken = [s._replace(role="output") if s.role == "disturbance" and _is_warm(s) else s for s in taken]
     if {"input", "output"} & {signal.role for signal in taken}:
-        return _limited(_without_unheated(taken)), "names and ranges"
+        return _limited(_without_strangers(_without_unheated(taken))), "names and ranges"
     taken = [signal._replace(role=_behaviour(signal)) for signal in signals]
     if not all(_is_switch(signal) for signal in taken if signal.role == "input"):
         taken = [s._replace(role="") if s.role == "input" and _is_switch(s) else s for s in taken]
     return taken, "the values alone: look at each line"
+
+
+def _without_strangers(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
+    """The signals without inputs of devices that no temperature belongs to, which are disturbances: the
+    command of a drive among those of zones. An input belongs to an output of the same numbers or with one of
+    its words, or its name says that it heats."""
+    outputs = [(_numbers(s.source), _plain_words(s.source)) for s in taken if s.role == "output"]
+    inputs = [s for s in taken if s.role == "input"]
+    shared = set.intersection(*(_plain_words(s.source) for s in inputs)) if inputs else set()
+    strangers = []
+    for signal in inputs:
+        name = read_name(telling_name(signal.source), signal.unit)
+        numbers, words = _numbers(signal.source), _plain_words(signal.source) - shared
+        belongs = any((numbers and numbers == own) or words & others for own, others in outputs)
+        belongs = belongs or any(says(pattern, name.words) for pattern in (COOLER, HEATER, PLACE))
+        is_named = any(word.isalpha() and not _is_common(word) for word in words)
+        if is_named and not belongs and signal.source != "motor":
+            strangers.append(signal.source)
+    if len(strangers) == len(inputs):
+        return list(taken)
+    return [s._replace(role="disturbance") if s.source in strangers else s for s in taken]
 
 
 def _limited(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
@@ -312,12 +334,18 @@ def _role_of_name(name: Name, signal: RecordedSignal) -> str:
         return "" if _is_constant(signal) else "beside"
     if _is_wanted(words, warm):
         return "set-point"
-    if _is_constant(signal) or kind == "other" or (says(QUANTITY, words) and not warm):
+    letter = loop_letter(words)
+    if (
+        _is_constant(signal)
+        or kind == "other"
+        or (says(QUANTITY, words) and not warm)
+        or letter in ("p", "l")
+    ):
         return ""
     if kind in _CELSIUS:
         return _role_of_temperature(words)
     moves = says(SPEED, words) or (says(MOVER, words) and not says(HEATER, words) and not says(PLACE, words))
-    if kind == "speed":
+    if kind == "speed" or letter in ("s", "f"):
         return "disturbance"
     if kind == "electric" or (says(ELECTRIC, words) and not _is_current_value(words, signal.values)):
         return "" if moves else "electric"

@@ -32,10 +32,10 @@ _UNITS = {
     "degC": r"°\s?c|℃|deg[ _]?c|grad ?c|celsius|c",
     "K": r"°k|kelvin|k",
     "degF": r"°\s?f|deg[ _]?f|fahrenheit|f",
-    "percent": r"%|pct|percent|per ?cent|prozent|pour ?cent|per ?cento|por ?ciento",
+    "percent": r"%|0 ?(?:-|\.\.|to|bis) ?1(?:00)?|pct|percent|per ?cento?|prozent|pour ?cent|por ?ciento",
     "speed": (
         r"rpm|upm|[u1r]/min|min-1|min\^-1|min⁻¹|tr/min|t/mn|rev/min|giri/min|g/min|[cm]?m/s|m?m/min|mm/sec|"
-        r"kg/hr?|ft/min|ft/s|in/s|lbs?/hr?|g/s|g/h|l/h|l/min|m[m³3]*/h|[cm]m[³3]/s|hz"
+        r"kg/hr?|ft/min|ft/s|in/s|lbs?/hr?|g/s|mpm|g/h|l/h|l/min|m[m³3]*/h|[cm]m[³3]/s|hz"
     ),
     "electric": r"m?a|m?v|k?w|amp|amps|ampere|volt|volts|watt|watts|kva",
     "other": (
@@ -48,7 +48,7 @@ _BRACKET = re.compile(r"[\[({<]\s*([^\[\](){}<>]+?)\s*[\])}>]")
 _TAIL = re.compile(
     r"(?:(?:^|[\s_,;./-])(?:in\s+)?|(?<=\d))("
     r"°\s?[ckf]|℃|deg[ _]?[cf]|celsius|kelvin|fahrenheit|pct|percent|prozent|rpm|upm|[u1r]/min|min-1|tr/min|"
-    r"m?m/s|m/min|kg/h|bar|psi|mpa|kpa|nm|kwh?|ma)$|_([ckf])$|(%)$"
+    r"m?m/s|m/min|kg/h|bar|psi|mpa|kpa|nm|kwh?|ma|hz|mpm)$|_([ckf])$|(%)$"
 )
 _INSIDE = (
     ("degC", re.compile(r"°\s?c|℃|celsius|deg_?c(?![a-z])")),
@@ -111,19 +111,20 @@ SET_POINT = _pattern(
     "[wtlcs]?sp spt sv setp setpt set_point* setpoint* set_val* set_temp* tempset set soll soll[wtdvsg]* "
     "*soll *sollwert* vorgabe* *vorgabe fuehrungsgr* target* tgt *target ref reference* desired wanted "
     "requested preset consign* csg cons deseado* deseada* objetivo objectif impost* obiettivo riferimento "
-    "nominal* gewenst* ingesteld* zadan*"
+    "nominal* gewenst* ingesteld* zadan* tset"
 )
 # what is measured of it
 ACTUAL = _pattern(
     "ist istw* *istwert* isttemp* istdreh* istleist* [tn]ist tempist actual* act tempact zoneact pv cpv "
     "process_val* measur* meas mess* gemess* mesur* medid* medicion misur* reale? actuel* attual* actueel "
-    "reading current_val* current_temp* akt aktuell* rueckm* feedback fbk"
+    "reading current_val* current_temp* akt aktuell* rueckm* feedback fbk tact tmeas"
 )
 # what a controller gives: a word of its own, and one that can also mean a place
 DUTY = _pattern(
     "stell* *stellgr* *stellwert* lmn op cv mv duty *pwm* power pwr *leistung* puiss* potenz* potenc* pot "
     "einschaltd* tastgrad tastverh* aussteuer* manipulat* wop ssr moc vermogen heat_out* out_heat "
-    "cool_out* output_heat output_cool active_out working_out* control_out* y_out pid_out* ctrl_out* % co"
+    "cool_out* output_heat output_cool active_out working_out* control_out* y_out pid_out* ctrl_out* % co "
+    "pout ansteuer*"
 )
 OUTPUT = _pattern("out output* outp uscita salida sortie *ausg* uitgang saida commande")
 COMMAND = _pattern("cmd command* comando demand* request*")
@@ -134,7 +135,8 @@ HEATER = _pattern(
 COOLER = _pattern("*cool* chill* *kuehl* refroid* refrig* enfri* raffred* exchang*")
 TEMPERATURE = _pattern(
     "temp temps temper* *temperat* *temp tempist tempsoll tmp thermo* tc tk pt100 pt_100 pt_1000 rtd "
-    "*fuehler sond[ea] t ti[ctr]? te tt trc celsius kelvin fahrenheit thermistor"
+    "*fuehler sond[ea] t ti[ctr]? te tt trc celsius kelvin fahrenheit thermistor tset tact tmeas tamb "
+    "tbed tnozzle thotend tzone"
 )
 # where a machine is heated
 PLACE = _pattern(
@@ -152,13 +154,14 @@ SPEED = _pattern(
 MOVER = _pattern(
     "screw* *schneck* vis husillo* tornillo vite motor* *motor moteur* motore *antrieb* drive feed* "
     "*filament* *foerder* *dosier* dosi* dosag* dosif* aliment* puller haul* *abzug* traction traino tiro "
-    "*pump* pomp* bomba spindle spindel valve* ventil* vanne* valvula* valvola* agit* mixer"
+    "*pump* pomp* bomba spindle spindel valve* ventil* vanne* valvula* valvola* agit* mixer vfd* freq* "
+    "*umrichter inverter plunger* piston* kolben* hopper"
 )
 # temperatures that no controller holds: of the surroundings, and of devices
 ROOM = _pattern(
     "room* *raum* umgeb* ambi* amb hallen* aussen* outdoor outside exter* estern* sala stanza habitacion "
     "omgeving environment* env enclosure werkstatt workshop coolant *wasser* water* eau agua acqua air "
-    "luft* umg tamb traum atelier taller salle officina"
+    "luft* umg tamb traum atelier taller salle officina lab labor laborator*"
 )
 DEVICE = _pattern(
     "mcu* cpu host *board* raspberry* rpi pi driver* stepper* cold_junction cjc cj vergleich* "
@@ -171,7 +174,7 @@ SETTING = _pattern(
     "*alarm* allarm* limit* *grenz* lim hihi lolo max* min maximum minimum kp ki kd tn tv xp gain "
     "*regelabw* deviation *abweich* ecart scarto desviacion error* fehler* auto* manu* mode modo "
     "*betriebsart* hand freigabe enable* schuss* shot* *zyklus* cycle_time cycles *zaehler* count* total* "
-    "*zeit laufzeit *dauer tempo tiempo hysteres* offset tolerance *tolerant* gesamt* cos_phi"
+    "*zeit laufzeit *dauer tempo tiempo hysteres* offset tolerance *tolerant* gesamt* cos_phi hlm llm"
 )
 QUANTITY = _pattern(
     "*druck* press* *pressure* pression* presion* pic pi energ* kwh *feucht* *humid* rh umidita humedad "
@@ -192,3 +195,9 @@ def says(pattern: re.Pattern[str], words: str) -> bool:
 def any_of(*patterns: re.Pattern[str]) -> re.Pattern[str]:
     """The words of all these patterns."""
     return re.compile("|".join(pattern.pattern for pattern in patterns))
+
+
+def loop_letter(words: str) -> str:
+    """The measured variable of a loop's tag (ISA 5.1): "t" of TIC 101, "s" of ST 201; "" without a tag."""
+    tag = re.search(r"(?<!\w)([a-z])(?:t|e|i|ic|c|ir|rc|it|y) (?!1000?(?!\d))\d{2,}", words)
+    return tag[1] if tag else ""

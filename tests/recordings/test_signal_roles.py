@@ -108,6 +108,50 @@ HEADERS = {
     ),
     "Filabot": "Time;Temperature:pv1;Set Temp:sp1;Heater Duty:op1;Puller Speed:rpm;Filament Diameter:",
     "DIN 19226": "Zeit;Zone 1 w:sp1;Zone 1 x:pv1;Zone 1 y:op1;Zone 2 w:sp2;Zone 2 x:pv2;Zone 2 y:op2",
+    "addresses of S7": (
+        "Zeit;DB20.DBD4 Zone 1 Ist:pv1;DB20.DBD8 Zone 1 Soll:sp1;DB20.DBD12 Zone 1 Stellgrad:op1;"
+        "DB20.DBD16 Zone 2 Ist:pv2;DB20.DBD20 Zone 2 Soll:sp2;DB20.DBD24 Zone 2 Stellgrad:op2"
+    ),
+    "CODESYS over OPC": (
+        "Time;|var|CODESYS.Application.GVL.rTempIst_1:pv1;|var|CODESYS.Application.GVL.rTempSoll_1:sp1;"
+        "|var|CODESYS.Application.GVL.rStellgrad_1:op1;|var|CODESYS.Application.GVL.rTempIst_2:pv2;"
+        "|var|CODESYS.Application.GVL.rTempSoll_2:sp2;|var|CODESYS.Application.GVL.rStellgrad_2:op2;"
+        "|var|CODESYS.Application.GVL.rDrehzahl:rpm"
+    ),
+    "German, a die and a feed zone": (
+        "Zeit;Kopf_Ist:pv1;Kopf_Soll:sp1;Kopf_Stellgrad:op1;Einzug_Ist:pv2;Einzug_Soll:sp2;"
+        "Einzug_Stellgrad:op2;Foerderrate:rpm"
+    ),
+    "short names": (
+        "Time;Tset:sp1;Tact:pv1;Pout:op1;E_speed:rpm;speed_factor:;Chamber Temp:room;Part Fan:fan"
+    ),
+    "a drive among PIDs": (
+        "Time;PID1_PV:pv1;PID1_SP:sp1;PID1_OUT:op1;PID2_PV:pv2;PID2_SP:sp2;PID2_OUT:op2;VFD_Freq_Hz:rpm;"
+        "VFD_Cmd:rpm"
+    ),
+    "a laboratory's printer": (
+        "Time (s);Nozzle T (C):pv1;Nozzle T demand (C):sp1;Nozzle heater duty (0-1):op1;Bed T (C):pv2;"
+        "Bed T demand (C):sp2;Bed heater duty (0-1):op2;Plunger speed (mm/s):rpm;Lab T (C):room"
+    ),
+    "feedback and set": (
+        "Time;Heater1_Fbk:pv1;Heater1_Set:sp1;Heater1_Out:op1;Heater2_Fbk:pv2;Heater2_Set:sp2;"
+        "Heater2_Out:op2;Motor1_Fbk:rpm;Motor1_Set:sp;Motor1_Out:rpm"
+    ),
+    "German, water and haul-off": (
+        "Zeit;Düse_Ist:pv1;Düse_Soll:sp1;Düse_Y:op1;Zone3_Ist:pv2;Zone3_Soll:sp2;Zone3_Y:op2;"
+        "Dosierschnecke_n:rpm;Kühlwasser_T:room;Abzug:rpm;Lüfter_%:fan"
+    ),
+    "Italian with units": (
+        "Time;Temperatura Zona 1 [°C]:pv1;SetPoint Zona 1 [°C]:sp1;Uscita Zona 1 [%]:op1;"
+        "Temperatura Zona 2 [°C]:pv2;SetPoint Zona 2 [°C]:sp2;Uscita Zona 2 [%]:op2;Giri Vite [rpm]:rpm;"
+        "Ventola [%]:fan;Pressione Massa [bar]:;Assorbimento Motore [A]:"
+    ),
+    "French with units": (
+        "Time;Consigne zone 1 (°C):sp1;Mesure zone 1 (°C):pv1;Sortie zone 1 (%):op1;"
+        "Consigne zone 2 (°C):sp2;Mesure zone 2 (°C):pv2;Sortie zone 2 (%):op2;Régime vis (tr/min):rpm;"
+        "Consigne vis (tr/min):sp;Température atelier (°C):room;Ventilateur (%):fan"
+    ),
+    "PT100 and SSR": ("Time;PT100_1:pv1;PT100_2:pv2;SSR_1:op1;SSR_2:op2;SET_1:sp1;SET_2:sp2;Tamb:room"),
     "an unknown word for the set-point": (
         "Time;Lämpötila 1 asetus [°C]:sp1;Lämpötila 1 [°C]:pv1;Lämmitys 1 [%]:op1;"
         "Lämpötila 2 asetus [°C]:sp2;"
