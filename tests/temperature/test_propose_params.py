@@ -124,6 +124,7 @@ def test_a_german_header_gives_a_plant_with_set_points_and_disturbances_that_ing
     )
     text = (tree / "params.yaml").read_text()
     (tree / "params.yaml").write_text(text.replace("low: null, high: null", "low: 0, high: 250"))
+    monkeypatch.delitem(sys.modules, "stages.ingest")
     runpy.run_module("stages.ingest", run_name="__main__", alter_sys=True)
     figures = artifacts.read_json("datasets/ingest/figures.json")
     assert (figures["recordings"], figures["quarantined"], figures["samples"]) == (1, 0, 900)
