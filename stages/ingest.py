@@ -22,10 +22,17 @@ if TYPE_CHECKING:
     from pipeline.recordings.signals import Source
 
 
+class MappedSignal(Mapped):
+    """Where a signal of the plant comes from. `set_point` is the column of what an output should be, with the
+    scale and offset of the output; null: not recorded."""
+
+    set_point: str | None = Field(default=None, min_length=1, max_length=300)
+
+
 class Ingest(Section):
     """Section `ingest`."""
 
-    mapping: dict[str, Mapped]
+    mapping: dict[str, MappedSignal]
     time: str = Field(max_length=300)
     decimal: Literal["", ".", ","]
     max_gap_s: float = Field(gt=0, le=86400)
@@ -71,7 +78,7 @@ def main() -> None:
         artifacts.write_metrics("ingest", figures, METRICS)
 
 
-def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, Mapped]) -> RecordingWish:
+def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, MappedSignal]) -> RecordingWish:
     """What to take from every recording of the machine."""
     from pipeline.recordings.recording_folders import RecordingWish
 
@@ -88,9 +95,9 @@ def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, Mapped])
     )
 
 
-def sources(machine: Plant, mapping: dict[str, Mapped]) -> tuple[Source, ...]:
+def sources(machine: Plant, mapping: dict[str, MappedSignal]) -> tuple[Source, ...]:
     """Where a recording has the signals of the machine: by `mapping`, else under their own names. Raises
-    ValueError for a mapping of no signal, or of another unit."""
+    ValueError for a mapping of no signal, of another unit, or with a set-point of what is no output."""
     from pipeline.recordings.signals import Source, nearest_names
 
     signals = [*machine.acting, *machine.outputs]
@@ -100,6 +107,12 @@ def sources(machine: Plant, mapping: dict[str, Mapped]) -> tuple[Source, ...]:
             f"params.yaml: ingest.mapping.{unknown[0]} is no signal of the plant; "
             f"{nearest_names(unknown[0], [s.name for s in signals])}"
         )
+    for signal in machine.acting:
+        if signal.name in mapping and mapping[signal.name].set_point is not None:
+            raise ValueError(
+                f"params.yaml: ingest.mapping.{signal.name}.set_point is for outputs alone, but "
+                f"{signal.name} is none; take it out"
+            )
     found = []
     for signal in signals:
         mapped = mapping.get(signal.name)

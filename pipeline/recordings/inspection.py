@@ -21,6 +21,7 @@ from pipeline.recordings.formats import (
     time_column,
 )
 from pipeline.recordings.mcap_files import Topic, bag_parts, joined, merged, survey
+from pipeline.recordings.missing_codes import missing_codes
 from pipeline.recordings.other_formats import LOADERS
 from pipeline.recordings.parquet_files import parquet_columns, read_parquet
 from pipeline.recordings.proposals import (
@@ -39,6 +40,7 @@ from pipeline.recordings.whole_tables import select
 
 # numbers of a topic, and columns of a table, that are described; the others are counted
 MOST_FIELDS, MOST_SIGNALS = 64, 128
+CODE = "missing code"  # kind of the note on numbers that stand for a missing value
 _NO_TIME = (
     "no column is called like a time; write its name, or time: every 1.0 s with the sample time, "
     "beside the mapping"
@@ -103,11 +105,14 @@ def look(path: Path) -> Inspected:
         )
     else:
         lines, groups, units, notes = _file(path, kind)
-    signals = [
-        RecordedSignal(prefix + name, units.get(name, ""), finite(values), limits.get(name))
-        for group, prefix in groups
-        for name, values in group.values.items()
-    ]
+    signals = []
+    for group, prefix in groups:
+        for name, values in group.values.items():
+            numbers = finite(values)
+            for code in missing_codes(numbers):
+                notes.append(_code_note(prefix + name, code, finite(values)))
+                numbers = numbers[numbers != code]
+            signals.append(RecordedSignal(prefix + name, units.get(name, ""), numbers, limits.get(name)))
     time = "every 1.0 s" if any(note.message == _NO_TIME for note in notes) else ""
     return Inspected(kind, lines, groups, signals, notes, time)
 
@@ -285,6 +290,16 @@ def finite(values: np.ndarray) -> np.ndarray:
     if len(values) and np.isfinite(values.min()) and np.isfinite(values.max()):
         return values
     return values[np.isfinite(values)]
+
+
+def _code_note(name: str, code: float, values: np.ndarray) -> Note:
+    count = int(np.count_nonzero(values == code))
+    share = f"{100 * count / len(values):.2g} % of its values"
+    message = (
+        f"{name} is exactly {code:g} in {share} ({count} of {len(values)}), far from the others: a code "
+        "for a missing value; write an empty cell (NaN) in its place, or it is taken for a measurement"
+    )
+    return Note(CODE, name, count, message)
 
 
 def _range(values: np.ndarray) -> str:

@@ -31,7 +31,13 @@ def test_the_proposal_is_yaml_that_maps_the_recording(tmp_path):
     assert proposed["ingest"]["mapping"] == {
         "heater_1": {"source": "Heater 1 (%)", "unit": "percent", "scale": 1.0, "offset": 0.0},
         "heater_2": {"source": "duty_2", "unit": "percent", "scale": 100.0, "offset": 0.0},
-        "temperature_1": {"source": "Zone 1 [K]", "unit": "degC", "scale": 1.0, "offset": -273.15},
+        "temperature_1": {
+            "source": "Zone 1 [K]",
+            "set_point": "Set Point 1",
+            "unit": "degC",
+            "scale": 1.0,
+            "offset": -273.15,
+        },
         "temperature_2": {"source": "T2_F", "unit": "degC", "scale": 0.555556, "offset": -17.7778},
     }
     Plant.model_validate_json(json.dumps(proposed["plant"]))
@@ -43,7 +49,6 @@ def test_the_proposal_is_yaml_that_maps_the_recording(tmp_path):
     assert raw.signals["temperature_1"][1][0] == pytest.approx(16.85)
     # 70 °F; the factor has six digits
     assert raw.signals["temperature_2"][1][0] == pytest.approx(21.111, abs=1e-3)
-    assert "set-points, which a plant's model has no use for: Set Point 1" in inspect(path)
 
 
 def test_rates_jitter_gaps_and_ranges_are_those_of_the_file(tmp_path):
@@ -466,3 +471,67 @@ def test_a_wide_table_is_described_by_what_its_names_tell_in_no_longer_than_it_i
     assert "fields: 3000 columns hold numbers; 128 are shown" in text
     mapped = {one["source"] for one in proposal(text)["ingest"]["mapping"].values()}
     assert {"heater_1_pct", "zone_1_C"} <= mapped
+
+
+# ---- codes for missing values
+
+
+def logged(path, code: float, share: float, rng: np.random.Generator) -> None:
+    """A zone that warms and cools between 22 and 210 °C with a duty; a share of the readings is the code."""
+    k = np.arange(1000)
+    duty = 60.0 * (k // 250 % 2 == 0)
+    zone = 22 + np.convolve(duty, 0.05 * np.exp(-k / 60))[:1000] + rng.normal(0, 0.1, 1000)
+    zone[rng.choice(1000, round(share * 1000), replace=False)] = code
+    rows = "".join(f"{i},{u:.1f},{y:.2f}\n" for i, u, y in zip(k, duty, zone, strict=True))
+    path.write_text("time_s,heater_1_pct,zone_1_C\n" + rows)
+
+
+@pytest.mark.parametrize("share", [0.004, 0.03, 0.2])
+@pytest.mark.parametrize("code", [-9999, -999, 9999, 32767, -32768, 6553.5, 850, 85, -127, 2048, 4095])
+def test_a_code_for_a_missing_value_is_named_with_its_share_and_the_remedy(tmp_path, code, share):
+    logged(tmp_path / "rig.csv", code, share, np.random.default_rng(7))
+    text = inspect(tmp_path / "rig.csv")
+    count = round(1000 * share)
+    assert (
+        f"missing code: zone_1_C is exactly {code:g} in {share * 100:.2g} % of its values ({count} of" in text
+    )
+    assert "write an empty cell (NaN) in its place" in text
+    assert proposal(text)["plant"]["outputs"][0]["reference"] > 20  # the code is left out of the proposal
+
+
+def test_a_clean_record_has_no_code_even_with_such_numbers_among_its_own(tmp_path):
+    rng, k = np.random.default_rng(5), np.arange(2000)
+    columns = {
+        "setpoint_C": np.repeat([60.0, 85.0, 60.0, 85.0], 500),
+        "furnace_setpoint_C": np.repeat([20.0, 850.0], 1000),
+        "duty_pct": np.clip(np.round(50 + 60 * np.sin(k / 40) + rng.normal(0, 8, 2000)), 0, 85),
+        "adc_duty": np.round(np.clip(2048 + 3000 * np.sin(k / 30), 0, 4095)),
+        "zone_1_C": np.round(85 + 3 * np.sin(k / 90) + rng.normal(0, 0.3, 2000), 1),
+        "zone_2_C": np.round(np.clip(20 + k / 2, 20, 850), 0),
+        "screw_rpm": np.repeat(rng.choice([0.0, 850.0, 999.0, 2000.0], 40), 50),
+        "pressure": np.round(rng.normal(1000, 20, 2000)),
+    }
+    rows = np.column_stack([k, *columns.values()])
+    header = ",".join(["time_s", *columns])
+    np.savetxt(tmp_path / "rig.csv", rows, delimiter=",", header=header, comments="", fmt="%.2f")
+    assert "missing code" not in inspect(tmp_path / "rig.csv")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "daisy_a/dryer.dat",
+        "daisy_a/evaporator.dat",
+        "daisy_a/glassfurnace.dat",
+        "tclab_apmonitor/energy_balance_mimo.csv",
+        "tclab_apmonitor/second_order_mimo.csv",
+        "tclab_mlid_prbs/prbs.csv",
+        "paper_reference/probing_log_seed1.parquet",
+        "caxton_print0_log/caxton_print0_early.csv",
+        "fast_caxton_frames/example_print_log.csv",
+        "mcap_ros2/cdr_test_0.mcap",
+        "mcap_ros2/wbag_0.mcap",
+    ],
+)
+def test_no_code_is_seen_in_real_records(shared, name):
+    assert "missing code" not in inspect(shared(f"data/{name}"))

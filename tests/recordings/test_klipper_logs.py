@@ -103,8 +103,10 @@ def test_a_heater_that_switches_on_and_off_has_no_pid(tmp_path, log):
 def test_inspect_proposes_heaters_temperatures_limits_and_set_points(tmp_path, log):
     text = inspect(write(tmp_path, log))
     assert "{name: heater_extruder, unit: percent, low: 0, high: 100, heats: true}" in text
-    assert "{name: temperature_extruder, unit: degC, reference: 200.0, low: 0, high: 260}" in text
-    assert "set-points, which a plant's model has no use for: heater_bed.target, extruder.target" in text
+    assert "{name: temperature_extruder, unit: degC, reference: 200.0, low: 0, high: 245}" in text
+    assert "high is 15 °C below the firmware's cut-off (max_temp)" in text  # 260 °C
+    for heater in ("heater_bed", "extruder"):
+        assert f'{{source: "{heater}.temp", set_point: "{heater}.target", unit: degC' in text
 
 
 def test_a_line_that_breaks_off_or_is_garbled_is_counted_and_left_out(tmp_path, log):

@@ -12,7 +12,7 @@ from pipeline.recordings.isolated import Budget, isolated
 from pipeline.recordings.recording_folders import RecordingWish, count_work, join, read_folder
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant
-from stages.ingest import Ingest, recording_wish
+from stages.ingest import Ingest, MappedSignal, recording_wish, sources
 from tests.recordings.klipper_machine import EXTRUDER, print_log
 from tests.recordings.test_bag_folders import bag
 from tests.temperature import long_readings
@@ -30,7 +30,7 @@ def wish(machine: Plant = MACHINE, **mapping: tuple[str, str, float, float]) -> 
     """What the stage takes from every recording with this mapping."""
     keys = ("source", "unit", "scale", "offset")
     settings = Ingest(
-        mapping={name: params.Mapped(**dict(zip(keys, to, strict=True))) for name, to in mapping.items()},
+        mapping={name: MappedSignal(**dict(zip(keys, to, strict=True))) for name, to in mapping.items()},
         time="",
         decimal="",
         max_gap_s=5.0,
@@ -310,6 +310,15 @@ def test_a_mapping_that_names_no_signal_gives_the_nearest_names():
         ValueError, match=r"ingest\.mapping\.zoone is no signal of the plant; the nearest names are zone"
     ):
         wish(zoone=("zone", "degC", 1.0, 0.0))
+
+
+def test_a_set_point_is_declared_beside_an_output_and_beside_nothing_else():
+    mapped = MappedSignal(source="T1_Ist", unit="degC", scale=1.0, offset=0.0, set_point="T1_Soll")
+    assert [source.source for source in sources(MACHINE, {"zone": mapped})] == ["heater", "T1_Ist"]
+    with pytest.raises(
+        ValueError, match="heater.set_point is for outputs alone, but heater is none; take it"
+    ):
+        sources(MACHINE, {"heater": mapped})
 
 
 # ---- more than one process
