@@ -38,19 +38,31 @@ from pipeline.recordings.formats import (
     forward,
     seconds,
     time_column,
+    writes_day_first,
 )
 from pipeline.recordings.instants import (
     hyphen_fraction,
     instants,
     is_compact,
+    is_date,
     month_first,
     over_midnight,
     steady_order,
 )
-from pipeline.recordings.long_tables import check_one_signal, naming_columns
+from pipeline.recordings.long_tables import (
+    check_one_signal,
+    joined,
+    long_columns,
+    naming_columns,
+    read_long,
+    read_scope,
+    scope_samples,
+)
 from pipeline.recordings.signals import Note
 
 FIELDS_AT_ONCE = 20_000
+# the clock of a table whose signals have each their own
+_OWN_CLOCKS = "own clocks"
 # rows that tell what a column holds; fewer of a wide table
 MOST_SHOWN, FEWEST_SHOWN = 200, 20
 
@@ -58,6 +70,8 @@ MOST_SHOWN, FEWEST_SHOWN = 200, 20
 def csv_columns(path: Path) -> list[FileColumn]:
     """The columns of a text file. A column is of type "number" by its first rows."""
     layout = csv_layout(path)
+    if names := [*long_columns(path, layout), *(name for name, _ in scope_samples(path, layout))]:
+        return [FileColumn(_OWN_CLOCKS, "time", ""), *(FileColumn(name, "number", "") for name in names)]
     most = min(MOST_SHOWN, max(FEWEST_SHOWN, FIELDS_AT_ONCE // len(layout.names)))
     shown = list(itertools.islice(rows(path, layout), most))
     columns = []
@@ -80,15 +94,43 @@ def csv_columns(path: Path) -> list[FileColumn]:
     return columns
 
 
+def read_groups(
+    path: Path, wanted: Sequence[str], time: str, decimal: str = ""
+) -> tuple[list[FileColumns], list[Note]]:
+    """The wanted columns of a text file as groups on one clock each. Raises ValueError as `read_csv` does."""
+    layout = csv_layout(path, decimal)
+    names, samples_ms = long_columns(path, layout), scope_samples(path, layout)
+    if not (names or samples_ms) or set(wanted) <= set(layout.names):
+        columns, notes = _read_one_clock(path, layout, wanted, time)
+        return [columns], notes
+    column_places(path, names or [name for name, _ in samples_ms], wanted)
+    if time:
+        raise ValueError(
+            f"{path}: each signal of this table has a time of its own, so time: {time} is not needed; "
+            "remove it"
+        )
+    layout = _decided(path, layout, layout.names)
+    groups, notes = read_long(path, layout, wanted) if names else read_scope(path, layout, samples_ms, wanted)
+    return groups, [*layout.notes, *notes]
+
+
 def read_csv(
     path: Path, wanted: Sequence[str], time: str, decimal: str = ""
 ) -> tuple[FileColumns, list[Note]]:
-    """The wanted columns, NaN where a field is empty. `decimal` is the declared decimal mark, "" to find it.
+    """The wanted columns of a text file on one clock, NaN where a signal has no value. `decimal` is the
+    declared decimal mark, "" to find it.
 
     Raises ValueError with the line for text, a row of another length, a missing column, and numbers that may
     be thousands.
     """
-    layout = csv_layout(path, decimal)
+    groups, notes = read_groups(path, wanted, time, decimal)
+    return groups[0] if len(groups) == 1 else joined(groups), notes
+
+
+def _read_one_clock(
+    path: Path, layout: CsvLayout, wanted: Sequence[str], time: str
+) -> tuple[FileColumns, list[Note]]:
+    """The wanted columns, NaN where a field is empty."""
     interval = every(time)
     clock = None if interval else time_column(path, layout.names, time)
     places = column_places(path, layout.names, wanted)
@@ -99,6 +141,7 @@ def read_csv(
     layout = _decided(path, layout, [*wanted, *([] if clock is None else [clock])])
     notes = list(layout.notes)
     clocks = None if clock is None else _CsvClock(path, layout, clock)
+    units = {name: layout.units[place] for name, place in zip(wanted, places, strict=True)}
     plain = None
     if clocks is None:
         plain = read_plain(path, layout, places, None, None)
@@ -112,7 +155,8 @@ def read_csv(
         if clocks and plain.time is not None:
             clocks.take(plain.time, plain.zoned)
     else:
-        values, lines = _rows_one_by_one(path, layout, places, wanted, clocks, notes)
+        values, lines, cell_units = _rows_one_by_one(path, layout, places, wanted, clocks, notes)
+        units |= cell_units
         count, place = len(lines), lambda i: f"line {lines[i]}"
     if not count:
         raise ValueError(
@@ -124,7 +168,7 @@ def read_csv(
         check_no_day_fractions(path, clocks.name, times, layout.units[clocks.place])
         if not time:
             check_no_counter(path, clocks.name, times)
-    columns_forward, turned = forward(FileColumns("rows", times, values, place, zone))
+    columns_forward, turned = forward(FileColumns("rows", times, values, place, zone, units))
     return columns_forward, notes + turned
 
 
@@ -135,9 +179,9 @@ def _rows_one_by_one(
     wanted: Sequence[str],
     clocks: "_CsvClock | None",
     notes: list[Note],
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """{column: values (n,)} and the line (n,) of each row: the slow way, which knows every word and names the
-    line of a fault."""
+) -> tuple[dict[str, np.ndarray], np.ndarray, dict[str, str]]:
+    """{column: values (n,)}, the line (n,) of each row and {column: unit} of numbers with their unit: the
+    slow way, which knows every word and names the line of a fault."""
     columns = Growing([float] * len(wanted))
     lines = Growing([np.int32])
     switches: dict[str, set[str]] = {}
@@ -164,11 +208,11 @@ def _rows_one_by_one(
     for name, words in switches.items():
         message = f"{name} is written as {' and '.join(sorted(words))}, which were read as 1 and 0"
         notes.append(Note("words", "", 1, message))
-    for name in wanted:
-        if name in styles and styles[name].unit:
-            message = f"{name} is written with its unit {styles[name].unit}, which was left out"
-            notes.append(Note("words", "", 1, message))
-    return dict(zip(wanted, columns.finished(), strict=True)), lines.finished()[0]
+    units = {name: styles[name].unit for name in wanted if name in styles and styles[name].unit}
+    for name, unit in units.items():
+        message = f"{name} is written with its unit {unit}, which was left out"
+        notes.append(Note("words", "", 1, message))
+    return dict(zip(wanted, columns.finished(), strict=True)), lines.finished()[0], units
 
 
 def _decided(path: Path, layout: CsvLayout, names: Sequence[str]) -> CsvLayout:
@@ -230,6 +274,8 @@ class _CsvClock:
         date = None if self.numeric else date_column(layout.names, name)
         # a date beside the time of day; some programs write both into one column and the date again beside it
         self.date = column_place(path, layout.names, date) if date and re.match(r"\d+:", sample) else None
+        if first and self.date is not None and not is_date(first[self.date]):
+            self.date = None if layout.names[self.date].strip().casefold() == "data" else self.date
         dates, sample = set(), self.text(first) if first else ""
         if not self.numeric and re.match(r"\s*\d{1,2}[/-]\d{1,2}[/-]\d", sample):
             dates = {
@@ -242,6 +288,9 @@ class _CsvClock:
             stamps = (self.text(row) for _, row in rows(path, layout) if len(row) > self.place)
             self.month_first = steady_order(stamp for stamp in stamps if stamp.strip())
             self.by_steps = self.month_first is not None
+        self.by_language = bool(dates) and self.month_first is None and writes_day_first([name, date or ""])
+        if self.by_language:
+            self.month_first = False
         written = (row[self.place] for _, row in rows(path, layout) if len(row) > self.place)
         self.hyphen_fraction = not self.numeric and hyphen_fraction(
             field for field in written if ":" in field
@@ -312,5 +361,8 @@ class _CsvClock:
                 f"the dates of {self.name} were read with the {first} first, in which they run on in equal "
                 f"steps; with the {other} first they do not"
             )
+            notes.append(Note("clock", "", 1, message))
+        if self.by_language:
+            message = f"the dates of {self.name} were read with the day first, as its language writes them"
             notes.append(Note("clock", "", 1, message))
         return times, "UTC" if self.zoned else ""

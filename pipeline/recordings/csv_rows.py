@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from pipeline.recordings.formats import CONTROL
 from pipeline.recordings.signals import Note
 
 COMMENT = ("#", "%", "//")
@@ -31,13 +32,20 @@ _GROUPED = {
 _AMBIGUOUS = re.compile(r"\s*[+-]?[1-9]\d{0,2}[.,]\d{3}\s*$")
 _UNGROUPED = re.compile(r"\s*[+-]?\d{4,}")
 # a number with its unit, 21.5 °C: it shows where the table is, and is refused with its line when it is read
-_QUANTITY = re.compile(r"\s*[+-]?\d[\d.,]*\s*(%|°\s?[CFK]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$")
+_QUANTITY = re.compile(r"\s*[+-]?\d[\d.,]*\s*(%|°\s?[CFK]|[℃℉]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$")
 _WITH_UNIT = re.compile(
-    r"(?P<number>[+-]?\d[\d.,]*?)\s*(?P<unit>%|°\s?[CFK]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$"
+    r"(?P<number>[+-]?\d[\d.,]*?)\s*(?P<unit>%|°\s?[CFK]|[℃℉]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$"
 )
-# text has tabs, line ends and form feeds, and sometimes the end mark of an old system; other control
-# characters are of binary files
-_CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f\x1a"))
+# code pages with letters of two bytes: the language, its usual letters, and those that it hardly uses. Usual
+# are kana and the first level of kanji (lead bytes 81 to 97), and the syllables of EUC-KR
+_PAGES = {
+    "cp932": ("Japanese", re.compile(rb"[\x81-\x97][\x40-\xfc]"), re.compile(rb"[\xe0-\xfc]")),
+    "cp949": (
+        "Korean",
+        re.compile(rb"[\xb0-\xc8][\xa1-\xfe]"),
+        re.compile(rb"[\x81-\xa0\xc9-\xfe].|.[\x41-\x7a]"),
+    ),
+}
 
 
 class Clock(Protocol):
@@ -215,22 +223,37 @@ def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
             return f"utf-16-{order}", [
                 Note("encoding", "", 1, "the text is UTF-16 without a byte order mark")
             ]
-    control = len(start) - len(start.translate(None, _CONTROL))
+    control = len(start) - len(start.translate(None, CONTROL))
     if control > len(start) // 100:
         raise ValueError(
             f"{path}: the bytes at offset 0 ({start[:8].hex(' ')}) are neither text nor Parquet "
             "nor MCAP; convert the recording to one of them"
         )
+    # a letter of several bytes may be cut at the end of the part that was read
+    whole = start if len(start) < OPENING_BYTES else start[: start.rfind(b"\n") + 1]
     try:
-        # a letter of several bytes may be cut at the end of the part that was read
-        start.decode("utf-8") if len(start) < OPENING_BYTES else start[: start.rfind(b"\n") + 1].decode(
-            "utf-8"
-        )
+        whole.decode("utf-8")
     except UnicodeDecodeError as error:
-        return "cp1252", [
-            Note("encoding", "", 1, f"byte {error.start} is not UTF-8, so the text was read as Windows-1252")
-        ]
+        encoding = next((page for page in _PAGES if _is_of_page(whole, page)), "cp1252")
+        name = "Windows-1252" if encoding == "cp1252" else f"{_PAGES[encoding][0]} ({encoding})"
+        message = f"byte {error.start} is not UTF-8, so the text was read as {name}"
+        return encoding, [Note("encoding", "", 1, message)]
     return "utf-8", []
+
+
+def _is_of_page(text: bytes, page: str) -> bool:
+    """Whether text is of a code page with letters of two bytes: all of it can be decoded, two such letters
+    stand side by side, and there is no letter that the language hardly uses. (Two letters of Windows-1252
+    side by side, as in créée, give one of those or cannot be decoded.)"""
+    _, letters, rare = _PAGES[page]
+    try:
+        decoded = text.decode(page)
+    except UnicodeDecodeError:
+        return False
+    runs = [[letter.encode(page) for letter in run] for run in re.findall(r"[^\x00-\x7f]+", decoded)]
+    pairs = [pair for run in runs for pair in itertools.pairwise(run)]
+    has_words = any(letters.match(first) and letters.match(second) for first, second in pairs)
+    return has_words and not any(rare.match(letter) for run in runs for letter in run)
 
 
 def _delimiter(lines: Sequence[str], decimals: Sequence[str]) -> tuple[str, str]:

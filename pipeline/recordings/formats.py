@@ -2,8 +2,9 @@
 
 import collections
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,8 @@ _EPOCHS = (
     (1e14, 1e6, 0, "us"),
     (1e11, 1e3, 0, "ms"),
 )
+# ticks of .NET, 100 ns since the year 1, from 1965 to 2124; in ns since 1970 that would be 1989 to 1991
+_TICKS, _SINCE_YEAR_1_S = (6.2e17, 6.7e17), 62_135_596_800
 # seconds since 1904, as LabVIEW counts, from 2015 to 2040
 _SINCE_1904_S, _LABVIEW = 2_082_844_800, (3.5e9, 4.3e9)
 # days since 1899-12-30 (since 1904 where the column says so) and since the year 0, from 1954 to 2119, and
@@ -46,6 +49,9 @@ _TIME_NAMES = (
     "zeitstempel",
     "zeit",
     "uhrzeit",
+    "heure",
+    "hora",
+    "ora",
     "x_value",
     "epoch",
     "unix_time",
@@ -56,9 +62,13 @@ _TIME_NAMES = (
     "tout",
     "date",
     "datum",
+    "fecha",
     "index",
 )
-DATE_NAMES = ("date", "datum")
+# Italian "data" is a date beside a time of day alone
+DATE_NAMES = ("date", "datum", "fecha", "data")
+# names of dates and times in languages that write the day before the month
+_DAY_FIRST = ("datum", "fecha", "data", "heure", "hora", "ora", "uhrzeit", "zeit", "zeitstempel")
 # times from a start, which no date beside them belongs to
 _ELAPSED = ("elapsed", "elapsed_time", "relative_time", "uptime", "runtime")
 # what pandas calls the index of a table where nobody named it
@@ -73,6 +83,12 @@ _PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0,
 _COUNTS = {"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds": "us", "nanoseconds": "ns"}
 
 _PARQUET = b"PAR1"
+# the format that a name promises, and how a format is called
+SUFFIXES = {".csv": "csv", ".parquet": "parquet", ".xlsx": "xlsx", ".mat": "MATLAB"}
+NAMES = {"csv": "CSV", "parquet": "Parquet", "mcap": "MCAP"}
+# text has tabs, line ends and form feeds, and sometimes the end mark of an old system; other control
+# characters are of binary files
+CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f\x1a"))
 _OTHER_FORMATS = {
     b"\x1f\x8b": ("gzip", "unpack it with gunzip"),
     b"PK\x03\x04": ("a zip file", "unpack it, or save the sheet as .xlsx or CSV"),
@@ -105,7 +121,7 @@ class FileColumns(NamedTuple):
     """Columns on one clock.
 
     `time` is time_s (n,), or time_ns (n,) on a calendar. `place(i)` names the place of sample i in the file.
-    `zone` is the calendar's zone, empty if the file does not give it.
+    `zone` is the calendar's zone, empty if the file does not give it; `units` are those that it gives.
     """
 
     name: str
@@ -113,6 +129,7 @@ class FileColumns(NamedTuple):
     values: dict[str, np.ndarray]
     place: Callable[[int], str]
     zone: str = "UTC"
+    units: Mapping[str, str] = MappingProxyType({})
 
 
 class FileColumn(NamedTuple):
@@ -158,7 +175,7 @@ class Growing:
 
 def file_format(path: Path) -> str:
     """ "mcap", "parquet", "csv", "bag" or a name of `LOADERS`, by the first bytes.
-    Text is "csv", but text named .mcap or .parquet is refused.
+    Text is "csv", but text named .mcap is refused.
 
     Raises ValueError for any other format.
     """
@@ -191,7 +208,8 @@ def file_format(path: Path) -> str:
             f"{path} begins with {len(start)} zero bytes but should be MCAP, Parquet or CSV; "
             "copy the recording again"
         )
-    if path.suffix in (".mcap", ".parquet"):
+    is_binary = len(start) - len(start.translate(None, CONTROL)) > len(start) // 100
+    if path.suffix == ".mcap" or (path.suffix == ".parquet" and is_binary):
         raise ValueError(
             f"{path}: the bytes at offset 0 are {start[:8].hex(' ')}, "
             f"which begin no {path.suffix[1:]} file; copy the recording again as binary, "
@@ -282,6 +300,11 @@ def date_column(names: Sequence[str], clock: str) -> str | None:
     return next((name for name in names if name != clock and _time_unit(name)[0] in DATE_NAMES), None)
 
 
+def writes_day_first(names: Iterable[str]) -> bool:
+    """Whether a column of a time or a date is named in a language that writes the day before the month."""
+    return any(_time_unit(name)[0] in _DAY_FIRST for name in names)
+
+
 def seconds(name: str, numbers: np.ndarray, written: str = "") -> tuple[np.ndarray, str]:
     """Time in seconds, and a remark if the unit was guessed.
 
@@ -293,6 +316,9 @@ def seconds(name: str, numbers: np.ndarray, written: str = "") -> tuple[np.ndarr
         return numbers / _PER_SECOND[unit], ""
     finite = numbers[np.isfinite(numbers)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
+    if _TICKS[0] < low and high < _TICKS[1]:
+        remark = f"column {name} was taken as ticks of .NET (100 ns since the year 1)"
+        return numbers / 1e7 - _SINCE_YEAR_1_S, remark
     for limit, per_second, epoch, unit in _EPOCHS:
         if high > limit:
             return (

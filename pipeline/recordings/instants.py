@@ -58,6 +58,11 @@ def is_compact(text: str) -> bool:
     return bool(_COMPACT.match(text))
 
 
+def is_date(text: str) -> bool:
+    """Whether a text begins with a date."""
+    return bool(re.match(rf"\s*{_DATE}", text))
+
+
 def instants(
     path: Path,
     name: str,

@@ -151,7 +151,9 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[FileColu
     if remark:
         notes.append(Note("clock", "", 1, remark))
     table_columns, turned = forward(
-        FileColumns("rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone)
+        FileColumns(
+            "rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone, units
+        )
     )
     return table_columns, notes + turned
 

@@ -24,7 +24,7 @@ PLANNED_LEVELS = 20
 # rest
 HOTTEST_DEGC = 450.0
 ROOM_KELVIN, ROOM_FAHRENHEIT = (283.0, 313.0), (55.0, 100.0)
-_CELSIUS = {"degc", "°c", "c", "celsius"}
+CELSIUS = {"degc", "°c", "℃", "c", "celsius"}
 _PERCENT = {"percent", "%", "pct"}
 
 
@@ -233,7 +233,7 @@ def _unit_flags(
             continue
         doubt = (
             _doubtful_celsius(name, usable, resting)
-            if unit in _CELSIUS
+            if unit in CELSIUS
             else _doubtful_percent(name, usable, limits.get(name, (0.0, 100.0))[1])
             if unit in _PERCENT
             else ""
@@ -251,7 +251,7 @@ def _at_rest(table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[
     starts = [
         value
         for name, value in first.items()
-        if name not in limits and units.get(name, "").casefold() in _CELSIUS
+        if name not in limits and units.get(name, "").casefold() in CELSIUS
     ]
     return idle or (len(starts) > 1 and np.ptp(starts) <= 3.0)
 

@@ -5,6 +5,7 @@ printers, spreadsheets, MATLAB files. Damaged, missing and left-out samples are 
 words.
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,14 +13,14 @@ import numpy as np
 
 from pipeline.recordings.bag_folders import read_bag
 from pipeline.recordings.clocks import mended_topics
-from pipeline.recordings.csv_files import read_csv
-from pipeline.recordings.formats import CALENDAR_S, FileColumns, file_format
+from pipeline.recordings.csv_files import read_groups
+from pipeline.recordings.formats import CALENDAR_S, NAMES, SUFFIXES, FileColumns, file_format
 from pipeline.recordings.inspection import inspect
 from pipeline.recordings.mcap_columns import mcap_columns
 from pipeline.recordings.mcap_records import check_magic
 from pipeline.recordings.other_formats import LOADERS
 from pipeline.recordings.parquet_files import read_parquet
-from pipeline.recordings.quality import flag
+from pipeline.recordings.quality import CELSIUS, flag
 from pipeline.recordings.resampling import resample
 from pipeline.recordings.signals import Flag, Jitter, Note, Raw, Source, Table, nearest_names
 from pipeline.recordings.whole_tables import select
@@ -37,6 +38,11 @@ __all__ = [
     "read",
     "resample",
 ]
+
+
+FAHRENHEIT = {"degf", "°f", "° f", "℉", "f", "fahrenheit"}
+# at the end of a column's name; a small f alone may be anything
+_NAMES_FAHRENHEIT = re.compile(r"(?:[\[(_ ](?:deg[Ff]|[Ff]ahrenheit|F)|°\s?F|℉)[\])]?$")
 
 
 def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal: str = "") -> Raw:
@@ -57,6 +63,7 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal
     path = Path(path)
     _check_sources(path, sources)
     kind = file_format(path)
+    named = SUFFIXES.get(path.suffix.lower(), kind)
     names = list(dict.fromkeys(source.source for source in sources))
     try:
         if kind == "mcap":
@@ -66,17 +73,22 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal
         elif kind == "bag":
             columns, places, messages, notes = read_bag(path, names, time)
         else:
-            if kind in LOADERS:
+            if kind == "csv":
+                columns, notes = read_groups(path, names, time, decimal)
+            elif kind in LOADERS:
                 table, notes = select(path, LOADERS[kind](path), names, time)
-            elif kind == "csv":
-                table, notes = read_csv(path, names, time, decimal)
+                columns = [table]
             else:
                 table, notes = read_parquet(path, names, time)
-            columns, places, messages = (
-                [table],
-                {name: (table.name, name) for name in names},
-                {table.name: len(table.time)},
+                columns = [table]
+            places = {name: (table.name, name) for table in columns for name in table.values}
+            messages = {table.name: len(table.time) for table in columns}
+        if kind != named:
+            message = (
+                f"the file is named {path.suffix.lower()} but begins as {NAMES.get(kind, kind)} does, "
+                "and was read as that"
             )
+            notes = [Note("format", "", 1, message), *notes]
     except OSError as error:
         raise ValueError(
             f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
@@ -116,6 +128,18 @@ def _check_sources(path: Path, sources: Sequence[Source]) -> None:
             )
 
 
+def _check_fahrenheit(path: Path, source: Source, unit: str) -> None:
+    """Raises ValueError for a column in °F, as its unit or its name says, that the mapping takes as °C."""
+    written = unit.strip(" ()[]").casefold()
+    is_fahrenheit = written in FAHRENHEIT if written else bool(_NAMES_FAHRENHEIT.search(source.source))
+    is_converted = abs(source.scale * 9 / 5 - 1) < 0.01
+    if is_fahrenheit and source.unit.casefold() in CELSIUS and not is_converted:
+        raise ValueError(
+            f"{path}: {source.source} is in °F but the mapping takes it as {source.unit} with scale "
+            f"{source.scale:g}; set scale: 0.555556 and offset: -17.7778"
+        )
+
+
 def _clocks(columns: Sequence[FileColumns], notes: list[Note]) -> dict[str, np.ndarray]:
     """{topic: time_s (n,)}, all counted from one instant."""
     first = min(group.time[0] for group in columns)
@@ -141,6 +165,7 @@ def _signal(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Time and values in the signal's unit. A signal that has a value in less than half of the rows, spread
     among them, has its own clock: those rows."""
+    _check_fahrenheit(path, source, group.units.get(source.source, ""))
     present = np.isfinite(recorded)
     if not present.any():
         raise ValueError(

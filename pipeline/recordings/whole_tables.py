@@ -79,7 +79,7 @@ def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> t
         clock, zone, remark = _clock(path, table, names, time)
         notes += [Note("clock", "", 1, remark)] if remark else []
     values = {name: table.values[name] for name in wanted}
-    columns, turned = forward(FileColumns("rows", clock, values, table.place, zone))
+    columns, turned = forward(FileColumns("rows", clock, values, table.place, zone, table.units))
     return columns, notes + turned
 
 
