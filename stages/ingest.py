@@ -58,6 +58,7 @@ def main() -> None:
             memo=Path("datasets/memo/ingest"),
             budget=Budget(settings.longest_s, settings.largest_mb),
             ignored=ignored,
+            waits=source == "recordings",
         )
         strict = settings.strict or "--strict" in sys.argv
         record, quality, figures = recording_folders.join(results, wish, strict=strict)
