@@ -18,8 +18,8 @@ from pipeline.temperature import tables
 from pipeline.temperature.settings import Plant, check_output_limits
 
 if TYPE_CHECKING:
+    from pipeline.recordings.formats import Source
     from pipeline.recordings.recording_folders import RecordingWish
-    from pipeline.recordings.signals import Source
 
 
 class Ingest(Section):
@@ -92,7 +92,7 @@ def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, Mapped])
 def sources(machine: Plant, mapping: dict[str, Mapped]) -> tuple[Source, ...]:
     """Where a recording has the signals of the machine: by `mapping`, else under their own names. Raises
     ValueError for a mapping of no signal, or of another unit."""
-    from pipeline.recordings.signals import Source, nearest_names
+    from pipeline.recordings.formats import Source, nearest_names
 
     signals = [*machine.acting, *machine.outputs]
     unknown = sorted(set(mapping) - {signal.name for signal in signals})

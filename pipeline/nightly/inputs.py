@@ -14,7 +14,7 @@ import yaml
 from pipeline.nightly.processes import LITERAL, changed, names
 from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.recordings import excluded, plain_files
-from pipeline.recordings.signatures import METADATA
+from pipeline.recordings.formats import METADATA
 from pipeline.store import artifacts, params
 
 QUARANTINE = Path("datasets/quarantine")

@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from pipeline.recordings.formats import FileColumns
+from pipeline.recordings.formats import METADATA, FileColumns, Note
 from pipeline.recordings.mcap_columns import Topic, mcap_columns, resolve, topics
-from pipeline.recordings.signals import Note
-from pipeline.recordings.signatures import METADATA
 
 LARGEST_METADATA = 1 << 20
 # between the parts of one recording

@@ -1,34 +1,31 @@
-"""CSV and its relatives from other people's programs: rows of numbers
-out of text, and every refusal names the line."""
+"""CSV and its relatives from other people's programs: rows of numbers out of text; every refusal names the
+line.
 
+Read too: long logs of WinCC in TIA Portal (a row for each value of each variable), and exports of TwinCAT
+Scope (a time and a value for each signal). Other tables with a column that says whose value stands beside it
+are refused: read as one signal they would be a mixture without a word.
+"""
+
+import codecs
+import collections
+import csv
 import itertools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple, Protocol
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv
 
-from pipeline.recordings.csv_arrow import iso_zone, read_plain
-from pipeline.recordings.csv_layout import csv_layout
-from pipeline.recordings.csv_rows import (
-    LONGEST_TAIL,
-    MISSING,
-    SWITCH,
-    ColumnStyle,
-    CsvLayout,
-    broken_line,
-    column_style,
-    decimal_mark,
-    floats,
-    is_ambiguous,
-    is_number,
-    rows,
-    sound_rows,
-)
 from pipeline.recordings.formats import (
+    CONTROL,
     FileColumn,
     FileColumns,
     Growing,
+    Note,
     check_no_counter,
     check_no_day_fractions,
     column_place,
@@ -36,11 +33,13 @@ from pipeline.recordings.formats import (
     date_column,
     every,
     forward,
+    is_time_name,
     seconds,
     time_column,
     writes_day_first,
 )
 from pipeline.recordings.instants import (
+    DAY_NS,
     hyphen_fraction,
     instants,
     is_compact,
@@ -49,16 +48,1010 @@ from pipeline.recordings.instants import (
     over_midnight,
     steady_order,
 )
-from pipeline.recordings.long_tables import (
-    check_one_signal,
-    joined,
-    long_columns,
-    naming_columns,
-    read_long,
-    read_scope,
-    scope_samples,
+
+COMMENT = ("#", "%", "//")
+OPENING_BYTES, LINES_SHOWN = 1 << 16, 400
+FEWEST_LINES, WIDEST_BYTES = 4, 1 << 21
+_NUMBER = {
+    decimal: re.compile(rf"\s*[+-]?(\d+({mark}\d*)?|{mark}\d+)([eE][+-]?\d+)?\s*$")
+    for decimal, mark in ((".", r"\."), (",", ","))
+}
+# digits in groups of three, 1,234.5 and 1 234,5 and 1'234.5, by the mark of the decimals
+_GROUPED = {
+    decimal: re.compile(
+        rf"\s*[+-]?\d{{1,3}}(?P<mark>[ '\u2019\xa0\u202f{other}])\d{{3}}((?P=mark)\d{{3}})*({mark}\d*)?\s*$"
+    )
+    for decimal, mark, other in ((".", r"\.", ","), (",", ",", "."))
+}
+# one and a fraction, or a thousand: nothing in the field tells
+_AMBIGUOUS = re.compile(r"\s*[+-]?[1-9]\d{0,2}[.,]\d{3}\s*$")
+_UNGROUPED = re.compile(r"\s*[+-]?\d{4,}")
+# a number with its unit, 21.5 °C: it shows where the table is, and is refused with its line when it is read
+_QUANTITY = re.compile(r"\s*[+-]?\d[\d.,]*\s*(%|°\s?[CFK]|[℃℉]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$")
+_WITH_UNIT = re.compile(
+    r"(?P<number>[+-]?\d[\d.,]*?)\s*(?P<unit>%|°\s?[CFK]|[℃℉]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$"
 )
-from pipeline.recordings.signals import Note
+# code pages with letters of two bytes: the language, its usual letters, and those that it hardly uses. Usual
+# are kana and the first level of kanji (lead bytes 81 to 97), and the syllables of EUC-KR
+_PAGES = {
+    "cp932": ("Japanese", re.compile(rb"[\x81-\x97][\x40-\xfc]"), re.compile(rb"[\xe0-\xfc]")),
+    "cp949": (
+        "Korean",
+        re.compile(rb"[\xb0-\xc8][\xa1-\xfe]"),
+        re.compile(rb"[\x81-\xa0\xc9-\xfe].|.[\x41-\x7a]"),
+    ),
+}
+
+
+class Clock(Protocol):
+    """The column of the time, for a reader with a clock."""
+
+    name: str
+
+    def text(self, row: list[str]) -> str: ...
+
+    def is_time(self, row: list[str]) -> bool: ...
+
+
+class CsvLayout(NamedTuple):
+    """The layout of a text file. Names and units stand in the `skip` lines before the data."""
+
+    encoding: str
+    delimiter: str
+    decimal: str
+    names: list[str]
+    units: list[str]
+    skip: int
+    notes: list[Note]
+    # whether a field tells the decimal mark from a mark between thousands, and whether its owner declared it
+    decided: bool = True
+    declared: bool = False
+
+
+class Opening(NamedTuple):
+    """The first lines of a text file as fields. `remark` says which lines are remarks; their marks are taken
+    off."""
+
+    encoding: str
+    delimiter: str
+    decimal: str
+    rows: list[list[str]]
+    remark: list[bool]
+    notes: list[Note]
+
+
+def opening(path: Path, decimal: str = "") -> Opening:
+    """Encoding, delimiter, decimal mark (`decimal`, or the likely one) and first lines of a text file.
+
+    Raises ValueError for a binary file, and for a first line without end.
+    """
+    with path.open("rb") as stream:
+        # zeros behind the text are what a file system leaves after a power failure
+        start = stream.read(OPENING_BYTES)
+        # the names of a wide table alone are as long as that
+        while len(start.splitlines()) <= FEWEST_LINES and len(start) < WIDEST_BYTES:
+            if not (more := stream.read(len(start))):
+                break
+            start += more
+        start = start.rstrip(b"\0")
+    encoding, notes = _encoding(path, start)
+    # as csv counts lines: form feeds and the like end none
+    lines = re.split("\r\n|\r|\n", start.decode(encoding, errors="replace"))
+    lines = lines[: -1 if not lines[-1] or len(start) >= OPENING_BYTES else None][:LINES_SHOWN]
+    if not lines and len(start) >= WIDEST_BYTES:
+        raise ValueError(
+            f"{path}: its first line has more than {WIDEST_BYTES} bytes, which no header of a table has; "
+            "save it with one row a line"
+        )
+    remark = [line.lstrip().startswith(COMMENT) for line in lines]
+    delimiter, decimal = _delimiter(
+        [line for line, is_remark in zip(lines, remark, strict=True) if line.strip() and not is_remark],
+        (decimal,) if decimal else (".", ","),
+    )
+    rows = [
+        _split(line.lstrip("#% ") if is_remark else line, delimiter)
+        for line, is_remark in zip(lines, remark, strict=True)
+    ]
+    if delimiter == " ":
+        rows = _with_wide_names(rows, lines, decimal)
+    return Opening(encoding, delimiter, decimal, rows, remark, notes)
+
+
+def _with_wide_names(rows: list[list[str]], lines: list[str], decimal: str) -> list[list[str]]:
+    """The rows of a table with blanks between its columns; a header whose names have blanks inside ("Zone 1
+    (C)   Heater 1") is split where two or a tab stand, if that gives as many names as there are columns."""
+    widths = [len(row) for row in rows if row and all(is_number(field, decimal) for field in row)]
+    width = max(widths, key=widths.count, default=0)
+    wide = [re.split(r"\s{2,}|\t", line.lstrip("#% \t").rstrip()) for line in lines]
+    return [
+        names if len(row) > width > 1 and len(names) == width else row
+        for row, names in zip(rows, wide, strict=True)
+    ]
+
+
+def list_layout(path: Path, is_header: Callable[[list[str]], bool]) -> CsvLayout:
+    """The layout of a list whose columns are found by name.
+
+    The header is the first line that `is_header`, or else the first line. Raises ValueError if no row
+    follows.
+    """
+    start = opening(path)
+    written = [i for i, row in enumerate(start.rows) if any(row) and not start.remark[i]]
+    heads = [i for i, row in enumerate(start.rows) if is_header(row)] or written
+    if not heads or not any(i > heads[0] for i in written):
+        content = "a header" if heads else "only blank or comment lines"
+        raise ValueError(
+            f"{path}: line 2 on should hold rows of numbers, but the file has {content} and no data; "
+            "record it again or remove it"
+        )
+    names = [field.strip() for field in start.rows[heads[0]]]
+    return CsvLayout(
+        start.encoding, start.delimiter, start.decimal, names, [""] * len(names), heads[0] + 1, start.notes
+    )
+
+
+def is_number(field: str, decimal: str) -> bool:
+    """Whether a field is a number with that decimal mark, "." or ","."""
+    return bool(_NUMBER[decimal].match(field))
+
+
+def is_quantity(field: str, decimal: str) -> bool:
+    return is_number(field, decimal) or bool(_QUANTITY.match(field) or _GROUPED[decimal].match(field))
+
+
+def is_ambiguous(field: str) -> bool:
+    """Whether a field is 1,000 or 1.000 and the like: one with three decimals, or a thousand."""
+    return bool(_AMBIGUOUS.match(field))
+
+
+def decimal_mark(field: str) -> str:
+    """The decimal mark that a field gives away, "" for none: 1,5 and 0,500 and 1.234,5 do, 1,500 and 7 do
+    not."""
+    if is_ambiguous(field):
+        return ""
+    for decimal in (".", ","):
+        if decimal in field and (is_number(field, decimal) or _proves_groups(field, decimal)):
+            return decimal
+    if (grouped := re.match(r"\s*[+-]?\d{1,3}(?:([.,])\d{3}){2,}\s*$", field)) is not None:
+        return "," if grouped[1] == "." else "."
+    return ""
+
+
+def _proves_groups(field: str, decimal: str) -> bool:
+    """Whether a field can only be read as digits in groups: 1,234.5, 1,234,567 or 1'234, but not 1,234."""
+    return bool(_GROUPED[decimal].match(field)) and not is_ambiguous(field)
+
+
+class ColumnStyle(NamedTuple):
+    """How a whole column writes its numbers: its mark between thousands and its unit, "" for none."""
+
+    groups: str
+    unit: str
+
+
+def column_style(path: Path, layout: CsvLayout, place: int) -> ColumnStyle:
+    """The style of a column, without a mark or unit that not all of its numbers have, and without a mark that
+    nothing proves."""
+    marks, units, proven = set(), set(), layout.declared
+    for _, row in rows(path, layout):
+        field = row[place].strip() if place < len(row) else ""
+        if field.casefold() in MISSING:
+            continue
+        quantity = _WITH_UNIT.match(field)
+        units.add(quantity["unit"] if quantity else "")
+        if grouped := _GROUPED[layout.decimal].match(field):
+            marks.add(grouped["mark"])
+            proven = proven or _proves_groups(field, layout.decimal)
+        elif is_number(field, layout.decimal) and _UNGROUPED.match(field):
+            marks.add("")
+    return ColumnStyle(
+        marks.pop() if proven and len(marks) == 1 else "", units.pop() if len(units) == 1 else ""
+    )
+
+
+def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
+    for mark, encoding in ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
+        if start.startswith(mark):
+            return encoding, []
+    for order, (high, low) in {"le": (start[1::2], start[0::2]), "be": (start[0::2], start[1::2])}.items():
+        if high.count(0) > len(start) // 4 and not low.count(0):
+            return f"utf-16-{order}", [
+                Note("encoding", "", 1, "the text is UTF-16 without a byte order mark")
+            ]
+    control = len(start) - len(start.translate(None, CONTROL))
+    if control > len(start) // 100:
+        raise ValueError(
+            f"{path}: the bytes at offset 0 ({start[:8].hex(' ')}) are neither text nor Parquet "
+            "nor MCAP; convert the recording to one of them"
+        )
+    # a letter of several bytes may be cut at the end of the part that was read
+    whole = start if len(start) < OPENING_BYTES else start[: start.rfind(b"\n") + 1]
+    try:
+        whole.decode("utf-8")
+    except UnicodeDecodeError as error:
+        encoding = next((page for page in _PAGES if _is_of_page(whole, page)), "cp1252")
+        name = "Windows-1252" if encoding == "cp1252" else f"{_PAGES[encoding][0]} ({encoding})"
+        message = f"byte {error.start} is not UTF-8, so the text was read as {name}"
+        return encoding, [Note("encoding", "", 1, message)]
+    return "utf-8", []
+
+
+def _is_of_page(text: bytes, page: str) -> bool:
+    """Whether text is of a code page with letters of two bytes: all of it can be decoded, two such letters
+    stand side by side, and there is no letter that the language hardly uses. (Two letters of Windows-1252
+    side by side, as in créée, give one of those or cannot be decoded.)"""
+    _, letters, rare = _PAGES[page]
+    try:
+        decoded = text.decode(page)
+    except UnicodeDecodeError:
+        return False
+    runs = [[letter.encode(page) for letter in run] for run in re.findall(r"[^\x00-\x7f]+", decoded)]
+    pairs = [pair for run in runs for pair in itertools.pairwise(run)]
+    has_words = any(letters.match(first) and letters.match(second) for first, second in pairs)
+    return has_words and not any(rare.match(letter) for run in runs for letter in run)
+
+
+def _delimiter(lines: Sequence[str], decimals: Sequence[str]) -> tuple[str, str]:
+    """The delimiter and decimal mark that make most fields numbers. Of equal ones, those are taken that give
+    most lines one width, and then those that leave the fewest other fields; the blank is tried last."""
+    best, choice = (0.0, 0.0, 0.0), (",", decimals[0])
+    for delimiter, decimal in itertools.product((",", ";", "\t", "|", " "), decimals):
+        split = [_split(line, delimiter) for line in lines[:50]]
+        if delimiter == " ":  # in words before the table there are numbers too
+            width = collections.Counter(map(len, split)).most_common(1)[0][0] if split else 0
+            split = [row for row in split if len(row) == width]
+        fields = [field for row in split for field in row]
+        quantities = sum(is_quantity(field, decimal) for field in fields)
+        # a comma before decimals splits the rows, and not the header
+        widths = collections.Counter(map(len, split)).most_common(1)
+        alike = widths[0][1] / len(split) if widths else 0.0
+        score = (quantities, alike, quantities / max(len(fields), 1))
+        # blanks inside of names and units make no table where another mark gives as many numbers
+        if delimiter == " " and quantities <= best[0]:
+            continue
+        if score > best:
+            best, choice = score, (delimiter, decimal)
+    return choice
+
+
+def _split(line: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        return line.split()
+    try:
+        row = next(csv.reader([line], delimiter=delimiter), [])
+    except (
+        csv.Error
+    ):  # a field longer than any is: that delimiter stands nowhere, or a quotation mark is open
+        return [line]
+    ends_with_delimiter = line.rstrip("\r\n ").endswith(delimiter)
+    return row[:-1] if len(row) > 1 and not row[-1].strip() and ends_with_delimiter else row
+
+
+# what programs write where they have no number
+MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "<null>", "none", "-", "--", "---", "?", "bad",
+           "bad input", "no data", "nodata", "error", "fault", "i/o timeout", "unavailable", "unknown",
+           "-nan(ind)", "1.#qnan", "-1.#ind", "#value!", "#ref!", "#div/0!"}  # fmt: skip
+SWITCH = {"on": 1.0, "true": 1.0, "off": 0.0, "false": 0.0}
+# totals and remarks behind the data; more than that is no tail
+LONGEST_TAIL = 20
+
+
+def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
+    """(line, fields) of the rows of data, without blank lines and comments."""
+    line = 0
+    with path.open(encoding=layout.encoding, newline="") as stream:
+        try:
+            if layout.delimiter == " ":
+                numbered = ((i, line.split()) for i, line in enumerate(stream, 1))
+            else:
+                reader = csv.reader(stream, delimiter=layout.delimiter, strict=True)
+                numbered = ((reader.line_num, row) for row in reader)
+            line = 0
+            for line, row in numbered:
+                start = row[0].lstrip() if row else ""
+                if (
+                    line > layout.skip
+                    and not start.startswith(COMMENT)
+                    and (start or any(field.strip() for field in row))
+                ):
+                    yield line, row
+        except UnicodeDecodeError as error:
+            raise ValueError(
+                f"{path}: byte 0x{error.object[error.start]:02x} is not {layout.encoding}; "
+                "save the file as UTF-8"
+            ) from None
+        except csv.Error as error:
+            if "unexpected end" in str(error):
+                raise ValueError(
+                    f"{path}: line {line + 1}: a quotation mark is opened there and never closed; "
+                    "remove or close it"
+                ) from None
+            raise ValueError(
+                f"{path}: line {line + 1} cannot be split into columns ({error}), as after a quotation mark "
+                "that is never closed; mend that line, or save the file again as plain CSV"
+            ) from None
+
+
+def sound_rows(
+    path: Path, layout: CsvLayout, clock: "Clock | None", notes: list[Note]
+) -> Iterator[tuple[int, list[str]]]:
+    """The rows with one field a column and a time.
+
+    A repeated header is counted and left out. Lines behind the data are left out and noted: a row that breaks
+    off (a logger lost its power), totals, remarks. The same lines amid the data are refused.
+    """
+    width, tail, repeated = len(layout.names), [], []
+    for line, row in rows(path, layout):
+        complete = len(row) == width or (len(row) > width and not any(field.strip() for field in row[width:]))
+        if complete and (clock is None or clock.is_time(row)):
+            if tail:
+                raise ValueError(f"{path}: {_unsound(*tail[0], layout, clock)}; mend or remove that line")
+            yield line, row
+        elif [field.strip() for field in row[:width]] in (layout.names, layout.units):
+            repeated.append(line)
+        elif breaks := sum(field.rstrip("\n").count("\n") for field in row):
+            raise ValueError(
+                f"{path}: line {line - breaks}: a quotation mark is opened there and never closed; "
+                "remove or close it"
+            )
+        else:
+            tail.append((line, row))
+            if len(tail) > LONGEST_TAIL:
+                raise ValueError(f"{path}: {_unsound(*tail[0], layout, clock)}; mend or remove that line")
+    if repeated:
+        notes.append(
+            Note(
+                "header",
+                "",
+                len(repeated),
+                f"the header is repeated {len(repeated)} times, first in line {repeated[0]}",
+            )
+        )
+    if len(tail) == 1 and len(tail[0][1]) < width:
+        notes.append(broken_line(tail[0][0], len(tail[0][1]), width))
+    elif tail:
+        shown = layout.delimiter.join(tail[0][1])[:60]
+        message = (
+            f"{len(tail)} lines behind the data were left out, from line {tail[0][0]} on, which is {shown!r}"
+        )
+        notes.append(Note("trailing", "", len(tail), message))
+
+
+def broken_line(line: int, fields: int, width: int) -> Note:
+    """The note on a last line that has fewer fields than the table."""
+    message = f"line {line}, the last, breaks off after {fields} of {width} fields and was left out"
+    return Note("truncated", "", 1, message)
+
+
+def _unsound(line: int, row: list[str], layout: CsvLayout, clock: "Clock | None") -> str:
+    if clock is None or len(row) != len(layout.names):
+        fields = "1 field" if len(row) == 1 else f"{len(row)} fields"
+        return f"line {line} has {fields} but the header has {len(layout.names)} columns"
+    time = clock.text(row).strip()
+    return f"line {line} should have a time in {clock.name} but has {repr(time[:40]) if time else 'none'}"
+
+
+def floats(
+    path: Path,
+    name: str,
+    fields: list[str],
+    decimal: str,
+    lines: list[int],
+    switches: dict[str, set[str]],
+    style: Callable[[str], ColumnStyle] | None = None,
+) -> np.ndarray:
+    """The numbers of a column's fields, NaN for a word that says there is none.
+
+    Words of a switch are counted in `switches`. `style` gives that of a column. Raises ValueError with the
+    line of a field that is no number.
+    """
+    try:
+        if decimal == "." and not any("_" in field for field in fields):
+            return np.array(list(map(float, fields)))
+        if decimal == "," and not any("." in field or "_" in field for field in fields):
+            return np.array([float(field.replace(",", ".")) for field in fields])
+    except ValueError:
+        pass  # one by one, which names the line
+    return np.array(
+        [
+            _float(path, name, field, decimal, line, switches, style)
+            for field, line in zip(fields, lines, strict=True)
+        ]
+    )
+
+
+def _float(
+    path: Path,
+    name: str,
+    field: str,
+    decimal: str,
+    line: int,
+    switches: dict[str, set[str]],
+    style: Callable[[str], ColumnStyle] | None,
+) -> float:
+    plain = field.strip()
+    # 1.5D+02, as Fortran writes
+    scientific = re.sub(r"(?<=[\d.,])[dD](?=[+-]?\d+$)", "e", plain)
+    if is_number(scientific, decimal):
+        return float(scientific.replace(",", "."))
+    grouped = _GROUPED[decimal].match(plain)
+    if grouped and style is not None and style(name).groups == grouped["mark"]:
+        return float(plain.replace(grouped["mark"], "").replace(",", "."))
+    quantity = _WITH_UNIT.match(plain)
+    if quantity and style is not None and style(name).unit and is_number(quantity["number"], decimal):
+        return float(quantity["number"].replace(",", "."))
+    word = plain.casefold()
+    if word in MISSING:
+        return np.nan
+    if word in SWITCH:
+        switches.setdefault(name, set()).add(plain)
+        return SWITCH[word]
+    if re.fullmatch(r"[+-]?(inf|infinity|nan)", word):
+        return float(word)
+    remedy = "mend that line, or leave the field empty"
+    if re.fullmatch(r"[+-]?[\d.,]+\s*[^\d\s.,]{1,6}", plain):
+        remedy = "write the numbers without their unit"
+    elif re.fullmatch(r"[+-]?[\d.,\s']+", plain):
+        mark = "a point" if decimal == "." else "a comma"
+        remedy = f"write the numbers without marks between thousands, with {mark} before the decimals"
+        if is_ambiguous(plain):
+            one, thousand = plain.replace(",", "."), re.sub("[.,]", "", plain)
+            remedy = f"it may be {one} or {thousand}: declare ingest.decimal, or {remedy}"
+    raise ValueError(f"{path}: line {line}, column {name} should be a number but is {plain[:40]!r}; {remedy}")
+
+
+# ---- the layout
+
+
+def csv_layout(path: Path, decimal: str = "") -> CsvLayout:
+    """Encoding, delimiter, decimal mark (`decimal` where it is declared) and header of a text file.
+
+    Raises ValueError for a file without rows of numbers.
+    """
+    layout, rows = _layout(path, decimal)
+    marks = collections.Counter(mark for row in rows for field in row if (mark := decimal_mark(field)))
+    # what writes commas between fields writes points before decimals
+    decided = bool(decimal) or layout.decimal in marks or (layout.delimiter, layout.decimal) == (",", ".")
+    return layout._replace(decided=decided, declared=bool(decimal))
+
+
+def _layout(path: Path, declared: str) -> tuple[CsvLayout, list[list[str]]]:
+    """The layout, and the rows of data that the file begins with."""
+    encoding, delimiter, decimal, rows, comment, notes = opening(path, declared)
+    numbers = [
+        0 if remark else sum(is_quantity(field, decimal) for field in row)
+        for row, remark in zip(rows, comment, strict=True)
+    ]
+    first, width = _first_row(path, rows, numbers, comment, delimiter)
+    data = [row for row, remark in zip(rows[first:], comment[first:], strict=True) if not remark]
+    heads = [
+        i
+        for i in range(first)
+        if len(rows[i]) >= width and any(rows[i]) and (not numbers[i] or _names_time(rows[i]))
+    ]
+    if not heads:
+        notes.append(
+            Note(
+                "header",
+                "",
+                1,
+                f"line {first + 1} is data already: the {width} columns were named "
+                f"column_1 to column_{width}",
+            )
+        )
+        names = [f"column_{i + 1}" for i in range(width)]
+        return CsvLayout(encoding, delimiter, decimal, names, [""] * width, first, notes), data
+    names, units = [field.strip() for field in rows[heads[-1]]], [""] * width
+    written = [sum(bool(field.strip()) for field in rows[i]) for i in heads]
+    if (
+        len(heads) > 1
+        and heads[-2] == heads[-1] - 1
+        and not any(any(row) for row in rows[heads[-1] + 1 : first])
+        and written[-2] >= written[-1]
+    ):
+        names, units = (
+            [field.strip() for field in rows[heads[-2]]],
+            [field.strip(" ()[]") for field in rows[heads[-1]]],
+        )
+    if len(names) == width + 1 and names[-1].casefold() == "comment":
+        names.pop()  # of LabVIEW, which writes it only where there is one
+    units += [""] * (len(names) - len(units))
+    return CsvLayout(encoding, delimiter, decimal, names, units, first, notes), data
+
+
+def _names_time(row: Sequence[str]) -> bool:
+    return len(row) > 1 and any(is_time_name(field) for field in row)
+
+
+def _is_heading(row: Sequence[str], table: Sequence[Sequence[str]]) -> bool:
+    """Whether a row with numbers begins with a word where the rows of the table begin with numbers, as the
+    lines before LabVIEW's do."""
+    first = row[0].strip().casefold()
+    if first in MISSING or _begins_a_number(first):
+        return False
+    return sum(_begins_a_number(other[0].strip()) for other in table) > 0.8 * len(table)
+
+
+def _begins_a_number(field: str) -> bool:
+    """Whether a field begins as a number or a time does."""
+    return bool(re.match(r"[+-]?[.,]?\d", field))
+
+
+def _first_row(
+    path: Path, rows: Sequence[list[str]], numbers: Sequence[int], comment: Sequence[bool], delimiter: str
+) -> tuple[int, int]:
+    """(index, width) of the first row of the table. It stands behind the first line that names a time, if
+    there is one, and has the width of most rows with numbers."""
+    header = next((i for i, row in enumerate(rows) if _names_time(row) and any(numbers[i + 1 :])), -1)
+    data = [i for i in range(header + 1, len(rows)) if numbers[i]]
+    if not data:
+        text = sum(bool(row) and not remark for row, remark in zip(rows, comment, strict=True))
+        content = (
+            f"{text} lines of text" if text > 1 else "a header" if text else "only blank or comment lines"
+        )
+        raise ValueError(
+            f"{path}: line 2 on should hold rows of numbers, but the file has {content} and no data; "
+            "record it again or remove it"
+        )
+    widths = collections.Counter(len(rows[i]) for i in data)
+    width = max(widths, key=lambda count: (widths[count], count))
+    table = [i for i in data if len(rows[i]) == width]
+    written = [i for i in range(table[0], len(rows)) if any(rows[i]) and not comment[i]]
+    # a language has words and lines of all lengths, with a number here and there
+    words = delimiter == " " and sum(numbers[i] for i in table) < width * len(table) / 2
+    if len(table) < len(written) / 2 or words or (len(table) == 1 and header < 0):
+        lines = "lines of words or of different widths" if len(written) > 1 else "a single line"
+        raise ValueError(
+            f"{path} is text but no table: expected rows of numbers of one width but found {lines}; "
+            "name a recording, or save it as CSV with one row a sample"
+        )
+    begin = next((i for i in table if not _is_heading(rows[i], [rows[k] for k in table])), table[0])
+    # most rows may end with an empty field, and the first ones not
+    while begin - 1 in data and len(rows[begin - 1]) == width + 1:
+        begin -= 1
+    return begin, len(rows[begin])
+
+
+def numbers(column: pa.Array, kind: type) -> np.ndarray:
+    """The values (n,) of a column of `kind`, NaN for null. Without null they are the column's memory."""
+    valid, content = column.buffers()
+    if content is None:
+        return np.empty(0, kind)
+    values = np.frombuffer(content, kind)[column.offset : column.offset + len(column)]
+    if not column.null_count:
+        return values
+    bits = np.unpackbits(np.frombuffer(valid, np.uint8), bitorder="little", count=column.offset + len(column))
+    return np.where(bits[column.offset :].astype(bool), values, np.nan)
+
+
+# ---- rows of plain numbers by Arrow, which reads only what the slow way reads in the same manner
+
+BLOCK_BYTES = 1 << 20
+# a first block of short rows may promise what is not there
+MOST_EXPECTED = 1 << 22
+_LINE_END = re.compile(rb"\r\n|\r|\n")
+# Arrow knows zones up to 24 h; ours end at 14, and some programs write a fraction behind a hyphen
+_FAR_ZONE = re.compile(rb":\d\d(?:\.\d+)?[+-](?:1[5-9]|2\d|14:?(?!00)\d)")
+_ISO = re.compile(r"\d{4}-\d\d-\d\d(?:[T ]\d\d:\d\d(?::\d\d(?:\.\d{1,9})?)?)?(Z|[+-]\d\d(?::?\d\d)?)?$")
+_REMARK = rf"^\s*({'|'.join(map(re.escape, COMMENT))})"
+_LAST_REMARK = re.compile(_REMARK.encode())
+_NULLS = sorted({spelt for word in MISSING for spelt in (word, word.upper(), word.title())} | {"NaN"})
+
+
+class PlainTable(NamedTuple):
+    """Values (n,) of the wanted columns. `time` is numbers, or ns since 1970, `zoned` if all name a zone.
+
+    `broken` is the last line and its count of fields, where it breaks off and is left out.
+    """
+
+    time: np.ndarray | None
+    zoned: bool
+    values: list[np.ndarray]
+    broken: tuple[int, int] | None
+
+
+class _NotPlain(Exception):
+    """Something that only the slow way reads."""
+
+
+def iso_zone(sample: str) -> str | None:
+    """ "UTC" for an ISO 8601 time with a zone, "" for one without, None for any other text."""
+    match = _ISO.match(sample)
+    return None if match is None else "UTC" if match[1] else ""
+
+
+def read_plain(
+    path: Path, layout: CsvLayout, places: Sequence[int], clock: int | None, zone: str | None
+) -> PlainTable | None:
+    """The columns at `places` and the time at `clock`, None for a file that is not plain.
+
+    `zone` is that of `iso_zone` for a clock of ISO times, None for a clock of numbers.
+    """
+    if layout.delimiter == " ":
+        return None
+    extra = _extra_columns(path, layout)
+    if extra is None:
+        return None
+    first_row = 0 not in places and clock != 0
+    read = list(dict.fromkeys([*places, *([] if clock is None else [clock])]))
+    types: dict[int, pa.DataType] = dict.fromkeys(places, pa.float64())
+    if clock is not None:
+        types[clock] = pa.float64() if zone is None else pa.timestamp("ns", zone or None)
+        if clock in places and zone is not None:
+            return None
+    types |= {len(layout.names) + i: pa.null() for i in range(extra)}
+    parts = Growing([np.int64 if pa.types.is_timestamp(types[place]) else float for place in read])
+    try:
+        text = _ArrowText(path, layout, bool(zone))
+        for batch in _batches(text, layout, types, extra, first_row):
+            columns = [
+                _plain_numbers(batch.column(f"{place}"), types[place], place == clock) for place in read
+            ]
+            if clock is None and np.isnan(columns).all(axis=0).any():
+                return None  # a blank row is no sample
+            if not parts.count:
+                _expect(parts, path, len(batch))
+            parts.append(*columns)
+    except (_NotPlain, pa.ArrowInvalid):
+        return None
+    if not parts.count:
+        return None
+    finished = dict(zip(read, parts.finished(), strict=True))
+    time = None if clock is None else finished[clock]
+    broken = (text.lines + 1, text.broken_after) if text.broken_after else None
+    return PlainTable(time, bool(zone), [finished[place] for place in places], broken)
+
+
+def _expect(parts: Growing, path: Path, in_block: int) -> None:
+    """Room for as many rows as the first block lets expect."""
+    expected = int(in_block * max(1.0, 1.02 * path.stat().st_size / BLOCK_BYTES)) + 1
+    parts.expect(min(expected, MOST_EXPECTED))
+
+
+def _extra_columns(path: Path, layout: CsvLayout) -> int | None:
+    """How many delimiters without a column end each row, by the first row."""
+    for _, row in rows(path, layout):
+        extra = row[len(layout.names) :]
+        return None if len(row) < len(layout.names) or any(field.strip() for field in extra) else len(extra)
+    return None
+
+
+def _batches(
+    text: "_ArrowText", layout: CsvLayout, types: dict[int, pa.DataType], extra: int, first_row: bool
+) -> Iterator[pa.RecordBatch]:
+    """Batches with columns called by their places. Raises _NotPlain and ArrowInvalid."""
+    shown = [*types, *([0] if first_row else [])]
+    reader = pa.csv.open_csv(
+        pa.PythonFile(text, mode="r"),
+        read_options=pa.csv.ReadOptions(
+            use_threads=False,
+            block_size=BLOCK_BYTES,
+            column_names=[f"{i}" for i in range(len(layout.names) + extra)],
+        ),
+        parse_options=pa.csv.ParseOptions(delimiter=layout.delimiter),
+        convert_options=pa.csv.ConvertOptions(
+            column_types={f"{place}": kind for place, kind in ({0: pa.string()} | types).items()},
+            include_columns=[f"{place}" for place in shown],
+            null_values=_NULLS,
+            decimal_point=layout.decimal,
+            timestamp_parsers=[pa.csv.ISO8601],
+        ),
+    )
+    for batch in reader:
+        if first_row and _has_comment(batch.column("0")):
+            raise _NotPlain
+        if text.strange:
+            raise _NotPlain
+        if len(batch):
+            yield batch
+    if text.strange:
+        raise _NotPlain
+
+
+def _has_comment(column: pa.Array) -> bool:
+    remarks = pc.call_function("match_substring_regex", [column], pc.MatchSubstringOptions(_REMARK))
+    return bool(pc.call_function("any", [remarks]).as_py())
+
+
+def _plain_numbers(column: pa.Array, kind: pa.DataType, is_clock: bool) -> np.ndarray:
+    """The numbers of a column. Raises _NotPlain for a missing time, and for a word that Arrow takes for NaN
+    or infinite."""
+    if is_clock and column.null_count:
+        raise _NotPlain
+    if pa.types.is_timestamp(kind):
+        return numbers(column, np.int64)
+    values = numbers(column, np.float64)
+    odd = len(values) - int(np.isfinite(values).sum())
+    if odd != column.null_count:
+        raise _NotPlain
+    return values
+
+
+class _ArrowText:
+    """The rows of data as UTF-8, a block at a time. `strange` turns true at zeros, and at bytes of another
+    encoding; the text ends there."""
+
+    closed = False
+
+    def __init__(self, path: Path, layout: CsvLayout, zoned: bool):
+        self._stream = path.open("rb")
+        self._decoder = codecs.getincrementaldecoder(layout.encoding)()
+        self._utf8 = layout.encoding.startswith("utf-8")
+        self._zoned, self.strange, self._before = zoned, False, b""
+        self._delimiter, self._columns = layout.delimiter.encode(), len(layout.names)
+        self.lines, self.broken_after, self._ended = 0, 0, False
+        self._size = path.stat().st_size
+        self._rest = self._behind(layout.skip)
+
+    def _behind(self, skip: int) -> bytes:
+        """What the first blocks hold behind the lines of the header."""
+        start = b""
+        while len(start) < 4 * BLOCK_BYTES:
+            block = self._block()
+            start += block if start else block.removeprefix(codecs.BOM_UTF8)
+            ends = [match.end() for _, match in zip(range(skip), _LINE_END.finditer(start), strict=False)]
+            if len(ends) == skip and (not ends or ends[-1] < len(start)):
+                begin = ends[-1] if ends else 0
+                if start[:begin].count(b'"') % 2:
+                    self.strange = True
+                return start[begin:]
+            if not block:
+                break
+        self.strange = True
+        return b""
+
+    def _block(self) -> bytes:
+        raw = self._stream.read(BLOCK_BYTES)
+        try:
+            if self._utf8 and raw.isascii() and not self._decoder.getstate()[0]:
+                block = raw
+            elif self._utf8:
+                self._decoder.decode(raw, final=not raw)
+                block = raw
+            else:
+                block = self._decoder.decode(raw, final=not raw).encode()
+        except UnicodeError:
+            self.strange = True
+            return b""
+        if b"\0" in block or (self._zoned and _FAR_ZONE.search(self._before + block)):
+            self.strange = True
+            return b""
+        self.lines += block.count(b"\n")
+        if b"\r" in block or self._before.endswith(b"\r"):
+            self.lines += block.count(b"\r") - block.count(b"\r\n")
+            self.lines -= self._before.endswith(b"\r") and block.startswith(b"\n")
+        self._before = block[-64:]
+        return block
+
+    def _next(self) -> bytes:
+        """The next block. The last ones come together, without a last line that breaks off."""
+        block, self._rest = self._rest or self._block(), b""
+        if self._ended or self._stream.tell() < self._size - BLOCK_BYTES:
+            return block
+        self._ended = True
+        parts = [block]
+        while part := self._block():
+            parts.append(part)
+        text = b"".join(parts)
+        cut = max(text.rfind(b"\n"), text.rfind(b"\r")) + 1
+        last = text[cut:]
+        fields = last.count(self._delimiter) + 1
+        if last.strip() and fields < self._columns and b'"' not in last and not _LAST_REMARK.match(last):
+            self.broken_after = fields
+            return text[:cut]
+        return text
+
+    def read(self, size: int = -1) -> bytes:
+        if self.strange:
+            return b""
+        block = self._next()
+        if size < 0 or len(block) <= size:
+            self._rest = b""
+            return block
+        self._rest = block[size:]
+        return block[:size]
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return False
+
+    def writable(self) -> bool:
+        return False
+
+    def close(self) -> None:
+        self._stream.close()
+        self.closed = True
+
+
+# ---- tables with several signals in one column, or several clocks side by side
+
+# columns that name the signal of a row: Home Assistant, InfluxDB, WinCC, historians
+_NAMING = (
+    "entity_id",
+    "_field",
+    "_measurement",
+    "varname",
+    "tagname",
+    "tag_name",
+    "tag",
+    "tag_id",
+    "metric",
+    "metric_name",
+    "series",
+    "variable",
+    "signal",
+    "signal_name",
+    "sensor_id",
+    "point_name",
+    "device_id",
+    "topic",
+)
+
+# what WinCC writes; rows of the panel's own events, such as $RT_OFF$, begin with a dollar
+_VARIABLE, _TEXT, _VALUE, _VALID, _DAYS = "VarName", "TimeString", "VarValue", "Validity", "Time_ms"
+_EVENT = "$"
+# 1970-01-01 in days since 1899-12-30; Time_ms counts millionths of a day
+_EPOCH_DAY = 25_569
+ROWS_AT_ONCE = 20_000
+# the time of an export in seconds, by what its interval is of SampleTime[ms]
+_SCOPE_UNITS = {1.0: 1e-3, 1e-3: 1.0, 1e3: 1e-6, 1e4: 1e-7, 1e6: 1e-9}
+_SCOPE_NAME, _SCOPE_SAMPLE, _SCOPE_TYPE = "Name", "SampleTime[ms]", "Data-Type"
+
+
+def long_columns(path: Path, layout: CsvLayout) -> list[str]:
+    """The variables of a long log of WinCC, in the order of the file; none for any other table."""
+    if not {_VARIABLE, _TEXT, _VALUE} <= set(layout.names):
+        return []
+    place = layout.names.index(_VARIABLE)
+    names = dict.fromkeys(row[place].strip() for _, row in rows(path, layout) if len(row) > place)
+    return [name for name in names if name and not name.startswith(_EVENT)]
+
+
+def read_long(path: Path, layout: CsvLayout, wanted: Sequence[str]) -> tuple[list[FileColumns], list[Note]]:
+    """The wanted variables of a long log of WinCC, each on its own clock; NaN for a value that is not valid.
+
+    The time is Time_ms, days since 1899-12-30 in millionths, or the text beside it, which has whole seconds.
+    Raises ValueError with the line for text in place of a number or a time.
+    """
+    at, codes = {name: i for i, name in enumerate(layout.names)}, {name: i for i, name in enumerate(wanted)}
+    columns, notes = Growing([np.int64, float, np.int32, np.int32]), []
+    events: collections.Counter[str] = collections.Counter()
+    invalid: collections.Counter[str] = collections.Counter()
+
+    def wanted_rows() -> Iterator[tuple[int, list[str]]]:
+        for line, row in sound_rows(path, layout, None, notes):
+            owner = row[at[_VARIABLE]] = row[at[_VARIABLE]].strip()
+            if owner.startswith(_EVENT):
+                events[owner] += 1
+            elif owner in codes:
+                yield line, row
+
+    pending = wanted_rows()
+    while block := list(itertools.islice(pending, ROWS_AT_ONCE)):
+        lines, fields = [line for line, _ in block], list(zip(*(row for _, row in block), strict=False))
+        owners, texts = fields[at[_VARIABLE]], list(fields[at[_VALUE]])
+        values = floats(path, _VALUE, texts, layout.decimal, lines, {})
+        if _VALID in at:
+            bad = [field.strip() not in ("1", "") for field in fields[at[_VALID]]]
+            invalid.update(itertools.compress(owners, bad))
+            values[bad] = np.nan
+        times = _log_times(path, layout, {name: fields[i] for name, i in at.items()}, lines)
+        columns.append(times, values, np.array(lines), np.array([codes[owner] for owner in owners]))
+    times, values, lines, owners = columns.finished()
+    for name, count in invalid.items():
+        message = f"{count} values of {name} are marked as not valid and are missing"
+        notes.append(Note("invalid", "", count, message))
+    if events:
+        message = f"{events.total()} rows are events of the panel ({', '.join(sorted(events))}), no values"
+        notes.append(Note("events", "", events.total(), message))
+    masks = {name: owners == code for name, code in codes.items()}
+    groups = [
+        FileColumns(name, times[own], {name: values[own]}, _place(lines[own]), "")
+        for name, own in masks.items()
+    ]
+    return groups, notes
+
+
+def _place(lines: Sequence[int] | np.ndarray) -> Callable[[int], str]:
+    return lambda i: f"line {lines[i]}"
+
+
+def _log_times(
+    path: Path, layout: CsvLayout, fields: Mapping[str, Sequence[str]], lines: list[int]
+) -> np.ndarray:
+    """ns (n,) since 1970 on the panel's clock."""
+    if _DAYS not in fields:
+        return instants(path, _TEXT, fields[_TEXT], lines, month_first=None).ns
+    days = floats(path, _DAYS, list(fields[_DAYS]), layout.decimal, lines, {})
+    # to the microsecond, a double's resolution there
+    return np.rint((days - 1e6 * _EPOCH_DAY) * (DAY_NS / 1e9)).astype(np.int64) * 1000
+
+
+# ---- TwinCAT Scope
+
+
+def scope_samples(path: Path, layout: CsvLayout) -> list[tuple[str, float]]:
+    """(signal, SampleTime in ms) of each signal in an export of TwinCAT Scope; none for any other table."""
+    if len(set(layout.names[::2])) != 1:  # the last line of its head too has one key, again and again
+        return []
+    heads: dict[str, list[str]] = {}
+    for row in opening(path).rows:
+        if row and len(row) % 2 == 0 and len(set(row[::2])) == 1:
+            heads[row[0].strip()] = [value.strip() for value in row[1::2]]
+    names, samples = heads.get(_SCOPE_NAME, []), heads.get(_SCOPE_SAMPLE, [])
+    if _SCOPE_TYPE not in heads or len(names) != len(samples):
+        return []
+    if not all(is_number(sample, layout.decimal) for sample in samples):
+        return []
+    return list(zip(names, [float(sample.replace(",", ".")) for sample in samples], strict=True))
+
+
+def read_scope(
+    path: Path, layout: CsvLayout, samples_ms: Sequence[tuple[str, float]], wanted: Sequence[str]
+) -> tuple[list[FileColumns], list[Note]]:
+    """The wanted signals, each with its own times. Raises ValueError for times in no unit that agrees with
+    the declared SampleTime."""
+    groups = []
+    for name, at in zip(wanted, column_places(path, [name for name, _ in samples_ms], wanted), strict=True):
+        place = 2 * at
+        fields = [(line, row[place : place + 2]) for line, row in rows(path, layout) if len(row) > place + 1]
+        fields = [(line, pair) for line, pair in fields if pair[0].strip()]
+        lines = [line for line, _ in fields]
+        times, values = (
+            floats(path, name, [pair[i] for _, pair in fields], layout.decimal, lines, {}) for i in (0, 1)
+        )
+        times = times * _scope_unit_s(path, name, times, samples_ms[at][1])
+        groups.append(FileColumns(name, times, {name: values}, _place(lines), ""))
+    return groups, []
+
+
+def _scope_unit_s(path: Path, name: str, times: np.ndarray, sample_ms: float) -> float:
+    interval = float(np.median(np.diff(times))) if len(times) > 1 else np.nan
+    for ratio, unit_s in _SCOPE_UNITS.items():
+        if abs(interval - ratio * sample_ms) < 0.02 * ratio * sample_ms:
+            return unit_s
+    raise ValueError(
+        f"{path}: the times of {name} have a median interval of {interval:g} but its SampleTime[ms] is "
+        f"{sample_ms:g}; export them again with times in milliseconds"
+    )
+
+
+def joined(groups: Sequence[FileColumns]) -> FileColumns:
+    """Signals with clocks of their own on all of their times, NaN where one has no value."""
+    times = np.unique(np.concatenate([group.time for group in groups]))
+    values = {}
+    for group in groups:
+        column = np.full(len(times), np.nan)
+        column[np.searchsorted(times, group.time)] = group.values[group.name]
+        values[group.name] = column
+    return FileColumns("rows", times, values, lambda i: f"time {i + 1}", groups[0].zone)
+
+
+def naming_columns(names: Sequence[str], wanted: Sequence[str]) -> list[str]:
+    """The columns that may say whose value a row holds; not those that are wanted as signals themselves."""
+    lower = [name.strip().casefold() for name in names]
+    # InfluxDB counts its series in a column of its own
+    naming = (*_NAMING, "table") if "_value" in lower else _NAMING
+    return [name for name, plain in zip(names, lower, strict=True) if plain in naming and name not in wanted]
+
+
+def check_one_signal(path: Path, name: str, owners: Iterable[tuple[str, str]]) -> None:
+    """Raises ValueError if column `name`, of (place, owner), names more than one owner."""
+    first = ""
+    for place, owner in owners:
+        owner = owner.strip()
+        if first and owner and owner != first:
+            raise ValueError(
+                f"{path}: {place}, column {name} names {owner[:40]!r} but the rows before {first[:40]!r}: "
+                "values of several signals stand in one column; write a column for each (a pivot table), "
+                "or a file for each"
+            )
+        first = first or owner
+
+
+# ---- the reader
 
 FIELDS_AT_ONCE = 20_000
 # the clock of a table whose signals have each their own

@@ -9,10 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.recordings.csv_rows import MISSING, CsvLayout, floats, list_layout, sound_rows
-from pipeline.recordings.formats import column_place
+from pipeline.recordings.csv_files import MISSING, CsvLayout, floats, list_layout, sound_rows
+from pipeline.recordings.formats import Note, column_place, nearest_names
 from pipeline.recordings.instants import instants, month_first
-from pipeline.recordings.signals import Note, nearest_names
 
 ROWS_AT_ONCE = 10_000
 # what a printer can be told; beyond it the column is another one, or in another unit

@@ -18,10 +18,10 @@ import numpy as np
 from tqdm import tqdm
 
 from pipeline.recordings.excluded import readable
+from pipeline.recordings.formats import Note
 from pipeline.recordings.frame_csv import FrameLog, read_log
 from pipeline.recordings.frame_images import MISSING, UNREADABLE, concatenate, key_areas_of_files, read_image
 from pipeline.recordings.frame_mcap import RecordedFrames, Topics, frames_at, read_recording
-from pipeline.recordings.signals import Note
 from pipeline.store.artifacts import sha256
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution

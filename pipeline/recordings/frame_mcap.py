@@ -11,14 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.recordings import image_messages
-from pipeline.recordings.formats import file_format
+from pipeline.recordings.formats import Note, Source, file_format, nearest_names
 from pipeline.recordings.frame_csv import stretches
 from pipeline.recordings.frame_images import concatenate
 from pipeline.recordings.image_topics import Frames, Walk, image_topic
 from pipeline.recordings.mcap_columns import Topic, resolve, topics
 from pipeline.recordings.mcap_frames import check_overlap, damage, read_frames, span_of
 from pipeline.recordings.mcap_messages import UnreadableMessage
-from pipeline.recordings.signals import Note, Source, nearest_names
 from pipeline.store.artifacts import sha256
 
 # the section of params.yaml with our signals' places in a recording

@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from pipeline.recordings.formats import FileColumns
+from pipeline.recordings.formats import FileColumns, Note, nearest_names
 from pipeline.recordings.image_messages import READABLE, ImageMessage, gray, is_image, reader
 from pipeline.recordings.mcap_columns import Topic
 from pipeline.recordings.mcap_files import McapFile, Messages
@@ -26,7 +26,6 @@ from pipeline.recordings.mcap_records import (
     prefixed,
     string,
 )
-from pipeline.recordings.signals import Note, nearest_names
 
 METADATA = 0x0C
 # (seconds, nanoseconds) as the fields of a time stamp are called in ROS 2, Foxglove JSON, ROS 1 and protobuf

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.recordings.formats import FileColumns, Growing, seconds
+from pipeline.recordings.formats import FileColumns, Growing, Note, nearest_names, seconds
 from pipeline.recordings.mcap_files import McapFile, Messages
 from pipeline.recordings.mcap_messages import (
     Channel,
@@ -19,7 +19,6 @@ from pipeline.recordings.mcap_messages import (
     fields,
     plain,
 )
-from pipeline.recordings.signals import Note, nearest_names
 
 SAMPLES = 20
 # a summary may promise what is not there

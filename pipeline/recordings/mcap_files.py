@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+from pipeline.recordings.formats import Note
 from pipeline.recordings.mcap_messages import Channel, UnreadableMessage, decompress
 from pipeline.recordings.mcap_records import (
     CHANNEL,
@@ -32,7 +33,6 @@ from pipeline.recordings.mcap_records import (
     records,
     string,
 )
-from pipeline.recordings.signals import Note
 
 # packed or not; recorders close a chunk at 1 to 64 MB
 LARGEST_CHUNK = 1 << 29

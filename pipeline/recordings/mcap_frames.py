@@ -16,11 +16,10 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from pipeline.recordings import image_messages
-from pipeline.recordings.formats import CALENDAR_S, FileColumns, check_clock
+from pipeline.recordings.formats import CALENDAR_S, FileColumns, Note, Source, check_clock
 from pipeline.recordings.image_topics import Frames, Walk, columns, frame_times
 from pipeline.recordings.mcap_columns import Topic
 from pipeline.recordings.mcap_files import McapFile
-from pipeline.recordings.signals import Note, Source
 from pipeline.store.artifacts import beside
 
 FRAME_ID = "nozzle"

@@ -8,11 +8,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from pipeline.recordings.arrow_arrays import numbers
+from pipeline.recordings.csv_files import check_one_signal, naming_columns, numbers
 from pipeline.recordings.formats import (
     FileColumn,
     FileColumns,
     Growing,
+    Note,
     check_no_counter,
     check_no_day_fractions,
     column_places,
@@ -23,8 +24,6 @@ from pipeline.recordings.formats import (
     time_column,
 )
 from pipeline.recordings.instants import instants
-from pipeline.recordings.long_tables import check_one_signal, naming_columns
-from pipeline.recordings.signals import Note
 
 ROWS_AT_ONCE = 50_000
 # an index may promise what is not there

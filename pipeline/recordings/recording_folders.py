@@ -13,13 +13,12 @@ import joblib
 import numpy as np
 
 from pipeline.recordings import excluded, plain_files
-from pipeline.recordings.formats import file_format
+from pipeline.recordings.formats import file_format, is_bag
 from pipeline.recordings.isolated import Budget, isolated
 from pipeline.recordings.klipper_logs import printer_heaters
 from pipeline.recordings.quality import flag
 from pipeline.recordings.recordings import Flag, Raw, Source, Table, read
 from pipeline.recordings.resampling import cut_flags, resample
-from pipeline.recordings.signatures import is_bag
 from pipeline.store import artifacts
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution

@@ -14,7 +14,21 @@ import numpy as np
 from pipeline.recordings.bag_folders import read_bag
 from pipeline.recordings.clocks import mended_topics
 from pipeline.recordings.csv_files import read_groups
-from pipeline.recordings.formats import CALENDAR_S, NAMES, SUFFIXES, FileColumns, file_format
+from pipeline.recordings.formats import (
+    CALENDAR_S,
+    NAMES,
+    SUFFIXES,
+    FileColumns,
+    Flag,
+    Jitter,
+    Note,
+    Raw,
+    Source,
+    Table,
+    file_format,
+    nearest_names,
+    select,
+)
 from pipeline.recordings.inspection import inspect
 from pipeline.recordings.mcap_columns import mcap_columns
 from pipeline.recordings.mcap_records import check_magic
@@ -22,8 +36,6 @@ from pipeline.recordings.other_formats import LOADERS
 from pipeline.recordings.parquet_files import read_parquet
 from pipeline.recordings.quality import CELSIUS, flag
 from pipeline.recordings.resampling import resample
-from pipeline.recordings.signals import Flag, Jitter, Note, Raw, Source, Table, nearest_names
-from pipeline.recordings.whole_tables import select
 
 __all__ = [
     "Flag",

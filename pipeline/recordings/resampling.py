@@ -6,8 +6,8 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from pipeline.recordings.mixing import alternate, mixed
-from pipeline.recordings.signals import Flag, Jitter, Raw, Table, intervals
+from pipeline.recordings.clocks import alternate, mixed
+from pipeline.recordings.formats import Flag, Jitter, Raw, Table, intervals
 
 # a sample within that share of the sample time from the grid is on it: a temperature's change in a hundredth
 # of a sample is far below any sensor's step

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.recordings.excluded import readable
-from pipeline.recordings.formats import file_format
+from pipeline.recordings.formats import Note, Source, file_format
 from pipeline.recordings.image_topics import Frames, image_topic
 from pipeline.recordings.mcap_columns import Topic, resolve, topics
 from pipeline.recordings.mcap_frames import (
@@ -25,7 +25,6 @@ from pipeline.recordings.mcap_frames import (
     tables_of,
     write_frames,
 )
-from pipeline.recordings.signals import Note, Source
 from pipeline.store.artifacts import write_csv
 from pipeline.store.params import Mapped
 

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.recordings.formats import Source
 from pipeline.recordings.frame_folder import figures
 from pipeline.recordings.frame_mcap import UNITS, Topics, middle_frame, open_film
 from pipeline.recordings.mcap_frames import tables_of, write_frames
 from pipeline.recordings.recordings import inspect
-from pipeline.recordings.signals import Source
 from pipeline.setpoint.frames import key_area
 from tests.mcap_writing import Written
 from tests.nozzle_folders import ANY, FLOWS, LEAST, SHOTS, expected, folder, read, scenes, table
