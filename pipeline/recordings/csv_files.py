@@ -12,7 +12,7 @@ import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -25,15 +25,13 @@ from pipeline.recordings.formats import (
     FileColumns,
     Growing,
     Note,
-    check_no_counter,
-    check_no_day_fractions,
+    clock_seconds,
     column_place,
     column_places,
     date_column,
     every,
     forward,
     is_time_name,
-    seconds,
     time_column,
     writes_day_first,
 )
@@ -82,14 +80,23 @@ _PAGES = {
 }
 
 
-class Clock(Protocol):
-    """The column of the time, for a reader with a clock."""
+class Clock(NamedTuple):
+    """The column of the time: numbers, or text that names instants."""
 
     name: str
+    place: int
+    decimal: str  # the mark of numbers, "" for text
+    date: int | None  # the column of the date beside a time of day
+    zone: str | None  # of ISO times, "" for none; None for any other text
+    hyphen_fraction: bool  # whether 13:12:54-05 is five hundredths of a second
 
-    def text(self, row: list[str]) -> str: ...
+    def text(self, row: list[str]) -> str:
+        return row[self.place] if self.date is None else f"{row[self.date]} {row[self.place]}"
 
-    def is_time(self, row: list[str]) -> bool: ...
+    def is_time(self, row: list[str]) -> bool:
+        """Whether the field looks like a time and not like a word. It is read exactly later."""
+        field = row[self.place].strip()
+        return field[:1].isdigit() or (is_number(field, self.decimal) if self.decimal else ":" in field)
 
 
 class CsvLayout(NamedTuple):
@@ -107,20 +114,9 @@ class CsvLayout(NamedTuple):
     declared: bool = False
 
 
-class Opening(NamedTuple):
-    """The first lines of a text file as fields. `remark` says which lines are remarks; their marks are taken
-    off."""
-
-    encoding: str
-    delimiter: str
-    decimal: str
-    rows: list[list[str]]
-    remark: list[bool]
-    notes: list[Note]
-
-
-def opening(path: Path, decimal: str = "") -> Opening:
-    """Encoding, delimiter, decimal mark (`decimal`, or the likely one) and first lines of a text file.
+def opening(path: Path, decimal: str = "") -> tuple[CsvLayout, list[list[str]], list[bool]]:
+    """Encoding, delimiter and decimal mark (`decimal`, or the likely one) of a text file; its first lines as
+    fields; and which of them are remarks, whose marks are taken off.
 
     Raises ValueError for a binary file, and for a first line without end.
     """
@@ -153,7 +149,7 @@ def opening(path: Path, decimal: str = "") -> Opening:
     ]
     if delimiter == " ":
         rows = _with_wide_names(rows, lines, decimal)
-    return Opening(encoding, delimiter, decimal, rows, remark, notes)
+    return CsvLayout(encoding, delimiter, decimal, [], [], 0, notes), rows, remark
 
 
 def _with_wide_names(rows: list[list[str]], lines: list[str], decimal: str) -> list[list[str]]:
@@ -174,19 +170,17 @@ def list_layout(path: Path, is_header: Callable[[list[str]], bool]) -> CsvLayout
     The header is the first line that `is_header`, or else the first line. Raises ValueError if no row
     follows.
     """
-    start = opening(path)
-    written = [i for i, row in enumerate(start.rows) if any(row) and not start.remark[i]]
-    heads = [i for i, row in enumerate(start.rows) if is_header(row)] or written
+    layout, fields, remark = opening(path)
+    written = [i for i, row in enumerate(fields) if any(row) and not remark[i]]
+    heads = [i for i, row in enumerate(fields) if is_header(row)] or written
     if not heads or not any(i > heads[0] for i in written):
         content = "a header" if heads else "only blank or comment lines"
         raise ValueError(
             f"{path}: line 2 on should hold rows of numbers, but the file has {content} and no data; "
             "record it again or remove it"
         )
-    names = [field.strip() for field in start.rows[heads[0]]]
-    return CsvLayout(
-        start.encoding, start.delimiter, start.decimal, names, [""] * len(names), heads[0] + 1, start.notes
-    )
+    names = [field.strip() for field in fields[heads[0]]]
+    return layout._replace(names=names, units=[""] * len(names), skip=heads[0] + 1)
 
 
 def is_number(field: str, decimal: str) -> bool:
@@ -221,16 +215,9 @@ def _proves_groups(field: str, decimal: str) -> bool:
     return bool(_GROUPED[decimal].match(field)) and not is_ambiguous(field)
 
 
-class ColumnStyle(NamedTuple):
-    """How a whole column writes its numbers: its mark between thousands and its unit, "" for none."""
-
-    groups: str
-    unit: str
-
-
-def column_style(path: Path, layout: CsvLayout, place: int) -> ColumnStyle:
-    """The style of a column, without a mark or unit that not all of its numbers have, and without a mark that
-    nothing proves."""
+def column_style(path: Path, layout: CsvLayout, place: int) -> tuple[str, str]:
+    """(mark between thousands, unit) of a whole column; "" for one that not all of its numbers have, and
+    for a mark that nothing proves."""
     marks, units, proven = set(), set(), layout.declared
     for _, row in rows(path, layout):
         field = row[place].strip() if place < len(row) else ""
@@ -243,9 +230,7 @@ def column_style(path: Path, layout: CsvLayout, place: int) -> ColumnStyle:
             proven = proven or _proves_groups(field, layout.decimal)
         elif is_number(field, layout.decimal) and _UNGROUPED.match(field):
             marks.add("")
-    return ColumnStyle(
-        marks.pop() if proven and len(marks) == 1 else "", units.pop() if len(units) == 1 else ""
-    )
+    return (marks.pop() if proven and len(marks) == 1 else "", units.pop() if len(units) == 1 else "")
 
 
 def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
@@ -372,7 +357,7 @@ def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
 
 
 def sound_rows(
-    path: Path, layout: CsvLayout, clock: "Clock | None", notes: list[Note]
+    path: Path, layout: CsvLayout, clock: Clock | None, notes: list[Note]
 ) -> Iterator[tuple[int, list[str]]]:
     """The rows with one field a column and a time.
 
@@ -407,7 +392,7 @@ def sound_rows(
             )
         )
     if len(tail) == 1 and len(tail[0][1]) < width:
-        notes.append(broken_line(tail[0][0], len(tail[0][1]), width))
+        notes.append(_last_line_note(tail[0][0], len(tail[0][1]), width))
     elif tail:
         shown = layout.delimiter.join(tail[0][1])[:60]
         message = (
@@ -416,13 +401,13 @@ def sound_rows(
         notes.append(Note("trailing", "", len(tail), message))
 
 
-def broken_line(line: int, fields: int, width: int) -> Note:
+def _last_line_note(line: int, fields: int, width: int) -> Note:
     """The note on a last line that has fewer fields than the table."""
     message = f"line {line}, the last, breaks off after {fields} of {width} fields and was left out"
     return Note("truncated", "", 1, message)
 
 
-def _unsound(line: int, row: list[str], layout: CsvLayout, clock: "Clock | None") -> str:
+def _unsound(line: int, row: list[str], layout: CsvLayout, clock: Clock | None) -> str:
     if clock is None or len(row) != len(layout.names):
         fields = "1 field" if len(row) == 1 else f"{len(row)} fields"
         return f"line {line} has {fields} but the header has {len(layout.names)} columns"
@@ -437,7 +422,7 @@ def floats(
     decimal: str,
     lines: list[int],
     switches: dict[str, set[str]],
-    style: Callable[[str], ColumnStyle] | None = None,
+    style: Callable[[str], tuple[str, str]] | None = None,
 ) -> np.ndarray:
     """The numbers of a column's fields, NaN for a word that says there is none.
 
@@ -466,7 +451,7 @@ def _float(
     decimal: str,
     line: int,
     switches: dict[str, set[str]],
-    style: Callable[[str], ColumnStyle] | None,
+    style: Callable[[str], tuple[str, str]] | None,
 ) -> float:
     plain = field.strip()
     # 1.5D+02, as Fortran writes
@@ -474,10 +459,10 @@ def _float(
     if is_number(scientific, decimal):
         return float(scientific.replace(",", "."))
     grouped = _GROUPED[decimal].match(plain)
-    if grouped and style is not None and style(name).groups == grouped["mark"]:
+    if grouped and style is not None and style(name)[0] == grouped["mark"]:
         return float(plain.replace(grouped["mark"], "").replace(",", "."))
     quantity = _WITH_UNIT.match(plain)
-    if quantity and style is not None and style(name).unit and is_number(quantity["number"], decimal):
+    if quantity and style is not None and style(name)[1] and is_number(quantity["number"], decimal):
         return float(quantity["number"].replace(",", "."))
     word = plain.casefold()
     if word in MISSING:
@@ -507,55 +492,42 @@ def csv_layout(path: Path, decimal: str = "") -> CsvLayout:
 
     Raises ValueError for a file without rows of numbers.
     """
-    layout, rows = _layout(path, decimal)
-    marks = collections.Counter(mark for row in rows for field in row if (mark := decimal_mark(field)))
-    # what writes commas between fields writes points before decimals
-    decided = bool(decimal) or layout.decimal in marks or (layout.delimiter, layout.decimal) == (",", ".")
-    return layout._replace(decided=decided, declared=bool(decimal))
-
-
-def _layout(path: Path, declared: str) -> tuple[CsvLayout, list[list[str]]]:
-    """The layout, and the rows of data that the file begins with."""
-    encoding, delimiter, decimal, rows, comment, notes = opening(path, declared)
+    layout, rows, comment = opening(path, decimal)
     numbers = [
-        0 if remark else sum(is_quantity(field, decimal) for field in row)
+        0 if remark else sum(is_quantity(field, layout.decimal) for field in row)
         for row, remark in zip(rows, comment, strict=True)
     ]
-    first, width = _first_row(path, rows, numbers, comment, delimiter)
+    first, width = _first_row(path, rows, numbers, comment, layout.delimiter)
     data = [row for row, remark in zip(rows[first:], comment[first:], strict=True) if not remark]
-    heads = [
-        i
-        for i in range(first)
-        if len(rows[i]) >= width and any(rows[i]) and (not numbers[i] or _names_time(rows[i]))
-    ]
-    if not heads:
-        notes.append(
-            Note(
-                "header",
-                "",
-                1,
-                f"line {first + 1} is data already: the {width} columns were named "
-                f"column_1 to column_{width}",
-            )
-        )
+    marks = {decimal_mark(field) for row in data for field in row}
+    # what writes commas between fields writes points before decimals
+    decided = bool(decimal) or layout.decimal in marks or (layout.delimiter, layout.decimal) == (",", ".")
+    names, units = _header(rows[:first], numbers, width)
+    if not names:
         names = [f"column_{i + 1}" for i in range(width)]
-        return CsvLayout(encoding, delimiter, decimal, names, [""] * width, first, notes), data
-    names, units = [field.strip() for field in rows[heads[-1]]], [""] * width
-    written = [sum(bool(field.strip()) for field in rows[i]) for i in heads]
-    if (
-        len(heads) > 1
-        and heads[-2] == heads[-1] - 1
-        and not any(any(row) for row in rows[heads[-1] + 1 : first])
-        and written[-2] >= written[-1]
-    ):
-        names, units = (
-            [field.strip() for field in rows[heads[-2]]],
-            [field.strip(" ()[]") for field in rows[heads[-1]]],
+        message = (
+            f"line {first + 1} is data already: the {width} columns were named {names[0]} to {names[-1]}"
         )
+        layout.notes.append(Note("header", "", 1, message))
+    units += [""] * (len(names) - len(units))
+    return layout._replace(names=names, units=units, skip=first, decided=decided, declared=bool(decimal))
+
+
+def _header(rows: Sequence[list[str]], numbers: Sequence[int], width: int) -> tuple[list[str], list[str]]:
+    """(names, units) in the lines before the data, each [] for none."""
+    wide = [i for i, row in enumerate(rows) if len(row) >= width and any(row)]
+    heads = [i for i in wide if not numbers[i] or _names_time(rows[i])]
+    if not heads:
+        return [], []
+    names, units = rows[heads[-1]], []
+    if heads[-2:] == [heads[-1] - 1, heads[-1]] and not any(map(any, rows[heads[-1] + 1 :])):
+        above = rows[heads[-2]]
+        if sum(bool(field.strip()) for field in above) >= sum(bool(field.strip()) for field in names):
+            names, units = above, [field.strip(" ()[]") for field in names]
+    names = [field.strip() for field in names]
     if len(names) == width + 1 and names[-1].casefold() == "comment":
         names.pop()  # of LabVIEW, which writes it only where there is one
-    units += [""] * (len(names) - len(units))
-    return CsvLayout(encoding, delimiter, decimal, names, units, first, notes), data
+    return names, units
 
 
 def _names_time(row: Sequence[str]) -> bool:
@@ -635,18 +607,6 @@ _REMARK = rf"^\s*({'|'.join(map(re.escape, COMMENT))})"
 _NULLS = sorted({spelt for word in MISSING for spelt in (word, word.upper(), word.title())} | {"NaN"})
 
 
-class PlainTable(NamedTuple):
-    """Values (n,) of the wanted columns. `time` is numbers, or ns since 1970, `zoned` if all name a zone.
-
-    `broken` is the last line and its count of fields, where it breaks off and is left out.
-    """
-
-    time: np.ndarray | None
-    zoned: bool
-    values: list[np.ndarray]
-    broken: tuple[int, int] | None
-
-
 class _NotPlain(Exception):
     """Something that only the slow way reads."""
 
@@ -658,16 +618,16 @@ def iso_zone(sample: str) -> str | None:
 
 
 def read_plain(
-    path: Path, layout: CsvLayout, places: Sequence[int], clock: int | None, zone: str | None
-) -> PlainTable | None:
-    """The columns at `places` and the time at `clock`, None for a file that is not plain.
-
-    `zone` is that of `iso_zone` for a clock of ISO times, None for a clock of numbers.
-    """
-    dates = None if zone is None else clock
-    if layout.delimiter == " " or dates in places:
+    path: Path, layout: CsvLayout, places: Sequence[int], clock: Clock | None
+) -> tuple[list[np.ndarray], np.ndarray, tuple[int, int] | None] | None:
+    """Values (n,) of the columns at `places`; the time (n,) as numbers, or ns since 1970; the last line and
+    its count of fields, if it breaks off and is left out. None for a file that is not plain."""
+    if layout.delimiter == " " or (clock is not None and not clock.decimal and clock.zone is None):
         return None
-    read = [*dict.fromkeys([*places, *([] if clock is None else [clock])])]
+    dates = clock.place if clock is not None and not clock.decimal else None
+    if dates in places:
+        return None
+    read = list(dict.fromkeys([*places, *([] if clock is None else [clock.place])]))
     parts = Growing([np.int64 if place == dates else float for place in read])
     broken: list[pa.csv.InvalidRow] = []
     try:
@@ -675,9 +635,9 @@ def read_plain(
             if _has_remark(batch.column("0")) and 0 not in read:
                 return None
             columns = [
-                _iso_times(batch.column(f"{place}"), zone or "")
-                if place == dates
-                else _plain_numbers(batch.column(f"{place}"), place == clock)
+                _iso_times(batch.column(f"{place}"), clock.zone or "")
+                if clock is not None and place == dates
+                else _plain_numbers(batch.column(f"{place}"), clock is not None and place == clock.place)
                 for place in read
             ]
             if clock is None and np.isnan(columns).all(axis=0).any():
@@ -685,14 +645,14 @@ def read_plain(
             if not parts.count:
                 _expect(parts, path, len(batch))
             parts.append(*columns)
-        if not parts.count:
-            return None
-        last = _broken_line(path, layout, broken[0]) if broken else None
+        last = _last_line(path, layout, broken[0]) if broken else None
     except (_NotPlain, pa.ArrowException, UnicodeError):
         return None
+    if not parts.count:
+        return None
     finished = dict(zip(read, parts.finished(), strict=True))
-    time = None if clock is None else finished[clock]
-    return PlainTable(time, bool(zone), [finished[place] for place in places], last)
+    time = np.empty(0) if clock is None else finished[clock.place]
+    return [finished[place] for place in places], time, last
 
 
 def _expect(parts: Growing, path: Path, in_block: int) -> None:
@@ -747,7 +707,7 @@ def _extra_fields(path: Path, layout: CsvLayout) -> int:
     return len(extra)
 
 
-def _broken_line(path: Path, layout: CsvLayout, row: pa.csv.InvalidRow) -> tuple[int, int]:
+def _last_line(path: Path, layout: CsvLayout, row: pa.csv.InvalidRow) -> tuple[int, int]:
     """The last line and its count of fields. Raises _NotPlain if `row` is another, or more than cut off."""
     with path.open(encoding=layout.encoding) as stream:
         line, text = collections.deque(enumerate(stream, 1), maxlen=1)[0]
@@ -894,7 +854,7 @@ def scope_samples(path: Path, layout: CsvLayout) -> list[tuple[str, float]]:
     if len(set(layout.names[::2])) != 1:  # the last line of its head too has one key, again and again
         return []
     heads: dict[str, list[str]] = {}
-    for row in opening(path).rows:
+    for row in opening(path)[1]:
         if row and len(row) % 2 == 0 and len(set(row[::2])) == 1:
             heads[row[0].strip()] = [value.strip() for value in row[1::2]]
     names, samples = heads.get(_SCOPE_NAME, []), heads.get(_SCOPE_SAMPLE, [])
@@ -935,7 +895,7 @@ def _scope_unit_s(path: Path, name: str, times: np.ndarray, sample_ms: float) ->
     )
 
 
-def joined(groups: Sequence[FileColumns]) -> FileColumns:
+def join_clocks(groups: Sequence[FileColumns]) -> FileColumns:
     """Signals with clocks of their own on all of their times, NaN where one has no value."""
     times = np.unique(np.concatenate([group.time for group in groups]))
     values = {}
@@ -1034,7 +994,7 @@ def read_csv(
     be thousands.
     """
     groups, notes = read_groups(path, wanted, time, decimal)
-    return groups[0] if len(groups) == 1 else joined(groups), notes
+    return groups[0] if len(groups) == 1 else join_clocks(groups), notes
 
 
 def _read_one_clock(
@@ -1050,34 +1010,33 @@ def _read_one_clock(
         check_one_signal(path, name, ((at, owner) for at, owner in owners if owner.strip() != name))
     layout = _decided(path, layout, [*wanted, *([] if clock is None else [clock])])
     notes = list(layout.notes)
-    clocks = None if clock is None else _CsvClock(path, layout, clock)
+    column = None if clock is None else _clock(path, layout, clock)
     units = {name: layout.units[place] for name, place in zip(wanted, places, strict=True)}
-    plain = None
-    if clocks is None:
-        plain = read_plain(path, layout, places, None, None)
-    elif clocks.is_plain:
-        plain = read_plain(path, layout, places, clocks.place, clocks.zone)
+    plain = read_plain(path, layout, places, column)
     if plain is not None:
-        values, place = dict(zip(wanted, plain.values, strict=True)), _line_of(path, layout)
-        count = len(plain.values[0])
-        if plain.broken:
-            notes.append(broken_line(*plain.broken, len(layout.names)))
-        if clocks and plain.time is not None:
-            clocks.take(plain.time, plain.zoned)
+        columns, written, broken = plain
+        values, place = dict(zip(wanted, columns, strict=True)), _line_of(path, layout)
+        lines = np.empty(0, int)
+        notes += [_last_line_note(*broken, len(layout.names))] if broken else []
     else:
-        values, lines, cell_units = _rows_one_by_one(path, layout, places, wanted, clocks, notes)
+        values, lines, written, cell_units = _rows_one_by_one(path, layout, places, wanted, column, notes)
         units |= cell_units
-        count, place = len(lines), lambda i: f"line {lines[i]}"
+        place = _place(lines)
+    count = len(next(iter(values.values())))
     if not count:
         raise ValueError(
             f"{path}: no row behind line {layout.skip} has a time and the {len(layout.names)} fields of the "
             "header; mend the rows, or record it again"
         )
-    times, zone = clocks.finished(notes) if clocks else (np.arange(count) * interval, "")
-    if clocks and clocks.numeric:
-        check_no_day_fractions(path, clocks.name, times, layout.units[clocks.place])
-        if not time:
-            check_no_counter(path, clocks.name, times)
+    if column is None:
+        times, zone = np.arange(count) * (interval or 0.0), ""
+    elif isinstance(written, list):
+        times, zone = _calendar_times(path, column, written, lines, layout.names, notes)
+    elif column.decimal:
+        unit = layout.units[column.place]
+        times, zone = clock_seconds(path, column.name, written, unit, notes, is_declared=bool(time)), "UTC"
+    else:
+        times, zone = written, column.zone or ""
     columns_forward, turned = forward(FileColumns("rows", times, values, place, zone, units))
     return columns_forward, notes + turned
 
@@ -1087,42 +1046,46 @@ def _rows_one_by_one(
     layout: CsvLayout,
     places: Sequence[int],
     wanted: Sequence[str],
-    clocks: "_CsvClock | None",
+    clock: Clock | None,
     notes: list[Note],
-) -> tuple[dict[str, np.ndarray], np.ndarray, dict[str, str]]:
-    """{column: values (n,)}, the line (n,) of each row and {column: unit} of numbers with their unit: the
-    slow way, which knows every word and names the line of a fault."""
-    columns = Growing([float] * len(wanted))
-    lines = Growing([np.int32])
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray | list[str], dict[str, str]]:
+    """{column: values (n,)}, the line (n,) of each row, its time as numbers (n,) or texts, and {column: unit}
+    of numbers with their unit: the slow way, which knows every word and names the line of a fault."""
+    columns, lines = Growing([float] * len(wanted)), Growing([np.int32])
+    times, texts = Growing([float]), []
     switches: dict[str, set[str]] = {}
-    styles: dict[str, ColumnStyle] = {}
+    styles: dict[str, tuple[str, str]] = {}
 
-    def style(name: str) -> ColumnStyle:
+    def style(name: str) -> tuple[str, str]:
         if name not in styles:
             styles[name] = column_style(path, layout, layout.names.index(name))
         return styles[name]
 
-    rows = sound_rows(path, layout, clocks, notes)
-    while block := list(itertools.islice(rows, max(1, FIELDS_AT_ONCE // len(layout.names)))):
-        numbers = [line for line, _ in block]
+    sound = sound_rows(path, layout, clock, notes)
+    while block := list(itertools.islice(sound, max(1, FIELDS_AT_ONCE // len(layout.names)))):
+        numbered = [line for line, _ in block]
+        lines.append(np.array(numbered))
         fields = [[row[place] for _, row in block] for place in places]
-        lines.append(np.array(numbers))
         columns.append(
             *(
-                floats(path, name, texts, layout.decimal, numbers, switches, style)
-                for name, texts in zip(wanted, fields, strict=True)
+                floats(path, name, of_column, layout.decimal, numbered, switches, style)
+                for name, of_column in zip(wanted, fields, strict=True)
             )
         )
-        if clocks:
-            clocks.append([row for _, row in block], numbers)
+        if clock and clock.decimal:
+            written = [row[clock.place] for _, row in block]
+            times.append(floats(path, clock.name, written, layout.decimal, numbered, {}))
+        elif clock:
+            texts += [clock.text(row) for _, row in block]
     for name, words in switches.items():
         message = f"{name} is written as {' and '.join(sorted(words))}, which were read as 1 and 0"
         notes.append(Note("words", "", 1, message))
-    units = {name: styles[name].unit for name in wanted if name in styles and styles[name].unit}
+    units = {name: styles[name][1] for name in wanted if name in styles and styles[name][1]}
     for name, unit in units.items():
         message = f"{name} is written with its unit {unit}, which was left out"
         notes.append(Note("words", "", 1, message))
-    return dict(zip(wanted, columns.finished(), strict=True)), lines.finished()[0], units
+    values = dict(zip(wanted, columns.finished(), strict=True))
+    return values, lines.finished()[0], texts or times.finished()[0], units
 
 
 def _decided(path: Path, layout: CsvLayout, names: Sequence[str]) -> CsvLayout:
@@ -1165,114 +1128,46 @@ def _line_of(path: Path, layout: CsvLayout) -> Callable[[int], str]:
 # ---- the clock
 
 
-class _CsvClock:
-    """The column of the time, read a part of the file at a time: numbers, or text that names instants. The
-    date may stand in another column."""
+def _clock(path: Path, layout: CsvLayout, name: str) -> Clock:
+    place = column_place(path, layout.names, name)
+    first = next((row for _, row in rows(path, layout) if len(row) > place and row[place].strip()), None)
+    sample = first[place].strip() if first else "0"
+    if is_number(sample, layout.decimal) and not is_compact(sample):
+        return Clock(name, place, layout.decimal, None, None, False)
+    # a date beside the time of day; some programs write both into one column and the date again beside it
+    date_name = date_column(layout.names, name) if re.match(r"\d+:", sample) else None
+    date = column_place(path, layout.names, date_name) if date_name else None
+    if first and date is not None and layout.names[date].strip().casefold() == "data":
+        date = date if is_date(first[date]) else None
+    fields = (row[place] for _, row in rows(path, layout) if len(row) > place)
+    is_fraction = hyphen_fraction(field for field in fields if ":" in field)
+    zone = None if date is not None or is_fraction else iso_zone(sample)
+    return Clock(name, place, "", date, zone, is_fraction)
 
-    def __init__(self, path: Path, layout: CsvLayout, name: str):
-        self.path, self.layout, self.name, self.place = (
-            path,
-            layout,
-            name,
-            column_place(path, layout.names, name),
-        )
-        first = next(
-            (row for _, row in rows(path, layout) if len(row) > self.place and row[self.place].strip()), None
-        )
-        sample = first[self.place].strip() if first else "0"
-        self.numeric = is_number(sample, layout.decimal) and not is_compact(sample)
-        date = None if self.numeric else date_column(layout.names, name)
-        # a date beside the time of day; some programs write both into one column and the date again beside it
-        self.date = column_place(path, layout.names, date) if date and re.match(r"\d+:", sample) else None
-        if first and self.date is not None and not is_date(first[self.date]):
-            self.date = None if layout.names[self.date].strip().casefold() == "data" else self.date
-        dates, sample = set(), self.text(first) if first else ""
-        if not self.numeric and re.match(r"\s*\d{1,2}[/-]\d{1,2}[/-]\d", sample):
-            dates = {
-                self.text(row).split()[0]
-                for _, row in rows(path, layout)
-                if len(row) > self.place and self.text(row).strip()
-            }
-        self.month_first, self.by_steps = month_first(dates, sample), False
-        if dates and self.month_first is None:
-            stamps = (self.text(row) for _, row in rows(path, layout) if len(row) > self.place)
-            self.month_first = steady_order(stamp for stamp in stamps if stamp.strip())
-            self.by_steps = self.month_first is not None
-        self.by_language = bool(dates) and self.month_first is None and writes_day_first([name, date or ""])
-        if self.by_language:
-            self.month_first = False
-        written = (row[self.place] for _, row in rows(path, layout) if len(row) > self.place)
-        self.hyphen_fraction = not self.numeric and hyphen_fraction(
-            field for field in written if ":" in field
-        )
-        self.latest: int | None = None
-        # the zone of ISO times; Arrow reads them, and numbers
-        self.zone = None if self.numeric or self.date is not None else iso_zone(sample.strip())
-        self.is_plain = self.numeric or (self.zone is not None and not self.hyphen_fraction)
-        self.times, self.zoned, self.dated = Growing([float if self.numeric else np.int64]), True, True
 
-    def text(self, row: list[str]) -> str:
-        return row[self.place] if self.date is None else f"{row[self.date]} {row[self.place]}"
-
-    def is_time(self, row: list[str]) -> bool:
-        """Whether the field looks like a time and not like a word. `append` reads it exactly."""
-        field = row[self.place].strip()
-        return (
-            field[:1].isdigit()
-            or (self.numeric and is_number(field, self.layout.decimal))
-            or (not self.numeric and ":" in field)
-        )
-
-    def append(self, rows: list[list[str]], lines: list[int]) -> None:
-        fields = [self.text(row) for row in rows]
-        if self.numeric:
-            self.times.append(floats(self.path, self.name, fields, self.layout.decimal, lines, {}))
-            return
-        dates = instants(
-            self.path,
-            self.name,
-            fields,
-            lines,
-            month_first=self.month_first,
-            hyphen_fraction=self.hyphen_fraction,
-            after=self.latest,
-        )
-        self.times.append(dates.ns)
-        self.latest = int(dates.ns[-1])
-        self.zoned, self.dated = self.zoned and dates.zoned, dates.dated
-
-    def take(self, times: np.ndarray, zoned: bool) -> None:
-        """The times that Arrow read."""
-        self.times.append(times)
-        self.zoned = zoned
-
-    def finished(self, notes: list[Note]) -> tuple[np.ndarray, str]:
-        """time_s or time_ns (n,) and its zone."""
-        times = self.times.finished()[0]
-        if self.numeric:
-            times, remark = seconds(self.name, times, self.layout.units[self.place])
-            if remark:
-                notes.append(Note("clock", "", 1, remark))
-            return times, "UTC"
-        if not self.dated:
-            times, midnights = over_midnight(times)
-            if midnights:
-                notes.append(
-                    Note(
-                        "clock",
-                        "",
-                        midnights,
-                        f"the time of day runs over midnight {midnights} times: a day was added each time",
-                    )
-                )
-        if self.by_steps:
-            first, other = ("month", "day") if self.month_first else ("day", "month")
-            message = (
-                f"the dates of {self.name} were read with the {first} first, in which they run on in equal "
-                f"steps; with the {other} first they do not"
-            )
-            notes.append(Note("clock", "", 1, message))
-        if self.by_language:
-            message = f"the dates of {self.name} were read with the day first, as its language writes them"
-            notes.append(Note("clock", "", 1, message))
-        return times, "UTC" if self.zoned else ""
+def _calendar_times(
+    path: Path, clock: Clock, texts: list[str], lines: np.ndarray, names: Sequence[str], notes: list[Note]
+) -> tuple[np.ndarray, str]:
+    """time_ns (n,) of texts, and its zone. The order of day and month is that which some date proves, or
+    else the one in which the times run on in equal steps, or else that of the language of the names."""
+    dates = set()
+    if re.match(r"\s*\d{1,2}[/-]\d{1,2}[/-]\d", texts[0]):
+        dates = {text.split()[0] for text in texts}
+    order, reason = month_first(dates, texts[0]), ""
+    if dates and order is None and (order := steady_order(texts)) is not None:
+        first, other = ("month", "day") if order else ("day", "month")
+        reason = f"{first} first, in which they run on in equal steps; with the {other} first they do not"
+    own_names = [clock.name] if clock.date is None else [clock.name, names[clock.date]]
+    if dates and order is None and writes_day_first(own_names):
+        order, reason = False, "day first, as its language writes them"
+    times, zoned, dated = instants(
+        path, clock.name, texts, lines, month_first=order, hyphen_fraction=clock.hyphen_fraction
+    )
+    if not dated:
+        times, midnights = over_midnight(times)
+        if midnights:
+            message = f"the time of day runs over midnight {midnights} times: a day was added each time"
+            notes.append(Note("clock", "", midnights, message))
+    if reason:
+        notes.append(Note("clock", "", 1, f"the dates of {clock.name} were read with the {reason}"))
+    return times, "UTC" if zoned else ""

@@ -507,6 +507,20 @@ def seconds(name: str, numbers: np.ndarray, written: str = "") -> tuple[np.ndarr
     return numbers, ""
 
 
+def clock_seconds(
+    path: Path, name: str, numbers: np.ndarray, unit: str, notes: list[Note], *, is_declared: bool
+) -> np.ndarray:
+    """The column of the time in seconds (n,); a guessed unit is noted. Raises ValueError for numbers that may
+    be fractions of a day, and, unless the column was declared, for an index that counts the rows."""
+    times, remark = seconds(name, numbers, unit)
+    if remark:
+        notes.append(Note("clock", "", 1, remark))
+    _check_no_day_fractions(path, name, times, unit)
+    if not is_declared:
+        _check_no_counter(path, name, times)
+    return times
+
+
 def _in_days(interval: float) -> bool:
     """Whether an interval is in days: up to 8 s, or whole seconds up to a minute. In seconds it would be
     11 kHz, or a rate that no such machine has: 1 kHz would be 86.4 s."""
@@ -514,7 +528,7 @@ def _in_days(interval: float) -> bool:
     return 0 < in_seconds < 8 or (in_seconds < 61 and abs(in_seconds - round(in_seconds)) < 0.02)
 
 
-def check_no_counter(path: Path, name: str, time: np.ndarray) -> None:
+def _check_no_counter(path: Path, name: str, time: np.ndarray) -> None:
     """Raises ValueError where an index that nobody named as the time counts the rows."""
     if name in INDEX_NAMES and time[0] in (0, 1) and (np.diff(time) == 1).all():
         raise ValueError(
@@ -523,7 +537,7 @@ def check_no_counter(path: Path, name: str, time: np.ndarray) -> None:
         )
 
 
-def check_no_day_fractions(path: Path, name: str, time: np.ndarray, written: str = "") -> None:
+def _check_no_day_fractions(path: Path, name: str, time: np.ndarray, written: str) -> None:
     """Raises ValueError where a time without a unit may be the fraction of a day that spreadsheets write for
     a time of day, or a Julian date: as seconds, it would have more than 11,000 samples a second."""
     if _time_unit(name)[1] or written.strip(" ()[]").casefold() in _PER_SECOND or len(time) < 3:
@@ -682,29 +696,29 @@ def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> t
     elif table.time is not None and not time:
         clock, zone = table.time, table.zone
     else:
-        clock, zone, remark = _clock(path, table, names, time)
-        notes += [Note("clock", "", 1, remark)] if remark else []
+        clock, zone = _clock(path, table, names, time, notes)
     values = {name: table.values[name] for name in wanted}
     columns, turned = forward(FileColumns("rows", clock, values, table.place, zone, table.units))
     return columns, notes + turned
 
 
-def _clock(path: Path, table: WholeTable, names: Sequence[str], time: str) -> tuple[np.ndarray, str, str]:
-    """(time, zone, remark) of the column that `time` names, or of the first with the name of a time."""
+def _clock(
+    path: Path, table: WholeTable, names: Sequence[str], time: str, notes: list[Note]
+) -> tuple[np.ndarray, str]:
+    """(time, zone) of the column that `time` names, or of the first with the name of a time."""
     if not time and table.stamps:
         called = [name for name in (*table.stamps, *table.values) if _is_clock_name(name)]
         time = time_column(path, called, "") if called else next(iter(table.stamps))
     name = time_column(path, names, time)
     if name in table.stamps:
-        return table.stamps[name], "", ""
+        return table.stamps[name], ""
     if name not in table.values:
         raise ValueError(
             f"{path}: time {name} should be seconds or a date but holds {table.others[name]}; convert it, "
             "or name another column"
         )
-    clock, remark = seconds(name, table.values[name], table.units.get(name, ""))
-    check_no_day_fractions(path, name, clock, table.units.get(name, ""))
-    return clock, "UTC", remark
+    unit = table.units.get(name, "")
+    return clock_seconds(path, name, table.values[name], unit, notes, is_declared=bool(time)), "UTC"
 
 
 def _is_clock_name(name: str) -> bool:

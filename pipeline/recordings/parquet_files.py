@@ -14,13 +14,11 @@ from pipeline.recordings.formats import (
     FileColumns,
     Growing,
     Note,
-    check_no_counter,
-    check_no_day_fractions,
+    clock_seconds,
     column_places,
     every,
     forward,
     is_time_name,
-    seconds,
     time_column,
 )
 from pipeline.recordings.instants import instants
@@ -139,16 +137,11 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[FileColu
     zoned = clock and kinds[clock] is np.int64 and getattr(types[clock], "tz", None)
     zone = "UTC" if zoned or not clock or kinds[clock] is float else ""
     if interval:
-        clock_values, remark = np.arange(count) * interval, ""
+        clock_values = np.arange(count) * interval
+    elif _is_numeric(types[clock]) and kinds[clock] is float:
+        clock_values = clock_seconds(path, clock, values[clock], units[clock], notes, is_declared=bool(time))
     else:
-        is_time = kinds[clock] is np.int64 or not _is_numeric(types[clock])
-        clock_values, remark = (values[clock], "") if is_time else seconds(clock, values[clock], units[clock])
-        if _is_numeric(types[clock]):
-            check_no_day_fractions(path, clock, clock_values, units[clock])
-        if not time and _is_numeric(types[clock]):
-            check_no_counter(path, clock, clock_values)
-    if remark:
-        notes.append(Note("clock", "", 1, remark))
+        clock_values = values[clock]
     table_columns, turned = forward(
         FileColumns(
             "rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone, units

@@ -105,9 +105,9 @@ def read_folder(
     if not files and growing:
         raise ValueError(f"{growing[0]} {_GROWING}")
     if not files:
-        held = f" but {partial[0].name}, which {_PARTIAL}" if partial else ""
+        beside = f" but {partial[0].name}, which {_PARTIAL}" if partial else ""
         raise ValueError(
-            f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none{held}; copy one "
+            f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none{beside}; copy one "
             "there, or set generate_probing.source: simulated"
         )
     code = "".join(artifacts.sha256(path) for pattern in READING for path in sorted(CODE.glob(pattern)))
