@@ -78,37 +78,12 @@ def read_folder(
     ago is waited for, ten seconds at most, and passed over if it changes meanwhile. Raises ValueError if
     there is no recording.
     """
-    plain_files.check_plain_files(folder)
-    bags = {path.parent for path in folder.rglob("metadata.yaml") if is_bag(path.parent)} - {folder}
-    files = sorted(
-        path
-        for path in folder.rglob("*")
-        if (path in bags or (path.is_file() and not bags & set(path.parents)))
-        and not path.name.startswith(".")
-        and path.suffix.lower() not in {".md", ".yaml", ".dvc"}
-        and path.name not in ignored
-        and path.name.lower() not in {"readme.txt", "license.txt", "source.txt", "notes.txt"}
-    )
-    files = excluded.readable(files, folder)
-    partial = [
-        RecordingTable(_utf8(path.relative_to(folder).as_posix()), {}, {}, f"{path} {_PARTIAL}", False, True)
-        for path in files
-        if plain_files.is_partial(path.name)
-    ]
-    files = [path for path in files if not plain_files.is_partial(path.name)]
-    growing = plain_files.wait_until_still(files) if waits else []
-    partial += [
-        RecordingTable(_utf8(path.relative_to(folder).as_posix()), {}, {}, f"{path} {_GROWING}", False, True)
-        for path in growing
-    ]
-    files = [path for path in files if path not in growing]
-    if not files and growing:
-        raise ValueError(f"{growing[0]} {_GROWING}")
+    files, passed = _recordings_below(folder, ignored, waits=waits)
     if not files:
-        beside = f" but {partial[0].name}, which {_PARTIAL}" if partial else ""
+        reason = f" but {next(iter(passed.values()))}" if passed else ""
         raise ValueError(
-            f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none{beside}; copy one "
-            "there, or set generate_probing.source: simulated"
+            f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none{reason}; "
+            "copy one there, or set generate_probing.source: simulated"
         )
     code = "".join(artifacts.sha256(path) for pattern in READING for path in sorted(CODE.glob(pattern)))
     hashes = [artifacts.sha256(path) for path in files]
@@ -127,15 +102,37 @@ def read_folder(
     reasons = left_out | dict(
         zip([path for path, _ in todo], _run(todo, folder, wish, execution, (memo, budget)), strict=True)
     )
-    return [
-        *(
-            _result(
-                name, entry or _remembered(memo, key, wish), _utf8(reasons.get(path, "")), entry is not None
-            )
-            for path, name, key, entry in zip(files, names, keys, remembered, strict=True)
-        ),
-        *partial,
+    results = [
+        _result(name, entry or _remembered(memo, key, wish), _utf8(reasons.get(path, "")), entry is not None)
+        for path, name, key, entry in zip(files, names, keys, remembered, strict=True)
     ]
+    return results + [
+        RecordingTable(_utf8(path.relative_to(folder).as_posix()), {}, {}, _utf8(reason), False, True)
+        for path, reason in passed.items()
+    ]
+
+
+def _recordings_below(
+    folder: Path, ignored: Collection[str], *, waits: bool
+) -> tuple[list[Path], dict[Path, str]]:
+    """The recordings below a folder, and {path: reason} of copies that are not complete."""
+    plain_files.check_plain_files(folder)
+    bags = {path.parent for path in folder.rglob("metadata.yaml") if is_bag(path.parent)} - {folder}
+    files = sorted(
+        path
+        for path in folder.rglob("*")
+        if (path in bags or (path.is_file() and not bags & set(path.parents)))
+        and not path.name.startswith(".")
+        and path.suffix.lower() not in {".md", ".yaml", ".dvc"}
+        and path.name not in ignored
+        and path.name.lower() not in {"readme.txt", "license.txt", "source.txt", "notes.txt"}
+    )
+    files = excluded.readable(files, folder)
+    passed = {path: f"{path} {_PARTIAL}" for path in files if plain_files.is_partial(path.name)}
+    files = [path for path in files if path not in passed]
+    growing = plain_files.wait_until_still(files) if waits else []
+    passed |= {path: f"{path} {_GROWING}" for path in growing}
+    return [path for path in files if path not in passed], passed
 
 
 def _copies(files: Sequence[Path], hashes: Sequence[str]) -> dict[Path, str]:

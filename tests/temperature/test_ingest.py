@@ -292,14 +292,16 @@ def test_a_recording_that_was_copied_a_moment_ago_is_read_when_it_has_rested(tmp
         plain_files.time, "sleep", lambda _: (raw / "000.csv").write_text("time_s,heater,zone\n")
     )
     os.utime(raw / "000.csv")
-    with pytest.raises(ValueError, match=r"000\.csv is still being written; wait until its copy is complete"):
+    with pytest.raises(
+        ValueError, match=r"found none but .*000\.csv is still being written; wait until its copy"
+    ):
         ingested(raw, tmp_path, waits=True)
 
 
 def test_a_folder_of_copies_that_are_not_complete_has_no_recording(tmp_path):
     (tmp_path / "raw").mkdir()
     (tmp_path / "raw/rig.csv.part").write_bytes(b"half")
-    with pytest.raises(ValueError, match=r"found none but rig\.csv\.part, which is a copy that is not comp"):
+    with pytest.raises(ValueError, match=r"found none but .*rig\.csv\.part is a copy that is not comp"):
         ingested(tmp_path / "raw", tmp_path)
 
 
