@@ -53,8 +53,8 @@ __all__ = [
 
 
 FAHRENHEIT = {"degf", "°f", "° f", "℉", "f", "fahrenheit"}
-# at the end of a column's name; a small f alone may be anything
-_NAMES_FAHRENHEIT = re.compile(r"(?:[\[(_ ](?:deg[Ff]|[Ff]ahrenheit|F)|°\s?F|℉)[\])]?$")
+# at the end of a column's name; an F without brackets is as well the sixth zone
+_NAMES_FAHRENHEIT = re.compile(r"(?:[\[(]F[\])]|(?:[\[(_ ](?:deg[Ff]|[Ff]ahrenheit)|°\s?F|℉)[\])]?)$")
 
 
 def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal: str = "") -> Raw:

@@ -382,6 +382,12 @@ def test_a_column_in_fahrenheit_is_not_taken_as_celsius(tmp_path, name):
     read(path, [Source("zone", name, "degF")])
 
 
+@pytest.mark.parametrize("name", ["Zone F", "zone_F", "T1 (°C)"])
+def test_an_f_at_the_end_of_a_name_is_no_unit_without_brackets(tmp_path, name):
+    path = write(tmp_path, f"time_s,{name}\n" + "".join(f"{i},{v}\n" for i, v in enumerate(ZONE)))
+    np.testing.assert_array_equal(zone(path, source=name)[1], ZONE)
+
+
 def test_fahrenheit_in_the_cells_in_a_row_of_units_and_in_other_formats_is_refused_too(tmp_path):
     cells = "time_s,T1\n" + "".join(f"{i},{v:.2f} °F\n" for i, v in enumerate(FAHRENHEIT))
     units = "time,T1\ns,°F\n" + "".join(f"{i},{v:.2f}\n" for i, v in enumerate(FAHRENHEIT))
