@@ -770,7 +770,7 @@ _NAMING = (
 _VARIABLE, _TEXT, _VALUE, _VALID, _DAYS = "VarName", "TimeString", "VarValue", "Validity", "Time_ms"
 _EVENT = "$"
 # 1970-01-01 in days since 1899-12-30; Time_ms counts millionths of a day
-_EPOCH_DAY = 25_569
+_EPOCH_DAY, _LAST_DAY = 25_569, 100_000
 ROWS_AT_ONCE = 20_000
 # the time of an export in seconds, by what its interval is of SampleTime[ms]
 _SCOPE_UNITS = {1.0: 1e-3, 1e-3: 1.0, 1e3: 1e-6, 1e4: 1e-7, 1e6: 1e-9}
@@ -824,6 +824,11 @@ def read_long(path: Path, layout: CsvLayout, wanted: Sequence[str]) -> tuple[lis
         message = f"{events.total()} rows are events of the panel ({', '.join(sorted(events))}), no values"
         notes.append(Note("events", "", events.total(), message))
     masks = {name: owners == code for name, code in codes.items()}
+    empty = [name for name, own in masks.items() if not own.any()]
+    if empty:
+        raise ValueError(
+            f"{path}: {empty[0]} should have values but no whole row holds one; map another variable"
+        )
     groups = [
         FileColumns(name, times[own], {name: values[own]}, _place(lines[own]), "")
         for name, own in masks.items()
@@ -842,6 +847,13 @@ def _log_times(
     if _DAYS not in fields:
         return instants(path, _TEXT, fields[_TEXT], lines, month_first=None).ns
     days = floats(path, _DAYS, list(fields[_DAYS]), layout.decimal, lines, {})
+    usable = (days > 0) & (days < _LAST_DAY * 1e6)
+    if not usable.all():
+        i = int(np.argmin(usable))
+        raise ValueError(
+            f"{path}: line {lines[i]}, time {_DAYS} should be millionths of a day since 1899-12-30 but is "
+            f"{fields[_DAYS][i][:40]!r}; mend or remove that line"
+        )
     # to the microsecond, a double's resolution there
     return np.rint((days - 1e6 * _EPOCH_DAY) * (DAY_NS / 1e9)).astype(np.int64) * 1000
 

@@ -119,6 +119,9 @@ def wait_until_still(
 
 
 def _state(path: Path) -> dict[Path, tuple[float, int]]:
-    """{file: (time of change in s, bytes)} of a file, or of those of a bag."""
+    """{file: (time of change in s, bytes)} of a file, or of those of a bag; empty if it is gone."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    return {file: (status.st_mtime, status.st_size) for file in files for status in [file.stat()]}
+    try:
+        return {file: (status.st_mtime, status.st_size) for file in files for status in [file.stat()]}
+    except OSError:
+        return {}

@@ -134,6 +134,15 @@ def test_a_file_that_changed_a_moment_ago_is_waited_for_ten_seconds_at_most(tmp_
     assert slept == [9.0]
 
 
+def test_a_file_that_is_renamed_while_it_is_waited_for_is_passed_over(tmp_path):
+    path = tmp_path / "rig.csv"
+    path.write_text("time_s,T1\n")
+    os.utime(path, (999, 999))
+    assert wait_until_still([path], rest_s=10.0, clock=lambda: 1000.0, sleep=lambda _: path.unlink()) == [
+        path
+    ]
+
+
 def test_a_bag_that_grows_is_waited_for_by_its_files(tmp_path):
     part = tmp_path / "bag/bag_0.mcap"
     part.parent.mkdir()

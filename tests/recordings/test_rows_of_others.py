@@ -326,6 +326,16 @@ def test_a_word_in_place_of_a_value_of_a_long_log_is_refused_with_its_line(tmp_p
         zone(write(tmp_path, text), source="A")
 
 
+def test_a_long_log_with_a_row_without_time_or_a_variable_without_a_whole_row_is_refused(tmp_path):
+    lines = siemens([("A", i, ZONE[i]) for i in range(40)]).splitlines(keepends=True)
+    no_time = lines[20].rpartition(";")[0] + ";\n"
+    path = write(tmp_path, "".join([*lines[:20], no_time, *lines[21:]]))
+    with pytest.raises(ValueError, match=r"line 21, time Time_ms should be millionths .* but is ''; mend"):
+        zone(path, source="A")
+    with pytest.raises(ValueError, match="B should have values but no whole row holds one; map another"):
+        zone(write(tmp_path, "".join([*lines, '"B";"21.11.2025 13:00:30"'])), source="B")
+
+
 def scope(*, unit: float = 1.0, samples_ms: tuple[int, int] = (500, 1000), mark: str = "\t") -> str:
     """An export of TwinCAT Scope: a head, then time and value of each signal; the second is half as fast."""
     head = "Name\tRig\nFile\tC:\\rig.tcscopex\nStarttime of export\t134082108000000000\tFreitag\n\n"
