@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.recordings.formats import OTHER_DEVICE_RUN, FileColumns, Note, check_clock
-from pipeline.recordings.quality import quantisation_step
+from pipeline.recordings.quality import least_change, quantisation_step
 
 HOUR_S = 3600
 # rows that came late, or had a time that another one has: more than that is another device, or no clock
@@ -325,16 +325,9 @@ def mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
 def _coarse_step(y: np.ndarray) -> float:
     """The step that a coarse sensor may explain, more than 0."""
     # over one sample and over more: with two devices in turn every change from sample to sample is a jump
-    step = min(COARSEST_STEP, *(_least_change(y, lag) for lag in (1, 2, 3)))
+    step = min(COARSEST_STEP, *(least_change(y, lag) for lag in (1, 2, 3)))
     # a converter may be coarser: its levels tell, where there are more than the two of two devices at rest
     return max(step, quantisation_step(y)) if len(np.unique(y)) > 2 else step
-
-
-def _least_change(y: np.ndarray, lag: int) -> float:
-    """The first percentile of the changes: one step of a coarse sensor, next to nothing of a fine one."""
-    changes = np.abs(y[lag:] - y[:-lag])
-    changes = changes[changes > 0]
-    return float(np.percentile(changes, 1)) if len(changes) else np.inf
 
 
 def _gaps(y: np.ndarray, starts: np.ndarray, size: int) -> np.ndarray:

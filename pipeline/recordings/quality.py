@@ -321,7 +321,7 @@ def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
     rests = rests[~_at_rail(values, table.segment, first[rests])]
     if not len(rests):
         return []
-    step, stretches = _step(values), []
+    step, stretches = least_change(values), []
     others = {other: measured(table, other) for other in table.values if other != name}
     whole = {other: _range(column) for other, column in others.items()}
     for i in rests:
@@ -339,19 +339,7 @@ def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
             message = (
                 f"{name} stays at {values[a]:g} for {b - a + 1} samples{beside}: a frozen sensor, masked"
             )
-            stretches.append(
-                (
-                    Flag(
-                        name,
-                        "frozen",
-                        float(table.time_s[a + 1]),
-                        float(table.time_s[b]),
-                        len(where),
-                        message,
-                    ),
-                    where,
-                )
-            )
+            stretches.append((_flag(table, name, "frozen", where, message), where))
     return stretches
 
 
@@ -371,7 +359,7 @@ def rails(table: Table, name: str) -> list[Flag]:
         there = np.flatnonzero((values[first] == rail) & (length > limit))
         there = there[_at_rail(values, table.segment, first[there])]
         long = list(zip(first[there].tolist(), last[there].tolist(), strict=True))
-        step = _step(values) if long else 0.0
+        step = least_change(values) if long else 0.0
         if any(_alive(_before(values, table.segment, a), step) in ("noise", "movement") for a, _ in long):
             count = sum(b - a + 1 for a, b in long)
             message = (
@@ -434,11 +422,12 @@ def _after(values: np.ndarray, segment: np.ndarray, last: int) -> np.ndarray:
     return np.diff(values[last : end + 1])
 
 
-def _step(values: np.ndarray) -> float:
-    """The smallest change but for rounding: the step of a coarse signal."""
-    changes = np.abs(np.diff(values))
+def least_change(values: np.ndarray, lag: int = 1) -> float:
+    """The first percentile of the changes over `lag` samples, infinite without changes: one step of a coarse
+    sensor, next to nothing of a fine one."""
+    changes = np.abs(values[lag:] - values[:-lag])
     changes = changes[changes > 0]
-    return float(np.percentile(changes, 1)) if len(changes) else 0.0
+    return float(np.percentile(changes, 1)) if len(changes) else np.inf
 
 
 def _alive(changes: np.ndarray, step: float) -> str:
