@@ -78,33 +78,17 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal
     named = SUFFIXES.get(path.suffix.lower(), kind)
     names = list(dict.fromkeys(source.source for source in sources))
     try:
-        if kind == "mcap":
-            with path.open("rb") as stream:
-                check_magic(path, stream.read(16))
-            columns, places, messages, notes = mcap_columns(path, names, time)
-        elif kind == "bag":
-            columns, places, messages, notes = read_bag(path, names, time)
-        else:
-            if kind == "csv":
-                columns, notes = read_groups(path, names, time, decimal)
-            elif kind in LOADERS:
-                table, notes = select(path, LOADERS[kind](path), names, time)
-                columns = [table]
-            else:
-                table, notes = read_parquet(path, names, time)
-                columns = [table]
-            places = {name: (table.name, name) for table in columns for name in table.values}
-            messages = {table.name: len(table.time) for table in columns}
-        if kind != named:
-            message = (
-                f"the file is named {path.suffix.lower()} but begins as {NAMES.get(kind, kind)} does, "
-                "and was read as that"
-            )
-            notes = [Note("format", "", 1, message), *notes]
+        columns, places, messages, notes = _file_columns(path, kind, names, time, decimal)
     except OSError as error:
         raise ValueError(
             f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
         ) from None
+    if kind != named:
+        message = (
+            f"the file is named {path.suffix.lower()} but begins as {NAMES.get(kind, kind)} does, "
+            "and was read as that"
+        )
+        notes = [Note("format", "", 1, message), *notes]
     parts = mended_topics(path, columns, one_clock=time in ("", "log_time"))
     columns = [part.columns for part in parts]
     notes += [note for part in parts for note in part.notes]
@@ -120,6 +104,29 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal
         group = next(group for group in columns if group.name == topic)
         signals[source.signal] = _signal(path, source, clocks[topic], group, group.values[field], notes)
     return Raw(str(path), signals, messages, notes, tuple(breaks))
+
+
+def _file_columns(
+    path: Path, kind: str, names: Sequence[str], time: str, decimal: str
+) -> tuple[list[FileColumns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
+    """Columns on their clocks, {source: (name of its columns, name in them)}, {name: count of messages or
+    rows} and notes of a file of that kind."""
+    if kind == "mcap":
+        with path.open("rb") as stream:
+            check_magic(path, stream.read(16))
+        return mcap_columns(path, names, time)
+    if kind == "bag":
+        return read_bag(path, names, time)
+    if kind == "csv":
+        columns, notes = read_groups(path, names, time, decimal)
+    elif kind in LOADERS:
+        table, notes = select(path, LOADERS[kind](path), names, time)
+        columns = [table]
+    else:
+        table, notes = read_parquet(path, names, time)
+        columns = [table]
+    places = {name: (table.name, name) for table in columns for name in table.values}
+    return columns, places, {table.name: len(table.time) for table in columns}, notes
 
 
 def _check_sources(path: Path, sources: Sequence[Source]) -> None:
