@@ -18,8 +18,8 @@ from pipeline.temperature import tables
 from pipeline.temperature.settings import Plant, check_output_limits
 
 if TYPE_CHECKING:
+    from pipeline.recordings.formats import Source
     from pipeline.recordings.recording_folders import RecordingWish
-    from pipeline.recordings.signals import Source
 
 
 class MappedSignal(Mapped):
@@ -65,6 +65,7 @@ def main() -> None:
             memo=Path("datasets/memo/ingest"),
             budget=Budget(settings.longest_s, settings.largest_mb),
             ignored=ignored,
+            waits=source == "recordings",
         )
         strict = settings.strict or "--strict" in sys.argv
         record, quality, figures = recording_folders.join(results, wish, strict=strict)
@@ -98,7 +99,7 @@ def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, MappedSi
 def sources(machine: Plant, mapping: dict[str, MappedSignal]) -> tuple[Source, ...]:
     """Where a recording has the signals of the machine: by `mapping`, else under their own names. Raises
     ValueError for a mapping of no signal, of another unit, or with a set-point of what is no output."""
-    from pipeline.recordings.signals import Source, nearest_names
+    from pipeline.recordings.formats import Source, nearest_names
 
     signals = [*machine.acting, *machine.outputs]
     unknown = sorted(set(mapping) - {signal.name for signal in signals})

@@ -351,6 +351,8 @@ def record_segments(
     )
     segments = {}
     for result in results:
+        if result.passed_over:
+            continue
         if result.reason:
             if broken is None:
                 raise ValueError(result.reason)

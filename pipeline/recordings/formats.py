@@ -1,15 +1,177 @@
-"""The format of a recording, and what all formats share: columns on a clock, and which column is the time."""
+"""The format of a recording, and what all formats share: the records that pass between a file and the
+learners, columns on a clock, which column is the time, and tables that are small enough to be read whole."""
 
 import collections
+import difflib
 import re
-from collections.abc import Callable, Sequence
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.recordings.signals import Note, nearest_names
-from pipeline.recordings.signatures import is_bag, other_format
+
+class Source(NamedTuple):
+    """`signal` in `unit` is `scale` value + `offset` of the recording's `source`.
+
+    A source is a column, or "/topic:field.sub[2]" in MCAP. There a bare name is the field of that name in the
+    only topic that has it.
+    """
+
+    signal: str
+    source: str
+    unit: str
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+class Note(NamedTuple):
+    """A remark of the reader on `count` messages, chunks, values or lines. `signal` is empty for the whole
+    recording."""
+
+    kind: str
+    signal: str
+    count: int
+    message: str
+
+
+class Raw(NamedTuple):
+    """A recording as it was made: {signal: (time_s (n,), values (n,))} with a clock each. A missing value is
+    NaN.
+
+    `messages` has the count of each topic's messages, or of the rows. `breaks` are the times at which the
+    clock had started over: nothing is held or interpolated from before to behind one.
+    """
+
+    path: str
+    signals: dict[str, tuple[np.ndarray, np.ndarray]]
+    messages: dict[str, int]
+    notes: list[Note]
+    breaks: tuple[float, ...] = ()
+
+
+class Flag(NamedTuple):
+    """A finding: what (`kind`), where (start_s to end_s), how many samples, and one sentence. `signal` is
+    empty for the whole recording."""
+
+    signal: str
+    kind: str
+    start_s: float
+    end_s: float
+    count: int
+    message: str
+
+
+class Jitter(NamedTuple):
+    """Intervals of one clock without those across gaps: their median, and the deviation from it (standard and
+    largest)."""
+
+    interval_s: float
+    std_s: float
+    max_s: float
+
+
+class Table(NamedTuple):
+    """A recording on one sample time: T samples in segments without a gap.
+
+    `values` are as measured, never altered. `masked` marks those that are not to be used. `jitter` is that of
+    each signal's own clock before resampling.
+    """
+
+    recording: str
+    segment: np.ndarray
+    time_s: np.ndarray
+    values: dict[str, np.ndarray]
+    masked: dict[str, np.ndarray]
+    flags: list[Flag]
+    jitter: dict[str, Jitter]
+
+
+def measured(table: Table, name: str) -> np.ndarray:
+    """The values (T,) of a signal, NaN where it is masked; no copy where nothing is."""
+    masked = table.masked[name]
+    return np.where(masked, np.nan, table.values[name]) if masked.any() else table.values[name]
+
+
+# comparing names takes 10 us each
+MOST_COMPARED = 50_000
+
+
+def nearest_names(name: str, names: Iterable[str]) -> str:
+    """ "the nearest names are a, b": names like `name`, or the first ten that there are."""
+    names = sorted(set(names))
+    if not names:
+        return "it has none that can be read as a number"
+    if len(names) > MOST_COMPARED:
+        return f"it has {', '.join(names[:10])} and {len(names) - 10} more"
+    # "/topic:field" is found by its field alone too
+    aliases = [
+        (part, full)
+        for full in names
+        for part in sorted({full.casefold(), full.casefold().rpartition(":")[2]})
+    ]
+    close = difflib.get_close_matches(name.casefold(), sorted({part for part, _ in aliases}), n=3, cutoff=0.5)
+    close += [name.casefold().rpartition(":")[2]]
+    close = list(dict.fromkeys(full for wanted in close for part, full in aliases if part == wanted))
+    if close:
+        return f"the nearest names are {', '.join(close[:5])}"
+    return f"it has {', '.join(names[:10])}{' and more' if len(names) > 10 else ''}"
+
+
+def intervals(time_s: np.ndarray, gap_limit_s: float = np.inf) -> Jitter:
+    """Jitter of a clock time_s (n,), n >= 2, from the intervals up to `gap_limit_s`."""
+    steps = np.diff(time_s)
+    inside, median = steps <= gap_limit_s, np.median(steps)
+    if inside.all() or not inside.any():
+        deviation = steps - median
+    else:
+        deviation = steps[inside] - np.median(steps[inside])
+    return Jitter(float(median), float(deviation.std()), float(np.abs(deviation).max()))
+
+
+# the configuration that a klippy.log begins with after a rollover has some 30 kB
+OPENING_BYTES = 1 << 17
+METADATA = "metadata.yaml"
+_KLIPPY = (b"Starting Klippy", b"Start printer at", b"===== Config file =====", b"== Log rollover at")
+_STATS = re.compile(rb"^(INFO:root:)?Stats \d+\.\d+: .*=", re.MULTILINE)
+# OctoPrint's serial.log, with a firmware's temperature report among its first lines
+_REPORT = re.compile(rb"^.*\bRecv:.*[\s:]T\d?:\s*-?\d", re.MULTILINE)
+_SERIAL = re.compile(rb"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} - (Recv|Send|Changing|Connect)", re.MULTILINE)
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a folder is a ROS 2 bag."""
+    return path.is_dir() and (path / METADATA).is_file()
+
+
+def other_format(path: Path, start: bytes) -> str:
+    """ "xlsx", "MATLAB", "Moonraker JSON", "klippy.log" or "serial.log", by the first 512 bytes and, of a
+    text, what follows; "" for anything else."""
+    if start.startswith(b"PK\x03\x04"):
+        return "xlsx" if _is_workbook(path) else ""
+    if start.startswith(b"MATLAB 5.0"):
+        return "MATLAB"
+    if b"\0" in start:
+        return ""
+    with path.open("rb") as stream:
+        opening = stream.read(OPENING_BYTES)
+    if opening.lstrip()[:1] == b"{":
+        return "Moonraker JSON" if b'"temperatures"' in opening else ""
+    if any(mark in opening for mark in _KLIPPY) or _STATS.search(opening):
+        return "klippy.log"
+    return "serial.log" if _REPORT.search(opening) or _SERIAL.match(opening) else ""
+
+
+def _is_workbook(path: Path) -> bool:
+    """Whether a zip file is a workbook; of a damaged one the name tells."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return "xl/workbook.xml" in archive.namelist()
+    except (zipfile.BadZipFile, OSError, NotImplementedError, ValueError):
+        return path.suffix.casefold() in (".xlsx", ".xlsm")
+
 
 # a number beyond the first of each row is no time in seconds but an epoch in ms, us, ns, or 100 ns as Windows
 # counts from 1601 (1e11 s is the year 5138)
@@ -19,6 +181,8 @@ _EPOCHS = (
     (1e14, 1e6, 0, "us"),
     (1e11, 1e3, 0, "ms"),
 )
+# ticks of .NET, 100 ns since the year 1, from 1965 to 2124; in ns since 1970 that would be 1989 to 1991
+_TICKS, _SINCE_YEAR_1_S = (6.2e17, 6.7e17), 62_135_596_800
 # seconds since 1904, as LabVIEW counts, from 2015 to 2040
 _SINCE_1904_S, _LABVIEW = 2_082_844_800, (3.5e9, 4.3e9)
 # days since 1899-12-30 (since 1904 where the column says so) and since the year 0, from 1954 to 2119, and
@@ -46,6 +210,9 @@ _TIME_NAMES = (
     "zeitstempel",
     "zeit",
     "uhrzeit",
+    "heure",
+    "hora",
+    "ora",
     "x_value",
     "epoch",
     "unix_time",
@@ -56,9 +223,13 @@ _TIME_NAMES = (
     "tout",
     "date",
     "datum",
+    "fecha",
     "index",
 )
-DATE_NAMES = ("date", "datum")
+# Italian "data" is a date beside a time of day alone
+DATE_NAMES = ("date", "datum", "fecha", "data")
+# names of dates and times in languages that write the day before the month
+_DAY_FIRST = ("datum", "fecha", "data", "heure", "hora", "ora", "uhrzeit", "zeit", "zeitstempel")
 # times from a start, which no date beside them belongs to
 _ELAPSED = ("elapsed", "elapsed_time", "relative_time", "uptime", "runtime")
 # what pandas calls the index of a table where nobody named it
@@ -73,6 +244,12 @@ _PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0,
 _COUNTS = {"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds": "us", "nanoseconds": "ns"}
 
 _PARQUET = b"PAR1"
+# the format that a name promises, and how a format is called
+SUFFIXES = {".csv": "csv", ".parquet": "parquet", ".xlsx": "xlsx", ".mat": "MATLAB"}
+NAMES = {"csv": "CSV", "parquet": "Parquet", "mcap": "MCAP"}
+# text has tabs, line ends and form feeds, and sometimes the end mark of an old system; other control
+# characters are of binary files
+CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f\x1a"))
 _OTHER_FORMATS = {
     b"\x1f\x8b": ("gzip", "unpack it with gunzip"),
     b"PK\x03\x04": ("a zip file", "unpack it, or save the sheet as .xlsx or CSV"),
@@ -105,7 +282,7 @@ class FileColumns(NamedTuple):
     """Columns on one clock.
 
     `time` is time_s (n,), or time_ns (n,) on a calendar. `place(i)` names the place of sample i in the file.
-    `zone` is the calendar's zone, empty if the file does not give it.
+    `zone` is the calendar's zone, empty if the file does not give it; `units` are those that it gives.
     """
 
     name: str
@@ -113,6 +290,7 @@ class FileColumns(NamedTuple):
     values: dict[str, np.ndarray]
     place: Callable[[int], str]
     zone: str = "UTC"
+    units: Mapping[str, str] = MappingProxyType({})
 
 
 class FileColumn(NamedTuple):
@@ -158,7 +336,7 @@ class Growing:
 
 def file_format(path: Path) -> str:
     """ "mcap", "parquet", "csv", "bag" or a name of `LOADERS`, by the first bytes.
-    Text is "csv", but text named .mcap or .parquet is refused.
+    Text is "csv", but text named .mcap is refused.
 
     Raises ValueError for any other format.
     """
@@ -191,7 +369,8 @@ def file_format(path: Path) -> str:
             f"{path} begins with {len(start)} zero bytes but should be MCAP, Parquet or CSV; "
             "copy the recording again"
         )
-    if path.suffix in (".mcap", ".parquet"):
+    is_binary = len(start) - len(start.translate(None, CONTROL)) > len(start) // 100
+    if path.suffix == ".mcap" or (path.suffix == ".parquet" and is_binary):
         raise ValueError(
             f"{path}: the bytes at offset 0 are {start[:8].hex(' ')}, "
             f"which begin no {path.suffix[1:]} file; copy the recording again as binary, "
@@ -282,6 +461,11 @@ def date_column(names: Sequence[str], clock: str) -> str | None:
     return next((name for name in names if name != clock and _time_unit(name)[0] in DATE_NAMES), None)
 
 
+def writes_day_first(names: Iterable[str]) -> bool:
+    """Whether a column of a time or a date is named in a language that writes the day before the month."""
+    return any(_time_unit(name)[0] in _DAY_FIRST for name in names)
+
+
 def seconds(name: str, numbers: np.ndarray, written: str = "") -> tuple[np.ndarray, str]:
     """Time in seconds, and a remark if the unit was guessed.
 
@@ -293,6 +477,9 @@ def seconds(name: str, numbers: np.ndarray, written: str = "") -> tuple[np.ndarr
         return numbers / _PER_SECOND[unit], ""
     finite = numbers[np.isfinite(numbers)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
+    if _TICKS[0] < low and high < _TICKS[1]:
+        remark = f"column {name} was taken as ticks of .NET (100 ns since the year 1)"
+        return numbers / 1e7 - _SINCE_YEAR_1_S, remark
     for limit, per_second, epoch, unit in _EPOCHS:
         if high > limit:
             return (
@@ -320,6 +507,20 @@ def seconds(name: str, numbers: np.ndarray, written: str = "") -> tuple[np.ndarr
     return numbers, ""
 
 
+def clock_seconds(
+    path: Path, name: str, numbers: np.ndarray, unit: str, notes: list[Note], *, is_declared: bool
+) -> np.ndarray:
+    """The column of the time in seconds (n,); a guessed unit is noted. Raises ValueError for numbers that may
+    be fractions of a day, and, unless the column was declared, for an index that counts the rows."""
+    times, remark = seconds(name, numbers, unit)
+    if remark:
+        notes.append(Note("clock", "", 1, remark))
+    _check_no_day_fractions(path, name, times, unit)
+    if not is_declared:
+        _check_no_counter(path, name, times)
+    return times
+
+
 def _in_days(interval: float) -> bool:
     """Whether an interval is in days: up to 8 s, or whole seconds up to a minute. In seconds it would be
     11 kHz, or a rate that no such machine has: 1 kHz would be 86.4 s."""
@@ -327,7 +528,7 @@ def _in_days(interval: float) -> bool:
     return 0 < in_seconds < 8 or (in_seconds < 61 and abs(in_seconds - round(in_seconds)) < 0.02)
 
 
-def check_no_counter(path: Path, name: str, time: np.ndarray) -> None:
+def _check_no_counter(path: Path, name: str, time: np.ndarray) -> None:
     """Raises ValueError where an index that nobody named as the time counts the rows."""
     if name in INDEX_NAMES and time[0] in (0, 1) and (np.diff(time) == 1).all():
         raise ValueError(
@@ -336,7 +537,7 @@ def check_no_counter(path: Path, name: str, time: np.ndarray) -> None:
         )
 
 
-def check_no_day_fractions(path: Path, name: str, time: np.ndarray, written: str = "") -> None:
+def _check_no_day_fractions(path: Path, name: str, time: np.ndarray, written: str) -> None:
     """Raises ValueError where a time without a unit may be the fraction of a day that spreadsheets write for
     a time of day, or a Julian date: as seconds, it would have more than 11,000 samples a second."""
     if _time_unit(name)[1] or written.strip(" ()[]").casefold() in _PER_SECOND or len(time) < 3:
@@ -437,3 +638,107 @@ def every(time: str) -> float | None:
 # a clock that begins later than three years is one of the calendar; it is counted from the record's first
 # whole second, so that floats hold nanoseconds
 CALENDAR_S = 1e8
+
+
+# what is unpacked of one spreadsheet or MATLAB file, in bytes; a print log of a day has 100 MB
+LARGEST_UNPACKED = 1 << 29
+MOST_COLUMNS = 2000
+# numbers of one table: 0.8 GB
+MOST_VALUES = 100_000_000
+
+
+class WholeTable(NamedTuple):
+    """Numbers of n rows by name, with the unit that the file gives ("" for none).
+
+    `time` is the file's own clock, time_s (n,) or time_ns (n,) on a calendar, None where a column holds it.
+    `limits` are the lowest and highest value that the machine's own settings allow, by column.
+    `others` are the columns that are no numbers, with what they hold.
+    """
+
+    values: dict[str, np.ndarray]
+    units: dict[str, str]
+    time: np.ndarray | None
+    zone: str
+    place: Callable[[int], str]
+    notes: list[Note]
+    limits: dict[str, tuple[float, float]]
+    others: dict[str, str]
+    stamps: dict[str, np.ndarray]
+
+    def columns(self) -> list[FileColumn]:
+        """The columns as `inspect` lists them."""
+        return [
+            *(FileColumn(name, "number", self.units.get(name, "")) for name in self.values),
+            *(FileColumn(name, "time", "") for name in self.stamps),
+            *(FileColumn(name, kind, "") for name, kind in self.others.items()),
+        ]
+
+
+def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> tuple[FileColumns, list[Note]]:
+    """The wanted columns on the clock that `time` names: "" for the table's own, a column, or "every 1 s".
+
+    Raises ValueError for a column that is missing or holds no numbers, and for a table without rows.
+    """
+    names = [column.name for column in table.columns()]
+    column_places(path, names, wanted)
+    for name in wanted:
+        if name not in table.values:
+            raise ValueError(
+                f"{path}: column {name} should hold numbers but holds {table.others.get(name, 'times')}; "
+                "write numbers, or map another column"
+            )
+    count = len(next(iter(table.values.values()), ()))
+    if not count:
+        raise ValueError(f"{path}: the table should have rows but has none; record it again or remove it")
+    interval, notes = every(time), list(table.notes)
+    if interval:
+        clock, zone = np.arange(count) * interval, ""
+    elif table.time is not None and not time:
+        clock, zone = table.time, table.zone
+    else:
+        clock, zone = _clock(path, table, names, time, notes)
+    values = {name: table.values[name] for name in wanted}
+    columns, turned = forward(FileColumns("rows", clock, values, table.place, zone, table.units))
+    return columns, notes + turned
+
+
+def _clock(
+    path: Path, table: WholeTable, names: Sequence[str], time: str, notes: list[Note]
+) -> tuple[np.ndarray, str]:
+    """(time, zone) of the column that `time` names, or of the first with the name of a time."""
+    if not time and table.stamps:
+        called = [name for name in (*table.stamps, *table.values) if _is_clock_name(name)]
+        time = time_column(path, called, "") if called else next(iter(table.stamps))
+    name = time_column(path, names, time)
+    if name in table.stamps:
+        return table.stamps[name], ""
+    if name not in table.values:
+        raise ValueError(
+            f"{path}: time {name} should be seconds or a date but holds {table.others[name]}; convert it, "
+            "or name another column"
+        )
+    unit = table.units.get(name, "")
+    return clock_seconds(path, name, table.values[name], unit, notes, is_declared=bool(time)), "UTC"
+
+
+def _is_clock_name(name: str) -> bool:
+    """Whether a column beside dates is called like a time, and neither like a temperature nor a counter."""
+    return is_time_name(name) and name not in ("T", *INDEX_NAMES)
+
+
+def check_values(path: Path, rows: int, columns: int) -> None:
+    """Raises ValueError for a table of more numbers than fit into memory."""
+    if rows * columns > MOST_VALUES:
+        raise ValueError(
+            f"{path}: {rows} rows of {columns} columns are more than the {MOST_VALUES} numbers "
+            "that are read; split the recording"
+        )
+
+
+def check_width(path: Path, count: int) -> None:
+    """Raises ValueError for a table of more columns than a machine has signals."""
+    if count > MOST_COLUMNS:
+        raise ValueError(
+            f"{path}: {count} columns are more than the {MOST_COLUMNS} that are read; "
+            "save the machine's signals alone"
+        )

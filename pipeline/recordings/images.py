@@ -33,7 +33,7 @@ import orjson
 from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
-from pipeline.recordings.formats import CALENDAR_S, FileColumns, check_clock, file_format
+from pipeline.recordings.formats import CALENDAR_S, FileColumns, Note, Source, check_clock, file_format
 from pipeline.recordings.mcap_files import (
     CHUNK,
     MESSAGE,
@@ -47,7 +47,6 @@ from pipeline.recordings.mcap_files import (
     unpack_chunk,
 )
 from pipeline.recordings.messages import Channel, UnreadableMessage, message_reader, message_types, plain
-from pipeline.recordings.signals import Note, Source
 from pipeline.store.artifacts import beside
 
 # the fields of each message in the order of the wire: b bytes, s text, I and B whole numbers

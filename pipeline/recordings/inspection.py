@@ -15,9 +15,12 @@ from pipeline.recordings.csv_files import csv_columns, csv_layout, read_csv
 from pipeline.recordings.formats import (
     FileColumn,
     FileColumns,
+    Note,
     check_clock,
     file_format,
+    intervals,
     is_time_name,
+    select,
     time_column,
 )
 from pipeline.recordings.mcap_files import Topic, bag_parts, joined, merged, survey
@@ -35,8 +38,6 @@ from pipeline.recordings.proposals import (
 )
 from pipeline.recordings.quality import quantisation_step
 from pipeline.recordings.resampling import GAP_INTERVALS
-from pipeline.recordings.signals import Note, intervals
-from pipeline.recordings.whole_tables import select
 
 # numbers of a topic, and columns of a table, that are described; the others are counted
 MOST_FIELDS, MOST_SIGNALS = 64, 128

@@ -58,24 +58,28 @@ def is_compact(text: str) -> bool:
     return bool(_COMPACT.match(text))
 
 
+def is_date(text: str) -> bool:
+    """Whether a text begins with a date."""
+    return bool(re.match(rf"\s*{_DATE}", text))
+
+
 def instants(
     path: Path,
     name: str,
     fields: Sequence[str],
-    lines: Sequence[int],
+    lines: Sequence[int] | np.ndarray,
     *,
     month_first: bool | None,
     hyphen_fraction: bool = False,
-    after: int | None = None,
 ) -> Instants:
     """The instants that `fields` name. `month_first` decides 05/03/2025; None refuses it. `hyphen_fraction`
     decides 13:12:54-05: five hundredths of a second, else five hours west.
 
-    The hour that the end of summer time in Europe/Berlin repeats is its second one behind the instant `after`
-    or that of the field before. Raises ValueError with the line of a field that is no time.
+    The hour that the end of summer time in Europe/Berlin repeats is its second one behind the instant of the
+    field before. Raises ValueError with the line of a field that is no time.
     """
     ns = np.empty(len(fields), np.int64)
-    zoned, dated = True, False
+    zoned, dated, after = True, False, None
     for i, (field, line) in enumerate(zip(fields, lines, strict=True)):
         try:
             written = _HYPHEN.sub(r"\1.\2", field) if hyphen_fraction else field

@@ -14,8 +14,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from pipeline.recordings.signals import Note
-from pipeline.recordings.whole_tables import WholeTable, check_values
+from pipeline.recordings.formats import Note, WholeTable, check_values
 
 # Stats lines have some 1,500 characters; a longer line is no line of Klipper's
 LONGEST_LINE = 1 << 16

@@ -13,14 +13,15 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from pipeline.recordings.formats import is_time_name, seconds
-from pipeline.recordings.signals import Note
-from pipeline.recordings.whole_tables import (
+from pipeline.recordings.formats import (
     LARGEST_UNPACKED,
     MOST_VALUES,
+    Note,
     WholeTable,
     check_values,
     check_width,
+    is_time_name,
+    seconds,
 )
 
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}

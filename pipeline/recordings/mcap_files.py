@@ -24,7 +24,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
-from pipeline.recordings.formats import FileColumns, Growing, seconds
+from pipeline.recordings.formats import METADATA, FileColumns, Growing, Note, nearest_names, seconds
 from pipeline.recordings.messages import (
     Channel,
     Decode,
@@ -34,8 +34,6 @@ from pipeline.recordings.messages import (
     fields,
     plain,
 )
-from pipeline.recordings.signals import Note, nearest_names
-from pipeline.recordings.signatures import METADATA
 
 MAGIC = b"\x89MCAP0\r\n"
 CHUNK, MESSAGE = int(Opcode.CHUNK), int(Opcode.MESSAGE)

@@ -21,10 +21,10 @@ import joblib
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.recordings.csv_rows import MISSING as NOTHING_WRITTEN
-from pipeline.recordings.csv_rows import CsvLayout, floats, list_layout, sound_rows
+from pipeline.recordings.csv_files import MISSING as NOTHING_WRITTEN
+from pipeline.recordings.csv_files import CsvLayout, floats, list_layout, sound_rows
 from pipeline.recordings.excluded import readable
-from pipeline.recordings.formats import column_place
+from pipeline.recordings.formats import Note, Source, column_place, nearest_names
 from pipeline.recordings.images import (
     MISSING,
     UNREADABLE,
@@ -42,7 +42,6 @@ from pipeline.recordings.images import (
 from pipeline.recordings.instants import instants, month_first
 from pipeline.recordings.mcap_files import McapFile, TopicColumns
 from pipeline.recordings.messages import UnreadableMessage
-from pipeline.recordings.signals import Note, Source, nearest_names
 from pipeline.store.artifacts import sha256
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution

@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from pipeline.recordings.formats import WholeTable
 from pipeline.recordings.klipper_logs import load_klippy
 from pipeline.recordings.matlab_files import load_matlab
 from pipeline.recordings.printer_logs import load_moonraker, load_serial_log
 from pipeline.recordings.spreadsheets import load_spreadsheet
-from pipeline.recordings.whole_tables import WholeTable
 
 LOADERS: dict[str, Callable[[Path], WholeTable]] = {
     "klippy.log": load_klippy,

@@ -8,23 +8,20 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from pipeline.recordings.arrow_arrays import numbers
+from pipeline.recordings.csv_files import check_one_signal, naming_columns, numbers
 from pipeline.recordings.formats import (
     FileColumn,
     FileColumns,
     Growing,
-    check_no_counter,
-    check_no_day_fractions,
+    Note,
+    clock_seconds,
     column_places,
     every,
     forward,
     is_time_name,
-    seconds,
     time_column,
 )
 from pipeline.recordings.instants import instants
-from pipeline.recordings.long_tables import check_one_signal, naming_columns
-from pipeline.recordings.signals import Note
 
 ROWS_AT_ONCE = 50_000
 # an index may promise what is not there
@@ -140,18 +137,15 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[FileColu
     zoned = clock and kinds[clock] is np.int64 and getattr(types[clock], "tz", None)
     zone = "UTC" if zoned or not clock or kinds[clock] is float else ""
     if interval:
-        clock_values, remark = np.arange(count) * interval, ""
+        clock_values = np.arange(count) * interval
+    elif _is_numeric(types[clock]) and kinds[clock] is float:
+        clock_values = clock_seconds(path, clock, values[clock], units[clock], notes, is_declared=bool(time))
     else:
-        is_time = kinds[clock] is np.int64 or not _is_numeric(types[clock])
-        clock_values, remark = (values[clock], "") if is_time else seconds(clock, values[clock], units[clock])
-        if _is_numeric(types[clock]):
-            check_no_day_fractions(path, clock, clock_values, units[clock])
-        if not time and _is_numeric(types[clock]):
-            check_no_counter(path, clock, clock_values)
-    if remark:
-        notes.append(Note("clock", "", 1, remark))
+        clock_values = values[clock]
     table_columns, turned = forward(
-        FileColumns("rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone)
+        FileColumns(
+            "rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone, units
+        )
     )
     return table_columns, notes + turned
 

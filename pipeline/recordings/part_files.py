@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.recordings import recordings
-from pipeline.recordings.formats import file_format
+from pipeline.recordings.formats import Source, file_format
 from pipeline.recordings.mcap_files import topics
 from pipeline.recordings.parquet_files import parquet_columns
 from pipeline.recordings.plain_files import check_plain_file
-from pipeline.recordings.signals import Source
 from pipeline.recordings.trial_files import COMMAND as COMMAND_TOPIC
 
 LARGEST_MB = 1000

@@ -4,13 +4,21 @@ A pipe without a writer stops whoever opens it, `dvc status` too. A link out of 
 changes, or is gone, without anybody having touched the folder. So both are refused by name before anything is
 opened. For recordings that lie on another disk, datasets/raw, datasets/raw/<loop> and folders of images
 directly below datasets/raw/setpoint may be links.
+
+Copies that are not complete are passed over: a name tells, or a change a moment ago.
 """
 
 import os
 import stat
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+# a file that has not changed for so long is complete
+REST_S = 10.0
+# endings of downloads and copies, an open workbook's lock, and what systems leave in folders
+_PARTIAL_ENDS = (".part", ".partial", ".crdownload", ".download", ".filepart")
+_PARTIAL_NAMES = ("thumbs.db", ".ds_store", "desktop.ini")
 _KINDS = (
     (stat.S_ISFIFO, "a named pipe (FIFO)"),
     (stat.S_ISSOCK, "a socket"),
@@ -79,3 +87,41 @@ def _special(path: Path, mode: int) -> Iterator[str]:
                 f"{path} is {kind}, which is no recording and stops whoever reads it; "
                 f"remove it (rm {path}) and copy the recording itself there"
             )
+
+
+# ---- copies that are not complete
+
+
+def is_partial(name: str) -> bool:
+    """Whether a file's name is that of a copy that is not complete, or of a system's own file."""
+    lower = name.lower()
+    return lower.endswith(_PARTIAL_ENDS) or lower.startswith("~$") or lower in _PARTIAL_NAMES
+
+
+def wait_until_still(
+    paths: Sequence[Path],
+    *,
+    rest_s: float | None = None,
+    clock: Callable[[], float] = time.time,
+    sleep: Callable[[float], None] | None = None,
+) -> list[Path]:
+    """Waits until no file has changed for `rest_s` (default REST_S), for `rest_s` at most; those that changed
+    meanwhile are still being written. A change in the future, of a clock set wrong, is not waited for."""
+    rest_s = REST_S if rest_s is None else rest_s
+    before = {path: _state(path) for path in paths}
+    now = clock()
+    ages = [now - changed for state in before.values() for changed, _ in state.values()]
+    youngest = min((age for age in ages if age >= 0), default=rest_s)
+    if youngest >= rest_s:
+        return []
+    (sleep or time.sleep)(rest_s - youngest)
+    return [path for path, state in before.items() if _state(path) != state]
+
+
+def _state(path: Path) -> dict[Path, tuple[float, int]]:
+    """{file: (time of change in s, bytes)} of a file, or of those of a bag; empty if it is gone."""
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    try:
+        return {file: (status.st_mtime, status.st_size) for file in files for status in [file.stat()]}
+    except OSError:
+        return {}

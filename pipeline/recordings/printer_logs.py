@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import orjson
 
+from pipeline.recordings.formats import Note, WholeTable, check_values, check_width
 from pipeline.recordings.instants import instants, over_midnight
-from pipeline.recordings.signals import Note
-from pipeline.recordings.whole_tables import WholeTable, check_values, check_width
 
 # a temperature store holds twenty minutes, some 100 kB
 LARGEST_JSON = 1 << 25

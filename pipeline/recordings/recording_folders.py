@@ -12,20 +12,22 @@ from typing import NamedTuple
 import joblib
 import numpy as np
 
-from pipeline.recordings import excluded
-from pipeline.recordings.formats import file_format
+from pipeline.recordings import excluded, plain_files
+from pipeline.recordings.formats import file_format, is_bag
 from pipeline.recordings.isolated import Budget, isolated
 from pipeline.recordings.klipper_logs import printer_heaters
-from pipeline.recordings.plain_files import check_plain_files
 from pipeline.recordings.quality import flag
-from pipeline.recordings.recordings import Source, Table, read
-from pipeline.recordings.resampling import resample
-from pipeline.recordings.signatures import is_bag
+from pipeline.recordings.recordings import Flag, Raw, Source, Table, read
+from pipeline.recordings.resampling import cut_flags, resample
 from pipeline.store import artifacts
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
 from pipeline.store.tables import Schema
 
+_PARTIAL = "is a copy that is not complete, or a system's own file, and was passed over"
+_GROWING = "is still being written; wait until its copy is complete and run it again"
+# notes of rows that a reader left out
+_LEFT_OUT = ("truncated", "trailing", "damage")
 CODE = Path(__file__).parents[1]
 # what decides what an entry of the memo holds: changed code reads everything again
 READING = ("store/artifacts.py", "store/params.py", "store/tables.py", "recordings/*.py")
@@ -56,6 +58,7 @@ class RecordingTable(NamedTuple):
     quality: dict[str, np.ndarray]
     reason: str
     reused: bool
+    passed_over: bool = False  # a copy that is not complete: neither read nor quarantined
 
 
 def read_folder(
@@ -66,26 +69,21 @@ def read_folder(
     memo: Path,
     budget: Budget,
     ignored: Collection[str] = (),
+    waits: bool = False,
 ) -> list[RecordingTable]:
     """Every recording below `folder` but files named `ignored`, in the order of names, on as many workers as
-    `execution` says. A recording that needs more than its budget is quarantined. Raises ValueError if there
-    is none."""
-    check_plain_files(folder)
-    bags = {path.parent for path in folder.rglob("metadata.yaml") if is_bag(path.parent)} - {folder}
-    files = sorted(
-        path
-        for path in folder.rglob("*")
-        if (path in bags or (path.is_file() and not bags & set(path.parents)))
-        and not path.name.startswith(".")
-        and path.suffix.lower() not in {".md", ".yaml", ".dvc"}
-        and path.name not in ignored
-        and path.name.lower() not in {"readme.txt", "license.txt", "source.txt", "notes.txt"}
-    )
-    files = excluded.readable(files, folder)
+    `execution` says. A recording that needs more than its budget is quarantined.
+
+    Copies that are not complete, by their names, are passed over. If `waits`, a file that changed a moment
+    ago is waited for, ten seconds at most, and passed over if it changes meanwhile. Raises ValueError if
+    there is no recording.
+    """
+    files, passed = _recordings_below(folder, ignored, waits=waits)
     if not files:
+        reason = f" but {next(iter(passed.values()))}" if passed else ""
         raise ValueError(
-            f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none; copy one there, "
-            "or set generate_probing.source: simulated"
+            f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none{reason}; "
+            "copy one there, or set generate_probing.source: simulated"
         )
     code = "".join(artifacts.sha256(path) for pattern in READING for path in sorted(CODE.glob(pattern)))
     hashes = [artifacts.sha256(path) for path in files]
@@ -104,10 +102,37 @@ def read_folder(
     reasons = left_out | dict(
         zip([path for path, _ in todo], _run(todo, folder, wish, execution, (memo, budget)), strict=True)
     )
-    return [
+    results = [
         _result(name, entry or _remembered(memo, key, wish), _utf8(reasons.get(path, "")), entry is not None)
         for path, name, key, entry in zip(files, names, keys, remembered, strict=True)
     ]
+    return results + [
+        RecordingTable(_utf8(path.relative_to(folder).as_posix()), {}, {}, _utf8(reason), False, True)
+        for path, reason in passed.items()
+    ]
+
+
+def _recordings_below(
+    folder: Path, ignored: Collection[str], *, waits: bool
+) -> tuple[list[Path], dict[Path, str]]:
+    """The recordings below a folder, and {path: reason} of copies that are not complete."""
+    plain_files.check_plain_files(folder)
+    bags = {path.parent for path in folder.rglob("metadata.yaml") if is_bag(path.parent)} - {folder}
+    files = sorted(
+        path
+        for path in folder.rglob("*")
+        if (path in bags or (path.is_file() and not bags & set(path.parents)))
+        and not path.name.startswith(".")
+        and path.suffix.lower() not in {".md", ".yaml", ".dvc"}
+        and path.name not in ignored
+        and path.name.lower() not in {"readme.txt", "license.txt", "source.txt", "notes.txt"}
+    )
+    files = excluded.readable(files, folder)
+    passed = {path: f"{path} {_PARTIAL}" for path in files if plain_files.is_partial(path.name)}
+    files = [path for path in files if path not in passed]
+    growing = plain_files.wait_until_still(files) if waits else []
+    passed |= {path: f"{path} {_GROWING}" for path in growing}
+    return [path for path in files if path not in passed], passed
 
 
 def _copies(files: Sequence[Path], hashes: Sequence[str]) -> dict[Path, str]:
@@ -179,6 +204,7 @@ def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, m
             max_gap_s=wish.max_gap_s,
         )
         table = flag(table, units=units, limits=wish.limits)
+        table = table._replace(flags=[*table.flags, *_cut_rows(raw)])
         for flagged in table.flags:
             if flagged.kind == "mixed" and table.masked[flagged.signal].mean() > 0.5:
                 raise ValueError(f"{path}: {flagged.message}")
@@ -206,6 +232,17 @@ def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, m
     artifacts.write_table(memo / f"{key}.quality.parquet", wish.quality, quality)
     artifacts.write_json(memo / f"{key}.json", _digests(memo, key))
     return ""
+
+
+def _cut_rows(raw: Raw) -> list[Flag]:
+    """A flag for a recording whose reader left out many rows. (MCAP's damage is counted in chunks.)"""
+    if file_format(Path(raw.path)) in ("mcap", "bag"):
+        return []
+    left_out = sum(note.count for note in raw.notes if note.kind in _LEFT_OUT)
+    times = [time_s for time_s, _ in raw.signals.values()]
+    start, end = min(time_s[0] for time_s in times), max(time_s[-1] for time_s in times)
+    count = sum(raw.messages.values()) + left_out
+    return cut_flags(left_out, count, "rows are damaged or no data", float(start), float(end))
 
 
 def _digests(memo: Path, key: str) -> dict[str, str]:
@@ -250,6 +287,8 @@ def join(
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict]:
     """The columns of one record and of one table of findings, in the order of names, and figures. Raises
     ValueError if no recording is left, or if `strict` and one is broken."""
+    passed = [result for result in results if result.passed_over]
+    results = [result for result in results if not result.passed_over]
     broken = [result for result in results if result.reason]
     if broken and (strict or len(broken) == len(results)):
         raise ValueError(
@@ -265,11 +304,11 @@ def join(
         column.name: np.concatenate([result.quality[column.name] for result in good])
         for column in wish.quality.columns
     }
-    for result in broken:
+    for result in [*broken, *passed]:
         row = {
             "recording": result.name,
             "signal": "",
-            "kind": "quarantined",
+            "kind": "passed_over" if result.passed_over else "quarantined",
             "start_s": np.nan,
             "end_s": np.nan,
             "count": 1,
@@ -289,6 +328,14 @@ def join(
         "segments": int(_segments(record)),
         "findings": counts,
     }
+    is_cut = quality["kind"] == "cut"
+    if is_cut.any():
+        shares = [float(message.partition(" %")[0]) for message in quality["message"][is_cut]]
+        names = [str(name) for name in quality["recording"][is_cut]]
+        figures["cut_percent"] = {
+            name: max(share for other, share in zip(names, shares, strict=True) if other == name)
+            for name in dict.fromkeys(names)
+        }
     return record, quality, figures
 
 

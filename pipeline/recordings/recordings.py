@@ -5,22 +5,35 @@ printers, spreadsheets, MATLAB files. Damaged, missing and left-out samples are 
 words.
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.recordings.clocks import mended_topics
-from pipeline.recordings.csv_files import read_csv
-from pipeline.recordings.formats import CALENDAR_S, FileColumns, file_format
+from pipeline.recordings.csv_files import read_groups
+from pipeline.recordings.formats import (
+    CALENDAR_S,
+    NAMES,
+    SUFFIXES,
+    FileColumns,
+    Flag,
+    Jitter,
+    Note,
+    Raw,
+    Source,
+    Table,
+    file_format,
+    nearest_names,
+    select,
+)
 from pipeline.recordings.inspection import inspect
 from pipeline.recordings.mcap_files import check_magic, mcap_columns, read_bag
 from pipeline.recordings.other_formats import LOADERS
 from pipeline.recordings.parquet_files import read_parquet
-from pipeline.recordings.quality import flag
+from pipeline.recordings.quality import CELSIUS, flag
 from pipeline.recordings.resampling import resample
-from pipeline.recordings.signals import Flag, Jitter, Note, Raw, Source, Table, nearest_names
-from pipeline.recordings.whole_tables import select
 
 __all__ = [
     "Flag",
@@ -35,6 +48,11 @@ __all__ = [
     "read",
     "resample",
 ]
+
+
+FAHRENHEIT = {"degf", "°f", "° f", "℉", "f", "fahrenheit"}
+# at the end of a column's name; an F without brackets is as well the sixth zone
+_NAMES_FAHRENHEIT = re.compile(r"(?:[\[(]F[\])]|(?:[\[(_ ](?:deg[Ff]|[Ff]ahrenheit)|°\s?F|℉)[\])]?)$")
 
 
 def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal: str = "") -> Raw:
@@ -55,30 +73,20 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal
     path = Path(path)
     _check_sources(path, sources)
     kind = file_format(path)
+    named = SUFFIXES.get(path.suffix.lower(), kind)
     names = list(dict.fromkeys(source.source for source in sources))
     try:
-        if kind == "mcap":
-            with path.open("rb") as stream:
-                check_magic(path, stream.read(16))
-            columns, places, messages, notes = mcap_columns(path, names, time)
-        elif kind == "bag":
-            columns, places, messages, notes = read_bag(path, names, time)
-        else:
-            if kind in LOADERS:
-                table, notes = select(path, LOADERS[kind](path), names, time)
-            elif kind == "csv":
-                table, notes = read_csv(path, names, time, decimal)
-            else:
-                table, notes = read_parquet(path, names, time)
-            columns, places, messages = (
-                [table],
-                {name: (table.name, name) for name in names},
-                {table.name: len(table.time)},
-            )
+        columns, places, messages, notes = _file_columns(path, kind, names, time, decimal)
     except OSError as error:
         raise ValueError(
             f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
         ) from None
+    if kind != named:
+        message = (
+            f"the file is named {path.suffix.lower()} but begins as {NAMES.get(kind, kind)} does, "
+            "and was read as that"
+        )
+        notes = [Note("format", "", 1, message), *notes]
     parts = mended_topics(path, columns, one_clock=time in ("", "log_time"))
     columns = [part.columns for part in parts]
     notes += [note for part in parts for note in part.notes]
@@ -94,6 +102,29 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal
         group = next(group for group in columns if group.name == topic)
         signals[source.signal] = _signal(path, source, clocks[topic], group, group.values[field], notes)
     return Raw(str(path), signals, messages, notes, tuple(breaks))
+
+
+def _file_columns(
+    path: Path, kind: str, names: Sequence[str], time: str, decimal: str
+) -> tuple[list[FileColumns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
+    """Columns on their clocks, {source: (name of its columns, name in them)}, {name: count of messages or
+    rows} and notes of a file of that kind."""
+    if kind == "mcap":
+        with path.open("rb") as stream:
+            check_magic(path, stream.read(16))
+        return mcap_columns(path, names, time)
+    if kind == "bag":
+        return read_bag(path, names, time)
+    if kind == "csv":
+        columns, notes = read_groups(path, names, time, decimal)
+    elif kind in LOADERS:
+        table, notes = select(path, LOADERS[kind](path), names, time)
+        columns = [table]
+    else:
+        table, notes = read_parquet(path, names, time)
+        columns = [table]
+    places = {name: (table.name, name) for table in columns for name in table.values}
+    return columns, places, {table.name: len(table.time) for table in columns}, notes
 
 
 def _check_sources(path: Path, sources: Sequence[Source]) -> None:
@@ -112,6 +143,18 @@ def _check_sources(path: Path, sources: Sequence[Source]) -> None:
                 f"{path}: the mapping of {source.signal} has scale {source.scale:g} and offset "
                 f"{source.offset:g}; both must be finite, scale not 0"
             )
+
+
+def _check_fahrenheit(path: Path, source: Source, unit: str) -> None:
+    """Raises ValueError for a column in °F, as its unit or its name says, that the mapping takes as °C."""
+    written = unit.strip(" ()[]").casefold()
+    is_fahrenheit = written in FAHRENHEIT if written else bool(_NAMES_FAHRENHEIT.search(source.source))
+    is_converted = abs(source.scale * 9 / 5 - 1) < 0.01
+    if is_fahrenheit and source.unit.casefold() in CELSIUS and not is_converted:
+        raise ValueError(
+            f"{path}: {source.source} is in °F but the mapping takes it as {source.unit} with scale "
+            f"{source.scale:g}; set scale: 0.555556 and offset: -17.7778"
+        )
 
 
 def _clocks(columns: Sequence[FileColumns], notes: list[Note]) -> dict[str, np.ndarray]:
@@ -139,6 +182,7 @@ def _signal(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Time and values in the signal's unit. A signal that has a value in less than half of the rows, spread
     among them, has its own clock: those rows."""
+    _check_fahrenheit(path, source, group.units.get(source.source, ""))
     present = np.isfinite(recorded)
     if not present.any():
         raise ValueError(

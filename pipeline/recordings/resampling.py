@@ -6,8 +6,8 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from pipeline.recordings.mixing import alternate, mixed
-from pipeline.recordings.signals import Flag, Jitter, Raw, Table, intervals
+from pipeline.recordings.clocks import alternate, mixed
+from pipeline.recordings.formats import Flag, Jitter, Raw, Table, intervals
 
 # a sample within that share of the sample time from the grid is on it: a temperature's change in a hundredth
 # of a sample is far below any sensor's step
@@ -17,6 +17,8 @@ GAP_INTERVALS = 3.0
 # silence is no gap
 PERIODIC_SHARE = 0.95
 JITTER_SHARE, JITTER_OFTEN = 0.1, 0.01
+# a recording of which more than that was left out is a finding, % of its rows or samples
+MOST_CUT_PERCENT = 5.0
 
 
 class _Clock(NamedTuple):
@@ -363,6 +365,11 @@ def _trim_flags(
             f"{cut} samples lie outside"
         )
         flags.append(Flag("", "trimmed", start, end, cut, message))
+        for clock in clocks:
+            outside = int(((clock.time_s < start) | (clock.time_s > end)).sum())
+            if np.isfinite(clock.gap_limit_s):
+                what = f"samples of {', '.join(clock.signals[:3])} lie outside the time in common"
+                flags += cut_flags(outside, len(clock.time_s), what, start, end)
     for grid in grids:
         if len(grid) < 2:
             flags.append(
@@ -376,6 +383,18 @@ def _trim_flags(
                 )
             )
     return flags
+
+
+def cut_flags(left_out: int, count: int, what: str, start_s: float, end_s: float) -> list[Flag]:
+    """A flag for a recording of which more than MOST_CUT_PERCENT was left out."""
+    percent = 100 * left_out / max(count, 1)
+    if percent <= MOST_CUT_PERCENT:
+        return []
+    message = (
+        f"{percent:.1f} % of the recording was left out (limit {MOST_CUT_PERCENT:g} %): "
+        f"{left_out} of {count} {what}; copy it again, or record it again"
+    )
+    return [Flag("", "cut", start_s, end_s, left_out, message)]
 
 
 def _filled_flags(

@@ -15,12 +15,16 @@ from typing import Any
 import numpy as np
 import python_calamine
 
-from pipeline.recordings.csv_rows import MISSING
-from pipeline.recordings.formats import date_column, is_time_name
+from pipeline.recordings.csv_files import MISSING, check_one_signal, naming_columns
+from pipeline.recordings.formats import (
+    LARGEST_UNPACKED,
+    Note,
+    WholeTable,
+    check_width,
+    date_column,
+    is_time_name,
+)
 from pipeline.recordings.instants import DAY_NS, over_midnight
-from pipeline.recordings.long_tables import check_one_signal, naming_columns
-from pipeline.recordings.signals import Note
-from pipeline.recordings.whole_tables import LARGEST_UNPACKED, WholeTable, check_width
 
 MOST_CELLS = 15_000_000
 # of all cells together, in characters

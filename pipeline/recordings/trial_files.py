@@ -18,8 +18,8 @@ import joblib
 import numpy as np
 
 from pipeline.recordings.excluded import readable
+from pipeline.recordings.formats import Note, Source
 from pipeline.recordings.images import Frames, check_overlap, read_frames, span_of, tables_of, write_frames
-from pipeline.recordings.signals import Note, Source
 from pipeline.store import artifacts
 from pipeline.store.params import Mapped
 from pipeline.store.tables import BYTES, FLOAT, NONE, TEXT, Column, Schema

@@ -207,10 +207,10 @@ def test_a_device_beside_the_heaters_is_no_output(tmp_path):
 
 
 def test_a_log_of_more_numbers_than_fit_into_memory_is_refused(tmp_path, monkeypatch):
-    from pipeline.recordings import klipper_logs, whole_tables
+    from pipeline.recordings import formats, klipper_logs
 
     monkeypatch.setattr(klipper_logs, "LINES_A_CHECK", 10)
-    monkeypatch.setattr(whole_tables, "MOST_VALUES", 1000)
+    monkeypatch.setattr(formats, "MOST_VALUES", 1000)
     wide = " ".join(f"d{i}: temp=1 pwm=0" for i in range(50))
     lines = [f"Stats 1.0: gcodein=0 {wide} print_time=1"]
     lines += [f"Stats {k}.0: gcodein=0 print_time={k}" for k in range(2, 200)]

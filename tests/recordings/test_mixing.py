@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipeline.recordings.mixing import alternate, mixed
+from pipeline.recordings.clocks import alternate, mixed
 from pipeline.recordings.recordings import Raw, resample
 
 

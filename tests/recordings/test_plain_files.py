@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.recordings.plain_files import check_plain_file, check_plain_files
+from pipeline.recordings.plain_files import check_plain_file, check_plain_files, is_partial, wait_until_still
 
 
 @pytest.fixture
@@ -99,3 +99,56 @@ def test_run_refuses_a_pipe_by_name_before_dvc_can_hang_on_it(root, raw, tmp_pat
     assert ended.returncode == 1
     assert "run: datasets/raw/temperature/pi\\x1b[31mpe.csv is a named pipe (FIFO)" in ended.stderr
     assert "\x1b" not in ended.stderr
+
+
+# ---- copies that are not complete
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["a.csv.part", "a.csv.crdownload", "A.PART", "~$rig.xlsx", "Thumbs.db", ".DS_Store", "desktop.ini"],
+)
+def test_names_of_copies_and_of_a_systems_own_files_are_no_recordings(name):
+    assert is_partial(name)
+    assert not is_partial("part.csv")
+    assert not is_partial("thumbs.csv")
+
+
+def test_a_file_that_changed_a_moment_ago_is_waited_for_ten_seconds_at_most(tmp_path):
+    old, new, growing = (tmp_path / name for name in ("old.csv", "new.csv", "growing.csv"))
+    for path, age in ((old, 60), (new, 4), (growing, 1)):
+        path.write_text("time_s,T1\n")
+        os.utime(path, (1000 - age, 1000 - age))
+    slept = []
+
+    def grow(seconds: float) -> None:
+        slept.append(seconds)
+        growing.write_text("time_s,T1\n0,1\n")
+
+    paths = [old, new, growing]
+    assert wait_until_still(paths, rest_s=10.0, clock=lambda: 1000.0, sleep=grow) == [growing]
+    assert slept == [9.0]
+    os.utime(growing, (1060, 1060))  # a clock that is set wrong is not waited for
+    assert wait_until_still(paths, rest_s=10.0, clock=lambda: 1050.0, sleep=grow) == []
+    assert wait_until_still(paths, rest_s=10.0, clock=lambda: 2000.0, sleep=grow) == []
+    assert slept == [9.0]
+
+
+def test_a_file_that_is_renamed_while_it_is_waited_for_is_passed_over(tmp_path):
+    path = tmp_path / "rig.csv"
+    path.write_text("time_s,T1\n")
+    os.utime(path, (999, 999))
+    assert wait_until_still([path], rest_s=10.0, clock=lambda: 1000.0, sleep=lambda _: path.unlink()) == [
+        path
+    ]
+
+
+def test_a_bag_that_grows_is_waited_for_by_its_files(tmp_path):
+    part = tmp_path / "bag/bag_0.mcap"
+    part.parent.mkdir()
+    part.write_bytes(b"1")
+    os.utime(part, (999, 999))
+    grown = wait_until_still(
+        [part.parent], rest_s=10.0, clock=lambda: 1000.0, sleep=lambda _: part.write_bytes(b"12")
+    )
+    assert grown == [part.parent]

@@ -1,9 +1,15 @@
 import numpy as np
 import pytest
 
-from pipeline.recordings.quality import MANY_VALUES, _none_stands_out, quantisation_step
+from pipeline.recordings.quality import (
+    MANY_VALUES,
+    _may_rest,
+    _none_stands_out,
+    _usual_of_others,
+    quantisation_step,
+    runs,
+)
 from pipeline.recordings.recordings import Flag, Source, Table, flag, read, resample
-from pipeline.recordings.stuck import _may_rest, _usual_of_others, runs
 
 LIMITS = {"u": (0.0, 100.0)}
 UNITS = {"u": "percent", "y": "degC", "z": "degC"}
