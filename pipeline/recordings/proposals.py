@@ -262,7 +262,8 @@ def _is_constant(signal: RecordedSignal) -> bool:
 
 def _with_roles(signals: Sequence[RecordedSignal]) -> tuple[list[RecordedSignal], str]:
     """The signals with their roles, and what these were guessed from."""
-    taken = _without_hidden_set_points([signal._replace(role=_role(signal)) for signal in signals])
+    taken = _with_commands_y([signal._replace(role=_role(signal)) for signal in signals])
+    taken = _without_hidden_set_points(taken)
     roles = {signal.role for signal in taken}
     # a heater's volts are its command if nothing else is; the room's air is measured if nothing else is
     if "input" not in roles:
@@ -275,6 +276,24 @@ def _with_roles(signals: Sequence[RecordedSignal]) -> tuple[list[RecordedSignal]
     if not all(_is_switch(signal) for signal in taken if signal.role == "input"):
         taken = [s._replace(role="") if s.role == "input" and _is_switch(s) else s for s in taken]
     return taken, "the values alone: look at each line"
+
+
+def _with_commands_y(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
+    """The signals with Y1, Y2 as what a controller gives (DIN 19226), if a set-point is there and nothing else
+    is given; else y is a measured output."""
+    roles = {signal.role for signal in taken}
+    if "input" in roles or "set-point" not in roles:
+        return list(taken)
+    given = [
+        signal.source
+        for signal in taken
+        if signal.role == "output"
+        and re.search(r"^y( \d+)?$", read_name(telling_name(signal.source)).words)
+        and signal.values.min() >= 0.0
+        and signal.values.max() <= 100.0
+    ]
+    measured = [s for s in taken if s.role == "output" and s.source not in given]
+    return [s._replace(role="input") if measured and s.source in given else s for s in taken]
 
 
 def _without_strangers(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
