@@ -279,8 +279,8 @@ def _with_roles(signals: Sequence[RecordedSignal]) -> tuple[list[RecordedSignal]
 
 
 def _with_commands_y(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
-    """The signals with Y1, Y2 as what a controller gives (DIN 19226), if there is a set-point and nothing else is
-    given; else y is a measured output."""
+    """The signals with Y1, Y2 as what a controller gives (DIN 19226), if there is a set-point and nothing
+    else is given; else y is a measured output."""
     roles = {signal.role for signal in taken}
     if "input" in roles or "set-point" not in roles:
         return list(taken)
