@@ -134,7 +134,6 @@ def _params(path: Path) -> None:
 
 
 def _table(path: Path) -> None:
-    artifacts.version(path)
     artifacts.read_table(path, SCHEMA)
 
 

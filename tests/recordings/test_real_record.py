@@ -233,8 +233,8 @@ def test_every_contestant_is_judged_as_deployed_on_plants_of_the_record(kit):
 def test_the_kit_is_judged_by_its_own_time_and_noise(kit):
     """A kit that needs 200 s for one time constant is not held to the 60 s of the study's machine."""
     figures = metrics(kit, "evaluate_temperature")
-    assert figures["limits"]["source"] == "from the record"
-    assert 300 < figures["limits"]["settling_s"] < 1200  # three of its time constants of some 200 s
+    assert figures["pace"]["source"] == "from the record"
+    assert 300 < figures["pace"]["settling_s"] < 1200  # three of its time constants of some 200 s
     assert figures["band_degC"] < 0.5  # three deviations of a sensor that is right to 0.1 °C
     assert figures["infeasible"] == []
 
