@@ -24,7 +24,7 @@ from pipeline.deposition.camera.rendering import HARD, NOMINAL, Scene, Simulated
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, routine
 from pipeline.deposition.learning import ilc
-from pipeline.reading.trial_files import TrialConditions, TrialSignals, read_trial, write_trial
+from pipeline.recordings.trial_files import TrialConditions, TrialSignals, read_trial, write_trial
 
 TS, SPEED, ANGLE_DEG, PX_PER_MM = 0.02, 8.0, 90.0, 125.0
 AREA = float(area(0.88, ANGLE_DEG))

@@ -113,8 +113,8 @@ def write_recording(path: Path, seed: int, samples: int) -> None:
 
 def recordings(count: int, folder: Path) -> Work:
     """So many CSV of 300 samples, none read before."""
-    from pipeline.reading.isolated import Budget
-    from pipeline.reading.recording_folders import join, read_folder
+    from pipeline.recordings.isolated import Budget
+    from pipeline.recordings.recording_folders import join, read_folder
     from pipeline.temperature.settings import Plant
     from stages.ingest import Ingest, recording_wish
 

@@ -70,7 +70,7 @@ def write(path: Path, kind: str, count: int) -> None:
 
 def ours(path: Path) -> int:
     """Every column as float64, quality checks apart."""
-    from pipeline.reading.recordings import Source, read
+    from pipeline.recordings.recordings import Source, read
 
     raw = read(path, [Source(name, name, "1") for name in NAMES])
     return len(raw.signals[NAMES[-1]][1])
@@ -78,9 +78,9 @@ def ours(path: Path) -> int:
 
 def checked(path: Path) -> int:
     """Every column as float64, on one sample time, with every check: what ingest does before it writes."""
-    from pipeline.reading.quality import flag
-    from pipeline.reading.recordings import Source, read
-    from pipeline.reading.resampling import resample
+    from pipeline.recordings.quality import flag
+    from pipeline.recordings.recordings import Source, read
+    from pipeline.recordings.resampling import resample
 
     inputs, outputs = NAMES[:INPUTS], NAMES[INPUTS:]
     raw = read(path, [Source(name, name, "1") for name in NAMES])
@@ -106,7 +106,8 @@ def protobuf_s(count: int = 200_000) -> dict[str, float]:
     """Seconds for the numbers of `count` messages: ours, and the package with its fields named by hand."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-    from pipeline.reading.protobuf_messages import decoder, message_types
+    from pipeline.recordings.messages import message_types
+    from pipeline.recordings.messages import protobuf_decoder as decoder
 
     file = descriptor_pb2.FileDescriptorProto(name="machine.proto", package="machine", syntax="proto3")
     state = file.message_type.add(name="State")

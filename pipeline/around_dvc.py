@@ -19,7 +19,7 @@ import zlib
 from pathlib import Path
 
 import stages
-from pipeline.reading.plain_files import check_plain_files
+from pipeline.recordings.plain_files import check_plain_files
 from pipeline.store.printable import printable
 
 # a link to this folder stays in the project that has the link

@@ -116,9 +116,9 @@ def runs(arguments: argparse.Namespace) -> None:
 def inspect(arguments: argparse.Namespace) -> None:
     """What is in a recording: signals, rates, jitter, gaps, ranges,
     damage; and a mapping to paste into params.yaml."""
-    from pipeline.reading.inspection import inspect as describe
-    from pipeline.reading.isolated import Budget, isolated
-    from pipeline.reading.plain_files import check_plain_file
+    from pipeline.recordings.inspection import inspect as describe
+    from pipeline.recordings.isolated import Budget, isolated
+    from pipeline.recordings.plain_files import check_plain_file
 
     here = Path(params.FILE) if Path(params.FILE).exists() else Path(__file__).parents[1] / params.FILE
     declared = params.load(Ingest, "ingest", here)
@@ -235,7 +235,7 @@ def _watch(arguments: argparse.Namespace, ready: "Ready") -> None:
     """Watches a source of frames with the loop that is ready."""
     from pipeline.commands import shadow as watching
     from pipeline.commands.shadow import deploy
-    from pipeline.reading.watch_sources import shown_place, source
+    from pipeline.recordings.watch_sources import shown_place, source
 
     asked = deploy.asked(
         arguments.flow, arguments.temperature, arguments.tip, once=arguments.once, settings=ready
@@ -256,7 +256,7 @@ def record_levels(arguments: argparse.Namespace) -> None:
     from pipeline.commands import record_levels as levels
     from pipeline.commands.shadow import deploy
     from pipeline.commands.training_print import numbers
-    from pipeline.reading.watch_sources import RecordingSource
+    from pipeline.recordings.watch_sources import RecordingSource
     from pipeline.setpoint.recordings import read_options
     from pipeline.setpoint.settings import SetpointMaterial
     from pipeline.setpoint.vision.calibrated_classifier import read_frames

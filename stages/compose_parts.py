@@ -32,7 +32,7 @@ def main() -> None:
 
     from pipeline.deposition.extruder import from_json
     from pipeline.deposition.parts import evaluation, part_report, stored
-    from pipeline.reading import part_files
+    from pipeline.recordings import part_files
 
     with artifacts.stage("compose_parts") as out:
         settings, printer = params.load(ComposeParts, "compose_parts"), params.load(Printer, "printer")
@@ -87,7 +87,7 @@ def compose_part(
     diameter of what E pushes, what drives the extrusion, and the declared bead instead of E, if a person
     requests these. Raises ValueError naming the file, and the line if there is one."""
     from pipeline.deposition.parts import part
-    from pipeline.reading.part_files import read_part_program
+    from pipeline.recordings.part_files import read_part_program
 
     learned_s = learned.library.sample_time_s
     if learned_s != printer.sample_time_s:
@@ -117,7 +117,7 @@ def report_with_measured(part: ComposedPart, folder: Path) -> dict[str, Any]:
     """The conformance report of a part, with measured_percent beside the forecast of each material whose
     print was measured."""
     from pipeline.deposition.parts import part_report, verification
-    from pipeline.reading import part_files
+    from pipeline.recordings import part_files
 
     report = part_report.report(part)
     for stream in part.composed.streams:

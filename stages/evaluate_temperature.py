@@ -1,6 +1,6 @@
 """Compare every temperature controller, tuned, as it would be deployed, on plants that nobody learned or
 tuned on: reads what the temperature stages wrote; writes datasets/evaluate_temperature: cases.parquet,
-trajectories.parquet and figures.json."""
+trajectories.parquet, and its figures as figures.json and summary.json."""
 
 from __future__ import annotations
 
@@ -200,6 +200,7 @@ def main() -> None:
         artifacts.write_table(out / "cases.parquet", tables.CASES, cases)
         drawn = tables.trajectories(loaded.machine.inputs, loaded.machine.outputs)
         artifacts.write_table(out / "trajectories.parquet", drawn, trajectories)
+        artifacts.write_json(out / "summary.json", summary)
         artifacts.write_metrics("evaluate_temperature", summary, METRICS)
 
 

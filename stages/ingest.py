@@ -18,14 +18,21 @@ from pipeline.temperature import tables
 from pipeline.temperature.settings import Plant, check_output_limits
 
 if TYPE_CHECKING:
-    from pipeline.reading.recording_folders import RecordingWish
-    from pipeline.reading.signals import Source
+    from pipeline.recordings.formats import Source
+    from pipeline.recordings.recording_folders import RecordingWish
+
+
+class MappedSignal(Mapped):
+    """Where a signal of the plant comes from. `set_point` is the column of what an output should be, with the
+    scale and offset of the output; null: not recorded."""
+
+    set_point: str | None = Field(default=None, min_length=1, max_length=300)
 
 
 class Ingest(Section):
     """Section `ingest`."""
 
-    mapping: dict[str, Mapped]
+    mapping: dict[str, MappedSignal]
     time: str = Field(max_length=300)
     decimal: Literal["", ".", ","]
     max_gap_s: float = Field(gt=0, le=86400)
@@ -40,8 +47,8 @@ METRICS = ("recordings", "samples", "segments", "findings")
 
 def main() -> None:
     with artifacts.stage("ingest") as out:
-        from pipeline.reading import recording_folders
-        from pipeline.reading.isolated import Budget
+        from pipeline.recordings import recording_folders
+        from pipeline.recordings.isolated import Budget
 
         settings, machine = params.load(Ingest, "ingest"), params.load(Plant, "plant")
         source = params.value("generate_probing.source", one_of=("simulated", "recordings"))
@@ -58,6 +65,7 @@ def main() -> None:
             memo=Path("datasets/memo/ingest"),
             budget=Budget(settings.longest_s, settings.largest_mb),
             ignored=ignored,
+            waits=source == "recordings",
         )
         strict = settings.strict or "--strict" in sys.argv
         record, quality, figures = recording_folders.join(results, wish, strict=strict)
@@ -71,9 +79,9 @@ def main() -> None:
         artifacts.write_metrics("ingest", figures, METRICS)
 
 
-def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, Mapped]) -> RecordingWish:
+def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, MappedSignal]) -> RecordingWish:
     """What to take from every recording of the machine."""
-    from pipeline.reading.recording_folders import RecordingWish
+    from pipeline.recordings.recording_folders import RecordingWish
 
     return RecordingWish(
         sources(machine, mapping),
@@ -88,10 +96,10 @@ def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, Mapped])
     )
 
 
-def sources(machine: Plant, mapping: dict[str, Mapped]) -> tuple[Source, ...]:
+def sources(machine: Plant, mapping: dict[str, MappedSignal]) -> tuple[Source, ...]:
     """Where a recording has the signals of the machine: by `mapping`, else under their own names. Raises
-    ValueError for a mapping of no signal, or of another unit."""
-    from pipeline.reading.signals import Source, nearest_names
+    ValueError for a mapping of no signal, of another unit, or with a set-point of what is no output."""
+    from pipeline.recordings.formats import Source, nearest_names
 
     signals = [*machine.acting, *machine.outputs]
     unknown = sorted(set(mapping) - {signal.name for signal in signals})
@@ -100,6 +108,12 @@ def sources(machine: Plant, mapping: dict[str, Mapped]) -> tuple[Source, ...]:
             f"params.yaml: ingest.mapping.{unknown[0]} is no signal of the plant; "
             f"{nearest_names(unknown[0], [s.name for s in signals])}"
         )
+    for signal in machine.acting:
+        if signal.name in mapping and mapping[signal.name].set_point is not None:
+            raise ValueError(
+                f"params.yaml: ingest.mapping.{signal.name}.set_point is for outputs alone, but "
+                f"{signal.name} is none; take it out"
+            )
     found = []
     for signal in signals:
         mapped = mapping.get(signal.name)

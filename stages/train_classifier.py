@@ -231,7 +231,7 @@ def write_frames(
     numbers, from which nothing was learned; rendered ones if there are no recordings."""
     import numpy as np
 
-    from pipeline.reading import frame_folder
+    from pipeline.recordings import nozzle_frames
     from pipeline.setpoint.recordings import read_options
     from pipeline.setpoint.vision import gallery
 
@@ -243,7 +243,7 @@ def write_frames(
         groups = gallery.group_frames(model, recordings)
         groups = groups._replace(group=np.where(judged, groups.group, ""))
         chosen = gallery.choose_frames(groups, recordings)
-        pictures = frame_folder.pictures(
+        pictures = nozzle_frames.pictures(
             [recordings.picture[i] for i in chosen], read_options(settings, material).topics
         )
         examples = (

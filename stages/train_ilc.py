@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from pipeline.deposition.camera import latency, readings, trial_flow
     from pipeline.deposition.extruder import Extruder, Routine
     from pipeline.deposition.learning.ilc import Trial
-    from pipeline.reading.trial_files import TrialRecording
+    from pipeline.recordings.trial_files import TrialRecording
 
 # the readings of a recording are remembered; this code decides what they are
 MEMO, PIPELINE = Path("datasets/memo/train_ilc"), Path(__file__).resolve().parents[1] / "pipeline"
-READERS = ("deposition/camera", "reading")
+READERS = ("deposition/camera", "recordings")
 Sections = tuple[TrainIlc, Printer, Camera]
 # trial sequences and measured trials by (material, number of the routine), models and figures by material
 Results = tuple[dict[tuple[str, int], list], dict[tuple[str, int], list], dict[str, dict], dict[str, dict]]
@@ -48,7 +48,7 @@ def main() -> None:
 
     from pipeline.deposition.camera import trial_flow
     from pipeline.deposition.learning import training
-    from pipeline.reading import plain_files, trial_files
+    from pipeline.recordings import plain_files, trial_files
     from pipeline.store.execution import run_all
 
     with artifacts.stage("train_ilc") as out:
@@ -129,7 +129,7 @@ def learn_in_pictures(
     draw what the camera sees, and what does not repeat."""
     from pipeline.deposition.camera import rendering, simulated_trial, trial_flow
     from pipeline.deposition.learning import training
-    from pipeline.reading.trial_files import TrialConditions, TrialSignals, open_trial, write_trial
+    from pipeline.recordings.trial_files import TrialConditions, TrialSignals, open_trial, write_trial
 
     (settings, printer, camera), measured = sections, []
     laws, name = settings.laws(printer), material.name
@@ -170,7 +170,7 @@ def learn_from_recordings(
     from pipeline.deposition import extruder
     from pipeline.deposition.camera import trial_flow
     from pipeline.deposition.learning import training
-    from pipeline.reading import trial_files
+    from pipeline.recordings import trial_files
 
     settings, printer, camera = sections
     routines, laws, results = printer.training_routines(), settings.laws(printer), ({}, {}, {}, {})
@@ -207,7 +207,7 @@ def learn_from_recordings(
 def read(recording: TrialRecording, camera: Camera, memo: Path | None = None) -> readings.Readings:
     """The readings of a recording's frames, out of the memo if it holds them."""
     from pipeline.deposition.camera import readings
-    from pipeline.reading import trial_memo
+    from pipeline.recordings import trial_files
 
     def measure() -> readings.Readings:
         with artifacts.about(recording.path):
@@ -216,7 +216,7 @@ def read(recording: TrialRecording, camera: Camera, memo: Path | None = None) ->
     if memo is None:
         return measure()
     code = [PIPELINE / name for name in READERS]
-    values = trial_memo.recall(memo, recording.path, camera.looks, code, measure)
+    values = trial_files.recall(memo, recording.path, camera.looks, code, measure)
     return readings.Readings.from_values(values)
 
 
@@ -228,7 +228,7 @@ def measure_trial(
     latency from section `camera`, or from this recording and `earlier` ones. Raises ValueError, naming the
     file, if it says nothing of its conditions or shows no bead."""
     from pipeline.deposition.camera import flow, latency, trial_flow
-    from pipeline.reading import trial_files
+    from pipeline.recordings import trial_files
 
     known = trial_files.checked_conditions(recording)
     with artifacts.about(recording.path):
@@ -244,7 +244,7 @@ def show_frames(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]
     """Writes a few frames of a recording with the measured edges drawn in as JPEG to `folder`, and returns a
     row for each: where it is from, what was measured, and why it was rejected."""
     from pipeline.deposition.camera.excerpts import excerpts
-    from pipeline.reading import trial_files
+    from pipeline.recordings import trial_files
 
     recording, rows = trial_files.open_trial(path, **camera.recording), []
     frames, signals, known = recording.frames, recording.signals, recording.conditions

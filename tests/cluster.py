@@ -22,7 +22,7 @@ FORKED.set_forkserver_preload(
         "distributed",
         "pandas",
         "pipeline.temperature.test_set.evaluation",
-        "pipeline.reading.recording_folders",
+        "pipeline.recordings.recording_folders",
         "tests.cluster",
     ]
 )

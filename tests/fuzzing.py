@@ -20,11 +20,11 @@ import pyarrow as pa
 from hypothesis import strategies as st
 
 from pipeline.deposition.toolpath import gcode
-from pipeline.reading import recordings
-from pipeline.reading.inspection import inspect
+from pipeline.recordings import recordings
+from pipeline.recordings.inspection import inspect
 from pipeline.store import artifacts, params, tables
 from pipeline.temperature.settings import Panel, Plant
-from tests.reading import damaging, hostile
+from tests.recordings import damaging, hostile
 
 ROOT = Path(__file__).resolve().parents[1]
 # what `artifacts.stage` and `beadline` answer with one sentence
@@ -134,7 +134,6 @@ def _params(path: Path) -> None:
 
 
 def _table(path: Path) -> None:
-    artifacts.version(path)
     artifacts.read_table(path, SCHEMA)
 
 

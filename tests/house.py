@@ -26,11 +26,11 @@ POSE = {f"pipeline/temperature/test_set/{name}.py" for name in ("cases", "contro
 MAY_KNOW: dict[str, set[str]] = {
     "statistics": set(),
     "store": set(),
-    "reading": {"store", "statistics"},
+    "recordings": {"store", "statistics"},
     "methods": {"constants", "statistics"},
     "plain": {"own", "constants", "store", "statistics", "verdict"},
     "constants": {"own", "plain", "files", "store", "statistics"},
-    "files": {"own", "plain", "constants", "store", "statistics", "reading"},
+    "files": {"own", "plain", "constants", "store", "statistics", "recordings"},
     "verdict": {"plain", "constants", "store", "statistics"},
     "runtime": {"verdict", "methods", "plain", "constants", "store", "statistics"},
     "report": {"verdict", "plain", "constants", "store", "statistics"},
@@ -92,7 +92,7 @@ PLACES = ("stages/", "pipeline/verdict/", "pipeline/report/")
 # the second pipeline: results that no recording changes, and no stage of the root asks for
 PAPERS = "datasets/papers/dvc.yaml"
 # a stage depends on these rooms whole, and on at most 8 files or folders of a loop's methods
-SHARED, MOST_METHODS = {"store", "reading", "verdict", "runtime", "report"}, 8
+SHARED, MOST_METHODS = {"store", "recordings", "verdict", "runtime", "report"}, 8
 
 
 # ---- the syntax tree

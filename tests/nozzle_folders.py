@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.reading import frame_folder
-from pipeline.reading.frame_mcap import Topics
+from pipeline.recordings import nozzle_frames
+from pipeline.recordings.nozzle_frames import Topics
 from pipeline.setpoint.frames import key_area, nozzle_scene
 from pipeline.setpoint.material import PLA
 from pipeline.setpoint.recordings import FrontEnd
@@ -74,10 +74,10 @@ def folder(path: Path, prints: int = 2) -> Path:
 
 def read(
     path: Path, *, tip=None, topics: Topics = ANY, jobs: int = 1, memo: Path | None = None
-) -> frame_folder.NozzleFrames:
+) -> nozzle_frames.NozzleFrames:
     front_end = FrontEnd(LEAST, (memo or path.parent / "memo").resolve())
-    how = frame_folder.ReadOptions(tip, front_end, topics, PLA)
-    return frame_folder.read_folder(path, how, Execution(backend="loky", jobs=jobs, scheduler=""))
+    how = nozzle_frames.ReadOptions(tip, front_end, topics, PLA)
+    return nozzle_frames.read_folder(path, how, Execution(backend="loky", jobs=jobs, scheduler=""))
 
 
 def expected() -> np.ndarray:
@@ -91,5 +91,5 @@ def expected() -> np.ndarray:
     return np.array([one.image for one in found])
 
 
-def notes(found: frame_folder.NozzleFrames) -> str:
+def notes(found: nozzle_frames.NozzleFrames) -> str:
     return "\n".join(note.message for note in found.notes)

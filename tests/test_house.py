@@ -123,7 +123,7 @@ def write(root: Path, files: dict[str, str]) -> Path:
 ALLOWED = {
     "pipeline/statistics.py": "import numpy as np",
     "pipeline/store/artifacts.py": "import pyarrow",
-    "pipeline/reading/csv.py": "from pipeline.store import artifacts",
+    "pipeline/recordings/csv.py": "from pipeline.store import artifacts",
     "pipeline/temperature/plant.py": "import numpy as np\nfrom pipeline import statistics",
     "pipeline/temperature/kernel.py": "from pipeline.temperature import plant",
     "pipeline/temperature/settings.py": "from pipeline.store import artifacts",
@@ -136,7 +136,7 @@ ALLOWED = {
     "pipeline/runtime/machine.py": "import time\nfrom pipeline.temperature import kernel",
     "pipeline/report/page.py": "from pipeline.verdict import rules",
     "pipeline/nightly/night.py": "from pipeline.commands import watch\nfrom pipeline.verdict import rules",
-    "pipeline/commands/watch.py": "from pipeline.reading import csv\nfrom pipeline.deposition import ilc",
+    "pipeline/commands/watch.py": "from pipeline.recordings import csv\nfrom pipeline.deposition import ilc",
     "pipeline/papers/study.py": "from stages import learn",
     "pipeline/cli.py": "from pipeline.report import page\nfrom pipeline.commands import watch",
     "stages/learn.py": "from pipeline.report import page\nfrom pipeline.deposition import ilc",
@@ -155,14 +155,14 @@ ALLOWED = {
         ("temperature", "from pipeline.temperature import settings", "must not know temperature/plain"),
         ("temperature", "from pipeline.temperature.nets import files", "must not know temperature/files"),
         ("temperature", "from pipeline.runtime import machine", "temperature must not know runtime"),
-        ("store", "from pipeline.reading import csv", "store must not know reading"),
+        ("store", "from pipeline.recordings import csv", "store must not know recordings"),
         ("store", "from pipeline.temperature import settings", "store must not know temperature/plain"),
-        ("reading", "from pipeline.temperature import plant", "reading must not know temperature"),
+        ("recordings", "from pipeline.temperature import plant", "recordings must not know temperature"),
         ("verdict", "from pipeline.temperature import plant", "verdict must not know temperature"),
         ("verdict", "from pipeline.report import page", "verdict must not know report"),
         ("report", "from pipeline.temperature import plant", "report must not know temperature"),
-        ("report", "from pipeline.reading import csv", "report must not know reading"),
-        ("runtime", "from pipeline.reading import csv", "runtime must not know reading"),
+        ("report", "from pipeline.recordings import csv", "report must not know recordings"),
+        ("runtime", "from pipeline.recordings import csv", "runtime must not know recordings"),
         ("nightly", "from pipeline.report import page", "nightly must not know report"),
         ("commands", "from pipeline.report import page", "commands must not know report"),
         ("report", "from stages import learn", "report must not know stages"),
@@ -194,13 +194,13 @@ def test_a_file_opened_or_a_global_seed_outside_the_edge_is_seen(tmp_path):
         tmp_path,
         {
             "pipeline/store/artifacts.py": "open('a', 'w')",
-            "pipeline/reading/log.py": "open('a', 'rb')\nopen('a', 'wb')\npath.open()\npath.write_text('')",
+            "pipeline/recordings/a.py": "open('a', 'rb')\nopen('a', 'wb')\npath.open()\npath.write_text('')",
             "pipeline/temperature/bad.py": "open('a')\nnp.load('a')\npath.write_text('')\n"
             "np.random.seed(0)\nnp.random.default_rng()\nnp.random.default_rng(1)",
             "stages/ingest.py": "artifacts.write_text('a', '')\nparams.load(A, 'a')\npath.read_text()",
         },
     )
-    places = ["pipeline/reading/log.py:2", "pipeline/reading/log.py:4"]
+    places = ["pipeline/recordings/a.py:2", "pipeline/recordings/a.py:4"]
     places += [f"pipeline/temperature/bad.py:{line}" for line in (1, 2, 3)] + ["stages/ingest.py:3"]
     assert [sentence.split(" ")[0] for sentence in house.forbidden_files(tmp_path)] == places
     seeds = [f"pipeline/temperature/bad.py:{line}" for line in (4, 5)]

@@ -11,9 +11,9 @@ from pipeline.deposition.parts import leads, part_report, stored
 from pipeline.deposition.parts.composition import Composed, LearnedLibrary
 from pipeline.deposition.parts.part import ComposedPart
 from pipeline.deposition.tables import LIBRARY, LINES, TASKS
-from pipeline.reading.mcap_frames import tables_of, write_frames
-from pipeline.reading.signals import Source
-from pipeline.reading.trial_files import COMMAND, TYPES
+from pipeline.recordings.formats import Source
+from pipeline.recordings.images import tables_of, write_frames
+from pipeline.recordings.trial_files import COMMAND, TYPES
 from pipeline.store import artifacts
 from pipeline.store.tables import FLOAT, Column, Schema
 

@@ -13,13 +13,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from pipeline.reading.formats import every
-from pipeline.reading.inspection import Inspected, look
-from pipeline.reading.proposals import Proposal, Proposed, mapping_lines, plant_lines, propose
-from pipeline.reading.recordings import Source, read
-from pipeline.reading.resampling import resample
+from pipeline.recordings.formats import every
+from pipeline.recordings.inspection import CODE, Inspected, look
+from pipeline.recordings.proposals import (
+    BELOW_CUT_OFF_DEGC,
+    Proposal,
+    Proposed,
+    mapping_lines,
+    plant_lines,
+    propose,
+)
+from pipeline.recordings.recordings import Source, read
+from pipeline.recordings.resampling import resample
 from pipeline.store import artifacts, params
-from pipeline.store.params_text import replaced
+from pipeline.store.params_text import inserted, replaced
 from pipeline.temperature.test_set.time_scale import time_constant
 
 RAW = Path("datasets/raw/temperature")
@@ -33,6 +40,7 @@ SHIPPED: dict[str, Any] = {
         {"name": name, "unit": "percent", "low": 0, "high": 100}
         for name in (*(f"heater_{i}" for i in range(1, 7)), "motor")
     ],
+    "plant.disturbances": [],
     "plant.outputs": [
         {"name": f"sensor_{i}", "unit": "degC", "reference": reference, "low": 0, "high": 250}
         for i, reference in enumerate((150, 160, 170, 175, 180), 1)
@@ -47,6 +55,12 @@ SHIPPED: dict[str, Any] = {
     "ingest.max_gap_s": 5.0,
     "report.overshoot_degC": 5.0,
 }
+# Klipper measures its heaters, and can run a controller, at multiples of this; its log has a line a second
+KLIPPER_STEP_S, KLIPPER_KINDS = 0.3, ("klippy.log", "Moonraker JSON")
+# samples a time constant of the fastest output: as many are taken if the clock allows, and at least as many
+MOST_SAMPLES, FEWEST_SAMPLES = 200, 10
+# what firmware without limits in its log leaves to the owner
+FIRMWARE_KINDS = (*KLIPPER_KINDS, "serial.log")
 GAP_SAMPLES = 3  # shortest gap of samples that ends a segment
 ABSOLUTE_ZERO_DEGC = -273.15
 # the next experiment: no move smaller or larger, in percent; samples that the stage takes
@@ -54,10 +68,12 @@ MOVES_PERCENT, PROBING_SAMPLES = (1.0, 20.0), (300, 100_000)
 
 
 class MachinePace(NamedTuple):
-    """The machine's pace and range: time constants in s by output, the sample time that suits them, the
-    lowest and highest temperature of the record, and the standard deviation of each input."""
+    """The machine's pace and range: time constants in s by output, the record's own clock and the sample time
+    that suits both, the lowest and highest temperature of the record, and the standard deviation of each
+    input."""
 
     time_constants_s: dict[str, float]
+    clock_s: float
     sample_time_s: float
     coldest_degC: float
     hottest_degC: float
@@ -96,10 +112,12 @@ def proposed(paths: Sequence[Path], *, sample_time: str = "") -> Initialised:
                 f"{path}: there is no {lacking[0]}, which another of the recordings has; "
                 "give recordings of one machine"
             )
-    scale = _scale(paths, proposal)
+    kind = recordings[0].kind
+    codes = [note.message for recording in recordings for note in recording.notes if note.kind == CODE]
+    scale = _scale(paths, proposal, step_s=KLIPPER_STEP_S if kind in KLIPPER_KINDS else 0.0)
     return Initialised(
         _values(proposal, scale),
-        _open_questions(proposal, scale, timed=not proposal.time or bool(sample_time)),
+        [*codes, *_open_questions(proposal, scale, kind, timed=not proposal.time or bool(sample_time))],
     )
 
 
@@ -120,7 +138,30 @@ def _widest(recordings: Sequence[Inspected]) -> Proposal:
 # ---- pace and range
 
 
-def _scale(paths: Sequence[Path], proposal: Proposal) -> MachinePace:
+def sample_time_s(clock_s: float, fastest_s: float, step_s: float = 0.0) -> float:
+    """The sample time in s: a multiple of the record's own clock, with MOST_SAMPLES in the fastest time
+    constant if the clock has as many, and FEWEST_SAMPLES unless the clock has fewer.
+
+    `step_s` is the interval of which the firmware runs multiples, 0 for none. If no multiple of both clocks
+    is short enough, it is the first multiple of step_s that is no shorter than the clock.
+    """
+    longest = fastest_s / FEWEST_SAMPLES
+    common = next((k for k in range(1, 101) if step_s and _is_multiple(k * clock_s, step_s)), 0)
+    if step_s and not (common and common * clock_s <= longest):
+        return _rounded(step_s * np.ceil(clock_s / step_s - 1e-6))
+    unit = max(common, 1) * clock_s
+    return _rounded(unit * max(1, round(fastest_s / MOST_SAMPLES / unit)))
+
+
+def _is_multiple(time_s: float, step_s: float) -> bool:
+    return abs(time_s / step_s - round(time_s / step_s)) < 1e-6
+
+
+def _rounded(time_s: float) -> float:
+    return float(f"{time_s:.9g}")
+
+
+def _scale(paths: Sequence[Path], proposal: Proposal, *, step_s: float = 0.0) -> MachinePace:
     inputs = [s.name for s in proposal.signals if s.role == "input"]
     outputs = [s for s in proposal.signals if s.role == "output"]
     sources = [Source(s.name, s.source, s.unit, s.scale, s.offset) for s in proposal.signals]
@@ -142,13 +183,12 @@ def _scale(paths: Sequence[Path], proposal: Proposal) -> MachinePace:
             constants[name] = time_constant(u, segments, sample_time_s=interval)
         except ValueError as error:
             raise ValueError(f"{paths[0]}: {name}: {error}") from None
-    # two hundred samples a time constant of the fastest are enough
-    sample_time = max(interval, float(f"{min(constants.values()) / 200:.1g}"))
+    sample_time = sample_time_s(interval, min(constants.values()), step_s)
     lows = [np.nanmin(np.concatenate(segments)) for segments in y.values()]
     highs = [np.nanmax(np.concatenate(segments)) for segments in y.values()]
     rows = np.vstack(u)
     return MachinePace(
-        constants, sample_time, float(np.min(lows)), float(np.max(highs)), rows.std(axis=0).tolist()
+        constants, interval, sample_time, float(np.min(lows)), float(np.max(highs)), rows.std(axis=0).tolist()
     )
 
 
@@ -161,16 +201,16 @@ def _gap_s(sample_time_s: float) -> float:
 
 def _values(proposal: Proposal, scale: MachinePace) -> dict[str, list[str]]:
     """The lines of each key."""
-    outputs = [s for s in proposal.signals if s.role == "output"]
+    references = [s.reference for s in proposal.signals if s.reference is not None]
     # a machine that is only ever warmed by 20 °C may not overshoot by five
     coldest = max(scale.coldest_degC, ABSOLUTE_ZERO_DEGC)
-    reference = min(s.reference for s in outputs if s.reference is not None)
-    reach = max(min(reference, scale.hottest_degC) - coldest, 1.0)
-    input_lines, output_lines = plant_lines(proposal)
+    reach = max(min(*references, scale.hottest_degC) - coldest, 1.0)
+    inputs, disturbances, outputs = plant_lines(proposal)
     return {
         "plant.sample_time_s": [repr(scale.sample_time_s)],
-        "plant.inputs": ["- " + line for line in input_lines],
-        "plant.outputs": ["- " + line for line in output_lines],
+        "plant.inputs": ["- " + line for line in inputs],
+        "plant.disturbances": ["- " + line for line in disturbances] or ["[]"],
+        "plant.outputs": ["- " + line for line in outputs],
         "generate_probing.source": ["recordings"],
         **_next_experiment(scale),
         "ingest.mapping": mapping_lines(proposal),
@@ -219,8 +259,9 @@ def _next_experiment(scale: MachinePace) -> dict[str, list[str]]:
     }
 
 
-def _open_questions(proposal: Proposal, scale: MachinePace, *, timed: bool) -> list[str]:
-    """What a person must decide; `timed`: the sample time was recorded or given."""
+def _open_questions(proposal: Proposal, scale: MachinePace, kind: str, *, timed: bool) -> list[str]:
+    """What a person must decide; `kind` is the file's format, `timed`: the sample time was recorded or
+    given."""
     questions = []
     if proposal.how != "names and ranges":
         questions.append(
@@ -231,12 +272,10 @@ def _open_questions(proposal: Proposal, scale: MachinePace, *, timed: bool) -> l
             "the sample time: the file has no time, and 1.0 s was assumed, on which all times rest that were "
             "written; if it is another, run init again with --time 'every 0.08 s' --force"
         )
+    questions += _questions_on_time(scale, kind)
     questions += _questions_on_inputs([s for s in proposal.signals if s.role == "input"])
-    unlimited = [s.name for s in proposal.signals if s.role == "output" and s.low is None]
-    if unlimited:
-        questions.append(
-            f"plant.outputs low and high of {', '.join(unlimited)}: between which °C the machine must stay"
-        )
+    questions += _questions_on_disturbances(proposal)
+    questions += _questions_on_limits([s for s in proposal.signals if s.role == "output"], kind)
     references = [f"{s.name} {s.reference:g}" for s in proposal.signals if s.role == "output"]
     questions.append(f"plant.outputs reference, where each should settle: now {', '.join(references)} °C")
     questions.append(
@@ -245,6 +284,64 @@ def _open_questions(proposal: Proposal, scale: MachinePace, *, timed: bool) -> l
     )
     paces = [f"{name} {float(f'{tau:.2g}'):g} s" for name, tau in scale.time_constants_s.items()]
     questions.append(f"report: whether the rules suit you; the time constants are {', '.join(paces)}")
+    return questions
+
+
+def _questions_on_time(scale: MachinePace, kind: str) -> list[str]:
+    """How the record comes to the sample time, if it is not the record's own, and whether it is too long."""
+    clock, time, fastest = scale.clock_s, scale.sample_time_s, min(scale.time_constants_s.values())
+    nth = {1: "each", 2: "every 2nd", 3: "every 3rd"}.get(round(time / clock), f"every {time / clock:.0f}th")
+    way = f"{nth} is taken" if _is_multiple(time, clock) else "temperatures are interpolated between two"
+    questions = []
+    if kind in KLIPPER_KINDS:
+        questions.append(
+            f"plant.sample_time_s {time:g} s: Klipper runs a controller at multiples of {KLIPPER_STEP_S:g} s "
+            f"and the log has a line every {clock:g} s, of which {way}"
+        )
+    elif time > clock:
+        questions.append(
+            f"plant.sample_time_s {time:g} s: the file has a sample every {clock:g} s, of which {way}"
+        )
+    if time > fastest / FEWEST_SAMPLES:
+        questions.append(
+            f"plant.sample_time_s {time:g} s is more than a tenth of the fastest time constant "
+            f"({fastest:.2g} s): record faster, at {_rounded(float(f'{fastest / FEWEST_SAMPLES:.1g}')):g} s"
+        )
+    return questions
+
+
+def _questions_on_disturbances(proposal: Proposal) -> list[str]:
+    names = [s.name for s in proposal.signals if s.role == "disturbance"]
+    if not names:
+        return []
+    return [
+        f"plant.disturbances {', '.join(names)}: does the controller move it, or is it only recorded? Move "
+        "to plant.inputs, in percent, what a controller moves; leave out what does not act on the "
+        "temperatures. No controller can be exported yet while plant.disturbances lists a signal"
+    ]
+
+
+def _questions_on_limits(outputs: Sequence[Proposed], kind: str) -> list[str]:
+    """Between which temperatures the machine must stay: what is proposed, and what nothing says."""
+    margin = f"{BELOW_CUT_OFF_DEGC:g} °C below the firmware's cut-off (max_temp)"
+    limited = [f"{s.name} {s.low:g} to {s.high:g}" for s in outputs if s.low is not None]
+    cut = [f"{s.name} {s.cut_off:g}" for s in outputs if s.cut_off is not None]
+    unlimited = [s.name for s in outputs if s.low is None]
+    questions = []
+    if limited:
+        because = (
+            f"; high is {margin}, at which it switches everything off: {', '.join(cut)} °C" if cut else ""
+        )
+        questions.append(
+            f"plant.outputs low and high, between which °C the machine must stay: now {', '.join(limited)} °C"
+            + because
+        )
+    if unlimited:
+        advice = f"; set high {margin}, which the log does not hold" if kind in FIRMWARE_KINDS else ""
+        questions.append(
+            f"plant.outputs low and high of {', '.join(unlimited)}: between which °C the machine must stay"
+            + advice
+        )
     return questions
 
 
@@ -291,6 +388,8 @@ def write(values: dict[str, list[str]], *, force: bool, path: str | Path = param
         for dotted, lines in changes.items():
             if params.home(dotted, path) == file:
                 text = replaced(text, dotted, lines)
+            elif dotted == "plant.disturbances" and params.home("plant.inputs", path) == file:
+                text = inserted(text, dotted, lines)
         if text != before:
             artifacts.write_text(file, text)
     return list(changes)
@@ -304,7 +403,7 @@ def _at(sections: dict, dotted: str) -> Any:
     value: Any = sections
     for key in dotted.split("."):
         value = value.get(key) if isinstance(value, dict) else None
-    return value
+    return [] if value is None and dotted == "plant.disturbances" else value
 
 
 def copy(paths: Sequence[Path], folder: Path = RAW) -> list[Path]:

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.reading.recordings import Source, Table, read
-from pipeline.reading.resampling import resample
+from pipeline.recordings.recordings import Source, Table, read
+from pipeline.recordings.resampling import resample
 from pipeline.runtime import machine, replay, supervisor, support
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.replay import GaplessLog

@@ -10,7 +10,7 @@ from pipeline.deposition.parts import forecast, part_report, verification
 from pipeline.deposition.parts.composition import LearnedLibrary, LearnedMaterial, Stream
 from pipeline.deposition.parts.part import ComposedPart
 from pipeline.deposition.settings import ComposeParts, Printer
-from pipeline.reading.part_files import COLUMNS, COMMAND, measured_name, measured_path, read_measured
+from pipeline.recordings.part_files import COLUMNS, COMMAND, measured_name, measured_path, read_measured
 from pipeline.store import artifacts
 from stages.compose_parts import compose_part
 

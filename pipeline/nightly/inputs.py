@@ -13,8 +13,8 @@ import yaml
 
 from pipeline.nightly.processes import LITERAL, changed, names
 from pipeline.nightly.settings import Nightly, NightlyLoop
-from pipeline.reading import excluded
-from pipeline.reading.signatures import METADATA
+from pipeline.recordings import excluded, plain_files
+from pipeline.recordings.formats import METADATA
 from pipeline.store import artifacts, params
 
 QUARANTINE = Path("datasets/quarantine")
@@ -76,6 +76,7 @@ class Hashes:
             for file in ([path] if path.is_file() else sorted(path.rglob("*")))
             if not any(part.startswith(".") or part == "__pycache__" for part in file.parts)
             and file.suffix != ".pyc"
+            and not plain_files.is_partial(file.name)
             and not file.is_dir()
         ]
         for file in relevant:
@@ -148,7 +149,9 @@ def quarantine(path: str, loop: str, reason: str) -> str:
     """Sets a recording aside, a file or a bag, and returns the reason. It is moved, unchanged, to
     datasets/quarantine, where no stage looks and git does not either, its reason beside it; nothing there is
     overwritten. What git or DVC keeps stays where it is, and is listed in excluded.yaml of its loop's
-    folder."""
+    folder. A copy that is not complete stays: it is another recording when it is."""
+    if plain_files.wait_until_still([Path(path)]):
+        return f"{reason} (it is still being written: it stays, and is looked at again)"
     if kept_by := keeper(Path(path)):
         folder = params.load(Nightly, "nightly").loops[loop].recordings
         excluded.exclude(path, folder, reason)

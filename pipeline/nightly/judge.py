@@ -11,8 +11,8 @@ import numpy as np
 from pipeline.deposition.tables import SCORES
 from pipeline.nightly.decision import CaseCosts
 from pipeline.nightly.settings import HoldOut, Nightly, NightlyLoop, PromotionRule
-from pipeline.reading import recording_folders
-from pipeline.reading.isolated import Budget
+from pipeline.recordings import recording_folders
+from pipeline.recordings.isolated import Budget
 from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
@@ -351,6 +351,8 @@ def record_segments(
     )
     segments = {}
     for result in results:
+        if result.passed_over:
+            continue
         if result.reason:
             if broken is None:
                 raise ValueError(result.reason)

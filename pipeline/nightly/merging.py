@@ -26,7 +26,7 @@ from pipeline.nightly.processes import (
     names,
 )
 from pipeline.nightly.records import ChampionState
-from pipeline.reading import excluded
+from pipeline.recordings import excluded
 
 PLACE = STATE / "merge"
 # made by nights: where both sides have them anew ours stay, and the next night makes them again

@@ -11,8 +11,8 @@ from pipeline.nightly import camera_drift
 from pipeline.nightly.inputs import quarantine
 from pipeline.nightly.records import Alarm, LoopDrift
 from pipeline.nightly.settings import DriftLimits
-from pipeline.reading import trial_files
-from pipeline.reading.excluded import readable
+from pipeline.recordings import trial_files
+from pipeline.recordings.excluded import readable
 from pipeline.store import params
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def of_prints(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
 
 
 def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[PrintFigures]:
-    from pipeline.reading import frame_folder
+    from pipeline.recordings import nozzle_frames
     from pipeline.setpoint.recordings import read_options
     from pipeline.setpoint.settings import SetpointMaterial, TrainClassifier
 
@@ -119,7 +119,7 @@ def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[Pr
     if settings.source != "recordings":
         return []
     material = params.load(SetpointMaterial, "setpoint_material").material()
-    frames = frame_folder.read_folder(
+    frames = nozzle_frames.read_folder(
         folder, read_options(settings, material), params.load(params.Execution, "execution")
     )
     prints = []
@@ -180,14 +180,14 @@ def prints_drift(
 
 def _unreadable(path: str, settings: "TrainClassifier") -> str:
     """Why a print's file cannot be read; empty where it can."""
-    from pipeline.reading import frame_csv, frame_mcap
+    from pipeline.recordings import nozzle_frames
     from pipeline.setpoint.recordings import read_options
 
     try:
         if path.lower().endswith(".csv"):
-            frame_csv.read_log(Path(path))
+            nozzle_frames.read_log(Path(path))
         elif path.lower().endswith(".mcap"):
-            frame_mcap.open_film(Path(path), read_options(settings).topics)
+            nozzle_frames.open_film(Path(path), read_options(settings).topics)
     except ValueError as error:
         return str(error)
     return ""

@@ -1,4 +1,4 @@
-"""Recordings of nozzle frames as this loop reads them: the options of reading/frame_folder.py by section
+"""Recordings of nozzle frames as this loop reads them: the options of recordings/nozzle_frames.py by section
 `train_classifier`, and the front end, which takes from a memo what it made of the same frames by the same
 code."""
 
@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 import joblib
 import numpy as np
 
-from pipeline.reading import frame_folder
-from pipeline.reading.frame_folder import NozzleFrames, ReadOptions
-from pipeline.reading.frame_mcap import Topics
+from pipeline.recordings import nozzle_frames
+from pipeline.recordings.nozzle_frames import NozzleFrames, ReadOptions, Topics
 from pipeline.setpoint.frames import familiar, front_end, key_area
 from pipeline.setpoint.frames.front_end import FrameKeyAreas
 from pipeline.setpoint.frames.rendered import LabelledFrames
@@ -26,9 +25,8 @@ HERE = Path(__file__).parents[1]
 # the code that decides what an entry of the memo holds
 CODE = (
     "setpoint/recordings.py", "setpoint/frames/front_end.py", "setpoint/frames/key_area.py",
-    "setpoint/frames/travel.py", "setpoint/frames/familiar.py", "reading/mcap_frames.py",
-    "reading/frame_images.py", "reading/frame_mcap.py", "reading/image_messages.py",
-    "reading/image_topics.py",
+    "setpoint/frames/travel.py", "setpoint/frames/familiar.py", "recordings/images.py",
+    "recordings/nozzle_frames.py",
 )  # fmt: skip
 KEY_AREAS = Schema(
     "key_areas",
@@ -84,8 +82,8 @@ def read_parts(
     # here, as who only reads needs no learner
     from pipeline.setpoint.vision.parts import deal_prints, split_windows
 
-    frames = frame_folder.read_folder(folder, read_options(settings, material), execution)
-    frame_folder.check(folder, frames)
+    frames = nozzle_frames.read_folder(folder, read_options(settings, material), execution)
+    nozzle_frames.check(folder, frames)
     usable = (frames.label >= 0) & np.isfinite(frames.temperature)
     truth = frames.label, frames.flow, frames.temperature, frames.print_number, frames.segment
     reasons = np.array(frames.reasons, object)
@@ -96,7 +94,7 @@ def read_parts(
         rng = np.random.default_rng([settings.seed, 1])
         by_part, windows, apart = split_windows(dealt, window_parts, window=settings.window, rng=rng)
     prints = {part: len(np.unique(of.print_number)) for part, of in windows.items()}
-    read = frame_folder.figures(frames) | {"windows_apart": apart, "window_prints": prints}
+    read = nozzle_frames.figures(frames) | {"windows_apart": apart, "window_prints": prints}
     return by_part, windows, read, frames
 
 

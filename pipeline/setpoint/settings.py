@@ -71,7 +71,7 @@ class Recipe(Section):
 
 
 class RecordedTopics(Section):
-    """Topics of a user's MCAP recordings, as frame_mcap.Topics says."""
+    """Topics of a user's MCAP recordings, as nozzle_frames.Topics says."""
 
     image: str = Field(max_length=300)
     time: str = Field(max_length=300)

@@ -146,6 +146,17 @@ def replaced(text: str, dotted: str, lines: Sequence[str]) -> str:
     return text[: key.end_mark.index] + ":" + _comment(text, key, line_end) + block + text[end:]
 
 
+def inserted(text: str, dotted: str, lines: Sequence[str]) -> str:
+    """`text` with a key that its section lacks, such as plant.disturbances, ahead of the section's first
+    key; the entries of its value stand below it, as `replaced` has them. Raises ValueError for a section that
+    is missing."""
+    section, _, key = dotted.rpartition(".")
+    _, value = _nodes(text, section)
+    first = value.start_mark.index
+    indent = " " * value.start_mark.column
+    return replaced(f"{text[:first]}{key}: []\n{indent}{text[first:]}", dotted, lines)
+
+
 def _comment(text: str, key: Node, line_end: int) -> str:
     """The comment behind the colon of a key whose value stands below it."""
     rest = text[key.end_mark.index : line_end].lstrip().removeprefix(":").strip()

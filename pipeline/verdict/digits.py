@@ -39,8 +39,10 @@ def typeset(text: str | float) -> str:
 
 
 def declared(value: float) -> int:
-    """Decimals of a number that somebody wrote down, such as a limit: as many as it has, at most nine."""
-    return next((places for places in range(9) if round(value, places) == value), 9)
+    """Decimals of a number that somebody wrote down, such as a limit: as many as it has, at most six. One
+    that was measured, such as a settling time that a record gives, is shown with three digits."""
+    exact = next((places for places in range(7) if round(value, places) == value), None)
+    return max(0, 2 - math.floor(math.log10(abs(value)))) if exact is None else exact
 
 
 # what a figure may be at most to say something: ten times the yardstick, or hotter than any machine. Beyond

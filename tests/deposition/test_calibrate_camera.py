@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.deposition.settings import Camera
-from pipeline.reading import trial_files
+from pipeline.recordings import trial_files
 from pipeline.store import params
 from tests.foreign.camera import Eye, Stage, tip_of
 

@@ -22,7 +22,7 @@ from pipeline.deposition.learning import training
 from pipeline.deposition.parts import stored
 from pipeline.deposition.settings import Camera, Printer, trial_conditions
 from pipeline.deposition.tables import LESSONS, LIBRARY, TASKS
-from pipeline.reading import trial_files
+from pipeline.recordings import trial_files
 from pipeline.store import artifacts, params
 from stages import train_ilc
 

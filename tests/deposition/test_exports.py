@@ -16,7 +16,7 @@ from pipeline.deposition.settings import ComposeParts, Printer
 from pipeline.deposition.toolpath import gcode, motion
 from pipeline.deposition.toolpath.gcode import Kind
 from pipeline.deposition.toolpath.gcode_words import LineRefusal
-from pipeline.reading import part_files
+from pipeline.recordings import part_files
 from pipeline.store import params
 from stages.compose_parts import compose_part
 from tests.deposition.trained import NOZZLE, PLANT, TS, learned

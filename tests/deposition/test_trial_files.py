@@ -14,10 +14,10 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
-from pipeline.reading import image_messages, trial_files
-from pipeline.reading.mcap_frames import ENCODERS
-from pipeline.reading.recordings import read
-from pipeline.reading.trial_files import (
+from pipeline.recordings import images, trial_files
+from pipeline.recordings.images import ENCODERS
+from pipeline.recordings.recordings import read
+from pipeline.recordings.trial_files import (
     COMMAND,
     FLOW,
     POSITION,
@@ -279,7 +279,7 @@ def machine_recording(
 
 
 def image_at(stamp_ns: int, frame: np.ndarray) -> tuple[str, str, bytes]:
-    return "cdr", "sensor_msgs/msg/Image", image_messages.image(image_messages.header(stamp_ns, "cam"), frame)
+    return "cdr", "sensor_msgs/msg/Image", images.image(images.header(stamp_ns, "cam"), frame)
 
 
 def ros1_at(frame: np.ndarray) -> tuple[str, str, bytes]:
@@ -461,8 +461,7 @@ def test_frames_that_cannot_be_decoded_are_left_out_and_counted_until_they_are_t
 def test_a_jpeg_that_is_cut_off_is_no_frame(tmp_path):
     data = cv2.imencode(".jpg", picture(0))[1]
     intact_bytes, cut = (
-        image_messages.compressed_image(image_messages.header(0, "cam"), "jpeg", part)
-        for part in (data, data[:-200])
+        images.compressed_image(images.header(0, "cam"), "jpeg", part) for part in (data, data[:-200])
     )
     path = tmp_path / "machine.mcap"
     path.write_bytes(

@@ -9,7 +9,7 @@ import pytest
 from pipeline.deposition.camera import bead, latency, pose, trial_flow
 from pipeline.deposition.extruder import Extruder, flow, routine
 from pipeline.deposition.settings import Camera, Printer, trial_conditions
-from pipeline.reading import trial_files
+from pipeline.recordings import trial_files
 from pipeline.store import params
 from stages import train_ilc
 from tests.foreign.camera import Eye, tip_of, trial

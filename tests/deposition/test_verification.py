@@ -14,7 +14,7 @@ from pipeline.deposition.parts.forecast import NAMES
 from pipeline.deposition.toolpath import gcode
 from pipeline.deposition.toolpath.motion import plan
 from pipeline.deposition.toolpath.tasks import printed_lines
-from pipeline.reading import part_files
+from pipeline.recordings import part_files
 from tests.deposition.test_composition import MACHINE, composed, of_part
 from tests.deposition.trained import AREA, NOMINAL, PLANT, TS, learned, percent_of_on_off
 from tests.foreign import parts as foreign_parts

@@ -11,8 +11,8 @@ import scipy.io
 
 from tests.foreign.hot_end import Record
 from tests.mcap_writing import Written, cdr
-from tests.reading.klipper_machine import EXTRUDER, config_lines
-from tests.reading.test_spreadsheets import sheet, workbook
+from tests.recordings.klipper_machine import EXTRUDER, config_lines
+from tests.recordings.test_spreadsheets import sheet, workbook
 
 NAMES = ("time_s", "heater_pct", "hotend_C")
 STATE = "float64 heater_pct\nfloat64 hotend_C\n"

@@ -17,7 +17,7 @@ from pipeline.cli import render_night
 from pipeline.nightly import accepting, branches, champion, inputs, merging, night, processes, remembered
 from pipeline.nightly.records import Champion, ChampionState, Installed
 from pipeline.nightly.settings import Nightly
-from pipeline.reading import excluded
+from pipeline.recordings import excluded
 from pipeline.store import artifacts, params
 from pipeline.verdict import verdict
 from tests.nightly.toy_nights import ROOT, SETTINGS, Project, entered

@@ -13,6 +13,7 @@ from pipeline.nightly import drift, inputs, screening, temperature_drift
 from pipeline.nightly.records import Alarm
 from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly
+from pipeline.recordings import plain_files
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
 from pipeline.temperature.identification import model_choice as identification
@@ -389,3 +390,14 @@ def test_one_more_part_makes_a_bag_new(made, monkeypatch):
         assert as_bag(bag, nights.a_night(1, 401), parts=3)[str(bag)] != before
     finally:
         shutil.rmtree(bag, ignore_errors=True)
+
+
+def test_a_copy_that_is_not_complete_is_no_recording_of_the_night_and_is_not_set_aside(tmp_path, monkeypatch):
+    growing, partial = tmp_path / "rig.csv", tmp_path / "rig.csv.part"
+    growing.write_text("time_s,T1\n")
+    partial.write_text("time")
+    assert list(inputs.contents(inputs.Hashes({}), [str(tmp_path)])) == [growing.as_posix()]
+    monkeypatch.setattr(plain_files, "REST_S", 10.0)
+    monkeypatch.setattr(plain_files.time, "sleep", lambda _: growing.write_text("time_s,T1\n0,1\n"))
+    assert "is still being written: it stays" in inputs.quarantine(str(growing), "temperature", "too short")
+    assert growing.is_file()

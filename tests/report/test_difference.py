@@ -66,7 +66,7 @@ def test_a_changed_parameter_code_and_artifact_are_counted_and_the_parameter_is_
     Path("stages/code.py").write_text("2\n")
     artifacts.write_json("datasets/tune_weights/weights.json", {"contestants": {"pi": {"cost": 3.0}}})
     main()
-    counted = "No figure moved beyond its noise. Changed: one parameter, code, one artifact."
+    counted = "No figure moved beyond its noise. Changed: one parameter, code, two artifacts."
     assert counted in Page(INDEX).text
     text = Page(RUNS).text
     assert counted in text and "report.disk_margin 0.4 0.41" in text

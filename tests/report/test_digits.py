@@ -8,6 +8,7 @@ from pipeline.verdict.digits import (
     band,
     count,
     decimals,
+    declared,
     number,
     percent,
     quantity,
@@ -89,3 +90,11 @@ def test_a_line_of_a_log_is_set_as_a_page_has_it_and_names_stay():
         f"night-0005, 2030-01-09: gain −15.1{thin}% (−16.0 to −0.2{thin}%), "
         f"offset −2.0{thin}°C; shift_-1.csv, a-b"
     )
+
+
+@pytest.mark.parametrize(
+    ("limit", "text"),
+    [(60.0, "60"), (0.5, "0.5"), (0.00025, "0.00025"), (577.382821858, "577"), (1 / 30, "0.0333"), (0, "0")],
+)
+def test_a_limit_has_the_digits_that_somebody_wrote_and_a_measured_one_has_three(limit, text):
+    assert number(limit, declared(limit)) == text

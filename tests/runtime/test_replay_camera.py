@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from pipeline import cli
 from pipeline.commands import replay_camera
 from pipeline.commands.shadow import deploy
-from pipeline.reading.frame_mcap import Topics
+from pipeline.recordings.nozzle_frames import Topics
 from pipeline.runtime.export import setpoint
 from pipeline.setpoint.agents import bayes, belief_agent
 from pipeline.setpoint.agents.files import Agents

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.reading.frame_folder import check, figures
+from pipeline.recordings.nozzle_frames import check, figures
 from tests.nozzle_folders import FLOWS, SHOTS, expected, folder, images, notes, read, rows, table
 
 COUNT = 2 * len(FLOWS) * SHOTS

@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.reading import frame_images
-from pipeline.reading.frame_csv import read_log, stretches
-from pipeline.reading.frame_folder import figures
+from pipeline.recordings.images import read_image
+from pipeline.recordings.nozzle_frames import figures, read_log, stretches
 from pipeline.setpoint.frames import key_area
 from tests.nozzle_folders import FLOWS, SHOTS, expected, folder, images, notes, read, rows, scenes, table
 
@@ -321,5 +320,5 @@ def test_the_real_frames_in_a_folder_as_users_have_them(shared, tmp_path):
 
 
 def test_the_decoder_s_complaints_about_padding_do_not_reach_the_terminal(shared, capfd):
-    frame_images.read_image(shared("data/caxton_samples/full/sample1011.jpg"))
+    read_image(shared("data/caxton_samples/full/sample1011.jpg"))
     assert capfd.readouterr().err == ""

@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.reading.frame_folder import figures
-from pipeline.reading.frame_mcap import UNITS, Topics, middle_frame, open_film
-from pipeline.reading.mcap_frames import tables_of, write_frames
-from pipeline.reading.recordings import inspect
-from pipeline.reading.signals import Source
+from pipeline.recordings.formats import Source
+from pipeline.recordings.images import tables_of, write_frames
+from pipeline.recordings.nozzle_frames import UNITS, Topics, figures, middle_frame, open_film
+from pipeline.recordings.recordings import inspect
 from pipeline.setpoint.frames import key_area
 from tests.mcap_writing import Written
 from tests.nozzle_folders import ANY, FLOWS, LEAST, SHOTS, expected, folder, read, scenes, table

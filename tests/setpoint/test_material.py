@@ -4,7 +4,7 @@ import numpy as np
 import pydantic
 import pytest
 
-from pipeline.reading import frame_folder
+from pipeline.recordings import nozzle_frames
 from pipeline.setpoint import published
 from pipeline.setpoint.frames import nozzle_scene
 from pipeline.setpoint.material import PLA, PrintedMaterial
@@ -76,9 +76,9 @@ def test_frames_of_a_folder_are_read_as_of_the_published_material(tmp_path):
         **{**DECLARED, "good_flow_percent": (50.0, 120.0), "flow_limits_percent": (20.0, 310.0)}
     )
     raw = folder(tmp_path / "raw")
-    options = frame_folder.ReadOptions(None, FrontEnd(LEAST, tmp_path / "memo"), ANY, petg.material())
+    options = nozzle_frames.ReadOptions(None, FrontEnd(LEAST, tmp_path / "memo"), ANY, petg.material())
     here = Execution(backend="loky", jobs=1, scheduler="")
-    found = frame_folder.read_folder(raw, options, here)
+    found = nozzle_frames.read_folder(raw, options, here)
     plain = read(raw)
     # 60 and 100 % are good for it, 150 % is over; 210 degC stand 10 below the range, as 170 do for PLA
     own = np.tile(np.repeat([60.0, 100.0, 150.0], SHOTS), 2)

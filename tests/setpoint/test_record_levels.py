@@ -12,7 +12,7 @@ from pipeline.commands.levels_files import restore_levels
 from pipeline.commands.record_levels import Eye, Protocol
 from pipeline.commands.shadow.decide import Mind
 from pipeline.commands.shadow.deploy import of_camera
-from pipeline.reading.watch_sources import CameraFrame, Folder
+from pipeline.recordings.watch_sources import CameraFrame, Folder
 from pipeline.setpoint import levels
 from pipeline.setpoint.material import PrintedMaterial
 from tests.setpoint.test_shadow import ASKED, FRAMES, TIP, by_width, deployed, fill, picture

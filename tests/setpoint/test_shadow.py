@@ -24,8 +24,8 @@ from pipeline.commands import shadow
 from pipeline.commands.shadow import decision_log
 from pipeline.commands.shadow.decide import DeployedLoop, WatchOptions
 from pipeline.commands.shadow.windows import FrameWindows
-from pipeline.reading import watch_sources
-from pipeline.reading.watch_sources import CameraFrame, Folder, RecordingSource
+from pipeline.recordings import watch_sources
+from pipeline.recordings.watch_sources import CameraFrame, Folder, RecordingSource
 from pipeline.setpoint.agents import bayes
 from pipeline.setpoint.deployment import deployment
 from pipeline.setpoint.material import PLA, PrintedMaterial
@@ -442,7 +442,7 @@ DRIVER = """
     import sys, time
     from pathlib import Path
     from pipeline.commands import shadow
-    from pipeline.reading.watch_sources import source
+    from pipeline.recordings.watch_sources import source
     from tests.nozzle_folders import ANY
     from tests.setpoint.test_shadow import ASKED, deployed
     with shadow.until_told() as stopped:
@@ -477,18 +477,18 @@ WRITER = """
     from pathlib import Path
     import numpy as np
     from mcap.writer import Writer
-    from pipeline.reading import image_messages
+    from pipeline.recordings import images
     from tests.setpoint.test_shadow import picture
     with open(sys.argv[1], "wb") as stream:
         writer = Writer(stream, chunk_size=150_000)
         writer.start()
-        text = image_messages.IMAGE.encode()
+        text = images.IMAGE.encode()
         camera = writer.register_channel(
             "/cam", "cdr", writer.register_schema("sensor_msgs/msg/Image", "ros2msg", text))
         for k in range(60):
             stamp = round(k * 5e7)
-            head = image_messages.header(stamp, "nozzle")
-            writer.add_message(camera, stamp, image_messages.image(head, picture(k)), stamp)
+            head = images.header(stamp, "nozzle")
+            writer.add_message(camera, stamp, images.image(head, picture(k)), stamp)
             stream.flush()
             time.sleep(0.02)
         late = time.monotonic() + 300
@@ -572,7 +572,7 @@ def test_nothing_in_the_watch_could_send():
     reads snapshots names no method and no body."""
     files = [
         *sorted((ROOT / "pipeline/commands/shadow").glob("*.py")),
-        ROOT / "pipeline/reading/watch_sources.py",
+        ROOT / "pipeline/recordings/watch_sources.py",
     ]
     for path in files:
         tree = ast.parse(path.read_text())

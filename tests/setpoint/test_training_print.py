@@ -11,7 +11,7 @@ import pytest
 from pipeline import cli
 from pipeline.deposition.toolpath import gcode
 from pipeline.deposition.toolpath.gcode import Kind
-from pipeline.reading.frame_csv import read_log
+from pipeline.recordings.nozzle_frames import read_log
 
 
 @pytest.fixture

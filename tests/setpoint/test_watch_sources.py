@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.reading import watch_sources
-from pipeline.reading.frame_mcap import Topics
-from pipeline.reading.growing_mcap import GrowingMcap
-from pipeline.reading.watch_sources import COPY, Folder, RecordingSource, Snapshots, shown_place, source
+from pipeline.recordings import watch_sources
+from pipeline.recordings.mcap_files import GrowingMcap
+from pipeline.recordings.nozzle_frames import Topics
+from pipeline.recordings.watch_sources import COPY, Folder, RecordingSource, Snapshots, shown_place, source
 from tests.mcap_writing import LZ4, NO, ZSTD, Written, chunks
 from tests.nozzle_folders import ANY
 

@@ -3,7 +3,7 @@
 import signal
 from pathlib import Path
 
-from pipeline.reading import recording_folders
+from pipeline.recordings import recording_folders
 
 
 def wait_for_ever(path: Path, *arguments) -> str:

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.reading import recording_folders
-from pipeline.reading.isolated import Budget, isolated
-from pipeline.reading.recording_folders import RecordingWish, count_work, join, read_folder
+from pipeline.recordings import plain_files, recording_folders
+from pipeline.recordings.isolated import Budget, isolated
+from pipeline.recordings.recording_folders import RecordingWish, count_work, join, read_folder
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant
-from stages.ingest import Ingest, recording_wish
-from tests.reading.klipper_machine import EXTRUDER, print_log
-from tests.reading.test_bag_folders import bag
+from stages.ingest import Ingest, MappedSignal, recording_wish, sources
+from tests.recordings.klipper_machine import EXTRUDER, print_log
+from tests.recordings.test_bag_folders import bag
 from tests.temperature import long_readings
 
 MACHINE = Plant.model_validate(
@@ -30,7 +30,7 @@ def wish(machine: Plant = MACHINE, **mapping: tuple[str, str, float, float]) -> 
     """What the stage takes from every recording with this mapping."""
     keys = ("source", "unit", "scale", "offset")
     settings = Ingest(
-        mapping={name: params.Mapped(**dict(zip(keys, to, strict=True))) for name, to in mapping.items()},
+        mapping={name: MappedSignal(**dict(zip(keys, to, strict=True))) for name, to in mapping.items()},
         time="",
         decimal="",
         max_gap_s=5.0,
@@ -69,10 +69,16 @@ def folder(root: Path, count: int) -> Path:
 
 
 def ingested(
-    raw: Path, out: Path, execution=INLINE, job=JOB, memo: Path | None = None, strict: bool = False
+    raw: Path,
+    out: Path,
+    execution=INLINE,
+    job=JOB,
+    memo: Path | None = None,
+    strict: bool = False,
+    waits: bool = False,
 ) -> dict:
     """What the stage does with a folder; the tables land in `out` for a look at their bytes."""
-    results = read_folder(raw, job, execution, memo=memo or out / "memo", budget=BUDGET)
+    results = read_folder(raw, job, execution, memo=memo or out / "memo", budget=BUDGET, waits=waits)
     record, quality, metrics = join(results, job, strict=strict)
     artifacts.write_table(out / "record.parquet", job.record, record)
     artifacts.write_table(out / "quality.parquet", job.quality, quality)
@@ -160,7 +166,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from pipeline.store import artifacts
-from pipeline.reading import recording_folders
+from pipeline.recordings import recording_folders
 from tests.temperature.test_ingest import BUDGET, INLINE, JOB
 
 write_table, written = artifacts.write_table, []
@@ -251,6 +257,82 @@ def test_a_recording_beyond_its_budget_is_quarantined_and_the_others_go_on(
     assert "in params.expert.yaml" in results[2].reason
 
 
+def kinds(out: Path) -> dict[tuple[str, str], str]:
+    """{(recording, kind): message} of the findings."""
+    quality = artifacts.read_table(out / "quality.parquet", JOB.quality)
+    rows = zip(quality["recording"], quality["kind"], quality["message"], strict=True)
+    return {(str(name), str(kind)): str(message) for name, kind, message in rows}
+
+
+def test_copies_that_are_not_complete_are_passed_over_with_a_note_and_not_quarantined(tmp_path, monkeypatch):
+    raw = folder(tmp_path, 2)
+    ingested(raw, tmp_path / "before")
+    for name in ("001.csv.part", "002.csv.crdownload", "~$rig.xlsx", "Thumbs.db"):
+        (raw / name).write_bytes(b"half")
+    growing = recording(raw / "new.csv", seed=7)
+    monkeypatch.setattr(plain_files, "REST_S", 10.0)
+    monkeypatch.setattr(plain_files.time, "sleep", lambda _: growing.write_text("time_s,heater,zone\n"))
+    settled = ingested(raw, tmp_path / "after", strict=True, waits=True)
+    assert (settled["recordings"], settled["quarantined"]) == (2, 0)
+    assert tables(tmp_path / "after")[0] == tables(tmp_path / "before")[0]
+    messages = kinds(tmp_path / "after")
+    assert "is still being written" in messages["new.csv", "passed_over"]
+    assert "is a copy that is not complete" in messages["001.csv.part", "passed_over"]
+    assert len([kind for _, kind in messages if kind == "passed_over"]) == 5
+
+
+def test_a_recording_that_was_copied_a_moment_ago_is_read_when_it_has_rested(tmp_path, monkeypatch):
+    raw, slept = folder(tmp_path, 1), []
+    monkeypatch.setattr(plain_files, "REST_S", 10.0)
+    monkeypatch.setattr(plain_files.time, "sleep", slept.append)
+    assert done(ingested(raw, tmp_path, waits=True)) == (1, 0, 0)
+    assert len(slept) == 1
+    assert 0 < slept[0] <= 10
+    monkeypatch.setattr(
+        plain_files.time, "sleep", lambda _: (raw / "000.csv").write_text("time_s,heater,zone\n")
+    )
+    os.utime(raw / "000.csv")
+    with pytest.raises(
+        ValueError, match=r"found none but .*000\.csv is still being written; wait until its copy"
+    ):
+        ingested(raw, tmp_path, waits=True)
+
+
+def test_a_folder_of_copies_that_are_not_complete_has_no_recording(tmp_path):
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "raw/rig.csv.part").write_bytes(b"half")
+    with pytest.raises(ValueError, match=r"found none but .*rig\.csv\.part is a copy that is not comp"):
+        ingested(tmp_path / "raw", tmp_path)
+
+
+@pytest.mark.parametrize(("cut", "share"), [(4, 0.0), (12, 9.1)])
+def test_a_record_that_is_cut_by_more_than_a_twentieth_says_by_how_much(tmp_path, cut, share):
+    raw = folder(tmp_path, 1)
+    with (raw / "000.csv").open("a") as stream:
+        stream.write("a total,of the\n" * cut)
+    figures = ingested(raw, tmp_path)
+    assert figures.get("cut_percent", {}) == ({"000.csv": share} if share else {})
+    messages = kinds(tmp_path)
+    assert (("000.csv", "cut") in messages) == bool(share)
+    if share:
+        assert messages["000.csv", "cut"].startswith("9.1 % of the recording was left out (limit 5 %)")
+
+
+def test_a_signal_that_ends_early_cuts_the_record(tmp_path):
+    raw = folder(tmp_path, 1)
+    lines = (raw / "000.csv").read_text().splitlines()
+    # the last quarter has no zone and less than half of the rows have its own clock: two files of a scope
+    head = "Name\theater\tName\tzone\nData-Type\tREAL64\tData-Type\tREAL64\n"
+    head += "SampleTime[ms]\t1000\tSampleTime[ms]\t1000\n"
+    rows = [line.split(",") for line in lines[1:]]
+    text = "".join(
+        f"{float(t) * 1000:g}\t{u}\t" + (f"{float(t) * 1000:g}\t{y}\n" if i < 90 else "\t\n")
+        for i, (t, u, y) in enumerate(rows)
+    )
+    (raw / "000.csv").write_text(head + text)
+    assert ingested(raw, tmp_path)["cut_percent"] == {"000.csv": 25.0}
+
+
 def test_strict_and_a_folder_of_broken_recordings_alone_end_with_the_first_reason(tmp_path):
     raw = folder(tmp_path, 1)
     broken(raw)
@@ -310,6 +392,15 @@ def test_a_mapping_that_names_no_signal_gives_the_nearest_names():
         ValueError, match=r"ingest\.mapping\.zoone is no signal of the plant; the nearest names are zone"
     ):
         wish(zoone=("zone", "degC", 1.0, 0.0))
+
+
+def test_a_set_point_is_declared_beside_an_output_and_beside_nothing_else():
+    mapped = MappedSignal(source="T1_Ist", unit="degC", scale=1.0, offset=0.0, set_point="T1_Soll")
+    assert [source.source for source in sources(MACHINE, {"zone": mapped})] == ["heater", "T1_Ist"]
+    with pytest.raises(
+        ValueError, match="heater.set_point is for outputs alone, but heater is none; take it"
+    ):
+        sources(MACHINE, {"heater": mapped})
 
 
 # ---- more than one process

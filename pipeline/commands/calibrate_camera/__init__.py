@@ -19,8 +19,8 @@ from pipeline.deposition.camera import bead, ladder, line
 from pipeline.deposition.camera.edges import BLOCK, FEWEST_BLOCKS
 from pipeline.deposition.camera.ladder import Ladder, Rung
 from pipeline.deposition.settings import Camera, Printer
-from pipeline.reading.image_topics import Frames, Walk, image_topic
-from pipeline.reading.mcap_columns import topics
+from pipeline.recordings.images import Frames, image_topic
+from pipeline.recordings.mcap_files import McapFile, TopicColumns, topics
 from pipeline.store import artifacts, params
 from pipeline.store.params_text import replaced
 
@@ -236,8 +236,7 @@ def _frames(path: Path, camera: Camera) -> list[np.ndarray]:
     """The picture of a file in gray, or SAMPLE frames of an MCAP recording, spread over it."""
     if path.suffix.lower() == ".mcap":
         topic = image_topic(path, topics(path), camera.topics.image)
-        walk = Walk(path, topic, set(), "log_time")
-        frames = Frames(walk, topic, "log_time", start_ns=0, unreadable_share=camera.unreadable_share)
+        frames = Frames(TopicColumns(McapFile(path), "log_time"), topic, camera.unreadable_share)
         wanted = set(np.linspace(0, len(frames) - 1, min(SAMPLE, len(frames))).astype(int).tolist())
         chosen = [frame for k, (_, frame) in enumerate(frames) if k in wanted]
         if not chosen:

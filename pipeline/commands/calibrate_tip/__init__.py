@@ -11,8 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.reading.frame_images import read_image
-from pipeline.reading.frame_mcap import middle_frame
+from pipeline.recordings.images import read_image
+from pipeline.recordings.nozzle_frames import middle_frame
 from pipeline.setpoint.frames import key_area
 from pipeline.store import artifacts
 

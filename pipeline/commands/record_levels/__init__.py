@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.commands.levels_files import RecordedLevels, store_levels
-from pipeline.reading.watch_sources import CameraFrame, Folder, FrameSource, RecordingSource
+from pipeline.recordings.watch_sources import CameraFrame, Folder, FrameSource, RecordingSource
 from pipeline.setpoint import levels
 from pipeline.setpoint.frames import familiar
 from pipeline.setpoint.frames.familiar import FALSE_ALARMS, KnownCamera

@@ -14,7 +14,7 @@ from pipeline.commands.shadow.decide import DeployedLoop, Mind, ShadowDecision, 
 from pipeline.commands.shadow.decision_log import DecisionLog
 from pipeline.commands.shadow.page import ENDED, render
 from pipeline.commands.shadow.windows import GAP_S, FrameWindows
-from pipeline.reading.watch_sources import FrameSource, RecordingSource, Snapshots
+from pipeline.recordings.watch_sources import FrameSource, RecordingSource, Snapshots
 from pipeline.setpoint.simulation.actuation import ACTS
 from pipeline.store import artifacts
 from pipeline.store.printable import counted, printable

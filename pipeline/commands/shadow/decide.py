@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.reading.watch_sources import CameraFrame
+from pipeline.recordings.watch_sources import CameraFrame
 from pipeline.setpoint.agents import bayes
 from pipeline.setpoint.deployment import deployment
 from pipeline.setpoint.deployment.deployment import JudgedWindow, camera_seen

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.commands.levels_files import LEVELS_FILE, restore_levels
 from pipeline.commands.shadow.decide import DeployedLoop, Looks, WatchOptions, deployed
-from pipeline.reading.frame_mcap import Topics
+from pipeline.recordings.nozzle_frames import Topics
 from pipeline.setpoint import levels
 from pipeline.setpoint.agents.files import restore_agents
 from pipeline.setpoint.controllers import CONTROLLERS, build_controllers

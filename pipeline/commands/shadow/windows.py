@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.reading.watch_sources import CameraFrame
+from pipeline.recordings.watch_sources import CameraFrame
 from pipeline.store.printable import counted
 
 # frames further apart than this are of no one window

@@ -21,7 +21,7 @@ MOST = 4
 FURTHER = "foreign: further from what was learned than allowed"
 
 
-# ---- of recordings: frames of reading/frame_folder.py
+# ---- of recordings: frames of recordings/nozzle_frames.py
 
 
 class Groups(NamedTuple):

@@ -1,0 +1,256 @@
+"""Times written as text -> nanoseconds on one calendar: ISO 8601, the dates of other countries, times of
+day."""
+
+import calendar
+import contextlib
+import datetime
+import functools
+import itertools
+import re
+import zoneinfo
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+# a clock is steady where no step is longer than so many medians, and there are so many; steps within a date
+# are the same in either order, and so many of them do
+STEADY, FEWEST_STEPS, FIRST_STEPS = 1.5, 5, 1000
+DAY_NS = 86_400 * 10**9
+_EPOCH = datetime.date(1970, 1, 1).toordinal()
+_MONTHS = {name: i for i, name in enumerate(calendar.month_abbr)}
+_DATE = (
+    r"(?P<date>\d{4}(?P<m>[-/.])\d{1,2}(?P=m)\d{1,2}|\d{8}|"
+    r"\d{1,2}(?P<k>[./-])(?:\d{1,2}|[A-Za-z]{3})(?P=k)(?:\d{4}|\d{2}))"
+)
+_TIME = (
+    r"(?P<hours>\d+):(?P<minutes>\d\d)(?::(?P<seconds>\d\d)(?:(?:[.,:]|-(?=\d{3}\s*$))(?P<fraction>\d+))?)?"
+    r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
+)
+_TEXT = re.compile(
+    rf"\s*(?:{_DATE}(?:[T,\s]+|$))?(?:{_TIME})?\s*(?P<zone>Z|z|[+-]\d\d(?::?\d\d)?|[A-Z]{{3,5}}|[A-Z]\w+(?:/[\w+-]+)+)?\s*$"
+)
+_PARTS = ("date", "hours", "minutes", "seconds", "fraction", "half", "zone")
+# 20251121130000 and 20251121130000250, as controllers stamp
+_COMPACT = re.compile(r"\s*((?:19|20)\d\d(?:0[1-9]|1[0-2])[0-3]\d)([0-2]\d)([0-5]\d)([0-5]\d)(\d{3})?\s*$")
+# what stands behind the seconds and a hyphen: a fraction as the camera program of CAXTON writes it, or a zone
+_HYPHEN = re.compile(r"(:\d\d)-(\d{1,6})\s*$")
+# zones by the letters that programs write behind a time; each says whether it is summer
+_ZONE_HOURS = {
+    "UTC": 0, "GMT": 0, "WET": 0, "WEST": 1, "BST": 1, "CET": 1, "CEST": 2, "MEZ": 1, "MESZ": 2,
+    "EET": 2, "EEST": 3, "MSK": 3, "JST": 9, "KST": 9, "AEST": 10, "AEDT": 11,
+    "EST": -5, "EDT": -4, "CST": -6, "CDT": -5, "MST": -7, "MDT": -6, "PST": -8, "PDT": -7,
+}  # fmt: skip
+EXPECTED = "seconds or ISO 8601 such as 2025-11-21T13:00:00.5"
+
+
+class Instants(NamedTuple):
+    """ns (n,) since 1970, or since midnight for text without a date. `zoned`: every time names its zone."""
+
+    ns: np.ndarray
+    zoned: bool
+    dated: bool
+
+
+def is_compact(text: str) -> bool:
+    """Whether a number is a date and a time without marks between, 20251121130000."""
+    return bool(_COMPACT.match(text))
+
+
+def is_date(text: str) -> bool:
+    """Whether a text begins with a date."""
+    return bool(re.match(rf"\s*{_DATE}", text))
+
+
+def instants(
+    path: Path,
+    name: str,
+    fields: Sequence[str],
+    lines: Sequence[int] | np.ndarray,
+    *,
+    month_first: bool | None,
+    hyphen_fraction: bool = False,
+) -> Instants:
+    """The instants that `fields` name. `month_first` decides 05/03/2025; None refuses it. `hyphen_fraction`
+    decides 13:12:54-05: five hundredths of a second, else five hours west.
+
+    The hour that the end of summer time in Europe/Berlin repeats is its second one behind the instant of the
+    field before. Raises ValueError with the line of a field that is no time.
+    """
+    ns = np.empty(len(fields), np.int64)
+    zoned, dated, after = True, False, None
+    for i, (field, line) in enumerate(zip(fields, lines, strict=True)):
+        try:
+            written = _HYPHEN.sub(r"\1.\2", field) if hyphen_fraction else field
+            after, has_zone, dated = _instant(written, month_first, after)
+            ns[i] = after
+        except (ValueError, OverflowError) as error:
+            hint = f" ({error}?)" if str(error).startswith(("day", "hours", "zone")) else ""
+            raise ValueError(
+                f"{path}: line {line}, time {name} should be {EXPECTED} but is {field.strip()[:40]!r}{hint}; "
+                "convert it, or name another column"
+            ) from None
+        zoned = zoned and has_zone
+    return Instants(ns, zoned, dated)
+
+
+def _instant(field: str, month_first: bool | None, after: int | None) -> tuple[int, bool, bool]:
+    """(ns, has a zone, has a date) of one text. Raises ValueError for text that is no time."""
+    compact = _COMPACT.match(field)
+    if compact:
+        date, hours, minutes, seconds, fraction = compact.groups()
+        half, zone = None, None
+    else:
+        match = _TEXT.match(field)
+        if not match or not (match["date"] or match["hours"]):
+            return _iso(field)
+        date, hours, minutes, seconds, fraction, half, zone = match.group(*_PARTS)
+        if not date and seconds is None:
+            raise ValueError("hours and minutes, or minutes and seconds")
+    hours, minutes, seconds = int(hours or 0), int(minutes or 0), int(seconds or 0)
+    if minutes > 59 or seconds > 60 or (date and hours > 24) or (half and not 1 <= hours <= 12):
+        raise ValueError
+    if half:
+        hours = hours % 12 + 12 * (half[0] in "Pp")
+    ns = ((hours * 60 + minutes) * 60 + seconds) * 10**9 + int(f"{fraction or 0:0<9}"[:9])
+    ns += _day(date, month_first) * DAY_NS if date else 0
+    return ns - _offset_ns(zone or "", ns, after), bool(zone), bool(date)
+
+
+def _iso(field: str) -> tuple[int, bool, bool]:
+    """The rarer forms of ISO 8601, such as 20251121T130000Z."""
+    instant = datetime.datetime.fromisoformat(field.strip())
+    zone = instant.utcoffset()
+    since = instant.replace(tzinfo=None) - datetime.datetime(1970, 1, 1) - (zone or datetime.timedelta())
+    return since // datetime.timedelta(microseconds=1) * 1000, zone is not None, True
+
+
+@functools.lru_cache(maxsize=4096)
+def _day(date: str, month_first: bool | None) -> int:
+    """Days since 1970 of one date; recordings have few of them."""
+    if date.isdigit():
+        year, month, day = int(date[:4]), int(date[4:6]), int(date[6:])
+    else:
+        mark = re.search(r"[-/.]", date)[0]
+        first, second, third = date.split(mark)
+        if len(first) == 4:
+            year, month, day = int(first), int(second), int(third)
+        else:
+            year = int(third) + (2000 if len(third) == 2 else 0)
+            if second.isalpha():
+                day, month = int(first), _MONTHS.get(second.title(), 0)
+            else:
+                day, month = _day_and_month(int(first), int(second), mark, month_first)
+                if not month:
+                    one, other = f"{second:0>2}-{first:0>2}", f"{first:0>2}-{second:0>2}"
+                    raise ValueError(f"day or month first: {year}-{one} or {year}-{other}")
+    return datetime.date(year, month, day).toordinal() - _EPOCH
+
+
+def _day_and_month(first: int, second: int, mark: str, month_first: bool | None) -> tuple[int, int]:
+    """(day, month), (0, 0) where nothing tells which is which."""
+    if mark == "." or first > 12 or first == second or month_first is False:
+        return first, second
+    if second > 12 or month_first:
+        return second, first
+    return 0, 0
+
+
+def month_first(dates: Iterable[str], sample: str) -> bool | None:
+    """Whether dates such as 05/03/2025 begin with the month, None if nothing tells.
+
+    A date that can be only one of both tells, and so do the am and pm of `sample` where the days run on in
+    one month: 11/03 before 12/03 is the next day in Australia, and a month later in America. A single day is
+    the same either way.
+    """
+    pairs = {
+        (int(match[1]), int(match[2]))
+        for date in dates
+        if (match := re.match(r"\s*(\d{1,2})[/-](\d{1,2})[/-]\d", date))
+    }
+    if any(first > 12 for first, _ in pairs):
+        return False
+    american = re.search(r"\d\s*[AaPp]\.?[Mm]", sample) and len({second for _, second in pairs}) > 1
+    return True if american or len(pairs) == 1 or any(second > 12 for _, second in pairs) else None
+
+
+def steady_order(stamps: Iterable[str]) -> bool | None:
+    """Whether the month stands first in dates that can be both, by the one reading that runs forward in
+    steps that are nearly equal; None where neither does or both do.
+
+    Steps count where the date changes, and at the first stamps. Text that is no time is passed over.
+    """
+    steps: dict[bool, list[int]] = {False: [], True: []}
+    for before, now in itertools.pairwise(stamps):
+        if len(steps[False]) >= FIRST_STEPS and before.split()[:1] == now.split()[:1]:
+            continue
+        with contextlib.suppress(ValueError, OverflowError):
+            pair = [(_instant(before, order, None)[0], _instant(now, order, None)[0]) for order in steps]
+            for order, (earlier, later) in zip(steps, pair, strict=True):
+                steps[order].append(later - earlier)
+    steady = [order for order, sizes in steps.items() if _is_steady(np.array(sizes))]
+    return steady[0] if len(steady) == 1 else None
+
+
+def _is_steady(steps: np.ndarray) -> bool:
+    return len(steps) >= FEWEST_STEPS and steps.min() > 0 and steps.max() <= STEADY * np.median(steps)
+
+
+def hyphen_fraction(fields: Iterable[str]) -> bool:
+    """Whether the digits behind hyphens, as in 14:12:33-797, are fractions of a second.
+
+    One field that can be no zone tells for all: zones are written as -HH or -HHMM, up to 14 hours. Fields
+    are looked at up to it, or up to one without such digits.
+    """
+    for field in fields:
+        match = _HYPHEN.search(field)
+        if not match:
+            return False
+        if not _is_offset(match[2]):
+            return True
+    return False
+
+
+def _is_offset(digits: str) -> bool:
+    """Whether a zone may lie HH or HHMM away from UTC."""
+    hours, minutes = int(digits[:2]), int(digits[2:] or 0)
+    return len(digits) in (2, 4) and minutes < 60 and hours * 60 + minutes <= 14 * 60
+
+
+def _offset_ns(zone: str, local_ns: int, after: int | None) -> int:
+    """What a clock of that zone is ahead of UTC at its time `local_ns`. Raises ValueError for no zone."""
+    if zone in ("", "Z", "z"):
+        return 0
+    if zone in _ZONE_HOURS:
+        return _ZONE_HOURS[zone] * 3600 * 10**9
+    if zone[0] not in "+-":
+        first, second = _region_offsets_ns(zone, local_ns // (900 * 10**9))
+        return second if first > second and after is not None and local_ns - first <= after else first
+    digits = zone[1:].replace(":", "")
+    if not _is_offset(digits):
+        raise ValueError
+    minutes = int(digits[:2]) * 60 + int(digits[2:] or 0)
+    return (-1 if zone[0] == "-" else 1) * minutes * 60 * 10**9
+
+
+@functools.lru_cache(maxsize=4096)
+def _region_offsets_ns(zone: str, quarter: int) -> tuple[int, int]:
+    """Offsets of a zone such as Europe/Berlin in a quarter of an hour of its own clock since 1970.
+
+    They differ in an hour that is repeated or left out.
+    """
+    try:
+        region = zoneinfo.ZoneInfo(zone)
+    except (zoneinfo.ZoneInfoNotFoundError, ValueError, OSError):
+        raise ValueError(f"zone {zone}") from None
+    local = datetime.datetime(1970, 1, 1, tzinfo=region) + datetime.timedelta(minutes=15 * quarter)
+    first, second = (local.replace(fold=fold).utcoffset() or datetime.timedelta() for fold in (0, 1))
+    return first // datetime.timedelta(seconds=1) * 10**9, second // datetime.timedelta(seconds=1) * 10**9
+
+
+def over_midnight(ns: np.ndarray) -> tuple[np.ndarray, int]:
+    """Times of day that run on over midnight, and the count of midnights. A day is added after each fall by
+    more than half a day."""
+    midnights = np.cumsum(np.r_[0, np.diff(ns) < -DAY_NS // 2])
+    return ns + midnights * DAY_NS, int(midnights[-1])

@@ -1,0 +1,203 @@
+"""Work on a stranger's file, done in a warm child process within a budget of time and memory.
+
+A child serves one call after the other. A call that runs out of its budget, or that ends the process, costs
+that call alone: the next one gets a fresh child. Calls go to the child pickled, as they are ours. Results
+come back as JSON, so that nothing a file did to the child runs here.
+"""
+
+import contextlib
+import json
+import os
+import pickle
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+if sys.platform != "win32":
+    import resource
+
+ROOT = Path(__file__).parents[2]
+_LENGTH = struct.Struct("<Q")
+# a child that keeps so much behind a call is replaced: the next call has its whole budget
+KEPT_MB = 256
+# what C++, Python and Arrow print last where memory is refused them; Arrow then ends the process
+OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "Out of memory", "memory allocation of")
+# the child's own code; -P: a folder `pipeline` in the working directory is not ours
+_SERVE = "from pipeline.recordings.isolated import serve; serve()"
+
+
+class Budget(NamedTuple):
+    """What one file may cost: seconds of the clock, and megabytes beyond what the child needs by itself."""
+
+    longest_s: float
+    largest_mb: float
+
+
+class Child(NamedTuple):
+    """A warm process, and the file that takes what it prints."""
+
+    process: subprocess.Popen
+    printed: IO[bytes]
+
+
+# children that wait for work; append and pop are atomic, so that threads share them
+_waiting: list[Child] = []
+
+
+def isolated(work: Callable[..., Any], *arguments: Any, shown: str | Path, budget: Budget) -> Any:
+    """work(*arguments) in a child; the result is what JSON can say. `work` is a function of a module.
+
+    Raises ValueError and OSError as `work` does, and ValueError with a sentence about the file `shown` if the
+    call takes longer or needs more memory than its budget, or ends the process.
+    """
+    child = _take()
+    call = pickle.dumps((budget, work, arguments))
+    reply: dict[str, Any] = {}
+    try:
+        pipe_in, pipe_out = child.process.stdin, child.process.stdout
+        assert pipe_in is not None and pipe_out is not None
+        with contextlib.suppress(BrokenPipeError):
+            pipe_in.write(_LENGTH.pack(len(call)) + call)
+            pipe_in.flush()
+        head = pipe_out.read(_LENGTH.size)
+        if len(head) == _LENGTH.size:
+            body = pipe_out.read(_LENGTH.unpack(head)[0])
+            reply = json.loads(body)
+    except ValueError:
+        reply = {}
+    finally:
+        # also where a person ends the run: a child at its work is not left behind
+        ended = (0, "")
+        if reply.get("ready"):
+            _waiting.append(child)
+        else:
+            ended = _end(child)
+    if "result" in reply:
+        return reply["result"]
+    if "refused" in reply:
+        raise ValueError(reply["refused"])
+    if "failed" in reply:
+        raise OSError(reply["failed"])
+    raise ValueError(_sentence(shown, budget, "memory" in reply, *ended))
+
+
+def _take() -> Child:
+    """A child that waits, or a new one."""
+    while _waiting:
+        child = _waiting.pop()
+        if child.process.poll() is None:
+            return child
+    printed = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-c", _SERVE],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=printed,
+        # Arrow's own allocator takes a GiB at once, of which most is never used
+        env=os.environ | {"PYTHONPATH": path, "ARROW_DEFAULT_MEMORY_POOL": "system"},
+    )
+    return Child(process, printed)
+
+
+def _end(child: Child) -> tuple[int, str]:
+    """Ends a child; its exit status, and the last line that it printed."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        # one that ended by itself has closed its pipes before it can be waited for
+        child.process.wait(timeout=1)
+    child.process.kill()
+    with contextlib.suppress(BrokenPipeError), child.process as process:
+        process.wait()
+    with child.printed as printed:
+        end = printed.seek(0, os.SEEK_END)
+        printed.seek(max(0, end - 2000))
+        lines = printed.read().decode(errors="replace").split("\n")
+    return child.process.returncode, next((line.strip() for line in reversed(lines) if line.strip()), "")
+
+
+# ---- the sentences
+
+
+def _sentence(shown: str | Path, budget: Budget, no_memory: bool, status: int, last: str) -> str:
+    """Why a call gave nothing."""
+    if status == -signal.SIGALRM:
+        return (
+            f"{shown}: reading it takes longer than the {budget.longest_s:g} s that a recording may take; "
+            "split the recording, or raise ingest.longest_s in params.expert.yaml if it is as long as that"
+        )
+    if no_memory or any(words in last for words in OUT_OF_MEMORY):
+        return (
+            f"{shown}: reading it needs more memory than the {budget.largest_mb:g} MB that a recording may "
+            "take; split the recording, or raise ingest.largest_mb in params.expert.yaml if it is as large "
+            "as that"
+        )
+    if status == -signal.SIGKILL:
+        return (
+            f"{shown}: the process that read it was killed, as a system does that runs out of memory; "
+            "lower execution.jobs or ingest.largest_mb, and run it again"
+        )
+    how = signal.Signals(-status).name if status < 0 else last[:200] or f"exit status {status}"
+    return (
+        f"{shown}: reading it ended the process that read it ({how}); "
+        "copy the recording again, and report it with the file if that does not help"
+    )
+
+
+# ---- in the child
+
+
+def serve() -> None:
+    """Answers the calls on standard input until it is closed."""
+    calls, replies = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what a library prints is no reply
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    ready = True
+    while ready and len(head := calls.read(_LENGTH.size)) == _LENGTH.size:
+        budget, work, arguments = pickle.loads(calls.read(_LENGTH.unpack(head)[0]))
+        ready = _answer(replies, budget, work, arguments)
+
+
+def _answer(replies: IO[bytes], budget: Budget, work: Callable[..., Any], arguments: tuple) -> bool:
+    """Replies with what one call gives. False if its memory ran out or much of it is kept: the next call
+    needs another child."""
+    base, reply = _data_mb(), {}
+    _limit_memory(base + budget.largest_mb)
+    signal.setitimer(signal.ITIMER_REAL, budget.longest_s)
+    try:
+        reply = {"result": work(*arguments)}
+    except MemoryError:
+        reply = {"memory": True}
+    except ValueError as error:
+        reply = {"refused": str(error)}
+    except OSError as error:
+        reply = {"failed": str(error)}
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    _limit_memory(None)
+    ready = "memory" not in reply and _data_mb() <= base + KEPT_MB
+    content = json.dumps(reply | {"ready": ready}).encode()
+    replies.write(_LENGTH.pack(len(content)) + content)
+    replies.flush()
+    return ready
+
+
+def _limit_memory(largest_mb: float | None) -> None:
+    most = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    wanted = most if largest_mb is None else int(largest_mb * 2**20)
+    if most != resource.RLIM_INFINITY and wanted != resource.RLIM_INFINITY:
+        wanted = min(wanted, most)
+    resource.setrlimit(resource.RLIMIT_DATA, (wanted, most))
+
+
+def _data_mb() -> float:
+    """What this process has taken of private memory; 0 on a system that does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[5])
+    except OSError:
+        return 0.0
+    return pages * resource.getpagesize() / 2**20

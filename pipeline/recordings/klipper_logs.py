@@ -1,0 +1,398 @@
+"""Klipper's log (klippy.log): what its Stats lines say of each heater, on the calendar, and the printer's own
+control in the configuration that the log repeats.
+
+A line is read as Klipper's own scripts/graphstats.py reads it: words behind "Stats"; a word without "=" is
+the device that the following target, temp and pwm are of; a line without print_time is left out. Times count
+from the computer's start. "Start printer at ... (system time, that count)" puts them on the calendar.
+"""
+
+import re
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+
+from pipeline.recordings.formats import Note, WholeTable, check_values
+
+# Stats lines have some 1,500 characters; a longer line is no line of Klipper's
+LONGEST_LINE = 1 << 16
+MOST_DEVICES = 200
+# how often the size of what was read is looked at
+LINES_A_CHECK = 10_000
+LONGEST_CONFIG = 20_000
+# sessions whose order in time is not known stand so far apart, in s: no gap limit joins them
+APART_S = 3600.0
+# Klipper divides its PID parameters by this: they are of a duty of 0 to 255
+PID_BASE = 255.0
+_STATS = (b"Stats", b"INFO:root:Stats")
+LATEST_S = 4e9  # the year 2096: beyond it a system time is none, and no count runs on so long
+_START = re.compile(rb"Start printer at .*\((\d+(?:\.\d+)?) (\d+(?:\.\d+)?)\)")
+# key of a Stats line -> unit and factor
+_KEYS = {
+    b"temp": ("temp", "degC", 1.0),
+    b"target": ("target", "degC", 1.0),
+    b"pwm": ("pwm", "percent", 100.0),
+    b"fan_speed": ("fan_speed", "percent", 100.0),
+}
+
+
+class PrinterPid(NamedTuple):
+    """The printer's own PID of a heater, u = kp e + ki ∫e dt - kd dy/dt, u in percent of duty and e in °C.
+
+    The derivative is smoothed over `smooth_s`; u is cut to 0 ... `most_percent`.
+    """
+
+    heater: str
+    kp_percent_per_degC: float
+    ki_percent_per_degC_s: float
+    kd_percent_s_per_degC: float
+    most_percent: float
+    smooth_s: float
+
+
+class HeaterConfig(NamedTuple):
+    """A heater as the printer's configuration has it; `pid` is None for on-off control."""
+
+    heater: str
+    control: str
+    low_degC: float
+    high_degC: float
+    most_percent: float
+    pid: PrinterPid | None
+
+
+class _Session(NamedTuple):
+    """A run of Klipper: its first row, and the system time at the count's zero, NaN if the log lacks it."""
+
+    first: int
+    zero_s: float
+
+
+def load_klippy(path: Path) -> WholeTable:
+    """Temperature, target (°C), duty and fan speed (percent) of every device in the Stats lines.
+
+    Columns are "extruder.temp", "extruder.target", "extruder.pwm". Raises ValueError for a log without a
+    Stats line of a heater.
+    """
+    log = _Log()
+    with path.open("rb") as stream:
+        for line, text in _lines(stream):
+            log.add(line, text)
+            if line % LINES_A_CHECK == 0:
+                check_values(path, len(log.times), len(log.columns))
+    if not log.times or not log.columns:
+        left_out = log.idle + log.garbled + log.cut
+        what = "no Stats line"
+        if log.times or left_out:
+            what = f"{len(log.times)} whole Stats lines of a printer at work, none of a heater"
+            what += f", and {left_out} that are idle, garbled or cut" if left_out else ""
+        raise ValueError(
+            f"{path}: line 2 on should hold Klipper's Stats lines with heaters, but the log has {what}; "
+            "log while the heaters are on, or name another file"
+        )
+    values = {name: np.frombuffer(column) for name, column in log.columns.items()}
+    heaters = heater_configs(log.config)
+    time, order, notes = _on_calendar(np.frombuffer(log.times), log.sessions, values)
+    lines = np.frombuffer(log.lines, np.int64)[order]
+    limits = {}
+    for heater in heaters:
+        limits[f"{heater.heater}.temp"] = (heater.low_degC, heater.high_degC)
+        limits[f"{heater.heater}.pwm"] = (0.0, heater.most_percent)
+    return WholeTable(
+        {name: column[order] for name, column in values.items()},
+        {name: _KEYS[name.rpartition(".")[2].encode()][1] for name in values},
+        time,
+        "UTC" if time.dtype == np.int64 else "",
+        lambda i: f"line {lines[i]}",
+        [*log.notes(), *notes, *map(_control_note, heaters)],
+        {name: limits[name] for name in values if name in limits},
+        {},
+        {},
+    )
+
+
+def printer_heaters(path: Path) -> list[HeaterConfig]:
+    """The heaters of the last configuration in a klippy.log; none if it has no configuration."""
+    log = _Log()
+    with path.open("rb") as stream:
+        for line, text in _lines(stream):
+            log.add_config(line, text)
+    return heater_configs(log.config)
+
+
+# ---- lines
+
+
+def _lines(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """(number, text) of the lines. Of a line that is too long or has no end only the word Stats is left."""
+    number = 0
+    while text := stream.readline(LONGEST_LINE):
+        number += 1
+        if not text.endswith(b"\n"):
+            text = b"Stats" if _is_stats(text[:64]) else b""
+            while (rest := stream.readline(LONGEST_LINE)) and not rest.endswith(b"\n"):
+                continue
+        yield number, text
+
+
+def _is_stats(text: bytes) -> bool:
+    return any(mark in text for mark in _STATS)
+
+
+class _Log:
+    """The columns that grow as the lines come in."""
+
+    def __init__(self) -> None:
+        self.times, self.lines, self.columns = array("d"), array("q"), {}
+        self.sessions: list[_Session] = [_Session(0, np.nan)]
+        self.config: list[str] = []
+        self.in_config = False
+        self.idle = self.garbled = self.cut = 0
+        self.first_garbled = self.first_undated = 0
+        self.keys: dict[bytes, tuple[str, float]] = {}
+
+    def add(self, line: int, text: bytes) -> None:
+        if _is_stats(text):
+            self._add_stats(line, text)
+        elif start := _START.search(text):
+            zero_s = float(start[1]) - float(start[2])
+            if not 0 <= zero_s < LATEST_S:
+                self.first_undated, zero_s = self.first_undated or line, np.nan
+            self.sessions.append(_Session(len(self.times), zero_s))
+        else:
+            self.add_config(line, text)
+
+    def add_config(self, line: int, text: bytes) -> None:
+        """The last configuration in the log counts."""
+        stripped = text.strip()
+        if stripped == b"===== Config file =====":
+            self.in_config, self.config = True, []
+        elif stripped == b"=======================" or len(self.config) >= LONGEST_CONFIG:
+            self.in_config = False
+        elif self.in_config:
+            self.config.append(text.decode("utf-8", errors="replace"))
+
+    def _add_stats(self, line: int, text: bytes) -> None:
+        words = text.split()
+        at = next((i for i, word in enumerate(words) if word in _STATS), None)
+        if at is None:
+            if b"\0" in text:  # what a file system leaves after a power failure
+                self._count_garbled(line)
+            return
+        if len(words) <= at + 2:
+            self.cut += 1
+            return
+        try:
+            time = float(words[at + 1][:-1])
+            row, has_print_time = self._row(words[at + 2 :])
+        except ValueError:
+            self._count_garbled(line)
+            return
+        if not np.isfinite(time) or not has_print_time:
+            self.idle += 1
+            return
+        if not 0 <= time < LATEST_S:
+            self._count_garbled(line)
+            return
+        # a count that falls without a start is another run, pasted behind
+        if self.times and time < self.times[-1] and self.sessions[-1].first < len(self.times):
+            self.sessions.append(_Session(len(self.times), np.nan))
+        count = len(self.times)
+        for name in row:
+            if name not in self.columns and len(self.columns) < MOST_DEVICES * len(_KEYS):
+                self.columns[name] = array("d", [np.nan]) * count
+        for name, column in self.columns.items():
+            column.append(row.get(name, np.nan))
+        self.times.append(time)
+        self.lines.append(line)
+
+    def _row(self, words: list[bytes]) -> tuple[dict[str, float], bool]:
+        """The numbers of the devices, and whether the line has a print_time. Raises ValueError for text in
+        place of a number."""
+        device, row, has_print_time = b"", {}, False
+        for word in words:
+            key, mark, value = word.partition(b"=")
+            if not mark:
+                device = word
+            elif key in _KEYS and device.endswith(b":"):
+                name, _, scale = _KEYS[key]
+                row[f"{device[:-1].decode('utf-8', errors='replace')}.{name}"] = float(value) * scale
+            elif key == b"print_time":
+                has_print_time = True
+        return row, has_print_time
+
+    def _count_garbled(self, line: int) -> None:
+        self.first_garbled = self.first_garbled or line
+        self.garbled += 1
+
+    def notes(self) -> list[Note]:
+        notes = []
+        if self.garbled:
+            message = (
+                f"{self.garbled} Stats lines hold text or zero bytes in place of a number, or a count "
+                "that no computer reaches, and were left out"
+            )
+            notes.append(
+                Note("damage", "", self.garbled, f"{message}, the first is line {self.first_garbled}")
+            )
+        if self.first_undated:
+            message = (
+                f"the start in line {self.first_undated} gives no time of day that can be; it is not used"
+            )
+            notes.append(Note("damage", "", 1, message))
+        if self.cut:
+            notes.append(
+                Note("truncated", "", self.cut, f"{self.cut} Stats lines break off and were left out")
+            )
+        if self.idle:
+            message = f"{self.idle} Stats lines have no print_time (no printer was ready) and were left out"
+            notes.append(Note("idle", "", self.idle, message))
+        return notes
+
+
+# ---- sessions and the calendar
+
+
+def _on_calendar(
+    counts_s: np.ndarray, sessions: list[_Session], values: dict[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, list[Note]]:
+    """(time, rows in the order of time, notes): time_ns where a start gives the calendar, else time_s."""
+    starts = [session.first for session in sessions] + [len(counts_s)]
+    pieces = [
+        (np.arange(a, b), session.zero_s)
+        for session, a, b in zip(sessions, starts[:-1], starts[1:], strict=True)
+        if b > a
+    ]
+    zeros = _zeros(pieces, counts_s, values)
+    on_calendar = bool(np.isfinite(zeros).any())
+    notes: list[Note] = []
+    rows, times = _sorted(pieces, zeros, counts_s, notes)
+    rows, times = _without_repeats(rows, times, values, notes)
+    if len(pieces) > 1:
+        notes.append(
+            Note("sessions", "", len(pieces), f"the log holds {len(pieces)} runs of Klipper, each a segment")
+        )
+    if on_calendar:
+        return np.rint(times * 1e9).astype(np.int64), rows, notes
+    return times, rows, notes
+
+
+def _zeros(
+    pieces: list[tuple[np.ndarray, float]], counts_s: np.ndarray, values: dict[str, np.ndarray]
+) -> np.ndarray:
+    """The system time at zero of each run; a run without a start takes that of a neighbour whose count runs
+    on, as the computer was not started anew between them, or which it repeats."""
+    zeros = np.array([zero for _, zero in pieces])
+    for i in range(1, len(pieces)):
+        before, first = pieces[i - 1][0], pieces[i][0][0]
+        runs_on = counts_s[first] > counts_s[before[-1]]
+        if np.isnan(zeros[i]) and (runs_on or _repeats(first, before, counts_s, values)):
+            zeros[i] = zeros[i - 1]
+    for i in range(len(pieces) - 2, -1, -1):
+        if np.isnan(zeros[i]) and counts_s[pieces[i][0][-1]] < counts_s[pieces[i + 1][0][0]]:
+            zeros[i] = zeros[i + 1]
+    return zeros
+
+
+def _repeats(row: int, before: np.ndarray, counts_s: np.ndarray, values: dict[str, np.ndarray]) -> bool:
+    """Whether a row stands among the rows `before` too, with the same count and values."""
+    at = before[min(np.searchsorted(counts_s[before], counts_s[row] - 0.05), len(before) - 1)]
+    same = [np.array_equal(column[at], column[row], equal_nan=True) for column in values.values()]
+    return abs(counts_s[at] - counts_s[row]) < 0.05 and all(same)
+
+
+def _sorted(pieces, zeros: np.ndarray, counts_s: np.ndarray, notes: list[Note]):
+    """(rows, times) of all runs in the order of time. A run whose time is not known follows the one ahead of
+    it in the file, an hour later."""
+    placed, end = [], np.nan
+    for (rows, _), zero in zip(pieces, zeros, strict=True):
+        times = counts_s[rows] + (0.0 if np.isnan(zero) else zero)
+        if np.isnan(zero) and (np.isfinite(end) or np.isfinite(zeros).any()):
+            before = end if np.isfinite(end) else np.nanmin(zeros) - (times[-1] - times[0]) - 2 * APART_S
+            times = times - times[0] + before + APART_S
+            notes.append(
+                Note(
+                    "clock",
+                    "",
+                    len(rows),
+                    f"{len(rows)} Stats lines of a run have no start with the time of day; "
+                    "they are placed an hour from the next run",
+                )
+            )
+        placed.append((rows, times))
+        end = times[-1]
+    placed.sort(key=lambda piece: piece[1][0])
+    rows, times = (np.concatenate(parts) for parts in zip(*placed, strict=True))
+    order = np.argsort(times, kind="stable")
+    return rows[order], times[order]
+
+
+def _without_repeats(rows: np.ndarray, times: np.ndarray, values: dict[str, np.ndarray], notes: list[Note]):
+    """Lines that stand twice (a log and its rollover in one file) count once."""
+    close = np.r_[False, np.diff(times) < 0.05]  # times have one decimal
+    same = np.zeros(len(rows), bool)
+    for i in np.flatnonzero(close):
+        pairs = [(column[rows[i]], column[rows[i - 1]]) for column in values.values()]
+        same[i] = all(now == before or (np.isnan(now) and np.isnan(before)) for now, before in pairs)
+    if (close & same).any():
+        count = int((close & same).sum())
+        notes.append(Note("repeated", "", count, f"{count} Stats lines stand twice and were used once"))
+    if (close & ~same).any():
+        count = int((close & ~same).sum())
+        message = f"{count} Stats lines have the time of another with other values and were left out"
+        notes.append(Note("repeated", "", count, message))
+    return rows[~close], times[~close]
+
+
+# ---- the printer's own control
+
+
+def heater_configs(lines: list[str]) -> list[HeaterConfig]:
+    """The heaters of a configuration, as Klipper writes it into its log. A value that is no number counts as
+    missing."""
+    sections: dict[str, dict[str, str]] = {}
+    keys: dict[str, str] = {}
+    for line in lines:
+        text = line.removeprefix("#*#").strip()
+        if section := re.fullmatch(r"\[([^\]]+)\]", text):
+            keys = sections.setdefault(section[1].strip(), {})
+        elif (option := re.match(r"(\w+)\s*[=:]\s*(.*)$", text)) and not line.startswith("#*# <"):
+            keys[option[1].casefold()] = option[2].split("#")[0].strip()
+    return [
+        _heater(name.split()[-1], keys)
+        for name, keys in sections.items()
+        if "heater_pin" in keys or "control" in keys and "max_temp" in keys
+    ]
+
+
+def _heater(name: str, keys: dict[str, str]) -> HeaterConfig:
+    most = 100 * _number(keys, "max_power", 1.0)
+    gains = [_number(keys, key, np.nan) * 100 / PID_BASE for key in ("pid_kp", "pid_ki", "pid_kd")]
+    control = keys.get("control", "")
+    pid = None
+    if control.startswith("pid") and np.isfinite(gains).all():
+        pid = PrinterPid(name, *gains, most, _number(keys, "smooth_time", 1.0))
+    return HeaterConfig(
+        name, control, _number(keys, "min_temp", np.nan), _number(keys, "max_temp", np.nan), most, pid
+    )
+
+
+def _number(keys: dict[str, str], key: str, default: float) -> float:
+    try:
+        return float(keys.get(key, default))
+    except ValueError:
+        return default
+
+
+def _control_note(heater: HeaterConfig) -> Note:
+    how = f"control {heater.control or 'unknown'}"
+    if heater.pid:
+        kp, ki, kd = (gain * PID_BASE / 100 for gain in heater.pid[1:4])
+        how = f"its own PID (pid_Kp {kp:g}, pid_Ki {ki:g}, pid_Kd {kd:g})"
+    message = (
+        f"the printer holds {heater.heater} by {how}, within {heater.low_degC:g} to {heater.high_degC:g} °C "
+        f"and up to {heater.most_percent:g} % of duty"
+    )
+    return Note("printer", "", 1, message)

@@ -1,0 +1,835 @@
+"""Numbers of the messages of an MCAP channel in ROS 2 CDR, ROS 1, protobuf or JSON. A message may be
+compressed by itself.
+
+A ROS message definition becomes a short program of struct formats, made once and run for each message, in a
+sixth of the time of the mcap-ros2-support package. ROS 2 writes CDR (OMG DDSI-RTPS 10.2, "classic CDR", and
+XCDR2 for final types), aligned to the size of each number behind a header of four bytes. ROS 1 has no header
+and no alignment. Sequences and text begin with their length (uint32). Text is skipped; fields behind a wide
+text cannot be read. Protobuf is decoded by the official package, by types made of the schema's
+FileDescriptorSet.
+"""
+
+import contextlib
+import graphlib
+import json
+import operator
+import re
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import lz4.frame
+import numpy as np
+import orjson
+import zstandard
+from google.protobuf import (
+    any_pb2,
+    descriptor_pb2,
+    descriptor_pool,
+    duration_pb2,
+    empty_pb2,
+    message_factory,
+    struct_pb2,
+    timestamp_pb2,
+    wrappers_pb2,
+)
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from google.protobuf.message import DecodeError, Message
+
+LARGEST_MESSAGE = 1 << 28
+# the longest in use have some 100 kB
+LARGEST_SCHEMA = 4 << 20
+ENCODINGS = "cdr with ros2msg, ros1 with ros1msg, protobuf, and json"
+_ZSTD, _LZ4 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
+_STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
+
+LARGEST_LAYOUT = 20_000
+LONGEST_LISTED = 64
+
+Decode = Callable[[list[bytes]], np.ndarray]
+
+
+class UnreadableMessage(ValueError):
+    """A message that does not fit its schema."""
+
+
+class Channel(NamedTuple):
+    """A channel of the file with its schema and the writer's metadata."""
+
+    id: int
+    topic: str
+    encoding: str
+    metadata: dict[str, str]
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+
+
+def fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
+    """Paths of the numbers in the channel's messages, by its schema and a few of its messages.
+
+    Raises ValueError with the reason for messages that cannot be read.
+    """
+    kind = _kind(channel)
+    samples = [plain(sample) for sample in samples]
+    if kind == "json":
+        return _json_fields(channel, samples)
+    first = samples[0] if samples else None
+    if kind == "protobuf":
+        return protobuf_fields(message_types(channel.schema), channel.schema_name, first)
+    version = 2 if kind == "cdr" else 1
+    return ros_fields(_layout(channel, version), first, version=version)
+
+
+def decoder(channel: Channel, names: Sequence[str]) -> Decode:
+    """A function from n messages to their numbers (n, len(names)), NaN for a number that a message lacks.
+
+    It raises UnreadableMessage for a message that does not fit its channel, and ValueError for text in place
+    of a wanted number.
+    """
+    kind = _kind(channel)
+    if kind == "json":
+        return _json_decoder(names)
+    if kind == "protobuf":
+        return protobuf_decoder(message_types(channel.schema), channel.schema_name, names)
+    version = 2 if kind == "cdr" else 1
+    return ros_decoder(_layout(channel, version), names, version=version)
+
+
+def _kind(channel: Channel) -> str:
+    pairs = {("cdr", "ros2msg"): "cdr", ("ros1", "ros1msg"): "ros1", ("protobuf", "protobuf"): "protobuf"}
+    kind = pairs.get((channel.encoding, channel.schema_encoding))
+    if len(channel.schema) > LARGEST_SCHEMA:
+        raise ValueError(
+            f"its schema {channel.schema_name[:60]} has {len(channel.schema)} bytes "
+            f"where {LARGEST_SCHEMA} are read"
+        )
+    if channel.encoding == "json":
+        return "json"
+    if kind is None:
+        schema = f"schema encoding {channel.schema_encoding!r}" if channel.schema_encoding else "no schema"
+        raise ValueError(f"message encoding {channel.encoding!r} with {schema} is not read; {ENCODINGS} are")
+    return kind
+
+
+# ---- compression of single messages
+
+
+def plain(message: bytes) -> bytes:
+    """The message, decompressed if it is a zstd or lz4 frame, as rosbag2 writes with compression mode
+    `message`."""
+    if message[:4] not in (_ZSTD, _LZ4):
+        return message
+    return decompress("zstd" if message[:4] == _ZSTD else "lz4", message, None)
+
+
+def decompress(method: str, data: bytes, size: int | None) -> bytes:
+    """The bytes of a zstd or lz4 frame; `size` is their count, or None. Raises UnreadableMessage for a
+    damaged frame.
+
+    The size that a zstd frame declares is checked first: after one flipped bit it may ask for terabytes.
+    """
+    room = LARGEST_MESSAGE if size is None else size
+    try:
+        if method == "zstd":
+            declared = zstandard.frame_content_size(data)
+            if declared > room:
+                raise UnreadableMessage(f"data that say they unpack to {declared} bytes, more than {room}")
+            most = 0 if declared >= 0 else room
+            unpacked = zstandard.ZstdDecompressor().decompress(data, max_output_size=most)
+        elif method == "lz4":
+            unpacked = lz4.frame.LZ4FrameDecompressor().decompress(data, room + 1)
+        else:
+            raise UnreadableMessage(f"the compression {method!r} is not known; zstd and lz4 are")
+    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError, OverflowError) as error:
+        why = (str(error) or "too large").splitlines()[0]
+        raise UnreadableMessage(f"{method} data that cannot be unpacked ({why})") from None
+    if len(unpacked) > room or size not in (None, len(unpacked)):
+        raise UnreadableMessage(f"{method} data that unpack to {len(unpacked)} bytes, not {size}")
+    return unpacked
+
+
+# ---- JSON
+
+
+def _document(message: bytes):
+    """The message's value. orjson is four times as fast as json, which also knows NaN and Infinity."""
+    try:
+        return orjson.loads(message)
+    except orjson.JSONDecodeError:
+        try:
+            return json.loads(message)
+        except (ValueError, RecursionError) as error:
+            raise UnreadableMessage(f"a message that is no JSON ({error})") from None
+
+
+def _json_fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
+    """Paths of the numbers that a JSON schema promises, and of those in the messages."""
+    names: dict[str, None] = {}
+    if channel.schema_encoding == "jsonschema" and channel.schema:
+        with contextlib.suppress(UnreadableMessage):  # the messages tell
+            names |= dict.fromkeys(_promised(_document(channel.schema), "", 0))
+    for sample in samples:
+        names |= dict.fromkeys(_paths(_document(sample)))
+        if len(names) > LARGEST_LAYOUT:
+            raise ValueError(f"its messages have {len(names)} numbers where {LARGEST_LAYOUT} are read")
+    return list(names)
+
+
+def _promised(schema, prefix: str, depth: int) -> Iterator[str]:
+    properties = schema.get("properties") if isinstance(schema, dict) else None
+    if not isinstance(properties, dict) or depth > 6:
+        return
+    for name, inner in properties.items():
+        kind = inner.get("type") if isinstance(inner, dict) else None
+        if kind == "object":
+            yield from _promised(inner, f"{prefix}{name}.", depth + 1)
+        elif kind == "boolean" or {"number", "integer"} & set(
+            map(str, kind if isinstance(kind, list) else [kind])
+        ):
+            yield prefix + name
+
+
+def _paths(value, prefix: str = "", depth: int = 0) -> Iterator[str]:
+    """Paths of the numbers in a value. Null counts, as another message may have a number there."""
+    if isinstance(value, int | float) or (value is None and prefix):
+        yield prefix
+    elif isinstance(value, dict) and depth < 8:
+        for name, inner in value.items():
+            yield from _paths(inner, f"{prefix}.{name}" if prefix else name, depth + 1)
+    elif isinstance(value, list) and depth < 8:
+        for i, inner in enumerate(value[:LONGEST_LISTED]):
+            yield from _paths(inner, f"{prefix}[{i}]", depth + 1)
+
+
+def _json_decoder(names: Sequence[str]) -> Decode:
+    steps = [tuple(int(index) if index else key for key, index in _STEP.findall(name)) for name in names]
+    at_top = operator.itemgetter(*names)
+
+    def decode(messages: list[bytes]) -> np.ndarray:
+        documents = [_document(message) for message in messages]
+        shape = len(messages), len(names)
+        with contextlib.suppress(KeyError, TypeError, IndexError, ValueError):
+            numbers = np.array([at_top(document) for document in documents]).reshape(shape)
+            if numbers.dtype.kind in "fiub":
+                return numbers.astype(float, copy=False)
+        # other kinds are text, null, or a mixture; they are read one by one
+        paths = list(zip(names, steps, strict=True))
+        return np.array([[_value(document, *path) for path in paths] for document in documents], float)
+
+    return decode
+
+
+def _value(document, name: str, steps: tuple) -> float:
+    value = document
+    try:
+        for step in steps:
+            value = value[step]
+    except (KeyError, TypeError, IndexError):
+        value = _by_prefix(document, name)
+    if value is not None and not isinstance(value, int | float):
+        raise ValueError(
+            f"{name} should be a number but is {json.dumps(value)[:60]}; map another field, or write numbers"
+        )
+    try:
+        return np.nan if value is None else float(value)
+    except OverflowError:
+        return np.inf
+
+
+def _by_prefix(document, name: str):
+    """The value of a path whose keys hold dots themselves, such as {"heater.1": 30}; None if there is
+    none."""
+    if not isinstance(document, dict):
+        return None
+    if name in document:
+        return document[name]
+    inner = (
+        _by_prefix(document[name[:i]], name[i + 1 :])
+        for i, letter in enumerate(name)
+        if letter == "." and name[:i] in document
+    )
+    return next((value for value in inner if value is not None), None)
+
+
+# ---- ROS
+
+ROS2_NUMBERS = {
+    "bool": "?", "byte": "B", "char": "B", "octet": "B", "int8": "b", "uint8": "B", "int16": "h",
+    "uint16": "H", "int32": "i",
+    "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
+}  # fmt: skip
+ROS1_NUMBERS = {**ROS2_NUMBERS, "byte": "b"}
+ROS1_NUMBERS.pop("octet")
+# types that many schema texts leave out, as every reader has them
+KNOWN = {
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
+    "ros1/time": "uint32 secs\nuint32 nsecs",
+    "ros1/duration": "int32 secs\nint32 nsecs",
+}
+# numbers of one array: no message is as long as that
+LARGEST_ARRAY = 1 << 30
+_FIELD = re.compile(r"^([A-Za-z]\w*(?:/\w+)*)(?:<=\d+)?\s*(\[(?:<=)?(\d*)\])?\s+([A-Za-z]\w*)\s*(=?)")
+# representation -> byte order, largest alignment; ROS does not write lists of parameters (0x0002, 0x0003 and
+# others)
+_REPRESENTATIONS = {
+    b"\x00\x00": (">", 8),
+    b"\x00\x01": ("<", 8),
+    b"\x00\x06": (">", 4),
+    b"\x00\x07": ("<", 4),
+}
+_LENGTH = {order: struct.Struct(order + "I") for order in "<>"}
+
+
+class Item(NamedTuple):
+    """A stretch of the layout: `count` numbers of one `format`, text, or a sequence of `items` (an empty
+    sequence of numbers has one item of count 1). The paths of a sequence's items hold [] for the index."""
+
+    kind: str
+    path: str
+    format: str = ""
+    count: int = 1
+    array: bool = False
+    items: tuple = ()
+
+
+def _layout(channel: Channel, version: int) -> list[Item]:
+    try:
+        return ros_layout(channel.schema.decode(), channel.schema_name, version=version)
+    except UnicodeDecodeError:
+        raise ValueError(f"the schema {channel.schema_name} is no text") from None
+
+
+def ros_layout(definition: str, name: str, *, version: int) -> list[Item]:
+    """The message's numbers, texts and sequences in the order of the wire. `version` is 1 or 2.
+
+    Raises ValueError for a definition that cannot be read.
+    """
+    if re.search(r"^---", definition, re.MULTILINE):
+        raise ValueError(f"the schema of {name} is a service's (---), not a message's")
+    return list(_expand(_plain(name), "", _types(definition, name), version, [LARGEST_LAYOUT]))
+
+
+def _types(definition: str, name: str) -> dict[str, list[tuple[str, str, str | None]]]:
+    """{type: [(field, its type, None | "" | length)]}; "" is a sequence without a fixed length."""
+    parts = re.split(r"^={3,}\s*$", definition, flags=re.MULTILINE)
+    texts = dict(KNOWN) | {_plain(name): parts[0]}
+    for part in parts[1:]:
+        head, _, body = part.strip().partition("\n")
+        if not head.startswith("MSG:"):
+            raise ValueError(f"the schema of {name} should have MSG: behind ==== but has {head[:40]!r}")
+        texts[_plain(head[4:].strip())] = body
+    return {kind: _fields(text, kind) for kind, text in texts.items()}
+
+
+def _plain(name: str) -> str:
+    return name.replace("/msg/", "/")
+
+
+def _fields(text: str, kind: str) -> list[tuple[str, str, str | None]]:
+    fields = []
+    for line in text.splitlines():
+        line = line.split("#")[0].strip()
+        if not line:
+            continue
+        match = _FIELD.match(line)
+        if not match:
+            raise ValueError(f"the schema of {kind} has the line {line[:60]!r}, which is no field")
+        if not match[5]:  # NAME=value is a constant and not on the wire
+            fields.append((match[4], match[1], match[3] if match[2] else None))
+    return fields
+
+
+def _resolve(kind: str, parent: str, types: dict) -> str:
+    candidates = [_plain(kind), f"{parent.rpartition('/')[0]}/{kind}", f"std_msgs/{kind}", f"ros1/{kind}"]
+    candidates += [name for name in types if name.endswith(f"/{kind}")]
+    for candidate in candidates:
+        if candidate in types:
+            return candidate
+    raise ValueError(f"the schema of {parent} uses {kind} but does not define it")
+
+
+def _expand(kind: str, prefix: str, types: dict, version: int, room: list[int]) -> list[Item]:
+    """The items of a type, in the order of the wire; `room` is how many more there may be."""
+    items: list[Item] = []
+    numbers = ROS2_NUMBERS if version == 2 else ROS1_NUMBERS
+    for field, of, length in types[kind]:
+        path = f"{prefix}.{field}" if prefix else field
+        if length and (len(length) > 12 or int(length) > LARGEST_ARRAY):
+            raise ValueError(
+                f"the schema of {kind} has {length[:20]} elements in {field}, more than any message can hold"
+            )
+        count = int(length or 1)
+        if length == "":
+            element = _element(of, f"{path}[]", kind, types, version, room)
+            items.append(Item("sequence", path, items=tuple(element)))
+        elif of in numbers:
+            items.append(Item("numbers", path, numbers[of], count, length is not None))
+        else:
+            for i in range(count):
+                _take_room(kind, room)
+                items += _element(of, f"{path}[{i}]" if length else path, kind, types, version, room)
+        _take_room(kind, room)
+    if not items and version == 2:
+        items.append(Item("numbers", prefix + "._", "B"))  # ROS 2 gives a message without fields one byte
+    return items
+
+
+def _take_room(kind: str, room: list[int]) -> None:
+    room[0] -= 1
+    if room[0] < 0:
+        raise ValueError(f"the schema of {kind} has more than {LARGEST_LAYOUT} parts")
+
+
+def _element(of: str, path: str, parent: str, types: dict, version: int, room: list[int]) -> list[Item]:
+    numbers = ROS2_NUMBERS if version == 2 else ROS1_NUMBERS
+    if of in numbers:
+        return [Item("numbers", path, numbers[of])]
+    if of in ("string", "wstring"):
+        return [Item(of, path)]
+    if path.count(".") > 30:
+        raise ValueError(f"the schema of {parent} contains itself in {path}")
+    return _expand(_resolve(of, parent, types), path, types, version, room)
+
+
+# ---- which numbers a message has
+
+
+def ros_fields(items: Sequence[Item], sample: bytes | None, *, version: int) -> list[str]:
+    """Paths of the numbers. Of a sequence they are those of the message `sample`, up to LONGEST_LISTED."""
+    names: list[str] = []
+    lists: dict[str, list[str]] = {}
+    for item in _readable(items):
+        if item.kind == "sequence" and all(part.kind == "numbers" for part in item.items):
+            start = len(item.path) + len("[]")
+            lists[item.path] = [part.path[start:] for part in item.items if not part.array]
+        elif item.kind == "numbers" and item.array:
+            names += [f"{item.path}[{i}]" for i in range(min(item.count, LONGEST_LISTED))]
+        elif item.kind == "numbers" and not item.path.endswith("._"):
+            names.append(item.path)
+    return names + _elements(lists, sample, lambda paths: ros_decoder(items, paths, version=version))
+
+
+def _elements(
+    lists: dict[str, list[str]], sample: bytes | None, make_decoder: Callable[[list[str]], Decode]
+) -> list[str]:
+    """Paths of the numbers in the lists of a message {path: [path below each element]}, up to
+    LONGEST_LISTED."""
+    if sample is None or not lists:
+        return []
+    try:
+        lengths = make_decoder([f"{path}[#]" for path in lists])([sample])[0]
+    except UnreadableMessage:
+        return []
+    return [
+        f"{path}[{i}]{part}"
+        for (path, parts), length in zip(lists.items(), np.nan_to_num(lengths), strict=True)
+        for i in range(min(int(length), LONGEST_LISTED))
+        for part in parts
+    ]
+
+
+def _readable(items: Sequence[Item]) -> list[Item]:
+    """The items up to the first wide text, as writers do not agree on the length of its characters."""
+    for i, item in enumerate(items):
+        if item.kind == "wstring" or (
+            item.kind == "sequence" and len(_readable(item.items)) < len(item.items)
+        ):
+            return list(items[:i])
+    return list(items)
+
+
+# ---- programs
+
+
+class _FixedRow:
+    """Numbers of fixed size in a row. `layouts[phase]` unpacks the wanted ones of a row that begins at that
+    phase of the alignment."""
+
+    def __init__(self, items: Sequence[Item], wanted: set[str], order: str, alignment: int):
+        self.layouts = [
+            struct.Struct(order + _row_format(items, wanted, phase, alignment)) for phase in range(8)
+        ]
+        self.names = [name for item in items for name in _names(item, wanted)]
+
+    def read(self, data: bytes, pos: int, values: list[float]) -> int:
+        unpack = self.layouts[pos & 7]
+        values += unpack.unpack_from(data, pos)
+        return pos + unpack.size
+
+
+def _names(item: Item, wanted: set[str]) -> list[str]:
+    """The wanted numbers of an item in the order of the wire. A long array is never written out."""
+    if not item.array:
+        return [item.path] if item.path in wanted else []
+    return [f"{item.path}[{i}]" for i in _indices(item, wanted)]
+
+
+def _indices(item: Item, wanted: set[str]) -> list[int]:
+    if item.count <= LONGEST_LISTED:
+        return [i for i in range(item.count) if f"{item.path}[{i}]" in wanted]
+    place = re.compile(re.escape(item.path) + r"\[(\d{1,12})\]")
+    return sorted(i for name in wanted if (at := place.fullmatch(name)) and (i := int(at[1])) < item.count)
+
+
+def _row_format(items: Sequence[Item], wanted: set[str], phase: int, alignment: int) -> str:
+    parts, pos = [], phase
+    for item in items:
+        size = struct.calcsize("=" + item.format)
+        pad = -pos % min(size, alignment) if item.count else 0
+        parts.append(f"{pad}x")
+        if not item.array:
+            parts.append(item.format if item.path in wanted else f"{size}x")
+        else:
+            following = 0
+            for i in _indices(item, wanted):
+                parts += [f"{size * (i - following)}x", item.format]
+                following = i + 1
+            parts.append(f"{size * (item.count - following)}x")
+        pos += pad + size * item.count
+    return "".join(part for part in parts if part != "0x")
+
+
+class _Text:
+    names: Sequence[str] = ()
+
+    def __init__(self, order: str, alignment: int):
+        self.unpack, self.alignment = _LENGTH[order].unpack_from, min(4, alignment)
+
+    def read(self, data: bytes, pos: int, values: list[float]) -> int:
+        pos += -pos % self.alignment
+        return pos + 4 + self.unpack(data, pos)[0]
+
+
+class _Sequence:
+    """A length and so many elements. Elements that are wanted by index are read (NaN if there are fewer), the
+    others skipped. "[#]" is the length itself."""
+
+    def __init__(self, item: Item, wanted: set[str], order: str, alignment: int):
+        self.unpack, self.alignment = _LENGTH[order].unpack_from, min(4, alignment)
+        place = re.compile(re.escape(item.path) + r"\[(\d+)\]")
+        indices = sorted({int(match[1]) for name in wanted if (match := place.match(name))})
+        self.skip = _program(item.items, set(), order, alignment)
+        self.elements = {i: _program(_at(item.items, i), wanted, order, alignment) for i in indices}
+        self.length = f"{item.path}[#]" in wanted
+        self.names = [f"{item.path}[#]"] * self.length + [
+            name for steps in self.elements.values() for step in steps for name in step.names
+        ]
+        only, *others = item.items
+        self.number = None
+        if not others and only.kind == "numbers" and not only.array:
+            self.number = struct.Struct(order + only.format)
+            self.element_alignment = min(self.number.size, alignment)
+
+    def read(self, data: bytes, pos: int, values: list[float]) -> int:
+        pos += -pos % self.alignment
+        length = self.unpack(data, pos)[0]
+        pos += 4
+        if length > len(data):
+            raise UnreadableMessage(f"a sequence of {length} elements in {len(data)} bytes")
+        if self.length:
+            values.append(length)
+        if self.number:
+            pos += -pos % self.element_alignment if length else 0
+            size, unpack = self.number.size, self.number.unpack_from
+            values += [unpack(data, pos + i * size)[0] if i < length else np.nan for i in self.elements]
+            return pos + length * size
+        for i in range(length):
+            for step in self.elements.get(i, self.skip):
+                pos = step.read(data, pos, values)
+        for i, steps in self.elements.items():
+            if i >= length:
+                values += [np.nan] * sum(len(step.names) for step in steps)
+        return pos
+
+
+def _at(items: Sequence[Item], i: int) -> list[Item]:
+    """The items of a sequence with their paths at index i."""
+    return [
+        part._replace(path=part.path.replace("[]", f"[{i}]", 1), items=tuple(_at(part.items, i)))
+        for part in items
+    ]
+
+
+def _program(items: Sequence[Item], wanted: set[str], order: str, alignment: int) -> list:
+    steps, row = [], []
+    for item in [*items, None]:
+        if item is not None and item.kind == "numbers":
+            row.append(item)
+            continue
+        if row:
+            steps.append(_FixedRow(row, wanted, order, alignment))
+            row = []
+        if item is not None:
+            steps.append(
+                _Text(order, alignment)
+                if item.kind == "string"
+                else _Sequence(item, wanted, order, alignment)
+            )
+    return steps
+
+
+def ros_decoder(
+    items: Sequence[Item], names: Sequence[str], *, version: int
+) -> Callable[[list[bytes]], np.ndarray]:
+    """A function from n messages to their numbers (n, len(names)). It raises UnreadableMessage for a message
+    that does not fit the layout."""
+    readable = _readable(items)
+    exact = len(readable) == len(items)
+    if version == 1:
+        steps = _program(readable, set(names), "<", 1)
+        order = _order(steps, names)
+        return lambda messages: _ros_numbers(messages, steps, exact, 0)[:, order]
+    programs = {code: _program(readable, set(names), *how) for code, how in _REPRESENTATIONS.items()}
+    order = _order(programs[b"\x00\x01"], names)
+
+    def decode(messages: list[bytes]) -> np.ndarray:
+        codes = {message[:2] for message in messages}
+        if len(codes) > 1:
+            return np.concatenate([decode([message]) for message in messages])
+        code = codes.pop()
+        if code not in programs:
+            raise UnreadableMessage(
+                f"CDR representation 0x{code.hex()} is not read; 0x0000, 0x0001, 0x0006 and 0x0007 are"
+            )
+        # alignment counts from behind the header of four bytes
+        return _ros_numbers([message[4:] for message in messages], programs[code], exact, 7)[:, order]
+
+    return decode
+
+
+def _order(steps: list, names: Sequence[str]) -> list[int]:
+    read = [name for step in steps for name in step.names]
+    missing = [name for name in names if name not in read]
+    if missing:
+        raise ValueError(f"no numeric field {missing[0]}")
+    return [read.index(name) for name in names]
+
+
+def _ends(data: bytes, size: int, exact: bool, padding: int) -> bool:
+    """Whether a message ends behind its `size` bytes, but for padding. Four bytes and more could be a number
+    of another schema, and must be zeros."""
+    behind = len(data) - size
+    return behind >= 0 and (
+        not exact or behind <= min(3, padding) or (behind <= padding and not any(data[size:]))
+    )
+
+
+def _ros_numbers(messages: list[bytes], steps: list, exact: bool, padding: int) -> np.ndarray:
+    """The numbers of the messages by the steps. Up to `padding` bytes may follow the last step."""
+    rows = []
+    try:
+        if len(steps) == 1 and isinstance(steps[0], _FixedRow):
+            unpack, size = steps[0].layouts[0].unpack_from, steps[0].layouts[0].size
+            # most messages have no more than that, which takes no look at their bytes
+            if not {len(data) for data in messages} <= set(range(size, size + min(3, padding) + 1)):
+                wrong = [len(data) for data in messages if not _ends(data, size, exact, padding)]
+                if wrong:
+                    raise UnreadableMessage(f"a message of {wrong[0]} bytes where {size} are expected")
+            rows = [unpack(data) for data in messages]
+        else:
+            for data in messages:
+                values: list[float] = []
+                pos = 0
+                for step in steps:
+                    pos = step.read(data, pos, values)
+                if not _ends(data, pos, exact, padding):
+                    raise UnreadableMessage(f"a message of {len(data)} bytes where {pos} are expected")
+                rows.append(values)
+    except struct.error as error:
+        raise UnreadableMessage(f"a message that is too short ({error})") from None
+    return np.array(rows, float).reshape(len(messages), -1)
+
+
+# ---- protobuf
+
+# what every compiler of protobuf brings along, and some recorders leave out
+_WELL_KNOWN = {
+    module.DESCRIPTOR.name: module.DESCRIPTOR
+    for module in (any_pb2, duration_pb2, empty_pb2, struct_pb2, timestamp_pb2, wrappers_pb2)
+}
+_FILES, _FILE = (
+    message_factory.GetMessageClass(descriptor_pb2.DESCRIPTOR.message_types_by_name[name])
+    for name in ("FileDescriptorSet", "FileDescriptorProto")
+)
+# a message that holds itself has no end, and one with a few levels of many messages nearly none
+_DEEPEST, _MOST_FIELDS = 6, 20_000
+
+Types = dict[str, Descriptor]
+Fill = Callable[[Message, list[float]], None]
+
+
+def message_types(descriptor_set: bytes) -> Types:
+    """{full name of the message: its type} of a serialised FileDescriptorSet.
+
+    Raises ValueError for other bytes, and for a set without a file that it imports.
+    """
+    try:
+        files = {file.name: file for file in _FILES.FromString(bytes(descriptor_set)).file}
+        order = graphlib.TopologicalSorter({name: list(file.dependency) for name, file in files.items()})
+        pool = descriptor_pool.DescriptorPool()  # ty: ignore[possibly-missing-implicit-call]
+        for name in order.static_order():
+            file = files.get(name, _FILE())
+            if name not in files and name in _WELL_KNOWN:
+                _WELL_KNOWN[name].CopyToProto(file)
+            elif name not in files:
+                raise ValueError(f"the schema imports {name[:80]} and does not hold it")
+            pool.Add(file)
+    except (DecodeError, TypeError, graphlib.CycleError) as error:
+        raise ValueError(f"the schema is no FileDescriptorSet ({error})") from None
+    types: Types = {}
+    waiting = [
+        message for name in files for message in pool.FindFileByName(name).message_types_by_name.values()
+    ]
+    while waiting:
+        message = waiting.pop()
+        types[message.full_name] = message
+        waiting += message.nested_types
+    return types
+
+
+def _defined(types: Types, name: str) -> Descriptor:
+    if name not in types:
+        raise ValueError(
+            f"the schema does not define its own message {name}; it defines {', '.join(sorted(types)[:5])}"
+        )
+    return types[name]
+
+
+def message_reader(types: Types, name: str) -> Callable[[bytes | memoryview], Message]:
+    """A function from bytes to the message of that name. It raises UnreadableMessage."""
+    made = message_factory.GetMessageClass(_defined(types, name))
+
+    def read(data: bytes | memoryview) -> Message:
+        try:
+            return made.FromString(data)
+        except DecodeError as error:
+            raise UnreadableMessage(f"a message that is not of its type ({error})") from None
+
+    return read
+
+
+# ---- which numbers a message has
+
+
+def _is_number(field: FieldDescriptor) -> bool:
+    texts = (FieldDescriptor.CPPTYPE_MESSAGE, FieldDescriptor.CPPTYPE_STRING)
+    return field.cpp_type not in texts
+
+
+def _is_message(field: FieldDescriptor) -> bool:
+    """Whether a field holds a message. A map holds its entries by key and not by place."""
+    return field.message_type is not None and not field.message_type.GetOptions().map_entry
+
+
+def protobuf_fields(types: Types, name: str, sample: bytes | None) -> list[str]:
+    """Paths of the numbers. Of a repeated field they are those of the message `sample`, up to
+    LONGEST_LISTED. Raises ValueError for a type with more than can be listed."""
+    names: list[str] = []
+    lists: dict[str, list[str]] = {}
+    for visited, (path, field) in enumerate(_leaves(_defined(types, name), "", 0)):
+        if visited == _MOST_FIELDS:
+            raise ValueError(f"the message {name} has more than {_MOST_FIELDS} fields; name the wanted ones")
+        single, is_list, part = path.partition("[]")
+        if field is not None and not is_list:
+            names.append(path)
+        elif field is not None:
+            lists.setdefault(single, []).append(part)
+    return names + _elements(lists, sample, lambda paths: protobuf_decoder(types, name, paths))
+
+
+def _leaves(message: Descriptor, prefix: str, depth: int) -> Iterator[tuple[str, FieldDescriptor | None]]:
+    """Paths of the numbers, "zones[].celsius" in repeated messages, without what a list holds in lists. A
+    message is a path without a field."""
+    for field in message.fields:
+        path = f"{prefix}{field.name}{'[]' if field.is_repeated else ''}"
+        if field.is_repeated and "[]" in prefix:
+            continue
+        if _is_number(field):
+            yield path, field
+        elif _is_message(field) and depth + 1 < _DEEPEST:
+            yield path, None
+            yield from _leaves(field.message_type, f"{path}.", depth + 1)
+
+
+# ---- decoding
+
+
+def protobuf_decoder(types: Types, name: str, names: Sequence[str]) -> Callable[[list[bytes]], np.ndarray]:
+    """A function from n messages to their numbers (n, len(names)), NaN for an absent field with presence.
+
+    "zones[#]" is the length of a list. The function raises UnreadableMessage.
+    """
+    message = _defined(types, name)
+    fill = _filler(message, {path: place for place, path in enumerate(names)})
+    read, count = message_reader(types, name), len(names)
+    if names and all(_is_plain(message.fields_by_name.get(path)) for path in names):
+        values = operator.attrgetter(*names)
+        return lambda messages: np.array([values(read(data)) for data in messages], float).reshape(-1, count)
+
+    def decode(messages: list[bytes]) -> np.ndarray:
+        rows = []
+        for message in messages:
+            row = [np.nan] * count
+            fill(read(message), row)
+            rows.append(row)
+        return np.array(rows, float).reshape(len(messages), count)
+
+    return decode
+
+
+def _is_plain(field: FieldDescriptor | None) -> bool:
+    """Whether a field is a number that every message has."""
+    return field is not None and _is_number(field) and not field.is_repeated and not field.has_presence
+
+
+def _filler(message: Descriptor, wanted: dict[str, int]) -> Fill:
+    """A function that puts the numbers of the paths {path below this message: place} into their places."""
+    numbers: list[tuple[int, Callable[[Message], float]]] = []
+    below: dict[tuple[str, str | None], dict[str, int]] = {}
+    for path, place in wanted.items():
+        match = re.match(r"(\w+)(?:\[(\d+|#)\])?(?:\.(.+))?$", path)
+        field = message.fields_by_name.get(match[1]) if match else None
+        if match is None or field is None or (match[2] is not None) != field.is_repeated:
+            raise ValueError(f"no numeric field {path}")
+        if match[3] and match[2] != "#" and _is_message(field):
+            below.setdefault((field.name, match[2]), {})[match[3]] = place
+        elif match[2] != "#" and (match[3] or not _is_number(field)):
+            raise ValueError(f"no numeric field {path}")
+        else:
+            numbers.append((place, _number(field, match[2])))
+    inner = [
+        (_submessage(name, index), _filler(message.fields_by_name[name].message_type, paths))
+        for (name, index), paths in below.items()
+    ]
+
+    def fill(values: Message, row: list[float]) -> None:
+        for place, number in numbers:
+            row[place] = number(values)
+        for submessage, deeper in inner:
+            if (part := submessage(values)) is not None:
+                deeper(part, row)
+
+    return fill
+
+
+def _number(field: FieldDescriptor, index: str | None) -> Callable[[Message], float]:
+    """A function from a message to a field's number, element or length ("#"), NaN if it is absent."""
+    name, nan = field.name, np.nan
+    if index == "#":
+        return lambda message: len(getattr(message, name))
+    if index is not None:
+        place = int(index)
+        return lambda message: elements[place] if place < len(elements := getattr(message, name)) else nan
+    if field.has_presence:
+        return lambda message: getattr(message, name) if message.HasField(name) else nan
+    return operator.attrgetter(name)
+
+
+def _submessage(name: str, index: str | None) -> Callable[[Message], Message | None]:
+    """A function from a message to the one in a field, or to its element; None if it is absent."""
+    if index is None:
+        return lambda message: getattr(message, name) if message.HasField(name) else None
+    place = int(index)
+    return lambda message: elements[place] if place < len(elements := getattr(message, name)) else None

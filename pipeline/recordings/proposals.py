@@ -1,0 +1,673 @@
+"""A mapping and a plant proposed from the names, units and ranges of a recording's signals."""
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.recordings.formats import FileColumns
+from pipeline.recordings.quality import ROOM_KELVIN, quantisation_step
+from pipeline.recordings.signal_names import (
+    ACTUAL,
+    COMMAND,
+    COOLER,
+    DEVICE,
+    DUTY,
+    ELECTRIC,
+    HEATER,
+    MOVER,
+    OUTPUT,
+    PLACE,
+    QUANTITY,
+    ROOM,
+    SET_POINT,
+    SETTING,
+    SPEED,
+    TEMPERATURE,
+    Name,
+    any_of,
+    loop_letter,
+    read_name,
+    says,
+    split,
+)
+
+# levels and steps are looked up in so many values of a signal
+LOOKED_AT = 6000
+# records of commands without names have 0.88 to 1.0, measurements of a dryer, a furnace, an evaporator and a
+# kit 0.29 to 0.57
+TWO_LEVELS = 0.7
+FEWEST_ROWS = 20
+# a clock's interval is that of so many samples
+CLOCK_SAMPLES = 100_000
+_STAMP = r"(^|\.)(sec|secs|seconds|nsec|nsecs|nanosec|nanos|seq|sequence)$|class$|(^|_)(id|num|index)$"
+# times and counts of a machine's own: an event counter, a time stamp in any unit
+_COUNTER = (
+    r"time.?stamp|(^|[._])(stamp|time|clock|uptime|millis|micros|ticks?|counter|epoch)(_?(s|ms|us|ns))?$"
+)
+_STATUS = (
+    r"e[\s_-]?stop|emergency|alarm|fault|error|status[^.]*$|(^|[._\s])(state|mode|ok|ready)$|enabled?|door|lamp|"
+    r"interlock|warning|running|connected|valid|busy|homed|watchdog|heartbeat"
+)
+_SILENT = re.compile(rf"{_STAMP}|{_COUNTER}|{_STATUS}")
+# fields that say nothing: their topic's name does
+_BARE_FIELDS = ("data", "value", "val", "reading", "measurement", "float", "double")
+_COMMON_WORDS = {
+    "temp", "temperature", "actual", "pwm", "duty", "power", "percent", "pct", "value", "data", "heater",
+    "measured", "celsius", "degc", "deg", "c", "k", "f", "val", "sensor", "heat", "output", "cycle",
+}  # fmt: skip
+_TIMES = ("temps", "heure", "hora", "ora", "fecha")
+# an input of such a name can only warm; Klipper calls the hot end's heater "extruder"
+_HEATED = re.compile(r"\b(hot ?end|nozzle|barrel|bed)\b|^extruder.* pwm$")
+_TAKEN_NAMES = ("recording", "segment", "time_s")  # columns of the table of the record
+_TELLING = any_of(SET_POINT, TEMPERATURE, HEATER, DUTY, OUTPUT, PLACE, SPEED, MOVER, ACTUAL)
+# unit -> what makes °C of it
+_CELSIUS = {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (0.555556, -17.7778)}
+# an owner's limit lies so far below that at which the firmware switches everything off
+BELOW_CUT_OFF_DEGC = 15.0
+MOST_DISTURBANCES = 16
+# a set-point rests in more than this share of its steps, and has few levels beside what is measured of it
+RESTING_SHARE, MORE_LEVELS = 0.95, 4
+
+
+class RecordedSignal(NamedTuple):
+    """A column: its source, the unit that the file gives, its finite numbers, the limits that the file gives,
+    and its role in the proposal."""
+
+    source: str
+    unit: str
+    values: np.ndarray
+    limits: tuple[float, float] | None = None
+    role: str = ""
+
+
+class Proposed(NamedTuple):
+    """A signal of the plant, "input", "disturbance" or "output", with its source and conversion. A limit or a
+    reference that nothing tells is None. `heats`: its name says that it can only warm. `set_point` is the
+    column of what an output should be, "" for none. `cut_off`: the firmware switches off at this temperature
+    in °C, None if the file does not say it."""
+
+    name: str
+    role: str
+    source: str
+    unit: str
+    scale: float
+    offset: float
+    low: float | None
+    high: float | None
+    reference: float | None
+    heats: bool = False
+    set_point: str = ""
+    cut_off: float | None = None
+
+
+class Proposal(NamedTuple):
+    """What `ingest.mapping` and `plant` could be; `how` says what it was guessed from, `time` is ingest.time,
+    `sample_time_s` the record's own clock. `set_points` belong to no output, `beside` was left out."""
+
+    signals: list[Proposed]
+    how: str
+    time: str
+    sample_time_s: float
+    set_points: list[str]
+    beside: list[str]
+
+
+def propose(
+    signals: Sequence[RecordedSignal], groups: Sequence[tuple[FileColumns, str]], time: str
+) -> Proposal:
+    """The proposal for the signals of a recording, which have the clocks of `groups`."""
+    taken, how = _with_roles(signals)
+    targets = _targets(taken)
+    used = {target.source for target in targets.values()}
+    prefixes = {role: _common_words(taken, role) for role in ("input", "disturbance", "output")}
+    names: set[str] = set()
+    proposed = []
+    for signal in taken:
+        if signal.role in prefixes:
+            name = _name(signal, prefixes[signal.role], names)
+            guessed = how != "names and ranges"
+            proposed.append(_proposed(signal, name, targets.get(signal.source), guessed=guessed))
+    set_points = [s.source for s in taken if s.role == "set-point" and s.source not in used]
+    beside = [s.source for s in taken if s.role == "beside"]
+    return Proposal(proposed, how, time, _sample_time(groups), set_points, beside)
+
+
+def yaml_lines(proposal: Proposal) -> list[str]:
+    """The proposal as YAML to paste under `ingest` and `plant`."""
+    if not proposal.signals:
+        return ["# no column looks like an input or an output of the machine; write the mapping by hand"]
+    inputs, disturbances, outputs = plant_lines(proposal)
+    lines = [f"# a proposal from {proposal.how}", "ingest:"]
+    if proposal.time:
+        lines.append(
+            f"  time: {proposal.time}    # write the sample time here and at sample_time_s below, "
+            "for the file does not say it; or the name of a column"
+        )
+    lines += ["  mapping:", *(f"    {line}" for line in mapping_lines(proposal))]
+    if proposal.set_points:
+        shown = ", ".join(proposal.set_points)
+        lines.append(f"# set-points of no output of the plant, left out: {shown}")
+    if proposal.beside:
+        lines.append(f"# temperatures that nothing heats, left out: {', '.join(proposal.beside)}")
+    if not inputs:
+        lines.append(
+            "# nothing looks like a heater or a motor: map the inputs by hand, "
+            "a plant cannot be identified without; if the duty is not in the recording, record it"
+        )
+    lines += ["plant:", "  inputs:" if inputs else "  inputs: []", *(f"    - {line}" for line in inputs)]
+    if disturbances:
+        lines.append(
+            "  disturbances:    # recorded, and moved by no controller; move to inputs what one moves"
+        )
+        lines += [f"    - {line}" for line in disturbances]
+    lines += ["  outputs:" if outputs else "  outputs: []", *(f"    - {line}" for line in outputs)]
+    if any(signal.cut_off is not None for signal in proposal.signals):
+        lines.append(f"  # high is {BELOW_CUT_OFF_DEGC:g} °C below the firmware's cut-off (max_temp)")
+    if any(signal.role == "output" and signal.low is None for signal in proposal.signals):
+        lines.append("  # low and high of an output: between which °C the machine must stay; fill them in")
+    return [*lines, f"  sample_time_s: {proposal.sample_time_s!r}"]
+
+
+def mapping_lines(proposal: Proposal) -> list[str]:
+    """`ingest.mapping`, a line a signal."""
+    return [
+        f"{s.name}: {{source: {_yaml(s.source)}, "
+        + (f"set_point: {_yaml(s.set_point)}, " if s.set_point else "")
+        + f"unit: {_yaml(s.unit)}, scale: {s.scale!r}, offset: {s.offset!r}}}"
+        for s in proposal.signals
+    ]
+
+
+def plant_lines(proposal: Proposal) -> tuple[list[str], list[str], list[str]]:
+    """`plant.inputs`, `plant.disturbances` and `plant.outputs`, a line a signal."""
+    inputs = [
+        f"{{name: {s.name}, unit: {s.unit}, low: {_number(s.low)}, high: {_number(s.high)}"
+        + (", heats: true}" if s.heats else "}")
+        for s in proposal.signals
+        if s.role == "input"
+    ]
+    disturbances = [
+        f"{{name: {s.name}, unit: {_yaml(s.unit)}}}" for s in proposal.signals if s.role == "disturbance"
+    ]
+    outputs = [
+        f"{{name: {s.name}, unit: {s.unit}, reference: {s.reference!r}, low: {_number(s.low)}, "
+        f"high: {_number(s.high)}}}"
+        for s in proposal.signals
+        if s.role == "output"
+    ]
+    return inputs, disturbances, outputs
+
+
+def _number(value: float | None) -> str:
+    return "null" if value is None else f"{value:.10g}"
+
+
+# ---- roles
+
+
+def telling_name(source: str) -> str:
+    """What names a signal: its field, or its topic's last part if the field says nothing ("data"). An index
+    of a topic's field counts from 1: "/zone_temperature:data[0]" is zone_temperature_1."""
+    topic, _, field = source.rpartition(":")
+    name, index = field.strip(), None
+    if topic.startswith("/") and (index := re.search(r"\[(\d+)\]$", name)):
+        name = name[: index.start()]
+    if name.casefold() in _BARE_FIELDS and topic:
+        parts = [part for part in topic.split("/") if part]
+        name = next((part for part in reversed(parts) if part.casefold() not in _BARE_FIELDS), name)
+    return f"{name}_{int(index[1]) + 1}" if index else name
+
+
+def telling(sources: Sequence[str], most: int) -> list[str]:
+    """At most `most` of the sources, in their order: first those whose names tell a heater, a motor, a
+    temperature or a set-point."""
+    if len(sources) <= most:
+        return list(sources)
+    tells = [_is_telling(source) for source in sources]
+    chosen = sorted(range(len(sources)), key=lambda i: (not tells[i], i))[:most]
+    return [sources[i] for i in sorted(chosen)]
+
+
+def _is_telling(source: str) -> bool:
+    text = telling_name(source)
+    name = read_name(text)
+    told = bool(name.kind) or says(_TELLING, name.words)
+    return told and not _SILENT.search(text.casefold())
+
+
+def has_bare_field(fields: Sequence[str]) -> bool:
+    """Whether one of a topic's fields says nothing without the topic."""
+    return any(field.casefold() in _BARE_FIELDS for field in fields)
+
+
+def sampled(values: np.ndarray) -> np.ndarray:
+    """At most LOOKED_AT of the values, from one end to the other."""
+    return values[:: max(1, len(values) // LOOKED_AT)]
+
+
+def _is_switch(signal: RecordedSignal) -> bool:
+    """Whether a signal has the values 0 and 1 alone."""
+    few = sampled(signal.values)
+    return bool(((few == 0) | (few == 1)).all()) and bool(np.isin(signal.values, (0.0, 1.0)).all())
+
+
+def _is_constant(signal: RecordedSignal) -> bool:
+    values = signal.values
+    return not len(values) or bool(np.ptp(sampled(values)) == 0 and np.ptp(values) == 0)
+
+
+def _with_roles(signals: Sequence[RecordedSignal]) -> tuple[list[RecordedSignal], str]:
+    """The signals with their roles, and what these were guessed from."""
+    taken = _with_commands_y([signal._replace(role=_role(signal)) for signal in signals])
+    taken = _without_hidden_set_points(taken)
+    roles = {signal.role for signal in taken}
+    # a heater's volts are its command if nothing else is; the room's air is measured if nothing else is
+    if "input" not in roles:
+        taken = [s._replace(role="input") if s.role == "electric" else s for s in taken]
+    if "output" not in roles:
+        taken = [s._replace(role="output") if s.role == "disturbance" and _is_warm(s) else s for s in taken]
+    if {"input", "output"} & {signal.role for signal in taken}:
+        return _limited(_without_strangers(_without_unheated(taken))), "names and ranges"
+    taken = [signal._replace(role=_behaviour(signal)) for signal in signals]
+    if not all(_is_switch(signal) for signal in taken if signal.role == "input"):
+        taken = [s._replace(role="") if s.role == "input" and _is_switch(s) else s for s in taken]
+    return taken, "the values alone: look at each line"
+
+
+def _with_commands_y(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
+    """The signals with Y1, Y2 as what a controller gives (DIN 19226), if there is a set-point and nothing
+    else is given; else y is a measured output."""
+    roles = {signal.role for signal in taken}
+    if "input" in roles or "set-point" not in roles:
+        return list(taken)
+    given = [
+        signal.source
+        for signal in taken
+        if signal.role == "output"
+        and re.search(r"^y( \d+)?$", read_name(telling_name(signal.source)).words)
+        and signal.values.min() >= 0.0
+        and signal.values.max() <= 100.0
+    ]
+    measured = [s for s in taken if s.role == "output" and s.source not in given]
+    return [s._replace(role="input") if measured and s.source in given else s for s in taken]
+
+
+def _without_strangers(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
+    """The signals without inputs of devices that no temperature belongs to, which are disturbances: the
+    command of a drive among those of zones. An input belongs to an output of the same numbers or with one of
+    its words, or its name says that it heats."""
+    outputs = [(_numbers(s.source), _plain_words(s.source)) for s in taken if s.role == "output"]
+    inputs = [s for s in taken if s.role == "input"]
+    shared = set.intersection(*(_plain_words(s.source) for s in inputs)) if inputs else set()
+    strangers = []
+    for signal in inputs:
+        name = read_name(telling_name(signal.source), signal.unit)
+        numbers, words = _numbers(signal.source), _plain_words(signal.source) - shared
+        belongs = any((numbers and numbers == own) or words & others for own, others in outputs)
+        belongs = belongs or any(says(pattern, name.words) for pattern in (COOLER, HEATER, PLACE))
+        is_named = any(word.isalpha() and not _is_common(word) for word in words)
+        if is_named and not belongs and signal.source != "motor":
+            strangers.append(signal.source)
+    if len(strangers) == len(inputs):
+        return list(taken)
+    return [s._replace(role="disturbance") if s.source in strangers else s for s in taken]
+
+
+def _limited(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
+    """The signals with as many disturbances as a plant may have."""
+    more = [signal.source for signal in taken if signal.role == "disturbance"][MOST_DISTURBANCES:]
+    return [signal._replace(role="") if signal.source in more else signal for signal in taken]
+
+
+def _is_warm(signal: RecordedSignal) -> bool:
+    name = read_name(telling_name(signal.source), signal.unit)
+    return name.kind in _CELSIUS or (not name.kind and says(TEMPERATURE, name.words))
+
+
+def _role(signal: RecordedSignal) -> str:
+    """ "set-point", "input", "electric" (an input if there is no other), "disturbance", "output", "beside" (a
+    temperature that nothing heats) or "", by the words of the name, its unit and the range of its values."""
+    text = telling_name(signal.source)
+    if not len(signal.values) or _SILENT.search(text.casefold()):
+        return ""
+    if signal.source == "motor" and signal.unit == "percent":  # as our own files name the study's
+        return "" if _is_constant(signal) else "input"
+    name = read_name(text, signal.unit)
+    role = _role_of_name(name, signal)
+    topic = signal.source.rpartition(":")[0]
+    if role or not topic or says(SETTING, name.words):
+        return role
+    return _role_of_name(read_name(f"{topic.rpartition('/')[2]} {text}", signal.unit), signal)
+
+
+def _role_of_name(name: Name, signal: RecordedSignal) -> str:
+    words, kind = name.words, name.kind
+    warm = kind in _CELSIUS or (not kind and (says(TEMPERATURE, words) or words == "b"))  # Marlin's bed
+    if says(SETTING, words) or words in _TIMES:
+        return ""
+    if warm and says(DEVICE, words):
+        return "" if _is_constant(signal) else "beside"
+    if _is_wanted(words, warm):
+        return "set-point"
+    letter = loop_letter(words)
+    if (
+        _is_constant(signal)
+        or kind == "other"
+        or (says(QUANTITY, words) and not warm)
+        or letter in ("p", "l")
+    ):
+        return ""
+    if kind in _CELSIUS:
+        return _role_of_temperature(words)
+    moves = says(SPEED, words) or (says(MOVER, words) and not says(HEATER, words) and not says(PLACE, words))
+    if kind == "speed" or letter in ("s", "f"):
+        return "disturbance"
+    if kind == "electric" or (says(ELECTRIC, words) and not _is_current_value(words, signal.values)):
+        return "" if moves else "electric"
+    duty = kind == "percent" or says(DUTY, words) or bool(re.search(r"\b[a-z\d]+ y$", words))
+    duty = duty or (not warm and words.startswith("u "))
+    if warm and not duty and not _is_given(words, signal.values):
+        return _role_of_temperature(words)
+    if moves or (says(ROOM, words) and not duty):
+        return "disturbance"
+    return _role_of_machine(words, signal, duty)
+
+
+def _role_of_machine(words: str, signal: RecordedSignal, duty: bool) -> str:
+    """The role of a signal that is no speed and that neither a word nor a unit calls a temperature."""
+    heats = duty or says(HEATER, words)
+    letter = re.search(r"^[qu]( \d+)?$", words)
+    if _is_switch(signal) and not heats:
+        return "input" if letter else ""
+    if duty or letter or (says(OUTPUT, words) and " " in words) or says(COMMAND, words):
+        return "input"
+    measured = says(ACTUAL, words) or bool(re.search(r"\b(x|current)$", words))
+    if says(HEATER, words) and not measured and not _is_beyond_percent(signal.values):
+        return "input"
+    if heats or measured or says(PLACE, words) or re.search(r"^y( \d+)?$", words):
+        return "output"
+    return "input" if says(COOLER, words) else ""
+
+
+def _role_of_temperature(words: str) -> str:
+    return "disturbance" if says(ROOM, words) and not says(HEATER, words) else "output"
+
+
+def _is_wanted(words: str, warm: bool) -> bool:
+    """Whether the words mean a set-point: by a word of its own, as the command of a temperature, as w beside
+    x and y (DIN 19226), or as a tool's active and standby temperature (RepRapFirmware)."""
+    heated = warm or says(HEATER, words) or says(PLACE, words)
+    return (
+        says(SET_POINT, words)
+        or (warm and says(COMMAND, words) and not says(HEATER, words))
+        or (bool(re.search(r"\d w$|^w \d+$", words)) and not says(HEATER, words))
+        or (heated and bool(re.search(r"\b(active|standby)$", words)))
+    )
+
+
+def _is_current_value(words: str, values: np.ndarray) -> bool:
+    """Whether "current" means the present temperature: no heater of such machines takes 40 A."""
+    return bool(re.search(r"\bcurrent$", words)) and float(values.max()) > 40.0
+
+
+def _is_given(words: str, values: np.ndarray) -> bool:
+    """Whether the output of a temperature's controller is meant: TIC_1_Out, of 0 to 100."""
+    if not says(OUTPUT, words):
+        return False
+    return says(HEATER, words) or says(COOLER, words) or bool(values.min() <= 0.0 and values.max() <= 100.0)
+
+
+def _is_beyond_percent(values: np.ndarray) -> bool:
+    """Whether the values are no share in percent, and no whole numbers of a converter that rest at 0."""
+    converted = values.min() == 0 and bool((values == np.rint(values)).all())
+    return bool(values.max() > 110.0 and not converted)
+
+
+def _behaviour(signal: RecordedSignal) -> str:
+    """The role by the values alone. Commands rest and jump between few levels, or stay near two of them;
+    measurements do neither. A counter has no role, nor has a table of a few rows."""
+    finite = signal.values
+    if (
+        _SILENT.search(telling_name(signal.source).casefold())
+        or _is_constant(signal)
+        or len(finite) < FEWEST_ROWS
+        or np.ptp(np.diff(finite)) < 1e-9 * np.ptp(finite)
+    ):
+        return ""
+    if _bimodality(sampled(finite)) > TWO_LEVELS:
+        return "input"
+    few = len(np.unique(np.round(sampled(finite), 1))) <= max(10, min(len(finite), LOOKED_AT) // 100)
+    return "input" if few and not quantisation_step(sampled(finite)) < 0.1 else "output"
+
+
+def _bimodality(values: np.ndarray) -> float:
+    """(skewness^2 + 1) / kurtosis: 1 for two levels, 5/9 for a uniform distribution, 1/3 for a normal one
+    (Pearson)."""
+    values = values / np.abs(values).max()
+    spread = values.std()
+    if not spread > 0:
+        return 0.0
+    z = (values - values.mean()) / spread
+    return float((np.mean(z**3) ** 2 + 1) / np.mean(z**4))
+
+
+def _without_unheated(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
+    """The signals without temperatures that nothing heats: those of devices without a duty, if other devices
+    of the recording have one, are the board's own sensors; a chamber's without a heater is the air around the
+    machine. Names are "device.temp" and "device.pwm"."""
+    heated = {s.source.rpartition(".")[0] for s in taken if s.source.endswith(".pwm")}
+    heats_chamber = any(s.role == "input" and _is_of_chamber(s) for s in taken)
+    inputs = any(s.role == "input" for s in taken)
+
+    def role(signal: RecordedSignal) -> str:
+        device, _, field = signal.source.rpartition(".")
+        if signal.role != "output":
+            return signal.role
+        if inputs and not heats_chamber and _is_of_chamber(signal):
+            return "disturbance"
+        return "beside" if heated and field == "temp" and device not in heated else "output"
+
+    return [signal._replace(role=role(signal)) for signal in taken]
+
+
+def _is_of_chamber(signal: RecordedSignal) -> bool:
+    return "chamber" in split(signal.source).split()
+
+
+# ---- set-points
+
+
+def _rests(values: np.ndarray) -> bool:
+    return len(values) >= FEWEST_ROWS and float(np.mean(np.diff(values) == 0)) > RESTING_SHARE
+
+
+def _without_hidden_set_points(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
+    """An output that rests at few levels beside a measured one of the same numbers, around the same
+    temperature, is the set-point of that one, whatever it is called."""
+    outputs = [(s, _numbers(s.source), np.unique(sampled(s.values))) for s in taken if s.role == "output"]
+    moving = [entry for entry in outputs if not _rests(entry[0].values)]
+    hidden = {
+        signal.source
+        for signal, numbers, levels in outputs
+        if _rests(signal.values)
+        for other, others, more in moving
+        if numbers == others and len(more) > MORE_LEVELS * len(levels)
+        # the set-point lies within what is measured, a tenth of it wider
+        if more[0] - 0.1 * np.ptp(more) <= np.median(signal.values) <= more[-1] + 0.1 * np.ptp(more)
+    }
+    return [s._replace(role="set-point") if s.source in hidden else s for s in taken]
+
+
+def _numbers(source: str) -> tuple[str, ...]:
+    return tuple(re.findall(r"\d+", re.sub(r"\bpt 1000?\b", "", read_name(source).words)))
+
+
+def _plain_words(source: str) -> set[str]:
+    """The words of a name that tell neither a temperature nor its set-point, with the numbers."""
+    words = read_name(source).words
+    for pattern in (SET_POINT, ACTUAL, TEMPERATURE):
+        words = pattern.sub(" ", words)
+    return set(words.split())
+
+
+def _targets(taken: Sequence[RecordedSignal]) -> dict[str, RecordedSignal]:
+    """{output: its set-point}: of the same numbers, with the most words in common. If no output has the same
+    numbers, words and numbers count alike."""
+    outputs = {s.source: (_numbers(s.source), _plain_words(s.source)) for s in taken if s.role == "output"}
+    targets: dict[str, tuple[float, RecordedSignal]] = {}
+    for signal in taken:
+        name = read_name(telling_name(signal.source), signal.unit)
+        if signal.role != "set-point" or name.kind not in ("", *_CELSIUS) or says(SPEED, name.words):
+            continue
+        numbers, words = _numbers(signal.source), _plain_words(signal.source)
+        likeness = {
+            source: len(words & others) / len(words | others) if words | others else 1.0
+            for source, (own, others) in outputs.items()
+        }
+        equal = [source for source, (own, _) in outputs.items() if own == numbers]
+        candidates = sorted(equal or outputs, key=lambda source: -likeness[source])
+        # without a word or a number in common only one candidate is no guess
+        if not candidates or (len(candidates) > 1 and likeness[candidates[0]] == 0.0):
+            continue
+        best = candidates[0]
+        if likeness[best] >= targets.get(best, (-1.0, signal))[0]:
+            targets[best] = likeness[best], signal
+    return {source: signal for source, (_, signal) in targets.items()}
+
+
+# ---- names, units, limits
+
+
+def _proposed(signal: RecordedSignal, name: str, target: RecordedSignal | None, *, guessed: bool) -> Proposed:
+    unit, scale, offset = _conversion(signal)
+    low = high = reference = cut_off = None
+    if signal.limits is not None and np.isfinite(signal.limits).all():
+        low, high = (limit * scale + offset for limit in signal.limits)
+    elif signal.role == "input":
+        low, high = _input_limits(signal.values * scale + offset, guessed=guessed and scale == 1.0)
+    if signal.role == "output":
+        reference = _reference(sampled(signal.values) * scale + offset, target, scale, offset)
+        if high is not None:
+            cut_off, high = high, max(high - BELOW_CUT_OFF_DEGC, reference)
+    words = read_name(telling_name(signal.source), signal.unit).words
+    heated = says(HEATER, words) or _HEATED.search(words) is not None
+    heats = signal.role == "input" and heated and not says(COOLER, words) and not says(SPEED, words)
+    set_point = target.source if target is not None else ""
+    return Proposed(
+        name, signal.role, signal.source, unit, scale, offset, low, high, reference, heats, set_point, cut_off
+    )
+
+
+def _input_limits(ours: np.ndarray, *, guessed: bool) -> tuple[float, float]:
+    """0 to 100 percent, or from below zero where it was recorded there. Of a `guessed` input nothing says
+    that it is percent: the whole numbers around what was recorded, so that no experiment asks for more."""
+    low, high = max(-100.0, float(np.floor(ours.min()))), min(100.0, float(np.ceil(ours.max())))
+    return (low, high) if guessed else (min(0.0, low), 100.0)
+
+
+def _reference(ours: np.ndarray, target: RecordedSignal | None, scale: float, offset: float) -> float:
+    """The set-point that was held longest, or the median where there is none."""
+    held = target.values if target is not None else np.empty(0)
+    held = held[held > 0]
+    if len(held):
+        levels, counts = np.unique(held, return_counts=True)
+        return float(np.round(levels[counts.argmax()] * scale + offset, 1)) + 0.0
+    return float(np.round(np.median(ours))) + 0.0
+
+
+def _words_of(signal: RecordedSignal) -> list[str]:
+    """The words of the topic's last part and of the telling name, each once."""
+    topic = signal.source.rpartition(":")[0].rpartition("/")[2]
+    name = telling_name(signal.source)
+    own = read_name(name, signal.unit).words.split()
+    return own if name.startswith(topic) else [*split(topic).split(), *own]
+
+
+def _common_words(taken: Sequence[RecordedSignal], role: str) -> int:
+    """How many first words the names of all signals of a role share."""
+    names = [_words_of(signal) for signal in taken if signal.role == role]
+    alike = [len(set(column)) == 1 for column in zip(*names, strict=False)]
+    return alike.index(False) if len(names) > 1 and False in alike else 0
+
+
+def _name(signal: RecordedSignal, prefix: int, names: set[str]) -> str:
+    """heater_1, temperature_bed, ...; an array of a topic, a motor and a disturbance keep their own names in
+    letters, digits and _. The number is the first one behind the words that all signals of the role share."""
+    words = _words_of(signal)
+    number = next((word for word in [*words[prefix:], *words] if word.isdigit()), "")
+    text = " ".join(words)
+    kind = "temperature" if signal.role == "output" else "cooler" if says(COOLER, text) else "heater"
+    own = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_")
+    is_array = signal.source.startswith("/") and signal.source.endswith("]")
+    if signal.role == "disturbance" or is_array or signal.source == "motor":
+        base = (own if re.match(r"[a-z]", own) else f"signal_{own}")[:40].strip("_")
+    elif number:
+        base = f"{kind}_{number}"
+    else:
+        rest = [word for word in words if re.fullmatch(r"[a-z]{2,}", word) and not _is_common(word)]
+        base = "_".join([kind, *dict.fromkeys(rest)])[:40] if rest else f"{kind}_1"
+    base = f"{base}_1" if base in _TAKEN_NAMES else base
+    name, i = base, 1
+    while name in names:
+        i += 1
+        name = f"{re.sub(r'_[0-9]+$', '', base)}_{i}"
+    names.add(name)
+    return name
+
+
+def _is_common(word: str) -> bool:
+    """Whether a word tells the role alone, and nothing of the place."""
+    return word in _COMMON_WORDS or any(
+        says(pattern, word) for pattern in (SET_POINT, ACTUAL, DUTY, OUTPUT, COMMAND)
+    )
+
+
+def _conversion(signal: RecordedSignal) -> tuple[str, float, float]:
+    """The unit of ours, and the scale and offset that lead to it."""
+    name = read_name(telling_name(signal.source), signal.unit)
+    finite = signal.values
+    low, high = finite.min(), finite.max()
+    if signal.role == "disturbance" and not _is_warm(signal):
+        if name.kind != "percent":
+            return name.unit[:20] or "1", 1.0, 0.0
+        return "percent", 100.0 if low >= 0 and high <= 1 else 1.0, 0.0
+    if signal.role == "input":
+        if low >= 0 and high <= 1 and signal.limits is None:
+            return "percent", 100.0, 0.0
+        integer = high > 100 and bool((finite == np.rint(finite)).all())
+        full = next((top for top in (255, 1023, 4095) if 100 < high <= top and low >= 0 and integer), None)
+        if full is None and max(high, -low) > 100:
+            full = max(high, -low)  # mV, W: percent of the largest
+        return "percent", _to_percent(full) if full and name.kind != "percent" else 1.0, 0.0
+    if name.kind in _CELSIUS:
+        return "degC", *_CELSIUS[name.kind]
+    return "degC", 1.0, -273.15 if ROOM_KELVIN[0] <= finite[0] <= ROOM_KELVIN[1] and low > 250 else 0.0
+
+
+def _to_percent(full: float) -> float:
+    """100 / full to six digits, rounded down: the largest recorded value stays within 100 %."""
+    unit = 10.0 ** (math.floor(math.log10(100 / full)) - 5)
+    return float(f"{math.floor(100 / full / unit) * unit:.6g}")
+
+
+def _yaml(source: str) -> str:
+    """A YAML scalar, quoted if it could be taken for anything else."""
+    return (
+        source
+        if re.fullmatch(r"[A-Za-z_]\w*|/[\w/.:]*\w", source) and ": " not in source
+        else json.dumps(source, ensure_ascii=False)
+    )
+
+
+def _sample_time(groups: Sequence[tuple[FileColumns, str]]) -> float:
+    """The largest of the clocks' median intervals, to two digits."""
+    medians = []
+    for group, _ in groups:
+        if len(group.time) > 1:
+            steps = np.diff(group.time[:CLOCK_SAMPLES]) / (1e9 if group.time.dtype == np.int64 else 1.0)
+            medians.append(float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0)
+    return float(f"{max(medians, default=1.0):.2g}")

@@ -1,0 +1,474 @@
+"""Flags for doubtful samples of a table, with place and count: spikes, frozen sensors, rails, constants,
+quantisation, units. Wrong samples are masked.
+"""
+
+import itertools
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from pipeline.recordings.formats import Flag, Table, measured
+
+SPIKE_WINDOW = 7
+# a spike is beyond eight robust standard deviations of the residual of the local median, and beyond three
+# times its neighbours' own changes
+SPIKE_SIGMAS, SPIKE_OVER_NEIGHBOURS = 8.0, 3.0
+SPIKE_LONGEST = 2
+# from so many values on, some of them are looked at before all
+MANY_VALUES = 10_000
+# an input with no more levels than that between its limits follows a plan, and is not held back by the lower
+# one
+PLANNED_LEVELS = 20
+# an extruder's barrel, nozzle and bed: a higher number in °C is doubtful; rooms in K and °F for a machine at
+# rest
+HOTTEST_DEGC = 450.0
+ROOM_KELVIN, ROOM_FAHRENHEIT = (283.0, 313.0), (55.0, 100.0)
+CELSIUS = {"degc", "°c", "℃", "c", "celsius"}
+_PERCENT = {"percent", "%", "pct"}
+
+
+def flag(table: Table, *, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> Table:
+    """The table with flags for doubtful samples. Samples that are no measurement are masked; values stay.
+
+    `limits` are {input: (low, high)} in the input's unit; all other signals are outputs. Spikes and frozen
+    stretches are masked. These are only reported: quantised, saturated, outside (an input beyond its limits),
+    constant, unit (looks like kelvin, fahrenheit, a duty of 0-1).
+    """
+    outputs = [name for name in table.values if name not in limits]
+    flags, masked = list(table.flags), {name: mask.copy() for name, mask in table.masked.items()}
+    for name in outputs:
+        for doubtful in (_spikes(table, name), frozen(table, name)):
+            for finding, where in doubtful:
+                flags.append(finding)
+                masked[name][where] = True
+    checked = table._replace(masked=masked)
+    for name in outputs:
+        for check in (_constant, _quantised, rails):
+            flags += check(checked, name)
+    for name, (low, high) in limits.items():
+        if name in table.values:
+            flags += _constant(checked, name) + _at_limits(checked, name, low, high)
+    flags += _unit_flags(checked, units, limits)
+    return checked._replace(flags=flags)
+
+
+def _usable(table: Table, name: str) -> np.ndarray:
+    return _chosen(table.values[name], ~table.masked[name])
+
+
+def _chosen(values: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """The values of a mask; no copy where it holds all."""
+    return values if which.all() else values[which]
+
+
+def _flag(table: Table, name: str, kind: str, where: np.ndarray, message: str) -> Flag:
+    return Flag(
+        name, kind, float(table.time_s[where[0]]), float(table.time_s[where[-1]]), len(where), message
+    )
+
+
+def _groups(where: np.ndarray, segment: np.ndarray) -> list[np.ndarray]:
+    """Sorted indices, split at every index that is missing and at the ends of segments."""
+    if not len(where):
+        return []
+    return np.split(where, np.flatnonzero((np.diff(where) > 1) | (np.diff(segment[where]) != 0)) + 1)
+
+
+def _in_segments(table: Table, name: str, of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """The filter `of` on the values of each segment. The last value before a masked gap bridges the gap."""
+    filtered = np.zeros(len(table.time_s))
+    values = measured(table, name)
+    starts = [0, *(np.flatnonzero(np.diff(table.segment)) + 1).tolist(), len(values)]
+    for start, end in itertools.pairwise(starts):
+        inside = values[start:end]
+        known = np.isfinite(inside)
+        if known.all():
+            filtered[start:end] = of(inside)
+        elif known.any():
+            finite = np.flatnonzero(known)
+            filtered[start:end] = of(inside[finite[np.maximum(np.cumsum(known) - 1, 0)]])
+    return filtered
+
+
+# ---- spikes
+
+
+def _spikes(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
+    """Isolated samples that leave the local median and come back (Hampel 1974,
+    with guards for quantised and for smooth signals)."""
+    residual = _in_segments(table, name, lambda y: y - median_filter(y, SPIKE_WINDOW, mode="nearest"))
+    usable = ~table.masked[name]
+    size = np.abs(residual)
+    known = _chosen(size, usable)
+    if len(known) < 3 * SPIKE_WINDOW or _none_stands_out(known):
+        return []
+    # the median alone is 0 for a quantised signal: the 90th percentile and the step of the values count too
+    sigma = max(
+        1.4826 * np.median(known),
+        np.percentile(known, 90) / 1.645,
+        quantisation_step(table.values[name][usable]),
+    )
+    spikes = []
+    for group in _groups(np.flatnonzero(usable & (size > SPIKE_SIGMAS * sigma)), table.segment):
+        # beside a spike the median of a smooth signal is off by what it does in a sample
+        group = group[size[group] > size[group].max() / 2]
+        if len(group) <= SPIKE_LONGEST and _stands_alone(table, name, group, size[group].min()):
+            at, value = float(table.time_s[group[0]]), float(table.values[name][group[0]])
+            local = value - float(residual[group[0]])
+            message = (
+                f"{name} is {value:g} at {at:g} s while its neighbours are at {local:g}: "
+                "a spike of the sensor, masked"
+            )
+            spikes.append((_flag(table, name, "spike", group, message), group))
+    return spikes
+
+
+def _none_stands_out(size: np.ndarray) -> bool:
+    """Whether no residual can be beyond eight of the deviations that the 90th percentile tells: more than a
+    tenth are at least an eighth as large as such a one. That is found by counting, in place of sorting."""
+    near = size.max() / SPIKE_SIGMAS * 1.645 * (1 + 1e-9)  # beyond what rounding does to the percentile
+    return bool(np.count_nonzero(size >= near) >= len(size) - int(0.9 * (len(size) - 1)))
+
+
+def _stands_alone(table: Table, name: str, group: np.ndarray, size: float) -> bool:
+    """Whether the neighbours on both sides go on as if the group were not there."""
+    inside = np.flatnonzero(table.segment == table.segment[group[0]])
+    near = inside[(inside >= group[0] - SPIKE_WINDOW) & (inside <= group[-1] + SPIKE_WINDOW)]
+    others = near[~np.isin(near, group) & ~table.masked[name][near]]
+    if not (others < group[0]).any() or not (others > group[-1]).any():
+        return False
+    changes = np.abs(np.diff(table.values[name][others]))
+    return size > SPIKE_OVER_NEIGHBOURS * changes.max(initial=0.0)
+
+
+def quantisation_step(values: np.ndarray) -> float:
+    """The step of a quantised signal, 0 if the levels have no common step.
+
+    The median distance d of neighbouring levels is the step if nine tenths of the distances are whole
+    multiples of it (to a tenth: rounded print-outs of 0.0322 differ by 0.032 or 0.033) and if values come
+    back to their levels, at least three times each.
+    """
+    # a signal with all its digits shows in little more than a third of its values that it has too many levels
+    some = values[: 2 * len(values) // 5] if len(values) >= MANY_VALUES else values
+    levels = np.unique(some)
+    if len(some) < len(values) and len(levels) <= len(values) / 3:
+        levels = np.unique(values)
+    if len(levels) < 2 or len(levels) > len(values) / 3:
+        return 0.0
+    distances = np.diff(levels)
+    # levels that differ by rounding alone are one
+    distances = distances[distances > 1e-9 * max(1.0, float(np.abs(levels).max()))]
+    if not len(distances):
+        return 0.0
+    step = float(np.median(distances))
+    ratio = distances / step
+    multiple = np.abs(ratio - np.rint(ratio)) <= 0.1 * np.maximum(1.0, np.rint(ratio))
+    return step if np.mean(multiple & (ratio > 0.5)) >= 0.9 else 0.0
+
+
+# ---- constants, limits, quantisation
+
+
+def _constant(table: Table, name: str) -> list[Flag]:
+    usable = _usable(table, name)
+    if not len(usable) or np.ptp(usable) > 0:
+        return []
+    message = (
+        f"{name} is {usable[0]:g} throughout: the recording says nothing of what it does; "
+        "move it, or leave it out"
+    )
+    return [_flag(table, name, "constant", np.arange(len(table.time_s)), message)]
+
+
+def _at_limits(table: Table, name: str, low: float, high: float) -> list[Flag]:
+    values, usable, flags = table.values[name], ~table.masked[name], []
+    tolerance = 1e-6 * (high - low)
+    inside = values[usable & (values > low + tolerance) & (values < high - tolerance)]
+    # a few values tell already that there are more
+    planned = all(len(np.unique(some)) <= PLANNED_LEVELS for some in (inside[:MANY_VALUES], inside))
+    # a controller or a random signal moves in most samples and is cut off; a plan of levels asks for it
+    cut_off = not planned and np.mean(np.diff(inside) != 0) > 0.5
+    remark = ": there the limit decides, not what commands it" if cut_off else ""
+    for limit, at in ((low, np.abs(values - low) <= tolerance), (high, np.abs(values - high) <= tolerance)):
+        where = np.flatnonzero(at & usable)
+        if len(where) and np.ptp(_usable(table, name)) > 0 and not (planned and limit == low):
+            message = f"{name} is at its limit {limit:g} in {len(where)} of {usable.sum()} samples{remark}"
+            flags.append(_flag(table, name, "saturated", where, message))
+    where = np.flatnonzero(usable & ((values < low - tolerance) | (values > high + tolerance)))
+    if len(where):
+        message = (
+            f"{name} is beyond its limits {low:g} to {high:g} in {len(where)} samples (up to"
+            f" {values[where].max():g}); mend the limits or the mapping"
+        )
+        flags.append(_flag(table, name, "outside", where, message))
+    return flags
+
+
+def _quantised(table: Table, name: str) -> list[Flag]:
+    usable = _usable(table, name)
+    step = quantisation_step(usable) if len(usable) else 0.0
+    if not step:
+        return []
+    levels = len(np.unique(usable))
+    noise = step / np.sqrt(12)
+    message = (
+        f"{name} comes in steps of {step:.3g} ({levels} levels): "
+        f"that is a noise of {noise:.2g} that no model explains"
+    )
+    return [_flag(table, name, "quantised", np.flatnonzero(~table.masked[name]), message)]
+
+
+# ---- units
+
+
+def _unit_flags(
+    table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]
+) -> list[Flag]:
+    resting = _at_rest(table, units, limits)
+    flags = []
+    for name in table.values:
+        usable, unit = _usable(table, name), units.get(name, "").casefold()
+        if not len(usable):
+            continue
+        doubt = (
+            _doubtful_celsius(name, usable, resting)
+            if unit in CELSIUS
+            else _doubtful_percent(name, usable, limits.get(name, (0.0, 100.0))[1])
+            if unit in _PERCENT
+            else ""
+        )
+        if doubt:
+            flags.append(_flag(table, name, "unit", np.flatnonzero(~table.masked[name]), doubt))
+    return flags
+
+
+def _at_rest(table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> bool:
+    """Whether the recording begins on a machine at the room's temperature: every input is at 0 or its lowest,
+    or several temperatures are alike."""
+    first = {name: float(_usable(table, name)[0]) for name in table.values if len(_usable(table, name))}
+    idle = bool(limits) and all(first.get(name, np.nan) in (0.0, low) for name, (low, _) in limits.items())
+    starts = [
+        value
+        for name, value in first.items()
+        if name not in limits and units.get(name, "").casefold() in CELSIUS
+    ]
+    return idle or (len(starts) > 1 and np.ptp(starts) <= 3.0)
+
+
+def _doubtful_celsius(name: str, values: np.ndarray, resting: bool) -> str:
+    first, middle = values[0], float(np.median(values))
+    if values.min() < -273.15:
+        return (
+            f"{name} falls to {values.min():g} °C, which no temperature does; "
+            "mend the mapping's scale and offset"
+        )
+    if middle > HOTTEST_DEGC or (resting and ROOM_KELVIN[0] <= first <= ROOM_KELVIN[1]):
+        return (
+            f"{name} begins at {first:g} and is {middle:g} in the middle: it looks like kelvin; "
+            "set offset: -273.15 if it is"
+        )
+    if resting and ROOM_FAHRENHEIT[0] <= first <= ROOM_FAHRENHEIT[1]:
+        return (
+            f"{name} begins at {first:g} on a machine at rest: it looks like fahrenheit; "
+            "set scale: 0.555556 and offset: -17.7778 if it is"
+        )
+    if resting and values.max() <= 1.0 and values.min() >= 0.0:
+        return (
+            f"{name} lies within 0 to 1: it looks like a share or a voltage; "
+            "set the sensor's scale and offset if it is"
+        )
+    return ""
+
+
+def _doubtful_percent(name: str, values: np.ndarray, high: float) -> str:
+    top = values.max()
+    if 0.0 < top <= 1.0 and values.min() >= 0.0:
+        return (
+            f"{name} lies within {values.min():g} to {top:g}: it looks like a duty of 0 to 1; "
+            "set scale: 100 if it is"
+        )
+    for full in (255, 1023, 4095, 65535):
+        if max(100.0, high) < top <= full and values.min() >= 0.0 and (values == np.rint(values)).all():
+            return (
+                f"{name} reaches {top:g} in whole numbers: it looks like a converter's 0 to {full}; "
+                f"set scale: {100 / full:.6g} if it is"
+            )
+    return ""
+
+
+# ---- sensors that stand still but should not. A process comes to rest slowly; a signal that stops at once
+# was stopped by its sensor
+
+FROZEN_SHORTEST, RAIL_SHORTEST, OVER_USUAL = 30, 10, 5.0
+# samples beside a stretch in which the signal must have been alive
+BESIDE = 24
+
+
+def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
+    """Stretches of one value that are far longer than usual for the signal and begin at once.
+
+    Noise ends at once at an end of the stretch, or a movement does although it went on: a jump at the end of
+    the stretch shows that, or other signals that move meanwhile.
+    """
+    values = measured(table, name)
+    if not _may_rest(values, FROZEN_SHORTEST):
+        return []
+    first, last = runs(values, table.segment)
+    length = last - first + 1
+    rests = np.flatnonzero(length >= FROZEN_SHORTEST)
+    rests = rests[length[rests] > OVER_USUAL * _usual_of_others(length, length[rests])]
+    rests = rests[~_at_rail(values, table.segment, first[rests])]
+    if not len(rests):
+        return []
+    step, stretches = least_change(values), []
+    others = {other: measured(table, other) for other in table.values if other != name}
+    whole = {other: _range(column) for other, column in others.items()}
+    for i in rests:
+        a, b = int(first[i]), int(last[i])
+        before, after = _before(values, table.segment, a), _after(values, table.segment, b)
+        entry, end = _alive(before, step), _alive(-after[::-1], step)
+        moving = [other for other, column in others.items() if _moves(column[a : b + 1], whole[other])]
+        released = len(after) > 0 and abs(after[0]) > 3 * max(
+            np.abs(before[1:]).max(initial=0.0), np.abs(after[1:]).max(initial=0.0)
+        )
+        noise_stopped = {entry, end} <= {"noise", "edge"} and "noise" in (entry, end)
+        if noise_stopped or (entry == "movement" and (released or moving)):
+            where = np.arange(a + 1, b + 1)
+            beside = f" while {', '.join(moving[:3])} move" if moving else ""
+            message = (
+                f"{name} stays at {values[a]:g} for {b - a + 1} samples{beside}: a frozen sensor, masked"
+            )
+            stretches.append((_flag(table, name, "frozen", where, message), where))
+    return stretches
+
+
+def rails(table: Table, name: str) -> list[Flag]:
+    """Flags for a largest or smallest value at which the signal stops at once and stays for long."""
+    values = measured(table, name)
+    if not _may_rest(values, RAIL_SHORTEST + 1):
+        return []
+    finite = values[np.isfinite(values)]
+    if not len(finite) or np.ptp(finite) == 0:
+        return []
+    first, last = runs(values, table.segment)
+    length = last - first + 1
+    limit = max(RAIL_SHORTEST, OVER_USUAL * float(np.percentile(length, 95)))
+    flags = []
+    for rail, side in ((finite.max(), "largest"), (finite.min(), "smallest")):
+        there = np.flatnonzero((values[first] == rail) & (length > limit))
+        there = there[_at_rail(values, table.segment, first[there])]
+        long = list(zip(first[there].tolist(), last[there].tolist(), strict=True))
+        step = least_change(values) if long else 0.0
+        if any(_alive(_before(values, table.segment, a), step) in ("noise", "movement") for a, _ in long):
+            count = sum(b - a + 1 for a, b in long)
+            message = (
+                f"{name} stays at {rail:g}, its {side} value, for {count} samples in {len(long)} stretches:"
+                f" the sensor or its converter is saturated"
+            )
+            flags.append(
+                Flag(
+                    name,
+                    "saturated",
+                    float(table.time_s[long[0][0]]),
+                    float(table.time_s[long[-1][1]]),
+                    count,
+                    message,
+                )
+            )
+    return flags
+
+
+def _may_rest(values: np.ndarray, least: int) -> bool:
+    """Whether enough samples equal the one before for a stretch of `least`: a quick no for a fine signal."""
+    return bool(np.count_nonzero(values[1:] == values[:-1]) >= least - 1)
+
+
+def runs(values: np.ndarray, segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First and last index (m,) of stretches of equal values within segments. A NaN ends a stretch and is in
+    none."""
+    begins = np.ones(len(values), bool)
+    begins[1:] = (values[1:] != values[:-1]) | (segment[1:] != segment[:-1])
+    first = np.flatnonzero(begins)
+    last = np.r_[first[1:], len(values)] - 1
+    finite = np.isfinite(values[first])
+    return first[finite], last[finite]
+
+
+def _usual_of_others(lengths: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """For stretches of length `own` (k,) among `lengths` (m,): the length that holds nine tenths of the
+    samples of the m - 1 others, infinite without others. A coarse or slow signal rests long, if not often."""
+    if len(lengths) < 2:
+        return np.full(len(own), np.inf)
+    ordered = np.sort(lengths)
+    held = np.cumsum(ordered)
+    at = np.searchsorted(ordered, own)  # where the stretch itself stands
+    wanted = np.ceil(0.9 * (held[-1] - own)).astype(int)
+    j = np.searchsorted(held, wanted)
+    # behind itself the others hold less by its length
+    behind = np.maximum(np.searchsorted(held, wanted + own), at + 1)
+    return ordered[np.where(j < at, j, behind)].astype(float)
+
+
+def _before(values: np.ndarray, segment: np.ndarray, first: int) -> np.ndarray:
+    """Changes from sample to sample that lead to `first`, within its segment."""
+    start = max(first - BESIDE, int(np.searchsorted(segment, segment[first])))
+    return np.diff(values[start : first + 1])
+
+
+def _after(values: np.ndarray, segment: np.ndarray, last: int) -> np.ndarray:
+    """Changes from `last` on, within its segment."""
+    end = min(last + BESIDE, int(np.searchsorted(segment, segment[last], side="right")) - 1)
+    return np.diff(values[last : end + 1])
+
+
+def least_change(values: np.ndarray, lag: int = 1) -> float:
+    """The first percentile of the changes over `lag` samples, infinite without changes: one step of a coarse
+    sensor, next to nothing of a fine one."""
+    changes = np.abs(values[lag:] - values[:-lag])
+    changes = changes[changes > 0]
+    return float(np.percentile(changes, 1)) if len(changes) else np.inf
+
+
+def _alive(changes: np.ndarray, step: float) -> str:
+    """The signal before it stops: "noise" of more than its step, "movement" one way that does not slow down,
+    "" for neither (it rests, or comes to rest), "edge" if the record has too little of it."""
+    changes = changes[np.isfinite(changes)]
+    if len(changes) < BESIDE // 2:
+        return "edge"
+    moved = changes[changes != 0]
+    if len(moved) < len(changes) / 3:
+        return ""
+    turns = np.count_nonzero(np.diff(np.sign(moved)))
+    if turns >= len(changes) / 6 and np.count_nonzero(np.abs(moved) > 1.5 * step) >= 3:
+        return "noise"
+    third = len(changes) // 3
+    early, late = changes[:third].sum(), changes[-third:].sum()
+    return (
+        "movement"
+        if turns <= 1
+        and early * late > 0
+        and abs(late) >= 0.5 * abs(early)
+        and len(moved) >= 0.75 * len(changes)
+        else ""
+    )
+
+
+def _range(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.ptp(finite)) if len(finite) else 0.0
+
+
+def _moves(inside: np.ndarray, whole: float) -> bool:
+    """Whether a signal changes over a stretch by a tenth of its own range, `whole`."""
+    inside = inside[np.isfinite(inside)]
+    return len(inside) > 1 and whole > 0 and bool(np.ptp(inside) >= 0.1 * whole)
+
+
+def _at_rail(values: np.ndarray, segment: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Mask (k,) of the stretches that lie on the largest or smallest value of all, and to which the signal
+    came from another value. (A machine at rest begins at its smallest.)"""
+    if not len(first):
+        return np.zeros(0, bool)
+    came = (first > 0) & (segment[first] == segment[np.maximum(first, 1) - 1])
+    return came & ((values[first] == np.nanmax(values)) | (values[first] == np.nanmin(values)))

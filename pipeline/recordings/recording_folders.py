@@ -1,0 +1,382 @@
+"""A folder of recordings -> the table of each: which files are read, which were read before and which are
+broken.
+
+The memo is content-addressed. The hash of the recording, of the wish and of the code that reads names the
+entry, so that one more recording costs one reading. An entry counts if its files have the digests that were
+written last; otherwise the recording is read again."""
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import joblib
+import numpy as np
+
+from pipeline.recordings import excluded, plain_files
+from pipeline.recordings.formats import file_format, is_bag
+from pipeline.recordings.isolated import Budget, isolated
+from pipeline.recordings.klipper_logs import printer_heaters
+from pipeline.recordings.quality import flag
+from pipeline.recordings.recordings import Flag, Raw, Source, Table, read
+from pipeline.recordings.resampling import cut_flags, resample
+from pipeline.store import artifacts
+from pipeline.store.execution import run_all
+from pipeline.store.params import Execution
+from pipeline.store.tables import Schema
+
+_PARTIAL = "is a copy that is not complete, or a system's own file, and was passed over"
+_GROWING = "is still being written; wait until its copy is complete and run it again"
+# notes of rows that a reader left out
+_LEFT_OUT = ("truncated", "trailing", "damage")
+CODE = Path(__file__).parents[1]
+# what decides what an entry of the memo holds: changed code reads everything again
+READING = ("store/artifacts.py", "store/params.py", "store/tables.py", "recordings/*.py")
+
+
+class RecordingWish(NamedTuple):
+    """What to take from every recording: the sources of all signals, which of them are inputs and within
+    which limits, the sample time, the clock, the gap limit, the decimal mark of text ("": found), and the
+    schemas of the record and of its findings."""
+
+    sources: tuple[Source, ...]
+    limits: dict[str, tuple[float, float]]
+    held: tuple[str, ...]  # inputs and disturbances: between two samples they keep their value
+    sample_time_s: float
+    time: str
+    max_gap_s: float
+    decimal: str
+    record: Schema
+    quality: Schema
+
+
+class RecordingTable(NamedTuple):
+    """One recording's share of the record and of its findings; `reason` is why it was quarantined, "" if it
+    was not."""
+
+    name: str
+    record: dict[str, np.ndarray]
+    quality: dict[str, np.ndarray]
+    reason: str
+    reused: bool
+    passed_over: bool = False  # a copy that is not complete: neither read nor quarantined
+
+
+def read_folder(
+    folder: Path,
+    wish: RecordingWish,
+    execution: Execution,
+    *,
+    memo: Path,
+    budget: Budget,
+    ignored: Collection[str] = (),
+    waits: bool = False,
+) -> list[RecordingTable]:
+    """Every recording below `folder` but files named `ignored`, in the order of names, on as many workers as
+    `execution` says. A recording that needs more than its budget is quarantined.
+
+    Copies that are not complete, by their names, are passed over. If `waits`, a file that changed a moment
+    ago is waited for, ten seconds at most, and passed over if it changes meanwhile. Raises ValueError if
+    there is no recording.
+    """
+    files, passed = _recordings_below(folder, ignored, waits=waits)
+    if not files:
+        reason = f" but {next(iter(passed.values()))}" if passed else ""
+        raise ValueError(
+            f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none{reason}; "
+            "copy one there, or set generate_probing.source: simulated"
+        )
+    code = "".join(artifacts.sha256(path) for pattern in READING for path in sorted(CODE.glob(pattern)))
+    hashes = [artifacts.sha256(path) for path in files]
+    names = [_utf8(path.relative_to(folder).as_posix()) for path in files]
+    keys = [joblib.hash((content, name, wish, code)) for content, name in zip(hashes, names, strict=True)]
+    left_out = _copies(files, hashes) | _without_text(files)
+    remembered = [
+        None if path in left_out else _remembered(memo, key, wish)
+        for path, key in zip(files, keys, strict=True)
+    ]
+    todo = [
+        (path, key)
+        for path, key, entry in zip(files, keys, remembered, strict=True)
+        if entry is None and path not in left_out
+    ]
+    reasons = left_out | dict(
+        zip([path for path, _ in todo], _run(todo, folder, wish, execution, (memo, budget)), strict=True)
+    )
+    results = [
+        _result(name, entry or _remembered(memo, key, wish), _utf8(reasons.get(path, "")), entry is not None)
+        for path, name, key, entry in zip(files, names, keys, remembered, strict=True)
+    ]
+    return results + [
+        RecordingTable(_utf8(path.relative_to(folder).as_posix()), {}, {}, _utf8(reason), False, True)
+        for path, reason in passed.items()
+    ]
+
+
+def _recordings_below(
+    folder: Path, ignored: Collection[str], *, waits: bool
+) -> tuple[list[Path], dict[Path, str]]:
+    """The recordings below a folder, and {path: reason} of copies that are not complete."""
+    plain_files.check_plain_files(folder)
+    bags = {path.parent for path in folder.rglob("metadata.yaml") if is_bag(path.parent)} - {folder}
+    files = sorted(
+        path
+        for path in folder.rglob("*")
+        if (path in bags or (path.is_file() and not bags & set(path.parents)))
+        and not path.name.startswith(".")
+        and path.suffix.lower() not in {".md", ".yaml", ".dvc"}
+        and path.name not in ignored
+        and path.name.lower() not in {"readme.txt", "license.txt", "source.txt", "notes.txt"}
+    )
+    files = excluded.readable(files, folder)
+    passed = {path: f"{path} {_PARTIAL}" for path in files if plain_files.is_partial(path.name)}
+    files = [path for path in files if path not in passed]
+    growing = plain_files.wait_until_still(files) if waits else []
+    passed |= {path: f"{path} {_GROWING}" for path in growing}
+    return [path for path in files if path not in passed], passed
+
+
+def _copies(files: Sequence[Path], hashes: Sequence[str]) -> dict[Path, str]:
+    """Why a file is left out that is a copy of another: what is learned from twice is
+    trusted twice, and judged by what it was learned from."""
+    first: dict[str, Path] = {}
+    return {
+        path: " ".join(
+            f"{path} is {first[content].name} once more, byte for byte; remove one of the two".split()
+        )
+        for path, content in zip(files, hashes, strict=True)
+        if first.setdefault(content, path) != path
+    }
+
+
+def _without_text(files: Sequence[Path]) -> dict[Path, str]:
+    """Why a file is left out whose name is no text: no table can hold it."""
+    return {
+        path: f"{_utf8(str(path))}: its name should be UTF-8 but has other bytes; rename the file"
+        for path in files
+        if _utf8(str(path)) != str(path)
+    }
+
+
+def _utf8(name: str) -> str:
+    """The name with its bytes that are no UTF-8 written out."""
+    return name.encode("utf-8", "backslashreplace").decode()
+
+
+def _run(
+    todo: Sequence[tuple[Path, str]],
+    folder: Path,
+    wish: RecordingWish,
+    execution: Execution,
+    where: tuple[Path, Budget],
+) -> list[str]:
+    """The reasons of `_within`, in the order of `todo`; workers of a cluster see the same file
+    system under absolute paths. On one machine threads wait for children that do the work."""
+    memo, budget = where
+    calls = [
+        joblib.delayed(_within)(budget, path.resolve(), path, folder, key, wish, memo.resolve())
+        for path, key in todo
+    ]
+    if execution.backend == "loky":
+        return joblib.Parallel(n_jobs=execution.jobs, backend="threading")(calls)
+    return list(run_all(calls, execution, remains=": what was read is kept"))
+
+
+def _within(budget: Budget, path: Path, shown: Path, *arguments) -> str:
+    """The reason of `_one`, which works in a child; also where it needs more than the budget."""
+    try:
+        return isolated(_one, path, shown, *arguments, shown=shown, budget=budget)
+    except ValueError as reason:
+        return str(reason)
+
+
+def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, memo: Path) -> str:
+    """Read, resample and flag one recording into the memo, under the path that is
+    `shown`; the reason why it cannot be, or an empty text."""
+    name = shown.relative_to(folder).as_posix()
+    units = {source.signal: source.unit for source in wish.sources}
+    try:
+        raw = read(path, wish.sources, time=wish.time, decimal=wish.decimal)
+        table = resample(
+            raw,
+            sample_time_s=wish.sample_time_s,
+            inputs=list(wish.held),
+            outputs=[name for name in units if name not in wish.held],
+            max_gap_s=wish.max_gap_s,
+        )
+        table = flag(table, units=units, limits=wish.limits)
+        table = table._replace(flags=[*table.flags, *_cut_rows(raw)])
+        for flagged in table.flags:
+            if flagged.kind == "mixed" and table.masked[flagged.signal].mean() > 0.5:
+                raise ValueError(f"{path}: {flagged.message}")
+    except ValueError as reason:
+        # on a cluster the path is absolute; what is said is the same wherever the work is done
+        return " ".join(str(reason).split()).replace(str(path), str(shown))
+    findings = [(f.kind, f.signal, f.start_s, f.end_s, f.count, f.message) for f in table.flags]
+    findings += [
+        (n.kind, n.signal, np.nan, np.nan, n.count, n.message.replace(str(path), str(shown)))
+        for n in raw.notes
+    ]
+    kinds, signals, starts, ends, counts, messages = (
+        [list(column) for column in zip(*findings, strict=True)] if findings else [[]] * 6
+    )
+    quality = {
+        "recording": [name] * len(findings),
+        "signal": signals,
+        "kind": kinds,
+        "start_s": starts,
+        "end_s": ends,
+        "count": counts,
+        "message": messages,
+    }
+    artifacts.write_table(memo / f"{key}.record.parquet", wish.record, _columns(name, table))
+    artifacts.write_table(memo / f"{key}.quality.parquet", wish.quality, quality)
+    artifacts.write_json(memo / f"{key}.json", _digests(memo, key))
+    return ""
+
+
+def _cut_rows(raw: Raw) -> list[Flag]:
+    """A flag for a recording whose reader left out many rows. (MCAP's damage is counted in chunks.)"""
+    if file_format(Path(raw.path)) in ("mcap", "bag"):
+        return []
+    left_out = sum(note.count for note in raw.notes if note.kind in _LEFT_OUT)
+    times = [time_s for time_s, _ in raw.signals.values()]
+    start, end = min(time_s[0] for time_s in times), max(time_s[-1] for time_s in times)
+    count = sum(raw.messages.values()) + left_out
+    return cut_flags(left_out, count, "rows are damaged or no data", float(start), float(end))
+
+
+def _digests(memo: Path, key: str) -> dict[str, str]:
+    return {part: artifacts.sha256(memo / f"{key}.{part}.parquet") for part in ("record", "quality")}
+
+
+def _remembered(
+    memo: Path, key: str, wish: RecordingWish
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]] | None:
+    """Record and quality of an entry whose digests, written last, are those of its files;
+    None where it is absent, half written or damaged."""
+    try:
+        if artifacts.read_json(memo / f"{key}.json") != _digests(memo, key):
+            return None
+        record = artifacts.read_table(memo / f"{key}.record.parquet", wish.record)
+        return record, artifacts.read_table(memo / f"{key}.quality.parquet", wish.quality)
+    except (OSError, ValueError):
+        return None
+
+
+def _columns(name: str, table: Table) -> dict[str, np.ndarray | list[str]]:
+    columns = {"recording": [name] * len(table.time_s), "segment": table.segment, "time_s": table.time_s}
+    for signal, values in table.values.items():
+        columns |= {signal: values, f"{signal}_masked": table.masked[signal]}
+    return columns
+
+
+def _result(name: str, entry: tuple[dict, dict] | None, reason: str, reused: bool) -> RecordingTable:
+    if reason:
+        return RecordingTable(name, {}, {}, reason, False)
+    if entry is None:
+        raise ValueError(
+            f"{name} was read by a worker but its entry is not in datasets/memo/ingest; "
+            "let the workers share this folder, "
+            "or set execution.backend: loky"
+        )
+    return RecordingTable(name, *entry, "", reused)
+
+
+def join(
+    results: Sequence[RecordingTable], wish: RecordingWish, *, strict: bool
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict]:
+    """The columns of one record and of one table of findings, in the order of names, and figures. Raises
+    ValueError if no recording is left, or if `strict` and one is broken."""
+    passed = [result for result in results if result.passed_over]
+    results = [result for result in results if not result.passed_over]
+    broken = [result for result in results if result.reason]
+    if broken and (strict or len(broken) == len(results)):
+        raise ValueError(
+            broken[0].reason
+            + (f" ({len(broken)} of {len(results)} recordings are broken)" if len(results) > 1 else "")
+        )
+    good = [result for result in results if not result.reason]
+    record = {
+        column.name: np.concatenate([result.record[column.name] for result in good])
+        for column in wish.record.columns
+    }
+    quality = {
+        column.name: np.concatenate([result.quality[column.name] for result in good])
+        for column in wish.quality.columns
+    }
+    for result in [*broken, *passed]:
+        row = {
+            "recording": result.name,
+            "signal": "",
+            "kind": "passed_over" if result.passed_over else "quarantined",
+            "start_s": np.nan,
+            "end_s": np.nan,
+            "count": 1,
+            "message": result.reason,
+        }
+        quality = {
+            name: np.append(values, np.array([row[name]], values.dtype)) for name, values in quality.items()
+        }
+    counts: dict[str, dict[str, int]] = {}
+    for signal, kind, count in zip(quality["signal"], quality["kind"], quality["count"], strict=True):
+        of = counts.setdefault(str(signal) or "recording", {})
+        of[str(kind)] = of.get(str(kind), 0) + int(count)
+    figures = {
+        "recordings": len(results),
+        "quarantined": len(broken),
+        "samples": len(record["time_s"]),
+        "segments": int(_segments(record)),
+        "findings": counts,
+    }
+    is_cut = quality["kind"] == "cut"
+    if is_cut.any():
+        shares = [float(message.partition(" %")[0]) for message in quality["message"][is_cut]]
+        names = [str(name) for name in quality["recording"][is_cut]]
+        figures["cut_percent"] = {
+            name: max(share for other, share in zip(names, shares, strict=True) if other == name)
+            for name in dict.fromkeys(names)
+        }
+    return record, quality, figures
+
+
+def count_work(results: Sequence[RecordingTable]) -> dict[str, int]:
+    """How many recordings were processed and how many the memo gave: of this run alone, so no metric."""
+    return {
+        "processed": sum(not r.reused and not r.reason for r in results),
+        "reused": sum(r.reused for r in results),
+    }
+
+
+def printer_pids(
+    folder: Path, results: Sequence[RecordingTable], sources: Sequence[Source], inputs: Collection[str]
+) -> dict[str, list[dict]]:
+    """{"heaters": [...]}: the PIDs by which a printer held the heaters whose duty and temperature are signals
+    of ours, in our units; {} if no good recording is a klippy.log. The last log's values count."""
+    of = {source.source: source for source in sources}
+    pids: dict[str, dict] = {}
+    logs = [r.name for r in results if not r.reason and file_format(folder / r.name) == "klippy.log"]
+    for name in logs:
+        for pid in [heater.pid for heater in printer_heaters(folder / name) if heater.pid]:
+            u, y = of.get(f"{pid.heater}.pwm"), of.get(f"{pid.heater}.temp")
+            if u is None or y is None or u.signal not in inputs:
+                continue
+            gains = [gain * u.scale / y.scale for gain in pid[1:4]]
+            pids[u.signal] = {
+                "recording": name,
+                "input": u.signal,
+                "output": y.signal,
+                **dict(zip(("Kp", "Ki", "Kd"), gains, strict=True)),
+                "most_percent": pid.most_percent * u.scale,
+                "smooth_s": pid.smooth_s,
+            }
+    return {"heaters": list(pids.values())} if pids else {}
+
+
+def _segments(record: dict[str, np.ndarray]) -> int:
+    return (
+        1
+        + (
+            (record["recording"][1:] != record["recording"][:-1])
+            | (record["segment"][1:] != record["segment"][:-1])
+        ).sum()
+    )

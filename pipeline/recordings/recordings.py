@@ -1,0 +1,217 @@
+"""Recordings of other people's machines -> signals on their own clocks: MCAP and bags, Parquet, CSV, logs of
+printers, spreadsheets, MATLAB files. Damaged, missing and left-out samples are counted.
+
+`read` is the entry point. `resample` and `flag` make a table of its result; `inspect` describes a file in
+words.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.recordings.clocks import mended_topics
+from pipeline.recordings.csv_files import read_groups
+from pipeline.recordings.formats import (
+    CALENDAR_S,
+    NAMES,
+    SUFFIXES,
+    FileColumns,
+    Flag,
+    Jitter,
+    Note,
+    Raw,
+    Source,
+    Table,
+    file_format,
+    nearest_names,
+    select,
+)
+from pipeline.recordings.inspection import inspect
+from pipeline.recordings.mcap_files import check_magic, mcap_columns, read_bag
+from pipeline.recordings.other_formats import LOADERS
+from pipeline.recordings.parquet_files import read_parquet
+from pipeline.recordings.quality import CELSIUS, flag
+from pipeline.recordings.resampling import resample
+
+__all__ = [
+    "Flag",
+    "Jitter",
+    "Note",
+    "Raw",
+    "Source",
+    "Table",
+    "flag",
+    "inspect",
+    "nearest_names",
+    "read",
+    "resample",
+]
+
+
+FAHRENHEIT = {"degf", "°f", "° f", "℉", "f", "fahrenheit"}
+# at the end of a column's name; an F without brackets is as well the sixth zone
+_NAMES_FAHRENHEIT = re.compile(r"(?:[\[(]F[\])]|(?:[\[(_ ](?:deg[Ff]|[Ff]ahrenheit)|°\s?F|℉)[\])]?)$")
+
+
+def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal: str = "") -> Raw:
+    """The signals of a recording, each on its own clock, in our units.
+
+    `time` names the clock. In a table it is a column (by default one with a name of a time) or, without one,
+    "every 0.5 s". In MCAP it is log_time (the default), publish_time, or a field of every topic such as
+    header.stamp. A clock of the calendar is counted from the first whole second of the record. Missing
+    numbers are NaN, and counted in a note. `decimal` is the decimal mark of a text file, "" to find it.
+
+    Of a clock that does not run forward, what can be put right without a guess is, and is counted in notes:
+    see `clocks.mended`.
+
+    Raises ValueError, one sentence with file, place, expected, found and remedy, for a source that is not
+    there, text in place of a number, a signal without any number, a time that is missing, repeated or runs
+    backwards, and a file that cannot be read.
+    """
+    path = Path(path)
+    _check_sources(path, sources)
+    kind = file_format(path)
+    named = SUFFIXES.get(path.suffix.lower(), kind)
+    names = list(dict.fromkeys(source.source for source in sources))
+    try:
+        columns, places, messages, notes = _file_columns(path, kind, names, time, decimal)
+    except OSError as error:
+        raise ValueError(
+            f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
+        ) from None
+    if kind != named:
+        message = (
+            f"the file is named {path.suffix.lower()} but begins as {NAMES.get(kind, kind)} does, "
+            "and was read as that"
+        )
+        notes = [Note("format", "", 1, message), *notes]
+    parts = mended_topics(path, columns, one_clock=time in ("", "log_time"))
+    columns = [part.columns for part in parts]
+    notes += [note for part in parts for note in part.notes]
+    clocks = _clocks(columns, notes)
+    # where several topics start over, they do so together
+    breaks = [
+        min(float(clocks[part.columns.name][i]) for part, i in zip(parts, rows, strict=True))
+        for rows in zip(*(part.restarts for part in parts), strict=True)
+    ]
+    signals = {}
+    for source in sources:
+        topic, field = places[source.source]
+        group = next(group for group in columns if group.name == topic)
+        signals[source.signal] = _signal(path, source, clocks[topic], group, group.values[field], notes)
+    return Raw(str(path), signals, messages, notes, tuple(breaks))
+
+
+def _file_columns(
+    path: Path, kind: str, names: Sequence[str], time: str, decimal: str
+) -> tuple[list[FileColumns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
+    """Columns on their clocks, {source: (name of its columns, name in them)}, {name: count of messages or
+    rows} and notes of a file of that kind."""
+    if kind == "mcap":
+        with path.open("rb") as stream:
+            check_magic(path, stream.read(16))
+        return mcap_columns(path, names, time)
+    if kind == "bag":
+        return read_bag(path, names, time)
+    if kind == "csv":
+        columns, notes = read_groups(path, names, time, decimal)
+    elif kind in LOADERS:
+        table, notes = select(path, LOADERS[kind](path), names, time)
+        columns = [table]
+    else:
+        table, notes = read_parquet(path, names, time)
+        columns = [table]
+    places = {name: (table.name, name) for table in columns for name in table.values}
+    return columns, places, {table.name: len(table.time) for table in columns}, notes
+
+
+def _check_sources(path: Path, sources: Sequence[Source]) -> None:
+    if not sources:
+        raise ValueError(
+            f"{path}: the mapping names no signal; map each input and output to a column or topic (beadline "
+            "inspect proposes a mapping)"
+        )
+    signals = [source.signal for source in sources]
+    twice = sorted({signal for signal in signals if signals.count(signal) > 1})
+    if twice:
+        raise ValueError(f"{path}: the mapping gives {twice[0]} more than one source; give it one")
+    for source in sources:
+        if not (np.isfinite(source.scale) and np.isfinite(source.offset) and source.scale != 0):
+            raise ValueError(
+                f"{path}: the mapping of {source.signal} has scale {source.scale:g} and offset "
+                f"{source.offset:g}; both must be finite, scale not 0"
+            )
+
+
+def _check_fahrenheit(path: Path, source: Source, unit: str) -> None:
+    """Raises ValueError for a column in °F, as its unit or its name says, that the mapping takes as °C."""
+    written = unit.strip(" ()[]").casefold()
+    is_fahrenheit = written in FAHRENHEIT if written else bool(_NAMES_FAHRENHEIT.search(source.source))
+    is_converted = abs(source.scale * 9 / 5 - 1) < 0.01
+    if is_fahrenheit and source.unit.casefold() in CELSIUS and not is_converted:
+        raise ValueError(
+            f"{path}: {source.source} is in °F but the mapping takes it as {source.unit} with scale "
+            f"{source.scale:g}; set scale: 0.555556 and offset: -17.7778"
+        )
+
+
+def _clocks(columns: Sequence[FileColumns], notes: list[Note]) -> dict[str, np.ndarray]:
+    """{topic: time_s (n,)}, all counted from one instant."""
+    first = min(group.time[0] for group in columns)
+    on_calendar = columns[0].time.dtype == np.int64
+    unit = 10**9 if on_calendar else 1.0
+    start = first // unit * unit if first > CALENDAR_S * unit else 0
+    if start:
+        zero = np.datetime64(int(start // unit), "s")
+        zones = sorted({group.zone or "of no zone" for group in columns})
+        notes.append(
+            Note(
+                "clock",
+                "",
+                1,
+                f"time is counted from {zero} ({', '.join(zones)}, as the recording's clock says)",
+            )
+        )
+    return {group.name: (group.time - start if start else group.time) / unit for group in columns}
+
+
+def _signal(
+    path: Path, source: Source, time: np.ndarray, group: FileColumns, recorded: np.ndarray, notes: list[Note]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Time and values in the signal's unit. A signal that has a value in less than half of the rows, spread
+    among them, has its own clock: those rows."""
+    _check_fahrenheit(path, source, group.units.get(source.source, ""))
+    present = np.isfinite(recorded)
+    if not present.any():
+        raise ValueError(
+            f"{path}: {source.source} should hold numbers for {source.signal} but all of its "
+            f"{len(recorded)} values are missing; map another source"
+        )
+    values = (
+        recorded if (source.scale, source.offset) == (1.0, 0.0) else recorded * source.scale + source.offset
+    )
+    if present.all():
+        return time, values
+    where = np.flatnonzero(present)
+    missing = len(recorded) - len(where)
+    if where.size < len(recorded) / 2 and where.size > 1 and np.median(np.diff(where)) > 1:
+        notes.append(
+            Note(
+                "sparse",
+                source.signal,
+                missing,
+                f"{source.source} has a value in {where.size} of {len(recorded)} rows; those are its samples",
+            )
+        )
+        return time[where], values[where]
+    first = int(np.flatnonzero(~present)[0])
+    infinite = int(np.isinf(recorded).sum())
+    kinds = f" ({infinite} of them infinite)" if infinite else ""
+    message = (
+        f"{missing} of {len(recorded)} values of {source.source} are missing{kinds}, "
+        f"the first in {group.place(first)}; they are masked"
+    )
+    notes.append(Note("missing", source.signal, missing, message))
+    return time, np.where(present, values, np.nan)

@@ -1,0 +1,465 @@
+"""Signals on their own clocks -> one table on one sample time. Inputs are held, outputs interpolated between
+near neighbours; a gap begins a new segment."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from pipeline.recordings.clocks import alternate, mixed
+from pipeline.recordings.formats import Flag, Jitter, Raw, Table, intervals
+
+# a sample within that share of the sample time from the grid is on it: a temperature's change in a hundredth
+# of a sample is far below any sensor's step
+ON_GRID = 0.01
+GAP_INTERVALS = 3.0
+# commands are sent periodically if nearly all of their intervals are alike; else they are events, and a long
+# silence is no gap
+PERIODIC_SHARE = 0.95
+JITTER_SHARE, JITTER_OFTEN = 0.1, 0.01
+# a recording of which more than that was left out is a finding, % of its rows or samples
+MOST_CUT_PERCENT = 5.0
+
+
+class _Clock(NamedTuple):
+    """One clock and the signals on it. A gap is an interval beyond `gap_limit_s` (infinite for commands that
+    come as events)."""
+
+    time_s: np.ndarray
+    signals: list[str]
+    gap_limit_s: float
+    jitter: Jitter | None
+
+
+class _Near(NamedTuple):
+    """The samples of a clock beside each t_k: the indices of the first behind it and of the nearest, and how
+    far that is, each (T,). `off` are the k without a sample on t_k."""
+
+    behind: np.ndarray
+    nearest: np.ndarray | slice
+    distance_s: np.ndarray
+    off: np.ndarray
+
+
+class _Next(NamedTuple):
+    """The t_k from which a command of a clock acts, for each of its n samples: k, how late that is, and
+    whether it counts, as one between two samples of a segment does."""
+
+    k: np.ndarray
+    late_s: np.ndarray
+    counts: np.ndarray
+
+
+def resample(
+    raw: Raw,
+    *,
+    sample_time_s: float,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    max_gap_s: float | None = None,
+) -> Table:
+    """The table of a recording on the grid t_k = t_0 + k T of each segment.
+
+    Inputs: u_k is the last command at or before t_k. Outputs: y_k is the sample at t_k if there is one
+    (within T / 100: the record's own numbers, unaltered), else the straight line between its neighbours.
+
+    A gap is an interval longer than `max_gap_s` (default: three sample times or three median intervals,
+    whichever is longer) on any clock. Nothing is interpolated or held across a gap, and a new segment begins
+    behind it. Segments span the time that all clocks have in common. A value whose neighbours are missing is
+    NaN and masked. Flags report gap, jitter, interpolated, filled, step_inside, step_lost, missing, mixed,
+    trimmed, short and rate.
+
+    Raises ValueError if a signal is not in the recording, if the clocks have no time in common, or if no
+    segment has two samples.
+    """
+    _check(raw, sample_time_s, inputs, outputs, max_gap_s)
+    clocks = _clocks(raw, sample_time_s, inputs, outputs, max_gap_s)
+    pieces = _pieces(raw, clocks, sample_time_s)
+    grids = [
+        start + sample_time_s * np.arange(int(np.floor((end - start) / sample_time_s + ON_GRID)) + 1)
+        for start, end in pieces
+    ]
+    segments = [grid for grid in grids if len(grid) > 1]
+    if not segments:
+        raise ValueError(
+            f"{raw.path}: the recording should have two samples {sample_time_s:g} s apart without a gap but "
+            f"its longest stretch is {max(end - start for start, end in pieces):g} s; record longer, "
+            "or set a smaller sample time or a larger gap limit"
+        )
+    time = np.concatenate(segments)
+    segment = np.repeat(np.arange(len(segments), dtype=np.int32), [len(grid) for grid in segments])
+    held = _once_a_clock(clocks, inputs, lambda own: _held(own, time, sample_time_s))
+    near = _once_a_clock(clocks, outputs, lambda own: _near(own, time, sample_time_s))
+    following = _once_a_clock(clocks, inputs, lambda own: _next(own, time, segment, sample_time_s))
+    values = {name: raw.signals[name][1][held[name]] for name in inputs}
+    values |= {name: _interpolated(*raw.signals[name], time, near[name]) for name in outputs}
+    masked = {name: ~np.isfinite(column) for name, column in values.items()}
+    flags = _gap_flags(clocks) + _jitter_flags(clocks) + _trim_flags(raw, clocks, pieces, grids)
+    jitter = _jitter(clocks)
+    for name in outputs:
+        flags += _filled_flags(name, near[name], time, sample_time_s, masked[name])
+        flags += _rate_flags(name, raw.signals[name][0], jitter[name].interval_s, sample_time_s)
+    for name in inputs:
+        flags += _step_flags(name, *raw.signals[name], following[name], sample_time_s)
+    for name in [*inputs, *outputs]:
+        flags += _missing_flags(name, masked[name], time)
+    for name in outputs:
+        flags += _mixed_flags(name, *raw.signals[name], time, masked[name])
+    return Table(raw.path, segment, time, values, masked, flags, jitter)
+
+
+def _check(
+    raw: Raw, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None
+) -> None:
+    for name in [*inputs, *outputs]:
+        if name not in raw.signals:
+            raise ValueError(
+                f"{raw.path}: signal {name} is wanted but the mapping gives {', '.join(raw.signals)}; "
+                "map it to a column or topic"
+            )
+    if not outputs:
+        raise ValueError(f"{raw.path}: no output is wanted; name at least one measured signal")
+    if not 0 < sample_time_s < np.inf:
+        raise ValueError(
+            f"{raw.path}: the sample time should be more than 0 s but is {sample_time_s:g}; "
+            "set it to about the recording's interval"
+        )
+    if max_gap_s is not None and not max_gap_s >= sample_time_s:
+        raise ValueError(
+            f"{raw.path}: the gap limit {max_gap_s:g} s should be at least the sample time "
+            f"{sample_time_s:g} s; raise it"
+        )
+    for name in outputs:
+        if len(raw.signals[name][0]) < 2:
+            raise ValueError(
+                f"{raw.path}: output {name} should have at least two samples but has "
+                f"{len(raw.signals[name][0])}; record longer"
+            )
+
+
+# ---- clocks, gaps and the time in common
+
+
+def _clocks(
+    raw: Raw, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None
+) -> list[_Clock]:
+    clocks: list[_Clock] = []
+    for name in [*outputs, *inputs]:
+        time = raw.signals[name][0]
+        same = next(
+            (clock for clock in clocks if clock.time_s is time or np.array_equal(clock.time_s, time)), None
+        )
+        if same:
+            same.signals.append(name)
+            continue
+        median = np.median(np.diff(time)) if len(time) > 1 else np.inf
+        limit = max_gap_s if max_gap_s is not None else GAP_INTERVALS * max(sample_time_s, median)
+        # outputs come first, so a new clock among the inputs is theirs alone
+        events = name in inputs and not (
+            np.mean(np.diff(time) < 2 * median) >= PERIODIC_SHARE if len(time) > 2 else False
+        )
+        limit = np.inf if events else limit
+        clocks.append(_Clock(time, [name], limit, intervals(time, limit) if len(time) > 1 else None))
+    return clocks
+
+
+_Looked = TypeVar("_Looked")
+
+
+def _once_a_clock(
+    clocks: Sequence[_Clock], names: Sequence[str], look: Callable[[np.ndarray], _Looked]
+) -> dict[str, _Looked]:
+    """{signal: look(its time_s)} for the named signals; those on one clock share it."""
+    found: dict[str, _Looked] = {}
+    for clock in clocks:
+        if here := [name for name in clock.signals if name in names]:
+            found |= dict.fromkeys(here, look(clock.time_s))
+    return found
+
+
+def _pieces(raw: Raw, clocks: Sequence[_Clock], sample_time_s: float) -> list[tuple[float, float]]:
+    """Stretches (start, end) in which every clock runs without a gap, and none had started over."""
+    pieces, breaks = [(-np.inf, np.inf)], np.array(raw.breaks)
+    for clock in clocks:
+        behind = np.searchsorted(breaks, clock.time_s, side="right")
+        cuts = np.flatnonzero((np.diff(clock.time_s) > clock.gap_limit_s) | (np.diff(behind) > 0))
+        starts, ends = (
+            clock.time_s[np.r_[0, cuts + 1]],
+            clock.time_s[np.r_[cuts, len(clock.time_s) - 1]].astype(float),
+        )
+        if np.isinf(clock.gap_limit_s):
+            # the last event holds on, up to where the clock starts over
+            until = np.nextafter(np.r_[breaks, np.inf], -np.inf)
+            ends = until[behind[np.r_[cuts, len(behind) - 1]]]
+        pieces = _common(
+            pieces, list(zip(starts.tolist(), ends.tolist(), strict=True)), sample_time_s * ON_GRID
+        )
+    if not pieces:
+        spans = "; ".join(
+            f"{', '.join(clock.signals[:3])} from {clock.time_s[0]:g} to {clock.time_s[-1]:g} s"
+            for clock in clocks
+        )
+        raise ValueError(
+            f"{raw.path}: the signals have no time in common ({spans}); "
+            "map signals that were recorded together, or name their clock"
+        )
+    return pieces
+
+
+def _common(
+    left: Sequence[tuple[float, float]], right: Sequence[tuple[float, float]], tolerance: float
+) -> list[tuple[float, float]]:
+    """Intersections of two sorted lists of intervals."""
+    common, i, j = [], 0, 0
+    while i < len(left) and j < len(right):
+        start, end = max(left[i][0], right[j][0]), min(left[i][1], right[j][1])
+        if end - start >= -tolerance:
+            common.append((start, max(start, end)))
+        if left[i][1] < right[j][1]:
+            i += 1
+        else:
+            j += 1
+    return common
+
+
+# ---- values
+
+
+def _in_one(indices: np.ndarray) -> np.ndarray | slice:
+    """Indices that run on one by one as a slice, which copies nothing."""
+    first = int(indices[0])
+    end = first + len(indices)
+    return slice(first, end) if np.array_equal(indices, np.arange(first, end)) else indices
+
+
+def _held(time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndarray | slice:
+    """The index of the last command at or before t_k. There is one, as pieces begin at or behind the first
+    command."""
+    last = np.searchsorted(time_s, grid + ON_GRID * sample_time_s, side="right") - 1
+    return _in_one(np.maximum(last, 0))
+
+
+def _near(time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> _Near:
+    behind = np.clip(np.searchsorted(time_s, grid), 1, len(time_s) - 1)
+    nearest = behind - (grid - time_s[behind - 1] <= time_s[behind] - grid)
+    distance = np.abs(time_s[nearest] - grid)
+    off = np.flatnonzero(distance > ON_GRID * sample_time_s)
+    return _Near(behind, nearest if len(off) else _in_one(nearest), distance, off)
+
+
+def _interpolated(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, near: _Near) -> np.ndarray:
+    """y(t_k): the sample on t_k itself, else the line between its neighbours. A NaN neighbour gives NaN."""
+    y = values[near.nearest].astype(float, copy=False)
+    if not len(near.off):
+        return y
+    behind = near.behind[near.off]
+    share = (grid[near.off] - time_s[behind - 1]) / (time_s[behind] - time_s[behind - 1])
+    y[near.off] = values[behind - 1] + np.clip(share, 0.0, 1.0) * (values[behind] - values[behind - 1])
+    return y
+
+
+def _next(time_s: np.ndarray, grid: np.ndarray, segment: np.ndarray, sample_time_s: float) -> _Next | None:
+    """None where each sample stands on a t_k of its own, so that no command is late or lost."""
+    k = np.searchsorted(grid, time_s - ON_GRID * sample_time_s)
+    within = np.clip(k, 1, len(grid) - 1)
+    late, counts = grid[within] - time_s, (k == within) & (segment[within] == segment[within - 1])
+    if (k[1:] > k[:-1]).all() and not (late[counts] > ON_GRID * sample_time_s).any():
+        return None
+    return _Next(k, late, counts)
+
+
+# ---- flags
+
+
+def _flag(signal: str, kind: str, where_s: np.ndarray, message: str) -> list[Flag]:
+    return (
+        [Flag(signal, kind, float(where_s[0]), float(where_s[-1]), len(where_s), message)]
+        if len(where_s)
+        else []
+    )
+
+
+def _gap_flags(clocks: Sequence[_Clock]) -> list[Flag]:
+    flags = []
+    for clock in clocks:
+        median = clock.jitter.interval_s if clock.jitter else 0.0
+        for i in np.flatnonzero(np.diff(clock.time_s) > clock.gap_limit_s):
+            start, end = float(clock.time_s[i]), float(clock.time_s[i + 1])
+            summer = " (an hour and an interval: a clock without a zone does so where summer time begins)"
+            message = (
+                f"no sample of {', '.join(clock.signals)} for {end - start:g} s (limit "
+                f"{clock.gap_limit_s:g} s)"
+                f"{summer if abs(end - start - 3600) <= 2 * median else ''}: a new segment begins behind it"
+            )
+            flags.append(Flag("", "gap", start, end, 1, message))
+    return flags
+
+
+def _jitter(clocks: Sequence[_Clock]) -> dict[str, Jitter]:
+    """{signal: jitter of its clock}."""
+    return {name: clock.jitter for clock in clocks for name in clock.signals if clock.jitter}
+
+
+def _jitter_flags(clocks: Sequence[_Clock]) -> list[Flag]:
+    """A flag for each clock with one interval in a hundred off by a tenth, or with any off by a half.
+    Commands that come as events have no interval."""
+    flags = []
+    for clock in clocks:
+        jitter = clock.jitter
+        if jitter is None or not np.isfinite(clock.gap_limit_s) or len(clock.time_s) < 3:
+            continue
+        steps = np.diff(clock.time_s)
+        inside = steps <= clock.gap_limit_s
+        off = np.flatnonzero(inside & (np.abs(steps - jitter.interval_s) > JITTER_SHARE * jitter.interval_s))
+        count = np.count_nonzero(inside)
+        if len(off) < JITTER_OFTEN * count and jitter.max_s <= 0.5 * jitter.interval_s:
+            continue
+        pattern = (
+            ", by turns longer and shorter: two devices may write under one name"
+            if alternate(steps[inside])
+            else ""
+        )
+        message = (
+            f"the intervals of {', '.join(clock.signals)} differ from {jitter.interval_s:.4g} s by "
+            f"{jitter.std_s:.2g} s (standard) and {jitter.max_s:.2g} s (largest), "
+            f"{len(off)} of {count} by more than a tenth{pattern}"
+        )
+        flags.append(
+            Flag(
+                "", "jitter", float(clock.time_s[off[0]]), float(clock.time_s[off[-1] + 1]), len(off), message
+            )
+        )
+    return flags
+
+
+def _mixed_flags(
+    name: str, time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, masked: np.ndarray
+) -> list[Flag]:
+    """Stretches of the record's own samples in which two devices write under one name. They are masked, as
+    nothing tells which of the two a sample is of."""
+    flags = []
+    for first, last, distance in mixed(values):
+        start, end = float(time_s[first]), float(time_s[last])
+        masked[(grid >= start) & (grid <= end)] = True
+        message = (
+            f"{name} jumps to and fro between two courses {distance:.3g} apart from {start:g} to {end:g} s, "
+            "masked: two devices seem to write under one name; record each under a name of its own"
+        )
+        flags.append(Flag(name, "mixed", start, end, last - first + 1, message))
+    return flags
+
+
+def _trim_flags(
+    raw: Raw, clocks: Sequence[_Clock], pieces: Sequence[tuple[float, float]], grids: Sequence[np.ndarray]
+) -> list[Flag]:
+    flags = []
+    if len(clocks) > 1:
+        start, end = pieces[0][0], pieces[-1][1]
+        cut = sum(
+            int(((clock.time_s < start) | (clock.time_s > end)).sum())
+            for clock in clocks
+            if np.isfinite(clock.gap_limit_s)
+        )
+        message = (
+            f"{len(clocks)} clocks were aligned over their common time {start:g} to {end:g} s; "
+            f"{cut} samples lie outside"
+        )
+        flags.append(Flag("", "trimmed", start, end, cut, message))
+        for clock in clocks:
+            outside = int(((clock.time_s < start) | (clock.time_s > end)).sum())
+            if np.isfinite(clock.gap_limit_s):
+                what = f"samples of {', '.join(clock.signals[:3])} lie outside the time in common"
+                flags += cut_flags(outside, len(clock.time_s), what, start, end)
+    for grid in grids:
+        if len(grid) < 2:
+            flags.append(
+                Flag(
+                    "",
+                    "short",
+                    float(grid[0]),
+                    float(grid[0]),
+                    1,
+                    f"the stretch at {grid[0]:g} s is shorter than two samples and was left out",
+                )
+            )
+    return flags
+
+
+def cut_flags(left_out: int, count: int, what: str, start_s: float, end_s: float) -> list[Flag]:
+    """A flag for a recording of which more than MOST_CUT_PERCENT was left out."""
+    percent = 100 * left_out / max(count, 1)
+    if percent <= MOST_CUT_PERCENT:
+        return []
+    message = (
+        f"{percent:.1f} % of the recording was left out (limit {MOST_CUT_PERCENT:g} %): "
+        f"{left_out} of {count} {what}; copy it again, or record it again"
+    )
+    return [Flag("", "cut", start_s, end_s, left_out, message)]
+
+
+def _filled_flags(
+    name: str, placed: _Near, grid: np.ndarray, sample_time_s: float, masked: np.ndarray
+) -> list[Flag]:
+    """Flags for samples between two measurements near by, and for those that nothing near by was measured
+    for. A masked sample is neither."""
+    off = placed.off[~masked[placed.off]]
+    is_far = placed.distance_s[off] > (0.5 + ON_GRID) * sample_time_s
+    near, far = off[~is_far], off[is_far]
+    between = f"{len(near)} of {len(grid)} samples of {name} lie between its own samples and are interpolated"
+    invented = (
+        f"{len(far)} of {len(grid)} samples of {name} have no measurement within half a sample time: "
+        "the straight line to the next ones fills them"
+    )
+    return _flag(name, "interpolated", grid[near], between) + _flag(name, "filled", grid[far], invented)
+
+
+def _rate_flags(name: str, time_s: np.ndarray, interval: float, sample_time_s: float) -> list[Flag]:
+    span = time_s[[0, -1]]
+    if interval < sample_time_s / 2:
+        message = (
+            f"{name} is sampled every {interval:g} s, the table every {sample_time_s:g} s: "
+            "only the samples at its times are used, without averaging"
+        )
+        return [Flag(name, "rate", float(span[0]), float(span[1]), len(time_s), message)]
+    if interval > 1.5 * sample_time_s:
+        message = (
+            f"{name} is sampled every {interval:g} s but the table every {sample_time_s:g} s: "
+            "what lies between is interpolated, no measurement"
+        )
+        return [Flag(name, "rate", float(span[0]), float(span[1]), len(time_s), message)]
+    return []
+
+
+def _step_flags(
+    name: str, time_s: np.ndarray, values: np.ndarray, following: _Next | None, sample_time_s: float
+) -> list[Flag]:
+    """Flags for commands that change between two samples. They act from the next sample on; a command that
+    another overtakes before that sample is lost."""
+    if following is None:
+        return []
+    changes = np.flatnonzero((values[1:] != values[:-1]) & following.counts[1:]) + 1
+    when, late, k = time_s[changes], following.late_s[changes], following.k[changes]
+    between = late > ON_GRID * sample_time_s
+    mean = f"{late[between].mean():.3g} s later on average" if between.any() else ""
+    message = (
+        f"{name} changes {between.sum()} times between two samples; "
+        f"it is not smeared but acts from the next sample on, {mean}"
+    )
+    flags = _flag(name, "step_inside", when[between], message)
+    overtaken = np.r_[k[1:] == k[:-1], False] if len(k) else np.zeros(0, bool)
+    message = (
+        f"{overtaken.sum()} commands of {name} were overtaken by another before the next sample and do not"
+        f" appear; a smaller sample time shows them"
+    )
+    return flags + _flag(name, "step_lost", when[overtaken], message)
+
+
+def _missing_flags(name: str, masked: np.ndarray, grid: np.ndarray) -> list[Flag]:
+    if not masked.any():
+        return []
+    return _flag(
+        name,
+        "missing",
+        grid[masked],
+        f"{masked.sum()} samples of {name} have no measured value and are masked",
+    )

@@ -1,0 +1,403 @@
+"""Frames of a camera that runs: a folder that fills with pictures, an MCAP recording that grows, snapshots
+over HTTP.
+
+A source is asked again and again and gives what came since. What is half-written is left for the next time;
+what is broken comes as a frame with the reason; a source that is not there is waited for.
+"""
+
+import base64
+import contextlib
+import hashlib
+import http.client
+import io
+import os
+import re
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.recordings import images
+from pipeline.recordings.images import UNREADABLE, decode, read_image
+from pipeline.recordings.mcap_files import GrowingMcap, Message
+from pipeline.recordings.messages import Channel, Decode, decoder, fields, plain
+from pipeline.recordings.nozzle_frames import Topics
+
+PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+# a picture that is not whole and has not grown for so long is broken
+SETTLE_S = 2.0
+# between two looks at a folder or a recording
+LOOK_S = 0.05
+# of one snapshot: seconds to wait for it, and bytes that are read
+TIMEOUT_S, LARGEST_PICTURE = 2.0, 32 << 20
+COPY = "the frame is a copy of the one before"
+# what a printer can be told; beyond it a number of a recording is no setpoint
+PLAUSIBLE = {"flow_percent": (0.0, 1000.0), "temperature_degC": (0.0, 600.0)}
+
+
+class CameraFrame(NamedTuple):
+    """A frame (height, width) uint8 or uint16, or in its place the reason why there is none, at time_s of its
+    source's clock; what the source says of flow in percent, temperature in degC, travel direction in degrees
+    and tip (x, y) in px, NaN where it says nothing; print_id "" likewise."""
+
+    name: str
+    time_s: float
+    frame: np.ndarray | str
+    flow: float = np.nan
+    temperature: float = np.nan
+    direction_deg: float = np.nan
+    tip: tuple[float, float] = (np.nan, np.nan)
+    print_id: str = ""
+
+
+def source(place: str, topics: Topics, *, rate_hz: float) -> "FrameSource":
+    """The source that a path or an address names. Raises ValueError for an address that is none, and for a
+    file that is no recording."""
+    if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", place):
+        return Snapshots(place, rate_hz)
+    if place.lower().endswith(".mcap") and not Path(place).is_dir():
+        return RecordingSource(Path(place), topics)
+    if Path(place).is_file():
+        raise ValueError(
+            f"{place}: expected a folder of pictures, a recording (.mcap) or an address, found another file; "
+            "name the folder that it is in"
+        )
+    return Folder(Path(place))
+
+
+def shown_place(place: str) -> str:
+    """A source's name as it may be shown: of an address without user and password."""
+    return _without_secret(urllib.parse.urlsplit(place)) if "://" in place else place
+
+
+# ---- a folder that fills
+
+
+class Folder:
+    """Pictures in the order in which they were written. A file is looked at once, as soon as it is whole."""
+
+    def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
+        self.path, self.clock, self.rest_s = path, clock, LOOK_S
+        self.lacks = f"a picture ({', '.join(PICTURES)})"
+        self.waits_for, self.ended = f"the folder {path} is not there yet", False
+        self.done: set[str] = set()
+        self.unfinished: dict[str, tuple[int, float]] = {}
+        self.before = b""
+
+    def frames(self) -> Iterator[CameraFrame]:
+        if not self.path.is_dir():
+            self.waits_for = f"the folder {self.path} is not there yet"
+            return
+        self.waits_for = ""
+        came = sorted(self._new(), key=lambda entry: (entry[1], _counted(entry[0])))
+        for name, written_ns, size in came:
+            shown = self._picture(name, written_ns / 1e9, size)
+            if shown is not None:
+                self.done.add(name)
+                self.unfinished.pop(name, None)
+                yield shown
+        self.ended = not self.unfinished
+
+    def _new(self) -> Iterator[tuple[str, int, int]]:
+        """(name from the folder on, ns when it was written, bytes) of pictures that were not looked at."""
+        began = time.monotonic()
+        for here, folders, names in os.walk(self.path):
+            folders[:] = [name for name in folders if not name.startswith(".")]
+            below = os.path.relpath(here, self.path)
+            for name in names:
+                inside = name if below == "." else f"{below}/{name}"
+                if name.startswith(".") or not name.lower().endswith(PICTURES) or inside in self.done:
+                    continue
+                with contextlib.suppress(OSError):  # a camera may remove its oldest
+                    about = os.stat(os.path.join(here, name))
+                    yield inside, about.st_mtime_ns, about.st_size
+        # a folder of very many names is looked through less often
+        self.rest_s = max(LOOK_S, 5 * (time.monotonic() - began))
+
+    def _picture(self, name: str, time_s: float, size: int) -> CameraFrame | None:
+        """None where the file is still being written."""
+        path = self.path / name
+        try:
+            data = path.read_bytes()
+            if not _has_end(data):
+                raise ValueError(f"found a picture of {len(data)} bytes without its end")
+            frame, digest = read_image(path), hashlib.blake2b(data, digest_size=16).digest()
+        except FileNotFoundError:
+            return CameraFrame(name, time_s, f"{UNREADABLE}: it was removed")
+        except (OSError, ValueError) as error:
+            before = self.unfinished.get(name, (-1, 0.0))
+            if before[0] != size:
+                self.unfinished[name] = (size, self.clock())
+                return None
+            if self.clock() - before[1] < SETTLE_S:
+                return None
+            return CameraFrame(name, time_s, f"{UNREADABLE}: {str(error).partition('found ')[2] or error}")
+        copy, self.before = digest == self.before, digest
+        return CameraFrame(name, time_s, COPY if copy else frame)
+
+
+def _counted(name: str) -> list:
+    """A key that puts image-9 before image-10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def _has_end(data: bytes) -> bool:
+    """Whether a JPEG or PNG has its end mark; of other formats the decoder decides."""
+    if data.startswith(b"\xff\xd8"):
+        return data.rfind(b"\xff\xd9", max(0, len(data) - 4096)) > 0
+    return b"IEND" in data[-64:] if data.startswith(b"\x89PNG") else bool(data)
+
+
+# ---- a recording that grows
+
+
+class RecordingSource:
+    """Frames of the image topic, with the setpoints that held when they were taken."""
+
+    def __init__(self, path: Path, where: Topics) -> None:
+        self.path, self.where, self.rest_s = path, where, LOOK_S
+        self.file, self.ended = GrowingMcap(path), False
+        self.waits_for = f"the recording {path} is not there yet"
+        self.sources = where.sources()
+        self.signals: dict[str, float] = {}
+        self.decoders: dict[int, tuple[list[str], Decode] | None] = {}
+        self.reads: dict[int, images.Read] = {}
+        self.camera, self.others = where.image, set()
+        self.before, self.count, self.others_held = b"", 0, set()
+
+    @property
+    def lacks(self) -> str:
+        """Images among the topics that it has."""
+        topics = sorted(self.others_held)
+        named = f"{', '.join(topics[:5])}{', ...' if len(topics) > 5 else ''}" if topics else "no messages"
+        return f"a topic with images; it holds {named}"
+
+    @property
+    def damage(self) -> list[str]:
+        return self.file.damage
+
+    def frames(self) -> Iterator[CameraFrame]:
+        try:
+            for message in self.file.messages(lambda channel: True):
+                if not images.is_image(message.channel):
+                    self.others_held.add(message.channel.topic)
+                    self._hold(message)
+                elif self._is_camera(message.channel):
+                    yield self._frame(message)
+            self.waits_for, self.ended = "", self.file.ended
+        except (FileNotFoundError, IsADirectoryError):
+            self.waits_for = f"the recording {self.path} is not there yet"
+        except OSError as error:
+            self.waits_for = f"{self.path} cannot be read ({error.strerror})"
+
+    def _is_camera(self, channel: Channel) -> bool:
+        """The topic of the settings, or else the first with images; another one is told once."""
+        self.camera = self.camera or channel.topic
+        if channel.topic != self.camera and channel.topic not in self.others:
+            self.others.add(channel.topic)
+            self.file.damage.append(
+                f"{self.path}: {channel.topic} holds images too and is not looked at; {self.camera} is "
+                "(train_classifier.topics.image)"
+            )
+        return channel.topic == self.camera
+
+    def _frame(self, message: Message) -> CameraFrame:
+        self.count += 1
+        name, stamp = f"{self.camera} {self.count}", message.log_time
+        try:
+            if message.channel.id not in self.reads:
+                self.reads[message.channel.id] = images.reader(message.channel)
+            picture = self.reads[message.channel.id](message.data)
+            if self.where.time == "publish_time":
+                stamp = message.publish_time
+            elif self.where.time not in ("", "log_time"):
+                stamp = picture.stamp_ns
+            digest = hashlib.blake2b(picture.data, digest_size=16).digest()
+            copy, self.before = digest == self.before, digest
+            frame = COPY if copy else images.gray(picture)
+        except ValueError as error:
+            frame = f"{UNREADABLE}: {error}"
+        number = self.signals.get("print_id", np.nan)
+        return CameraFrame(
+            name,
+            stamp / 1e9,
+            frame,
+            self.signals.get("flow_percent", np.nan),
+            self.signals.get("temperature_degC", np.nan),
+            self.signals.get("travel_direction_deg", np.nan),
+            (self.signals.get("tip_x_px", np.nan), self.signals.get("tip_y_px", np.nan)),
+            f"{number:g}" if np.isfinite(number) else "",
+        )
+
+    def _hold(self, message: Message) -> None:
+        """Takes over what a message says of our signals."""
+        number = message.channel.id
+        if number not in self.decoders:
+            self.decoders[number] = self._decoder(message)
+        if (known := self.decoders[number]) is None:
+            return
+        names, decode = known
+        try:
+            values = decode([plain(message.data)])[0]
+        except ValueError:
+            self.file.damage.append(f"{self.path}: a message of {message.channel.topic} cannot be read")
+            return
+        for name, value in zip(names, values, strict=True):
+            at = self.sources[name]
+            value = float(value) * at.scale + at.offset
+            low, high = PLAUSIBLE.get(name, (-np.inf, np.inf))
+            if np.isfinite(value) and low <= value <= high:
+                self.signals[name] = value
+
+    def _decoder(self, message: Message) -> tuple[list[str], Decode] | None:
+        """Our signals that a channel has, and what reads them; None where it has none."""
+        channel = message.channel
+        try:
+            there = set(fields(channel, [message.data]))
+            places = {
+                name: field
+                for name, at in self.sources.items()
+                for topic, colon, field in [at.source.rpartition(":")]
+                if field in there and (not colon or topic == channel.topic)
+            }
+            return (list(places), decoder(channel, list(places.values()))) if places else None
+        except (ValueError, RecursionError):
+            return None
+
+
+# ---- snapshots over HTTP
+
+
+class _SameHost(urllib.request.HTTPRedirectHandler):
+    """Follows no redirection: what a camera answers may not lead anywhere else."""
+
+    def redirect_request(self, req, fp, code, msg, headers, newurl):
+        return None
+
+
+class _Until(io.RawIOBase):
+    """The bytes of an answer, until its time is over: a camera that drips is given up in its headers too."""
+
+    def __init__(self, raw: io.RawIOBase, until: float) -> None:
+        self.of, self.until = raw, until
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int | None:
+        if time.monotonic() > self.until:
+            raise TimeoutError(f"its answer took more than {TIMEOUT_S:g} s")
+        return self.of.readinto(buffer)
+
+    def close(self) -> None:
+        self.of.close()
+        super().close()
+
+
+class _Answer(http.client.HTTPResponse):
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.fp = io.BufferedReader(_Until(self.fp.detach(), time.monotonic() + TIMEOUT_S))
+
+
+class _Timely(urllib.request.HTTPHandler, urllib.request.HTTPSHandler):
+    """Opens connections whose answers are given up when their time is over."""
+
+    def http_open(self, req):
+        return self.do_open(type("_Plain", (http.client.HTTPConnection,), {"response_class": _Answer}), req)
+
+    def https_open(self, req):
+        return self.do_open(type("_Secure", (http.client.HTTPSConnection,), {"response_class": _Answer}), req)
+
+
+class Snapshots:
+    """A picture for each request. Only the address that was named is asked, without a proxy."""
+
+    def __init__(self, address: str, rate_hz: float) -> None:
+        parts = urllib.parse.urlsplit(address)
+        try:
+            port = parts.port
+        except ValueError:
+            port = -1
+        if parts.scheme not in ("http", "https") or not parts.hostname or port == -1:
+            raise ValueError(
+                f"{_without_secret(parts)}: expected the address of a snapshot such as "
+                "http://127.0.0.1:8080/?action=snapshot, found another; look it up in the camera's settings"
+            )
+        host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
+        self.address = parts._replace(netloc=host + (f":{port}" if port else ""), fragment="").geturl()
+        self.shown = _without_secret(parts)
+        self.headers = {"User-Agent": "beadline"}
+        if parts.username is not None:
+            pair = f"{urllib.parse.unquote(parts.username)}:{urllib.parse.unquote(parts.password or '')}"
+            self.headers["Authorization"] = f"Basic {base64.b64encode(pair.encode()).decode()}"
+        self.opener = urllib.request.build_opener(urllib.request.ProxyHandler({}), _SameHost(), _Timely())
+        self.period_s, self.rest_s, self.ended = 1 / rate_hz, 0.0, False
+        self.waits_for, self.lacks = f"{self.shown} has not answered yet", "a picture"
+        self.count, self.before = 0, b""
+
+    def frames(self) -> Iterator[CameraFrame]:
+        """One picture, or none where the camera does not answer; a new one for each period of the rate."""
+        began = time.monotonic()
+        try:
+            data = self._asked()
+            self.count += 1
+            name, digest = f"snapshot {self.count}", hashlib.blake2b(data, digest_size=16).digest()
+            copy, self.before = digest == self.before, digest
+            try:
+                frame = COPY if copy else _decoded(data)
+            except ValueError as error:
+                frame = f"{UNREADABLE}: {error}"
+            self.waits_for = ""
+            yield CameraFrame(name, time.time(), frame)
+        except urllib.error.HTTPError as error:
+            error.close()
+            self.waits_for = f"{self.shown} answers {error.code} {error.reason}"
+        except (OSError, http.client.HTTPException) as error:
+            why = getattr(error, "reason", None) or error
+            self.waits_for = f"{self.shown} does not answer ({str(why) or type(why).__name__})"
+        self.rest_s = max(0.0, self.period_s - (time.monotonic() - began))
+
+    def _asked(self) -> bytes:
+        """The bytes of one answer, whole."""
+        request = urllib.request.Request(self.address, headers=self.headers)
+        with self.opener.open(request, timeout=TIMEOUT_S) as answer:
+            kind = answer.headers.get_content_type()
+            if kind.startswith("multipart/"):
+                raise OSError("it is a stream of pictures; name the address of a single one")
+            if kind.startswith("text/") and "Content-Type" in answer.headers:
+                raise OSError(f"it shows {kind}, no picture; name the address of a snapshot")
+            parts, size = [], 0
+            while part := answer.read1(1 << 16):
+                parts.append(part)
+                size += len(part)
+                if size > LARGEST_PICTURE:
+                    raise OSError(f"its answer is longer than {LARGEST_PICTURE >> 20} MB")
+            promised = answer.headers.get("Content-Length", "")
+            if promised.isdigit() and int(promised) != size:
+                raise OSError(f"its answer broke off after {size} of {promised} bytes")
+            if not size:
+                raise OSError("its answer is empty")
+            return b"".join(parts)
+
+
+def _decoded(data: bytes) -> np.ndarray:
+    if not _has_end(data):
+        raise ValueError(f"a picture of {len(data)} bytes without its end")
+    return decode(data)
+
+
+def _without_secret(parts: urllib.parse.SplitResult) -> str:
+    """An address as it may be shown: no user, no password."""
+    return parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl()
+
+
+# `frames` gives what came since it was last asked; `waits_for` says why nothing comes, "" if something may;
+# `lacks` what a source that is there has none of; `ended`: nothing more will come; `rest_s`: how long to wait
+# before the next look
+FrameSource = Folder | RecordingSource | Snapshots
