@@ -112,7 +112,7 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     machine, schema = wire(declared), tables.record(declared.acting, declared.outputs)
     names = ([signal.name for signal in side] for side in (declared.inputs, declared.outputs))
     pieces = without_gaps(*segments(artifacts.read_table(RECORD, schema), *names))
-    parts = certify.split_newest(*pieces)
+    parts = certify.split_newest(*certify.cut_at_missing(*pieces))
     record = EvidenceRecord(machine.inputs, machine.outputs, machine.sample_time_s, *parts)
     setting, rng = loaded.setting, np.random.default_rng(settings.seed)
     half = setting.rehearsal.judging

@@ -17,8 +17,23 @@ from pipeline.temperature.plant import Plant
 from pipeline.temperature.test_set import panel
 
 NEWEST = 0.25  # of a single recording: its end stands for the machine as it is today
+SHORTEST = 100  # samples of a piece between two missing ones, below which it shows nothing of its own
 REACH = 0.25  # of the recorded span, beyond which no reference is certified
 COOLEST = 0.05  # quantile of the recorded temperatures
+
+
+def cut_at_missing(
+    u: Sequence[np.ndarray], y: Sequence[np.ndarray], recordings: Sequence[int]
+) -> tuple[list[np.ndarray], list[np.ndarray], list[int]]:
+    """The pieces (T, m), (T, p) and the recording of each, cut where a sample of an output is missing (NaN);
+    pieces shorter than SHORTEST samples are left out."""
+    parts = [
+        (inputs[run], outputs[run], number)
+        for inputs, outputs, number in zip(u, y, recordings, strict=True)
+        for run in np.ma.clump_unmasked(np.ma.masked_invalid(outputs.sum(axis=1)))
+        if run.stop - run.start >= min(SHORTEST, len(outputs))
+    ]
+    return [a for a, _, _ in parts], [b for _, b, _ in parts], [number for *_, number in parts]
 
 
 def split_newest(

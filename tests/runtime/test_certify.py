@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.runtime import assembly, certified, checks
+from pipeline.runtime import certify as measuring
 from pipeline.runtime.export import c
 from pipeline.runtime.machine import Exported, check
 from pipeline.temperature.controllers.table import BY_NAME, design_controllers
@@ -86,3 +87,11 @@ def test_c_with_other_golden_vectors_is_refused():
     if checks.find_compiler():
         with pytest.raises(ValueError, match="the exported C of lqg does not pass its golden vectors"):
             checks.check_compiled(of, files)
+
+
+def test_a_record_is_cut_where_a_sample_of_an_output_is_missing():
+    u, y = np.arange(500.0)[:, None], np.stack([np.arange(500.0), np.ones(500)], axis=1)
+    y[300, 1] = y[350, 0] = np.nan
+    inputs, outputs, numbers = measuring.cut_at_missing([u, u[:50]], [y, y[:50]], [0, 1])
+    assert [(part[0, 0], part[-1, 0]) for part in inputs] == [(0, 299), (351, 499), (0, 49)]
+    assert all(np.isfinite(part).all() for part in outputs) and numbers == [0, 0, 1]
