@@ -159,7 +159,7 @@ def certify_controller(
             name, design, fallback, common.machine, setting, family, simulated=loaded.simulated
         )
         machine.check(made)
-        difference = checks.judged_difference(made, half, *judged_commands(name, loaded.machine))
+        difference = checks.judged_difference(made, half, *judged_case(name, loaded.machine))
         checks.check_same(made, difference)
         measured = certify.measure(
             made,
@@ -193,15 +193,17 @@ def _not_measured(why: str) -> dict[str, Any]:
     return {"measured": False, "why": why, "largest_difference": {}}
 
 
-def judged_commands(name: str, declared: Plant) -> tuple[int, np.ndarray]:
-    """The number of the case that decided the comparison, and the applied inputs (steps, m) in percent."""
+def judged_case(name: str, declared: Plant) -> tuple[int, np.ndarray, np.ndarray]:
+    """The number of the case that decided the comparison, its true outputs (steps, p) in °C, and the applied
+    inputs (steps, m) in percent."""
     import numpy as np
 
     schema = tables.trajectories(declared.inputs, declared.outputs)
     played = artifacts.read_table("datasets/evaluate_temperature/trajectories.parquet", schema)
     rows = (played["contestant"] == name) & (played["case_name"] == "deciding")
     case = artifacts.read_figures("evaluate_temperature")["deciding"]["case"]
-    return case, np.stack([played[f"{one.name}_applied"][rows] for one in declared.inputs], axis=1)
+    outputs = np.stack([played[one.name][rows] for one in declared.outputs], axis=1)
+    return case, outputs, np.stack([played[f"{one.name}_applied"][rows] for one in declared.inputs], axis=1)
 
 
 # ---- setpoint

@@ -22,17 +22,21 @@ SAME = 1e-9  # of an input's range, by which commands in another order of sums m
 COMPILERS = ("cc", "gcc", "clang")
 
 
-def judged_difference(made: Exported, cases: panel.Cases, case: int, applied: np.ndarray) -> float:
+def judged_difference(
+    made: Exported, cases: panel.Cases, case: int, outputs: np.ndarray, applied: np.ndarray
+) -> float:
     """The largest difference in percent between the commands of `made`, a sample at a time, and the commands
-    `applied` (steps, m) that the judged controller gave in that case."""
-    return float(np.abs(commands(made, cases, case) - applied).max())
+    `applied` (steps, m) that the judged controller gave in that case, on the same outputs (steps, p)."""
+    return float(np.abs(commands(made, cases, case, outputs) - applied).max())
 
 
-def commands(made: Exported, cases: panel.Cases, case: int) -> np.ndarray:
-    """Commands (steps, m) of the law, a sample at a time, in one case of a test set."""
+def commands(made: Exported, cases: panel.Cases, case: int, outputs: np.ndarray) -> np.ndarray:
+    """Commands (steps, m) of the law, a sample at a time, in one case of a test set whose true outputs were
+    `outputs` (steps, p). The plant itself is not simulated: a loop at its limits would make a difference of
+    rounding as large as the limits."""
     running, noise = RunningController(made.controller, made.model), panel.noise_of(cases)[:, case]
-    plant, x, u = cases.plants[cases.plant[case]], cases.x0[case], cases.u0[case]
-    held, first = plant.C @ x + plant.d, cases.references[cases.asked[case, 0]]
+    plant, u = cases.plants[cases.plant[case]], cases.u0[case]
+    held, first = plant.C @ cases.x0[case] + plant.d, cases.references[cases.asked[case, 0]]
     for t in range(cases.hold):
         running.watch(u, held + noise[t], first.H @ first.w0)
     running.hand_over(held + noise[cases.hold], at=cases.starts[cases.start[case]])
@@ -41,8 +45,7 @@ def commands(made: Exported, cases: panel.Cases, case: int) -> np.ndarray:
         number = cases.asked[case, np.flatnonzero(cases.begin[case] <= t)[-1]]
         reference = cases.references[number]
         r = reference if len(reference.w0) > 1 else reference.H[:, 0]
-        u = given[t] = running.step(plant.C @ x + plant.d + noise[cases.hold + t], r, t)
-        x = plant.A @ x + plant.B @ u + plant.b
+        given[t] = running.step(outputs[t] + noise[cases.hold + t], r, t)
     return given
 
 

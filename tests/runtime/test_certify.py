@@ -17,13 +17,14 @@ from tests.temperature.test_evaluate_temperature import judged, small
 
 
 @cache
-def deciding(name: str) -> tuple[int, np.ndarray]:
-    """Number and applied inputs of the case that decided the comparison."""
+def deciding(name: str) -> tuple[int, np.ndarray, np.ndarray]:
+    """Number, true outputs and applied inputs of the case that decided the comparison."""
     result = judged(small())
     played = {key: np.asarray(values) for key, values in result.trajectories.items()}
     rows = (played["contestant"] == name) & (played["case_name"] == "deciding")
-    columns = [played[f"{one.name}_applied"][rows] for one in small().machine.inputs]
-    return result.summary["deciding"]["case"], np.stack(columns, axis=1)
+    outputs = [played[one.name][rows] for one in small().machine.outputs]
+    applied = [played[f"{one.name}_applied"][rows] for one in small().machine.inputs]
+    return result.summary["deciding"]["case"], np.stack(outputs, axis=1), np.stack(applied, axis=1)
 
 
 @cache
@@ -54,10 +55,10 @@ def test_a_law_that_was_changed_since_is_not_exported():
 
 
 def test_commands_of_another_case_are_not_those_that_were_judged():
-    case, applied = deciding("pi")
+    case, outputs, applied = deciding("pi")
     half = small().setting.rehearsal.judging
     others = [row for row, plant in enumerate(half.plant) if plant != half.plant[case]]
-    difference = checks.judged_difference(made("pi"), half, others[0], applied)
+    difference = checks.judged_difference(made("pi"), half, others[0], outputs, applied)
     with pytest.raises(ValueError, match="pi gives commands"):
         checks.check_same(made("pi"), difference)
 
