@@ -1,7 +1,7 @@
 """Recordings -> one table: reads datasets/probe_machine (simulated) or every file below
-datasets/raw/temperature (recordings); writes datasets/ingest/record.parquet, quality.parquet and
-printer_pid.json. A recording that was processed before, with the same parameters and code, is taken from a
-memo; a broken one is quarantined with its reason."""
+datasets/raw/temperature (recordings); writes datasets/ingest/record.parquet, quality.parquet,
+set_points.parquet if the mapping has set-points, and printer_pid.json. A recording that was processed before,
+with the same parameters and code, is taken from a memo; a broken one is quarantined with its reason."""
 
 from __future__ import annotations
 
@@ -71,7 +71,10 @@ def main() -> None:
         record, quality, figures = recording_folders.join(results, wish, strict=strict)
         done = recording_folders.count_work(results)
         print(f"ingest: {done['processed']} recordings read, {done['reused']} taken from the memo")
-        artifacts.write_table(out / "record.parquet", wish.record, record)
+        for name, schema in (("record", wish.record), ("set_points", wish.set_points)):
+            if schema is not None:
+                columns = {column.name: record[column.name] for column in schema.columns}
+                artifacts.write_table(out / f"{name}.parquet", schema, columns)
         artifacts.write_table(out / "quality.parquet", wish.quality, quality)
         inputs = [signal.name for signal in machine.inputs]
         pids = recording_folders.printer_pids(folder, results, wish.sources, inputs)
@@ -83,6 +86,7 @@ def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, MappedSi
     """What to take from every recording of the machine."""
     from pipeline.recordings.recording_folders import RecordingWish
 
+    any_set_point = any(mapped.set_point is not None for mapped in mapping.values())
     return RecordingWish(
         sources(machine, mapping),
         limits={signal.name: (signal.low, signal.high) for signal in machine.inputs},
@@ -93,12 +97,14 @@ def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, MappedSi
         decimal=settings.decimal,
         record=tables.record(machine.acting, machine.outputs),
         quality=tables.QUALITY,
+        set_points=tables.set_points(machine.outputs) if any_set_point else None,
     )
 
 
 def sources(machine: Plant, mapping: dict[str, MappedSignal]) -> tuple[Source, ...]:
-    """Where a recording has the signals of the machine: by `mapping`, else under their own names. Raises
-    ValueError for a mapping of no signal, of another unit, or with a set-point of what is no output."""
+    """Where a recording has the signals of the machine, and the set-points of its outputs: by `mapping`, else
+    under their own names. Raises ValueError for a mapping of no signal, of another unit, or with a
+    set-point of what is no output."""
     from pipeline.recordings.formats import Source, nearest_names
 
     signals = [*machine.acting, *machine.outputs]
@@ -114,11 +120,11 @@ def sources(machine: Plant, mapping: dict[str, MappedSignal]) -> tuple[Source, .
                 f"params.yaml: ingest.mapping.{signal.name}.set_point is for outputs alone, but "
                 f"{signal.name} is none; take it out"
             )
-    found = []
+    mapped_sources = []
     for signal in signals:
         mapped = mapping.get(signal.name)
         if mapped is None:
-            found.append(Source(signal.name, signal.name, signal.unit))
+            mapped_sources.append(Source(signal.name, signal.name, signal.unit))
             continue
         if mapped.unit != signal.unit:
             raise ValueError(
@@ -126,8 +132,12 @@ def sources(machine: Plant, mapping: dict[str, MappedSignal]) -> tuple[Source, .
                 f"{signal.name} is in {signal.unit}; convert with scale and offset, "
                 f"and write unit: {signal.unit}"
             )
-        found.append(Source(signal.name, mapped.source, mapped.unit, mapped.scale, mapped.offset))
-    return tuple(found)
+        source = Source(signal.name, mapped.source, mapped.unit, mapped.scale, mapped.offset)
+        mapped_sources.append(source)
+        if mapped.set_point is not None:
+            set_point = tables.set_point_of(signal.name)
+            mapped_sources.append(source._replace(signal=set_point, source=mapped.set_point))
+    return tuple(mapped_sources)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from pipeline.recordings.isolated import Budget, isolated
 from pipeline.recordings.klipper_logs import printer_heaters
 from pipeline.recordings.quality import flag
 from pipeline.recordings.recordings import Flag, Raw, Source, Table, read
-from pipeline.recordings.resampling import cut_flags, resample
+from pipeline.recordings.resampling import cut_flags, hold, resample
 from pipeline.store import artifacts
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
@@ -36,7 +36,7 @@ READING = ("store/artifacts.py", "store/params.py", "store/tables.py", "recordin
 class RecordingWish(NamedTuple):
     """What to take from every recording: the sources of all signals, which of them are inputs and within
     which limits, the sample time, the clock, the gap limit, the decimal mark of text ("": found), and the
-    schemas of the record and of its findings."""
+    schemas of the record, of the set-points beside it (None: not recorded) and of its findings."""
 
     sources: tuple[Source, ...]
     limits: dict[str, tuple[float, float]]
@@ -47,6 +47,13 @@ class RecordingWish(NamedTuple):
     decimal: str
     record: Schema
     quality: Schema
+    set_points: Schema | None = None
+
+    @property
+    def whole(self) -> Schema:
+        """Record and set-points in one table."""
+        beside = self.set_points.columns if self.set_points else ()
+        return self.record._replace(columns=(*self.record.columns, *beside))
 
 
 class RecordingTable(NamedTuple):
@@ -193,9 +200,12 @@ def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, m
     """Read, resample and flag one recording into the memo, under the path that is
     `shown`; the reason why it cannot be, or an empty text."""
     name = shown.relative_to(folder).as_posix()
-    units = {source.signal: source.unit for source in wish.sources}
+    beside = [column.name for column in wish.set_points.columns] if wish.set_points else []
+    units = {source.signal: source.unit for source in wish.sources if source.signal not in beside}
     try:
         raw = read(path, wish.sources, time=wish.time, decimal=wish.decimal)
+        nothing = np.empty(0), np.empty(0)
+        set_points = {signal: raw.signals.pop(signal, nothing) for signal in beside}
         table = resample(
             raw,
             sample_time_s=wish.sample_time_s,
@@ -228,7 +238,9 @@ def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, m
         "count": counts,
         "message": messages,
     }
-    artifacts.write_table(memo / f"{key}.record.parquet", wish.record, _columns(name, table))
+    columns = _columns(name, table)
+    columns |= {signal: hold(*samples, table.time_s) for signal, samples in set_points.items()}
+    artifacts.write_table(memo / f"{key}.record.parquet", wish.whole, columns)
     artifacts.write_table(memo / f"{key}.quality.parquet", wish.quality, quality)
     artifacts.write_json(memo / f"{key}.json", _digests(memo, key))
     return ""
@@ -257,7 +269,7 @@ def _remembered(
     try:
         if artifacts.read_json(memo / f"{key}.json") != _digests(memo, key):
             return None
-        record = artifacts.read_table(memo / f"{key}.record.parquet", wish.record)
+        record = artifacts.read_table(memo / f"{key}.record.parquet", wish.whole)
         return record, artifacts.read_table(memo / f"{key}.quality.parquet", wish.quality)
     except (OSError, ValueError):
         return None
@@ -298,7 +310,7 @@ def join(
     good = [result for result in results if not result.reason]
     record = {
         column.name: np.concatenate([result.record[column.name] for result in good])
-        for column in wish.record.columns
+        for column in wish.whole.columns
     }
     quality = {
         column.name: np.concatenate([result.quality[column.name] for result in good])

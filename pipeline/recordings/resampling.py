@@ -108,6 +108,12 @@ def resample(
     return Table(raw.path, segment, time, values, masked, flags, jitter)
 
 
+def hold(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarray:
+    """The last of the values (n,) at or before each instant (T,); NaN before the first."""
+    rows = np.searchsorted(time_s, at_s, side="right")
+    return np.r_[np.nan, values][rows]
+
+
 def _check(
     raw: Raw, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None
 ) -> None:

@@ -27,13 +27,16 @@ def judged_difference(
 ) -> float:
     """The largest difference in percent between the commands of `made`, a sample at a time, and the commands
     `applied` (steps, m) that the judged controller gave in that case, on the same outputs (steps, p)."""
-    return float(np.abs(commands(made, cases, case, outputs) - applied).max())
+    return float(np.abs(commands(made, cases, case, outputs, applied) - applied).max())
 
 
-def commands(made: Exported, cases: panel.Cases, case: int, outputs: np.ndarray) -> np.ndarray:
+def commands(
+    made: Exported, cases: panel.Cases, case: int, outputs: np.ndarray, applied: np.ndarray
+) -> np.ndarray:
     """Commands (steps, m) of the law, a sample at a time, in one case of a test set whose true outputs were
-    `outputs` (steps, p). The plant itself is not simulated: a loop at its limits would make a difference of
-    rounding as large as the limits."""
+    `outputs` (steps, p) under inputs `applied` (steps, m). The law remembers those, not its own commands: an
+    output limiter at work makes a difference of rounding grow sample by sample until it is as large as the
+    limits."""
     running, noise = RunningController(made.controller, made.model), panel.noise_of(cases)[:, case]
     plant, u = cases.plants[cases.plant[case]], cases.u0[case]
     held, first = plant.C @ cases.x0[case] + plant.d, cases.references[cases.asked[case, 0]]
@@ -45,7 +48,7 @@ def commands(made: Exported, cases: panel.Cases, case: int, outputs: np.ndarray)
         number = cases.asked[case, np.flatnonzero(cases.begin[case] <= t)[-1]]
         reference = cases.references[number]
         r = reference if len(reference.w0) > 1 else reference.H[:, 0]
-        given[t] = running.step(outputs[t] + noise[cases.hold + t], r, t)
+        given[t] = running.step(outputs[t] + noise[cases.hold + t], r, t, applied[t])
     return given
 
 

@@ -31,6 +31,21 @@ def record(inputs: Sequence[PlantSignal], outputs: Sequence[PlantSignal]) -> Sch
     return Schema("record", 1, tuple(columns))
 
 
+def set_points(outputs: Sequence[PlantSignal]) -> Schema:
+    """The table that ingest writes beside the record, row by row, if the mapping has a set-point: what each
+    output was to be, as recorded; NaN before the first value, and if it was not recorded."""
+    columns = [
+        Column(set_point_of(signal.name), FLOAT, signal.unit, f"set-point of {signal.name}", nullable=True)
+        for signal in outputs
+    ]
+    return Schema("set_points", 1, tuple(columns))
+
+
+def set_point_of(output: str) -> str:
+    """The column of an output's set-point."""
+    return f"{output}_set_point"
+
+
 QUALITY = Schema(
     "quality",
     1,

@@ -154,6 +154,24 @@ def test_cases_are_governed_alike_alone_and_among_many():
         np.testing.assert_allclose(alone, together[one], rtol=0, atol=1e-9 * 100)
 
 
+def test_a_case_that_is_cramped_from_both_sides_is_governed_alike_alone_and_among_many():
+    """Two heaters as identified, each of which cools the other zone at first: drawing one zone from its wall
+    pushes the other onto its own in the same sweep."""
+    model = make_plant([[0.90, 0.06], [0.05, 0.92]], [[0.30, -0.12], [-0.10, 0.25]], np.eye(2))
+    limits = ActuatorLimits(np.zeros(2), np.full(2, 100.0), np.full(2, np.inf))
+    spread = panel.PlantSpread(0.2, 0.3, 0.01, 0.5, 5.0)
+    family, strength = panel.corners([model], spread)
+    outputs = OutputLimits(np.zeros(2), np.full(2, 75.0), np.full(2, 0.3), 0.2)
+    guard, rng = governor(family, limits, outputs, strength), np.random.default_rng(4)
+    y, u = rng.uniform(35, 45, (200, 2)), rng.uniform(0, 100, (200, 2))
+    memory = predicted(guard, started(guard, y), rng.uniform(0, 100, (200, 2)))
+    target = y + rng.uniform(-1, 1, (200, 2))
+    low, high = np.zeros((200, 2)), np.full((200, 2), 100.0)
+    together = governed(guard, memory, u, target, low, high)
+    alone = [governed(guard, memory[:, [k]], u[[k]], target[[k]], low[[k]], high[[k]])[0] for k in range(200)]
+    np.testing.assert_allclose(together, alone, rtol=0, atol=1e-9 * 100)
+
+
 # ---- what it learns
 
 

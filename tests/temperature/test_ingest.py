@@ -25,19 +25,16 @@ MACHINE = Plant.model_validate(
     }
 )
 
+SETTINGS = Ingest(
+    mapping={}, time="", decimal="", max_gap_s=5.0, longest_s=60.0, largest_mb=2000, strict=False
+)
+
 
 def wish(machine: Plant = MACHINE, **mapping: tuple[str, str, float, float]) -> RecordingWish:
     """What the stage takes from every recording with this mapping."""
     keys = ("source", "unit", "scale", "offset")
-    settings = Ingest(
-        mapping={name: MappedSignal(**dict(zip(keys, to, strict=True))) for name, to in mapping.items()},
-        time="",
-        decimal="",
-        max_gap_s=5.0,
-        longest_s=60.0,
-        largest_mb=2000,
-        strict=False,
-    )
+    signals = {name: MappedSignal(**dict(zip(keys, to, strict=True))) for name, to in mapping.items()}
+    settings = SETTINGS.model_copy(update={"mapping": signals})
     return recording_wish(settings, machine, settings.mapping)
 
 
@@ -396,7 +393,7 @@ def test_a_mapping_that_names_no_signal_gives_the_nearest_names():
 
 def test_a_set_point_is_declared_beside_an_output_and_beside_nothing_else():
     mapped = MappedSignal(source="T1_Ist", unit="degC", scale=1.0, offset=0.0, set_point="T1_Soll")
-    assert [source.source for source in sources(MACHINE, {"zone": mapped})] == ["heater", "T1_Ist"]
+    assert [source.source for source in sources(MACHINE, {"zone": mapped})] == ["heater", "T1_Ist", "T1_Soll"]
     with pytest.raises(
         ValueError, match="heater.set_point is for outputs alone, but heater is none; take it"
     ):
@@ -434,6 +431,25 @@ while not os.listdir(sys.argv[1]):
 os.kill(int(sys.argv[2]), 9)
 print(sum(name.endswith(".json") for name in os.listdir(sys.argv[1])))
 """
+
+
+def test_a_set_point_is_held_from_its_own_samples_and_missing_before_the_first(tmp_path):
+    rows = ["time_s,heater,Soll,zone"]
+    rows += [f"{t},20,{'' if t < 50 else 41 if t < 130 else 45},{40 + t / 10}" for t in range(200)]
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "raw/a.csv").write_text("\n".join(rows))
+    zone = MappedSignal(source="zone", unit="degC", scale=1.8, offset=32.0, set_point="Soll")
+    settings = SETTINGS.model_copy(update={"mapping": {"zone": zone}})
+    job = recording_wish(settings, MACHINE, settings.mapping)
+    results = read_folder(tmp_path / "raw", job, INLINE, memo=tmp_path / "memo", budget=BUDGET)
+    record, quality, _ = join(results, job, strict=False)
+    held = record["zone_set_point"]
+    assert np.isnan(held[:50]).all()
+    np.testing.assert_allclose(held[50:], 1.8 * np.where(np.arange(50, 200) < 130, 41, 45) + 32)
+    assert not record["zone_masked"].any()
+    assert list(quality["message"]) == [
+        "50 of 200 values of Soll are missing, the first in line 2; they are masked"
+    ]
 
 
 def test_a_worker_killed_at_its_work_costs_nothing_but_time(tmp_path, mortal_cluster):

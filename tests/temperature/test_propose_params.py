@@ -380,6 +380,20 @@ def test_the_record_is_the_print_without_a_conversion(printer):
     assert findings["quarantined"] == 0
 
 
+def test_the_record_has_the_set_points_of_the_print_beside_it(printer):
+    machine = params.load(Plant, "plant", printer / "params.yaml")
+    folder = printer / "datasets/ingest"
+    set_points = artifacts.read_table(folder / "set_points.parquet", tables.set_points(machine.outputs))
+    record = artifacts.read_table(folder / "record.parquet", tables.record(machine.inputs, machine.outputs))
+    assert len(record["time_s"]) == len(next(iter(set_points.values())))
+    for output in machine.outputs:
+        asked = set_points[f"{output.name}_set_point"]
+        assert output.reference in asked
+        # what a firmware holds is at its set-point most of the time
+        late = asked > 0
+        assert np.median(np.abs(record[output.name] - asked)[late]) < 3.0
+
+
 def test_the_plant_of_the_print_has_both_heaters_and_their_pace(printer):
     settings = params.load(IdentifyPlant, "identify_plant", printer / "params.yaml")
     assert settings.max_order == 4

@@ -168,6 +168,9 @@ def collect(
             tables[name] = OFF
             continue
         path = f"{folders[stage]}/{file}"
+        if name == "set_points" and not artifacts.exists(path):
+            tables[name] = {}  # no set-point was recorded
+            continue
         tables[name] = _read(read, path, name, stage, kind, reader)
         if name == "printer_pid" and not tables[name]:
             del read[path]
@@ -261,6 +264,7 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
 
     return [
         ("record", "ingest", "record.parquet", *table(schemas.record(machine.acting, machine.outputs))),
+        ("set_points", "ingest", "set_points.parquet", *table(schemas.set_points(machine.outputs))),
         ("quality", "ingest", "quality.parquet", *table(schemas.QUALITY)),
         ("printer_pid", "ingest", "printer_pid.json", "printer_pid", artifacts.read_json),
         ("plant", "identify_plant", "plant.parquet", *arrays("plant")),

@@ -10,6 +10,7 @@ from markupsafe import Markup
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
+from pipeline.temperature.tables import set_point_of
 from pipeline.verdict.digits import THIN, count, number, short
 from pipeline.verdict.evidence import Table, lookup
 from pipeline.verdict.verdict import UNJUDGED, Missing
@@ -84,13 +85,18 @@ def record(sources: Sources) -> Picture:
     if isinstance(table, Missing):
         return placeholder("record", title, table)
     machine, time = sources.declared.machine, _elapsed(table, sources.declared.machine.sample_time_s)
+    set_points = sources.tables["set_points"]
+    if isinstance(set_points, Missing):
+        set_points = {}
     masked_total = 0
     halves: list[list[Markup]] = [[], []]
     for half, signals in enumerate((machine.inputs, machine.outputs)):
         for i, signal in enumerate(signals):
             values, masked = table[signal.name], table[f"{signal.name}_masked"]
             masked_total += int(masked.sum())
-            halves[half].append(_signal(signal, time, values, masked, quality, last=i == len(signals) - 1))
+            set_point = set_points.get(set_point_of(signal.name))
+            last = i == len(signals) - 1
+            halves[half].append(_signal(signal, time, values, masked, quality, set_point, last=last))
     recordings = count(len(np.unique(table["recording"])), "recording")
     masks = (
         f"{count(masked_total, 'value is', 'values are')} masked and not used"
@@ -112,6 +118,7 @@ def record(sources: Sources) -> Picture:
         (
             "Against time in s, recordings one after the other; at most 480 points a signal, highest and "
             "lowest of each stretch kept. Grey: flagged; vermillion, without a line: masked."
+            + (" Dashed: what the output was to be." if set_points else "")
         ),
         page.origin(
             sources.source("record", "quality"), y=[s.name for s in (*machine.acting, *machine.outputs)]
@@ -136,9 +143,17 @@ def _elapsed(table: Table, step: float) -> np.ndarray:
 
 
 def _signal(
-    signal, time: np.ndarray, values: np.ndarray, masked: np.ndarray, quality: Table | Missing, *, last: bool
+    signal,
+    time: np.ndarray,
+    values: np.ndarray,
+    masked: np.ndarray,
+    quality: Table | Missing,
+    set_point: np.ndarray | None,
+    *,
+    last: bool,
 ) -> Markup:
-    finite = values[np.isfinite(values)]
+    shown = values if set_point is None else np.concatenate([values, set_point])
+    finite = shown[np.isfinite(shown)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
     frame = charts.Frame(
         charts.linear(0, float(time[-1]) or 1.0),
@@ -151,7 +166,8 @@ def _signal(
         below=16 if last else 4,
         above=22,
     )
-    layers = [charts.line(frame, time, np.where(masked, np.nan, values), "line thin")]
+    layers = [] if set_point is None else [charts.line(frame, time, set_point, "ref")]
+    layers += [charts.line(frame, time, np.where(masked, np.nan, values), "line thin")]
     stretches = charts.stretches(masked)
     layers += [charts.interval(frame, float(time[a]), float(time[b - 1]), "gone") for a, b in stretches[:200]]
     mine = [] if isinstance(quality, Missing) else np.flatnonzero(quality["signal"] == signal.name)

@@ -393,10 +393,12 @@ class RunningController:
         here = self._aimed(constant(y if at is None else at))[1]
         self._state = handed_over(self.controller, self._remembers(), y[None], [here])
 
-    def step(self, y: np.ndarray, r: np.ndarray | Reference, t: int) -> np.ndarray:
+    def step(
+        self, y: np.ndarray, r: np.ndarray | Reference, t: int, applied: np.ndarray | None = None
+    ) -> np.ndarray:
         """Inputs u (m,) to apply from outputs y (p,) measured at sample t under reference r, as batch_step
-        has them. Raises ValueError where y or r is not finite or of another machine, where t falls, or
-        nothing was watched before."""
+        has them; `applied` (m,) if the machine is given others. Raises ValueError where y or r is not finite
+        or of another machine, where t falls, or nothing was watched before."""
         y, state = self._measured(y), self._remembers()
         feed, y_star, now = self._target(r, t)
         controller, limits, before = self.controller, self.controller.limits, state.u[0]
@@ -411,9 +413,11 @@ class RunningController:
         if family is not None:
             x = corrected(family, x, y[None])
             u = governed(family, x, u[None], y_star[None], low[None], high[None])[0]
-            x = predicted(family, x, u[None])
-        xi = _integrated(controller, state.xi, (y_star - y)[None], u[None], wished[None])
-        self._state = ControllerState(self._kept(state.z[0], u, y, now)[None], xi, u[None], x)
+        acts = u if applied is None else applied
+        if family is not None:
+            x = predicted(family, x, acts[None])
+        xi = _integrated(controller, state.xi, (y_star - y)[None], acts[None], wished[None])
+        self._state = ControllerState(self._kept(state.z[0], acts, y, now)[None], xi, acts[None], x)
         return u.copy()
 
     def saved(self) -> dict[str, np.ndarray]:

@@ -424,16 +424,17 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
     helps = helps.transpose(2, 0, 3, 1).reshape(p, f * h, m)
     for _ in range(SWEEPS):
         over = np.matmul(u, side.rows).reshape(room.shape) - room
-        at_fault = np.flatnonzero((over > EXACT).any(axis=(0, 1, 3)))
-        if not at_fault.size:
+        at_fault = (over > EXACT).any(axis=(0, 3))  # (s, p)
+        if not at_fault.any():
             break
-        for j in at_fault:
+        for j in np.flatnonzero(at_fault.any(axis=0)):
             excess = np.matmul(u, rows[:, :, j]) - room[:, :, j]
             excess = excess.transpose(1, 0, 2).reshape(s, f * h)
             most = excess.max(axis=1)
             worst = (excess >= most[:, None] - EXACT).argmax(axis=1)
             direction = helps[j, worst] * (u > low + EXACT)
             size = (direction**2).sum(axis=1)
-            step = np.where(most > EXACT, most, 0.0) / np.where(size > 0, size, np.inf)
+            # an output that is at fault in another case alone waits for the next sweep, as it does by itself
+            step = np.where(at_fault[:, j] & (most > EXACT), most, 0.0) / np.where(size > 0, size, np.inf)
             u = np.maximum(u - step[:, None] * direction, low)
     return u
