@@ -229,8 +229,8 @@ class _Log:
         self.is_printing, self.is_over, self.opened = True, False, ("", -1)
 
     def _add_position(self, line: int, queue: dict[bytes, float]) -> None:
-        """Where Klipper is in the printed file. A position that falls, or comes without a start, is of another
-        print."""
+        """Where Klipper is in the printed file. A position that falls, or comes without a start, is of
+        another print."""
         position, buffer_s = queue.get(b"sd_pos", -1.0), queue.get(b"buffer_time", 0.0)
         reads = 0 <= position < 1e15
         if reads:

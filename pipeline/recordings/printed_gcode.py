@@ -1,16 +1,19 @@
 """Positions in a printed G-code file -> part fan in percent and filament feed in mm/s, on the clock of a
 klippy.log.
 
-Klipper writes up to which byte it has run the printed file (sd_pos), and how far the planned motion is ahead of
-now (buffer_time). The lines before that byte have moved when the planned motion is over:
+Klipper writes up to which byte it has run the printed file (sd_pos), and how far the planned motion is ahead
+of now (buffer_time). The lines before that byte have moved when the planned motion is over:
 
     E(t + buffer_time(t)) = E of the lines before sd_pos(t)
     feed(t) = (E(t + dt) - E(t)) / dt                            dt: to the next Stats line
 
-The fan is that of the last M106 or M107 so far, or of a macro whose text in the configuration has one. It is 0
-when Klipper starts, and after a print as the file left it. Between prints and in a pause the feed is 0.
-Which file was printed: the one that Moonraker's history or the log names, or any beside the log, if its lines
-end where the log's positions are. Source: Klipper's virtual_sdcard.py, toolhead.py, gcode_move.py, fan.py.
+The fan is that of the last M106 or M107 so far, or of a macro whose text in the configuration has one. It is
+0 when Klipper starts, and after a print as the file left it. Between prints and in a pause the feed is 0.
+
+The printed file is the one beside the log whose lines end where the log's positions are; if several fit, the
+one that Moonraker's history or the log names.
+
+Source: Klipper's virtual_sdcard.py, toolhead.py, gcode_move.py and fan.py.
 """
 
 import filecmp
@@ -39,6 +42,7 @@ MOST_FILES, MOST_BYTES, LARGEST_HISTORY = 1000, 1 << 29, 1 << 25
 BLOCK = 1 << 20  # a longer line is no command
 # positions of a print that are held against the ends of a file's lines, and the share that must agree
 MOST_POSITIONS, AGREEING_SHARE = 2000, 0.99
+FEWEST_POSITIONS = 10  # so many positions tell a file without its name
 # a job of the history begins within so many s of its print
 SAME_START_S = 10.0
 FILAMENT_TOLERANCE = 0.05
@@ -49,6 +53,11 @@ _COMMAND = re.compile(
     rb"|([A-Z_]{3}\w{0,60}))",
     re.MULTILINE | re.IGNORECASE,
 )
+_WORDS = {
+    letter: re.compile(letter + rb"[ \t]*([-+]?(?:\d{1,20}\.?\d{0,20}|\.\d{1,20}))", re.IGNORECASE)
+    for letter in (b"E", b"P", b"S")
+}
+MOST_FAN_COMMANDS = 500_000
 # commands of Klipper's own that move no filament and no part fan
 _NO_MACRO = re.compile(
     r"SET_|EXCLUDE_OBJECT|TIMELAPSE|RESPOND|BED_MESH|(SAVE|RESTORE)_GCODE_STATE|TEMPERATURE_WAIT"
@@ -84,7 +93,7 @@ class PrintedFile(NamedTuple):
     unscaled_mm: np.ndarray  # (n,) without M221, as Klipper counts filament_used
     fan_positions: np.ndarray  # (m,) byte at which a command for the fan begins
     fan_percent: np.ndarray  # (m,) and what it requests
-    remark: str  # what is left out, "" for nothing
+    remark: str  # what is left out or assumed, "" for nothing
 
 
 # ---- a file
@@ -98,12 +107,14 @@ class _Reading:
         self.filament = self.unscaled = self.origin = 0.0
         self.factor = 1.0
         self.is_absolute_move = self.is_absolute_e = True
+        self.is_declared, self.feeds_undeclared = False, False
         self.fan_positions, self.fan_percent = array("q"), array("d")
         self.names: Counter[str] = Counter()
         self.left_out: Counter[str] = Counter()
 
     def move(self, number: bytes) -> None:
         fed = float(number) * self.factor
+        self.feeds_undeclared |= not self.is_declared
         if self.is_absolute_e and self.is_absolute_move:
             fed += self.origin - self.filament
         if abs(fed) > LONGEST_MOVE_MM:
@@ -118,7 +129,7 @@ class _Reading:
             case "G90" | "G91":
                 self.is_absolute_move = command == "G90"
             case "M82" | "M83":
-                self.is_absolute_e = command == "M82"
+                self.is_absolute_e, self.is_declared = command == "M82", True
             case "G92" if not words.strip() or _word(b"E", words) is not None:
                 self.origin = self.filament - (_word(b"E", words) or 0.0) * self.factor
             case "M221" if 0 < (percent := _word(b"S", words) or 0.0) <= 1000:
@@ -141,25 +152,32 @@ class _Reading:
             self.names[name] += 1
 
     def set_fan(self, start: int, percent: float) -> None:
-        self.fan_positions.append(start)
-        self.fan_percent.append(percent)
+        if len(self.fan_percent) >= MOST_FAN_COMMANDS:
+            self.left_out[f"commands for the fan beyond the first {MOST_FAN_COMMANDS}"] += 1
+        elif not self.fan_percent or percent != self.fan_percent[-1]:
+            self.fan_positions.append(start)
+            self.fan_percent.append(percent)
 
     def remark(self) -> str:
         parts = [f"{count} {what}" for what, count in self.left_out.items()]
         if self.names:
             parts.append("filament that macros feed (" + ", ".join(list(self.names)[:6]) + ")")
-        return ", ".join(parts)
+        remark = "the feed and the fan leave out " + ", ".join(parts) if parts else ""
+        absolute = (
+            "E was taken as absolute until the file's first M82 or M83" if self.feeds_undeclared else ""
+        )
+        return "; ".join(filter(None, [remark, absolute]))
 
 
 def _word(letter: bytes, words: bytes) -> float | None:
-    number = re.search(letter + rb"[ \t]*([-+]?(?:\d{1,20}\.?\d{0,20}|\.\d{1,20}))", words, re.IGNORECASE)
+    number = _WORDS[letter].search(words)
     return float(number[1]) if number else None
 
 
 def fan_percent(words: bytes) -> float:
     """What M106 requests with these words: S of 0 to 255, everything without an S."""
     speed = _word(b"S", words)
-    return float(np.clip(100 * (255.0 if speed is None else speed) / 255, 0, 100))
+    return min(max(100 * (255.0 if speed is None else speed) / 255, 0.0), 100.0)
 
 
 def read_file(path: Path, positions: np.ndarray, macros: Mapping[str, float]) -> PrintedFile:
@@ -249,6 +267,11 @@ def _jobs(path: Path) -> list[dict]:
     ]
 
 
+def _note(kind: str, count: int, message: str) -> Note:
+    """A note in one line of text, whatever bytes the names of files have."""
+    return Note(kind, "", count, " ".join(message.encode("utf-8", "backslashreplace").decode().split()))
+
+
 def _is_number(value) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
@@ -275,42 +298,39 @@ def misfit(path: Path, positions: np.ndarray, end: int, size: int = -1) -> str:
         file = stream.fileno()
         ends = [position == 0 or os.pread(file, 1, position - 1) == b"\n" for position in few.tolist()]
         if end >= 0 and (own - end > BLOCK or b"\n" in os.pread(file, BLOCK, end)):
-            return f"has {own} bytes and goes on where the print was over"
+            return f"has {own} bytes"
     if np.mean(ends) < AGREEING_SHARE:
-        return f"has no line that ends at {ends.count(False)} of {len(ends)} positions"
+        return f"has other lines (none ends at {ends.count(False)} of {len(ends)} positions of the log)"
     return ""
 
 
 def _choose(
-    candidates: Sequence[Path], name: str, positions: np.ndarray, part: Print
+    candidates: Sequence[Path], name: str, positions: np.ndarray, of: Print
 ) -> tuple[Path | None, str]:
-    """The file of a print, or why there is none: expected, found."""
-    bytes_ = part.end if part.end >= 0 else int(positions.max())
-    expected = f"{name or 'a G-code file'} of {'' if part.end >= 0 else 'at least '}{bytes_} bytes"
-    files = [path for path in candidates if not name or path.name == Path(name).name]
-    misfits = {path: misfit(path, positions, part.end, part.size) for path in files}
-    fitting = [path for path in files if not misfits[path]]
+    """(the file of a print, "") or (None, why there is none). `name` is what the history or the log calls it,
+    "" if none does."""
+    misfits = {path: misfit(path, positions, of.end, of.size) for path in candidates}
+    named = [path for path in candidates if path.name == Path(name).name]
+    fitting = [path for path in candidates if not misfits[path]]
+    if name and (len(positions) < FEWEST_POSITIONS or any(path in fitting for path in named)):
+        fitting = [path for path in fitting if path in named]
     # copies of one file are one
-    fitting = [
-        p for i, p in enumerate(fitting) if not any(filecmp.cmp(p, q, shallow=False) for q in fitting[:i])
-    ]
+    fitting = [p for i, p in enumerate(fitting) if not any(filecmp.cmp(p, q, False) for q in fitting[:i])]
     if len(fitting) == 1:
         return fitting[0], ""
     if fitting:
         names = " and ".join(path.name for path in fitting[:3])
-        return None, (
-            f"{names} may be the printed file, expected is one; leave the printed one beside the log, "
-            "or save the answer of /server/history/list there"
+        remedy = (
+            "leave the printed one alone there, or add the answer of /server/history/list as history.json"
         )
-    problem = next((f"{path.name} {why}" for path, why in misfits.items()), "")
-    count = f"{len(candidates)} other G-code files" if candidates else "no G-code file"
-    count += (
-        f", {problem}" if problem and len(files) == 1 else f", of {len(files)} none fits" if files else ""
-    )
-    count = problem if problem and len(candidates) == 1 else count
-    return (
-        None,
-        f"expected is {expected}, found beside the log: {count}; put the printed file beside the log or into {FOLDER}/",
+        return None, f"expected one G-code file beside the log that fits, found {names}; {remedy}"
+    size = f"{of.end}" if of.end >= 0 else f"at least {int(positions.max())}"
+    counted = f"{len(candidates)} G-code files, none of which fits" if candidates else "no G-code file"
+    problems = [f"{path.name} {misfits[path]}" for path in (named or candidates)]
+    found = problems[0] if len(problems) == 1 else counted
+    return None, (
+        f"expected {name or 'the printed G-code file'} of {size} bytes, found {found}; put the file that was "
+        f"printed beside the log or into {FOLDER}/"
     )
 
 
@@ -328,16 +348,16 @@ class PrintSignals(NamedTuple):
 def print_signals(
     log: Path, rows: PrintRows, prints: Sequence[Print], start_s: float, macros: Mapping[str, float]
 ) -> PrintSignals:
-    """Part fan and filament feed at the rows of a log; NaN in a print whose file is not known. `start_s` is the
-    time of day of the first row, NaN if it is not known."""
+    """Part fan and filament feed at the rows of a log; NaN in a print whose file is not known. `start_s` is
+    the time of day of the first row, NaN if it is not known."""
     notes: list[Note] = []
     indices = [int(i) for i in dict.fromkeys(rows.print_index.tolist()) if i >= 0]
     if not indices:
         message = (
-            f"{FAN} and {FEED} are not recorded: the log has no sd_pos, the position in a printed file (it was not "
-            "printed from Klipper's virtual SD card)"
+            f"{FAN} and {FEED} are not recorded: the log has no sd_pos, the place in a printed file; print "
+            "from Klipper's virtual SD card (Mainsail, Fluidd), as a file that OctoPrint streams has none"
         )
-        return PrintSignals({}, [Note(NOT_RECORDED, "", 1, message)], [])
+        return PrintSignals({}, [_note(NOT_RECORDED, 1, message)], [])
     places = {i: np.flatnonzero(rows.print_index == i) for i in indices}
     files, jobs, histories = _files_of(log, rows, prints, places, start_s, notes)
     contents = _contents(files, rows, prints, places, macros, notes)
@@ -352,7 +372,7 @@ def print_signals(
             notes += _filament_note(files[i], float(printed), job.get("filament_used"))
     used = list(dict.fromkeys(files.values()))
     message = f"{FAN} and {FEED} are those of {', '.join(path.name for path in used[:6])} in {len(files)} of "
-    notes.append(Note(LEFT_OUT, "", len(files), message + f"{len(indices)} prints"))
+    notes.append(_note(LEFT_OUT, len(files), message + f"{len(indices)} prints"))
     return PrintSignals({FAN: fan, FEED: filament}, notes, used + histories)
 
 
@@ -367,9 +387,9 @@ def _files_of(log, rows: PrintRows, prints, places, start_s: float, notes: list[
             histories.append(path)
         except (OSError, ValueError) as error:
             message = f"{path.name} should be Moonraker's history but cannot be read ({error}); save it again"
-            notes.append(Note(NOT_RECORDED, "", 1, message))
+            notes.append(_note(NOT_RECORDED, 1, message))
     candidates = [path for path in beside if path not in histories and path.suffix.lower() in SUFFIXES]
-    files, job_of, reasons = {}, {}, Counter()
+    files, job_of, reasons = {}, {}, {}
     for i, where in places.items():
         positions = np.unique(rows.position[where])
         job_of[i] = _job_of(jobs, start_s + rows.time_s[where[0]])
@@ -381,10 +401,11 @@ def _files_of(log, rows: PrintRows, prints, places, start_s: float, notes: list[
         if path:
             files[i] = path
         else:
-            reasons[reason] += 1
-    for reason, count in list(reasons.items())[:6]:
-        message = f"{FAN} and {FEED} are not recorded in {count} of {len(places)} prints: {reason}"
-        notes.append(Note(NOT_RECORDED, "", count, message))
+            reasons.setdefault(reason, []).append(prints[i].line)
+    for reason, lines in list(reasons.items())[:6]:
+        which = f"{len(lines)} of {len(places)} prints, the first from line {lines[0]} on"
+        message = f"{FAN} and {FEED} are not recorded in {which}: {reason}"
+        notes.append(_note(NOT_RECORDED, len(lines), message))
     return files, job_of, histories
 
 
@@ -400,63 +421,60 @@ def _contents(files, rows: PrintRows, prints, places, macros, notes: list[Note])
                 f"{FAN} and {FEED} of {path.name} are not recorded: the printed files have more than "
                 f"{MOST_BYTES >> 20} MB; split the log"
             )
-            notes.append(Note(NOT_RECORDED, "", len(own), message))
+            notes.append(_note(NOT_RECORDED, len(own), message))
             continue
         content = read_file(path, positions.astype(np.int64), macros)
         contents[path] = positions, content
         if content.remark:
-            notes.append(
-                Note(LEFT_OUT, "", 1, f"{path.name}: the feed and the fan leave out {content.remark}")
-            )
+            notes.append(_note(LEFT_OUT, 1, f"{path.name}: {content.remark}"))
     return contents
 
 
 def _on_rows(rows: PrintRows, prints, places, files, contents) -> tuple[np.ndarray, np.ndarray]:
-    """(feed, fan) at the rows (n,)."""
+    """(feed, fan) at the rows (n,): the mean feed until the next row, the fan halfway to it."""
     count = len(rows.time_s)
     moved_s = np.maximum.accumulate(rows.time_s + rows.buffer_s)
     filament, unknown, total = np.zeros(count), np.zeros(count, bool), 0.0
-    events: list[tuple[float, float]] = [(-np.inf, 0.0)]
+    events = [_event(-np.inf, 0.0)]  # (time, percent) of the fan, (m, 2)
     starts = [where[0] for where in places.values()] + [count]
     for (i, where), following in zip(places.items(), starts[1:], strict=True):
         first = where[0]
         filament[first:following] = total
-        before_s = moved_s[first - 1] if first else moved_s[first] - 1.0
+        before_s = moved_s[first - 1] if first else -np.inf
         if i not in files:
             unknown[where] = rows.reads[where] | (rows.buffer_s[where] > 0)
-            events.append((before_s, np.nan))
+            events.append(_event(before_s, np.nan))
             continue
         known, content = contents[files[i]]
         at = np.searchsorted(known, [prints[i].start, *rows.position[where]])
         filament[where] = total + content.filament_mm[at[1:]] - content.filament_mm[at[0]]
         total = filament[where[-1]]
         filament[where[-1] : following] = total
-        events += _fan_events(content, prints[i].start, rows.position[where], moved_s[where], before_s)
+        events.append(_fan_events(content, prints[i].start, rows.position[where], moved_s[where], before_s))
     # a restart of Klipper switches the fan off
     restarts = np.flatnonzero((rows.print_index[1:] < 0) & (rows.print_index[:-1] >= 0)) + 1
-    events += [(time, 0.0) for time in rows.time_s[restarts].tolist()]
+    events += [_event(time, 0.0) for time in rows.time_s[restarts].tolist()]
     step_s = np.diff(rows.time_s, append=np.nan)
     step_s[-1] = np.median(step_s[:-1]) if count > 1 else 1.0
     at_row, behind = (np.interp(time, moved_s, filament) for time in (rows.time_s, rows.time_s + step_s))
-    times, percent = np.array(sorted(events, key=lambda event: event[0])).T
+    times, percent = np.vstack(events)[np.argsort(np.vstack(events)[:, 0], kind="stable")].T
     fan = percent[np.searchsorted(times, rows.time_s + step_s / 2, side="right") - 1]
     return np.where(unknown, np.nan, (behind - at_row) / step_s), fan
 
 
-def _fan_events(
-    content: PrintedFile, start: int, positions, moved_s, before_s: float
-) -> list[tuple[float, float]]:
-    """(time, percent) of each command for the fan in a print; a log that begins within the print takes the
+def _event(time_s: float, percent: float) -> np.ndarray:
+    return np.array([[time_s, percent]])
+
+
+def _fan_events(content: PrintedFile, start: int, positions, moved_s, before_s: float) -> np.ndarray:
+    """(time, percent) (m, 2) of the fan's commands in a print; a log that begins within the print takes the
     last command before."""
     known = np.maximum.accumulate(np.r_[start, positions])
     at, percent = content.fan_positions, content.fan_percent
     inside = (at >= start) & (at < known[-1])
-    times = np.interp(at[inside], known, np.r_[min(before_s, moved_s[0]), moved_s])
-    before = percent[at < start][-1:]
-    return [
-        *((before_s, p) for p in before.tolist()),
-        *zip(times.tolist(), percent[inside].tolist(), strict=True),
-    ]
+    times = np.interp(at[inside], known, np.r_[max(before_s, moved_s[0] - 1.0), moved_s])
+    before = [_event(before_s, p) for p in percent[at < start][-1:]]
+    return np.vstack([*before, np.column_stack([times, percent[inside]])])
 
 
 def _filament_note(path: Path, printed_mm: float, used_mm) -> list[Note]:
@@ -467,4 +485,4 @@ def _filament_note(path: Path, printed_mm: float, used_mm) -> list[Note]:
         f"{path.name} feeds {printed_mm:.0f} mm of filament up to its last position, but Moonraker's history "
         f"has {used_mm:.0f} mm; macros feed the difference, or the file was changed: check the feed"
     )
-    return [Note(LEFT_OUT, "", 1, message)]
+    return [_note(LEFT_OUT, 1, message)]

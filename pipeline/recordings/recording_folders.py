@@ -234,6 +234,7 @@ def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, m
             inputs=list(wish.held),
             outputs=[name for name in units if name not in wish.held],
             max_gap_s=wish.max_gap_s,
+            averaged=[source.signal for source in wish.sources if source.source in printed_gcode.UNITS],
         )
         table = flag(table, units=units, limits=wish.limits)
         table = table._replace(flags=[*table.flags, *_cut_rows(raw)])

@@ -1,8 +1,8 @@
 """A printer with Klipper in simulation that prints G-code, written from what Klipper does and not from our
 reader: trapezoidal motion, a look-ahead queue, a buffer of planned motion, and the log that it leaves.
 
-A slicer writes lines as text and, beside them, what they do. The machine knows only what they do, and the byte
-at which each line begins; so the truth is drawn without reading G-code.
+A slicer writes lines as text and, beside them, what they do. The machine knows only what they do, and the
+byte at which each line begins; so the truth is drawn without reading G-code.
 """
 
 import time
@@ -20,8 +20,8 @@ FILAMENT_MM_PER_MM = 0.033  # 0.4 mm by 0.2 mm from a filament of 1.75 mm
 
 
 class Line(NamedTuple):
-    """A line's text, and what it does: a move of `distance` mm at `speed` mm/s that feeds `e` mm, the part fan
-    in percent, a wait in s of the host ("wait") or of the motion ("dwell"), or a stop by its owner
+    """A line's text, and what it does: a move of `distance` mm at `speed` mm/s that feeds `e` mm, the part
+    fan in percent, a wait in s of the host ("wait") or of the motion ("dwell"), or a stop by its owner
     ("pause")."""
 
     text: str
@@ -142,9 +142,10 @@ def _plan(lines: Sequence[Line]) -> list[np.ndarray]:
 class Machine:
     """Prints files one after another; `log()` and `truth()` are what it leaves."""
 
-    def __init__(self, *, seed=0, start_s=1_752_314_400.0, count_s=100.0, has_sd=True, gains_loss=True):
+    def __init__(self, *, seed=0, start_s=1_752_314_400.0, count_s=100.0, has_sd=True, high_s=HIGH_S):
         rng = np.random.default_rng(seed)
         self.heaters = [Simulated(EXTRUDER, rng), Simulated(BED, rng)]
+        self.high_s = high_s
         self.has_sd, self.epoch_s, self.now = has_sd, start_s - count_s, count_s
         self.print_time, self.primed = count_s, False
         self.next_stats, self.next_step = count_s, count_s
@@ -183,8 +184,8 @@ class Machine:
     def _stats(self, now: float) -> None:
         position = f"sd_pos={self.position} " if self.position is not None and self.has_sd else ""
         self.text.append(
-            f"Stats {now:.1f}: gcodein=0 mcu: mcu_awake=0.014 {position}{self.heaters[1].stats()} mcu: temp=31.3 "
-            f"sysload=1.40 print_time={self.print_time - 7:.3f} "
+            f"Stats {now:.1f}: gcodein=0 mcu: mcu_awake=0.014 {position}{self.heaters[1].stats()} "
+            f"mcu: temp=31.3 sysload=1.40 print_time={self.print_time - 7:.3f} "
             f"buffer_time={max(0.0, self.print_time - now):.3f} print_stall=0 {self.heaters[0].stats()}"
         )
 
@@ -213,8 +214,8 @@ class Machine:
                 last = queue.pop()
                 self._flush(queue)
                 queue.append(last)
-                while self.print_time - self.now > HIGH_S:
-                    self.wait(self.print_time - HIGH_S + 0.005)
+                while self.print_time - self.now > self.high_s:
+                    self.wait(self.print_time - self.high_s + 0.005)
         self._flush(queue)
         if stop_at is None:
             self.text.append("Finished SD card print")
