@@ -137,7 +137,7 @@ class _Reading:
                 self.factor = percent / 100
                 self.origin = self.filament - e * self.factor
             case "M106" | "M107" if _word(b"P", words):
-                self.left_out["commands for other fans (P)"] += 1
+                self.left_out["commands for other fans (M106 P)"] += 1
             case "M106" | "M107":
                 self.set_fan(start, fan_percent(words) if command == "M106" else 0.0)
             case "G10" | "G11":
@@ -234,9 +234,12 @@ def _blocks(stream) -> Iterator[tuple[int, bytes]]:
 
 def companions(log: Path) -> list[Path]:
     """The G-code files and histories beside a log and in its folder `gcodes`, in the order of names."""
-    places = itertools.chain(log.parent.iterdir(), (log.parent / FOLDER).rglob("*"))
+    places = itertools.chain(log.parent.glob("*"), (log.parent / FOLDER).rglob("*"))
     files = (path for path in places if path.suffix.lower() in SUFFIXES or is_history(path))
-    return sorted(itertools.islice((path for path in files if path.is_file()), MOST_FILES))
+    try:
+        return sorted(itertools.islice((path for path in files if path.is_file()), MOST_FILES))
+    except OSError:
+        return []
 
 
 def is_history(path: Path) -> bool:

@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 from pipeline.commands import propose_params
+from pipeline.recordings import plain_files, recording_folders
+from pipeline.recordings.formats import Raw
 from pipeline.recordings.inspection import inspect
 from pipeline.recordings.klipper_logs import fan_macros, load_klippy, printed_files
 from pipeline.recordings.printed_gcode import BLOCK, FAN, FEED, LEFT_OUT, NOT_RECORDED, companions, read_file
+from pipeline.recordings.resampling import resample
 from tests.recordings.printing_machine import Machine, gcode, slice_box
 
 
@@ -251,8 +254,8 @@ def test_what_is_left_out_is_counted(tmp_path):
     path.write_text("START_PRINT\nSET_VELOCITY_LIMIT ACCEL=1\nG1 E1\nG10\nG10\nM106 P2 S9\n")
     remark = read_file(path, np.array([path.stat().st_size]), {}).remark
     assert remark == (
-        "the feed and the fan leave out 2 firmware retractions (G10, G11), 1 commands for other fans (P), "
-        "filament that macros feed (START_PRINT); E was taken as absolute until the file's first M82 or M83"
+        "the feed and the fan leave out 2 firmware retractions (G10, G11), 1 commands for other fans "
+        "(M106 P), filament that macros feed (START_PRINT); E was taken as absolute until the file's first M82 or M83"
     )
 
 
@@ -320,6 +323,27 @@ def _record(folder):
 
     frame = pd.read_parquet(folder / "datasets/ingest/record.parquet")
     return {name: frame[name].to_numpy() for name in frame}
+
+
+def test_a_mean_over_a_sample_keeps_the_volume_of_a_flow():
+    time, flow = np.arange(7.0), np.array([0.0, 3.0, 0.0, 6.0, np.nan, 0.0, 9.0])
+    signals = {"feed": (time, flow), "y": (time, time)}
+    table = resample(
+        Raw("a", signals, {}, []), sample_time_s=2.0, inputs=["feed"], outputs=["y"], averaged=["feed"]
+    )
+    np.testing.assert_allclose(table.values["feed"], [1.5, 3.0, np.nan, 9.0])
+
+
+def test_a_log_whose_printed_file_is_still_being_copied_is_passed_over(tmp_path, monkeypatch):
+    log = write(tmp_path, MACHINE, {"a.gcode": CONTENT[:100], "b.csv": b"t,y\n0,1\n"})
+
+    def copy_on(seconds):
+        (tmp_path / "a.gcode").write_bytes(CONTENT)
+
+    monkeypatch.setattr(plain_files, "REST_S", 10.0)
+    monkeypatch.setattr(plain_files.time, "sleep", copy_on)
+    recordings, passed = recording_folders._recordings_below(tmp_path, [], waits=True)
+    assert [path.name for path in recordings] == ["b.csv"] and "still being written" in passed[log]
 
 
 def test_companions_are_files_of_gcode_and_histories_alone(tmp_path):
