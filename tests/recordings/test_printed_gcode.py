@@ -255,7 +255,8 @@ def test_what_is_left_out_is_counted(tmp_path):
     remark = read_file(path, np.array([path.stat().st_size]), {}).remark
     assert remark == (
         "the feed and the fan leave out 2 firmware retractions (G10, G11), 1 commands for other fans "
-        "(M106 P), filament that macros feed (START_PRINT); E was taken as absolute until the file's first M82 or M83"
+        "(M106 P), filament that macros feed (START_PRINT); "
+        "E was taken as absolute until the file's first M82 or M83"
     )
 
 
