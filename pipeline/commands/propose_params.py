@@ -16,7 +16,7 @@ import yaml
 from pipeline.recordings.formats import every, file_format
 from pipeline.recordings.inspection import CODE, Inspected, look
 from pipeline.recordings.klipper_logs import printed_files
-from pipeline.recordings.printed_gcode import NOT_RECORDED
+from pipeline.recordings.printed_gcode import NOT_RECORDED, UNITS
 from pipeline.recordings.proposals import (
     BELOW_CUT_OFF_DEGC,
     Proposal,
@@ -110,6 +110,9 @@ def proposed(paths: Sequence[Path], *, sample_time: str = "") -> Initialised:
         sources = {signal.source for signal in recording.signals}
         lacking = [signal.source for signal in proposal.signals if signal.source not in sources]
         if lacking:
+            reasons = [note.message for note in recording.notes if note.kind == NOT_RECORDED]
+            if reasons and lacking[0] in UNITS:
+                raise ValueError(f"{path}: {reasons[0]}; another of the recordings has them")
             raise ValueError(
                 f"{path}: there is no {lacking[0]}, which another of the recordings has; "
                 "give recordings of one machine"

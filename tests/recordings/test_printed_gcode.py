@@ -14,6 +14,7 @@ from pipeline.recordings.formats import Raw
 from pipeline.recordings.inspection import inspect
 from pipeline.recordings.klipper_logs import fan_macros, load_klippy, printed_files
 from pipeline.recordings.printed_gcode import BLOCK, FAN, FEED, LEFT_OUT, NOT_RECORDED, companions, read_file
+from pipeline.recordings.recordings import Source, read
 from pipeline.recordings.resampling import resample
 from tests.recordings.printing_machine import Machine, gcode, slice_box
 
@@ -280,6 +281,15 @@ def test_init_asks_for_the_printed_file(tmp_path):
     assert "put the file that was printed beside the log" in inspect(log)
     open_questions = propose_params.proposed([log]).open_questions
     assert any("put the file that was printed beside the log" in question for question in open_questions)
+
+
+def test_a_log_without_its_file_beside_one_that_has_it_is_refused_with_the_file(tmp_path, printed):
+    log, whole = write(tmp_path / "a", MACHINE, {}), write(tmp_path / "b", *printed)
+    with pytest.raises(ValueError, match=r"a/klippy.log: .*put the file that was printed beside the log"):
+        read(log, [Source("feed", FEED, "mm/s"), Source("y", "extruder.temp", "degC")])
+    assert len(read(log, [Source("y", "extruder.temp", "degC")]).signals) == 1
+    with pytest.raises(ValueError, match=rf"{len(CONTENT)} bytes, .*another of the recordings has them"):
+        propose_params.proposed([whole, log])
 
 
 def test_init_proposes_fan_and_feed_as_disturbances_and_ingest_writes_them(
