@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from pipeline.recordings.formats import every
+from pipeline.recordings.formats import every, file_format
 from pipeline.recordings.inspection import CODE, Inspected, look
+from pipeline.recordings.klipper_logs import printed_files
+from pipeline.recordings.printed_gcode import NOT_RECORDED, UNITS
 from pipeline.recordings.proposals import (
     BELOW_CUT_OFF_DEGC,
     Proposal,
@@ -108,16 +110,19 @@ def proposed(paths: Sequence[Path], *, sample_time: str = "") -> Initialised:
         sources = {signal.source for signal in recording.signals}
         lacking = [signal.source for signal in proposal.signals if signal.source not in sources]
         if lacking:
+            reasons = [note.message for note in recording.notes if note.kind == NOT_RECORDED]
+            if reasons and lacking[0] in UNITS:
+                raise ValueError(f"{path}: {reasons[0]}; another of the recordings has them")
             raise ValueError(
                 f"{path}: there is no {lacking[0]}, which another of the recordings has; "
                 "give recordings of one machine"
             )
     kind = recordings[0].kind
-    codes = [note.message for recording in recordings for note in recording.notes if note.kind == CODE]
+    remarks = [note.message for one in recordings for note in one.notes if note.kind in (CODE, NOT_RECORDED)]
     scale = _scale(paths, proposal, step_s=KLIPPER_STEP_S if kind in KLIPPER_KINDS else 0.0)
     return Initialised(
         _values(proposal, scale),
-        [*codes, *_open_questions(proposal, scale, kind, timed=not proposal.time or bool(sample_time))],
+        [*remarks, *_open_questions(proposal, scale, kind, timed=not proposal.time or bool(sample_time))],
     )
 
 
@@ -407,11 +412,12 @@ def _at(sections: dict, dotted: str) -> Any:
 
 
 def copy(paths: Sequence[Path], folder: Path = RAW) -> list[Path]:
-    """The recordings copied into `folder`; one that lies there already stays. Raises ValueError for another
-    file of the same name."""
+    """The recordings copied into `folder`, a klippy.log with the printed files that it was read with; one
+    that lies there already stays. Raises ValueError for another file of the same name."""
     folder.mkdir(parents=True, exist_ok=True)
     copied = []
-    for path in paths:
+    printed = [file for path in paths if file_format(path) == "klippy.log" for file in printed_files(path)]
+    for path in [*paths, *dict.fromkeys(printed)]:
         target = folder / path.name
         if target.resolve() == path.resolve():
             continue

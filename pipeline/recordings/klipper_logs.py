@@ -4,6 +4,7 @@ control in the configuration that the log repeats.
 A line is read as Klipper's own scripts/graphstats.py reads it: words behind "Stats"; a word without "=" is
 the device that the following target, temp and pwm are of; a line without print_time is left out. Times count
 from the computer's start. "Start printer at ... (system time, that count)" puts them on the calendar.
+Part fan and filament feed are those of the printed G-code beside the log (printed_gcode).
 """
 
 import re
@@ -14,7 +15,9 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from pipeline.recordings.formats import Note, WholeTable, check_values
+from pipeline.recordings import printed_gcode
+from pipeline.recordings.formats import CALENDAR_S, Note, WholeTable, check_values
+from pipeline.recordings.printed_gcode import Print, PrintRows, PrintSignals
 
 # Stats lines have some 1,500 characters; a longer line is no line of Klipper's
 LONGEST_LINE = 1 << 16
@@ -29,6 +32,12 @@ PID_BASE = 255.0
 _STATS = (b"Stats", b"INFO:root:Stats")
 LATEST_S = 4e9  # the year 2096: beyond it a system time is none, and no count runs on so long
 _START = re.compile(rb"Start printer at .*\((\d+(?:\.\d+)?) (\d+(?:\.\d+)?)\)")
+# what virtual_sdcard logs: it reads from a position on, the file is over, it stops at a position
+_PRINTING = re.compile(
+    rb"(Start|Exit)ing SD card print \(position (\d{1,15})\)|(Finished) SD card print|"
+    rb"File opened:(.{1,300}?) Size:(\d{1,15})"
+)
+LONGEST_BUFFER_S = 3600.0  # motion is not planned further ahead
 # key of a Stats line -> unit and factor
 _KEYS = {
     b"temp": ("temp", "degC", 1.0),
@@ -36,6 +45,10 @@ _KEYS = {
     b"pwm": ("pwm", "percent", 100.0),
     b"fan_speed": ("fan_speed", "percent", 100.0),
 }
+
+
+# keys of the motion queue and of the printed file
+_QUEUE = (b"print_time", b"buffer_time", b"sd_pos")
 
 
 class PrinterPid(NamedTuple):
@@ -73,15 +86,11 @@ class _Session(NamedTuple):
 def load_klippy(path: Path) -> WholeTable:
     """Temperature, target (°C), duty and fan speed (percent) of every device in the Stats lines.
 
-    Columns are "extruder.temp", "extruder.target", "extruder.pwm". Raises ValueError for a log without a
+    Columns are "extruder.temp", "extruder.target", "extruder.pwm"; and "part_fan.speed" (percent) and
+    "filament.feed" (mm/s) if the printed G-code lies beside the log. Raises ValueError for a log without a
     Stats line of a heater.
     """
-    log = _Log()
-    with path.open("rb") as stream:
-        for line, text in _lines(stream):
-            log.add(line, text)
-            if line % LINES_A_CHECK == 0:
-                check_values(path, len(log.times), len(log.columns))
+    log = _read(path)
     if not log.times or not log.columns:
         left_out = log.idle + log.garbled + log.cut
         what = "no Stats line"
@@ -96,21 +105,29 @@ def load_klippy(path: Path) -> WholeTable:
     heaters = heater_configs(log.config)
     time, order, notes = _on_calendar(np.frombuffer(log.times), log.sessions, values)
     lines = np.frombuffer(log.lines, np.int64)[order]
+    printed = _print_signals(path, log, time, order)
     limits = {}
     for heater in heaters:
         limits[f"{heater.heater}.temp"] = (heater.low_degC, heater.high_degC)
         limits[f"{heater.heater}.pwm"] = (0.0, heater.most_percent)
     return WholeTable(
-        {name: column[order] for name, column in values.items()},
-        {name: _KEYS[name.rpartition(".")[2].encode()][1] for name in values},
+        {name: column[order] for name, column in values.items()} | printed.values,
+        {name: _KEYS[name.rpartition(".")[2].encode()][1] for name in values} | printed_gcode.UNITS,
         time,
         "UTC" if time.dtype == np.int64 else "",
         lambda i: f"line {lines[i]}",
-        [*log.notes(), *notes, *map(_control_note, heaters)],
+        [*log.notes(), *notes, *printed.notes, *map(_control_note, heaters)],
         {name: limits[name] for name in values if name in limits},
         {},
         {},
     )
+
+
+def printed_files(path: Path) -> list[Path]:
+    """The G-code files and histories beside a klippy.log that its fan and feed are from."""
+    log = _read(path)
+    time, order, _ = _on_calendar(np.frombuffer(log.times), log.sessions, {})
+    return _print_signals(path, log, time, order).files if log.times else []
 
 
 def printer_heaters(path: Path) -> list[HeaterConfig]:
@@ -120,6 +137,16 @@ def printer_heaters(path: Path) -> list[HeaterConfig]:
         for line, text in _lines(stream):
             log.add_config(line, text)
     return heater_configs(log.config)
+
+
+def _read(path: Path) -> "_Log":
+    log = _Log()
+    with path.open("rb") as stream:
+        for line, text in _lines(stream):
+            log.add(line, text)
+            if line % LINES_A_CHECK == 0:
+                check_values(path, len(log.times), len(log.columns))
+    return log
 
 
 # ---- lines
@@ -151,7 +178,11 @@ class _Log:
         self.in_config = False
         self.idle = self.garbled = self.cut = 0
         self.first_garbled = self.first_undated = 0
-        self.keys: dict[bytes, tuple[str, float]] = {}
+        self.prints: list[Print] = []
+        self.is_printing, self.is_over, self.position, self.opened = False, False, -1, ("", -1)
+        # of each row: buffer_time, position in the printed file, index of the print, whether it is being read
+        self.buffers, self.positions = array("d"), array("q")
+        self.print_index, self.reads = array("q"), array("b")
 
     def add(self, line: int, text: bytes) -> None:
         if _is_stats(text):
@@ -161,6 +192,9 @@ class _Log:
             if not 0 <= zero_s < LATEST_S:
                 self.first_undated, zero_s = self.first_undated or line, np.nan
             self.sessions.append(_Session(len(self.times), zero_s))
+            self.is_printing, self.position = False, -1
+        elif event := _PRINTING.search(text):
+            self._add_print_event(line, event)
         else:
             self.add_config(line, text)
 
@@ -174,6 +208,40 @@ class _Log:
         elif self.in_config:
             self.config.append(text.decode("utf-8", errors="replace"))
 
+    def _add_print_event(self, line: int, event: re.Match[bytes]) -> None:
+        what, position, finished, name, size = event.groups()
+        if name:
+            self.opened = name.decode("utf-8", errors="replace").strip(), int(size)
+        elif finished:
+            self.is_over = True  # the position follows
+        elif what == b"Start":
+            # a print that goes on after a pause starts at the position where it stopped
+            if not (self.is_printing and int(position) == self.position and self.prints[-1].end < 0):
+                self._start_print(line, int(position))
+            self.position = int(position)
+        elif what and self.is_printing:
+            self.position = int(position)
+            if self.is_over:
+                self.prints[-1] = self.prints[-1]._replace(end=self.position)
+
+    def _start_print(self, line: int, position: int) -> None:
+        self.prints.append(Print(position, -1, *self.opened, line))
+        self.is_printing, self.is_over, self.opened = True, False, ("", -1)
+
+    def _add_position(self, line: int, queue: dict[bytes, float]) -> None:
+        """Where Klipper is in the printed file. A position that falls, or comes without a start, is of
+        another print."""
+        position, buffer_s = queue.get(b"sd_pos", -1.0), queue.get(b"buffer_time", 0.0)
+        reads = 0 <= position < 1e15
+        if reads:
+            if not self.is_printing or position < self.position:
+                self._start_print(line, int(position))
+            self.position = int(position)
+        self.buffers.append(buffer_s if 0 <= buffer_s < LONGEST_BUFFER_S else 0.0)
+        self.positions.append(self.position)
+        self.print_index.append(len(self.prints) - 1 if self.is_printing else -1)
+        self.reads.append(reads)
+
     def _add_stats(self, line: int, text: bytes) -> None:
         words = text.split()
         at = next((i for i, word in enumerate(words) if word in _STATS), None)
@@ -186,11 +254,11 @@ class _Log:
             return
         try:
             time = float(words[at + 1][:-1])
-            row, has_print_time = self._row(words[at + 2 :])
+            row, queue = self._row(words[at + 2 :])
         except ValueError:
             self._count_garbled(line)
             return
-        if not np.isfinite(time) or not has_print_time:
+        if not np.isfinite(time) or b"print_time" not in queue:
             self.idle += 1
             return
         if not 0 <= time < LATEST_S:
@@ -199,6 +267,7 @@ class _Log:
         # a count that falls without a start is another run, pasted behind
         if self.times and time < self.times[-1] and self.sessions[-1].first < len(self.times):
             self.sessions.append(_Session(len(self.times), np.nan))
+            self.is_printing, self.position = False, -1
         count = len(self.times)
         for name in row:
             if name not in self.columns and len(self.columns) < MOST_DEVICES * len(_KEYS):
@@ -207,11 +276,12 @@ class _Log:
             column.append(row.get(name, np.nan))
         self.times.append(time)
         self.lines.append(line)
+        self._add_position(line, queue)
 
-    def _row(self, words: list[bytes]) -> tuple[dict[str, float], bool]:
-        """The numbers of the devices, and whether the line has a print_time. Raises ValueError for text in
-        place of a number."""
-        device, row, has_print_time = b"", {}, False
+    def _row(self, words: list[bytes]) -> tuple[dict[str, float], dict[bytes, float]]:
+        """The numbers of the devices, and those of the motion queue. Raises ValueError for text in place of a
+        number."""
+        device, row, queue = b"", {}, {}
         for word in words:
             key, mark, value = word.partition(b"=")
             if not mark:
@@ -219,9 +289,9 @@ class _Log:
             elif key in _KEYS and device.endswith(b":"):
                 name, _, scale = _KEYS[key]
                 row[f"{device[:-1].decode('utf-8', errors='replace')}.{name}"] = float(value) * scale
-            elif key == b"print_time":
-                has_print_time = True
-        return row, has_print_time
+            elif key in _QUEUE:
+                queue[key] = float(value)
+        return row, queue
 
     def _count_garbled(self, line: int) -> None:
         self.first_garbled = self.first_garbled or line
@@ -344,6 +414,37 @@ def _without_repeats(rows: np.ndarray, times: np.ndarray, values: dict[str, np.n
         message = f"{count} Stats lines have the time of another with other values and were left out"
         notes.append(Note("repeated", "", count, message))
     return rows[~close], times[~close]
+
+
+# ---- the print
+
+
+def _print_signals(path: Path, log: _Log, time: np.ndarray, order: np.ndarray) -> PrintSignals:
+    """Part fan and feed at the rows in the order of time."""
+    on_calendar = time.dtype == np.int64
+    start_s = float(time[0] / 1e9 if on_calendar else time[0])
+    rows = PrintRows(
+        (time - time[0]) / 1e9 if on_calendar else time - time[0],
+        np.frombuffer(log.buffers)[order],
+        np.frombuffer(log.positions, np.int64)[order],
+        np.frombuffer(log.print_index, np.int64)[order],
+        np.frombuffer(log.reads, np.int8)[order] != 0,
+    )
+    start_s = start_s if start_s > CALENDAR_S else np.nan
+    return printed_gcode.print_signals(path, rows, log.prints, start_s, fan_macros(log.config))
+
+
+def fan_macros(lines: list[str]) -> dict[str, float]:
+    """{name: percent} of the macros of a configuration that set the part fan to a number, by their last
+    command for it."""
+    macros, name = {}, ""
+    for line in lines:
+        if section := re.match(r"\s*\[(?:gcode_macro\s+(\w+)|[^\]]*)\s*\]", line):
+            name = (section[1] or "").upper()
+        elif name and (command := re.match(r"\s*(M10[67])(?![\d.])([^;{]*)$", line, re.IGNORECASE)):
+            off = command[1].upper() == "M107"
+            macros[name] = 0.0 if off else printed_gcode.fan_percent(command[2].encode())
+    return macros
 
 
 # ---- the printer's own control

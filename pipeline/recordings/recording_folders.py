@@ -12,7 +12,7 @@ from typing import NamedTuple
 import joblib
 import numpy as np
 
-from pipeline.recordings import excluded, plain_files
+from pipeline.recordings import excluded, plain_files, printed_gcode
 from pipeline.recordings.formats import file_format, is_bag
 from pipeline.recordings.isolated import Budget, isolated
 from pipeline.recordings.klipper_logs import printer_heaters
@@ -95,7 +95,11 @@ def read_folder(
     code = "".join(artifacts.sha256(path) for pattern in READING for path in sorted(CODE.glob(pattern)))
     hashes = [artifacts.sha256(path) for path in files]
     names = [_utf8(path.relative_to(folder).as_posix()) for path in files]
-    keys = [joblib.hash((content, name, wish, code)) for content, name in zip(hashes, names, strict=True)]
+    printed = _printed_beside(files)
+    keys = [
+        joblib.hash((content, name, wish, code, *printed[path]))
+        for path, content, name in zip(files, hashes, names, strict=True)
+    ]
     left_out = _copies(files, hashes) | _without_text(files)
     remembered = [
         None if path in left_out else _remembered(memo, key, wish)
@@ -119,6 +123,32 @@ def read_folder(
     ]
 
 
+def _growing(files: Sequence[Path]) -> list[Path]:
+    """The recordings that change, or whose printed files do."""
+    beside = {path: printed_gcode.companions(path) if _is_klippy(path) else [] for path in files}
+    watched = dict.fromkeys([*files, *(other for others in beside.values() for other in others)])
+    changing = set(plain_files.wait_until_still(list(watched)))
+    return [path for path in files if changing.intersection([path, *beside[path]])]
+
+
+def _printed_beside(files: Sequence[Path]) -> dict[Path, list[tuple[str, str]]]:
+    """(name, hash) of each G-code file and history beside a klippy.log, which its fan and feed are from; none
+    for another recording."""
+    beside: dict[Path, list[tuple[str, str]]] = {}
+    for path in files:
+        if path.parent not in beside and _is_klippy(path):
+            companions = printed_gcode.companions(path)
+            beside[path.parent] = [(str(other), artifacts.sha256(other)) for other in companions]
+    return {path: beside.get(path.parent, []) if _is_klippy(path) else [] for path in files}
+
+
+def _is_klippy(path: Path) -> bool:
+    try:
+        return file_format(path) == "klippy.log"
+    except ValueError:
+        return False
+
+
 def _recordings_below(
     folder: Path, ignored: Collection[str], *, waits: bool
 ) -> tuple[list[Path], dict[Path, str]]:
@@ -132,12 +162,14 @@ def _recordings_below(
         and not path.name.startswith(".")
         and path.suffix.lower() not in {".md", ".yaml", ".dvc"}
         and path.name not in ignored
+        and path.suffix.lower() not in printed_gcode.SUFFIXES
+        and not printed_gcode.is_history(path)
         and path.name.lower() not in {"readme.txt", "license.txt", "source.txt", "notes.txt"}
     )
     files = excluded.readable(files, folder)
     passed = {path: f"{path} {_PARTIAL}" for path in files if plain_files.is_partial(path.name)}
     files = [path for path in files if path not in passed]
-    growing = plain_files.wait_until_still(files) if waits else []
+    growing = _growing(files) if waits else []
     passed |= {path: f"{path} {_GROWING}" for path in growing}
     return [path for path in files if path not in passed], passed
 
@@ -212,6 +244,7 @@ def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, m
             inputs=list(wish.held),
             outputs=[name for name in units if name not in wish.held],
             max_gap_s=wish.max_gap_s,
+            averaged=[source.signal for source in wish.sources if source.source in printed_gcode.UNITS],
         )
         table = flag(table, units=units, limits=wish.limits)
         table = table._replace(flags=[*table.flags, *_cut_rows(raw)])

@@ -24,6 +24,7 @@ from pipeline.recordings.formats import (
     Raw,
     Source,
     Table,
+    WholeTable,
     file_format,
     nearest_names,
     select,
@@ -32,6 +33,7 @@ from pipeline.recordings.inspection import inspect
 from pipeline.recordings.mcap_files import check_magic, mcap_columns, read_bag
 from pipeline.recordings.other_formats import LOADERS
 from pipeline.recordings.parquet_files import read_parquet
+from pipeline.recordings.printed_gcode import NOT_RECORDED, UNITS
 from pipeline.recordings.quality import CELSIUS, flag
 from pipeline.recordings.resampling import resample
 
@@ -118,13 +120,22 @@ def _file_columns(
     if kind == "csv":
         columns, notes = read_groups(path, names, time, decimal)
     elif kind in LOADERS:
-        table, notes = select(path, LOADERS[kind](path), names, time)
+        whole = LOADERS[kind](path)
+        _check_printed(path, whole, names)
+        table, notes = select(path, whole, names, time)
         columns = [table]
     else:
         table, notes = read_parquet(path, names, time)
         columns = [table]
     places = {name: (table.name, name) for table in columns for name in table.values}
     return columns, places, {table.name: len(table.time) for table in columns}, notes
+
+
+def _check_printed(path: Path, table: WholeTable, names: Sequence[str]) -> None:
+    """Raises ValueError with the file that is missing if the fan or the feed is wanted without it."""
+    reason = next((note.message for note in table.notes if note.kind == NOT_RECORDED), "")
+    if reason and any(name in UNITS and name not in table.values for name in names):
+        raise ValueError(f"{path}: {reason}")
 
 
 def _check_sources(path: Path, sources: Sequence[Source]) -> None:

@@ -1,7 +1,7 @@
 """Signals on their own clocks -> one table on one sample time. Inputs are held, outputs interpolated between
 near neighbours; a gap begins a new segment."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -57,11 +57,14 @@ def resample(
     inputs: Sequence[str],
     outputs: Sequence[str],
     max_gap_s: float | None = None,
+    averaged: Collection[str] = (),
 ) -> Table:
     """The table of a recording on the grid t_k = t_0 + k T of each segment.
 
     Inputs: u_k is the last command at or before t_k. Outputs: y_k is the sample at t_k if there is one
     (within T / 100: the record's own numbers, unaltered), else the straight line between its neighbours.
+    Inputs that are `averaged`: u_k is the mean of the held commands from t_k to t_k + T, so that a flow that
+    changes faster keeps its volume.
 
     A gap is an interval longer than `max_gap_s` (default: three sample times or three median intervals,
     whichever is longer) on any clock. Nothing is interpolated or held across a gap, and a new segment begins
@@ -93,13 +96,14 @@ def resample(
     following = _once_a_clock(clocks, inputs, lambda own: _next(own, time, segment, sample_time_s))
     values = {name: raw.signals[name][1][held[name]] for name in inputs}
     values |= {name: _interpolated(*raw.signals[name], time, near[name]) for name in outputs}
+    values |= {name: _means(*raw.signals[name], time, sample_time_s) for name in inputs if name in averaged}
     masked = {name: ~np.isfinite(column) for name, column in values.items()}
     flags = _gap_flags(clocks) + _jitter_flags(clocks) + _trim_flags(raw, clocks, pieces, grids)
     jitter = _jitter(clocks)
     for name in outputs:
         flags += _filled_flags(name, near[name], time, sample_time_s, masked[name])
         flags += _rate_flags(name, raw.signals[name][0], jitter[name].interval_s, sample_time_s)
-    for name in inputs:
+    for name in (name for name in inputs if name not in averaged):
         flags += _step_flags(name, *raw.signals[name], following[name], sample_time_s)
     for name in [*inputs, *outputs]:
         flags += _missing_flags(name, masked[name], time)
@@ -243,6 +247,18 @@ def _held(time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndar
     command."""
     last = np.searchsorted(time_s, grid + ON_GRID * sample_time_s, side="right") - 1
     return _in_one(np.maximum(last, 0))
+
+
+def _means(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndarray:
+    """(F(t_k + T) - F(t_k)) / T, F the integral of the held commands; NaN if one of them is missing."""
+    ends = np.r_[time_s, max(time_s[-1], grid[-1]) + sample_time_s]
+    missing = ~np.isfinite(values)
+    areas = [np.r_[0.0, np.cumsum(v * np.diff(ends))] for v in (np.where(missing, 0.0, values), missing)]
+    mean, share = (
+        (np.interp(grid + sample_time_s, ends, area) - np.interp(grid, ends, area)) / sample_time_s
+        for area in areas
+    )
+    return np.where(share > ON_GRID, np.nan, mean)
 
 
 def _near(time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> _Near:
