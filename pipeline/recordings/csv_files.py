@@ -23,7 +23,6 @@ from pipeline.recordings.formats import (
     CONTROL,
     FileColumn,
     FileColumns,
-    Growing,
     Note,
     clock_seconds,
     column_place,
@@ -78,6 +77,31 @@ _PAGES = {
         re.compile(rb"[\x81-\xa0\xc9-\xfe].|.[\x41-\x7a]"),
     ),
 }
+
+
+class Growing:
+    """Columns (n,) that grow in place as parts of a file come in. (Joining the parts at the end would need
+    twice the memory.)"""
+
+    def __init__(self, kinds: Sequence[type], expected: int = 0):
+        self.count = 0
+        self._columns = [np.empty(max(expected, 1), kind) for kind in kinds]
+
+    def append(self, *parts: np.ndarray) -> None:
+        end = self.count + len(parts[0])
+        if end > len(self._columns[0]):
+            self._resize(end + end // 4)
+        for column, part in zip(self._columns, parts, strict=True):
+            column[self.count : end] = part
+        self.count = end
+
+    def _resize(self, size: int) -> None:
+        for column in self._columns:
+            column.resize(size, refcheck=False)
+
+    def finished(self) -> list[np.ndarray]:
+        self._resize(self.count)
+        return self._columns
 
 
 class Clock(NamedTuple):
@@ -628,7 +652,7 @@ def read_plain(
     if dates in places:
         return None
     read = list(dict.fromkeys([*places, *([] if clock is None else [clock.place])]))
-    parts = Growing([np.int64 if place == dates else float for place in read])
+    parts: Growing | None = None
     broken: list[pa.csv.InvalidRow] = []
     try:
         for batch in _batches(path, layout, read, dates, broken):
@@ -642,23 +666,19 @@ def read_plain(
             ]
             if clock is None and np.isnan(columns).all(axis=0).any():
                 return None  # a blank row is no sample
-            if not parts.count:
-                _expect(parts, path, len(batch))
+            if parts is None:
+                # as many rows as the first block promises, so that growing moves nothing
+                expected = int(len(batch) * max(1.0, 1.02 * path.stat().st_size / BLOCK_BYTES)) + 1
+                parts = Growing([column.dtype.type for column in columns], min(expected, MOST_EXPECTED))
             parts.append(*columns)
         last = _last_line(path, layout, broken[0]) if broken else None
     except (_NotPlain, pa.ArrowException, UnicodeError):
         return None
-    if not parts.count:
+    if parts is None:
         return None
     finished = dict(zip(read, parts.finished(), strict=True))
     time = np.empty(0) if clock is None else finished[clock.place]
     return [finished[place] for place in places], time, last
-
-
-def _expect(parts: Growing, path: Path, in_block: int) -> None:
-    """Room for as many rows as the first block lets expect."""
-    expected = int(in_block * max(1.0, 1.02 * path.stat().st_size / BLOCK_BYTES)) + 1
-    parts.expect(min(expected, MOST_EXPECTED))
 
 
 def _batches(
@@ -1049,8 +1069,7 @@ def _read_one_clock(
         times, zone = clock_seconds(path, column.name, written, unit, notes, is_declared=bool(time)), "UTC"
     else:
         times, zone = written, column.zone or ""
-    columns_forward, turned = forward(FileColumns("rows", times, values, place, zone, units))
-    return columns_forward, notes + turned
+    return forward(FileColumns("rows", times, values, place, zone, units), notes), notes
 
 
 def _rows_one_by_one(

@@ -4,21 +4,20 @@ The words give its format, its clocks with rate, jitter and gaps, its signals wi
 """
 
 import collections
+import contextlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.recordings.clocks import Mended, mended_topics
+from pipeline.recordings.clocks import check_clock, repair_topics
 from pipeline.recordings.csv_files import csv_columns, csv_layout, read_csv
 from pipeline.recordings.formats import (
     FileColumn,
     FileColumns,
     Note,
-    check_clock,
     file_format,
-    intervals,
     is_time_name,
     select,
     time_column,
@@ -37,7 +36,7 @@ from pipeline.recordings.proposals import (
     yaml_lines,
 )
 from pipeline.recordings.quality import quantisation_step
-from pipeline.recordings.resampling import GAP_INTERVALS
+from pipeline.recordings.resampling import GAP_INTERVALS, intervals
 
 # numbers of a topic, and columns of a table, that are described; the others are counted
 MOST_FIELDS, MOST_SIGNALS = 64, 128
@@ -72,12 +71,11 @@ def inspect(path: str | Path) -> str:
     path = Path(path)
     looked = look(path)
     lines, groups = list(looked.lines), [group for group, _ in looked.groups]
-    try:
-        parts = mended_topics(path, groups, one_clock=True) if groups else []
-    except ValueError:
-        parts = [Mended(group, np.empty(0, int), []) for group in groups]
-    looked.notes.extend(note for part in parts for note in part.notes)
-    for group in (part.columns for part in parts):
+    with contextlib.suppress(ValueError):
+        repaired = repair_topics(path, groups, one_clock=True) if groups else []
+        groups = [group for group, _, _ in repaired]
+        looked.notes.extend(note for _, _, notes in repaired for note in notes)
+    for group in groups:
         lines += ["", *_clock(path, group)]
         lines += [f"  {name:<32} {_range(values)}" for name, values in group.values.items()]
     lines += ["", "Findings:" if looked.notes else "Findings: none"]
@@ -265,7 +263,7 @@ def _clock(path: Path, group: FileColumns) -> list[str]:
         return [f"{group.name}: {count} samples", f"  {error}"]
     if count < 2:
         return [f"{group.name}: {count} sample"]
-    time = (group.time - group.time[0]) / (1e9 if group.time.dtype == np.int64 else 1.0)
+    time = (group.time - group.time[0]) / group.second
     steps = np.diff(time)
     limit = GAP_INTERVALS * float(np.median(steps))
     jitter = intervals(time, limit)

@@ -8,11 +8,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from pipeline.recordings.csv_files import check_one_signal, naming_columns, numbers
+from pipeline.recordings.csv_files import Growing, check_one_signal, naming_columns, numbers
 from pipeline.recordings.formats import (
     FileColumn,
     FileColumns,
-    Growing,
     Note,
     clock_seconds,
     column_places,
@@ -136,18 +135,11 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[FileColu
     notes: list[Note] = []
     zoned = clock and kinds[clock] is np.int64 and getattr(types[clock], "tz", None)
     zone = "UTC" if zoned or not clock or kinds[clock] is float else ""
-    if interval:
-        clock_values = np.arange(count) * interval
-    elif _is_numeric(types[clock]) and kinds[clock] is float:
-        clock_values = clock_seconds(path, clock, values[clock], units[clock], notes, is_declared=bool(time))
-    else:
-        clock_values = values[clock]
-    table_columns, turned = forward(
-        FileColumns(
-            "rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone, units
-        )
-    )
-    return table_columns, notes + turned
+    times = np.arange(count) * interval if interval else values[clock]
+    if clock and _is_numeric(types[clock]):
+        times = clock_seconds(path, clock, times, units[clock], notes, is_declared=bool(time))
+    signals = {name: values[name] for name in wanted}
+    return forward(FileColumns("rows", times, signals, lambda i: f"row {i}", zone, units), notes), notes
 
 
 def _check_one_signal(

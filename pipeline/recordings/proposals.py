@@ -668,6 +668,6 @@ def _sample_time(groups: Sequence[tuple[FileColumns, str]]) -> float:
     medians = []
     for group, _ in groups:
         if len(group.time) > 1:
-            steps = np.diff(group.time[:CLOCK_SAMPLES]) / (1e9 if group.time.dtype == np.int64 else 1.0)
+            steps = np.diff(group.time[:CLOCK_SAMPLES]) / group.second
             medians.append(float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0)
     return float(f"{max(medians, default=1.0):.2g}")
