@@ -287,20 +287,21 @@ def check_clock(path: Path, group: FileColumns) -> None:
 
 def _remedy(group: FileColumns, steps_s: np.ndarray, back: np.ndarray) -> str:
     """The remedy for a clock that stands still or runs backwards, by the way it does."""
-    if steps_s[back[0]] == 0:
-        return "name a finer clock, or give each device or tag that writes here a column of its own"
-    if len(back) > 0.9 * len(steps_s):
-        return "sort the rows by time, from the oldest on"
-    if len(back) >= 3 and len(steps_s) <= OTHER_DEVICE_RUN * (len(back) + 1):
-        return (
+    step = steps_s[back[0]]
+    remedies = (
+        (step == 0, "name a finer clock, or give each device or tag that writes here a column of its own"),
+        (len(back) > 0.9 * len(steps_s), "sort the rows by time, from the oldest on"),
+        (
+            len(back) >= 3 and len(steps_s) <= OTHER_DEVICE_RUN * (len(back) + 1),
             "two devices with clocks of their own seem to write under one name: "
-            "record each under a name of its own"
-        )
-    if len(back) == 1 and abs(steps_s[back[0]] + 3600) <= 3 * np.median(np.abs(steps_s)):
-        return (
+            "record each under a name of its own",
+        ),
+        (
+            len(back) == 1 and abs(step + 3600) <= 3 * np.median(np.abs(steps_s)),
             "an hour is what the end of summer time takes away: write the times with their zone or in UTC, "
-            "or split the recording there"
-        )
-    if group.name == "rows":
-        return "split the recording where its clock was set back"
-    return "sort it with: mcap sort, or split it where its clock was set back"
+            "or split the recording there",
+        ),
+        (group.name == "rows", "split the recording where its clock was set back"),
+        (True, "sort it with: mcap sort, or split it where its clock was set back"),
+    )
+    return next(remedy for holds, remedy in remedies if holds)

@@ -31,7 +31,7 @@ from pipeline.recordings.proposals import (
     RecordedSignal,
     has_bare_field,
     propose,
-    sampled,
+    sample,
     telling,
     yaml_lines,
 )
@@ -310,7 +310,7 @@ def _range(values: np.ndarray) -> str:
     low, high = numbers.min(), numbers.max()
     if low == high:
         return f"constant {low:g}{missing}"
-    ordered = np.sort(sampled(numbers))
+    ordered = np.sort(sample(numbers))
     levels = 1 + np.count_nonzero(ordered[1:] != ordered[:-1])
     step = quantisation_step(ordered) if 12 < levels <= len(ordered) / 3 else 0.0
     if levels <= 12 and len(ordered) < len(numbers):

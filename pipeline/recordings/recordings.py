@@ -146,18 +146,6 @@ def _check_sources(path: Path, sources: Sequence[Source]) -> None:
             )
 
 
-def _check_fahrenheit(path: Path, source: Source, unit: str) -> None:
-    """Raises ValueError for a column in °F, as its unit or its name says, that the mapping takes as °C."""
-    written = unit.strip(" ()[]").casefold()
-    is_fahrenheit = written in FAHRENHEIT if written else bool(_NAMES_FAHRENHEIT.search(source.source))
-    is_converted = abs(source.scale * 9 / 5 - 1) < 0.01
-    if is_fahrenheit and source.unit.casefold() in CELSIUS and not is_converted:
-        raise ValueError(
-            f"{path}: {source.source} is in °F but the mapping takes it as {source.unit} with scale "
-            f"{source.scale:g}; set scale: 0.555556 and offset: -17.7778"
-        )
-
-
 def _clocks(columns: Sequence[FileColumns], notes: list[Note]) -> dict[str, np.ndarray]:
     """{topic: time_s (n,)}, all counted from one instant."""
     first = min(group.time[0] for group in columns)
@@ -176,8 +164,16 @@ def _signal(
     path: Path, source: Source, time: np.ndarray, group: FileColumns, recorded: np.ndarray, notes: list[Note]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Time and values in the signal's unit. A signal that has a value in less than half of the rows, spread
-    among them, has its own clock: those rows."""
-    _check_fahrenheit(path, source, group.units.get(source.source, ""))
+    among them, has its own clock: those rows. Raises ValueError for a column without any number, and for one
+    in °F, as its unit or its name says, that the mapping takes as °C."""
+    written = group.units.get(source.source, "").strip(" ()[]").casefold()
+    is_fahrenheit = written in FAHRENHEIT if written else bool(_NAMES_FAHRENHEIT.search(source.source))
+    is_converted = abs(source.scale * 9 / 5 - 1) < 0.01
+    if is_fahrenheit and source.unit.casefold() in CELSIUS and not is_converted:
+        raise ValueError(
+            f"{path}: {source.source} is in °F but the mapping takes it as {source.unit} with scale "
+            f"{source.scale:g}; set scale: 0.555556 and offset: -17.7778"
+        )
     present = np.isfinite(recorded)
     if not present.any():
         raise ValueError(

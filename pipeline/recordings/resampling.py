@@ -100,30 +100,35 @@ def resample(
 def _check(
     raw: Raw, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None
 ) -> None:
-    for name in [*inputs, *outputs]:
-        if name not in raw.signals:
-            raise ValueError(
-                f"{raw.path}: signal {name} is wanted but the mapping gives {', '.join(raw.signals)}; "
-                "map it to a column or topic"
+    gap_s = sample_time_s if max_gap_s is None else max_gap_s
+    counts = {name: len(raw.signals[name][0]) for name in outputs if name in raw.signals}
+    faults = [
+        *(
+            (
+                name not in raw.signals,
+                f"signal {name} is wanted but the mapping gives {', '.join(raw.signals)}; "
+                "map it to a column or topic",
             )
-    if not outputs:
-        raise ValueError(f"{raw.path}: no output is wanted; name at least one measured signal")
-    if not 0 < sample_time_s < np.inf:
-        raise ValueError(
-            f"{raw.path}: the sample time should be more than 0 s but is {sample_time_s:g}; "
-            "set it to about the recording's interval"
-        )
-    if max_gap_s is not None and not max_gap_s >= sample_time_s:
-        raise ValueError(
-            f"{raw.path}: the gap limit {max_gap_s:g} s should be at least the sample time "
-            f"{sample_time_s:g} s; raise it"
-        )
-    for name in outputs:
-        if len(raw.signals[name][0]) < 2:
-            raise ValueError(
-                f"{raw.path}: output {name} should have at least two samples but has "
-                f"{len(raw.signals[name][0])}; record longer"
-            )
+            for name in [*inputs, *outputs]
+        ),
+        (not outputs, "no output is wanted; name at least one measured signal"),
+        (
+            not 0 < sample_time_s < np.inf,
+            f"the sample time should be more than 0 s but is {sample_time_s:g}; "
+            "set it to about the recording's interval",
+        ),
+        (
+            not gap_s >= sample_time_s,
+            f"the gap limit {gap_s:g} s should be at least the sample time {sample_time_s:g} s; raise it",
+        ),
+        *(
+            (count < 2, f"output {name} should have at least two samples but has {count}; record longer")
+            for name, count in counts.items()
+        ),
+    ]
+    for is_fault, sentence in faults:
+        if is_fault:
+            raise ValueError(f"{raw.path}: {sentence}")
 
 
 # ---- clocks, gaps and the time in common
