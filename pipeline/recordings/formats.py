@@ -532,7 +532,7 @@ class WholeTable(NamedTuple):
 
     `time` is the file's own clock, time_s (n,) or time_ns (n,) on a calendar, None where a column holds it.
     `limits` are the lowest and highest value that the machine's own settings allow, by column.
-    `others` are the columns that are no numbers, with what they hold.
+    `texts` are the columns that are no numbers, with what they hold.
     """
 
     values: dict[str, np.ndarray]
@@ -542,7 +542,7 @@ class WholeTable(NamedTuple):
     place: Callable[[int], str]
     notes: list[Note]
     limits: dict[str, tuple[float, float]]
-    others: dict[str, str]
+    texts: dict[str, str]
     stamps: dict[str, np.ndarray]
 
     def columns(self) -> list[FileColumn]:
@@ -550,7 +550,7 @@ class WholeTable(NamedTuple):
         return [
             *(FileColumn(name, "number", self.units.get(name, "")) for name in self.values),
             *(FileColumn(name, "time", "") for name in self.stamps),
-            *(FileColumn(name, kind, "") for name, kind in self.others.items()),
+            *(FileColumn(name, kind, "") for name, kind in self.texts.items()),
         ]
 
 
@@ -564,7 +564,7 @@ def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> t
     for name in wanted:
         if name not in table.values:
             raise ValueError(
-                f"{path}: column {name} should hold numbers but holds {table.others.get(name, 'times')}; "
+                f"{path}: column {name} should hold numbers but holds {table.texts.get(name, 'times')}; "
                 "write numbers, or map another column"
             )
     count = len(next(iter(table.values.values()), ()))
@@ -598,7 +598,7 @@ def _clock(
         return table.stamps[name], ""
     if name not in table.values:
         raise ValueError(
-            f"{path}: time {name} should be seconds or a date but holds {table.others[name]}; convert it, "
+            f"{path}: time {name} should be seconds or a date but holds {table.texts[name]}; convert it, "
             "or name another column"
         )
     unit = table.units.get(name, "")

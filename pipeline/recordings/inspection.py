@@ -5,6 +5,7 @@ The words give its format, its clocks with rate, jitter and gaps, its signals wi
 
 import collections
 import contextlib
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -96,20 +97,27 @@ def look(path: Path) -> Inspected:
     elif kind in LOADERS:
         table = LOADERS[kind](path)
         limits = table.limits
+        read = functools.partial(select, path, table)
+        lines, groups, units, notes = _table(path, table.columns(), table.time is not None, read)
+    elif kind == "csv":
+        layout = csv_layout(path)
         lines, groups, units, notes = _table(
-            path,
-            table.columns(),
-            table.time is not None,
-            lambda names, time: select(path, table, names, time),
+            path, csv_columns(path), False, functools.partial(read_csv, path)
+        )
+        lines.insert(
+            0,
+            f"{layout.encoding}, delimiter {layout.delimiter!r}, decimal mark {layout.decimal!r}, "
+            f"data from line {layout.skip + 1}",
         )
     else:
-        lines, groups, units, notes = _file(path, kind)
+        read = functools.partial(read_parquet, path)
+        lines, groups, units, notes = _table(path, parquet_columns(path), False, read)
     signals = []
     for group, prefix in groups:
         for name, values in group.values.items():
             numbers = finite(values)
             for code in missing_codes(numbers):
-                notes.append(_code_note(prefix + name, code, finite(values)))
+                notes.append(_code_note(prefix + name, code, values))
                 numbers = numbers[numbers != code]
             signals.append(RecordedSignal(prefix + name, units.get(name, ""), numbers, limits.get(name)))
     time = "every 1.0 s" if any(note.message == _NO_TIME for note in notes) else ""
@@ -119,33 +127,18 @@ def look(path: Path) -> Inspected:
 # ---- formats
 
 
-def _file(path: Path, kind: str) -> _Content:
-    """Words, columns, units and notes of a CSV or Parquet file."""
-    columns = csv_columns(path) if kind == "csv" else parquet_columns(path)
-    reader: Callable = read_csv if kind == "csv" else read_parquet
-    lines, groups, units, notes = _table(path, columns, False, lambda names, time: reader(path, names, time))
-    if kind == "csv":
-        layout = csv_layout(path)
-        first = (
-            f"{layout.encoding}, delimiter {layout.delimiter!r}, decimal mark {layout.decimal!r}, "
-            f"data from line {layout.skip + 1}"
-        )
-        lines.insert(0, first)
-    return lines, groups, units, notes
-
-
 def _table(path: Path, columns: Sequence[FileColumn], has_clock: bool, read: _Read) -> _Content:
     """Words, columns, units and notes of a table, which `read` reads; `has_clock`: a clock of its own."""
     names = [column.name for column in columns]
     numeric = [column.name for column in columns if column.type == "number" and column.name]
     numbers = set(numeric)
-    others = [
+    texts = [
         f"{column.name or '(no name)'} ({column.type})" for column in columns if column.name not in numbers
     ]
     counts = collections.Counter(names)
     twice = [f"{name} ({count} times)" for name, count in counts.items() if name and count > 1]
     lines = [f"{len(columns)} columns, {len(numeric)} of them numbers"]
-    lines += [f"not numbers: {', '.join(others[:20])}"] if others else []
+    lines += [f"not numbers: {', '.join(texts[:20])}"] if texts else []
     if twice:
         lines.append(
             "the same name twice, so that none of them can be mapped; give each its own: "
@@ -156,7 +149,7 @@ def _table(path: Path, columns: Sequence[FileColumn], has_clock: bool, read: _Re
     signals = telling(every_signal, MOST_SIGNALS)
     wanted = [*([clock] if clock in numbers and counts[clock] == 1 else []), *signals]
     if not signals:
-        examples = f" ({', '.join(others[:6] + twice)})" if others or twice else ""
+        examples = f" ({', '.join(texts[:6] + twice)})" if texts or twice else ""
         raise ValueError(
             f"{path}: none of its {len(columns)} columns holds numbers beside the time{examples}; "
             "write numbers without units, with one decimal mark, and a name for each column"
@@ -223,23 +216,23 @@ def _unit_note(clock: str, group: FileColumns) -> list[Note]:
 def _mcap(path: Path) -> _Content:
     """Words, columns, units and notes of an MCAP file or a bag, in one walk."""
     surveys = [survey(part, MOST_FIELDS) for part in (bag_parts(path) if path.is_dir() else [path])]
-    by_name = merged([one.topics for one in surveys])
+    by_name = merged([part.topics for part in surveys])
     lines, groups, units = [f"{len(by_name)} topics"], [], {}
-    notes = list(dict.fromkeys(note for one in surveys for note in one.notes))
+    notes = list(dict.fromkeys(note for part in surveys for note in part.notes))
     bare = collections.Counter(field for topic in by_name.values() for field in topic.fields)
     for topic in by_name.values():
         lines.append(f"  {topic.name}: {_content(topic)}")
         if len(topic.fields) > MOST_FIELDS:
             message = f"{topic.name} has {len(topic.fields)} numbers; the first {MOST_FIELDS} are shown"
             notes.append(Note("fields", "", len(topic.fields), message))
-        parts = [group for one in surveys for group in one.columns if group.name == topic.name]
-        if not parts:
+        columns = [group for part in surveys for group in part.columns if group.name == topic.name]
+        if not columns:
             continue
         alone = all(bare[field] == 1 for field in topic.fields) and not has_bare_field(topic.fields)
-        groups.append((joined(path, parts), "" if alone else f"{topic.name}:"))
+        groups.append((joined(path, columns), "" if alone else f"{topic.name}:"))
         for channel in topic.channels:
-            given = {key: unit for key, unit in channel.metadata.items() if key.endswith(".unit")}
-            units |= {key[: -len(".unit")]: unit for key, unit in given.items()}
+            metadata = channel.metadata.items()
+            units |= {key.removesuffix(".unit"): unit for key, unit in metadata if key.endswith(".unit")}
     return lines, groups, units, notes
 
 
@@ -292,11 +285,10 @@ def finite(values: np.ndarray) -> np.ndarray:
 
 
 def _code_note(name: str, code: float, values: np.ndarray) -> Note:
-    count = int(np.count_nonzero(values == code))
-    share = f"{100 * count / len(values):.2g} % of its values"
+    count, total = int(np.count_nonzero(values == code)), len(finite(values))
     message = (
-        f"{name} is exactly {code:g} in {share} ({count} of {len(values)}), far from the others: a code "
-        "for a missing value; write an empty cell (NaN) in its place, or it is taken for a measurement"
+        f"{name} is exactly {code:g} in {100 * count / total:.2g} % of its values ({count} of {total}), far "
+        "from the others: a code for a missing value; write an empty cell (NaN) in its place, or it is taken for a measurement"
     )
     return Note(CODE, name, count, message)
 
