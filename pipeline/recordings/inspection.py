@@ -288,7 +288,8 @@ def _code_note(name: str, code: float, values: np.ndarray) -> Note:
     count, total = int(np.count_nonzero(values == code)), len(finite(values))
     message = (
         f"{name} is exactly {code:g} in {100 * count / total:.2g} % of its values ({count} of {total}), far "
-        "from the others: a code for a missing value; write an empty cell (NaN) in its place, or it is taken for a measurement"
+        "from the others: a code for a missing value; write an empty cell (NaN) in its place, or it is "
+        "taken for a measurement"
     )
     return Note(CODE, name, count, message)
 
