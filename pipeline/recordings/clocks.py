@@ -76,7 +76,7 @@ def repair_topics(path: Path, groups: Sequence[FileColumns], *, one_clock: bool)
 
 def _forward(path: Path, group: FileColumns, restarts: np.ndarray, notes: list[Note]) -> Repaired:
     """Stamps that share a second spread, late rows sorted back, repeats dropped; checked."""
-    group = group._replace(time=_spread_stamps(group, restarts, notes))
+    group = group._replace(time=_distribute_stamps(group, restarts, notes))
     order = _forward_rows(group, notes)
     columns = _rows(group, order)
     check_clock(path, columns)
@@ -171,7 +171,7 @@ def _agree(groups: Sequence[FileColumns], restarts: Sequence[np.ndarray]) -> boo
     return bool((np.ptp(ends, axis=0) <= tolerance).all())
 
 
-def _spread_stamps(group: FileColumns, restarts: np.ndarray, notes: list[Note]) -> np.ndarray:
+def _distribute_stamps(group: FileColumns, restarts: np.ndarray, notes: list[Note]) -> np.ndarray:
     """Times of rows that share a stamp of whole seconds, spread evenly over it.
 
     Nearly every second must hold as many rows, and the rows must not be exact repeats nor take turns between

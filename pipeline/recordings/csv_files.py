@@ -598,10 +598,10 @@ class _NotPlain(Exception):
 
 
 def read_plain(
-    path: Path, layout: CsvLayout, places: Sequence[int], clock: Clock | None
-) -> tuple[list[np.ndarray], np.ndarray, tuple[int, int] | None] | None:
-    """Values (n,) of the columns at `places`; the time (n,) as numbers, or ns since 1970; the last line and
-    its count of fields, if it breaks off and is left out. None for a file that is not plain."""
+    path: Path, layout: CsvLayout, places: Sequence[int], clock: Clock | None, notes: list[Note]
+) -> dict[int, np.ndarray] | None:
+    """{place: values (n,)} of the columns at `places`, and of the time as numbers, or ns since 1970. A last
+    line that breaks off is left out and noted. None for a file that is not plain."""
     if layout.delimiter == " " or (clock is not None and not clock.decimal and clock.zone is None):
         return None
     dates = clock.place if clock is not None and not clock.decimal else None
@@ -628,14 +628,13 @@ def read_plain(
                 expected = int(len(batch) * max(1.0, 1.02 * path.stat().st_size / BLOCK_BYTES)) + 1
                 parts = Growing([column.dtype.type for column in columns], min(expected, MOST_EXPECTED))
             parts.append(*columns)
-        last = _last_line(path, layout, broken[0]) if broken else None
+        if parts is None:
+            return None
+        if broken:
+            notes.append(_last_line_note(path, layout, broken[0]))
     except (_NotPlain, pa.ArrowException, UnicodeError):
         return None
-    if parts is None:
-        return None
-    finished = dict(zip(read, parts.finished(), strict=True))
-    time = np.empty(0) if clock is None else finished[clock.place]
-    return [finished[place] for place in places], time, last
+    return dict(zip(read, parts.finished(), strict=True))
 
 
 def _batches(
@@ -684,14 +683,14 @@ def _extra_fields(path: Path, layout: CsvLayout) -> int:
     return len(extra)
 
 
-def _last_line(path: Path, layout: CsvLayout, row: pa.csv.InvalidRow) -> tuple[int, int]:
-    """The last line and its count of fields. Raises _NotPlain if `row` is another, or more than cut off."""
+def _last_line_note(path: Path, layout: CsvLayout, row: pa.csv.InvalidRow) -> Note:
+    """The note on a last line that breaks off. Raises _NotPlain if `row` is another, or more than cut off."""
     with path.open(encoding=layout.encoding) as stream:
         line, text = collections.deque(enumerate(stream, 1), maxlen=1)[0]
     is_cut = row.actual_columns < len(layout.names) and row.text == text
     if not is_cut or '"' in text or "\0" in text or re.match(_REMARK, text):
         raise _NotPlain
-    return line, row.actual_columns
+    return Note("truncated", "", 1, _BROKEN_OFF.format(line, row.actual_columns, len(layout.names)))
 
 
 def _has_match(column: pa.Array, pattern: str) -> bool:
@@ -996,16 +995,13 @@ def _read_one_clock(
     notes = list(layout.notes)
     column = None if clock is None else _clock(path, layout, clock, places.pop())
     units = {name: layout.units[place] for name, place in zip(wanted, places, strict=True)}
-    plain = read_plain(path, layout, places, column)
+    plain = read_plain(path, layout, places, column, notes)
     if plain is not None:
-        columns, written, broken = plain
-        values, lines = dict(zip(wanted, columns, strict=True)), np.empty(0, int)
+        values = {name: plain[place] for name, place in zip(wanted, places, strict=True)}
+        written, lines = plain[column.place] if column else np.empty(0), np.empty(0, int)
         place = functools.partial(_look_up_line, path, layout)
-        if broken:
-            notes.append(Note("truncated", "", 1, _BROKEN_OFF.format(*broken, len(layout.names))))
     else:
-        values, lines, written, cell_units = _rows_one_by_one(path, layout, places, wanted, column, notes)
-        units |= cell_units
+        values, lines, written = _rows_one_by_one(path, layout, places, units, column, notes)
         place = _place(lines)
     count = len(next(iter(values.values())))
     if not count:
@@ -1029,14 +1025,15 @@ def _rows_one_by_one(
     path: Path,
     layout: CsvLayout,
     places: Sequence[int],
-    wanted: Sequence[str],
+    units: dict[str, str],
     clock: Clock | None,
     notes: list[Note],
-) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray | list[str], dict[str, str]]:
-    """{column: values (n,)}, the line (n,) of each row, its time as numbers (n,) or texts, and {column: unit}
-    of numbers with their unit: the slow way, which knows every word and names the line of a fault."""
-    columns, lines = Growing([float] * len(wanted)), Growing([np.int32])
-    times, texts = Growing([float]), []
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray | list[str]]:
+    """{column: values (n,)}, the line (n,) of each row, and its time as numbers (n,) or texts: the slow way,
+    which knows every word and names the line of a fault. A unit beside the numbers goes into `units`, which
+    has the names of the columns."""
+    is_numeric, texts = clock is not None and bool(clock.decimal), []
+    columns = Growing([np.int32, *[float] * (len(units) + is_numeric)])
     switches: dict[str, set[str]] = {}
     styles: dict[str, tuple[str, str]] = {}
 
@@ -1047,29 +1044,27 @@ def _rows_one_by_one(
 
     sound = sound_rows(path, layout, clock, notes)
     while block := list(itertools.islice(sound, max(1, FIELDS_AT_ONCE // len(layout.names)))):
-        numbered = [line for line, _ in block]
-        lines.append(np.array(numbered))
-        fields = [[row[place] for _, row in block] for place in places]
-        columns.append(
-            *(
-                floats(path, name, of_column, layout.decimal, numbered, switches, style)
-                for name, of_column in zip(wanted, fields, strict=True)
-            )
-        )
-        if clock and clock.decimal:
-            written = [row[clock.place] for _, row in block]
-            times.append(floats(path, clock.name, written, layout.decimal, numbered, {}))
-        elif clock:
-            texts += [clock.text(row) for _, row in block]
+        lines = [line for line, _ in block]
+        parts = [
+            floats(path, name, [row[place] for _, row in block], layout.decimal, lines, switches, style)
+            for name, place in zip(units, places, strict=True)
+        ]
+        times = [clock.text(row) for _, row in block] if clock else []
+        if clock and is_numeric:
+            parts.append(floats(path, clock.name, times, layout.decimal, lines, {}))
+        else:
+            texts += times
+        columns.append(np.array(lines), *parts)
     for name, words in switches.items():
         message = f"{name} is written as {' and '.join(sorted(words))}, which were read as 1 and 0"
         notes.append(Note("words", "", 1, message))
-    units = {name: styles[name][1] for name in wanted if name in styles and styles[name][1]}
-    for name, unit in units.items():
-        message = f"{name} is written with its unit {unit}, which was left out"
-        notes.append(Note("words", "", 1, message))
-    values = dict(zip(wanted, columns.finished(), strict=True))
-    return values, lines.finished()[0], texts or times.finished()[0], units
+    for name in units:
+        if unit := styles.get(name, ("", ""))[1]:
+            units[name] = unit
+            message = f"{name} is written with its unit {unit}, which was left out"
+            notes.append(Note("words", "", 1, message))
+    numbers, *values = columns.finished()
+    return dict(zip(units, values, strict=False)), numbers, values[-1] if is_numeric else texts
 
 
 def _decide_decimal(path: Path, layout: CsvLayout, names: Mapping[int, str]) -> CsvLayout:

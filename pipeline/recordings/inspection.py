@@ -144,7 +144,9 @@ def _table(path: Path, columns: Sequence[FileColumn], has_clock: bool, read: _Re
             "the same name twice, so that none of them can be mapped; give each its own: "
             + ", ".join(twice[:20])
         )
-    clock = "" if has_clock else _clock_name(path, columns)
+    clock = ""
+    with contextlib.suppress(ValueError):  # no column is called like a time
+        clock = "" if has_clock else time_column(path, names, "")
     every_signal = [name for name in numeric if counts[name] == 1 and name != clock]
     signals = telling(every_signal, MOST_SIGNALS)
     wanted = [*([clock] if clock in numbers and counts[clock] == 1 else []), *signals]
@@ -183,14 +185,6 @@ def _table(path: Path, columns: Sequence[FileColumn], has_clock: bool, read: _Re
         if not (is_time_name(name) and (np.diff(column) >= 0).all() and np.ptp(column) > 0)
     }
     return lines, [(group._replace(values=values), "")], {c.name: c.unit for c in columns}, notes
-
-
-def _clock_name(path: Path, columns: Sequence[FileColumn]) -> str:
-    """The column that is read as the time, "" for none."""
-    try:
-        return time_column(path, [column.name for column in columns], "")
-    except ValueError:
-        return ""
 
 
 def _unit_note(clock: str, group: FileColumns) -> list[Note]:

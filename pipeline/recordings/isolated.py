@@ -191,11 +191,11 @@ def _answer(replies: IO[bytes], budget: Budget, work: Callable[..., Any], argume
 
 
 def _limit_memory(largest_mb: float | None) -> None:
-    most = resource.getrlimit(resource.RLIMIT_DATA)[1]
-    wanted = most if largest_mb is None else int(largest_mb * 2**20)
-    if most != resource.RLIM_INFINITY and wanted != resource.RLIM_INFINITY:
-        wanted = min(wanted, most)
-    resource.setrlimit(resource.RLIMIT_DATA, (wanted, most))
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    limit = hard if largest_mb is None else int(largest_mb * 2**20)
+    if hard != resource.RLIM_INFINITY:
+        limit = min(limit, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
 
 
 def _data_mb() -> float:

@@ -479,7 +479,7 @@ def mask_mixed(table: Table, signals: Mapping[str, tuple[np.ndarray, np.ndarray]
     of."""
     flags = list(table.flags)
     for name, (time_s, values) in signals.items():
-        for first, last, distance in mixed_stretches(values):
+        for first, last, distance in find_mixed(values):
             start, end = float(time_s[first]), float(time_s[last])
             table.masked[name][(table.time_s >= start) & (table.time_s <= end)] = True
             message = (
@@ -490,7 +490,7 @@ def mask_mixed(table: Table, signals: Mapping[str, tuple[np.ndarray, np.ndarray]
     return table._replace(flags=flags)
 
 
-def mixed_stretches(values: np.ndarray) -> list[tuple[int, int, float]]:
+def find_mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
     """(first, last, distance) of the stretches of values (n,) whose samples belong to two courses at once,
     `distance` apart.
 
@@ -536,15 +536,15 @@ def _gaps(y: np.ndarray, starts: np.ndarray, size: int) -> np.ndarray:
     step."""
     windows = np.lib.stride_tricks.sliding_window_view(y, size)[starts]
     parabola = np.linalg.qr(np.vander(np.linspace(-1, 1, size), 3))[0]
-    rest = windows - windows @ parabola @ parabola.T
-    ordered = np.sort(rest, axis=1)
+    residual = windows - windows @ parabola @ parabola.T
+    ordered = np.sort(residual, axis=1)
     between = np.diff(ordered, axis=1)
     least, rows = round(LEAST_SHARE * size), np.arange(len(starts))
     at = least - 1 + np.argmax(between[:, least - 1 : size - least], axis=1)
     gap, middle = between[rows, at], (ordered[rows, at] + ordered[rows, at + 1]) / 2
     between[rows, at] = 0
     apart = np.flatnonzero(gap > GAP * between.max(1))
-    crossings = np.count_nonzero(np.diff(rest[apart] > middle[apart, None], axis=1), axis=1)
+    crossings = np.count_nonzero(np.diff(residual[apart] > middle[apart, None], axis=1), axis=1)
     two = apart[crossings >= LEAST_CROSSINGS]
     gaps = np.zeros(len(starts))
     gaps[two] = gap[two]
