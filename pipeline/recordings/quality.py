@@ -504,8 +504,9 @@ def find_mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
         if len(y) < size:
             continue
         starts = np.unique(np.r_[np.arange(0, len(y) - size, size // 2), len(y) - size])
+        parabolas = np.linalg.qr(np.vander(np.linspace(-1, 1, size), 3))[0]
         gap = np.concatenate(
-            [_gaps(y, part, size) for part in np.array_split(starts, -(-len(starts) // WINDOWS_AT_ONCE))]
+            [_gaps(y, part, parabolas) for part in np.array_split(starts, -(-len(starts) // WINDOWS_AT_ONCE))]
         )
         hit = _in_a_row(gap > 0, min(LEAST_WINDOWS, len(gap)))
         if not hit.any():
@@ -531,12 +532,12 @@ def _coarse_step(y: np.ndarray) -> float:
     return max(step, quantisation_step(y)) if len(np.unique(y)) > 2 else step
 
 
-def _gaps(y: np.ndarray, starts: np.ndarray, size: int) -> np.ndarray:
+def _gaps(y: np.ndarray, starts: np.ndarray, parabolas: np.ndarray) -> np.ndarray:
     """The gap between the two courses in each window, 0 for a window without two, whatever the sensor's
-    step."""
+    step. `parabolas` (size, 3) is an orthonormal basis of the parabolas over a window."""
+    size = len(parabolas)
     windows = np.lib.stride_tricks.sliding_window_view(y, size)[starts]
-    parabola = np.linalg.qr(np.vander(np.linspace(-1, 1, size), 3))[0]
-    residual = windows - windows @ parabola @ parabola.T
+    residual = windows - windows @ parabolas @ parabolas.T
     ordered = np.sort(residual, axis=1)
     between = np.diff(ordered, axis=1)
     least, rows = round(LEAST_SHARE * size), np.arange(len(starts))
