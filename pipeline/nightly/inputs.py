@@ -129,7 +129,7 @@ def recordings(digests: Mapping[str, str], loop: NightlyLoop) -> dict[str, str]:
         elif not name.lower().endswith(notes):
             single[name] = content
     every = single | {bag: digest(files) for bag, files in bags.items()}
-    left_out = {path.as_posix() for path in excluded.excluded(folder)} if folder else set()
+    left_out = {path.as_posix() for path in excluded.exclusions(folder)} if folder else set()
     return {
         name: content
         for name, content in every.items()

@@ -93,7 +93,7 @@ def _merged(branch: str, head: str, theirs: str) -> str:
         champion.write_state(state, PLACE)
     for path in _conflicts():
         if Path(path).name == excluded.FILE:
-            both = [excluded.parsed(git("show", f"{side}:{path}")) for side in (theirs, head)]
+            both = [excluded.parse(git("show", f"{side}:{path}")) for side in (theirs, head)]
             excluded.write((PLACE / path).parent, both[0] | both[1])
             git("add", "--", path, place=place)
     if conflicts := _conflicts():

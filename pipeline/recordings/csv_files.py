@@ -8,6 +8,7 @@ are refused: read as one signal they would be a mixture without a word.
 
 import collections
 import csv
+import functools
 import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -23,7 +24,6 @@ from pipeline.recordings.formats import (
     CONTROL,
     FileColumn,
     FileColumns,
-    Growing,
     Note,
     clock_seconds,
     column_place,
@@ -60,8 +60,9 @@ _GROUPED = {
     )
     for decimal, mark, other in ((".", r"\.", ","), (",", ",", "."))
 }
-# one and a fraction, or a thousand: nothing in the field tells
+# 1,000 or 1.000 and the like: one and a fraction, or a thousand; nothing in the field tells
 _AMBIGUOUS = re.compile(r"\s*[+-]?[1-9]\d{0,2}[.,]\d{3}\s*$")
+_BEGINS_A_NUMBER = re.compile(r"[+-]?[.,]?\d")  # or a time
 _UNGROUPED = re.compile(r"\s*[+-]?\d{4,}")
 # a number with its unit, 21.5 °C: it shows where the table is, and is refused with its line when it is read
 _QUANTITY = re.compile(r"\s*[+-]?\d[\d.,]*\s*(%|°\s?[CFK]|[℃℉]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$")
@@ -78,6 +79,31 @@ _PAGES = {
         re.compile(rb"[\x81-\xa0\xc9-\xfe].|.[\x41-\x7a]"),
     ),
 }
+
+
+class Growing:
+    """Columns (n,) that grow in place as parts of a file come in. (Joining the parts at the end would need
+    twice the memory.)"""
+
+    def __init__(self, kinds: Sequence[type], expected: int = 0):
+        self.count = 0
+        self._columns = [np.empty(max(expected, 1), kind) for kind in kinds]
+
+    def append(self, *parts: np.ndarray) -> None:
+        end = self.count + len(parts[0])
+        if end > len(self._columns[0]):
+            self._resize(end + end // 4)
+        for column, part in zip(self._columns, parts, strict=True):
+            column[self.count : end] = part
+        self.count = end
+
+    def _resize(self, size: int) -> None:
+        for column in self._columns:
+            column.resize(size, refcheck=False)
+
+    def finished(self) -> list[np.ndarray]:
+        self._resize(self.count)
+        return self._columns
 
 
 class Clock(NamedTuple):
@@ -125,9 +151,9 @@ def opening(path: Path, decimal: str = "") -> tuple[CsvLayout, list[list[str]], 
         start = stream.read(OPENING_BYTES)
         # the names of a wide table alone are as long as that
         while len(start.splitlines()) <= FEWEST_LINES and len(start) < WIDEST_BYTES:
-            if not (more := stream.read(len(start))):
+            if not (following := stream.read(len(start))):
                 break
-            start += more
+            start += following
         start = start.rstrip(b"\0")
     encoding, notes = _encoding(path, start)
     # as csv counts lines: form feeds and the like end none
@@ -192,27 +218,21 @@ def is_quantity(field: str, decimal: str) -> bool:
     return is_number(field, decimal) or bool(_QUANTITY.match(field) or _GROUPED[decimal].match(field))
 
 
-def is_ambiguous(field: str) -> bool:
-    """Whether a field is 1,000 or 1.000 and the like: one with three decimals, or a thousand."""
-    return bool(_AMBIGUOUS.match(field))
-
-
 def decimal_mark(field: str) -> str:
     """The decimal mark that a field gives away, "" for none: 1,5 and 0,500 and 1.234,5 do, 1,500 and 7 do
     not."""
-    if is_ambiguous(field):
+    if _AMBIGUOUS.match(field):
         return ""
     for decimal in (".", ","):
         if decimal in field and (is_number(field, decimal) or _proves_groups(field, decimal)):
             return decimal
-    if (grouped := re.match(r"\s*[+-]?\d{1,3}(?:([.,])\d{3}){2,}\s*$", field)) is not None:
-        return "," if grouped[1] == "." else "."
-    return ""
+    grouped = re.match(r"\s*[+-]?\d{1,3}(?:([.,])\d{3}){2,}\s*$", field)
+    return "" if grouped is None else "," if grouped[1] == "." else "."
 
 
 def _proves_groups(field: str, decimal: str) -> bool:
     """Whether a field can only be read as digits in groups: 1,234.5, 1,234,567 or 1'234, but not 1,234."""
-    return bool(_GROUPED[decimal].match(field)) and not is_ambiguous(field)
+    return bool(_GROUPED[decimal].match(field)) and not _AMBIGUOUS.match(field)
 
 
 def column_style(path: Path, layout: CsvLayout, place: int) -> tuple[str, str]:
@@ -249,11 +269,11 @@ def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
             "nor MCAP; convert the recording to one of them"
         )
     # a letter of several bytes may be cut at the end of the part that was read
-    whole = start if len(start) < OPENING_BYTES else start[: start.rfind(b"\n") + 1]
+    text = start if len(start) < OPENING_BYTES else start[: start.rfind(b"\n") + 1]
     try:
-        whole.decode("utf-8")
+        text.decode("utf-8")
     except UnicodeDecodeError as error:
-        encoding = next((page for page in _PAGES if _is_of_page(whole, page)), "cp1252")
+        encoding = next((page for page in _PAGES if _is_of_page(text, page)), "cp1252")
         name = "Windows-1252" if encoding == "cp1252" else f"{_PAGES[encoding][0]} ({encoding})"
         message = f"byte {error.start} is not UTF-8, so the text was read as {name}"
         return encoding, [Note("encoding", "", 1, message)]
@@ -281,15 +301,14 @@ def _delimiter(lines: Sequence[str], decimals: Sequence[str]) -> tuple[str, str]
     best, choice = (0.0, 0.0, 0.0), (",", decimals[0])
     for delimiter, decimal in itertools.product((",", ";", "\t", "|", " "), decimals):
         split = [_split(line, delimiter) for line in lines[:50]]
+        width = collections.Counter(map(len, split)).most_common(1)[0][0] if split else 0
+        regular = [row for row in split if len(row) == width]
         if delimiter == " ":  # in words before the table there are numbers too
-            width = collections.Counter(map(len, split)).most_common(1)[0][0] if split else 0
-            split = [row for row in split if len(row) == width]
+            split = regular
         fields = [field for row in split for field in row]
         quantities = sum(is_quantity(field, decimal) for field in fields)
         # a comma before decimals splits the rows, and not the header
-        widths = collections.Counter(map(len, split)).most_common(1)
-        alike = widths[0][1] / len(split) if widths else 0.0
-        score = (quantities, alike, quantities / max(len(fields), 1))
+        score = (quantities, len(regular) / max(len(split), 1), quantities / max(len(fields), 1))
         # blanks inside of names and units make no table where another mark gives as many numbers
         if delimiter == " " and quantities <= best[0]:
             continue
@@ -318,6 +337,7 @@ MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "<null>", "none", "-", "--", 
 SWITCH = {"on": 1.0, "true": 1.0, "off": 0.0, "false": 0.0}
 # totals and remarks behind the data; more than that is no tail
 LONGEST_TAIL = 20
+_BROKEN_OFF = "line {}, the last, breaks off after {} of {} fields and was left out"
 
 
 def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
@@ -345,15 +365,13 @@ def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
                 "save the file as UTF-8"
             ) from None
         except csv.Error as error:
-            if "unexpected end" in str(error):
-                raise ValueError(
-                    f"{path}: line {line + 1}: a quotation mark is opened there and never closed; "
-                    "remove or close it"
-                ) from None
-            raise ValueError(
-                f"{path}: line {line + 1} cannot be split into columns ({error}), as after a quotation mark "
+            problem = (
+                ": a quotation mark is opened there and never closed; remove or close it"
+                if "unexpected end" in str(error)
+                else f" cannot be split into columns ({error}), as after a quotation mark "
                 "that is never closed; mend that line, or save the file again as plain CSV"
-            ) from None
+            )
+            raise ValueError(f"{path}: line {line + 1}{problem}") from None
 
 
 def sound_rows(
@@ -383,28 +401,14 @@ def sound_rows(
             if len(tail) > LONGEST_TAIL:
                 raise ValueError(f"{path}: {_unsound(*tail[0], layout, clock)}; mend or remove that line")
     if repeated:
-        notes.append(
-            Note(
-                "header",
-                "",
-                len(repeated),
-                f"the header is repeated {len(repeated)} times, first in line {repeated[0]}",
-            )
-        )
+        message = f"the header is repeated {len(repeated)} times, first in line {repeated[0]}"
+        notes.append(Note("header", "", len(repeated), message))
     if len(tail) == 1 and len(tail[0][1]) < width:
-        notes.append(_last_line_note(tail[0][0], len(tail[0][1]), width))
+        notes.append(Note("truncated", "", 1, _BROKEN_OFF.format(tail[0][0], len(tail[0][1]), width)))
     elif tail:
-        shown = layout.delimiter.join(tail[0][1])[:60]
-        message = (
-            f"{len(tail)} lines behind the data were left out, from line {tail[0][0]} on, which is {shown!r}"
-        )
-        notes.append(Note("trailing", "", len(tail), message))
-
-
-def _last_line_note(line: int, fields: int, width: int) -> Note:
-    """The note on a last line that has fewer fields than the table."""
-    message = f"line {line}, the last, breaks off after {fields} of {width} fields and was left out"
-    return Note("truncated", "", 1, message)
+        line, row = tail[0]
+        message = f"{len(tail)} lines behind the data were left out, from line {line} on, which is "
+        notes.append(Note("trailing", "", len(tail), message + repr(layout.delimiter.join(row)[:60])))
 
 
 def _unsound(line: int, row: list[str], layout: CsvLayout, clock: Clock | None) -> str:
@@ -478,9 +482,9 @@ def _float(
     elif re.fullmatch(r"[+-]?[\d.,\s']+", plain):
         mark = "a point" if decimal == "." else "a comma"
         remedy = f"write the numbers without marks between thousands, with {mark} before the decimals"
-        if is_ambiguous(plain):
-            one, thousand = plain.replace(",", "."), re.sub("[.,]", "", plain)
-            remedy = f"it may be {one} or {thousand}: declare ingest.decimal, or {remedy}"
+        if _AMBIGUOUS.match(plain):
+            fraction, thousand = plain.replace(",", "."), re.sub("[.,]", "", plain)
+            remedy = f"it may be {fraction} or {thousand}: declare ingest.decimal, or {remedy}"
     raise ValueError(f"{path}: line {line}, column {name} should be a number but is {plain[:40]!r}; {remedy}")
 
 
@@ -538,14 +542,8 @@ def _is_heading(row: Sequence[str], table: Sequence[Sequence[str]]) -> bool:
     """Whether a row with numbers begins with a word where the rows of the table begin with numbers, as the
     lines before LabVIEW's do."""
     first = row[0].strip().casefold()
-    if first in MISSING or _begins_a_number(first):
-        return False
-    return sum(_begins_a_number(other[0].strip()) for other in table) > 0.8 * len(table)
-
-
-def _begins_a_number(field: str) -> bool:
-    """Whether a field begins as a number or a time does."""
-    return bool(re.match(r"[+-]?[.,]?\d", field))
+    numbers = sum(bool(_BEGINS_A_NUMBER.match(data[0].strip())) for data in table)
+    return not (first in MISSING or _BEGINS_A_NUMBER.match(first)) and numbers > 0.8 * len(table)
 
 
 def _first_row(
@@ -583,18 +581,6 @@ def _first_row(
     return begin, len(rows[begin])
 
 
-def numbers(column: pa.Array, kind: type) -> np.ndarray:
-    """The values (n,) of a column of `kind`, NaN for null. Without null they are the column's memory."""
-    valid, content = column.buffers()
-    if content is None:
-        return np.empty(0, kind)
-    values = np.frombuffer(content, kind)[column.offset : column.offset + len(column)]
-    if not column.null_count:
-        return values
-    bits = np.unpackbits(np.frombuffer(valid, np.uint8), bitorder="little", count=column.offset + len(column))
-    return np.where(bits[column.offset :].astype(bool), values, np.nan)
-
-
 # ---- rows of plain numbers by Arrow, which reads only what the slow way reads in the same manner
 
 BLOCK_BYTES = 1 << 20
@@ -611,28 +597,23 @@ class _NotPlain(Exception):
     """Something that only the slow way reads."""
 
 
-def iso_zone(sample: str) -> str | None:
-    """ "UTC" for an ISO 8601 time with a zone, "" for one without, None for any other text."""
-    match = _ISO.match(sample)
-    return None if match is None else "UTC" if match[1] else ""
-
-
 def read_plain(
-    path: Path, layout: CsvLayout, places: Sequence[int], clock: Clock | None
-) -> tuple[list[np.ndarray], np.ndarray, tuple[int, int] | None] | None:
-    """Values (n,) of the columns at `places`; the time (n,) as numbers, or ns since 1970; the last line and
-    its count of fields, if it breaks off and is left out. None for a file that is not plain."""
+    path: Path, layout: CsvLayout, places: Sequence[int], clock: Clock | None, notes: list[Note]
+) -> dict[int, np.ndarray] | None:
+    """{place: values (n,)} of the columns at `places`, and of the time as numbers, or ns since 1970. A last
+    line that breaks off is left out and noted. None for a file that is not plain."""
     if layout.delimiter == " " or (clock is not None and not clock.decimal and clock.zone is None):
         return None
     dates = clock.place if clock is not None and not clock.decimal else None
     if dates in places:
         return None
     read = list(dict.fromkeys([*places, *([] if clock is None else [clock.place])]))
-    parts = Growing([np.int64 if place == dates else float for place in read])
+    parts: Growing | None = None
     broken: list[pa.csv.InvalidRow] = []
     try:
         for batch in _batches(path, layout, read, dates, broken):
-            if _has_remark(batch.column("0")) and 0 not in read:
+            first = batch.column("0")
+            if 0 not in read and pa.types.is_string(first.type) and _has_match(first, _REMARK):
                 return None
             columns = [
                 _iso_times(batch.column(f"{place}"), clock.zone or "")
@@ -642,23 +623,18 @@ def read_plain(
             ]
             if clock is None and np.isnan(columns).all(axis=0).any():
                 return None  # a blank row is no sample
-            if not parts.count:
-                _expect(parts, path, len(batch))
+            if parts is None:
+                # as many rows as the first block promises, so that growing moves nothing
+                expected = int(len(batch) * max(1.0, 1.02 * path.stat().st_size / BLOCK_BYTES)) + 1
+                parts = Growing([column.dtype.type for column in columns], min(expected, MOST_EXPECTED))
             parts.append(*columns)
-        last = _last_line(path, layout, broken[0]) if broken else None
+        if parts is None:
+            return None
+        if broken:
+            notes.append(_last_line_note(path, layout, broken[0]))
     except (_NotPlain, pa.ArrowException, UnicodeError):
         return None
-    if not parts.count:
-        return None
-    finished = dict(zip(read, parts.finished(), strict=True))
-    time = np.empty(0) if clock is None else finished[clock.place]
-    return [finished[place] for place in places], time, last
-
-
-def _expect(parts: Growing, path: Path, in_block: int) -> None:
-    """Room for as many rows as the first block lets expect."""
-    expected = int(in_block * max(1.0, 1.02 * path.stat().st_size / BLOCK_BYTES)) + 1
-    parts.expect(min(expected, MOST_EXPECTED))
+    return dict(zip(read, parts.finished(), strict=True))
 
 
 def _batches(
@@ -707,35 +683,32 @@ def _extra_fields(path: Path, layout: CsvLayout) -> int:
     return len(extra)
 
 
-def _last_line(path: Path, layout: CsvLayout, row: pa.csv.InvalidRow) -> tuple[int, int]:
-    """The last line and its count of fields. Raises _NotPlain if `row` is another, or more than cut off."""
+def _last_line_note(path: Path, layout: CsvLayout, row: pa.csv.InvalidRow) -> Note:
+    """The note on a last line that breaks off. Raises _NotPlain if `row` is another, or more than cut off."""
     with path.open(encoding=layout.encoding) as stream:
         line, text = collections.deque(enumerate(stream, 1), maxlen=1)[0]
     is_cut = row.actual_columns < len(layout.names) and row.text == text
     if not is_cut or '"' in text or "\0" in text or re.match(_REMARK, text):
         raise _NotPlain
-    return line, row.actual_columns
+    return Note("truncated", "", 1, _BROKEN_OFF.format(line, row.actual_columns, len(layout.names)))
 
 
-def _has_remark(column: pa.Array) -> bool:
-    if not pa.types.is_string(column.type):
-        return False
-    remarks = pc.call_function("match_substring_regex", [column], pc.MatchSubstringOptions(_REMARK))
-    return bool(pc.call_function("any", [remarks]).as_py())
+def _has_match(column: pa.Array, pattern: str) -> bool:
+    matches = pc.call_function("match_substring_regex", [column], pc.MatchSubstringOptions(pattern))
+    return bool(pc.call_function("any", [matches]).as_py())
 
 
 def _iso_times(column: pa.Array, zone: str) -> np.ndarray:
     """ns (n,) since 1970. Raises _NotPlain, or ArrowInvalid, for another text than ISO 8601."""
-    far = pc.call_function("match_substring_regex", [column], pc.MatchSubstringOptions(_FAR_ZONE))
-    if column.null_count or (zone and pc.call_function("any", [far]).as_py()):
+    if column.null_count or (zone and _has_match(column, _FAR_ZONE)):
         raise _NotPlain
-    return numbers(column.cast(pa.timestamp("ns", zone or None)), np.int64)
+    return column.cast(pa.timestamp("ns", zone or None)).cast(pa.int64()).to_numpy(zero_copy_only=False)
 
 
 def _plain_numbers(column: pa.Array, is_clock: bool) -> np.ndarray:
     """The numbers of a column. Raises _NotPlain for a missing time, and for a word that Arrow takes for NaN
     or infinite."""
-    values = numbers(column, np.float64)
+    values = column.to_numpy(zero_copy_only=False)
     odd = len(values) - int(np.isfinite(values).sum())
     if odd != column.null_count or (is_clock and odd):
         raise _NotPlain
@@ -954,12 +927,12 @@ def csv_columns(path: Path) -> list[FileColumn]:
     layout = csv_layout(path)
     if names := [*long_columns(path, layout), *(name for name, _ in scope_samples(path, layout))]:
         return [FileColumn(_OWN_CLOCKS, "time", ""), *(FileColumn(name, "number", "") for name in names)]
-    most = min(MOST_SHOWN, max(FEWEST_SHOWN, FIELDS_AT_ONCE // len(layout.names)))
-    shown = list(itertools.islice(rows(path, layout), most))
+    count = min(MOST_SHOWN, max(FEWEST_SHOWN, FIELDS_AT_ONCE // len(layout.names)))
+    samples = list(itertools.islice(rows(path, layout), count))
     columns = []
     for i, (name, unit) in enumerate(zip(layout.names, layout.units, strict=True)):
         fields = [
-            row[i].strip() for _, row in shown if i < len(row) and row[i].strip().casefold() not in MISSING
+            row[i].strip() for _, row in samples if i < len(row) and row[i].strip().casefold() not in MISSING
         ]
         words = [
             field
@@ -968,11 +941,8 @@ def csv_columns(path: Path) -> list[FileColumn]:
         ]
         # totals may stand behind a short table
         numeric = fields and len(words) <= min(LONGEST_TAIL, len(fields) // 10)
-        columns.append(
-            FileColumn(
-                name, "number" if numeric else f"text such as {words[0][:20]!r}" if words else "empty", unit
-            )
-        )
+        kind = "number" if numeric else f"text such as {words[0][:20]!r}" if words else "empty"
+        columns.append(FileColumn(name, kind, unit))
     return columns
 
 
@@ -991,7 +961,7 @@ def read_groups(
             f"{path}: each signal of this table has a time of its own, so time: {time} is not needed; "
             "remove it"
         )
-    layout = _decided(path, layout, layout.names)
+    layout = _decide_decimal(path, layout, dict(enumerate(layout.names)))
     groups, notes = read_long(path, layout, wanted) if names else read_scope(path, layout, samples_ms, wanted)
     return groups, [*layout.notes, *notes]
 
@@ -1015,24 +985,23 @@ def _read_one_clock(
     """The wanted columns, NaN where a field is empty."""
     interval = every(time)
     clock = None if interval else time_column(path, layout.names, time)
-    places = column_places(path, layout.names, wanted)
+    signals = [*wanted, *([] if clock is None else [clock])]
+    places = column_places(path, layout.names, signals)
     for name in naming_columns(layout.names, [*wanted, clock or ""]):
         place = column_place(path, layout.names, name)
         owners = ((f"line {line}", row[place]) for line, row in rows(path, layout) if len(row) > place)
         check_one_signal(path, name, ((at, owner) for at, owner in owners if owner.strip() != name))
-    layout = _decided(path, layout, [*wanted, *([] if clock is None else [clock])])
+    layout = _decide_decimal(path, layout, dict(zip(places, signals, strict=True)))
     notes = list(layout.notes)
-    column = None if clock is None else _clock(path, layout, clock)
+    column = None if clock is None else _clock(path, layout, clock, places.pop())
     units = {name: layout.units[place] for name, place in zip(wanted, places, strict=True)}
-    plain = read_plain(path, layout, places, column)
+    plain = read_plain(path, layout, places, column, notes)
     if plain is not None:
-        columns, written, broken = plain
-        values, place = dict(zip(wanted, columns, strict=True)), _line_of(path, layout)
-        lines = np.empty(0, int)
-        notes += [_last_line_note(*broken, len(layout.names))] if broken else []
+        values = {name: plain[place] for name, place in zip(wanted, places, strict=True)}
+        written, lines = plain[column.place] if column else np.empty(0), np.empty(0, int)
+        place = functools.partial(_look_up_line, path, layout)
     else:
-        values, lines, written, cell_units = _rows_one_by_one(path, layout, places, wanted, column, notes)
-        units |= cell_units
+        values, lines, written = _rows_one_by_one(path, layout, places, units, column, notes)
         place = _place(lines)
     count = len(next(iter(values.values())))
     if not count:
@@ -1049,22 +1018,22 @@ def _read_one_clock(
         times, zone = clock_seconds(path, column.name, written, unit, notes, is_declared=bool(time)), "UTC"
     else:
         times, zone = written, column.zone or ""
-    columns_forward, turned = forward(FileColumns("rows", times, values, place, zone, units))
-    return columns_forward, notes + turned
+    return forward(FileColumns("rows", times, values, place, zone, units), notes), notes
 
 
 def _rows_one_by_one(
     path: Path,
     layout: CsvLayout,
     places: Sequence[int],
-    wanted: Sequence[str],
+    units: dict[str, str],
     clock: Clock | None,
     notes: list[Note],
-) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray | list[str], dict[str, str]]:
-    """{column: values (n,)}, the line (n,) of each row, its time as numbers (n,) or texts, and {column: unit}
-    of numbers with their unit: the slow way, which knows every word and names the line of a fault."""
-    columns, lines = Growing([float] * len(wanted)), Growing([np.int32])
-    times, texts = Growing([float]), []
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray | list[str]]:
+    """{column: values (n,)}, the line (n,) of each row, and its time as numbers (n,) or texts: the slow way,
+    which knows every word and names the line of a fault. A unit beside the numbers goes into `units`, which
+    has the names of the columns."""
+    is_numeric, texts = clock is not None and bool(clock.decimal), []
+    columns = Growing([np.int32, *[float] * (len(units) + is_numeric)])
     switches: dict[str, set[str]] = {}
     styles: dict[str, tuple[str, str]] = {}
 
@@ -1075,73 +1044,65 @@ def _rows_one_by_one(
 
     sound = sound_rows(path, layout, clock, notes)
     while block := list(itertools.islice(sound, max(1, FIELDS_AT_ONCE // len(layout.names)))):
-        numbered = [line for line, _ in block]
-        lines.append(np.array(numbered))
-        fields = [[row[place] for _, row in block] for place in places]
-        columns.append(
-            *(
-                floats(path, name, of_column, layout.decimal, numbered, switches, style)
-                for name, of_column in zip(wanted, fields, strict=True)
-            )
-        )
-        if clock and clock.decimal:
-            written = [row[clock.place] for _, row in block]
-            times.append(floats(path, clock.name, written, layout.decimal, numbered, {}))
-        elif clock:
-            texts += [clock.text(row) for _, row in block]
+        lines = [line for line, _ in block]
+        parts = [
+            floats(path, name, [row[place] for _, row in block], layout.decimal, lines, switches, style)
+            for name, place in zip(units, places, strict=True)
+        ]
+        times = [clock.text(row) for _, row in block] if clock else []
+        if clock and is_numeric:
+            parts.append(floats(path, clock.name, times, layout.decimal, lines, {}))
+        else:
+            texts += times
+        columns.append(np.array(lines), *parts)
     for name, words in switches.items():
         message = f"{name} is written as {' and '.join(sorted(words))}, which were read as 1 and 0"
         notes.append(Note("words", "", 1, message))
-    units = {name: styles[name][1] for name in wanted if name in styles and styles[name][1]}
-    for name, unit in units.items():
-        message = f"{name} is written with its unit {unit}, which was left out"
-        notes.append(Note("words", "", 1, message))
-    values = dict(zip(wanted, columns.finished(), strict=True))
-    return values, lines.finished()[0], texts or times.finished()[0], units
+    for name in units:
+        if unit := styles.get(name, ("", ""))[1]:
+            units[name] = unit
+            message = f"{name} is written with its unit {unit}, which was left out"
+            notes.append(Note("words", "", 1, message))
+    numbers, *values = columns.finished()
+    return dict(zip(units, values, strict=False)), numbers, values[-1] if is_numeric else texts
 
 
-def _decided(path: Path, layout: CsvLayout, names: Sequence[str]) -> CsvLayout:
-    """The layout with the decimal mark that some field of the file gives away.
+def _decide_decimal(path: Path, layout: CsvLayout, names: Mapping[int, str]) -> CsvLayout:
+    """The layout with the decimal mark that some field of the file gives away. `names` are those of the
+    columns that are read, by their places.
 
-    Raises ValueError with both readings where 1,000 or 1.000 is all that there is.
+    Raises ValueError with both readings if 1,000 or 1.000 is all that there is.
     """
     if layout.decided:
         return layout
-    places = dict(zip(column_places(path, layout.names, names), names, strict=True))
     doubtful: tuple[int, str, str] | None = None
     for line, row in rows(path, layout):
         for i, field in enumerate(row):
             if mark := decimal_mark(field):
                 return layout._replace(decimal=mark, decided=True)
-            if doubtful is None and i in places and is_ambiguous(field):
-                doubtful = line, places[i], field.strip()
+            if doubtful is None and i in names and _AMBIGUOUS.match(field):
+                doubtful = line, names[i], field.strip()
     if doubtful is None:
         return layout._replace(decided=True)
     line, name, field = doubtful
     mark = "," if "," in field else "."
-    one, thousand = field.replace(",", "."), re.sub("[.,]", "", field)
+    fraction, thousand = field.replace(",", "."), re.sub("[.,]", "", field)
     raise ValueError(
-        f"{path}: line {line}, column {name}: {field} may be {one} or {thousand}, as every fraction in the "
-        f'file has three digits; declare ingest.decimal: "{mark}" for {one}, '
+        f"{path}: line {line}, column {name}: {field} may be {fraction} or {thousand}, as every fraction in "
+        f'the file has three digits; declare ingest.decimal: "{mark}" for {fraction}, '
         f'or "{"." if mark == "," else ","}" for {thousand}'
     )
 
 
-def _line_of(path: Path, layout: CsvLayout) -> Callable[[int], str]:
-    """The place of a row in a file that was read without counting its lines: it is looked up where somebody
-    asks."""
-
-    def place(i: int) -> str:
-        return f"line {next(itertools.islice(sound_rows(path, layout, None, []), i, None))[0]}"
-
-    return place
+def _look_up_line(path: Path, layout: CsvLayout, i: int) -> str:
+    """The place of row i of a file that was read without counting its lines."""
+    return f"line {next(itertools.islice(sound_rows(path, layout, None, []), i, None))[0]}"
 
 
 # ---- the clock
 
 
-def _clock(path: Path, layout: CsvLayout, name: str) -> Clock:
-    place = column_place(path, layout.names, name)
+def _clock(path: Path, layout: CsvLayout, name: str, place: int) -> Clock:
     first = next((row for _, row in rows(path, layout) if len(row) > place and row[place].strip()), None)
     sample = first[place].strip() if first else "0"
     if is_number(sample, layout.decimal) and not is_compact(sample):
@@ -1153,7 +1114,8 @@ def _clock(path: Path, layout: CsvLayout, name: str) -> Clock:
         date = date if is_date(first[date]) else None
     fields = (row[place] for _, row in rows(path, layout) if len(row) > place)
     is_fraction = hyphen_fraction(field for field in fields if ":" in field)
-    zone = None if date is not None or is_fraction else iso_zone(sample)
+    iso = None if date is not None or is_fraction else _ISO.match(sample)
+    zone = None if iso is None else "UTC" if iso[1] else ""
     return Clock(name, place, "", date, zone, is_fraction)
 
 
@@ -1162,13 +1124,12 @@ def _calendar_times(
 ) -> tuple[np.ndarray, str]:
     """time_ns (n,) of texts, and its zone. The order of day and month is that which some date proves, or
     else the one in which the times run on in equal steps, or else that of the language of the names."""
-    dates = set()
-    if re.match(r"\s*\d{1,2}[/-]\d{1,2}[/-]\d", texts[0]):
-        dates = {text.split()[0] for text in texts}
+    has_dates = re.match(r"\s*\d{1,2}[/-]\d{1,2}[/-]\d", texts[0])
+    dates = {text.split()[0] for text in texts} if has_dates else set()
     order, reason = month_first(dates, texts[0]), ""
     if dates and order is None and (order := steady_order(texts)) is not None:
-        first, other = ("month", "day") if order else ("day", "month")
-        reason = f"{first} first, in which they run on in equal steps; with the {other} first they do not"
+        first, second = ("month", "day") if order else ("day", "month")
+        reason = f"{first} first, in which they run on in equal steps; with the {second} first they do not"
     own_names = [clock.name] if clock.date is None else [clock.name, names[clock.date]]
     if dates and order is None and writes_day_first(own_names):
         order, reason = False, "day first, as its language writes them"

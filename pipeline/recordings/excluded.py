@@ -8,7 +8,6 @@ content that was refused: a recording that was mended is read again.
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
 
 import yaml
 
@@ -21,60 +20,58 @@ HEAD = """\
 """
 
 
-class Exclusion(NamedTuple):
-    """SHA-256 of the recording that was refused, and the reason."""
+# "sha256" of the recording that was refused, and the "reason"
 
-    sha256: str
-    reason: str
+Exclusion = dict[str, str]
 
 
-def listed(folder: str | Path) -> dict[str, Exclusion]:
+def read_list(folder: str | Path) -> dict[str, Exclusion]:
     """{path below the folder: exclusion}; empty where there is no list. Raises ValueError where the list
     cannot be read."""
     path = Path(folder) / FILE
     try:
-        return parsed(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        return parse(path.read_text(encoding="utf-8")) if path.is_file() else {}
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def parsed(text: str) -> dict[str, Exclusion]:
+def parse(text: str) -> dict[str, Exclusion]:
     """The entries of a list. Raises ValueError where the text is none."""
     try:
         entries = yaml.safe_load(text) or {}
-        return {str(name): Exclusion(str(e["sha256"]), str(e["reason"])) for name, e in entries.items()}
+        return {str(name): {key: str(e[key]) for key in ("sha256", "reason")} for name, e in entries.items()}
     except (yaml.YAMLError, AttributeError, KeyError, TypeError) as error:
-        found = " ".join(str(error).split())[:200]
         raise ValueError(
             "expected paths, each with sha256 and reason, found something else "
-            f"({found}); mend the list, or take it away: the next night looks at its recordings again"
+            f"({' '.join(str(error).split())[:200]}); mend the list, or take it away: the next night looks "
+            "at its recordings again"
         ) from None
 
 
 def write(folder: str | Path, entries: dict[str, Exclusion]) -> None:
     """Writes the list, in the order of the paths."""
-    plain = {name: entries[name]._asdict() for name in sorted(entries)}
-    text = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=1000)
+    ordered = {name: entries[name] for name in sorted(entries)}
+    text = yaml.safe_dump(ordered, sort_keys=False, allow_unicode=True, width=1000)
     artifacts.write_text(Path(folder) / FILE, HEAD + text)
 
 
 def exclude(path: str | Path, folder: str | Path, reason: str) -> None:
     """Lists a recording below `folder`, a file or the folder of a bag, as it is now."""
     name = Path(path).relative_to(folder).as_posix()
-    write(folder, listed(folder) | {name: Exclusion(artifacts.sha256(path), reason)})
+    write(folder, read_list(folder) | {name: {"sha256": artifacts.sha256(path), "reason": reason}})
 
 
-def excluded(folder: str | Path) -> frozenset[Path]:
+def exclusions(folder: str | Path) -> frozenset[Path]:
     """The recordings below `folder` that are listed, and still what they were when they were refused."""
     folder = Path(folder)
     return frozenset(
         folder / name
-        for name, entry in listed(folder).items()
-        if (folder / name).exists() and artifacts.sha256(folder / name) == entry.sha256
+        for name, entry in read_list(folder).items()
+        if (folder / name).exists() and artifacts.sha256(folder / name) == entry["sha256"]
     )
 
 
 def readable(paths: Iterable[Path], folder: str | Path) -> list[Path]:
     """Those of `paths`, files or bags below `folder`, that are not excluded, in their order."""
-    left_out = excluded(folder)
+    left_out = exclusions(folder)
     return [path for path in paths if path not in left_out and not left_out.intersection(path.parents)]

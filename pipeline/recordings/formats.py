@@ -89,12 +89,6 @@ class Table(NamedTuple):
     jitter: dict[str, Jitter]
 
 
-def measured(table: Table, name: str) -> np.ndarray:
-    """The values (T,) of a signal, NaN where it is masked; no copy where nothing is."""
-    masked = table.masked[name]
-    return np.where(masked, np.nan, table.values[name]) if masked.any() else table.values[name]
-
-
 # comparing names takes 10 us each
 MOST_COMPARED = 50_000
 
@@ -118,17 +112,6 @@ def nearest_names(name: str, names: Iterable[str]) -> str:
     if close:
         return f"the nearest names are {', '.join(close[:5])}"
     return f"it has {', '.join(names[:10])}{' and more' if len(names) > 10 else ''}"
-
-
-def intervals(time_s: np.ndarray, gap_limit_s: float = np.inf) -> Jitter:
-    """Jitter of a clock time_s (n,), n >= 2, from the intervals up to `gap_limit_s`."""
-    steps = np.diff(time_s)
-    inside, median = steps <= gap_limit_s, np.median(steps)
-    if inside.all() or not inside.any():
-        deviation = steps - median
-    else:
-        deviation = steps[inside] - np.median(steps[inside])
-    return Jitter(float(median), float(deviation.std()), float(np.abs(deviation).max()))
 
 
 # the configuration that a klippy.log begins with after a rollover has some 30 kB
@@ -190,8 +173,6 @@ _SINCE_1904_S, _LABVIEW = 2_082_844_800, (3.5e9, 4.3e9)
 _SERIAL_DAYS = ((20_000, 80_000, 25_569, "spreadsheets"), (713_000, 774_000, 719_529, "MATLAB"))
 # fractions of a day, and Julian dates from 1858 to 2132
 _DAYS = ((0, 2), (2_400_000, 2_500_000))
-# a clock that runs on for no more than so many samples before it falls back is not one clock
-OTHER_DEVICE_RUN = 8
 _TIME_NAMES = (
     "t",
     "time",
@@ -292,6 +273,11 @@ class FileColumns(NamedTuple):
     zone: str = "UTC"
     units: Mapping[str, str] = MappingProxyType({})
 
+    @property
+    def second(self) -> float:
+        """One second in the unit of `time`."""
+        return 1e9 if self.time.dtype == np.int64 else 1.0
+
 
 class FileColumn(NamedTuple):
     """A column of a file; `unit` is empty if the file does not give it."""
@@ -299,36 +285,6 @@ class FileColumn(NamedTuple):
     name: str
     type: str
     unit: str
-
-
-class Growing:
-    """Columns (n,) that grow in place as parts of a file come in. (Joining the parts at the end would need
-    twice the memory.)"""
-
-    def __init__(self, kinds: Sequence[type], expected: int = 0):
-        self.count = 0
-        self._columns = [np.empty(max(expected, 1), kind) for kind in kinds]
-
-    def expect(self, size: int) -> None:
-        """Room for `size` rows at once, so that growing moves nothing."""
-        if size > len(self._columns[0]):
-            self._resize(size)
-
-    def append(self, *parts: np.ndarray) -> None:
-        end = self.count + len(parts[0])
-        if end > len(self._columns[0]):
-            self._resize(end + end // 4)
-        for column, part in zip(self._columns, parts, strict=True):
-            column[self.count : end] = part
-        self.count = end
-
-    def _resize(self, size: int) -> None:
-        for column in self._columns:
-            column.resize(size, refcheck=False)
-
-    def finished(self) -> list[np.ndarray]:
-        self._resize(self.count)
-        return self._columns
 
 
 # ---- format
@@ -395,10 +351,9 @@ def time_column(path: Path, names: Sequence[str], time: str) -> str:
     if not ranked and index:
         return index[0]
     if not ranked:
-        shown = ", ".join(names[:12])
         raise ValueError(
-            f"{path}: no column is called like a time (t_s, time, timestamp, ...) among {shown}; name it, "
-            "or write time: every 1.0 s"
+            f"{path}: no column is called like a time (t_s, time, timestamp, ...) among "
+            f"{', '.join(names[:12])}; name it, or write time: every 1.0 s"
         )
     return min(ranked)[1]
 
@@ -433,8 +388,6 @@ def _time_rank(name: str) -> tuple[bool, int] | None:
     if name.strip() == "T":  # more often a temperature
         return True, len(_TIME_NAMES)
     base, unit = _time_unit(name)
-    if name.strip() == "T":  # more likely a temperature
-        return True, len(_TIME_NAMES)
     return (not unit, _TIME_NAMES.index(base)) if base in _TIME_NAMES else None
 
 
@@ -445,13 +398,8 @@ def _time_unit(name: str) -> tuple[str, str]:
     if plain in _COUNTS:
         return "time", _COUNTS[plain]
     match = re.match(r"^(.*?)[\s_.]*[(\[/_\s]\s*(\w+)\s*[)\]]?$", plain)
-    if match and match[2] in _PER_SECOND:
-        return _word(match[1]), match[2]
-    return _word(plain), ""
-
-
-def _word(name: str) -> str:
-    return name if name in _TIME_NAMES else re.sub(r"\W+", "_", name).strip("_")
+    base, unit = (match[1], match[2]) if match and match[2] in _PER_SECOND else (plain, "")
+    return base if base in _TIME_NAMES else re.sub(r"\W+", "_", base).strip("_"), unit
 
 
 def date_column(names: Sequence[str], clock: str) -> str | None:
@@ -472,8 +420,7 @@ def seconds(name: str, numbers: np.ndarray, written: str = "") -> tuple[np.ndarr
     The unit is that of the column's name, or the one `written` beside it, as in a row of units. Without one
     it is seconds, or what the size of the numbers tells: an epoch, or a spreadsheet's days.
     """
-    unit = _time_unit(name)[1] or written.strip(" ()[]").casefold()
-    if unit in _PER_SECOND:
+    if unit := _unit_of_time(name, written):
         return numbers / _PER_SECOND[unit], ""
     finite = numbers[np.isfinite(numbers)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
@@ -515,10 +462,28 @@ def clock_seconds(
     times, remark = seconds(name, numbers, unit)
     if remark:
         notes.append(Note("clock", "", 1, remark))
-    _check_no_day_fractions(path, name, times, unit)
-    if not is_declared:
-        _check_no_counter(path, name, times)
+    has_unit = _unit_of_time(name, unit) or len(times) < 3
+    step = 0.0 if has_unit else float(np.median(np.abs(np.diff(times))))
+    # a time of day in a spreadsheet, or a Julian date: as seconds, more than 11,000 samples a second
+    of_days = any(first <= times.min() and times.max() < last for first, last in _DAYS)
+    if of_days and 0 < step * 86400 < 8:
+        raise ValueError(
+            f"{path}: time {name} runs from {times.min():.6g} to {times.max():.6g} in steps of {step:.3g}, "
+            f"which may be seconds, or days with {step * 86400:.3g} s between samples; "
+            f"write its unit into its name, as in {name}_s or {name}_days"
+        )
+    if not is_declared and name in INDEX_NAMES and times[0] in (0, 1) and (np.diff(times) == 1).all():
+        raise ValueError(
+            f"{path}: no column is called like a time, and {name or 'the column without a name'} counts the "
+            "rows 0, 1, 2, ..., which is no time; write time: every 1.0 s with the sample time, or its name"
+        )
     return times
+
+
+def _unit_of_time(name: str, written: str) -> str:
+    """The unit in the name of a time, or the one `written` beside it, "" for none."""
+    unit = _time_unit(name)[1] or written.strip(" ()[]").casefold()
+    return unit if unit in _PER_SECOND else ""
 
 
 def _in_days(interval: float) -> bool:
@@ -528,111 +493,26 @@ def _in_days(interval: float) -> bool:
     return 0 < in_seconds < 8 or (in_seconds < 61 and abs(in_seconds - round(in_seconds)) < 0.02)
 
 
-def _check_no_counter(path: Path, name: str, time: np.ndarray) -> None:
-    """Raises ValueError where an index that nobody named as the time counts the rows."""
-    if name in INDEX_NAMES and time[0] in (0, 1) and (np.diff(time) == 1).all():
-        raise ValueError(
-            f"{path}: no column is called like a time, and {name or 'the column without a name'} counts the "
-            "rows 0, 1, 2, ..., which is no time; write time: every 1.0 s with the sample time, or its name"
-        )
-
-
-def _check_no_day_fractions(path: Path, name: str, time: np.ndarray, written: str) -> None:
-    """Raises ValueError where a time without a unit may be the fraction of a day that spreadsheets write for
-    a time of day, or a Julian date: as seconds, it would have more than 11,000 samples a second."""
-    if _time_unit(name)[1] or written.strip(" ()[]").casefold() in _PER_SECOND or len(time) < 3:
-        return
-    step = float(np.median(np.abs(np.diff(time))))
-    of_days = any(first <= time.min() and time.max() < last for first, last in _DAYS)
-    if of_days and 0 < step * 86400 < 8:
-        raise ValueError(
-            f"{path}: time {name} runs from {time.min():.6g} to {time.max():.6g} in steps of {step:.3g}, "
-            f"which may be seconds, or days with {step * 86400:.3g} s between samples; "
-            f"write its unit into its name, as in {name}_s or {name}_days"
-        )
-
-
 # ---- which way the time runs
 
 
-def forward(columns: FileColumns) -> tuple[FileColumns, list[Note]]:
-    """The columns from the oldest sample on. Columns with the newest first are reversed; nothing else is
-    sorted."""
+def forward(columns: FileColumns, notes: list[Note]) -> FileColumns:
+    """The columns from the oldest sample on. Columns with the newest first are reversed, which is noted;
+    nothing else is sorted."""
     last = len(columns.time) - 1
     if last < 1 or not (np.diff(columns.time) < 0).all():
-        return columns, []
+        return columns
+    message = "the newest sample stands first: the rows were read from the last to the first"
+    notes.append(Note("clock", "", last + 1, message))
     values = {name: column[::-1] for name, column in columns.values.items()}
-    turned = columns._replace(time=columns.time[::-1], values=values, place=lambda i: columns.place(last - i))
-    return turned, [
-        Note(
-            "clock",
-            "",
-            last + 1,
-            "the newest sample stands first: the rows were read from the last to the first",
-        )
-    ]
-
-
-def check_clock(path: Path, group: FileColumns) -> None:
-    """Raises ValueError with the place if a time is missing, repeated or before the one ahead of it."""
-    time = group.time
-    if np.issubdtype(time.dtype, np.floating) and not np.isfinite(time).all():
-        i = int(np.flatnonzero(~np.isfinite(time))[0])
-        missing = int((~np.isfinite(time)).sum())
-        raise ValueError(
-            f"{path}: {group.place(i)} should have a time but has none, the first of {missing}; "
-            "fill it in or remove the row"
-        )
-    if (time[1:] > time[:-1]).all():
-        return
-    steps = np.diff(time)
-    back = np.flatnonzero(time[1:] <= time[:-1])  # a step over half of all int64 would seem to run forward
-    i, count = int(back[0]), len(back)
-    unit = 1e9 if time.dtype == np.int64 else 1.0
-    start = time[0].item() if unit == 1e9 else 0
-    now, before = ((time[j].item() - start) / unit for j in (i + 1, i))
-    since = " after the first" if start else ""
-    problem = (
-        f"has the same time as the sample before it, {now:.9g} s{since}"
-        if steps[i] == 0
-        else f"is at {now:.9g} s{since}, which is before the sample ahead of it at {before:.9g} s"
-    )
-    times = f", the first of {count}" if count > 1 else ""
-    raise ValueError(
-        f"{path}: {group.place(i + 1)} {problem}{times}, but time should only run forward; "
-        f"{_remedy(group, steps / unit, back)}"
-    )
-
-
-def _remedy(group: FileColumns, steps_s: np.ndarray, back: np.ndarray) -> str:
-    """The remedy for a clock that stands still or runs backwards, by the way it does."""
-    if steps_s[back[0]] == 0:
-        return "name a finer clock, or give each device or tag that writes here a column of its own"
-    if len(back) > 0.9 * len(steps_s):
-        return "sort the rows by time, from the oldest on"
-    if len(back) >= 3 and len(steps_s) <= OTHER_DEVICE_RUN * (len(back) + 1):
-        return (
-            "two devices with clocks of their own seem to write under one name: "
-            "record each under a name of its own"
-        )
-    if len(back) == 1 and abs(steps_s[back[0]] + 3600) <= 3 * np.median(np.abs(steps_s)):
-        return (
-            "an hour is what the end of summer time takes away: write the times with their zone or in UTC, "
-            "or split the recording there"
-        )
-    if group.name == "rows":
-        return "split the recording where its clock was set back"
-    return "sort it with: mcap sort, or split it where its clock was set back"
+    return columns._replace(time=columns.time[::-1], values=values, place=lambda i: columns.place(last - i))
 
 
 def every(time: str) -> float | None:
     """The interval of "every 0.5 s", the time of a table without one; None for a column's name."""
-    match = re.fullmatch(r"every\s+([0-9.eE+-]+)\s*s", time.strip())
-    try:
-        interval = float(match[1]) if match else None
-    except ValueError:
-        return None
-    return interval if interval is not None and 0 < interval < np.inf else None
+    match = re.fullmatch(r"every\s+(\+?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*s", time.strip())
+    interval = float(match[1]) if match else 0.0
+    return interval if 0 < interval < np.inf else None
 
 
 # a clock that begins later than three years is one of the calendar; it is counted from the record's first
@@ -652,7 +532,7 @@ class WholeTable(NamedTuple):
 
     `time` is the file's own clock, time_s (n,) or time_ns (n,) on a calendar, None where a column holds it.
     `limits` are the lowest and highest value that the machine's own settings allow, by column.
-    `others` are the columns that are no numbers, with what they hold.
+    `texts` are the columns that are no numbers, with what they hold.
     """
 
     values: dict[str, np.ndarray]
@@ -662,7 +542,7 @@ class WholeTable(NamedTuple):
     place: Callable[[int], str]
     notes: list[Note]
     limits: dict[str, tuple[float, float]]
-    others: dict[str, str]
+    texts: dict[str, str]
     stamps: dict[str, np.ndarray]
 
     def columns(self) -> list[FileColumn]:
@@ -670,7 +550,7 @@ class WholeTable(NamedTuple):
         return [
             *(FileColumn(name, "number", self.units.get(name, "")) for name in self.values),
             *(FileColumn(name, "time", "") for name in self.stamps),
-            *(FileColumn(name, kind, "") for name, kind in self.others.items()),
+            *(FileColumn(name, kind, "") for name, kind in self.texts.items()),
         ]
 
 
@@ -684,7 +564,7 @@ def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> t
     for name in wanted:
         if name not in table.values:
             raise ValueError(
-                f"{path}: column {name} should hold numbers but holds {table.others.get(name, 'times')}; "
+                f"{path}: column {name} should hold numbers but holds {table.texts.get(name, 'times')}; "
                 "write numbers, or map another column"
             )
     count = len(next(iter(table.values.values()), ()))
@@ -698,8 +578,7 @@ def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> t
     else:
         clock, zone = _clock(path, table, names, time, notes)
     values = {name: table.values[name] for name in wanted}
-    columns, turned = forward(FileColumns("rows", clock, values, table.place, zone, table.units))
-    return columns, notes + turned
+    return forward(FileColumns("rows", clock, values, table.place, zone, table.units), notes), notes
 
 
 def _clock(
@@ -707,23 +586,23 @@ def _clock(
 ) -> tuple[np.ndarray, str]:
     """(time, zone) of the column that `time` names, or of the first with the name of a time."""
     if not time and table.stamps:
-        called = [name for name in (*table.stamps, *table.values) if _is_clock_name(name)]
+        # beside dates a temperature or a counter is no time
+        called = [
+            name
+            for name in (*table.stamps, *table.values)
+            if is_time_name(name) and name not in ("T", *INDEX_NAMES)
+        ]
         time = time_column(path, called, "") if called else next(iter(table.stamps))
     name = time_column(path, names, time)
     if name in table.stamps:
         return table.stamps[name], ""
     if name not in table.values:
         raise ValueError(
-            f"{path}: time {name} should be seconds or a date but holds {table.others[name]}; convert it, "
+            f"{path}: time {name} should be seconds or a date but holds {table.texts[name]}; convert it, "
             "or name another column"
         )
     unit = table.units.get(name, "")
     return clock_seconds(path, name, table.values[name], unit, notes, is_declared=bool(time)), "UTC"
-
-
-def _is_clock_name(name: str) -> bool:
-    """Whether a column beside dates is called like a time, and neither like a temperature nor a counter."""
-    return is_time_name(name) and name not in ("T", *INDEX_NAMES)
 
 
 def check_values(path: Path, rows: int, columns: int) -> None:

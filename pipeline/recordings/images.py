@@ -33,7 +33,8 @@ import orjson
 from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
-from pipeline.recordings.formats import CALENDAR_S, FileColumns, Note, Source, check_clock, file_format
+from pipeline.recordings.clocks import check_clock
+from pipeline.recordings.formats import CALENDAR_S, FileColumns, Note, Source, file_format
 from pipeline.recordings.mcap_files import (
     CHUNK,
     MESSAGE,

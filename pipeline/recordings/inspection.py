@@ -4,21 +4,21 @@ The words give its format, its clocks with rate, jitter and gaps, its signals wi
 """
 
 import collections
+import contextlib
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.recordings.clocks import Mended, mended_topics
+from pipeline.recordings.clocks import check_clock, repair_topics
 from pipeline.recordings.csv_files import csv_columns, csv_layout, read_csv
 from pipeline.recordings.formats import (
     FileColumn,
     FileColumns,
     Note,
-    check_clock,
     file_format,
-    intervals,
     is_time_name,
     select,
     time_column,
@@ -32,12 +32,12 @@ from pipeline.recordings.proposals import (
     RecordedSignal,
     has_bare_field,
     propose,
-    sampled,
+    sample,
     telling,
     yaml_lines,
 )
 from pipeline.recordings.quality import quantisation_step
-from pipeline.recordings.resampling import GAP_INTERVALS
+from pipeline.recordings.resampling import GAP_INTERVALS, intervals
 
 # numbers of a topic, and columns of a table, that are described; the others are counted
 MOST_FIELDS, MOST_SIGNALS = 64, 128
@@ -72,12 +72,11 @@ def inspect(path: str | Path) -> str:
     path = Path(path)
     looked = look(path)
     lines, groups = list(looked.lines), [group for group, _ in looked.groups]
-    try:
-        parts = mended_topics(path, groups, one_clock=True) if groups else []
-    except ValueError:
-        parts = [Mended(group, np.empty(0, int), []) for group in groups]
-    looked.notes.extend(note for part in parts for note in part.notes)
-    for group in (part.columns for part in parts):
+    with contextlib.suppress(ValueError):
+        repaired = repair_topics(path, groups, one_clock=True) if groups else []
+        groups = [group for group, _, _ in repaired]
+        looked.notes.extend(note for _, _, notes in repaired for note in notes)
+    for group in groups:
         lines += ["", *_clock(path, group)]
         lines += [f"  {name:<32} {_range(values)}" for name, values in group.values.items()]
     lines += ["", "Findings:" if looked.notes else "Findings: none"]
@@ -98,20 +97,27 @@ def look(path: Path) -> Inspected:
     elif kind in LOADERS:
         table = LOADERS[kind](path)
         limits = table.limits
+        read = functools.partial(select, path, table)
+        lines, groups, units, notes = _table(path, table.columns(), table.time is not None, read)
+    elif kind == "csv":
+        layout = csv_layout(path)
         lines, groups, units, notes = _table(
-            path,
-            table.columns(),
-            table.time is not None,
-            lambda names, time: select(path, table, names, time),
+            path, csv_columns(path), False, functools.partial(read_csv, path)
+        )
+        lines.insert(
+            0,
+            f"{layout.encoding}, delimiter {layout.delimiter!r}, decimal mark {layout.decimal!r}, "
+            f"data from line {layout.skip + 1}",
         )
     else:
-        lines, groups, units, notes = _file(path, kind)
+        read = functools.partial(read_parquet, path)
+        lines, groups, units, notes = _table(path, parquet_columns(path), False, read)
     signals = []
     for group, prefix in groups:
         for name, values in group.values.items():
             numbers = finite(values)
             for code in missing_codes(numbers):
-                notes.append(_code_note(prefix + name, code, finite(values)))
+                notes.append(_code_note(prefix + name, code, values))
                 numbers = numbers[numbers != code]
             signals.append(RecordedSignal(prefix + name, units.get(name, ""), numbers, limits.get(name)))
     time = "every 1.0 s" if any(note.message == _NO_TIME for note in notes) else ""
@@ -121,44 +127,31 @@ def look(path: Path) -> Inspected:
 # ---- formats
 
 
-def _file(path: Path, kind: str) -> _Content:
-    """Words, columns, units and notes of a CSV or Parquet file."""
-    columns = csv_columns(path) if kind == "csv" else parquet_columns(path)
-    reader: Callable = read_csv if kind == "csv" else read_parquet
-    lines, groups, units, notes = _table(path, columns, False, lambda names, time: reader(path, names, time))
-    if kind == "csv":
-        layout = csv_layout(path)
-        first = (
-            f"{layout.encoding}, delimiter {layout.delimiter!r}, decimal mark {layout.decimal!r}, "
-            f"data from line {layout.skip + 1}"
-        )
-        lines.insert(0, first)
-    return lines, groups, units, notes
-
-
 def _table(path: Path, columns: Sequence[FileColumn], has_clock: bool, read: _Read) -> _Content:
     """Words, columns, units and notes of a table, which `read` reads; `has_clock`: a clock of its own."""
     names = [column.name for column in columns]
     numeric = [column.name for column in columns if column.type == "number" and column.name]
     numbers = set(numeric)
-    others = [
+    texts = [
         f"{column.name or '(no name)'} ({column.type})" for column in columns if column.name not in numbers
     ]
     counts = collections.Counter(names)
     twice = [f"{name} ({count} times)" for name, count in counts.items() if name and count > 1]
     lines = [f"{len(columns)} columns, {len(numeric)} of them numbers"]
-    lines += [f"not numbers: {', '.join(others[:20])}"] if others else []
+    lines += [f"not numbers: {', '.join(texts[:20])}"] if texts else []
     if twice:
         lines.append(
             "the same name twice, so that none of them can be mapped; give each its own: "
             + ", ".join(twice[:20])
         )
-    clock = "" if has_clock else _clock_name(path, columns)
+    clock = ""
+    with contextlib.suppress(ValueError):  # no column is called like a time
+        clock = "" if has_clock else time_column(path, names, "")
     every_signal = [name for name in numeric if counts[name] == 1 and name != clock]
     signals = telling(every_signal, MOST_SIGNALS)
     wanted = [*([clock] if clock in numbers and counts[clock] == 1 else []), *signals]
     if not signals:
-        examples = f" ({', '.join(others[:6] + twice)})" if others or twice else ""
+        examples = f" ({', '.join(texts[:6] + twice)})" if texts or twice else ""
         raise ValueError(
             f"{path}: none of its {len(columns)} columns holds numbers beside the time{examples}; "
             "write numbers without units, with one decimal mark, and a name for each column"
@@ -194,14 +187,6 @@ def _table(path: Path, columns: Sequence[FileColumn], has_clock: bool, read: _Re
     return lines, [(group._replace(values=values), "")], {c.name: c.unit for c in columns}, notes
 
 
-def _clock_name(path: Path, columns: Sequence[FileColumn]) -> str:
-    """The column that is read as the time, "" for none."""
-    try:
-        return time_column(path, [column.name for column in columns], "")
-    except ValueError:
-        return ""
-
-
 def _unit_note(clock: str, group: FileColumns) -> list[Note]:
     """A note on a clock that would have minutes between its samples, as one in ms has without its unit, or
     more of them a second than a log of temperatures holds, as one in hours has."""
@@ -225,23 +210,23 @@ def _unit_note(clock: str, group: FileColumns) -> list[Note]:
 def _mcap(path: Path) -> _Content:
     """Words, columns, units and notes of an MCAP file or a bag, in one walk."""
     surveys = [survey(part, MOST_FIELDS) for part in (bag_parts(path) if path.is_dir() else [path])]
-    by_name = merged([one.topics for one in surveys])
+    by_name = merged([part.topics for part in surveys])
     lines, groups, units = [f"{len(by_name)} topics"], [], {}
-    notes = list(dict.fromkeys(note for one in surveys for note in one.notes))
+    notes = list(dict.fromkeys(note for part in surveys for note in part.notes))
     bare = collections.Counter(field for topic in by_name.values() for field in topic.fields)
     for topic in by_name.values():
         lines.append(f"  {topic.name}: {_content(topic)}")
         if len(topic.fields) > MOST_FIELDS:
             message = f"{topic.name} has {len(topic.fields)} numbers; the first {MOST_FIELDS} are shown"
             notes.append(Note("fields", "", len(topic.fields), message))
-        parts = [group for one in surveys for group in one.columns if group.name == topic.name]
-        if not parts:
+        columns = [group for part in surveys for group in part.columns if group.name == topic.name]
+        if not columns:
             continue
         alone = all(bare[field] == 1 for field in topic.fields) and not has_bare_field(topic.fields)
-        groups.append((joined(path, parts), "" if alone else f"{topic.name}:"))
+        groups.append((joined(path, columns), "" if alone else f"{topic.name}:"))
         for channel in topic.channels:
-            given = {key: unit for key, unit in channel.metadata.items() if key.endswith(".unit")}
-            units |= {key[: -len(".unit")]: unit for key, unit in given.items()}
+            metadata = channel.metadata.items()
+            units |= {key.removesuffix(".unit"): unit for key, unit in metadata if key.endswith(".unit")}
     return lines, groups, units, notes
 
 
@@ -265,7 +250,7 @@ def _clock(path: Path, group: FileColumns) -> list[str]:
         return [f"{group.name}: {count} samples", f"  {error}"]
     if count < 2:
         return [f"{group.name}: {count} sample"]
-    time = (group.time - group.time[0]) / (1e9 if group.time.dtype == np.int64 else 1.0)
+    time = (group.time - group.time[0]) / group.second
     steps = np.diff(time)
     limit = GAP_INTERVALS * float(np.median(steps))
     jitter = intervals(time, limit)
@@ -294,11 +279,11 @@ def finite(values: np.ndarray) -> np.ndarray:
 
 
 def _code_note(name: str, code: float, values: np.ndarray) -> Note:
-    count = int(np.count_nonzero(values == code))
-    share = f"{100 * count / len(values):.2g} % of its values"
+    count, total = int(np.count_nonzero(values == code)), len(finite(values))
     message = (
-        f"{name} is exactly {code:g} in {share} ({count} of {len(values)}), far from the others: a code "
-        "for a missing value; write an empty cell (NaN) in its place, or it is taken for a measurement"
+        f"{name} is exactly {code:g} in {100 * count / total:.2g} % of its values ({count} of {total}), far "
+        "from the others: a code for a missing value; write an empty cell (NaN) in its place, or it is "
+        "taken for a measurement"
     )
     return Note(CODE, name, count, message)
 
@@ -312,7 +297,7 @@ def _range(values: np.ndarray) -> str:
     low, high = numbers.min(), numbers.max()
     if low == high:
         return f"constant {low:g}{missing}"
-    ordered = np.sort(sampled(numbers))
+    ordered = np.sort(sample(numbers))
     levels = 1 + np.count_nonzero(ordered[1:] != ordered[:-1])
     step = quantisation_step(ordered) if 12 < levels <= len(ordered) / 3 else 0.0
     if levels <= 12 and len(ordered) < len(numbers):

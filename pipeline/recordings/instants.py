@@ -79,12 +79,12 @@ def instants(
     field before. Raises ValueError with the line of a field that is no time.
     """
     ns = np.empty(len(fields), np.int64)
-    zoned, dated, after = True, False, None
+    zoned, dated, previous = True, False, None
     for i, (field, line) in enumerate(zip(fields, lines, strict=True)):
         try:
             written = _HYPHEN.sub(r"\1.\2", field) if hyphen_fraction else field
-            after, has_zone, dated = _instant(written, month_first, after)
-            ns[i] = after
+            previous, has_zone, dated = _instant(written, month_first, previous)
+            ns[i] = previous
         except (ValueError, OverflowError) as error:
             hint = f" ({error}?)" if str(error).startswith(("day", "hours", "zone")) else ""
             raise ValueError(
@@ -95,7 +95,7 @@ def instants(
     return Instants(ns, zoned, dated)
 
 
-def _instant(field: str, month_first: bool | None, after: int | None) -> tuple[int, bool, bool]:
+def _instant(field: str, month_first: bool | None, previous: int | None) -> tuple[int, bool, bool]:
     """(ns, has a zone, has a date) of one text. Raises ValueError for text that is no time."""
     compact = _COMPACT.match(field)
     if compact:
@@ -115,7 +115,7 @@ def _instant(field: str, month_first: bool | None, after: int | None) -> tuple[i
         hours = hours % 12 + 12 * (half[0] in "Pp")
     ns = ((hours * 60 + minutes) * 60 + seconds) * 10**9 + int(f"{fraction or 0:0<9}"[:9])
     ns += _day(date, month_first) * DAY_NS if date else 0
-    return ns - _offset_ns(zone or "", ns, after), bool(zone), bool(date)
+    return ns - _offset_ns(zone or "", ns, previous), bool(zone), bool(date)
 
 
 def _iso(field: str) -> tuple[int, bool, bool]:
@@ -129,32 +129,19 @@ def _iso(field: str) -> tuple[int, bool, bool]:
 @functools.lru_cache(maxsize=4096)
 def _day(date: str, month_first: bool | None) -> int:
     """Days since 1970 of one date; recordings have few of them."""
-    if date.isdigit():
-        year, month, day = int(date[:4]), int(date[4:6]), int(date[6:])
+    parts = [date[:4], date[4:6], date[6:]] if date.isdigit() else re.split(r"[-/.]", date)
+    if len(parts[0]) == 4:
+        year, month, day = map(int, parts)
     else:
-        mark = re.search(r"[-/.]", date)[0]
-        first, second, third = date.split(mark)
-        if len(first) == 4:
-            year, month, day = int(first), int(second), int(third)
-        else:
-            year = int(third) + (2000 if len(third) == 2 else 0)
-            if second.isalpha():
-                day, month = int(first), _MONTHS.get(second.title(), 0)
-            else:
-                day, month = _day_and_month(int(first), int(second), mark, month_first)
-                if not month:
-                    one, other = f"{second:0>2}-{first:0>2}", f"{first:0>2}-{second:0>2}"
-                    raise ValueError(f"day or month first: {year}-{one} or {year}-{other}")
+        day, month = int(parts[0]), _MONTHS.get(parts[1].title()) or int(parts[1])
+        year = int(parts[2]) + (2000 if len(parts[2]) == 2 else 0)
+        may_be_month = parts[1].isdigit() and "." not in date and day <= 12 and day != month
+        if may_be_month and month <= 12 and month_first is None:
+            dates = f"{year}-{month:02}-{day:02} or {year}-{day:02}-{month:02}"
+            raise ValueError(f"day or month first: {dates}")
+        if may_be_month and month_first is not False:
+            day, month = month, day
     return datetime.date(year, month, day).toordinal() - _EPOCH
-
-
-def _day_and_month(first: int, second: int, mark: str, month_first: bool | None) -> tuple[int, int]:
-    """(day, month), (0, 0) where nothing tells which is which."""
-    if mark == "." or first > 12 or first == second or month_first is False:
-        return first, second
-    if second > 12 or month_first:
-        return second, first
-    return 0, 0
 
 
 def month_first(dates: Iterable[str], sample: str) -> bool | None:
@@ -182,19 +169,21 @@ def steady_order(stamps: Iterable[str]) -> bool | None:
     Steps count where the date changes, and at the first stamps. Text that is no time is passed over.
     """
     steps: dict[bool, list[int]] = {False: [], True: []}
-    for before, now in itertools.pairwise(stamps):
-        if len(steps[False]) >= FIRST_STEPS and before.split()[:1] == now.split()[:1]:
+    for earlier, later in itertools.pairwise(stamps):
+        if len(steps[False]) >= FIRST_STEPS and earlier.split()[:1] == later.split()[:1]:
             continue
         with contextlib.suppress(ValueError, OverflowError):
-            pair = [(_instant(before, order, None)[0], _instant(now, order, None)[0]) for order in steps]
-            for order, (earlier, later) in zip(steps, pair, strict=True):
-                steps[order].append(later - earlier)
-    steady = [order for order, sizes in steps.items() if _is_steady(np.array(sizes))]
+            step = {
+                order: _instant(later, order, None)[0] - _instant(earlier, order, None)[0] for order in steps
+            }
+            for order, size in step.items():
+                steps[order].append(size)
+    steady = [
+        order
+        for order, sizes in steps.items()
+        if len(sizes) >= FEWEST_STEPS and min(sizes) > 0 and max(sizes) <= STEADY * np.median(sizes)
+    ]
     return steady[0] if len(steady) == 1 else None
-
-
-def _is_steady(steps: np.ndarray) -> bool:
-    return len(steps) >= FEWEST_STEPS and steps.min() > 0 and steps.max() <= STEADY * np.median(steps)
 
 
 def hyphen_fraction(fields: Iterable[str]) -> bool:
@@ -203,13 +192,8 @@ def hyphen_fraction(fields: Iterable[str]) -> bool:
     One field that can be no zone tells for all: zones are written as -HH or -HHMM, up to 14 hours. Fields
     are looked at up to it, or up to one without such digits.
     """
-    for field in fields:
-        match = _HYPHEN.search(field)
-        if not match:
-            return False
-        if not _is_offset(match[2]):
-            return True
-    return False
+    matches = itertools.takewhile(bool, map(_HYPHEN.search, fields))
+    return any(not _is_offset(match[2]) for match in matches if match)
 
 
 def _is_offset(digits: str) -> bool:
@@ -218,7 +202,7 @@ def _is_offset(digits: str) -> bool:
     return len(digits) in (2, 4) and minutes < 60 and hours * 60 + minutes <= 14 * 60
 
 
-def _offset_ns(zone: str, local_ns: int, after: int | None) -> int:
+def _offset_ns(zone: str, local_ns: int, previous: int | None) -> int:
     """What a clock of that zone is ahead of UTC at its time `local_ns`. Raises ValueError for no zone."""
     if zone in ("", "Z", "z"):
         return 0
@@ -226,7 +210,7 @@ def _offset_ns(zone: str, local_ns: int, after: int | None) -> int:
         return _ZONE_HOURS[zone] * 3600 * 10**9
     if zone[0] not in "+-":
         first, second = _region_offsets_ns(zone, local_ns // (900 * 10**9))
-        return second if first > second and after is not None and local_ns - first <= after else first
+        return second if first > second and previous is not None and local_ns - first <= previous else first
     digits = zone[1:].replace(":", "")
     if not _is_offset(digits):
         raise ValueError

@@ -83,7 +83,7 @@ def isolated(work: Callable[..., Any], *arguments: Any, shown: str | Path, budge
         raise ValueError(reply["refused"])
     if "failed" in reply:
         raise OSError(reply["failed"])
-    raise ValueError(_sentence(shown, budget, "memory" in reply, *ended))
+    raise ValueError(f"{shown}: {_sentence(budget, 'memory' in reply, *ended)}")
 
 
 def _take() -> Child:
@@ -123,29 +123,33 @@ def _end(child: Child) -> tuple[int, str]:
 # ---- the sentences
 
 
-def _sentence(shown: str | Path, budget: Budget, no_memory: bool, status: int, last: str) -> str:
-    """Why a call gave nothing."""
-    if status == -signal.SIGALRM:
-        return (
-            f"{shown}: reading it takes longer than the {budget.longest_s:g} s that a recording may take; "
-            "split the recording, or raise ingest.longest_s in params.expert.yaml if it is as long as that"
-        )
-    if no_memory or any(words in last for words in OUT_OF_MEMORY):
-        return (
-            f"{shown}: reading it needs more memory than the {budget.largest_mb:g} MB that a recording may "
-            "take; split the recording, or raise ingest.largest_mb in params.expert.yaml if it is as large "
-            "as that"
-        )
-    if status == -signal.SIGKILL:
-        return (
-            f"{shown}: the process that read it was killed, as a system does that runs out of memory; "
-            "lower execution.jobs or ingest.largest_mb, and run it again"
-        )
+def _sentence(budget: Budget, no_memory: bool, status: int, last: str) -> str:
+    """Why a call gave nothing: the first that holds."""
     how = signal.Signals(-status).name if status < 0 else last[:200] or f"exit status {status}"
-    return (
-        f"{shown}: reading it ended the process that read it ({how}); "
-        "copy the recording again, and report it with the file if that does not help"
+    reasons = (
+        (
+            status == -signal.SIGALRM,
+            f"reading it takes longer than the {budget.longest_s:g} s that a recording may take; "
+            "split the recording, or raise ingest.longest_s in params.expert.yaml if it is as long as that",
+        ),
+        (
+            no_memory or any(words in last for words in OUT_OF_MEMORY),
+            f"reading it needs more memory than the {budget.largest_mb:g} MB that a recording may "
+            "take; split the recording, or raise ingest.largest_mb in params.expert.yaml if it is as large "
+            "as that",
+        ),
+        (
+            status == -signal.SIGKILL,
+            "the process that read it was killed, as a system does that runs out of memory; "
+            "lower execution.jobs or ingest.largest_mb, and run it again",
+        ),
+        (
+            True,
+            f"reading it ended the process that read it ({how}); "
+            "copy the recording again, and report it with the file if that does not help",
+        ),
     )
+    return next(sentence for holds, sentence in reasons if holds)
 
 
 # ---- in the child
@@ -187,11 +191,11 @@ def _answer(replies: IO[bytes], budget: Budget, work: Callable[..., Any], argume
 
 
 def _limit_memory(largest_mb: float | None) -> None:
-    most = resource.getrlimit(resource.RLIMIT_DATA)[1]
-    wanted = most if largest_mb is None else int(largest_mb * 2**20)
-    if most != resource.RLIM_INFINITY and wanted != resource.RLIM_INFINITY:
-        wanted = min(wanted, most)
-    resource.setrlimit(resource.RLIMIT_DATA, (wanted, most))
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    limit = hard if largest_mb is None else int(largest_mb * 2**20)
+    if hard != resource.RLIM_INFINITY:
+        limit = min(limit, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
 
 
 def _data_mb() -> float:

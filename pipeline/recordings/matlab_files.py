@@ -5,11 +5,12 @@ garbled files and for deeply nested cells, and read a matrix of negative size. T
 against what is there, and ended no child.)
 """
 
+import math
 import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import numpy as np
 
@@ -34,17 +35,10 @@ _DEEPEST, MOST_PARTS = 8, 20_000
 _MOST_DIMENSIONS = 32
 
 
-class _MatlabPart(NamedTuple):
-    """A variable or a part of one: its numbers, or words on what it is."""
-
-    name: str
-    numbers: np.ndarray | None
-    words: str
-
-
-class _Element(NamedTuple):
-    kind: int
-    data: memoryview
+# a variable or a part of one: its name, its numbers, and words on what it is
+_MatlabPart = tuple[str, np.ndarray | None, str]
+# the kind and the data of an element
+_Element = tuple[int, memoryview]
 
 
 class _Broken(ValueError):
@@ -57,26 +51,28 @@ def load_matlab(path: Path) -> WholeTable:
     A structure's parts are "log.T1". The clock is the vector with the name of a time, if there is one. Raises
     ValueError for a damaged file and for one without two samples of anything.
     """
-    arrays, others, count = {}, {}, 0
+    arrays, no_columns, count = {}, {}, 0
     with path.open("rb") as stream:
-        for part in _parts(path, stream):
-            if part.numbers is None or part.numbers.size == 1:
-                others[part.name] = part.words
+        for name, numbers, words in _parts(path, stream):
+            if numbers is None or numbers.size == 1:
+                no_columns[name] = words
                 continue
-            count += part.numbers.size
+            count += numbers.size
             check_values(path, count, 1)
-            arrays[part.name] = part.numbers.squeeze()
-    length = _common_length(arrays)
+            arrays[name] = numbers.squeeze()
+    # the length that most arrays have along their longest side; of equally many the longer
+    lengths = [max(array.shape) for array in arrays.values() if array.ndim in (1, 2) and array.size]
+    length = max(lengths, key=lambda length: (lengths.count(length), length), default=0)
     if length < 2:
-        held = ", ".join([*arrays, *others][:6]) or "nothing"
+        content = ", ".join([*arrays, *no_columns][:6]) or "nothing"
         raise ValueError(
-            f"{path}: expected vectors of one length, at least 2 samples, but found {held}; "
+            f"{path}: expected vectors of one length, at least 2 samples, but found {content}; "
             "save time, inputs and outputs as vectors"
         )
     values: dict[str, np.ndarray] = {}
     for name, array in arrays.items():
         if array.ndim > 2 or length not in array.shape:
-            others[name] = f"an array of {' x '.join(map(str, array.shape))}"
+            no_columns[name] = f"an array of {' x '.join(map(str, array.shape))}"
         elif array.ndim == 1:
             values[name] = array
         else:
@@ -84,10 +80,10 @@ def load_matlab(path: Path) -> WholeTable:
             check_width(path, len(values) + table.shape[1])
             values |= {f"{name}_{j + 1}": table[:, j] for j in range(table.shape[1])}
     check_width(path, len(values))
-    return _with_clock(values, others)
+    return _with_clock(values, no_columns)
 
 
-def _with_clock(values: dict[str, np.ndarray], others: dict[str, str]) -> WholeTable:
+def _with_clock(values: dict[str, np.ndarray], no_columns: dict[str, str]) -> WholeTable:
     """The table on the clock of the first vector that has the name of a time and runs forward."""
     notes: list[Note] = []
     forward = [
@@ -101,26 +97,22 @@ def _with_clock(values: dict[str, np.ndarray], others: dict[str, str]) -> WholeT
         name = min(forward, key=len)
         time, remark = seconds(name.rpartition(".")[2], values[name])
         notes.append(Note("clock", "", 1, remark or f"{name} is the clock"))
-        for other in sorted(set(values) - set(forward)):
-            own = _own_clock(other, forward)
+        for column in sorted(set(values) - set(forward)):
+            own = _own_clock(column, forward)
             if own and not np.array_equal(values[own], values[name]):
-                others[other] = f"numbers on a clock of its own, {own}; save it with its clock alone"
+                no_columns[column] = f"numbers on a clock of its own, {own}; save it with its clock alone"
         values = {
-            other: column for other, column in values.items() if other not in forward and other not in others
+            column: numbers
+            for column, numbers in values.items()
+            if column not in forward and column not in no_columns
         }
-    return WholeTable(values, {}, time, "UTC", lambda i: f"sample {i + 1}", notes, {}, others, {})
+    return WholeTable(values, {}, time, "UTC", lambda i: f"sample {i + 1}", notes, {}, no_columns, {})
 
 
 def _own_clock(name: str, clocks: list[str]) -> str:
     """The clock of the innermost structure around `name` that has one, "" for none."""
     around = [clock for clock in clocks if "." in clock and name.startswith(clock.rpartition(".")[0] + ".")]
     return max(around, key=lambda clock: clock.count("."), default="")
-
-
-def _common_length(arrays: dict[str, np.ndarray]) -> int:
-    """The length that most arrays have along their longest side; of equally many the longer."""
-    lengths = [max(array.shape) for array in arrays.values() if array.ndim in (1, 2) and array.size]
-    return max(lengths, key=lambda length: (lengths.count(length), length), default=0)
 
 
 # ---- variables
@@ -139,7 +131,7 @@ def _parts(path: Path, stream: BinaryIO) -> Iterator[_MatlabPart]:
             if kind == _MATRIX:
                 content = memoryview(stream.read(length))
             elif kind == _COMPRESSED:
-                content = _unpacked(stream.read(length), LARGEST_UNPACKED - unpacked, order)
+                content = _unpack(stream.read(length), LARGEST_UNPACKED - unpacked, order)
             else:
                 stream.seek(length, 1)
                 continue
@@ -156,7 +148,7 @@ def _parts(path: Path, stream: BinaryIO) -> Iterator[_MatlabPart]:
             ) from None
 
 
-def _unpacked(packed: bytes, room: int, order: str) -> memoryview:
+def _unpack(packed: bytes, room: int, order: str) -> memoryview:
     """The matrix in a compressed variable."""
     unpacker = zlib.decompressobj()
     content = unpacker.decompress(packed, room + 9)
@@ -164,10 +156,10 @@ def _unpacked(packed: bytes, room: int, order: str) -> memoryview:
         raise _Broken(f"the file unpacks to more than {LARGEST_UNPACKED >> 20} MB")
     if not unpacker.eof:
         raise _Broken(f"it breaks off after {len(content)} unpacked bytes")
-    element = next(_elements(memoryview(content), order), None)
-    if element is None or element.kind != _MATRIX:
+    kind, data = next(_elements(memoryview(content), order), (0, memoryview(b"")))
+    if kind != _MATRIX:
         raise _Broken("no matrix is in it")
-    return element.data
+    return data
 
 
 def _elements(data: memoryview, order: str) -> Iterator[_Element]:
@@ -182,53 +174,51 @@ def _elements(data: memoryview, order: str) -> Iterator[_Element]:
                 raise _Broken(f"a short element of {length} bytes")
         if start + length > len(data):
             raise _Broken(f"an element of {length} bytes where {len(data) - start} are left")
-        yield _Element(kind, data[start : start + length])
+        yield kind, data[start : start + length]
         pos = pos + 8 if start == pos + 4 else start + length + (-length) % 8
 
 
-def _numbers(element: _Element | None, order: str) -> np.ndarray:
-    if element is None or element.kind not in _KINDS:
+def _next_numbers(elements: Iterator[_Element], order: str) -> np.ndarray:
+    kind, data = next(elements, (0, memoryview(b"")))
+    if kind not in _KINDS:
         raise _Broken("an element that should hold numbers holds none")
-    kind = np.dtype(order + _KINDS[element.kind])
-    if len(element.data) % kind.itemsize:
-        raise _Broken(f"an element of {len(element.data)} bytes, no multiple of {kind.itemsize}")
-    return np.frombuffer(element.data, kind)
+    dtype = np.dtype(order + _KINDS[kind])
+    if len(data) % dtype.itemsize:
+        raise _Broken(f"an element of {len(data)} bytes, no multiple of {dtype.itemsize}")
+    return np.frombuffer(data, dtype)
 
 
 def _variable(data: memoryview, order: str, above: str, depth: int) -> Iterator[_MatlabPart]:
     """The parts of a matrix; `above` is the name of what holds it."""
     elements = _elements(data, order)
-    flags = _numbers(next(elements, None), order)
-    dims = _numbers(next(elements, None), order)
-    own = _text(next(elements, None))
-    name = above or own
+    flags, dims = _next_numbers(elements, order), _next_numbers(elements, order)
+    _, own = next(elements, (0, b""))
+    name = above or _text(own)
     if not len(flags) or (dims < 0).any():
         raise _Broken("its flags or dimensions are none")
     kind, shape = int(flags[0]) & 0xFF, tuple(int(size) for size in dims)
     if kind in _NUMBERS:
-        yield _numeric(name, _numbers(next(elements, None), order), shape, bool(int(flags[0]) & _COMPLEX))
+        yield _numeric(name, _next_numbers(elements, order), shape, bool(int(flags[0]) & _COMPLEX))
     elif kind in (_CELL, _STRUCTURE, _OBJECT) and depth < _DEEPEST:
         yield from _inner(elements, order, name, kind, depth)
     elif kind == _TEXT:
-        yield _MatlabPart(name, None, f"a text of {np.prod(shape, dtype=float):.0f} characters")
+        yield name, None, f"a text of {np.prod(shape, dtype=float):.0f} characters"
     else:
-        yield _MatlabPart(name, None, _CLASSES.get(kind, f"of class {kind}"))
+        yield name, None, _CLASSES.get(kind, f"of class {kind}")
 
 
 def _numeric(name: str, numbers: np.ndarray, shape: tuple[int, ...], is_complex: bool) -> _MatlabPart:
-    count = 1
-    for size in shape:
-        count *= size
+    count = math.prod(shape)
     if count != len(numbers):
         raise _Broken(f"{name} should have {count} numbers but has {len(numbers)}")
     if count > MOST_VALUES:
         raise _Broken(f"{name} has {count} numbers, more than the {MOST_VALUES} that are read")
     if len(shape) > _MOST_DIMENSIONS:
-        return _MatlabPart(name, None, f"an array of {len(shape)} dimensions")
+        return name, None, f"an array of {len(shape)} dimensions"
     if is_complex:
-        return _MatlabPart(name, None, "complex numbers")
+        return name, None, "complex numbers"
     words = f"one number, {float(numbers[0]):g}" if count == 1 else f"{count} numbers"
-    return _MatlabPart(name, numbers.astype(float).reshape(shape, order="F"), words)
+    return name, numbers.astype(float).reshape(shape, order="F"), words
 
 
 def _inner(
@@ -239,27 +229,23 @@ def _inner(
     if kind != _CELL:
         if kind == _OBJECT:
             next(elements, None)
-        width = int((_numbers(next(elements, None), order)[:1].tolist() or [0])[0])
-        names = next(elements, None)
-        if width < 1 or names is None:
+        width = int((_next_numbers(elements, order)[:1].tolist() or [0])[0])
+        kind_of_names, names = next(elements, (0, b""))
+        if width < 1 or not kind_of_names:
             raise _Broken("its fields have no names")
-        fields = [_plain(bytes(names.data[i : i + width])) for i in range(0, len(names.data), width)]
+        fields = [_text(names[i : i + width]) for i in range(0, len(names), width)]
         if not fields:
             return
-    parts = [element for element in elements if element.kind == _MATRIX]
-    for i, element in enumerate(parts[:MOST_PARTS]):
+    parts = [data for element_kind, data in elements if element_kind == _MATRIX]
+    for i, data in enumerate(parts[:MOST_PARTS]):
         if kind == _CELL:
             full = f"{name}_{i + 1}"
         else:
             entry = f"_{i // len(fields) + 1}" if len(parts) > len(fields) else ""
             full = f"{name}{entry}.{fields[i % len(fields)]}"
-        if len(element.data):
-            yield from _variable(element.data, order, full, depth + 1)
+        if len(data):
+            yield from _variable(data, order, full, depth + 1)
 
 
-def _text(element: _Element | None) -> str:
-    return _plain(bytes(element.data)) if element is not None else ""
-
-
-def _plain(name: bytes) -> str:
-    return name.split(b"\0")[0].decode("ascii", errors="replace")
+def _text(name: bytes | memoryview) -> str:
+    return bytes(name).split(b"\0")[0].decode("ascii", errors="replace")

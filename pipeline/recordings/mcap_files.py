@@ -24,7 +24,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
-from pipeline.recordings.formats import METADATA, FileColumns, Growing, Note, nearest_names, seconds
+from pipeline.recordings.csv_files import Growing
+from pipeline.recordings.formats import METADATA, FileColumns, Note, nearest_names, seconds
 from pipeline.recordings.messages import (
     Channel,
     Decode,

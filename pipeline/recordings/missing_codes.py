@@ -27,29 +27,28 @@ def missing_codes(values: np.ndarray) -> list[float]:
     Another number counts if the signal jumps there and back, nearly each time by more than JUMP_OVER_STEPS of
     the largest steps of the others, which have many levels.
     """
-    here = np.isin(values, _CODES)
-    if not here.any():
+    candidates = np.isin(values, _CODES)
+    if not candidates.any():
         return []
-    codes = []
-    for code in values[here][np.sort(np.unique(values[here], return_index=True)[1])]:
+    codes, ordinary = [], values[~candidates]
+    for code in dict.fromkeys(values[candidates].tolist()):
         at = values == code
-        others = values[~here]
-        if not FEWEST <= np.count_nonzero(at) <= LARGEST_SHARE * len(values) or len(others) < FEWEST_LEVELS:
+        if not FEWEST <= np.count_nonzero(at) <= LARGEST_SHARE * len(values) or len(ordinary) < FEWEST_LEVELS:
             continue
         if code in _SENTINELS:
-            far = max(others.min() - code, code - others.max()) > np.ptp(others)
+            far = max(ordinary.min() - code, code - ordinary.max()) > np.ptp(ordinary)
         else:
-            far = _jumps(values, at, others)
+            far = _jumps(values, at, ordinary)
         if far:
-            codes.append(float(code))
+            codes.append(code)
     return codes
 
 
-def _jumps(values: np.ndarray, at: np.ndarray, others: np.ndarray) -> bool:
-    """Whether stretches of a code begin and end with a jump that the others never make."""
-    steps = np.abs(np.diff(others))
+def _jumps(values: np.ndarray, at: np.ndarray, ordinary: np.ndarray) -> bool:
+    """Whether stretches of a code begin and end with a jump that the ordinary values never make."""
+    steps = np.abs(np.diff(ordinary))
     resting = np.mean(steps == 0) > 0.9
-    if resting or len(np.unique(others)) <= FEWEST_LEVELS:
+    if resting or len(np.unique(ordinary)) <= FEWEST_LEVELS:
         return False
     edges = np.flatnonzero(at[1:] != at[:-1])
     jumps = np.abs(values[edges + 1] - values[edges])

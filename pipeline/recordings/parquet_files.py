@@ -8,11 +8,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from pipeline.recordings.csv_files import check_one_signal, naming_columns, numbers
+from pipeline.recordings.csv_files import Growing, check_one_signal, naming_columns
 from pipeline.recordings.formats import (
     FileColumn,
     FileColumns,
-    Growing,
     Note,
     clock_seconds,
     column_places,
@@ -136,18 +135,11 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[FileColu
     notes: list[Note] = []
     zoned = clock and kinds[clock] is np.int64 and getattr(types[clock], "tz", None)
     zone = "UTC" if zoned or not clock or kinds[clock] is float else ""
-    if interval:
-        clock_values = np.arange(count) * interval
-    elif _is_numeric(types[clock]) and kinds[clock] is float:
-        clock_values = clock_seconds(path, clock, values[clock], units[clock], notes, is_declared=bool(time))
-    else:
-        clock_values = values[clock]
-    table_columns, turned = forward(
-        FileColumns(
-            "rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone, units
-        )
-    )
-    return table_columns, notes + turned
+    times = np.arange(count) * interval if interval else values[clock]
+    if clock and _is_numeric(types[clock]):
+        times = clock_seconds(path, clock, times, units[clock], notes, is_declared=bool(time))
+    signals = {name: values[name] for name in wanted}
+    return forward(FileColumns("rows", times, signals, lambda i: f"row {i}", zone, units), notes), notes
 
 
 def _check_one_signal(
@@ -207,12 +199,12 @@ def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.nda
     if name == clock and (pa.types.is_duration(column.type) or pa.types.is_time(column.type)):
         unit = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[column.type.unit]
         counts = column.cast(pa.int32() if column.type.bit_width == 32 else pa.int64())
-        return numbers(counts.cast(pa.float64(), safe=False).chunk(0), np.float64) / unit
+        return counts.cast(pa.float64(), safe=False).chunk(0).to_numpy(zero_copy_only=False) / unit
     if _is_stamp(column.type):
         if column.null_count:
             raise ValueError(f"{path}: time {name} is missing in {column.null_count} rows; remove them")
         stamps = column.cast(pa.timestamp("ns", getattr(column.type, "tz", None))).cast(pa.int64())
-        return numbers(stamps.chunk(0), np.int64)
+        return stamps.chunk(0).to_numpy()
     if name == clock and not _is_numeric(column.type):
         raise ValueError(
             f"{path}: time {name} should be seconds or a timestamp but is of type {column.type}; convert it, "
@@ -224,7 +216,7 @@ def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.nda
     if pa.types.is_boolean(column.type):
         column = column.cast(pa.uint8())
     try:
-        return numbers(column.cast(pa.float64(), safe=False).chunk(0), np.float64)
+        return column.cast(pa.float64(), safe=False).chunk(0).to_numpy(zero_copy_only=False)
     except pa.ArrowInvalid as error:
         raise ValueError(
             f"{path}: column {name} should hold numbers but is of type {written} ({_first_line(error)}); "

@@ -83,6 +83,10 @@ class RecordedSignal(NamedTuple):
     limits: tuple[float, float] | None = None
     role: str = ""
 
+    @property
+    def name(self) -> Name:
+        return read_name(telling_name(self.source), self.unit)
+
 
 class Proposed(NamedTuple):
     """A signal of the plant, "input", "disturbance" or "output", with its source and conversion. A limit or a
@@ -106,34 +110,34 @@ class Proposed(NamedTuple):
 
 class Proposal(NamedTuple):
     """What `ingest.mapping` and `plant` could be; `how` says what it was guessed from, `time` is ingest.time,
-    `sample_time_s` the record's own clock. `set_points` belong to no output, `beside` was left out."""
+    `sample_time_s` the record's own clock. `set_points` belong to no output; nothing heats `unheated`."""
 
     signals: list[Proposed]
     how: str
     time: str
     sample_time_s: float
     set_points: list[str]
-    beside: list[str]
+    unheated: list[str]
 
 
 def propose(
     signals: Sequence[RecordedSignal], groups: Sequence[tuple[FileColumns, str]], time: str
 ) -> Proposal:
     """The proposal for the signals of a recording, which have the clocks of `groups`."""
-    taken, how = _with_roles(signals)
-    targets = _targets(taken)
+    signals, how = _with_roles(signals)
+    targets = _targets(signals)
     used = {target.source for target in targets.values()}
-    prefixes = {role: _common_words(taken, role) for role in ("input", "disturbance", "output")}
+    prefixes = {role: _common_words(signals, role) for role in ("input", "disturbance", "output")}
     names: set[str] = set()
     proposed = []
-    for signal in taken:
+    for signal in signals:
         if signal.role in prefixes:
             name = _name(signal, prefixes[signal.role], names)
             guessed = how != "names and ranges"
-            proposed.append(_proposed(signal, name, targets.get(signal.source), guessed=guessed))
-    set_points = [s.source for s in taken if s.role == "set-point" and s.source not in used]
-    beside = [s.source for s in taken if s.role == "beside"]
-    return Proposal(proposed, how, time, _sample_time(groups), set_points, beside)
+            proposed.append(_propose_signal(signal, name, targets.get(signal.source), guessed=guessed))
+    set_points = [s.source for s in signals if s.role == "set-point" and s.source not in used]
+    unheated = [s.source for s in signals if s.role == "beside"]
+    return Proposal(proposed, how, time, _sample_time(groups), set_points, unheated)
 
 
 def yaml_lines(proposal: Proposal) -> list[str]:
@@ -149,10 +153,9 @@ def yaml_lines(proposal: Proposal) -> list[str]:
         )
     lines += ["  mapping:", *(f"    {line}" for line in mapping_lines(proposal))]
     if proposal.set_points:
-        shown = ", ".join(proposal.set_points)
-        lines.append(f"# set-points of no output of the plant, left out: {shown}")
-    if proposal.beside:
-        lines.append(f"# temperatures that nothing heats, left out: {', '.join(proposal.beside)}")
+        lines.append(f"# set-points of no output of the plant, left out: {', '.join(proposal.set_points)}")
+    if proposal.unheated:
+        lines.append(f"# temperatures that nothing heats, left out: {', '.join(proposal.unheated)}")
     if not inputs:
         lines.append(
             "# nothing looks like a heater or a motor: map the inputs by hand, "
@@ -222,21 +225,20 @@ def telling_name(source: str) -> str:
     return f"{name}_{int(index[1]) + 1}" if index else name
 
 
-def telling(sources: Sequence[str], most: int) -> list[str]:
-    """At most `most` of the sources, in their order: first those whose names tell a heater, a motor, a
+def telling(sources: Sequence[str], limit: int) -> list[str]:
+    """At most `limit` of the sources, in their order: first those whose names tell a heater, a motor, a
     temperature or a set-point."""
-    if len(sources) <= most:
+    if len(sources) <= limit:
         return list(sources)
     tells = [_is_telling(source) for source in sources]
-    chosen = sorted(range(len(sources)), key=lambda i: (not tells[i], i))[:most]
+    chosen = sorted(range(len(sources)), key=lambda i: (not tells[i], i))[:limit]
     return [sources[i] for i in sorted(chosen)]
 
 
 def _is_telling(source: str) -> bool:
     text = telling_name(source)
     name = read_name(text)
-    told = bool(name.kind) or says(_TELLING, name.words)
-    return told and not _SILENT.search(text.casefold())
+    return (bool(name.kind) or says(_TELLING, name.words)) and not _SILENT.search(text.casefold())
 
 
 def has_bare_field(fields: Sequence[str]) -> bool:
@@ -244,87 +246,98 @@ def has_bare_field(fields: Sequence[str]) -> bool:
     return any(field.casefold() in _BARE_FIELDS for field in fields)
 
 
-def sampled(values: np.ndarray) -> np.ndarray:
+def sample(values: np.ndarray) -> np.ndarray:
     """At most LOOKED_AT of the values, from one end to the other."""
     return values[:: max(1, len(values) // LOOKED_AT)]
 
 
 def _is_switch(signal: RecordedSignal) -> bool:
     """Whether a signal has the values 0 and 1 alone."""
-    few = sampled(signal.values)
+    few = sample(signal.values)
     return bool(((few == 0) | (few == 1)).all()) and bool(np.isin(signal.values, (0.0, 1.0)).all())
 
 
 def _is_constant(signal: RecordedSignal) -> bool:
     values = signal.values
-    return not len(values) or bool(np.ptp(sampled(values)) == 0 and np.ptp(values) == 0)
+    return not len(values) or bool(np.ptp(sample(values)) == 0 and np.ptp(values) == 0)
 
 
 def _with_roles(signals: Sequence[RecordedSignal]) -> tuple[list[RecordedSignal], str]:
     """The signals with their roles, and what these were guessed from."""
-    taken = _with_commands_y([signal._replace(role=_role(signal)) for signal in signals])
-    taken = _without_hidden_set_points(taken)
-    roles = {signal.role for signal in taken}
+    named = _with_commands_y([signal._replace(role=_role(signal)) for signal in signals])
+    named = _without_hidden_set_points(named)
+    roles = {signal.role for signal in named}
     # a heater's volts are its command if nothing else is; the room's air is measured if nothing else is
     if "input" not in roles:
-        taken = [s._replace(role="input") if s.role == "electric" else s for s in taken]
+        named = [s._replace(role="input") if s.role == "electric" else s for s in named]
     if "output" not in roles:
-        taken = [s._replace(role="output") if s.role == "disturbance" and _is_warm(s) else s for s in taken]
-    if {"input", "output"} & {signal.role for signal in taken}:
-        return _limited(_without_strangers(_without_unheated(taken))), "names and ranges"
-    taken = [signal._replace(role=_behaviour(signal)) for signal in signals]
-    if not all(_is_switch(signal) for signal in taken if signal.role == "input"):
-        taken = [s._replace(role="") if s.role == "input" and _is_switch(s) else s for s in taken]
-    return taken, "the values alone: look at each line"
+        named = [s._replace(role="output") if s.role == "disturbance" and _is_warm(s) else s for s in named]
+    if {"input", "output"} & {signal.role for signal in named}:
+        named = _without_strangers(_without_unheated(named))
+        surplus = [s.source for s in named if s.role == "disturbance"][MOST_DISTURBANCES:]
+        return [s._replace(role="") if s.source in surplus else s for s in named], "names and ranges"
+    moving = [signal._replace(role=_behaviour(signal)) for signal in signals]
+    if not all(_is_switch(signal) for signal in moving if signal.role == "input"):
+        moving = [s._replace(role="") if s.role == "input" and _is_switch(s) else s for s in moving]
+    return moving, "the values alone: look at each line"
 
 
-def _with_commands_y(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
+def _with_commands_y(signals: Sequence[RecordedSignal]) -> Sequence[RecordedSignal]:
     """The signals with Y1, Y2 as what a controller gives (DIN 19226), if there is a set-point and nothing
     else is given; else y is a measured output."""
-    roles = {signal.role for signal in taken}
-    if "input" in roles or "set-point" not in roles:
-        return list(taken)
-    given = [
+    roles = {signal.role for signal in signals}
+    outputs = [signal for signal in signals if signal.role == "output"]
+    commands = [
         signal.source
-        for signal in taken
-        if signal.role == "output"
-        and re.search(r"^y( \d+)?$", read_name(telling_name(signal.source)).words)
+        for signal in outputs
+        if re.search(r"^y( \d+)?$", read_name(telling_name(signal.source)).words)
         and signal.values.min() >= 0.0
         and signal.values.max() <= 100.0
     ]
-    measured = [s for s in taken if s.role == "output" and s.source not in given]
-    return [s._replace(role="input") if measured and s.source in given else s for s in taken]
+    if "input" in roles or "set-point" not in roles or len(commands) == len(outputs):
+        return signals
+    return [s._replace(role="input") if s.source in commands else s for s in signals]
 
 
-def _without_strangers(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
+def _without_unheated(signals: Sequence[RecordedSignal]) -> list[RecordedSignal]:
+    """The signals without temperatures that nothing heats: those of devices without a duty, if other devices
+    of the recording have one, are the board's own sensors; a chamber's without a heater is the air around the
+    machine. Names are "device.temp" and "device.pwm"."""
+    heated = {s.source.rpartition(".")[0] for s in signals if s.source.endswith(".pwm")}
+    chamber = {s.source for s in signals if "chamber" in split(s.source).split()}
+    inputs = {s.source for s in signals if s.role == "input"}
+    roles = {}
+    for signal in signals:
+        device, _, field = signal.source.rpartition(".")
+        if inputs and not inputs & chamber and signal.source in chamber:
+            roles[signal.source] = "disturbance"
+        elif heated and field == "temp" and device not in heated:
+            roles[signal.source] = "beside"
+    return [s._replace(role=roles.get(s.source, s.role)) if s.role == "output" else s for s in signals]
+
+
+def _without_strangers(signals: Sequence[RecordedSignal]) -> Sequence[RecordedSignal]:
     """The signals without inputs of devices that no temperature belongs to, which are disturbances: the
     command of a drive among those of zones. An input belongs to an output of the same numbers or with one of
     its words, or its name says that it heats."""
-    outputs = [(_numbers(s.source), _plain_words(s.source)) for s in taken if s.role == "output"]
-    inputs = [s for s in taken if s.role == "input"]
+    outputs = [(_numbers(s.source), _plain_words(s.source)) for s in signals if s.role == "output"]
+    inputs = [s for s in signals if s.role == "input"]
     shared = set.intersection(*(_plain_words(s.source) for s in inputs)) if inputs else set()
     strangers = []
     for signal in inputs:
-        name = read_name(telling_name(signal.source), signal.unit)
         numbers, words = _numbers(signal.source), _plain_words(signal.source) - shared
-        belongs = any((numbers and numbers == own) or words & others for own, others in outputs)
-        belongs = belongs or any(says(pattern, name.words) for pattern in (COOLER, HEATER, PLACE))
+        belongs = any((numbers and numbers == own) or words & plain for own, plain in outputs)
+        belongs = belongs or any(says(pattern, signal.name.words) for pattern in (COOLER, HEATER, PLACE))
         is_named = any(word.isalpha() and not _is_common(word) for word in words)
         if is_named and not belongs and signal.source != "motor":
             strangers.append(signal.source)
     if len(strangers) == len(inputs):
-        return list(taken)
-    return [s._replace(role="disturbance") if s.source in strangers else s for s in taken]
-
-
-def _limited(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
-    """The signals with as many disturbances as a plant may have."""
-    more = [signal.source for signal in taken if signal.role == "disturbance"][MOST_DISTURBANCES:]
-    return [signal._replace(role="") if signal.source in more else signal for signal in taken]
+        return signals
+    return [s._replace(role="disturbance") if s.source in strangers else s for s in signals]
 
 
 def _is_warm(signal: RecordedSignal) -> bool:
-    name = read_name(telling_name(signal.source), signal.unit)
+    name = signal.name
     return name.kind in _CELSIUS or (not name.kind and says(TEMPERATURE, name.words))
 
 
@@ -336,68 +349,53 @@ def _role(signal: RecordedSignal) -> str:
         return ""
     if signal.source == "motor" and signal.unit == "percent":  # as our own files name the study's
         return "" if _is_constant(signal) else "input"
-    name = read_name(text, signal.unit)
-    role = _role_of_name(name, signal)
+    role = _role_of_name(signal.name, signal)
     topic = signal.source.rpartition(":")[0]
-    if role or not topic or says(SETTING, name.words):
+    if role or not topic or says(SETTING, signal.name.words):
         return role
     return _role_of_name(read_name(f"{topic.rpartition('/')[2]} {text}", signal.unit), signal)
 
 
 def _role_of_name(name: Name, signal: RecordedSignal) -> str:
-    words, kind = name.words, name.kind
-    warm = kind in _CELSIUS or (not kind and (says(TEMPERATURE, words) or words == "b"))  # Marlin's bed
-    if says(SETTING, words) or words in _TIMES:
-        return ""
-    if warm and says(DEVICE, words):
-        return "" if _is_constant(signal) else "beside"
-    if _is_wanted(words, warm):
-        return "set-point"
+    """The role by the first rule that holds."""
+    words, kind, values = name.words, name.kind, signal.values
+    low, high, is_constant = values.min(), values.max(), _is_constant(signal)
+    says_heater, says_place = says(HEATER, words), says(PLACE, words)
     letter = loop_letter(words)
-    if (
-        _is_constant(signal)
-        or kind == "other"
-        or (says(QUANTITY, words) and not warm)
-        or letter in ("p", "l")
-    ):
-        return ""
-    if kind in _CELSIUS:
-        return _role_of_temperature(words)
-    moves = says(SPEED, words) or (says(MOVER, words) and not says(HEATER, words) and not says(PLACE, words))
-    if kind == "speed" or letter in ("s", "f"):
-        return "disturbance"
-    if kind == "electric" or (says(ELECTRIC, words) and not _is_current_value(words, signal.values)):
-        return "" if moves else "electric"
+    warm = kind in _CELSIUS or (not kind and (says(TEMPERATURE, words) or words == "b"))  # Marlin's bed
+    temperature = "disturbance" if says(ROOM, words) and not says_heater else "output"
+    moves = says(SPEED, words) or (says(MOVER, words) and not says_heater and not says_place)
     duty = kind == "percent" or says(DUTY, words) or bool(re.search(r"\b[a-z\d]+ y$", words))
     duty = duty or (not warm and words.startswith("u "))
-    if warm and not duty and not _is_given(words, signal.values):
-        return _role_of_temperature(words)
-    if moves or (says(ROOM, words) and not duty):
-        return "disturbance"
-    return _role_of_machine(words, signal, duty)
-
-
-def _role_of_machine(words: str, signal: RecordedSignal, duty: bool) -> str:
-    """The role of a signal that is no speed and that neither a word nor a unit calls a temperature."""
-    heats = duty or says(HEATER, words)
-    letter = re.search(r"^[qu]( \d+)?$", words)
-    if _is_switch(signal) and not heats:
-        return "input" if letter else ""
-    if duty or letter or (says(OUTPUT, words) and " " in words) or says(COMMAND, words):
-        return "input"
+    # "current" is the present temperature: no heater of such machines takes 40 A
+    electric = says(ELECTRIC, words) and not (re.search(r"\bcurrent$", words) and high > 40.0)
+    # the output of a temperature's controller: TIC_1_Out, of 0 to 100
+    in_percent = bool(low <= 0.0 and high <= 100.0)
+    commands = says(OUTPUT, words) and (says_heater or says(COOLER, words) or in_percent)
+    # what neither a word nor a unit calls a temperature
+    symbol = re.search(r"^[qu]( \d+)?$", words)
     measured = says(ACTUAL, words) or bool(re.search(r"\b(x|current)$", words))
-    if says(HEATER, words) and not measured and not _is_beyond_percent(signal.values):
-        return "input"
-    if heats or measured or says(PLACE, words) or re.search(r"^y( \d+)?$", words):
-        return "output"
-    return "input" if says(COOLER, words) else ""
+    converted = low == 0 and bool((values == np.rint(values)).all())  # whole numbers that rest at 0
+    rules = (
+        (says(SETTING, words) or words in _TIMES, ""),
+        (warm and says(DEVICE, words), "" if is_constant else "beside"),
+        (_is_set_point(words, warm), "set-point"),
+        (is_constant or kind == "other" or (says(QUANTITY, words) and not warm) or letter in ("p", "l"), ""),
+        (kind in _CELSIUS, temperature),
+        (kind == "speed" or letter in ("s", "f"), "disturbance"),
+        (kind == "electric" or electric, "" if moves else "electric"),
+        (warm and not duty and not commands, temperature),
+        (moves or (says(ROOM, words) and not duty), "disturbance"),
+        (_is_switch(signal) and not duty and not says_heater, "input" if symbol else ""),
+        (duty or symbol or (says(OUTPUT, words) and " " in words) or says(COMMAND, words), "input"),
+        (says_heater and not measured and (high <= 110.0 or converted), "input"),
+        (says_heater or measured or says_place or re.search(r"^y( \d+)?$", words), "output"),
+        (says(COOLER, words), "input"),
+    )
+    return next((role for holds, role in rules if holds), "")
 
 
-def _role_of_temperature(words: str) -> str:
-    return "disturbance" if says(ROOM, words) and not says(HEATER, words) else "output"
-
-
-def _is_wanted(words: str, warm: bool) -> bool:
+def _is_set_point(words: str, warm: bool) -> bool:
     """Whether the words mean a set-point: by a word of its own, as the command of a temperature, as w beside
     x and y (DIN 19226), or as a tool's active and standby temperature (RepRapFirmware)."""
     heated = warm or says(HEATER, words) or says(PLACE, words)
@@ -407,24 +405,6 @@ def _is_wanted(words: str, warm: bool) -> bool:
         or (bool(re.search(r"\d w$|^w \d+$", words)) and not says(HEATER, words))
         or (heated and bool(re.search(r"\b(active|standby)$", words)))
     )
-
-
-def _is_current_value(words: str, values: np.ndarray) -> bool:
-    """Whether "current" means the present temperature: no heater of such machines takes 40 A."""
-    return bool(re.search(r"\bcurrent$", words)) and float(values.max()) > 40.0
-
-
-def _is_given(words: str, values: np.ndarray) -> bool:
-    """Whether the output of a temperature's controller is meant: TIC_1_Out, of 0 to 100."""
-    if not says(OUTPUT, words):
-        return False
-    return says(HEATER, words) or says(COOLER, words) or bool(values.min() <= 0.0 and values.max() <= 100.0)
-
-
-def _is_beyond_percent(values: np.ndarray) -> bool:
-    """Whether the values are no share in percent, and no whole numbers of a converter that rest at 0."""
-    converted = values.min() == 0 and bool((values == np.rint(values)).all())
-    return bool(values.max() > 110.0 and not converted)
 
 
 def _behaviour(signal: RecordedSignal) -> str:
@@ -438,10 +418,10 @@ def _behaviour(signal: RecordedSignal) -> str:
         or np.ptp(np.diff(finite)) < 1e-9 * np.ptp(finite)
     ):
         return ""
-    if _bimodality(sampled(finite)) > TWO_LEVELS:
+    if _bimodality(sample(finite)) > TWO_LEVELS:
         return "input"
-    few = len(np.unique(np.round(sampled(finite), 1))) <= max(10, min(len(finite), LOOKED_AT) // 100)
-    return "input" if few and not quantisation_step(sampled(finite)) < 0.1 else "output"
+    few = len(np.unique(np.round(sample(finite), 1))) <= max(10, min(len(finite), LOOKED_AT) // 100)
+    return "input" if few and not quantisation_step(sample(finite)) < 0.1 else "output"
 
 
 def _bimodality(values: np.ndarray) -> float:
@@ -455,29 +435,6 @@ def _bimodality(values: np.ndarray) -> float:
     return float((np.mean(z**3) ** 2 + 1) / np.mean(z**4))
 
 
-def _without_unheated(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
-    """The signals without temperatures that nothing heats: those of devices without a duty, if other devices
-    of the recording have one, are the board's own sensors; a chamber's without a heater is the air around the
-    machine. Names are "device.temp" and "device.pwm"."""
-    heated = {s.source.rpartition(".")[0] for s in taken if s.source.endswith(".pwm")}
-    heats_chamber = any(s.role == "input" and _is_of_chamber(s) for s in taken)
-    inputs = any(s.role == "input" for s in taken)
-
-    def role(signal: RecordedSignal) -> str:
-        device, _, field = signal.source.rpartition(".")
-        if signal.role != "output":
-            return signal.role
-        if inputs and not heats_chamber and _is_of_chamber(signal):
-            return "disturbance"
-        return "beside" if heated and field == "temp" and device not in heated else "output"
-
-    return [signal._replace(role=role(signal)) for signal in taken]
-
-
-def _is_of_chamber(signal: RecordedSignal) -> bool:
-    return "chamber" in split(signal.source).split()
-
-
 # ---- set-points
 
 
@@ -485,21 +442,21 @@ def _rests(values: np.ndarray) -> bool:
     return len(values) >= FEWEST_ROWS and float(np.mean(np.diff(values) == 0)) > RESTING_SHARE
 
 
-def _without_hidden_set_points(taken: Sequence[RecordedSignal]) -> list[RecordedSignal]:
+def _without_hidden_set_points(signals: Sequence[RecordedSignal]) -> list[RecordedSignal]:
     """An output that rests at few levels beside a measured one of the same numbers, around the same
     temperature, is the set-point of that one, whatever it is called."""
-    outputs = [(s, _numbers(s.source), np.unique(sampled(s.values))) for s in taken if s.role == "output"]
+    outputs = [(s, _numbers(s.source), np.unique(sample(s.values))) for s in signals if s.role == "output"]
     moving = [entry for entry in outputs if not _rests(entry[0].values)]
     hidden = {
         signal.source
         for signal, numbers, levels in outputs
         if _rests(signal.values)
-        for other, others, more in moving
-        if numbers == others and len(more) > MORE_LEVELS * len(levels)
+        for _, own, course in moving
+        if numbers == own and len(course) > MORE_LEVELS * len(levels)
         # the set-point lies within what is measured, a tenth of it wider
-        if more[0] - 0.1 * np.ptp(more) <= np.median(signal.values) <= more[-1] + 0.1 * np.ptp(more)
+        if course[0] - 0.1 * np.ptp(course) <= np.median(signal.values) <= course[-1] + 0.1 * np.ptp(course)
     }
-    return [s._replace(role="set-point") if s.source in hidden else s for s in taken]
+    return [s._replace(role="set-point") if s.source in hidden else s for s in signals]
 
 
 def _numbers(source: str) -> tuple[str, ...]:
@@ -514,19 +471,19 @@ def _plain_words(source: str) -> set[str]:
     return set(words.split())
 
 
-def _targets(taken: Sequence[RecordedSignal]) -> dict[str, RecordedSignal]:
+def _targets(signals: Sequence[RecordedSignal]) -> dict[str, RecordedSignal]:
     """{output: its set-point}: of the same numbers, with the most words in common. If no output has the same
     numbers, words and numbers count alike."""
-    outputs = {s.source: (_numbers(s.source), _plain_words(s.source)) for s in taken if s.role == "output"}
+    outputs = {s.source: (_numbers(s.source), _plain_words(s.source)) for s in signals if s.role == "output"}
     targets: dict[str, tuple[float, RecordedSignal]] = {}
-    for signal in taken:
-        name = read_name(telling_name(signal.source), signal.unit)
+    for signal in signals:
+        name = signal.name
         if signal.role != "set-point" or name.kind not in ("", *_CELSIUS) or says(SPEED, name.words):
             continue
         numbers, words = _numbers(signal.source), _plain_words(signal.source)
         likeness = {
-            source: len(words & others) / len(words | others) if words | others else 1.0
-            for source, (own, others) in outputs.items()
+            source: len(words & plain) / len(words | plain) if words | plain else 1.0
+            for source, (_, plain) in outputs.items()
         }
         equal = [source for source, (own, _) in outputs.items() if own == numbers]
         candidates = sorted(equal or outputs, key=lambda source: -likeness[source])
@@ -542,7 +499,9 @@ def _targets(taken: Sequence[RecordedSignal]) -> dict[str, RecordedSignal]:
 # ---- names, units, limits
 
 
-def _proposed(signal: RecordedSignal, name: str, target: RecordedSignal | None, *, guessed: bool) -> Proposed:
+def _propose_signal(
+    signal: RecordedSignal, name: str, target: RecordedSignal | None, *, guessed: bool
+) -> Proposed:
     unit, scale, offset = _conversion(signal)
     low = high = reference = cut_off = None
     if signal.limits is not None and np.isfinite(signal.limits).all():
@@ -550,10 +509,10 @@ def _proposed(signal: RecordedSignal, name: str, target: RecordedSignal | None, 
     elif signal.role == "input":
         low, high = _input_limits(signal.values * scale + offset, guessed=guessed and scale == 1.0)
     if signal.role == "output":
-        reference = _reference(sampled(signal.values) * scale + offset, target, scale, offset)
+        reference = _reference(sample(signal.values) * scale + offset, target, scale, offset)
         if high is not None:
             cut_off, high = high, max(high - BELOW_CUT_OFF_DEGC, reference)
-    words = read_name(telling_name(signal.source), signal.unit).words
+    words = signal.name.words
     heated = says(HEATER, words) or _HEATED.search(words) is not None
     heats = signal.role == "input" and heated and not says(COOLER, words) and not says(SPEED, words)
     set_point = target.source if target is not None else ""
@@ -562,36 +521,33 @@ def _proposed(signal: RecordedSignal, name: str, target: RecordedSignal | None, 
     )
 
 
-def _input_limits(ours: np.ndarray, *, guessed: bool) -> tuple[float, float]:
+def _input_limits(percent: np.ndarray, *, guessed: bool) -> tuple[float, float]:
     """0 to 100 percent, or from below zero where it was recorded there. Of a `guessed` input nothing says
     that it is percent: the whole numbers around what was recorded, so that no experiment asks for more."""
-    low, high = max(-100.0, float(np.floor(ours.min()))), min(100.0, float(np.ceil(ours.max())))
+    low, high = max(-100.0, float(np.floor(percent.min()))), min(100.0, float(np.ceil(percent.max())))
     return (low, high) if guessed else (min(0.0, low), 100.0)
 
 
-def _reference(ours: np.ndarray, target: RecordedSignal | None, scale: float, offset: float) -> float:
+def _reference(celsius: np.ndarray, target: RecordedSignal | None, scale: float, offset: float) -> float:
     """The set-point that was held longest, or the median where there is none."""
-    held = target.values if target is not None else np.empty(0)
-    held = held[held > 0]
-    if len(held):
-        levels, counts = np.unique(held, return_counts=True)
+    wanted = target.values if target is not None else np.empty(0)
+    levels, counts = np.unique(wanted[wanted > 0], return_counts=True)
+    if len(levels):
         return float(np.round(levels[counts.argmax()] * scale + offset, 1)) + 0.0
-    return float(np.round(np.median(ours))) + 0.0
+    return float(np.round(np.median(celsius))) + 0.0
 
 
 def _words_of(signal: RecordedSignal) -> list[str]:
     """The words of the topic's last part and of the telling name, each once."""
-    topic = signal.source.rpartition(":")[0].rpartition("/")[2]
-    name = telling_name(signal.source)
-    own = read_name(name, signal.unit).words.split()
-    return own if name.startswith(topic) else [*split(topic).split(), *own]
+    topic, words = signal.source.rpartition(":")[0].rpartition("/")[2], signal.name.words.split()
+    return words if telling_name(signal.source).startswith(topic) else [*split(topic).split(), *words]
 
 
-def _common_words(taken: Sequence[RecordedSignal], role: str) -> int:
+def _common_words(signals: Sequence[RecordedSignal], role: str) -> int:
     """How many first words the names of all signals of a role share."""
-    names = [_words_of(signal) for signal in taken if signal.role == role]
-    alike = [len(set(column)) == 1 for column in zip(*names, strict=False)]
-    return alike.index(False) if len(names) > 1 and False in alike else 0
+    names = [_words_of(signal) for signal in signals if signal.role == role]
+    shared = [len(set(column)) == 1 for column in zip(*names, strict=False)]
+    return shared.index(False) if len(names) > 1 and False in shared else 0
 
 
 def _name(signal: RecordedSignal, prefix: int, names: set[str]) -> str:
@@ -608,8 +564,8 @@ def _name(signal: RecordedSignal, prefix: int, names: set[str]) -> str:
     elif number:
         base = f"{kind}_{number}"
     else:
-        rest = [word for word in words if re.fullmatch(r"[a-z]{2,}", word) and not _is_common(word)]
-        base = "_".join([kind, *dict.fromkeys(rest)])[:40] if rest else f"{kind}_1"
+        own_words = [word for word in words if re.fullmatch(r"[a-z]{2,}", word) and not _is_common(word)]
+        base = "_".join([kind, *dict.fromkeys(own_words)])[:40] if own_words else f"{kind}_1"
     base = f"{base}_1" if base in _TAKEN_NAMES else base
     name, i = base, 1
     while name in names:
@@ -628,8 +584,7 @@ def _is_common(word: str) -> bool:
 
 def _conversion(signal: RecordedSignal) -> tuple[str, float, float]:
     """The unit of ours, and the scale and offset that lead to it."""
-    name = read_name(telling_name(signal.source), signal.unit)
-    finite = signal.values
+    name, finite = signal.name, signal.values
     low, high = finite.min(), finite.max()
     if signal.role == "disturbance" and not _is_warm(signal):
         if name.kind != "percent":
@@ -668,6 +623,6 @@ def _sample_time(groups: Sequence[tuple[FileColumns, str]]) -> float:
     medians = []
     for group, _ in groups:
         if len(group.time) > 1:
-            steps = np.diff(group.time[:CLOCK_SAMPLES]) / (1e9 if group.time.dtype == np.int64 else 1.0)
+            steps = np.diff(group.time[:CLOCK_SAMPLES]) / group.second
             medians.append(float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0)
     return float(f"{max(medians, default=1.0):.2g}")

@@ -3,12 +3,12 @@ quantisation, units. Wrong samples are masked.
 """
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.ndimage import median_filter
 
-from pipeline.recordings.formats import Flag, Table, measured
+from pipeline.recordings.formats import Flag, Table
 
 SPIKE_WINDOW = 7
 # a spike is beyond eight robust standard deviations of the residual of the local median, and beyond three
@@ -38,13 +38,12 @@ def flag(table: Table, *, units: Mapping[str, str], limits: Mapping[str, tuple[f
     outputs = [name for name in table.values if name not in limits]
     flags, masked = list(table.flags), {name: mask.copy() for name, mask in table.masked.items()}
     for name in outputs:
-        for doubtful in (_spikes(table, name), frozen(table, name)):
-            for finding, where in doubtful:
-                flags.append(finding)
-                masked[name][where] = True
+        for finding, where in [*_spikes(table, name), *frozen(table, name)]:
+            flags.append(finding)
+            masked[name][where] = True
     checked = table._replace(masked=masked)
     for name in outputs:
-        for check in (_constant, _quantised, rails):
+        for check in (_constant, _quantisation, rails):
             flags += check(checked, name)
     for name, (low, high) in limits.items():
         if name in table.values:
@@ -53,13 +52,16 @@ def flag(table: Table, *, units: Mapping[str, str], limits: Mapping[str, tuple[f
     return checked._replace(flags=flags)
 
 
+def values_or_nan(table: Table, name: str) -> np.ndarray:
+    """The values (T,) of a signal, NaN where it is masked; no copy where nothing is."""
+    masked = table.masked[name]
+    return np.where(masked, np.nan, table.values[name]) if masked.any() else table.values[name]
+
+
 def _usable(table: Table, name: str) -> np.ndarray:
-    return _chosen(table.values[name], ~table.masked[name])
-
-
-def _chosen(values: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """The values of a mask; no copy where it holds all."""
-    return values if which.all() else values[which]
+    """The values that are not masked; no copy if none is."""
+    masked = table.masked[name]
+    return table.values[name][~masked] if masked.any() else table.values[name]
 
 
 def _flag(table: Table, name: str, kind: str, where: np.ndarray, message: str) -> Flag:
@@ -75,20 +77,20 @@ def _groups(where: np.ndarray, segment: np.ndarray) -> list[np.ndarray]:
     return np.split(where, np.flatnonzero((np.diff(where) > 1) | (np.diff(segment[where]) != 0)) + 1)
 
 
-def _in_segments(table: Table, name: str, of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """The filter `of` on the values of each segment. The last value before a masked gap bridges the gap."""
-    filtered = np.zeros(len(table.time_s))
-    values = measured(table, name)
+def _residual(table: Table, name: str) -> np.ndarray:
+    """What each value differs by from the local median in its segment. The last value before a masked gap
+    bridges the gap."""
+    residual = np.zeros(len(table.time_s))
+    values = values_or_nan(table, name)
     starts = [0, *(np.flatnonzero(np.diff(table.segment)) + 1).tolist(), len(values)]
     for start, end in itertools.pairwise(starts):
         inside = values[start:end]
-        known = np.isfinite(inside)
-        if known.all():
-            filtered[start:end] = of(inside)
-        elif known.any():
-            finite = np.flatnonzero(known)
-            filtered[start:end] = of(inside[finite[np.maximum(np.cumsum(known) - 1, 0)]])
-    return filtered
+        finite = np.isfinite(inside)
+        if finite.any():
+            if not finite.all():
+                inside = inside[np.flatnonzero(finite)[np.maximum(np.cumsum(finite) - 1, 0)]]
+            residual[start:end] = inside - median_filter(inside, SPIKE_WINDOW, mode="nearest")
+    return residual
 
 
 # ---- spikes
@@ -97,16 +99,15 @@ def _in_segments(table: Table, name: str, of: Callable[[np.ndarray], np.ndarray]
 def _spikes(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
     """Isolated samples that leave the local median and come back (Hampel 1974,
     with guards for quantised and for smooth signals)."""
-    residual = _in_segments(table, name, lambda y: y - median_filter(y, SPIKE_WINDOW, mode="nearest"))
-    usable = ~table.masked[name]
+    residual, usable = _residual(table, name), ~table.masked[name]
     size = np.abs(residual)
-    known = _chosen(size, usable)
-    if len(known) < 3 * SPIKE_WINDOW or _none_stands_out(known):
+    sizes = size[usable]
+    if len(sizes) < 3 * SPIKE_WINDOW or _none_stands_out(sizes):
         return []
     # the median alone is 0 for a quantised signal: the 90th percentile and the step of the values count too
     sigma = max(
-        1.4826 * np.median(known),
-        np.percentile(known, 90) / 1.645,
+        1.4826 * np.median(sizes),
+        np.percentile(sizes, 90) / 1.645,
         quantisation_step(table.values[name][usable]),
     )
     spikes = []
@@ -127,18 +128,18 @@ def _spikes(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
 def _none_stands_out(size: np.ndarray) -> bool:
     """Whether no residual can be beyond eight of the deviations that the 90th percentile tells: more than a
     tenth are at least an eighth as large as such a one. That is found by counting, in place of sorting."""
-    near = size.max() / SPIKE_SIGMAS * 1.645 * (1 + 1e-9)  # beyond what rounding does to the percentile
-    return bool(np.count_nonzero(size >= near) >= len(size) - int(0.9 * (len(size) - 1)))
+    limit = size.max() / SPIKE_SIGMAS * 1.645 * (1 + 1e-9)  # beyond what rounding does to the percentile
+    return bool(np.count_nonzero(size >= limit) >= len(size) - int(0.9 * (len(size) - 1)))
 
 
 def _stands_alone(table: Table, name: str, group: np.ndarray, size: float) -> bool:
     """Whether the neighbours on both sides go on as if the group were not there."""
     inside = np.flatnonzero(table.segment == table.segment[group[0]])
-    near = inside[(inside >= group[0] - SPIKE_WINDOW) & (inside <= group[-1] + SPIKE_WINDOW)]
-    others = near[~np.isin(near, group) & ~table.masked[name][near]]
-    if not (others < group[0]).any() or not (others > group[-1]).any():
+    window = inside[(inside >= group[0] - SPIKE_WINDOW) & (inside <= group[-1] + SPIKE_WINDOW)]
+    neighbours = window[~np.isin(window, group) & ~table.masked[name][window]]
+    if not (neighbours < group[0]).any() or not (neighbours > group[-1]).any():
         return False
-    changes = np.abs(np.diff(table.values[name][others]))
+    changes = np.abs(np.diff(table.values[name][neighbours]))
     return size > SPIKE_OVER_NEIGHBOURS * changes.max(initial=0.0)
 
 
@@ -205,7 +206,7 @@ def _at_limits(table: Table, name: str, low: float, high: float) -> list[Flag]:
     return flags
 
 
-def _quantised(table: Table, name: str) -> list[Flag]:
+def _quantisation(table: Table, name: str) -> list[Flag]:
     usable = _usable(table, name)
     step = quantisation_step(usable) if len(usable) else 0.0
     if not step:
@@ -231,15 +232,14 @@ def _unit_flags(
         usable, unit = _usable(table, name), units.get(name, "").casefold()
         if not len(usable):
             continue
-        doubt = (
-            _doubtful_celsius(name, usable, resting)
-            if unit in CELSIUS
-            else _doubtful_percent(name, usable, limits.get(name, (0.0, 100.0))[1])
-            if unit in _PERCENT
-            else ""
-        )
+        doubts: list[tuple[object, str]] = []
+        if unit in CELSIUS:
+            doubts = _celsius_doubts(usable, resting)
+        elif unit in _PERCENT:
+            doubts = _percent_doubts(usable, limits.get(name, (0.0, 100.0))[1])
+        doubt = next((message for holds, message in doubts if holds), "")
         if doubt:
-            flags.append(_flag(table, name, "unit", np.flatnonzero(~table.masked[name]), doubt))
+            flags.append(_flag(table, name, "unit", np.flatnonzero(~table.masked[name]), f"{name} {doubt}"))
     return flags
 
 
@@ -256,45 +256,47 @@ def _at_rest(table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[
     return idle or (len(starts) > 1 and np.ptp(starts) <= 3.0)
 
 
-def _doubtful_celsius(name: str, values: np.ndarray, resting: bool) -> str:
-    first, middle = values[0], float(np.median(values))
-    if values.min() < -273.15:
-        return (
-            f"{name} falls to {values.min():g} °C, which no temperature does; "
-            "mend the mapping's scale and offset"
-        )
-    if middle > HOTTEST_DEGC or (resting and ROOM_KELVIN[0] <= first <= ROOM_KELVIN[1]):
-        return (
-            f"{name} begins at {first:g} and is {middle:g} in the middle: it looks like kelvin; "
-            "set offset: -273.15 if it is"
-        )
-    if resting and ROOM_FAHRENHEIT[0] <= first <= ROOM_FAHRENHEIT[1]:
-        return (
-            f"{name} begins at {first:g} on a machine at rest: it looks like fahrenheit; "
-            "set scale: 0.555556 and offset: -17.7778 if it is"
-        )
-    if resting and values.max() <= 1.0 and values.min() >= 0.0:
-        return (
-            f"{name} lies within 0 to 1: it looks like a share or a voltage; "
-            "set the sensor's scale and offset if it is"
-        )
-    return ""
+def _celsius_doubts(values: np.ndarray, resting: bool) -> list[tuple[object, str]]:
+    """(whether it holds, words) of the units that the values may be in instead of °C; the first that holds
+    counts."""
+    first, median, low, high = values[0], float(np.median(values)), values.min(), values.max()
+    return [
+        (
+            low < -273.15,
+            f"falls to {low:g} °C, which no temperature does; mend the mapping's scale and offset",
+        ),
+        (
+            median > HOTTEST_DEGC or (resting and ROOM_KELVIN[0] <= first <= ROOM_KELVIN[1]),
+            f"begins at {first:g} and is {median:g} in the middle: it looks like kelvin; "
+            "set offset: -273.15 if it is",
+        ),
+        (
+            resting and ROOM_FAHRENHEIT[0] <= first <= ROOM_FAHRENHEIT[1],
+            f"begins at {first:g} on a machine at rest: it looks like fahrenheit; "
+            "set scale: 0.555556 and offset: -17.7778 if it is",
+        ),
+        (
+            resting and 0.0 <= low and high <= 1.0,
+            "lies within 0 to 1: it looks like a share or a voltage; "
+            "set the sensor's scale and offset if it is",
+        ),
+    ]
 
 
-def _doubtful_percent(name: str, values: np.ndarray, high: float) -> str:
-    top = values.max()
-    if 0.0 < top <= 1.0 and values.min() >= 0.0:
-        return (
-            f"{name} lies within {values.min():g} to {top:g}: it looks like a duty of 0 to 1; "
-            "set scale: 100 if it is"
+def _percent_doubts(values: np.ndarray, limit: float) -> list[tuple[object, str]]:
+    """(whether it holds, words) of what the values may be instead of percent."""
+    low, high = values.min(), values.max()
+    converted = low >= 0.0 and max(100.0, limit) < high and bool((values == np.rint(values)).all())
+    duty = f"lies within {low:g} to {high:g}: it looks like a duty of 0 to 1; set scale: 100 if it is"
+    converters = [
+        (
+            converted and high <= full,
+            f"reaches {high:g} in whole numbers: it looks like a converter's 0 to {full}; "
+            f"set scale: {100 / full:.6g} if it is",
         )
-    for full in (255, 1023, 4095, 65535):
-        if max(100.0, high) < top <= full and values.min() >= 0.0 and (values == np.rint(values)).all():
-            return (
-                f"{name} reaches {top:g} in whole numbers: it looks like a converter's 0 to {full}; "
-                f"set scale: {100 / full:.6g} if it is"
-            )
-    return ""
+        for full in (255, 1023, 4095, 65535)
+    ]
+    return [(low >= 0.0 and 0.0 < high <= 1.0, duty), *converters]
 
 
 # ---- sensors that stand still but should not. A process comes to rest slowly; a signal that stops at once
@@ -311,7 +313,7 @@ def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
     Noise ends at once at an end of the stretch, or a movement does although it went on: a jump at the end of
     the stretch shows that, or other signals that move meanwhile.
     """
-    values = measured(table, name)
+    values = values_or_nan(table, name)
     if not _may_rest(values, FROZEN_SHORTEST):
         return []
     first, last = runs(values, table.segment)
@@ -322,22 +324,22 @@ def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
     if not len(rests):
         return []
     step, stretches = least_change(values), []
-    others = {other: measured(table, other) for other in table.values if other != name}
-    whole = {other: _range(column) for other, column in others.items()}
+    columns = {other: values_or_nan(table, other) for other in table.values if other != name}
+    ranges = {other: _range(column) for other, column in columns.items()}
     for i in rests:
         a, b = int(first[i]), int(last[i])
-        before, after = _before(values, table.segment, a), _after(values, table.segment, b)
-        entry, end = _alive(before, step), _alive(-after[::-1], step)
-        moving = [other for other, column in others.items() if _moves(column[a : b + 1], whole[other])]
-        released = len(after) > 0 and abs(after[0]) > 3 * max(
-            np.abs(before[1:]).max(initial=0.0), np.abs(after[1:]).max(initial=0.0)
+        earlier, later = _before(values, table.segment, a), _after(values, table.segment, b)
+        entry, end = _alive(earlier, step), _alive(-later[::-1], step)
+        moving = [other for other, column in columns.items() if _moves(column[a : b + 1], ranges[other])]
+        released = len(later) > 0 and abs(later[0]) > 3 * max(
+            np.abs(earlier[1:]).max(initial=0.0), np.abs(later[1:]).max(initial=0.0)
         )
         noise_stopped = {entry, end} <= {"noise", "edge"} and "noise" in (entry, end)
         if noise_stopped or (entry == "movement" and (released or moving)):
             where = np.arange(a + 1, b + 1)
-            beside = f" while {', '.join(moving[:3])} move" if moving else ""
+            meanwhile = f" while {', '.join(moving[:3])} move" if moving else ""
             message = (
-                f"{name} stays at {values[a]:g} for {b - a + 1} samples{beside}: a frozen sensor, masked"
+                f"{name} stays at {values[a]:g} for {b - a + 1} samples{meanwhile}: a frozen sensor, masked"
             )
             stretches.append((_flag(table, name, "frozen", where, message), where))
     return stretches
@@ -345,7 +347,7 @@ def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
 
 def rails(table: Table, name: str) -> list[Flag]:
     """Flags for a largest or smallest value at which the signal stops at once and stays for long."""
-    values = measured(table, name)
+    values = values_or_nan(table, name)
     if not _may_rest(values, RAIL_SHORTEST + 1):
         return []
     finite = values[np.isfinite(values)]
@@ -356,26 +358,17 @@ def rails(table: Table, name: str) -> list[Flag]:
     limit = max(RAIL_SHORTEST, OVER_USUAL * float(np.percentile(length, 95)))
     flags = []
     for rail, side in ((finite.max(), "largest"), (finite.min(), "smallest")):
-        there = np.flatnonzero((values[first] == rail) & (length > limit))
-        there = there[_at_rail(values, table.segment, first[there])]
-        long = list(zip(first[there].tolist(), last[there].tolist(), strict=True))
+        rests = np.flatnonzero((values[first] == rail) & (length > limit))
+        rests = rests[_at_rail(values, table.segment, first[rests])]
+        long = list(zip(first[rests].tolist(), last[rests].tolist(), strict=True))
         step = least_change(values) if long else 0.0
         if any(_alive(_before(values, table.segment, a), step) in ("noise", "movement") for a, _ in long):
-            count = sum(b - a + 1 for a, b in long)
+            where = np.concatenate([np.arange(a, b + 1) for a, b in long])
             message = (
-                f"{name} stays at {rail:g}, its {side} value, for {count} samples in {len(long)} stretches:"
-                f" the sensor or its converter is saturated"
+                f"{name} stays at {rail:g}, its {side} value, for {len(where)} samples in {len(long)} "
+                "stretches: the sensor or its converter is saturated"
             )
-            flags.append(
-                Flag(
-                    name,
-                    "saturated",
-                    float(table.time_s[long[0][0]]),
-                    float(table.time_s[long[-1][1]]),
-                    count,
-                    message,
-                )
-            )
+            flags.append(_flag(table, name, "saturated", where, message))
     return flags
 
 
@@ -401,13 +394,13 @@ def _usual_of_others(lengths: np.ndarray, own: np.ndarray) -> np.ndarray:
     if len(lengths) < 2:
         return np.full(len(own), np.inf)
     ordered = np.sort(lengths)
-    held = np.cumsum(ordered)
+    total = np.cumsum(ordered)
     at = np.searchsorted(ordered, own)  # where the stretch itself stands
-    wanted = np.ceil(0.9 * (held[-1] - own)).astype(int)
-    j = np.searchsorted(held, wanted)
+    wanted = np.ceil(0.9 * (total[-1] - own)).astype(int)
+    j = np.searchsorted(total, wanted)
     # behind itself the others hold less by its length
-    behind = np.maximum(np.searchsorted(held, wanted + own), at + 1)
-    return ordered[np.where(j < at, j, behind)].astype(float)
+    later = np.maximum(np.searchsorted(total, wanted + own), at + 1)
+    return ordered[np.where(j < at, j, later)].astype(float)
 
 
 def _before(values: np.ndarray, segment: np.ndarray, first: int) -> np.ndarray:
@@ -444,14 +437,8 @@ def _alive(changes: np.ndarray, step: float) -> str:
         return "noise"
     third = len(changes) // 3
     early, late = changes[:third].sum(), changes[-third:].sum()
-    return (
-        "movement"
-        if turns <= 1
-        and early * late > 0
-        and abs(late) >= 0.5 * abs(early)
-        and len(moved) >= 0.75 * len(changes)
-        else ""
-    )
+    goes_on = early * late > 0 and abs(late) >= 0.5 * abs(early)
+    return "movement" if turns <= 1 and goes_on and len(moved) >= 0.75 * len(changes) else ""
 
 
 def _range(values: np.ndarray) -> float:
@@ -459,10 +446,10 @@ def _range(values: np.ndarray) -> float:
     return float(np.ptp(finite)) if len(finite) else 0.0
 
 
-def _moves(inside: np.ndarray, whole: float) -> bool:
-    """Whether a signal changes over a stretch by a tenth of its own range, `whole`."""
+def _moves(inside: np.ndarray, full_range: float) -> bool:
+    """Whether a signal changes over a stretch by a tenth of its own range."""
     inside = inside[np.isfinite(inside)]
-    return len(inside) > 1 and whole > 0 and bool(np.ptp(inside) >= 0.1 * whole)
+    return len(inside) > 1 and full_range > 0 and bool(np.ptp(inside) >= 0.1 * full_range)
 
 
 def _at_rail(values: np.ndarray, segment: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -472,3 +459,113 @@ def _at_rail(values: np.ndarray, segment: np.ndarray, first: np.ndarray) -> np.n
         return np.zeros(0, bool)
     came = (first > 0) & (segment[first] == segment[np.maximum(first, 1) - 1])
     return came & ((values[first] == np.nanmax(values)) | (values[first] == np.nanmin(values)))
+
+
+# ---- two devices under one name: samples jump to and fro between two courses, and intervals alternate
+
+# windows of so many samples, half overlapping: short ones for devices that write in turn, long ones for
+# devices that write in batches
+WINDOWS = (32, 128)
+LEAST_SHARE, LEAST_CROSSINGS, LEAST_WINDOWS = 1 / 8, 4, 3
+# between the two courses lies nothing: a gap three times any other, and three steps of a coarse sensor, of
+# which none is coarser than 2
+GAP, COARSEST_STEP = 3.0, 2.0
+WINDOWS_AT_ONCE = 1000
+
+
+def mask_mixed(table: Table, signals: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Table:
+    """The table with flags for stretches of the record's own samples {signal: (time_s (n,), values (n,))} in
+    which two devices write under one name. They are masked, as nothing tells which of the two a sample is
+    of."""
+    flags = list(table.flags)
+    for name, (time_s, values) in signals.items():
+        for first, last, distance in find_mixed(values):
+            start, end = float(time_s[first]), float(time_s[last])
+            table.masked[name][(table.time_s >= start) & (table.time_s <= end)] = True
+            message = (
+                f"{name} jumps to and fro between two courses {distance:.3g} apart from {start:g} to {end:g} "
+                "s, masked: two devices seem to write under one name; record each under a name of its own"
+            )
+            flags.append(Flag(name, "mixed", start, end, last - first + 1, message))
+    return table._replace(flags=flags)
+
+
+def find_mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
+    """(first, last, distance) of the stretches of values (n,) whose samples belong to two courses at once,
+    `distance` apart.
+
+    In each window the best parabola is taken off and the rest sorted. Two courses make two groups with a gap
+    between, and the samples change group again and again. (A step changes it once, a spike twice.)
+    """
+    finite = np.flatnonzero(np.isfinite(values))
+    y, step = values[finite], 0.0
+    suspect, distance = np.zeros(len(y), bool), np.zeros(len(y), np.float32)
+    for size in WINDOWS:
+        if len(y) < size:
+            continue
+        starts = np.unique(np.r_[np.arange(0, len(y) - size, size // 2), len(y) - size])
+        parabolas = np.linalg.qr(np.vander(np.linspace(-1, 1, size), 3))[0]
+        gap = np.concatenate(
+            [_gaps(y, part, parabolas) for part in np.array_split(starts, -(-len(starts) // WINDOWS_AT_ONCE))]
+        )
+        hit = _in_a_row(gap > 0, min(LEAST_WINDOWS, len(gap)))
+        if not hit.any():
+            continue
+        # most records are through by now: the step costs more than the gaps
+        step = step or _coarse_step(y)
+        hit = _in_a_row(gap > GAP * step, min(LEAST_WINDOWS, len(gap)))
+        for start, width in zip(starts[hit], gap[hit], strict=True):
+            suspect[start : start + size] = True
+            distance[start : start + size] = width
+    edges = np.flatnonzero(np.diff(np.r_[False, suspect, False].astype(np.int8)))
+    return [
+        (int(finite[a]), int(finite[b - 1]), float(np.median(distance[a:b])))
+        for a, b in zip(edges[::2], edges[1::2], strict=True)
+    ]
+
+
+def _coarse_step(y: np.ndarray) -> float:
+    """The step that a coarse sensor may explain, more than 0."""
+    # over one sample and over more: with two devices in turn every change from sample to sample is a jump
+    step = min(COARSEST_STEP, *(least_change(y, lag) for lag in (1, 2, 3)))
+    # a converter may be coarser: its levels tell, where there are more than the two of two devices at rest
+    return max(step, quantisation_step(y)) if len(np.unique(y)) > 2 else step
+
+
+def _gaps(y: np.ndarray, starts: np.ndarray, parabolas: np.ndarray) -> np.ndarray:
+    """The gap between the two courses in each window, 0 for a window without two, whatever the sensor's
+    step. `parabolas` (size, 3) is an orthonormal basis of the parabolas over a window."""
+    size = len(parabolas)
+    windows = np.lib.stride_tricks.sliding_window_view(y, size)[starts]
+    residual = windows - windows @ parabolas @ parabolas.T
+    ordered = np.sort(residual, axis=1)
+    between = np.diff(ordered, axis=1)
+    least, rows = round(LEAST_SHARE * size), np.arange(len(starts))
+    at = least - 1 + np.argmax(between[:, least - 1 : size - least], axis=1)
+    gap, middle = between[rows, at], (ordered[rows, at] + ordered[rows, at + 1]) / 2
+    between[rows, at] = 0
+    apart = np.flatnonzero(gap > GAP * between.max(1))
+    crossings = np.count_nonzero(np.diff(residual[apart] > middle[apart, None], axis=1), axis=1)
+    two = apart[crossings >= LEAST_CROSSINGS]
+    gaps = np.zeros(len(starts))
+    gaps[two] = gap[two]
+    return gaps
+
+
+def _in_a_row(hit: np.ndarray, least: int) -> np.ndarray:
+    """Mask (n,) of the hits that stand in a row of at least `least`."""
+    edges = np.flatnonzero(np.diff(np.r_[False, hit, False].astype(int)))
+    long_enough = np.zeros(len(hit), bool)
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        long_enough[a:b] = b - a >= least
+    return long_enough
+
+
+def alternate(intervals_s: np.ndarray) -> bool:
+    """Whether a long interval follows each short one, as with two clocks of one rate, one behind the
+    other."""
+    if len(intervals_s) < 20:
+        return False
+    deviation = intervals_s - intervals_s.mean()
+    power = float(deviation @ deviation)
+    return power > 0 and float(deviation[1:] @ deviation[:-1]) < -0.8 * power

@@ -5,13 +5,14 @@ printers, spreadsheets, MATLAB files. Damaged, missing and left-out samples are 
 words.
 """
 
+import itertools
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.recordings.clocks import mended_topics
+from pipeline.recordings.clocks import repair_topics
 from pipeline.recordings.csv_files import read_groups
 from pipeline.recordings.formats import (
     CALENDAR_S,
@@ -66,7 +67,7 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal
     numbers are NaN, and counted in a note. `decimal` is the decimal mark of a text file, "" to find it.
 
     Of a clock that does not run forward, what can be put right without a guess is, and is counted in notes:
-    see `clocks.mended`.
+    see `clocks.repair`.
 
     Raises ValueError, one sentence with file, place, expected, found and remedy, for a source that is not
     there, text in place of a number, a signal without any number, a time that is missing, repeated or runs
@@ -89,14 +90,14 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal
             "and was read as that"
         )
         notes = [Note("format", "", 1, message), *notes]
-    parts = mended_topics(path, columns, one_clock=time in ("", "log_time"))
-    columns = [part.columns for part in parts]
-    notes += [note for part in parts for note in part.notes]
+    repaired = repair_topics(path, columns, one_clock=time in ("", "log_time"))
+    columns, restarts, remarks = zip(*repaired, strict=True)
+    notes += itertools.chain(*remarks)
     clocks = _clocks(columns, notes)
-    # where several topics start over, they do so together
+    # if several topics start over, they do so together
     breaks = [
-        min(float(clocks[part.columns.name][i]) for part, i in zip(parts, rows, strict=True))
-        for rows in zip(*(part.restarts for part in parts), strict=True)
+        min(float(clocks[group.name][i]) for group, i in zip(columns, rows, strict=True))
+        for rows in zip(*restarts, strict=True)
     ]
     signals = {}
     for source in sources:
@@ -156,18 +157,6 @@ def _check_sources(path: Path, sources: Sequence[Source]) -> None:
             )
 
 
-def _check_fahrenheit(path: Path, source: Source, unit: str) -> None:
-    """Raises ValueError for a column in °F, as its unit or its name says, that the mapping takes as °C."""
-    written = unit.strip(" ()[]").casefold()
-    is_fahrenheit = written in FAHRENHEIT if written else bool(_NAMES_FAHRENHEIT.search(source.source))
-    is_converted = abs(source.scale * 9 / 5 - 1) < 0.01
-    if is_fahrenheit and source.unit.casefold() in CELSIUS and not is_converted:
-        raise ValueError(
-            f"{path}: {source.source} is in °F but the mapping takes it as {source.unit} with scale "
-            f"{source.scale:g}; set scale: 0.555556 and offset: -17.7778"
-        )
-
-
 def _clocks(columns: Sequence[FileColumns], notes: list[Note]) -> dict[str, np.ndarray]:
     """{topic: time_s (n,)}, all counted from one instant."""
     first = min(group.time[0] for group in columns)
@@ -176,15 +165,9 @@ def _clocks(columns: Sequence[FileColumns], notes: list[Note]) -> dict[str, np.n
     start = first // unit * unit if first > CALENDAR_S * unit else 0
     if start:
         zero = np.datetime64(int(start // unit), "s")
-        zones = sorted({group.zone or "of no zone" for group in columns})
-        notes.append(
-            Note(
-                "clock",
-                "",
-                1,
-                f"time is counted from {zero} ({', '.join(zones)}, as the recording's clock says)",
-            )
-        )
+        zones = ", ".join(sorted({group.zone or "of no zone" for group in columns}))
+        message = f"time is counted from {zero} ({zones}, as the recording's clock says)"
+        notes.append(Note("clock", "", 1, message))
     return {group.name: (group.time - start if start else group.time) / unit for group in columns}
 
 
@@ -192,8 +175,16 @@ def _signal(
     path: Path, source: Source, time: np.ndarray, group: FileColumns, recorded: np.ndarray, notes: list[Note]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Time and values in the signal's unit. A signal that has a value in less than half of the rows, spread
-    among them, has its own clock: those rows."""
-    _check_fahrenheit(path, source, group.units.get(source.source, ""))
+    among them, has its own clock: those rows. Raises ValueError for a column without any number, and for one
+    in °F, as its unit or its name says, that the mapping takes as °C."""
+    written = group.units.get(source.source, "").strip(" ()[]").casefold()
+    is_fahrenheit = written in FAHRENHEIT if written else bool(_NAMES_FAHRENHEIT.search(source.source))
+    is_converted = abs(source.scale * 9 / 5 - 1) < 0.01
+    if is_fahrenheit and source.unit.casefold() in CELSIUS and not is_converted:
+        raise ValueError(
+            f"{path}: {source.source} is in °F but the mapping takes it as {source.unit} with scale "
+            f"{source.scale:g}; set scale: 0.555556 and offset: -17.7778"
+        )
     present = np.isfinite(recorded)
     if not present.any():
         raise ValueError(
@@ -208,21 +199,16 @@ def _signal(
     where = np.flatnonzero(present)
     missing = len(recorded) - len(where)
     if where.size < len(recorded) / 2 and where.size > 1 and np.median(np.diff(where)) > 1:
-        notes.append(
-            Note(
-                "sparse",
-                source.signal,
-                missing,
-                f"{source.source} has a value in {where.size} of {len(recorded)} rows; those are its samples",
-            )
+        message = (
+            f"{source.source} has a value in {where.size} of {len(recorded)} rows; those are its samples"
         )
+        notes.append(Note("sparse", source.signal, missing, message))
         return time[where], values[where]
-    first = int(np.flatnonzero(~present)[0])
     infinite = int(np.isinf(recorded).sum())
     kinds = f" ({infinite} of them infinite)" if infinite else ""
     message = (
         f"{missing} of {len(recorded)} values of {source.source} are missing{kinds}, "
-        f"the first in {group.place(first)}; they are masked"
+        f"the first in {group.place(int(np.argmin(present)))}; they are masked"
     )
     notes.append(Note("missing", source.signal, missing, message))
     return time, np.where(present, values, np.nan)

@@ -6,8 +6,8 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from pipeline.recordings.clocks import alternate, mixed
-from pipeline.recordings.formats import Flag, Jitter, Raw, Table, intervals
+from pipeline.recordings.formats import Flag, Jitter, Raw, Table
+from pipeline.recordings.quality import alternate, mask_mixed
 
 # a sample within that share of the sample time from the grid is on it: a temperature's change in a hundredth
 # of a sample is far below any sensor's step
@@ -31,23 +31,12 @@ class _Clock(NamedTuple):
     jitter: Jitter | None
 
 
-class _Near(NamedTuple):
-    """The samples of a clock beside each t_k: the indices of the first behind it and of the nearest, and how
-    far that is, each (T,). `off` are the k without a sample on t_k."""
-
-    behind: np.ndarray
-    nearest: np.ndarray | slice
-    distance_s: np.ndarray
-    off: np.ndarray
-
-
-class _Next(NamedTuple):
-    """The t_k from which a command of a clock acts, for each of its n samples: k, how late that is, and
-    whether it counts, as one between two samples of a segment does."""
-
-    k: np.ndarray
-    late_s: np.ndarray
-    counts: np.ndarray
+# the samples of a clock beside each t_k: the indices of the first behind it and of the nearest, and how far
+# that is, each (T,); and the k without a sample on t_k
+_Neighbours = tuple[np.ndarray, np.ndarray | slice, np.ndarray, np.ndarray]
+# the t_k from which a command of a clock acts, for each of its n samples: k, how late that is, and whether it
+# counts, as one between two samples of a segment does
+_Effect = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def resample(
@@ -91,25 +80,25 @@ def resample(
         )
     time = np.concatenate(segments)
     segment = np.repeat(np.arange(len(segments), dtype=np.int32), [len(grid) for grid in segments])
-    held = _once_a_clock(clocks, inputs, lambda own: _held(own, time, sample_time_s))
-    near = _once_a_clock(clocks, outputs, lambda own: _near(own, time, sample_time_s))
-    following = _once_a_clock(clocks, inputs, lambda own: _next(own, time, segment, sample_time_s))
-    values = {name: raw.signals[name][1][held[name]] for name in inputs}
-    values |= {name: _interpolated(*raw.signals[name], time, near[name]) for name in outputs}
+    commands = _once_a_clock(clocks, inputs, lambda own: _last_command(own, time, sample_time_s))
+    neighbours = _once_a_clock(clocks, outputs, lambda own: _neighbours(own, time, sample_time_s))
+    effects = _once_a_clock(clocks, inputs, lambda own: _effect(own, time, segment, sample_time_s))
+    values = {name: raw.signals[name][1][commands[name]] for name in inputs}
+    values |= {name: _interpolate(*raw.signals[name], time, neighbours[name]) for name in outputs}
     values |= {name: _means(*raw.signals[name], time, sample_time_s) for name in inputs if name in averaged}
     masked = {name: ~np.isfinite(column) for name, column in values.items()}
-    flags = _gap_flags(clocks) + _jitter_flags(clocks) + _trim_flags(raw, clocks, pieces, grids)
-    jitter = _jitter(clocks)
+    flags = _gap_flags(clocks) + _jitter_flags(clocks) + _trim_flags(clocks, pieces, grids)
+    jitter = {name: clock.jitter for clock in clocks for name in clock.signals if clock.jitter}
     for name in outputs:
-        flags += _filled_flags(name, near[name], time, sample_time_s, masked[name])
+        flags += _fill_flags(name, neighbours[name], time, sample_time_s, masked[name])
         flags += _rate_flags(name, raw.signals[name][0], jitter[name].interval_s, sample_time_s)
     for name in (name for name in inputs if name not in averaged):
-        flags += _step_flags(name, *raw.signals[name], following[name], sample_time_s)
-    for name in [*inputs, *outputs]:
-        flags += _missing_flags(name, masked[name], time)
-    for name in outputs:
-        flags += _mixed_flags(name, *raw.signals[name], time, masked[name])
-    return Table(raw.path, segment, time, values, masked, flags, jitter)
+        flags += _step_flags(name, *raw.signals[name], effects[name], sample_time_s)
+    for name, mask in masked.items():
+        message = f"{mask.sum()} samples of {name} have no measured value and are masked"
+        flags += _flag(name, "missing", time[mask], message)
+    table = Table(raw.path, segment, time, values, masked, flags, jitter)
+    return mask_mixed(table, {name: raw.signals[name] for name in outputs})
 
 
 def hold(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarray:
@@ -121,30 +110,35 @@ def hold(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarray
 def _check(
     raw: Raw, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None
 ) -> None:
-    for name in [*inputs, *outputs]:
-        if name not in raw.signals:
-            raise ValueError(
-                f"{raw.path}: signal {name} is wanted but the mapping gives {', '.join(raw.signals)}; "
-                "map it to a column or topic"
+    gap_s = sample_time_s if max_gap_s is None else max_gap_s
+    counts = {name: len(raw.signals[name][0]) for name in outputs if name in raw.signals}
+    faults = [
+        *(
+            (
+                name not in raw.signals,
+                f"signal {name} is wanted but the mapping gives {', '.join(raw.signals)}; "
+                "map it to a column or topic",
             )
-    if not outputs:
-        raise ValueError(f"{raw.path}: no output is wanted; name at least one measured signal")
-    if not 0 < sample_time_s < np.inf:
-        raise ValueError(
-            f"{raw.path}: the sample time should be more than 0 s but is {sample_time_s:g}; "
-            "set it to about the recording's interval"
-        )
-    if max_gap_s is not None and not max_gap_s >= sample_time_s:
-        raise ValueError(
-            f"{raw.path}: the gap limit {max_gap_s:g} s should be at least the sample time "
-            f"{sample_time_s:g} s; raise it"
-        )
-    for name in outputs:
-        if len(raw.signals[name][0]) < 2:
-            raise ValueError(
-                f"{raw.path}: output {name} should have at least two samples but has "
-                f"{len(raw.signals[name][0])}; record longer"
-            )
+            for name in [*inputs, *outputs]
+        ),
+        (not outputs, "no output is wanted; name at least one measured signal"),
+        (
+            not 0 < sample_time_s < np.inf,
+            f"the sample time should be more than 0 s but is {sample_time_s:g}; "
+            "set it to about the recording's interval",
+        ),
+        (
+            not gap_s >= sample_time_s,
+            f"the gap limit {gap_s:g} s should be at least the sample time {sample_time_s:g} s; raise it",
+        ),
+        *(
+            (count < 2, f"output {name} should have at least two samples but has {count}; record longer")
+            for name, count in counts.items()
+        ),
+    ]
+    for is_fault, sentence in faults:
+        if is_fault:
+            raise ValueError(f"{raw.path}: {sentence}")
 
 
 # ---- clocks, gaps and the time in common
@@ -156,11 +150,9 @@ def _clocks(
     clocks: list[_Clock] = []
     for name in [*outputs, *inputs]:
         time = raw.signals[name][0]
-        same = next(
-            (clock for clock in clocks if clock.time_s is time or np.array_equal(clock.time_s, time)), None
-        )
-        if same:
-            same.signals.append(name)
+        equal = [clock for clock in clocks if clock.time_s is time or np.array_equal(clock.time_s, time)]
+        if equal:
+            equal[0].signals.append(name)
             continue
         median = np.median(np.diff(time)) if len(time) > 1 else np.inf
         limit = max_gap_s if max_gap_s is not None else GAP_INTERVALS * max(sample_time_s, median)
@@ -173,37 +165,44 @@ def _clocks(
     return clocks
 
 
-_Looked = TypeVar("_Looked")
+def intervals(time_s: np.ndarray, gap_limit_s: float = np.inf) -> Jitter:
+    """Jitter of a clock time_s (n,), n >= 2, from the intervals up to `gap_limit_s`."""
+    steps = np.diff(time_s)
+    inside, median = steps <= gap_limit_s, np.median(steps)
+    if inside.all() or not inside.any():
+        deviation = steps - median
+    else:
+        deviation = steps[inside] - np.median(steps[inside])
+    return Jitter(float(median), float(deviation.std()), float(np.abs(deviation).max()))
+
+
+_Result = TypeVar("_Result")
 
 
 def _once_a_clock(
-    clocks: Sequence[_Clock], names: Sequence[str], look: Callable[[np.ndarray], _Looked]
-) -> dict[str, _Looked]:
-    """{signal: look(its time_s)} for the named signals; those on one clock share it."""
-    found: dict[str, _Looked] = {}
+    clocks: Sequence[_Clock], names: Sequence[str], calculate: Callable[[np.ndarray], _Result]
+) -> dict[str, _Result]:
+    """{signal: calculate(its time_s)} for the named signals; those on one clock share it."""
+    results: dict[str, _Result] = {}
     for clock in clocks:
-        if here := [name for name in clock.signals if name in names]:
-            found |= dict.fromkeys(here, look(clock.time_s))
-    return found
+        if signals := [name for name in clock.signals if name in names]:
+            results |= dict.fromkeys(signals, calculate(clock.time_s))
+    return results
 
 
 def _pieces(raw: Raw, clocks: Sequence[_Clock], sample_time_s: float) -> list[tuple[float, float]]:
     """Stretches (start, end) in which every clock runs without a gap, and none had started over."""
     pieces, breaks = [(-np.inf, np.inf)], np.array(raw.breaks)
     for clock in clocks:
-        behind = np.searchsorted(breaks, clock.time_s, side="right")
-        cuts = np.flatnonzero((np.diff(clock.time_s) > clock.gap_limit_s) | (np.diff(behind) > 0))
-        starts, ends = (
-            clock.time_s[np.r_[0, cuts + 1]],
-            clock.time_s[np.r_[cuts, len(clock.time_s) - 1]].astype(float),
-        )
+        restarts = np.searchsorted(breaks, clock.time_s, side="right")
+        cuts = np.flatnonzero((np.diff(clock.time_s) > clock.gap_limit_s) | (np.diff(restarts) > 0))
+        last = np.r_[cuts, len(clock.time_s) - 1]
+        starts, ends = clock.time_s[np.r_[0, cuts + 1]], clock.time_s[last].astype(float)
         if np.isinf(clock.gap_limit_s):
             # the last event holds on, up to where the clock starts over
-            until = np.nextafter(np.r_[breaks, np.inf], -np.inf)
-            ends = until[behind[np.r_[cuts, len(behind) - 1]]]
-        pieces = _common(
-            pieces, list(zip(starts.tolist(), ends.tolist(), strict=True)), sample_time_s * ON_GRID
-        )
+            ends = np.nextafter(np.r_[breaks, np.inf], -np.inf)[restarts[last]]
+        stretches = list(zip(starts.tolist(), ends.tolist(), strict=True))
+        pieces = _common(pieces, stretches, sample_time_s * ON_GRID)
     if not pieces:
         spans = "; ".join(
             f"{', '.join(clock.signals[:3])} from {clock.time_s[0]:g} to {clock.time_s[-1]:g} s"
@@ -217,15 +216,15 @@ def _pieces(raw: Raw, clocks: Sequence[_Clock], sample_time_s: float) -> list[tu
 
 
 def _common(
-    left: Sequence[tuple[float, float]], right: Sequence[tuple[float, float]], tolerance: float
+    first: Sequence[tuple[float, float]], second: Sequence[tuple[float, float]], tolerance: float
 ) -> list[tuple[float, float]]:
     """Intersections of two sorted lists of intervals."""
     common, i, j = [], 0, 0
-    while i < len(left) and j < len(right):
-        start, end = max(left[i][0], right[j][0]), min(left[i][1], right[j][1])
+    while i < len(first) and j < len(second):
+        start, end = max(first[i][0], second[j][0]), min(first[i][1], second[j][1])
         if end - start >= -tolerance:
             common.append((start, max(start, end)))
-        if left[i][1] < right[j][1]:
+        if first[i][1] < second[j][1]:
             i += 1
         else:
             j += 1
@@ -242,7 +241,7 @@ def _in_one(indices: np.ndarray) -> np.ndarray | slice:
     return slice(first, end) if np.array_equal(indices, np.arange(first, end)) else indices
 
 
-def _held(time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndarray | slice:
+def _last_command(time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndarray | slice:
     """The index of the last command at or before t_k. There is one, as pieces begin at or behind the first
     command."""
     last = np.searchsorted(time_s, grid + ON_GRID * sample_time_s, side="right") - 1
@@ -261,33 +260,37 @@ def _means(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, sample_time
     return np.where(share > ON_GRID, np.nan, mean)
 
 
-def _near(time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> _Near:
-    behind = np.clip(np.searchsorted(time_s, grid), 1, len(time_s) - 1)
-    nearest = behind - (grid - time_s[behind - 1] <= time_s[behind] - grid)
+def _neighbours(time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> _Neighbours:
+    later = np.clip(np.searchsorted(time_s, grid), 1, len(time_s) - 1)
+    nearest = later - (grid - time_s[later - 1] <= time_s[later] - grid)
     distance = np.abs(time_s[nearest] - grid)
     off = np.flatnonzero(distance > ON_GRID * sample_time_s)
-    return _Near(behind, nearest if len(off) else _in_one(nearest), distance, off)
+    return later, nearest if len(off) else _in_one(nearest), distance, off
 
 
-def _interpolated(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, near: _Near) -> np.ndarray:
+def _interpolate(
+    time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, neighbours: _Neighbours
+) -> np.ndarray:
     """y(t_k): the sample on t_k itself, else the line between its neighbours. A NaN neighbour gives NaN."""
-    y = values[near.nearest].astype(float, copy=False)
-    if not len(near.off):
-        return y
-    behind = near.behind[near.off]
-    share = (grid[near.off] - time_s[behind - 1]) / (time_s[behind] - time_s[behind - 1])
-    y[near.off] = values[behind - 1] + np.clip(share, 0.0, 1.0) * (values[behind] - values[behind - 1])
+    later, nearest, _, off = neighbours
+    y = values[nearest].astype(float, copy=False)
+    if len(off):
+        later = later[off]
+        share = (grid[off] - time_s[later - 1]) / (time_s[later] - time_s[later - 1])
+        y[off] = values[later - 1] + np.clip(share, 0.0, 1.0) * (values[later] - values[later - 1])
     return y
 
 
-def _next(time_s: np.ndarray, grid: np.ndarray, segment: np.ndarray, sample_time_s: float) -> _Next | None:
-    """None where each sample stands on a t_k of its own, so that no command is late or lost."""
+def _effect(
+    time_s: np.ndarray, grid: np.ndarray, segment: np.ndarray, sample_time_s: float
+) -> _Effect | None:
+    """None if each sample stands on a t_k of its own, so that no command is late or lost."""
     k = np.searchsorted(grid, time_s - ON_GRID * sample_time_s)
     within = np.clip(k, 1, len(grid) - 1)
     late, counts = grid[within] - time_s, (k == within) & (segment[within] == segment[within - 1])
     if (k[1:] > k[:-1]).all() and not (late[counts] > ON_GRID * sample_time_s).any():
         return None
-    return _Next(k, late, counts)
+    return k, late, counts
 
 
 # ---- flags
@@ -315,11 +318,6 @@ def _gap_flags(clocks: Sequence[_Clock]) -> list[Flag]:
             )
             flags.append(Flag("", "gap", start, end, 1, message))
     return flags
-
-
-def _jitter(clocks: Sequence[_Clock]) -> dict[str, Jitter]:
-    """{signal: jitter of its clock}."""
-    return {name: clock.jitter for clock in clocks for name in clock.signals if clock.jitter}
 
 
 def _jitter_flags(clocks: Sequence[_Clock]) -> list[Flag]:
@@ -354,56 +352,26 @@ def _jitter_flags(clocks: Sequence[_Clock]) -> list[Flag]:
     return flags
 
 
-def _mixed_flags(
-    name: str, time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, masked: np.ndarray
-) -> list[Flag]:
-    """Stretches of the record's own samples in which two devices write under one name. They are masked, as
-    nothing tells which of the two a sample is of."""
-    flags = []
-    for first, last, distance in mixed(values):
-        start, end = float(time_s[first]), float(time_s[last])
-        masked[(grid >= start) & (grid <= end)] = True
-        message = (
-            f"{name} jumps to and fro between two courses {distance:.3g} apart from {start:g} to {end:g} s, "
-            "masked: two devices seem to write under one name; record each under a name of its own"
-        )
-        flags.append(Flag(name, "mixed", start, end, last - first + 1, message))
-    return flags
-
-
 def _trim_flags(
-    raw: Raw, clocks: Sequence[_Clock], pieces: Sequence[tuple[float, float]], grids: Sequence[np.ndarray]
+    clocks: Sequence[_Clock], pieces: Sequence[tuple[float, float]], grids: Sequence[np.ndarray]
 ) -> list[Flag]:
     flags = []
     if len(clocks) > 1:
         start, end = pieces[0][0], pieces[-1][1]
-        cut = sum(
-            int(((clock.time_s < start) | (clock.time_s > end)).sum())
-            for clock in clocks
-            if np.isfinite(clock.gap_limit_s)
-        )
+        periodic = [clock for clock in clocks if np.isfinite(clock.gap_limit_s)]
+        outside = [int(((clock.time_s < start) | (clock.time_s > end)).sum()) for clock in periodic]
         message = (
             f"{len(clocks)} clocks were aligned over their common time {start:g} to {end:g} s; "
-            f"{cut} samples lie outside"
+            f"{sum(outside)} samples lie outside"
         )
-        flags.append(Flag("", "trimmed", start, end, cut, message))
-        for clock in clocks:
-            outside = int(((clock.time_s < start) | (clock.time_s > end)).sum())
-            if np.isfinite(clock.gap_limit_s):
-                what = f"samples of {', '.join(clock.signals[:3])} lie outside the time in common"
-                flags += cut_flags(outside, len(clock.time_s), what, start, end)
+        flags.append(Flag("", "trimmed", start, end, sum(outside), message))
+        for clock, count in zip(periodic, outside, strict=True):
+            what = f"samples of {', '.join(clock.signals[:3])} lie outside the time in common"
+            flags += cut_flags(count, len(clock.time_s), what, start, end)
     for grid in grids:
         if len(grid) < 2:
-            flags.append(
-                Flag(
-                    "",
-                    "short",
-                    float(grid[0]),
-                    float(grid[0]),
-                    1,
-                    f"the stretch at {grid[0]:g} s is shorter than two samples and was left out",
-                )
-            )
+            message = f"the stretch at {grid[0]:g} s is shorter than two samples and was left out"
+            flags += _flag("", "short", grid, message)
     return flags
 
 
@@ -419,48 +387,51 @@ def cut_flags(left_out: int, count: int, what: str, start_s: float, end_s: float
     return [Flag("", "cut", start_s, end_s, left_out, message)]
 
 
-def _filled_flags(
-    name: str, placed: _Near, grid: np.ndarray, sample_time_s: float, masked: np.ndarray
+def _fill_flags(
+    name: str, neighbours: _Neighbours, grid: np.ndarray, sample_time_s: float, masked: np.ndarray
 ) -> list[Flag]:
     """Flags for samples between two measurements near by, and for those that nothing near by was measured
     for. A masked sample is neither."""
-    off = placed.off[~masked[placed.off]]
-    is_far = placed.distance_s[off] > (0.5 + ON_GRID) * sample_time_s
-    near, far = off[~is_far], off[is_far]
-    between = f"{len(near)} of {len(grid)} samples of {name} lie between its own samples and are interpolated"
+    _, _, distance_s, off = neighbours
+    off = off[~masked[off]]
+    is_far = distance_s[off] > (0.5 + ON_GRID) * sample_time_s
+    close, far = off[~is_far], off[is_far]
+    between = (
+        f"{len(close)} of {len(grid)} samples of {name} lie between its own samples and are interpolated"
+    )
     invented = (
         f"{len(far)} of {len(grid)} samples of {name} have no measurement within half a sample time: "
         "the straight line to the next ones fills them"
     )
-    return _flag(name, "interpolated", grid[near], between) + _flag(name, "filled", grid[far], invented)
+    return _flag(name, "interpolated", grid[close], between) + _flag(name, "filled", grid[far], invented)
 
 
 def _rate_flags(name: str, time_s: np.ndarray, interval: float, sample_time_s: float) -> list[Flag]:
-    span = time_s[[0, -1]]
     if interval < sample_time_s / 2:
         message = (
             f"{name} is sampled every {interval:g} s, the table every {sample_time_s:g} s: "
             "only the samples at its times are used, without averaging"
         )
-        return [Flag(name, "rate", float(span[0]), float(span[1]), len(time_s), message)]
-    if interval > 1.5 * sample_time_s:
+    elif interval > 1.5 * sample_time_s:
         message = (
             f"{name} is sampled every {interval:g} s but the table every {sample_time_s:g} s: "
             "what lies between is interpolated, no measurement"
         )
-        return [Flag(name, "rate", float(span[0]), float(span[1]), len(time_s), message)]
-    return []
+    else:
+        return []
+    return _flag(name, "rate", time_s, message)
 
 
 def _step_flags(
-    name: str, time_s: np.ndarray, values: np.ndarray, following: _Next | None, sample_time_s: float
+    name: str, time_s: np.ndarray, values: np.ndarray, effect: _Effect | None, sample_time_s: float
 ) -> list[Flag]:
     """Flags for commands that change between two samples. They act from the next sample on; a command that
     another overtakes before that sample is lost."""
-    if following is None:
+    if effect is None:
         return []
-    changes = np.flatnonzero((values[1:] != values[:-1]) & following.counts[1:]) + 1
-    when, late, k = time_s[changes], following.late_s[changes], following.k[changes]
+    k, late, counts = effect
+    changes = np.flatnonzero((values[1:] != values[:-1]) & counts[1:]) + 1
+    when, late, k = time_s[changes], late[changes], k[changes]
     between = late > ON_GRID * sample_time_s
     mean = f"{late[between].mean():.3g} s later on average" if between.any() else ""
     message = (
@@ -474,14 +445,3 @@ def _step_flags(
         f" appear; a smaller sample time shows them"
     )
     return flags + _flag(name, "step_lost", when[overtaken], message)
-
-
-def _missing_flags(name: str, masked: np.ndarray, grid: np.ndarray) -> list[Flag]:
-    if not masked.any():
-        return []
-    return _flag(
-        name,
-        "missing",
-        grid[masked],
-        f"{masked.sum()} samples of {name} have no measured value and are masked",
-    )

@@ -90,10 +90,10 @@ _LETTERS = str.maketrans(
 @functools.lru_cache(maxsize=4096)
 def read_name(name: str, unit: str = "") -> Name:
     """The words and the unit of a name; `unit` is the one that the file gives beside it, "" for none."""
-    rest, kind, written = _unit(name.strip())
+    bare, kind, written = _unit(name.strip())
     if unit:
         kind, written = unit_kind(unit) or "other", unit
-    return Name(split(rest), kind, written)
+    return Name(split(bare), kind, written)
 
 
 def split(name: str) -> str:

@@ -71,48 +71,47 @@ def _table(path: Path, sheet: str, rows: list[list[Any]], notes: list[Note]) -> 
     typical = float(np.median([count for count in quantities if count]))
     first = next(i for i, count in enumerate(quantities) if count >= max(1.0, 0.5 * typical))
     heads = [i for i in range(first) if sum(bool(str(cell).strip()) for cell in rows[i]) >= 0.5 * typical]
-    names, units = [""] * width, [""] * width
+    units = [""] * width
     if heads:
         two = len(heads) > 1 and heads[-2] == heads[-1] - 1 == first - 2
         names = [str(cell).strip() for cell in rows[heads[-2] if two else heads[-1]]]
         units = [str(cell).strip(" ()[]") for cell in rows[heads[-1]]] if two else units
     else:
-        notes.append(
-            Note("header", "", 1, f"row {first + 1} is data already: the columns were named column_1, ...")
-        )
+        message = f"row {first + 1} is data already: the columns were named column_1, ..."
+        notes.append(Note("header", "", 1, message))
         names = [f"column_{j + 1}" for j in range(width)]
     data = [(i + 1, row) for i, row in enumerate(rows) if i >= first and any(cell != "" for cell in row)]
     lines = [line for line, _ in data]
-    values, given, others, stamps, of_day = {}, {}, {}, {}, set()
+    values, value_units, texts, stamps, of_day = {}, {}, {}, {}, set()
     for j, column in enumerate(names):
         cells = [row[j] if j < len(row) else "" for _, row in data]
         if not column or column in values or column in stamps:
             if any(cell != "" for cell in cells):
-                others[column or "(no name)"] = "numbers under no name of their own"
+                texts[column or "(no name)"] = "numbers under no name of their own"
         elif (numbers := _numbers(path, sheet, column, cells, lines)) is not None:
-            values[column], given[column] = numbers, units[j]
+            values[column], value_units[column] = numbers, units[j]
         elif (ns := _instants(cells)) is not None:
             stamps[column] = ns
             of_day |= {column} if all(isinstance(cell, datetime.time) for cell in cells) else set()
         else:
-            others[column] = f"text such as {next((str(c) for c in cells if c != ''), '')[:20]!r}"
+            texts[column] = f"text such as {next((str(c) for c in cells if c != ''), '')[:20]!r}"
             if naming_columns([column], []):
                 check_one_signal(
                     path, column, ((f"row {line}", str(c)) for line, c in zip(lines, cells, strict=True))
                 )
-    _join_dates(stamps, of_day, others)
+    _join_dates(stamps, of_day, texts)
     return WholeTable(
-        values, given, None, "", lambda i: f"row {lines[i]} of sheet {sheet}", notes, {}, others, stamps
+        values, value_units, None, "", lambda i: f"row {lines[i]} of sheet {sheet}", notes, {}, texts, stamps
     )
 
 
-def _join_dates(stamps: dict[str, np.ndarray], of_day: set[str], others: dict[str, str]) -> None:
+def _join_dates(stamps: dict[str, np.ndarray], of_day: set[str], texts: dict[str, str]) -> None:
     """Puts the column of the date and that of the time of day beside it together."""
     dates = [name for name, ns in stamps.items() if name not in of_day and not (ns % DAY_NS).any()]
     for name in of_day:
         if is_time_name(name) and (date := date_column(dates, name)) is not None:
             stamps[name] = stamps.pop(date) + stamps[name] % DAY_NS
-            others[date] = f"the date of {name}"
+            texts[date] = f"the date of {name}"
             return
 
 
@@ -154,10 +153,8 @@ def _instants(cells: Sequence[Any]) -> np.ndarray | None:
 
 def _ns(cell: Any) -> int:
     if isinstance(cell, datetime.time):
-        cell = datetime.timedelta(
-            hours=cell.hour, minutes=cell.minute, seconds=cell.second, microseconds=cell.microsecond
-        )
-    if isinstance(cell, datetime.date) and not isinstance(cell, datetime.datetime):
+        cell = datetime.datetime.combine(_EPOCH, cell)
+    elif isinstance(cell, datetime.date) and not isinstance(cell, datetime.datetime):
         cell = datetime.datetime.combine(cell, datetime.time())
     since = cell if isinstance(cell, datetime.timedelta) else cell.replace(tzinfo=None) - _EPOCH
     return since // datetime.timedelta(microseconds=1) * 1000
@@ -201,14 +198,14 @@ def _size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[int, int, i
     """(last row, last column, cells with a shared text) of a sheet."""
     rows = columns = texts = 0
     with archive.open(entry) as stream:
-        rest = b""
+        ending = b""
         while piece := stream.read(1 << 20):
-            text = rest + piece
+            text = ending + piece
             for letters, number in _CELL.findall(text):
                 rows, columns = max(rows, int(number)), max(columns, _column(letters))
             rows = max([rows, *map(int, _ROW.findall(text))])
             texts += piece.count(b't="s"')
-            rest = text[-200:]
+            ending = text[-200:]
     return rows, columns, texts
 
 

@@ -312,7 +312,7 @@ def test_lists_of_what_is_excluded_are_joined(by_branch):
         by_branch.run("git", "add", "-A")
         by_branch.run("git", "commit", "-qm", name)
     merging.merge("other")
-    assert set(excluded.listed(raw)) == {"ours.csv", "theirs.csv"} and by_branch.dirty() == []
+    assert set(excluded.read_list(raw)) == {"ours.csv", "theirs.csv"} and by_branch.dirty() == []
 
 
 # ---- where a commit would be lost, and what no commit holds
@@ -554,8 +554,8 @@ def test_a_recording_that_git_or_dvc_keeps_stays_is_excluded_and_alarms_once(pro
     )
     assert (raw / "kept.mcap").read_bytes() == BROKEN and not (raw / "dropped.mcap").exists()
     assert (inputs.QUARANTINE / "deposition/dropped.mcap").exists()
-    entry = excluded.listed(raw)["kept.mcap"]
-    assert entry.sha256 == artifacts.sha256(raw / "kept.mcap") and "kept.mcap" in entry.reason
+    entry = excluded.read_list(raw)["kept.mcap"]
+    assert entry["sha256"] == artifacts.sha256(raw / "kept.mcap") and "kept.mcap" in entry["reason"]
     assert excluded.readable([raw / "kept.mcap", raw / "other.mcap"], raw) == [raw / "other.mcap"]
     # the list is committed with the recordings, and no night speaks of it again
     assert project.dirty() == []

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.recordings.clocks import mended
+from pipeline.recordings.clocks import repair
 from pipeline.recordings.formats import FileColumns
 from pipeline.recordings.recordings import Source, read, resample
 from tests.mcap_writing import Written
@@ -133,7 +133,7 @@ def test_a_clock_that_falls_by_more_than_half_of_all_counts_is_refused_in_one_se
     time = np.array([2**63 - 2, 2**63 - 1, -(2**63), 1 - 2**63])
     group = FileColumns("/zone", time, {"T": np.arange(4.0)}, lambda i: f"message {i + 1}")
     with pytest.raises(ValueError, match="message 3 is at .* which is before the sample ahead of it"):
-        mended(Path("rig.mcap"), group, may_restart=False)
+        repair(Path("rig.mcap"), group, may_restart=False)
 
 
 # ---- MCAP: the recorder's clock, or one that each message carries

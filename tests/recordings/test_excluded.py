@@ -32,8 +32,8 @@ def test_a_second_entry_keeps_the_first_and_any_name_and_reason_come_back(tmp_pa
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(name)
         excluded.exclude(tmp_path / name, tmp_path, reason)
-    assert {name: entry.reason for name, entry in excluded.listed(tmp_path).items()} == names
-    assert excluded.excluded(tmp_path) == {tmp_path / name for name in names}
+    assert {name: entry["reason"] for name, entry in excluded.read_list(tmp_path).items()} == names
+    assert excluded.exclusions(tmp_path) == {tmp_path / name for name in names}
 
 
 def test_temperatures_are_ingested_without_an_excluded_recording_until_it_is_mended(tmp_path):

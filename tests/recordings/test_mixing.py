@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipeline.recordings.clocks import alternate, mixed
+from pipeline.recordings.quality import alternate, find_mixed
 from pipeline.recordings.recordings import Raw, resample
 
 
@@ -33,27 +33,27 @@ WAYS = {
 @pytest.mark.parametrize("apart", [3.0, 15.0])
 def test_two_devices_under_one_name_are_found_over_the_whole_record(way, apart):
     y = course() + apart * WAYS[way](600)
-    covered = sum(last - first + 1 for first, last, _ in mixed(y))
+    covered = sum(last - first + 1 for first, last, _ in find_mixed(y))
     # the window that shows batches is longer than what a parabola follows where the heater is switched
     assert covered > (0.4 if "batches" in way else 0.75) * 600
     # the gap is what lies between the courses, less their noise and what they move within a window
-    assert all(0.5 * apart < distance < 1.2 * apart for _, _, distance in mixed(y))
+    assert all(0.5 * apart < distance < 1.2 * apart for _, _, distance in find_mixed(y))
 
 
 def test_the_place_is_where_the_second_device_writes():
     y = course()
     y[300:420] += 5 * in_turn(120)
-    ((first, last, _),) = mixed(y)
+    ((first, last, _),) = find_mixed(y)
     # to half a window of 32 samples
     assert abs(first - 300) <= 32
     assert abs(last - 419) <= 32
 
 
 def test_two_devices_at_rest_are_two_and_a_coarse_sensor_between_two_steps_is_one():
-    assert mixed(np.where(in_turn(200), 35.0, 20.0))
+    assert find_mixed(np.where(in_turn(200), 35.0, 20.0))
     rng = np.random.default_rng(0)
     for step in (0.1, 0.25, 1.0, 2.0):
-        assert mixed(20 + step * (rng.random(500) < 0.5)) == []
+        assert find_mixed(20 + step * (rng.random(500) < 0.5)) == []
 
 
 @pytest.mark.parametrize("step", [0.5, 5.0, 10.0, 16.0, 50.0])
@@ -61,7 +61,7 @@ def test_two_devices_at_rest_are_two_and_a_coarse_sensor_between_two_steps_is_on
 def test_a_coarse_converter_that_steps_by_one_is_one_device_whatever_its_step(step, noise):
     rng = np.random.default_rng(3)
     y = 200 + step * (1.5 * np.sin(np.arange(4000) / 300) + rng.normal(0, noise, 4000))
-    assert mixed(np.round(y / step) * step) == []
+    assert find_mixed(np.round(y / step) * step) == []
 
 
 def test_what_one_device_does_is_not_mixed():
@@ -77,7 +77,7 @@ def test_what_one_device_does_is_not_mixed():
         np.full(2000, 20.0),
         np.where(time % 97 == 0, 85.0, course(2000)),
     ):
-        assert mixed(y) == []
+        assert find_mixed(y) == []
 
 
 def test_what_is_mixed_is_masked_with_its_place_though_the_table_would_show_one_of_the_two():
