@@ -230,7 +230,7 @@ def measure_trial(
     from pipeline.deposition.camera import flow, latency, trial_flow
     from pipeline.recordings import trial_files
 
-    known = trial_files.checked_conditions(recording)
+    known = trial_files.check_conditions(recording)
     with artifacts.about(recording.path):
         return trial_flow.measure_trial(
             values, recording.signals, routine, camera.mounting, scale=known.scale,

@@ -591,17 +591,17 @@ class Topic(NamedTuple):
     count: int
 
 
-def merged(parts: Iterable[dict[str, Topic]]) -> dict[str, Topic]:
+def merge_topics(parts: Iterable[dict[str, Topic]]) -> dict[str, Topic]:
     """The topics of all parts."""
     union: dict[str, Topic] = {}
     for topic in itertools.chain.from_iterable(part.values() for part in parts):
-        before = union.get(topic.name, Topic(topic.name, [], [], "", 0))
+        earlier = union.get(topic.name, Topic(topic.name, [], [], "", 0))
         union[topic.name] = Topic(
             topic.name,
-            before.channels + topic.channels,
-            list(dict.fromkeys([*before.fields, *topic.fields])),
-            topic.unreadable or before.unreadable,
-            before.count + topic.count,
+            earlier.channels + topic.channels,
+            list(dict.fromkeys([*earlier.fields, *topic.fields])),
+            topic.unreadable or earlier.unreadable,
+            earlier.count + topic.count,
         )
     return union
 
@@ -632,7 +632,7 @@ def topics(path: Path, samples: int = SAMPLES) -> dict[str, Topic]:
         look(number, [])
     # the counts are whole if every message was looked at, else those of the summary
     totals = file.counts if samples > SAMPLES else file.promised or file.counts
-    return merged(
+    return merge_topics(
         {
             channel.topic: Topic(
                 channel.topic,
@@ -747,7 +747,7 @@ class TopicColumns:
                 pieces.append(FileColumns(str(number), time, columns, str))
         if not pieces:
             bad = self.bad.get(topic)
-            why = (
+            reason = (
                 f"all of its {bad} messages are not what its schema says"
                 if bad
                 else "it has no whole message"
@@ -755,13 +755,13 @@ class TopicColumns:
             damage = "; ".join(note.message for note in notes[:2])
             raise ValueError(
                 f"{path}: nothing of topic {topic} could be read because "
-                f"{why}{f' ({damage})' if damage else ''}; copy the recording again"
+                f"{reason}{f' ({damage})' if damage else ''}; copy the recording again"
             )
         overlap = (
-            f"topic {topic} comes from channels {{before}} and {{after}} at the same time, as if two devices "
+            f"topic {topic} comes from channels {{first}} and {{second}} at the same time, as if two devices "
             "had one name; record each under a topic of its own"
         )
-        columns = joined(path, pieces, overlap)
+        columns = join_parts(path, pieces, overlap)
         if len(pieces) > 1:
             message = f"topic {topic} was recorded by {len(pieces)} channels one after the other"
             notes.append(Note("channels", "", len(pieces), f"{message}, which were joined"))
@@ -777,17 +777,17 @@ class TopicColumns:
         ]
 
 
-def joined(
+def join_parts(
     path: Path,
     groups: Sequence[FileColumns],
-    overlap: str = "two parts of the bag hold {before} at the same time; "
+    overlap: str = "two parts of the bag hold {first} at the same time; "
     "name the part in metadata.yaml that is to be read",
 ) -> FileColumns:
     """One topic's columns of several parts or channels. Raises ValueError for those that overlap in time."""
     groups = sorted(groups, key=lambda group: group.time.min())
-    for before, after in itertools.pairwise(groups):
-        if after.time.min() <= before.time.max():
-            raise ValueError(f"{path}: {overlap.format(before=before.name, after=after.name)}")
+    for first, second in itertools.pairwise(groups):
+        if second.time.min() <= first.time.max():
+            raise ValueError(f"{path}: {overlap.format(first=first.name, second=second.name)}")
     if len(groups) == 1:
         return groups[0]
     values = {name: np.concatenate([group.values[name] for group in groups]) for name in groups[0].values}
@@ -799,8 +799,8 @@ def _stamps(clock: Sequence[str], stamps: np.ndarray) -> np.ndarray:
     if len(clock) == 1:
         return np.rint(seconds(clock[0].rpartition(".")[2], stamps[:, 0])[0] * 1e9).astype(np.int64)
     # both parts are whole numbers below 2^53, so that floats hold them and the nanoseconds are exact
-    whole = stamps.astype(np.int64)
-    return whole[:, 0] * 10**9 + whole[:, 1]
+    parts = stamps.astype(np.int64)
+    return parts[:, 0] * 10**9 + parts[:, 1]
 
 
 def _decode(decode: Decode, data: list[bytes], width: int) -> tuple[np.ndarray, slice | list[int]]:
@@ -859,9 +859,9 @@ def _places(path: Path, sources: Sequence[str]) -> tuple[dict[str, tuple[str, st
     if not any(topic.fields for topic in by_name.values()):
         reasons = [f"{topic.name}: {topic.unreadable}" for topic in by_name.values() if topic.unreadable]
         notes = [note.message for note in McapFile(path).walk() if note.kind in ("damage", "truncated")]
-        why = "; ".join([*reasons, *notes][:3]) or "its messages hold text or nothing"
+        reason = "; ".join([*reasons, *notes][:3]) or "its messages hold text or nothing"
         raise ValueError(
-            f"{path}: no topic with numbers could be read ({why}); record numeric topics, "
+            f"{path}: no topic with numbers could be read ({reason}); record numeric topics, "
             "or copy the recording again"
         )
     try:
@@ -963,7 +963,7 @@ def read_bag(
     """What `mcap_columns` gives, of all parts of a bag one behind the other."""
     parts = bag_parts(path)
     by_part = [topics(part) for part in parts]
-    union = merged(by_part)
+    union = merge_topics(by_part)
     places = {source: resolve(path, source, union) for source in sources}
     pieces: dict[str, list[FileColumns]] = {}
     counts: dict[str, int] = {}
@@ -974,8 +974,8 @@ def read_bag(
         ]
         if not wanted:
             continue
-        columns, _, messages, more = mcap_columns(part, wanted, time)
-        notes += [note._replace(message=f"{part.name}: {note.message}") for note in more]
+        columns, _, messages, part_notes = mcap_columns(part, wanted, time)
+        notes += [note._replace(message=f"{part.name}: {note.message}") for note in part_notes]
         for topic, count in messages.items():
             counts[topic] = counts.get(topic, 0) + count
         for group in columns:
@@ -983,7 +983,7 @@ def read_bag(
     missing = sorted({topic for topic, _ in places.values()} - set(pieces))
     if missing:
         raise ValueError(f"{path}: no part of the bag holds a message of {missing[0]}; map another topic")
-    columns = [joined(path, groups) for groups in pieces.values()]
+    columns = [join_parts(path, groups) for groups in pieces.values()]
     return columns, places, counts, notes + _pauses(pieces)
 
 

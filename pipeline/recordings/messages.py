@@ -136,15 +136,15 @@ def decompress(method: str, data: bytes, size: int | None) -> bytes:
             declared = zstandard.frame_content_size(data)
             if declared > room:
                 raise UnreadableMessage(f"data that say they unpack to {declared} bytes, more than {room}")
-            most = 0 if declared >= 0 else room
-            unpacked = zstandard.ZstdDecompressor().decompress(data, max_output_size=most)
+            limit = 0 if declared >= 0 else room
+            unpacked = zstandard.ZstdDecompressor().decompress(data, max_output_size=limit)
         elif method == "lz4":
             unpacked = lz4.frame.LZ4FrameDecompressor().decompress(data, room + 1)
         else:
             raise UnreadableMessage(f"the compression {method!r} is not known; zstd and lz4 are")
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError, OverflowError) as error:
-        why = (str(error) or "too large").splitlines()[0]
-        raise UnreadableMessage(f"{method} data that cannot be unpacked ({why})") from None
+        reason = (str(error) or "too large").splitlines()[0]
+        raise UnreadableMessage(f"{method} data that cannot be unpacked ({reason})") from None
     if len(unpacked) > room or size not in (None, len(unpacked)):
         raise UnreadableMessage(f"{method} data that unpack to {len(unpacked)} bytes, not {size}")
     return unpacked
@@ -169,7 +169,7 @@ def _json_fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
     names: dict[str, None] = {}
     if channel.schema_encoding == "jsonschema" and channel.schema:
         with contextlib.suppress(UnreadableMessage):  # the messages tell
-            names |= dict.fromkeys(_promised(_document(channel.schema), "", 0))
+            names |= dict.fromkeys(_schema_paths(_document(channel.schema), "", 0))
     for sample in samples:
         names |= dict.fromkeys(_paths(_document(sample)))
         if len(names) > LARGEST_LAYOUT:
@@ -177,14 +177,14 @@ def _json_fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
     return list(names)
 
 
-def _promised(schema, prefix: str, depth: int) -> Iterator[str]:
+def _schema_paths(schema, prefix: str, depth: int) -> Iterator[str]:
     properties = schema.get("properties") if isinstance(schema, dict) else None
     if not isinstance(properties, dict) or depth > 6:
         return
     for name, inner in properties.items():
         kind = inner.get("type") if isinstance(inner, dict) else None
         if kind == "object":
-            yield from _promised(inner, f"{prefix}{name}.", depth + 1)
+            yield from _schema_paths(inner, f"{prefix}{name}.", depth + 1)
         elif kind == "boolean" or {"number", "integer"} & set(
             map(str, kind if isinstance(kind, list) else [kind])
         ):
@@ -357,7 +357,7 @@ def _expand(kind: str, prefix: str, types: dict, version: int, room: list[int]) 
     """The items of a type, in the order of the wire; `room` is how many more there may be."""
     items: list[Item] = []
     numbers = ROS2_NUMBERS if version == 2 else ROS1_NUMBERS
-    for field, of, length in types[kind]:
+    for field, part_kind, length in types[kind]:
         path = f"{prefix}.{field}" if prefix else field
         if length and (len(length) > 12 or int(length) > LARGEST_ARRAY):
             raise ValueError(
@@ -365,14 +365,14 @@ def _expand(kind: str, prefix: str, types: dict, version: int, room: list[int]) 
             )
         count = int(length or 1)
         if length == "":
-            element = _element(of, f"{path}[]", kind, types, version, room)
-            items.append(Item("sequence", path, items=tuple(element)))
-        elif of in numbers:
-            items.append(Item("numbers", path, numbers[of], count, length is not None))
+            elements = _element(part_kind, f"{path}[]", kind, types, version, room)
+            items.append(Item("sequence", path, items=tuple(elements)))
+        elif part_kind in numbers:
+            items.append(Item("numbers", path, numbers[part_kind], count, length is not None))
         else:
             for i in range(count):
                 _take_room(kind, room)
-                items += _element(of, f"{path}[{i}]" if length else path, kind, types, version, room)
+                items += _element(part_kind, f"{path}[{i}]" if length else path, kind, types, version, room)
         _take_room(kind, room)
     if not items and version == 2:
         items.append(Item("numbers", prefix + "._", "B"))  # ROS 2 gives a message without fields one byte
@@ -385,15 +385,15 @@ def _take_room(kind: str, room: list[int]) -> None:
         raise ValueError(f"the schema of {kind} has more than {LARGEST_LAYOUT} parts")
 
 
-def _element(of: str, path: str, parent: str, types: dict, version: int, room: list[int]) -> list[Item]:
+def _element(element: str, path: str, parent: str, types: dict, version: int, room: list[int]) -> list[Item]:
     numbers = ROS2_NUMBERS if version == 2 else ROS1_NUMBERS
-    if of in numbers:
-        return [Item("numbers", path, numbers[of])]
-    if of in ("string", "wstring"):
-        return [Item(of, path)]
+    if element in numbers:
+        return [Item("numbers", path, numbers[element])]
+    if element in ("string", "wstring"):
+        return [Item(element, path)]
     if path.count(".") > 30:
         raise ValueError(f"the schema of {parent} contains itself in {path}")
-    return _expand(_resolve(of, parent, types), path, types, version, room)
+    return _expand(_resolve(element, parent, types), path, types, version, room)
 
 
 # ---- which numbers a message has
@@ -620,9 +620,9 @@ def _order(steps: list[Step], names: Sequence[str]) -> list[int]:
 def _ends(data: bytes, size: int, exact: bool, padding: int) -> bool:
     """Whether a message ends behind its `size` bytes, but for padding. Four bytes and more could be a number
     of another schema, and must be zeros."""
-    behind = len(data) - size
-    return behind >= 0 and (
-        not exact or behind <= min(3, padding) or (behind <= padding and not any(data[size:]))
+    surplus = len(data) - size
+    return surplus >= 0 and (
+        not exact or surplus <= min(3, padding) or (surplus <= padding and not any(data[size:]))
     )
 
 
@@ -715,7 +715,7 @@ def message_types(descriptor_set: bytes) -> Types:
     return types
 
 
-def _defined(types: Types, name: str) -> Descriptor:
+def _definition(types: Types, name: str) -> Descriptor:
     if name not in types:
         raise ValueError(
             f"the schema does not define its own message {name}; it defines {', '.join(sorted(types)[:5])}"
@@ -725,11 +725,11 @@ def _defined(types: Types, name: str) -> Descriptor:
 
 def message_reader(types: Types, name: str) -> Callable[[bytes | memoryview], Message]:
     """A function from bytes to the message of that name. It raises UnreadableMessage."""
-    made = message_factory.GetMessageClass(_defined(types, name))
+    message_class = message_factory.GetMessageClass(_definition(types, name))
 
     def read(data: bytes | memoryview) -> Message:
         try:
-            return made.FromString(data)
+            return message_class.FromString(data)
         except DecodeError as error:
             raise UnreadableMessage(f"a message that is not of its type ({error})") from None
 
@@ -754,7 +754,7 @@ def protobuf_fields(types: Types, name: str, sample: bytes | None) -> list[str]:
     LONGEST_LISTED. Raises ValueError for a type with more than can be listed."""
     names: list[str] = []
     lists: dict[str, list[str]] = {}
-    for visited, (path, field) in enumerate(_leaves(_defined(types, name), "", 0)):
+    for visited, (path, field) in enumerate(_leaves(_definition(types, name), "", 0)):
         if visited == _MOST_FIELDS:
             raise ValueError(f"the message {name} has more than {_MOST_FIELDS} fields; name the wanted ones")
         single, is_list, part = path.partition("[]")
@@ -787,7 +787,7 @@ def protobuf_decoder(types: Types, name: str, names: Sequence[str]) -> Callable[
 
     "zones[#]" is the length of a list. The function raises UnreadableMessage.
     """
-    message, read, count = _defined(types, name), message_reader(types, name), len(names)
+    message, read, count = _definition(types, name), message_reader(types, name), len(names)
     if names and all(_is_plain(message.fields_by_name.get(path)) for path in names):
         values = operator.attrgetter(*names)
         return lambda messages: np.array([values(read(data)) for data in messages], float).reshape(-1, count)
@@ -835,5 +835,7 @@ def _number(message: Message, steps: Sequence[FieldStep]) -> Any:
         values = getattr(part, name)
         if index is not None and index >= len(values):
             return np.nan
-        part = values if index is None else len(values) if index == -1 else values[index]
+        if index == -1:
+            return len(values)
+        part = values if index is None else values[index]
     return part

@@ -68,7 +68,7 @@ def source(place: str, topics: Topics, *, rate_hz: float) -> "FrameSource":
     return Folder(Path(place))
 
 
-def shown_place(place: str) -> str:
+def display_name(place: str) -> str:
     """A source's name as it may be shown: of an address without user and password."""
     return _without_secret(urllib.parse.urlsplit(place)) if "://" in place else place
 
@@ -92,27 +92,27 @@ class Folder:
             self.waits_for = f"the folder {self.path} is not there yet"
             return
         self.waits_for = ""
-        came = sorted(self._new(), key=lambda entry: (entry[1], _counted(entry[0])))
+        came = sorted(self._new(), key=lambda entry: (entry[1], _number_key(entry[0])))
         for name, written_ns, size in came:
-            shown = self._picture(name, written_ns / 1e9, size)
-            if shown is not None:
+            frame = self._picture(name, written_ns / 1e9, size)
+            if frame is not None:
                 self.done.add(name)
                 self.unfinished.pop(name, None)
-                yield shown
+                yield frame
         self.ended = not self.unfinished
 
     def _new(self) -> Iterator[tuple[str, int, int]]:
         """(name from the folder on, ns when it was written, bytes) of pictures that were not looked at."""
         began = time.monotonic()
-        for here, folders, names in os.walk(self.path):
+        for root, folders, names in os.walk(self.path):
             folders[:] = [name for name in folders if not name.startswith(".")]
-            below = os.path.relpath(here, self.path)
+            below = os.path.relpath(root, self.path)
             for name in names:
                 inside = name if below == "." else f"{below}/{name}"
                 if name.startswith(".") or not name.lower().endswith(PICTURES) or inside in self.done:
                     continue
                 with contextlib.suppress(OSError):  # a camera may remove its oldest
-                    about = os.stat(os.path.join(here, name))
+                    about = os.stat(os.path.join(root, name))
                     yield inside, about.st_mtime_ns, about.st_size
         # a folder of very many names is looked through less often
         self.rest_s = max(LOOK_S, 5 * (time.monotonic() - began))
@@ -128,18 +128,18 @@ class Folder:
         except FileNotFoundError:
             return CameraFrame(name, time_s, f"{UNREADABLE}: it was removed")
         except (OSError, ValueError) as error:
-            before = self.unfinished.get(name, (-1, 0.0))
-            if before[0] != size:
+            previous = self.unfinished.get(name, (-1, 0.0))
+            if previous[0] != size:
                 self.unfinished[name] = (size, self.clock())
                 return None
-            if self.clock() - before[1] < SETTLE_S:
+            if self.clock() - previous[1] < SETTLE_S:
                 return None
             return CameraFrame(name, time_s, f"{UNREADABLE}: {str(error).partition('found ')[2] or error}")
         copy, self.before = digest == self.before, digest
         return CameraFrame(name, time_s, COPY if copy else frame)
 
 
-def _counted(name: str) -> list:
+def _number_key(name: str) -> list:
     """A key that puts image-9 before image-10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
@@ -231,9 +231,9 @@ class RecordingSource:
         number = message.channel.id
         if number not in self.decoders:
             self.decoders[number] = self._decoder(message)
-        if (known := self.decoders[number]) is None:
+        if (reader := self.decoders[number]) is None:
             return
-        names, decode = known
+        names, decode = reader
         try:
             values = decode([plain(message.data)])[0]
         except ValueError:
@@ -250,12 +250,12 @@ class RecordingSource:
         """Our signals that a channel has, and what reads them; None where it has none."""
         channel = message.channel
         try:
-            there = set(fields(channel, [message.data]))
+            names = set(fields(channel, [message.data]))
             places = {
                 name: field
                 for name, at in self.sources.items()
                 for topic, colon, field in [at.source.rpartition(":")]
-                if field in there and (not colon or topic == channel.topic)
+                if field in names and (not colon or topic == channel.topic)
             }
             return (list(places), decoder(channel, list(places.values()))) if places else None
         except (ValueError, RecursionError):
@@ -294,7 +294,7 @@ class Snapshots:
         try:
             data = self._answer()
             self.count += 1
-            frame, self.before = _new_frame(data, self.before, lambda: _decoded(data))
+            frame, self.before = _new_frame(data, self.before, lambda: _decode(data))
             self.waits_for = ""
             yield CameraFrame(f"snapshot {self.count}", time.time(), frame)
         except (OSError, http.client.HTTPException) as error:
@@ -349,20 +349,20 @@ def _read_picture(answer: http.client.HTTPResponse) -> bytes:
     return data
 
 
-def _decoded(data: bytes) -> np.ndarray:
+def _decode(data: bytes) -> np.ndarray:
     if not _has_end(data):
         raise ValueError(f"a picture of {len(data)} bytes without its end")
     return decode(data)
 
 
 def _new_frame(
-    content: bytes | memoryview, before: bytes, decode: Callable[[], np.ndarray]
+    content: bytes | memoryview, previous: bytes, decode: Callable[[], np.ndarray]
 ) -> tuple[np.ndarray | str, bytes]:
     """The decoded frame, or the reason why there is none, and the digest of its content; `before` is that of
     the frame before."""
     digest = hashlib.blake2b(content, digest_size=16).digest()
     try:
-        return COPY if digest == before else decode(), digest
+        return COPY if digest == previous else decode(), digest
     except ValueError as error:
         return f"{UNREADABLE}: {error}", digest
 

@@ -461,7 +461,7 @@ def test_frames_that_cannot_be_decoded_are_left_out_and_counted_until_they_are_t
 def test_a_jpeg_that_is_cut_off_is_no_frame(tmp_path):
     data = cv2.imencode(".jpg", picture(0))[1]
     intact_bytes, cut = (
-        images.compressed_image(images.header(0, "cam"), "jpeg", part) for part in (data, data[:-200])
+        images.image_bytes(images.header(0, "cam"), "jpeg", part) for part in (data, data[:-200])
     )
     path = tmp_path / "machine.mcap"
     path.write_bytes(
