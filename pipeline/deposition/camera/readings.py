@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.deposition.camera import bead, latency, line
 from pipeline.deposition.camera.bead import Bead
 from pipeline.deposition.camera.latency import Gantry, Latency
-from pipeline.deposition.camera.pose import Mounting, pose
+from pipeline.deposition.camera.line import Mounting, pose
 
 # frames measured together
 TOGETHER = 16
