@@ -311,17 +311,6 @@ def read_trial(
     may turn out not to be decodable when they are asked for.
     """
     path = Path(path)
-    if not 0 <= unreadable_share <= 1:
-        raise ValueError(
-            f"{path}: unreadable_share should be within 0 and 1 but is {unreadable_share:g}; "
-            "give a share of the frames"
-        )
-    for needed in (POSITION, SPEED, COMMAND):
-        if [source.signal for source in sources].count(needed.signal) != 1:
-            raise ValueError(
-                f"{path}: the mapping should give {needed.signal} one source; "
-                "map the gantry's position and speed, and the command"
-            )
     # only the true flow, which no machine knows, may be absent if its source is ours
     optional = {FLOW.signal} if FLOW in sources else ()
     try:
