@@ -121,7 +121,7 @@ def report_with_measured(part: ComposedPart, folder: Path) -> dict[str, Any]:
 
     report = part_report.report(part)
     for stream in part.composed.streams:
-        path = part_files.measured_path(folder, part.name, stream.material)
+        path = part_files.print_path(folder, part.name, stream.material)
         if path:
             y, _ = part_files.read_measured(path, len(stream.r), part.composed.sample_time_s)
             with artifacts.about(path):

@@ -209,9 +209,11 @@ def read(recording: TrialRecording, camera: Camera, memo: Path | None = None) ->
     from pipeline.deposition.camera import readings
     from pipeline.recordings import trial_files
 
+    mounting = camera.mounting
+
     def measure() -> readings.Readings:
         with artifacts.about(recording.path):
-            return readings.read(recording.frames, recording.signals["position_mm"], camera.mounting)
+            return readings.read(recording.frames, recording.signals["position_mm"], mounting)
 
     if memo is None:
         return measure()
@@ -230,12 +232,12 @@ def measure_trial(
     from pipeline.deposition.camera import flow, latency, trial_flow
     from pipeline.recordings import trial_files
 
-    known = trial_files.checked_conditions(recording)
+    known, mounting = trial_files.check_conditions(recording), camera.mounting
+    scale, late = known.scale, latency.of_camera(camera.latency_s, [*earlier, values.latency])
     with artifacts.about(recording.path):
         return trial_flow.measure_trial(
-            values, recording.signals, routine, camera.mounting, scale=known.scale,
-            view=flow.View(known.mm_per_px, known.nozzle_column), nozzle_mm=printer.nozzle_mm,
-            latency=latency.of_camera(camera.latency_s, [*earlier, values.latency]),
+            values, recording.signals, routine, mounting, scale=scale,
+            view=flow.View(known.mm_per_px, known.nozzle_column), nozzle_mm=printer.nozzle_mm, latency=late,
             contact_angle_deg=known.contact_angle_deg, width_deviation_mm=camera.width_deviation_mm,
         )  # fmt: skip
 

@@ -10,7 +10,7 @@ from pipeline.deposition.parts import forecast, part_report, verification
 from pipeline.deposition.parts.composition import LearnedLibrary, LearnedMaterial, Stream
 from pipeline.deposition.parts.part import ComposedPart
 from pipeline.deposition.settings import ComposeParts, Printer
-from pipeline.recordings.part_files import COLUMNS, COMMAND, measured_name, measured_path, read_measured
+from pipeline.recordings.part_files import COLUMNS, COMMAND, print_name, print_path, read_measured
 from pipeline.store import artifacts
 from stages.compose_parts import compose_part
 
@@ -39,7 +39,7 @@ def write(
         )
         sentences.append(part_report.forecast_sentence(print_.composed, print_.composed.streams[0]))
         sentences.append(
-            f"print it; copy it and its measured flow, as {measured_name(path.stem, stream.material)} with "
+            f"print it; copy it and its measured flow, as {print_name(path.stem, stream.material)} with "
             f"columns {' and '.join(COLUMNS)} (or .parquet, or .mcap with the plunger's topic), to "
             "datasets/parts: the page then shows it beside the forecast"
         )
@@ -65,7 +65,7 @@ def next_commands(
     composed one, unless the file holds another."""
     commands = {}
     for stream in part.composed.streams:
-        path = measured_path(folder, part.name, stream.material)
+        path = print_path(folder, part.name, stream.material)
         if path:
             y, u = read_measured(path, len(stream.r), part.composed.sample_time_s)
             commands[stream.material] = verification.next_command(
@@ -90,5 +90,5 @@ def write_next(
         clock = np.arange(len(u)) * part.composed.sample_time_s
         artifacts.write_csv(path, {COLUMNS[0]: clock, COMMAND: u})
         text.append(f"the next command for {material}, learned from its measured print: {path}")
-    names = ", ".join(measured_name(part.name, stream.material) for stream in part.composed.streams)
+    names = ", ".join(print_name(part.name, stream.material) for stream in part.composed.streams)
     return "\n".join(text) or f"to learn on from this command, put the measured flow beside the part: {names}"

@@ -15,7 +15,7 @@ from pydantic import Field
 from pipeline.store.params import Mapped, Section
 
 if TYPE_CHECKING:
-    from pipeline.deposition.camera.pose import Mounting
+    from pipeline.deposition.camera.line import Mounting
     from pipeline.deposition.drive import Drive
     from pipeline.deposition.extruder import Extruder, Routine
     from pipeline.deposition.learning.training import LawSettings, Noise
@@ -215,7 +215,7 @@ class Camera(Section):
     @property
     def mounting(self) -> Mounting:
         """How the camera hangs, and what of its pictures is measured."""
-        from pipeline.deposition.camera.pose import Mounting
+        from pipeline.deposition.camera.line import Mounting
 
         known_px = [known / abs(self.mm_per_px) for known in self.known_widths_mm]
         return Mounting(

@@ -193,7 +193,7 @@ def _protobuf(message: memoryview, read: Callable[[memoryview], Message]) -> Ima
     values = {field.name: value for field, value in read(message).ListFields()}
     stamp, data = values.get("timestamp"), values.get("data", b"")
     since = [0 if stamp is None else getattr(stamp, name, "") for name in ("seconds", "nanos")]
-    if not all(isinstance(whole, int) for whole in since) or not isinstance(data, bytes):
+    if not all(isinstance(number, int) for number in since) or not isinstance(data, bytes):
         raise UnreadableMessage("something else where an image has its bytes or its time")
     return _picture(values | {"data": memoryview(data)}, since[0] * 10**9 + since[1])
 
@@ -211,7 +211,7 @@ def _json(message: memoryview) -> ImageMessage:
 def _picture(values: dict, stamp_ns: int) -> ImageMessage:
     height, width, step = (values.get(name, 0) for name in ("height", "width", "step"))
     encoding, format = (values.get(name, "") for name in ("encoding", "format"))
-    if not all(isinstance(whole, int) for whole in (height, width, step)):
+    if not all(isinstance(number, int) for number in (height, width, step)):
         raise UnreadableMessage("something else where an image has a whole number")
     if not (isinstance(encoding, str) and isinstance(format, str) and isinstance(values["data"], memoryview)):
         raise UnreadableMessage("something else where an image has its bytes or its format")
@@ -228,7 +228,7 @@ def gray(picture: ImageMessage) -> np.ndarray:
     """The gray frame (height, width), uint8 or uint16; of mono8 a view of the message. Raises
     UnreadableMessage."""
     if not picture.height:
-        frame = _decoded(picture.data, 0)
+        frame = _decode_picture(picture.data, 0)
         if frame is None:
             what = f"its {len(picture.data)} bytes of format {picture.encoding!r}"
             raise UnreadableMessage(f"{what} are no whole picture")
@@ -277,7 +277,7 @@ def _size(data: bytes) -> tuple[int, int]:
     return 0, 0
 
 
-def _decoded(data: bytes | memoryview, flags: int) -> np.ndarray | None:
+def _decode_picture(data: bytes | memoryview, flags: int) -> np.ndarray | None:
     """The gray picture of encoded bytes, None if there is none. Raises UnreadableMessage."""
     height, width = _size(bytes(data[: 1 << 16]))
     if height * width > MOST_PIXELS:
@@ -331,7 +331,7 @@ def decode(data: bytes) -> np.ndarray:
     # a broken end is filled with gray: the end mark must follow the last scan
     if data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
         raise ValueError(f"a JPEG of {len(data)} bytes without its end")
-    frame = _decoded(data, cv2.IMREAD_IGNORE_ORIENTATION)
+    frame = _decode_picture(data, cv2.IMREAD_IGNORE_ORIENTATION)
     if frame is None:
         raise ValueError(f"{len(data)} bytes that are no whole picture, beginning with {data[:8].hex(' ')}")
     if frame.dtype not in (np.uint8, np.uint16):
@@ -452,7 +452,7 @@ class Frames:
                         )
                         yield (time - self.start_ns) / 1e9, picture
 
-    def chosen(self, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
+    def pick(self, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
         """(number, frame) of the pictures with these numbers; only they are decoded, and one that cannot be
         decoded is left out."""
         for number, (_, picture) in enumerate(self.pictures()):
@@ -491,8 +491,8 @@ class Frames:
             stream.seek(offset)
             head = stream.read(9)
             record = stream.read(RECORD_HEAD.unpack(head)[1])
-            whole, pos = unpack_chunk(record, check=False) if head[0] == CHUNK else (head + record, 0)
-            content = memoryview(whole)
+            record_bytes, pos = unpack_chunk(record, check=False) if head[0] == CHUNK else (head + record, 0)
+            content = memoryview(record_bytes)
             while pos < len(content):
                 length = RECORD_HEAD.unpack_from(content, pos)[1]
                 if content[pos] == MESSAGE:
@@ -529,13 +529,13 @@ def image_topic(path: Path, topics: dict[str, Topic], name: str, place: str = ""
             f"{path}: {len(chosen)} topics have images ({', '.join(topic.name for topic in chosen)}); "
             f"name the one of the nozzle's camera{place}"
         )
-    there = ", ".join(
+    available = ", ".join(
         f"{topic.name} ({topic.channels[0].schema_name or 'no type'} in {topic.channels[0].encoding})"
         for topic in topics.values()
     )
     what = f"topic {name} with images" if name else "image topic"
     raise ValueError(
-        f"{path}: there is no {what}; it has {there or 'no topic at all'}; "
+        f"{path}: there is no {what}; it has {available or 'no topic at all'}; "
         f"images are read as {READABLE}{place}"
     )
 
@@ -595,9 +595,9 @@ def read_frames(
 
 
 def check_overlap(
-    path: str | Path, frames: tuple[float, float], others: dict[str, tuple[float, float]]
+    path: str | Path, frames: tuple[float, float], spans: dict[str, tuple[float, float]]
 ) -> None:
-    for name, (first, last) in others.items():
+    for name, (first, last) in spans.items():
         if frames[1] < first or last < frames[0]:
             raise ValueError(
                 f"{path}: the frames run from {frames[0]:.3f} to {frames[1]:.3f} s but {name} from "
@@ -679,21 +679,21 @@ def image(head: bytes, frame: np.ndarray) -> bytes:
     """sensor_msgs/msg/Image of a frame (height, width), uint8 (mono8) or uint16 (mono16)."""
     height, width = frame.shape
     body = (
-        _padded(head)
+        _pad(head)
         + struct.pack("<II", height, width)
         + _text("mono8" if frame.itemsize == 1 else "mono16")
         + b"\0"
     )
     data = np.ascontiguousarray(frame, "<u2" if frame.itemsize == 2 else np.uint8)
     return b"".join(
-        [_padded(body), struct.pack("<II", width * frame.itemsize, data.nbytes), memoryview(data).cast("B")]
+        [_pad(body), struct.pack("<II", width * frame.itemsize, data.nbytes), memoryview(data).cast("B")]
     )
 
 
-def compressed_image(head: bytes, format: str, data: np.ndarray) -> bytes:
+def image_bytes(head: bytes, format: str, data: np.ndarray) -> bytes:
     """sensor_msgs/msg/CompressedImage of encoded bytes (n,)."""
     return b"".join(
-        [_padded(_padded(head) + _text(format)), struct.pack("<I", data.size), memoryview(data).cast("B")]
+        [_pad(_pad(head) + _text(format)), struct.pack("<I", data.size), memoryview(data).cast("B")]
     )
 
 
@@ -701,7 +701,7 @@ def _text(text: str) -> bytes:
     return struct.pack("<I", len(text) + 1) + text.encode() + b"\0"
 
 
-def _padded(body: bytes) -> bytes:
+def _pad(body: bytes) -> bytes:
     return body + bytes(-len(body) % 4)
 
 
@@ -806,10 +806,10 @@ def _frame_messages(
     """CDR messages of the frames. Each frame is checked, and at the end the overlap with the signals'
     time."""
     ending, settings = ENCODERS[encoding]
-    kind, before, first = None, -1, math.nan
+    kind, last, first = None, -1, math.nan
     for k, (time, frame) in enumerate(frames):
         stamp = round(time * 1e9) if math.isfinite(time) else -1
-        if stamp <= before:
+        if stamp <= last:
             raise ValueError(
                 f"{path}: frame {k} is at {time:g} s but frames should run forward from 0 s or later; "
                 "sort them or shift the time"
@@ -832,11 +832,11 @@ def _frame_messages(
             )
         head = header(stamp, FRAME_ID)
         if ending:
-            message = compressed_image(head, encoding, cv2.imencode(ending, frame, settings)[1])
+            message = image_bytes(head, encoding, cv2.imencode(ending, frame, settings)[1])
         else:
             message = image(head, frame)
-        before, first = stamp, time if k == 0 else first
+        last, first = stamp, time if k == 0 else first
         yield stamp, channel, message
-    if before < 0:
+    if last < 0:
         raise ValueError(f"{path}: a trial should have frames but there is none; give at least one")
-    check_overlap(path, (first, before / 1e9), {"signals": span})
+    check_overlap(path, (first, last / 1e9), {"signals": span})

@@ -23,7 +23,9 @@ from pipeline.recordings.formats import (
     select,
     time_column,
 )
-from pipeline.recordings.mcap_files import Topic, bag_parts, joined, merged, survey
+from pipeline.recordings.mcap_files import Topic, bag_parts, survey
+from pipeline.recordings.mcap_files import join_parts as joined
+from pipeline.recordings.mcap_files import merge_topics as merged
 from pipeline.recordings.missing_codes import missing_codes
 from pipeline.recordings.other_formats import LOADERS
 from pipeline.recordings.parquet_files import parquet_columns, read_parquet

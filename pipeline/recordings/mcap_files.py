@@ -10,6 +10,7 @@ import contextlib
 import io
 import itertools
 import mmap
+import os
 import re
 import struct
 import zlib
@@ -35,6 +36,7 @@ from pipeline.recordings.messages import (
     fields,
     plain,
 )
+from pipeline.recordings.resampling import cut_flags
 
 MAGIC = b"\x89MCAP0\r\n"
 CHUNK, MESSAGE = int(Opcode.CHUNK), int(Opcode.MESSAGE)
@@ -56,11 +58,46 @@ SAMPLES = 20
 MOST_EXPECTED = 1 << 26
 # a network brings messages out of order now and then; two publishers with clocks of their own do all the time
 OUT_OF_ORDER = 0.05
+# a lost chunk that says it lasted so many times longer than all others together is not believed
+LONGEST_CHUNK = 10
 # (seconds, nanoseconds) as the fields of a time stamp are called in ROS 2, Foxglove JSON, ROS 1 and protobuf
 _STAMPS = (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "nanos"))
 LARGEST_METADATA = 1 << 20
 # between the parts of one bag
 LONGEST_PAUSE_S = 60.0
+# how text-mode copying changes the magic
+_CONVERSIONS = {
+    b"\x89MCAP0\n": "CR LF to LF",
+    b"\x89MCAP0\r\r\n": "LF to CR LF",
+    b"\x89MCAP0\r\x0b": "CR LF",
+    b"\x89MCAP0\r": "CR LF to CR",
+}
+# the length of a record that has always the same
+_LENGTHS = {Opcode.FOOTER: 20, Opcode.DATA_END: 4}
+ENDS = "the file ends in it"
+# kind of the note and its sentence
+_REMARKS = {
+    "chunk": ("damage", "the chunk or record at byte {offset} was left out with its {lost} because {reason}"),
+    "summary": ("damage", "the summary at byte {start} {reason} and was not used"),
+    "end": ("damage", "from byte {offset} on, where {reason}, the last {size} bytes hold no whole chunk and "
+            "were left out"),
+    "cut off": ("truncated", "the file breaks off: from byte {offset} on, its last {size} bytes hold no "
+                "whole chunk and were left out"),
+    "range": ("damage", "the chunk at byte {offset} says {first} to {last} ns but has messages from {begin} "
+              "to {end} ns; its contents {checked} were kept"),
+    "data": ("damage", "the data section's CRC is 0x{actual:08x} instead of 0x{expected:08x}; all chunks are "
+             "whole, so it is beside them"),
+    "undeclared": ("damage", "{count} messages are of channels that are declared nowhere and were left out"),
+    "promised": ("damage", "the summary counts {promised} messages but {total} were found{also}"),
+    "no footer": ("truncated", "the file has no footer: it was cut off or never closed; {chunks} whole "
+                  "chunks and {count} messages were recovered"),
+    "unchecked": ("unchecked", "{count} {what} no CRC, so damage there would not be seen"),
+}  # fmt: skip
+
+
+def _note(name: str, count: int = 1, **values: Any) -> Note:
+    kind, sentence = _REMARKS[name]
+    return Note(kind, "", count, sentence.format(count=count, **values))
 
 
 class Messages(NamedTuple):
@@ -82,13 +119,7 @@ def check_magic(path: Path, start: bytes) -> None:
     if start[:8] == MAGIC:
         return
     expected, actual = MAGIC.hex(" "), start[:8].hex(" ")
-    converted = {
-        b"\x89MCAP0\n": "CR LF to LF",
-        b"\x89MCAP0\r\r\n": "LF to CR LF",
-        b"\x89MCAP0\r\x0b": "CR LF",
-        b"\x89MCAP0\r": "CR LF to CR",
-    }
-    how = next((how for damaged, how in converted.items() if start.startswith(damaged)), "")
+    how = next((how for damaged, how in _CONVERSIONS.items() if start.startswith(damaged)), "")
     if how:
         raise ValueError(
             f"{path}: the bytes at offset 0 should be {expected} but are {actual}: "
@@ -162,13 +193,23 @@ def _next_chunk(stream: BinaryIO, offset: int) -> int | None:
     return None
 
 
-class _Definitions:
-    """The schemas and channels that were met so far, and the metadata records {name: {key: value}}."""
+class _Walk:
+    """A walk through the records of a file, with the schemas and channels that were met so far, and the
+    metadata records {name: {key: value}}. `offset` is that of the first byte that was not read. A walk that
+    `waits` ends where the file ends in a record; any other leaves that record out."""
 
-    def __init__(self) -> None:
+    waits = False
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.offset, self.size = path, len(MAGIC), 0
         self.schemas: dict[int, tuple[str, str, bytes]] = {}
         self.channels: dict[int, Channel] = {}
         self.metadata: dict[str, dict[str, str]] = {}
+
+    def leave_out(self, offset: int, reason: str, chunk: bytes, resumed: int | None) -> None:
+        """Takes note of damage at `offset`: its reason, what can be read of a chunk's record there, and the
+        offset of the next chunk, None if there is none."""
+        raise NotImplementedError
 
     def define(self, opcode: int, body: bytes) -> None:
         """Remembers a definition; other records are passed over. Raises UnreadableMessage."""
@@ -184,24 +225,79 @@ class _Definitions:
                 metadata = _parse(records.Metadata, body)
                 self.metadata[metadata.name] = metadata.metadata
 
+    def records(self, stream: BinaryIO) -> Iterator[tuple[int, int, bytes, bytes]]:
+        """(opcode, offset, head, body) of the records. Behind damage it goes on at the next chunk."""
+        stream.seek(self.offset)
+        while self.offset < self.size:
+            offset, head, body = self.offset, stream.read(9), b""
+            reason = self._unsound_head(head)
+            if not reason:
+                opcode, length = RECORD_HEAD.unpack(head)
+                body = stream.read(length)
+                reason = self._unsound_body(opcode, body)
+            if not reason:
+                self.offset += 9 + length
+                yield opcode, offset, head, body
+                if opcode == Opcode.FOOTER:
+                    return
+                continue
+            # 0: room that the recorder has taken but not filled
+            if self.waits and (reason == ENDS or head[0] == 0):
+                return
+            chunk = body or stream.read(CHUNK_HEAD.size) if head[0] == CHUNK else b""
+            resumed = _next_chunk(stream, offset + 1)
+            self.leave_out(offset, reason, chunk, resumed)
+            if resumed is None:
+                return
+            self.offset = stream.seek(resumed)
 
-class _Damage(NamedTuple):
-    offset: int
-    reason: str
-    lost: list[int]  # one number: messages that the index behind the chunk counts
+    def _unsound_head(self, head: bytes) -> str:
+        """The reason why no whole record begins with this head, "" if one does."""
+        if len(head) < RECORD_HEAD.size:
+            return ENDS
+        opcode, length = RECORD_HEAD.unpack(head)
+        if opcode == 0 or 0x0F < opcode < 0x80:
+            return f"a record of kind 0x{opcode:02x} begins there, which there is none of"
+        if _LENGTHS.get(opcode, length) != length:
+            return f"its length {length} is not that of its kind"
+        if length > LARGEST_CHUNK:
+            return f"its length {length} is more than the {LARGEST_CHUNK} bytes that are read at once"
+        return ENDS if self.offset + 9 + length > self.size else ""
+
+    def _unsound_body(self, opcode: int, body: bytes) -> str:
+        """The reason why the lengths inside do not agree with the record's own, "" if they do. If they do
+        not, the next record is not where it seems."""
+        sound = True
+        try:
+            if opcode == CHUNK:
+                start = CHUNK_HEAD.size + CHUNK_HEAD.unpack_from(body)[4]
+                sound = len(body) == start + 8 + struct.unpack_from("<Q", body, start)[0]
+            elif opcode == Opcode.MESSAGE_INDEX:
+                sound = len(body) == 6 + struct.unpack_from("<I", body, 2)[0]
+            elif opcode == MESSAGE:
+                sound = len(body) >= 22
+            else:
+                self.define(opcode, body)
+        except (struct.error, UnreadableMessage):
+            sound = False
+        return "" if sound else "the lengths in it do not agree"
 
 
-class McapFile(_Definitions):
+class McapFile(_Walk):
     """Walks a file once and remembers schemas, channels, counts and damage. Raises ValueError for a file that
     is no MCAP."""
 
     def __init__(self, path: Path):
-        super().__init__()
-        self.path = path
+        super().__init__(path)
         self.counts: dict[int, int] = {}
         self.chunks = self.unchecked = self.unchunked = self.undeclared = 0  # chunks: the whole ones
-        self.damage: list[_Damage] = []
-        self._losing: _Damage | None = None  # the damaged chunk whose message indexes may follow
+        self.damage: dict[int, str] = {}  # {offset: reason}
+        self.lost: dict[
+            int, int
+        ] = {}  # {offset of a damaged chunk: messages that the index behind it counts}
+        self.lost_ns: list[tuple[int, int]] = []  # first and last time of the chunks that were left out
+        self.span_ns: tuple[int, int] | None = None  # of the messages that were read
+        self._losing: int | None = None  # the damaged chunk whose message indexes may follow
         self.remarks: list[Note] = []
         self.promised: dict[int, int] | None = None  # messages of each channel, as the summary counts them
         self.has_footer = self.verified = False  # verified: by the CRC of the whole data section
@@ -230,22 +326,19 @@ class McapFile(_Definitions):
         stream.seek(start)
         summary = stream.read(end - start)
         actual = zlib.crc32(summary + tail[: FOOTER_RECORD.size - 4])
-        why = f"has CRC 0x{actual:08x} instead of 0x{crc:08x}" if crc and actual != crc else ""
+        reason = f"has CRC 0x{actual:08x} instead of 0x{crc:08x}" if crc and actual != crc else ""
         try:
-            for opcode, body in () if why else _split_records(summary):
+            for opcode, body in () if reason else _split_records(summary):
                 self.define(opcode, body)
                 if opcode == Opcode.STATISTICS:
-                    counted = _parse(records.Statistics, body)
+                    statistics = _parse(records.Statistics, body)
                     # a writer may leave out what each channel has
-                    if counted.channel_message_counts or not counted.message_count:
-                        self.promised = counted.channel_message_counts
+                    if statistics.channel_message_counts or not statistics.message_count:
+                        self.promised = statistics.channel_message_counts
         except (struct.error, UnreadableMessage):
-            why = "cannot be read"
-        if why:
-            self._remark("damage", f"the summary at byte {start} {why} and was not used")
-
-    def _remark(self, kind: str, message: str) -> None:
-        self.remarks.append(Note(kind, "", 1, message))
+            reason = "cannot be read"
+        if reason:
+            self.remarks.append(_note("summary", start=start, reason=reason))
 
     # ---- the data
 
@@ -253,9 +346,8 @@ class McapFile(_Definitions):
         """{channel: Messages} of each chunk, or of a megabyte of messages outside chunks. Only wanted
         channels come with data."""
         with self.path.open("rb", buffering=1 << 16) as stream:
-            stream.seek(8)
             crc, group, grouped = zlib.crc32(MAGIC), {}, 0
-            for opcode, offset, head, record in self._records(stream):
+            for opcode, offset, head, record in self.records(stream):
                 if opcode == Opcode.DATA_END:
                     self._check_data_crc(struct.unpack_from("<I", record)[0], crc)
                     break
@@ -264,18 +356,20 @@ class McapFile(_Definitions):
                 if opcode == CHUNK:
                     batch = self._chunk(offset, record, wanted)
                     if batch is not None:
-                        yield self._count(batch)
+                        yield batch
                 elif opcode == MESSAGE:
                     self.unchunked += 1
                     self._split(head + record, 0, offset, wanted, group)
                     grouped += len(record)
-                elif opcode == Opcode.MESSAGE_INDEX and self._losing:
-                    self._losing.lost[0] += (len(record) - 6) // 16
+                elif opcode == Opcode.MESSAGE_INDEX and self._losing is not None:
+                    self.lost[self._losing] += (len(record) - 6) // 16
                 if grouped > GROUP_BYTES:
-                    yield self._count(group)
+                    self._count(group)
+                    yield group
                     group, grouped = {}, 0
             if group:
-                yield self._count(group)
+                self._count(group)
+                yield group
 
     def walk(self) -> list[Note]:
         """What `notes` gives of the whole file, without any message."""
@@ -283,90 +377,37 @@ class McapFile(_Definitions):
             pass
         return self.notes()
 
-    def _records(self, stream: BinaryIO) -> Iterator[tuple[int, int, bytes, bytes]]:
-        """(opcode, offset, head, body) of the records. Behind damage it goes on at the next chunk."""
-        offset = 8
-        while offset < self.size:
-            head, record, reason = stream.read(9), b"", "the file ends in it"
-            if len(head) == 9:
-                opcode, length = RECORD_HEAD.unpack(head)
-                reason = self._unsound(opcode, length, offset)
-                if not reason:
-                    record = stream.read(length)
-                    reason = self._unsound_body(opcode, record)
-            if not reason:
-                yield opcode, offset, head, record
-                if opcode == Opcode.FOOTER:
-                    return
-                offset += 9 + length
-                continue
-            resumed = _next_chunk(stream, offset + 1)
-            if resumed is None:
-                lost = f"the last {self.size - offset} bytes hold no whole chunk and were left out"
-                if self.has_footer:
-                    self._remark("damage", f"from byte {offset} on, where {reason}, {lost}")
-                else:
-                    lost = lost.replace("the last", "its last")
-                    self._remark("truncated", f"the file breaks off: from byte {offset} on, {lost}")
-                return
-            self.damage.append(_Damage(offset, reason, [0]))
-            offset = resumed
-            stream.seek(offset)
-
-    def _unsound(self, opcode: int, length: int, offset: int) -> str:
-        if opcode == 0 or 0x0F < opcode < 0x80:
-            return f"a record of kind 0x{opcode:02x} begins there, which there is none of"
-        if {Opcode.FOOTER: 20, Opcode.DATA_END: 4}.get(opcode, length) != length:
-            return f"its length {length} is not that of its kind"
-        if offset + 9 + length > self.size:
-            return f"its length {length} is more than the file has left"
-        if length > LARGEST_CHUNK:
-            return f"its length {length} is more than the {LARGEST_CHUNK} bytes that are read at once"
-        return ""
-
-    def _unsound_body(self, opcode: int, record: bytes) -> str:
-        """The reason why the lengths inside do not agree with the record's own, "" if they do. If they do
-        not, the next record is not where it seems."""
-        sound = True
-        try:
-            if opcode == CHUNK:
-                start = CHUNK_HEAD.size + CHUNK_HEAD.unpack_from(record)[4]
-                sound = len(record) == start + 8 + struct.unpack_from("<Q", record, start)[0]
-            elif opcode == Opcode.MESSAGE_INDEX:
-                sound = len(record) == 6 + struct.unpack_from("<I", record, 2)[0]
-            elif opcode == MESSAGE:
-                sound = len(record) >= 22
-            else:
-                self.define(opcode, record)
-        except (struct.error, UnreadableMessage):
-            sound = False
-        return "" if sound else "the lengths in it do not agree"
+    def leave_out(self, offset: int, reason: str, chunk: bytes, resumed: int | None) -> None:
+        if len(chunk) >= CHUNK_HEAD.size:
+            self.lost_ns.append(CHUNK_HEAD.unpack_from(chunk)[:2])
+        if resumed is not None:
+            self.damage[offset] = reason
+        else:
+            name = "end" if self.has_footer else "cut off"
+            self.remarks.append(_note(name, offset=offset, reason=reason, size=self.size - offset))
 
     def _chunk(
         self, offset: int, record: bytes, wanted: Callable[[Channel], bool]
     ) -> dict[int, Messages] | None:
+        """The messages of a chunk, None if it is damaged."""
         first, last, _, crc, _ = CHUNK_HEAD.unpack_from(record)
         batch: dict[int, Messages] = {}
         try:
             content, begin = unpack_chunk(record)
             self._split(content, begin, offset, wanted, batch)
         except (UnreadableMessage, struct.error, UnicodeDecodeError) as error:
-            self._losing = _Damage(offset, str(error), [0])
-            self.damage.append(self._losing)
+            self.leave_out(offset, str(error), record, self.offset)
+            self._losing = offset
+            self.lost[offset] = 0
             return None
         self._losing = None
         self.chunks += 1
         self.unchecked += not crc
-        times = [
-            time for messages in batch.values() for time in (min(messages.log_time), max(messages.log_time))
-        ]
-        if times and (min(times), max(times)) != (first, last):
+        span_ns = self._count(batch) or (first, last)
+        if span_ns != (first, last):
             checked = "agree with their CRC and" if crc else "have no CRC and"
-            self._remark(
-                "damage",
-                f"the chunk at byte {offset} says {first} to {last} ns but has messages from {min(times)} to "
-                f"{max(times)} ns; its contents {checked} were kept",
-            )
+            values = {"first": first, "last": last, "begin": span_ns[0], "end": span_ns[1]}
+            self.remarks.append(_note("range", offset=offset, checked=checked, **values))
         return batch
 
     def _split(
@@ -405,11 +446,17 @@ class McapFile(_Definitions):
                 )
             pos = following
 
-    def _count(self, batch: dict[int, Messages]) -> dict[int, Messages]:
+    def _count(self, batch: dict[int, Messages]) -> tuple[int, int] | None:
+        """Counts the messages; their first and last time, None if there are none."""
+        times = []
         for number, messages in batch.items():
             self.counts[number] = self.counts.get(number, 0) + len(messages.log_time)
             self.undeclared += len(messages.log_time) * (number not in self.channels)
-        return batch
+            times += [min(messages.log_time), max(messages.log_time)]
+        if not times:
+            return None
+        self.span_ns = min(times + list(self.span_ns or ())), max(times + list(self.span_ns or ()))
+        return min(times), max(times)
 
     def _check_data_crc(self, expected: int, actual: int) -> None:
         self.verified = bool(expected) and expected == actual
@@ -421,39 +468,46 @@ class McapFile(_Definitions):
                 f"0x{actual:08x}, and its messages have no CRC of their own that would tell which are "
                 "damaged; copy the recording again from the machine"
             )
-        self._remark(
-            "damage",
-            f"the data section's CRC is 0x{actual:08x} instead of 0x{expected:08x}; all chunks are whole, "
-            "so it is beside them",
-        )
+        self.remarks.append(_note("data", actual=actual, expected=expected))
 
     def notes(self) -> list[Note]:
         """Damage and its extent. It is complete when the batches have been walked."""
-        remarks = []
-        for damage in self.damage:
-            lost = f"{damage.lost[0]} messages" if damage.lost[0] else "messages, how many is not known,"
-            what = f"the chunk or record at byte {damage.offset} was left out with its {lost} because"
-            remarks.append(("damage", 1, f"{what} {damage.reason}"))
-        remarks += [(remark.kind, remark.count, remark.message) for remark in self.remarks]
+        notes = []
+        for offset, reason in self.damage.items():
+            count = self.lost.get(offset)
+            lost = f"{count} messages" if count else "messages, how many is not known,"
+            notes.append(_note("chunk", offset=offset, lost=lost, reason=reason))
+        notes += self.remarks
         if self.undeclared:
-            what = "messages are of channels that are declared nowhere and were left out"
-            remarks.append(("damage", self.undeclared, f"{self.undeclared} {what}"))
-        total, lost = sum(self.counts.values()), sum(damage.lost[0] for damage in self.damage)
+            notes.append(_note("undeclared", self.undeclared))
+        total, lost = sum(self.counts.values()), sum(self.lost.values())
         promised = total + lost if self.promised is None else sum(self.promised.values())
         if promised != total + lost:
             also = f" and {lost} are lost with damaged chunks" if lost else ""
-            what = f"the summary counts {promised} messages but {total} were found{also}"
-            remarks.append(("damage", abs(promised - total - lost), what))
+            missing = abs(promised - total - lost)
+            notes.append(_note("promised", missing, promised=promised, total=total, also=also))
         if not self.has_footer:
-            what = f"the file has no footer: it was cut off or never closed; {self.chunks} whole chunks"
-            remarks.append(("truncated", total, f"{what} and {total} messages were recovered"))
+            notes.append(_note("no footer", total, chunks=self.chunks))
         count = self.unchecked or self.unchunked
         if count and not self.verified:
             what = ("chunk" if self.unchecked else "message") + ("s" if count > 1 else "")
-            where, have = "" if self.unchecked else " outside chunks", "have" if count > 1 else "has"
-            sentence = f"{count} {what}{where} {have} no CRC, so damage there would not be seen"
-            remarks.append(("unchecked", count, sentence))
-        return [Note(kind, "", count, message) for kind, count, message in remarks]
+            where = "" if self.unchecked else " outside chunks"
+            have = "have" if count > 1 else "has"
+            notes.append(_note("unchecked", count, what=f"{what}{where} {have}"))
+        return notes + self._cut(total, max(lost, promised - total))
+
+    def _cut(self, total: int, lost: int) -> list[Note]:
+        """A note with the share of the recording that is lost: of its messages if the file counts them, else
+        of its time, as the heads of the lost chunks say."""
+        what = "messages are lost"
+        if not lost and self.span_ns:
+            begin_ns, end_ns = self.span_ns
+            longest = LONGEST_CHUNK * (end_ns - begin_ns)
+            lost_ns = [last - first for first, last in self.lost_ns if begin_ns <= first <= last]
+            lost = sum(duration for duration in lost_ns if duration <= longest) // 10**6
+            total, what = (end_ns - begin_ns) // 10**6, "ms are those of lost chunks"
+        flags = cut_flags(lost, total + lost, what, np.nan, np.nan) if lost else []
+        return [Note("cut", "", flag.count, flag.message) for flag in flags]
 
 
 # ---- a file that is still being written
@@ -468,78 +522,60 @@ class Message(NamedTuple):
     data: bytes
 
 
-class GrowingMcap(_Definitions):
+class GrowingMcap(_Walk):
     """The whole records of a file so far, and those that come. A recorder closes a chunk every second or so,
     and writes the footer last. What is not whole yet is left for the next look; a file that was begun anew is
     read from its start.
 
-    `offset` is that of the first byte that was not read; `ended` whether the footer was met; `damage`
-    sentences.
+    `ended` says whether the footer was met; `damage` has sentences.
     """
 
+    waits = True
+
     def __init__(self, path: Path) -> None:
-        super().__init__()
-        self.path, self.damage, self.inode = path, [], None
-        self.offset, self.ended = 0, False
+        super().__init__(path)
+        self.damage: list[str] = []
+        self.inode, self.ended = 0, False
+
+    def leave_out(self, offset: int, reason: str, chunk: bytes, resumed: int | None) -> None:
+        if resumed is not None:
+            self.damage.append(f"{self.path}: the chunk or record at byte {offset} was left out ({reason})")
 
     def messages(self, wanted: Callable[[Channel], bool]) -> Iterator[Message]:
         """The messages that came since the last look, of wanted channels. Raises FileNotFoundError if there
         is no such file, and ValueError if it is no MCAP."""
         with self.path.open("rb", buffering=1 << 16) as stream:
-            inode, size = self.path.stat().st_ino, stream.seek(0, 2)
-            if self.inode not in (None, inode) or size < self.offset:
+            status = os.fstat(stream.fileno())
+            if (self.inode and self.inode != status.st_ino) or status.st_size < min(self.offset, self.size):
                 self.damage.append(f"{self.path} was begun anew after {self.offset} bytes")
-                self.offset, self.ended = 0, False
+                self.offset, self.ended = len(MAGIC), False
                 self.schemas.clear()
                 self.channels.clear()
-            self.inode = inode
-            if self.offset == 0:
-                stream.seek(0)
-                start = stream.read(len(MAGIC))
-                if len(start) < len(MAGIC) and MAGIC.startswith(start):
-                    return
-                check_magic(self.path, start)
-                self.offset = len(MAGIC)
-            while not self.ended and (record := self._record(stream, size)) is not None:
-                yield from self._messages(*record, wanted)
-
-    def _record(self, stream: BinaryIO, size: int) -> tuple[int, bytes] | None:
-        """The next whole record, None if none has come; behind damage the next chunk's."""
-        while self.offset + RECORD_HEAD.size <= size:
-            stream.seek(self.offset)
-            opcode, length = RECORD_HEAD.unpack(stream.read(RECORD_HEAD.size))
-            sound = length <= LARGEST_CHUNK and (opcode <= Opcode.DATA_END or opcode >= 0x80)
-            # opcode 0: room that the recorder has taken but not filled
-            if opcode == 0 or (sound and self.offset + RECORD_HEAD.size + length > size):
-                return None
-            if sound:
-                self.offset += RECORD_HEAD.size + length
-                return opcode, stream.read(length)
-            resumed = _next_chunk(stream, self.offset + 1)
-            if resumed is None:
-                return None
-            self.damage.append(f"{self.path}: bytes {self.offset} to {resumed} are no records")
-            self.offset = resumed
-        return None
-
-    def _messages(self, opcode: int, body: bytes, wanted: Callable[[Channel], bool]) -> Iterator[Message]:
-        """The messages of a record outside or inside a chunk; a definition is remembered."""
-        try:
-            if opcode == CHUNK:
-                content, begin = unpack_chunk(body)
-                for inner, part in _split_records(content[begin:]):
-                    if inner != CHUNK:
-                        yield from self._messages(inner, part, wanted)
-            elif opcode == MESSAGE:
-                number, _, log_time, publish_time = struct.unpack_from("<HIQQ", body)
-                channel = self.channels.get(number)
-                if channel is not None and wanted(channel):
-                    yield Message(channel, log_time, publish_time, body[22:])
-            else:
-                self.define(opcode, body)
+            self.inode, self.size = status.st_ino, status.st_size
+            start = stream.read(len(MAGIC))
+            if MAGIC.startswith(start) and start != MAGIC:
+                return
+            check_magic(self.path, start)
+            for opcode, offset, head, body in () if self.ended else self.records(stream):
                 self.ended = opcode == Opcode.FOOTER
-        except (UnreadableMessage, struct.error, UnicodeDecodeError) as error:
-            self.damage.append(f"{self.path}: a record before byte {self.offset} was left out ({error})")
+                try:
+                    if opcode == CHUNK:
+                        content, begin = unpack_chunk(body)
+                        yield from self._messages(content[begin:], wanted)
+                    elif opcode == MESSAGE:
+                        yield from self._messages(head + body, wanted)
+                except (UnreadableMessage, struct.error, UnicodeDecodeError) as error:
+                    self.leave_out(offset, str(error), body, self.offset)
+
+    def _messages(self, content: bytes, wanted: Callable[[Channel], bool]) -> Iterator[Message]:
+        for opcode, body in _split_records(content):
+            if opcode != MESSAGE:
+                self.define(opcode, body)
+                continue
+            number, _, log_time, publish_time = struct.unpack_from("<HIQQ", body)
+            channel = self.channels.get(number)
+            if channel is not None and wanted(channel):
+                yield Message(channel, log_time, publish_time, body[22:])
 
 
 # ---- topics
@@ -556,71 +592,58 @@ class Topic(NamedTuple):
     count: int
 
 
-class _Fields(NamedTuple):
-    """What the first messages of each channel tell: its fields, or the reason why it cannot be read."""
-
-    names: dict[int, dict[str, None]]
-    unreadable: dict[int, str]
-
-    def add(self, channel: Channel, data: Sequence[bytes]) -> None:
-        try:
-            self.names.setdefault(channel.id, {}).update(dict.fromkeys(fields(channel, data)))
-        except (ValueError, RecursionError) as error:
-            self.unreadable.setdefault(channel.id, str(error))
-
-    def topics(self, channels: dict[int, Channel], counts: dict[int, int]) -> dict[str, Topic]:
-        return merged(
-            {
-                channel.topic: Topic(
-                    channel.topic,
-                    [channel],
-                    list(self.names.get(number, ())),
-                    self.unreadable.get(number, ""),
-                    counts.get(number, 0),
-                )
-            }
-            for number, channel in sorted(channels.items())
-        )
-
-
-def merged(parts: Iterable[dict[str, Topic]]) -> dict[str, Topic]:
+def merge_topics(parts: Iterable[dict[str, Topic]]) -> dict[str, Topic]:
     """The topics of all parts."""
     union: dict[str, Topic] = {}
     for topic in itertools.chain.from_iterable(part.values() for part in parts):
-        before = union.get(topic.name, Topic(topic.name, [], [], "", 0))
+        earlier = union.get(topic.name, Topic(topic.name, [], [], "", 0))
         union[topic.name] = Topic(
             topic.name,
-            before.channels + topic.channels,
-            list(dict.fromkeys([*before.fields, *topic.fields])),
-            topic.unreadable or before.unreadable,
-            before.count + topic.count,
+            earlier.channels + topic.channels,
+            list(dict.fromkeys([*earlier.fields, *topic.fields])),
+            topic.unreadable or earlier.unreadable,
+            earlier.count + topic.count,
         )
     return union
 
 
-def topics(path: Path, samples: int | None = SAMPLES) -> dict[str, Topic]:
-    """The topics of a file, by its summary and the first `samples` messages of each channel (None: all).
+def topics(path: Path, samples: int = SAMPLES) -> dict[str, Topic]:
+    """The topics of a file, by its summary and the first `samples` messages of each channel.
 
     Raises ValueError for a file that is no MCAP.
     """
-    file, sampled_fields = McapFile(path), _Fields({}, {})
-    sampled: dict[int, int] = {}
-    for batch in file.batches(lambda channel: samples is None or sampled.get(channel.id, 0) < samples):
+    file, names, unreadable, counts = McapFile(path), {}, {}, {}
+
+    def look(number: int, data: Sequence[bytes]) -> None:
+        counts[number] = counts.get(number, 0) + len(data)
+        try:
+            paths = dict.fromkeys(fields(file.channels[number], data))
+            names[number] = names.get(number, {}) | paths
+        except (ValueError, RecursionError) as error:
+            unreadable.setdefault(number, str(error))
+
+    for batch in file.batches(lambda channel: counts.get(channel.id, 0) < samples):
         for number, messages in batch.items():
-            data = messages.data[: None if samples is None else samples - sampled.get(number, 0)]
-            sampled[number] = sampled.get(number, 0) + len(data)
-            if number in file.channels and data:
-                sampled_fields.add(file.channels[number], data)
-        if (
-            samples
-            and file.promised
-            and all(sampled.get(number, 0) >= min(samples, count) for number, count in file.promised.items())
-        ):
+            if messages.data:
+                look(number, messages.data[: samples - counts.get(number, 0)])
+        promised = (file.promised or {}).items()
+        if promised and all(counts.get(number, 0) >= min(samples, count) for number, count in promised):
             break
-    for number in set(file.channels) - set(sampled):
-        sampled_fields.add(file.channels[number], [])
-    return sampled_fields.topics(
-        file.channels, file.counts if samples is None else file.promised or file.counts
+    for number in set(file.channels) - set(counts):
+        look(number, [])
+    # the counts are whole if every message was looked at, else those of the summary
+    totals = file.counts if samples > SAMPLES else file.promised or file.counts
+    return merge_topics(
+        {
+            channel.topic: Topic(
+                channel.topic,
+                [channel],
+                list(names.get(number, ())),
+                unreadable.get(number, ""),
+                totals.get(number, 0),
+            )
+        }
+        for number, channel in sorted(file.channels.items())
     )
 
 
@@ -687,14 +710,13 @@ class TopicColumns:
         channel = self.file.channels.get(number)
         if channel is None or channel.topic not in self.fields or not messages.data:
             return
-        names, clock = self.fields[channel.topic], self.clocks[channel.topic]
+        topic, names, clock = channel.topic, self.fields[channel.topic], self.clocks[channel.topic]
         if number not in self.decoders:
             try:
                 self.decoders[number] = decoder(channel, [*names, *clock])
             except ValueError as error:
                 raise ValueError(
-                    f"{self.file.path}: topic {channel.topic} cannot be read because {error}; "
-                    "map another topic"
+                    f"{self.file.path}: topic {topic} cannot be read because {error}; map another topic"
                 ) from None
             expected = min((self.file.promised or {}).get(number, 0), MOST_EXPECTED)
             self.parts[number] = Growing([np.int64, *[float] * len(names)], expected)
@@ -702,7 +724,7 @@ class TopicColumns:
             values, sound = _decode(self.decoders[number], messages.data, len(names) + len(clock))
         except ValueError as error:
             place = f"one of its messages from {min(messages.log_time)} to {max(messages.log_time)} ns"
-            raise ValueError(f"{self.file.path}: topic {channel.topic}, {place}: {error}") from None
+            raise ValueError(f"{self.file.path}: topic {topic}, {place}: {error}") from None
         published = np.array(messages.publish_time, np.uint64).astype(np.int64)
         if clock:
             times = _stamps(clock, values[:, len(names) :])
@@ -711,11 +733,9 @@ class TopicColumns:
         else:
             times = np.array(messages.log_time, np.uint64).astype(np.int64)[sound]
         self.parts[number].append(times, *values[:, : len(names)].T)
-        for counts, count in (
-            (self.bad, len(messages.data) - len(times)),
-            (self.backwards, np.count_nonzero(np.diff(published) < 0)),
-        ):
-            counts[channel.topic] = counts.get(channel.topic, 0) + int(count)
+        self.bad[topic] = self.bad.get(topic, 0) + len(messages.data) - len(times)
+        back = int(np.count_nonzero(np.diff(published) < 0))
+        self.backwards[topic] = self.backwards.get(topic, 0) + back
 
     def join(self, topic: str, notes: list[Note]) -> FileColumns:
         """The topic's channels one behind the other. Two channels at the same time are two devices under one
@@ -724,32 +744,29 @@ class TopicColumns:
         for number in [number for number in self.parts if self.file.channels[number].topic == topic]:
             time, *values = self.parts.pop(number).finished()
             if len(time):
-                pieces.append((time.min(), number, time, values))
-        pieces.sort(key=lambda piece: piece[0])
+                columns = dict(zip(self.fields[topic], values, strict=True))
+                pieces.append(FileColumns(str(number), time, columns, str))
         if not pieces:
             bad = self.bad.get(topic)
-            why = "it has no whole message"
-            if bad:
-                why = f"all of its {bad} messages are not what its schema says"
+            reason = (
+                f"all of its {bad} messages are not what its schema says"
+                if bad
+                else "it has no whole message"
+            )
             damage = "; ".join(note.message for note in notes[:2])
             raise ValueError(
                 f"{path}: nothing of topic {topic} could be read because "
-                f"{why}{f' ({damage})' if damage else ''}; copy the recording again"
+                f"{reason}{f' ({damage})' if damage else ''}; copy the recording again"
             )
-        for before, after in itertools.pairwise(pieces):
-            if after[0] <= before[2].max():
-                raise ValueError(
-                    f"{path}: topic {topic} comes from channels {before[1]} and {after[1]} at the "
-                    "same time, as if two devices had one name; record each under a topic of its own"
-                )
-        _, _, time, values = pieces[0]
+        overlap = (
+            f"topic {topic} comes from channels {{first}} and {{second}} at the same time, as if two devices "
+            "had one name; record each under a topic of its own"
+        )
+        columns = join_parts(path, pieces, overlap)
         if len(pieces) > 1:
             message = f"topic {topic} was recorded by {len(pieces)} channels one after the other"
             notes.append(Note("channels", "", len(pieces), f"{message}, which were joined"))
-            time = np.concatenate([piece[2] for piece in pieces])
-            values = [np.concatenate(arrays) for arrays in zip(*(piece[3] for piece in pieces), strict=True)]
-        columns = dict(zip(self.fields[topic], values, strict=True))
-        return FileColumns(topic, time, columns, lambda i: f"message {i + 1} of {topic}")
+        return columns._replace(name=topic, place=lambda i: f"message {i + 1} of {topic}")
 
     def notes(self) -> list[Note]:
         """Notes of the messages that do not fit their schema."""
@@ -761,13 +778,30 @@ class TopicColumns:
         ]
 
 
+def join_parts(
+    path: Path,
+    groups: Sequence[FileColumns],
+    overlap: str = "two parts of the bag hold {first} at the same time; "
+    "name the part in metadata.yaml that is to be read",
+) -> FileColumns:
+    """One topic's columns of several parts or channels. Raises ValueError for those that overlap in time."""
+    groups = sorted(groups, key=lambda group: group.time.min())
+    for first, second in itertools.pairwise(groups):
+        if second.time.min() <= first.time.max():
+            raise ValueError(f"{path}: {overlap.format(first=first.name, second=second.name)}")
+    if len(groups) == 1:
+        return groups[0]
+    values = {name: np.concatenate([group.values[name] for group in groups]) for name in groups[0].values}
+    return groups[0]._replace(time=np.concatenate([group.time for group in groups]), values=values)
+
+
 def _stamps(clock: Sequence[str], stamps: np.ndarray) -> np.ndarray:
     """Times in ns (n,) of the clock's fields (n, 1 or 2)."""
     if len(clock) == 1:
         return np.rint(seconds(clock[0].rpartition(".")[2], stamps[:, 0])[0] * 1e9).astype(np.int64)
     # both parts are whole numbers below 2^53, so that floats hold them and the nanoseconds are exact
-    whole = stamps.astype(np.int64)
-    return whole[:, 0] * 10**9 + whole[:, 1]
+    parts = stamps.astype(np.int64)
+    return parts[:, 0] * 10**9 + parts[:, 1]
 
 
 def _decode(decode: Decode, data: list[bytes], width: int) -> tuple[np.ndarray, slice | list[int]]:
@@ -780,6 +814,15 @@ def _decode(decode: Decode, data: list[bytes], width: int) -> tuple[np.ndarray, 
             rows.append(decode([plain(message)]))
             sound.append(i)
     return np.concatenate(rows), sound
+
+
+def _topic_counts(file: McapFile) -> dict[str, int]:
+    """{topic: count of the messages that were read}."""
+    counts: dict[str, int] = {}
+    for number, count in file.counts.items():
+        topic = file.channels[number].topic if number in file.channels else f"channel {number}"
+        counts[topic] = counts.get(topic, 0) + count
+    return counts
 
 
 def mcap_columns(
@@ -799,11 +842,7 @@ def mcap_columns(
     for batch in file.batches(lambda channel: channel.topic in columns.fields):
         for number, messages in batch.items():
             columns.add(number, messages)
-    counts: dict[str, int] = {}
-    for number, count in file.counts.items():
-        topic = file.channels[number].topic if number in file.channels else f"channel {number}"
-        counts[topic] = counts.get(topic, 0) + count
-    notes = file.notes() + columns.notes()
+    counts, notes = _topic_counts(file), file.notes() + columns.notes()
     for topic, count in columns.backwards.items():
         if count > OUT_OF_ORDER * counts[topic]:
             message = (
@@ -821,16 +860,16 @@ def _places(path: Path, sources: Sequence[str]) -> tuple[dict[str, tuple[str, st
     if not any(topic.fields for topic in by_name.values()):
         reasons = [f"{topic.name}: {topic.unreadable}" for topic in by_name.values() if topic.unreadable]
         notes = [note.message for note in McapFile(path).walk() if note.kind in ("damage", "truncated")]
-        why = "; ".join([*reasons, *notes][:3]) or "its messages hold text or nothing"
+        reason = "; ".join([*reasons, *notes][:3]) or "its messages hold text or nothing"
         raise ValueError(
-            f"{path}: no topic with numbers could be read ({why}); record numeric topics, "
+            f"{path}: no topic with numbers could be read ({reason}); record numeric topics, "
             "or copy the recording again"
         )
     try:
         return {source: resolve(path, source, by_name) for source in sources}, by_name
     except ValueError:
         # a key that JSON messages get later than the first ones
-        by_name = topics(path, None)
+        by_name = topics(path, MOST_EXPECTED)
         return {source: resolve(path, source, by_name) for source in sources}, by_name
 
 
@@ -843,54 +882,28 @@ class Survey(NamedTuple):
 
 
 def survey(path: Path, most_fields: int) -> Survey:
-    """The topics of a file with the first `most_fields` numbers of each on log_time, in one walk.
+    """The topics of a file with the first `most_fields` numbers of each on log_time: one look at the first
+    messages, and one walk.
 
     Raises ValueError for a file that is no MCAP.
     """
-    file, sampled_fields = McapFile(path), _Fields({}, {})
+    by_name, file, failures = topics(path), McapFile(path), {}
     columns = TopicColumns(file, "")
-    waiting: dict[int, Messages] = {}  # the first messages of a channel, until there are SAMPLES
-
-    def add(number: int, messages: Messages) -> None:
-        channel = file.channels[number]
-        if number not in sampled_fields.names:
-            sampled_fields.add(channel, messages.data[:SAMPLES])
-            names = list(sampled_fields.names[number])[:most_fields]
-            if number in sampled_fields.unreadable or not names:
-                sampled_fields.unreadable.setdefault(number, "")
-            elif channel.topic not in columns.fields:
-                columns.want(Topic(channel.topic, [], [], "", 0), names)
-        if number not in sampled_fields.unreadable:
+    for topic in by_name.values():
+        if topic.fields:
+            columns.want(topic, topic.fields[:most_fields])
+    for batch in file.batches(lambda channel: channel.topic in columns.fields and channel.id not in failures):
+        for number, messages in batch.items():
             try:
                 columns.add(number, messages)
             except ValueError as error:
-                sampled_fields.unreadable[number] = str(error)
-
-    for batch in file.batches(lambda channel: channel.id not in sampled_fields.unreadable):
-        for number, messages in batch.items():
-            if number not in file.channels or not messages.data:
-                continue
-            if number not in sampled_fields.names:
-                first = waiting.pop(number, Messages([], [], [], []))
-                messages = Messages(
-                    first.log_time + messages.log_time,
-                    first.publish_time + messages.publish_time,
-                    first.data + messages.data,
-                    first.offsets + messages.offsets,
-                )
-                if len(messages.data) < SAMPLES:
-                    waiting[number] = messages
-                    continue
-            add(number, messages)
-    for number, messages in waiting.items():
-        add(number, messages)
-    for number in set(file.channels) - set(sampled_fields.names):
-        sampled_fields.add(file.channels[number], [])
-    by_name = sampled_fields.topics(file.channels, file.counts)
-    notes, groups = file.notes() + columns.notes(), []
-    columns.parts = {
-        number: part for number, part in columns.parts.items() if number not in sampled_fields.unreadable
-    }
+                failures[number] = str(error)
+                columns.parts.pop(number, None)
+    counts, notes, groups = _topic_counts(file), file.notes() + columns.notes(), []
+    for number, error in failures.items():
+        name = file.channels[number].topic
+        by_name[name] = by_name[name]._replace(unreadable=by_name[name].unreadable or error)
+    by_name = {name: topic._replace(count=counts.get(name, 0)) for name, topic in by_name.items()}
     for topic in dict.fromkeys(file.channels[number].topic for number in columns.parts):
         try:
             groups.append(columns.join(topic, notes))
@@ -951,7 +964,7 @@ def read_bag(
     """What `mcap_columns` gives, of all parts of a bag one behind the other."""
     parts = bag_parts(path)
     by_part = [topics(part) for part in parts]
-    union = merged(by_part)
+    union = merge_topics(by_part)
     places = {source: resolve(path, source, union) for source in sources}
     pieces: dict[str, list[FileColumns]] = {}
     counts: dict[str, int] = {}
@@ -962,8 +975,8 @@ def read_bag(
         ]
         if not wanted:
             continue
-        columns, _, messages, more = mcap_columns(part, wanted, time)
-        notes += [note._replace(message=f"{part.name}: {note.message}") for note in more]
+        columns, _, messages, part_notes = mcap_columns(part, wanted, time)
+        notes += [note._replace(message=f"{part.name}: {note.message}") for note in part_notes]
         for topic, count in messages.items():
             counts[topic] = counts.get(topic, 0) + count
         for group in columns:
@@ -971,7 +984,7 @@ def read_bag(
     missing = sorted({topic for topic, _ in places.values()} - set(pieces))
     if missing:
         raise ValueError(f"{path}: no part of the bag holds a message of {missing[0]}; map another topic")
-    columns = [joined(path, groups) for groups in pieces.values()]
+    columns = [join_parts(path, groups) for groups in pieces.values()]
     return columns, places, counts, notes + _pauses(pieces)
 
 
@@ -989,16 +1002,3 @@ def _pauses(pieces: dict[str, list[FileColumns]]) -> list[Note]:
                 )
                 return [Note("clock", "", len(spans), message)]
     return []
-
-
-def joined(path: Path, groups: Sequence[FileColumns]) -> FileColumns:
-    """One topic's columns of several parts. Raises ValueError for parts that overlap in time."""
-    groups = sorted(groups, key=lambda group: group.time[0])
-    for before, after in itertools.pairwise(groups):
-        if after.time[0] <= before.time[-1]:
-            raise ValueError(
-                f"{path}: two parts of the bag hold {before.name} at the same time; "
-                "name the part in metadata.yaml that is to be read"
-            )
-    values = {name: np.concatenate([g.values[name] for g in groups]) for name in groups[0].values}
-    return groups[0]._replace(time=np.concatenate([group.time for group in groups]), values=values)

@@ -11,12 +11,13 @@ FileDescriptorSet.
 
 import contextlib
 import graphlib
+import itertools
 import json
 import operator
 import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import lz4.frame
 import numpy as np
@@ -135,15 +136,15 @@ def decompress(method: str, data: bytes, size: int | None) -> bytes:
             declared = zstandard.frame_content_size(data)
             if declared > room:
                 raise UnreadableMessage(f"data that say they unpack to {declared} bytes, more than {room}")
-            most = 0 if declared >= 0 else room
-            unpacked = zstandard.ZstdDecompressor().decompress(data, max_output_size=most)
+            limit = 0 if declared >= 0 else room
+            unpacked = zstandard.ZstdDecompressor().decompress(data, max_output_size=limit)
         elif method == "lz4":
             unpacked = lz4.frame.LZ4FrameDecompressor().decompress(data, room + 1)
         else:
             raise UnreadableMessage(f"the compression {method!r} is not known; zstd and lz4 are")
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError, OverflowError) as error:
-        why = (str(error) or "too large").splitlines()[0]
-        raise UnreadableMessage(f"{method} data that cannot be unpacked ({why})") from None
+        reason = (str(error) or "too large").splitlines()[0]
+        raise UnreadableMessage(f"{method} data that cannot be unpacked ({reason})") from None
     if len(unpacked) > room or size not in (None, len(unpacked)):
         raise UnreadableMessage(f"{method} data that unpack to {len(unpacked)} bytes, not {size}")
     return unpacked
@@ -168,7 +169,7 @@ def _json_fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
     names: dict[str, None] = {}
     if channel.schema_encoding == "jsonschema" and channel.schema:
         with contextlib.suppress(UnreadableMessage):  # the messages tell
-            names |= dict.fromkeys(_promised(_document(channel.schema), "", 0))
+            names |= dict.fromkeys(_schema_paths(_document(channel.schema), "", 0))
     for sample in samples:
         names |= dict.fromkeys(_paths(_document(sample)))
         if len(names) > LARGEST_LAYOUT:
@@ -176,14 +177,14 @@ def _json_fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
     return list(names)
 
 
-def _promised(schema, prefix: str, depth: int) -> Iterator[str]:
+def _schema_paths(schema, prefix: str, depth: int) -> Iterator[str]:
     properties = schema.get("properties") if isinstance(schema, dict) else None
     if not isinstance(properties, dict) or depth > 6:
         return
     for name, inner in properties.items():
         kind = inner.get("type") if isinstance(inner, dict) else None
         if kind == "object":
-            yield from _promised(inner, f"{prefix}{name}.", depth + 1)
+            yield from _schema_paths(inner, f"{prefix}{name}.", depth + 1)
         elif kind == "boolean" or {"number", "integer"} & set(
             map(str, kind if isinstance(kind, list) else [kind])
         ):
@@ -279,6 +280,8 @@ _REPRESENTATIONS = {
     b"\x00\x06": (">", 4),
     b"\x00\x07": ("<", 4),
 }
+# so many messages are worth a format of their own
+FEWEST_ALIKE = 4
 _LENGTH = {order: struct.Struct(order + "I") for order in "<>"}
 
 
@@ -354,7 +357,7 @@ def _expand(kind: str, prefix: str, types: dict, version: int, room: list[int]) 
     """The items of a type, in the order of the wire; `room` is how many more there may be."""
     items: list[Item] = []
     numbers = ROS2_NUMBERS if version == 2 else ROS1_NUMBERS
-    for field, of, length in types[kind]:
+    for field, part_kind, length in types[kind]:
         path = f"{prefix}.{field}" if prefix else field
         if length and (len(length) > 12 or int(length) > LARGEST_ARRAY):
             raise ValueError(
@@ -362,14 +365,14 @@ def _expand(kind: str, prefix: str, types: dict, version: int, room: list[int]) 
             )
         count = int(length or 1)
         if length == "":
-            element = _element(of, f"{path}[]", kind, types, version, room)
-            items.append(Item("sequence", path, items=tuple(element)))
-        elif of in numbers:
-            items.append(Item("numbers", path, numbers[of], count, length is not None))
+            elements = _element(part_kind, f"{path}[]", kind, types, version, room)
+            items.append(Item("sequence", path, items=tuple(elements)))
+        elif part_kind in numbers:
+            items.append(Item("numbers", path, numbers[part_kind], count, length is not None))
         else:
             for i in range(count):
                 _take_room(kind, room)
-                items += _element(of, f"{path}[{i}]" if length else path, kind, types, version, room)
+                items += _element(part_kind, f"{path}[{i}]" if length else path, kind, types, version, room)
         _take_room(kind, room)
     if not items and version == 2:
         items.append(Item("numbers", prefix + "._", "B"))  # ROS 2 gives a message without fields one byte
@@ -382,15 +385,15 @@ def _take_room(kind: str, room: list[int]) -> None:
         raise ValueError(f"the schema of {kind} has more than {LARGEST_LAYOUT} parts")
 
 
-def _element(of: str, path: str, parent: str, types: dict, version: int, room: list[int]) -> list[Item]:
+def _element(element: str, path: str, parent: str, types: dict, version: int, room: list[int]) -> list[Item]:
     numbers = ROS2_NUMBERS if version == 2 else ROS1_NUMBERS
-    if of in numbers:
-        return [Item("numbers", path, numbers[of])]
-    if of in ("string", "wstring"):
-        return [Item(of, path)]
+    if element in numbers:
+        return [Item("numbers", path, numbers[element])]
+    if element in ("string", "wstring"):
+        return [Item(element, path)]
     if path.count(".") > 30:
         raise ValueError(f"the schema of {parent} contains itself in {path}")
-    return _expand(_resolve(of, parent, types), path, types, version, room)
+    return _expand(_resolve(element, parent, types), path, types, version, room)
 
 
 # ---- which numbers a message has
@@ -443,20 +446,22 @@ def _readable(items: Sequence[Item]) -> list[Item]:
 # ---- programs
 
 
-class _FixedRow:
+# the names of the numbers that a step reads, and a function (message, position, numbers so far) -> position
+# behind it
+Step = tuple[list[str], Callable[[bytes, int, list[float]], int]]
+
+
+def _row(items: Sequence[Item], wanted: set[str], order: str, alignment: int) -> Step:
     """Numbers of fixed size in a row. `layouts[phase]` unpacks the wanted ones of a row that begins at that
     phase of the alignment."""
+    layouts = [struct.Struct(order + _row_format(items, wanted, phase, alignment)) for phase in range(8)]
 
-    def __init__(self, items: Sequence[Item], wanted: set[str], order: str, alignment: int):
-        self.layouts = [
-            struct.Struct(order + _row_format(items, wanted, phase, alignment)) for phase in range(8)
-        ]
-        self.names = [name for item in items for name in _names(item, wanted)]
+    def read(data: bytes, pos: int, values: list[float]) -> int:
+        layout = layouts[pos & 7]
+        values += layout.unpack_from(data, pos)
+        return pos + layout.size
 
-    def read(self, data: bytes, pos: int, values: list[float]) -> int:
-        unpack = self.layouts[pos & 7]
-        values += unpack.unpack_from(data, pos)
-        return pos + unpack.size
+    return [name for item in items for name in _names(item, wanted)], read
 
 
 def _names(item: Item, wanted: set[str]) -> list[str]:
@@ -491,57 +496,56 @@ def _row_format(items: Sequence[Item], wanted: set[str], phase: int, alignment: 
     return "".join(part for part in parts if part != "0x")
 
 
-class _Text:
-    names: Sequence[str] = ()
+def _text(order: str, alignment: int) -> Step:
+    unpack, alignment = _LENGTH[order].unpack_from, min(4, alignment)
 
-    def __init__(self, order: str, alignment: int):
-        self.unpack, self.alignment = _LENGTH[order].unpack_from, min(4, alignment)
+    def read(data: bytes, pos: int, values: list[float]) -> int:
+        pos += -pos % alignment
+        return pos + 4 + unpack(data, pos)[0]
 
-    def read(self, data: bytes, pos: int, values: list[float]) -> int:
-        pos += -pos % self.alignment
-        return pos + 4 + self.unpack(data, pos)[0]
+    return [], read
 
 
-class _Sequence:
+def _sequence(item: Item, wanted: set[str], order: str, alignment: int) -> Step:
     """A length and so many elements. Elements that are wanted by index are read (NaN if there are fewer), the
     others skipped. "[#]" is the length itself."""
+    unpack, begin = _LENGTH[order].unpack_from, min(4, alignment)
+    place = re.compile(re.escape(item.path) + r"\[(\d+)\]")
+    indices = sorted({int(match[1]) for name in wanted if (match := place.match(name))})
+    skip = _program(item.items, set(), order, alignment)
+    elements = {i: _program(_at(item.items, i), wanted, order, alignment) for i in indices}
+    widths = {i: sum(len(names) for names, _ in steps) for i, steps in elements.items()}
+    has_length = f"{item.path}[#]" in wanted
+    names = [f"{item.path}[#]"] * has_length + [
+        name for steps in elements.values() for step_names, _ in steps for name in step_names
+    ]
+    alone = len(item.items) == 1 and item.items[0].kind == "numbers" and not item.items[0].array
+    number = struct.Struct(order + item.items[0].format) if alone else None
 
-    def __init__(self, item: Item, wanted: set[str], order: str, alignment: int):
-        self.unpack, self.alignment = _LENGTH[order].unpack_from, min(4, alignment)
-        place = re.compile(re.escape(item.path) + r"\[(\d+)\]")
-        indices = sorted({int(match[1]) for name in wanted if (match := place.match(name))})
-        self.skip = _program(item.items, set(), order, alignment)
-        self.elements = {i: _program(_at(item.items, i), wanted, order, alignment) for i in indices}
-        self.length = f"{item.path}[#]" in wanted
-        self.names = [f"{item.path}[#]"] * self.length + [
-            name for steps in self.elements.values() for step in steps for name in step.names
-        ]
-        only, *others = item.items
-        self.number = None
-        if not others and only.kind == "numbers" and not only.array:
-            self.number = struct.Struct(order + only.format)
-            self.element_alignment = min(self.number.size, alignment)
-
-    def read(self, data: bytes, pos: int, values: list[float]) -> int:
-        pos += -pos % self.alignment
-        length = self.unpack(data, pos)[0]
+    def read(data: bytes, pos: int, values: list[float]) -> int:
+        pos += -pos % begin
+        length = unpack(data, pos)[0]
         pos += 4
         if length > len(data):
             raise UnreadableMessage(f"a sequence of {length} elements in {len(data)} bytes")
-        if self.length:
+        if has_length:
             values.append(length)
-        if self.number:
-            pos += -pos % self.element_alignment if length else 0
-            size, unpack = self.number.size, self.number.unpack_from
-            values += [unpack(data, pos + i * size)[0] if i < length else np.nan for i in self.elements]
+        if number:
+            size = number.size
+            pos += -pos % min(size, alignment) if length else 0
+            values += [
+                number.unpack_from(data, pos + i * size)[0] if i < length else np.nan for i in elements
+            ]
             return pos + length * size
         for i in range(length):
-            for step in self.elements.get(i, self.skip):
-                pos = step.read(data, pos, values)
-        for i, steps in self.elements.items():
+            for _, read_step in elements.get(i, skip):
+                pos = read_step(data, pos, values)
+        for i, width in widths.items():
             if i >= length:
-                values += [np.nan] * sum(len(step.names) for step in steps)
+                values += [np.nan] * width
         return pos
+
+    return names, read
 
 
 def _at(items: Sequence[Item], i: int) -> list[Item]:
@@ -552,21 +556,18 @@ def _at(items: Sequence[Item], i: int) -> list[Item]:
     ]
 
 
-def _program(items: Sequence[Item], wanted: set[str], order: str, alignment: int) -> list:
-    steps, row = [], []
-    for item in [*items, None]:
-        if item is not None and item.kind == "numbers":
-            row.append(item)
-            continue
-        if row:
-            steps.append(_FixedRow(row, wanted, order, alignment))
-            row = []
-        if item is not None:
-            steps.append(
-                _Text(order, alignment)
+def _program(items: Sequence[Item], wanted: set[str], order: str, alignment: int) -> list[Step]:
+    steps = []
+    for is_row, run in itertools.groupby(items, key=lambda item: item.kind == "numbers"):
+        if is_row:
+            steps.append(_row(list(run), wanted, order, alignment))
+        else:
+            steps += [
+                _text(order, alignment)
                 if item.kind == "string"
-                else _Sequence(item, wanted, order, alignment)
-            )
+                else _sequence(item, wanted, order, alignment)
+                for item in run
+            ]
     return steps
 
 
@@ -575,17 +576,17 @@ def ros_decoder(
 ) -> Callable[[list[bytes]], np.ndarray]:
     """A function from n messages to their numbers (n, len(names)). It raises UnreadableMessage for a message
     that does not fit the layout."""
-    readable = _readable(items)
+    readable, wanted = _readable(items), set(names)
     exact = len(readable) == len(items)
-    if version == 1:
-        steps = _program(readable, set(names), "<", 1)
-        order = _order(steps, names)
-        return lambda messages: _ros_numbers(messages, steps, exact, 0)[:, order]
-    programs = {code: _program(readable, set(names), *how) for code, how in _REPRESENTATIONS.items()}
-    order = _order(programs[b"\x00\x01"], names)
+    has_sequence = any(item.kind == "sequence" for item in readable)
+    representations = _REPRESENTATIONS if version == 2 else {b"": ("<", 1)}
+    # alignment counts from behind the header of four bytes, and so many bytes of padding may follow
+    header, padding = (4, 7) if version == 2 else (0, 0)
+    programs = {code: _program(readable, wanted, *how) for code, how in representations.items()}
+    columns = _order(next(iter(programs.values())), names)
 
     def decode(messages: list[bytes]) -> np.ndarray:
-        codes = {message[:2] for message in messages}
+        codes = {message[: header // 2] for message in messages}
         if len(codes) > 1:
             return np.concatenate([decode([message]) for message in messages])
         code = codes.pop()
@@ -593,53 +594,79 @@ def ros_decoder(
             raise UnreadableMessage(
                 f"CDR representation 0x{code.hex()} is not read; 0x0000, 0x0001, 0x0006 and 0x0007 are"
             )
-        # alignment counts from behind the header of four bytes
-        return _ros_numbers([message[4:] for message in messages], programs[code], exact, 7)[:, order]
+        bodies = [message[header:] for message in messages] if header else messages
+        values = None
+        if len(bodies) >= FEWEST_ALIKE and not has_sequence:
+            values = _unpack_alike(bodies, readable, wanted, *representations[code], padding)
+        if values is None:
+            try:
+                rows = [_run(data, programs[code], exact, padding) for data in bodies]
+            except struct.error as error:
+                raise UnreadableMessage(f"a message that is too short ({error})") from None
+            values = np.array(rows, float).reshape(len(messages), -1)
+        return values[:, columns]
 
     return decode
 
 
-def _order(steps: list, names: Sequence[str]) -> list[int]:
-    read = [name for step in steps for name in step.names]
-    missing = [name for name in names if name not in read]
+def _order(steps: list[Step], names: Sequence[str]) -> list[int]:
+    in_order = [name for step_names, _ in steps for name in step_names]
+    missing = [name for name in names if name not in in_order]
     if missing:
         raise ValueError(f"no numeric field {missing[0]}")
-    return [read.index(name) for name in names]
+    return [in_order.index(name) for name in names]
 
 
 def _ends(data: bytes, size: int, exact: bool, padding: int) -> bool:
     """Whether a message ends behind its `size` bytes, but for padding. Four bytes and more could be a number
     of another schema, and must be zeros."""
-    behind = len(data) - size
-    return behind >= 0 and (
-        not exact or behind <= min(3, padding) or (behind <= padding and not any(data[size:]))
+    surplus = len(data) - size
+    return surplus >= 0 and (
+        not exact or surplus <= min(3, padding) or (surplus <= padding and not any(data[size:]))
     )
 
 
-def _ros_numbers(messages: list[bytes], steps: list, exact: bool, padding: int) -> np.ndarray:
-    """The numbers of the messages by the steps. Up to `padding` bytes may follow the last step."""
-    rows = []
+def _unpack_alike(
+    messages: list[bytes], items: Sequence[Item], wanted: set[str], order: str, alignment: int, padding: int
+) -> np.ndarray | None:
+    """The numbers (n, k) of messages whose texts are as long as those of the first, by one format for all of
+    them; None if there are others."""
+    parts, pos, is_number = [order], 0, []
     try:
-        if len(steps) == 1 and isinstance(steps[0], _FixedRow):
-            unpack, size = steps[0].layouts[0].unpack_from, steps[0].layouts[0].size
-            # most messages have no more than that, which takes no look at their bytes
-            if not {len(data) for data in messages} <= set(range(size, size + min(3, padding) + 1)):
-                wrong = [len(data) for data in messages if not _ends(data, size, exact, padding)]
-                if wrong:
-                    raise UnreadableMessage(f"a message of {wrong[0]} bytes where {size} are expected")
-            rows = [unpack(data) for data in messages]
-        else:
-            for data in messages:
-                values: list[float] = []
-                pos = 0
-                for step in steps:
-                    pos = step.read(data, pos, values)
-                if not _ends(data, pos, exact, padding):
-                    raise UnreadableMessage(f"a message of {len(data)} bytes where {pos} are expected")
-                rows.append(values)
-    except struct.error as error:
-        raise UnreadableMessage(f"a message that is too short ({error})") from None
-    return np.array(rows, float).reshape(len(messages), -1)
+        for is_row, run in itertools.groupby(items, key=lambda item: item.kind == "numbers"):
+            row = list(run)
+            if is_row:
+                parts.append(_row_format(row, wanted, pos & 7, alignment))
+                pos += struct.calcsize(order + parts[-1])
+                is_number += [True] * sum(len(_names(item, wanted)) for item in row)
+            for _ in () if is_row else row:
+                pad = -pos % min(4, alignment)
+                length = _LENGTH[order].unpack_from(messages[0], pos + pad)[0]
+                parts.append(f"{pad}xI{length}x")
+                pos += pad + 4 + length
+                is_number.append(False)
+        layout = struct.Struct("".join(parts))
+        if not {len(data) for data in messages} <= set(range(layout.size, layout.size + min(3, padding) + 1)):
+            return None
+        values = np.array([layout.unpack_from(data) for data in messages], float)
+    except struct.error:
+        return None
+    values, kinds = values.reshape(len(messages), -1), np.array(is_number, bool)
+    if kinds.all():
+        return values
+    lengths = values[:, ~kinds]
+    return values[:, kinds] if (lengths == lengths[0]).all() else None
+
+
+def _run(data: bytes, steps: list[Step], exact: bool, padding: int) -> list[float]:
+    """The numbers of a message by the steps. Up to `padding` bytes may follow the last step."""
+    values: list[float] = []
+    pos = 0
+    for _, read in steps:
+        pos = read(data, pos, values)
+    if not _ends(data, pos, exact, padding):
+        raise UnreadableMessage(f"a message of {len(data)} bytes where {pos} are expected")
+    return values
 
 
 # ---- protobuf
@@ -657,7 +684,6 @@ _FILES, _FILE = (
 _DEEPEST, _MOST_FIELDS = 6, 20_000
 
 Types = dict[str, Descriptor]
-Fill = Callable[[Message, list[float]], None]
 
 
 def message_types(descriptor_set: bytes) -> Types:
@@ -689,7 +715,7 @@ def message_types(descriptor_set: bytes) -> Types:
     return types
 
 
-def _defined(types: Types, name: str) -> Descriptor:
+def _definition(types: Types, name: str) -> Descriptor:
     if name not in types:
         raise ValueError(
             f"the schema does not define its own message {name}; it defines {', '.join(sorted(types)[:5])}"
@@ -699,11 +725,11 @@ def _defined(types: Types, name: str) -> Descriptor:
 
 def message_reader(types: Types, name: str) -> Callable[[bytes | memoryview], Message]:
     """A function from bytes to the message of that name. It raises UnreadableMessage."""
-    made = message_factory.GetMessageClass(_defined(types, name))
+    message_class = message_factory.GetMessageClass(_definition(types, name))
 
     def read(data: bytes | memoryview) -> Message:
         try:
-            return made.FromString(data)
+            return message_class.FromString(data)
         except DecodeError as error:
             raise UnreadableMessage(f"a message that is not of its type ({error})") from None
 
@@ -728,7 +754,7 @@ def protobuf_fields(types: Types, name: str, sample: bytes | None) -> list[str]:
     LONGEST_LISTED. Raises ValueError for a type with more than can be listed."""
     names: list[str] = []
     lists: dict[str, list[str]] = {}
-    for visited, (path, field) in enumerate(_leaves(_defined(types, name), "", 0)):
+    for visited, (path, field) in enumerate(_leaves(_definition(types, name), "", 0)):
         if visited == _MOST_FIELDS:
             raise ValueError(f"the message {name} has more than {_MOST_FIELDS} fields; name the wanted ones")
         single, is_list, part = path.partition("[]")
@@ -761,19 +787,14 @@ def protobuf_decoder(types: Types, name: str, names: Sequence[str]) -> Callable[
 
     "zones[#]" is the length of a list. The function raises UnreadableMessage.
     """
-    message = _defined(types, name)
-    fill = _filler(message, {path: place for place, path in enumerate(names)})
-    read, count = message_reader(types, name), len(names)
+    message, read, count = _definition(types, name), message_reader(types, name), len(names)
     if names and all(_is_plain(message.fields_by_name.get(path)) for path in names):
         values = operator.attrgetter(*names)
         return lambda messages: np.array([values(read(data)) for data in messages], float).reshape(-1, count)
+    steps = [_steps(message, path) for path in names]
 
     def decode(messages: list[bytes]) -> np.ndarray:
-        rows = []
-        for message in messages:
-            row = [np.nan] * count
-            fill(read(message), row)
-            rows.append(row)
+        rows = [[_number(values, path) for path in steps] for values in map(read, messages)]
         return np.array(rows, float).reshape(len(messages), count)
 
     return decode
@@ -784,52 +805,37 @@ def _is_plain(field: FieldDescriptor | None) -> bool:
     return field is not None and _is_number(field) and not field.is_repeated and not field.has_presence
 
 
-def _filler(message: Descriptor, wanted: dict[str, int]) -> Fill:
-    """A function that puts the numbers of the paths {path below this message: place} into their places."""
-    numbers: list[tuple[int, Callable[[Message], float]]] = []
-    below: dict[tuple[str, str | None], dict[str, int]] = {}
-    for path, place in wanted.items():
-        match = re.match(r"(\w+)(?:\[(\d+|#)\])?(?:\.(.+))?$", path)
-        field = message.fields_by_name.get(match[1]) if match else None
+# the name of a field, whether it may be absent, and the index in it: None, a place, or -1 for its length
+FieldStep = tuple[str, bool, int | None]
+
+
+def _steps(message: Descriptor, path: str) -> list[FieldStep]:
+    """The steps from a message to the number of a path. Raises ValueError if there is none."""
+    steps, kind, field = [], message, None
+    for part in path.split("."):
+        match = re.fullmatch(r"(\w+)(?:\[(\d+|#)\])?", part)
+        field = kind.fields_by_name.get(match[1]) if match and kind else None
         if match is None or field is None or (match[2] is not None) != field.is_repeated:
             raise ValueError(f"no numeric field {path}")
-        if match[3] and match[2] != "#" and _is_message(field):
-            below.setdefault((field.name, match[2]), {})[match[3]] = place
-        elif match[2] != "#" and (match[3] or not _is_number(field)):
-            raise ValueError(f"no numeric field {path}")
-        else:
-            numbers.append((place, _number(field, match[2])))
-    inner = [
-        (_submessage(name, index), _filler(message.fields_by_name[name].message_type, paths))
-        for (name, index), paths in below.items()
-    ]
-
-    def fill(values: Message, row: list[float]) -> None:
-        for place, number in numbers:
-            row[place] = number(values)
-        for submessage, deeper in inner:
-            if (part := submessage(values)) is not None:
-                deeper(part, row)
-
-    return fill
+        index = -1 if match[2] == "#" else None if match[2] is None else int(match[2])
+        steps.append((field.name, field.has_presence, index))
+        # behind the length, and in a map, there is nothing
+        kind = field.message_type if index != -1 and _is_message(field) else None
+    if field is None or (steps[-1][2] != -1 and not _is_number(field)):
+        raise ValueError(f"no numeric field {path}")
+    return steps
 
 
-def _number(field: FieldDescriptor, index: str | None) -> Callable[[Message], float]:
-    """A function from a message to a field's number, element or length ("#"), NaN if it is absent."""
-    name, nan = field.name, np.nan
-    if index == "#":
-        return lambda message: len(getattr(message, name))
-    if index is not None:
-        place = int(index)
-        return lambda message: elements[place] if place < len(elements := getattr(message, name)) else nan
-    if field.has_presence:
-        return lambda message: getattr(message, name) if message.HasField(name) else nan
-    return operator.attrgetter(name)
-
-
-def _submessage(name: str, index: str | None) -> Callable[[Message], Message | None]:
-    """A function from a message to the one in a field, or to its element; None if it is absent."""
-    if index is None:
-        return lambda message: getattr(message, name) if message.HasField(name) else None
-    place = int(index)
-    return lambda message: elements[place] if place < len(elements := getattr(message, name)) else None
+def _number(message: Message, steps: Sequence[FieldStep]) -> Any:
+    """The number at the end of the steps, NaN if a message or an element is absent."""
+    part: Any = message
+    for name, has_presence, index in steps:
+        if has_presence and not part.HasField(name):
+            return np.nan
+        values = getattr(part, name)
+        if index is not None and index >= len(values):
+            return np.nan
+        if index == -1:
+            return len(values)
+        part = values if index is None else values[index]
+    return part

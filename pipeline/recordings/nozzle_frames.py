@@ -213,9 +213,9 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution) -> Noz
     folders. Raises ValueError, one sentence, for what read_log and read_recording refuse, for two lines that
     contradict one another about an image, and where no frame at all shows a line.
     """
-    there = _images(folder)
+    names = _images(folder)
     files = {
-        ending: readable(sorted(folder / name for name in there if name.lower().endswith(ending)), folder)
+        ending: readable(sorted(folder / name for name in names if name.lower().endswith(ending)), folder)
         for ending in (".csv", ".mcap")
     }
     for path in (*files[".csv"], *files[".mcap"]):
@@ -230,11 +230,11 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution) -> Noz
             f"{folder}: expected a CSV with its images, or MCAP recordings, found neither; copy them there, "
             "or set the source to simulated"
         )
-    listed = [_image_paths(log, folder, there) for log in logs]
-    reasons = _listed(logs, [images for images, _ in listed])
+    listed = [_image_paths(log, folder, names) for log in logs]
+    reasons = _line_problems(logs, [images for images, _ in listed])
     calls = [
-        _crops(log, folder, images, why, options)
-        for log, (images, _), why in zip(logs, listed, reasons, strict=True)
+        _crops(log, folder, images, problems, options)
+        for log, (images, _), problems in zip(logs, listed, reasons, strict=True)
     ]
     films = [
         joblib.delayed(read_recording)(
@@ -249,26 +249,27 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution) -> Noz
         _of_log(
             log,
             [next(results) for _ in pieces],
-            why,
+            problems,
             [folder / image for image in images],
             options.material,
             notes,
         )
-        for log, (images, notes), why, pieces in zip(logs, listed, reasons, calls, strict=True)
+        for log, (images, notes), problems, pieces in zip(logs, listed, reasons, calls, strict=True)
     ]
     parts += results
-    read = {name for name in there if name.lower().endswith(tuple(files))}
-    unread = there.difference(read, *(images for images, _ in listed))
-    return _joined(folder, parts, options, copies + _unread(folder, unread))
+    read = {name for name in names if name.lower().endswith(tuple(files))}
+    unread = names.difference(read, *(images for images, _ in listed))
+    return _join(folder, parts, options, copies + _unread(folder, unread))
 
 
-def _crops(log: FrameLog, folder: Path, images: list[str], why: list[str], options: ReadOptions) -> list:
+def _crops(log: FrameLog, folder: Path, images: list[str], problems: list[str], options: ReadOptions) -> list:
     """Calls that crop the key areas of a log's images, piece by piece; a line with a reason has no path."""
     tips = log.tip
     if options.tip_px is not None:
         tips = np.broadcast_to(np.array(options.tip_px, float), log.tip.shape)
     paths = [
-        "" if reason else str(folder.resolve() / image) for image, reason in zip(images, why, strict=True)
+        "" if reason else str(folder.resolve() / image)
+        for image, reason in zip(images, problems, strict=True)
     ]
     return [
         joblib.delayed(key_areas_of_files)(paths[at], tips[at], log.direction[at], options.front_end)
@@ -316,7 +317,7 @@ def pictures(places: Sequence[tuple[Path, int]], topics: Topics) -> list[np.ndar
     """The gray pictures of (image, -1) or (recording, place among its frames). Raises ValueError if one
     cannot be read any more."""
     films = {
-        path: frames_at(path, topics, [k for one, k in places if one == path])
+        path: frames_at(path, topics, [k for recording, k in places if recording == path])
         for path in {path: None for path, k in places if k >= 0}
     }
     return [films[path][k] if k >= 0 else read_image(path) for path, k in places]
@@ -356,22 +357,22 @@ def _images(folder: Path) -> set[str]:
     """Paths of all files that are not hidden, from `folder` on, with forward
     slashes; what links lead to once more is walked once."""
     files, walked = set(), set()
-    for here, folders, names in os.walk(folder, followlinks=True):
+    for place, folders, names in os.walk(folder, followlinks=True):
         # a link may lead back to where it lies
-        walked.add(os.path.realpath(here))
+        walked.add(os.path.realpath(place))
         folders[:] = sorted(
             name
             for name in folders
-            if not name.startswith(".") and os.path.realpath(f"{here}/{name}") not in walked
+            if not name.startswith(".") and os.path.realpath(f"{place}/{name}") not in walked
         )
-        inside = Path(here).relative_to(folder).as_posix()
+        inside = Path(place).relative_to(folder).as_posix()
         files.update(
             name if inside == "." else f"{inside}/{name}" for name in names if not name.startswith(".")
         )
     return files
 
 
-def _image_paths(log: FrameLog, folder: Path, there: set[str]) -> tuple[list[str], list[Note]]:
+def _image_paths(log: FrameLog, folder: Path, files: set[str]) -> tuple[list[str], list[Note]]:
     """Each image's path from `folder` on, empty where it is not there: all of a
     file's lie in one place, that where most are found."""
     parts = [[part for part in image.split("/") if part not in ("", ".")] for image in log.image]
@@ -382,7 +383,7 @@ def _image_paths(log: FrameLog, folder: Path, there: set[str]) -> tuple[list[str
             posixpath.normpath("/".join([base, *names[first:]])) if len(names) > first else ""
             for names in some
         ]
-        return [name if name in there else "" for name in named]
+        return [name if name in files else "" for name in named]
 
     few = parts[:: max(1, len(parts) // LOOKED_AT)]
     places = [
@@ -396,7 +397,7 @@ def _image_paths(log: FrameLog, folder: Path, there: set[str]) -> tuple[list[str
         places += [
             (base, -1)
             for base in sorted(
-                {posixpath.dirname(path) for path in there if posixpath.basename(path) in wanted}
+                {posixpath.dirname(path) for path in files if posixpath.basename(path) in wanted}
             )
         ]
     best = max(places, key=lambda place: sum(map(bool, below(*place, few))), default=(own, 0))
@@ -415,7 +416,7 @@ def _image_paths(log: FrameLog, folder: Path, there: set[str]) -> tuple[list[str
     return below(*best, parts), notes
 
 
-def _listed(logs: Sequence[FrameLog], images: Sequence[list[str]]) -> list[list[str]]:
+def _line_problems(logs: Sequence[FrameLog], images: Sequence[list[str]]) -> list[list[str]]:
     """Why a line cannot be learned from, before any image is opened. Raises
     ValueError where two lines contradict one another."""
     first: dict[str, tuple[int, int]] = {}
@@ -426,32 +427,35 @@ def _listed(logs: Sequence[FrameLog], images: Sequence[list[str]]) -> list[list[
             (NO_TEMPERATURE, ~np.isfinite(log.temperature)),
             (NO_PRINT, np.array([not name for name in log.print_id], bool)),
         )
-        why = [MISSING if not image else "" for image in paths]
-        why = [NO_NAME if not named else reason for named, reason in zip(log.image, why, strict=True)]
+        problems = [MISSING if not image else "" for image in paths]
+        problems = [
+            NO_NAME if not named else reason for named, reason in zip(log.image, problems, strict=True)
+        ]
         for reason, rows in unknown:
             for i in np.flatnonzero(rows):
-                why[i] = reason
+                problems[i] = reason
         for i, image in enumerate(paths):
-            if why[i] == "" and first.setdefault(image, (k, i)) != (k, i):
+            if problems[i] == "" and first.setdefault(image, (k, i)) != (k, i):
                 _check_alike(logs[first[image][0]], first[image][1], log, i)
-                why[i] = REPEATED
-        reasons.append(why)
+                problems[i] = REPEATED
+        reasons.append(problems)
     return reasons
 
 
-def _check_alike(before: FrameLog, i: int, log: FrameLog, j: int) -> None:
-    ours, theirs = (
-        (one.flow[row], one.temperature[row], one.print_id[row]) for one, row in ((before, i), (log, j))
+def _check_alike(earlier: FrameLog, i: int, log: FrameLog, j: int) -> None:
+    settings_before, settings_after = (
+        (listing.flow[row], listing.temperature[row], listing.print_id[row])
+        for listing, row in ((earlier, i), (log, j))
     )
-    if ours != theirs:
+    if settings_before != settings_after:
         settings = [
             f"{flow:g} percent and {temperature:g} degC in print {name!r}"
-            for flow, temperature, name in (theirs, ours)
+            for flow, temperature, name in (settings_after, settings_before)
         ]
         raise ValueError(
             f"{log.path}: line {log.line[j]}: expected {log.image[j]} once, "
-            f"found it here with {settings[0]} and in line {before.line[i]} "
-            f"of {before.path.name} "
+            f"found it here with {settings[0]} and in line {earlier.line[i]} "
+            f"of {earlier.path.name} "
             f"with {settings[1]}; remove the line that is wrong"
         )
 
@@ -528,23 +532,23 @@ def _column(name: str) -> str:
 def _columns(path: Path, layout: CsvLayout, notes: list[Note], hotend: float) -> tuple[str, ...]:
     """The columns to read, the image first and the temperature second; raises ValueError where one that is
     needed is not there, and notes those that are lived without."""
-    there = layout.names
-    temperature = "target_hotend" if "target_hotend" in there or "hotend" not in there else "hotend"
-    stated = bool(np.isfinite(hotend)) and temperature not in there
+    names = layout.names
+    temperature = "target_hotend" if "target_hotend" in names or "hotend" not in names else "hotend"
+    stated = bool(np.isfinite(hotend)) and temperature not in names
     needed = ("img_path", "flow_rate") if stated else ("img_path", temperature, "flow_rate")
-    name = next((name for name in needed if name not in there), "")
+    name = next((name for name in needed if name not in names), "")
     if name:
         either = "target_hotend or hotend" if name == temperature else name
         raise ValueError(
-            f"{path}: expected a column {either}, found none; {nearest_names(name, there)}; rename it, "
+            f"{path}: expected a column {either}, found none; {nearest_names(name, names)}; rename it, "
             "or move the file out of the folder"
         )
-    if ("nozzle_tip_x" in there) != ("nozzle_tip_y" in there):
+    if ("nozzle_tip_x" in names) != ("nozzle_tip_y" in names):
         raise ValueError(
             f"{path}: expected both nozzle_tip_x and nozzle_tip_y, found one; add the other, "
             "or remove it and set the tip in params.yaml"
         )
-    without = [f"{name} ({how})" for name, how in OPTIONAL.items() if name not in there]
+    without = [f"{name} ({how})" for name, how in OPTIONAL.items() if name not in names]
     remarks = (
         ("temperature", stated, f"it has no temperature, so the stated {hotend:g} degC is its frames'"),
         ("temperature", temperature == "hotend",
@@ -552,7 +556,7 @@ def _columns(path: Path, layout: CsvLayout, notes: list[Note], hotend: float) ->
         ("", len(without), f"it is read without {', '.join(without)}"),
     )  # fmt: skip
     notes += [Note("columns", name, int(n), f"{path}: {remark}") for name, n, remark in remarks if n]
-    optional = [name for name in (*OPTIONAL, "nozzle_tip_y", *SETTINGS, LABELS) if name in there]
+    optional = [name for name in (*OPTIONAL, "nozzle_tip_y", *SETTINGS, LABELS) if name in names]
     return (*needed, *optional)
 
 
@@ -568,14 +572,14 @@ def _rows(
     lines: list[int] = []
     rows = sound_rows(path, layout, None, notes)
     while block := list(itertools.islice(rows, ROWS_AT_ONCE)):
-        here = [line for line, _ in block]
-        lines += here
+        numbers = [line for line, _ in block]
+        lines += numbers
         for name, place in places.items():
             fields = [row[place].strip() for _, row in block]
             if name in texts:
                 texts[name] += ["" if field.casefold() in NOTHING else field for field in fields]
             else:
-                parts[name].append(floats(path, name, fields, layout.decimal, here, {}))
+                parts[name].append(floats(path, name, fields, layout.decimal, numbers, {}))
     return texts, {name: np.concatenate(blocks) for name, blocks in parts.items()}, np.array(lines)
 
 
@@ -594,13 +598,13 @@ def _check_numbers(path: Path, lines: np.ndarray, numbers: dict[str, np.ndarray]
         )
         if wrong.any():
             i = int(np.flatnonzero(wrong)[0])
-            more = f", the first of {wrong.sum()}" if wrong.sum() > 1 else ""
+            suffix = f", the first of {wrong.sum()}" if wrong.sum() > 1 else ""
             remedy = (
                 "mend it, or remove that column" if name == LABELS else "mend it, or write it in that unit"
             )
             raise ValueError(
                 f"{path}: line {lines[i]}: expected {name} within {low:g} and {high:g} ({unit}), "
-                f"found {values[i]:g}{more}; {remedy}"
+                f"found {values[i]:g}{suffix}; {remedy}"
             )
 
 
@@ -627,11 +631,11 @@ def _check_time(
     order = np.argsort(which, kind="stable")
     back = np.flatnonzero((np.diff(times[order]) < 0) & (np.diff(which[order]) == 0))
     if len(back):
-        i, before = order[back[0] + 1], order[back[0]]
-        more = f", the first of {len(back)} such lines" if len(back) > 1 else ""
+        i, previous = order[back[0] + 1], order[back[0]]
+        suffix = f", the first of {len(back)} such lines" if len(back) > 1 else ""
         raise ValueError(
             f"{path}: line {lines[i]}: expected time to run forward within print {names[i]!r}, "
-            f"found it {times[before] - times[i]:.6g} s before line {lines[before]}{more}; "
+            f"found it {times[previous] - times[i]:.6g} s before line {lines[previous]}{suffix}; "
             "sort the rows of each print by timestamp, or give what comes after a clock was set back "
             "a print_id of its own"
         )
@@ -641,7 +645,7 @@ def _check_time(
 
 
 def read_recording(
-    path: Path, shown: Path, where: Topics, tip_px: tuple[float, float] | None, *, front_end: Any
+    path: Path, label: Path, where: Topics, tip_px: tuple[float, float] | None, *, front_end: Any
 ) -> FrameFile:
     """The key areas of a recording, with the setpoints that held when each frame was taken, a few frames in
     memory at a time; `shown` is the path that is spoken of.
@@ -651,15 +655,15 @@ def read_recording(
     setpoints that do not overlap in time; what is damaged is left out and noted.
     """
     try:
-        return _read_recording(path, shown, where, tip_px, front_end)
+        return _read_recording(path, label, where, tip_px, front_end)
     except ValueError as error:
-        raise ValueError(str(error).replace(str(path), str(shown))) from None
+        raise ValueError(str(error).replace(str(path), str(label))) from None
     except OSError as error:
         # what cannot be written is said already
         if not error.strerror:
             raise
         raise ValueError(
-            f"{shown} cannot be read ({error.strerror}); check the disk, or copy the recording again"
+            f"{label} cannot be read ({error.strerror}); check the disk, or copy the recording again"
         ) from None
 
 
@@ -705,7 +709,7 @@ def middle_frame(path: Path, image: str) -> np.ndarray:
 
 
 def _read_recording(
-    path: Path, shown: Path, where: Topics, tip_px: tuple[float, float] | None, front_end: Any
+    path: Path, label: Path, where: Topics, tip_px: tuple[float, float] | None, front_end: Any
 ) -> FrameFile:
     frames, signals, notes = open_film(path, where)
     check_overlap(path, span_of(frames.time_s), {name: (signals[name][0][0], np.inf) for name in NEEDED})
@@ -719,12 +723,12 @@ def _read_recording(
     # of a recording with frames that cannot be decoded these are met again, and counted
     areas = front_end.remember((sha256(path), where, tip_px), len(frames), find)
     flow, temperature, number = (
-        _held(signals, name, time_s) for name in ("flow_percent", "temperature_degC", "print_id")
+        _hold(signals, name, time_s) for name in ("flow_percent", "temperature_degC", "print_id")
     )
     prints = (
         [f"{value:g}" if np.isfinite(value) else "" for value in number]
         if "print_id" in signals
-        else [shown.stem] * len(time_s)
+        else [label.stem] * len(time_s)
     )
     settings, degrees = [flow, number], np.nan_to_num(temperature, nan=-1.0)
     if np.count_nonzero(degrees[1:] != degrees[:-1]) <= max(MEASURED, len(time_s) / MEASURED):
@@ -737,18 +741,18 @@ def _read_recording(
         notes.append(Note("temperature", "temperature_degC", 1, sentence))
     reasons = areas.reasons
     for reason, values in ((NO_TEMPERATURE, temperature), (NO_FLOW, flow)):
-        there = np.isfinite(values)
-        reasons = [front if present else reason for front, present in zip(reasons, there, strict=True)]
+        present_rows = np.isfinite(values)
+        reasons = [front if present else reason for front, present in zip(reasons, present_rows, strict=True)]
     return FrameFile(
-        shown,
+        label,
         areas._replace(reasons=reasons),
         flow,
         temperature,
         prints,
         stretches(np.column_stack(settings)),
         [f"{time:.3f} s" for time in time_s],
-        [(shown, i) for i in range(len(time_s))],
-        [note._replace(message=f"{shown}: {note.message}") for note in [*notes, *frames.notes()]],
+        [(label, i) for i in range(len(time_s))],
+        [note._replace(message=f"{label}: {note.message}") for note in [*notes, *frames.notes()]],
     )
 
 
@@ -759,9 +763,9 @@ def _find_all(
     times, pieces, walking = [], [], iter(frames)
     while batch := list(itertools.islice(walking, AT_ONCE)):
         time_s = np.array([time for time, _ in batch])
-        tips = np.column_stack([_held(signals, name, time_s) for name in ("tip_x_px", "tip_y_px")])
+        tips = np.column_stack([_hold(signals, name, time_s) for name in ("tip_x_px", "tip_y_px")])
         tips = tips if tip_px is None else np.broadcast_to(np.array(tip_px, float), tips.shape)
-        directions = _held(signals, "travel_direction_deg", time_s)
+        directions = _hold(signals, "travel_direction_deg", time_s)
         areas = front_end.find((frame for _, frame in batch), tips, directions)
         pieces.append(
             areas._replace(
@@ -777,7 +781,7 @@ def _find_all(
     return np.concatenate(times), concatenate(pieces)
 
 
-def _held(signals: Mapping[str, tuple[np.ndarray, np.ndarray]], name: str, time_s: np.ndarray) -> np.ndarray:
+def _hold(signals: Mapping[str, tuple[np.ndarray, np.ndarray]], name: str, time_s: np.ndarray) -> np.ndarray:
     """The signal's value at each time (n,): a setpoint holds until the next; NaN
     before the first, and where there is no such signal."""
     if name not in signals:
@@ -791,10 +795,15 @@ def _held(signals: Mapping[str, tuple[np.ndarray, np.ndarray]], name: str, time_
 
 
 def _of_log(
-    log: FrameLog, pieces: Sequence[Any], why: list[str], images: list[Path], material: Any, notes: list[Note]
+    log: FrameLog,
+    pieces: Sequence[Any],
+    problems: list[str],
+    images: list[Path],
+    material: Any,
+    notes: list[Note],
 ) -> FrameFile:
     areas = concatenate(pieces)
-    areas = areas._replace(reasons=[mine or front for mine, front in zip(why, areas.reasons, strict=True)])
+    areas = areas._replace(reasons=[own or front for own, front in zip(problems, areas.reasons, strict=True)])
     label, labelled = material.label(log.flow), np.isfinite(log.label) & np.isfinite(log.flow)
     wrong = np.flatnonzero(labelled & (log.label != label))
     notes = [*log.notes, *notes]
@@ -819,21 +828,19 @@ def _of_log(
     )
 
 
-def _joined(
-    folder: Path, parts: Sequence[FrameFile], options: ReadOptions, notes: list[Note]
-) -> NozzleFrames:
+def _join(folder: Path, parts: Sequence[FrameFile], options: ReadOptions, notes: list[Note]) -> NozzleFrames:
     """All parts, copies of frames left out, every rejection counted by file and reason; flows and
     temperatures carried to the published material."""
     digests: set[str] = set()
     notes, reasons, starts = list(notes), [], [0]
     for part in parts:
-        why = list(part.areas.reasons)
+        problems = list(part.areas.reasons)
         for i, digest in enumerate(part.areas.digests):
-            if digest and not why[i]:
-                why[i] = COPY if digest in digests else ""
+            if digest and not problems[i]:
+                problems[i] = COPY if digest in digests else ""
                 digests.add(digest)
-        notes += [*part.notes, *_rejections(folder, part, why, REMEDIES | options.front_end.remedies)]
-        reasons += why
+        notes += [*part.notes, *_rejections(folder, part, problems, REMEDIES | options.front_end.remedies)]
+        reasons += problems
         starts.append(starts[-1] + int(part.stretch.max(initial=-1)) + 1)
     names = [name for part in parts for name in part.prints]
     prints = tuple(dict.fromkeys(name for name in names if name))
@@ -925,7 +932,7 @@ def concatenate(parts: Sequence[Any]) -> Any:
         *(
             np.concatenate(some)
             if isinstance(some[0], np.ndarray)
-            else [one for part in some for one in part]
+            else [item for part in some for item in part]
             for some in columns
         )
     )

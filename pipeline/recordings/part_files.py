@@ -47,22 +47,22 @@ def read_part_program(path: Path) -> bytes:
 # ---- measured prints
 
 
-def measured_name(part: str, material: str, ending: str = ".csv") -> str:
+def print_name(part: str, material: str, ending: str = ".csv") -> str:
     """The file that holds the measured flow of a part's print."""
     return f"{part}_{material}_measured{ending}"
 
 
-def measured_path(folder: Path, part: str, material: str) -> Path | None:
+def print_path(folder: Path, part: str, material: str) -> Path | None:
     """The file in `folder` with the measured flow of a part's print, whatever its form; None if there is
     none. Raises ValueError if there are two."""
-    paths = [folder / measured_name(part, material, ending) for ending in ENDINGS]
-    there = [path for path in paths if path.exists()]
-    if len(there) > 1:
-        names = " and ".join(path.name for path in there)
+    paths = [folder / print_name(part, material, ending) for ending in ENDINGS]
+    present = [path for path in paths if path.exists()]
+    if len(present) > 1:
+        names = " and ".join(path.name for path in present)
         raise ValueError(
             f"{folder}: expected one measured print of {part}, {material}, found {names}; keep one"
         )
-    return there[0] if there else None
+    return present[0] if present else None
 
 
 def read_measured(path: Path, samples: int, sample_time_s: float) -> tuple[np.ndarray, np.ndarray | None]:
@@ -70,28 +70,30 @@ def read_measured(path: Path, samples: int, sample_time_s: float) -> tuple[np.nd
     after the last row and in gaps longer than five samples; and the command u (samples,) in mm that was
     printed, None if the file does not have it. Time 0 is where the command begins: of a table as it stands,
     of an MCAP recording the first message of the plunger. Raises ValueError naming file and place."""
-    flow, command = _rows(path) if path.suffix == ".csv" else _recorded(path)
+    flow, command = _rows(path) if path.suffix == ".csv" else _read_recorded(path)
     t, y = flow
     clock = np.arange(samples) * sample_time_s
-    after = np.clip(np.searchsorted(t, clock), 1, len(t) - 1)
-    seen = (clock >= t[0] - 1e-9) & (clock <= t[-1] + 1e-9)
-    seen &= t[after] - t[after - 1] <= 5 * max(sample_time_s, float(np.median(np.diff(t))))
+    right = np.clip(np.searchsorted(t, clock), 1, len(t) - 1)
+    covered = (clock >= t[0] - 1e-9) & (clock <= t[-1] + 1e-9)
+    covered &= t[right] - t[right - 1] <= 5 * max(sample_time_s, float(np.median(np.diff(t))))
     u = None if command is None else np.interp(clock, *command)
     if u is not None and not np.isfinite(u).all():
         raise ValueError(
             f"{path}: expected a number in each row of {COMMAND}, found some without; fill them in"
         )
-    return np.where(seen, np.interp(clock, t, y), np.nan), u
+    return np.where(covered, np.interp(clock, t, y), np.nan), u
 
 
-def _recorded(path: Path) -> tuple[Series, Series | None]:
+def _read_recorded(path: Path) -> tuple[Series, Series | None]:
     """Flow and, where it has one, command of a Parquet table or an MCAP recording."""
     kind, wanted = file_format(path), [Source(COLUMNS[1], COLUMNS[1], "mm^3/s")]
     if kind == "mcap":
         plunger = topics(path).get(COMMAND_TOPIC.source.partition(":")[0])
         wanted += [COMMAND_TOPIC] if plunger and plunger.count else []
     elif kind == "parquet":
-        wanted += [Source(COMMAND, COMMAND, "mm")] * any(one.name == COMMAND for one in parquet_columns(path))
+        wanted += [Source(COMMAND, COMMAND, "mm")] * any(
+            column.name == COMMAND for column in parquet_columns(path)
+        )
     else:
         raise ValueError(f"{path}: expected a Parquet table or an MCAP recording, found {kind}; name it so")
     raw = recordings.read(path, wanted, time="" if kind == "mcap" else COLUMNS[0])
@@ -117,9 +119,10 @@ def _rows(path: Path) -> tuple[Series, Series | None]:
         rows = list(csv.reader(file))
     names = tuple(name.strip() for name in rows[0]) if rows else ()
     if names not in (COLUMNS, (*COLUMNS, COMMAND)):
-        found = ",".join(rows[0]) if rows else "an empty file"
+        header = ",".join(rows[0]) if rows else "an empty file"
         raise ValueError(
-            f"{path}: expected the columns {','.join(COLUMNS)} but found {found}; write them as the first row"
+            f"{path}: expected the columns {','.join(COLUMNS)} but found {header}; "
+            "write them as the first row"
         )
     values = []
     for number, row in enumerate(rows[1:], 2):

@@ -32,8 +32,8 @@ def check_plain_files(folder: str | Path) -> None:
     link that leads out of it."""
     problems = list(_problems(Path(folder), Path(folder).resolve()))
     if problems:
-        more = f" (and {len(problems) - 1} more like it)" if len(problems) > 1 else ""
-        raise ValueError(f"{problems[0]}{more}")
+        suffix = f" (and {len(problems) - 1} more like it)" if len(problems) > 1 else ""
+        raise ValueError(f"{problems[0]}{suffix}")
 
 
 def check_plain_file(path: str | Path) -> None:
@@ -108,14 +108,14 @@ def wait_until_still(
     """Waits until no file has changed for `rest_s` (default REST_S), for `rest_s` at most; those that changed
     meanwhile are still being written. A change in the future, of a clock set wrong, is not waited for."""
     rest_s = REST_S if rest_s is None else rest_s
-    before = {path: _state(path) for path in paths}
-    now = clock()
-    ages = [now - changed for state in before.values() for changed, _ in state.values()]
+    states = {path: _state(path) for path in paths}
+    now_s = clock()
+    ages = [now_s - changed for state in states.values() for changed, _ in state.values()]
     youngest = min((age for age in ages if age >= 0), default=rest_s)
     if youngest >= rest_s:
         return []
     (sleep or time.sleep)(rest_s - youngest)
-    return [path for path, state in before.items() if _state(path) != state]
+    return [path for path, state in states.items() if _state(path) != state]
 
 
 def _state(path: Path) -> dict[Path, tuple[float, int]]:

@@ -179,20 +179,21 @@ def open_trial(
 def sources(mapping: Mapping[str, Mapped]) -> tuple[Source, ...]:
     """Where a recording has our signals, `mapping` in place of our own topics. Raises ValueError for a signal
     that no trial has, and for another unit."""
-    ours = {source.signal: source for source in SOURCES}
+    by_signal = {source.signal: source for source in SOURCES}
     for name, place in mapping.items():
-        if name not in ours:
+        if name not in by_signal:
             raise ValueError(
                 f"params.yaml: camera.topics.mapping.{name} is no signal of a trial; "
-                f"map {', '.join(list(ours)[:-1])}"
+                f"map {', '.join(list(by_signal)[:-1])}"
             )
-        if place.unit != ours[name].unit:
+        if place.unit != by_signal[name].unit:
             raise ValueError(
                 f"params.yaml: camera.topics.mapping.{name}.unit is {place.unit} but {name} is in "
-                f"{ours[name].unit}; convert with scale and offset, and write unit: {ours[name].unit}"
+                f"{by_signal[name].unit}; convert with scale and offset, "
+                f"and write unit: {by_signal[name].unit}"
             )
-        ours[name] = Source(name, place.source, place.unit, place.scale, place.offset)
-    return tuple(ours.values())
+        by_signal[name] = Source(name, place.source, place.unit, place.scale, place.offset)
+    return tuple(by_signal.values())
 
 
 def trial_paths(folder: Path) -> list[Path]:
@@ -216,7 +217,7 @@ def group_trials(
     """
     groups: dict[tuple[str, int], dict[int, TrialRecording]] = {}
     for recording in recordings:
-        conditions = checked_conditions(recording)
+        conditions = check_conditions(recording)
         number, material = conditions.trial, conditions.material
         index = _routine(recording.path, conditions, materials, nozzle, routines)
         trials = groups.setdefault((material, index), {})
@@ -236,7 +237,7 @@ def group_trials(
     return {key: [trials[number] for number in sorted(trials)] for key, trials in sorted(groups.items())}
 
 
-def checked_conditions(recording: TrialRecording) -> TrialConditions:
+def check_conditions(recording: TrialRecording) -> TrialConditions:
     """What a trial was run with. Raises ValueError if its recording does not say, or says what cannot be."""
     conditions = recording.conditions
     if conditions is None:
@@ -310,17 +311,6 @@ def read_trial(
     may turn out not to be decodable when they are asked for.
     """
     path = Path(path)
-    if not 0 <= unreadable_share <= 1:
-        raise ValueError(
-            f"{path}: unreadable_share should be within 0 and 1 but is {unreadable_share:g}; "
-            "give a share of the frames"
-        )
-    for needed in (POSITION, SPEED, COMMAND):
-        if [source.signal for source in sources].count(needed.signal) != 1:
-            raise ValueError(
-                f"{path}: the mapping should give {needed.signal} one source; "
-                "map the gantry's position and speed, and the command"
-            )
     # only the true flow, which no machine knows, may be absent if its source is ours
     optional = {FLOW.signal} if FLOW in sources else ()
     try:
@@ -399,9 +389,9 @@ def recall(
     frame. An entry is named by the hash of the recording, of the settings, and of the code that reads."""
     what = ((artifacts.sha256(recording), settings), [artifacts.sha256(path) for path in code])
     place = folder / f"{joblib.hash(what)}.parquet"
-    known = _remembered(place)
-    if known is not None:
-        return known
+    entry = _recall_entry(place)
+    if entry is not None:
+        return entry
     values = read()
     if len(values[0]):
         _remember(place, values)
@@ -422,7 +412,7 @@ def _remember(place: Path, values: Values) -> None:
     artifacts.write_table(place, READINGS, table)
 
 
-def _remembered(place: Path) -> Values | None:
+def _recall_entry(place: Path) -> Values | None:
     """The readings of an entry; None if there is none, or if the checksums of its pages do not hold."""
     try:
         table = artifacts.read_table(place, READINGS)

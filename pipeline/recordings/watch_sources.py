@@ -9,16 +9,14 @@ import base64
 import contextlib
 import hashlib
 import http.client
-import io
 import os
 import re
+import threading
 import time
-import urllib.error
 import urllib.parse
-import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -70,7 +68,7 @@ def source(place: str, topics: Topics, *, rate_hz: float) -> "FrameSource":
     return Folder(Path(place))
 
 
-def shown_place(place: str) -> str:
+def display_name(place: str) -> str:
     """A source's name as it may be shown: of an address without user and password."""
     return _without_secret(urllib.parse.urlsplit(place)) if "://" in place else place
 
@@ -94,27 +92,27 @@ class Folder:
             self.waits_for = f"the folder {self.path} is not there yet"
             return
         self.waits_for = ""
-        came = sorted(self._new(), key=lambda entry: (entry[1], _counted(entry[0])))
+        came = sorted(self._new(), key=lambda entry: (entry[1], _number_key(entry[0])))
         for name, written_ns, size in came:
-            shown = self._picture(name, written_ns / 1e9, size)
-            if shown is not None:
+            frame = self._picture(name, written_ns / 1e9, size)
+            if frame is not None:
                 self.done.add(name)
                 self.unfinished.pop(name, None)
-                yield shown
+                yield frame
         self.ended = not self.unfinished
 
     def _new(self) -> Iterator[tuple[str, int, int]]:
         """(name from the folder on, ns when it was written, bytes) of pictures that were not looked at."""
         began = time.monotonic()
-        for here, folders, names in os.walk(self.path):
+        for root, folders, names in os.walk(self.path):
             folders[:] = [name for name in folders if not name.startswith(".")]
-            below = os.path.relpath(here, self.path)
+            below = os.path.relpath(root, self.path)
             for name in names:
                 inside = name if below == "." else f"{below}/{name}"
                 if name.startswith(".") or not name.lower().endswith(PICTURES) or inside in self.done:
                     continue
                 with contextlib.suppress(OSError):  # a camera may remove its oldest
-                    about = os.stat(os.path.join(here, name))
+                    about = os.stat(os.path.join(root, name))
                     yield inside, about.st_mtime_ns, about.st_size
         # a folder of very many names is looked through less often
         self.rest_s = max(LOOK_S, 5 * (time.monotonic() - began))
@@ -130,18 +128,18 @@ class Folder:
         except FileNotFoundError:
             return CameraFrame(name, time_s, f"{UNREADABLE}: it was removed")
         except (OSError, ValueError) as error:
-            before = self.unfinished.get(name, (-1, 0.0))
-            if before[0] != size:
+            previous = self.unfinished.get(name, (-1, 0.0))
+            if previous[0] != size:
                 self.unfinished[name] = (size, self.clock())
                 return None
-            if self.clock() - before[1] < SETTLE_S:
+            if self.clock() - previous[1] < SETTLE_S:
                 return None
             return CameraFrame(name, time_s, f"{UNREADABLE}: {str(error).partition('found ')[2] or error}")
         copy, self.before = digest == self.before, digest
         return CameraFrame(name, time_s, COPY if copy else frame)
 
 
-def _counted(name: str) -> list:
+def _number_key(name: str) -> list:
     """A key that puts image-9 before image-10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
@@ -217,31 +215,25 @@ class RecordingSource:
                 stamp = message.publish_time
             elif self.where.time not in ("", "log_time"):
                 stamp = picture.stamp_ns
-            digest = hashlib.blake2b(picture.data, digest_size=16).digest()
-            copy, self.before = digest == self.before, digest
-            frame = COPY if copy else images.gray(picture)
+            frame, self.before = _new_frame(picture.data, self.before, lambda: images.gray(picture))
         except ValueError as error:
             frame = f"{UNREADABLE}: {error}"
         number = self.signals.get("print_id", np.nan)
-        return CameraFrame(
-            name,
-            stamp / 1e9,
-            frame,
-            self.signals.get("flow_percent", np.nan),
-            self.signals.get("temperature_degC", np.nan),
-            self.signals.get("travel_direction_deg", np.nan),
-            (self.signals.get("tip_x_px", np.nan), self.signals.get("tip_y_px", np.nan)),
-            f"{number:g}" if np.isfinite(number) else "",
+        flow, temperature, direction, x, y = (
+            self.signals.get(name, np.nan)
+            for name in ("flow_percent", "temperature_degC", "travel_direction_deg", "tip_x_px", "tip_y_px")
         )
+        print_id = f"{number:g}" if np.isfinite(number) else ""
+        return CameraFrame(name, stamp / 1e9, frame, flow, temperature, direction, (x, y), print_id)
 
     def _hold(self, message: Message) -> None:
         """Takes over what a message says of our signals."""
         number = message.channel.id
         if number not in self.decoders:
             self.decoders[number] = self._decoder(message)
-        if (known := self.decoders[number]) is None:
+        if (reader := self.decoders[number]) is None:
             return
-        names, decode = known
+        names, decode = reader
         try:
             values = decode([plain(message.data)])[0]
         except ValueError:
@@ -258,12 +250,12 @@ class RecordingSource:
         """Our signals that a channel has, and what reads them; None where it has none."""
         channel = message.channel
         try:
-            there = set(fields(channel, [message.data]))
+            names = set(fields(channel, [message.data]))
             places = {
                 name: field
                 for name, at in self.sources.items()
                 for topic, colon, field in [at.source.rpartition(":")]
-                if field in there and (not colon or topic == channel.topic)
+                if field in names and (not colon or topic == channel.topic)
             }
             return (list(places), decoder(channel, list(places.values()))) if places else None
         except (ValueError, RecursionError):
@@ -271,48 +263,6 @@ class RecordingSource:
 
 
 # ---- snapshots over HTTP
-
-
-class _SameHost(urllib.request.HTTPRedirectHandler):
-    """Follows no redirection: what a camera answers may not lead anywhere else."""
-
-    def redirect_request(self, req, fp, code, msg, headers, newurl):
-        return None
-
-
-class _Until(io.RawIOBase):
-    """The bytes of an answer, until its time is over: a camera that drips is given up in its headers too."""
-
-    def __init__(self, raw: io.RawIOBase, until: float) -> None:
-        self.of, self.until = raw, until
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int | None:
-        if time.monotonic() > self.until:
-            raise TimeoutError(f"its answer took more than {TIMEOUT_S:g} s")
-        return self.of.readinto(buffer)
-
-    def close(self) -> None:
-        self.of.close()
-        super().close()
-
-
-class _Answer(http.client.HTTPResponse):
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self.fp = io.BufferedReader(_Until(self.fp.detach(), time.monotonic() + TIMEOUT_S))
-
-
-class _Timely(urllib.request.HTTPHandler, urllib.request.HTTPSHandler):
-    """Opens connections whose answers are given up when their time is over."""
-
-    def http_open(self, req):
-        return self.do_open(type("_Plain", (http.client.HTTPConnection,), {"response_class": _Answer}), req)
-
-    def https_open(self, req):
-        return self.do_open(type("_Secure", (http.client.HTTPSConnection,), {"response_class": _Answer}), req)
 
 
 class Snapshots:
@@ -329,14 +279,11 @@ class Snapshots:
                 f"{_without_secret(parts)}: expected the address of a snapshot such as "
                 "http://127.0.0.1:8080/?action=snapshot, found another; look it up in the camera's settings"
             )
-        host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
-        self.address = parts._replace(netloc=host + (f":{port}" if port else ""), fragment="").geturl()
-        self.shown = _without_secret(parts)
-        self.headers = {"User-Agent": "beadline"}
+        self.shown, self.parts, self.port = _without_secret(parts), parts, port
+        self.headers = {"User-Agent": "beadline", "Connection": "close"}
         if parts.username is not None:
             pair = f"{urllib.parse.unquote(parts.username)}:{urllib.parse.unquote(parts.password or '')}"
             self.headers["Authorization"] = f"Basic {base64.b64encode(pair.encode()).decode()}"
-        self.opener = urllib.request.build_opener(urllib.request.ProxyHandler({}), _SameHost(), _Timely())
         self.period_s, self.rest_s, self.ended = 1 / rate_hz, 0.0, False
         self.waits_for, self.lacks = f"{self.shown} has not answered yet", "a picture"
         self.count, self.before = 0, b""
@@ -345,51 +292,79 @@ class Snapshots:
         """One picture, or none where the camera does not answer; a new one for each period of the rate."""
         began = time.monotonic()
         try:
-            data = self._asked()
+            data = self._answer()
             self.count += 1
-            name, digest = f"snapshot {self.count}", hashlib.blake2b(data, digest_size=16).digest()
-            copy, self.before = digest == self.before, digest
-            try:
-                frame = COPY if copy else _decoded(data)
-            except ValueError as error:
-                frame = f"{UNREADABLE}: {error}"
+            frame, self.before = _new_frame(data, self.before, lambda: _decode(data))
             self.waits_for = ""
-            yield CameraFrame(name, time.time(), frame)
-        except urllib.error.HTTPError as error:
-            error.close()
-            self.waits_for = f"{self.shown} answers {error.code} {error.reason}"
+            yield CameraFrame(f"snapshot {self.count}", time.time(), frame)
         except (OSError, http.client.HTTPException) as error:
-            why = getattr(error, "reason", None) or error
-            self.waits_for = f"{self.shown} does not answer ({str(why) or type(why).__name__})"
+            self.waits_for = f"{self.shown} does not answer with a picture ({error or type(error).__name__})"
         self.rest_s = max(0.0, self.period_s - (time.monotonic() - began))
 
-    def _asked(self) -> bytes:
-        """The bytes of one answer, whole."""
-        request = urllib.request.Request(self.address, headers=self.headers)
-        with self.opener.open(request, timeout=TIMEOUT_S) as answer:
-            kind = answer.headers.get_content_type()
-            if kind.startswith("multipart/"):
-                raise OSError("it is a stream of pictures; name the address of a single one")
-            if kind.startswith("text/") and "Content-Type" in answer.headers:
-                raise OSError(f"it shows {kind}, no picture; name the address of a snapshot")
-            parts, size = [], 0
-            while part := answer.read1(1 << 16):
-                parts.append(part)
-                size += len(part)
-                if size > LARGEST_PICTURE:
-                    raise OSError(f"its answer is longer than {LARGEST_PICTURE >> 20} MB")
-            promised = answer.headers.get("Content-Length", "")
-            if promised.isdigit() and int(promised) != size:
-                raise OSError(f"its answer broke off after {size} of {promised} bytes")
-            if not size:
-                raise OSError("its answer is empty")
-            return b"".join(parts)
+    def _answer(self) -> bytes:
+        """The bytes of one answer, whole. A camera that drips is hung up on, in its headers too."""
+        kinds = {"http": http.client.HTTPConnection, "https": http.client.HTTPSConnection}
+        connection = kinds[self.parts.scheme](self.parts.hostname or "", self.port, timeout=TIMEOUT_S)
+        late = threading.Event()
+
+        def hang_up() -> None:
+            late.set()
+            with contextlib.suppress(OSError):  # the camera may have done so
+                line.shutdown(2)  # in both directions
+
+        connection.connect()
+        line = connection.sock
+        # the timeout of the connection is that of one packet, and comes first
+        alarm = threading.Timer(1.2 * TIMEOUT_S, hang_up)
+        alarm.start()
+        try:
+            address = self.parts._replace(scheme="", netloc="", fragment="", path=self.parts.path or "/")
+            connection.request("GET", address.geturl(), headers=self.headers)
+            return _read_picture(connection.getresponse())
+        finally:
+            alarm.cancel()
+            connection.close()
+            if late.is_set():
+                raise TimeoutError(f"its answer took more than {TIMEOUT_S:g} s")
 
 
-def _decoded(data: bytes) -> np.ndarray:
+def _read_picture(answer: http.client.HTTPResponse) -> bytes:
+    """The picture of an answer. Raises OSError with the reason if it has none, or not a whole one."""
+    kind = answer.headers.get_content_type()
+    data = b"" if kind.startswith("multipart/") else answer.read(LARGEST_PICTURE + 1)
+    problems = (
+        (answer.status // 100 != 2, f"it says {answer.status} {answer.reason}"),
+        (kind.startswith("multipart/"), "it is a stream of pictures; name the address of a single one"),
+        (
+            kind.startswith("text/") and "Content-Type" in answer.headers,
+            f"it shows {kind}, no picture; name the address of a snapshot",
+        ),
+        (len(data) > LARGEST_PICTURE, f"its answer is longer than {LARGEST_PICTURE >> 20} MB"),
+        (answer.length, f"its answer broke off {answer.length} bytes before its end"),
+        (not data, "its answer is empty"),
+    )
+    for is_so, problem in problems:
+        if is_so:
+            raise OSError(problem)
+    return data
+
+
+def _decode(data: bytes) -> np.ndarray:
     if not _has_end(data):
         raise ValueError(f"a picture of {len(data)} bytes without its end")
     return decode(data)
+
+
+def _new_frame(
+    content: bytes | memoryview, previous: bytes, decode: Callable[[], np.ndarray]
+) -> tuple[np.ndarray | str, bytes]:
+    """The decoded frame, or the reason why there is none, and the digest of its content; `before` is that of
+    the frame before."""
+    digest = hashlib.blake2b(content, digest_size=16).digest()
+    try:
+        return COPY if digest == previous else decode(), digest
+    except ValueError as error:
+        return f"{UNREADABLE}: {error}", digest
 
 
 def _without_secret(parts: urllib.parse.SplitResult) -> str:

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.deposition.camera.bead import area, measure
-from pipeline.deposition.camera.edges import BLOCK
+from pipeline.deposition.camera.bead import BLOCK, area, measure
 from pipeline.deposition.camera.flow import Sections, View, deposit_share, estimate, sections
 from pipeline.deposition.camera.rendering import HARD, NOMINAL, SimulatedCamera
 from pipeline.deposition.extruder import draw, flow, routine

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.deposition.camera import bead, latency, pose, trial_flow
+from pipeline.deposition.camera import bead, latency, line, trial_flow
 from pipeline.deposition.extruder import Extruder, flow, routine
 from pipeline.deposition.settings import Camera, Printer, trial_conditions
 from pipeline.recordings import trial_files
@@ -142,5 +142,5 @@ def test_without_a_tip_a_level_line_stays_as_it_lies_and_an_askew_one_is_turned_
         path = recorded(tmp_path / f"{angle:g}.mcap", EYE._replace(angle_deg=angle, ground="striped"))
         recording = trial_files.open_trial(path, **camera.recording)
         frames, gantry = recording.frames, recording.signals["position_mm"]
-        turn = pose.pose(camera.mounting, frames.time_s, gantry, frames.chosen)
+        turn = line.pose(camera.mounting, frames.time_s, gantry, frames.pick)
         assert (turn is None) if not angle else turn.angle_deg == pytest.approx(angle, abs=2)

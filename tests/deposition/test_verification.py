@@ -224,9 +224,9 @@ def test_a_recorded_print_that_cannot_be_read_is_refused_in_one_sentence(tmp_pat
 
 
 def test_of_two_measured_prints_none_is_guessed(tmp_path):
-    assert part_files.measured_path(tmp_path, "dashes", "A") is None
+    assert part_files.print_path(tmp_path, "dashes", "A") is None
     path = recorded(tmp_path / "dashes_A_measured.mcap")
-    assert part_files.measured_path(tmp_path, "dashes", "A") == path
+    assert part_files.print_path(tmp_path, "dashes", "A") == path
     written(tmp_path, "time_s,flow_mm3_per_s\n0,1\n")
     with pytest.raises(ValueError, match=r"found dashes_A_measured.csv and dashes_A_measured.mcap; keep one"):
-        part_files.measured_path(tmp_path, "dashes", "A")
+        part_files.print_path(tmp_path, "dashes", "A")

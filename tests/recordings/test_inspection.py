@@ -329,7 +329,7 @@ def test_a_controller_with_a_topic_a_signal_is_named_by_its_topics(tmp_path):
     Plant.model_validate_json(json.dumps(proposed["plant"]))
 
 
-def test_a_file_is_walked_once_whatever_the_number_of_topics(tmp_path, monkeypatch):
+def test_a_file_is_looked_at_and_walked_once_whatever_the_number_of_topics(tmp_path, monkeypatch):
     from pipeline.recordings import mcap_files
 
     walks, batches = [], mcap_files.McapFile.batches
@@ -341,7 +341,7 @@ def test_a_file_is_walked_once_whatever_the_number_of_topics(tmp_path, monkeypat
     plc(tmp_path / "plc.mcap")
     monkeypatch.setattr(mcap_files.McapFile, "batches", counted)
     inspect(tmp_path / "plc.mcap")
-    assert len(walks) == 1
+    assert len(walks) == 2
 
 
 def test_rubbish_behind_the_first_bytes_is_among_the_findings(tmp_path):

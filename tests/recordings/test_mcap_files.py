@@ -220,3 +220,49 @@ def test_two_publishers_whose_clocks_differ_are_told_and_a_late_message_is_not(t
         "two devices with clocks of their own seem to publish it; record each under a topic of its own"
         in note.message
     )
+
+
+def cut_notes(raw: Raw) -> list[str]:
+    return [note.message for note in raw.notes if note.kind == "cut"]
+
+
+@pytest.mark.parametrize("statistics", [True, False])
+def test_a_recording_of_which_a_twentieth_is_lost_says_how_much(tmp_path, statistics):
+    content = json_recording(SAMPLES, NO, chunk_size=4000, use_statistics=statistics)
+    parts = chunks(content)
+    assert cut_notes(opened(tmp_path, content)) == []
+    one = flipped(content, parts[4][1] + 50, 0)
+    assert cut_notes(opened(tmp_path, one)) == []
+    for _, start, _ in parts[5:10]:
+        content = flipped(content, start + 50, 0)
+    raw = opened(tmp_path, content)
+    lost = SAMPLES - len(raw.signals["heater_1"][0])
+    share = 100 * lost / SAMPLES
+    assert share > 5
+    assert cut_notes(raw) == [
+        f"{share:.1f} % of the recording was left out (limit 5 %): {lost} of {SAMPLES} messages are lost; "
+        "copy it again, or record it again"
+    ]
+
+
+@pytest.mark.parametrize(("chunk_size", "is_cut"), [(20_000, True), (2000, False)])
+def test_a_file_that_ends_in_a_chunk_says_how_long_the_chunk_was(tmp_path, chunk_size, is_cut):
+    content = json_recording(SAMPLES, NO, chunk_size=chunk_size)
+    parts = chunks(content)
+    # all chunks but the last, which is shorter than the others
+    end = (parts[-2][1] + parts[-2][2]) // 2
+    raw = opened(tmp_path, content[:end])
+    notes = cut_notes(raw)
+    assert bool(notes) == is_cut
+    if is_cut:
+        first, last = struct.unpack_from("<QQ", content, parts[-2][0] + 9)
+        lost_s, rest_s = (last - first) / 1e9, raw.signals["heater_1"][0][-1]
+        assert notes[0].startswith(f"{100 * lost_s / (lost_s + rest_s):.1f} % of the recording was left out")
+
+
+def test_a_lost_chunk_whose_times_are_garbled_is_not_believed(tmp_path):
+    content = json_recording(SAMPLES, NO, chunk_size=4000)
+    parts = chunks(content)
+    end = (parts[-2][1] + parts[-2][2]) // 2
+    raw = opened(tmp_path, flipped(content, parts[-2][0] + 9 + 15, 5)[:end])
+    assert cut_notes(raw) == []

@@ -593,6 +593,7 @@ def test_nothing_in_the_watch_could_send():
         if path.name != "watch_sources.py":
             assert not names & {"urllib", "http"}
         calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
-        requests = [call for call in calls if ast.unparse(call.func).endswith("Request")]
+        requests = [call for call in calls if ast.unparse(call.func).endswith(".request")]
+        assert len(requests) == (path.name == "watch_sources.py")
+        assert all(ast.unparse(call.args[0]) == "'GET'" and len(call.args) == 2 for call in requests)
         assert all({word.arg for word in call.keywords} == {"headers"} for call in requests)
-    assert watch_sources.urllib.request.Request("http://127.0.0.1/").get_method() == "GET"

@@ -16,7 +16,7 @@ import pytest
 from pipeline.recordings import watch_sources
 from pipeline.recordings.mcap_files import GrowingMcap
 from pipeline.recordings.nozzle_frames import Topics
-from pipeline.recordings.watch_sources import COPY, Folder, RecordingSource, Snapshots, shown_place, source
+from pipeline.recordings.watch_sources import COPY, Folder, RecordingSource, Snapshots, display_name, source
 from tests.mcap_writing import LZ4, NO, ZSTD, Written, chunks
 from tests.nozzle_folders import ANY
 
@@ -166,7 +166,7 @@ def test_a_length_that_is_garbled_costs_a_chunk_not_the_watch(tmp_path):
     (tmp_path / "a.mcap").write_bytes(content)
     here = RecordingSource(tmp_path / "a.mcap", ANY)
     assert 20 < len(list(here.frames())) < 40
-    assert "are no records" in here.damage[0]
+    assert "is more than the 536870912 bytes" in here.damage[0]
 
 
 def test_a_recording_that_is_begun_anew_is_read_anew(tmp_path):
@@ -386,5 +386,5 @@ def test_the_kind_of_a_source_is_told_by_its_name(tmp_path):
     assert isinstance(source("http://127.0.0.1/", ANY, rate_hz=5.0), Snapshots)
     assert isinstance(source(str(tmp_path / "A.MCAP"), ANY, rate_hz=5.0), RecordingSource)
     assert isinstance(source(str(tmp_path), ANY, rate_hz=5.0), Folder)
-    assert shown_place("http://me:secret@cam/a?b") == "http://cam/a?b"
-    assert shown_place("C:/a") == "C:/a"
+    assert display_name("http://me:secret@cam/a?b") == "http://cam/a?b"
+    assert display_name("C:/a") == "C:/a"

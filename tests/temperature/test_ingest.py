@@ -13,6 +13,8 @@ from pipeline.recordings.recording_folders import RecordingWish, count_work, joi
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant
 from stages.ingest import Ingest, MappedSignal, recording_wish, sources
+from tests.mcap_writing import NO, chunks, flipped
+from tests.recordings import hostile
 from tests.recordings.klipper_machine import EXTRUDER, print_log
 from tests.recordings.test_bag_folders import bag
 from tests.temperature import long_readings
@@ -313,6 +315,16 @@ def test_a_record_that_is_cut_by_more_than_a_twentieth_says_by_how_much(tmp_path
     assert (("000.csv", "cut") in messages) == bool(share)
     if share:
         assert messages["000.csv", "cut"].startswith("9.1 % of the recording was left out (limit 5 %)")
+
+
+def test_an_mcap_that_lost_a_tenth_of_its_messages_says_so(tmp_path):
+    raw = folder(tmp_path, 1)
+    content = hostile.good_mcap(compression=NO)
+    parts = chunks(content)
+    (raw / "rig.mcap").write_bytes(content)
+    assert "cut_percent" not in ingested(raw, tmp_path)
+    (raw / "rig.mcap").write_bytes(flipped(content, parts[2][1] + 50, 0))
+    assert ingested(raw, tmp_path)["cut_percent"] == {"rig.mcap": pytest.approx(100 / len(parts), abs=2.0)}
 
 
 def test_a_signal_that_ends_early_cuts_the_record(tmp_path):

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from pipeline.deposition.camera import bead, ladder, line
-from pipeline.deposition.camera.edges import BLOCK, FEWEST_BLOCKS
+from pipeline.deposition.camera.bead import BLOCK, FEWEST_BLOCKS
 from pipeline.deposition.camera.ladder import Ladder, Rung
 from pipeline.deposition.settings import Camera, Printer
 from pipeline.recordings.images import Frames, image_topic

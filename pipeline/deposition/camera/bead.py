@@ -1,15 +1,58 @@
 """Camera frame -> sub-pixel bead width along the line, or the reason why there is none; pixels -> millimetres
-on known widths; width -> cross-section."""
+on known widths; width -> cross-section.
 
+Both edges lie along the rows of the frame: outermost significant run, then the half level of the plateau
+beside each edge. A specular line on the bead has a stronger gradient than its edges, glare moves the
+background, shading bends the plateau, and texture lies beside it: so nothing here looks for the strongest
+gradient. The functions of the edges take k frames at once: k small calls cost more than one large one.
+"""
+
+import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+import scipy.special
 
-from pipeline.deposition.camera import edges
-from pipeline.deposition.camera.edges import BLOCK, FEWEST_BLOCKS
+# columns averaged into one profile (64 um at 125 px/mm, an eighth of a
+# nozzle) and rows averaged to find the run
+BLOCK, COARSE = 8, 4
+# rows outward and inward of an edge in its window; levels of the background, beside the edge and deeper
+# inside are read where a blurred edge has come to rest
+OUT, IN = 12, 20
+OUTSIDE, NEAR, FAR = np.arange(-OUT, -5), np.arange(5, 9), np.arange(12, 21)
+NEAR_ROW, FAR_ROW, NEAR_VARIANCE, FAR_VARIANCE = (
+    float(NEAR.mean()),
+    float(FAR.mean()),
+    float(NEAR.var()),
+    float(FAR.var()),
+)
+LEVELS = np.zeros((OUT + 1 + IN, 3), np.float32)
+LEVELS[OUT + OUTSIDE, 0], LEVELS[OUT + NEAR, 1], LEVELS[OUT + FAR, 2] = (
+    1 / len(OUTSIDE),
+    1 / len(NEAR),
+    1 / len(FAR),
+)
+# an edge is sought outward from here: past it a dark bead's specular line may dip
+INSIDE = OUT + 5
+# the top edge lies towards lower rows of its bead, the bottom edge towards higher ones
+OUTWARD = np.array([-1, 1]).reshape(2, 1, 1)
+OUTWARDS = OUTWARD * np.arange(3).reshape(3, 1, 1, 1)
+REACH = -OUTWARD[..., None] * np.arange(-OUT, IN + 1)
+THREE, THREE_VARIANCE = np.full((1, 3), 1 / 3, np.float32), 2 / 3
+# where one edge is brighter than the other by this share of the plateau, the specular line lies beside it
+UNEVEN = 0.12
+# edge, blur and shading settle within so many rounds, two where the edge is sharp
+ROUNDS = 12
+# a coarse row is bead where it stands so many standard deviations of the background above it, one in 10^9
+# rows of noise, and this share of the steps
+SIGNIFICANT, STEEP = 6.0, 0.2
+# a plateau above all levels: no bead
+NONE = 1e9
+# fewer blocks are dirt, not a line; less height is no measurable bead
+FEWEST_BLOCKS, FEWEST_ROWS, FEWEST_LINES = 4, 2, 48
 
 
 class Bead(NamedTuple):
@@ -148,22 +191,22 @@ def measure_all(
         )
     if not frames:
         return []
-    g = edges.profiles(frames, columns)
+    g = profiles(frames, columns)
     n = g.shape[1]
     where = columns[0] + BLOCK * np.arange(n) + (BLOCK - 1) / 2
-    coarse = edges.coarse(g, np.iinfo(frames[0].dtype).max / 255, sign)
+    rough = coarse(g, np.iinfo(frames[0].dtype).max / 255, sign)
     # most frames of a trial are bare
     (top, bottom), blur = (
-        edges.fine(g, coarse) if coarse.solid.any() else (coarse.rows, np.full(len(frames), math.nan))
+        fine(g, rough) if rough.solid.any() else (rough.rows, np.full(len(frames), math.nan))
     )
-    good = coarse.solid & (bottom > top)
-    widths = np.where(coarse.solid | coarse.unclear | coarse.cut, math.nan, 0.0)
-    cut, few = coarse.cut.sum(axis=1) > n / 2, good.sum(axis=1) < FEWEST_BLOCKS
+    good = rough.solid & (bottom > top)
+    widths = np.where(rough.solid | rough.unclear | rough.cut, math.nan, 0.0)
+    cut, few = rough.cut.sum(axis=1) > n / 2, good.sum(axis=1) < FEWEST_BLOCKS
     out = []
     for i in range(len(frames)):
         reasons = {
             "cut by the frame": cut[i],
-            "saturated": coarse.saturated[i],
+            "saturated": rough.saturated[i],
             "no bead": few[i],
             "blurred": blur[i] > longest_blur_px,
         }
@@ -184,7 +227,7 @@ def measure_all(
                     top[i],
                     bottom[i],
                     float(blur[i]),
-                    float(coarse.sign[i] * coarse.plateau[i]),
+                    float(rough.sign[i] * rough.plateau[i]),
                 )
             )
     return out
@@ -223,3 +266,225 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
         keep, count = miss <= 3 * max(spread, 1e-9), len(a)
         a, b = x[keep], y[keep]
     return float(mean - slope * middle), spread / math.sqrt(count)
+
+
+# ---- edges
+
+
+def profiles(frames: list[np.ndarray], columns: tuple[int, int]) -> np.ndarray:
+    """(frames, blocks, rows) sums of 8 columns each. The transposed
+    copy makes every later pass run along memory."""
+    first, last = columns
+    h, w = frames[0].shape
+    n = (last - first) // BLOCK
+    if not 0 <= first < last <= w or n < FEWEST_BLOCKS or h < FEWEST_LINES:
+        raise ValueError(
+            f"frame: expected at least {FEWEST_LINES} rows, and {FEWEST_BLOCKS * BLOCK} columns between "
+            f"{first} and {last}, "
+            f"but found {h} rows of {w}; check the camera's region of interest"
+        )
+    g = np.empty((len(frames), n, h), np.uint16 if frames[0].dtype == np.uint8 else np.uint32)
+    for sums, frame in zip(g, frames, strict=True):
+        across = cv2.transpose(frame[:, first : first + n * BLOCK]).reshape(n, BLOCK, h)
+        np.add.reduce(across, axis=1, dtype=g.dtype, out=sums)
+    return g
+
+
+class CoarseEdges(NamedTuple):
+    """Of k frames: rows (2, k, n) of the coarse edges; blocks (k, n) bool with a solid run,
+    with an unclear one, with one that the frame cuts; plateau (k,) in levels above background,
+    NONE without a bead; sign (k,), saturated (k,)."""
+
+    rows: np.ndarray
+    solid: np.ndarray
+    unclear: np.ndarray
+    cut: np.ndarray
+    plateau: np.ndarray
+    sign: np.ndarray
+    saturated: np.ndarray
+
+
+def coarse(g: np.ndarray, level: float, bead_sign: int = 0) -> CoarseEdges:
+    """The outermost run above half the plateau in each block, on rows averaged by four.
+
+    Background is the straight line between the means of the first and the last sixteenth of the rows; its
+    noise counts as at least half a gray level. What is significant has steps over 16 rows; glare swells
+    without any. The plateau is the median of all that reaches STEEP of those steps.
+    """
+    k, n, h = g.shape[0], g.shape[1], g.shape[2] // COARSE
+    m, ends, line = _background(h)
+    g = g[:, :, : h * COARSE]
+    c = (g[..., ::4] + g[..., 1::4] + g[..., 2::4] + g[..., 3::4]).astype(np.float32) * np.float32(
+        1 / (BLOCK * COARSE)
+    )
+    margins = c @ ends
+    d = c - margins @ line
+    step, plateau, sign = np.empty(k), np.empty(k), np.empty(k)
+    for i in range(k):
+        step[i], plateau[i], sign[i] = _plateau(d[i], m, level, bead_sign)
+        if sign[i] < 0:
+            d[i] *= -1
+    half = (plateau / 2).astype(np.float32)[:, None, None]
+    inside = d > half
+    at = np.stack([inside.argmax(axis=2), h - 1 - inside[..., ::-1].argmax(axis=2)])
+    rows = np.add.reduce(inside, axis=2, dtype=np.int32)
+    # the first row inside, and the first and second outside of it
+    beside = np.minimum(np.maximum(at + OUTWARDS, 0), h - 1) + (h * np.arange(k * n)).reshape(k, n)
+    inner, outer, far = d.ravel().take(beside)
+    back = (inner - half[..., 0]) / np.maximum(inner - outer, 1e-6)
+    edges = COARSE * (at + OUTWARD * np.minimum(np.maximum(back, 0), 1)) + (COARSE - 1) / 2
+    some = rows >= FEWEST_ROWS
+    solid = (rows > 0.6 * (at[1] - at[0] + 1)) & (inner - far > STEEP * half[..., 0]).all(axis=0)
+    # a bead in the first or last rows passes for background there
+    lopsided = np.abs(margins[..., 0] - margins[..., 1]) > step[:, None] / 2
+    cut = some & ((at[0] < m) | (at[1] >= h - m) | ~solid & lopsided)
+    white = np.add.reduce((c > 0.98 * 255 * level).reshape(k, -1), axis=1, dtype=np.int32)
+    return CoarseEdges(
+        edges, some & solid & ~cut, some & ~solid & ~cut, cut, plateau, sign, white > 0.3 * rows.sum(axis=1)
+    )
+
+
+def _plateau(d: np.ndarray, m: int, level: float, bead_sign: int) -> tuple[float, float, float]:
+    """Of one frame: median of the significant steps, median of what reaches STEEP of them, sign of the bead;
+    NONE and 1 where nothing is significant."""
+    noise = max(math.hypot(cv2.norm(d[:, :m]), cv2.norm(d[:, -m:])) / math.sqrt(2 * m * len(d)), level / 2)
+    steps = d[:, 4:] - d[:, :-4]
+    steps = np.maximum(steps.max(axis=1), -steps.min(axis=1))
+    steps = steps[steps > SIGNIFICANT * math.sqrt(2) * noise]
+    if len(steps) < FEWEST_BLOCKS:
+        return NONE, NONE, 1.0
+    step = float(np.partition(steps, len(steps) // 2)[len(steps) // 2])
+    threshold = max(STEEP * step, SIGNIFICANT * noise)
+    up, down = d > threshold, d < -threshold
+    light = bead_sign > 0 or (bead_sign == 0 and np.count_nonzero(up) >= np.count_nonzero(down))
+    sign, rows = (1.0, up) if light else (-1.0, down)
+    values = np.abs(d[rows])
+    if not len(values):
+        return NONE, NONE, 1.0
+    return step, float(np.partition(values, len(values) // 2)[len(values) // 2]), sign
+
+
+@functools.cache
+def _background(h: int) -> tuple[int, np.ndarray, np.ndarray]:
+    """Rows in a sixteenth; (h, 2) that takes the mean of the first and of the last;
+    (2, h) that draws the straight line between them."""
+    m = max(h // 16, 2)
+    ends = np.zeros((h, 2), np.float32)
+    ends[:m, 0] = ends[-m:, 1] = 1 / m
+    share = ((np.arange(h) - (m - 1) / 2) / (h - m)).astype(np.float32)
+    return m, ends, np.stack([1 - share, share])
+
+
+def fine(g: np.ndarray, first: CoarseEdges) -> tuple[np.ndarray, np.ndarray]:
+    """(2, k, n) sub-pixel rows of the top and the bottom edge, and each frame's blur (k,): standard deviation
+    of its edge in px, NaN without a bead.
+
+    The half level lies between the local background and the plateau beside the edge, which is extrapolated to
+    the edge against shading. Shading is the same at both edges; where one is brighter than the other, the
+    specular line lies beside it, and the other edge gives the plateau of both.
+    """
+    k, n, h = g.shape
+    # a speck beside the bead moves one block's coarse edge, not its neighbours'
+    coarse = first.rows.astype(np.float32).reshape(2 * k, 1, n)
+    rows = np.rint([cv2.medianBlur(edge, 5)[0] for edge in coarse]).astype(int).reshape(2, k, n)
+    E = g.ravel().take((rows + (h * np.arange(k * n)).reshape(k, n))[..., None] + REACH, mode="clip") * (
+        first.sign[:, None, None] / BLOCK
+    ).astype(np.float32)
+    # a bead narrower than its windows has no plateau of its own
+    wide = first.solid & (rows[1] - rows[0] > OUT + IN)
+    flat = wide.any(axis=1)
+    used = np.where(flat[:, None], wide, first.solid)
+    share = used / np.maximum(np.count_nonzero(used, axis=1), 1)[:, None]
+
+    def mean(x):
+        return np.einsum("...kn,kn->...k", x, share)
+
+    outside, near, far = np.moveaxis(E @ LEVELS, -1, 0)
+    top, bottom = mean(far - outside)
+    darker = np.where(first.sign * (bottom - top) < 0, 1, 0)
+    clean = np.where(np.abs(top - bottom) > UNEVEN * first.plateau, darker, [[0], [1]]), np.arange(k)
+    rise, width = (
+        np.where(flat, mean((far - near)[clean]).mean(axis=0), 0.0),
+        np.maximum(mean(rows[1] - rows[0]), OUT + IN),
+    )
+    fall, _ = _shading(rise, width, 0.0)
+    along = _along(np.concatenate([outside, near]), used)
+    outside, plateau = along[:2], first.plateau[:, None]
+    level = np.minimum(np.maximum((along[2:] - outside)[clean] - fall[:, None], 0.3 * plateau), plateau)
+    level = np.where(wide, level, plateau)
+    into, step = _crossing(E, (outside + level / 2).astype(np.float32))
+    shift, blur = _settled(
+        mean(level).mean(axis=0), mean(step).mean(axis=0), mean(into), clean, rise, width, fall, first.plateau
+    )
+    return rows - OUTWARD * (into + shift[:, None]), np.where(used.any(axis=1), blur, math.nan)
+
+
+def _crossing(E: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (2, k, n) inward from the middle of each window to its half level, sought from the inside outward,
+    and the rise of the row in which it lies."""
+    shape, rows = E.shape, E.shape[-1]
+    E = cv2.filter2D(E.reshape(-1, rows), -1, THREE, borderType=cv2.BORDER_REPLICATE)
+    half = half.ravel()
+    after = np.maximum(INSIDE - (E[:, INSIDE - 1 :: -1] < half[:, None]).argmax(axis=1), 1)
+    index = rows * np.arange(len(E)) + after
+    below = E.ravel().take(index - 1)
+    step = np.maximum(E.ravel().take(index) - below, np.float32(1e-6))
+    into = after - 1 - OUT + np.minimum(np.maximum((half - below) / step, 0), 1)
+    return into.reshape(shape[:3]), step.reshape(shape[:3])
+
+
+def _settled(read, steep, inward, clean, rise, width, fall, plateau) -> tuple[np.ndarray, np.ndarray]:
+    """Shift (k,) of all edges inward, and blur (k,), that agree with
+    each other; all arguments (k,), inward (2, k).
+
+    A blurred edge has not come to rest where its levels were read: what is missing there looks
+    like shading and hides the blur. And the edge lies `at` from the window's middle, so that the
+    plateau was extrapolated too far or not far enough.
+    """
+    at, across = inward[clean].mean(axis=0), width - inward.sum(axis=0)
+    p0, steep = np.maximum(read, 1e-6), np.maximum(steep, 1e-6)
+    for _ in range(ROUNDS):
+        variance = np.square(p0 / (math.sqrt(2 * math.pi) * steep))
+        blur = np.sqrt(np.maximum(variance - THREE_VARIANCE, 0.01))
+        missing, spilt = p0 * _tail(NEAR, at, blur), p0 * _tail(-OUTSIDE, -at, blur)
+        nearer, q = _shading(np.where(rise == 0, 0.0, rise - missing), across, at)
+        previous, p0 = p0, np.maximum(read + missing + spilt + fall - nearer, 0.5 * np.maximum(read, 1e-6))
+        if np.all(np.abs(p0 - previous) < 1e-3 * p0):
+            break
+    # blur carries the shading's slope over the edge: (p0 + q x) Phi(x
+    # / s) + q s phi(x / s) = p0 / 2 at x = -q s^2 / p0
+    shift = (missing - spilt + fall - nearer) / (2 * steep) + q * variance / p0
+    # an edge so soft that no level came to rest passes for shading: then the whole plateau tells
+    apparent = plateau / (math.sqrt(2 * math.pi) * steep)
+    return shift, np.where(blur < 0.6 * apparent, apparent, blur)
+
+
+def _tail(rows: np.ndarray, at: np.ndarray, blur: np.ndarray) -> np.ndarray:
+    """Mean (k,) of Phi((at - row) / blur) over the rows: what a blurred step at `at` still lacks inside of
+    it; for rows outside give all with the other sign."""
+    return scipy.special.ndtr((at[:, None] - rows) / blur[:, None]).mean(axis=1)
+
+
+def _shading(rise: np.ndarray, width: np.ndarray, into: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """How far the level falls from the near rows to the edge, and its slope there, where it rises by `rise`
+    from the near to the far rows; the edge is `into` from the window's middle.
+
+    The level across the bead is taken as a - b u, u = (1 - 2 x / w)^2, x from the edge: the first term of
+    every shading that is the same on both sides.
+    """
+    near = (1 - 2 * (NEAR_ROW - into) / width) ** 2 + 4 * NEAR_VARIANCE / width**2
+    far = (1 - 2 * (FAR_ROW - into) / width) ** 2 + 4 * FAR_VARIANCE / width**2
+    b = rise / (near - far)
+    return b * (1 - near), 4 * b / width
+
+
+def _along(levels: np.ndarray, has_bead: np.ndarray) -> np.ndarray:
+    """levels (edges, k, n) averaged over nine blocks along the bead, blocks without a bead left out."""
+    near = _neighbours(levels.shape[-1])
+    weight = has_bead.astype(np.float32)
+    return (levels * weight) @ near / np.maximum(weight @ near, np.float32(1e-9))
+
+
+@functools.cache
+def _neighbours(n: int) -> np.ndarray:
+    return np.array(np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= 4, np.float32)

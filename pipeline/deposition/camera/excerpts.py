@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.deposition.camera import bead
 from pipeline.deposition.camera.bead import Bead
-from pipeline.deposition.camera.pose import Mounting
+from pipeline.deposition.camera.line import Mounting
 from pipeline.deposition.camera.readings import TrialFrames, measure_beads
 
 

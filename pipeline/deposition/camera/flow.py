@@ -13,8 +13,7 @@ import scipy.linalg
 import scipy.optimize
 import scipy.sparse
 
-from pipeline.deposition.camera.bead import area
-from pipeline.deposition.camera.edges import BLOCK
+from pipeline.deposition.camera.bead import BLOCK, area
 
 # instants a sample at which the nozzle is placed: at 8 mm/s and 50 Hz every 20 um, a third of a place
 INSTANTS = 8

@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.deposition.camera import bead, latency, line
 from pipeline.deposition.camera.bead import Bead
 from pipeline.deposition.camera.latency import Gantry, Latency
-from pipeline.deposition.camera.pose import Mounting, pose
+from pipeline.deposition.camera.line import Mounting, pose
 
 # frames measured together
 TOGETHER = 16
@@ -26,7 +26,7 @@ class TrialFrames(Protocol):
 
     def __iter__(self) -> Iterator[tuple[float, np.ndarray]]: ...
 
-    def chosen(self, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
+    def pick(self, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
         """(number, picture) of those with these numbers."""
         ...
 
@@ -54,7 +54,7 @@ def measure_beads(
 ) -> Iterator[tuple[float, np.ndarray, Bead]]:
     """(time, picture as it is measured, bead) of each frame, a few at a time: memory stays flat, and what a
     frame costs beyond its decoding is shared."""
-    turn, rest = pose(mounting, frames.time_s, gantry, frames.chosen), iter(frames)
+    turn, rest = pose(mounting, frames.time_s, gantry, frames.pick), iter(frames)
     while batch := list(itertools.islice(rest, TOGETHER)):
         times, pictures = zip(*batch, strict=True)
         pictures = [picture if turn is None else line.turned(picture, turn) for picture in pictures]

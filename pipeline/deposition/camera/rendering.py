@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.deposition.camera import bead
 from pipeline.deposition.camera.bead import area
 from pipeline.deposition.camera.flow import View, deposit_share
-from pipeline.deposition.camera.pose import Mounting
+from pipeline.deposition.camera.line import Mounting
 
 # frames of each known width, spread over the stage
 CALIBRATION_FRAMES = 12
