@@ -575,10 +575,11 @@ def _first_row(
             "name a recording, or save it as CSV with one row a sample"
         )
     begin = next((i for i in table if not _is_heading(rows[i], [rows[k] for k in table])), table[0])
-    # most rows may end with an empty field, and the first ones not
-    while begin - 1 in data and len(rows[begin - 1]) == width + 1:
+    # most rows may end with an empty field and the first ones not, or the first ones alone
+    widths_above = {width + 1} | ({width - 1} if header >= 0 and len(rows[header]) == width else set())
+    while begin - 1 in data and len(rows[begin - 1]) in widths_above:
         begin -= 1
-    return begin, len(rows[begin])
+    return begin, max(width, len(rows[begin]))
 
 
 # ---- rows of plain numbers by Arrow, which reads only what the slow way reads in the same manner

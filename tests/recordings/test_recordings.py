@@ -486,3 +486,16 @@ def test_a_first_line_without_end_is_refused_in_a_sentence(tmp_path):
     (tmp_path / "a.csv").write_bytes(b"1," * (1 << 21))
     with pytest.raises(ValueError, match="its first line has more than 2097152 bytes"):
         read(tmp_path / "a.csv", SOURCES)
+
+
+@pytest.mark.parametrize("blank", [1, 10, 90, 300])
+def test_the_first_rows_count_if_they_alone_end_with_an_empty_field(tmp_path, blank):
+    """A set-point that is written from the first change on."""
+    rows = ["time_s,heater,zone,Soll"]
+    rows += [f"{t},20,{40 + t / 10},{'' if t < blank else 41}" for t in range(600)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(rows))
+    raw = read(path, [Source("zone", "zone", "degC"), Source("soll", "Soll", "degC")])
+    assert [len(time_s) for time_s, _ in raw.signals.values()] == [600, 600]
+    assert np.isnan(raw.signals["soll"][1][:blank]).all()
+    assert [(note.kind, note.count) for note in raw.notes] == [("missing", blank)]
