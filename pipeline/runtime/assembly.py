@@ -33,7 +33,7 @@ def assemble(
         deploy(design, setting),
         design.model,
         deploy(fallback, setting) if fallback else None,
-        supervisor.supervision(design.model, family, machine, setting.rehearsal.noise),
+        supervisor.supervision(design.model, machine, setting.rehearsal.noise),
         simulated,
         plants_sha256(family[:1]),
         plants_sha256(family[1:]),
