@@ -1,8 +1,8 @@
-"""Heated machines of six structures with drawn constants, simulated apart from the product: nothing of pipeline is
-imported, and no model of the product has their structure.
+"""Heated machines of six structures with drawn constants, simulated apart from the product: nothing of
+pipeline is imported, and no model of the product has their structure.
 
-`draw` gives a machine, `record` and `evening` what its owner logs, `thermal_machine.c` integrates it: here through
-ctypes, in normal_life.py linked with an exported controller.
+`draw` gives a machine, `record` and `evening` what its owner logs, `thermal_machine.c` integrates it: here
+through ctypes, in normal_life.py linked with an exported controller.
 """
 
 import ctypes
@@ -58,8 +58,8 @@ class Pid(ctypes.Structure):
 
 
 class Machine(NamedTuple):
-    """A machine as its owner knows it, and its parts, which its owner does not. Arrays by heater, which is as many
-    as sensors."""
+    """A machine as its owner knows it, and its parts, which its owner does not. Arrays by heater, of which
+    there are as many as sensors."""
 
     structure: str
     parts: Parts
@@ -295,7 +295,7 @@ STRUCTURES: tuple[Callable[[np.random.Generator], Wishes], ...] = (
 
 
 def draw(seed: int) -> Machine:
-    """The machine of a seed: structures take turns, constants are drawn. The same seed gives the same bytes."""
+    """The machine of a seed: structures take turns, constants are drawn."""
     make = STRUCTURES[(seed - 1) % len(STRUCTURES)]
     rng = np.random.default_rng([seed, 20])
     w = make(rng)
@@ -328,8 +328,8 @@ def draw(seed: int) -> Machine:
 
 
 def _size(parts: Parts, w: Wishes, room: float, largest: float, more: np.ndarray) -> np.ndarray:
-    """Powers by which the highest set-points are held at 80 % on the worst day; the lowest set-points (m,), which
-    heaters must still hold by 3 % on the warmest day, with the hottest shear."""
+    """Sets powers by which the highest set-points are held at 80 % on the coldest day. Returns the lowest
+    set-points (m,), which heaters still hold by 3 % on the warmest day, with the strongest shear."""
     m, worst = len(w.reference), np.zeros(len(w.reference))
     for fan in (0.0, 1.0) if w.has_fan else (0.0,):
         for flow in {0.0, largest}:
@@ -448,8 +448,8 @@ def holding(machine: Machine, target: np.ndarray) -> np.ndarray:
 
 
 def heating_s(machine: Machine) -> float:
-    """Seconds until the slowest zone has risen 63 % of the way to its typical reference under the duty that holds
-    it."""
+    """Seconds until the slowest zone has risen 63 % of the way to its typical reference under the duty that
+    holds it."""
     duty, T = holding(machine, machine.reference_degC), round(10 * 3600 / machine.sample_time_s)
     y, _ = drive(machine, start(machine, 1), np.tile(duty, (T, 1)), quiet(machine, T))
     reached = y > machine.room_degC + 0.63 * (machine.reference_degC - machine.room_degC)
@@ -457,8 +457,8 @@ def heating_s(machine: Machine) -> float:
 
 
 def tune(machine: Machine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """SIMC on the slope and the apparent delay of heating up at full power, each heater alone (Skogestad 2003,
-    integrating process, tau_c = delay):
+    """SIMC on the slope and the apparent delay of heating up at full power, each heater alone (Skogestad
+    2003, integrating process, tau_c = delay):
 
         K = 1 / (slope (tau_c + delay)),  T_i = 4 (tau_c + delay)
 
@@ -496,8 +496,8 @@ def _simc(machine: Machine, h: int) -> tuple[float, float]:
 
 
 class Record(NamedTuple):
-    """One recording, a row a sample: time (T,) in s, duties (T, m) in percent, readings and set-points (T, p) in
-    degC, and what acted from outside (T, 4)."""
+    """One recording, a row a sample: time (T,) in s, duties (T, m) in percent, readings and set-points (T, p)
+    in degC, and what acted from outside (T, 4)."""
 
     time_s: np.ndarray
     duty_percent: np.ndarray
@@ -509,8 +509,8 @@ class Record(NamedTuple):
 def record(
     machine: Machine, rng: np.random.Generator, minutes: float | None = None, *, disturbed: bool = False
 ) -> Record:
-    """Steps by hand from cold: levels that hold set-points, on each of them switches of some percent, every heater
-    on its own. With `disturbed`, fan and feed or screw are moved too."""
+    """Steps by hand from cold: levels that hold set-points, on each of them switches of some percent, every
+    heater on its own. With `disturbed`, fan and feed or screw are moved too."""
     dt, m = machine.sample_time_s, len(machine.inputs)
     T = round((minutes or machine.minutes) * 60 / dt)
     levels = [holding(machine, _set_point(machine, rng)) for _ in range(6)]
@@ -602,8 +602,8 @@ def _set_point(machine: Machine, rng: np.random.Generator) -> np.ndarray:
 
 
 def life(machine: Machine, rng: np.random.Generator, hours: float) -> tuple[np.ndarray, np.ndarray]:
-    """Normal life: set-points (T, p) that change by 5 to 60 degC every 20 to 120 min, and what acts from outside
-    (T, 4): the room, the fan, feed or screw, and doors of 20 to 90 s, about two in three hours."""
+    """Normal life: set-points (T, p) that change by 5 to 60 degC every 20 to 120 min, and what acts from
+    outside (T, 4): the room, the fan, feed or screw, and doors of 20 to 90 s, about two in three hours."""
     dt = machine.sample_time_s
     T = round(hours * 3600 / dt)
     r, t, target = np.zeros((T, len(machine.outputs))), 0, _set_point(machine, rng)
