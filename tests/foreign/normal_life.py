@@ -16,7 +16,6 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -143,7 +142,8 @@ def exported_folder(seed: int, *, disturbed: bool = False) -> Path:
 class Life(NamedTuple):
     """A row a sample: set-points, readings and sensors before noise and steps (T, p) in degC, commands (T, m)
     in percent, modes (T,), the first cause's kind and signal (T,), -1 for none, whether a person acknowledged
-    (T,), and the samples at which a fault began and from which it shows, -1 for never."""
+    (T,), and the signal of a fault with the samples at which it began and from which it shows, -1 for
+    never."""
 
     target: np.ndarray
     reading: np.ndarray
@@ -153,6 +153,7 @@ class Life(NamedTuple):
     cause: np.ndarray
     signal: np.ndarray
     acknowledged: np.ndarray
+    struck: int  # the signal of the fault
     began: int
     shows: int
 
@@ -203,7 +204,7 @@ def play(
     )  # fmt: skip
     if result:
         raise RuntimeError(f"machine {seed}: a call of the exported controller ended with result {result}")
-    return Life(r, y, sensor, u, modes, causes, signals, acknowledged, at[0], at[1])
+    return Life(r, y, sensor, u, modes, causes, signals, acknowledged, signal, at[0], at[1])
 
 
 def live(folder: Path, seed: int, hours: float, *, nth: int = 0) -> dict[str, Any]:
@@ -227,6 +228,7 @@ def live(folder: Path, seed: int, hours: float, *, nth: int = 0) -> dict[str, An
         "crossings": int((np.diff(past.astype(int), axis=0) > 0).sum()),
         "rms_degC": _rms(error),
         "rms_settled_degC": _rms(_settled(life, machine, error)),
+        "rms_settled_under_law_degC": _rms(_settled(life, machine, error, under_law=True)),
         "own_control_rms_degC": _rms(own),
         "own_control_rms_settled_degC": _rms(_settled(life, machine, own)),
         "travel_percent_a_sample": np.abs(np.diff(life.command, axis=0)).mean(axis=0).round(3).tolist(),
@@ -242,12 +244,15 @@ def own_reading(machine: Machine, seed: int, life: Life, *, nth: int) -> np.ndar
 
 
 def _rms(error: np.ndarray) -> list[float]:
-    return np.sqrt((error**2).mean(axis=0)).round(2).tolist()
+    return np.sqrt((error**2).mean(axis=0)).round(2).tolist() if len(error) else []
 
 
-def _settled(life: Life, machine: Machine, error: np.ndarray) -> np.ndarray:
-    """Errors from 15 min after a change of the set-points on."""
+def _settled(life: Life, machine: Machine, error: np.ndarray, *, under_law: bool = False) -> np.ndarray:
+    """Errors from 15 min after a change of the set-points on, and if asked, 15 min after the controller came
+    back to the law."""
     changed = np.r_[True, (np.diff(life.target, axis=0) != 0).any(axis=1)]
+    if under_law:
+        changed |= life.mode != 0
     since = np.arange(len(error)) - np.maximum.accumulate(np.where(changed, np.arange(len(error)), 0))
     return error[since * machine.sample_time_s >= 900]
 
@@ -272,7 +277,8 @@ def suffer(folder: Path, seed: int, fault: str, *, nth: int = 0, hours: float = 
     the mode is off, modes and causes that followed within 600 samples, and degC past the limits."""
     machine, begin = draw(seed), time.process_time()
     life = play(folder, seed, hours, fault=fault, nth=nth, after_h=2.0)
-    found: dict[str, Any] = {"fault": fault, "began": life.began >= 0, "shows": life.shows >= 0}
+    found: dict[str, Any] = {"fault": fault, "signal": life.struck + 1, "named": False}
+    found |= {"began": life.began >= 0, "shows": life.shows >= 0}
     if life.began < 0:
         return found
     shows = life.shows if life.shows >= 0 else len(life.mode)
@@ -284,9 +290,11 @@ def suffer(folder: Path, seed: int, fault: str, *, nth: int = 0, hours: float = 
     if left is not None:
         rows = slice(left, left + 600)
         found["modes"] = [MODES[k] for k in dict.fromkeys(life.mode[rows].tolist())]
-        found["causes"] = [KINDS[k] for k in dict.fromkeys(life.cause[rows].tolist()) if k >= 0]
+        pairs = zip(life.cause[rows].tolist(), life.signal[rows].tolist(), strict=True)
+        causes = [(KINDS[k], signal) for k, signal in dict.fromkeys(pairs) if k >= 0]
+        found["causes"] = [f"{kind} {signal + 1}" if signal >= 0 else kind for kind, signal in causes]
+        found["named"] = any(kind in NAMES[fault] and j in (life.struck, -1) for kind, j in causes)
     found["past_limit_degC"] = round(float((life.sensor[life.began :] - machine.high_degC).max()), 1)
-    found["named"] = bool(NAMES[fault] & set(found.get("causes", ())))
     found["in_time"] = _in_time(found, fault)
     found["cpu_s"] = round(time.process_time() - begin, 2)
     return found
@@ -326,39 +334,75 @@ def judge(seed: int, hours: float, trials: int, *, disturbed: bool = False) -> d
     return {"made": made, "life": life, "faults": faults}
 
 
-def print_table(judged: Iterable[dict[str, Any]]) -> None:
-    rows = list(judged)
-    alive = [row for row in rows if row["life"]]
-    print("\n| totals | |\n|---|---|")
-    exported = sum(row["made"]["exported"] for row in rows)
-    print(f"| machines | {len(rows)}, exported {exported}, played {len(alive)} |")
-    hours = sum(row["life"]["hours"] for row in alive)
-    false = sum(row["life"]["false_safe_modes"] for row in alive)
-    print(f"| false safe modes | {false} in {hours:g} h |")
-    print(f"| crossings of limits | {sum(row['life']['crossings'] for row in alive)} |")
-    print("\n| fault | began | showed | in time | named | left before it showed | median samples |")
-    print("|---|---|---|---|---|---|---|")
+def fault_table(rows: list[dict[str, Any]]) -> list[str]:
+    """A line a fault: how often it began and showed; of those that showed, how often the supervisor left the
+    law in time (heater stuck on: was off), named the fault, and had every heater off in time; how often it left
+    the law before the fault showed, perhaps for another reason; the median of samples until it acted."""
+    lines = ["| fault | began | showed | in time | named | off in time | left before | samples |"]
+    lines += ["|---|---|---|---|---|---|---|---|"]
     for fault in FAULTS[1:]:
-        ones = [one for row in alive for one in row["faults"] if one["fault"] == fault and one["began"]]
+        ones = [one for row in rows for one in row["faults"] if one["fault"] == fault and one["began"]]
         shown = [one for one in ones if one["shows"]]
         key = "off_after" if fault == "heater stuck on" else "left_after"
         after = [one[key] for one in shown if one[key] is not None]
+        counts = [
+            len(ones),
+            len(shown),
+            sum(bool(one["in_time"]) for one in shown),
+            sum(one["named"] for one in shown),
+            sum(one["off_after"] is not None and one["off_after"] <= ACTS_WITHIN for one in shown),
+            sum(one["left_after"] is not None and one["left_after"] < 0 for one in ones),
+        ]
         middle = f"{np.median(after):g}" if after else "-"
-        early = sum(one["left_after"] is not None and one["left_after"] < 0 for one in ones)
-        counts = [sum(bool(one["in_time"]) for one in shown), sum(one["named"] for one in shown), early]
-        print(f"| {fault} | {len(ones)} | {len(shown)} | {' | '.join(map(str, counts))} | {middle} |")
+        lines.append(f"| {fault} | {' | '.join(map(str, counts))} | {middle} |")
+    return lines
 
 
-def print_machine(row: dict[str, Any]) -> None:
-    made, life = row["made"], row["life"]
-    which = f"{made['controller']}{'' if made['exported'] else ' (not exported)'}"
-    print(
-        f"\n{made['seed']} {made['structure']}: {which}; made in {made['cpu_s']} CPU s. {made.get('why', '')}"
-    )
-    if life:
-        print("  life", json.dumps(life))
-    for one in row["faults"]:
-        print("  ", json.dumps(one), flush=True)
+def machine_table(rows: list[dict[str, Any]]) -> list[str]:
+    """A line a machine: its controller and its normal life."""
+    lines = [
+        "| seed | machine | controller | hours | false safe modes | median s | longest s | under law % "
+        "| crossings | rms settled | under law | own control | travel | make s | life s | causes |",
+        "|" + "---|" * 16,
+    ]
+    for row in rows:
+        made, life = row["made"], row["life"]
+        begin = f"| {made['seed']} | {made['structure']} | {made['controller'] or 'none'}"
+        begin += "" if made["exported"] or not made["controller"] else " (not exported)"
+        if not life:
+            lines.append(f"{begin} |" + " |" * 10 + f" {made['cpu_s']} | | |")
+            continue
+        names = (
+            "hours", "false_safe_modes", "safe_s_median", "safe_s_longest", "under_law_percent", "crossings",
+            "rms_settled_degC", "rms_settled_under_law_degC", "own_control_rms_settled_degC",
+            "travel_percent_a_sample",
+        )  # fmt: skip
+        cells = [" ".join(f"{v:g}" for v in np.ravel(life[name])) for name in names]
+        causes = ", ".join(f"{name} {count}" for name, count in life["named"].items())
+        lines.append(f"{begin} | {' | '.join(cells)} | {made['cpu_s']} | {life['cpu_s']} | {causes} |")
+    return lines
+
+
+def print_machine(row: dict[str, Any], *, whole: bool = False) -> None:
+    print("", *machine_table([row]), "", *fault_table([row]), sep="\n")
+    if row["made"].get("why"):
+        print(f"\nNot exported: {row['made']['why']}")
+        for name, why in row["made"].get("certify", {}).items():
+            print(f"  {name}: {why or 'certified or measured'}")
+    for one in row["faults"] if whole else []:
+        print("  ", json.dumps(one))
+    print(flush=True)
+
+
+def print_totals(rows: list[dict[str, Any]]) -> None:
+    alive = [row for row in rows if row["life"]]
+    exported = sum(row["made"]["exported"] for row in rows)
+    hours = sum(row["life"]["hours"] for row in alive)
+    false = sum(row["life"]["false_safe_modes"] for row in alive)
+    crossings = sum(row["life"]["crossings"] for row in alive)
+    print("\nAll machines", "", *machine_table(rows), "", *fault_table(alive), "", sep="\n")
+    print(f"{len(rows)} machines, {exported} exported, {len(alive)} played.")
+    print(f"{false} false safe modes in {hours:g} h, {crossings} crossings of limits.")
 
 
 def main() -> None:
@@ -366,7 +410,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=_seeds, default=_seeds("1-12"))
     parser.add_argument("--hours", type=float, default=100.0)
     parser.add_argument("--trials", type=int, default=2, help="of each fault")
-    parser.add_argument("--disturbed", action="store_true", help="declare fan, feed and screw")
+    parser.add_argument("--disturbed", action="store_true", help="record and declare fan, feed and screw")
+    parser.add_argument("--whole", action="store_true", help="print every fault")
     parser.add_argument("--only-make", action="store_true")
     asked = parser.parse_args()
     judged = []
@@ -375,9 +420,9 @@ def main() -> None:
             print((exported_folder(seed, disturbed=asked.disturbed) / "made.json").read_text(), flush=True)
             continue
         judged.append(judge(seed, asked.hours, asked.trials, disturbed=asked.disturbed))
-        print_machine(judged[-1])
+        print_machine(judged[-1], whole=asked.whole)
     if judged:
-        print_table(judged)
+        print_totals(judged)
 
 
 if __name__ == "__main__":
