@@ -11,6 +11,7 @@ import argparse
 import ctypes
 import json
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -23,7 +24,7 @@ import numpy as np
 
 from pipeline.runtime.supervisor import KINDS, MODES
 from tests.foreign import thermal_machines
-from tests.foreign.thermal_machines import Machine, draw, pointer
+from tests.foreign.thermal_machines import Machine, draw, pointer, sampled
 from tests.mission import toy_temperature
 
 HERE = Path(__file__).parent
@@ -170,6 +171,14 @@ def build(folder: Path) -> ctypes.CDLL:
     return ctypes.CDLL(str(library))
 
 
+def sample_time_s(folder: Path) -> float:
+    """That of an exported controller, which `init` proposed."""
+    found = re.search(r"#define BEADLINE_SAMPLE_TIME_S (\S+)", (folder / "c/machine.h").read_text())
+    if not found:
+        raise ValueError(f"{folder}/c/machine.h tells no sample time")
+    return float(found[1])
+
+
 def scenario(
     machine: Machine, seed: int, hours: float, nth: int
 ) -> tuple[np.ndarray, np.ndarray, int, np.random.Generator]:
@@ -184,9 +193,11 @@ def play(
 ) -> Life:
     """The nth normal life of the machine of a seed under an exported controller; a fault begins at a random
     instant of its second half, `after_h` before the end at least."""
-    machine = draw(seed)
+    machine, dt = draw(seed), sample_time_s(folder)
     r, outside, noise, rng = scenario(machine, seed, hours, nth)
-    T, m, dt = len(r), len(machine.inputs), machine.sample_time_s
+    rows = np.arange(int(len(r) * machine.sample_time_s / dt)) * dt / machine.sample_time_s
+    r, outside, machine = r[rows.astype(int)], outside[rows.astype(int)], sampled(machine, dt)
+    T, m = len(r), len(machine.inputs)
     signal = int(rng.integers(m))
     earliest = int(T * rng.uniform(0.5, max(1 - after_h / hours, 0.5)))
     kind = FAULTS.index(fault)
@@ -209,13 +220,15 @@ def play(
 
 def live(folder: Path, seed: int, hours: float, *, nth: int = 0) -> dict[str, Any]:
     """Figures of a normal life without a fault."""
-    machine, begin = draw(seed), time.process_time()
-    life = play(folder, seed, hours, nth=nth)
+    begin, life = time.process_time(), play(folder, seed, hours, nth=nth)
+    machine = sampled(draw(seed), sample_time_s(folder))
     starts, ends = _runs(life.mode != 0, life.acknowledged)
     lengths = (ends - starts) * machine.sample_time_s
     causes = [_cause(life, a, b) for a, b in zip(starts, ends, strict=True)]
     named = {name: causes.count(name) for name in sorted(set(causes))}
-    error, own = life.sensor - life.target, own_reading(machine, seed, life, nth=nth) - life.target
+    error, (own, own_target) = life.sensor - life.target, own_life(seed, hours, nth)
+    changed = np.r_[True, (np.diff(life.target, axis=0) != 0).any(axis=1)]
+    own_changed = np.r_[True, (np.diff(own_target, axis=0) != 0).any(axis=1)]
     past = life.sensor > machine.high_degC
     return {
         "hours": hours,
@@ -227,34 +240,35 @@ def live(folder: Path, seed: int, hours: float, *, nth: int = 0) -> dict[str, An
         "acknowledged": int(life.acknowledged.sum()),
         "crossings": int((np.diff(past.astype(int), axis=0) > 0).sum()),
         "rms_degC": _rms(error),
-        "rms_settled_degC": _rms(_settled(life, machine, error)),
-        "rms_settled_under_law_degC": _rms(_settled(life, machine, error, under_law=True)),
+        "rms_settled_degC": _rms(_settled(error, changed, machine.sample_time_s)),
+        "rms_settled_under_law_degC": _rms(
+            _settled(error, changed | (life.mode != 0), machine.sample_time_s)
+        ),
         "own_control_rms_degC": _rms(own),
-        "own_control_rms_settled_degC": _rms(_settled(life, machine, own)),
+        "own_control_rms_settled_degC": _rms(_settled(own, own_changed, draw(seed).sample_time_s)),
         "travel_percent_a_sample": np.abs(np.diff(life.command, axis=0)).mean(axis=0).round(3).tolist(),
         "cpu_s": round(time.process_time() - begin, 2),
     }
 
 
-def own_reading(machine: Machine, seed: int, life: Life, *, nth: int) -> np.ndarray:
-    """Readings (T, p) of the same life under the machine's own control."""
-    _, outside, noise, _ = scenario(machine, seed, len(life.target) * machine.sample_time_s / 3600, nth)
-    state = thermal_machines.start(machine, noise)
-    return thermal_machines.control(machine, state, machine.own_control, life.target, outside)[0]
+def own_life(seed: int, hours: float, nth: int) -> tuple[np.ndarray, np.ndarray]:
+    """Errors and set-points (T, p) of the same life under the machine's own control, at its sample time."""
+    machine = draw(seed)
+    r, outside, noise, _ = scenario(machine, seed, hours, nth)
+    y, _ = thermal_machines.control(
+        machine, thermal_machines.start(machine, noise), machine.own_control, r, outside
+    )
+    return y - r, r
 
 
 def _rms(error: np.ndarray) -> list[float]:
     return np.sqrt((error**2).mean(axis=0)).round(2).tolist() if len(error) else []
 
 
-def _settled(life: Life, machine: Machine, error: np.ndarray, *, under_law: bool = False) -> np.ndarray:
-    """Errors from 15 min after a change of the set-points on, and if asked, 15 min after the controller came
-    back to the law."""
-    changed = np.r_[True, (np.diff(life.target, axis=0) != 0).any(axis=1)]
-    if under_law:
-        changed |= life.mode != 0
-    since = np.arange(len(error)) - np.maximum.accumulate(np.where(changed, np.arange(len(error)), 0))
-    return error[since * machine.sample_time_s >= 900]
+def _settled(error: np.ndarray, changed: np.ndarray, sample_time_s: float) -> np.ndarray:
+    """Errors from 15 min after the last change (T,) on: of set-points, or of the mode."""
+    t = np.arange(len(error))
+    return error[(t - np.maximum.accumulate(np.where(changed, t, 0))) * sample_time_s >= 900]
 
 
 def _runs(safe: np.ndarray, acknowledged: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -336,8 +350,8 @@ def judge(seed: int, hours: float, trials: int, *, disturbed: bool = False) -> d
 
 def fault_table(rows: list[dict[str, Any]]) -> list[str]:
     """A line a fault: how often it began and showed; of those that showed, how often the supervisor left the
-    law in time (heater stuck on: was off), named the fault, and had every heater off in time; how often it left
-    the law before the fault showed, perhaps for another reason; the median of samples until it acted."""
+    law in time (heater stuck on: was off), named the fault, and had every heater off in time; how often it
+    left the law before the fault showed, perhaps for another reason; the median of samples until it acted."""
     lines = ["| fault | began | showed | in time | named | off in time | left before | samples |"]
     lines += ["|---|---|---|---|---|---|---|---|"]
     for fault in FAULTS[1:]:

@@ -327,6 +327,14 @@ def draw(seed: int) -> Machine:
     return machine._replace(own_control=tune(machine))
 
 
+def sampled(machine: Machine, sample_time_s: float) -> Machine:
+    """The same machine read and driven at another sample time."""
+    parts = Parts.from_buffer_copy(machine.parts)
+    parts.substeps = np.ceil(parts.substeps * sample_time_s / parts.sample_s - 1e-9)
+    parts.sample_s = sample_time_s
+    return machine._replace(parts=parts, sample_time_s=sample_time_s)
+
+
 def _size(parts: Parts, w: Wishes, room: float, largest: float, more: np.ndarray) -> np.ndarray:
     """Sets powers by which the highest set-points are held at 80 % on the coldest day. Returns the lowest
     set-points (m,), which heaters still hold by 3 % on the warmest day, with the strongest shear."""
