@@ -33,6 +33,7 @@ FAULTS = (
     "no fault", "sensor open", "sensor out of range", "sensor still", "sensor still with its noise",
     "heater stuck on", "heater half", "heater off", "reference out of reach",
 )  # fmt: skip
+RECORDS = ("quiet", "moved", "declared")  # what fan, feed and screw did while the owner recorded
 # causes that name the fault, by the kinds of the supervisor
 NAMES = {
     "sensor open": {"sensor_nan"},
@@ -64,10 +65,10 @@ QUICK = {
 # ---- from the record to the exported C
 
 
-def make(seed: int, folder: Path, *, disturbed: bool = False) -> dict[str, Any]:
+def make(seed: int, folder: Path, *, records: str = RECORDS[0]) -> dict[str, Any]:
     """The owner's path for the machine of a seed in an empty folder: two recordings, `init`, limits and
-    references, the stages up to the export. With `disturbed`, fan and feed or screw move in the recordings
-    and are declared.
+    references, the stages up to the export. Fan and feed or screw rest in the recordings (`records` "quiet"),
+    move unrecorded ("moved"), or move and are recorded beside, which `init` declares ("declared").
 
     Writes c/ (the exported C, or that of a controller that was not exported, so that its supervisor is judged
     all the same) and made.json, which it returns: controller, whether it was exported, why not, CPU s."""
@@ -81,8 +82,8 @@ def make(seed: int, folder: Path, *, disturbed: bool = False) -> dict[str, Any]:
     toy_temperature.begin(project)
     rng = np.random.default_rng([seed, 1])
     for name, recording in (("steps", thermal_machines.record), ("evening", thermal_machines.evening)):
-        recorded = recording(machine, rng, disturbed=disturbed)
-        thermal_machines.write_csv(folder / f"{name}.csv", machine, recorded, disturbed=disturbed)
+        recorded, beside = recording(machine, rng, disturbed=records != "quiet"), records == "declared"
+        thermal_machines.write_csv(folder / f"{name}.csv", machine, recorded, disturbed=beside)
     try:
         declare(project, machine, [folder / "evening.csv", folder / "steps.csv"])
         toy_temperature.play(project, *toy_temperature.stages_between("ingest", "export_controllers"))
@@ -124,16 +125,14 @@ def _read_exported(project: Path) -> dict[str, Any]:
     return found
 
 
-def exported_folder(seed: int, *, disturbed: bool = False) -> Path:
+def exported_folder(seed: int, *, records: str = RECORDS[0]) -> Path:
     """The folder that `make` filled for a seed; kept under BEADLINE_LIVES, if that is set."""
     kept = os.environ.get(KEPT)
-    folder = (
-        Path(kept or tempfile.mkdtemp(prefix="lives_")) / f"{'disturbed' if disturbed else 'quiet'}_{seed}"
-    )
+    folder = Path(kept or tempfile.mkdtemp(prefix="lives_")) / f"{records}_{seed}"
     if not (folder / "made.json").exists():
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        make(seed, folder, disturbed=disturbed)
+        make(seed, folder, records=records)
     return folder
 
 
@@ -337,9 +336,9 @@ def _seeds(text: str) -> list[int]:
     return [seed for first, *last in ends for seed in range(first, (last or [first])[0] + 1)]
 
 
-def judge(seed: int, hours: float, trials: int, *, disturbed: bool = False) -> dict[str, Any]:
+def judge(seed: int, hours: float, trials: int, *, records: str = RECORDS[0]) -> dict[str, Any]:
     """All figures of a machine: {"made", "life", "faults"}."""
-    folder = exported_folder(seed, disturbed=disturbed)
+    folder = exported_folder(seed, records=records)
     made = json.loads((folder / "made.json").read_text())
     if not made["controller"]:
         return {"made": made, "life": None, "faults": []}
@@ -424,16 +423,16 @@ def main() -> None:
     parser.add_argument("--seeds", type=_seeds, default=_seeds("1-12"))
     parser.add_argument("--hours", type=float, default=100.0)
     parser.add_argument("--trials", type=int, default=2, help="of each fault")
-    parser.add_argument("--disturbed", action="store_true", help="record and declare fan, feed and screw")
+    parser.add_argument("--records", choices=RECORDS, default=RECORDS[0], help="what fan, feed, screw did")
     parser.add_argument("--whole", action="store_true", help="print every fault")
     parser.add_argument("--only-make", action="store_true")
     asked = parser.parse_args()
     judged = []
     for seed in asked.seeds:
         if asked.only_make:
-            print((exported_folder(seed, disturbed=asked.disturbed) / "made.json").read_text(), flush=True)
+            print((exported_folder(seed, records=asked.records) / "made.json").read_text(), flush=True)
             continue
-        judged.append(judge(seed, asked.hours, asked.trials, disturbed=asked.disturbed))
+        judged.append(judge(seed, asked.hours, asked.trials, records=asked.records))
         print_machine(judged[-1], whole=asked.whole)
     if judged:
         print_totals(judged)
