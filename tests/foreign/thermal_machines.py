@@ -338,19 +338,19 @@ def sampled(machine: Machine, sample_time_s: float) -> Machine:
 def _size(parts: Parts, w: Wishes, room: float, largest: float, more: np.ndarray) -> np.ndarray:
     """Sets powers by which the highest set-points are held at 80 % on the coldest day. Returns the lowest
     set-points (m,), which heaters still hold by 3 % on the warmest day, with the strongest shear."""
-    m, worst = len(w.reference), np.zeros(len(w.reference))
-    for fan in (0.0, 1.0) if w.has_fan else (0.0,):
-        for flow in {0.0, largest}:
-            needed = at_rest(parts, w.reference + w.above, (room - ROOM_DEGC, fan, flow, 0.0))[1]
-            worst = np.maximum(worst, needed)
-    parts.power[:m] = list(np.ceil(worst / 0.8 * more))
-    below = w.below.copy()
+    m, below, flows = len(w.reference), w.below.copy(), sorted({0.0, largest})
+    apart = 2 * min(w.offset_degC, float((w.below + w.above).min()) / 4)
+    alone = np.eye(m) if m > 1 else np.zeros((1, 1))  # one zone at an end of its range, the others not
+    fans = (0.0, 1.0) if w.has_fan else (0.0,)
     for _ in range(40):
-        held = [
-            at_rest(parts, w.reference - below, (room + ROOM_DEGC, 0.0, flow, 0.0))[1]
-            for flow in (0.0, largest)
-        ]
-        short = np.min(held, axis=0) < 0.03 * np.array(parts.power[:m])
+        hot = [w.reference + w.above - apart * (1 - one) * (m > 1) for one in (*alone, np.ones(m))]
+        cold = [w.reference - below + apart * (1 - one) * (m > 1) for one in (*alone, np.ones(m))]
+        out = [(room - ROOM_DEGC, fan, flow, 0.0) for fan in fans for flow in flows]
+        needed = np.max([at_rest(parts, target, one)[1] for target in hot for one in out], axis=0)
+        parts.power[:m] = list(np.ceil(needed / 0.8 * more))
+        warm = [(room + ROOM_DEGC, 0.0, flow, 0.0) for flow in flows]
+        least = np.min([at_rest(parts, target, one)[1] for target in cold for one in warm], axis=0)
+        short = least < 0.03 * np.array(parts.power[:m])
         if not short.any():
             break
         below[short] *= 0.8

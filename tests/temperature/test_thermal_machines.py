@@ -161,11 +161,25 @@ def test_a_normal_life_stays_in_what_is_declared(seed):
     assert (outside[:, DOOR].mean() > 0) == machine.has_door and outside[:, DOOR].mean() < 0.05
 
 
+@pytest.mark.parametrize("seed", [*SEEDS, 9])
+def test_every_set_point_can_be_held_on_every_day(seed):
+    machine, rng = draw(seed), np.random.default_rng(4)
+    m, largest = len(machine.inputs), dict(machine.recorded.values())
+    for _ in range(10):
+        r, _ = thermal_machines.life(machine, rng, 0.5)
+        for room in (-8.0, 8.0):
+            for fan in {0.0, largest.get(FAN, 0.0)}:
+                for flow in {0.0, largest.get(FLOW, 0.0)}:
+                    outside = (machine.room_degC + room, fan, flow, 0.0)
+                    watt = thermal_machines.at_rest(machine.parts, r[0], outside)[1]
+                    share = watt / np.array(machine.parts.power[:m])
+                    assert 0.0 < share.min() and share.max() < 0.9
+
+
 def test_the_machines_know_nothing_of_the_product():
-    for name in ("thermal_machines.py",):
-        tree = ast.parse((normal_life.HERE / name).read_text(encoding="utf-8"))
-        nodes_ = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
-        assert not any("pipeline" in ast.unparse(node) for node in nodes_)
+    tree = ast.parse((normal_life.HERE / "thermal_machines.py").read_text(encoding="utf-8"))
+    imported = [ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    assert imported and not any("pipeline" in line for line in imported)
 
 
 # ---- a life in C
