@@ -25,7 +25,7 @@ def assemble(
     *,
     simulated: bool,
 ) -> Exported:
-    """The controller as it was judged. `fallback` is the safe mode "pi"; None: the inputs are held. `family`
+    """The controller as it was judged. `fallback` is the safe mode "own"; None: the heaters go off. `family`
     is the identified plant, then its spread."""
     return Exported(
         name,

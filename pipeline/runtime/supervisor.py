@@ -186,8 +186,8 @@ class Kept(NamedTuple):
     By kind and signal (k, w): since and last in s of the supervisor's own time, -1 if not so; amount.
 
     The observer: x (n,), the innovation e (p,) before, the mean drift `slow` (p,), the forecast `expected`
-    (p,). By output (p,): y the last reading, quantum the smallest move seen, bad readings in a row, cleared_s
-    the time at which it last moved as forecast, returns how often it was trusted again.
+    (p,). By output (p,): y the last reading and its repeats, quantum the smallest move seen, bad readings in
+    a row, cleared_s the time at which it last moved as forecast, returns how often it was trusted again.
 
     Windows (K): states (2, K, n), from the drift as it was and from its mean; given and unit (K, n, m), the
     responses to the inputs and to one percent of each; before (K, m) the former a sample ago; began, least,
@@ -211,6 +211,7 @@ class Kept(NamedTuple):
     expected: np.ndarray
     y: np.ndarray
     quantum: np.ndarray
+    repeats: np.ndarray
     bad: np.ndarray
     cleared_s: np.ndarray
     returns: np.ndarray
@@ -252,6 +253,7 @@ def kept(s: Supervision) -> Kept:
         expected=np.zeros(p),
         y=np.full(p, np.nan),
         quantum=np.full(p, np.inf),
+        repeats=np.zeros(p, int),
         bad=np.zeros(p, int),
         cleared_s=np.full(p, -np.inf),
         returns=np.zeros(p, int),
@@ -311,6 +313,7 @@ def read(s: Supervision, k: Kept, y: np.ndarray) -> np.ndarray:
         say(k, OPEN, j, y[j])
     moves = np.where(counts, np.abs(y - k.y), np.inf)
     k.quantum[:] = np.minimum(k.quantum, np.where(moves > 1e-9, moves, np.inf))
+    k.repeats[:] = np.where(counts & (moves < 1e-12), k.repeats + 1, np.where(counts, 0, k.repeats))
     k.y[:] = np.where(counts, y, k.y)
     return counts & ((k.since[[OPEN, STILL, DEAF], : len(y)] < 0).all(axis=0))
 
@@ -407,9 +410,15 @@ def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
         window, i = np.unravel_index(np.where(shown, k.square, -1.0).argmax(), shown.shape)
         cause = GIVES if gives[window, i] else LACKS
         onset = int(left[window, :, i, cause].argmin())
-        share = float(amount[window, onset, i, cause])
-        # a reading that has not moved may be the sensor's fault
-        say(k, ON if cause == GIVES else WEAK, int(i), -share if same[window, own[i]] else share)
+        if same[window, own[i]]:
+            say_still(k, int(own[i]), moves[window, own[i]])
+        else:
+            say(k, ON if cause == GIVES else WEAK, int(i), float(amount[window, onset, i, cause]))
+
+
+def say_still(k: Kept, j: int, moves_degC: float) -> None:
+    """An output stands still, or shows noise alone, while its forecast moves: its sensor, or its heater."""
+    say(k, STILL if k.repeats[j] >= STILL_AFTER // 2 else DEAF, j, moves_degC)
 
 
 def unmoved(s: Supervision, k: Kept) -> np.ndarray:
@@ -421,9 +430,8 @@ def unmoved(s: Supervision, k: Kept) -> np.ndarray:
 def judge_sensors(s: Supervision, k: Kept, moves: np.ndarray, still: np.ndarray, honest: np.ndarray) -> None:
     """Says which sensors stand still (K, p) as long as nothing that is no fault, which leaves `honest` (K, m)
     of what they miss, explains that as well."""
-    quantum = np.where(np.isfinite(k.quantum), k.quantum, 0.0)
-    age, spread = np.maximum(k.age, 1)[:, None], k.most - k.least
-    still = still & (np.abs(moves) >= SAME_STEPS * spread)
+    age = np.maximum(k.age, 1)[:, None]
+    still = still & (np.abs(moves) >= SAME_STEPS * (k.most - k.least))
     for j in np.flatnonzero(still.any(axis=0)):
         heaters = np.flatnonzero(s.of_input == j)
         if not heaters.size:
@@ -435,9 +443,7 @@ def judge_sensors(s: Supervision, k: Kept, moves: np.ndarray, still: np.ndarray,
         clear = still[:, j] & (better >= CLEARER)
         if clear.any():
             window = int(np.where(clear, np.abs(moves[:, j]), -1.0).argmax())
-            # a sensor that has never moved has no step
-            same_reading = not np.isfinite(k.quantum[j]) or spread[window, j] <= 0.5 * quantum[j] + 1e-9
-            say(k, STILL if same_reading else DEAF, int(j), moves[window, j])
+            say_still(k, int(j), moves[window, j])
 
 
 def forget(s: Supervision, k: Kept) -> None:
@@ -523,7 +529,7 @@ def sentence(s: Supervision, machine: Machine, kind: int, signal: int, amount: f
         OPEN: f"{zone} reads {amount:.1f} degC, outside its limits.",
         STILL: f"{zone} stands still while its model moves by {amount:+.1f} degC: {zone}, or {heater}.",
         DEAF: f"{zone} shows noise alone while its model moves by {amount:+.1f} degC: {zone}, or {heater}.",
-        ON: f"{heater} gives {100 * abs(amount):.0f} % of what it could add: it is stuck on, and only the "
+        ON: f"{heater} gives {100 * amount:.0f} % of what it could add: it is stuck on, and only the "
         "mains can stop it.",
         WEAK: f"{heater} lacks {100 * abs(amount):.0f} % of what it is told"
         + (f", or {zone} is out of place." if amount < 0 else "."),

@@ -209,7 +209,7 @@ def tables(exported: Exported) -> str:
         text += ONE_INPUT
     text += _aiming(exported) + _governing(exported)
     text += "\n/* ---- the law */\n\n" + _law("the_law", exported.controller)
-    text += "\n/* ---- the safe mode PI */\n\n" + define("HAS_FALLBACK", int(exported.fallback is not None))
+    text += "\n/* ---- the safe mode own */\n\n" + define("HAS_FALLBACK", int(exported.fallback is not None))
     text += "#define the_fallback the_law\n" if exported.fallback is None else ""
     text += _law("the_fallback", exported.fallback) if exported.fallback is not None else ""
     return text + supervising(exported.supervision)

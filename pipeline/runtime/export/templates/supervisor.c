@@ -71,6 +71,7 @@ static void read_sensors(supervisor_kept *k, const double *y, int *counts)
             double move = fabs(y[j] - k->y[j]);
             if (move > 1e-9)
                 k->quantum[j] = fmin(k->quantum[j], move);
+            k->repeats[j] = move < 1e-12 ? k->repeats[j] + 1 : 0;
             k->y[j] = y[j];
         }
         counts[j] = good && k->since[SENSOR_OPEN][j] < 0 && k->since[SENSOR_STILL][j] < 0
@@ -275,6 +276,12 @@ static double honest_of(const supervisor_kept *k, int w, int i)
     return best;
 }
 
+/* An output stands still, or shows noise alone, while its forecast moves: its sensor, or its heater */
+static void say_still(supervisor_kept *k, int j, double moves_degC)
+{
+    say(k, k->repeats[j] >= STILL_AFTER / 2 ? SENSOR_STILL : SENSOR_DEAF, j, moves_degC);
+}
+
 /* Says which sensors stand still, as long as nothing that is no fault explains that as well */
 static void judge_sensors(supervisor_kept *k, double moves[WINDOWS][OUTPUTS], int still[WINDOWS][OUTPUTS])
 {
@@ -300,17 +307,14 @@ static void judge_sensors(supervisor_kept *k, double moves[WINDOWS][OUTPUTS], in
                 && (at < 0 || fabs(moves[w][j]) > fabs(moves[at][j])))
                 at = w;
         }
-        if (at >= 0) {
-            double spread = k->window[at].most[j] - k->window[at].least[j];
-            /* a sensor that has never moved has no step */
-            int equal = !isfinite(k->quantum[j]) || spread <= 0.5 * k->quantum[j] + 1e-9;
-            say(k, equal ? SENSOR_STILL : SENSOR_DEAF, j, moves[at][j]);
-        }
+        if (at >= 0)
+            say_still(k, j, moves[at][j]);
     }
 }
 
 /* Says which heater heats otherwise than it was told: the one that explains most */
-static void judge_heaters(supervisor_kept *k, const double *y, const int *counts)
+static void judge_heaters(supervisor_kept *k, const double *y, const int *counts,
+                          double moves[WINDOWS][OUTPUTS])
 {
     double share[WINDOWS][INPUTS];
     int clear[WINDOWS][INPUTS], gives[WINDOWS][INPUTS], shows[2][INPUTS] = {{0}};
@@ -347,10 +351,10 @@ static void judge_heaters(supervisor_kept *k, const double *y, const int *counts
                 at = w;
                 of = i;
             }
-    if (at >= 0) { /* a reading that has not moved may be the sensor's fault */
-        double amount = unmoved(k, at, supervisor_of_input[of]) ? -share[at][of] : share[at][of];
-        say(k, gives[at][of] ? HEATER_STUCK_ON : HEATER_WEAK, of, amount);
-    }
+    if (at >= 0 && unmoved(k, at, supervisor_of_input[of]))
+        say_still(k, supervisor_of_input[of], moves[at][supervisor_of_input[of]]);
+    else if (at >= 0)
+        say(k, gives[at][of] ? HEATER_STUCK_ON : HEATER_WEAK, of, share[at][of]);
 }
 
 /* Causes that are gone */
@@ -390,7 +394,7 @@ static void follow_law(supervisor_kept *k, const double *u, const double *y, con
     compare(k, y, counts);
     clear_sensors(k, counts, moves, still);
     judge_sensors(k, moves, still);
-    judge_heaters(k, y, counts);
+    judge_heaters(k, y, counts, moves);
 }
 
 /* One sample of outputs y, inputs `applied` since the one before, none of `samples` in manual; `filled` is y

@@ -22,6 +22,6 @@ typedef struct {
     double y[OUTPUTS], quantum[OUTPUTS], cleared_s[OUTPUTS];
     forecast_window window[WINDOWS];
     double asked[INPUTS], usual[INPUTS], stirred[INPUTS], clock_s[2];
-    int bad[OUTPUTS], returns[OUTPUTS], shown[2][INPUTS];
+    int repeats[OUTPUTS], bad[OUTPUTS], returns[OUTPUTS], shown[2][INPUTS];
     int samples, mode, clocked, active; /* active: causes that are there */
 } supervisor_kept;
