@@ -399,9 +399,9 @@ def machine_table(rows: list[dict[str, Any]]) -> list[str]:
 def print_machine(row: dict[str, Any], *, whole: bool = False) -> None:
     print("", *machine_table([row]), "", *fault_table([row]), sep="\n")
     if row["made"].get("why"):
-        print(f"\nNot exported: {row['made']['why']}")
+        print(f"\n{row['made']['why']}")
         for name, why in row["made"].get("certify", {}).items():
-            print(f"  {name}: {why or 'certified or measured'}")
+            print(f"  {name}: {why or 'measured'}")
     for one in row["faults"] if whole else []:
         print("  ", json.dumps(one))
     print(flush=True)
