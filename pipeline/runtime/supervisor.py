@@ -13,6 +13,7 @@ corrects (a window). As long as a window lasts, readings are held against it:
       r = a (high U - g)    it gives a share a of what it could add: 1 if it is stuck on
       r = q U               a fan, a door, filament or the room take or give q percent: no fault
       r = -tau (g - g')     the machine is late by tau samples: no fault
+      r = c                 what the sensor sees of air or filament at once: no fault
 
   with g the response to the input since then, g' that a sample ago, U that to one percent. A heater is
   at fault if that explains the readings clearly better than what is no fault.
@@ -53,10 +54,11 @@ SAME_STEPS, SAME_NOISE = 1.5, 6.0  # steps and deviations within which a reading
 FOLLOWS = (0.5, 1.7)  # share of the forecast's move by which a sensor is cleared
 CLEARED_S = 60.0  # for how long it is cleared then
 # why readings miss the forecast: a heater lacks a share, or gives one of what it could add; heat of the
-# surroundings as a share of the input's range; samples late; a heater that differs from the model by a share
-LACKS, GIVES, HEAT, LATE, DIFFERS = range(5)
-LEAST = np.array([0.35, 0.4, -0.4, -8.0, -0.25])
-MOST = np.array([1.3, 1.5, 0.4, 8.0, 0.25])
+# surroundings as a share of the input's range; samples late; a heater that differs from the model by a share;
+# a step of the reading in degC
+LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS = range(6)
+LEAST = np.array([0.35, 0.4, -0.3, -8.0, -0.25, -1e3])
+MOST = np.array([1.3, 1.5, 0.3, 8.0, 0.25, 1e3])
 CLEARER = 16.0  # of -2 log likelihood, by which a fault must explain better than what is none
 MISFIT = 0.15  # of what readings miss, which even the right cause leaves: no model is the machine
 DOUBT = 0.25  # share of what inputs did lately by which a forecast may be wrong
@@ -65,7 +67,7 @@ REPEATED = 3  # samples in a row with a reading that is none
 SHOWN = 6  # samples in a row that show a fault
 SLOWLY = 1 / 60  # share a sample of the mean drift, from which heat is counted
 EARLY, JUMP = 0.5, 10.0  # shares of the sample time between which two samples are apart
-RETURNS = 3  # times that a sensor that stood still is trusted again
+RETURNS = 3  # times an hour that heaters which went off are tried again
 LEAK = 0.9999  # of the drift, kept a step
 HURRIED = 0.1  # of an innovation, by which the drift follows in manual
 
@@ -75,7 +77,8 @@ class Supervision(NamedTuple):
 
     A (n, n), B (n, m), C (p, n), b (n,), d (p,): the model with a drift w (p) in degC a step as its last
     states; L, M (n, p) move its state by an innovation, from one sample to the next and at once; `hurried` is
-    added to L in manual; `unsure` (WINDOWS SPACING + 1, p) in degC is the deviation of a forecast by its age.
+    added to L in manual; `unsure` (WINDOWS SPACING + 1, p) in degC is the deviation of a forecast by its age,
+    `wander` the sum of four times its squares.
     It starts at start y + start_0. low, high (m,) in percent; `coldest`, `hottest` (p,) in degC between which
     a reading is one; `of_input` (m,) the output that each input moves most; `back_s` the
     time without the cause after which the law takes over again.
@@ -90,6 +93,7 @@ class Supervision(NamedTuple):
     M: np.ndarray
     hurried: np.ndarray
     unsure: np.ndarray
+    wander: np.ndarray
     start: np.ndarray
     start_0: np.ndarray
     low: np.ndarray
@@ -145,6 +149,7 @@ def supervision(
         M=M,
         hurried=np.vstack([np.zeros((n, p)), HURRIED * np.eye(p) - (A @ M)[n:]]),
         unsure=unsure,
+        wander=np.cumsum((2 * unsure) ** 2, axis=0),
         start=heat,
         start_0=-heat @ plant.d,
         low=np.array([one.low for one in machine.inputs]),
@@ -187,14 +192,15 @@ class Kept(NamedTuple):
 
     The observer: x (n,), the innovation e (p,) before, the mean drift `slow` (p,), the forecast `expected`
     (p,). By output (p,): y the last reading and its repeats, quantum the smallest move seen, bad readings in
-    a row, cleared_s the time at which it last moved as forecast, returns how often it was trusted again.
+    a row, cleared_s the time at which it last moved as forecast, returns how often it was trusted again, the
+    last time at returned_s.
 
     Windows (K): states (2, K, n), from the drift as it was and from its mean; given and unit (K, n, m), the
-    responses to the inputs and to one percent of each; before (K, m) the former a sample ago; began, least,
-    most (K, p) the forecast at first, the least and the most reading; away (K, p) samples in a row in which
-    the forecast was away from it; square (K, m) the sum of r^2, causes
-    (K, m, 5) that of each cause's signature squared, cross (K, K, m, 5) that of r of a window times the
-    signature of a cause that began with another; age (K,) in samples, -1 for none.
+    responses to the inputs and to one percent of each; before (K, m) the former a sample ago; began, first,
+    least, most (K, p) the forecast and the reading at first, the least and the most reading; away (K, p)
+    samples in a row in which the forecast was away from it; square (K, m) the sum of r^2, causes (K, m, 6)
+    that of each cause's signature squared, cross (K, K, m, 6) that of r of a window times the signature of a
+    cause that began with another; age (K,) in samples, -1 for none.
 
     shown (2, m): samples in a row in which a heater was stuck on, or weak. asked (m,) the last command,
     usual (m,) its mean, stirred (m,) how far it was from it lately.
@@ -215,11 +221,13 @@ class Kept(NamedTuple):
     bad: np.ndarray
     cleared_s: np.ndarray
     returns: np.ndarray
+    returned_s: np.ndarray
     states: np.ndarray
     given: np.ndarray
     unit: np.ndarray
     before: np.ndarray
     began: np.ndarray
+    first: np.ndarray
     least: np.ndarray
     most: np.ndarray
     away: np.ndarray
@@ -257,17 +265,19 @@ def kept(s: Supervision) -> Kept:
         bad=np.zeros(p, int),
         cleared_s=np.full(p, -np.inf),
         returns=np.zeros(p, int),
+        returned_s=np.full(p, -np.inf),
         states=np.zeros((2, K, n)),
         given=np.zeros((K, n, m)),
         unit=np.zeros((K, n, m)),
         before=np.zeros((K, m)),
         began=np.zeros((K, p)),
+        first=np.zeros((K, p)),
         least=np.zeros((K, p)),
         most=np.zeros((K, p)),
         away=np.zeros((K, p), int),
         square=np.zeros((K, m)),
-        causes=np.zeros((K, m, 5)),
-        cross=np.zeros((K, K, m, 5)),
+        causes=np.zeros((K, m, len(LEAST))),
+        cross=np.zeros((K, K, m, len(LEAST))),
         total=np.zeros((2, K, p)),
         age=np.full(K, -1),
         shown=np.zeros((2, m), int),
@@ -318,7 +328,7 @@ def read(s: Supervision, k: Kept, y: np.ndarray) -> np.ndarray:
     return counts & ((k.since[[OPEN, STILL, DEAF], : len(y)] < 0).all(axis=0))
 
 
-def begin_window(s: Supervision, k: Kept, at: int) -> None:
+def begin_window(s: Supervision, k: Kept, at: int, counts: np.ndarray) -> None:
     """A forecast from where the machine is now."""
     start = k.x + s.M @ k.e
     k.states[:, at] = start
@@ -327,6 +337,8 @@ def begin_window(s: Supervision, k: Kept, at: int) -> None:
         part[at] = 0
     k.cross[:, at] = k.total[:, at] = 0.0
     k.began[at] = k.least[at] = k.most[at] = s.C @ start + s.d
+    # a sensor that does not count may be far from its forecast, and moves with it all the same
+    k.first[at] = np.where(counts, k.began[at], k.y)
     k.age[at] = 0
 
 
@@ -350,7 +362,9 @@ def compare(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     missed = np.where(counts & runs, y - k.states[1] @ s.C.T - s.d, 0.0)[:, own]
     given, unit = ((s.C @ part)[:, own, inputs] for part in (k.given, k.unit))
     span = s.high - s.low
-    signatures = np.stack([-given, span * unit - given, span * unit, k.before - given, -given], axis=2)
+    step = np.where(runs, 1.0, 0.0) * np.ones_like(given)
+    parts = [-given, span * unit - given, span * unit, k.before - given, -given, step]
+    signatures = np.stack(parts, axis=2)
     moved = np.where(counts, y - k.began, 0.0)
     k.total[...] += moved, moved * moved
     k.before[:] = given
@@ -366,39 +380,39 @@ def threshold(s: Supervision, k: Kept) -> np.ndarray:
     return np.maximum(least, NOISE_STILL * s.unsure[np.minimum(np.maximum(k.age, 0), len(s.unsure) - 1)])
 
 
-def clear_sensors(s: Supervision, k: Kept) -> tuple[np.ndarray, np.ndarray]:
+def clear_sensors(s: Supervision, k: Kept, doubt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Clears sensors that move as forecast. By how many degC (K, p) each forecast has moved, and whether that
-    is more than its doubt."""
-    moves, moved = k.states[0] @ s.C.T + s.d - k.began, k.y - k.began
+    is more than its doubt (K, p)."""
+    moves, moved = k.states[0] @ s.C.T + s.d - k.began, k.y - k.first
     large = (np.abs(moves) >= threshold(s, k)) & (k.age > 0)[:, None]
     share = moved / np.where(large, moves, 1.0)
     follows = large & (share >= FOLLOWS[0]) & (share <= FOLLOWS[1])
     k.cleared_s[:] = np.where(follows.any(axis=0) & (k.bad == 0), k.clock_s[1], k.cleared_s)
     k.away[:] = np.where(large, k.away + 1, 0)
-    doubt = DOUBT * np.abs(s.C @ k.unit) @ k.stirred
     return moves, large & (np.abs(moves) >= doubt)
 
 
 def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     """Says which sensors stand still while the forecast moves, and which heater heats otherwise than it was
     told: what explains clearly better than anything that is no fault."""
-    moves, large = clear_sensors(s, k)
+    doubt = DOUBT * np.abs(s.C @ k.unit) @ k.stirred
+    moves, large = clear_sensors(s, k, doubt)
     own, age = s.of_input, np.maximum(k.age, 1)[:, None]
-    variance = s.variance(k.quantum)
     missed = np.abs(y - k.states[1] @ s.C.T - s.d)
-    tells = (k.age >= FIT_AFTER)[:, None] & counts & (missed >= threshold(s, k))
+    tells = (k.age >= FIT_AFTER)[:, None] & counts & (missed >= np.maximum(threshold(s, k), doubt))
     still = (k.away >= STILL_AFTER) & large & counts
     if not (tells.any() or still.any()):
         k.shown[:] = 0
         return
     amount = np.clip(k.cross / np.maximum(k.causes, 1e-12), LEAST, MOST)
     left = k.square[:, None, :, None] - 2 * amount * k.cross + amount**2 * k.causes
-    floor = age * variance[own] + MISFIT**2 * k.square + 1e-12
+    noise = age * s.variance(k.quantum) + s.wander[np.minimum(np.maximum(k.age, 0), len(s.wander) - 1)]
+    floor = noise[:, own] + MISFIT**2 * k.square + 1e-12
     later = (k.age[None, :] <= k.age[:, None]) & (k.age >= REPEATED)[None, :]
     left = np.where(later[:, :, None, None], np.maximum(left, floor[:, None, :, None]), 1e300)
     honest = np.minimum(left[..., HEAT:].min(axis=(1, 3)), np.maximum(k.square, floor))
     same = unmoved(s, k)
-    judge_sensors(s, k, moves, still & same, honest)
+    judge_sensors(s, k, moves, still & same, honest, noise)
     explained = left[..., :HEAT].min(axis=1)
     best = explained.min(axis=2)
     clear = (age * np.log(honest / best) >= CLEARER) & tells[:, own] & (best <= 2 * floor)
@@ -427,9 +441,11 @@ def unmoved(s: Supervision, k: Kept) -> np.ndarray:
     return k.most - k.least <= np.maximum(SAME_STEPS * quantum, SAME_NOISE * s.noise_degC)
 
 
-def judge_sensors(s: Supervision, k: Kept, moves: np.ndarray, still: np.ndarray, honest: np.ndarray) -> None:
+def judge_sensors(
+    s: Supervision, k: Kept, moves: np.ndarray, still: np.ndarray, honest: np.ndarray, noise: np.ndarray
+) -> None:
     """Says which sensors stand still (K, p) as long as nothing that is no fault, which leaves `honest` (K, m)
-    of what they miss, explains that as well."""
+    of what they miss, explains that as well; `noise` (K, p) of it is none of anything."""
     age = np.maximum(k.age, 1)[:, None]
     still = still & (np.abs(moves) >= SAME_STEPS * (k.most - k.least))
     for j in np.flatnonzero(still.any(axis=0)):
@@ -438,30 +454,36 @@ def judge_sensors(s: Supervision, k: Kept, moves: np.ndarray, still: np.ndarray,
             continue
         square = k.square[:, heaters].max(axis=1)
         steady = k.total[1, :, j] - k.total[0, :, j] ** 2 / age[:, 0]
-        floor = age[:, 0] * s.variance(k.quantum)[j] + MISFIT**2 * square + 1e-12
+        floor = noise[:, j] + MISFIT**2 * square + 1e-12
         better = age[:, 0] * np.log(honest[:, heaters].min(axis=1) / np.maximum(steady, floor))
-        clear = still[:, j] & (better >= CLEARER)
+        # what moves a heater is a reading that moved: nothing honest keeps one equal meanwhile
+        equal = k.repeats[j] >= age[:, 0]
+        clear = still[:, j] & ((better >= CLEARER) | equal)
         if clear.any():
             window = int(np.where(clear, np.abs(moves[:, j]), -1.0).argmax())
             say_still(k, int(j), moves[window, j])
 
 
 def forget(s: Supervision, k: Kept) -> None:
-    """Causes that are gone. A sensor that stood still is trusted again when it moves as forecast; a heater
-    that is stuck on, or was switched off for being weak, waits for a person."""
+    """Causes that are gone: after `back_s` without them, or, if the heaters are off for them, as soon as the
+    output moves as forecast again. That counts RETURNS times an hour; from then on a person is waited for."""
     if not k.counters[ACTIVE]:
         return
     gone = (k.since >= 0) & (k.clock_s[1] - k.last > s.back_s)
-    p = len(s.d)
-    again = (k.cleared_s > k.last[[STILL, DEAF], :p]) & (k.returns < RETURNS)
-    gone[[STILL, DEAF]] = False
-    gone[[STILL, DEAF], :p] = (k.since[[STILL, DEAF], :p] >= 0) & again
-    k.returns[...] += gone[[STILL, DEAF], :p].any(axis=0)
-    gone[ON] = False
-    gone[WEAK] &= k.amount[WEAK] >= 0
-    k.since[gone] = k.last[gone] = -1.0
-    k.counters[ACTIVE] -= int(gone.sum())
+    for kind in (STILL, DEAF, ON, WEAK):
+        for signal in np.flatnonzero(k.since[kind] >= 0):
+            if kind == WEAK and k.amount[WEAK, signal] >= 0:
+                continue
+            j = s.of_input[signal] if kind in OF_INPUT else signal
+            rested = k.clock_s[1] - k.returned_s[j] > 3600.0
+            again = k.cleared_s[j] > k.last[kind, signal] and (rested or k.returns[j] < RETURNS)
+            gone[kind, signal] = again
+            if again:
+                k.returns[j] = 1 if rested else k.returns[j] + 1
+                k.returned_s[j] = k.clock_s[1]
     if gone.any():
+        k.since[gone] = k.last[gone] = -1.0
+        k.counters[ACTIVE] -= int(gone.sum())
         k.age[:] = -1
 
 
@@ -494,7 +516,7 @@ def follow(s: Supervision, k: Kept, y: np.ndarray, applied: np.ndarray | None, s
     k.e[:] = np.where(counts, filled - k.expected, 0.0)
     forget(s, k)
     if samples and k.counters[SAMPLES] % SPACING == 0:
-        begin_window(s, k, k.counters[SAMPLES] // SPACING % WINDOWS)
+        begin_window(s, k, k.counters[SAMPLES] // SPACING % WINDOWS, counts)
     k.counters[SAMPLES] += 1
     return filled
 

@@ -5,7 +5,7 @@
 #include <math.h>
 
 enum {
-    NO_FAULT, SENSOR_OPEN, SENSOR_RANGE, SENSOR_STILL, SENSOR_STILL_NOISY, HEATER_ON, HEATER_HALF, HEATER_OFF,
+    FAULT_NO_FAULT, FAULT_SENSOR_OPEN, FAULT_SENSOR_RANGE, FAULT_SENSOR_STILL, FAULT_SENSOR_STILL_NOISY, FAULT_HEATER_ON, FAULT_HEATER_HALF, FAULT_HEATER_OFF,
     OUT_OF_REACH
 };
 
@@ -63,21 +63,21 @@ int normal_life(const thermal_parts *p, double degC, uint64_t seed, int steps, i
             wish[j] = r[k * OUTPUTS + j];
         }
         if (fault->began >= 0) {
-            if (kind == SENSOR_OPEN)
+            if (kind == FAULT_SENSOR_OPEN)
                 now[signal] = NAN;
-            if (kind == SENSOR_RANGE)
+            if (kind == FAULT_SENSOR_RANGE)
                 now[signal] = beyond;
-            if (kind == SENSOR_STILL)
+            if (kind == FAULT_SENSOR_STILL)
                 now[signal] = frozen;
-            if (kind == SENSOR_STILL_NOISY)
+            if (kind == FAULT_SENSOR_STILL_NOISY)
                 now[signal] = rint((frozen + p->noise[signal] * rough(&random)) / p->step[signal]) * p->step[signal];
             if (kind == OUT_OF_REACH)
                 wish[signal] = beyond;
             if (fault->shows < 0) {
-                double apart = kind <= SENSOR_RANGE || kind == OUT_OF_REACH ? INFINITY : 0.0;
+                double apart = kind <= FAULT_SENSOR_RANGE || kind == OUT_OF_REACH ? INFINITY : 0.0;
                 for (j = 0; j < OUTPUTS; j++)
-                    if (kind >= HEATER_ON || j == signal)
-                        apart = fmax(apart, fabs((kind >= HEATER_ON ? s.sensor[j] : frozen) - twin.sensor[j])
+                    if (kind >= FAULT_HEATER_ON || j == signal)
+                        apart = fmax(apart, fabs((kind >= FAULT_HEATER_ON ? s.sensor[j] : frozen) - twin.sensor[j])
                                                 / visible[j]);
                 if (apart >= 1.0)
                     fault->shows = k;
@@ -113,8 +113,8 @@ int normal_life(const thermal_parts *p, double degC, uint64_t seed, int steps, i
             acted[j] = command[j];
         if (fault->began >= 0) {
             double of[] = {100.0, 0.5 * acted[signal], 0.0};
-            if (kind >= HEATER_ON && kind <= HEATER_OFF)
-                acted[signal] = of[kind - HEATER_ON];
+            if (kind >= FAULT_HEATER_ON && kind <= FAULT_HEATER_OFF)
+                acted[signal] = of[kind - FAULT_HEATER_ON];
             thermal_read(&twin, p, unread); /* keeps its noise in step */
             thermal_advance(&twin, p, command, outside + k * OUTSIDE);
         }

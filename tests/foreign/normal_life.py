@@ -36,13 +36,13 @@ FAULTS = (
 RECORDS = ("quiet", "moved", "declared")  # what fan, feed and screw did while the owner recorded
 # causes that name the fault, by the kinds of the supervisor
 NAMES = {
-    "sensor open": {"sensor_nan"},
-    "sensor out of range": {"out_of_range"},
-    "sensor still": {"sensor_frozen"},
-    "sensor still with its noise": {"sensor_frozen"},
-    "heater stuck on": {"heater_stuck_on", "thermal_runaway"},
-    "heater half": {"heater_weak", "heater_stuck_off"},
-    "heater off": {"heater_stuck_off", "heater_weak"},
+    "sensor open": {"sensor_open"},
+    "sensor out of range": {"sensor_open"},
+    "sensor still": {"sensor_still", "sensor_deaf"},
+    "sensor still with its noise": {"sensor_deaf", "sensor_still"},
+    "heater stuck on": {"heater_stuck_on"},
+    "heater half": {"heater_weak"},
+    "heater off": {"heater_weak", "sensor_still", "sensor_deaf"},
     "reference out of reach": {"reference_out_of_reach"},
 }
 COLD = 30  # samples in manual

@@ -1,4 +1,4 @@
-"""The supervisor on a machine of two zones that no stage made: quiet where the plant is honest, and six faults
+"""The supervisor on a machine of two zones that no stage made: quiet if the plant is honest, and six faults
 named, each with its safe mode and the way back."""
 
 import numpy as np
@@ -231,7 +231,7 @@ def test_what_only_the_mains_can_stop_stays_until_a_person_acknowledges_it():
     run = Run(seed=6)
     run.go(100)
     run.go(40, command=HEATERS["heater_stuck_on"][0])
-    assert {one.mode for one in run.go(400)} == {"off"}
+    assert {one.mode for one in run.go(400, command=HEATERS["heater_stuck_on"][0])} == {"off"}
     run.x[:2] = R - ROOM
     run.supervised.acknowledge()
     assert run.go(100)[-1].mode == "law"

@@ -384,7 +384,22 @@ OF_SUPERVISOR = (
     "CLEARED_S", "CLEARER", "MISFIT", "DOUBT", "RESTS", "REPEATED", "SHOWN", "SLOWLY", "EARLY", "JUMP",
     "RETURNS",
 )  # fmt: skip
-OF_OBSERVER = ("A", "B", "C", "b", "d", "L", "M", "hurried", "unsure", "start", "start_0", "low", "high")
+OF_OBSERVER = (
+    "A",
+    "B",
+    "C",
+    "b",
+    "d",
+    "L",
+    "M",
+    "hurried",
+    "unsure",
+    "wander",
+    "start",
+    "start_0",
+    "low",
+    "high",
+)
 
 
 def supervising(s: supervisor.Supervision) -> str:

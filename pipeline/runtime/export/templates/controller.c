@@ -72,7 +72,7 @@ beadline_result beadline_init(beadline_controller *c, const beadline_machine *ma
     for (j = 0; j < OUTPUTS; j++) {
         c->kept.y[j] = NAN;
         c->kept.quantum[j] = INFINITY;
-        c->kept.cleared_s[j] = -INFINITY;
+        c->kept.cleared_s[j] = c->kept.returned_s[j] = -INFINITY;
     }
     c->ready = 1;
     return BEADLINE_DONE;

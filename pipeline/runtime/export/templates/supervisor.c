@@ -85,7 +85,7 @@ static double forecast(const double *state, int j)
 }
 
 /* A forecast from where the machine is now */
-static void begin_window(supervisor_kept *k, int at)
+static void begin_window(supervisor_kept *k, int at, const int *counts)
 {
     forecast_window *one = &k->window[at];
     int j, w;
@@ -94,8 +94,11 @@ static void begin_window(supervisor_kept *k, int at)
     add_product(one->state[0], supervisor_M[0], k->e, WATCH, OUTPUTS);
     memcpy(one->state[1], one->state[0], sizeof k->x);
     memcpy(one->state[1] + WATCH - OUTPUTS, k->slow, sizeof k->slow);
-    for (j = 0; j < OUTPUTS; j++)
+    for (j = 0; j < OUTPUTS; j++) {
         one->began[j] = one->least[j] = one->most[j] = forecast(one->state[0], j);
+        /* a sensor that does not count may be far from its forecast, and moves with it all the same */
+        one->first[j] = counts[j] ? one->began[j] : k->y[j];
+    }
     for (w = 0; w < WINDOWS; w++)
         memset(k->window[w].cross[at], 0, sizeof one->cross[at]);
 }
@@ -189,6 +192,7 @@ static void compare(supervisor_kept *k, const double *y, const int *counts)
             signature[w][GIVES] = span * unit - given;
             signature[w][HEAT] = span * unit;
             signature[w][LATE] = one->before[i] - given;
+            signature[w][SHIFTS] = one->age < 0 ? 0.0 : 1.0;
             one->before[i] = given;
             one->square[i] += missed[w] * missed[w];
             for (f = 0; f < EXPLANATIONS; f++)
@@ -211,10 +215,22 @@ static double threshold(const supervisor_kept *k, int w, int j)
     return largest(least, NOISE_STILL * supervisor_unsure[age][j]);
 }
 
-static double variance_of(const supervisor_kept *k, int j)
+static double doubt_of(const supervisor_kept *k, int w, int j)
+{
+    double doubt = 0.0;
+    int i;
+    for (i = 0; i < INPUTS; i++)
+        doubt += DOUBT * fabs(response_of(k->window[w].unit[0], j, i)) * k->stirred[i];
+    return doubt;
+}
+
+/* Squares that noise and a wandering forecast leave of what a window missed */
+static double noise_of(const supervisor_kept *k, int w, int j)
 {
     double deviation = 2 * largest(supervisor_noise[j], steps_of(k, j) / sqrt(12.0));
-    return deviation * deviation;
+    int age = k->window[w].age < 0 ? 0 : k->window[w].age;
+    return (age < 1 ? 1 : age) * (deviation * deviation)
+           + supervisor_wander[age > WINDOWS * SPACING ? WINDOWS * SPACING : age][j];
 }
 
 /* Clears sensors that move as forecast; how far each forecast has moved, and which stands away from readings
@@ -222,21 +238,19 @@ static double variance_of(const supervisor_kept *k, int j)
 static void clear_sensors(supervisor_kept *k, const int *counts, double moves[WINDOWS][OUTPUTS],
                           int still[WINDOWS][OUTPUTS])
 {
-    int i, j, w;
+    int j, w;
     for (w = 0; w < WINDOWS; w++)
         for (j = 0; j < OUTPUTS; j++) {
             forecast_window *one = &k->window[w];
-            double share, doubt = 0.0;
+            double share;
             int large;
             moves[w][j] = forecast(one->state[0], j) - one->began[j];
             large = one->age > 0 && fabs(moves[w][j]) >= threshold(k, w, j);
-            share = (k->y[j] - one->began[j]) / (large ? moves[w][j] : 1.0);
+            share = (k->y[j] - one->first[j]) / (large ? moves[w][j] : 1.0);
             if (large && share >= FOLLOWS_LEAST && share <= FOLLOWS_MOST && k->bad[j] == 0)
                 k->cleared_s[j] = k->clock_s[1];
             one->away[j] = large ? one->away[j] + 1 : 0;
-            for (i = 0; i < INPUTS; i++)
-                doubt += DOUBT * fabs(response_of(one->unit[0], j, i)) * k->stirred[i];
-            still[w][j] = one->away[j] >= STILL_AFTER && fabs(moves[w][j]) >= doubt && counts[j];
+            still[w][j] = one->away[j] >= STILL_AFTER && fabs(moves[w][j]) >= doubt_of(k, w, j) && counts[j];
         }
 }
 
@@ -260,9 +274,7 @@ static double left_of(const supervisor_kept *k, int w, int v, int i, int f, doub
 
 static double floor_of(const supervisor_kept *k, int w, int i)
 {
-    const forecast_window *one = &k->window[w];
-    double age = one->age < 1 ? 1 : one->age;
-    return age * variance_of(k, supervisor_of_input[i]) + MISFIT * MISFIT * one->square[i] + 1e-12;
+    return noise_of(k, w, supervisor_of_input[i]) + MISFIT * MISFIT * k->window[w].square[i] + 1e-12;
 }
 
 /* The least that anything that is no fault leaves */
@@ -271,7 +283,7 @@ static double honest_of(const supervisor_kept *k, int w, int i)
     double amount, at_least = floor_of(k, w, i), best = largest(k->window[w].square[i], at_least);
     int v, f;
     for (v = 0; v < WINDOWS; v++)
-        for (f = HEAT; f <= DIFFERS; f++)
+        for (f = HEAT; f < EXPLANATIONS; f++)
             best = fmin(best, largest(left_of(k, w, v, i, f, &amount), at_least));
     return best;
 }
@@ -302,8 +314,9 @@ static void judge_sensors(supervisor_kept *k, double moves[WINDOWS][OUTPUTS], in
             if (!isfinite(honest))
                 continue;
             steady = one->total[1][j] - one->total[0][j] * one->total[0][j] / age;
-            at_least = age * variance_of(k, j) + MISFIT * MISFIT * square + 1e-12;
-            if (age * log(honest / largest(steady, at_least)) >= CLEARER
+            at_least = noise_of(k, w, j) + MISFIT * MISFIT * square + 1e-12;
+            /* what moves a heater is a reading that moved: nothing honest keeps one equal meanwhile */
+            if ((k->repeats[j] >= age || age * log(honest / largest(steady, at_least)) >= CLEARER)
                 && (at < 0 || fabs(moves[w][j]) > fabs(moves[at][j])))
                 at = w;
         }
@@ -326,7 +339,7 @@ static void judge_heaters(supervisor_kept *k, const double *y, const int *counts
             double at_least = floor_of(k, w, i), best = 1e300, amount;
             clear[w][i] = gives[w][i] = 0;
             if (one->age < FIT_AFTER || !counts[j]
-                || fabs(y[j] - forecast(one->state[1], j)) < threshold(k, w, j))
+                || fabs(y[j] - forecast(one->state[1], j)) < largest(threshold(k, w, j), doubt_of(k, w, j)))
                 continue;
             for (f = LACKS; f <= GIVES; f++)
                 for (v = 0; v < WINDOWS; v++) {
@@ -357,22 +370,32 @@ static void judge_heaters(supervisor_kept *k, const double *y, const int *counts
         say(k, gives[at][of] ? HEATER_STUCK_ON : HEATER_WEAK, of, share[at][of]);
 }
 
+/* Whether the heaters, off for this cause, are tried again: its output moves as forecast, and that was not so
+ * RETURNS times in the last hour */
+static int tried_again(supervisor_kept *k, int kind, int signal)
+{
+    int j = kind == HEATER_STUCK_ON || kind == HEATER_WEAK ? supervisor_of_input[signal] : signal;
+    int rested = k->clock_s[1] - k->returned_s[j] > 3600.0;
+    if (k->cleared_s[j] <= k->last[kind][signal] || (!rested && k->returns[j] >= RETURNS))
+        return 0;
+    k->returns[j] = rested ? 1 : k->returns[j] + 1;
+    k->returned_s[j] = k->clock_s[1];
+    return 1;
+}
+
 /* Causes that are gone */
 static void forget(supervisor_kept *k)
 {
     int kind, signal, any = 0;
     for (kind = 0; kind < KINDS && k->active; kind++)
         for (signal = 0; signal < SIGNALS; signal++) {
-            int gone = k->since[kind][signal] >= 0 && k->clock_s[1] - k->last[kind][signal] > SUPERVISOR_BACK_S;
-            if (kind == SENSOR_STILL || kind == SENSOR_DEAF)
-                gone = signal < OUTPUTS && k->since[kind][signal] >= 0
-                       && k->cleared_s[signal] > k->last[kind][signal] && k->returns[signal] < RETURNS;
-            if (kind == HEATER_STUCK_ON || (kind == HEATER_WEAK && k->amount[kind][signal] < 0))
-                gone = 0;
-            if (!gone)
+            int off = kind == SENSOR_STILL || kind == SENSOR_DEAF || kind == HEATER_STUCK_ON
+                      || (kind == HEATER_WEAK && k->amount[kind][signal] < 0);
+            if (k->since[kind][signal] < 0)
                 continue;
-            if (kind == SENSOR_STILL || kind == SENSOR_DEAF)
-                k->returns[signal]++;
+            if (off ? !tried_again(k, kind, signal)
+                    : k->clock_s[1] - k->last[kind][signal] <= SUPERVISOR_BACK_S)
+                continue;
             k->since[kind][signal] = k->last[kind][signal] = -1.0;
             k->active--;
             any = 1;
@@ -436,7 +459,7 @@ static void follow(supervisor_kept *k, const double *y, const double *applied, i
         k->e[j] = counts[j] ? filled[j] - k->expected[j] : 0.0;
     forget(k);
     if (samples && k->samples % SPACING == 0)
-        begin_window(k, k->samples / SPACING % WINDOWS);
+        begin_window(k, k->samples / SPACING % WINDOWS, counts);
     k->samples++;
 }
 

@@ -5,12 +5,12 @@ enum { SENSOR_OPEN, SENSOR_STILL, SENSOR_DEAF, HEATER_STUCK_ON, HEATER_WEAK, REF
 enum { MODE_LAW, MODE_OWN, MODE_OFF };
 
 /* Why readings miss a forecast: faults of a heater, then what is no fault */
-enum { LACKS, GIVES, HEAT, LATE, DIFFERS, EXPLANATIONS };
+enum { LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS, EXPLANATIONS };
 
 /* A forecast that no reading corrects, and what readings missed of it (supervisor.Kept) */
 typedef struct {
     double state[2][WATCH], given[WATCH][INPUTS], unit[WATCH][INPUTS]; /* responses to inputs and one percent */
-    double before[INPUTS], began[OUTPUTS], least[OUTPUTS], most[OUTPUTS], total[2][OUTPUTS];
+    double before[INPUTS], began[OUTPUTS], first[OUTPUTS], least[OUTPUTS], most[OUTPUTS], total[2][OUTPUTS];
     double square[INPUTS], causes[INPUTS][EXPLANATIONS], cross[WINDOWS][INPUTS][EXPLANATIONS];
     int age, away[OUTPUTS];
 } forecast_window;
@@ -19,7 +19,7 @@ typedef struct {
 typedef struct {
     double since[KINDS][SIGNALS], last[KINDS][SIGNALS], amount[KINDS][SIGNALS];
     double x[WATCH], e[OUTPUTS], slow[OUTPUTS], expected[OUTPUTS];
-    double y[OUTPUTS], quantum[OUTPUTS], cleared_s[OUTPUTS];
+    double y[OUTPUTS], quantum[OUTPUTS], cleared_s[OUTPUTS], returned_s[OUTPUTS];
     forecast_window window[WINDOWS];
     double asked[INPUTS], usual[INPUTS], stirred[INPUTS], clock_s[2];
     int repeats[OUTPUTS], bad[OUTPUTS], returns[OUTPUTS], shown[2][INPUTS];
