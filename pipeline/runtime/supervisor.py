@@ -526,12 +526,12 @@ def choose_mode(s: Supervision, k: Kept) -> int:
     and its sensor has not moved as forecast for CLEARED_S; otherwise the machine's own control takes over."""
     if not k.counters[ACTIVE]:
         return LAW
-    active = (k.since >= 0).any(axis=1)
+    doubtful = (k.since[[OPEN, STILL, DEAF, ON]] >= 0).any()
     for i in np.flatnonzero(k.since[WEAK] >= 0):
         if k.amount[WEAK, i] >= 0 and k.since[WEAK, i] - k.cleared_s[s.of_input[i]] > CLEARED_S:
             k.amount[WEAK, i] = -k.amount[WEAK, i]
-    unsafe = active[[OPEN, STILL, DEAF, ON]].any() or (k.amount[WEAK][k.since[WEAK] >= 0] < 0).any()
-    return OFF if unsafe else OWN
+    uncleared = (k.amount[WEAK][k.since[WEAK] >= 0] < 0).any()
+    return OFF if doubtful or uncleared else OWN
 
 
 # ---- in words
