@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pipeline.temperature.plant import Plant as PlantModel
 
 RECORD = "datasets/ingest/record.parquet"
-FALLBACK = "pi_simc"  # the safe mode "pi"; if the machine allows none, the inputs are held
+FALLBACK = "pi_simc"  # the safe mode "own"; if the machine allows none, the heaters go off
 NO_FEED_FORWARD = (
     "The machine declares disturbances ({names}), which an exported controller cannot read yet: none is "
     "certified. Remove plant.disturbances to certify controllers that do without them."

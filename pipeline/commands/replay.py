@@ -13,7 +13,6 @@ from pipeline.recordings.resampling import resample
 from pipeline.runtime import machine, replay, supervisor, support
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.replay import GaplessLog
-from pipeline.runtime.supervised import Supervised
 from pipeline.runtime.support_file import read_support
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant
@@ -194,18 +193,21 @@ def _filled(values: np.ndarray) -> np.ndarray:
 
 
 def _causes(made: Exported, log: GaplessLog, cuts: np.ndarray) -> np.ndarray:
-    """The first cause (T,) that the supervisor has while it watches, as an index of supervisor.KINDS; -1
-    where it has none, and where it did not watch."""
+    """The first cause (T,) that the supervisor has under the recorded inputs, as an index of
+    supervisor.KINDS; -1 if it has none, and at samples that it did not watch."""
     T, cause = len(log.u), np.full(len(log.u), -1, np.int8)
     starts = [0] if T <= WATCHED else np.linspace(0, T - STRETCH, WATCHED // STRETCH).astype(int)
     length = T if T <= WATCHED else STRETCH
+    s = made.supervision
     for start in starts:
-        watching = Supervised(made, rehearsal=True)
+        k = supervisor.kept(s)
         for t in range(int(start), int(start) + length):
             if t in cuts:
-                watching = Supervised(made, rehearsal=True)
-            watching.watch(log.u[t], log.y[t], log.r[t])
-            active = np.flatnonzero((watching.kept.since >= 0).any(axis=1))
+                k = supervisor.kept(s)
+            supervisor.follow(s, k, log.y[t], None, int(k.counters[supervisor.SAMPLES] >= HOLD))
+            k.asked[:] = log.u[t]
+            k.clock_s[1] += s.sample_time_s
+            active = np.flatnonzero((k.since >= 0).any(axis=1))
             cause[t] = active[0] if len(active) else -1
     return cause
 

@@ -25,7 +25,7 @@ def assemble(
     *,
     simulated: bool,
 ) -> Exported:
-    """The controller as it was judged. `fallback` is the safe mode "pi"; None: the inputs are held. `family`
+    """The controller as it was judged. `fallback` is the safe mode "own"; None: the heaters go off. `family`
     is the identified plant, then its spread."""
     return Exported(
         name,
@@ -33,7 +33,7 @@ def assemble(
         deploy(design, setting),
         design.model,
         deploy(fallback, setting) if fallback else None,
-        supervisor.supervision(design.model, family, machine, setting.rehearsal.noise),
+        supervisor.supervision(design.model, machine, setting.rehearsal.noise),
         simulated,
         plants_sha256(family[:1]),
         plants_sha256(family[1:]),

@@ -1,210 +1,172 @@
-"""The supervisor round a law: fifteen kinds of fault, each with a declared safe mode, its reason in one
-sentence, and the way back.
+"""The supervisor round a law: six faults that a firmware does not see, each with its safe mode, its reason in
+one sentence, and the way back.
 
-Every sample it compares what was measured with what the model forecast (innovations.py). Some faults are seen
-as they are: a reading that is no number, out of range, or the same for too long; a clock, a command, a
-reference out of reach; a zone that is heated and does not warm (Klipper's verify_heater). The others show in
-the innovation. Two-sided sums of it (CUSUM) raise the alarm, from which the inputs are held; then the bank of
-hypotheses says which input or sensor explains it, within DECIDED_BY samples.
+An observer of the model follows the machine. Every few samples a forecast starts from it that no reading
+corrects (a window). As long as a window lasts, readings are held against it:
 
-What one record cannot tell apart is said so: a cause names the other that would show the same, and its mode
-is safe for both. `Kept` is all that is remembered: arrays of fixed size, plain arithmetic.
+* A sensor stands still if the forecast moves by three of its steps, or four deviations of its noise, and the
+  reading does not move with it, with its noise on top or without.
+* What readings r miss of the forecast is explained by one cause that began when one of the windows did, by
+  least squares:
+
+      r = -a g              a heater lacks the share a of what it is told
+      r = a (high U - g)    it gives a share a of what it could add: 1 if it is stuck on
+      r = q U               a fan, a door, filament or the room take or give q percent: no fault
+      r = -tau (g - g')     the machine is late by tau samples: no fault
+      r = c                 what the sensor sees of air or filament at once: no fault
+
+  with g the response to the input since then, g' that a sample ago, U that to one percent. A heater is
+  at fault if that explains the readings clearly better than what is no fault.
+
+`Kept` is all that is remembered: arrays of fixed size, plain arithmetic.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 
-from pipeline.runtime import innovations
 from pipeline.runtime.signals import Machine
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
+from pipeline.temperature.tracking import reached_state, riccati
 
 KINDS = (
+    "sensor_open",
+    "sensor_still",
+    "sensor_deaf",
     "heater_stuck_on",
-    "heater_stuck_off",
     "heater_weak",
-    "thermal_runaway",
-    "out_of_range",
-    "sensor_nan",
-    "sensor_frozen",
-    "sensor_offset",
-    "sensor_slow",
-    "sensor_noisy",
-    "command_not_applied",
-    "clock_jump",
-    "deadline_missed",
-    "model_no_longer_right",
     "reference_out_of_reach",
 )
-(ON, OFF, WEAK, RUNAWAY, RANGE, NAN, FROZEN, OFFSET, SLOW, NOISY, COMMAND, CLOCK, DEADLINE, MODEL, REACH) = (
-    range(len(KINDS))
-)
-MODES = ("law", "hold", "pi", "off")
-LAW, HOLD, PI, OFF_MODE = range(4)
-# off wins over hold, hold over PI: where several causes are there
-SEVERITY = np.array([0, 2, 1, 3])
-# the declared safe mode of each kind
-SAFE = {
-    "heater_stuck_on": "off",
-    "heater_stuck_off": "off",
-    "heater_weak": "pi",
-    "thermal_runaway": "off",
-    "out_of_range": "off",
-    "sensor_nan": "hold",
-    "sensor_frozen": "hold",
-    "sensor_offset": "hold",
-    "sensor_slow": "hold",
-    "sensor_noisy": "hold",
-    "command_not_applied": "off",
-    "clock_jump": "hold",
-    "deadline_missed": "hold",
-    "model_no_longer_right": "pi",
-    "reference_out_of_reach": "pi",
-}
-# kinds that stay until a person acknowledges them: in their safe mode nothing could show that they are gone
-LATCHED = ("heater_stuck_on", "heater_stuck_off", "heater_weak", "thermal_runaway", "sensor_slow")
-OF_INPUT = (ON, OFF, WEAK, COMMAND)
-OF_OUTPUT = (RUNAWAY, RANGE, NAN, FROZEN, OFFSET, SLOW, NOISY)
+OPEN, STILL, DEAF, ON, WEAK, REACH = range(len(KINDS))
+OF_INPUT = (ON, WEAK)
+# "own": the machine's own control, or PI
+MODES = ("law", "own", "off")
+LAW, OWN, OFF = range(3)
 
-ALARM = 8.5  # of a sum of innovations, in deviations: 7 gave two false ones in 120 h of a room that jumps
-DECIDED_AFTER, DECIDED_BY = 4, 9  # samples from the alarm: where one cause is clear, and at the latest
-TOLD_APART = 8.0  # of -2 log likelihood, by which one cause is clear of another, or of none
-UNEXPLAINED, UNEXPLAINED_SHARE = 12.0, 0.3  # mean square that is left of an output, and its share
-DEAD_SHARE = 0.75  # of its command that a heater lacks, from which it is off, not weak
-MOST_Z = 100.0  # deviations that count
-FORGETS = 1 / 8  # share a sample of the mean squares by which noise is told
-NOISY_SQUARE, NOISY_LAG = 6.0, 0.3  # mean square, and its share at lag one, of a noisy sensor
-CHANCE = 1e-9  # that a sensor repeats itself so often
-REPEATS_LEAST = 5
-SETTLED_DEGC = 5.0  # from the target: where inputs are such as can be held
-HELD_SHARE = 1 / 30  # share a sample of the mean of inputs that hold
-HEAT = 0.06  # share of the strongest input's range: heat that a zone gains or loses, and no input explains
-SLOWLY = 1 / 100  # share a sample of the mean drift, from which such heat is counted
-SURELY = 8.0  # deviations of the observer's drift at rest, and
-LEFT_OPEN = 2.0  # of what the spread leaves open of it
-APPLIED = 0.01  # share of an input's range by which it may differ from the command
+WINDOWS, SPACING = 6, 6  # forecasts side by side, and samples from one to the next
+STILL_AFTER = 10  # samples for which a forecast must have been away before a sensor stands still
+FIT_AFTER = 12  # samples of a window before it tells of a heater
+STEPS_STILL, NOISE_STILL = 3.0, 4.0  # steps and deviations that a forecast must move
+SAME_STEPS, SAME_NOISE = 1.5, 6.0  # steps and deviations within which a reading has not moved
+FOLLOWS = (0.5, 1.7)  # share of the forecast's move by which a sensor is cleared
+CLEARED_S = 60.0  # for how long it is cleared then
+# why readings miss the forecast: a heater lacks a share, or gives one of what it could add; heat of the
+# surroundings as a share of the input's range; samples late; a heater that differs from the model by a share;
+# a step of the reading in degC
+LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS = range(6)
+LEAST = np.array([0.35, 0.4, -0.3, -8.0, -0.25, -1e3])
+MOST = np.array([1.3, 1.5, 0.3, 8.0, 0.25, 1e3])
+CLEARER = 16.0  # of -2 log likelihood, by which a fault must explain better than what is none
+MISFIT = 0.15  # of what readings miss, which even the right cause leaves: no model is the machine
+DOUBT = 0.25  # share of what inputs did lately by which a forecast may be wrong
+RESTS = 1 / 40  # share a sample by which that is forgotten
+REPEATED = 3  # samples in a row with a reading that is none
+SHOWN = 6  # samples in a row that show a fault
+SLOWLY = 1 / 60  # share a sample of the mean drift, from which heat is counted
+EARLY, JUMP = 0.5, 10.0  # shares of the sample time between which two samples are apart
+RETURNS = 3  # times an hour that heaters which went off are tried again
+LEAK = 0.9999  # of the drift, kept a step
+HURRIED = 0.1  # of an innovation, by which the drift follows in manual
 
 
 class Supervision(NamedTuple):
-    """Thresholds and declared safe modes, the arrays by kind (k,), input (m,) or output (p,).
+    """What a machine is watched by.
 
-    `mode` (k,) the number in MODES, `back_s` (k,) seconds without the cause after which the law takes over
-    again, inf: a person acknowledges it. low, high (p,) in degC between which a reading is one. peak (p, m)
-    in degC per percent: how fast each input moves each output. `hysteresis_degC`, `gain_degC`, `check_s` and
-    `error_degC_s` are verify_heater's. `early`, `late`, `jump` are shares of the sample time: less than
-    `early` or more than `jump` is no time between two samples, more than `late` is a deadline missed.
-    `reach_degC`: a target that far from its reference is out of reach. `heat` (p,) in degC a sample: how far
-    the observer's drift may be from its mean.
+    A (n, n), B (n, m), C (p, n), b (n,), d (p,): the model with a drift w (p) in degC a step as its last
+    states; L, M (n, p) move its state by an innovation, from one sample to the next and at once; `hurried` is
+    added to L in manual; `unsure` (WINDOWS SPACING + 1, p) in degC is the deviation of a forecast by its age,
+    `wander` the sum of four times its squares.
+    It starts at start y + start_0. low, high (m,) in percent; `coldest`, `hottest` (p,) in degC between which
+    a reading is one; `of_input` (m,) the output that each input moves most; `back_s` the
+    time without the cause after which the law takes over again.
     """
 
-    watch: innovations.Watch
-    bank: innovations.Bank
-    mode: np.ndarray
-    back_s: np.ndarray
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    b: np.ndarray
+    d: np.ndarray
+    L: np.ndarray
+    M: np.ndarray
+    hurried: np.ndarray
+    unsure: np.ndarray
+    wander: np.ndarray
+    start: np.ndarray
+    start_0: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    coldest: np.ndarray
+    hottest: np.ndarray
     noise_degC: np.ndarray
-    peak: np.ndarray
-    hysteresis_degC: np.ndarray
-    gain_degC: np.ndarray
-    check_s: np.ndarray
-    error_degC_s: np.ndarray
+    of_input: np.ndarray
     sample_time_s: float
-    early: float
-    late: float
-    jump: float
     reach_degC: float
-    heat: np.ndarray
+    back_s: float
+
+    def variance(self, quantum: np.ndarray) -> np.ndarray:
+        """Of a reading (p,) in degC^2, with twice the sensors' noise or steps."""
+        steps = np.where(np.isfinite(quantum), quantum, 0.0) / np.sqrt(12)
+        return (2 * np.maximum(self.noise_degC, steps)) ** 2
 
 
 def supervision(
-    model: Plant,
-    family: Sequence[Plant],
-    machine: Machine,
-    noise_degC: np.ndarray,
-    *,
-    spread: innovations.PlantDeviations | None = None,
-    modes: Mapping[str, str] = SAFE,
-    back_s: float | None = None,
+    model: Plant, machine: Machine, noise_degC: np.ndarray, *, drift: float = 0.05, follows: float = 0.3
 ) -> Supervision:
-    """What a machine is watched by: an identified `model`, the `family` of plants that the machine may be
-    instead, and the deviation of its sensors' noise (p,) in degC.
-
-    `spread` by itself follows from the family (`spread_of`). `back_s` by itself is 30 samples, 10 s at least.
-    Raises ValueError for an unknown kind or mode, and for noise that is no number above zero.
-    """
+    """The observer of the stationary Riccati equation: outputs are moved a step by `follows` of the sensors'
+    noise (p,), along the state that inputs reach, and the drift wanders by `drift` of it. Raises ValueError
+    for noise that is no number above zero."""
     noise = np.broadcast_to(np.asarray(noise_degC, float), (model.p,)).copy()
     if not (np.isfinite(noise).all() and (noise > 0).all()):
         raise ValueError(
             f"supervision: expected the sensors' noise in degC above zero, found {noise}; estimate it from "
             "a hold of the record"
         )
-    if set(modes) != set(KINDS) or not set(modes.values()) <= set(MODES[1:]):
-        raise ValueError(
-            f"supervision: expected one of {', '.join(MODES[1:])} for each of {', '.join(KINDS)}, found "
-            f"{dict(modes)}; declare the safe mode of every kind"
-        )
+    plant = strictly_proper(model)
+    n, m, p = plant.n, plant.m, plant.p
+    likely, sensors = reached_state(plant), np.diag(np.maximum(noise, 1e-3) ** 2)
+    A = np.block([[plant.A, likely], [np.zeros((p, n)), LEAK * np.eye(p)]])
+    C = np.hstack([plant.C, np.zeros((p, p))])
+    moved = likely * follows * noise
+    P = riccati(A.T, C.T, scipy.linalg.block_diag(moved @ moved.T, np.diag((drift * noise) ** 2)), sensors)
+    M = P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
+    heat = np.vstack([likely, np.zeros((p, p))])
+    pulses = np.abs(markov_parameters(plant, 60))
+    unsure, spread = np.empty((WINDOWS * SPACING + 1, p)), P - M @ C @ P
+    for age in range(len(unsure)):
+        unsure[age] = np.sqrt(np.maximum(np.diag(C @ spread @ C.T), 0.0))
+        spread = A @ spread @ A.T
     T = machine.sample_time_s
-    waits = max(30 * T, 10.0) if back_s is None else back_s
-    limits = np.array([i.low for i in machine.inputs]), np.array([i.high for i in machine.inputs])
-    pulses = markov_parameters(strictly_proper(model), innovations.MOST_LATE)
-    check = _check_s(model, limits, T)
-    watch = innovations.watch(model, limits, noise, spread or spread_of(model, family))
-    peak = np.abs(pulses).max(axis=0)
     return Supervision(
-        watch=watch,
-        bank=innovations.bank(model),
-        mode=np.array([MODES.index(modes[kind]) for kind in KINDS]),
-        back_s=np.array([np.inf if kind in LATCHED else waits for kind in KINDS]),
-        low=np.array([o.low for o in machine.outputs]),
-        high=np.array([o.high for o in machine.outputs]),
+        A=A,
+        B=np.vstack([plant.B, np.zeros((p, m))]),
+        C=C,
+        b=np.r_[plant.b, np.zeros(p)],
+        d=plant.d,
+        L=A @ M,
+        M=M,
+        hurried=np.vstack([np.zeros((n, p)), HURRIED * np.eye(p) - (A @ M)[n:]]),
+        unsure=unsure,
+        wander=np.cumsum((2 * unsure) ** 2, axis=0),
+        start=heat,
+        start_0=-heat @ plant.d,
+        low=np.array([one.low for one in machine.inputs]),
+        high=np.array([one.high for one in machine.inputs]),
+        coldest=np.array([one.low for one in machine.outputs]),
+        hottest=np.array([one.high for one in machine.outputs]),
         noise_degC=noise,
-        peak=peak,
-        hysteresis_degC=np.maximum(5.0, 6 * noise),
-        gain_degC=np.maximum(2.0, 6 * noise),
-        check_s=check,
-        error_degC_s=6.0 * check,
+        of_input=pulses.max(axis=0).argmax(axis=0),
         sample_time_s=T,
-        early=0.5,
-        late=1.5,
-        jump=10.0,
         reach_degC=max(0.5, 3 * float(noise.max())),
-        heat=np.maximum(
-            HEAT * (peak * (limits[1] - limits[0])).max(axis=1), SURELY * innovations.drift_sd(watch, noise)
-        ),
+        back_s=max(30 * T, 10.0),
     )
 
 
-def _check_s(model: Plant, limits: tuple[np.ndarray, np.ndarray], sample_time_s: float) -> np.ndarray:
-    """Seconds (p,) in which an output must gain its degrees: ten times what a quarter of the inputs' range
-    takes to warm it by 2 degC; 20 s at least, as in Klipper."""
-    rise = np.cumsum(np.abs(markov_parameters(strictly_proper(model), 200)).max(axis=2), axis=0)
-    takes = (rise * 0.25 * (limits[1] - limits[0]).max() < 2.0).sum(axis=0) + 1
-    return np.maximum(10 * takes * sample_time_s, 20.0)
-
-
-def spread_of(model: Plant, family: Sequence[Plant]) -> innovations.PlantDeviations:
-    """How far the plants of a family are from the model, a deviation each: gain by the rise over MOST_LATE
-    samples of each output's strongest input; no less than what records leave open anyway."""
-    lags = innovations.MOST_LATE
-    rise = np.abs(markov_parameters(strictly_proper(model), lags).sum(axis=0))
-    i = rise.argmax(axis=1)
-    j = np.arange(model.p)
-    ratios = [
-        np.abs(markov_parameters(strictly_proper(one), lags).sum(axis=0))[j, i] / rise[j, i] - 1
-        for one in family
-    ]
-    gain = float(np.sqrt(np.mean(np.square(ratios)))) if ratios else 0.0
-    return innovations.PlantDeviations(gain=max(gain, 0.15), pace=0.15, loss=0.003, late=0.7)
-
-
 class Cause(NamedTuple):
-    """What is wrong: its kind (KINDS), the signal's name or "machine", the reason in one sentence, and the
-    time since when."""
+    """What is wrong: its kind (KINDS), the signal's name, the reason in one sentence, and the time since
+    when."""
 
     kind: str
     signal: str
@@ -213,8 +175,7 @@ class Cause(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """Inputs u (m,) to apply in percent, the mode (MODES), and its causes, the one that explains most
-    first."""
+    """Inputs u (m,) to apply in percent, the mode (MODES), and its causes."""
 
     u: np.ndarray
     mode: str
@@ -225,441 +186,375 @@ class Decision(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """All that the supervisor remembers beside innovations.Memory, arrays that are changed in place.
+    """All that the supervisor remembers, arrays that are changed in place.
 
-    By kind and signal (k, w): since, last in s of the supervisor's own time, -1 where not so; amount; other,
-    the number of the kind that would show the same, -1 for none, ALL_INPUTS where it is of every input.
+    By kind and signal (k, w): since and last in s of the supervisor's own time, -1 if not so; amount.
 
-    By output (p,): y the last reading; repeats of it, and quantum the smallest move seen; square and lag,
-    means of z(t)^2 and z(t) z(t-1), z the last; trusted 1 or 0; absurd 1 where it left its range by itself;
-    expected and e the last forecast and innovation; error, goal and waited of verify_heater in degC s, degC
-    and s.
+    The observer: x (n,), the innovation e (p,) before, the mean drift `slow` (p,), the forecast `expected`
+    (p,). By output (p,): y the last reading and its repeats, quantum the smallest move seen, bad readings in
+    a row, cleared_s the time at which it last moved as forecast, returns how often it was trusted again, the
+    last time at returned_s.
 
-    drift (p, m + 4) the mean of innovations.drift.
+    Windows (K): states (2, K, n), from the drift as it was and from its mean; given and unit (K, n, m), the
+    responses to the inputs and to one percent of each; before (K, m) the former a sample ago; began, first,
+    least, most (K, p) the forecast and the reading at first, the least and the most reading; away (K, p)
+    samples in a row in which the forecast was away from it; square (K, m) the sum of r^2, causes (K, m, 6)
+    that of each cause's signature squared, cross (K, K, m, 6) that of r of a window times the signature of a
+    cause that began with another; age (K,) in samples, -1 for none.
 
-    By input (m,): held the inputs that hold; asked the last command; lacks the share that a weak heater
-    lacks; stuck 1 where it is on.
-
-    counters (8,): samples since the start or an acknowledgement; samples since the alarm, -1 for none; mode;
-    1 once the clock was read; samples in all; causes that are there; 1 where a heater is stuck or weak; 1
-    where a zone is colder than it should be. clock_s (2,): the clock at the last sample, and the supervisor's
-    own time, which never falls.
+    shown (2, m): samples in a row in which a heater was stuck on, or weak. asked (m,) the last command,
+    usual (m,) its mean, stirred (m,) how far it was from it lately.
+    counters (5,): samples, mode, 1 once the clock was read, causes that are there, samples under the law.
+    clock_s (2,): the clock at the last sample, and the supervisor's own time, which never falls.
     """
 
     since: np.ndarray
     last: np.ndarray
     amount: np.ndarray
-    other: np.ndarray
-    y: np.ndarray
-    repeats: np.ndarray
-    quantum: np.ndarray
-    square: np.ndarray
-    lag: np.ndarray
-    z: np.ndarray
-    trusted: np.ndarray
-    absurd: np.ndarray
-    expected: np.ndarray
+    x: np.ndarray
     e: np.ndarray
-    error: np.ndarray
-    goal: np.ndarray
-    waited: np.ndarray
-    drift: np.ndarray
-    held: np.ndarray
+    slow: np.ndarray
+    expected: np.ndarray
+    y: np.ndarray
+    quantum: np.ndarray
+    repeats: np.ndarray
+    bad: np.ndarray
+    cleared_s: np.ndarray
+    returns: np.ndarray
+    returned_s: np.ndarray
+    states: np.ndarray
+    given: np.ndarray
+    unit: np.ndarray
+    before: np.ndarray
+    began: np.ndarray
+    first: np.ndarray
+    least: np.ndarray
+    most: np.ndarray
+    away: np.ndarray
+    square: np.ndarray
+    causes: np.ndarray
+    cross: np.ndarray
+    total: np.ndarray
+    age: np.ndarray
+    shown: np.ndarray
     asked: np.ndarray
-    lacks: np.ndarray
-    stuck: np.ndarray
+    usual: np.ndarray
+    stirred: np.ndarray
     counters: np.ndarray
     clock_s: np.ndarray
 
 
-SAMPLES, ALARMED, MODE, CLOCKED, STEPS, ACTIVE, CHANGED, COLDER = range(8)
+SAMPLES, MODE, CLOCKED, ACTIVE, RUNS = range(5)
 
 
 def kept(s: Supervision) -> Kept:
-    """What a supervisor knows before its first sample."""
-    (p, m), k = s.peak.shape, len(KINDS)
-    w = max(m, p)
+    """A memory that has seen nothing."""
+    n, m, p, K = len(s.A), len(s.low), len(s.d), WINDOWS
+    w, k = max(m, p), len(KINDS)
     return Kept(
         since=np.full((k, w), -1.0),
         last=np.full((k, w), -1.0),
         amount=np.zeros((k, w)),
-        other=np.full((k, w), -1),
-        y=np.full(p, np.nan),
-        repeats=np.zeros(p, int),
-        quantum=np.full(p, np.inf),
-        square=np.ones(p),
-        lag=np.zeros(p),
-        z=np.zeros(p),
-        trusted=np.ones(p),
-        absurd=np.zeros(p),
-        expected=np.zeros(p),
+        x=np.zeros(n),
         e=np.zeros(p),
-        error=np.zeros(p),
-        goal=np.full(p, -np.inf),
-        waited=np.zeros(p),
-        drift=np.zeros((p, m + 4)),
-        held=np.zeros(m),
+        slow=np.zeros(p),
+        expected=np.zeros(p),
+        y=np.full(p, np.nan),
+        quantum=np.full(p, np.inf),
+        repeats=np.zeros(p, int),
+        bad=np.zeros(p, int),
+        cleared_s=np.full(p, -np.inf),
+        returns=np.zeros(p, int),
+        returned_s=np.full(p, -np.inf),
+        states=np.zeros((2, K, n)),
+        given=np.zeros((K, n, m)),
+        unit=np.zeros((K, n, m)),
+        before=np.zeros((K, m)),
+        began=np.zeros((K, p)),
+        first=np.zeros((K, p)),
+        least=np.zeros((K, p)),
+        most=np.zeros((K, p)),
+        away=np.zeros((K, p), int),
+        square=np.zeros((K, m)),
+        causes=np.zeros((K, m, len(LEAST))),
+        cross=np.zeros((K, K, m, len(LEAST))),
+        total=np.zeros((2, K, p)),
+        age=np.full(K, -1),
+        shown=np.zeros((2, m), int),
         asked=np.zeros(m),
-        lacks=np.zeros(m),
-        stuck=np.zeros(m),
-        counters=np.array([0, -1, 0, 0, 0, 0, 0, 0]),
+        usual=np.zeros(m),
+        stirred=np.zeros(m),
+        counters=np.zeros(5, int),
         clock_s=np.zeros(2),
     )
 
 
-# ---- one sample, kind by kind
+# ---- a sample
 
 
-def said(k: Kept, kind: int, signal: int, amount: float = 0.0, other: int = -1) -> None:
-    """The cause is there now; what was said of it first stays."""
-    t_s = k.clock_s[1]
+def say(k: Kept, kind: int, signal: int, amount: float = 0.0) -> None:
+    """A cause is there now; what was said first of it stays."""
     if k.since[kind, signal] < 0:
-        k.since[kind, signal], k.amount[kind, signal], k.other[kind, signal] = t_s, amount, other
+        k.since[kind, signal], k.amount[kind, signal] = k.clock_s[1], amount
         k.counters[ACTIVE] += 1
-    k.last[kind, signal] = t_s
+    k.last[kind, signal] = k.clock_s[1]
 
 
-def timed(s: Supervision, k: Kept, t_s: float) -> int:
-    """Whole samples since the last one, by which the supervisor's own time goes on: 1 where the clock tells
-    none. Says where clock or deadline are wrong."""
+def pass_time(s: Supervision, k: Kept, t_s: float) -> int:
+    """Whole samples since the last one, by which the supervisor's own time goes on. A clock that tells no
+    time between two samples, or a long one, counts as one; then forecasts begin anew."""
+    if not k.counters[CLOCKED]:
+        k.clock_s[0], k.counters[CLOCKED] = t_s - s.sample_time_s, 1
     gap_s = t_s - k.clock_s[0]
     gap = gap_s / s.sample_time_s
-    sane = s.early <= gap <= s.jump
+    sane = EARLY <= gap <= JUMP
     k.clock_s[0] = t_s
     k.clock_s[1] += gap_s if sane else s.sample_time_s
-    if not sane:
-        said(k, CLOCK, 0, gap_s)
-    elif gap > s.late:
-        said(k, DEADLINE, 0, gap_s)
-    return int(gap + 0.5) if sane and gap > s.late else 1
+    if not sane or gap > 1.5:
+        k.age[:] = -1
+    return int(gap + 0.5) if sane and gap > 1.5 else 1
 
 
-def acted(s: Supervision, k: Kept, applied: np.ndarray | None) -> np.ndarray:
-    """Inputs (m,) that acted since the last sample, as far as is known; says where one was not applied."""
-    u = k.asked
-    if applied is not None:
-        off = np.abs(applied - k.asked) > APPLIED * (s.watch.high - s.watch.low)
-        wrong = np.flatnonzero(off | ~np.isfinite(applied))
-        if len(wrong) > 1:
-            said(k, COMMAND, 0, 0.0, ALL_INPUTS)
-        elif len(wrong):
-            said(k, COMMAND, int(wrong[0]), float(applied[wrong[0]]))
-        u = np.where(np.isfinite(applied), applied, k.asked)
-    if k.counters[CHANGED]:
-        u = np.where(k.stuck > 0, s.watch.high, u * (1 - k.lacks))
-    return u
+def read(s: Supervision, k: Kept, y: np.ndarray) -> np.ndarray:
+    """Whether each output (p,) counts now; says which gives no number, or one out of its range."""
+    counts = np.isfinite(y) & (y >= s.coldest) & (y <= s.hottest)
+    k.bad[:] = np.where(counts, 0, k.bad + 1)
+    for j in np.flatnonzero(k.bad >= REPEATED):
+        say(k, OPEN, j, y[j])
+    moves = np.where(counts, np.abs(y - k.y), np.inf)
+    k.quantum[:] = np.minimum(k.quantum, np.where(moves > 1e-9, moves, np.inf))
+    k.repeats[:] = np.where(counts & (moves < 1e-12), k.repeats + 1, np.where(counts, 0, k.repeats))
+    k.y[:] = np.where(counts, y, k.y)
+    return counts & ((k.since[[OPEN, STILL, DEAF], : len(y)] < 0).all(axis=0))
 
 
-def read(s: Supervision, k: Kept, y: np.ndarray) -> None:
-    """Readings that are none, out of range, or the same for too long."""
-    moves = np.abs(y - k.y)
-    # one comparison for all, where every reading is one
-    if (
-        math.isfinite(sum(y.tolist()))
-        and min((y - s.low).tolist()) >= 0 <= min((s.high - y).tolist())
-        and min(moves.tolist()) > 1e-9
-    ):
-        k.quantum[:] = np.minimum(k.quantum, moves)
-        k.repeats[:] = 0
-        k.y[:] = y
+def begin_window(s: Supervision, k: Kept, at: int, counts: np.ndarray) -> None:
+    """A forecast from where the machine is now."""
+    start = k.x + s.M @ k.e
+    k.states[:, at] = start
+    k.states[1, at, -len(s.d) :] = k.slow
+    for part in (k.given, k.unit, k.before, k.away, k.square, k.causes, k.cross):
+        part[at] = 0
+    k.cross[:, at] = k.total[:, at] = 0.0
+    k.began[at] = k.least[at] = k.most[at] = s.C @ start + s.d
+    # a sensor that does not count may be far from its forecast, and moves with it all the same
+    k.first[at] = np.where(counts, k.began[at], k.y)
+    k.age[at] = 0
+
+
+def advance(s: Supervision, k: Kept, u: np.ndarray) -> None:
+    """Observer and windows a sample on, inputs u (m,) applied."""
+    on = s.B @ u + s.b
+    k.x[:] = s.A @ k.x + on + s.L @ k.e
+    runs = k.age >= 0
+    k.states[:] = np.where(runs[:, None], k.states @ s.A.T + on, 0.0)
+    k.given[:] = np.where(runs[:, None, None], s.A @ k.given + s.B * (u - s.low), 0.0)
+    k.unit[:] = np.where(runs[:, None, None], s.A @ k.unit + s.B, 0.0)
+    k.age[:] = np.where(runs, k.age + 1, -1)
+
+
+def compare(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
+    """Readings y (p,) that count against every window: what moved, and the sums of the fits."""
+    k.least[:] = np.where(counts, np.minimum(k.least, y), k.least)
+    k.most[:] = np.where(counts, np.maximum(k.most, y), k.most)
+    own, inputs = s.of_input, np.arange(len(s.low))
+    runs = (k.age >= 0)[:, None]
+    missed = np.where(counts & runs, y - k.states[1] @ s.C.T - s.d, 0.0)[:, own]
+    given, unit = ((s.C @ part)[:, own, inputs] for part in (k.given, k.unit))
+    span = s.high - s.low
+    step = np.where(runs, 1.0, 0.0) * np.ones_like(given)
+    parts = [-given, span * unit - given, span * unit, k.before - given, -given, step]
+    signatures = np.stack(parts, axis=2)
+    moved = np.where(counts, y - k.began, 0.0)
+    k.total[...] += moved, moved * moved
+    k.before[:] = given
+    k.square[...] += missed * missed
+    k.causes[...] += signatures * signatures
+    k.cross[...] += missed[:, None, :, None] * signatures
+
+
+def threshold(s: Supervision, k: Kept) -> np.ndarray:
+    """By how many degC (K, p) a forecast must move, or be missed, before a sensor or heater is judged."""
+    quantum = np.where(np.isfinite(k.quantum), k.quantum, 0.0)
+    least = np.maximum(STEPS_STILL * quantum, NOISE_STILL * s.noise_degC)
+    return np.maximum(least, NOISE_STILL * s.unsure[np.minimum(np.maximum(k.age, 0), len(s.unsure) - 1)])
+
+
+def clear_sensors(s: Supervision, k: Kept, doubt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Clears sensors that move as forecast. By how many degC (K, p) each forecast has moved, and whether that
+    is more than its doubt (K, p)."""
+    moves, moved = k.states[0] @ s.C.T + s.d - k.began, k.y - k.first
+    large = (np.abs(moves) >= threshold(s, k)) & (k.age > 0)[:, None]
+    share = moved / np.where(large, moves, 1.0)
+    follows = large & (share >= FOLLOWS[0]) & (share <= FOLLOWS[1])
+    k.cleared_s[:] = np.where(follows.any(axis=0) & (k.bad == 0), k.clock_s[1], k.cleared_s)
+    k.away[:] = np.where(large, k.away + 1, 0)
+    return moves, large & (np.abs(moves) >= doubt)
+
+
+def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
+    """Says which sensors stand still while the forecast moves, and which heater heats otherwise than it was
+    told: what explains clearly better than anything that is no fault."""
+    doubt = DOUBT * np.abs(s.C @ k.unit) @ k.stirred
+    moves, large = clear_sensors(s, k, doubt)
+    own, age = s.of_input, np.maximum(k.age, 1)[:, None]
+    missed = np.abs(y - k.states[1] @ s.C.T - s.d)
+    tells = (k.age >= FIT_AFTER)[:, None] & counts & (missed >= np.maximum(threshold(s, k), doubt))
+    still = (k.away >= STILL_AFTER) & large & counts
+    if not (tells.any() or still.any()):
+        k.shown[:] = 0
         return
-    for j in range(len(y)):
-        value = y[j]
-        if not math.isfinite(value):
-            said(k, NAN, j)
-            k.repeats[j] = 0
-            continue
-        if not s.low[j] <= value <= s.high[j]:
-            said(k, RANGE, j, value)
-        move = abs(value - k.y[j])
-        if move == 0:
-            k.repeats[j] += 1
-            if k.counters[SAMPLES] > 20 and k.repeats[j] >= repeats_at_most(k.quantum[j], s.noise_degC[j]):
-                said(k, FROZEN, j, value)
+    amount = np.clip(k.cross / np.maximum(k.causes, 1e-12), LEAST, MOST)
+    left = k.square[:, None, :, None] - 2 * amount * k.cross + amount**2 * k.causes
+    noise = age * s.variance(k.quantum) + s.wander[np.minimum(np.maximum(k.age, 0), len(s.wander) - 1)]
+    floor = noise[:, own] + MISFIT**2 * k.square + 1e-12
+    later = (k.age[None, :] <= k.age[:, None]) & (k.age >= REPEATED)[None, :]
+    left = np.where(later[:, :, None, None], np.maximum(left, floor[:, None, :, None]), 1e300)
+    honest = np.minimum(left[..., HEAT:].min(axis=(1, 3)), np.maximum(k.square, floor))
+    same = unmoved(s, k)
+    judge_sensors(s, k, moves, still & same, honest, noise)
+    explained = left[..., :HEAT].min(axis=1)
+    best = explained.min(axis=2)
+    clear = (age * np.log(honest / best) >= CLEARER) & tells[:, own] & (best <= 2 * floor)
+    gives = explained[..., GIVES] < explained[..., LACKS]
+    shows = np.stack([(clear & gives).any(axis=0), (clear & ~gives).any(axis=0)])
+    k.shown[:] = np.where(shows, k.shown + 1, 0)
+    shown = clear & (k.shown.max(axis=0) >= SHOWN)
+    if shown.any():
+        window, i = np.unravel_index(np.where(shown, k.square, -1.0).argmax(), shown.shape)
+        cause = GIVES if gives[window, i] else LACKS
+        onset = int(left[window, :, i, cause].argmin())
+        if same[window, own[i]]:
+            say_still(k, int(own[i]), moves[window, own[i]])
         else:
-            if move > 1e-9:
-                k.quantum[j] = min(k.quantum[j], move)
-            k.repeats[j] = 0
-        k.y[j] = value
+            say(k, ON if cause == GIVES else WEAK, int(i), float(amount[window, onset, i, cause]))
 
 
-def repeats_at_most(quantum: float, noise: float) -> float:
-    """Repeats that an honest sensor of such steps in degC and such noise shows with probability CHANCE."""
-    same = math.erf(min(quantum, 1e9) / (2 * math.sqrt(2) * noise))
-    if same >= 1:
-        return math.inf
-    return max(REPEATS_LEAST, math.log(CHANCE) / math.log(max(same, 1e-12)))
+def say_still(k: Kept, j: int, moves_degC: float) -> None:
+    """An output stands still, or shows noise alone, while its forecast moves: its sensor, or its heater."""
+    say(k, STILL if k.repeats[j] >= STILL_AFTER // 2 else DEAF, j, moves_degC)
 
 
-def verified(s: Supervision, k: Kept, y: np.ndarray, y_star: np.ndarray) -> None:
-    """verify_heater of Klipper: an output colder than its target must gain `gain_degC` in `check_s`, or the
-    time it is colder than its hysteresis adds up."""
-    T, colder = s.sample_time_s, y_star - s.hysteresis_degC - y
-    if max(colder.tolist()) <= 0:
-        if k.counters[COLDER]:
-            k.counters[COLDER] = 0
-            k.error[:] = k.waited[:] = 0.0
-        return
-    k.counters[COLDER] = 1
-    for j in range(len(y)):
-        below = colder[j]
-        if not below > 0 or not k.trusted[j]:
-            k.error[j] = k.waited[j] = 0.0
-            continue
-        if k.waited[j] == 0 or y[j] >= k.goal[j]:
-            k.goal[j], k.waited[j], k.error[j] = y[j] + s.gain_degC[j], 0.0, 0.0
-        k.waited[j] += T
-        if k.waited[j] > s.check_s[j]:
-            k.error[j] += below * T
-            if k.error[j] > s.error_degC_s[j]:
-                said(k, RUNAWAY, j, below)
+def unmoved(s: Supervision, k: Kept) -> np.ndarray:
+    """Whether readings (K, p) have stood still since each window began, but for noise."""
+    quantum = np.where(np.isfinite(k.quantum), k.quantum, 0.0)
+    return k.most - k.least <= np.maximum(SAME_STEPS * quantum, SAME_NOISE * s.noise_degC)
 
 
-def noted(k: Kept, z: np.ndarray) -> None:
-    """Mean squares of the innovation, and at lag one."""
-    z, square, lag = np.minimum(np.maximum(z, -MOST_Z), MOST_Z), k.square, k.lag
-    square += FORGETS * (z * z - square)
-    lag += FORGETS * (z * k.z - lag)
-    k.z[:] = z
-
-
-def diagnosed(s: Supervision, k: Kept, memory: innovations.Memory) -> bool:
-    """From the alarm on: whether it is decided what explains the innovation, and says so."""
-    since = k.counters[ALARMED]
-    if since < DECIDED_AFTER or memory.ahead[0] > 0 or memory.age[0] < 0:
-        return False
-    verdict = innovations.judged(s.bank, memory)
-    best = int(verdict.cost.argmin())
-    kinds, signals = _named(s, k, verdict)
-    same = (kinds == kinds[best]) & (signals == signals[best])
-    rival = int(np.where(same, np.inf, verdict.cost).argmin())
-    clear = verdict.cost[rival] - verdict.cost[best]
-    explains = verdict.none - verdict.cost[best] > TOLD_APART
-    if since < DECIDED_BY and not (clear > TOLD_APART and explains):
-        return False
-    worst = int(verdict.own.argmax())
-    repeated = k.repeats[worst] >= 2 and _chance(k, s, worst) < 1e-4
-    spoilt = (verdict.left > UNEXPLAINED) & (verdict.left > UNEXPLAINED_SHARE * verdict.own)
-    if repeated:
-        said(k, FROZEN, worst, k.y[worst])
-    elif (
-        k.square[worst] > NOISY_SQUARE
-        and k.lag[worst] < NOISY_LAG * k.square[worst]
-        and (not explains or spoilt.any())
-    ):
-        said(k, NOISY, worst, math.sqrt(k.square[worst]))
-    elif not explains or spoilt.any():
-        said(k, MODEL, 0, math.sqrt(verdict.own[worst]))
-    else:
-        other = int(kinds[rival]) if clear <= TOLD_APART else -1
-        _explained(k, memory, (int(kinds[best]), int(signals[best]), best), verdict.amplitude[best], other)
-    return True
-
-
-def _chance(k: Kept, s: Supervision, j: int) -> float:
-    same = math.erf(min(k.quantum[j], 1e9) / (2 * math.sqrt(2) * s.noise_degC[j]))
-    return same ** int(k.repeats[j])
-
-
-def _named(s: Supervision, k: Kept, verdict: innovations.Verdict) -> tuple[np.ndarray, np.ndarray]:
-    """Kind and signal (h,) of every hypothesis at its amplitude."""
-    form, signal, a = s.bank.form, s.bank.signal, verdict.amplitude
-    cooling = s.peak @ k.held
-    output = np.minimum(signal, len(cooling) - 1)
-    falls = -a > 2 * cooling[output] + 10 * s.noise_degC[output]
-    kinds = np.full(len(form), OFFSET)
-    kinds[form == innovations.ON] = ON
-    kinds[form == innovations.LESS] = WEAK
-    kinds[(form == innovations.LESS) & (a > DEAD_SHARE)] = OFF
-    kinds[form == innovations.NOT_APPLIED] = COMMAND
-    kinds[form == innovations.LAG] = SLOW
-    kinds[(form == innovations.RAMP) & falls] = RUNAWAY
-    return kinds, signal
-
-
-def _explained(
-    k: Kept, memory: innovations.Memory, named: tuple[int, int, int], amount: float, other: int
+def judge_sensors(
+    s: Supervision, k: Kept, moves: np.ndarray, still: np.ndarray, honest: np.ndarray, noise: np.ndarray
 ) -> None:
-    """The cause, and the observer freed of what it did to it."""
-    kind, signal, best = named
-    memory.Z[:, 0] += amount * memory.Xb[:, best]
-    if kind in (OFFSET, RUNAWAY) and k.since[RANGE, signal] >= 0:
-        k.absurd[signal] = 1.0  # the reading left its range at once: that is its reason
-        return
-    if kind == COMMAND:
-        other = ALL_INPUTS
-    said(k, kind, signal, amount * memory.f[best] if kind == OFFSET else amount, other)
-    k.counters[CHANGED] = int(k.counters[CHANGED] or kind in (ON, OFF, WEAK))
-    if kind == ON:
-        k.stuck[signal] = 1.0
-    elif kind in (OFF, WEAK):
-        k.lacks[signal] = min(amount, 1.0)
+    """Says which sensors stand still (K, p) as long as nothing that is no fault, which leaves `honest` (K, m)
+    of what they miss, explains that as well; `noise` (K, p) of it is none of anything."""
+    age = np.maximum(k.age, 1)[:, None]
+    still = still & (np.abs(moves) >= SAME_STEPS * (k.most - k.least))
+    for j in np.flatnonzero(still.any(axis=0)):
+        heaters = np.flatnonzero(s.of_input == j)
+        if not heaters.size:
+            continue
+        square = k.square[:, heaters].max(axis=1)
+        steady = k.total[1, :, j] - k.total[0, :, j] ** 2 / age[:, 0]
+        floor = noise[:, j] + MISFIT**2 * square + 1e-12
+        better = age[:, 0] * np.log(honest[:, heaters].min(axis=1) / np.maximum(steady, floor))
+        # what moves a heater is a reading that moved: nothing honest keeps one equal meanwhile
+        equal = k.repeats[j] >= age[:, 0]
+        clear = still[:, j] & ((better >= CLEARER) | equal)
+        if clear.any():
+            window = int(np.where(clear, np.abs(moves[:, j]), -1.0).argmax())
+            say_still(k, int(j), moves[window, j])
 
 
-def distrusted(s: Supervision, k: Kept, y: np.ndarray) -> None:
-    """Sensors that do not count now; an offset is gone where the reading is nearer to the forecast than half
-    of it."""
-    if not k.counters[ACTIVE]:  # not even one that gives no number
-        k.trusted[:] = 1.0
-        return
-    for j in range(len(y)):
-        bad = k.since[NAN, j] >= 0 or k.since[FROZEN, j] >= 0 or k.since[SLOW, j] >= 0
-        bad = bad or k.since[OFFSET, j] >= 0 or k.absurd[j] > 0
-        bad = bad or k.since[RUNAWAY, j] >= 0 or k.since[NOISY, j] >= 0 or not math.isfinite(y[j])
-        k.trusted[j] = 0.0 if bad else 1.0
-        off = abs(y[j] - k.expected[j])
-        if k.since[OFFSET, j] >= 0 and not off < 0.5 * abs(k.amount[OFFSET, j]):
-            k.last[OFFSET, j] = k.clock_s[1]
-        if k.since[NOISY, j] >= 0 and off > 5 * s.noise_degC[j]:
-            k.last[NOISY, j] = k.clock_s[1]
-
-
-def gone(s: Supervision, k: Kept) -> bool:
-    """Forgets causes that were not there for their time; whether one of a sensor went."""
+def forget(s: Supervision, k: Kept) -> None:
+    """Causes that are gone: after `back_s` without them, or, if the heaters are off for them, as soon as the
+    output moves as forecast again. That counts RETURNS times an hour; from then on a person is waited for."""
     if not k.counters[ACTIVE]:
-        return False
-    active = k.since >= 0
-    k.absurd[:] = np.where(k.since[RANGE, : len(k.absurd)] >= 0, k.absurd, 0.0)
-    went = active & (k.clock_s[1] - k.last > s.back_s[:, None])
-    k.since[went], k.last[went], k.other[went] = -1.0, -1.0, -1
-    k.counters[ACTIVE] -= int(went.sum())
-    return bool(went[list(OF_OUTPUT)].any())
+        return
+    gone = (k.since >= 0) & (k.clock_s[1] - k.last > s.back_s)
+    for kind in (STILL, DEAF, ON, WEAK):
+        for signal in np.flatnonzero(k.since[kind] >= 0):
+            if kind == WEAK and k.amount[WEAK, signal] >= 0:
+                continue
+            j = s.of_input[signal] if kind in OF_INPUT else signal
+            rested = k.clock_s[1] - k.returned_s[j] > 3600.0
+            again = k.cleared_s[j] > k.last[kind, signal] and (rested or k.returns[j] < RETURNS)
+            gone[kind, signal] = again
+            if again:
+                k.returns[j] = 1 if rested else k.returns[j] + 1
+                k.returned_s[j] = k.clock_s[1]
+    if gone.any():
+        k.since[gone] = k.last[gone] = -1.0
+        k.counters[ACTIVE] -= int(gone.sum())
+        k.age[:] = -1
 
 
-def mode_of(s: Supervision, k: Kept) -> int:
-    """The most severe of the modes that the causes declare; hold while an alarm is not decided."""
-    if not k.counters[ACTIVE]:
-        return LAW if k.counters[ALARMED] < 0 else HOLD
-    kinds, signals = np.nonzero(k.since >= 0)
-    beside = k.other[kinds, signals]
-    # a mode that is safe for what would show the same, too
-    modes = s.mode[np.r_[kinds, beside[beside >= 0]]]
-    worst = int(modes[SEVERITY[modes].argmax()])
-    if k.counters[ALARMED] >= 0 and SEVERITY[worst] < SEVERITY[HOLD]:
-        return HOLD
-    return worst
-
-
-def followed(
-    s: Supervision,
-    k: Kept,
-    memory: innovations.Memory,
-    y: np.ndarray,
-    y_star: np.ndarray,
-    applied,
-    samples: int,
-) -> np.ndarray:
-    """One sample of outputs y (p,), of which targets were y_star, inputs `applied` since the one before, none
-    of `samples` in manual; y (p,) with what is not trusted as forecast."""
-    manual, samples = samples == 0, max(samples, 1)
-    watch, first = s.watch, k.counters[SAMPLES] == 0
-    u = acted(s, k, applied)
-    read(s, k, y)
-    moved = np.zeros(len(y))
-    if first:
-        innovations.started(watch, memory, np.where(np.isfinite(y), y, y_star))
-        memory.u[:] = u
-        k.drift[:] = 0.0
+def follow(s: Supervision, k: Kept, y: np.ndarray, applied: np.ndarray | None, samples: int) -> np.ndarray:
+    """One sample of outputs y (p,), inputs `applied` since the one before, none of `samples` in manual; y
+    (p,) with what does not count as forecast."""
+    u = k.asked if applied is None else np.where(np.isfinite(applied), applied, k.asked)
+    counts = read(s, k, y)
+    if k.counters[SAMPLES] == 0:
+        k.x[:] = s.start @ np.where(np.isfinite(y), y, s.d) + s.start_0
+    for step in range(max(samples, 1) if k.counters[SAMPLES] else 0):
+        advance(s, k, u)
+        if samples == 0:
+            k.x[...] += s.hurried @ k.e
+        elif step:
+            k.e[:] = 0.0
+    k.expected[:] = s.C @ k.x + s.d
+    filled = np.where(counts, y, k.expected)
+    if samples == 0:
+        k.age[:] = -1
+        k.slow[:] = k.x[-len(s.d) :]
+        k.usual[:] = u if k.counters[SAMPLES] < 2 else k.usual + SLOWLY * (u - k.usual)
+        k.stirred[:] = 0.0
     else:
-        for step in range(samples):
-            e = k.e if step == 0 else 0.0 * k.e
-            moved = innovations.advanced(watch, memory, u, e)
-            if manual:
-                memory.Z[:, 0] += watch.hurried @ e
-                memory.Z[:, 1:] = 0.0
-    distrusted(s, k, y)
-    now = innovations.seen(watch, memory, y, k.trusted)
-    noted(k, now.z)
-    innovations.kept(memory, now, moved)
-    innovations.suspected(watch, s.bank, memory, now, alarmed=bool(k.counters[ALARMED] >= 0))
-    k.expected[:], k.e[:] = now.expected, now.e
-    filled = np.where(k.trusted > 0, y, now.expected) if k.counters[ACTIVE] else y
-    if manual:
-        innovations.rested(memory)
-        k.drift[:] = innovations.drift(memory, len(y))
-    else:
-        alarmed(s, k, memory, now.highest)
-        heated(s, k, memory)
-    if gone(s, k):
-        # a sensor counts again: what it showed meanwhile does not
-        innovations.started(watch, memory, filled)
-        k.e[:] = 0.0
-        k.drift[:] = 0.0
+        k.slow[...] += SLOWLY * (k.x[-len(s.d) :] - k.slow)
+        k.usual[...] += SLOWLY * (u - k.usual)
+        k.stirred[:] = np.maximum(np.abs(u - k.usual), (1 - RESTS) * k.stirred)
+        compare(s, k, filled, counts)
+        judge(s, k, filled, counts)
+    k.e[:] = np.where(counts, filled - k.expected, 0.0)
+    forget(s, k)
+    if samples and k.counters[SAMPLES] % SPACING == 0:
+        begin_window(s, k, k.counters[SAMPLES] // SPACING % WINDOWS, counts)
     k.counters[SAMPLES] += 1
-    k.counters[STEPS] += 1
     return filled
 
 
-def _loudest(memory: innovations.Memory) -> int:
-    """The output whose sum is largest."""
-    return int(np.maximum(memory.sums[0], memory.sums[1]).argmax())
-
-
-def alarmed(s: Supervision, k: Kept, memory: innovations.Memory, highest: float) -> None:
-    """The alarm, and its end where it is decided, or where the sensor that raised it is seen to be wrong."""
-    c = k.counters
-    if c[ALARMED] < 0:
-        if highest > ALARM:
-            c[ALARMED] = 0
-        return
-    c[ALARMED] += 1
-    if diagnosed(s, k, memory) or c[ALARMED] > 2 * DECIDED_BY or not k.trusted[_loudest(memory)]:
-        c[ALARMED] = -1
-        innovations.rested(memory)
-
-
-def heated(s: Supervision, k: Kept, memory: innovations.Memory) -> None:
-    """An output that drifts within seconds by more than the heat that surroundings may take or give, while
-    nothing else is odd: the observer has followed it, so that no sum shows it. Of that, what a plant of the
-    spread may do does not count."""
-    mean = k.drift
-    away = innovations.drift(memory, len(mean)) - mean
-    quiet = not k.counters[ACTIVE] and k.counters[ALARMED] < 0
-    if quiet and max((np.abs(away[:, 0]) - s.heat).tolist()) > 0:
-        for j, X in enumerate(away[:, 1:]):
-            off = away[j, 0] + X @ memory.theta[j]
-            stirred = X * s.watch.prior
-            left = math.sqrt(s.watch.unexplained**2 * (stirred @ stirred) + X @ (memory.P[j] @ X))
-            if abs(off) > s.heat[j] + LEFT_OPEN * left:
-                said(k, OFFSET, j, off / FORGETS)
-                innovations.drift(memory, len(mean))[j, 0] -= off
-    mean += SLOWLY * away
+def choose_mode(s: Supervision, k: Kept) -> int:
+    """The safe mode of the causes that are there: the heaters go off if a sensor is in doubt, or a heater is
+    and its sensor has not moved as forecast for CLEARED_S; otherwise the machine's own control takes over."""
+    if not k.counters[ACTIVE]:
+        return LAW
+    doubtful = (k.since[[OPEN, STILL, DEAF, ON]] >= 0).any()
+    for i in np.flatnonzero(k.since[WEAK] >= 0):
+        if k.amount[WEAK, i] >= 0 and k.since[WEAK, i] - k.cleared_s[s.of_input[i]] > CLEARED_S:
+            k.amount[WEAK, i] = -k.amount[WEAK, i]
+    uncleared = (k.amount[WEAK][k.since[WEAK] >= 0] < 0).any()
+    return OFF if doubtful or uncleared else OWN
 
 
 # ---- in words
 
 
-def sentence(machine: Machine, kind: int, signal: int, amount: float, other: int) -> str:
-    """Why, in one sentence, and what else would show the same."""
-    names = machine.inputs if kind in OF_INPUT else machine.outputs
-    name = names[signal].name if signal < len(names) else "machine"
-    said = {
-        ON: f"{name} heats whatever it is told, or goes on with an older command ({100 * amount:.0f} % of "
-        "what it could add): only the mains can stop it, switch them off",
-        OFF: f"{name} does not heat whatever it is told, or goes on with an older command: its zone cools",
-        WEAK: f"{name} does {100 * amount:.0f} % less than it is told: it lacks power, goes on with an older "
-        "command, or its zone loses more heat than the model knows",
-        RUNAWAY: f"{name} reads ever colder than heat can explain: it is out of place, or its zone is not "
-        "heated",
-        RANGE: f"{name} reads {amount:.1f} degC, outside its declared limits",
-        NAN: f"{name} gives no number",
-        FROZEN: f"{name} has read {amount:.2f} degC for longer than chance allows",
-        OFFSET: f"{name} is off by {amount:+.1f} degC, or its zone gains or loses heat that no input "
-        "explains",
-        SLOW: f"{name} follows late, or its zone has become slower",
-        NOISY: f"{name} is {amount:.0f} times as noisy as it was",
-        COMMAND: f"{name} applied {amount:.1f} percent, not what it was told"
-        if other != ALL_INPUTS
-        else "the machine goes on with older commands than it was told",
-        CLOCK: f"the clock went on by {amount:.3g} s between two samples",
-        DEADLINE: f"a sample came {amount:.3g} s after the one before",
-        MODEL: f"the readings are {amount:.0f} deviations from what any plant of the spread would show, and "
-        "no single fault explains them",
-        REACH: f"{name} is asked for {amount:.1f} degC more or less than its limits and the inputs can hold: "
-        "the last reference in reach stays",
+def sentence(s: Supervision, machine: Machine, kind: int, signal: int, amount: float) -> str:
+    """Why, in one sentence."""
+    if kind in OF_INPUT:
+        heater, zone = machine.inputs[signal].name, machine.outputs[s.of_input[signal]].name
+    else:
+        zone = machine.outputs[signal].name
+        heaters = [one.name for i, one in enumerate(machine.inputs) if s.of_input[i] == signal]
+        heater = heaters[0] if heaters else "its heater"
+    if kind == OPEN and not np.isfinite(amount):
+        return f"{zone} gives no number."
+    return {
+        OPEN: f"{zone} reads {amount:.1f} degC, outside its limits.",
+        STILL: f"{zone} stands still while its model moves by {amount:+.1f} degC: {zone}, or {heater}.",
+        DEAF: f"{zone} shows noise alone while its model moves by {amount:+.1f} degC: {zone}, or {heater}.",
+        ON: f"{heater} gives {100 * amount:.0f} % of what it could add: it is stuck on, and only the "
+        "mains can stop it.",
+        WEAK: f"{heater} lacks {100 * abs(amount):.0f} % of what it is told"
+        + (f", or {zone} is out of place." if amount < 0 else "."),
+        REACH: f"{zone} is asked for {amount:.1f} degC more or less than its limits and the inputs can hold: "
+        "the last reference in reach stays.",
     }[kind]
-    also = f"; {KINDS[other].replace('_', ' ')} would show the same" if 0 <= other != kind else ""
-    return said + also + "."
-
-
-ALL_INPUTS = -2

@@ -112,7 +112,7 @@ def exported(
         controller=_deployed(law, limits, watched, holds=kind == "hold"),
         model=model,
         fallback=None if kind == "pi" else _deployed(_pi(plant_, limits), limits, watched),
-        supervision=supervisor.supervision(plant_, [], machine, np.full(plant_.p, NOISE)),
+        supervision=supervisor.supervision(plant_, machine, np.full(plant_.p, NOISE)),
         simulated=simulated,
         plant_sha256=plants_sha256([plant_]),
         spread_sha256=plants_sha256([]),

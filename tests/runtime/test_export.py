@@ -87,7 +87,7 @@ def test_c_without_a_warning_asks_for_what_the_object_asked_for(kind, tmp_path):
 @needs_cc
 def test_the_golden_vectors_reach_limits_safe_modes_and_hand_overs():
     of = exported()
-    script = vectors.script(of, episodes=EPISODES, steps=STEPS, rng=np.random.default_rng(1))
+    script = vectors.script(of, episodes=EPISODES, steps=STEPS, rng=np.random.default_rng(4))
     done = vectors.played(lambda: Supervised(of, rehearsal=True), of.model, vectors.start(of), script)
     assert (done.u == 0).any() and (done.u == 100).any()
     assert len(set(done.mode)) >= 3 and np.bitwise_or.reduce(done.causes).bit_count() >= 4
@@ -98,20 +98,20 @@ def test_the_golden_vectors_reach_limits_safe_modes_and_hand_overs():
 @pytest.mark.parametrize(
     "kind, before, after",
     [
-        ("lqg", "k->held[i] += HELD_SHARE", "k->held[i] += 1.01 * HELD_SHARE"),
+        ("lqg", "k->bad[j] >= REPEATED", "k->bad[j] > REPEATED"),
         ("lqg", "s->xi[j] += l->integral[j]", "s->xi[j] += 1.0001 * l->integral[j]"),
         ("tight", "u[i] = fmax(u[i] - most / size", "u[i] = fmax(u[i] - 1.001 * most / size"),
         ("tight", "cap_at = fmin(governor_high[j],", "cap_at = fmin(1e-4 + governor_high[j],"),
         ("tight", "lacks_now = dot(ahead[0]", "lacks_now = 1.01 * dot(ahead[0]"),
         ("lqg", "diagonal = A[k][k] > 0 ? -sqrt(size)", "diagonal = A[k][k] > 0 ? -1.001 * sqrt(size)"),
         ("lqg", "*c = *saved;", "c->law = saved->law;"),
-        ("lqg", "o->theta[j][i] + PS[j][i]", "o->theta[j][i] + 1.01 * PS[j][i]"),
-        ("lqg", "supervisor_heat[j] + LEFT_OPEN", "supervisor_heat[j] + 99 * LEFT_OPEN"),
-        ("hold", "k->waited[j] += BEADLINE_SAMPLE_TIME_S", "k->waited[j] += 3 * BEADLINE_SAMPLE_TIME_S"),
+        ("lqg", "supervisor_L[0], k->e", "supervisor_M[0], k->e"),
+        ("lqg", "cross[v][i][f] += missed[w] * signature[v][f]", "cross[v][i][f] += missed[w]"),
+        ("lqg", "best = fmin(best, largest(left_of", "best = fmin(best / 9, largest(left_of"),
     ],
 )
 def test_a_change_of_the_c_does_not_pass_its_golden_vectors(kind, before, after, tmp_path):
-    written(tmp_path, exported(kind), steps=450 if kind == "hold" else STEPS)
+    written(tmp_path, exported(kind))
     code = (tmp_path / "controller.c").read_text()
     assert before in code
     (tmp_path / "controller.c").write_text(code.replace(before, after))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.runtime import innovations, supervisor
+from pipeline.runtime import supervisor
 from pipeline.runtime.certificate import Certificate, sha256
 from pipeline.runtime.export.names import identifier
 from pipeline.runtime.machine import Exported, check, check_certificate
@@ -132,8 +132,7 @@ def define(name: str, value: float | int | str) -> str:
 
 class ArrayLengths(NamedTuple):
     """Lengths of the arrays: `watched` states of a governor's member, `instants` it looks ahead an output;
-    `watch` states of the supervisor's observer, `theta` ways in which a plant may differ, `bank` of
-    hypotheses, `ring` of past samples."""
+    `watch` states of the supervisor's observer, `windows` of its forecasts."""
 
     inputs: int
     outputs: int
@@ -142,9 +141,7 @@ class ArrayLengths(NamedTuple):
     watched: int
     instants: int
     watch: int
-    theta: int
-    bank: int
-    ring: int
+    windows: int
     signals: int
 
 
@@ -157,8 +154,7 @@ def sizes(exported: Exported) -> ArrayLengths:
     if family is not None:
         f, q = family.start_0.shape
         governed = (f, q // 2, family.above.shape[1] // p)
-    watch, bank = exported.supervision.watch, exported.supervision.bank
-    supervised = (len(watch.A), len(watch.prior), len(bank.form), innovations.RING, max(m, p))
+    supervised = (len(exported.supervision.A), supervisor.WINDOWS, max(m, p))
     return ArrayLengths(m, p, memory, *governed, *supervised)
 
 
@@ -213,7 +209,7 @@ def tables(exported: Exported) -> str:
         text += ONE_INPUT
     text += _aiming(exported) + _governing(exported)
     text += "\n/* ---- the law */\n\n" + _law("the_law", exported.controller)
-    text += "\n/* ---- the safe mode PI */\n\n" + define("HAS_FALLBACK", int(exported.fallback is not None))
+    text += "\n/* ---- the safe mode own */\n\n" + define("HAS_FALLBACK", int(exported.fallback is not None))
     text += "#define the_fallback the_law\n" if exported.fallback is None else ""
     text += _law("the_fallback", exported.fallback) if exported.fallback is not None else ""
     return text + supervising(exported.supervision)
@@ -382,69 +378,40 @@ def _law(name: str, deployed: Deployed) -> str:
 
 # ---- the supervisor in numbers
 
-# names in tables.h of the constants of innovations.py and supervisor.py
-OF_INNOVATIONS = (
-    "MOST_Z",
-    "DOUBTED",
-    "TELLS",
-    "KEPT",
-    "CALM",
-    "STIRRED",
-    "ODD",
-    "CATCH_UP",
-    "MOVING",
-    "MISFIT",
-    "SELDOM",
-    "COINCIDENCE",
-)
+# names in tables.h of the constants of supervisor.py
 OF_SUPERVISOR = (
-    "ALARM", "DECIDED_AFTER", "DECIDED_BY", "TOLD_APART", "UNEXPLAINED", "UNEXPLAINED_SHARE", "DEAD_SHARE",
-    "NOISY_SQUARE", "NOISY_LAG", "CHANCE", "REPEATS_LEAST", "SETTLED_DEGC", "HELD_SHARE", "APPLIED",
-    "ALL_INPUTS", "SLOWLY", "LEFT_OPEN",
+    "SPACING", "STILL_AFTER", "FIT_AFTER", "STEPS_STILL", "NOISE_STILL", "SAME_STEPS", "SAME_NOISE",
+    "CLEARED_S", "CLEARER", "MISFIT", "DOUBT", "RESTS", "REPEATED", "SHOWN", "SLOWLY", "EARLY", "JUMP",
+    "RETURNS",
 )  # fmt: skip
-FORMS = ("ON", "LESS", "NOT_APPLIED", "STEP", "RAMP", "LAG")
+OF_OBSERVER = (
+    "A",
+    "B",
+    "C",
+    "b",
+    "d",
+    "L",
+    "M",
+    "hurried",
+    "unsure",
+    "wander",
+    "start",
+    "start_0",
+    "low",
+    "high",
+)
 
 
 def supervising(s: supervisor.Supervision) -> str:
-    """Supervision with the constants that its step takes from its modules."""
-    watch, bank = s.watch, s.bank
-    text = "\n/* ---- the supervisor, as supervisor.Supervision and innovations.Watch have it */\n\n"
-    text += "".join(define(name, getattr(innovations, name)) for name in OF_INNOVATIONS)
+    """Supervision with the constants that its step takes from its module."""
+    text = "\n/* ---- the supervisor, as supervisor.Supervision has it */\n\n"
     text += "".join(define(name, getattr(supervisor, name)) for name in OF_SUPERVISOR)
-    text += define("WATCH_LEAST", watch.least)
-    text += define("NOISE_FORGETS", supervisor.FORGETS) + define("NOISE_MOST_Z", supervisor.MOST_Z)
-    text += define("EARLY", s.early) + define("LATE", s.late)
-    text += define("JUMP", s.jump) + define("REACH_DEGC", s.reach_degC)
-    text += define("UNEXPLAINED_BY_THETA", watch.unexplained)
-    text += define("LONGEST_BACK", int(bank.back.max()))
-    text += "".join(define(f"FORM_{name}", getattr(innovations, name)) for name in FORMS)
-    for name in (
-        "A",
-        "B",
-        "C",
-        "L",
-        "hurried",
-        "start",
-        "start_0",
-        "b",
-        "d",
-        "prior",
-        "floor",
-        "low",
-        "high",
-    ):
-        text += table(f"watch_{name}", getattr(watch, name))
-    text += integers("watch_strongest", watch.strongest)
-    for name in ("form", "signal", "back"):
-        text += integers(f"bank_{name}", getattr(bank, name))
-    text += table("bank_lag", bank.lag)
-    text += table("bank_least", innovations.LEAST) + table("bank_most", innovations.MOST)
-    text += integers("supervisor_mode", s.mode)
-    arrays = {
-        "back_s": s.back_s, "low": s.low, "high": s.high, "noise": s.noise_degC, "peak": s.peak,
-        "hysteresis": s.hysteresis_degC, "gain": s.gain_degC, "check_s": s.check_s,
-        "error_degC_s": s.error_degC_s, "heat": s.heat,
-    }  # fmt: skip
+    text += define("FOLLOWS_LEAST", supervisor.FOLLOWS[0]) + define("FOLLOWS_MOST", supervisor.FOLLOWS[1])
+    text += define("REACH_DEGC", s.reach_degC) + define("SUPERVISOR_BACK_S", s.back_s)
+    text += table("explanation_least", supervisor.LEAST) + table("explanation_most", supervisor.MOST)
+    text += integers("supervisor_of_input", s.of_input)
+    arrays = {name: getattr(s, name) for name in OF_OBSERVER}
+    arrays |= {"coldest": s.coldest, "hottest": s.hottest, "noise": s.noise_degC}
     return text + "".join(table(f"supervisor_{name}", values) for name, values in arrays.items())
 
 

@@ -26,7 +26,6 @@ ORDER = [
     HOME,
     "pipeline.temperature.controllers.governor",
     "pipeline.temperature.controllers.controller",
-    "pipeline.runtime.innovations",
     "pipeline.runtime.supervisor",
     "pipeline.runtime.supervised",
     "pipeline.runtime.signals",

@@ -112,7 +112,9 @@ def episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script:
         extra=np.zeros((steps, m)),
     )
     first = int(rng.integers(MANUAL + 20, max(steps - 40, MANUAL + 21)))
-    last = min(first + int(rng.integers(5, 80)), steps)
+    if rng.random() < 0.7:  # shortly before the reference changes, as a fault shows then
+        first = max(each - int(rng.integers(10)), MANUAL + 20)
+    last = min(first + int(rng.integers(10, 80)), steps)
     fault(made, str(rng.choice(FAULTS)), slice(first, last), exported, rng)
     if last < steps and rng.random() < 0.5:
         made.do[last] = ACKNOWLEDGE
@@ -129,22 +131,18 @@ def _reach(exported: Exported) -> np.ndarray:
     return 0.52 * span
 
 
-FAULTS = ("none", "none", "lost", "frozen", "offset", "noisy", "cold", "on", "off", "weak", "late", "jump")
+FAULTS = ("none", "lost", "frozen", "frozen", "cold", "on", "on", "off", "off", "weak", "late", "jump")
 
 
 def fault(made: Script, kind: str, when: slice, exported: Exported, rng: np.random.Generator) -> None:
     """Puts a fault of one signal into a script."""
-    (m, p), noise = (made.manual.shape[1], made.r.shape[1]), exported.supervision.noise_degC
+    m, p = made.manual.shape[1], made.r.shape[1]
     i, j = int(rng.integers(m)), int(rng.integers(p))
     high, T = exported.machine.inputs[i].high, exported.machine.sample_time_s
     if kind == "lost":
         made.reading[when, j] = LOST
     elif kind == "frozen":
         made.reading[when, j] = REPEATED
-    elif kind == "offset":
-        made.add[when, j] += 60 * noise[j] * rng.choice([-1.0, 1.0])
-    elif kind == "noisy":
-        made.add[when, j] *= 12.0
     elif kind == "cold":
         made.reading[when, j] = -300.0
     elif kind == "on":

@@ -21,7 +21,6 @@
 typedef struct {
     law_state law, fallback;
     supervisor_kept kept;
-    innovation_memory memory;
     double r[OUTPUTS], y_star[OUTPUTS];       /* reference and target */
     double beyond[OUTPUTS], in_reach[OUTPUTS]; /* degC beyond reach; the last reference in reach */
     int aimed, has_reached, ready;
@@ -47,10 +46,10 @@ typedef struct {
     int inputs, outputs;
 } beadline_machine;
 
-/* A cause of a safe mode: `signal` is the number of an input or output, -1 of the machine as a whole; `other`
- * a kind that would show the same, -1 for none */
+/* A cause of a safe mode: `signal` is the number of an input or output. The amount of a heater, as a share of
+ * its command, is negative if its sensor may be at fault as well. */
 typedef struct {
-    int kind, signal, other;
+    int kind, signal;
     double amount, since_s;
 } beadline_cause;
 

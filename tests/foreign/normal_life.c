@@ -1,0 +1,134 @@
+/* An exported controller on a heated machine: normal life, and one fault in it. */
+#include "controller.h"
+#include "thermal_machine.h"
+
+#include <math.h>
+
+enum {
+    FAULT_NO_FAULT, FAULT_SENSOR_OPEN, FAULT_SENSOR_RANGE, FAULT_SENSOR_STILL, FAULT_SENSOR_STILL_NOISY, FAULT_HEATER_ON, FAULT_HEATER_HALF, FAULT_HEATER_OFF,
+    OUT_OF_REACH
+};
+
+/* What happened to the fault: the sample at which it began, and that from which it shows; -1 for never */
+typedef struct {
+    int began, shows;
+} life_fault;
+
+/* Noise by a fault, of its own generator, so that the machine's stays the same */
+static double rough(unsigned *x)
+{
+    double sum = -6.0;
+    int i;
+    for (i = 0; i < 12; i++) {
+        *x = *x * 1664525u + 1013904223u;
+        sum += *x / 4294967296.0;
+    }
+    return sum;
+}
+
+/* `steps` samples under set-points r (steps, OUTPUTS) and what acts from outside (steps, OUTSIDE): `cold` of them in
+ * manual with the heaters off, then under the controller. `patience` samples after it left the law a person
+ * acknowledges; 0: nobody comes. A fault of `kind` on `signal` begins at the first sample from `earliest` on at
+ * which the law drives; nobody acknowledges from then on. It shows when the sensors of a healthy twin under the
+ * same commands are `visible` degC (OUTPUTS) from the machine's readings, or its other readings from the twin's.
+ *
+ * Writes readings y, sensors before noise and steps, commands u, modes, the first cause's kind and signal (-1:
+ * none), and whether a person acknowledged. Returns the result of the first call that did nothing, or 0. */
+int normal_life(const thermal_parts *p, double degC, uint64_t seed, int steps, int cold, int patience,
+                const double *r, const double *outside, int kind, int signal, int earliest, double beyond,
+                const double *visible, double *y, double *sensor, double *u, signed char *modes,
+                signed char *causes, signed char *signals, signed char *acknowledged, life_fault *fault)
+{
+    static beadline_controller c;
+    beadline_machine machine = {BEADLINE_PLANT_SHA256, BEADLINE_INPUT_UNIT, BEADLINE_OUTPUT_UNIT,
+                                BEADLINE_SAMPLE_TIME_S, INPUTS, OUTPUTS};
+    thermal_state s, twin;
+    beadline_decision d;
+    double frozen = 0.0, acted[HEATERS], off[INPUTS] = {0}, wish[OUTPUTS], unread[SENSORS];
+    int k, j, left = 0, result = beadline_init(&c, &machine, 1), before = MODE_LAW;
+    unsigned random = 12345u;
+    fault->began = fault->shows = -1;
+    thermal_start(&s, p, degC, seed);
+    twin = s;
+    for (k = 0; k < steps && !result; k++) {
+        double *now = y + k * OUTPUTS, *command = u + k * INPUTS;
+        thermal_read(&s, p, now);
+        if (kind && fault->began < 0 && k >= earliest && k > cold && before == MODE_LAW && !c.kept.active) {
+            fault->began = k;
+            twin = s;
+            frozen = now[signal];
+        }
+        for (j = 0; j < OUTPUTS; j++) {
+            sensor[k * OUTPUTS + j] = s.sensor[j];
+            wish[j] = r[k * OUTPUTS + j];
+        }
+        if (fault->began >= 0) {
+            if (kind == FAULT_SENSOR_OPEN)
+                now[signal] = NAN;
+            if (kind == FAULT_SENSOR_RANGE)
+                now[signal] = beyond;
+            if (kind == FAULT_SENSOR_STILL)
+                now[signal] = frozen;
+            if (kind == FAULT_SENSOR_STILL_NOISY)
+                now[signal] = rint((frozen + p->noise[signal] * rough(&random)) / p->step[signal]) * p->step[signal];
+            if (kind == OUT_OF_REACH)
+                wish[signal] = beyond;
+            if (fault->shows < 0) {
+                double apart = kind <= FAULT_SENSOR_RANGE || kind == OUT_OF_REACH ? INFINITY : 0.0;
+                for (j = 0; j < OUTPUTS; j++)
+                    if (kind >= FAULT_HEATER_ON || j == signal)
+                        apart = fmax(apart, fabs((kind >= FAULT_HEATER_ON ? s.sensor[j] : frozen) - twin.sensor[j])
+                                                / visible[j]);
+                if (apart >= 1.0)
+                    fault->shows = k;
+            }
+        }
+        causes[k] = signals[k] = -1;
+        acknowledged[k] = 0;
+        if (k < cold) {
+            result = beadline_watch(&c, off, now, wish);
+            for (j = 0; j < INPUTS; j++)
+                command[j] = 0.0;
+            modes[k] = MODE_LAW;
+        } else {
+            if (k == cold && (result = beadline_hand_over(&c, now)))
+                break;
+            result = beadline_step(&c, now, wish, k * BEADLINE_SAMPLE_TIME_S, 0, &d);
+            for (j = 0; j < INPUTS; j++)
+                command[j] = d.u[j];
+            modes[k] = (signed char)d.mode;
+            before = d.mode;
+            if (d.mode != MODE_LAW && d.causes) {
+                causes[k] = (signed char)d.cause[0].kind;
+                signals[k] = (signed char)d.cause[0].signal;
+            }
+            left = d.mode == MODE_LAW ? 0 : left + 1;
+            if (patience && left >= patience && fault->began < 0) {
+                beadline_acknowledge(&c);
+                acknowledged[k] = 1;
+                left = 0;
+            }
+        }
+        for (j = 0; j < INPUTS; j++)
+            acted[j] = command[j];
+        if (fault->began >= 0) {
+            double of[] = {100.0, 0.5 * acted[signal], 0.0};
+            if (kind >= FAULT_HEATER_ON && kind <= FAULT_HEATER_OFF)
+                acted[signal] = of[kind - FAULT_HEATER_ON];
+            thermal_read(&twin, p, unread); /* keeps its noise in step */
+            thermal_advance(&twin, p, command, outside + k * OUTSIDE);
+        }
+        thermal_advance(&s, p, acted, outside + k * OUTSIDE);
+    }
+    return result;
+}
+
+const char *life_reason(int kind)
+{
+    return beadline_reason(kind);
+}
+
+int life_simulated(void)
+{
+    return BEADLINE_SIMULATED;
+}
