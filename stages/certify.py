@@ -32,10 +32,9 @@ if TYPE_CHECKING:
 
 RECORD = "datasets/ingest/record.parquet"
 FALLBACK = "pi_simc"  # the safe mode "own"; if the machine allows none, the heaters go off
-NO_FEED_FORWARD = (
-    "The machine declares disturbances ({names}), which an exported controller cannot read yet: none is "
-    "certified. Remove plant.disturbances to certify controllers that do without them."
-)
+# the conditions that a certificate names
+DISTURBED = "Made with {names} as recorded. The controller does not read them, and meets them at their mean."
+UNDISTURBED = "No fan, feed or other disturbance is declared: what one does to the temperatures is not shown."
 NOT_ASKED = "Not asked: loops.{} is false."
 
 
@@ -58,6 +57,7 @@ class Common(NamedTuple):
     models: WindowModels
     generator: np.random.Generator  # as the window models left it: every controller goes on with a copy
     plants: list[PlantModel]  # which forecast a recording
+    conditions: str
 
 
 def main() -> None:
@@ -89,9 +89,6 @@ def certify_temperature(folder: Path, settings: Certify) -> dict[str, dict[str, 
     names = [one.name for one in CONTROLLERS if one.kind != "reference"]
     found = {name: _not_measured(refused[name]) for name in names if name in refused}
     names = [name for name in names if name in designs and not designs[name].holds]
-    if disturbances := [one.name for one in loaded.machine.disturbances]:
-        why = NO_FEED_FORWARD.format(names=", ".join(disturbances))
-        return found | {name: _not_measured(why) for name in names}
     common = prepare(loaded, settings)
     certify = delayed(certify_controller)
     calls = [certify(folder / name, name, designs, loaded, common) for name in names]
@@ -123,7 +120,9 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     else:
         spread = cases.spread_around(loaded.panel, loaded.problem.plant)
     plants = support_logs.forecasting_plants(family, spread, np.random.default_rng(settings.seed))
-    return Common(machine, record, rules, models, rng, plants)
+    disturbances = ", ".join(one.name for one in declared.disturbances)
+    conditions = DISTURBED.format(names=disturbances) if disturbances else UNDISTURBED
+    return Common(machine, record, rules, models, rng, plants, conditions)
 
 
 def wire(declared: Plant) -> Machine:
@@ -170,6 +169,7 @@ def certify_controller(
             common.generator,
             learning=route,
             delay_share=setting.faster,
+            conditions=common.conditions,
         )
         honest = support_logs.honest_logs(made, half, setting.limits)
         recorded = support_logs.recorded_logs(common.record)

@@ -144,6 +144,7 @@ class Certificate(NamedTuple):
     rules: tuple[RuleResult, ...]
     verdict: Literal["passed", "refused"]
     first_failed: str | None
+    conditions: str  # one sentence: which disturbances were recorded, and what the controller knows of them
 
 
 RULES = (

@@ -84,18 +84,21 @@ def measure(
     *,
     learning: bands.GainRoute | None = None,
     delay_share: float = 1.0,
+    conditions: str = "",
 ) -> MeasuredController:
     """What the certificate of a controller says before its limits are known.
 
     `family` is the spread of the identified plant, `models` what certificate_evidence.window_models drew from
     the record with `rng`, which is copied. `learning` says how gains were learned from the record; then bands
-    of them are measured. `delay_share` of a declared delay margin is required of this machine.
+    of them are measured. `delay_share` of a declared delay margin is required of this machine. `conditions`
+    is the certificate's sentence.
     """
     rng = copy.deepcopy(rng)
     results = certificate_evidence.of_signals(exported, record, rules)
     figures, fields = {}, {}
+    draft = _draft(exported, record)._replace(conditions=conditions)
     if not all(one.passed for one in results):
-        return MeasuredController(_draft(exported, record)._replace(rules=tuple(results)), {})
+        return MeasuredController(draft._replace(rules=tuple(results)), {})
     results = [*results, *models.results]
     if models.noise_degC is not None:
         names = [one.name for one in exported.machine.outputs]
@@ -117,7 +120,7 @@ def measure(
                 figures["delay_margin"]["share"] = delay_share
                 if learning is not None:
                     fields["bands"] = certificate_loop.gain_bands(exported, record, learning, rules, rng)
-    return MeasuredController(_draft(exported, record)._replace(rules=tuple(results), **fields), figures)
+    return MeasuredController(draft._replace(rules=tuple(results), **fields), figures)
 
 
 def _draft(exported: Exported, record: EvidenceRecord) -> Certificate:
@@ -141,4 +144,5 @@ def _draft(exported: Exported, record: EvidenceRecord) -> Certificate:
         rules=(),
         verdict="refused",
         first_failed=None,
+        conditions="",
     )

@@ -114,11 +114,6 @@ def test_the_exported_controller_heats_a_foreign_hot_end_from_cold_over_two_set_
     assert without_fan.measured.max() <= 225.0 + 5.0  # °C past the highest set-point
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="the supervisor takes the part fan for a weak heater and holds the duty (issues 38, 39)",
-)
 def test_the_exported_controller_keeps_a_foreign_hot_end_at_its_set_point_when_the_part_fan_goes_on(with_fan):
     assert safe_seconds(with_fan) <= SAFE_S
     assert farthest_from_set_point(with_fan, FAN_S + 120, END_S) <= WITHIN_DEGC

@@ -53,6 +53,7 @@ def certificate(refused: str = "", *, evidence: str = "simulated", bands: bool =
         if whole else None,
         "violations": [], "bands": table if whole and bands else None, "rules": rules,
         "verdict": "passed" if whole else "refused", "first_failed": refused or None,
+        "conditions": "No fan is declared.",
     }  # fmt: skip
 
 

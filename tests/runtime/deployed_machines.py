@@ -145,6 +145,7 @@ def passed(of: Exported) -> Certificate:
         rules=tuple(RuleResult(name, True, 0.0, 1.0, "", "It holds.") for name in RULES),
         verdict="passed",
         first_failed=None,
+        conditions="No disturbance is declared.",
     )
 
 

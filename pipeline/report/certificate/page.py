@@ -145,6 +145,7 @@ def about(shown: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [
         ("Controller", heading(name) if name in BY_NAME else name),
         ("Evidence", shown["evidence"]),
+        ("Conditions", shown["conditions"]),
         ("Sample time", with_unit(shown["sample_time_s"], "s", 2)),
         *(
             (side.capitalize(), "; ".join(_signal(one) for one in shown[side]))

@@ -43,7 +43,8 @@ def subspace_lqg(problem: DesignProblem, values: Mapping[str, float]) -> Design:
 def varx_riccati(problem: DesignProblem, values: Mapping[str, float]) -> Design:
     made, N = window.controller(problem.window, problem.gamma), problem.window.N
     law = controller.compact(made.design(*weights(problem, values), values["integral"]), N)
-    return Design(law, made.model, lambda: made.design(*unit_weights(problem)))
+    model = made.model._replace(sample_time_s=problem.plant.sample_time_s)
+    return Design(law, model, lambda: made.design(*unit_weights(problem)))
 
 
 def learned_kernel(problem: DesignProblem, values: Mapping[str, float]) -> Design | None:
@@ -52,8 +53,9 @@ def learned_kernel(problem: DesignProblem, values: Mapping[str, float]) -> Desig
         return None
     made = kernel.controller(problem.kernel, problem.gamma, window.observer_form(problem.window)[0])
     law = made.design(*weights(problem, values), values["integral"])
+    model = made.model._replace(sample_time_s=problem.plant.sample_time_s)
     return Design(
-        controller.compact(law, problem.kernel.N), made.model, lambda: made.design(*unit_weights(problem))
+        controller.compact(law, problem.kernel.N), model, lambda: made.design(*unit_weights(problem))
     )
 
 
