@@ -1,6 +1,6 @@
 """A controller learned from two recordings of a foreign hot end, in the normal life of that machine:
-set-points, part fan, filament, another room. Its supervisor leaves the healthy machine to the law, and acts on faults.
-"""
+set-points, part fan, filament, another room. Its supervisor leaves the healthy machine to the law, and acts
+on faults."""
 
 import json
 import shutil
