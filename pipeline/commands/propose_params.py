@@ -322,7 +322,7 @@ def _questions_on_disturbances(proposal: Proposal) -> list[str]:
     return [
         f"plant.disturbances {', '.join(names)}: does the controller move it, or is it only recorded? Move "
         "to plant.inputs, in percent, what a controller moves; leave out what does not act on the "
-        "temperatures. No controller can be exported yet while plant.disturbances lists a signal"
+        "temperatures. A controller does not read these signals: the certificate says so"
     ]
 
 

@@ -51,7 +51,7 @@ STILL_AFTER = 10  # samples for which a forecast must have been away before a se
 FIT_AFTER = 12  # samples of a window before it tells of a heater
 STEPS_STILL, NOISE_STILL = 3.0, 4.0  # steps and deviations that a forecast must move
 SAME_STEPS, SAME_NOISE = 1.5, 6.0  # steps and deviations within which a reading has not moved
-FOLLOWS = (0.5, 1.7)  # share of the forecast's move by which a sensor is cleared
+FOLLOWS = (0.7, 1.4)  # share of the forecast's move by which a sensor is cleared
 CLEARED_S = 60.0  # for how long it is cleared then
 # why readings miss the forecast: a heater lacks a share, or gives one of what it could add; heat of the
 # surroundings as a share of the input's range; samples late; a heater that differs from the model by a share;
@@ -59,6 +59,7 @@ CLEARED_S = 60.0  # for how long it is cleared then
 LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS = range(6)
 LEAST = np.array([0.35, 0.4, -0.3, -8.0, -0.25, -1e3])
 MOST = np.array([1.3, 1.5, 0.3, 8.0, 0.25, 1e3])
+MORE_THAN_ALL = 1.05  # of its command: no heater lacks so much, and its sensor is in doubt
 CLEARER = 16.0  # of -2 log likelihood, by which a fault must explain better than what is none
 MISFIT = 0.15  # of what readings miss, which even the right cause leaves: no model is the machine
 DOUBT = 0.25  # share of what inputs did lately by which a forecast may be wrong
@@ -424,10 +425,13 @@ def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
         window, i = np.unravel_index(np.where(shown, k.square, -1.0).argmax(), shown.shape)
         cause = GIVES if gives[window, i] else LACKS
         onset = int(left[window, :, i, cause].argmin())
+        share = float(amount[window, onset, i, cause])
         if same[window, own[i]]:
             say_still(k, int(own[i]), moves[window, own[i]])
+        elif cause == LACKS and share > MORE_THAN_ALL:
+            say(k, WEAK, int(i), -share)
         else:
-            say(k, ON if cause == GIVES else WEAK, int(i), float(amount[window, onset, i, cause]))
+            say(k, ON if cause == GIVES else WEAK, int(i), share)
 
 
 def say_still(k: Kept, j: int, moves_degC: float) -> None:
@@ -466,17 +470,18 @@ def judge_sensors(
 
 def forget(s: Supervision, k: Kept) -> None:
     """Causes that are gone: after `back_s` without them, or, if the heaters are off for them, as soon as the
-    output moves as forecast again. That counts RETURNS times an hour; from then on a person is waited for."""
+    output moves as forecast again. A heater is tried again RETURNS times an hour; from then on a person is
+    waited for."""
     if not k.counters[ACTIVE]:
         return
     gone = (k.since >= 0) & (k.clock_s[1] - k.last > s.back_s)
     for kind in (STILL, DEAF, ON, WEAK):
         for signal in np.flatnonzero(k.since[kind] >= 0):
-            if kind == WEAK and k.amount[WEAK, signal] >= 0:
-                continue
             j = s.of_input[signal] if kind in OF_INPUT else signal
             rested = k.clock_s[1] - k.returned_s[j] > 3600.0
-            again = k.cleared_s[j] > k.last[kind, signal] and (rested or k.returns[j] < RETURNS)
+            heated = kind == WEAK and k.amount[WEAK, signal] >= 0  # under the machine's own control
+            over = gone[kind, signal] if heated else k.cleared_s[j] > k.last[kind, signal]
+            again = bool(over) and (rested or k.returns[j] < RETURNS)
             gone[kind, signal] = again
             if again:
                 k.returns[j] = 1 if rested else k.returns[j] + 1

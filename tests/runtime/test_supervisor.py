@@ -189,6 +189,15 @@ def test_the_machines_own_control_takes_over_from_a_weak_heater_if_its_sensor_mo
         assert (decisions[at].u > 0).any() == (run is cleared)
 
 
+def test_a_reading_that_lacks_more_than_the_heater_could_give_is_a_sensors_fault():
+    """A sensor that slips out reads the room: the heaters go off, and stay off."""
+    run = Run(seed=3)
+    run.go(200)
+    decisions = run.go(400, reading=put(0, lambda y, k: ROOM + 0.02 * (y - ROOM)))
+    at, _ = first(decisions)
+    assert at <= 31 and {one.mode for one in decisions[at:]} == {"off"}
+
+
 def test_a_reference_out_of_reach_leaves_the_last_one_that_was_not():
     run = Run(seed=11)
     run.go(60)

@@ -381,8 +381,8 @@ def _law(name: str, deployed: Deployed) -> str:
 # names in tables.h of the constants of supervisor.py
 OF_SUPERVISOR = (
     "SPACING", "STILL_AFTER", "FIT_AFTER", "STEPS_STILL", "NOISE_STILL", "SAME_STEPS", "SAME_NOISE",
-    "CLEARED_S", "CLEARER", "MISFIT", "DOUBT", "RESTS", "REPEATED", "SHOWN", "SLOWLY", "EARLY", "JUMP",
-    "RETURNS",
+    "CLEARED_S", "CLEARER", "MORE_THAN_ALL", "MISFIT", "DOUBT", "RESTS", "REPEATED", "SHOWN", "SLOWLY",
+    "EARLY", "JUMP", "RETURNS",
 )  # fmt: skip
 OF_OBSERVER = (
     "A",

@@ -367,16 +367,19 @@ static void judge_heaters(supervisor_kept *k, const double *y, const int *counts
     if (at >= 0 && unmoved(k, at, supervisor_of_input[of]))
         say_still(k, supervisor_of_input[of], moves[at][supervisor_of_input[of]]);
     else if (at >= 0)
-        say(k, gives[at][of] ? HEATER_STUCK_ON : HEATER_WEAK, of, share[at][of]);
+        say(k, gives[at][of] ? HEATER_STUCK_ON : HEATER_WEAK, of,
+            !gives[at][of] && share[at][of] > MORE_THAN_ALL ? -share[at][of] : share[at][of]);
 }
 
-/* Whether the heaters, off for this cause, are tried again: its output moves as forecast, and that was not so
- * RETURNS times in the last hour */
-static int tried_again(supervisor_kept *k, int kind, int signal)
+/* Whether a heater is tried again: the heaters are off for this cause and its output moves as forecast, or
+ * the machine's own control heats and the cause is gone. RETURNS times an hour, then a person is waited for. */
+static int tried_again(supervisor_kept *k, int kind, int signal, int gone)
 {
     int j = kind == HEATER_STUCK_ON || kind == HEATER_WEAK ? supervisor_of_input[signal] : signal;
     int rested = k->clock_s[1] - k->returned_s[j] > 3600.0;
-    if (k->cleared_s[j] <= k->last[kind][signal] || (!rested && k->returns[j] >= RETURNS))
+    int heated = kind == HEATER_WEAK && k->amount[kind][signal] >= 0;
+    int over = heated ? gone : k->cleared_s[j] > k->last[kind][signal];
+    if (!over || (!rested && k->returns[j] >= RETURNS))
         return 0;
     k->returns[j] = rested ? 1 : k->returns[j] + 1;
     k->returned_s[j] = k->clock_s[1];
@@ -389,12 +392,10 @@ static void forget(supervisor_kept *k)
     int kind, signal, any = 0;
     for (kind = 0; kind < KINDS && k->active; kind++)
         for (signal = 0; signal < SIGNALS; signal++) {
-            int off = kind == SENSOR_STILL || kind == SENSOR_DEAF || kind == HEATER_STUCK_ON
-                      || (kind == HEATER_WEAK && k->amount[kind][signal] < 0);
-            if (k->since[kind][signal] < 0)
-                continue;
-            if (off ? !tried_again(k, kind, signal)
-                    : k->clock_s[1] - k->last[kind][signal] <= SUPERVISOR_BACK_S)
+            int counted = kind == SENSOR_STILL || kind == SENSOR_DEAF || kind == HEATER_STUCK_ON
+                          || kind == HEATER_WEAK;
+            int gone = k->clock_s[1] - k->last[kind][signal] > SUPERVISOR_BACK_S;
+            if (k->since[kind][signal] < 0 || !(counted ? tried_again(k, kind, signal, gone) : gone))
                 continue;
             k->since[kind][signal] = k->last[kind][signal] = -1.0;
             k->active--;
