@@ -72,7 +72,7 @@ class Supervised:
         k = self.kept
         k.since[:] = k.last[:] = -1.0
         k.counters[ACTIVE] = 0
-        for part in (k.amount, k.bad, k.returns, k.shown):
+        for part in (k.amount, k.returns, k.shown):
             part[:] = 0
         k.age[:] = -1
 
@@ -122,6 +122,7 @@ class Supervised:
         if mode == OFF or self.own is None:
             return self.exported.controller.limits.low.copy()
         if before != OWN:
+            self.own = RunningController(self.own.controller, self.own.model)
             self.own.watch(self.kept.asked, y, r)
             self.own.hand_over(y)
         return self.own.step(y, r, n)

@@ -68,6 +68,7 @@ REPEATED = 3  # samples in a row with a reading that is none
 SHOWN = 6  # samples in a row that show a fault
 SLOWLY = 1 / 60  # share a sample of the mean drift, from which heat is counted
 EARLY, JUMP = 0.5, 10.0  # shares of the sample time between which two samples are apart
+MOST_STEP_DEGC = 5.0  # no sensor's step is larger: what moves by more at first was switched on
 RETURNS = 3  # times an hour that heaters which went off are tried again
 LEAK = 0.9999  # of the drift, kept a step
 HURRIED = 0.1  # of an innovation, by which the drift follows in manual
@@ -205,7 +206,8 @@ class Kept(NamedTuple):
 
     shown (2, m): samples in a row in which a heater was stuck on, or weak. asked (m,) the last command,
     usual (m,) its mean, stirred (m,) how far it was from it lately.
-    counters (5,): samples, mode, 1 once the clock was read, causes that are there, samples under the law.
+    counters (6,): samples, mode, 1 once the clock was read, causes that are there, samples under the law, 1
+    after a gap of the clock that is none.
     clock_s (2,): the clock at the last sample, and the supervisor's own time, which never falls.
     """
 
@@ -245,7 +247,7 @@ class Kept(NamedTuple):
     clock_s: np.ndarray
 
 
-SAMPLES, MODE, CLOCKED, ACTIVE, RUNS = range(5)
+SAMPLES, MODE, CLOCKED, ACTIVE, RUNS, INSANE = range(6)
 
 
 def kept(s: Supervision) -> Kept:
@@ -285,7 +287,7 @@ def kept(s: Supervision) -> Kept:
         asked=np.zeros(m),
         usual=np.zeros(m),
         stirred=np.zeros(m),
-        counters=np.zeros(5, int),
+        counters=np.zeros(6, int),
         clock_s=np.zeros(2),
     )
 
@@ -303,7 +305,7 @@ def say(k: Kept, kind: int, signal: int, amount: float = 0.0) -> None:
 
 def pass_time(s: Supervision, k: Kept, t_s: float) -> int:
     """Whole samples since the last one, by which the supervisor's own time goes on. A clock that tells no
-    time between two samples, or a long one, counts as one; then forecasts begin anew."""
+    time between two samples, or a long one, counts as one; the first time forecasts begin anew."""
     if not k.counters[CLOCKED]:
         k.clock_s[0], k.counters[CLOCKED] = t_s - s.sample_time_s, 1
     gap_s = t_s - k.clock_s[0]
@@ -311,8 +313,9 @@ def pass_time(s: Supervision, k: Kept, t_s: float) -> int:
     sane = EARLY <= gap <= JUMP
     k.clock_s[0] = t_s
     k.clock_s[1] += gap_s if sane else s.sample_time_s
-    if not sane or gap > 1.5:
+    if not sane and not k.counters[INSANE]:
         k.age[:] = -1
+    k.counters[INSANE] = 0 if sane else 1
     return int(gap + 0.5) if sane and gap > 1.5 else 1
 
 
@@ -323,13 +326,13 @@ def read(s: Supervision, k: Kept, y: np.ndarray) -> np.ndarray:
     for j in np.flatnonzero(k.bad >= REPEATED):
         say(k, OPEN, j, y[j])
     moves = np.where(counts, np.abs(y - k.y), np.inf)
-    k.quantum[:] = np.minimum(k.quantum, np.where(moves > 1e-9, moves, np.inf))
+    k.quantum[:] = np.minimum(k.quantum, np.where(moves > 1e-9, np.minimum(moves, MOST_STEP_DEGC), np.inf))
     k.repeats[:] = np.where(counts & (moves < 1e-12), k.repeats + 1, np.where(counts, 0, k.repeats))
     k.y[:] = np.where(counts, y, k.y)
     return counts & ((k.since[[OPEN, STILL, DEAF], : len(y)] < 0).all(axis=0))
 
 
-def begin_window(s: Supervision, k: Kept, at: int, counts: np.ndarray) -> None:
+def begin_window(s: Supervision, k: Kept, at: int) -> None:
     """A forecast from where the machine is now."""
     start = k.x + s.M @ k.e
     k.states[:, at] = start
@@ -337,9 +340,9 @@ def begin_window(s: Supervision, k: Kept, at: int, counts: np.ndarray) -> None:
     for part in (k.given, k.unit, k.before, k.away, k.square, k.causes, k.cross):
         part[at] = 0
     k.cross[:, at] = k.total[:, at] = 0.0
-    k.began[at] = k.least[at] = k.most[at] = s.C @ start + s.d
-    # a sensor that does not count may be far from its forecast, and moves with it all the same
-    k.first[at] = np.where(counts, k.began[at], k.y)
+    k.began[at] = s.C @ start + s.d
+    # a sensor may be far from its forecast: whether it moves is told from its own readings
+    k.first[at] = k.least[at] = k.most[at] = np.where(np.isfinite(k.y), k.y, k.began[at])
     k.age[at] = 0
 
 
@@ -416,7 +419,7 @@ def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     judge_sensors(s, k, moves, still & same, honest, noise)
     explained = left[..., :HEAT].min(axis=1)
     best = explained.min(axis=2)
-    clear = (age * np.log(honest / best) >= CLEARER) & tells[:, own] & (best <= 2 * floor)
+    clear = (age * np.log(honest / best) >= CLEARER) & tells[:, own] & (best <= 2 * floor) & (best < 1e300)
     gives = explained[..., GIVES] < explained[..., LACKS]
     shows = np.stack([(clear & gives).any(axis=0), (clear & ~gives).any(axis=0)])
     k.shown[:] = np.where(shows, k.shown + 1, 0)
@@ -496,9 +499,10 @@ def follow(s: Supervision, k: Kept, y: np.ndarray, applied: np.ndarray | None, s
     """One sample of outputs y (p,), inputs `applied` since the one before, none of `samples` in manual; y
     (p,) with what does not count as forecast."""
     u = k.asked if applied is None else np.where(np.isfinite(applied), applied, k.asked)
+    u = np.minimum(np.maximum(u, s.low), s.high)
     counts = read(s, k, y)
     if k.counters[SAMPLES] == 0:
-        k.x[:] = s.start @ np.where(np.isfinite(y), y, s.d) + s.start_0
+        k.x[:] = s.start @ np.where(counts, y, s.d) + s.start_0
     for step in range(max(samples, 1) if k.counters[SAMPLES] else 0):
         advance(s, k, u)
         if samples == 0:
@@ -521,7 +525,7 @@ def follow(s: Supervision, k: Kept, y: np.ndarray, applied: np.ndarray | None, s
     k.e[:] = np.where(counts, filled - k.expected, 0.0)
     forget(s, k)
     if samples and k.counters[SAMPLES] % SPACING == 0:
-        begin_window(s, k, k.counters[SAMPLES] // SPACING % WINDOWS, counts)
+        begin_window(s, k, k.counters[SAMPLES] // SPACING % WINDOWS)
     k.counters[SAMPLES] += 1
     return filled
 

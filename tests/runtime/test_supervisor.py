@@ -189,6 +189,41 @@ def test_the_machines_own_control_takes_over_from_a_weak_heater_if_its_sensor_mo
         assert (decisions[at].u > 0).any() == (run is cleared)
 
 
+@pytest.mark.parametrize("below", [1.0, 4.0, 12.0])
+def test_a_sensor_that_stands_still_below_its_reference_is_told_whatever_its_reading(below):
+    run = Run(seed=0)
+    run.go(200)
+    decisions = run.go(600, reading=lambda y, k: np.array([y[0], R[1] - below]))
+    full = np.array([one.u[1] >= 99.0 for one in decisions])
+    assert decisions[-1].mode == "off" and full.sum() <= 60
+
+
+@pytest.mark.parametrize("gap", [1.6, 0.0, 1000.0])
+def test_a_clock_that_is_always_wrong_hides_no_fault(gap):
+    run = Run(seed=0)
+    run.go(100, r=steps_of)
+    decisions = []
+    for k in range(200):
+        run.skew = (gap - 1.0) * (k + 1)
+        decisions += run.go(1, reading=lambda y, k: np.array([y[0], R[1] - 4.0]), r=steps_of)
+    assert {one.mode for one in decisions[100:]} == {"off"}
+
+
+def test_a_sensor_that_begins_with_its_power_on_value_has_no_steps_of_that_size():
+    run = Run(seed=0)
+    run.supervised.kept.y[1] = 85.0 + R[1]
+    run.go(1)
+    assert run.supervised.kept.quantum[1] <= supervisor.MOST_STEP_DEGC
+
+
+def test_an_acknowledgement_hides_no_dead_sensor():
+    run = Run(seed=0)
+    for _ in range(20):
+        decision = run.go(1, reading=put(1, lambda y, k: np.nan))[0]
+        run.supervised.acknowledge()
+    assert decision.mode == "off"
+
+
 def test_a_reading_that_lacks_more_than_the_heater_could_give_is_a_sensors_fault():
     """A sensor that slips out reads the room: the heaters go off, and stay off."""
     run = Run(seed=3)

@@ -382,7 +382,7 @@ def _law(name: str, deployed: Deployed) -> str:
 OF_SUPERVISOR = (
     "SPACING", "STILL_AFTER", "FIT_AFTER", "STEPS_STILL", "NOISE_STILL", "SAME_STEPS", "SAME_NOISE",
     "CLEARED_S", "CLEARER", "MORE_THAN_ALL", "MISFIT", "DOUBT", "RESTS", "REPEATED", "SHOWN", "SLOWLY",
-    "EARLY", "JUMP", "RETURNS",
+    "EARLY", "JUMP", "RETURNS", "MOST_STEP_DEGC",
 )  # fmt: skip
 OF_OBSERVER = (
     "A",

@@ -46,7 +46,6 @@ static void forget_all(supervisor_kept *k)
         for (signal = 0; signal < SIGNALS; signal++)
             k->since[kind][signal] = k->last[kind][signal] = -1.0;
     memset(k->amount, 0, sizeof k->amount);
-    memset(k->bad, 0, sizeof k->bad);
     memset(k->returns, 0, sizeof k->returns);
     memset(k->shown, 0, sizeof k->shown);
     k->active = 0;
@@ -157,6 +156,7 @@ static void be_safe(beadline_controller *c, int mode, const double *y, const dou
         return;
     }
     if (k->mode != MODE_OWN) {
+        memset(&c->fallback, 0, sizeof c->fallback);
         law_watch(&the_fallback, &c->fallback, k->asked, y, r);
         law_hand_over(&the_fallback, &c->fallback, y);
     }

@@ -33,7 +33,8 @@ static void end_windows(supervisor_kept *k)
         k->window[w].age = -1;
 }
 
-/* Whole samples since the last one; a clock that tells no time between two samples counts as one */
+/* Whole samples since the last one; a clock that tells no time between two samples counts as one, and the
+ * first time forecasts begin anew */
 static int pass_time(supervisor_kept *k, double t_s)
 {
     double gap_s, gap;
@@ -47,8 +48,9 @@ static int pass_time(supervisor_kept *k, double t_s)
     sane = gap >= EARLY && gap <= JUMP;
     k->clock_s[0] = t_s;
     k->clock_s[1] += sane ? gap_s : BEADLINE_SAMPLE_TIME_S;
-    if (!sane || gap > 1.5)
+    if (!sane && !k->insane)
         end_windows(k);
+    k->insane = !sane;
     return sane && gap > 1.5 ? (int)(gap + 0.5) : 1;
 }
 
@@ -70,7 +72,7 @@ static void read_sensors(supervisor_kept *k, const double *y, int *counts)
         if (good) {
             double move = fabs(y[j] - k->y[j]);
             if (move > 1e-9)
-                k->quantum[j] = fmin(k->quantum[j], move);
+                k->quantum[j] = fmin(k->quantum[j], fmin(move, MOST_STEP_DEGC));
             k->repeats[j] = move < 1e-12 ? k->repeats[j] + 1 : 0;
             k->y[j] = y[j];
         }
@@ -85,7 +87,7 @@ static double forecast(const double *state, int j)
 }
 
 /* A forecast from where the machine is now */
-static void begin_window(supervisor_kept *k, int at, const int *counts)
+static void begin_window(supervisor_kept *k, int at)
 {
     forecast_window *one = &k->window[at];
     int j, w;
@@ -95,9 +97,9 @@ static void begin_window(supervisor_kept *k, int at, const int *counts)
     memcpy(one->state[1], one->state[0], sizeof k->x);
     memcpy(one->state[1] + WATCH - OUTPUTS, k->slow, sizeof k->slow);
     for (j = 0; j < OUTPUTS; j++) {
-        one->began[j] = one->least[j] = one->most[j] = forecast(one->state[0], j);
-        /* a sensor that does not count may be far from its forecast, and moves with it all the same */
-        one->first[j] = counts[j] ? one->began[j] : k->y[j];
+        one->began[j] = forecast(one->state[0], j);
+        /* a sensor may be far from its forecast: whether it moves is told from its own readings */
+        one->first[j] = one->least[j] = one->most[j] = isfinite(k->y[j]) ? k->y[j] : one->began[j];
     }
     for (w = 0; w < WINDOWS; w++)
         memset(k->window[w].cross[at], 0, sizeof one->cross[at]);
@@ -338,6 +340,7 @@ static void judge_heaters(supervisor_kept *k, const double *y, const int *counts
             int j = supervisor_of_input[i];
             double at_least = floor_of(k, w, i), best = 1e300, amount;
             clear[w][i] = gives[w][i] = 0;
+            share[w][i] = 0.0;
             if (one->age < FIT_AFTER || !counts[j]
                 || fabs(y[j] - forecast(one->state[1], j)) < largest(threshold(k, w, j), doubt_of(k, w, j)))
                 continue;
@@ -350,7 +353,7 @@ static void judge_heaters(supervisor_kept *k, const double *y, const int *counts
                         gives[w][i] = f == GIVES;
                     }
                 }
-            clear[w][i] = best <= 2 * at_least && one->age * log(honest_of(k, w, i) / best) >= CLEARER;
+            clear[w][i] = best < 1e300 && best <= 2 * at_least && one->age * log(honest_of(k, w, i) / best) >= CLEARER;
             if (clear[w][i])
                 shows[!gives[w][i]][i] = 1;
         }
@@ -428,11 +431,12 @@ static void follow(supervisor_kept *k, const double *y, const double *applied, i
     double u[INPUTS];
     int counts[OUTPUTS], i, j, step;
     for (i = 0; i < INPUTS; i++)
-        u[i] = applied && isfinite(applied[i]) ? applied[i] : k->asked[i];
+        u[i] = cut(applied && isfinite(applied[i]) ? applied[i] : k->asked[i], supervisor_low[i],
+                   supervisor_high[i]);
     read_sensors(k, y, counts);
     if (!k->samples) {
         for (j = 0; j < OUTPUTS; j++)
-            filled[j] = isfinite(y[j]) ? y[j] : supervisor_d[j];
+            filled[j] = counts[j] ? y[j] : supervisor_d[j];
         memcpy(k->x, supervisor_start_0, sizeof k->x);
         add_product(k->x, supervisor_start[0], filled, WATCH, OUTPUTS);
     }
@@ -460,7 +464,7 @@ static void follow(supervisor_kept *k, const double *y, const double *applied, i
         k->e[j] = counts[j] ? filled[j] - k->expected[j] : 0.0;
     forget(k);
     if (samples && k->samples % SPACING == 0)
-        begin_window(k, k->samples / SPACING % WINDOWS, counts);
+        begin_window(k, k->samples / SPACING % WINDOWS);
     k->samples++;
 }
 

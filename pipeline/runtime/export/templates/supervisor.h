@@ -23,5 +23,5 @@ typedef struct {
     forecast_window window[WINDOWS];
     double asked[INPUTS], usual[INPUTS], stirred[INPUTS], clock_s[2];
     int repeats[OUTPUTS], bad[OUTPUTS], returns[OUTPUTS], shown[2][INPUTS];
-    int samples, mode, clocked, active; /* active: causes that are there */
+    int samples, mode, clocked, insane, active; /* active: causes that are there */
 } supervisor_kept;
