@@ -4,6 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.recordings.recordings import Raw, Source, Table, read, resample
+from pipeline.recordings.resampling import hold
 
 
 def recorded(**signals: tuple) -> Raw:
@@ -230,3 +231,9 @@ def test_a_gap_of_an_hour_and_an_interval_may_be_summer_time():
     time[150:] += 60
     (flag,) = flags_of(time, "gap")
     assert "summer" not in flag.message
+
+
+def test_a_set_point_is_held_from_its_own_instants_and_missing_before_the_first():
+    at_s = np.array([0.0, 1.9, 2.0, 4.9, 5.0, 90.0])
+    held = hold(np.array([2.0, 5.0]), np.array([200.0, 0.0]), at_s)
+    np.testing.assert_array_equal(held, [np.nan, np.nan, 200.0, 200.0, 0.0, 0.0])
