@@ -221,6 +221,7 @@ class TuneWeights(Section):
     allow_settled_error_degC: float = Field(gt=0, le=1000)
     allow_at_limits_percent: float = Field(gt=0, le=100)
     allow_effort_percent: float = Field(gt=0, le=100)
+    allow_travel_percent: float = Field(gt=0, le=100)
     worst_case: float = Field(ge=0, le=1000)
     least_disk_margin: float = Field(ge=0, le=2)
     least_delay_margin_s: float = Field(ge=0, le=1e6)
@@ -228,10 +229,13 @@ class TuneWeights(Section):
 
 class TemperatureRules(Section, extra="ignore"):
     """Of section `report` the limits that a simulation of the temperature loop can check; settling_s null: as
-    panel.settling_s says on the study's machine, as the record says on another."""
+    panel.settling_s says on the study's machine, as the record says on another; heating_s null: that and the
+    shortest time from cold."""
 
     settled_error_degC: float = Field(gt=0, le=1000)
+    peak_error_degC: float = Field(gt=0, le=1000)
     settling_s: float | None = Field(gt=0, le=1e6)
+    heating_s: float | None = Field(gt=0, le=1e6)
     overshoot_degC: float = Field(gt=0, le=1000)
     at_limits_percent: float = Field(gt=0, le=100)
     disk_margin: float = Field(gt=0, le=2)

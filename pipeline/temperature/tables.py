@@ -97,7 +97,7 @@ CASES = Schema(
         Column("contestant", TEXT, NONE, "which contestant"),
         Column("case", INDEX, NONE, "number of the case, the same for every contestant", low=0),
         Column("plant", INDEX, NONE, "plant of the panel", low=0),
-        Column("kind", TEXT, NONE, "reference: constant, ramp, sinusoid or sequence"),
+        Column("kind", TEXT, NONE, "reference: constant, ramp, sinusoid, sequence; or held and disturbed"),
         Column("start_degC", FLOAT, "degC", "temperature that the plant was held at"),
         Column(
             "settled_error_degC",
@@ -109,16 +109,45 @@ CASES = Schema(
         ),
         Column("settled_zone", TEXT, NONE, "that output"),
         Column(
-            "settling_s",
+            "peak_degC",
             FLOAT,
-            "s",
-            "last time outside the band about the reached reference; missing where it never settles",
+            "degC",
+            "largest error of the last 100 steps, worst output; missing where unstable",
             low=0,
             nullable=True,
         ),
+        Column(
+            "settling_s",
+            FLOAT,
+            "s",
+            "last time outside the band about the reached reference; missing where it never settles, and "
+            "from the coldest start",
+            low=0,
+            nullable=True,
+        ),
+        Column("heating_s", FLOAT, "s", "the same from the coldest start", low=0, nullable=True),
         Column("overshoot_degC", FLOAT, "degC", "largest way past a reference", low=0, nullable=True),
-        Column("at_limits_percent", FLOAT, "percent", "share of the time at a limit of an input", 0, 100),
+        Column(
+            "at_limits_percent",
+            FLOAT,
+            "percent",
+            "share of the time at a limit of an input; missing from the coldest start",
+            0,
+            100,
+            nullable=True,
+        ),
         Column("energy_percent", FLOAT, "percent", "mean input given, over all inputs", nullable=True),
+        Column(
+            "travel_percent", FLOAT, "percent", "mean change of the input that moves most, a sample", low=0
+        ),
+        Column(
+            "dip_degC",
+            FLOAT,
+            "degC",
+            "largest error, worst output, where a door, a fan and another room disturb; missing elsewhere",
+            low=0,
+            nullable=True,
+        ),
         Column("rms_degC", FLOAT, "degC", "root mean square error, over all outputs", low=0, nullable=True),
         Column("cost", FLOAT, NONE, "the declared engineering cost, as deployed", low=0, nullable=True),
         Column(

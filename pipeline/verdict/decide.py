@@ -38,8 +38,8 @@ from pipeline.verdict.wording import name_first, places_of, straddling, worded, 
 
 NEVER = Missing(OPEN, "The nightly job measures it and has not run")
 # limits that the comparison resolves for the machine: declared, or those of a recorded machine's own pace
-RESOLVED = ("settled_error_degC", "settling_s", "overshoot_degC")
-# judged on the median plant
+RESOLVED = ("settled_error_degC", "settling_s", "heating_s", "overshoot_degC")
+# judged on the plant that a tenth of all plants lie below
 MARGINS = ("disk", "delay_s")
 # rules that no row holds: only the machine shows drift, once the controller runs; the stage `certify` refuses
 DRIFT = "drift"
@@ -392,7 +392,7 @@ def _closest_limit(standing: Standing) -> str:
         return ""
     question, figure = min(asked, key=lambda pair: -share(pair[0], _worst_end(*pair)))
     places = places_of(question, [figure])
-    whose = " of the median plant" if question.key in MARGINS else ""
+    whose = " of the weakest tenth of plants" if question.key in MARGINS else ""
     return (
         f"Closest to its limit: {question.rule}{whose}, {worded(question, figure.value, places)} of "
         f"at {'least' if question.at_least else 'most'} {with_unit(question.limit, question.unit, places)}."
@@ -400,7 +400,7 @@ def _closest_limit(standing: Standing) -> str:
 
 
 def _worst_margins(compared: Mapping[str, Any], winner: Standing) -> str:
-    """The margins of the worst plant where they are below the limits, which hold for the median plant."""
+    """The margins of the worst plant where they are below the limits, which a tenth of plants may miss."""
     parts = []
     for rule in winner.rules:
         question = rule.question

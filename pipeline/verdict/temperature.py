@@ -14,7 +14,18 @@ from pipeline.verdict.verdict import OPEN, Figure, Missing, count_of
 LOOP = "temperature"
 REPEAT = "Run ./run dvc repro evaluate_temperature"
 # figures of the scorecard that come as median and quantile
-QUANTILES = ("settled_error", "settling", "overshoot", "at_limits", "energy", "cost")
+QUANTILES = (
+    "settled_error",
+    "peak",
+    "settling",
+    "heating",
+    "overshoot",
+    "at_limits",
+    "energy",
+    "travel",
+    "dip",
+    "cost",
+)
 
 
 def comparison(figures: Figures) -> Mapping[str, Any]:
@@ -97,13 +108,12 @@ def unstable(figures: Any) -> tuple[int, int]:
 
 
 def _margin(figures: Any, key: str) -> Figure | None:
-    """A margin of the median plant; none where a plant's loop is unstable. The panel's spread has gain, speed
-    and delay in it: a margin on its worst plant would ask for the same doubt twice."""
+    """A margin of the plant that a tenth of all plants lie below; none where a plant's loop is unstable. The
+    panel's spread has gain, speed and delay in it: the worst plant would ask for the same doubt twice."""
     margin = entry(figures, "margins", key)
-    if not isinstance(margin, Mapping) or "median" not in margin:
+    if not isinstance(margin, Mapping) or "q10" not in margin:
         return None
-    median = 0.0 if unstable(figures)[0] else finite(margin["median"])
-    return count_of(median)
+    return count_of(0.0 if unstable(figures)[0] else finite(margin["q10"]))
 
 
 def _without_margin(figures: Mapping[str, Any], gap: Missing) -> Missing:

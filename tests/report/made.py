@@ -75,10 +75,14 @@ def contestant(cost=2.0, **changed):
     """Figures that pass every rule of params.yaml."""
     return {
         "settled_error": figure(0.1, 0.05, 0.2),
+        "peak": figure(0.3, 0.2, 0.4),
         "settling": figure(6.0, 5.0, 8.0),
+        "heating": figure(20.0, 18.0, 24.0),
         "overshoot": figure(0.5, 0.3, 0.9),
         "at_limits": figure(1.0, 0.5, 2.0),
         "energy": figure(30.0, 29.0, 31.0),
+        "travel": figure(0.4, 0.3, 0.5),
+        "dip": figure(2.0, 1.8, 2.3),
         "cost": figure(cost, 0.9 * cost, 1.1 * cost),
         "rms": figure(4.0, 3.0, 5.0),
         "crossings": {"cases": 0, "of": CASES, "worst_degC": 0.0},
@@ -88,7 +92,10 @@ def contestant(cost=2.0, **changed):
             "q90_percent": 0.4,
             "convention": "Q = R = I, discounted 0.99, unclipped, without integrator, plant known at rest",
         },
-        "margins": {"disk": {"median": 0.7, "worst": 0.6}, "delay_s": {"median": 3.0, "worst": 2.5}},
+        "margins": {
+            "disk": {"q10": 0.7, "median": 0.9, "worst": 0.6},
+            "delay_s": {"q10": 3.0, "median": 4.0, "worst": 2.5},
+        },
         "stable": {"count": PLANTS, "of": PLANTS},
         "tuned": {"observer_tau": 3.0},
         "at_bound": [],

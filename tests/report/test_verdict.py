@@ -41,7 +41,9 @@ from tests.report.test_pages import INDEX, TEMPERATURE, Page
 
 RULES = ReportRules(
     settled_error_degC=0.5,
+    peak_error_degC=1.0,
     settling_s=60.0,
+    heating_s=70.0,
     overshoot_degC=5.0,
     at_limits_percent=10.0,
     disk_margin=0.4,
@@ -160,7 +162,10 @@ def test_passed_says_what_is_closest_to_its_limit_and_never_counts_drift_as_pass
     assert (verdict.state, verdict.winner) == (PASSED, "subspace_lqg")
     assert verdict.decision == "Pass (simulation): subspace + LQG."
     assert verdict.lead == "Every rule measured so far passed on 6 simulated plants."
-    assert verdict.reason == "Closest to its limit: disk margin of the median plant, 0.70 of at least 0.40."
+    assert (
+        verdict.reason
+        == "Closest to its limit: disk margin of the weakest tenth of plants, 0.70 of at least 0.40."
+    )
     assert verdict.remedy.startswith("Drift is not measured. The nightly job measures it and has not run.")
     calm = judge(metrics(), drift=Figure(1.0, 0.0, 2.0))
     assert calm.lead == "All rules passed on 6 simulated plants."
@@ -177,7 +182,7 @@ def test_a_pair_of_which_one_was_refused_is_told_as_refused_and_not_as_no_differ
     assert pair_sentence(stages).text == "Model-based against data-driven: not measured."
 
 
-def test_a_pass_on_the_median_plant_names_the_margins_that_the_worst_plant_lacks():
+def test_a_pass_on_nine_plants_in_ten_names_the_margins_that_the_worst_plant_lacks():
     stages = metrics()
     margins = stages["evaluate_temperature"]["contestants"]["subspace_lqg"]["margins"]
     margins["disk"]["worst"], margins["delay_s"]["worst"] = 0.18, 0.41
@@ -210,14 +215,26 @@ def test_of_recordings_a_pass_is_ready_for_a_supervised_trial_and_nothing_more()
             "never settles at the 90 % quantile of all cases; the rule allows 60 s.",
         ),
         (
+            {"peak": made.figure(1.4, 1.2, 1.6)},
+            "peak error",
+            "swings 1.40 °C around its reference once settled, at the 90 % quantile of all cases; "
+            "the rule allows 1.00 °C.",
+        ),
+        (
+            {"heating": made.figure(95.0, 90.0, 99.0)},
+            "heating up",
+            "needs 95 s from cold until it has settled, at the 90 % quantile of all cold starts; "
+            "the rule allows 70 s.",
+        ),
+        (
             {"overshoot": made.figure(5.33, 5.1, 5.6)},
             "overshoot",
             "overshoots by 5.3 °C at the 90 % quantile of all cases; the rule allows 5.0 °C.",
         ),
         (
-            {"margins": {"disk": {"median": 0.3, "worst": 0.2}, "delay_s": {"median": 3.0, "worst": 2.0}}},
+            {"margins": {"disk": {"q10": 0.3, "worst": 0.2}, "delay_s": {"q10": 3.0, "worst": 2.0}}},
             "disk margin",
-            "has a disk margin of 0.30 on the median plant; the rule asks for 0.40.",
+            "has a disk margin of 0.30 on the weakest tenth of plants; the rule asks for 0.40.",
         ),
         ({"stable": {"count": 3, "of": 6}}, "disk margin", "is unstable on 3 of 6 plants."),
         (
@@ -348,7 +365,7 @@ def random_comparison(rng):
         figures["cost"] = random_figure(rng, float(rng.uniform(1, 4)))
         figures["gap"] |= {"median_percent": float(10 ** rng.uniform(-3, 24)), "q90_percent": None}
         figures["crossings"]["cases"] = int(rng.choice([0, 0, 0, 3]))
-        figures["margins"]["disk"]["median"] = float(rng.choice([0.1, 0.6]))
+        figures["margins"]["disk"]["q10"] = float(rng.choice([0.1, 0.6]))
         figures["stable"]["count"] = int(rng.choice([made.PLANTS, made.PLANTS, 3]))
     names = [name for name in compared["order"] if name in compared["contestants"]]
     compared["best"] = rng.choice([*names, None])

@@ -21,6 +21,15 @@ def static(gain: float) -> Law:
 
 
 def asked(plants, starts, references, *, steps, hold=1, noise=0.0, seed=1, cells=False, **kinds) -> Cases:
+    """Without structure and without the disturbed case, which the tests ask for by themselves."""
+    made = asked_all(plants, starts, references, steps, hold, noise, seed, cells, (panel.Structure(),), kinds)
+    keep = made.kind != "disturbed"
+    own = ("plant", "kind", "start", "x0", "u0", "begin", "asked")
+    parts = {name: getattr(made, name)[keep] for name in own}
+    return made._replace(each=made.each - 1, outside=made.outside[:, keep], **parts)
+
+
+def asked_all(plants, starts, references, steps, hold, noise, seed, cells, structures, kinds) -> Cases:
     questions = Questions(
         np.array(starts, float),
         np.array(references, float),
@@ -36,6 +45,7 @@ def asked(plants, starts, references, *, steps, hold=1, noise=0.0, seed=1, cells
         steps=steps,
         hold=hold,
         cells=cells,
+        structures=structures,
     )
 
 
@@ -144,7 +154,10 @@ def test_every_case_begins_at_rest_where_it_says(cells):
         one, y = plants[index], cases.starts[start]
         # rounding at 90 °C
         np.testing.assert_allclose(one.A @ x + one.B @ u + one.b, x, atol=1e-9)
-        np.testing.assert_allclose(x[:6] if cells else one.C @ x + one.d, y[0], atol=1e-8)
+        held = start == len(cases.starts) - 1  # at the first reference
+        np.testing.assert_allclose(
+            x[:6] if cells and not held else one.C @ x + one.d, y[0] if not held else y, atol=1e-8
+        )
 
 
 def test_every_controller_measures_the_same_noise_of_the_level_asked_for():
@@ -252,6 +265,60 @@ def test_what_runs_within_its_limits_is_the_closed_loop_of_which_the_margins_are
         state = loop @ state
 
 
+# ---- what no model holds
+
+
+def played(structure: panel.Structure, steps: int, law: Law) -> tuple[panel.Rollout, Cases]:
+    """A machine with y+ = 0.9 y + 0.1 u + 2, 20 °C where nothing heats it, from 20 °C and held at 100 °C."""
+    machine = plant([[0.9]], [[0.1]], [[1.0]], b=[2.0])
+    cases = asked_all([machine], [[20.0]], [[100.0]], steps, 1, 0.0, 1, False, (structure,), {})
+    limits = ActuatorLimits(np.zeros(1), np.full(1, 200.0), np.full(1, np.inf))
+    controller = deployed(law, limits, integral_limit=1.0)
+    return panel.rolled_out(
+        controller, cases, panel.aims(law, panel.rests(machine, cases, limits), cases)
+    ), cases
+
+
+def test_a_door_a_fan_and_another_room_cool_a_held_machine_by_their_shares_of_its_rise():
+    run, cases = played(panel.Structure(), 2000, still_law(1, 1))
+    assert list(cases.kind) == ["constant", "disturbed"]
+    y = run.y[:, 1, 0]
+    # 80 °C warmer than from where it starts: in the end 15 %, 8 % and 3 % of that colder
+    ends = [y[int(2000 * share) - 1] for share in (0.1, 0.15, 0.3, 0.5, 0.6, 1.0)]
+    np.testing.assert_allclose(ends, [100, 88, 100, 93.6, 100, 97.6], atol=1e-3)
+    np.testing.assert_allclose(run.y[-1, 0], 100.0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("structure", "ends"),
+    [
+        # 80 °C of heat; the wall passes on a tenth of the rise y - 20: y - 20 = 80 + 0.1 (y - 20)
+        (panel.Structure(wall=0.1, slower=0.02), 20 + 80 / 0.9),
+        # y - 20 = 80 - 0.1 (y - 20)^2 / 80
+        (panel.Structure(radiates=0.1), 20 + 80 * (np.sqrt(1 + 4 * 0.1) - 1) / 0.2),
+    ],
+)
+def test_a_slow_wall_and_radiation_end_where_their_equations_say(structure, ends):
+    run, _ = played(structure, 3000, still_law(1, 1))
+    np.testing.assert_allclose(run.y[-1, 0, 0], ends, atol=1e-3)
+
+
+def test_a_sensor_in_steps_is_what_is_measured_and_a_duty_in_steps_what_heats():
+    run, _ = played(panel.Structure(step_degC=0.25, duty=0.1), 50, static(0.3))
+    measured, y = run.measured[:, 0, 0], run.y[:, 0, 0]
+    np.testing.assert_array_equal(measured, 0.25 * np.round(y / 0.25))
+    # 80 percent hold the reference: the heater gives whole steps of 8
+    given = (y[1:] - 0.9 * y[:-1] - 2.0) / 0.1
+    np.testing.assert_allclose(given, 8 * np.round(run.u[:-1, 0, 0] / 8), atol=1e-9)
+    assert np.abs(given - run.u[:-1, 0, 0]).max() > 1
+
+
+def test_a_loop_that_swings_around_its_reference_has_a_peak_and_no_settled_error():
+    cases = asked([MACHINE], [[20.0]], [[100.0]], steps=9)
+    result = figures_of([20.0, 60, 103, 98, 102, 98, 102, 98, 102], cases, r=100.0, settled=4)
+    assert (result.settled_error[0], result.peak[0]) == (0.0, 2.0)
+
+
 # ---- figures
 
 
@@ -281,10 +348,16 @@ def test_an_engineer_s_figures_by_hand():
     y = [20.0, 60, 103, 100.5, 98, 100.5, 100.5, 99.8, 100.3]
     wished = [120.0, 50, -10, 5, 5, 5, 5, 5, 5]
     result = figures_of(y, cases, wished=wished, r=100.0)
-    assert result.settling[0] == 5  # out of the band for the last time at sample 4
+    # out of the band for the last time at sample 4, from cold: no settling of its own, and no time at limits
+    assert result.heating[0] == 5 and np.isnan([result.settling[0], result.at_limits[0]]).all()
     assert result.overshoot[0] == pytest.approx(3.0)
     assert result.settled_error[0] == pytest.approx(0.2)  # |mean(0.5, -0.2, 0.3)|
-    assert result.at_limits[0] == pytest.approx(100 * 2 / 9)
+    assert result.peak[0] == pytest.approx(0.5)
+    # commands as applied 100, 50, 0, 5 and then still
+    assert result.travel[0] == pytest.approx((50 + 50 + 5) / 8)
+    warm = figures_of(y, cases._replace(start=np.array([1])), wished=wished, r=100.0)
+    assert warm.settling[0] == 5 and np.isnan(warm.heating[0])
+    assert warm.at_limits[0] == pytest.approx(100 * 2 / 9)
     assert result.energy[0] == pytest.approx((100 + 50 + 6 * 5) / 9)
     assert result.rms[0] == pytest.approx(np.sqrt(((np.array(y) - 100) ** 2).mean()))
     assert result.crossing[0] == pytest.approx(1.0)  # 103 against 102
@@ -295,14 +368,14 @@ def test_an_engineer_s_figures_by_hand():
 def test_settling_is_of_the_reachable_target_and_the_settled_error_of_the_reference():
     cases = asked([MACHINE], [[20.0]], [[100.0]], steps=6)
     result = figures_of([20.0, 90, 90, 90, 90, 90], cases, r=100.0, target=90.0)
-    assert (result.settling[0], result.settled_error[0]) == (1.0, 10.0)
+    assert (result.heating[0], result.settled_error[0]) == (1.0, 10.0)
 
 
 def test_a_run_that_ends_outside_the_band_never_settles_and_cooling_overshoots_downwards():
     cases = asked([MACHINE], [[100.0]], [[20.0]], steps=4)
     result = figures_of([100.0, 50, 15, 30], cases, r=20.0)
-    assert (result.settling[0], result.overshoot[0]) == (np.inf, 5.0)
-    assert figures_of([20.5] * 4, cases, r=20.0).settling[0] == 0
+    assert (result.heating[0], result.overshoot[0]) == (np.inf, 5.0)
+    assert figures_of([20.5] * 4, cases, r=20.0).heating[0] == 0
 
 
 def test_a_sequence_counts_settling_and_overshoot_from_each_new_reference():
@@ -342,20 +415,24 @@ def test_a_moving_reference_has_a_root_mean_square_and_no_settling(kind):
 
 def test_the_declared_cost_by_hand_and_no_more_than_ten_thousand():
     allowance = Allowance(
-        outside=15.0, overshoot=2.0, settled_error=0.5, at_limits=10.0, energy=10.0, rms=4.0
+        outside=15.0, overshoot=2.0, settled_error=0.5, at_limits=10.0, energy=10.0, travel=5.0, rms=4.0
     )
     nan = np.nan
     rows = Figures(
         settled_error=np.array([0.5, 1.0, np.inf]),
         settled_zone=np.zeros(3, int),
+        peak=np.zeros(3),
         settling=np.array([30.0, nan, np.inf]),
+        heating=np.full(3, nan),
         overshoot=np.array([1.0, nan, 1e300]),
-        at_limits=np.array([20.0, 0.0, 0.0]),
+        at_limits=np.array([20.0, nan, 0.0]),
         energy=np.array([5.0, 10.0, 0.0]),
+        travel=np.array([10.0, 0.0, 0.0]),
+        dip=np.full(3, nan),
         rms=np.array([9.0, 2.0, 1.0]),
         crossing=np.zeros(3),
         outside=np.array([45.0, 600.0, 1.0]),
     )
     # a reference that moves costs its r.m.s., one that stands its time outside and its overshoot
-    expected = [3 + 0.5 + 1 + 2 + 0.5, 0.5 + 2 + 0 + 1, 1e4]
+    expected = [3 + 0.5 + 1 + 2 + 0.5 + 2, 0.5 + 2 + 0 + 1, 1e4]
     np.testing.assert_allclose(panel.costs(rows, allowance), expected)

@@ -11,7 +11,9 @@ INDEX = (
     "quantile",
     "passed",
     "settled",
+    "peak",
     "settling",
+    "heating",
     "overshoot",
     "at_limits",
     "margin_disk",
@@ -32,7 +34,9 @@ INDEX = (
 # key of an answer -> the word that explains it
 ANSWERS = {
     "settled_error": "settled",
+    "peak": "peak",
     "settling": "settling",
+    "heating": "heating",
     "overshoot": "overshoot",
     "at_limits": "at_limits",
     "disk": "margin_disk",
@@ -103,6 +107,16 @@ FIXED = {
         "Settling",
         "How long it takes until every zone has come within the band around its reference and "
         "stays there for good.",
+    ),
+    "peak": (
+        "Largest error once settled",
+        "How far the worst zone is from its reference at most, once the controller has settled: a loop that "
+        "swings around its reference has no settled error, and is no good.",
+    ),
+    "heating": (
+        "Settling from cold",
+        "The same from the coldest start. Its limit is the settling limit plus the shortest time in which "
+        "full inputs take the identified plant there.",
     ),
     "overshoot": ("Overshoot", "The furthest way that any zone goes past its reference."),
     "drift": (

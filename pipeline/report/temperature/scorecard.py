@@ -17,14 +17,20 @@ from pipeline.verdict.wording import banded, places_of, worded
 # figures without a rule
 UNRULED = (
     Question(0, "energy", "Energy, mean input", "%", math.inf, False, ""),
+    Question(0, "travel", "Travel of the input that moves most, a sample", "%", math.inf, False, ""),
+    Question(0, "dip", "Largest error under door, fan and another room", "°C", math.inf, False, ""),
     Question(0, "cost", "Cost as deployed", "", math.inf, False, ""),
 )
 ORDER = (
     "settled_error",
+    "peak",
     "settling",
+    "heating",
     "overshoot",
+    "dip",
     "at_limits",
     "energy",
+    "travel",
     "cost",
     "crossings",
     "disk",
@@ -138,9 +144,10 @@ def _cell(
 def _beside(question: Question, own: Any, places: int) -> list[str]:
     """Median, and the worst case with its plant."""
     if question.key in ("disk", "delay_s"):
-        worst = entry(own, "margins", question.key, "worst")
         plain = question._replace(unit="")
-        return ["median plant", *([] if worst is None else [f"worst {worded(plain, finite(worst), places)}"])]
+        ends = {end: entry(own, "margins", question.key, end) for end in ("median", "worst")}
+        found = [f"{end} {worded(plain, finite(value), places)}" for end, value in ends.items() if value]
+        return ["weakest tenth of plants", *found]
     figures = entry(own, question.key)
     if not isinstance(figures, Mapping):
         return []

@@ -54,7 +54,11 @@ def _state(question: Question, figure: Figure | Missing) -> str:
     return PASSED if isinstance(figure, Missing) and figure.state == UNJUDGED else state(question, figure)
 
 
-SUB = {"at_limits": "clipped commands", "disk": "median plant", "delay_s": "median plant"}
+SUB = {
+    "at_limits": "clipped commands",
+    "disk": "weakest tenth of plants",
+    "delay_s": "weakest tenth of plants",
+}
 
 
 def _cell(question: Question, name: str, figure: Figure | Missing, places: int) -> dict[str, Any]:

@@ -16,26 +16,26 @@ from pipeline.temperature.test_set import panel, scenario_defaults
 
 class Rehearsal(NamedTuple):
     """The two halves of the panel, and what counts on this machine: the band and the settling limit that
-    follow from its record (None: as declared), noise (p,) in °C, references out of reach, and in words where
-    it comes from."""
+    follow from its record (None: as declared), the shortest time from cold to the first reference, noise (p,)
+    in °C, references out of reach, and in words where it comes from."""
 
     judging: panel.Cases
     training: panel.Cases
     band_degC: float
     settling_s: float | None
+    heat_up_s: float
     noise: np.ndarray
     infeasible: list[dict[str, Any]]
     source: str
 
 
 class CaseConditions(NamedTuple):
-    """What all controllers share, tuned and judged: the rehearsal, the identified plant with all inputs a
-    sample late, limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in
-    °C, the settled window in steps, what the cost counts as one, the discount, the sample time, and the share
-    of the declared delay margins that is asked here (`faster`)."""
+    """What all controllers share, tuned and judged: the rehearsal, limits of inputs and outputs (low, high
+    (p,) in °C), the governor, the integrator's limit in °C, the settled window in steps, what the cost counts
+    as one, the discount, the sample time, and the share of the declared delay margins that is asked here
+    (`faster`)."""
 
     rehearsal: Rehearsal
-    late: plant.Plant
     limits: governor.ActuatorLimits
     output_limits: tuple[np.ndarray, np.ndarray]
     governor: governor.Governor
@@ -71,13 +71,13 @@ def conditions(
         settled_error=tuning.allow_settled_error_degC * band,
         at_limits=tuning.allow_at_limits_percent,
         energy=tuning.allow_effort_percent,
+        travel=tuning.allow_travel_percent,
         rms=tuning.allow_overshoot_degC * band,
     )
     # nearer to a reference than its noise no forecast can tell an overshoot
     overshoot = max(tracking.governor_overshoot_degC * band, 3 * float(rehearsal.noise.max()))
     return CaseConditions(
         rehearsal,
-        panel.delayed(family[0], late=True),
         input_limits(machine),
         output_limits(machine),
         watchdog(machine, settings, family, rehearsal.noise, overshoot),
@@ -199,8 +199,16 @@ def from_declaration(
     missed = scenario_defaults.unreachable(
         truth, (limits.low, limits.high), reference, *output_limits(machine)
     )
+    cold = settings.judging.starts_degC[0] * np.ones_like(reference)
     return Rehearsal(
-        judging, training, settings.band_degC, None, noise, _infeasible(machine, missed), "declared"
+        judging,
+        training,
+        settings.band_degC,
+        None,
+        scenario_defaults.heat_up_s(family[0], cold, reference, limits.high),
+        noise,
+        _infeasible(machine, missed),
+        "declared",
     )
 
 
@@ -238,9 +246,9 @@ def _half(
     scaled = panel.PlantSpread(*(half.spread * value for value in declared))._replace(
         delayed=min(half.spread * declared.delayed, 1.0)
     )
-    plants = panel.drawn(around, half.plants, scaled, cells=cells, rng=rng)
+    plants = panel.drawn(panel.padded(around), half.plants, scaled, cells=cells, rng=rng)
     return panel.asked(
-        panel.padded(plants),
+        plants,
         questions,
         noise=noise,
         seed=half.seed,
@@ -318,10 +326,7 @@ def from_record(
     questions = panel.Questions(
         asked.starts, asked.references, (lower, asked.ramp_degC_per_step), swing, asked.sequence
     )
-    middle = asked.starts.mean(axis=0, keepdims=True)
-    training = panel.Questions(
-        middle, asked.references.mean(axis=0, keepdims=True), None, None, asked.sequence
-    )
+    training = panel.Questions(asked.starts, asked.references[:1], None, None, asked.sequence)
     judging, trained = (
         _half(
             settings,
@@ -344,6 +349,7 @@ def from_record(
         trained,
         asked.band_degC,
         asked.settling_s,
+        scenario_defaults.heat_up_s(identified, asked.starts[0], asked.references[0], limits.high),
         scale.noise_degC,
         _infeasible(machine, asked.infeasible),
         "from the record",

@@ -14,10 +14,14 @@ from pipeline.temperature.test_set.cases import CaseConditions, play
 
 FIGURES = {
     "settled_error": "settled_error_degC",
+    "peak": "peak_degC",
     "settling": "settling_s",
+    "heating": "heating_s",
     "overshoot": "overshoot_degC",
     "at_limits": "at_limits_percent",
     "energy": "energy_percent",
+    "travel": "travel_percent",
+    "dip": "dip_degC",
     "cost": "cost",
     "rms": "rms_degC",
 }
@@ -89,10 +93,14 @@ def _columns(one: ControllerOutcome, setting: CaseConditions) -> dict[str, np.nd
     f = one.figures
     return {
         "settled_error_degC": f.settled_error,
+        "peak_degC": f.peak,
         "settling_s": f.settling * setting.sample_time_s,
+        "heating_s": f.heating * setting.sample_time_s,
         "overshoot_degC": f.overshoot,
         "at_limits_percent": f.at_limits,
         "energy_percent": f.energy,
+        "travel_percent": f.travel,
+        "dip_degC": f.dip,
         "cost": one.costs,
         "rms_degC": f.rms,
     }
@@ -110,11 +118,11 @@ def summarise(
             **{key: _number(getattr(band, key)) for key in ("median", "q90", "low", "high", "worst")},
             "worst_case": _case(cases, band.worst_case),
         }
-    constant = ~np.isnan(one.figures.settling)
+    steps = np.fmax(one.figures.settling, one.figures.heating)
     crossing, noise = one.figures.crossing, setting.rehearsal.noise.max()
     return {
         **figures,
-        "never_settled_percent": 100.0 * float(np.isinf(one.figures.settling[constant]).mean()),
+        "never_settled_percent": 100.0 * float(np.isinf(steps[~np.isnan(steps)]).mean()),
         "crossings": {
             "cases": int((crossing > 3 * noise).sum()),
             "of": len(crossing),
@@ -141,13 +149,15 @@ def _gap(one: ControllerOutcome, setting: CaseConditions) -> dict[str, Any] | No
 
 
 def _margin_figures(margins: list[scorecard.Margins]) -> dict[str, Any] | None:
-    """The worst disk margin in `scorecard.Margins`, unlimited delay margins as null."""
+    """The margins of the plant that a tenth of all plants lie below, of the median one and of the worst;
+    unlimited delay margins as null."""
     if not margins:
         return None
     result = {}
     for key in ("disk", "delay_s"):
         values = np.array([getattr(margin, key) for margin in margins])
         result[key] = {
+            "q10": _number(np.quantile(values, 0.1, method="nearest")),
             "median": _number(np.quantile(values, 0.5, method="nearest")),
             "worst": _number(values.min()),
         }
@@ -217,7 +227,7 @@ def _pair(
         "plants": len(np.unique(block)),
         "figures": {
             name: [figures[one][name]["q90"] for one in (a, b)]
-            for name in ("settling", "overshoot", "settled_error", "cost")
+            for name in ("settling", "heating", "overshoot", "settled_error", "cost")
         },
     }
 

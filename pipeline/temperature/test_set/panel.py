@@ -2,8 +2,10 @@
 controller as it runs (controller.py).
 
 Plants, drawn uniformly around a nominal one: each input's gain, the speed of the whole plant, more heat lost,
-a sample of delay on every input in a part of them, another ambient. Cases of each: constant references from
-several starts, a ramp, a sinusoid, a sequence of references; sensor noise.
+a sample of delay on every input in a part of them, another ambient. Three in four have a structure that no
+controller's model holds beside that (STRUCTURES). Cases of each: constant references from several starts, the
+coldest first, a ramp, a sinusoid, a sequence of references, and a door, a fan and another room while a
+reference is held; sensor noise.
 """
 
 from collections.abc import Sequence
@@ -32,6 +34,27 @@ from pipeline.temperature.plant import Plant, hold_output, hold_state
 from pipeline.temperature.tracking import Law, reached_state
 
 RESTLESS = 1e-8  # reciprocal condition of I - A below which a plant has no rest of its own
+# the surroundings while a reference is held: from, until (shares of the run), share of the rise by which they
+# are colder: a door, a part fan, another room
+DOOR, FAN, ROOM = (0.1, 0.15, 0.15), (0.3, 0.5, 0.08), (0.6, 1.0, 0.03)
+MOVES = ("ramp", "sinusoid", "disturbed")  # cases without a step of the reference
+
+
+class Structure(NamedTuple):
+    """What a machine has that no model here holds: a slow wall that passes on a share `wall` of how much
+    warmer the outputs are than at the start, with a time constant of `slower` runs; heat radiated, a share
+    `radiates` of the rise where the outputs are a whole rise from the start; sensors in steps of `step_degC`;
+    inputs in steps of a share `duty` of what holds the first reference."""
+
+    wall: float = 0.0
+    slower: float = 0.5
+    radiates: float = 0.0
+    step_degC: float = 0.0
+    duty: float = 0.0
+
+
+# of the plants, in turn
+STRUCTURES = (Structure(), Structure(wall=0.1), Structure(radiates=0.1), Structure(step_degC=0.25, duty=0.01))
 
 
 class PlantSpread(NamedTuple):
@@ -158,7 +181,8 @@ def padded(plants: Sequence[Plant]) -> list[Plant]:
 class Questions(NamedTuple):
     """What every plant is asked, by zone: starts (a, p) and constant references (j, p) in °C, each start with
     each; from the middle start a ramp (r (p,), slope (p,) in °C a step), a sinusoid (mean (p,), amplitude
-    (p,), period in steps) and a sequence (g, p) of references for equal times."""
+    (p,), period in steps) and a sequence (g, p) of references for equal times; held at the first reference, a
+    door, a fan and another room."""
 
     starts: np.ndarray
     constants: np.ndarray
@@ -172,7 +196,10 @@ class Cases(NamedTuple):
     then `steps` under the controller.
 
     `references` and of each case `begin` (s, g), the step at which its g-th reference begins, and `asked`
-    (s, g), which one; noise (s,) in °C drawn from `seed` (s,); `start` (s,) which start.
+    (s, g), which one; noise (s,) in °C drawn from `seed` (s,); `start` (s,) which start, 0 the coldest.
+    `warms` (plants, n) is what surroundings that are 1 °C warmer add to a state each step, `outside` (steps,
+    s) by how many °C they are, `rise` in °C from the coldest start to the first reference; `structure`
+    (plants, 5) of each plant.
     """
 
     plants: list[Plant]
@@ -190,6 +217,15 @@ class Cases(NamedTuple):
     seed: int
     steps: int
     hold: int
+    warms: np.ndarray
+    outside: np.ndarray
+    rise: float
+    structure: np.ndarray
+
+    @property
+    def cold(self) -> np.ndarray:
+        """Whether a case (s,) is a start from cold."""
+        return (self.kind == "constant") & (self.start == 0)
 
 
 def asked(
@@ -202,9 +238,12 @@ def asked(
     hold: int,
     cells: bool,
     limits: ActuatorLimits | None = None,
+    structures: Sequence[Structure] = STRUCTURES,
 ) -> Cases:
-    """The questions put to every plant. Where states are `cells`, a start holds every cell at one
-    temperature, otherwise every output, or what comes nearest within `limits`; noise (p,) in °C."""
+    """The questions put to every plant, which has one of `structures` in turn. Where states are `cells`, a
+    start holds every cell at one temperature, otherwise every output, or what comes nearest within `limits`;
+    noise (p,) in °C."""
+    starts = np.vstack([questions.starts, questions.constants[:1]])
     references = [constant(r) for r in questions.constants]
     rows = [("constant", a, [j]) for a in range(len(questions.starts)) for j in range(len(references))]
     middle = len(questions.starts) // 2
@@ -217,6 +256,7 @@ def asked(
     if questions.sequence is not None:
         rows.append(("sequence", middle, [len(references) + g for g in range(len(questions.sequence))]))
         references += [constant(r) for r in questions.sequence]
+    rows.append(("disturbed", len(questions.starts), [0]))
     most = max(len(row[2]) for row in rows)
     begin = np.array(
         [[g * steps // len(row[2]) if g < len(row[2]) else steps for g in range(most)] for row in rows]
@@ -224,18 +264,20 @@ def asked(
     which = np.array([[row[2][min(g, len(row[2]) - 1)] for g in range(most)] for row in rows])
     x0, u0 = [], []
     for plant in plants:
-        for _, a, _ in rows:
-            state, held = _held(plant, questions.starts[a], cells, limits)
+        for name, a, _ in rows:
+            state, held = _held(plant, starts[a], cells and name != "disturbed", limits)
             x0.append(state)
             u0.append(held)
-    count = len(plants)
+    count, kind = len(plants), np.array([row[0] for row in rows])
+    rise = max(float((questions.constants[0] - questions.starts[0]).mean()), 0.0)
+    outside = np.outer(surroundings(steps, rise), kind == "disturbed")
     return Cases(
         list(plants),
         np.repeat(np.arange(count), len(rows)),
         len(rows),
-        np.tile([row[0] for row in rows], count),
+        np.tile(kind, count),
         np.tile([row[1] for row in rows], count),
-        questions.starts,
+        starts,
         np.array(x0),
         np.array(u0),
         references,
@@ -245,6 +287,39 @@ def asked(
         seed,
         steps,
         hold,
+        np.stack([warmed(plant, cells=cells) for plant in plants]),
+        np.tile(outside, count),
+        rise,
+        np.array([structures[k % len(structures)] for k in range(count)]),
+    )
+
+
+def surroundings(steps: int, rise: float) -> np.ndarray:
+    """By how many °C (steps,) the surroundings are warmer, of a machine that is `rise` °C warmer than
+    they."""
+    t = np.arange(steps) / steps
+    on = [share * ((t >= first) & (t < last)) for first, last, share in (DOOR, FAN, ROOM)]
+    return -rise * np.sum(on, axis=0)
+
+
+def warmed(plant: Plant, *, cells: bool) -> np.ndarray:
+    """What surroundings that are 1 °C warmer add to the state (n,) each step of a plant of `delayed`, so that
+    every cell, or every output, ends 1 °C warmer."""
+    inner = _undelayed(plant)
+    warmer = np.ones(inner.n) if cells else reached_state(inner) @ np.ones(inner.p)
+    return np.r_[warmer - inner.A @ warmer, np.zeros(plant.n - inner.n)]
+
+
+def _undelayed(plant: Plant) -> Plant:
+    """The plant of `delayed` without the inputs that it carries along."""
+    n = plant.n - plant.m
+    late = np.any(plant.A[:n, n:])
+    return plant._replace(
+        A=plant.A[:n, :n],
+        B=plant.A[:n, n:] if late else plant.B[:n],
+        C=plant.C[:, :n],
+        b=plant.b[:n],
+        K=plant.K[:n],
     )
 
 
@@ -253,23 +328,15 @@ def _held(
 ) -> tuple[np.ndarray, np.ndarray]:
     """State and input of a plant of `delayed` held at outputs y (p,), or at cells of y[0] °C; where inputs
     would have to leave `limits`, at rest under the nearest within."""
-    n = plant.n - plant.m
-    late = bool(np.any(plant.A[:n, n:]))
-    inner = plant._replace(
-        A=plant.A[:n, :n],
-        B=plant.A[:n, n:] if late else plant.B[:n],
-        C=plant.C[:, :n],
-        b=plant.b[:n],
-        K=plant.K[:n],
-    )
+    inner = _undelayed(plant)
     if cells:
-        x = np.full(n, y[0])
+        x = np.full(inner.n, y[0])
         u = hold_state(inner, x)
     else:
         x, u = hold_output(inner, y)
     if limits is None:
         return np.r_[x, u], u
-    within, balance = np.clip(u, limits.low, limits.high), np.eye(n) - inner.A
+    within, balance = np.clip(u, limits.low, limits.high), np.eye(inner.n) - inner.A
     # a plant that nearly integrates drifts slowly from where it is, and has no rest worth a start
     if np.any(within != u) and np.linalg.cond(balance) < 1 / RESTLESS:
         x = np.linalg.solve(balance, inner.B @ within + inner.b)
@@ -329,7 +396,8 @@ def schedule(cases: Cases, aimed: Sequence[Aim]) -> tuple[np.ndarray, np.ndarray
 
 
 def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Rollout:
-    """Every case at once under one controller; `aimed` from `aims`."""
+    """Every case at once under one controller; `aimed` from `aims`. The structure of its plant acts on what
+    it measures, what its inputs do, and the surroundings."""
     count, each = len(cases.plants), cases.each
     A, B, C = (
         np.stack([getattr(plant, name) for plant in cases.plants]).transpose(0, 2, 1) for name in "ABC"
@@ -337,43 +405,70 @@ def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Roll
     b, d = (np.stack([getattr(plant, name) for plant in cases.plants])[:, None] for name in "bd")
     r, target, feed = schedule(cases, aimed)
     noise = noise_of(cases)
+    wall_share, slower, radiates, step_degC, duty = cases.structure[cases.plant].T
+    # the last case of each plant is held at the first reference
+    duty = (duty * np.abs(cases.u0[each - 1 :: each]).max(axis=1)[cases.plant])[:, None]
+    warms, pace = cases.warms[cases.plant], 1 / (slower * cases.steps)
+    wall, rise = np.zeros(len(cases.plant)), max(cases.rise, 1.0)
     x, u = cases.x0, cases.u0
     p, m = r.shape[2], u.shape[1]
 
     def outputs(x):
         return (np.matmul(x.reshape(count, each, -1), C) + d).reshape(-1, p)
 
+    def read(y, noise):
+        return in_steps(y + noise, step_degC[:, None])
+
     held = outputs(x)
-    state = watched(controller, None, u, held + noise[0], r[0])
+    state = watched(controller, None, u, read(held, noise[0]), r[0])
     for t in range(1, cases.hold):
-        state = watched(controller, state, u, held + noise[t], r[0])
+        state = watched(controller, state, u, read(held, noise[t]), r[0])
     here = [aimed[len(cases.references) + a] for a in cases.start]
-    state = handed_over(controller, state, held + noise[cases.hold], here)
-    y, wished, applied = np.empty_like(r), np.empty_like(feed), np.empty_like(feed)
+    state = handed_over(controller, state, read(held, noise[cases.hold]), here)
+    y, measured, wished, applied = (
+        np.empty_like(r),
+        np.empty_like(r),
+        np.empty_like(feed),
+        np.empty_like(feed),
+    )
     noise = noise[cases.hold :]
     for t in range(cases.steps):
         y[t] = outputs(x)
-        applied[t], wished[t], state = batch_step(
-            controller, state, y[t] + noise[t], r[t], feed[t], target[t]
-        )
-        x = np.matmul(x.reshape(count, each, -1), A) + np.matmul(applied[t].reshape(count, each, m), B) + b
-        x = x.reshape(len(cases.plant), -1)
+        measured[t] = read(y[t], noise[t])
+        applied[t], wished[t], state = batch_step(controller, state, measured[t], r[t], feed[t], target[t])
+        given = in_steps(applied[t], duty)
+        x = np.matmul(x.reshape(count, each, -1), A) + np.matmul(given.reshape(count, each, m), B) + b
+        warmer = np.clip((y[t] - held).mean(axis=1), -1e4, 1e4)
+        wall += pace * (warmer - wall)
+        outside = cases.outside[t] + wall_share * wall - radiates * warmer**2 / rise
+        x = x.reshape(len(cases.plant), -1) + warms * outside[:, None]
         if not np.abs(x).max() < 1e9:
             x = np.clip(np.nan_to_num(x), -1e9, 1e9)
             state = state._replace(z=np.clip(np.nan_to_num(state.z), -1e9, 1e9))
-    return Rollout(y, r, target, wished, applied, y + noise)
+    return Rollout(y, r, target, wished, applied, measured)
+
+
+def in_steps(values: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """The nearest of whole steps; as they are where the step is 0."""
+    return np.where(step > 0, step * np.round(values / np.where(step > 0, step, 1.0)), values)
 
 
 class Figures(NamedTuple):
-    """An engineer's figures of each case (s,), of true outputs, worst zone: °C, steps, percent. Settling is
-    inf where the outputs are outside at the end, NaN where the reference moves; so is overshoot there."""
+    """An engineer's figures of each case (s,), of true outputs, worst zone: °C, steps, percent. Settling, or
+    heating from the coldest start, is inf where the outputs are outside at the end; both, and overshoot, are
+    NaN where the reference makes no step; the time at limits is NaN from the coldest start, the dip where no
+    door, fan or room disturbs."""
 
     settled_error: np.ndarray
     settled_zone: np.ndarray
+    peak: np.ndarray
     settling: np.ndarray
+    heating: np.ndarray
     overshoot: np.ndarray
     at_limits: np.ndarray
     energy: np.ndarray
+    travel: np.ndarray
+    dip: np.ndarray
     rms: np.ndarray
     crossing: np.ndarray
     outside: np.ndarray
@@ -389,16 +484,17 @@ def figures(
     band: float,
     settled: int = 100,
 ) -> Figures:
-    """Settled error: |mean of the last `settled` steps - r|. Settling: the last step outside `band` °C of the
-    target, counted from each new reference, the longest of them. Overshoot: past the target in the direction
-    of the step. At limits: share of (input, step) wished outside. Energy: mean input. Crossing: how far y
-    lies beyond low, high (p,). Outside: steps outside the band, an edge of a fifth of it counted in part:
-    smooth."""
+    """Settled error: |mean of the last `settled` steps - r|. Peak: largest |y - r| of these steps. Settling
+    and heating: the last step outside `band` °C of the target, counted from each new reference, the longest
+    of them. Overshoot: past the target in the direction of the step. At limits: share of (input, step) wished
+    outside. Energy: mean input. Travel: mean |u(t+1) - u(t)|, of the input that moves most. Dip: largest
+    |y - r| of all steps. Crossing: how far y lies beyond low, high (p,). Outside: steps outside the band, an
+    edge of a fifth of it counted in part: smooth."""
     error = rollout.y - rollout.r
-    late = np.abs((rollout.y - rollout.r)[-settled:].mean(axis=0))
+    late = np.abs(error[-settled:].mean(axis=0))
     off = rollout.y - rollout.target
     beyond = np.abs(off).max(axis=2)
-    moving = np.isin(cases.kind, ("ramp", "sinusoid"))
+    moving = np.isin(cases.kind, MOVES)
     settling, overshoot = np.zeros(len(cases.plant)), np.zeros(len(cases.plant))
     ends = np.column_stack([cases.begin[:, 1:], np.full(len(cases.plant), cases.steps)])
     for first, after in {
@@ -413,14 +509,19 @@ def figures(
         past = (way * off[first:after, rows]).max(axis=(0, 2))
         overshoot[rows] = np.maximum(overshoot[rows], past)
     settling[moving], overshoot[moving] = np.nan, np.nan
+    cold = cases.cold
     wished = (rollout.wished < limits.low - 1e-9) | (rollout.wished > limits.high + 1e-9)
     return Figures(
         late.max(axis=1),
         late.argmax(axis=1),
-        settling,
+        np.abs(error[-settled:]).max(axis=(0, 2)),
+        np.where(cold, np.nan, settling),
+        np.where(cold, settling, np.nan),
         overshoot,
-        100.0 * wished.mean(axis=(0, 2)),
+        np.where(cold, np.nan, 100.0 * wished.mean(axis=(0, 2))),
         rollout.u.mean(axis=(0, 2)),
+        np.abs(np.diff(rollout.u, axis=0)).mean(axis=0).max(axis=1),
+        np.where(cases.kind == "disturbed", np.abs(error).max(axis=(0, 2)), np.nan),
         np.sqrt((error**2).mean(axis=(0, 2))),
         np.maximum((rollout.y - high).max(axis=(0, 2)), (low - rollout.y).max(axis=(0, 2))),
         np.clip((beyond - band) / (0.2 * band) + 0.5, 0.0, 1.0).sum(axis=0),
@@ -429,13 +530,15 @@ def figures(
 
 class Allowance(NamedTuple):
     """What the cost counts as one: steps outside the band, °C of overshoot and of settled error, percent of
-    commands outside the limits, percent of mean input, °C of r.m.s. error where the reference moves."""
+    commands outside the limits, percent of mean input, percent of travel a step, °C of r.m.s. error where the
+    reference makes no step."""
 
     outside: float
     overshoot: float
     settled_error: float
     at_limits: float
     energy: float
+    travel: float
     rms: float
 
 
@@ -451,7 +554,8 @@ def costs(results: Figures, allowance: Allowance) -> np.ndarray:
     total = (
         response
         + results.settled_error / allowance.settled_error
-        + results.at_limits / allowance.at_limits
+        + np.nan_to_num(results.at_limits) / allowance.at_limits
         + results.energy / allowance.energy
+        + results.travel / allowance.travel
     )
     return np.minimum(np.nan_to_num(total, nan=1e4, posinf=1e4), 1e4)

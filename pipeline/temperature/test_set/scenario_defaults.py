@@ -13,13 +13,13 @@ import scipy.optimize
 
 from pipeline.temperature.controllers.baseline import rises
 from pipeline.temperature.identification.validation import one_step_errors, simulated
-from pipeline.temperature.plant import Plant, strictly_proper
+from pipeline.temperature.plant import Plant, hold_output, strictly_proper
 from pipeline.temperature.test_set.time_scale import time_constant
 
 RANGE = (0.01, 0.99)  # quantiles that count as recorded: a spike, or one sample of a start, is none
 ONE_DEVIATION = (0.1587, 0.8413)  # quantiles of a normal one standard deviation either side of its median
-# near the bottom, where a machine is switched on, and the middle, where a reference is changed
-START_SHARES = (0.1, 0.5)
+# the coldest of the record, as a machine is switched on, and the middle, where a reference is changed
+START_SHARES = (0.0, 0.5)
 LOWER_SHARE = 0.15  # of the recorded span, by which the second reference lies below the first
 # as an open loop needs to come within 5 % of its end; the delay counts as the step and its answer are late
 SETTLING = (3.0, 2.0)  # time constants, delays
@@ -162,8 +162,8 @@ def defaults(
     output_low and output_high (p,) in °C, NaN where the owner declares none.
 
     starts: START_SHARES of the recorded range; what the inputs cannot hold, a temperature below the room's
-    above all, becomes the nearest that they can. references: the declared one where it can be held; in its
-    place otherwise the nearest that leaves HEADROOM to inputs and the band to declared limits of outputs;
+    above all, becomes the nearest that they can, for the coldest with inputs at their limits. references: the
+    declared one where it can be held; in its place otherwise the nearest that leaves HEADROOM to inputs and the band to declared limits of outputs;
     and one LOWER_SHARE of the recorded span below. ramp: from the lower to the higher in one run. sinusoid:
     about their middle, so small that its heat is no more than the way between them needs. sequence: lower,
     higher, middle. All these lie between two states that can be held, so that they can be held too.
@@ -171,7 +171,10 @@ def defaults(
     band, span = _band(scale), scale.high_degC - scale.low_degC
     outputs = _declared(output_low, -np.inf), _declared(output_high, np.inf)
     bounds, careful = Bounds(*limits, *outputs), _drawn_in(Bounds(*limits, *outputs), band)
-    starts = [_nearest(model, scale.low_degC + share * span, careful)[0] for share in START_SHARES]
+    starts = [
+        _nearest(model, scale.low_degC + share * span, careful if share else bounds)[0]
+        for share in START_SHARES
+    ]
     asked = np.asarray(asked_reference, float)
     reached, u = _nearest(model, asked, bounds)
     first, entries = asked, []
@@ -201,6 +204,20 @@ def defaults(
         sequence=np.stack([lower, first, (first + lower) / 2]),
         notes=notes,
     )
+
+
+def heat_up_s(model: Plant, cold: np.ndarray, reference: np.ndarray, high: np.ndarray) -> float:
+    """Time in s in which the inputs at `high` (m,) take the outputs from where they are held at `cold` (p,)
+    past `reference` (p,) in °C, each zone once; STEPS[1] samples where one never gets there."""
+    model = strictly_proper(model)
+    x, _ = hold_output(model, cold)
+    past = model.C @ x + model.d >= reference - REACHED_DEGC
+    for t in range(STEPS[1]):
+        if past.all():
+            return t * model.sample_time_s
+        x = model.A @ x + model.B @ high + model.b
+        past |= model.C @ x + model.d >= reference - REACHED_DEGC
+    return STEPS[1] * model.sample_time_s
 
 
 def unreachable(
