@@ -8,7 +8,7 @@ coldest first, a ramp, a sinusoid, a sequence of references, and a door, a fan a
 reference is held; sensor noise.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -396,56 +396,79 @@ def schedule(cases: Cases, aimed: Sequence[Aim]) -> tuple[np.ndarray, np.ndarray
 
 
 def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Rollout:
-    """Every case at once under one controller; `aimed` from `aims`. The structure of its plant acts on what
-    it measures, what its inputs do, and the surroundings."""
-    count, each = len(cases.plants), cases.each
+    """Every case at once under one controller; `aimed` from `aims`."""
+    r, target, feed = schedule(cases, aimed)
+    held = held_readings(cases)
+    state = watched(controller, None, cases.u0, held[0], r[0])
+    for measured in held[1:-1]:
+        state = watched(controller, state, cases.u0, measured, r[0])
+    state = handed_over(controller, state, held[-1], [aimed[len(cases.references) + a] for a in cases.start])
+
+    def drive(t: int, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        nonlocal state
+        applied, wished, state = batch_step(controller, state, measured, r[t], feed[t], target[t])
+        if not np.abs(state.z).max(initial=0.0) < 1e9:
+            state = state._replace(z=np.clip(np.nan_to_num(state.z), -1e9, 1e9))
+        return applied, wished
+
+    return simulated(cases, drive, r, target)
+
+
+def held_readings(cases: Cases) -> np.ndarray:
+    """(hold + 1, s, p): what is measured while the machines are held, the last of it as the controller takes
+    over."""
+    C, d = (np.stack([getattr(plant, name) for plant in cases.plants])[cases.plant] for name in ("C", "d"))
+    held = np.einsum("spn,sn->sp", C, cases.x0) + d
+    return in_steps(held + noise_of(cases)[: cases.hold + 1], cases.structure[cases.plant, 3][:, None])
+
+
+def simulated(
+    cases: Cases,
+    drive: Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    r: np.ndarray,
+    target: np.ndarray,
+) -> Rollout:
+    """Every machine at once from where it is held; drive(t, measured (s, p)) gives the inputs (s, m) applied
+    and wished. The structure of a machine acts on what is measured, on what its inputs do, and on the
+    surroundings."""
+    count, each, (steps, s, p), m = len(cases.plants), cases.each, r.shape, cases.u0.shape[1]
     A, B, C = (
         np.stack([getattr(plant, name) for plant in cases.plants]).transpose(0, 2, 1) for name in "ABC"
     )
     b, d = (np.stack([getattr(plant, name) for plant in cases.plants])[:, None] for name in "bd")
-    r, target, feed = schedule(cases, aimed)
-    noise = noise_of(cases)
     wall_share, slower, radiates, step_degC, duty = cases.structure[cases.plant].T
     # the last case of each plant is held at the first reference
     duty = (duty * np.abs(cases.u0[each - 1 :: each]).max(axis=1)[cases.plant])[:, None]
-    warms, pace = cases.warms[cases.plant], 1 / (slower * cases.steps)
-    wall, rise = np.zeros(len(cases.plant)), max(cases.rise, 1.0)
-    x, u = cases.x0, cases.u0
-    p, m = r.shape[2], u.shape[1]
-
-    def outputs(x):
-        return (np.matmul(x.reshape(count, each, -1), C) + d).reshape(-1, p)
-
-    def read(y, noise):
-        return in_steps(y + noise, step_degC[:, None])
-
-    held = outputs(x)
-    state = watched(controller, None, u, read(held, noise[0]), r[0])
-    for t in range(1, cases.hold):
-        state = watched(controller, state, u, read(held, noise[t]), r[0])
-    here = [aimed[len(cases.references) + a] for a in cases.start]
-    state = handed_over(controller, state, read(held, noise[cases.hold]), here)
-    y, measured, wished, applied = (
-        np.empty_like(r),
-        np.empty_like(r),
-        np.empty_like(feed),
-        np.empty_like(feed),
-    )
-    noise = noise[cases.hold :]
-    for t in range(cases.steps):
-        y[t] = outputs(x)
-        measured[t] = read(y[t], noise[t])
-        applied[t], wished[t], state = batch_step(controller, state, measured[t], r[t], feed[t], target[t])
+    warms, pace = cases.warms[cases.plant], 1 / (slower * steps)
+    x, wall, rise = cases.x0, np.zeros(s), max(cases.rise, 1.0)
+    noise = noise_of(cases)[cases.hold :]
+    y, measured = np.empty((steps, s, p)), np.empty((steps, s, p))
+    applied, wished = np.empty((steps, s, m)), np.empty((steps, s, m))
+    for t in range(steps):
+        y[t] = (np.matmul(x.reshape(count, each, -1), C) + d).reshape(-1, p)
+        measured[t] = in_steps(y[t] + noise[t], step_degC[:, None])
+        applied[t], wished[t] = drive(t, measured[t])
         given = in_steps(applied[t], duty)
         x = np.matmul(x.reshape(count, each, -1), A) + np.matmul(given.reshape(count, each, m), B) + b
-        warmer = np.clip((y[t] - held).mean(axis=1), -1e4, 1e4)
+        warmer = np.clip((y[t] - y[0]).mean(axis=1), -1e4, 1e4)
         wall += pace * (warmer - wall)
         outside = cases.outside[t] + wall_share * wall - radiates * warmer**2 / rise
-        x = x.reshape(len(cases.plant), -1) + warms * outside[:, None]
+        x = x.reshape(s, -1) + warms * outside[:, None]
         if not np.abs(x).max() < 1e9:
             x = np.clip(np.nan_to_num(x), -1e9, 1e9)
-            state = state._replace(z=np.clip(np.nan_to_num(state.z), -1e9, 1e9))
     return Rollout(y, r, target, wished, applied, measured)
+
+
+def some(cases: Cases, kinds: Sequence[str], plants: int) -> Cases:
+    """Of the first `plants` plants the cases of these kinds, the disturbed one among them."""
+    keep = np.isin(cases.kind, kinds) & (cases.plant < plants)
+    rows = ("plant", "kind", "start", "x0", "u0", "begin", "asked")
+    return cases._replace(
+        plants=cases.plants[:plants],
+        each=int(keep[: cases.each].sum()),
+        outside=cases.outside[:, keep],
+        **{name: getattr(cases, name)[keep] for name in rows},
+    )
 
 
 def in_steps(values: np.ndarray, step: np.ndarray) -> np.ndarray:

@@ -163,8 +163,9 @@ def defaults(
 
     starts: START_SHARES of the recorded range; what the inputs cannot hold, a temperature below the room's
     above all, becomes the nearest that they can, for the coldest with inputs at their limits. references: the
-    declared one where it can be held; in its place otherwise the nearest that leaves HEADROOM to inputs and the band to declared limits of outputs;
-    and one LOWER_SHARE of the recorded span below. ramp: from the lower to the higher in one run. sinusoid:
+    declared one where it can be held; in its place otherwise the nearest that leaves HEADROOM to inputs and
+    the band to declared limits of outputs; and one LOWER_SHARE of the recorded span below. ramp: from the
+    lower to the higher in one run. sinusoid:
     about their middle, so small that its heat is no more than the way between them needs. sequence: lower,
     higher, middle. All these lie between two states that can be held, so that they can be held too.
     """
