@@ -121,6 +121,7 @@ def compare(
         "refused": refused,
     }
     summary |= evaluation.decide(outcomes, entrants, summary, setting, settings.seed)
+    summary["redesign_excess_percent"] = redesign_excesses(entrants, loaded)
     typical = evaluation.typical_case(outcomes, entrants)
     drawn = {"typical": typical, "deciding": summary["deciding"]["case"]}
     return (
@@ -149,6 +150,20 @@ def evaluate_all(
     results = run_all(calls, execution)
     outcomes = dict(tqdm(results, total=len(calls), desc="evaluate_temperature: controllers", mininterval=2))
     return {name: outcomes[name] for name in designs}, refused
+
+
+def redesign_excesses(names: list[str], loaded: EvaluationInputs) -> dict[str, float | None]:
+    """By controller that takes the identified plant, the extra cost in percent that the plant's bands leave
+    open; None if it is without bound."""
+    from pipeline.temperature.controllers.table import BY_NAME
+    from pipeline.temperature.redesign import redesign_excess
+
+    excesses = {}
+    for name in (name for name in names if BY_NAME[name].learned_from == "plant"):
+        values = {one.name: loaded.weights[name][one.name] for one in BY_NAME[name].parameters}
+        excess = redesign_excess(name, loaded.problem, values, loaded.setting)
+        excesses[name] = 100.0 * excess if excess < float("inf") else None
+    return excesses
 
 
 def conditions(machine: Plant, panel: Panel, setting: CaseConditions) -> dict[str, Any]:

@@ -100,16 +100,21 @@ def main() -> None:
         artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(long))
         if best.learned is not None:
             artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, best.learned.stored())
-        artifacts.write_metrics("learn_kernel", figures(long, enough, candidates, best), METRICS)
+        artifacts.write_metrics("learn_kernel", figures(settings, long, enough, candidates, best), METRICS)
 
 
 def figures(
-    long: WindowModel, enough: Sufficiency, candidates: list[KernelCandidate], best: KernelCandidate
+    settings: LearnKernel,
+    long: WindowModel,
+    enough: Sufficiency,
+    candidates: list[KernelCandidate],
+    best: KernelCandidate,
 ) -> dict[str, Any]:
     kernel = best.learned
     return {
         "window": long.N,
         "samples": long.samples,
+        "allowed_gap_percent": settings.allowed_gap_percent,
         "half_record_gap_percent": 100 * enough.half_gap,
         "samples_needed_for_noise": enough.needed,
         "state": best.state if kernel else None,

@@ -274,7 +274,7 @@ DYNAMICS = Schema(
         *(
             Column(f"{name}{end}", FLOAT, unit, meaning + of, low, nullable=unit == "s")
             for name, unit, meaning, low in (
-                ("gain", "degC per percent", "the step response at its end", None),
+                ("gain", "degC per percent", "steady value, or at the end if the record shows none", None),
                 ("peak", "degC per percent", "its largest excursion", None),
                 ("time_constant_s", "s", "1.5 times the way from 28.3 to 63.2 % of the largest excursion", 0),
                 ("delay_s", "s", "what is left of the time to 63.2 % without one time constant", 0),

@@ -142,39 +142,51 @@ def crossings(figures: Any, undeclared: Sequence[str] = ()) -> Figure | Missing:
 
 
 def data(figures: Figures, name: str) -> Figure | Missing:
-    """Samples of the record over the samples that a controller needs: for its noise, and for its unknowns."""
-    learned = figures.get("learn_kernel")
+    """Samples of the record over those that a controller needs. So many are needed that what its estimator
+    leaves open costs no more in closed loop than `learn_kernel.allowed_gap_percent`; extra cost falls as one
+    over the samples. Undecided if the identified plant is none to judge by."""
+    learned, compared = figures.get("learn_kernel"), figures.get("evaluate_temperature")
     learned_from = BY_NAME[name].learned_from if name in BY_NAME else "plant"
+    allowed = entry(learned, "allowed_gap_percent")
     if learned_from == "kernel":
         if entry(learned, "refused") and entry(learned, "samples_needed") is None:
             return Missing("failed", str(entry(learned, "refused")))
-        return _of(learned, entry(learned, "samples"), entry(learned, "samples_needed"))
+        gap = entry(learned, "candidates", entry(learned, "state") or "", "gap_on_window_model_percent")
+        needed = [entry(learned, "samples_needed"), _for_gap(entry(learned, "samples"), gap, allowed)]
+        return _of(learned, entry(learned, "samples"), max((n for n in needed if n), default=None))
     if learned_from == "window":
-        noise, past = entry(learned, "samples_needed_for_noise"), entry(learned, "window")
-        needed = None if noise is None or past is None else max(noise, _unknowns(figures, past))
-        return _of(learned, entry(learned, "samples"), needed)
+        return _of(learned, entry(learned, "samples"), entry(learned, "samples_needed_for_noise"))
     if learned_from == "plant":
-        return _model_data(figures)
+        model, excess = figures.get("identify_plant"), entry(compared, "redesign_excess_percent", name)
+        rows = entry(model, "rows")
+        return _no_plant(model) or _of(model, rows, _for_gap(rows, excess, allowed))
     if name in BY_NAME and BY_NAME[name].kind in ("model-based", "data-driven"):
         return Missing(OPEN, f"the row of {heading(name)} in controllers/table.py has no learned_from")
     return Missing("not applicable", f"{heading(name)} learns nothing from the record")
 
 
-def _unknowns(figures: Figures, past: int) -> int:
-    """Unknowns of one output's regression on `past` samples of every signal and a constant."""
-    model = figures.get("identify_plant")
-    return past * sum(len(entry(model, key) or ()) for key in ("delays", "fit_holdout")) + 1
+def _for_gap(samples: Any, excess: Any, allowed: Any) -> int | None:
+    """Samples at which an extra cost in percent falls to what is allowed."""
+    if samples is None or excess is None or not allowed:
+        return None
+    return max(math.ceil(samples * excess / allowed), 1)
 
 
-def _model_data(figures: Figures) -> Figure | Missing:
-    """The model has fewer unknowns than the window, so that noise asks no more of it; its
-    own first step, a long VARX, asks for its unknowns."""
-    model = figures.get("identify_plant")
-    past, needed = entry(model, "past"), entry(model, "samples_needed")
-    noise = entry(figures.get("learn_kernel"), "samples_needed_for_noise")
-    if needed is None and past is not None and noise is not None:
-        needed = max(noise, _unknowns(figures, past))
-    return _of(model, entry(model, "rows"), needed)
+def _no_plant(model: Any) -> Missing | None:
+    """Why an identified plant is none to judge a record by: it predicts too little, or a heater cools in it.
+    Its bands are about a wrong plant then, and their width says nothing."""
+    least = rows("identification")["ahead"].at_least
+    ends = entry(model, "fit_holdout_ahead_band") or {}
+    poor = [output for output, (_, high) in ends.items() if high < least]
+    longer = "Record twice as long, or run the experiment in datasets/generate_probing"
+    if poor:
+        fit = number(entry(model, "fit_holdout_ahead", poor[0]), 0)
+        return Missing(OPEN, f"{poor[0]} is predicted with a fit of {fit} % (limit {least:g} %)", longer)
+    certain = [gain for gain in entry(model, "forbidden_gains") or () if gain["certain"]]
+    if certain:
+        gain = certain[0]
+        return Missing(OPEN, f"{gain['input']} on {gain['output']} is {gain['reason']}", longer)
+    return None
 
 
 def _of(stage: Any, samples: Any, needed: Any) -> Figure | Missing:

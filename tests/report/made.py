@@ -119,6 +119,7 @@ def comparison():
         "band_degC": 1.0,
         "contestants": held,
         "order": list(CONTESTANTS),
+        "redesign_excess_percent": {"pi_simc": 0.05, "pi": 0.05, "subspace_lqg": 0.05},
         "best": "subspace_lqg",
         "best_reason": {"against": "pi", "p": 0.01, "difference": 40.0},
         "pair": {
@@ -216,6 +217,7 @@ def metrics():
             "samples": 380,
             "half_record_gap_percent": 0.01,
             "samples_needed_for_noise": 30,
+            "allowed_gap_percent": 1.0,
             "state": "predicted state",
             "refused": None,
             "rank": 5,

@@ -17,6 +17,7 @@ from pipeline.temperature.controllers.kernel import regress
 from pipeline.temperature.controllers.problem import DesignProblem
 from pipeline.temperature.controllers.table import BY_NAME, CONTROLLERS, PAIR
 from pipeline.temperature.plant import baam
+from pipeline.temperature.redesign import redesign_excess
 from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights
 from pipeline.temperature.study import data_sets
 from pipeline.temperature.test_set import (
@@ -482,3 +483,17 @@ def test_a_reference_that_the_declared_machine_cannot_hold_is_named_with_what_bi
     for one in missed:
         assert one["reachable_degC"] < one["asked_degC"] - 0.1
         assert one["binding"].endswith("at 0.5 percent")
+
+
+def test_what_the_bands_of_a_plant_leave_open_of_a_loop_grows_with_the_bands(given):
+    def excess(spread: float) -> float:
+        gains = 1 + spread * np.random.default_rng(3).standard_normal(6)
+        one = given.problem.plant
+        family = [one, *(one._replace(B=gain * one.B) for gain in gains)]
+        weights = given.weights["subspace_lqg"]
+        problem = given.problem._replace(family=family)
+        return redesign_excess("subspace_lqg", problem, weights, given.setting)
+
+    small, large = excess(0.02), excess(0.3)
+    assert excess(0.0) == 0
+    assert small < 0.01 < large

@@ -166,6 +166,16 @@ def test_steps_hold_the_truth_and_say_where_the_sign_is_not_known():
     assert np.isnan(responses.time_constant[:, 0, 1]).all() and np.isnan(responses.delay[:, 0, 1]).all()
 
 
+def test_a_gain_is_where_the_response_settles_and_of_an_integrator_to_the_record_where_it_ends():
+    slow = plant([[0.9, 0.0], [0.0, 0.999]], [[0.1], [0.0001]], [[1.0, 1.0]])
+    others = [slow._replace(B=scale * slow.B) for scale in np.linspace(0.9, 1.1, 21)]
+    settled = steps(slow, others, 2000).gain[:, 0, 0]
+    assert settled[0] == pytest.approx(1.1, abs=1e-9)  # 0.1 / (1 - 0.9) + 0.0001 / (1 - 0.999)
+    assert settled[1:] == pytest.approx([0.91 * 1.1, 1.09 * 1.1], abs=1e-9)
+    short = steps(slow, others, 500)
+    assert short.gain[0, 0, 0] == step_response(slow, short.samples[-1] + 1)[-1, 0, 0] < 1.06
+
+
 def test_a_response_that_turns_back_has_its_peak_beside_its_end():
     # fast up, slow back: 10 (0.9) against -8 (0.98) of the same input
     responses = steps(

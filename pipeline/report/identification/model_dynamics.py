@@ -53,8 +53,8 @@ def steps(sources: Sources) -> dict[str, Any]:
             if sure < every
             else "Every effect is sure in sign. "
         )
-        + "The figure is the largest excursion, with its band; for an effect that turns back, also where "
-        "it ends."
+        + "The figure is the largest excursion, with its band; for an effect that turns back or still rises "
+        "at the end, also its steady value."
     )
     caption = (
         f"Answer in °C to one per cent of the input, over {short(end)}{THIN}s from rest; "
@@ -127,9 +127,9 @@ def _response(
             "foot": "sign not known",
         }
     tau, delay = (f"{short(float(dynamics[key][row]), 2)}{THIN}s" for key in ("time_constant_s", "delay_s"))
-    turns = gain[0] / peak[0] < 0.8
+    elsewhere = not 0.8 < gain[0] / peak[0] < 1.05
     figure = f"{number(peak[0], _places(peak))} ({_span(peak)})" + (
-        f", then {number(gain[0], _places(gain))}" if turns else ""
+        f", then {number(gain[0], _places(gain))} ({_span(gain)})" if elsewhere else ""
     )
     alt = f"{output} after {name}: {figure} °C per %; time constant {tau}, delay {delay}"
     return {

@@ -429,8 +429,8 @@ def glossary(sources: Sources) -> dict[str, tuple[str, str]]:
         "spread": ("Plant spread", spread),
         "data": (
             "Samples needed",
-            f"So many that a controller learned from them costs {enough}, "
-            "and no fewer than it has unknowns to learn.",
+            f"So many that what its own estimator leaves open costs {enough}; for the learned kernel, no "
+            "fewer than its unknowns.",
         ),
         "step": ("Step", f"One sample of the controller, {machine.sample_time_s:g} s here."),
     }

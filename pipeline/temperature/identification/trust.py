@@ -13,9 +13,11 @@ from pipeline.temperature.identification.subspace import Segments
 from pipeline.temperature.identification.validation import (
     RecordExcitation,
     Residuals,
+    banded,
     predicted_ahead,
     simulated,
     spread_bands,
+    steady_gain,
     step_response,
 )
 from pipeline.temperature.plant import Plant
@@ -49,9 +51,10 @@ class Steps(NamedTuple):
     plants: response, low, high (K, p, m) at samples (K,).
 
     first_order: models of the plant's responses and the family's, (1 + family, p, m).
-    gain, peak, time_constant, delay (3, p, m): value and the ends of its band. gain is the last value, peak
-    the largest excursion; times are in samples, NaN where `significant` (p, m) is False: the band of the peak
-    holds zero, so that not even the sign of the effect is known.
+    gain, peak, time_constant, delay (3, p, m): value and the ends of its band. gain is the steady value, or
+    the last one of a plant that is an integrator to the record; peak is the largest excursion at samples.
+    Times are in samples, NaN where `significant` (p, m) is False: the band of the peak holds zero, so that
+    not even the sign of the effect is known.
     """
 
     samples: np.ndarray
@@ -173,12 +176,19 @@ def horizon(plant: Plant, longest: int) -> int:
     study's plant, 16 of 35 signs at one and 1 of them wrong, 22 at the other and none).
     """
     radius = np.abs(np.linalg.eigvals(plant.A)).max()
-    if abs(np.log(max(radius, np.finfo(float).tiny))) * longest < 1:
+    if not _settles(plant, longest):
         longest = max(longest // 10, 20)
     longest = min(longest, int(np.ceil(3 / np.log(radius)))) if radius > 1 + 1e-9 else longest
     r = step_response(plant, longest)
     away = (np.abs(r - r[-1]) > 0.05 * np.abs(r).max(axis=(0, 2))[:, None]).any(axis=(1, 2))
     return int(min(max(np.flatnonzero(away).max(initial=0) * 4 // 3, 20), longest))
+
+
+def _settles(plant: Plant, longest: int) -> bool:
+    """Whether every mode decays, or grows, by 63 % within `longest` samples: others are integrators to a
+    record of that length."""
+    radius = np.abs(np.linalg.eigvals(plant.A)).max()
+    return bool(abs(np.log(max(radius, np.finfo(float).tiny))) * longest >= 1)
 
 
 def two_points(responses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -215,10 +225,11 @@ def steps(
     samples = horizon(nominal, longest)
     bands = spread_bands(nominal, family, samples + 1, level=LEVEL, left_out=left_out)
     at = np.abs(bands.nominal).argmax(axis=0)[None]
-    gain, peak = (
-        np.stack([part[-1] for part in bands[:3]]),
-        np.concatenate([np.take_along_axis(part, at, axis=0) for part in bands[:3]]),
-    )
+    peak = np.concatenate([np.take_along_axis(part, at, axis=0) for part in bands[:3]])
+    gain = np.stack([part[-1] for part in bands[:3]])
+    if _settles(nominal, longest) and np.abs(np.linalg.eigvals(nominal.A)).max() < 1:
+        own, *rest = (steady_gain(plant) for plant in (nominal, *family, *left_out))
+        gain = np.stack([own, *banded(own, rest[: len(family)], rest[len(family) :], LEVEL)])
     significant = peak[1] * peak[2] > 0
     responses = [step_response(plant, samples + 1) for plant in (nominal, *family)]
     shapes = np.stack([two_points(part) for part in responses])  # (1 + family, 2, p, m)

@@ -320,6 +320,12 @@ def step_response(plant: Plant, steps: int) -> np.ndarray:
     )
 
 
+def steady_gain(plant: Plant) -> np.ndarray:
+    """D + C (I - A)^-1 B (p, m): what the outputs settle at after a unit step of each input. A must have no
+    pole at 1."""
+    return plant.D + plant.C @ np.linalg.solve(np.eye(plant.n) - plant.A, plant.B)
+
+
 def spread_bands(
     nominal: Plant,
     family: Sequence[Plant],
@@ -334,15 +340,23 @@ def spread_bands(
     They reach at least as far as Student's quantile of the jackknife's deviation over the `left_out` plants
     (`left_out_plants`), where there are any.
     """
-    responses = np.stack([step_response(plant, steps) for plant in family])
-    low, high = np.quantile(responses, [(1 - level) / 2, (1 + level) / 2], axis=0)
-    own, blocks = step_response(nominal, steps), len(left_out)
+    own, *rest = (step_response(plant, steps) for plant in (nominal, *family, *left_out))
+    low, high = banded(own, rest[: len(family)], rest[len(family) :], level)
+    return PlantBootstrap(own, low, high, [np.linalg.eigvals(plant.A) for plant in family], level)
+
+
+def banded(
+    own: np.ndarray, family: Sequence[np.ndarray], left_out: Sequence[np.ndarray], level: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Low and high ends (...) of a quantity `own` (...) of the plant, from those of a family and of plants
+    without a block, as `spread_bands` says."""
+    low, high = np.quantile(np.stack(family), [(1 - level) / 2, (1 + level) / 2], axis=0)
+    blocks = len(left_out)
     if blocks > 1:
-        others = np.stack([step_response(plant, steps) for plant in left_out])
-        deviation = np.sqrt((blocks - 1) * others.var(axis=0))
+        deviation = np.sqrt((blocks - 1) * np.stack(left_out).var(axis=0))
         reach = scipy.stats.t.ppf((1 + level) / 2, blocks - 1) * deviation
         low, high = np.minimum(low, own - reach), np.maximum(high, own + reach)
-    return PlantBootstrap(own, low, high, [np.linalg.eigvals(plant.A) for plant in family], level)
+    return low, high
 
 
 def advice(
