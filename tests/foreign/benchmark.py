@@ -9,7 +9,6 @@ under BEADLINE_LIVES, if that is set, and are made once a seed.
 
 import argparse
 import contextlib
-import csv
 import ctypes
 import json
 import os
@@ -22,6 +21,7 @@ from typing import Any
 
 import control
 import numpy as np
+import pandas as pd
 import pyarrow.parquet as pq
 
 from stages.evaluate_temperature import load_problem
@@ -30,7 +30,7 @@ from tests.foreign.normal_life import COLD
 from tests.foreign.thermal_machines import DOOR, ROOM, Machine, draw, pointer, quiet, sampled, start
 from tests.mission import toy_temperature
 
-STAGES = ("ingest", "export_controllers")
+STAGES = "ingest", "export_controllers"
 PLANTS = 24  # of the judging half, where its cases are a forecast
 LIKELY = 0.05, 0.95  # quantiles of the cases of a situation: the forecast's interval
 # a settled output stays within the larger of these of its reference
@@ -54,25 +54,24 @@ def walk(seed: int, folder: Path) -> dict[str, Any]:
     folder.mkdir(parents=True)
     machine, project = draw(seed), toy_temperature.begin(folder / "project")
     found: dict[str, Any] = {"seed": seed, "structure": machine.structure, "error": "", "times": {}}
-    rng, logs = np.random.default_rng([seed, 1]), []
-    for name, recording in (("steps", thermal_machines.record), ("evening", thermal_machines.evening)):
-        logs.append(folder / f"{name}.csv")
-        thermal_machines.write_csv(logs[-1], machine, recording(machine, rng))
+    rng, logs = np.random.default_rng([seed, 1]), [folder / "steps.csv", folder / "evening.csv"]
+    thermal_machines.write_csv(logs[0], machine, thermal_machines.record(machine, rng))
+    thermal_machines.write_csv(logs[1], machine, thermal_machines.evening(machine, rng))
     try:
         found["where"] = "inspect"
-        printed = [toy_temperature.beadline(project, "inspect", str(log.resolve())) for log in logs]
-        (folder / "inspect.txt").write_text("\n".join(printed), encoding="utf-8")
+        for log in logs:
+            toy_temperature.beadline(project, "inspect", str(log.resolve()))
         found["where"] = "init"
         normal_life.declare(project, machine, logs[::-1])
-        _play(project, found, toy_temperature.stages_between(*STAGES))
+        _play(project, found, STAGES)
     except Exception as error:  # whatever ends an owner's path is a finding
         found["error"] = f"{type(error).__name__}: {error}"
     (folder / "path.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
     return found
 
 
-def _play(project: Path, found: dict[str, Any], stages: list[str]) -> None:
-    for stage in stages:
+def _play(project: Path, found: dict[str, Any], first_last: tuple[str, str]) -> None:
+    for stage in toy_temperature.stages_between(*first_last):
         found["where"], begin = stage, normal_life._cpu_s()
         toy_temperature.play(project, stage)
         found["times"][stage] = round(normal_life._cpu_s() - begin, 1)
@@ -118,35 +117,34 @@ def _json(project: Path, name: str) -> Any:
     return json.loads((project / "datasets" / name).read_text(encoding="utf-8"))
 
 
+def _copy(folder: Path, name: str) -> Path:
+    """A fresh copy of the project."""
+    shutil.rmtree(folder / name, ignore_errors=True)
+    return Path(shutil.copytree(folder / "project", folder / name, symlinks=True))
+
+
 def refit(folder: Path, nth: int, of: int) -> dict[str, Any]:
     """The path again from the stage after `ingest`, on the nth of `of` equal windows of the record that
     overlap by half: what read_outcome says, or the error."""
-    project = folder / "refit"
-    shutil.rmtree(project, ignore_errors=True)
-    shutil.copytree(folder / "project", project, symlinks=True)
+    project, found = _copy(folder, "refit"), {"where": "", "error": "", "times": {}}
     path = project / "datasets/ingest/record.parquet"
     table = pq.read_table(path)
     length = 2 * len(table) // (of + 1)
     pq.write_table(table.slice(nth * length // 2, length), path)
-    found: dict[str, Any] = {"where": "", "times": {}}
     try:
-        _play(project, found, toy_temperature.stages_between("identify_plant", STAGES[1]))
-        found |= {"error": ""} | read_outcome(project)
+        _play(project, found, ("identify_plant", STAGES[1]))
     except toy_temperature.Refused as error:
-        found["error"] = str(error)
-    return found
+        return found | {"error": str(error)}
+    return found | read_outcome(project)
 
 
 def count_limits(folder: Path, rng: np.random.Generator, count: int) -> Counter[str]:
     """Verdict and export of one fit under `count` draws of the limits of section `report`: how often "Ready"
     stands, a file is written, and the two agree."""
-    project, seen = folder / "refit", Counter[str]()
-    shutil.rmtree(project, ignore_errors=True)
-    shutil.copytree(folder / "project", project, symlinks=True)
-    for _ in range(count):
-        names = "settled_error_degC", "disk_margin", "delay_margin_s"
-        drawn = dict(zip(names, rng.uniform([0.05, 0.1, 0.2], [1, 0.9, 4]).tolist(), strict=True))
-        toy_temperature.declare(project, {f"report.{name}": value for name, value in drawn.items()})
+    project, seen = _copy(folder, "refit"), Counter[str]()
+    for drawn in rng.uniform([0.05, 0.1, 0.2], [1, 0.9, 4], (count, 3)).tolist():
+        names = "report.settled_error_degC", "report.disk_margin", "report.delay_margin_s"
+        toy_temperature.declare(project, dict(zip(names, drawn, strict=True)))
         toy_temperature.play(project, "verdict", "export_controllers")
         found = read_outcome(project)
         seen.update(["fits", *(name for name in ("ready", "file", "consistent") if found[name])])
@@ -161,42 +159,32 @@ def forecast(folder: Path, name: str) -> dict[str, Any]:
     s and overshoot in degC, and the schedule of references that the machine has to follow."""
     project = folder / "forecast"
     if not project.exists():
-        shutil.copytree(folder / "project", project, symlinks=True)
-        toy_temperature.declare(project, {"panel.judging.plants": PLANTS})
+        toy_temperature.declare(_copy(folder, "forecast"), {"panel.judging.plants": PLANTS})
         toy_temperature.play(project, "evaluate_temperature")
     with contextlib.chdir(project):
         half = load_problem().setting.rehearsal.judging
     table = pq.read_table(project / "datasets/evaluate_temperature/cases.parquet").to_pandas()
-    mine = table[table.contestant == name].sort_values("case")
-    first, middle = half.references[half.asked[0, 0]].H[:, 0], len(half.starts) // 2
-    row = int(np.flatnonzero(half.kind == "sequence")[0])
+    mine, own = table[table.contestant == name], _json(project, "evaluate_temperature/figures.json")
+    row = half.kind.tolist().index("sequence")
     steps = [half.references[k].H[:, 0] for k in half.asked[row]]
-    own = _json(project, "evaluate_temperature/figures.json")
-    summary = own["contestants"][name]
+    held = [np.tile(half.starts[half.start[row]], (half.steps, 1))]
     return {
         "band_degC": own["band_degC"],
-        "page_settling_s": summary["settling"]["q90"],
-        "page_overshoot_degC": summary["overshoot"]["q90"],
+        "page_settling_s": own["contestants"][name]["settling"]["q90"],
+        "page_overshoot_degC": own["contestants"][name]["overshoot"]["q90"],
         "cold": _interval(mine[mine.case % half.each == 0]),
         "steps": _interval(mine[mine.kind == "sequence"]),
         "start_degC": half.starts[0],
-        "cold_schedule": np.tile(first, (half.steps, 1)),
-        "steps_schedule": np.concatenate(
-            [np.tile(half.starts[middle], (half.steps, 1))]
-            + [np.tile(r, (half.steps // len(steps), 1)) for r in steps]
-        ),
+        "cold_schedule": np.tile(half.references[half.asked[0, 0]].H[:, 0], (half.steps, 1)),
+        "steps_schedule": np.concatenate(held + [np.tile(r, (half.steps // len(steps), 1)) for r in steps]),
         "begins": half.steps + np.arange(len(steps)) * (half.steps // len(steps)),
     }
 
 
 def _interval(cases: Any) -> dict[str, tuple[float, float]]:
-    columns = {"settling_s": np.inf, "overshoot_degC": np.nan}
-    ends = {}
-    for name, missing in columns.items():
-        values = cases[name].fillna(missing).to_numpy()
-        low, high = np.quantile(values, LIKELY, method="nearest").tolist()
-        ends[name] = low, high
-    return ends
+    """Ends of LIKELY; what never settles needs forever."""
+    filled = cases[["settling_s", "overshoot_degC"]].fillna(np.inf)
+    return {name: tuple(np.quantile(filled[name], LIKELY, method="nearest").tolist()) for name in filled}
 
 
 def follow(
@@ -477,7 +465,7 @@ def _figures(machine: Machine, y: np.ndarray, r: np.ndarray, begins: list[float]
 
 
 def judge(seed: int, *, compare: bool) -> dict[str, Any]:
-    """The row of a machine."""
+    """The row of a machine. If the controller is not exported, the C that `certify` prepared is compared."""
     folder = walked_folder(seed)
     path = json.loads((folder / "path.json").read_text(encoding="utf-8"))
     row = {key: path[key] for key in ("seed", "structure", "where", "error")}
@@ -485,39 +473,21 @@ def judge(seed: int, *, compare: bool) -> dict[str, Any]:
     if path["error"]:
         return row
     row |= read_outcome(folder / "project")
-    code = [f"{at}/temperature{name}/c" for at, name in _code(row["subject"])]
-    sources = [folder / "project/datasets" / one for one in code]
-    there = next((one for one in sources if one.exists()), None)
-    if not compare or there is None:
+    prepared = folder / "project/datasets/certify/temperature" / row["subject"] / "c"
+    if not compare or not prepared.exists():
         return row
-    if not (folder / "c").exists():
-        shutil.copytree(there, folder / "c")
+    shutil.copytree(prepared, folder / "c", dirs_exist_ok=True)
     machine = sampled(draw(seed), normal_life.sample_time_s(folder))
     return row | against_forecast(folder, machine, row["subject"]) | against_person(folder, seed, machine)
 
 
-def _code(subject: str) -> list[tuple[str, str]]:
-    """Where the C of the controller that the verdict is about may lie."""
-    return [("export_controllers", ""), ("certify", f"/{subject}")]
-
-
-def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, names)
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def print_totals(rows: list[dict[str, Any]]) -> None:
-    """How many rows hold each of the bars, of those that have the figure."""
-    print(f"\n{len(rows)} rows; {sum(not row.get('error') for row in rows)} ran to the end.")
-    for decision, count in Counter(row.get("decision", "error").split(":")[0] for row in rows).items():
-        print(f"  {count} {decision}")
-    names = [name for row in rows for name, value in row.items() if isinstance(value, bool)]
-    for name in dict.fromkeys(names):
-        having = [row[name] for row in rows if name in row]
-        print(f"  {name}: {sum(having)} of {len(having)}")
+    """The verdicts, and how many rows hold each of the bars, of those that have the figure."""
+    print(f"\n{len(rows)} rows; {sum(not row['error'] for row in rows)} ran to the end.")
+    print(Counter(row.get("decision", "error").split(":")[0] for row in rows))
+    bars = [(name, value) for row in rows for name, value in row.items() if isinstance(value, bool)]
+    for name, of in Counter(name for name, _ in bars).items():
+        print(f"  {name}: {bars.count((name, True))} of {of}")
 
 
 def main() -> None:
@@ -527,24 +497,20 @@ def main() -> None:
     parser.add_argument("--refits", type=int, default=0, help="windows of each record that are learned again")
     parser.add_argument("--limits", type=int, default=0, help="draws of the limits for each fit")
     parser.add_argument("--out", type=Path, default=Path("."))
-    asked = parser.parse_args()
-    rows, fits, seen = [], [], Counter[str]()
+    asked, seen = parser.parse_args(), Counter[str]()
+    tables: dict[str, list[dict[str, Any]]] = {"machines": [], "fits": []}
     for seed in asked.seeds:
-        rows.append(judge(seed, compare=asked.compare))
-        print(json.dumps(rows[-1]), flush=True)
-        folder = walked_folder(seed)
-        for nth in range(asked.refits):
-            fits.append({"seed": seed, "nth": nth} | refit(folder, nth, asked.refits))
-            print(json.dumps(fits[-1]), flush=True)
-        if asked.limits and not rows[-1]["error"]:
-            seen += count_limits(folder, np.random.default_rng([seed, 4]), asked.limits)
-        for name, table in (("machines.csv", rows), ("fits.csv", fits)):
-            write_rows(asked.out / name, table)
-    print_totals(rows)
-    if fits:
-        print_totals(fits)
-    if seen:
-        print("\nLimits drawn:", ", ".join(f"{count} {name}" for name, count in seen.items()))
+        tables["machines"].append(judge(seed, compare=asked.compare))
+        folder, ended = walked_folder(seed), not tables["machines"][-1]["error"]
+        for nth in range(asked.refits * ended):
+            tables["fits"].append({"seed": seed, "nth": nth} | refit(folder, nth, asked.refits))
+        seen += count_limits(folder, np.random.default_rng([seed, 4]), asked.limits * ended)
+        for name, rows in tables.items():
+            pd.DataFrame(rows).to_csv(asked.out / f"{name}.csv", index=False)
+    for name, rows in tables.items():
+        print(f"\n{name}", *map(json.dumps, rows), sep="\n")
+        print_totals(rows)
+    print("\nLimits drawn:", dict(seen))
 
 
 if __name__ == "__main__":
