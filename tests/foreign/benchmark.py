@@ -106,7 +106,7 @@ def read_outcome(project: Path) -> dict[str, Any]:
         "missing": [
             f"{one['name']} ({one['state']}): {one['reason']}"
             for one in rules
-            if one["state"] in ("failed", "open") and one["name"] != "drift"
+            if one["state"] != "passed" and one["name"] != "drift"
         ],
         "reason": "" if ready else f"{verdict['reason']} {verdict['remedy']}",
         "refused": {name: one["why"] for name, one in certified.items() if not one["passed"]},
@@ -446,7 +446,8 @@ def against_person(folder: Path, seed: int, machine: Machine) -> dict[str, Any]:
 
 
 def _figures(machine: Machine, y: np.ndarray, r: np.ndarray, begins: list[float]) -> dict[str, float]:
-    dt, rows = machine.sample_time_s, [round(begin / machine.sample_time_s) for begin in begins]
+    dt = machine.sample_time_s
+    rows = np.ceil(np.array(begins) / dt - 1e-6).astype(int).tolist()
     parts = [(y[a:b], r[a:b]) for a, b in zip(rows, rows[1:], strict=False)]
     settled = [settling_s(one, aim, _band(aim[0]), dt) for one, aim in parts]
     past = [overshoot_degC(one, aim, one[0]) for one, aim in parts]
