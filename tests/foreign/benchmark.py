@@ -10,6 +10,7 @@ under BEADLINE_LIVES, if that is set, and are made once a seed.
 import argparse
 import contextlib
 import ctypes
+import functools
 import json
 import os
 import shutil
@@ -78,6 +79,7 @@ def _play(project: Path, found: dict[str, Any], first_last: tuple[str, str]) -> 
     found["where"] = "end"
 
 
+@functools.cache
 def walked_folder(seed: int) -> Path:
     """The folder that `walk` filled for a seed; kept under BEADLINE_LIVES, if that is set."""
     folder = Path(os.environ.get(normal_life.KEPT) or tempfile.mkdtemp(prefix="paths_")) / f"path_{seed}"
