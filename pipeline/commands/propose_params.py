@@ -30,6 +30,7 @@ from pipeline.recordings.recordings import Source, read
 from pipeline.recordings.resampling import resample
 from pipeline.store import artifacts, params
 from pipeline.store.params_text import inserted, replaced
+from pipeline.temperature import tables
 from pipeline.temperature.test_set.time_scale import time_constant
 
 RAW = Path("datasets/raw/temperature")
@@ -172,9 +173,14 @@ def _scale(paths: Sequence[Path], proposal: Proposal, *, step_s: float = 0.0) ->
     outputs = [s for s in proposal.signals if s.role == "output"]
     sources = [Source(s.name, s.source, s.unit, s.scale, s.offset) for s in proposal.signals]
     interval = proposal.sample_time_s
+    wanted = {tables.set_point_of(s.name): s for s in outputs if s.set_point}
+    sources += [Source(name, s.set_point, s.unit, s.scale, s.offset) for name, s in wanted.items()]
     u, y = [], {output.name: [] for output in outputs}
+    targets: dict[str, list[np.ndarray]] = {name: [] for name in wanted}
     for path in paths:
         raw = read(path, sources, time=proposal.time)
+        for name in wanted:
+            targets[name].append(raw.signals.pop(name, (np.empty(0), np.empty(0)))[1])
         table = resample(
             raw, sample_time_s=interval, inputs=inputs, outputs=list(y), max_gap_s=_gap_s(interval)
         )
@@ -190,7 +196,12 @@ def _scale(paths: Sequence[Path], proposal: Proposal, *, step_s: float = 0.0) ->
         except ValueError as error:
             raise ValueError(f"{paths[0]}: {name}: {error}") from None
     # a zone that is held all the time shows the pace of its noise
-    still = [name for name, segments in y.items() if stands_still(_finite(segments), None)]
+    set_points = {name: np.concatenate(parts) for name, parts in targets.items()}
+    still = [
+        name
+        for name, segments in y.items()
+        if stands_still(_finite(segments), set_points.get(tables.set_point_of(name)))
+    ]
     if len(still) < len(y):
         constants = {name: tau for name, tau in constants.items() if name not in still}
     sample_time = sample_time_s(interval, min(constants.values()), step_s)

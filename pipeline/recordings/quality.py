@@ -178,12 +178,13 @@ def quantisation_step(values: np.ndarray) -> float:
 # ---- constants, limits, quantisation
 
 STILL_DEGC = 2.0  # a heater's own control keeps a held temperature within that
-STILL_DEVIATIONS = 6.0  # of the noise from sample to sample
+STILL_DEVIATIONS, STILL_STEPS = 6.0, 3.0  # of the noise from sample to sample, and of a coarse sensor
 
 
 def stands_still(measured: np.ndarray, set_point: np.ndarray | None) -> bool:
     """Whether a temperature (T,) in °C never moves: 99 % of its samples lie within STILL_DEGC, and its
-    set-point (T,) never changed. If that was not recorded (None), they span no more than noise."""
+    set-point (T,) never changed. If that was not recorded (None), they span no more than noise
+    or a few steps of the sensor."""
     if len(measured) < 2:
         return False
     low, high = np.quantile(measured, [0.005, 0.995])
@@ -191,7 +192,8 @@ def stands_still(measured: np.ndarray, set_point: np.ndarray | None) -> bool:
         return False
     if set_point is not None and np.isfinite(set_point).any():
         return bool(np.ptp(set_point[np.isfinite(set_point)]) == 0)
-    return bool(high - low <= STILL_DEVIATIONS * np.diff(measured).std() / np.sqrt(2))
+    noise = STILL_DEVIATIONS * np.diff(measured).std() / np.sqrt(2)
+    return bool(high - low <= 1.01 * max(noise, STILL_STEPS * quantisation_step(measured)))
 
 
 def _constant(table: Table, name: str) -> list[Flag]:

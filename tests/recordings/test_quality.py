@@ -359,6 +359,8 @@ def test_a_signal_that_is_passed_over_as_restless_has_no_stretch_of_that_length(
 def test_a_temperature_that_is_held_stands_still_and_one_that_is_moved_does_not():
     rng, samples = np.random.default_rng(0), 3000
     held = np.round(60 + rng.normal(0, 0.05, samples), 1)
+    quiet = np.round(60 + rng.normal(0, 0.025, samples), 1)
+    assert stands_still(quiet, None), "its readings take three values"
     swings = 60 + 0.6 * np.sin(np.arange(samples) / 20)
     constant, moved = np.full(samples, 60.0), np.where(np.arange(samples) < 1500, 60.0, 61.0)
     assert stands_still(held, None) and stands_still(held, constant) and stands_still(swings, constant)
