@@ -117,6 +117,7 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     from pipeline.runtime import certificate_evidence, certify, support_logs
     from pipeline.runtime.certificate import EvidenceRecord
     from pipeline.runtime.replay import GaplessLog
+    from pipeline.temperature.controllers.window import at_mean_disturbances
     from pipeline.temperature.identification.segments import segments, without_gaps
     from pipeline.temperature.test_set import cases
 
@@ -126,7 +127,7 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     pieces = without_gaps(*segments(artifacts.read_table(RECORD, schema), *names))
     acting, y, recordings = certify.cut_at_missing(*pieces)
     u = [piece[:, : len(declared.inputs)] for piece in acting]
-    undisturbed = certify.at_mean_disturbances(acting, y, len(declared.inputs))
+    undisturbed = at_mean_disturbances(acting, y, len(declared.inputs))
     parts = certify.split_newest(u, undisturbed, recordings)
     record = EvidenceRecord(machine.inputs, machine.outputs, machine.sample_time_s, *parts)
     setting, rng = loaded.setting, np.random.default_rng(settings.seed)

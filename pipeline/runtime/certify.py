@@ -13,14 +13,12 @@ from pipeline.runtime.certificate import LOOP, VERSION, Certificate, EvidenceRec
 from pipeline.runtime.certificate_evidence import WindowModels
 from pipeline.runtime.certified import MeasuredController
 from pipeline.runtime.machine import Exported, controller_sha256
-from pipeline.temperature.controllers.window import learn, observer_form
-from pipeline.temperature.plant import Plant, simulate
+from pipeline.temperature.plant import Plant
 from pipeline.temperature.test_set import panel
 
 NEWEST = 0.25  # of a single recording: its end stands for the machine as it is today
 SHORTEST = 100  # samples of a piece between two missing ones, below which it shows nothing of its own
 REACH = 0.25  # of the recorded span, beyond which no reference is certified
-LONGEST, ENOUGH = 24, 20  # samples of a window at most, and samples of the record for each of its columns
 COOLEST = 0.05  # quantile of the recorded temperatures
 
 
@@ -36,34 +34,6 @@ def cut_at_missing(
         if run.stop - run.start >= min(SHORTEST, len(outputs))
     ]
     return [a for a, _, _ in parts], [b for _, b, _ in parts], [number for *_, number in parts]
-
-
-def at_mean_disturbances(
-    acting: Sequence[np.ndarray], y: Sequence[np.ndarray], inputs: int
-) -> list[np.ndarray]:
-    """y (T, p) of each piece as it would be with every disturbance at its mean, as a controller meets them.
-    `acting` (T, m + q) has the disturbances d after the `inputs` m.
-
-    A window model of the record, which is told them, says what they did:
-
-    e(t) = sum_i A_i e(t-i) + E_i (d(t-i) - mean d), at rest before the first sample
-
-    If that model is unstable, or the record too short for one, y is as recorded.
-    """
-    q, columns = acting[0].shape[1] - inputs, acting[0].shape[1] + y[0].shape[1]
-    longest = min(LONGEST, sum(map(len, y)) // (ENOUGH * columns), min(map(len, y)) - 1)
-    if q == 0 or longest < 1:
-        return list(y)
-    model = observer_form(learn(acting, y, longest=longest, offset=True))[0]
-    effect = model._replace(B=model.B[:, inputs:], D=model.D[:, inputs:], b=0 * model.b, d=0 * model.d)
-    if np.abs(np.linalg.eigvals(effect.A)).max() >= 1:
-        return list(y)
-    mean = np.vstack(acting)[:, inputs:].mean(axis=0)
-    moves = [piece[:, inputs:] - mean for piece in acting]
-    rests = [np.linalg.solve(np.eye(effect.n) - effect.A, effect.B @ move[0]) for move in moves]
-    return [
-        piece - simulate(effect, move, rest)[1] for piece, move, rest in zip(y, moves, rests, strict=True)
-    ]
 
 
 def split_newest(

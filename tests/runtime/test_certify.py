@@ -8,10 +8,10 @@ import pytest
 
 from pipeline.runtime import assembly, certified, checks
 from pipeline.runtime import certify as measuring
-from pipeline.runtime.certify import at_mean_disturbances
 from pipeline.runtime.export import c
 from pipeline.runtime.machine import Exported, check
 from pipeline.temperature.controllers.table import BY_NAME, design_controllers
+from pipeline.temperature.controllers.window import at_mean_disturbances
 from stages import certify
 from tests.runtime.deployed_machines import exported
 from tests.temperature.test_evaluate_temperature import judged, small
