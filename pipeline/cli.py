@@ -142,10 +142,11 @@ def init(arguments: argparse.Namespace) -> None:
 
     initialised = propose_params.proposed(arguments.recordings, sample_time=arguments.time)
     values = propose_params.loops_to_run(["temperature"]) | initialised.values
-    changed = propose_params.write(values, force=arguments.force)
+    changed, edited = propose_params.write(values, force=arguments.force)
     if arguments.copy:
         propose_params.copy(arguments.recordings)
-    print(propose_params.summary(initialised, changed, arguments.recordings, arguments.copy))
+    initialised = initialised._replace(values=values)
+    print(propose_params.summary(initialised, changed, edited, arguments.recordings, arguments.copy))
 
 
 def first_experiment(arguments: argparse.Namespace) -> None:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from pipeline.runtime.certificate import EvidenceRecord, Rules
     from pipeline.runtime.certificate_evidence import WindowModels
+    from pipeline.runtime.replay import GaplessLog
     from pipeline.runtime.signals import Machine
     from pipeline.temperature.controllers.problem import Design
     from pipeline.temperature.plant import Plant as PlantModel
@@ -33,8 +34,17 @@ if TYPE_CHECKING:
 RECORD = "datasets/ingest/record.parquet"
 FALLBACK = "pi_simc"  # the safe mode "own"; if the machine allows none, the heaters go off
 # the conditions that a certificate names
-DISTURBED = "Made with {names} as recorded. The controller does not read them, and meets them at their mean."
+DISTURBED = (
+    "Made with {names} at their mean: what they did to the temperatures was learned and taken off the "
+    "record. The controller does not read them."
+)
 UNDISTURBED = "No fan, feed or other disturbance is declared: what one does to the temperatures is not shown."
+# what the setpoint loop's files are made of: without them the temperature loop is certified alone
+SEEN = (
+    "datasets/train_classifier/weights.safetensors",
+    "datasets/train_agent/weights.safetensors",
+    "datasets/evaluate_setpoint/choice.json",
+)
 NOT_ASKED = "Not asked: loops.{} is false."
 
 
@@ -57,6 +67,7 @@ class Common(NamedTuple):
     models: WindowModels
     generator: np.random.Generator  # as the window models left it: every controller goes on with a copy
     plants: list[PlantModel]  # which forecast a recording
+    recorded: list[GaplessLog]  # the machine's own record, which is on support whatever the plants say
     conditions: str
 
 
@@ -68,7 +79,10 @@ def main() -> None:
         if loops.temperature:
             temperature = certify_temperature(out / "temperature", settings)
         if loops.setpoint:
-            setpoint = certify_setpoint(out / "setpoint", settings.seed)
+            lacking = [path for path in SEEN if not artifacts.exists(path)]
+            setpoint |= _not_measured(f"Not measured: {lacking[0]} is missing." if lacking else "")
+            if not lacking:
+                setpoint = certify_setpoint(out / "setpoint", settings.seed)
         artifacts.write_json(out / "certified.json", {"temperature": temperature, "setpoint": setpoint})
 
 
@@ -102,14 +116,19 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
 
     from pipeline.runtime import certificate_evidence, certify, support_logs
     from pipeline.runtime.certificate import EvidenceRecord
+    from pipeline.runtime.replay import GaplessLog
+    from pipeline.temperature.controllers.window import at_mean_disturbances
     from pipeline.temperature.identification.segments import segments, without_gaps
     from pipeline.temperature.test_set import cases
 
     declared, family = loaded.machine, loaded.problem.family
     machine, schema = wire(declared), tables.record(declared.acting, declared.outputs)
-    names = ([signal.name for signal in side] for side in (declared.inputs, declared.outputs))
+    names = ([signal.name for signal in side] for side in (declared.acting, declared.outputs))
     pieces = without_gaps(*segments(artifacts.read_table(RECORD, schema), *names))
-    parts = certify.split_newest(*certify.cut_at_missing(*pieces))
+    acting, y, recordings = certify.cut_at_missing(*pieces)
+    u = [piece[:, : len(declared.inputs)] for piece in acting]
+    undisturbed = at_mean_disturbances(acting, y, len(declared.inputs))
+    parts = certify.split_newest(u, undisturbed, recordings)
     record = EvidenceRecord(machine.inputs, machine.outputs, machine.sample_time_s, *parts)
     setting, rng = loaded.setting, np.random.default_rng(settings.seed)
     half = setting.rehearsal.judging
@@ -122,7 +141,8 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     plants = support_logs.forecasting_plants(family, spread, np.random.default_rng(settings.seed))
     disturbances = ", ".join(one.name for one in declared.disturbances)
     conditions = DISTURBED.format(names=disturbances) if disturbances else UNDISTURBED
-    return Common(machine, record, rules, models, rng, plants, conditions)
+    recorded = [GaplessLog(*log) for log in zip(u, y, y, strict=True)]
+    return Common(machine, record, rules, models, rng, plants, recorded, conditions)
 
 
 def wire(declared: Plant) -> Machine:
@@ -172,8 +192,7 @@ def certify_controller(
             conditions=common.conditions,
         )
         honest = support_logs.honest_logs(made, half, setting.limits)
-        recorded = support_logs.recorded_logs(common.record)
-        within = support.support(common.plants, honest, setting.rehearsal.noise, recorded)
+        within = support.support(common.plants, honest, setting.rehearsal.noise, common.recorded)
         sources = c.code(made, certified.PLACE) | {"golden.csv": vectors.golden(made)}
         checks.check_compiled(made, sources)
         code = python.code(made, certified.PLACE)

@@ -14,7 +14,7 @@ import stages
 from pipeline.store import artifacts, params
 from pipeline.store.params import Execution, Section
 from pipeline.temperature import tables
-from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights
+from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights, recorded
 from stages.tune_weights import load_design_problem
 
 if TYPE_CHECKING:
@@ -80,7 +80,8 @@ class EvaluationInputs(NamedTuple):
 def load_problem() -> EvaluationInputs:
     """The parameters, and what the stages before wrote: the same for the evaluation and for the
     certificate."""
-    machine, panel = params.load(Plant, "plant"), params.load(Panel, "panel")
+    machine = recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet")
+    panel = params.load(Panel, "panel")
     simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
     setting, problem = load_design_problem(
         machine,

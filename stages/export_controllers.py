@@ -51,7 +51,7 @@ def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
     verdict = artifacts.read_json(VERDICTS / "temperature.json")
     name = verdict["winner"] or verdict.get("refused")
     if name is None or name == "hold":
-        why = f"Not exported: {verdict['decision']} {verdict['lead']}"
+        why = f"Not exported: {verdict['decision']} {verdict['lead']} {verdict['reason']}".strip()
         if name:
             why = "Doing nothing is recommended: there is no controller to export."
         return describe(why=why, unit="percent")

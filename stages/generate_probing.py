@@ -18,6 +18,7 @@ from pipeline.temperature.settings import (
     Tracking,
     check_output_limits,
     given_centre,
+    recorded,
 )
 
 if TYPE_CHECKING:
@@ -44,7 +45,8 @@ def main() -> None:
         from pipeline.temperature.identification.segments import segments
         from pipeline.temperature.plant import restored
 
-        settings, machine = params.load(GenerateProbing, "generate_probing"), params.load(Plant, "plant")
+        settings = params.load(GenerateProbing, "generate_probing")
+        machine = recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet")
         tracking = params.load(Tracking, "tracking")
         check_output_limits(machine, settings.source)
         shapes = {"D": (None, len(machine.outputs), len(machine.inputs))}

@@ -16,6 +16,7 @@ from pipeline.store import artifacts, params
 from pipeline.store.params import Section
 from pipeline.temperature import tables
 from pipeline.temperature.settings import Plant as Machine
+from pipeline.temperature.settings import recorded
 
 if TYPE_CHECKING:
     import numpy as np
@@ -73,7 +74,8 @@ def main() -> None:
     with artifacts.stage("identify_plant") as out:
         from pipeline.temperature.plant import stored
 
-        settings, machine = params.load(IdentifyPlant, "identify_plant"), params.load(Machine, "plant")
+        settings = params.load(IdentifyPlant, "identify_plant")
+        machine = recorded(params.load(Machine, "plant"), "datasets/ingest/record.parquet")
         plant, spread, page_tables, figures = identify(settings, machine, "datasets/ingest/record.parquet")
         artifacts.write_arrays(out / "plant.parquet", "plant", 1, stored([plant]))
         artifacts.write_arrays(out / "spread.parquet", "spread", 1, stored(spread))

@@ -1,13 +1,14 @@
 """Recordings -> one table: reads datasets/probe_machine (simulated) or every file below
 datasets/raw/temperature (recordings); writes datasets/ingest/record.parquet, quality.parquet,
-set_points.parquet if the mapping has set-points, and printer_pid.json. A recording that was processed before,
-with the same parameters and code, is taken from a memo; a broken one is quarantined with its reason."""
+set_points.parquet if the mapping has set-points, and printer_pid.json. Zones whose record never moves are
+left out of record and set-points. A recording that was processed before, with the same parameters and code,
+is taken from a memo; a broken one is quarantined with its reason."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
@@ -18,8 +19,15 @@ from pipeline.temperature import tables
 from pipeline.temperature.settings import Plant, check_output_limits
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    import numpy as np
+
     from pipeline.recordings.formats import Source
     from pipeline.recordings.recording_folders import RecordingWish
+
+# a zone that is left out of the design
+STILL = "{}: its record never moves; it keeps its own control; record a set-point change to judge it"
 
 
 class MappedSignal(Mapped):
@@ -71,15 +79,49 @@ def main() -> None:
         record, quality, figures = recording_folders.join(results, wish, strict=strict)
         done = recording_folders.count_work(results)
         print(f"ingest: {done['processed']} recordings read, {done['reused']} taken from the memo")
-        for name, schema in (("record", wish.record), ("set_points", wish.set_points)):
-            if schema is not None:
-                columns = {column.name: record[column.name] for column in schema.columns}
-                artifacts.write_table(out / f"{name}.parquet", schema, columns)
-        artifacts.write_table(out / "quality.parquet", wish.quality, quality)
         inputs = [signal.name for signal in machine.inputs]
         pids = recording_folders.printer_pids(folder, results, wish.sources, inputs)
+        still = still_zones(machine, record, pids.get("heaters", []))
+        for output in still:
+            quality = recording_folders.with_finding(quality, output, "still", STILL.format(output))
+            figures["findings"].setdefault(output, {})["still"] = 1
+        kept = without(machine, still)
+        schemas = {"record": tables.record(kept.acting, kept.outputs)}
+        if wish.set_points is not None:
+            schemas["set_points"] = tables.set_points(kept.outputs)
+        for name, schema in schemas.items():
+            columns = {column.name: record[column.name] for column in schema.columns}
+            artifacts.write_table(out / f"{name}.parquet", schema, columns)
+        artifacts.write_table(out / "quality.parquet", wish.quality, quality)
         artifacts.write_json(out / "printer_pid.json", pids)
         artifacts.write_metrics("ingest", figures, METRICS)
+
+
+def still_zones(
+    machine: Plant, record: Mapping[str, np.ndarray], heaters: Sequence[Mapping[str, Any]]
+) -> dict[str, str]:
+    """{output: its heater} of the zones whose record never moves: nothing can be learned of them, and no
+    controller designed. A heater is known from the printer's PIDs, or by its name: heater_bed of
+    temperature_bed. {} if no other zone would be left."""
+    from pipeline.recordings.quality import stands_still
+
+    by_name = {signal.name.partition("_")[2]: signal.name for signal in machine.inputs}
+    by_pid = {heater["output"]: heater["input"] for heater in heaters}
+    zones = {}
+    for output in machine.outputs:
+        heater = by_pid.get(output.name) or by_name.get(output.name.partition("_")[2])
+        measured = record[output.name][~record[f"{output.name}_masked"]]
+        if heater and stands_still(measured, record.get(tables.set_point_of(output.name))):
+            zones[output.name] = heater
+    enough = len(zones) < len(machine.outputs) and len(set(zones.values())) < len(machine.inputs)
+    return zones if enough else {}
+
+
+def without(machine: Plant, zones: Mapping[str, str]) -> Plant:
+    """The machine without these outputs and their heaters."""
+    inputs = [signal for signal in machine.inputs if signal.name not in zones.values()]
+    outputs = [signal for signal in machine.outputs if signal.name not in zones]
+    return machine.model_copy(update={"inputs": inputs, "outputs": outputs})
 
 
 def recording_wish(settings: Ingest, machine: Plant, mapping: dict[str, MappedSignal]) -> RecordingWish:

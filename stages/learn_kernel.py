@@ -12,7 +12,7 @@ import stages
 from pipeline.store import artifacts, params
 from pipeline.store.params import Section
 from pipeline.temperature import tables
-from pipeline.temperature.settings import Panel, Plant, Tracking
+from pipeline.temperature.settings import Panel, Plant, Tracking, recorded
 
 if TYPE_CHECKING:
     import numpy as np
@@ -64,7 +64,8 @@ def main() -> None:
         from pipeline.temperature.identification import model_choice
         from pipeline.temperature.test_set.scorecard import CommonCost
 
-        settings, machine = params.load(LearnKernel, "learn_kernel"), params.load(Plant, "plant")
+        settings = params.load(LearnKernel, "learn_kernel")
+        machine = recorded(params.load(Plant, "plant"), RECORD)
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
         simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
         inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]

@@ -123,11 +123,15 @@ def main() -> None:
     from pipeline.report.shared.sources import Declared, collect, digest
     from pipeline.report.temperature.judgement import judgement, shown
     from pipeline.report.viewer import page as viewer_page
-    from pipeline.temperature.settings import Plant
+    from pipeline.temperature.settings import Plant, recorded
     from pipeline.verdict.settings import ReportRules
 
     with artifacts.stage("report"):
-        declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
+        declared = Declared(
+            params.load(ReportRules, "report"),
+            recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet"),
+            params.read(),
+        )
         sources = collect(
             declared, FIGURES, FOLDERS, "reports/accepted.json", ("pipeline", "stages"), VERDICTS
         )

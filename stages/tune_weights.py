@@ -12,7 +12,7 @@ import stages
 from pipeline.store import artifacts, params
 from pipeline.store.params import Execution
 from pipeline.temperature import tables
-from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights
+from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights, recorded
 
 if TYPE_CHECKING:
     from pipeline.temperature.controllers.printer_pid import HeaterPid
@@ -161,7 +161,8 @@ def main() -> None:
     with artifacts.stage("tune_weights") as out:
         from pipeline.temperature.test_set.controller_search import tuned_values
 
-        settings, machine = params.load(TuneWeights, "tune_weights"), params.load(Plant, "plant")
+        settings = params.load(TuneWeights, "tune_weights")
+        machine = recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet")
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
         simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
         setting, problem = load_design_problem(machine, panel, tracking, settings, simulated=simulated)

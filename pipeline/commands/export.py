@@ -16,16 +16,52 @@ UNCERTIFIED = (
 )
 TRIAL = "May run: its certificate was passed on recordings of the machine."
 
+# where the files of each form go, and how to go back
+PLACING = {
+    "c": """Copy this there
+    cp controller.c controller.h machine.h tables.h FIRMWARE/
+    Call it as above, and keep the firmware's own control beside it.
+
+Go back
+    Call the firmware's own control again, then
+    rm FIRMWARE/controller.c FIRMWARE/controller.h FIRMWARE/machine.h FIRMWARE/tables.h
+""",
+    "python": """Copy this there
+    cp controller.py PROGRAM/
+    Call controller(...) of that file. It needs numpy.
+
+Go back
+    Let your own control run again, then
+    rm PROGRAM/controller.py
+""",
+    "klipper": """Nothing that you have is replaced: your PID, max_power and max_temp stay in printer.cfg.
+
+Copy this there
+    cp beadline.py beadline_controller.py KLIPPER/klippy/extras/
+    cp beadline.cfg CONFIG/
+    sed -i '1i [include beadline.cfg]' CONFIG/printer.cfg
+    Restart Klipper: sudo systemctl restart klipper
+
+Go back
+    sed -i '/^\\[include beadline.cfg\\]$/d' CONFIG/printer.cfg
+    rm CONFIG/beadline.cfg KLIPPER/klippy/extras/beadline.py KLIPPER/klippy/extras/beadline_controller.py
+    Restart Klipper: sudo systemctl restart klipper
+
+KLIPPER is the folder of Klipper (often ~/klipper), CONFIG that of printer.cfg (often ~/printer_data/config).
+""",
+}
+
 
 def files(made: Exported, shown: Certificate, to: str, section: str, power_W: float | None) -> dict[str, str]:
     """The files of one form, name to text. Raises ValueError, naming what is missing, where the machine or
     the certificate does not allow it."""
     if to == "c":
-        return c.files(made, shown, vectors.golden(made))
+        texts = c.files(made, shown, vectors.golden(made))
+        return texts | {"README.txt": f"{texts['README.txt']}\n{PLACING[to]}"}
     if to == "python":
-        return {"controller.py": python.text(made, shown)}
-    shown_settings = klipper.settings(made, shown, section=section, heater_power_W=power_W)
-    return {"printer.cfg": shown_settings, **klipper.module(made, shown)}
+        return {"controller.py": python.text(made, shown), "README.txt": PLACING[to]}
+    section_text = klipper.settings(made, shown, section=section, heater_power_W=power_W)
+    return {klipper.FILE: section_text, **klipper.module(made, shown), "README.txt": PLACING[to]}
 
 
 def export(folder: Path, to: str, out: Path | None, section: str, power_W: float | None) -> str:

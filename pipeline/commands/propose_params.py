@@ -25,10 +25,12 @@ from pipeline.recordings.proposals import (
     plant_lines,
     propose,
 )
+from pipeline.recordings.quality import stands_still
 from pipeline.recordings.recordings import Source, read
 from pipeline.recordings.resampling import resample
 from pipeline.store import artifacts, params
 from pipeline.store.params_text import inserted, replaced
+from pipeline.temperature import tables
 from pipeline.temperature.test_set.time_scale import time_constant
 
 RAW = Path("datasets/raw/temperature")
@@ -171,9 +173,14 @@ def _scale(paths: Sequence[Path], proposal: Proposal, *, step_s: float = 0.0) ->
     outputs = [s for s in proposal.signals if s.role == "output"]
     sources = [Source(s.name, s.source, s.unit, s.scale, s.offset) for s in proposal.signals]
     interval = proposal.sample_time_s
+    wanted = {tables.set_point_of(s.name): s for s in outputs if s.set_point}
+    sources += [Source(name, s.set_point, s.unit, s.scale, s.offset) for name, s in wanted.items()]
     u, y = [], {output.name: [] for output in outputs}
+    targets: dict[str, list[np.ndarray]] = {name: [] for name in wanted}
     for path in paths:
         raw = read(path, sources, time=proposal.time)
+        for name in wanted:
+            targets[name].append(raw.signals.pop(name, (np.empty(0), np.empty(0)))[1])
         table = resample(
             raw, sample_time_s=interval, inputs=inputs, outputs=list(y), max_gap_s=_gap_s(interval)
         )
@@ -188,6 +195,15 @@ def _scale(paths: Sequence[Path], proposal: Proposal, *, step_s: float = 0.0) ->
             constants[name] = time_constant(u, segments, sample_time_s=interval)
         except ValueError as error:
             raise ValueError(f"{paths[0]}: {name}: {error}") from None
+    # a zone that is held all the time shows the pace of its noise
+    set_points = {name: np.concatenate(parts) for name, parts in targets.items()}
+    still = [
+        name
+        for name, segments in y.items()
+        if stands_still(_finite(segments), set_points.get(tables.set_point_of(name)))
+    ]
+    if len(still) < len(y):
+        constants = {name: tau for name, tau in constants.items() if name not in still}
     sample_time = sample_time_s(interval, min(constants.values()), step_s)
     lows = [np.nanmin(np.concatenate(segments)) for segments in y.values()]
     highs = [np.nanmax(np.concatenate(segments)) for segments in y.values()]
@@ -195,6 +211,11 @@ def _scale(paths: Sequence[Path], proposal: Proposal, *, step_s: float = 0.0) ->
     return MachinePace(
         constants, interval, sample_time, float(np.min(lows)), float(np.max(highs)), rows.std(axis=0).tolist()
     )
+
+
+def _finite(segments: Sequence[np.ndarray]) -> np.ndarray:
+    values = np.concatenate(segments)
+    return values[np.isfinite(values)]
 
 
 def _gap_s(sample_time_s: float) -> float:
@@ -374,20 +395,20 @@ def _questions_on_inputs(inputs: Sequence[Proposed]) -> list[str]:
 # ---- files
 
 
-def write(values: dict[str, list[str]], *, force: bool, path: str | Path = params.FILE) -> list[str]:
-    """Writes the values into params.yaml and params.expert.yaml beside it; returns the keys that changed.
+def write(
+    values: dict[str, list[str]], *, force: bool, path: str | Path = params.FILE
+) -> tuple[list[str], list[str]]:
+    """Writes the values into params.yaml and params.expert.yaml beside it; returns the keys that were
+    written, and those that a person edited.
 
-    A key that holds neither what was shipped nor what is written now was edited: without `force` nothing is
-    written then. Raises ValueError that names such keys.
+    A key that holds neither what was shipped nor what is written now was edited: without `force` it stays,
+    and nothing is written, for the keys of a machine belong together.
     """
     sections = params.read(path)
     changes = {dotted: lines for dotted, lines in values.items() if _at(sections, dotted) != _parsed(lines)}
     edited = [dotted for dotted in changes if _at(sections, dotted) != SHIPPED[dotted]]
     if edited and not force:
-        raise ValueError(
-            f"{params.home(edited[0], path) or path}: {', '.join(edited)} was edited and would be "
-            "overwritten; nothing was written: keep the file, or give --force"
-        )
+        return [], edited
     for file in params.files(path):
         before = text = Path(file).read_text(encoding="utf-8")
         for dotted, lines in changes.items():
@@ -397,7 +418,7 @@ def write(values: dict[str, list[str]], *, force: bool, path: str | Path = param
                 text = inserted(text, dotted, lines)
         if text != before:
             artifacts.write_text(file, text)
-    return list(changes)
+    return list(changes), []
 
 
 def _parsed(lines: Sequence[str]) -> Any:
@@ -431,9 +452,18 @@ def copy(paths: Sequence[Path], folder: Path = RAW) -> list[Path]:
     return copied
 
 
-def summary(initialised: Initialised, changed: Sequence[str], paths: Sequence[Path], copied: bool) -> str:
-    """What was written, and what is left to a person."""
+def summary(
+    initialised: Initialised,
+    changed: Sequence[str],
+    edited: Sequence[str],
+    paths: Sequence[Path],
+    copied: bool,
+) -> str:
+    """What was written, or would replace what was edited, and what is left to a person."""
     lines = [f"written: {', '.join(changed)}" if changed else "nothing to change: the files say so already"]
+    if edited:
+        lines = [f"kept as they are: {', '.join(edited)}. Nothing was written. With --force they would be:"]
+        lines += [f"  {dotted}: {' '.join(initialised.values[dotted])}" for dotted in edited]
     off = [loop for loop, on in params.load(params.Loops, "loops").model_dump().items() if not on]
     if off:
         lines.append(f"off: {' and '.join(off)}, without recordings; loops in params.yaml switches a loop on")

@@ -18,7 +18,7 @@ from pipeline.store import artifacts, params
 from pipeline.temperature import plant
 from pipeline.temperature.controllers import table, window
 from pipeline.temperature.controllers.problem import Design
-from pipeline.temperature.settings import Panel, Tracking, TuneWeights
+from pipeline.temperature.settings import Panel, Tracking, TuneWeights, recorded
 from pipeline.temperature.settings import Plant as Machine
 from pipeline.temperature.test_set import cases, evaluation, panel
 from stages.ingest import Ingest, recording_wish
@@ -170,7 +170,10 @@ def declared(holdout: HoldOut) -> str:
 def frozen_panel(holdout: HoldOut) -> FrozenPanel:
     """Plants drawn, with the seed of section `nightly.holdout`, around the true plant or around those of the
     hold-out recordings, as far away as section `panel` says."""
-    machine, tracking = params.load(Machine, "plant"), params.load(Tracking, "tracking")
+    machine, tracking = (
+        recorded(params.load(Machine, "plant"), "datasets/ingest/record.parquet"),
+        params.load(Tracking, "tracking"),
+    )
     settings, tuning = params.load(Panel, "panel"), params.load(TuneWeights, "tune_weights")
     simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
     records = [] if simulated else _holdout_records(holdout, machine)

@@ -22,7 +22,7 @@ from pipeline.nightly.records import (
 )
 from pipeline.nightly.settings import DriftLimits, NightlyLoop
 from pipeline.store import artifacts, params
-from pipeline.temperature.settings import Plant
+from pipeline.temperature.settings import Plant, recorded
 
 REFERENCE = "reference.json"  # in the champion's folder
 PIECES = 4  # into which a single record of the champion is cut, to stand for nights
@@ -92,7 +92,7 @@ Nights = list[NightChanges]  # the last one last
 def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict[str, Any] | None:
     """champion/<loop>/reference.json of the model below `folder`, from the loop's recordings, or `only` those
     named; None where they are none, or too short."""
-    machine = params.load(Plant, "plant")
+    machine = recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet")
     records = judge.record_segments(Path(loop.recordings), machine, broken={})
     named = [path.removeprefix(f"{loop.recordings}/") for path in only] or sorted(records)
     nights = [_last(records[path]) for path in named if records.get(path)][-NIGHTS:]
@@ -165,7 +165,7 @@ def look(
     drifted = LoopDrift.none(name)
     if not Path(folder).is_dir():
         return drifted, None
-    machine, broken = params.load(Plant, "plant"), {}
+    machine, broken = recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet"), {}
     records = judge.record_segments(Path(folder), machine, broken=broken)
     for path, reason in broken.items():
         if f"{folder}/{path}" in new:

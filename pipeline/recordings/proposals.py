@@ -172,6 +172,7 @@ def yaml_lines(proposal: Proposal) -> list[str]:
         lines.append(f"  # high is {BELOW_CUT_OFF_DEGC:g} °C below the firmware's cut-off (max_temp)")
     if any(signal.role == "output" and signal.low is None for signal in proposal.signals):
         lines.append("  # low and high of an output: between which °C the machine must stay; fill them in")
+    lines.append("  # the file's own clock; init takes the multiple of it that suits machine and firmware")
     return [*lines, f"  sample_time_s: {proposal.sample_time_s!r}"]
 
 

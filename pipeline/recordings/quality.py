@@ -3,7 +3,7 @@ quantisation, units. Wrong samples are masked.
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -28,14 +28,21 @@ CELSIUS = {"degc", "°c", "℃", "c", "celsius"}
 _PERCENT = {"percent", "%", "pct"}
 
 
-def flag(table: Table, *, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> Table:
+def flag(
+    table: Table,
+    *,
+    units: Mapping[str, str],
+    limits: Mapping[str, tuple[float, float]],
+    computed: Collection[str] = (),
+) -> Table:
     """The table with flags for doubtful samples. Samples that are no measurement are masked; values stay.
 
-    `limits` are {input: (low, high)} in the input's unit; all other signals are outputs. Spikes and frozen
-    stretches are masked. These are only reported: quantised, saturated, outside (an input beyond its limits),
-    constant, unit (looks like kelvin, fahrenheit, a duty of 0-1).
+    `limits` are {input: (low, high)} in the input's unit; all other signals are outputs, but those that were
+    `computed` from a printed file, which no sensor measured. Spikes and frozen stretches are masked. These
+    are only reported: quantised, saturated, outside (an input beyond its limits), constant, unit (looks like
+    kelvin, fahrenheit, a duty of 0-1).
     """
-    outputs = [name for name in table.values if name not in limits]
+    outputs = [name for name in table.values if name not in limits and name not in computed]
     flags, masked = list(table.flags), {name: mask.copy() for name, mask in table.masked.items()}
     for name in outputs:
         for finding, where in [*_spikes(table, name), *frozen(table, name)]:
@@ -169,6 +176,24 @@ def quantisation_step(values: np.ndarray) -> float:
 
 
 # ---- constants, limits, quantisation
+
+STILL_DEGC = 2.0  # a heater's own control keeps a held temperature within that
+STILL_DEVIATIONS, STILL_STEPS = 6.0, 3.0  # of the noise from sample to sample, and of a coarse sensor
+
+
+def stands_still(measured: np.ndarray, set_point: np.ndarray | None) -> bool:
+    """Whether a temperature (T,) in °C never moves: 99 % of its samples lie within STILL_DEGC, and its
+    set-point (T,) never changed. If that was not recorded (None), they span no more than noise
+    or a few steps of the sensor."""
+    if len(measured) < 2:
+        return False
+    low, high = np.quantile(measured, [0.005, 0.995])
+    if high - low > STILL_DEGC:
+        return False
+    if set_point is not None and np.isfinite(set_point).any():
+        return bool(np.ptp(set_point[np.isfinite(set_point)]) == 0)
+    noise = STILL_DEVIATIONS * np.diff(measured).std() / np.sqrt(2)
+    return bool(high - low <= 1.01 * max(noise, STILL_STEPS * quantisation_step(measured)))
 
 
 def _constant(table: Table, name: str) -> list[Flag]:

@@ -5,7 +5,7 @@ The memo is content-addressed. The hash of the recording, of the wish and of the
 entry, so that one more recording costs one reading. An entry counts if its files have the digests that were
 written last; otherwise the recording is read again."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -234,6 +234,7 @@ def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, m
     name = shown.relative_to(folder).as_posix()
     beside = [column.name for column in wish.set_points.columns] if wish.set_points else []
     units = {source.signal: source.unit for source in wish.sources if source.signal not in beside}
+    computed = [source.signal for source in wish.sources if source.source in printed_gcode.UNITS]
     try:
         raw = read(path, wish.sources, time=wish.time, decimal=wish.decimal)
         nothing = np.empty(0), np.empty(0)
@@ -244,9 +245,9 @@ def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, m
             inputs=list(wish.held),
             outputs=[name for name in units if name not in wish.held],
             max_gap_s=wish.max_gap_s,
-            averaged=[source.signal for source in wish.sources if source.source in printed_gcode.UNITS],
+            averaged=computed,
         )
-        table = flag(table, units=units, limits=wish.limits)
+        table = flag(table, units=units, limits=wish.limits, computed=computed)
         table = table._replace(flags=[*table.flags, *_cut_rows(raw)])
         for flagged in table.flags:
             if flagged.kind == "mixed" and table.masked[flagged.signal].mean() > 0.5:
@@ -350,18 +351,8 @@ def join(
         for column in wish.quality.columns
     }
     for result in [*broken, *passed]:
-        row = {
-            "recording": result.name,
-            "signal": "",
-            "kind": "passed_over" if result.passed_over else "quarantined",
-            "start_s": np.nan,
-            "end_s": np.nan,
-            "count": 1,
-            "message": result.reason,
-        }
-        quality = {
-            name: np.append(values, np.array([row[name]], values.dtype)) for name, values in quality.items()
-        }
+        kind = "passed_over" if result.passed_over else "quarantined"
+        quality = with_finding(quality, "", kind, result.reason, recording=result.name)
     counts: dict[str, dict[str, int]] = {}
     for signal, kind, count in zip(quality["signal"], quality["kind"], quality["count"], strict=True):
         of = counts.setdefault(str(signal) or "recording", {})
@@ -382,6 +373,22 @@ def join(
             for name in dict.fromkeys(names)
         }
     return record, quality, figures
+
+
+def with_finding(
+    quality: Mapping[str, np.ndarray], signal: str, kind: str, message: str, *, recording: str = ""
+) -> dict[str, np.ndarray]:
+    """The columns of findings with one more row, which has no place in time."""
+    row = {
+        "recording": recording,
+        "signal": signal,
+        "kind": kind,
+        "start_s": np.nan,
+        "end_s": np.nan,
+        "count": 1,
+        "message": message,
+    }
+    return {name: np.append(values, np.array([row[name]], values.dtype)) for name, values in quality.items()}
 
 
 def count_work(results: Sequence[RecordingTable]) -> dict[str, int]:

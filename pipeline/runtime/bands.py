@@ -202,15 +202,6 @@ def bands(
     return Bands(here, centre - reach, centre + reach, level, len(found))
 
 
-def gain(u: Segments, y: Segments, learning: GainRoute) -> np.ndarray:
-    """[K K_r] (m, N (m+p) + p) of the record itself."""
-    data = rows(u, y, learning.N)
-    of = moments(data, max(2 * learning.N, 10))
-    taken = np.ones((1, len(of.starts)))
-    learned = predictors(of, taken, data, gain_spread=learning.gain_spread)
-    return _gain(data, of, taken[0], learned.window(0), learning)
-
-
 def _gain(
     data: Rows, of: Moments, counts: np.ndarray, learned: WindowModel, learning: GainRoute
 ) -> np.ndarray:

@@ -42,7 +42,7 @@ class Rules(NamedTuple):
     settled: int = 50  # the last samples, over which the settled error is the mean error
     crossing_degC: float = 1.0  # allowed beyond the limits of outputs
     failing: float = 0.1  # share of the plants that may miss a limit
-    tail: float = 0.5  # share of a margin's limit for nine plants in ten, and for the newest record alone
+    tail: float = 0.5  # share of a margin's limit that is required on the newest record alone
     plants: int = 1000
     poles_of: int = 24
     resamples: int = 200

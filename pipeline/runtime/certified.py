@@ -107,23 +107,23 @@ def _of_newest(figures: Mapping[str, Any], limit_degC: float) -> RuleResult:
 
 
 def _of_margin(name: str, figures: Mapping[str, Any], limit: float) -> RuleResult:
-    """`limit` for the median plant, and a share of it for nine plants in ten and for the newest record; a
+    """`limit` for the 10 % plant, which nine plants in ten reach, and a share of it on the newest record; a
     margin without end is None. The sentence names the figure that is furthest below its limit."""
     unit = {"disk_margin": "1", "delay_margin": "s"}[name]
-    margins = [_number(one) for one in figures["margins"]]
-    limits = [limit, figures["tail"] * limit, figures["tail"] * limit]
+    margins = [_number(one) for one in figures["margins"][1:]]
+    limits = [limit, figures["tail"] * limit]
     worst = int(np.argmin(np.array(margins) - limits)) if np.isfinite(margins).any() else 0
-    of = ("of the median plant", "that nine of ten plants reach", "on what the newest record alone shows")
-    what = f"The {name.replace('_', ' ')}"
+    of = ("of the 10 % plant", "on what the newest record alone shows")
+    what = f"The {name.replace('_', ' ')} on the record"
     texts = [f"{margin:.3g}" if np.isfinite(margin) else "without end" for margin in margins]
-    each = ", ".join(f"{text} {where}" for text, where in zip(texts, of, strict=True))
+    each = " and ".join(f"{text} {where}" for text, where in zip(texts, of, strict=True))
     return at_least(
         name,
         margins[worst],
         limits[worst],
         unit,
         f"{what} is {each}.",
-        f"{what} {of[worst]} is {texts[worst]}, where {limits[worst]:g} is asked: {each}.",
+        f"{what} is {each}; {limits[worst]:g} is required {of[worst]}.",
     )
 
 

@@ -33,6 +33,7 @@ from pipeline.temperature.plant import Plant
 
 VERSION = 1
 CONTROLLER, ARRAYS, CERTIFICATE = "controller.json", "arrays.safetensors", "certificate.json"
+EXPORTED = "exported.json"  # beside the folders of the loops: what there is, and why not
 
 
 class Exported(NamedTuple):
@@ -206,6 +207,8 @@ def read(folder: str | Path) -> tuple[Exported, Certificate]:
     """The controller and certificate of a folder that `write` wrote. Raises ValueError where a file is
     missing, broken, or not the one that was certified."""
     folder = Path(folder)
+    if not (folder / CONTROLLER).exists() and (why := _why_none(folder)):
+        raise ValueError(f"{folder} has no {CONTROLLER}. {why}")
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder; give a CONTROLLER folder with {CONTROLLER}")
     about = artifacts.read_json(folder / CONTROLLER)
@@ -231,6 +234,13 @@ def read(folder: str | Path) -> tuple[Exported, Certificate]:
         check(exported)
         check_certificate(exported, certificate)
     return exported, certificate
+
+
+def _why_none(folder: Path) -> str:
+    """Why the stage export_controllers left no controller in its folder, in its own words; "" if it did not
+    say."""
+    stated = folder.parent / EXPORTED
+    return artifacts.read_json(stated).get(folder.name, {}).get("why", "") if stated.exists() else ""
 
 
 def controller_sha256(exported: Exported) -> str:

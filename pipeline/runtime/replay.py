@@ -14,7 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.controllers.controller import Aim, Deployed, Reference, aim, constant, rest
+from pipeline.temperature.controllers.controller import (
+    AS_WISHED,
+    Aim,
+    Deployed,
+    Reference,
+    aim,
+    constant,
+    rest,
+)
 from pipeline.temperature.controllers.governor import Governor, corrected, governed, predicted, started
 from pipeline.temperature.plant import Plant
 
@@ -242,7 +250,7 @@ def _conditional(
     for t in range(hold, len(xi)):
         xi[t] = at
         after = at + law.integral * (target[t] - log.y[t])
-        inside = log.u[t] == base[t] - law.K_r @ at
+        inside = np.abs(log.u[t] - base[t] + law.K_r @ at) <= AS_WISHED * (limits.high - limits.low)
         within = back @ np.clip(-law.K_r @ after, limits.low, limits.high)
         at = np.where(inside @ moves, within, at)
     return xi

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.runtime.certificate import EvidenceRecord
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.replay import GaplessLog
 from pipeline.temperature.controllers.governor import ActuatorLimits
@@ -34,9 +33,3 @@ def honest_logs(made: Exported, half: panel.Cases, limits: ActuatorLimits) -> li
         )  # fmt: skip
         logs.append(GaplessLog(*(np.concatenate(part) for part in parts)))
     return logs
-
-
-def recorded_logs(record: EvidenceRecord) -> list[GaplessLog]:
-    """The pieces of the machine's own record, which are on support whatever the plants say."""
-    pieces = zip([*record.u, *record.newest_u], [*record.y, *record.newest_y], strict=True)
-    return [GaplessLog(u, y, y) for u, y in pieces]

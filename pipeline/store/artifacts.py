@@ -94,6 +94,17 @@ def read_table(path: str | Path, schema: Schema) -> dict[str, np.ndarray]:
     }
 
 
+def column_names(path: str | Path) -> list[str]:
+    """The names of a table's columns; [] if there is no such file, or it is broken."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return pq.read_schema(path).names
+    except (OSError, pa.ArrowException):
+        return []
+
+
 def write_arrays(
     path: str | Path, name: str, version: int, arrays: Mapping[str, tuple[np.ndarray, str, str]]
 ) -> None:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import pydantic
 from pydantic import AfterValidator, Field
 
+from pipeline.store import artifacts
 from pipeline.store.params import Section
 
 _TABLE_COLUMNS = ("recording", "segment", "time_s")
@@ -90,6 +91,17 @@ class Plant(Section):
     def acting(self) -> list[PlantSignal]:
         """What acts on the outputs: inputs, then disturbances."""
         return [*self.inputs, *self.disturbances]
+
+
+def recorded(machine: Plant, record: str) -> Plant:
+    """The machine without the zones that ingest left out of the table `record`: what controllers are designed
+    and judged for. If the table is missing or of another machine, the machine as declared."""
+    names = artifacts.column_names(record)
+    sides = {
+        side: [signal for signal in getattr(machine, side) if signal.name in names]
+        for side in ("inputs", "disturbances", "outputs")
+    }
+    return machine.model_copy(update=sides) if sides["inputs"] and sides["outputs"] else machine
 
 
 def check_output_limits(machine: Plant, source: str) -> None:

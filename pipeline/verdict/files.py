@@ -6,7 +6,7 @@ from typing import Any
 from pipeline.deposition.tables import SCORES
 from pipeline.setpoint.tables import SCOREBOARD
 from pipeline.store import artifacts, params
-from pipeline.temperature.settings import Plant
+from pipeline.temperature.settings import Plant, recorded
 from pipeline.temperature.tables import DYNAMICS, RESIDUALS
 from pipeline.verdict.evidence import OFF, Evidence, switched_off
 from pipeline.verdict.settings import QUICK_LOOK, ReportRules
@@ -46,7 +46,7 @@ def read_evidence(stored: str = "") -> Evidence:
     return Evidence(
         {**figures, **dict.fromkeys(off, OFF)},
         {name: OFF if place[1] in off else _read(*place) for name, place in places.items()},
-        params.load(Plant, "plant"),
+        recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet"),
         params.load(ReportRules, "report"),
         params.read(),
         artifacts.exists(QUICK_LOOK),

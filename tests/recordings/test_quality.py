@@ -8,6 +8,7 @@ from pipeline.recordings.quality import (
     _usual_of_others,
     quantisation_step,
     runs,
+    stands_still,
 )
 from pipeline.recordings.recordings import Flag, Source, Table, flag, read, resample
 
@@ -353,3 +354,43 @@ def test_a_signal_that_is_passed_over_as_restless_has_no_stretch_of_that_length(
     alone = np.array([0.0, 1, 1, 1, 2])
     assert _may_rest(alone, 3)
     assert not _may_rest(alone, 4)
+
+
+def test_a_temperature_that_is_held_stands_still_and_one_that_is_moved_does_not():
+    rng, samples = np.random.default_rng(0), 3000
+    held = np.round(60 + rng.normal(0, 0.05, samples), 1)
+    quiet = np.round(60 + rng.normal(0, 0.025, samples), 1)
+    assert stands_still(quiet, None), "its readings take three values"
+    swings = 60 + 0.6 * np.sin(np.arange(samples) / 20)
+    constant, moved = np.full(samples, 60.0), np.where(np.arange(samples) < 1500, 60.0, 61.0)
+    assert stands_still(held, None) and stands_still(held, constant) and stands_still(swings, constant)
+    assert not stands_still(swings, None), "nobody says that it was to stand still"
+    assert not stands_still(swings, moved), "its set-point was changed"
+    assert not stands_still(np.linspace(24, 60, samples), constant), "it was heated up"
+    assert not stands_still(rig()["y"], None)
+
+
+def test_a_signal_that_was_computed_from_a_printed_file_has_no_findings_of_a_sensor():
+    values = rig()
+    fan = np.repeat(np.arange(20.0) % 2 * 100, 100)
+    fan[450] = 30.0  # for a sample, in a layer of its own
+    table = {"u": values["u"], "y": values["y"], "fan": fan}
+    measured, computed = (
+        flag(
+            Table(
+                "rig.csv",
+                np.zeros(2000, np.int32),
+                np.arange(2000.0),
+                table,
+                {name: np.zeros(2000, bool) for name in table},
+                [],
+                {},
+            ),
+            units={**UNITS, "fan": "percent"},
+            limits=LIMITS,
+            computed=names,
+        )
+        for names in ((), ("fan",))
+    )
+    assert measured.masked["fan"].any() and not computed.masked["fan"].any()
+    assert not [one for one in computed.flags if one.signal == "fan"]

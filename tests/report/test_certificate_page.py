@@ -69,8 +69,8 @@ def test_margins_of_the_plants_that_page_one_judges_on_stand_beside_the_certific
 
     found = {"disk": {"median": 0.541, "worst": 0.272}, "delay_s": {"median": 1.06, "worst": None}}
     assert told(found).endswith(
-        "On the 60 plants that the temperature page judges on, the disk margin is 0.541 of the median plant "
-        "and 0.272 of the worst, the delay margin 1.06 s and unlimited."
+        "The temperature page has the margins on the test set, 60 other plants: disk margin 0.541 of the "
+        "median plant and 0.272 of the worst, delay margin 1.06 s and unlimited."
     )
     # nothing is claimed of what was not judged
     assert (told(None), told({"disk": found["disk"]})) == ("", "")

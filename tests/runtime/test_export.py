@@ -2,6 +2,7 @@
 and neither runs for another machine."""
 
 import ast
+import configparser
 import ctypes
 import importlib.util
 import json
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from pipeline.commands import export
 from pipeline.runtime.certificate import sha256
 from pipeline.runtime.export import c, klipper, python, vectors
 from pipeline.runtime.export.vectors import TOLERANCE
@@ -363,19 +365,64 @@ def test_klippers_pid_settles_the_heater_by_klippers_own_formula(sample_time_s):
     assert max(abs(one - 210.0) for one in y[1500:]) < 2.0
 
 
-def test_printer_cfg_names_the_options_of_their_documentation():
-    """pid_Kp, pid_Ki, pid_Kd, max_power, min_temp, max_temp of Klipper's Config_Reference.md; heater_power,
-    block_heat_capacity, ambient_transfer, sensor_responsiveness of Kalico's MPC.md."""
+def test_the_settings_name_the_options_of_their_documentation():
+    """pid_Kp, pid_Ki, pid_Kd of Klipper's Config_Reference.md; heater_power, block_heat_capacity,
+    ambient_transfer, sensor_responsiveness of Kalico's MPC.md."""
     of = exported(zones=1)
     text = klipper.settings(of, passed(of), section="extruder", heater_power_W=POWER_W)
     options = re.findall(r"^(?:# )?([a-z]\w+): ", text, re.M)
     assert options == [
-        "control", "pid_Kp", "pid_Ki", "pid_Kd", "max_power", "min_temp", "max_temp",
-        "heater", "plant", "rehearsal",
+        "heater", "plant", "rehearsal", "pid_Kp", "pid_Ki", "pid_Kd",
         "control", "heater_power", "block_heat_capacity", "ambient_transfer", "sensor_responsiveness",
     ]  # fmt: skip
     assert "block_heat_capacity: 20  # J/K" in text and "ambient_transfer: 0.15  # W/K" in text
-    assert "# Rehearsal: the plant was simulated" in text and sha256(passed(of)) in text
+    assert "# rehearsal: True  # the plant was simulated" in text and sha256(passed(of)) in text
+
+
+@pytest.mark.parametrize("section", ["extruder", "heater_bed"])
+def test_the_settings_replace_neither_the_owner_s_pid_nor_max_temp(section):
+    of = exported(zones=1)
+    read = configparser.RawConfigParser()
+    read.read_string(klipper.settings(of, passed(of), section=section, heater_power_W=POWER_W))
+    assert read.sections() == ["beadline"] and set(read["beadline"]) == {"heater", "plant"}
+    assert klipper.FILE != "printer.cfg"
+
+
+def test_the_readme_for_klipper_is_followed_there_and_back(tmp_path):
+    """Its lines run as they stand; the owner's files are then what they were."""
+    of, home = exported(zones=1), tmp_path / "export"
+    extras, config = tmp_path / "klipper/klippy/extras", tmp_path / "config"
+    for folder in (home, extras, config):
+        folder.mkdir(parents=True)
+    for name, text in export.files(of, passed(of), "klipper", "extruder", None).items():
+        (home / name).write_text(text)
+    owned = "[extruder]\ncontrol = pid\npid_kp = 22.2\nmax_temp = 260\n\n#*# <--- SAVE_CONFIG --->\n"
+    (config / "printer.cfg").write_text(owned)
+    readme = (home / "README.txt").read_text().replace("KLIPPER/", f"{tmp_path}/klipper/")
+    there, back = readme.replace("CONFIG/", f"{config}/").split("Go back\n")
+    run = [re.findall(r"^    ((?:cp|sed|rm) .*)$", part, re.M) for part in (there, back)]
+    assert [len(commands) for commands in run] == [3, 2]
+    for command in run[0]:
+        subprocess.run(["sh", "-ec", command], cwd=home, check=True)
+    assert sorted(path.name for path in extras.iterdir()) == ["beadline.py", "beadline_controller.py"]
+    assert (config / "printer.cfg").read_text() == "[include beadline.cfg]\n" + owned
+    for command in run[1]:
+        subprocess.run(["sh", "-ec", command], cwd=home, check=True)
+    assert (config / "printer.cfg").read_text() == owned
+    assert not list(extras.iterdir()) and [path.name for path in config.iterdir()] == ["printer.cfg"]
+
+
+@pytest.mark.parametrize(("to", "place"), [("c", "FIRMWARE"), ("python", "PROGRAM")])
+def test_the_readme_of_each_form_is_followed_there_and_back(tmp_path, to, place):
+    of, home, target = exported(zones=1), tmp_path / "export", tmp_path / place
+    home.mkdir(), target.mkdir()
+    for name, text in export.files(of, passed(of), to, "extruder", None).items():
+        (home / name).write_text(text)
+    there, back = (home / "README.txt").read_text().replace(f"{place}/", f"{target}/").split("Go back\n")
+    for part, count in ((there, {"c": 4, "python": 1}[to]), (back, 0)):
+        (command,) = re.findall(r"^    ((?:cp|rm) .*)$", part, re.M)
+        subprocess.run(["sh", "-ec", command], cwd=home, check=True)
+        assert len(list(target.iterdir())) == count
 
 
 def test_klipper_gets_no_machine_that_it_cannot_control():

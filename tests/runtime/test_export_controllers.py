@@ -53,7 +53,8 @@ def project(tmp_path, monkeypatch):
 
 
 def name_winner(project: Path, winner: str | None, **more) -> None:
-    verdict = {"winner": winner, "decision": "Fail (simulation).", "lead": "Not one settles."} | more
+    verdict = {"winner": winner, "decision": "Fail (simulation).", "lead": "Not one settles."}
+    verdict |= {"reason": "First failed rule: settling."} | more
     artifacts.write_json(project / "datasets/verdict/temperature.json", verdict)
 
 
@@ -98,7 +99,7 @@ def test_a_changed_limit_refuses_without_measuring_again(project):
 @pytest.mark.parametrize(
     ("winner", "why"),
     [
-        (None, "Not exported: Fail (simulation). Not one settles."),
+        (None, "Not exported: Fail (simulation). Not one settles. First failed rule: settling."),
         ("hold", "Doing nothing is recommended: there is no controller to export."),
         ("pi", "It cannot be designed."),
     ],
@@ -145,6 +146,12 @@ def test_measured_figures_are_the_same_after_a_round_trip(project):
 def test_an_export_of_what_is_no_controller_is_refused_in_a_sentence(tmp_path):
     with pytest.raises(ValueError, match="is no folder; give a CONTROLLER folder with controller.json"):
         export.export(tmp_path / "none", "c", None, "extruder", None)
+    why = {"temperature": {"why": "Not exported: Fail. First failed rule: disk margin."}}
+    (tmp_path / "exported.json").write_text(json.dumps(why))
+    with pytest.raises(
+        ValueError, match="temperature has no controller.json. Not exported: Fail. First failed"
+    ):
+        export.export(tmp_path / "temperature", "c", None, "extruder", None)
     with pytest.raises(ValueError, match="--power: expected the heater's power above 0 W, found -4"):
         export.export(tmp_path, "klipper", None, "extruder", -4.0)
     (tmp_path / "out").write_text("")

@@ -11,8 +11,9 @@ from pipeline.recordings import plain_files, recording_folders
 from pipeline.recordings.isolated import Budget, isolated
 from pipeline.recordings.recording_folders import RecordingWish, count_work, join, read_folder
 from pipeline.store import artifacts, params
-from pipeline.temperature.settings import Plant
-from stages.ingest import Ingest, MappedSignal, recording_wish, sources
+from pipeline.temperature import tables as schemas
+from pipeline.temperature.settings import Plant, recorded
+from stages.ingest import Ingest, MappedSignal, recording_wish, sources, still_zones, without
 from tests.mcap_writing import NO, chunks, flipped
 from tests.recordings import hostile
 from tests.recordings.klipper_machine import EXTRUDER, print_log
@@ -574,3 +575,52 @@ def test_the_figures_of_the_probing_are_no_recording(tmp_path):
     (raw / "figures.json").write_text("{}")
     results = read_folder(raw, JOB, INLINE, memo=tmp_path / "memo", budget=BUDGET, ignored=["figures.json"])
     assert [result.name for result in results] == ["000.csv"]
+
+
+TWO_HEATERS = Plant.model_validate(
+    {
+        "sample_time_s": 1.0,
+        "inputs": [
+            {"name": name, "unit": "percent", "low": 0.0, "high": 100.0}
+            for name in ("heater_extruder", "heater_bed")
+        ],
+        "disturbances": [{"name": "fan", "unit": "percent"}],
+        "outputs": [
+            {"name": name, "unit": "degC", "reference": 60.0}
+            for name in ("temperature_bed", "temperature_extruder")
+        ],
+    }
+)
+
+
+def printed_record(bed_degC: np.ndarray, extruder_degC: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns of ingest, with the set-points of a bed that is held at 60 °C."""
+    rng, samples = np.random.default_rng(0), len(bed_degC)
+    values = {
+        "temperature_bed": bed_degC + rng.normal(0, 0.05, samples),
+        "temperature_extruder": extruder_degC + rng.normal(0, 0.05, samples),
+        **{name: rng.uniform(0, 100, samples) for name in ("heater_extruder", "heater_bed", "fan")},
+    }
+    columns = {"recording": np.full(samples, "klippy.log", object), "segment": np.zeros(samples, np.int64)}
+    columns |= {"time_s": np.arange(float(samples)), **values}
+    columns |= {f"{name}_masked": np.zeros(samples, bool) for name in values}
+    return columns | {"temperature_bed_set_point": np.full(samples, 60.0)}
+
+
+def test_a_bed_that_is_held_all_night_is_left_out_and_the_hot_end_is_not(tmp_path):
+    still, moved = np.full(3000, 60.0), 200 + 20 * np.sin(np.arange(3000) / 300)
+    record = printed_record(still, moved)
+    zones = still_zones(TWO_HEATERS, record, [])
+    assert zones == {"temperature_bed": "heater_bed"}
+    assert still_zones(TWO_HEATERS, printed_record(moved, moved), []) == {}
+    assert still_zones(TWO_HEATERS, printed_record(still, still), []) == {}, "then no zone would be left"
+    pid = {"input": "heater_extruder", "output": "temperature_bed"}
+    assert still_zones(TWO_HEATERS, record, [pid]) == {"temperature_bed": "heater_extruder"}
+    kept = without(TWO_HEATERS, zones)
+    path = tmp_path / "record.parquet"
+    schema = schemas.record(kept.acting, kept.outputs)
+    artifacts.write_table(path, schema, {column.name: record[column.name] for column in schema.columns})
+    assert recorded(TWO_HEATERS, str(path)) == kept
+    assert [signal.name for signal in kept.acting] == ["heater_extruder", "fan"]
+    assert recorded(TWO_HEATERS, str(tmp_path / "none.parquet")) == TWO_HEATERS
+    assert recorded(MACHINE, str(path)) == MACHINE, "a table of another machine"

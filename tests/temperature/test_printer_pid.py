@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from pipeline.temperature.controllers.controller import ActuatorLimits, Rest, aim, constant, deployed
+from pipeline.temperature.controllers.controller import (
+    ActuatorLimits,
+    Rest,
+    RunningController,
+    aim,
+    constant,
+    deployed,
+)
 from pipeline.temperature.controllers.printer_pid import HeaterPid, controller, law
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.test_set import panel
@@ -186,3 +193,22 @@ def test_the_weights_mean_nothing_to_it_and_it_has_its_own_integral():
     one, other = made.design(np.ones(2), np.ones(2), 0.0), made.design(np.full(2, 9.0), np.ones(2), 0.02)
     assert one is other and one.conditional
     np.testing.assert_allclose(one.integral, [0.30 / 21.5, 0.42 / 9.12], rtol=1e-12)  # Ki T / (Kp + Ki T)
+
+
+def test_it_gives_its_commands_again_from_its_temperatures_although_they_round_otherwise():
+    plant, wanted = heaters(1.0), np.array([60.0, 205.0])
+    limits = ActuatorLimits(*LIMITS, ANY_RATE)
+    runs = [
+        RunningController(deployed(law((BED, HOT), sample_time_s=1.0), limits, integral_limit=5.0), plant)
+        for _ in range(2)
+    ]
+    x, commands = np.array([50.0, 190.0]), []
+    for run in runs:
+        run.watch(np.full(2, 30.0), x, wanted)
+        run.hand_over(x)
+    for t in range(600):
+        u = runs[0].step(x, wanted, t)
+        rounded = np.clip(u * (1 + 1e-14), *LIMITS)
+        commands.append(np.abs(runs[1].step(x, wanted, t, rounded) - u).max())
+        x = plant.A @ x + plant.B @ u + plant.b
+    assert max(commands) < 1e-9

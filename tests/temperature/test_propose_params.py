@@ -186,9 +186,10 @@ def test_a_second_run_changes_nothing_and_an_edited_value_is_not_overwritten(tre
     assert ((tree / "params.yaml").read_bytes(), (tree / "params.expert.yaml").read_bytes()) == first
     edited = (tree / "params.yaml").read_text().replace("reference: 200.0", "reference: 210.0")
     (tree / "params.yaml").write_text(edited)
-    with pytest.raises(SystemExit):
-        init(monkeypatch, "klippy.log")
-    assert "plant.outputs was edited and would be overwritten; nothing was written" in capsys.readouterr().err
+    init(monkeypatch, "klippy.log")
+    printed = capsys.readouterr().out
+    assert "kept as they are: plant.outputs. Nothing was written. With --force they would be:" in printed
+    assert "  plant.outputs: - {name: " in printed and "reference: 200.0" in printed
     assert (tree / "params.yaml").read_text() == edited
     init(monkeypatch, "klippy.log", "--force")
     assert ((tree / "params.yaml").read_bytes(), (tree / "params.expert.yaml").read_bytes()) == first
@@ -439,3 +440,28 @@ def test_what_to_play_next_on_the_printer_is_forecast_within_its_limits_or_left_
             for o in machine.outputs:
                 assert o.low <= told["lowest_degC"][o.name] <= told["highest_degC"][o.name] <= o.high
     assert artifacts.read_json(printer / "datasets/generate_probing/forecast.json") == figures
+
+
+def test_a_bed_that_is_held_all_night_does_not_set_the_sample_time(tree):
+    """Its noise looks like a machine of 4 s."""
+    rng, k = np.random.default_rng(0), np.arange(4000)
+    duty = np.repeat(rng.uniform(20, 60, 40), 100)
+    hot = np.full(4000, 200.0)
+    for t in range(1, 4000):
+        hot[t] = 0.995 * hot[t - 1] + 0.005 * (25 + 4 * duty[t - 1])
+    columns = {
+        "time_s": k.astype(float),
+        "heater_extruder_pct": duty,
+        "heater_bed_pct": rng.uniform(20, 40, 4000),
+        "extruder_C": np.round(hot + rng.normal(0, 0.03, 4000), 2),
+        "bed_C": np.round(60 + rng.normal(0, 0.05, 4000), 1),
+    }
+    artifacts.write_csv(tree / "night.csv", columns)
+    values = propose_params.proposed([tree / "night.csv"]).values
+    (reference,) = values["plant.sample_time_s"]
+    artifacts.write_csv(
+        tree / "alone.csv", {name: values for name, values in columns.items() if "bed" not in name}
+    )
+    alone = propose_params.proposed([tree / "alone.csv"]).values
+    assert [reference] == alone["plant.sample_time_s"]
+    assert values["generate_probing.shortest_steps"] == alone["generate_probing.shortest_steps"]

@@ -69,7 +69,9 @@ def changes(sources: Sources, judged: Judgement) -> Changes:
     moved, compared = sum(len(loop.moved) for loop in loops), sum(loop.of for loop in loops)
     beside = inputs(judged.changed) if judged.changed else ""
     if sources.another_machine:
-        return Changes(ANOTHER, "Deposition and setpoint are compared.", loops=loops)
+        others = " and ".join(loop for loop in sources.verdicts if loop != "temperature")
+        sentence = f"{others} {'are' if ' and ' in others else 'is'} compared.".capitalize()
+        return Changes(ANOTHER, sentence if others else "", loops=loops)
     if not moved:
         nothing = judged.changed is not None and judged.changed.empty and all(loop.of for loop in loops)
         strong = "Nothing changed; no figure moved." if nothing else "No figure moved beyond its noise."

@@ -112,7 +112,7 @@ def _cell(question: Question, figure: Figure | Missing, places: int, best: float
 
 
 def _step(sources: Sources, verdict: Verdict) -> CardStep:
-    if not verdict.winner and verdict.state not in (PASSED, FAILED):
+    if isinstance(sources.metrics["evaluate_temperature"], Missing):
         return CardStep("Run the stages of this loop.", "./run dvc repro evaluate_temperature")
     if not sources.recorded:
         return CardStep("Record your own machine.", "./run beadline init RECORDING.csv --copy")

@@ -12,7 +12,7 @@ from pipeline.verdict.verdict import Missing
 def findings(sources: Sources) -> list[tuple[str, str]]:
     """What a reader should take away, each with its figure; a figure
     that was not measured is said to be so."""
-    claims = [_flagged(sources), _printer(sources)]
+    claims = [*_still(sources), _flagged(sources), _printer(sources)]
     units = sources.declared.machine.sample_time_s
     if sources.declared.everything.get("generate_probing", {}).get("source") == "simulated":
         claims += [
@@ -28,6 +28,15 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
             ),
         ]
     return [item for item in claims if item]
+
+
+def _still(sources: Sources) -> list[tuple[str, str]]:
+    """The zones that ingest left out of the design, and what would let them be judged."""
+    quality = sources.tables["quality"]
+    if isinstance(quality, Missing):
+        return []
+    messages = quality["message"][quality["kind"] == "still"]
+    return [(f"{message.partition(':')[0]} is not judged.", f"{message}.") for message in messages]
 
 
 def _flagged(sources: Sources) -> tuple[str, str] | None:

@@ -1,4 +1,5 @@
-"""Settings for printers that run Klipper or Kalico: the PID of one heater, and the model of Kalico's MPC.
+"""Settings for printers that run Klipper or Kalico: the section of our module, and for comparison the PID of
+one heater and the model of Kalico's MPC.
 
 PID by SIMC (baseline.pairing) from the model that the controller was made on. Klipper divides pid_Kp, pid_Ki
 and pid_Kd by 255 (PID_PARAM_BASE) and works with a duty of 0..1, so that
@@ -28,6 +29,7 @@ from pipeline.runtime.machine import Exported, check, check_certificate
 from pipeline.temperature.controllers import baseline
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
 
+FILE = "beadline.cfg"  # never printer.cfg: that one is the owner's
 MODULE = Path(__file__).parent / "templates" / "beadline.py.txt"  # for klippy/extras/
 SECTIONS = ("extruder", "heater_bed")
 PID_PARAM_BASE = 255.0
@@ -48,7 +50,9 @@ class Mpc(NamedTuple):
 def settings(
     exported: Exported, certificate: Certificate, *, section: str, heater_power_W: float | None = None
 ) -> str:
-    """Lines for printer.cfg. With the heater's power in W those for Kalico's MPC follow, as comments.
+    """The text of FILE, which printer.cfg includes: the section of the module. PI by SIMC, and with the
+    heater's power in W what Kalico's MPC would need, follow as comments: the owner's own PID, limits and
+    max_temp stay as they are.
 
     Raises ValueError for a machine of more than one heater or sensor, for an unknown section, and where the
     certificate was not passed, or is of another controller."""
@@ -63,21 +67,19 @@ def settings(
     heater, sensor = exported.machine.inputs[0], exported.machine.outputs[0]
     Kp, Ki = pi_gains(exported)
     lines = [
-        f"# {heater.name} and {sensor.name}, by SIMC from the model of controller {exported.name}",
-        f"# plant {exported.plant_sha256}",
+        f"# {heater.name} and {sensor.name}: controller {exported.name} in place of the PID of [{section}],",
+        "# which stays in printer.cfg and goes on if this one fails",
         f"# certificate {sha256(certificate)}",
-        *(["# Rehearsal: the plant was simulated; print with none of these"] if exported.simulated else []),
-        f"[{section}]",
-        "control: pid",
-        f"pid_Kp: {Kp:.4g}  # 1/255 of full duty per degC",
-        f"pid_Ki: {Ki:.4g}  # 1/255 of full duty per degC and s",
-        "pid_Kd: 0  # SIMC's rule for a first-order model has no derivative",
-        f"max_power: {heater.high / 100:g}",
+        "[beadline]",
+        f"heater: {section}",
+        f"plant: {exported.plant_sha256}",
+        *(["# rehearsal: True  # the plant was simulated: never on a printer"] if exported.simulated else []),
+        "",
+        "# For comparison only, PI by SIMC from the same model. [beadline] does not need it:",
+        f"# pid_Kp: {Kp:.4g}  # 1/255 of full duty per degC",
+        f"# pid_Ki: {Ki:.4g}  # 1/255 of full duty per degC and s",
+        "# pid_Kd: 0  # SIMC's rule for a first-order model has no derivative",
     ]
-    for option, value in (("min_temp", sensor.low), ("max_temp", sensor.high)):
-        if np.isfinite(value):
-            lines.append(f"{option}: {value:g}  # degC, declared for {sensor.name}")
-    lines += _module_lines(exported, section)
     if heater_power_W is not None:
         lines += _mpc_lines(mpc(exported.model, heater_power_W), heater_power_W, section)
     return "\n".join(lines) + "\n"
@@ -91,18 +93,6 @@ def module(exported: Exported, certificate: Certificate) -> dict[str, str]:
         MODULE.stem: MODULE.read_text(encoding="utf-8"),
         "beadline_controller.py": python.text(exported, certificate),
     }
-
-
-def _module_lines(exported: Exported, section: str) -> list[str]:
-    return [
-        "",
-        f"# The controller itself in place of this PID, which goes on where it fails: copy {MODULE.stem} and",
-        "# beadline_controller.py to klippy/extras/, and remove the # before these lines:",
-        "# [beadline]",
-        f"# heater: {section}",
-        f"# plant: {exported.plant_sha256}",
-        *(["# rehearsal: True  # the plant was simulated: never on a printer"] if exported.simulated else []),
-    ]
 
 
 def one_heater(exported: Exported) -> None:
@@ -194,7 +184,7 @@ def _fitted(time_s: np.ndarray, response: np.ndarray) -> tuple[float, float, flo
 def _mpc_lines(made: Mpc, heater_power_W: float, section: str) -> list[str]:
     return [
         "",
-        "# Kalico's MPC in place of PID (remove the four lines of control and pid_ above):",
+        "# For comparison only, Kalico's MPC from the same model:",
         f"# [{section}]",
         "# control: mpc",
         f"# heater_power: {heater_power_W:g}  # W, as its owner says",

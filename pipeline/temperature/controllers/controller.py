@@ -169,6 +169,9 @@ def _leaking(balance: np.ndarray) -> np.ndarray:
 # ---- the law, a sample at a time
 
 
+AS_WISHED = 1e-9  # of an input's range, within which a command is the one that was wished
+
+
 class Deployed(NamedTuple):
     """A law with what it runs under: `integral_limit` °C is the largest error, and the largest
     back-calculated shift, that the integrator sees; `back` (p, m) is P of the module's formula; `shift` is k
@@ -300,7 +303,8 @@ def _integrated(controller: Deployed, xi, error, u, wished):
     law, most = controller.law, controller.integral_limit
     if law.conditional:
         after = xi + law.integral * error
-        inside = np.abs(u - wished) <= 0
+        # the command as wished, but for rounding: a replay sums in another order than what it replays
+        inside = np.abs(u - wished) <= AS_WISHED * (controller.limits.high - controller.limits.low)
         within = (
             np.clip(-after @ law.K_r.T, controller.limits.low, controller.limits.high) @ controller.back.T
         )
