@@ -38,6 +38,7 @@ RESTLESS = 1e-8  # reciprocal condition of I - A below which a plant has no rest
 # are colder: a door, a part fan, another room
 DOOR, FAN, ROOM = (0.1, 0.15, 0.15), (0.3, 0.5, 0.08), (0.6, 1.0, 0.03)
 MOVES = ("ramp", "sinusoid", "disturbed")  # cases without a step of the reference
+GLANCE = 5  # samples: what is outside the band for fewer is noise that the controller answers
 
 
 class Structure(NamedTuple):
@@ -241,8 +242,8 @@ def asked(
     structures: Sequence[Structure] = STRUCTURES,
 ) -> Cases:
     """The questions put to every plant, which has one of `structures` in turn. Where states are `cells`, a
-    start holds every cell at one temperature, otherwise every output, or what comes nearest within `limits`;
-    noise (p,) in °C."""
+    start holds every cell at one temperature, otherwise every output, or what comes nearest within `limits`,
+    the coldest start aside: a machine that is switched on need not be held; noise (p,) in °C."""
     starts = np.vstack([questions.starts, questions.constants[:1]])
     references = [constant(r) for r in questions.constants]
     rows = [("constant", a, [j]) for a in range(len(questions.starts)) for j in range(len(references))]
@@ -265,7 +266,9 @@ def asked(
     x0, u0 = [], []
     for plant in plants:
         for name, a, _ in rows:
-            state, held = _held(plant, starts[a], cells and name != "disturbed", limits)
+            state, held = _held(
+                plant, starts[a], cells and name != "disturbed", limits if a or len(starts) < 3 else None
+            )
             x0.append(state)
             u0.append(held)
     count, kind = len(plants), np.array([row[0] for row in rows])
@@ -508,8 +511,8 @@ def figures(
     settled: int = 100,
 ) -> Figures:
     """Settled error: |mean of the last `settled` steps - r|. Peak: largest |y - r| of these steps. Settling
-    and heating: the last step outside `band` °C of the target, counted from each new reference, the longest
-    of them. Overshoot: past the target in the direction of the step. At limits: share of (input, step) wished
+    and heating: the last step outside `band` °C of the target, for GLANCE steps at least, counted from each
+    new reference, the longest of them. Overshoot: past the target in the direction of the step. At limits: share of (input, step) wished
     outside. Energy: mean input. Travel: mean |u(t+1) - u(t)|, of the input that moves most. Dip: largest
     |y - r| of all steps. Crossing: how far y lies beyond low, high (p,). Outside: steps outside the band, an
     edge of a fifth of it counted in part: smooth."""
@@ -524,7 +527,7 @@ def figures(
         (int(a), int(b)) for a, b in zip(cases.begin.ravel(), ends.ravel(), strict=True) if a < b
     }:
         rows = np.flatnonzero(((cases.begin == first) & (ends == after)).any(axis=1))
-        outside = beyond[first:after, rows] > band
+        outside = lasting(beyond[first:after, rows] > band)
         last = np.where(outside.any(axis=0), len(outside) - outside[::-1].argmax(axis=0), 0).astype(float)
         last[outside[-1]] = np.inf
         settling[rows] = np.maximum(settling[rows], last)
@@ -549,6 +552,14 @@ def figures(
         np.maximum((rollout.y - high).max(axis=(0, 2)), (low - rollout.y).max(axis=(0, 2))),
         np.clip((beyond - band) / (0.2 * band) + 0.5, 0.0, 1.0).sum(axis=0),
     )
+
+
+def lasting(outside: np.ndarray) -> np.ndarray:
+    """Of (steps, s) the runs of GLANCE steps and more; as it is where there are fewer steps."""
+    if len(outside) < GLANCE:
+        return outside
+    long = np.lib.stride_tricks.sliding_window_view(outside, GLANCE, axis=0).all(axis=-1)
+    return np.stack([np.pad(long, ((k, GLANCE - 1 - k), (0, 0))) for k in range(GLANCE)]).any(axis=0)
 
 
 class Allowance(NamedTuple):

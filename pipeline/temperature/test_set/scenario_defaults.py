@@ -18,8 +18,7 @@ from pipeline.temperature.test_set.time_scale import time_constant
 
 RANGE = (0.01, 0.99)  # quantiles that count as recorded: a spike, or one sample of a start, is none
 ONE_DEVIATION = (0.1587, 0.8413)  # quantiles of a normal one standard deviation either side of its median
-# the coldest of the record, as a machine is switched on, and the middle, where a reference is changed
-START_SHARES = (0.0, 0.5)
+MIDDLE = 0.5  # of the recorded span, where a reference is changed
 LOWER_SHARE = 0.15  # of the recorded span, by which the second reference lies below the first
 # as an open loop needs to come within 5 % of its end; the delay counts as the step and its answer are late
 SETTLING = (3.0, 2.0)  # time constants, delays
@@ -161,21 +160,17 @@ def defaults(
     """Starts, references and rules for one machine; `limits` low and high (m,) of the inputs in percent,
     output_low and output_high (p,) in °C, NaN where the owner declares none.
 
-    starts: START_SHARES of the recorded range; what the inputs cannot hold, a temperature below the room's
-    above all, becomes the nearest that they can, for the coldest with inputs at their limits. references: the
-    declared one where it can be held; in its place otherwise the nearest that leaves HEADROOM to inputs and
-    the band to declared limits of outputs; and one LOWER_SHARE of the recorded span below. ramp: from the
-    lower to the higher in one run. sinusoid:
-    about their middle, so small that its heat is no more than the way between them needs. sequence: lower,
-    higher, middle. All these lie between two states that can be held, so that they can be held too.
+    starts: the coldest of the record, as a machine is switched on, and the middle of its range, or the
+    nearest to it that the inputs can hold. references: the declared one where it can be held; in its place
+    otherwise the nearest that leaves HEADROOM to inputs and the band to declared limits of outputs; and one
+    LOWER_SHARE of the recorded span below. ramp: from the lower to the higher in one run. sinusoid: about
+    their middle, so small that its heat is no more than the way between them needs. sequence: lower, higher,
+    middle. All references lie between two states that can be held, so that they can be held too.
     """
     band, span = _band(scale), scale.high_degC - scale.low_degC
     outputs = _declared(output_low, -np.inf), _declared(output_high, np.inf)
     bounds, careful = Bounds(*limits, *outputs), _drawn_in(Bounds(*limits, *outputs), band)
-    starts = [
-        _nearest(model, scale.low_degC + share * span, careful if share else bounds)[0]
-        for share in START_SHARES
-    ]
+    middle = _nearest(model, scale.low_degC + MIDDLE * span, careful)[0]
     asked = np.asarray(asked_reference, float)
     reached, u = _nearest(model, asked, bounds)
     first, entries = asked, []
@@ -191,7 +186,7 @@ def defaults(
     slowest, delay = float(scale.time_constant_s.max()), float(scale.delay_s.max())
     steps, notes = _steps(slowest, delay, sample_time_s)
     return CaseDefaults(
-        starts=np.stack(starts),
+        starts=np.stack([scale.low_degC, middle]),
         references=np.stack([first, lower]),
         infeasible=entries,
         settling_s=SETTLING[0] * slowest + SETTLING[1] * delay,
