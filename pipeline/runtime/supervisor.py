@@ -73,10 +73,8 @@ SHOWN = 6  # samples in a row that show a fault
 SLOWLY = 1 / 60  # share a sample of the mean drift, from which heat is counted
 EARLY, JUMP = 0.5, 10.0  # shares of the sample time between which two samples are apart
 MOST_STEP_DEGC = 5.0  # what moves by more at first was perhaps switched on
-MISSING, AT_LIMIT = (
-    0.3,
-    0.1,
-)  # shares of an input's range, of heat that is missing; with the heater at its limit
+# shares of an input's range, of heat that is missing; with the heater at its limit
+MISSING, AT_LIMIT = 0.4, 0.1
 MISSING_FOR, DOOR_S = 60, 110.0  # for so many samples, and longer than a door is open
 FAR_DEGC = 1e4  # no machine is so hot: its model is unstable, and no reading corrects it
 RETURNS = 3  # times an hour that heaters which went off are tried again
