@@ -18,6 +18,7 @@ from pipeline.runtime.supervisor import (
     OWN,
     REACH,
     RUNS,
+    SAMPLES,
     Cause,
     Decision,
     choose_mode,
@@ -28,6 +29,23 @@ from pipeline.runtime.supervisor import (
     sentence,
 )
 from pipeline.temperature.controllers.controller import Reference, RunningController, constant, rest
+
+
+def _numbers(
+    values: np.ndarray | float, shape: tuple[int, ...], what: str, *, finite: bool = False
+) -> np.ndarray:
+    """An array of a shape. Raises ValueError for another, and if `finite` is asked for and one is not."""
+    array = np.asarray(values, float)
+    if array.shape != shape:
+        raise ValueError(
+            f"the supervisor expects {shape[0] if shape else 'one'} {what} but was given an array of shape "
+            f"{array.shape}; give one a signal, NaN for a sensor that does not answer"
+        )
+    if finite and not np.isfinite(array).all():
+        raise ValueError(
+            f"the supervisor expects finite {what} but was given {array}; keep the last that was"
+        )
+    return array
 
 
 class Supervised:
@@ -54,10 +72,12 @@ class Supervised:
         self._in_reach = np.full(len(exported.machine.outputs), np.nan)
 
     def watch(self, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> None:
-        """One sample in manual, as RunningController has it; what is wrong is told by the first `step`."""
-        u, y = np.asarray(u, float), np.asarray(y, float)
-        r_now, _ = self._target(r)
+        """One sample in manual, as RunningController has it; what is wrong is told by the first `step`.
+        Raises ValueError as `step` does, and if inputs u (m,) are not finite; it then remembers nothing."""
         k = self.kept
+        y = self._accepted(y, r)
+        u = _numbers(u, k.asked.shape, "inputs in percent", finite=True)
+        r_now, _ = self._target(r)
         filled = follow(self.supervision, k, y, None, 0)
         k.asked[:] = u
         k.clock_s[1] += self.supervision.sample_time_s
@@ -72,7 +92,7 @@ class Supervised:
         k = self.kept
         k.since[:] = k.last[:] = -1.0
         k.counters[ACTIVE] = 0
-        for part in (k.amount, k.returns, k.shown):
+        for part in (k.amount, k.returns, k.shown, k.missing):
             part[:] = 0
         k.age[:] = -1
 
@@ -82,14 +102,13 @@ class Supervised:
         """What to apply from outputs y (p,) measured at t_s on the machine's clock, NaN where a sensor gives
         none, under reference r; `applied` (m,) are the inputs that acted since the last sample, where the
         machine reads them back. Raises ValueError for another number of them, before any watch, and where r
-        is not finite."""
+        or t_s is not finite, and remembers nothing."""
         s, k = self.supervision, self.kept
-        y = np.asarray(y, float)
-        if y.shape != k.y.shape:
-            raise ValueError(
-                f"the supervisor expects {len(k.y)} temperatures but was given an array of shape {y.shape}; "
-                "give NaN for a sensor that does not answer"
-            )
+        y = self._accepted(y, r)
+        _numbers(t_s, (), "time in s", finite=True)
+        applied = None if applied is None else _numbers(applied, k.asked.shape, "inputs in percent")
+        if not k.counters[SAMPLES]:
+            raise ValueError("the supervisor has seen no sample; call watch with each sample in manual first")
         samples = pass_time(s, k, t_s)
         r_now, _ = self._target(r)
         filled = follow(s, k, y, applied, samples)
@@ -101,6 +120,13 @@ class Supervised:
             r = r_now = self._in_reach
         u, mode = self._drive(filled, r, r_now)
         return Decision(u.copy(), MODES[mode], self._causes(t_s) if mode != LAW else ())
+
+    def _accepted(self, y: np.ndarray, r: np.ndarray | Reference) -> np.ndarray:
+        """Outputs y (p,), NaN where a sensor gives none. Raises ValueError for another number of them, or if
+        the reference r is not p finite numbers."""
+        p = self.kept.y.shape
+        _numbers(r.H @ r.w0 if isinstance(r, Reference) else r, p, "references in °C", finite=True)
+        return _numbers(y, p, "temperatures")
 
     def _drive(self, y: np.ndarray, r: np.ndarray | Reference, r_now: np.ndarray) -> tuple[np.ndarray, int]:
         """Inputs of the mode, and the mode; the law watches where it does not drive."""
@@ -173,7 +199,7 @@ class Supervised:
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Goes on from what another of the same controller `saved`. Raises ValueError where its arrays are
-        not of this controller."""
+        not of this controller, and stays as it was."""
         memory = self.kept._asdict()
         for name, part in memory.items():
             if name not in arrays or np.shape(arrays[name]) != part.shape:
@@ -182,17 +208,24 @@ class Supervised:
                     f"the supervisor expects to be restored from {name} of shape {part.shape} but was given "
                     f"{given}; restore what a supervisor of the same controller saved"
                 )
-        for prefix, runner in (("law.", self.law), ("own.", self.own)):
-            own = {
-                name.removeprefix(prefix): part for name, part in arrays.items() if name.startswith(prefix)
-            }
-            if own and runner is not None:
-                runner.restore(own)
+        parts: dict[str, dict[str, np.ndarray]] = {"law": {}, "own": {}, "aim": {}}
+        for name, part in arrays.items():
+            if "." in name:
+                parts[name.partition(".")[0]][name.partition(".")[2]] = np.array(part)
+        aim = parts["aim"]
+        if lost := {*Reference._fields, "w", "Y", "beyond", "in_reach"} - set(aim):
+            raise ValueError(
+                f"the supervisor expects to be restored from aim.{', aim.'.join(sorted(lost))}; "
+                "restore what a supervisor of the same controller saved"
+            )
+        law, own = RunningController(self.law.controller, self.law.model), self.own
+        law.restore(parts["law"])
+        if own is not None and arrays["counters"][MODE] == OWN:
+            own = RunningController(own.controller, own.model)
+            own.restore(parts["own"])
+        self.law, self.own = law, own
         for name, part in memory.items():
             part[...] = arrays[name]
-        aim = {
-            name.removeprefix("aim."): np.array(arrays[name]) for name in arrays if name.startswith("aim.")
-        }
         self._reference = Reference(*(aim[name] for name in Reference._fields))
         self._w, self._Y, self._beyond, self._in_reach = (
             aim[name] for name in ("w", "Y", "beyond", "in_reach")

@@ -17,6 +17,10 @@ corrects (a window). As long as a window lasts, readings are held against it:
 
   with g the response to the input since then, g' that a sample ago, U that to one percent. A heater is
   at fault if that explains the readings clearly better than what is no fault.
+* The drift follows any slow loss of heat. A sensor that drifts, or sticks with noise just below its
+  reference, looks like such a loss. So the drift has a bound that does not adapt: if more heat is missing
+  than a fan or filament takes, for longer than a door is open, and the readings do not rise, then the heater
+  or its sensor is in doubt.
 
 `Kept` is all that is remembered: arrays of fixed size, plain arithmetic.
 """
@@ -68,7 +72,11 @@ REPEATED = 3  # samples in a row with a reading that is none
 SHOWN = 6  # samples in a row that show a fault
 SLOWLY = 1 / 60  # share a sample of the mean drift, from which heat is counted
 EARLY, JUMP = 0.5, 10.0  # shares of the sample time between which two samples are apart
-MOST_STEP_DEGC = 5.0  # no sensor's step is larger: what moves by more at first was switched on
+MOST_STEP_DEGC = 5.0  # what moves by more at first was perhaps switched on
+# shares of an input's range, of heat that is missing; with the heater at its limit
+MISSING, AT_LIMIT = 0.4, 0.1
+MISSING_FOR, DOOR_S = 60, 110.0  # for so many samples, and longer than a door is open
+FAR_DEGC = 1e4  # no machine is so hot: its model is unstable, and no reading corrects it
 RETURNS = 3  # times an hour that heaters which went off are tried again
 LEAK = 0.9999  # of the drift, kept a step
 HURRIED = 0.1  # of an innovation, by which the drift follows in manual
@@ -82,8 +90,10 @@ class Supervision(NamedTuple):
     added to L in manual; `unsure` (WINDOWS SPACING + 1, p) in degC is the deviation of a forecast by its age,
     `wander` the sum of four times its squares.
     It starts at start y + start_0. low, high (m,) in percent; `coldest`, `hottest` (p,) in degC between which
-    a reading is one; `of_input` (m,) the output that each input moves most; `back_s` the
-    time without the cause after which the law takes over again.
+    a reading is one. Pairs (q,) of an output `of_input` and an input `input_of`: first the output in which
+    each input has the largest share, then the outputs that are left, with the input that moves them most.
+    `heat` (m, p) is the share of the inputs' range that a drift of 1 stands for, `missing_for` the samples
+    for which heat must be missing; `back_s` the time without the cause after which the law takes over again.
     """
 
     A: np.ndarray
@@ -104,14 +114,21 @@ class Supervision(NamedTuple):
     hottest: np.ndarray
     noise_degC: np.ndarray
     of_input: np.ndarray
+    input_of: np.ndarray
+    heat: np.ndarray
+    missing_for: int
     sample_time_s: float
     reach_degC: float
     back_s: float
 
-    def variance(self, quantum: np.ndarray) -> np.ndarray:
-        """Of a reading (p,) in degC^2, with twice the sensors' noise or steps."""
-        steps = np.where(np.isfinite(quantum), quantum, 0.0) / np.sqrt(12)
-        return (2 * np.maximum(self.noise_degC, steps)) ** 2
+    def coarser(self, quantum: np.ndarray) -> np.ndarray:
+        """How often the sensors' noise (p,) their readings deviate, with steps of `quantum` (p,) in degC."""
+        return np.maximum(1.0, known_steps(quantum) / np.sqrt(12) / self.noise_degC)
+
+
+def known_steps(quantum: np.ndarray) -> np.ndarray:
+    """Steps of sensors (p,) in degC; large ones as long as they are not known."""
+    return np.where(np.isfinite(quantum), quantum, MOST_STEP_DEGC)
 
 
 def supervision(
@@ -135,7 +152,13 @@ def supervision(
     P = riccati(A.T, C.T, scipy.linalg.block_diag(moved @ moved.T, np.diag((drift * noise) ** 2)), sensors)
     M = P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
     heat = np.vstack([likely, np.zeros((p, p))])
-    pulses = np.abs(markov_parameters(plant, 60))
+    pulses = np.abs(markov_parameters(plant, 60)).max(axis=0)
+    shares = pulses / np.maximum(pulses.max(axis=1, keepdims=True), 1e-300)
+    of_input = (shares + 1e-6 * pulses / max(pulses.max(), 1e-300)).argmax(axis=0)
+    others = np.setdiff1d(np.arange(p), of_input)
+    span = np.array([one.high - one.low for one in machine.inputs])
+    drifts = markov_parameters(plant._replace(B=likely), 60).sum(axis=0)
+    lost = np.linalg.pinv(markov_parameters(plant, 60).sum(axis=0)) @ drifts
     unsure, spread = np.empty((WINDOWS * SPACING + 1, p)), P - M @ C @ P
     for age in range(len(unsure)):
         unsure[age] = np.sqrt(np.maximum(np.diag(C @ spread @ C.T), 0.0))
@@ -159,7 +182,10 @@ def supervision(
         coldest=np.array([one.low for one in machine.outputs]),
         hottest=np.array([one.high for one in machine.outputs]),
         noise_degC=noise,
-        of_input=pulses.max(axis=0).argmax(axis=0),
+        of_input=np.r_[of_input, others],
+        input_of=np.r_[np.arange(m), pulses[others].argmax(axis=1)],
+        heat=lost / span[:, None],
+        missing_for=max(MISSING_FOR, int(np.ceil(DOOR_S / T))),
         sample_time_s=T,
         reach_degC=max(0.5, 3 * float(noise.max())),
         back_s=max(30 * T, 10.0),
@@ -193,18 +219,19 @@ class Kept(NamedTuple):
     By kind and signal (k, w): since and last in s of the supervisor's own time, -1 if not so; amount.
 
     The observer: x (n,), the innovation e (p,) before, the mean drift `slow` (p,), the forecast `expected`
-    (p,). By output (p,): y the last reading and its repeats, quantum the smallest move seen, bad readings in
-    a row, cleared_s the time at which it last moved as forecast, returns how often it was trusted again, the
-    last time at returned_s.
+    (p,). By output (p,): y the last reading and its repeats, quantum the smallest move seen (infinite: none;
+    NaN: a large one, perhaps of power-on), bad readings in a row, cleared_s the time at which it last moved
+    as forecast, returns how often it was trusted again, the last time at returned_s.
 
     Windows (K): states (2, K, n), from the drift as it was and from its mean; given and unit (K, n, m), the
-    responses to the inputs and to one percent of each; before (K, m) the former a sample ago; began, first,
+    responses to the inputs and to one percent of each; before (K, q) the former a sample ago; began, first,
     least, most (K, p) the forecast and the reading at first, the least and the most reading; away (K, p)
-    samples in a row in which the forecast was away from it; square (K, m) the sum of r^2, causes (K, m, 6)
-    that of each cause's signature squared, cross (K, K, m, 6) that of r of a window times the signature of a
+    samples in a row in which the forecast was away from it; square (K, q) the sum of r^2, causes (K, q, 6)
+    that of each cause's signature squared, cross (K, K, q, 6) that of r of a window times the signature of a
     cause that began with another; age (K,) in samples, -1 for none.
 
-    shown (2, m): samples in a row in which a heater was stuck on, or weak. asked (m,) the last command,
+    shown (2, m): samples in a row in which a heater was stuck on, or weak; missing (m,) samples in a
+    row in which its heat was. asked (m,) the last command,
     usual (m,) its mean, stirred (m,) how far it was from it lately.
     counters (6,): samples, mode, 1 once the clock was read, causes that are there, samples under the law, 1
     after a gap of the clock that is none.
@@ -240,6 +267,7 @@ class Kept(NamedTuple):
     total: np.ndarray
     age: np.ndarray
     shown: np.ndarray
+    missing: np.ndarray
     asked: np.ndarray
     usual: np.ndarray
     stirred: np.ndarray
@@ -252,7 +280,7 @@ SAMPLES, MODE, CLOCKED, ACTIVE, RUNS, INSANE = range(6)
 
 def kept(s: Supervision) -> Kept:
     """A memory that has seen nothing."""
-    n, m, p, K = len(s.A), len(s.low), len(s.d), WINDOWS
+    n, m, p, q, K = len(s.A), len(s.low), len(s.d), len(s.of_input), WINDOWS
     w, k = max(m, p), len(KINDS)
     return Kept(
         since=np.full((k, w), -1.0),
@@ -272,18 +300,19 @@ def kept(s: Supervision) -> Kept:
         states=np.zeros((2, K, n)),
         given=np.zeros((K, n, m)),
         unit=np.zeros((K, n, m)),
-        before=np.zeros((K, m)),
+        before=np.zeros((K, q)),
         began=np.zeros((K, p)),
         first=np.zeros((K, p)),
         least=np.zeros((K, p)),
         most=np.zeros((K, p)),
         away=np.zeros((K, p), int),
-        square=np.zeros((K, m)),
-        causes=np.zeros((K, m, len(LEAST))),
-        cross=np.zeros((K, K, m, len(LEAST))),
+        square=np.zeros((K, q)),
+        causes=np.zeros((K, q, len(LEAST))),
+        cross=np.zeros((K, K, q, len(LEAST))),
         total=np.zeros((2, K, p)),
         age=np.full(K, -1),
         shown=np.zeros((2, m), int),
+        missing=np.zeros(m, int),
         asked=np.zeros(m),
         usual=np.zeros(m),
         stirred=np.zeros(m),
@@ -326,7 +355,8 @@ def read(s: Supervision, k: Kept, y: np.ndarray) -> np.ndarray:
     for j in np.flatnonzero(k.bad >= REPEATED):
         say(k, OPEN, j, y[j])
     moves = np.where(counts, np.abs(y - k.y), np.inf)
-    k.quantum[:] = np.minimum(k.quantum, np.where(moves > 1e-9, np.minimum(moves, MOST_STEP_DEGC), np.inf))
+    first = np.isposinf(k.quantum) & (moves > MOST_STEP_DEGC) & np.isfinite(moves)
+    k.quantum[:] = np.where(first, np.nan, np.fmin(k.quantum, np.where(moves > 1e-9, moves, np.inf)))
     k.repeats[:] = np.where(counts & (moves < 1e-12), k.repeats + 1, np.where(counts, 0, k.repeats))
     k.y[:] = np.where(counts, y, k.y)
     return counts & ((k.since[[OPEN, STILL, DEAF], : len(y)] < 0).all(axis=0))
@@ -361,11 +391,11 @@ def compare(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     """Readings y (p,) that count against every window: what moved, and the sums of the fits."""
     k.least[:] = np.where(counts, np.minimum(k.least, y), k.least)
     k.most[:] = np.where(counts, np.maximum(k.most, y), k.most)
-    own, inputs = s.of_input, np.arange(len(s.low))
+    own, inputs = s.of_input, s.input_of
     runs = (k.age >= 0)[:, None]
     missed = np.where(counts & runs, y - k.states[1] @ s.C.T - s.d, 0.0)[:, own]
     given, unit = ((s.C @ part)[:, own, inputs] for part in (k.given, k.unit))
-    span = s.high - s.low
+    span = (s.high - s.low)[inputs]
     step = np.where(runs, 1.0, 0.0) * np.ones_like(given)
     parts = [-given, span * unit - given, span * unit, k.before - given, -given, step]
     signatures = np.stack(parts, axis=2)
@@ -379,9 +409,9 @@ def compare(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
 
 def threshold(s: Supervision, k: Kept) -> np.ndarray:
     """By how many degC (K, p) a forecast must move, or be missed, before a sensor or heater is judged."""
-    quantum = np.where(np.isfinite(k.quantum), k.quantum, 0.0)
-    least = np.maximum(STEPS_STILL * quantum, NOISE_STILL * s.noise_degC)
-    return np.maximum(least, NOISE_STILL * s.unsure[np.minimum(np.maximum(k.age, 0), len(s.unsure) - 1)])
+    least = np.maximum(STEPS_STILL * known_steps(k.quantum), NOISE_STILL * s.noise_degC)
+    unsure = s.unsure[np.minimum(np.maximum(k.age, 0), len(s.unsure) - 1)]
+    return np.maximum(least, NOISE_STILL * unsure * s.coarser(k.quantum))
 
 
 def clear_sensors(s: Supervision, k: Kept, doubt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -399,9 +429,10 @@ def clear_sensors(s: Supervision, k: Kept, doubt: np.ndarray) -> tuple[np.ndarra
 def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     """Says which sensors stand still while the forecast moves, and which heater heats otherwise than it was
     told: what explains clearly better than anything that is no fault."""
+    judge_heat(s, k, y, counts)
     doubt = DOUBT * np.abs(s.C @ k.unit) @ k.stirred
     moves, large = clear_sensors(s, k, doubt)
-    own, age = s.of_input, np.maximum(k.age, 1)[:, None]
+    own, age, m = s.of_input, np.maximum(k.age, 1)[:, None], len(s.low)
     missed = np.abs(y - k.states[1] @ s.C.T - s.d)
     tells = (k.age >= FIT_AFTER)[:, None] & counts & (missed >= np.maximum(threshold(s, k), doubt))
     still = (k.away >= STILL_AFTER) & large & counts
@@ -410,31 +441,53 @@ def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
         return
     amount = np.clip(k.cross / np.maximum(k.causes, 1e-12), LEAST, MOST)
     left = k.square[:, None, :, None] - 2 * amount * k.cross + amount**2 * k.causes
-    noise = age * s.variance(k.quantum) + s.wander[np.minimum(np.maximum(k.age, 0), len(s.wander) - 1)]
+    wander = s.wander[np.minimum(np.maximum(k.age, 0), len(s.wander) - 1)]
+    noise = (age * (2 * s.noise_degC) ** 2 + wander) * s.coarser(k.quantum) ** 2
     floor = noise[:, own] + MISFIT**2 * k.square + 1e-12
     later = (k.age[None, :] <= k.age[:, None]) & (k.age >= REPEATED)[None, :]
     left = np.where(later[:, :, None, None], np.maximum(left, floor[:, None, :, None]), 1e300)
     honest = np.minimum(left[..., HEAT:].min(axis=(1, 3)), np.maximum(k.square, floor))
     same = unmoved(s, k)
     judge_sensors(s, k, moves, still & same, honest, noise)
+    left, honest, floor = left[:, :, :m], honest[:, :m], floor[:, :m]
     explained = left[..., :HEAT].min(axis=1)
     best = explained.min(axis=2)
-    clear = (age * np.log(honest / best) >= CLEARER) & tells[:, own] & (best <= 2 * floor) & (best < 1e300)
+    clear = (
+        (age * np.log(honest / best) >= CLEARER) & tells[:, own[:m]] & (best <= 2 * floor) & (best < 1e300)
+    )
     gives = explained[..., GIVES] < explained[..., LACKS]
     shows = np.stack([(clear & gives).any(axis=0), (clear & ~gives).any(axis=0)])
     k.shown[:] = np.where(shows, k.shown + 1, 0)
     shown = clear & (k.shown.max(axis=0) >= SHOWN)
     if shown.any():
-        window, i = np.unravel_index(np.where(shown, k.square, -1.0).argmax(), shown.shape)
+        window, i = np.unravel_index(np.where(shown, k.square[:, :m], -1.0).argmax(), shown.shape)
         cause = GIVES if gives[window, i] else LACKS
         onset = int(left[window, :, i, cause].argmin())
         share = float(amount[window, onset, i, cause])
         if same[window, own[i]]:
             say_still(k, int(own[i]), moves[window, own[i]])
-        elif cause == LACKS and share > MORE_THAN_ALL:
-            say(k, WEAK, int(i), -share)
+        elif cause == GIVES:
+            say(k, ON, int(i), share)
         else:
-            say(k, ON if cause == GIVES else WEAK, int(i), share)
+            say_weak(k, int(i), share)
+
+
+def say_weak(k: Kept, i: int, share: float) -> None:
+    """A heater lacks a share of what it is told; the sensor is in doubt if that is more than all."""
+    say(k, WEAK, i, -share if share > MORE_THAN_ALL else share)
+
+
+def judge_heat(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
+    """Says whose heat is missing for long: more than disturbances take, or some of it while the heater is at
+    its limit, as long as its output does not rise."""
+    m, p, window = len(s.low), len(s.d), int(k.age.argmax())
+    own, span = s.of_input[:m], s.high - s.low
+    lost = -s.heat @ k.x[-p:]
+    rises = (k.age[window] < (WINDOWS - 1) * SPACING) | (y - k.first[window] > same_degC(s, k))
+    least = np.where(k.asked >= s.high, AT_LIMIT, MISSING)
+    k.missing[:] = np.where(counts[own] & ~rises[own] & (lost >= least), k.missing + 1, 0)
+    for i in np.flatnonzero(k.missing >= s.missing_for):
+        say_weak(k, int(i), lost[i] / max((k.usual[i] - s.low[i]) / span[i], lost[i]))
 
 
 def say_still(k: Kept, j: int, moves_degC: float) -> None:
@@ -444,8 +497,12 @@ def say_still(k: Kept, j: int, moves_degC: float) -> None:
 
 def unmoved(s: Supervision, k: Kept) -> np.ndarray:
     """Whether readings (K, p) have stood still since each window began, but for noise."""
-    quantum = np.where(np.isfinite(k.quantum), k.quantum, 0.0)
-    return k.most - k.least <= np.maximum(SAME_STEPS * quantum, SAME_NOISE * s.noise_degC)
+    return k.most - k.least <= same_degC(s, k)
+
+
+def same_degC(s: Supervision, k: Kept) -> np.ndarray:
+    """By how many degC (p,) a reading may vary that stands still."""
+    return np.maximum(SAME_STEPS * known_steps(k.quantum), SAME_NOISE * s.noise_degC)
 
 
 def judge_sensors(
@@ -457,8 +514,6 @@ def judge_sensors(
     still = still & (np.abs(moves) >= SAME_STEPS * (k.most - k.least))
     for j in np.flatnonzero(still.any(axis=0)):
         heaters = np.flatnonzero(s.of_input == j)
-        if not heaters.size:
-            continue
         square = k.square[:, heaters].max(axis=1)
         steady = k.total[1, :, j] - k.total[0, :, j] ** 2 / age[:, 0]
         floor = noise[:, j] + MISFIT**2 * square + 1e-12
@@ -489,6 +544,7 @@ def forget(s: Supervision, k: Kept) -> None:
             if again:
                 k.returns[j] = 1 if rested else k.returns[j] + 1
                 k.returned_s[j] = k.clock_s[1]
+                k.cleared_s[j] = -np.inf  # what cooled as forecast may yet be out of place
     if gone.any():
         k.since[gone] = k.last[gone] = -1.0
         k.counters[ACTIVE] -= int(gone.sum())
@@ -500,9 +556,9 @@ def follow(s: Supervision, k: Kept, y: np.ndarray, applied: np.ndarray | None, s
     (p,) with what does not count as forecast."""
     u = k.asked if applied is None else np.where(np.isfinite(applied), applied, k.asked)
     u = np.minimum(np.maximum(u, s.low), s.high)
+    silent = np.isnan(k.y)
     counts = read(s, k, y)
-    if k.counters[SAMPLES] == 0:
-        k.x[:] = s.start @ np.where(counts, y, s.d) + s.start_0
+    begins = k.counters[SAMPLES] == 0 or (silent & counts).any()
     for step in range(max(samples, 1) if k.counters[SAMPLES] else 0):
         advance(s, k, u)
         if samples == 0:
@@ -510,6 +566,9 @@ def follow(s: Supervision, k: Kept, y: np.ndarray, applied: np.ndarray | None, s
         elif step:
             k.e[:] = 0.0
     k.expected[:] = s.C @ k.x + s.d
+    if begins or (np.abs(k.expected) > FAR_DEGC).any():
+        k.x[:] = s.start @ np.where(np.isfinite(k.y), k.y, s.d) + s.start_0
+        k.expected[:], k.slow[:], k.age[:] = s.C @ k.x + s.d, 0.0, -1
     filled = np.where(counts, y, k.expected)
     if samples == 0:
         k.age[:] = -1
@@ -537,7 +596,7 @@ def choose_mode(s: Supervision, k: Kept) -> int:
         return LAW
     doubtful = (k.since[[OPEN, STILL, DEAF, ON]] >= 0).any()
     for i in np.flatnonzero(k.since[WEAK] >= 0):
-        if k.amount[WEAK, i] >= 0 and k.since[WEAK, i] - k.cleared_s[s.of_input[i]] > CLEARED_S:
+        if k.amount[WEAK, i] >= 0 and k.last[WEAK, i] - k.cleared_s[s.of_input[i]] > CLEARED_S:
             k.amount[WEAK, i] = -k.amount[WEAK, i]
     uncleared = (k.amount[WEAK][k.since[WEAK] >= 0] < 0).any()
     return OFF if doubtful or uncleared else OWN
@@ -552,8 +611,7 @@ def sentence(s: Supervision, machine: Machine, kind: int, signal: int, amount: f
         heater, zone = machine.inputs[signal].name, machine.outputs[s.of_input[signal]].name
     else:
         zone = machine.outputs[signal].name
-        heaters = [one.name for i, one in enumerate(machine.inputs) if s.of_input[i] == signal]
-        heater = heaters[0] if heaters else "its heater"
+        heater = machine.inputs[s.input_of[(s.of_input == signal).argmax()]].name
     if kind == OPEN and not np.isfinite(amount):
         return f"{zone} gives no number."
     return {

@@ -6,7 +6,7 @@
 
 enum {
     FAULT_NO_FAULT, FAULT_SENSOR_OPEN, FAULT_SENSOR_RANGE, FAULT_SENSOR_STILL, FAULT_SENSOR_STILL_NOISY, FAULT_HEATER_ON, FAULT_HEATER_HALF, FAULT_HEATER_OFF,
-    OUT_OF_REACH
+    OUT_OF_REACH, FAULT_SENSOR_NEAR, FAULT_SENSOR_DRIFTS
 };
 
 /* What happened to the fault: the sample at which it began, and that from which it shows; -1 for never */
@@ -30,7 +30,8 @@ static double rough(unsigned *x)
  * manual with the heaters off, then under the controller. `patience` samples after it left the law a person
  * acknowledges; 0: nobody comes. A fault of `kind` on `signal` begins at the first sample from `earliest` on at
  * which the law drives; nobody acknowledges from then on. It shows when the sensors of a healthy twin under the
- * same commands are `visible` degC (OUTPUTS) from the machine's readings, or its other readings from the twin's.
+ * same commands are `visible` degC (OUTPUTS) from the machine's. If a sensor lies, its twin is that of a model,
+ * which foresees no fan and no door: outside the machine all stays as it was when the fault began.
  *
  * Writes readings y, sensors before noise and steps, commands u, modes, the first cause's kind and signal (-1:
  * none), and whether a person acknowledged. Returns the result of the first call that did nothing, or 0. */
@@ -45,6 +46,7 @@ int normal_life(const thermal_parts *p, double degC, uint64_t seed, int steps, i
     thermal_state s, twin;
     beadline_decision d;
     double frozen = 0.0, acted[HEATERS], off[INPUTS] = {0}, wish[OUTPUTS], unread[SENSORS];
+    int heater = kind >= FAULT_HEATER_ON && kind <= FAULT_HEATER_OFF;
     int k, j, left = 0, result = beadline_init(&c, &machine, 1), before = MODE_LAW;
     unsigned random = 12345u;
     fault->began = fault->shows = -1;
@@ -71,13 +73,19 @@ int normal_life(const thermal_parts *p, double degC, uint64_t seed, int steps, i
                 now[signal] = frozen;
             if (kind == FAULT_SENSOR_STILL_NOISY)
                 now[signal] = rint((frozen + p->noise[signal] * rough(&random)) / p->step[signal]) * p->step[signal];
+            if (kind == FAULT_SENSOR_NEAR)
+                now[signal] = rint((wish[signal] - beyond + p->noise[signal] * rough(&random)) / p->step[signal]) * p->step[signal];
+            if (kind == FAULT_SENSOR_DRIFTS)
+                now[signal] -= beyond * (k - fault->began);
             if (kind == OUT_OF_REACH)
                 wish[signal] = beyond;
             if (fault->shows < 0) {
-                double apart = kind <= FAULT_SENSOR_RANGE || kind == OUT_OF_REACH ? INFINITY : 0.0;
+                int open = kind <= FAULT_SENSOR_RANGE || kind == OUT_OF_REACH, lies = kind > OUT_OF_REACH;
+                double apart = open ? INFINITY : 0.0;
                 for (j = 0; j < OUTPUTS; j++)
-                    if (kind >= FAULT_HEATER_ON || j == signal)
-                        apart = fmax(apart, fabs((kind >= FAULT_HEATER_ON ? s.sensor[j] : frozen) - twin.sensor[j])
+                    if (heater || j == signal)
+                        apart = fmax(apart, fabs((heater ? s.sensor[j] : lies ? now[j] : frozen)
+                                                 - (lies ? s.sensor[j] : twin.sensor[j]))
                                                 / visible[j]);
                 if (apart >= 1.0)
                     fault->shows = k;
@@ -113,10 +121,10 @@ int normal_life(const thermal_parts *p, double degC, uint64_t seed, int steps, i
             acted[j] = command[j];
         if (fault->began >= 0) {
             double of[] = {100.0, 0.5 * acted[signal], 0.0};
-            if (kind >= FAULT_HEATER_ON && kind <= FAULT_HEATER_OFF)
+            if (heater)
                 acted[signal] = of[kind - FAULT_HEATER_ON];
             thermal_read(&twin, p, unread); /* keeps its noise in step */
-            thermal_advance(&twin, p, command, outside + k * OUTSIDE);
+            thermal_advance(&twin, p, command, outside + (heater ? k : fault->began) * OUTSIDE);
         }
         thermal_advance(&s, p, acted, outside + k * OUTSIDE);
     }

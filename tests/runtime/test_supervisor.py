@@ -36,16 +36,28 @@ def exported(*, fallback: bool = True) -> Exported:
 
 class Run:
     """A plant that differs from the model: stronger heaters, late by a sample, a sensor in steps; `taken`
-    (2,) in degC a sample is what a fan or a door takes."""
+    (2,) in degC a sample is what a fan or a door takes. It is watched first, and zone_2 is
+    `silent` at the beginning."""
 
-    def __init__(self, *, seed: int = 0, late: bool = True, gain=(1.1, 0.93), step=0.0, fallback=True):
+    def __init__(
+        self,
+        *,
+        seed: int = 0,
+        late: bool = True,
+        gain=(1.1, 0.93),
+        step=0.0,
+        fallback=True,
+        watches=30,
+        silent=0,
+    ):
         self.plant, self.step_degC = delayed(MODEL._replace(B=MODEL.B * gain), late), step
         self.rng, self.t, self.skew, self.taken = np.random.default_rng(seed), 0, 0.0, np.zeros(2)
         self.supervised = Supervised(exported(fallback=fallback), rehearsal=True)
         u = np.linalg.solve(MODEL.B * gain, (np.eye(2) - MODEL.A) @ (R - ROOM))
         self.x = np.r_[R - ROOM, u]
-        for _ in range(30):
-            self.supervised.watch(u, self.read(), R)
+        for k in range(watches):
+            y = self.read()
+            self.supervised.watch(u, np.where([False, k < silent], np.nan, y), R)
             self.advance(u)
         self.supervised.hand_over(self.read())
 
@@ -108,6 +120,18 @@ def test_a_sensor_at_rest_may_repeat_itself_for_long():
     """In steps of 2 degC it reads the same for hundreds of samples."""
     run = Run(seed=5, step=2.0)
     assert {one.mode for one in run.go(600)} == {"law"}
+
+
+@pytest.mark.parametrize("step", [4.0, 8.0, 12.0])
+def test_a_sensor_in_steps_of_many_degrees_is_left_to_the_law(step):
+    run = Run(seed=1, step=step)
+    assert {one.mode for one in run.go(1100, r=lambda t: R + (30.0 if t // 200 % 2 else -30.0))} == {"law"}
+
+
+@pytest.mark.parametrize("watches", [1, 2])
+def test_a_sensor_that_answers_late_is_followed_from_its_first_reading(watches):
+    run = Run(seed=1, watches=watches, silent=watches)
+    assert {one.mode for one in run.go(300)} == {"law"}
 
 
 # ---- six faults
@@ -196,6 +220,61 @@ def test_a_sensor_that_stands_still_below_its_reference_is_told_whatever_its_rea
     decisions = run.go(600, reading=lambda y, k: np.array([y[0], R[1] - below]))
     full = np.array([one.u[1] >= 99.0 for one in decisions])
     assert decisions[-1].mode == "off" and full.sum() <= 60
+
+
+@pytest.mark.parametrize("step", [0.0, 0.25])
+def test_a_sensor_that_sticks_with_noise_just_below_its_reference_is_in_doubt(step):
+    run, rng = Run(seed=0, step=step), np.random.default_rng(9)
+    run.go(200)
+
+    def near(y, k):
+        shown = R[1] - 0.3 + NOISE * rng.standard_normal()
+        return np.array([y[0], np.round(shown / step) * step if step else shown])
+
+    decisions = run.go(600, reading=near)
+    at, cause = first(decisions)
+    assert (cause.kind, cause.signal) == ("heater_weak", "heater_2")
+    assert "or zone_2 is out of place" in cause.sentence
+    assert {one.mode for one in decisions[at:]} == {"off"}
+    full = [one.u[1] for one in decisions].count(100.0)
+    assert full <= supervision(MODEL, WIRED, np.full(2, NOISE)).missing_for
+
+
+def test_a_sensor_that_drifts_is_in_doubt_before_its_heater_gives_half_of_its_range_more():
+    run = Run(seed=0)
+    run.go(200)
+    decisions = run.go(1200, reading=put(1, lambda y, k: y - 0.1 * k))
+    at, cause = first(decisions)
+    assert cause.signal == "heater_2" and "or zone_2 is out of place" in cause.sentence
+    usual = np.linalg.solve(MODEL.B, (np.eye(2) - MODEL.A) @ (R - ROOM))
+    assert decisions[at].mode == "off" and max(one.u[1] for one in decisions[:at]) <= usual[1] + 49.0
+
+
+def test_a_sensor_that_slips_out_in_part_does_not_come_back_by_cooling_as_forecast():
+    """It cools as forecast, only from a lower reading: that clears no sensor while the heater heats."""
+    run = Run(seed=3)
+    run.go(200)
+    decisions = run.go(900, reading=put(0, lambda y, k: ROOM + 0.1 * (y - ROOM)))
+    assert decisions[-1].mode == "off"
+    assert "own" not in {one.mode for one in decisions}
+
+
+def test_a_sensor_that_no_input_moves_most_is_judged_too():
+    """One heater, two sensors."""
+    model = plant([[0.98, 0.003], [0.01, 0.978]], [[0.055], [0.02]], np.eye(2), d=[ROOM, ROOM])
+    s = supervision(model, WIRED._replace(inputs=WIRED.inputs[:1]), np.full(2, NOISE))
+    assert s.of_input.tolist() == [0, 1] and s.input_of.tolist() == [0, 0]
+    k, rng = supervisor.kept(s), np.random.default_rng(0)
+    x, held = np.array([60.0, 40.0]), 0.0
+    for t in range(400):
+        u = np.array([40.0 + 30.0 * (t // 60 % 2)])
+        y = x + ROOM + NOISE * rng.standard_normal(2)
+        held = y[1] if t < 230 else held
+        y[1] = held + NOISE * rng.standard_normal() * (t >= 230)
+        supervisor.pass_time(s, k, float(t))
+        supervisor.follow(s, k, y, u, int(t >= 30))
+        x = model.A @ x + model.B @ u
+    assert k.since[supervisor.DEAF, 1] >= 230.0 and (k.since >= 0).sum() == 1
 
 
 @pytest.mark.parametrize("gap", [1.6, 0.0, 1000.0])
@@ -312,6 +391,66 @@ def test_it_goes_on_from_what_it_saved_bit_by_bit():
         one, same = (each.step(y, R, float(run.t)) for each in (run.supervised, other))
         np.testing.assert_array_equal(one.u, same.u)
         assert one.mode == same.mode and one.causes == same.causes
+
+
+def test_it_goes_on_from_what_it_saved_under_the_machines_own_control():
+    run = Run(seed=6)
+    run.go(200, r=steps_of)
+    command = HEATERS["heater_weak"][0]
+    assert run.go(40, command=command, r=steps_of)[-1].mode == "own"
+    run.x[:2] = R - ROOM + 5.0
+    run.go(5, r=steps_of)
+    saved, other = run.supervised.saved(), Supervised(exported(), rehearsal=True)
+    other.restore(saved)
+    for _ in range(10):
+        y = run.read()
+        one, same = (each.step(y, R, float(run.t)) for each in (run.supervised, other))
+        np.testing.assert_array_equal(one.u, same.u)
+        assert one.mode == same.mode == "own" and one.causes == same.causes
+        run.advance(one.u)
+        run.t += 1
+
+
+def test_what_is_refused_changes_nothing():
+    run = Run(seed=6)
+    run.go(200, r=steps_of)
+    run.go(40, command=HEATERS["heater_weak"][0], r=steps_of)
+    one, y = run.supervised, R.copy()
+    before = one.saved()
+    no_own = {name: part for name, part in before.items() if not name.startswith("own.")}
+    refused = (
+        lambda: one.watch(np.array([np.nan, 0.0]), y, R),
+        lambda: one.watch(np.zeros(3), y, R),
+        lambda: one.watch(np.zeros(2), np.zeros(3), R),
+        lambda: one.watch(np.zeros(2), y, np.array([np.nan, 0.0])),
+        lambda: one.step(y, np.array([np.inf, 0.0]), 900.0),
+        lambda: one.step(y, R, np.nan),
+        lambda: one.step(y, R, 900.0, np.zeros(3)),
+        lambda: one.restore(before | {"slow": np.zeros(3)}),
+        lambda: one.restore(before | {"law.xi": np.full((1, 2), np.nan)}),
+        lambda: one.restore(no_own),
+        lambda: one.restore({name: part for name, part in before.items() if name != "aim.w"}),
+    )
+    for call in refused:
+        with pytest.raises(ValueError):
+            call()
+        after = one.saved()
+        assert set(after) == set(before)
+        for name, part in before.items():
+            np.testing.assert_array_equal(after[name], part, err_msg=name)
+    with pytest.raises(ValueError, match="seen no sample; call watch"):
+        Supervised(exported(), rehearsal=True).step(y, R, 0.0)
+
+
+def test_an_unstable_model_stays_finite_while_its_sensor_is_lost():
+    model = plant(np.diag([1.02, 0.98]), np.diag([0.055, 0.065]), np.eye(2), d=[ROOM, ROOM])
+    s = supervision(model, WIRED, np.full(2, NOISE))
+    k = supervisor.kept(s)
+    for t in range(3000):
+        y = np.array([150.0 if t < 100 else np.nan, 150.0])
+        supervisor.pass_time(s, k, float(t))
+        filled = supervisor.follow(s, k, y, np.array([50.0, 40.0]), 1)
+    assert (np.abs(filled) <= supervisor.FAR_DEGC).all() and np.isfinite(k.x).all()
 
 
 def test_what_was_said_first_of_a_cause_stays_and_counts_once():

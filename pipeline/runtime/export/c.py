@@ -132,7 +132,7 @@ def define(name: str, value: float | int | str) -> str:
 
 class ArrayLengths(NamedTuple):
     """Lengths of the arrays: `watched` states of a governor's member, `instants` it looks ahead an output;
-    `watch` states of the supervisor's observer, `windows` of its forecasts."""
+    `watch` states of the supervisor's observer, `windows` of its forecasts, `pairs` of input and output."""
 
     inputs: int
     outputs: int
@@ -143,6 +143,7 @@ class ArrayLengths(NamedTuple):
     watch: int
     windows: int
     signals: int
+    pairs: int
 
 
 def sizes(exported: Exported) -> ArrayLengths:
@@ -154,7 +155,12 @@ def sizes(exported: Exported) -> ArrayLengths:
     if family is not None:
         f, q = family.start_0.shape
         governed = (f, q // 2, family.above.shape[1] // p)
-    supervised = (len(exported.supervision.A), supervisor.WINDOWS, max(m, p))
+    supervised = (
+        len(exported.supervision.A),
+        supervisor.WINDOWS,
+        max(m, p),
+        len(exported.supervision.of_input),
+    )
     return ArrayLengths(m, p, memory, *governed, *supervised)
 
 
@@ -382,7 +388,7 @@ def _law(name: str, deployed: Deployed) -> str:
 OF_SUPERVISOR = (
     "SPACING", "STILL_AFTER", "FIT_AFTER", "STEPS_STILL", "NOISE_STILL", "SAME_STEPS", "SAME_NOISE",
     "CLEARED_S", "CLEARER", "MORE_THAN_ALL", "MISFIT", "DOUBT", "RESTS", "REPEATED", "SHOWN", "SLOWLY",
-    "EARLY", "JUMP", "RETURNS", "MOST_STEP_DEGC",
+    "EARLY", "JUMP", "RETURNS", "MOST_STEP_DEGC", "MISSING", "AT_LIMIT", "FAR_DEGC",
 )  # fmt: skip
 OF_OBSERVER = (
     "A",
@@ -399,6 +405,7 @@ OF_OBSERVER = (
     "start_0",
     "low",
     "high",
+    "heat",
 )
 
 
@@ -409,7 +416,8 @@ def supervising(s: supervisor.Supervision) -> str:
     text += define("FOLLOWS_LEAST", supervisor.FOLLOWS[0]) + define("FOLLOWS_MOST", supervisor.FOLLOWS[1])
     text += define("REACH_DEGC", s.reach_degC) + define("SUPERVISOR_BACK_S", s.back_s)
     text += table("explanation_least", supervisor.LEAST) + table("explanation_most", supervisor.MOST)
-    text += integers("supervisor_of_input", s.of_input)
+    text += define("MISSING_FOR", s.missing_for)
+    text += integers("supervisor_of_input", s.of_input) + integers("supervisor_input_of", s.input_of)
     arrays = {name: getattr(s, name) for name in OF_OBSERVER}
     arrays |= {"coldest": s.coldest, "hottest": s.hottest, "noise": s.noise_degC}
     return text + "".join(table(f"supervisor_{name}", values) for name, values in arrays.items())

@@ -48,6 +48,7 @@ static void forget_all(supervisor_kept *k)
     memset(k->amount, 0, sizeof k->amount);
     memset(k->returns, 0, sizeof k->returns);
     memset(k->shown, 0, sizeof k->shown);
+    memset(k->missing, 0, sizeof k->missing);
     k->active = 0;
     end_windows(k);
 }

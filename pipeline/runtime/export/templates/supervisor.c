@@ -54,10 +54,10 @@ static int pass_time(supervisor_kept *k, double t_s)
     return sane && gap > 1.5 ? (int)(gap + 0.5) : 1;
 }
 
-/* Steps of a sensor in degC, 0 as long as it has not moved */
+/* Steps of a sensor in degC; large ones as long as they are not known */
 static double steps_of(const supervisor_kept *k, int j)
 {
-    return isfinite(k->quantum[j]) ? k->quantum[j] : 0.0;
+    return isfinite(k->quantum[j]) ? k->quantum[j] : MOST_STEP_DEGC;
 }
 
 /* Which outputs count now; says which gives no number, or one out of its range */
@@ -71,8 +71,10 @@ static void read_sensors(supervisor_kept *k, const double *y, int *counts)
             say(k, SENSOR_OPEN, j, y[j]);
         if (good) {
             double move = fabs(y[j] - k->y[j]);
-            if (move > 1e-9)
-                k->quantum[j] = fmin(k->quantum[j], fmin(move, MOST_STEP_DEGC));
+            if (isinf(k->quantum[j]) && move > MOST_STEP_DEGC)
+                k->quantum[j] = NAN; /* perhaps it was switched on */
+            else if (move > 1e-9)
+                k->quantum[j] = fmin(k->quantum[j], move);
             k->repeats[j] = move < 1e-12 ? k->repeats[j] + 1 : 0;
             k->y[j] = y[j];
         }
@@ -178,16 +180,17 @@ static void compare(supervisor_kept *k, const double *y, const int *counts)
                 one->total[0][j] += moved;
                 one->total[1][j] += moved * moved;
             }
-    for (i = 0; i < INPUTS; i++) {
-        double span = supervisor_high[i] - supervisor_low[i];
+    for (i = 0; i < PAIRS; i++) {
+        int input = supervisor_input_of[i];
+        double span = supervisor_high[input] - supervisor_low[input];
         j = supervisor_of_input[i];
         for (w = 0; w < WINDOWS; w++) {
             forecast_window *one = &k->window[w];
             double given = 0.0, unit = 0.0;
             missed[w] = 0.0;
             if (one->age >= 0) {
-                given = response_of(one->given[0], j, i);
-                unit = response_of(one->unit[0], j, i);
+                given = response_of(one->given[0], j, input);
+                unit = response_of(one->unit[0], j, input);
                 missed[w] = counts[j] ? y[j] - forecast(one->state[1], j) : 0.0;
             }
             signature[w][LACKS] = signature[w][DIFFERS] = -given;
@@ -207,6 +210,18 @@ static void compare(supervisor_kept *k, const double *y, const int *counts)
     }
 }
 
+/* How often its noise a reading deviates, with its steps */
+static double coarser(const supervisor_kept *k, int j)
+{
+    return largest(1.0, steps_of(k, j) / sqrt(12.0) / supervisor_noise[j]);
+}
+
+/* By how many degC a reading may vary that stands still */
+static double same_degC(const supervisor_kept *k, int j)
+{
+    return largest(SAME_STEPS * steps_of(k, j), SAME_NOISE * supervisor_noise[j]);
+}
+
 /* By how many degC a forecast must move, or be missed, before a sensor or heater is judged */
 static double threshold(const supervisor_kept *k, int w, int j)
 {
@@ -214,7 +229,7 @@ static double threshold(const supervisor_kept *k, int w, int j)
     double least = largest(STEPS_STILL * steps_of(k, j), NOISE_STILL * supervisor_noise[j]);
     if (age > WINDOWS * SPACING)
         age = WINDOWS * SPACING;
-    return largest(least, NOISE_STILL * supervisor_unsure[age][j]);
+    return largest(least, NOISE_STILL * supervisor_unsure[age][j] * coarser(k, j));
 }
 
 static double doubt_of(const supervisor_kept *k, int w, int j)
@@ -229,10 +244,10 @@ static double doubt_of(const supervisor_kept *k, int w, int j)
 /* Squares that noise and a wandering forecast leave of what a window missed */
 static double noise_of(const supervisor_kept *k, int w, int j)
 {
-    double deviation = 2 * largest(supervisor_noise[j], steps_of(k, j) / sqrt(12.0));
+    double deviation = 2 * supervisor_noise[j], wander;
     int age = k->window[w].age < 0 ? 0 : k->window[w].age;
-    return (age < 1 ? 1 : age) * (deviation * deviation)
-           + supervisor_wander[age > WINDOWS * SPACING ? WINDOWS * SPACING : age][j];
+    wander = supervisor_wander[age > WINDOWS * SPACING ? WINDOWS * SPACING : age][j];
+    return ((age < 1 ? 1 : age) * (deviation * deviation) + wander) * (coarser(k, j) * coarser(k, j));
 }
 
 /* Clears sensors that move as forecast; how far each forecast has moved, and which stands away from readings
@@ -258,8 +273,7 @@ static void clear_sensors(supervisor_kept *k, const int *counts, double moves[WI
 
 static int unmoved(const supervisor_kept *k, int w, int j)
 {
-    double same = largest(SAME_STEPS * steps_of(k, j), SAME_NOISE * supervisor_noise[j]);
-    return k->window[w].most[j] - k->window[w].least[j] <= same;
+    return k->window[w].most[j] - k->window[w].least[j] <= same_degC(k, j);
 }
 
 /* What an explanation leaves of the squares that a window missed, and its amount; no explanation begins before
@@ -308,13 +322,11 @@ static void judge_sensors(supervisor_kept *k, double moves[WINDOWS][OUTPUTS], in
             if (!still[w][j] || !unmoved(k, w, j)
                 || fabs(moves[w][j]) < SAME_STEPS * (one->most[j] - one->least[j]))
                 continue;
-            for (i = 0; i < INPUTS; i++)
+            for (i = 0; i < PAIRS; i++)
                 if (supervisor_of_input[i] == j) {
                     honest = fmin(honest, honest_of(k, w, i));
                     square = largest(square, one->square[i]);
                 }
-            if (!isfinite(honest))
-                continue;
             steady = one->total[1][j] - one->total[0][j] * one->total[0][j] / age;
             at_least = noise_of(k, w, j) + MISFIT * MISFIT * square + 1e-12;
             /* what moves a heater is a reading that moved: nothing honest keeps one equal meanwhile */
@@ -324,6 +336,34 @@ static void judge_sensors(supervisor_kept *k, double moves[WINDOWS][OUTPUTS], in
         }
         if (at >= 0)
             say_still(k, j, moves[at][j]);
+    }
+}
+
+/* A heater lacks a share of what it is told; the sensor is in doubt if that is more than all */
+static void say_weak(supervisor_kept *k, int i, double share)
+{
+    say(k, HEATER_WEAK, i, share > MORE_THAN_ALL ? -share : share);
+}
+
+/* Says whose heat is missing for long, as long as its output does not rise */
+static void judge_heat(supervisor_kept *k, const double *y, const int *counts)
+{
+    int i, j, w, oldest = 0;
+    for (w = 1; w < WINDOWS; w++)
+        if (k->window[w].age > k->window[oldest].age)
+            oldest = w;
+    for (i = 0; i < INPUTS; i++) {
+        double lost = -dot(supervisor_heat[i], k->x + WATCH - OUTPUTS, OUTPUTS), told;
+        double least = k->asked[i] >= supervisor_high[i] ? AT_LIMIT : MISSING;
+        j = supervisor_of_input[i];
+        if (counts[j] && k->window[oldest].age >= (WINDOWS - 1) * SPACING
+            && y[j] - k->window[oldest].first[j] <= same_degC(k, j) && lost >= least)
+            k->missing[i]++;
+        else
+            k->missing[i] = 0;
+        told = (k->usual[i] - supervisor_low[i]) / (supervisor_high[i] - supervisor_low[i]);
+        if (k->missing[i] >= MISSING_FOR)
+            say_weak(k, i, lost / largest(told, lost));
     }
 }
 
@@ -369,9 +409,10 @@ static void judge_heaters(supervisor_kept *k, const double *y, const int *counts
             }
     if (at >= 0 && unmoved(k, at, supervisor_of_input[of]))
         say_still(k, supervisor_of_input[of], moves[at][supervisor_of_input[of]]);
+    else if (at >= 0 && gives[at][of])
+        say(k, HEATER_STUCK_ON, of, share[at][of]);
     else if (at >= 0)
-        say(k, gives[at][of] ? HEATER_STUCK_ON : HEATER_WEAK, of,
-            !gives[at][of] && share[at][of] > MORE_THAN_ALL ? -share[at][of] : share[at][of]);
+        say_weak(k, of, share[at][of]);
 }
 
 /* Whether a heater is tried again: the heaters are off for this cause and its output moves as forecast, or
@@ -386,6 +427,7 @@ static int tried_again(supervisor_kept *k, int kind, int signal, int gone)
         return 0;
     k->returns[j] = rested ? 1 : k->returns[j] + 1;
     k->returned_s[j] = k->clock_s[1];
+    k->cleared_s[j] = -INFINITY; /* what cooled as forecast may yet be out of place */
     return 1;
 }
 
@@ -419,9 +461,24 @@ static void follow_law(supervisor_kept *k, const double *u, const double *y, con
         k->stirred[i] = largest(fabs(u[i] - k->usual[i]), (1 - RESTS) * k->stirred[i]);
     }
     compare(k, y, counts);
+    judge_heat(k, y, counts);
     clear_sensors(k, counts, moves, still);
     judge_sensors(k, moves, still);
     judge_heaters(k, y, counts, moves);
+}
+
+/* The observer at the last readings, as if inputs had reached them */
+static void begin_anew(supervisor_kept *k)
+{
+    double from[OUTPUTS];
+    int j;
+    for (j = 0; j < OUTPUTS; j++) {
+        from[j] = isfinite(k->y[j]) ? k->y[j] : supervisor_d[j];
+        k->slow[j] = 0.0;
+    }
+    memcpy(k->x, supervisor_start_0, sizeof k->x);
+    add_product(k->x, supervisor_start[0], from, WATCH, OUTPUTS);
+    end_windows(k);
 }
 
 /* One sample of outputs y, inputs `applied` since the one before, none of `samples` in manual; `filled` is y
@@ -429,17 +486,13 @@ static void follow_law(supervisor_kept *k, const double *u, const double *y, con
 static void follow(supervisor_kept *k, const double *y, const double *applied, int samples, double *filled)
 {
     double u[INPUTS];
-    int counts[OUTPUTS], i, j, step;
+    int counts[OUTPUTS], begins = !k->samples, i, j, step;
+    for (j = 0; j < OUTPUTS; j++)
+        begins |= isnan(k->y[j]) && isfinite(y[j]) && y[j] >= supervisor_coldest[j] && y[j] <= supervisor_hottest[j];
     for (i = 0; i < INPUTS; i++)
         u[i] = cut(applied && isfinite(applied[i]) ? applied[i] : k->asked[i], supervisor_low[i],
                    supervisor_high[i]);
     read_sensors(k, y, counts);
-    if (!k->samples) {
-        for (j = 0; j < OUTPUTS; j++)
-            filled[j] = counts[j] ? y[j] : supervisor_d[j];
-        memcpy(k->x, supervisor_start_0, sizeof k->x);
-        add_product(k->x, supervisor_start[0], filled, WATCH, OUTPUTS);
-    }
     for (step = 0; k->samples && step < (samples > 1 ? samples : 1); step++) {
         advance(k, u);
         if (!samples)
@@ -447,6 +500,10 @@ static void follow(supervisor_kept *k, const double *y, const double *applied, i
         else if (step)
             memset(k->e, 0, sizeof k->e);
     }
+    for (j = 0; j < OUTPUTS; j++)
+        begins |= fabs(forecast(k->x, j)) > FAR_DEGC;
+    if (begins)
+        begin_anew(k);
     for (j = 0; j < OUTPUTS; j++) {
         k->expected[j] = forecast(k->x, j);
         filled[j] = counts[j] ? y[j] : k->expected[j];
@@ -477,7 +534,7 @@ static int find_mode(supervisor_kept *k)
             if (k->since[kind][signal] < 0)
                 continue;
             if (kind == HEATER_WEAK && k->amount[kind][signal] >= 0
-                && k->since[kind][signal] - k->cleared_s[supervisor_of_input[signal]] > CLEARED_S)
+                && k->last[kind][signal] - k->cleared_s[supervisor_of_input[signal]] > CLEARED_S)
                 k->amount[kind][signal] = -k->amount[kind][signal];
             if (kind < HEATER_WEAK || (kind == HEATER_WEAK && k->amount[kind][signal] < 0))
                 mode = MODE_OFF;

@@ -10,8 +10,8 @@ enum { LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS, EXPLANATIONS };
 /* A forecast that no reading corrects, and what readings missed of it (supervisor.Kept) */
 typedef struct {
     double state[2][WATCH], given[WATCH][INPUTS], unit[WATCH][INPUTS]; /* responses to inputs and one percent */
-    double before[INPUTS], began[OUTPUTS], first[OUTPUTS], least[OUTPUTS], most[OUTPUTS], total[2][OUTPUTS];
-    double square[INPUTS], causes[INPUTS][EXPLANATIONS], cross[WINDOWS][INPUTS][EXPLANATIONS];
+    double before[PAIRS], began[OUTPUTS], first[OUTPUTS], least[OUTPUTS], most[OUTPUTS], total[2][OUTPUTS];
+    double square[PAIRS], causes[PAIRS][EXPLANATIONS], cross[WINDOWS][PAIRS][EXPLANATIONS];
     int age, away[OUTPUTS];
 } forecast_window;
 
@@ -22,6 +22,6 @@ typedef struct {
     double y[OUTPUTS], quantum[OUTPUTS], cleared_s[OUTPUTS], returned_s[OUTPUTS];
     forecast_window window[WINDOWS];
     double asked[INPUTS], usual[INPUTS], stirred[INPUTS], clock_s[2];
-    int repeats[OUTPUTS], bad[OUTPUTS], returns[OUTPUTS], shown[2][INPUTS];
+    int repeats[OUTPUTS], bad[OUTPUTS], returns[OUTPUTS], shown[2][INPUTS], missing[INPUTS];
     int samples, mode, clocked, insane, active; /* active: causes that are there */
 } supervisor_kept;
