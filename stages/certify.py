@@ -19,7 +19,7 @@ from pipeline.store import artifacts, params
 from pipeline.store.params import Section
 from pipeline.temperature import tables
 from pipeline.temperature.settings import Plant
-from stages.evaluate_temperature import EvaluationInputs, load_problem
+from stages.evaluate_temperature import EvaluationInputs, load_problem, wire
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from pipeline.temperature.plant import Plant as PlantModel
 
 RECORD = "datasets/ingest/record.parquet"
-FALLBACK = "pi_simc"  # the safe mode "own"; if the machine allows none, the heaters go off
 # the conditions that a certificate names
 DISTURBED = (
     "Made with {names} at their mean: what they did to the temperatures was learned and taken off the "
@@ -145,34 +144,18 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     return Common(machine, record, rules, models, rng, plants, recorded, conditions)
 
 
-def wire(declared: Plant) -> Machine:
-    """Section `plant` as a controller knows it."""
-    from pipeline.runtime.signals import Machine, Signal
-    from pipeline.temperature.test_set import cases
-
-    low, high = cases.output_limits(declared)
-    return Machine(
-        tuple(Signal(one.name, one.unit, one.low, one.high) for one in declared.inputs),
-        tuple(
-            Signal(one.name, one.unit, float(least), float(most))
-            for one, least, most in zip(declared.outputs, low, high, strict=True)
-        ),
-        declared.sample_time_s,
-    )
-
-
 def certify_controller(
     folder: Path, name: str, designs: dict[str, Design], loaded: EvaluationInputs, common: Common
 ) -> tuple[str, dict[str, Any]]:
     """Measures one controller and writes its folder; its name, and what certified.json says of it."""
-    from pipeline.runtime import assembly, certified, certify, checks, machine, support, support_logs
+    from pipeline.runtime import assembly, bands, certified, certify, checks, machine, support, support_logs
     from pipeline.runtime.export import c, python, vectors
     from pipeline.runtime.support_file import write_support
     from pipeline.temperature.controllers.table import BY_NAME
 
     setting, problem, half = loaded.setting, loaded.problem, loaded.setting.rehearsal.judging
-    design, fallback, family = designs[name], designs.get(FALLBACK), problem.family
-    route = assembly.gain_route(problem, BY_NAME[name].learned_from, loaded.weights.get(name, {}))
+    design, fallback, family = designs[name], assembly.own_control(designs), problem.family
+    route = bands.gain_route(problem, BY_NAME[name].learned_from, loaded.weights.get(name, {}))
     try:
         made = assembly.assemble(
             name, design, fallback, common.machine, setting, family, simulated=loaded.simulated

@@ -4,7 +4,6 @@ trajectories.parquet, and its figures as figures.json and summary.json."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -18,7 +17,8 @@ from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights, r
 from stages.tune_weights import load_design_problem
 
 if TYPE_CHECKING:
-    from pipeline.temperature.controllers.problem import DesignProblem
+    from pipeline.runtime.signals import Machine
+    from pipeline.temperature.controllers.problem import Design, DesignProblem
     from pipeline.temperature.test_set.cases import CaseConditions
     from pipeline.temperature.test_set.evaluation import ControllerOutcome
 
@@ -65,6 +65,22 @@ def read_weights(path: str | Path) -> Weights:
         raise ValueError(f"{path}: {place}: {first['msg']}; {artifacts.remedy(path)}") from None
 
 
+def wire(declared: Plant) -> Machine:
+    """Section `plant` as a controller knows it."""
+    from pipeline.runtime.signals import Machine, Signal
+    from pipeline.temperature.test_set import cases
+
+    low, high = cases.output_limits(declared)
+    return Machine(
+        tuple(Signal(one.name, one.unit, one.low, one.high) for one in declared.inputs),
+        tuple(
+            Signal(one.name, one.unit, float(least), float(most))
+            for one, least, most in zip(declared.outputs, low, high, strict=True)
+        ),
+        declared.sample_time_s,
+    )
+
+
 class EvaluationInputs(NamedTuple):
     """What every controller is designed from and compared by: sections, the conditions of all cases, the
     problem, and the tuned parameters by controller."""
@@ -104,7 +120,7 @@ def compare(
     from pipeline.temperature.test_set import evaluation
 
     machine, setting = loaded.machine, loaded.setting
-    outcomes, refused = evaluate_all(loaded.problem, loaded.weights, setting, execution)
+    outcomes, supervised, refused = evaluate_all(loaded, execution)
     entrants = [name for name in outcomes if BY_NAME[name].role != "yardstick"]
     summary: dict[str, Any] = {
         **conditions(machine, loaded.panel, setting),
@@ -116,6 +132,7 @@ def compare(
                 seed=settings.seed,
                 resamples=settings.resamples,
             )
+            | {"supervised": supervised[name]}
             for name, outcome in outcomes.items()
         },
         "order": entrants,
@@ -133,24 +150,41 @@ def compare(
 
 
 def evaluate_all(
-    problem: DesignProblem,
-    weights: Mapping[str, Mapping[str, Any]],
-    setting: CaseConditions,
-    execution: Execution,
-) -> tuple[dict[str, ControllerOutcome], dict[str, str]]:
-    """The outcome of every controller on the judging half of the panel; by name why others are refused."""
+    loaded: EvaluationInputs, execution: Execution
+) -> tuple[dict[str, ControllerOutcome], dict[str, dict[str, Any] | None], dict[str, str]]:
+    """The outcome of every controller on the judging half of the panel, and what its supervisor found on
+    healthy machines, by name; and by name why others are refused."""
     from joblib import delayed
     from tqdm import tqdm
 
+    from pipeline.runtime.assembly import own_control
     from pipeline.store.execution import run_all
     from pipeline.temperature.controllers.table import design_controllers
+
+    designs, refused = design_controllers(loaded.problem, loaded.weights)
+    own = own_control(designs)
+    calls = [delayed(judge)(name, design, own, loaded) for name, design in designs.items()]
+    results = run_all(calls, execution)
+    found = list(tqdm(results, total=len(calls), desc="evaluate_temperature: controllers", mininterval=2))
+    outcomes, supervised = ({one[0]: one[part] for one in found} for part in (1, 2))
+    return {name: outcomes[name] for name in designs}, supervised, refused
+
+
+def judge(
+    name: str, design: Design, own: Design | None, loaded: EvaluationInputs
+) -> tuple[str, ControllerOutcome, dict[str, Any] | None]:
+    """One controller alone and under its supervisor, which the one that does nothing has none of."""
+    from pipeline.runtime import assembly, healthy
     from pipeline.temperature.test_set.evaluation import evaluate
 
-    designs, refused = design_controllers(problem, weights)
-    calls = [delayed(evaluate)(name, design, setting) for name, design in designs.items()]
-    results = run_all(calls, execution)
-    outcomes = dict(tqdm(results, total=len(calls), desc="evaluate_temperature: controllers", mininterval=2))
-    return {name: outcomes[name] for name in designs}, refused
+    setting = loaded.setting
+    _, outcome = evaluate(name, design, setting)
+    if design.holds:
+        return name, outcome, None
+    made = assembly.assemble(
+        name, design, own, wire(loaded.machine), setting, loaded.problem.family, simulated=loaded.simulated
+    )
+    return name, outcome, healthy.play(made, setting.rehearsal.judging)
 
 
 def redesign_excesses(names: list[str], loaded: EvaluationInputs) -> dict[str, float | None]:
@@ -208,6 +242,8 @@ METRICS = (
     "contestants.*.cost.q90",
     "contestants.*.never_settled_percent",
     "contestants.*.crossings.cases",
+    "contestants.*.supervised.left",
+    "contestants.*.supervised.cases",
     "contestants.*.margins",
     "contestants.*.stable.count",
 )

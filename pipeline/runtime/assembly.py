@@ -2,17 +2,29 @@
 for."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from pipeline.runtime import supervisor
-from pipeline.runtime.bands import GainRoute
 from pipeline.runtime.machine import Exported, plants_sha256
 from pipeline.runtime.signals import Machine
-from pipeline.temperature.controllers.problem import Design, DesignProblem
+from pipeline.temperature.controllers.problem import Design
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.test_set.cases import CaseConditions, deploy
+from pipeline.temperature.test_set.scorecard import closed_loop
+
+# what takes over if the law is left: the control that the machine has, or a PI in its place
+OWN_CONTROL = ("printer_pid", "pi", "pi_simc")
+
+
+def own_control(designs: Mapping[str, Design]) -> Design | None:
+    """The first of OWN_CONTROL that holds its model stable; without one the heaters go off."""
+    for name in OWN_CONTROL:
+        if name in designs:
+            loop = closed_loop(designs[name].model, designs[name].law)
+            if np.abs(np.linalg.eigvals(loop)).max() < 1:
+                return designs[name]
+    return None
 
 
 def assemble(
@@ -38,15 +50,3 @@ def assemble(
         plants_sha256(family[:1]),
         plants_sha256(family[1:]),
     )
-
-
-def gain_route(problem: DesignProblem, learned_from: str, values: Mapping[str, Any]) -> GainRoute | None:
-    """How the gains of a controller were learned from the record; None if they are those of a model. `values`
-    are its tuned parameters."""
-    if learned_from != "window" and learned_from != "kernel":
-        return None
-    learned = problem.window if learned_from == "window" else problem.kernel
-    if learned is None:
-        return None
-    effort = np.full(problem.plant.m, float(values["effort_weight"]))
-    return GainRoute(learned_from, learned.N, np.ones(problem.plant.p), effort, problem.gamma)

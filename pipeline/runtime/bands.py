@@ -7,8 +7,8 @@ is a plant that the record does not contradict. Blocks keep what is not white: d
 has.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -24,6 +24,7 @@ from pipeline.temperature.controllers.controller import (
     watched,
 )
 from pipeline.temperature.controllers.kernel import Tuples, regress, value_iteration, window_shift, windows
+from pipeline.temperature.controllers.problem import DesignProblem
 from pipeline.temperature.controllers.window import WindowModel, observer_form, predictor
 from pipeline.temperature.plant import Plant, hold_output, observability_matrix
 from pipeline.temperature.test_set.panel import padded
@@ -82,6 +83,18 @@ class GainRoute(NamedTuple):
     r: np.ndarray
     gamma: float
     gain_spread: float = 0.0
+
+
+def gain_route(problem: DesignProblem, learned_from: str, values: Mapping[str, Any]) -> GainRoute | None:
+    """How the gains of a controller were learned from the record; None if they are those of a model. `values`
+    are its tuned parameters."""
+    if learned_from != "window" and learned_from != "kernel":
+        return None
+    learned = problem.window if learned_from == "window" else problem.kernel
+    if learned is None:
+        return None
+    effort = np.full(problem.plant.m, float(values["effort_weight"]))
+    return GainRoute(learned_from, learned.N, np.ones(problem.plant.p), effort, problem.gamma)
 
 
 class Bands(NamedTuple):

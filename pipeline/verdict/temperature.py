@@ -71,12 +71,14 @@ def of_controller(figures: Figures, name: str, undeclared: Sequence[str] = ()) -
     """{key: figure} of one controller; `undeclared` are outputs without low and high."""
     own = entry(comparison(figures), "contestants", name)
     by_path = {key: row for key, row in rows(LOOP).items() if "." in row.figure}
-    if taken := [key for key in (*QUANTILES, "disk", "delay_s", "crossings", "data") if key in by_path]:
+    if taken := [
+        key for key in (*QUANTILES, "disk", "delay_s", "crossings", "supervisor", "data") if key in by_path
+    ]:
         raise ValueError(
             f"rules.toml: [{LOOP}.{taken[0]}] has the key of a figure of the page; give the row another key"
         )
     if own is None:
-        keys = (*QUANTILES, "disk", "delay_s", "crossings", *by_path)
+        keys = (*QUANTILES, "disk", "delay_s", "crossings", "supervisor", *by_path)
         return dict.fromkeys(keys, _without(figures, name)) | {"data": data(figures, name)}
     gap = Missing(OPEN, "This figure is not in the scorecard", REPEAT)
     return {
@@ -87,6 +89,7 @@ def of_controller(figures: Figures, name: str, undeclared: Sequence[str] = ()) -
             for key, row in by_path.items()
         },
         "crossings": crossings(own, undeclared),
+        "supervisor": false_stops(own),
         "data": data(figures, name),
     }
 
@@ -136,6 +139,17 @@ def crossings(figures: Any, undeclared: Sequence[str] = ()) -> Figure | Missing:
     if not isinstance(cases, int):
         return Missing(OPEN, "Crossings of the outputs’ limits are not in the scorecard", REPEAT)
     return count_of(float(cases))._replace(note=f"of {number(finite(of), 0)} cases")
+
+
+def false_stops(figures: Any) -> Figure | Missing:
+    """Cases on healthy machines in which the supervisor leaves the law."""
+    found = entry(figures, "supervised")
+    if isinstance(figures, Mapping) and "supervised" in figures and found is None:
+        return Missing("not applicable", "it has no supervisor")
+    left, of = (entry(found, key) for key in ("left", "cases"))
+    if not isinstance(left, int):
+        return Missing(OPEN, "What its supervisor does on healthy machines is not in the scorecard", REPEAT)
+    return count_of(float(left))._replace(note=f"of {number(finite(of), 0)} cases")
 
 
 # ---- the data

@@ -86,6 +86,7 @@ def contestant(cost=2.0, **changed):
         "cost": figure(cost, 0.9 * cost, 1.1 * cost),
         "rms": figure(4.0, 3.0, 5.0),
         "crossings": {"cases": 0, "of": CASES, "worst_degC": 0.0},
+        "supervised": {"cases": 16, "left": 0, "percent": 0.0, "why": "", "plant": None},
         "never_settled_percent": 0.0,
         "gap": {
             "median_percent": 0.1,

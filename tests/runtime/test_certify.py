@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipeline.runtime import assembly, certified, checks
+from pipeline.runtime import assembly, bands, certified, checks
 from pipeline.runtime import certify as measuring
 from pipeline.runtime.export import c
 from pipeline.runtime.machine import Exported, check
@@ -76,7 +76,7 @@ def test_only_learned_gains_have_bands():
     of = small()
 
     def route(name):
-        return assembly.gain_route(of.problem, BY_NAME[name].learned_from, of.weights.get(name, {}))
+        return bands.gain_route(of.problem, BY_NAME[name].learned_from, of.weights.get(name, {}))
 
     assert route("subspace_lqg") is None and route("pi_simc") is None
     assert route("varx_riccati").route == "window"

@@ -259,13 +259,13 @@ def judged_margins(sources: Sources) -> str:
         return ""
     # null is a margin without end
     disk, delay = (
-        ["unlimited" if one.get(of) is None else _figure(one[of], unit) for of in ("median", "worst")]
+        ["unlimited" if one.get(of) is None else _figure(one[of], unit) for of in ("q10", "worst")]
         for one, unit in zip(ends, ("", "s"), strict=True)
     )
     return (
         "These are the margins on the record: on the identified model, on its spread and on what the record "
         "leaves open. The rules ask for them on the 10 % plant. The temperature page has the margins on the "
-        f"test set, {plants} other plants: disk margin {disk[0]} of the median plant and {disk[1]} of the "
+        f"test set, {plants} other plants: disk margin {disk[0]} of the weakest tenth and {disk[1]} of the "
         f"worst, delay margin {delay[0]} and {delay[1]}."
     )
 

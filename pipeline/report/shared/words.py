@@ -19,6 +19,7 @@ INDEX = (
     "margin_disk",
     "margin_delay",
     "crossings",
+    "false_stops",
     "spread",
     "data",
     "drift",
@@ -42,6 +43,7 @@ ANSWERS = {
     "disk": "margin_disk",
     "delay_s": "margin_delay",
     "crossings": "crossings",
+    "supervisor": "false_stops",
     "cost": "cost",
     "data": "data",
 }
@@ -69,6 +71,11 @@ FIXED = {
     "crossings": (
         "Crossings",
         "Cases in which a true output leaves the range between low and high of plant.outputs.",
+    ),
+    "false_stops": (
+        "False stops",
+        "Each controller runs with its supervisor on eight healthy machines, through set-point changes, a "
+        "door, a fan and another room. Counted are the runs in which the supervisor leaves the law.",
     ),
     "cost": (
         "Cost as deployed",

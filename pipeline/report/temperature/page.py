@@ -22,6 +22,7 @@ WORDS = (
     "at_limits",
     "cost",
     "crossings",
+    "false_stops",
     "gap",
     "margin_disk",
     "margin_delay",

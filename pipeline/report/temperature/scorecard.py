@@ -33,6 +33,7 @@ ORDER = (
     "travel",
     "cost",
     "crossings",
+    "supervisor",
     "disk",
     "delay_s",
     "data",
@@ -97,7 +98,7 @@ def _row(
         _cell(sources, question, name, figure, best=not alike and getattr(figure, "value", None) == best)
         for name, figure in zip(names, figures, strict=True)
     ]
-    limit = "none" if question.key == "crossings" else ""
+    limit = "none" if question.key in ("crossings", "supervisor") else ""
     if not limit and math.isfinite(question.limit):
         sign = "≥" if question.at_least else "≤"
         limit = f"{sign} {with_unit(question.limit, question.unit, declared(question.limit))}"
@@ -128,7 +129,7 @@ def _cell(
     if lost and (text == "unstable" or question.key in ("disk", "delay_s")):
         text = f"unstable on {lost} of {of} plants"
     notes = [held if held == UNDECIDED else ""]
-    if question.key in ("crossings", "data"):
+    if question.key in ("crossings", "supervisor", "data"):
         notes.insert(0, figure.note.split(" samples")[0])
     else:
         notes = [banded(question, figure, places), *_beside(question, own, places), *notes]

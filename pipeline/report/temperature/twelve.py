@@ -39,7 +39,7 @@ def _row(question: Question, judged: Judgement, unmoved: str) -> dict[str, Any]:
         "word": words.explaining(question.key),
         "sub": SUB.get(question.key, ""),
         "cells": [_cell(question, name, figure, places) for name, figure in pair],
-        "limit": "none" if question.key == "crossings" else limit,
+        "limit": "none" if question.key in ("crossings", "supervisor") else limit,
         "state": mine,
         "strip": charts.strip(question, [(heading(name), page.MARKS.get(name, "bl"), f) for name, f in pair]),
         "change": move.text() if move else unmoved,
@@ -76,7 +76,9 @@ def _cell(question: Question, name: str, figure: Figure | Missing, places: int) 
     fraction = figure.note.split(" samples")[0].replace(" of ", " / ")
     return cell | {
         "value": worded(question, figure.value, places),
-        "band": fraction if question.key in ("data", "crossings") else banded(question, figure, places),
+        "band": fraction
+        if question.key in ("data", "crossings", "supervisor")
+        else banded(question, figure, places),
     }
 
 

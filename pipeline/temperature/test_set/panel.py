@@ -512,10 +512,10 @@ def figures(
 ) -> Figures:
     """Settled error: |mean of the last `settled` steps - r|. Peak: largest |y - r| of these steps. Settling
     and heating: the last step outside `band` °C of the target, for GLANCE steps at least, counted from each
-    new reference, the longest of them. Overshoot: past the target in the direction of the step. At limits: share of (input, step) wished
-    outside. Energy: mean input. Travel: mean |u(t+1) - u(t)|, of the input that moves most. Dip: largest
-    |y - r| of all steps. Crossing: how far y lies beyond low, high (p,). Outside: steps outside the band, an
-    edge of a fifth of it counted in part: smooth."""
+    new reference, the longest of them. Overshoot: past the target in the direction of the step. At limits:
+    share of (input, step) wished outside. Energy: mean input. Travel: mean |u(t+1) - u(t)|, of the input that
+    moves most. Dip: largest |y - r| of all steps. Crossing: how far y lies beyond low, high (p,). Outside:
+    steps outside the band, an edge of a fifth of it counted in part: smooth."""
     error = rollout.y - rollout.r
     late = np.abs(error[-settled:].mean(axis=0))
     off = rollout.y - rollout.target
@@ -559,7 +559,8 @@ def lasting(outside: np.ndarray) -> np.ndarray:
     if len(outside) < GLANCE:
         return outside
     long = np.lib.stride_tricks.sliding_window_view(outside, GLANCE, axis=0).all(axis=-1)
-    return np.stack([np.pad(long, ((k, GLANCE - 1 - k), (0, 0))) for k in range(GLANCE)]).any(axis=0)
+    runs = [np.pad(long, ((k, GLANCE - 1 - k), (0, 0))) for k in range(GLANCE)]
+    return np.any(runs, axis=0, keepdims=True)[0]
 
 
 class Allowance(NamedTuple):
