@@ -139,7 +139,7 @@ def compare(
         "refused": refused,
     }
     summary |= evaluation.decide(outcomes, entrants, summary, setting, settings.seed)
-    summary["redesign_excess_percent"] = redesign_excesses(entrants, loaded)
+    summary["redesigned"] = redesigns(entrants, loaded)
     typical = evaluation.typical_case(outcomes, entrants)
     drawn = {"typical": typical, "deciding": summary["deciding"]["case"]}
     return (
@@ -187,18 +187,19 @@ def judge(
     return name, outcome, healthy.play(made, setting.rehearsal.judging)
 
 
-def redesign_excesses(names: list[str], loaded: EvaluationInputs) -> dict[str, float | None]:
+def redesigns(names: list[str], loaded: EvaluationInputs) -> dict[str, dict[str, Any]]:
     """By controller that takes the identified plant, the extra cost in percent that the plant's bands leave
-    open; None if it is without bound."""
+    open, None if it is without bound, and of how many resamples of the record another controller comes."""
     from pipeline.temperature.controllers.table import BY_NAME
-    from pipeline.temperature.redesign import redesign_excess
+    from pipeline.temperature.redesign import redesigned
 
-    excesses = {}
+    found = {}
     for name in (name for name in names if BY_NAME[name].learned_from == "plant"):
         values = {one.name: loaded.weights[name][one.name] for one in BY_NAME[name].parameters}
-        excess = redesign_excess(name, loaded.problem, values, loaded.setting)
-        excesses[name] = 100.0 * excess if excess < float("inf") else None
-    return excesses
+        one = redesigned(name, loaded.problem, values, loaded.setting)
+        percent = 100.0 * one.excess if one.excess < float("inf") else None
+        found[name] = {"excess_percent": percent, "broken": one.broken, "of": one.of}
+    return found
 
 
 def conditions(machine: Plant, panel: Panel, setting: CaseConditions) -> dict[str, Any]:

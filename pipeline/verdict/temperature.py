@@ -12,6 +12,8 @@ from pipeline.verdict.rules import at_path, rows
 from pipeline.verdict.verdict import OPEN, Figure, Missing, count_of
 
 LOOP = "temperature"
+# of the engineering cost, which the spread of the judged plants moves by more
+ALLOWED_PERCENT = 10.0
 REPEAT = "Run ./run dvc repro evaluate_temperature"
 # figures of the scorecard that come as median and quantile
 QUANTILES = (
@@ -157,8 +159,9 @@ def false_stops(figures: Any) -> Figure | Missing:
 
 def data(figures: Figures, name: str) -> Figure | Missing:
     """Samples of the record over those that a controller needs. So many are needed that what its estimator
-    leaves open costs no more in closed loop than `learn_kernel.allowed_gap_percent`; extra cost falls as one
-    over the samples. Undecided if the identified plant is none to judge by."""
+    leaves open costs no more in closed loop than `learn_kernel.allowed_gap_percent` of the quadratic cost, or
+    ALLOWED_PERCENT of the engineering cost; extra cost falls as one over the samples. Undecided if the
+    identified plant is none to judge by."""
     learned, compared = figures.get("learn_kernel"), figures.get("evaluate_temperature")
     learned_from = BY_NAME[name].learned_from if name in BY_NAME else "plant"
     allowed = entry(learned, "allowed_gap_percent")
@@ -171,9 +174,9 @@ def data(figures: Figures, name: str) -> Figure | Missing:
     if learned_from == "window":
         return _of(learned, entry(learned, "samples"), entry(learned, "samples_needed_for_noise"))
     if learned_from == "plant":
-        model, excess = figures.get("identify_plant"), entry(compared, "redesign_excess_percent", name)
+        model, excess = figures.get("identify_plant"), entry(compared, "redesigned", name, "excess_percent")
         rows = entry(model, "rows")
-        return _no_plant(model) or _of(model, rows, _for_gap(rows, excess, allowed))
+        return _no_plant(model) or _of(model, rows, _for_gap(rows, excess, ALLOWED_PERCENT))
     if name in BY_NAME and BY_NAME[name].kind in ("model-based", "data-driven"):
         return Missing(OPEN, f"the row of {heading(name)} in controllers/table.py has no learned_from")
     return Missing("not applicable", f"{heading(name)} learns nothing from the record")

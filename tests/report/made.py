@@ -120,7 +120,9 @@ def comparison():
         "band_degC": 1.0,
         "contestants": held,
         "order": list(CONTESTANTS),
-        "redesign_excess_percent": {"pi_simc": 0.05, "pi": 0.05, "subspace_lqg": 0.05},
+        "redesigned": {
+            name: {"excess_percent": 0.5, "broken": 0, "of": 7} for name in ("pi_simc", "pi", "subspace_lqg")
+        },
         "best": "subspace_lqg",
         "best_reason": {"against": "pi", "p": 0.01, "difference": 40.0},
         "pair": {

@@ -17,7 +17,7 @@ from pipeline.temperature.controllers.kernel import regress
 from pipeline.temperature.controllers.problem import DesignProblem
 from pipeline.temperature.controllers.table import BY_NAME, CONTROLLERS, PAIR
 from pipeline.temperature.plant import baam
-from pipeline.temperature.redesign import redesign_excess
+from pipeline.temperature.redesign import redesigned
 from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights
 from pipeline.temperature.study import data_sets
 from pipeline.temperature.test_set import (
@@ -486,14 +486,23 @@ def test_a_reference_that_the_declared_machine_cannot_hold_is_named_with_what_bi
 
 
 def test_what_the_bands_of_a_plant_leave_open_of_a_loop_grows_with_the_bands(given):
-    def excess(spread: float) -> float:
+    def found(spread: float):
         gains = 1 + spread * np.random.default_rng(3).standard_normal(6)
         one = given.problem.plant
         family = [one, *(one._replace(B=gain * one.B) for gain in gains)]
         weights = given.weights["subspace_lqg"]
         problem = given.problem._replace(family=family)
-        return redesign_excess("subspace_lqg", problem, weights, given.setting)
+        return redesigned("subspace_lqg", problem, weights, given.setting)
 
-    small, large = excess(0.02), excess(0.3)
-    assert excess(0.0) == 0
-    assert small < 0.01 < large
+    small, large = found(0.02), found(0.3)
+    assert found(0.0) == (0.0, 0, 6)
+    assert small.excess < 0.01 < large.excess and small.broken == 0
+
+
+def test_a_resample_of_the_record_that_gives_another_controller_is_counted(given):
+    """Of three plants that the record cannot tell apart one has its first two heaters exchanged."""
+    one = given.problem.plant
+    exchanged = one._replace(B=one.B[:, [1, 0, 2, 3, 4, 5, 6]])
+    problem = given.problem._replace(family=[one, one, exchanged, one])
+    found = redesigned("pi", problem, {"gain_factor": 1.0, "reset_factor": 1.0}, given.setting)
+    assert (found.broken, found.of) == (1, 3) and found.excess == 0

@@ -25,7 +25,7 @@ def test_the_samples_of_a_window_are_not_charged_to_a_controller_without_one(fig
 
 
 def test_a_controller_needs_the_samples_at_which_its_extra_cost_is_allowed(figures):
-    figures["evaluate_temperature"]["redesign_excess_percent"]["pi"] = 2.0
+    figures["evaluate_temperature"]["redesigned"]["pi"]["excess_percent"] = 20.0
     assert data(figures, "pi").note == "380 of 760 samples; record 380 more"
     assert data(figures, "subspace_lqg").value > 1
     figures["learn_kernel"]["candidates"] = {"predicted state": {"gap_on_window_model_percent": 3.0}}

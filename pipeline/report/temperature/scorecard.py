@@ -56,7 +56,10 @@ def scorecard(sources: Sources, judgement: Judgement, words: Mapping[str, str]) 
         "heads": [{"mark": name, "name": heading(name), "kind": kind(name)} for name in judged],
         "rows": rows,
         "caption": _caption(sources),
-        "below": [*filter(None, [_gap(compared, judged), _at_bound(compared, judged)]), *_refused(sources)],
+        "below": [
+            *filter(None, [_gap(compared, judged), _at_bound(compared, judged), _broken(compared, judged)]),
+            *_refused(sources),
+        ],
     }
 
 
@@ -217,6 +220,22 @@ def _at_bound(compared: Mapping[str, Any], names: list[str]) -> str:
     ]
     return (
         f"At a bound of the search, so that a wider one may be better: {'; '.join(parts)}." if parts else ""
+    )
+
+
+def _broken(compared: Mapping[str, Any], names: list[str]) -> str:
+    """Controllers that another record like this one would have made otherwise."""
+    found = {name: entry(compared, "redesigned", name) or {} for name in names}
+    parts = [
+        f"{in_a_sentence(name)} from {one['broken']} of {one['of']}"
+        for name, one in found.items()
+        if one.get("broken")
+    ]
+    return (
+        "Designed anew from resamples of this record, a controller may cost more than twice as much: "
+        f"{'; '.join(parts)}. Record longer to settle it."
+        if parts
+        else ""
     )
 
 
