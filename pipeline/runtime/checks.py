@@ -37,18 +37,19 @@ def commands(
     `outputs` (steps, p) under inputs `applied` (steps, m). The law remembers those, not its own commands: an
     output limiter at work makes a difference of rounding grow sample by sample until it is as large as the
     limits."""
-    running, noise = RunningController(made.controller, made.model), panel.noise_of(cases)[:, case]
-    plant, u = cases.plants[cases.plant[case]], cases.u0[case]
-    held, first = plant.C @ cases.x0[case] + plant.d, cases.references[cases.asked[case, 0]]
-    for t in range(cases.hold):
-        running.watch(u, held + noise[t], first.H @ first.w0)
-    running.hand_over(held + noise[cases.hold], at=cases.starts[cases.start[case]])
+    running, held = RunningController(made.controller, made.model), panel.held_readings(cases)[:, case]
+    u, first = cases.u0[case], cases.references[cases.asked[case, 0]]
+    noise, step_degC = panel.noise_of(cases)[cases.hold :, case], cases.structure[cases.plant[case], 3]
+    measured = panel.in_steps(outputs + noise, step_degC)
+    for reading in held[:-1]:
+        running.watch(u, reading, first.H @ first.w0)
+    running.hand_over(held[-1], at=cases.starts[cases.start[case]])
     given = np.empty((cases.steps, len(u)))
     for t in range(cases.steps):
         number = cases.asked[case, np.flatnonzero(cases.begin[case] <= t)[-1]]
         reference = cases.references[number]
         r = reference if len(reference.w0) > 1 else reference.H[:, 0]
-        given[t] = running.step(outputs[t] + noise[cases.hold + t], r, t, applied[t])
+        given[t] = running.step(measured[t], r, t, applied[t])
     return given
 
 

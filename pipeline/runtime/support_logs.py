@@ -23,12 +23,11 @@ def forecasting_plants(
 def honest_logs(made: Exported, half: panel.Cases, limits: ActuatorLimits) -> list[GaplessLog]:
     """Logs of cases of the judging half under the controller as deployed, from the hold on."""
     aims = panel.aims(made.controller.law, panel.rests(made.model, half, limits), half)
-    run, noise = panel.rolled_out(made.controller, half, aims), panel.noise_of(half)[: half.hold]
+    run, held = panel.rolled_out(made.controller, half, aims), panel.held_readings(half)[:-1]
     logs = []
     for case in np.unique(np.linspace(0, len(half.plant) - 1, HONEST_LOGS).astype(int)):
-        plant, still = half.plants[half.plant[case]], np.ones((half.hold, 1))
-        held = plant.C @ half.x0[case] + plant.d + noise[:, case]
-        parts = (still * half.u0[case], run.u[:, case]), (held, run.measured[:, case]), (
+        still = np.ones((half.hold, 1))
+        parts = (still * half.u0[case], run.u[:, case]), (held[:, case], run.measured[:, case]), (
             still * run.r[0, case], run.r[:, case],
         )  # fmt: skip
         logs.append(GaplessLog(*(np.concatenate(part) for part in parts)))
