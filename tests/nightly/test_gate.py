@@ -135,7 +135,7 @@ def margin(key, least):
 
     at = [(PASSED, 2.0 * least), (PASSED, least), (FAILED, np.nextafter(least, 0)), (FAILED, 0.0)]
     return [
-        *((state, to({"median": value, "worst": 0.5 * value})) for state, value in at),
+        *((state, to({"q10": value, "worst": 0.5 * value})) for state, value in at),
         (OPEN, lambda stages: [one["margins"].pop(key, None) for one in contestants(stages)]),
     ]
 
@@ -153,6 +153,7 @@ def drift(key):
 def temperature(rules: ReportRules):
     return [
         banded("settled_error", rules.settled_error_degC),
+        banded("peak", rules.peak_error_degC),
         banded("settling", 60.0),
         banded("overshoot", rules.overshoot_degC),
         banded("at_limits", rules.at_limits_percent),

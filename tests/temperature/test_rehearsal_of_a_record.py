@@ -53,9 +53,10 @@ def shared(family, judged: cases.Rehearsal) -> cases.CaseConditions:
 
 
 def test_no_plant_starts_where_its_inputs_could_not_hold_it(family):
-    """In a warm room 10 % of the recorded range lies below the ambient: such a plant starts at rest."""
+    """But for the coldest reading of the record, which a machine that is switched on need not be held at."""
     judged = rehearsal(family).judging
-    assert judged.u0.min() >= 0 and judged.u0.max() <= 100
+    held = judged.start > 0
+    assert judged.u0[held].min() >= 0 and judged.u0[held].max() <= 100
     for k, plant in enumerate(judged.plants):
         rows = judged.plant == k
         after = judged.x0[rows] @ plant.A.T + judged.u0[rows] @ plant.B.T + plant.b
