@@ -5,8 +5,8 @@ An observer of the model follows the machine. Every few samples a forecast start
 corrects (a window). As long as a window lasts, readings are held against it:
 
 * A sensor stands still if the forecast moves by three of its steps, or four deviations of its noise, and the
-  reading does not move with it, with its noise on top or without. If readings are all equal, the forecast
-  need not be surer than that.
+  reading does not move with it, with its noise on top or without. If readings in steps finer than their
+  noise are all equal, the forecast need not be surer than that.
 * What readings r miss of the forecast is explained by one cause that began when one of the windows did, by
   least squares:
 
@@ -416,13 +416,6 @@ def threshold(s: Supervision, k: Kept) -> np.ndarray:
     return np.maximum(least, NOISE_STILL * unsure * s.coarser(k.quantum))
 
 
-def least_unequal(s: Supervision, k: Kept) -> np.ndarray:
-    """By how many degC (p,) a forecast must move before readings that are all equal show a sensor that stands
-    still: farther for steps above the noise, in which a healthy one repeats itself."""
-    step = known_steps(k.quantum)
-    return np.maximum(STEPS_STILL * step, NOISE_STILL * s.noise_degC) * np.maximum(1.0, step / s.noise_degC)
-
-
 def both_ahead(s: Supervision, k: Kept, y: np.ndarray) -> np.ndarray:
     """By how many degC (K, p) both forecasts, from the drift as it was and from its mean, are above y (p,) or
     (K, p), or below it if negative; 0 if y lies between them."""
@@ -449,7 +442,9 @@ def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     old, moves = counts & (age >= FIT_AFTER), both_ahead(s, k, k.began)
     least = np.maximum(threshold(s, k), DOUBT * np.abs(s.C @ k.unit) @ k.stirred)
     tells = old & (np.abs(y - k.states[1] @ s.C.T - s.d) >= least)
-    equal = old & (k.repeats >= age) & (np.abs(moves) >= least_unequal(s, k))
+    # a healthy sensor repeats itself for long only if its steps are coarser than its noise
+    equal = old & (k.repeats >= age) & (known_steps(k.quantum) <= s.noise_degC)
+    equal &= np.abs(moves) >= NOISE_STILL * s.noise_degC
     still = (k.away >= STILL_AFTER) & (np.abs(moves) >= least) & counts | equal
     if not (tells.any() or still.any()):
         k.shown[:] = 0

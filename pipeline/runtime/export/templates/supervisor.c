@@ -250,14 +250,6 @@ static double noise_of(const supervisor_kept *k, int w, int j)
     return ((age < 1 ? 1 : age) * (deviation * deviation) + wander) * (coarser(k, j) * coarser(k, j));
 }
 
-/* By how many degC a forecast must move before readings that are all equal show a sensor that stands still:
- * farther for steps above the noise, in which a healthy one repeats itself */
-static double least_unequal(const supervisor_kept *k, int j)
-{
-    double step = steps_of(k, j), noise = supervisor_noise[j];
-    return largest(STEPS_STILL * step, NOISE_STILL * noise) * largest(1.0, step / noise);
-}
-
 /* By how many degC both forecasts of a window, from the drift as it was and from its mean, are above y, or below
  * it if negative; 0 if y lies between them */
 static double both_ahead(const forecast_window *one, int j, double y)
@@ -286,8 +278,10 @@ static void clear_sensors(supervisor_kept *k, const int *counts, double moves[WI
             move = fabs(moves[w][j]);
             still[w][j] = counts[j]
                           && ((one->away[j] >= STILL_AFTER && move >= largest(least, doubt_of(k, w, j)))
+                              /* a healthy sensor repeats itself for long only if its steps are coarser than noise */
                               || (one->age >= FIT_AFTER && k->repeats[j] >= one->age
-                                  && move >= least_unequal(k, j)));
+                                  && steps_of(k, j) <= supervisor_noise[j]
+                                  && move >= NOISE_STILL * supervisor_noise[j]));
         }
 }
 
