@@ -5,7 +5,8 @@ An observer of the model follows the machine. Every few samples a forecast start
 corrects (a window). As long as a window lasts, readings are held against it:
 
 * A sensor stands still if the forecast moves by three of its steps, or four deviations of its noise, and the
-  reading does not move with it, with its noise on top or without.
+  reading does not move with it, with its noise on top or without. If readings in steps finer than their
+  noise are all equal, the forecast need not be surer than that.
 * What readings r miss of the forecast is explained by one cause that began when one of the windows did, by
   least squares:
 
@@ -17,6 +18,9 @@ corrects (a window). As long as a window lasts, readings are held against it:
 
   with g the response to the input since then, g' that a sample ago, U that to one percent. A heater is
   at fault if that explains the readings clearly better than what is no fault.
+* A window has two forecasts, from the drift as it was when it began and from its mean. Slow masses, such as
+  the walls of a chamber, move the machine between the two. A sensor stands still only if both move the same
+  way. A heater is stuck on only if the readings rise above both.
 * The drift follows any slow loss of heat. A sensor that drifts, or sticks with noise just below its
   reference, looks like such a loss. So the drift has a bound that does not adapt: if more heat is missing
   than a fan or filament takes, for longer than a door is open, and the readings do not rise, then the heater
@@ -61,7 +65,7 @@ CLEARED_S = 60.0  # for how long it is cleared then
 # surroundings as a share of the input's range; samples late; a heater that differs from the model by a share;
 # a step of the reading in degC
 LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS = range(6)
-LEAST = np.array([0.35, 0.4, -0.3, -8.0, -0.25, -1e3])
+LEAST = np.array([0.35, 0.6, -0.3, -8.0, -0.25, -1e3])
 MOST = np.array([1.3, 1.5, 0.3, 8.0, 0.25, 1e3])
 MORE_THAN_ALL = 1.05  # of its command: no heater lacks so much, and its sensor is in doubt
 CLEARER = 16.0  # of -2 log likelihood, by which a fault must explain better than what is none
@@ -163,7 +167,6 @@ def supervision(
     for age in range(len(unsure)):
         unsure[age] = np.sqrt(np.maximum(np.diag(C @ spread @ C.T), 0.0))
         spread = A @ spread @ A.T
-    T = machine.sample_time_s
     return Supervision(
         A=A,
         B=np.vstack([plant.B, np.zeros((p, m))]),
@@ -185,10 +188,10 @@ def supervision(
         of_input=np.r_[of_input, others],
         input_of=np.r_[np.arange(m), pulses[others].argmax(axis=1)],
         heat=lost / span[:, None],
-        missing_for=max(MISSING_FOR, int(np.ceil(DOOR_S / T))),
-        sample_time_s=T,
+        missing_for=max(MISSING_FOR, int(np.ceil(DOOR_S / machine.sample_time_s))),
+        sample_time_s=machine.sample_time_s,
         reach_degC=max(0.5, 3 * float(noise.max())),
-        back_s=max(30 * T, 10.0),
+        back_s=max(30 * machine.sample_time_s, 10.0),
     )
 
 
@@ -397,8 +400,7 @@ def compare(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     given, unit = ((s.C @ part)[:, own, inputs] for part in (k.given, k.unit))
     span = (s.high - s.low)[inputs]
     step = np.where(runs, 1.0, 0.0) * np.ones_like(given)
-    parts = [-given, span * unit - given, span * unit, k.before - given, -given, step]
-    signatures = np.stack(parts, axis=2)
+    signatures = np.stack([-given, span * unit - given, span * unit, k.before - given, -given, step], axis=2)
     moved = np.where(counts, y - k.began, 0.0)
     k.total[...] += moved, moved * moved
     k.before[:] = given
@@ -414,28 +416,36 @@ def threshold(s: Supervision, k: Kept) -> np.ndarray:
     return np.maximum(least, NOISE_STILL * unsure * s.coarser(k.quantum))
 
 
-def clear_sensors(s: Supervision, k: Kept, doubt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Clears sensors that move as forecast. By how many degC (K, p) each forecast has moved, and whether that
-    is more than its doubt (K, p)."""
+def both_ahead(s: Supervision, k: Kept, y: np.ndarray) -> np.ndarray:
+    """By how many degC (K, p) both forecasts, from the drift as it was and from its mean, are above y (p,) or
+    (K, p), or below it if negative; 0 if y lies between them."""
+    first, second = k.states @ s.C.T + s.d - y
+    return np.where(first * second > 0, np.where(np.abs(first) < np.abs(second), first, second), 0.0)
+
+
+def clear_sensors(s: Supervision, k: Kept) -> None:
+    """Clears sensors that move as forecast, and counts the samples for which each forecast was away."""
     moves, moved = k.states[0] @ s.C.T + s.d - k.began, k.y - k.first
     large = (np.abs(moves) >= threshold(s, k)) & (k.age > 0)[:, None]
     share = moved / np.where(large, moves, 1.0)
     follows = large & (share >= FOLLOWS[0]) & (share <= FOLLOWS[1])
     k.cleared_s[:] = np.where(follows.any(axis=0) & (k.bad == 0), k.clock_s[1], k.cleared_s)
     k.away[:] = np.where(large, k.away + 1, 0)
-    return moves, large & (np.abs(moves) >= doubt)
 
 
 def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     """Says which sensors stand still while the forecast moves, and which heater heats otherwise than it was
     told: what explains clearly better than anything that is no fault."""
     judge_heat(s, k, y, counts)
-    doubt = DOUBT * np.abs(s.C @ k.unit) @ k.stirred
-    moves, large = clear_sensors(s, k, doubt)
+    clear_sensors(s, k)
     own, age, m = s.of_input, np.maximum(k.age, 1)[:, None], len(s.low)
-    missed = np.abs(y - k.states[1] @ s.C.T - s.d)
-    tells = (k.age >= FIT_AFTER)[:, None] & counts & (missed >= np.maximum(threshold(s, k), doubt))
-    still = (k.away >= STILL_AFTER) & large & counts
+    old, moves = counts & (age >= FIT_AFTER), both_ahead(s, k, k.began)
+    least = np.maximum(threshold(s, k), DOUBT * np.abs(s.C @ k.unit) @ k.stirred)
+    tells = old & (np.abs(y - k.states[1] @ s.C.T - s.d) >= least)
+    # a healthy sensor repeats itself for long only if its steps are coarser than its noise
+    equal = old & (k.repeats >= age) & (known_steps(k.quantum) <= s.noise_degC)
+    equal &= np.abs(moves) >= NOISE_STILL * s.noise_degC
+    still = (k.away >= STILL_AFTER) & (np.abs(moves) >= least) & counts | equal
     if not (tells.any() or still.any()):
         k.shown[:] = 0
         return
@@ -447,34 +457,29 @@ def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     later = (k.age[None, :] <= k.age[:, None]) & (k.age >= REPEATED)[None, :]
     left = np.where(later[:, :, None, None], np.maximum(left, floor[:, None, :, None]), 1e300)
     honest = np.minimum(left[..., HEAT:].min(axis=(1, 3)), np.maximum(k.square, floor))
-    same = unmoved(s, k)
+    same = k.most - k.least <= same_degC(s, k)
+    # a heater that is stuck on heats, and by more than the drift of either forecast
+    heats = (y - k.least > same_degC(s, k)) & (-both_ahead(s, k, y) >= least)
     judge_sensors(s, k, moves, still & same, honest, noise)
     left, honest, floor = left[:, :, :m], honest[:, :m], floor[:, :m]
     explained = left[..., :HEAT].min(axis=1)
     best = explained.min(axis=2)
-    clear = (
-        (age * np.log(honest / best) >= CLEARER) & tells[:, own[:m]] & (best <= 2 * floor) & (best < 1e300)
-    )
     gives = explained[..., GIVES] < explained[..., LACKS]
+    tells = tells[:, own[:m]] & (heats[:, own[:m]] | ~gives)
+    clear = (age * np.log(honest / best) >= CLEARER) & tells & (best <= 2 * floor) & (best < 1e300)
     shows = np.stack([(clear & gives).any(axis=0), (clear & ~gives).any(axis=0)])
     k.shown[:] = np.where(shows, k.shown + 1, 0)
     shown = clear & (k.shown.max(axis=0) >= SHOWN)
     if shown.any():
         window, i = np.unravel_index(np.where(shown, k.square[:, :m], -1.0).argmax(), shown.shape)
         cause = GIVES if gives[window, i] else LACKS
-        onset = int(left[window, :, i, cause].argmin())
-        share = float(amount[window, onset, i, cause])
+        share = float(amount[window, left[window, :, i, cause].argmin(), i, cause])
         if same[window, own[i]]:
             say_still(k, int(own[i]), moves[window, own[i]])
         elif cause == GIVES:
             say(k, ON, int(i), share)
         else:
-            say_weak(k, int(i), share)
-
-
-def say_weak(k: Kept, i: int, share: float) -> None:
-    """A heater lacks a share of what it is told; the sensor is in doubt if that is more than all."""
-    say(k, WEAK, i, -share if share > MORE_THAN_ALL else share)
+            say(k, WEAK, int(i), -share if share > MORE_THAN_ALL else share)
 
 
 def judge_heat(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
@@ -487,17 +492,12 @@ def judge_heat(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> No
     least = np.where(k.asked >= s.high, AT_LIMIT, MISSING)
     k.missing[:] = np.where(counts[own] & ~rises[own] & (lost >= least), k.missing + 1, 0)
     for i in np.flatnonzero(k.missing >= s.missing_for):
-        say_weak(k, int(i), lost[i] / max((k.usual[i] - s.low[i]) / span[i], lost[i]))
+        say(k, WEAK, int(i), lost[i] / max((k.usual[i] - s.low[i]) / span[i], lost[i]))
 
 
 def say_still(k: Kept, j: int, moves_degC: float) -> None:
     """An output stands still, or shows noise alone, while its forecast moves: its sensor, or its heater."""
     say(k, STILL if k.repeats[j] >= STILL_AFTER // 2 else DEAF, j, moves_degC)
-
-
-def unmoved(s: Supervision, k: Kept) -> np.ndarray:
-    """Whether readings (K, p) have stood still since each window began, but for noise."""
-    return k.most - k.least <= same_degC(s, k)
 
 
 def same_degC(s: Supervision, k: Kept) -> np.ndarray:
@@ -519,8 +519,7 @@ def judge_sensors(
         floor = noise[:, j] + MISFIT**2 * square + 1e-12
         better = age[:, 0] * np.log(honest[:, heaters].min(axis=1) / np.maximum(steady, floor))
         # what moves a heater is a reading that moved: nothing honest keeps one equal meanwhile
-        equal = k.repeats[j] >= age[:, 0]
-        clear = still[:, j] & ((better >= CLEARER) | equal)
+        clear = still[:, j] & ((better >= CLEARER) | (k.repeats[j] >= age[:, 0]))
         if clear.any():
             window = int(np.where(clear, np.abs(moves[:, j]), -1.0).argmax())
             say_still(k, int(j), moves[window, j])
@@ -539,8 +538,7 @@ def forget(s: Supervision, k: Kept) -> None:
             rested = k.clock_s[1] - k.returned_s[j] > 3600.0
             heated = kind == WEAK and k.amount[WEAK, signal] >= 0  # under the machine's own control
             over = gone[kind, signal] if heated else k.cleared_s[j] > k.last[kind, signal]
-            again = bool(over) and (rested or k.returns[j] < RETURNS)
-            gone[kind, signal] = again
+            again = gone[kind, signal] = bool(over) and (rested or k.returns[j] < RETURNS)
             if again:
                 k.returns[j] = 1 if rested else k.returns[j] + 1
                 k.returned_s[j] = k.clock_s[1]

@@ -1,8 +1,6 @@
 /* An exported controller on a heated machine: normal life, and one fault in it. */
-#include "controller.h"
+#include "controller.c" /* whole: what a fault's model predicts is told by the tables and functions in it */
 #include "thermal_machine.h"
-
-#include <math.h>
 
 enum {
     FAULT_NO_FAULT, FAULT_SENSOR_OPEN, FAULT_SENSOR_RANGE, FAULT_SENSOR_STILL, FAULT_SENSOR_STILL_NOISY, FAULT_HEATER_ON, FAULT_HEATER_HALF, FAULT_HEATER_OFF,
@@ -26,12 +24,45 @@ static double rough(unsigned *x)
     return sum;
 }
 
+/* The controller's model free of readings, from its state at sample `began` */
+typedef struct {
+    double state[WATCH], from[OUTPUTS];
+} life_model;
+
+static void begin_model(life_model *model, const supervisor_kept *k)
+{
+    int j;
+    memcpy(model->state, k->x, sizeof model->state);
+    add_product(model->state, supervisor_M[0], k->e, WATCH, OUTPUTS);
+    for (j = 0; j < OUTPUTS; j++)
+        model->from[j] = forecast(model->state, j);
+}
+
+static void advance_model(life_model *model, const double *u)
+{
+    double on[WATCH];
+    memcpy(on, supervisor_b, sizeof on);
+    add_product(on, supervisor_B[0], u, WATCH, INPUTS);
+    move_state(model->state, on);
+}
+
+/* What a forecast of `age` samples tells from doubt, in degC: its own threshold, with the sensor's true steps */
+static double sure_degC(const thermal_parts *p, int j, int age, double visible)
+{
+    double coarse = largest(1.0, p->step[j] / sqrt(12.0) / supervisor_noise[j]);
+    int last = age < WINDOWS * SPACING ? age : WINDOWS * SPACING;
+    return largest(visible, NOISE_STILL * supervisor_unsure[last][j] * coarse);
+}
+
 /* `steps` samples under set-points r (steps, OUTPUTS) and what acts from outside (steps, OUTSIDE): `cold` of them in
  * manual with the heaters off, then under the controller. `patience` samples after it left the law a person
  * acknowledges; 0: nobody comes. A fault of `kind` on `signal` begins at the first sample from `earliest` on at
- * which the law drives; nobody acknowledges from then on. It shows when the sensors of a healthy twin under the
- * same commands are `visible` degC (OUTPUTS) from the machine's. If a sensor lies, its twin is that of a model,
- * which foresees no fan and no door: outside the machine all stays as it was when the fault began.
+ * which the law drives; nobody acknowledges from then on. From where it shows:
+ * a sensor that stands still: the controller's own model, free of readings since the fault and fed the same
+ * commands, has moved by `visible` degC (OUTPUTS);
+ * a heater: the sensors of a healthy twin under the same commands are so far from the machine's, and farther than
+ * the supervisor doubts a forecast of that age;
+ * a sensor near its set-point, or that drifts: so far from the truth.
  *
  * Writes readings y, sensors before noise and steps, commands u, modes, the first cause's kind and signal (-1:
  * none), and whether a person acknowledged. Returns the result of the first call that did nothing, or 0. */
@@ -44,9 +75,11 @@ int normal_life(const thermal_parts *p, double degC, uint64_t seed, int steps, i
     beadline_machine machine = {BEADLINE_PLANT_SHA256, BEADLINE_INPUT_UNIT, BEADLINE_OUTPUT_UNIT,
                                 BEADLINE_SAMPLE_TIME_S, INPUTS, OUTPUTS};
     thermal_state s, twin;
+    life_model model;
     beadline_decision d;
     double frozen = 0.0, acted[HEATERS], off[INPUTS] = {0}, wish[OUTPUTS], unread[SENSORS];
     int heater = kind >= FAULT_HEATER_ON && kind <= FAULT_HEATER_OFF;
+    int still = kind == FAULT_SENSOR_STILL || kind == FAULT_SENSOR_STILL_NOISY;
     int k, j, left = 0, result = beadline_init(&c, &machine, 1), before = MODE_LAW;
     unsigned random = 12345u;
     fault->began = fault->shows = -1;
@@ -79,14 +112,18 @@ int normal_life(const thermal_parts *p, double degC, uint64_t seed, int steps, i
                 now[signal] -= beyond * (k - fault->began);
             if (kind == OUT_OF_REACH)
                 wish[signal] = beyond;
+            if (k > fault->began)
+                advance_model(&model, u + (k - 1) * INPUTS);
             if (fault->shows < 0) {
-                int open = kind <= FAULT_SENSOR_RANGE || kind == OUT_OF_REACH, lies = kind > OUT_OF_REACH;
+                int open = kind <= FAULT_SENSOR_RANGE || kind == OUT_OF_REACH;
                 double apart = open ? INFINITY : 0.0;
-                for (j = 0; j < OUTPUTS; j++)
-                    if (heater || j == signal)
-                        apart = fmax(apart, fabs((heater ? s.sensor[j] : lies ? now[j] : frozen)
-                                                 - (lies ? s.sensor[j] : twin.sensor[j]))
-                                                / visible[j]);
+                if (still && k > fault->began)
+                    apart = fabs(forecast(model.state, signal) - model.from[signal]) / visible[signal];
+                if (kind > OUT_OF_REACH)
+                    apart = fabs(now[signal] - s.sensor[signal]) / visible[signal];
+                for (j = 0; j < OUTPUTS && heater; j++)
+                    apart = fmax(apart, fabs(s.sensor[j] - twin.sensor[j])
+                                            / sure_degC(p, j, k - fault->began, visible[j]));
                 if (apart >= 1.0)
                     fault->shows = k;
             }
@@ -106,6 +143,8 @@ int normal_life(const thermal_parts *p, double degC, uint64_t seed, int steps, i
                 command[j] = d.u[j];
             modes[k] = (signed char)d.mode;
             before = d.mode;
+            if (k == fault->began)
+                begin_model(&model, &c.kept);
             if (d.mode != MODE_LAW && d.causes) {
                 causes[k] = (signed char)d.cause[0].kind;
                 signals[k] = (signed char)d.cause[0].signal;
@@ -124,7 +163,7 @@ int normal_life(const thermal_parts *p, double degC, uint64_t seed, int steps, i
             if (heater)
                 acted[signal] = of[kind - FAULT_HEATER_ON];
             thermal_read(&twin, p, unread); /* keeps its noise in step */
-            thermal_advance(&twin, p, command, outside + (heater ? k : fault->began) * OUTSIDE);
+            thermal_advance(&twin, p, command, outside + k * OUTSIDE);
         }
         thermal_advance(&s, p, acted, outside + k * OUTSIDE);
     }

@@ -163,9 +163,9 @@ class Life(NamedTuple):
 
 def build(folder: Path) -> ctypes.CDLL:
     """The exported C of a folder linked with the machine's."""
-    library, sources = folder / "life.so", [folder / "c/controller.c"]
-    sources += [HERE / "normal_life.c", HERE / "thermal_machine.c"]
-    if not library.exists() or library.stat().st_mtime < max(path.stat().st_mtime for path in sources):
+    library, sources = folder / "life.so", [HERE / "normal_life.c", HERE / "thermal_machine.c"]
+    read = [folder / "c/controller.c", *sources]
+    if not library.exists() or library.stat().st_mtime < max(path.stat().st_mtime for path in read):
         new = library.with_suffix(f".{os.getpid()}")
         command = [*thermal_machines.COMPILE, f"-I{folder / 'c'}", f"-I{HERE}", "-o", str(new)]
         subprocess.run([*command, *map(str, sources), "-lm"], check=True, timeout=300)

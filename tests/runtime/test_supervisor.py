@@ -116,6 +116,37 @@ def test_a_fan_and_a_door_are_no_faults(step):
     assert fan == door == {"law"}
 
 
+def swing(t: int) -> np.ndarray:
+    """References that move by 30 degC every 150 samples."""
+    return R + (20.0 if t // 150 % 2 else -10.0)
+
+
+def wall(run: Run, share: float, samples: float):
+    """What a wall takes from each zone: `share` of the distance to its own temperature, which follows in
+    `samples`."""
+    behind = [run.true()]
+
+    def taken(t):
+        behind[0] = behind[0] + (run.true() - behind[0]) / samples
+        return share * (run.true() - behind[0])
+
+    return taken
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wall_that_no_model_knows_is_no_sensor_that_shows_noise_alone(seed):
+    run = Run(seed=seed, late=False, gain=(1.0, 1.0))
+    assert {one.mode for one in run.go(1200, r=swing, taken=wall(run, 0.1, 15.0))} == {"law"}
+
+
+@pytest.mark.parametrize(("share", "samples"), [(0.1, 100.0), (0.2, 15.0)])
+def test_heat_that_a_slow_wall_gives_back_is_no_heater_that_is_stuck_on(share, samples):
+    run = Run(seed=1, late=False, gain=(1.0, 1.0))
+    decisions = run.go(1200, r=swing, taken=wall(run, share, samples))
+    kinds = {cause.kind for one in decisions for cause in one.causes}
+    assert "heater_stuck_on" not in kinds
+
+
 def test_a_sensor_at_rest_may_repeat_itself_for_long():
     """In steps of 2 degC it reads the same for hundreds of samples."""
     run = Run(seed=5, step=2.0)
@@ -182,6 +213,16 @@ def test_a_sensor_that_stands_still_while_its_heater_moves_switches_the_heaters_
     assert at <= 10 + 31 and {one.mode for one in decisions[at:]} == {"off"}
     kinds = {(c.kind, c.signal) for one in decisions[at:] for c in one.causes}
     assert kinds == {(kind, "zone_2")} and "zone_2, or heater_2" in cause.sentence
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_readings_that_are_all_equal_need_no_large_move_of_the_forecast(seed):
+    """Its reference creeps away by 0.0025 degC a sample: the controller moves the heater by little."""
+    run = Run(seed=seed, step=0.02)
+    run.go(200)
+    creep = run.go(60, reading=put(1, lambda y, k: R[1]), r=lambda t: R + [0.0, 0.0025 * (t - 200)])
+    at, cause = first(creep)
+    assert at <= 25 and (cause.kind, cause.signal) == ("sensor_still", "zone_2")
 
 
 HEATERS = {

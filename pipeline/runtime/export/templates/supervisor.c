@@ -250,8 +250,17 @@ static double noise_of(const supervisor_kept *k, int w, int j)
     return ((age < 1 ? 1 : age) * (deviation * deviation) + wander) * (coarser(k, j) * coarser(k, j));
 }
 
-/* Clears sensors that move as forecast; how far each forecast has moved, and which stands away from readings
- * for long, by more than its doubt */
+/* By how many degC both forecasts of a window, from the drift as it was and from its mean, are above y, or below
+ * it if negative; 0 if y lies between them */
+static double both_ahead(const forecast_window *one, int j, double y)
+{
+    double first = forecast(one->state[0], j) - y, second = forecast(one->state[1], j) - y;
+    if (first * second <= 0.0)
+        return 0.0;
+    return fabs(first) < fabs(second) ? first : second;
+}
+
+/* Clears sensors that move as forecast; how far each forecast has moved, and from which readings stand away */
 static void clear_sensors(supervisor_kept *k, const int *counts, double moves[WINDOWS][OUTPUTS],
                           int still[WINDOWS][OUTPUTS])
 {
@@ -259,15 +268,20 @@ static void clear_sensors(supervisor_kept *k, const int *counts, double moves[WI
     for (w = 0; w < WINDOWS; w++)
         for (j = 0; j < OUTPUTS; j++) {
             forecast_window *one = &k->window[w];
-            double share;
-            int large;
-            moves[w][j] = forecast(one->state[0], j) - one->began[j];
-            large = one->age > 0 && fabs(moves[w][j]) >= threshold(k, w, j);
-            share = (k->y[j] - one->first[j]) / (large ? moves[w][j] : 1.0);
+            double least = threshold(k, w, j), move = forecast(one->state[0], j) - one->began[j];
+            int large = one->age > 0 && fabs(move) >= least;
+            double share = (k->y[j] - one->first[j]) / (large ? move : 1.0);
             if (large && share >= FOLLOWS_LEAST && share <= FOLLOWS_MOST && k->bad[j] == 0)
                 k->cleared_s[j] = k->clock_s[1];
             one->away[j] = large ? one->away[j] + 1 : 0;
-            still[w][j] = one->away[j] >= STILL_AFTER && fabs(moves[w][j]) >= doubt_of(k, w, j) && counts[j];
+            moves[w][j] = both_ahead(one, j, one->began[j]);
+            move = fabs(moves[w][j]);
+            still[w][j] = counts[j]
+                          && ((one->away[j] >= STILL_AFTER && move >= largest(least, doubt_of(k, w, j)))
+                              /* a healthy sensor repeats itself for long only if its steps are coarser than noise */
+                              || (one->age >= FIT_AFTER && k->repeats[j] >= one->age
+                                  && steps_of(k, j) <= supervisor_noise[j]
+                                  && move >= NOISE_STILL * supervisor_noise[j]));
         }
 }
 
@@ -339,12 +353,6 @@ static void judge_sensors(supervisor_kept *k, double moves[WINDOWS][OUTPUTS], in
     }
 }
 
-/* A heater lacks a share of what it is told; the sensor is in doubt if that is more than all */
-static void say_weak(supervisor_kept *k, int i, double share)
-{
-    say(k, HEATER_WEAK, i, share > MORE_THAN_ALL ? -share : share);
-}
-
 /* Says whose heat is missing for long, as long as its output does not rise */
 static void judge_heat(supervisor_kept *k, const double *y, const int *counts)
 {
@@ -363,7 +371,7 @@ static void judge_heat(supervisor_kept *k, const double *y, const int *counts)
             k->missing[i] = 0;
         told = (k->usual[i] - supervisor_low[i]) / (supervisor_high[i] - supervisor_low[i]);
         if (k->missing[i] >= MISSING_FOR)
-            say_weak(k, i, lost / largest(told, lost));
+            say(k, HEATER_WEAK, i, lost / largest(told, lost));
     }
 }
 
@@ -379,10 +387,11 @@ static void judge_heaters(supervisor_kept *k, const double *y, const int *counts
             const forecast_window *one = &k->window[w];
             int j = supervisor_of_input[i];
             double at_least = floor_of(k, w, i), best = 1e300, amount;
+            double needed = largest(threshold(k, w, j), doubt_of(k, w, j));
             clear[w][i] = gives[w][i] = 0;
             share[w][i] = 0.0;
             if (one->age < FIT_AFTER || !counts[j]
-                || fabs(y[j] - forecast(one->state[1], j)) < largest(threshold(k, w, j), doubt_of(k, w, j)))
+                || fabs(y[j] - forecast(one->state[1], j)) < needed)
                 continue;
             for (f = LACKS; f <= GIVES; f++)
                 for (v = 0; v < WINDOWS; v++) {
@@ -393,6 +402,9 @@ static void judge_heaters(supervisor_kept *k, const double *y, const int *counts
                         gives[w][i] = f == GIVES;
                     }
                 }
+            /* a heater that is stuck on heats, and by more than the drift of either forecast */
+            if (gives[w][i] && (y[j] - one->least[j] <= same_degC(k, j) || -both_ahead(one, j, y[j]) < needed))
+                continue;
             clear[w][i] = best < 1e300 && best <= 2 * at_least && one->age * log(honest_of(k, w, i) / best) >= CLEARER;
             if (clear[w][i])
                 shows[!gives[w][i]][i] = 1;
@@ -411,8 +423,8 @@ static void judge_heaters(supervisor_kept *k, const double *y, const int *counts
         say_still(k, supervisor_of_input[of], moves[at][supervisor_of_input[of]]);
     else if (at >= 0 && gives[at][of])
         say(k, HEATER_STUCK_ON, of, share[at][of]);
-    else if (at >= 0)
-        say_weak(k, of, share[at][of]);
+    else if (at >= 0) /* the sensor is in doubt if more than all is lacking */
+        say(k, HEATER_WEAK, of, share[at][of] > MORE_THAN_ALL ? -share[at][of] : share[at][of]);
 }
 
 /* Whether a heater is tried again: the heaters are off for this cause and its output moves as forecast, or
