@@ -78,7 +78,7 @@ def design(
     experiment unsafe is a reason in the figures, not an error."""
     import numpy as np
 
-    from pipeline.temperature import experiment, forecast
+    from pipeline.temperature import experiment
 
     lacking = [o.name for o in machine.outputs if o.low is None or o.high is None]
     if lacking:
@@ -96,7 +96,9 @@ def design(
         None if centre is None else np.array(centre),
     )
     names = experiment.Names([i.name for i in machine.inputs], [o.name for o in machine.outputs])
-    doubt = forecast.Doubt(settings.doubt_input_gain, settings.doubt_ambient_degC, settings.doubt_delay_steps)
+    doubt = experiment.Doubt(
+        settings.doubt_input_gain, settings.doubt_ambient_degC, settings.doubt_delay_steps
+    )
     try:
         family = experiment.family_of(
             plants,
@@ -140,7 +142,7 @@ def design_dither(
 
     from pipeline.temperature import experiment
     from pipeline.temperature.controllers import baseline
-    from pipeline.temperature.identification.trust import horizon
+    from pipeline.temperature.identification.validation import horizon
 
     try:
         rise = horizon(family.model, wish.samples)

@@ -7,12 +7,12 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
-from pipeline.temperature import judging
 from pipeline.temperature.controllers import window as window_route
 from pipeline.temperature.controllers.kernel import window_law
 from pipeline.temperature.plant import Plant, baam, plant
 from pipeline.temperature.published import GAMMA, REFERENCE, TAU
 from pipeline.temperature.study import data_sets
+from pipeline.temperature.test_set import scorecard
 from pipeline.temperature.test_set.scorecard import (
     CommonCost,
     Cost,
@@ -358,28 +358,28 @@ def learned():
 
 def test_a_longer_record_is_asked_for_where_noise_costs_too_much(learned):
     u, y, long = learned
-    check, rule = judging.CheckRun(20.0, REFERENCE, 200), {"offset": False, "gain_spread": 0.0}
-    enough = judging.sufficiency([u], [y], long, YARDSTICK, check, allowed=0.01, **rule)
+    check, rule = scorecard.CheckRun(20.0, REFERENCE, 200), {"offset": False, "gain_spread": 0.0}
+    enough = scorecard.sufficiency([u], [y], long, YARDSTICK, check, allowed=0.01, **rule)
     assert 0 < enough.half_gap < 0.01
     assert enough.samples == long.samples
-    strict = judging.sufficiency([u], [y], long, YARDSTICK, check, allowed=enough.half_gap / 20, **rule)
+    strict = scorecard.sufficiency([u], [y], long, YARDSTICK, check, allowed=enough.half_gap / 20, **rule)
     assert strict.needed == pytest.approx(10 * long.samples, abs=1)  # half of the gap, over a twentieth of it
 
 
 def test_the_state_of_algorithm_2_is_chosen_from_the_record_and_refusals_are_kept(learned):
     u, y, long = learned
-    candidates = judging.kernel_candidates(
-        [u], [y], long, YARDSTICK, judging.CheckRun(20.0, REFERENCE, 200), largest=3, offset=False
+    candidates = scorecard.kernel_candidates(
+        [u], [y], long, YARDSTICK, scorecard.CheckRun(20.0, REFERENCE, 200), largest=3, offset=False
     )
     assert [c.state for c in candidates] == ["window of 1", "window of 2", "window of 3", "predicted state"]
     gaps = {c.state: c.gap for c in candidates}
     assert min(gaps["window of 2"], gaps["predicted state"]) < min(0.01, gaps["window of 1"])
-    short = judging.kernel_candidates(
+    short = scorecard.kernel_candidates(
         [u[:300]],
         [y[:300]],
         window_route.learn([u[:300]], [y[:300]], longest=4),
         YARDSTICK,
-        judging.CheckRun(20.0, REFERENCE, 50),
+        scorecard.CheckRun(20.0, REFERENCE, 50),
         largest=2,
         offset=False,
     )

@@ -12,9 +12,9 @@ import numpy as np
 import scipy.optimize
 
 from pipeline.temperature.controllers.baseline import rises
+from pipeline.temperature.identification.first_order import time_constant
 from pipeline.temperature.identification.validation import one_step_errors, simulated
 from pipeline.temperature.plant import Plant, hold_output, strictly_proper
-from pipeline.temperature.test_set.time_scale import time_constant
 
 RANGE = (0.01, 0.99)  # quantiles that count as recorded: a spike, or one sample of a start, is none
 ONE_DEVIATION = (0.1587, 0.8413)  # quantiles of a normal one standard deviation either side of its median
