@@ -52,7 +52,8 @@ def search(
             cost,
             low,
             high,
-            tuning.SearchSettings(initial, evaluations - last),
+            initial=initial,
+            evaluations=evaluations - last,
             rng=np.random.default_rng(settings.seed),
             start=first,
         )
