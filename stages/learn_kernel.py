@@ -80,22 +80,31 @@ def main() -> None:
         start_degC = (
             panel.training.starts_degC[0] if simulated else float(np.nanquantile(np.vstack(y), COLD_SHARE))
         )
-        check = scorecard.CheckRun(start_degC, np.array([o.reference for o in machine.outputs]), panel.steps)
         long = window.learn(
             u, y, longest=settings.longest_window, offset=settings.offset, gain_spread=settings.gain_spread
+        )
+        scenarios = scorecard.panel(
+            [window.predictor(long)],
+            starts=[start_degC],
+            references=[[o.reference for o in machine.outputs]],
+            noise=[0.0],
+            seeds=[0],
+            steps=panel.steps,
+            hold=0,
+            cells=False,
         )
         enough = scorecard.sufficiency(
             u,
             y,
             long,
             yardstick,
-            check,
+            scenarios,
             allowed=settings.allowed_gap_percent / 100,
             offset=settings.offset,
             gain_spread=settings.gain_spread,
         )
         candidates = scorecard.kernel_candidates(
-            u, y, long, yardstick, check, largest=settings.largest_kernel_window, offset=settings.offset
+            u, y, long, yardstick, scenarios, largest=settings.largest_kernel_window, offset=settings.offset
         )
         best = min(candidates, key=lambda candidate: candidate.gap)
         artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(long))

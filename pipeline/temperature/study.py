@@ -18,15 +18,7 @@ from pipeline.temperature.controllers.kernel import (
 from pipeline.temperature.plant import baam
 from pipeline.temperature.probing import study_probe, study_signal
 from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, PublishedFigures
-from pipeline.temperature.test_set.scorecard import (
-    CommonCost,
-    Scenarios,
-    cost,
-    optimum,
-    panel,
-    regret,
-    simulate,
-)
+from pipeline.temperature.test_set.scorecard import CommonCost, Scenarios, cost, optimum, panel, simulate
 from pipeline.temperature.test_set.tuning import SearchResult, fitness
 from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
 
@@ -55,7 +47,7 @@ def study_panel(
 def gap(law: Law, scenarios: Scenarios) -> np.ndarray:
     """J / J* - 1 of each scenario, unclipped, Q = R = I."""
     run = simulate(scenarios, law)
-    return regret(cost(scenarios, run, YARDSTICK), optimum(scenarios, YARDSTICK))
+    return cost(scenarios, run, YARDSTICK) / optimum(scenarios, YARDSTICK) - 1
 
 
 def data_sets(rng: np.random.Generator, samples: int, sets: int) -> tuple[np.ndarray, np.ndarray]:
@@ -99,10 +91,10 @@ def exact() -> Exact:
     K, K_r = exact_gains(plant, best, 2)
     history = window_law(K, K_r, best.k, 2)
     empty = history._replace(start_u=np.zeros_like(history.start_u))
-    J = [float(cost(scenarios, simulate(scenarios, run), YARDSTICK).J[0]) for run in (law, from_50)]
+    J = [float(cost(scenarios, simulate(scenarios, run), YARDSTICK)[0]) for run in (law, from_50)]
     return Exact(
-        float(optimum(scenarios, YARDSTICK).J[0]),
-        float(optimum(short, YARDSTICK).J[0]),
+        float(optimum(scenarios, YARDSTICK)[0]),
+        float(optimum(short, YARDSTICK)[0]),
         *J,
         float(gap(empty, scenarios)[0]),
     )
@@ -154,7 +146,7 @@ def under_noise(
         run = simulate(scenarios, law)
         late = (run.y - scenarios.r)[500:]
         result[name] = (
-            float(regret(cost(scenarios, run, YARDSTICK), optimum(scenarios, YARDSTICK))[0]),
+            float((cost(scenarios, run, YARDSTICK) / optimum(scenarios, YARDSTICK) - 1)[0]),
             float(np.sqrt((late**2).mean())),
         )
     return result
@@ -262,7 +254,7 @@ def scaled_weights(scale: float = 0.4) -> dict[str, float]:
     law = observer_law(plant, other, observer_gain(plant, TAU))
     run = simulate(scenarios, law)
     J = [
-        cost(scenarios, run, CommonCost(np.full(5, factor), np.full(7, factor), GAMMA)).J[0]
+        cost(scenarios, run, CommonCost(np.full(5, factor), np.full(7, factor), GAMMA))[0]
         for factor in (1.0, scale)
     ]
     return {

@@ -67,13 +67,11 @@ class ModelStructure(NamedTuple):
 
 class Validation(NamedTuple):
     """How candidates are judged: `blocks` left out in turn, or whole recordings where `recordings` labels the
-    segments with more than one; on simulated outputs, of a record in `closed` loop on predicted ones too.
-    `max_radius` bounds their poles."""
+    segments with more than one; on simulated outputs, of a record in `closed` loop on predicted ones too."""
 
     blocks: int = 5
     recordings: tuple[int, ...] = ()
     closed: bool = False
-    max_radius: float | None = None
 
 
 class OrderCandidate(NamedTuple):
@@ -403,10 +401,8 @@ def cross_validate(
     A structure whose window does not fit into what remains of the record has no rows.
     """
     u, y = shifted(u, y, structure.delays)
-    settings, errors = (
-        FitSettings(structure.feedthrough, structure.offset, validation.max_radius, VALIDATED_STEPS),
-        {},
-    )
+    settings = FitSettings(structure.feedthrough, structure.offset, max_iterations=VALIDATED_STEPS)
+    errors = {}
     judged = closed_loop_errors if validation.closed else simulation_errors
     for train_u, train_y, test_u, test_y in folds(u, y, validation.blocks, validation.recordings):
         try:

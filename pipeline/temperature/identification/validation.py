@@ -40,23 +40,12 @@ ROUNDING = 1e-8
 ADDS = 0.1  # of the error: what the inputs must take off that of the free response for a fit to be theirs
 
 
-class PlantBootstrap(NamedTuple):
-    """Step responses (steps, p, m) of the nominal plant and their bands over a family, at `level`; poles of
-    every member, a list of (n,) arrays."""
-
-    nominal: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    poles: list[np.ndarray]
-    level: float
-
-
 class Residuals(NamedTuple):
     """Residual tests at 99 %: autocorrelation (p, lags+1), cross-correlation with each input (p, m, 2 lags+1)
     at lags -lags..lags (positive: input first).
 
     band and cross_band are what an ideal residual stays under; whiteness is Ljung and Box's statistic for
-    each output and whiteness_limit its 99 % point.
+    each output.
     """
 
     autocorrelation: np.ndarray
@@ -64,7 +53,6 @@ class Residuals(NamedTuple):
     band: float
     cross_band: np.ndarray
     whiteness: np.ndarray
-    whiteness_limit: float
     whiteness_passed: np.ndarray
     independence_passed: np.ndarray
 
@@ -77,7 +65,6 @@ class RecordExcitation(NamedTuple):
     full: int
     condition: float
     per_input_rank: np.ndarray
-    per_input_condition: np.ndarray
     levels: np.ndarray
 
 
@@ -102,10 +89,6 @@ def predicted_ahead(
     to the state that fits the first max(3 n, 30) one-step predictions; callers leave these rows out of a
     score. NaN in y passes as a missing measurement.
     """
-    if steps < 1:
-        raise ValueError(
-            f"predicted_ahead: expected steps of at least 1 but found {steps}; one step ahead is steps=1"
-        )
     model = prediction_form(plant, [])
     if x0 is None:
         first = min(max(3 * plant.n, 30), len(u))
@@ -178,7 +161,7 @@ def residual_tests(
     widened = scipy.stats.norm.ppf(1 - 0.005 / (lags + 1)) / QUANTILE_99
     independent = np.abs(cross[:, :, lags + closed :]).max(axis=2) <= widened * cross_band
     return Residuals(
-        auto, cross, QUANTILE_99 / np.sqrt(N), cross_band, whiteness, limit, whiteness <= limit, independent
+        auto, cross, QUANTILE_99 / np.sqrt(N), cross_band, whiteness, whiteness <= limit, independent
     )
 
 
@@ -205,14 +188,7 @@ def excitation(u: Segments, past: int) -> RecordExcitation:
 
     rank, condition = rank_and_condition(stacked.reshape(len(stacked), -1))
     alone = [rank_and_condition(stacked[:, j]) for j in range(stacked.shape[1])]
-    return RecordExcitation(
-        rank,
-        stacked.shape[1] * past,
-        condition,
-        np.array([r for r, _ in alone]),
-        np.array([c for _, c in alone]),
-        levels,
-    )
+    return RecordExcitation(rank, stacked.shape[1] * past, condition, np.array([r for r, _ in alone]), levels)
 
 
 def _block_resampled(errors: np.ndarray, block: int, length: int, rng: np.random.Generator) -> np.ndarray:
@@ -338,16 +314,15 @@ def spread_bands(
     *,
     level: float = 0.99,
     left_out: Sequence[Plant] = (),
-) -> PlantBootstrap:
-    """Bands of the step responses and the poles over a family of plants; with few members the band is their
-    range.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Step responses (steps, p, m) of the nominal plant, and the low and high ends of their bands at `level`
+    over a family of plants; with few members the band is their range.
 
     They reach at least as far as Student's quantile of the jackknife's deviation over the `left_out` plants
     (`left_out_plants`), where there are any.
     """
     own, *rest = (step_response(plant, steps) for plant in (nominal, *family, *left_out))
-    low, high = banded(own, rest[: len(family)], rest[len(family) :], level)
-    return PlantBootstrap(own, low, high, [np.linalg.eigvals(plant.A) for plant in family], level)
+    return own, *banded(own, rest[: len(family)], rest[len(family) :], level)
 
 
 def banded(
@@ -658,9 +633,9 @@ def steps(
     constant and delay, beside the family's; `left_out` as in `spread_bands`."""
     samples = horizon(nominal, longest)
     bands = spread_bands(nominal, family, samples + 1, level=LEVEL, left_out=left_out)
-    at = np.abs(bands.nominal).argmax(axis=0)[None]
-    peak = np.concatenate([np.take_along_axis(part, at, axis=0) for part in bands[:3]])
-    gain = np.stack([part[-1] for part in bands[:3]])
+    at = np.abs(bands[0]).argmax(axis=0)[None]
+    peak = np.concatenate([np.take_along_axis(part, at, axis=0) for part in bands])
+    gain = np.stack([part[-1] for part in bands])
     if _settles(nominal, longest) and np.abs(np.linalg.eigvals(nominal.A)).max() < 1:
         own, *rest = (steady_gain(plant) for plant in (nominal, *family, *left_out))
         gain = np.stack([own, *banded(own, rest[: len(family)], rest[len(family) :], LEVEL)])
@@ -669,7 +644,7 @@ def steps(
     shapes = np.stack([two_points(part) for part in responses])  # (1 + family, 2, p, m)
     times = np.where(significant, np.concatenate([shapes[:1], np.quantile(shapes[1:], ENDS, axis=0)]), np.nan)
     grid = np.arange(0, samples + 1, -(-samples // points))
-    response, low, high = (part[grid] for part in bands[:3])
+    response, low, high = (part[grid] for part in bands)
     # equal ratios: what a controller meets first counts as much as what a drift does in the end
     ratios = np.unique(np.geomspace(1, samples, points).round().astype(int))
     models = of_step_responses(ratios, np.stack([part[ratios] for part in responses], axis=1))

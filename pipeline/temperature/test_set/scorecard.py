@@ -48,13 +48,6 @@ class CommonCost(NamedTuple):
     gamma: float
 
 
-class Cost(NamedTuple):
-    """J of each scenario, together with the yardstick that it was computed with."""
-
-    J: np.ndarray
-    yardstick: CommonCost
-
-
 class PanelRun(NamedTuple):
     """True outputs y and inputs u (steps, scenarios, p or m)."""
 
@@ -144,15 +137,15 @@ def simulate(panel: Scenarios, law: Law) -> PanelRun:
     return PanelRun(y, u)
 
 
-def cost(panel: Scenarios, run: PanelRun, yardstick: CommonCost) -> Cost:
-    """(3) of every scenario: discounted, on true outputs and applied inputs."""
+def cost(panel: Scenarios, run: PanelRun, yardstick: CommonCost) -> np.ndarray:
+    """(3) of every scenario (s,): discounted, on true outputs and applied inputs."""
     error = run.y - panel.r
     stage = error**2 @ yardstick.q + run.u**2 @ yardstick.r
-    return Cost(yardstick.gamma ** np.arange(len(stage)) @ stage, yardstick)
+    return yardstick.gamma ** np.arange(len(stage)) @ stage
 
 
-def optimum(panel: Scenarios, yardstick: CommonCost) -> Cost:
-    """J* of every scenario: the Riccati law of its own plant, which knows the state, unclipped."""
+def optimum(panel: Scenarios, yardstick: CommonCost) -> np.ndarray:
+    """J* of every scenario (s,): the Riccati law of its own plant, which knows the state, unclipped."""
     best = [
         gains(plant, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma) for plant in panel.plants
     ]
@@ -174,24 +167,6 @@ def _state_feedback(panel: Scenarios, best: Sequence[Gains]) -> PanelRun:
     return PanelRun(y, u)
 
 
-def regret(J: Cost, best: Cost) -> np.ndarray:
-    """J / J* - 1 (scenarios,). Raises ValueError where the two were computed under different weights: such
-    costs say nothing about each other."""
-    a, b = J.yardstick, best.yardstick
-    if not (np.array_equal(a.q, b.q) and np.array_equal(a.r, b.r) and a.gamma == b.gamma):
-        raise ValueError(
-            f"costs under different weights cannot be compared: one was computed with q = {_short(a.q)}, "
-            f"r = {_short(a.r)}, gamma = {a.gamma:g}, the other with "
-            f"q = {_short(b.q)}, r = {_short(b.r)}, gamma = {b.gamma:g}; "
-            "compute both under one yardstick (section tracking of params.expert.yaml)"
-        )
-    return J.J / best.J - 1
-
-
-def _short(values: np.ndarray) -> str:
-    return np.array2string(np.asarray(values), precision=3, threshold=4, edgeitems=2)
-
-
 # ---- margins
 
 
@@ -210,17 +185,12 @@ class Margins(NamedTuple):
 def margins(plants: Sequence[Plant], law: Law, *, grid: int = 240) -> list[Margins]:
     """Of each plant: disk margin 1 / max |S - I/2| (Seiler, Packard, Gahinet 2020, skew 0) and delay margin
     min (pi + arg lambda(L)) / omega over |lambda(L)| = 1."""
-    omega = _frequencies(grid)
+    # rad a step: even in logarithms where loops of heaters cross, then even to pi
+    slow = np.geomspace(1e-4, 0.3, grid // 2, endpoint=False)
+    omega = np.concatenate([slow, np.linspace(0.3, np.pi, grid - grid // 2)])
     z = np.exp(1j * omega)
     K = law_response(law, z)
     return [_margins(plant, law, omega, z, K) for plant in plants]
-
-
-def _frequencies(grid: int) -> np.ndarray:
-    """rad a step: even in logarithms where loops of heaters cross, then even to pi."""
-    return np.concatenate(
-        [np.geomspace(1e-4, 0.3, grid // 2, endpoint=False), np.linspace(0.3, np.pi, grid - grid // 2)]
-    )
 
 
 def _structured(M: np.ndarray, *, sweeps: int = 12) -> np.ndarray:
@@ -438,41 +408,19 @@ class Sufficiency(NamedTuple):
     needed: int
 
 
-class CheckRun(NamedTuple):
-    """The noise-free run on which candidates are compared: from temperature `start` to `reference` (p,), both
-    in °C, over `steps`."""
-
-    start: float
-    reference: np.ndarray
-    steps: int
-
-    def on(self, model: Plant) -> Scenarios:
-        return panel(
-            [model],
-            starts=[self.start],
-            references=[self.reference],
-            noise=[0.0],
-            seeds=[0],
-            steps=self.steps,
-            hold=0,
-            cells=False,
-        )
-
-
 def sufficiency(
     u: Sequence[np.ndarray],
     y: Sequence[np.ndarray],
     learned: window_route.WindowModel,
     yardstick: CommonCost,
-    check: CheckRun,
+    scenarios: Scenarios,
     *,
     allowed: float,
     offset: bool,
     gain_spread: float,
 ) -> Sufficiency:
     """Whether the record is long enough for its noise, by the record alone. A controller is learned from each
-    half of it and judged by the model learned from all of it."""
-    scenarios = check.on(window_route.predictor(learned))
+    half of it and judged on `scenarios` of the model learned from all of it."""
     best = optimum(scenarios, yardstick)
     gaps = []
     for part in (0, 1):
@@ -483,7 +431,7 @@ def sufficiency(
         half = window_route.learn(half_u, half_y, longest=learned.N, offset=offset, gain_spread=gain_spread)
         law = window_route.law(half, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
         run = simulate(scenarios, law)
-        gaps.append(regret(cost(scenarios, run, yardstick), best)[0])
+        gaps.append((cost(scenarios, run, yardstick) / best - 1)[0])
     half_gap = float(np.mean(gaps))
     # never fewer than twice the numbers of one output's predictor:
     # below that the half-record test itself means nothing
@@ -508,19 +456,18 @@ def kernel_candidates(
     y: Sequence[np.ndarray],
     long: window_route.WindowModel,
     yardstick: CommonCost,
-    check: CheckRun,
+    scenarios: Scenarios,
     *,
     largest: int,
     offset: bool,
 ) -> list[KernelCandidate]:
     """Algorithm 2 on windows of 1 to `largest` samples and on the predicted state, all from one record. The
-    model of the long window judges each.
+    model of the long window judges each, on `scenarios` of it.
 
     Without noise the shortest window that holds the plant's state is exact. With noise longer windows are
     biased; the predicted state is not.
     """
     model = window_route.predictor(long)
-    scenarios = check.on(model)
     best = optimum(scenarios, yardstick)
     tried = [
         (f"window of {N}", lambda N=N: kernel.tuples(u, y, N, offset=offset)) for N in range(1, largest + 1)
@@ -535,6 +482,6 @@ def kernel_candidates(
             candidates.append(KernelCandidate(state, None, float("inf"), str(refusal)))
             continue
         run = simulate(scenarios, law)
-        gap = float(regret(cost(scenarios, run, yardstick), best)[0])
+        gap = float((cost(scenarios, run, yardstick) / best - 1)[0])
         candidates.append(KernelCandidate(state, learned, gap if np.isfinite(gap) else float("inf"), ""))
     return candidates
