@@ -95,7 +95,7 @@ def design(
         settings.shortest_steps,
         None if centre is None else np.array(centre),
     )
-    names = experiment.Names([i.name for i in machine.inputs], [o.name for o in machine.outputs])
+    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
     doubt = experiment.Doubt(
         settings.doubt_input_gain, settings.doubt_ambient_degC, settings.doubt_delay_steps
     )
@@ -106,7 +106,8 @@ def design(
             reach=limits.high - limits.low,
             longest=settings.samples,
             doubt=doubt,
-            names=names,
+            inputs=inputs,
+            outputs=outputs,
         )
         plan = experiment.design(family, wish, limits, np.random.default_rng(settings.seed))
     except (ValueError, np.linalg.LinAlgError) as error:
@@ -121,11 +122,9 @@ def design(
         else dither_figures(machine, dither),
     }
     added = (
-        {}
-        if dither is None or dither.reason
-        else columns(dither.u, [f"{n}_dither" for n in names.inputs], step)
+        {} if dither is None or dither.reason else columns(dither.u, [f"{n}_dither" for n in inputs], step)
     )
-    return columns(plan.u, names.inputs, step) if plan.written else {}, added, figures
+    return columns(plan.u, inputs, step) if plan.written else {}, added, figures
 
 
 def refuse(settings: GenerateProbing, reason: str) -> tuple[Columns, Columns, dict[str, Any]]:

@@ -436,23 +436,17 @@ class Dither(NamedTuple):
     limited: float
 
 
-class Names(NamedTuple):
-    """Of inputs and outputs, for sentences."""
-
-    inputs: Sequence[str]
-    outputs: Sequence[str]
-
-
 class Family(NamedTuple):
     """The identified plants, the model first; their pace; what they do not hold; where the record leaves the
-    machine; the band of noise and model error; and the signals' names."""
+    machine; the band of noise and model error; and the names of inputs and outputs."""
 
     plants: Sequence[Plant]
     pace: Pace
     doubt: Doubt
     begin: Start
     band: Band
-    names: Names
+    inputs: Sequence[str]
+    outputs: Sequence[str]
 
     @property
     def model(self) -> Plant:
@@ -469,7 +463,8 @@ def family_of(
     reach: np.ndarray,
     longest: int,
     doubt: Doubt,
-    names: Names,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
 ) -> Family:
     """The family for experiments of at most `longest` samples on the machine of this record (u, y); reach
     (m,) is each input's range.
@@ -480,7 +475,7 @@ def family_of(
     """
     plants = [stabilised(plant, LARGEST_RADIUS) for plant in plants]
     speed = pace(plants, reach, longest)
-    return Family(plants, speed, doubt, start(plants, *record), band(plants[0], *record), names)
+    return Family(plants, speed, doubt, start(plants, *record), band(plants[0], *record), inputs, outputs)
 
 
 def pace(plants: Sequence[Plant], reach: np.ndarray, longest: int) -> Pace:
@@ -499,20 +494,15 @@ def pace(plants: Sequence[Plant], reach: np.ndarray, longest: int) -> Pace:
 # ---- the signal
 
 
-def own_pace(speed: Pace) -> np.ndarray:
-    """Fastest time constant (m,) in samples that each input shows; the fastest of all where it shows none."""
-    tau = np.where(speed.seen, speed.time_constant, np.inf).min(axis=0)
-    return np.where(np.isfinite(tau), tau, speed.fastest)
-
-
 def signal(rng: np.random.Generator, samples: int, wish: Wish, speed: Pace) -> np.ndarray:
     """(samples, m) of amplitude 1 and about zero mean, with its power where each input is answered."""
-    tau = own_pace(speed)
+    # the fastest time constant that each input shows; the fastest of all where it shows none
+    tau = np.where(speed.seen, speed.time_constant, np.inf).min(axis=0)
+    tau = np.where(np.isfinite(tau), tau, speed.fastest)
     if wish.signal == "prbs":
         holds = np.clip(np.round(HOLD * tau), wish.shortest, max(samples // SWITCHES, wish.shortest))
         return np.column_stack([_binary(rng, samples, int(hold)) for hold in holds])
-    lines = _lines(samples, CORNERS / tau)
-    return np.column_stack([_flattest(rng, samples, own) for own in lines])
+    return np.column_stack([_flattest(rng, samples, own) for own in _lines(samples, CORNERS / tau)])
 
 
 def _binary(rng: np.random.Generator, samples: int, hold: int) -> np.ndarray:
@@ -756,23 +746,17 @@ def design(family: Family, wish: Wish, limits: ExperimentLimits, rng: np.random.
     step = limits.rate / max(wish.amplitude, limits.rate / 2)
     played = shaped(signal(rng, samples, wish, speed), rise, step)
     whole = answers(family.plants, family.begin, ramp, played)
-    best, most, reason = None, 0.0, ""
+    tries = []
     shortest = min(max(4 * rise, int(5 * speed.fastest), 50), wish.samples)
     while samples >= shortest:
         reach = truncated(whole, samples) if samples < wish.samples else whole
         tried = _designed(family, reach, wish, limits, (ramp[:samples], played[:samples], rise))
-        reason = reason or tried.reason
-        if best is None or (tried.lesson is not None and tried.written and tried.lesson.information > most):
-            best, most = (
-                tried,
-                tried.lesson.information if tried.lesson is not None and tried.written else 0.0,
-            )
+        tries.append(tried)
         if tried.written and (tried.amplitude >= FAIR * caps(family, reach, wish, limits)).all():
             break
         samples //= 2
-    if best is None:
-        raise ValueError(f"generate_probing.samples is {wish.samples}, too few for an experiment; raise it")
-    return best if best.written else best._replace(reason=reason)
+    taught = [one.lesson.information if one.written and one.lesson is not None else 0.0 for one in tries]
+    return tries[int(np.argmax(taught))]
 
 
 def _nothing_left(family: Family, limits: ExperimentLimits) -> str:
@@ -783,7 +767,7 @@ def _nothing_left(family: Family, limits: ExperimentLimits) -> str:
     if spare[o] > 0:
         return ""
     return (
-        f"the model's simulation misses the record of {family.names.outputs[o]} by "
+        f"the model's simulation misses the record of {family.outputs[o]} by "
         f"{min(family.band.width[o], 1e4):.3g} degC, more than its limits leave: mend the identification"
     )
 
@@ -839,7 +823,7 @@ def _teaches_little(family: Family, amplitude: np.ndarray, taught: Lesson) -> st
         return ""
     j = int(weak[error[weak].argmax()])
     return (
-        f"{family.names.inputs[j]} may move by {amplitude[j]:.2g} percent within the limits, which would "
+        f"{family.inputs[j]} may move by {amplitude[j]:.2g} percent within the limits, which would "
         f"leave its gain unknown by {100 * min(error[j], 10.0):.0f} % or more; widen plant.outputs low and "
         "high, or measure with less noise"
     )
@@ -862,7 +846,7 @@ def _left(family: Family, reach: Answers, centre: np.ndarray, limits: Experiment
         f"{family.doubt.ambient_degC:g} ambient"
     )
     reason = (
-        f"without its controller {family.names.outputs[o]} may {'reach' if hot else 'fall to'} "
+        f"without its controller {family.outputs[o]} may {'reach' if hot else 'fall to'} "
         f"{np.clip(reached, -1e4, 1e4):.0f} degC within {family.seconds(reach.at[-1] + 1):.0f} s even with "
         f"no signal played, and its limit is {limit:g} degC: {why}"
     )
@@ -908,7 +892,7 @@ def dither(
     o = int(np.maximum(extremes.highest - limits.y_high, limits.y_low - extremes.lowest).argmax())
     low, high = (np.clip(side[o], -1e4, 1e4) for side in (extremes.lowest, extremes.highest))
     reason = (
-        f"over the family the controller itself lets {family.names.outputs[o]} go from {low:.0f} to "
+        f"over the family the controller itself lets {family.outputs[o]} go from {low:.0f} to "
         f"{high:.0f} degC, and its limits are {limits.y_low[o]:g} and {limits.y_high[o]:g}"
     )
     return Dither(nothing, reason, extremes, 0.0 * wanted, limited)

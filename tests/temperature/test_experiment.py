@@ -11,7 +11,7 @@ from pipeline import cli
 from pipeline.store import artifacts, params
 from pipeline.temperature import experiment, tracking
 from pipeline.temperature.controllers import baseline
-from pipeline.temperature.experiment import ExperimentLimits, Names, Wish
+from pipeline.temperature.experiment import ExperimentLimits, Wish
 from pipeline.temperature.plant import hold_output, plant, simulate
 from pipeline.temperature.settings import GenerateProbing, Plant, Tracking
 from stages import generate_probing
@@ -60,9 +60,9 @@ def wish(reference, samples=1500, **more):
 
 
 def family_of(plants, u, y, samples=1500):
-    names = Names(["heater"], ["zone"])
+    names = {"inputs": ["heater"], "outputs": ["zone"]}
     return experiment.family_of(
-        plants, ([u], [y]), reach=np.full(1, 100.0), longest=samples, doubt=DOUBT, names=names
+        plants, ([u], [y]), reach=np.full(1, 100.0), longest=samples, doubt=DOUBT, **names
     )
 
 

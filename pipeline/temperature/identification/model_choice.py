@@ -229,7 +229,7 @@ def identify(
     if choice.table:
         rate = chosen_rate(record.u, record.y, choice.structure, choice.order, choice.fit, validation)
     fitted = fitted._replace(feedback=feedback, drift=rate, reasons=tuple(reasons))
-    return _with_remarks(fitted, record._replace(notes=record.notes + reasons), names)
+    return _remarked(fitted, record, reasons, names)
 
 
 def refit(u: Segments, y: Segments, identified: Identified, *, names: Sequence[str] = ()) -> Identified:
@@ -248,7 +248,7 @@ def refit(u: Segments, y: Segments, identified: Identified, *, names: Sequence[s
     choice = ModelChoice(structure, identified.order, identified.fit, exact, table)
     fitted = _fit_all(record.u, record.y, choice, identified.plant.sample_time_s)
     fitted = fitted._replace(feedback=identified.feedback, drift=identified.drift, reasons=identified.reasons)
-    return _with_remarks(fitted, record._replace(notes=[*record.notes, *identified.reasons]), names)
+    return _remarked(fitted, record, identified.reasons, names)
 
 
 class _Record(NamedTuple):
@@ -505,15 +505,11 @@ def _fit_all(u: Segments, y: Segments, choice: ModelChoice, sample_time_s: float
     )
 
 
-def _with_remarks(fitted: Identified, record: _Record, names: Sequence[str]) -> Identified:
-    return fitted._replace(
-        dropped_rows=fitted.dropped_rows + record.cut, notes=record.notes + _remarks(fitted, names)
-    )
-
-
-def _remarks(fitted: Identified, names: Sequence[str]) -> list[str]:
-    """What a user should know of the fit, a sentence each."""
-    notes = []
+def _remarked(
+    fitted: Identified, record: _Record, reasons: Sequence[str], names: Sequence[str]
+) -> Identified:
+    """The fit with what a user should know of it, a sentence each."""
+    notes = [*record.notes, *reasons]
     if fitted.dropped_rows:
         notes.append(f"{fitted.dropped_rows} rows touch a masked sample and were left out of the fit")
     notes += [
@@ -543,7 +539,7 @@ def _remarks(fitted: Identified, names: Sequence[str]) -> list[str]:
             f"the largest pole is {radius - 1:.2g} outside the unit circle; refine with a limit, "
             "or record longer, before simulating far ahead"
         )
-    return notes
+    return fitted._replace(dropped_rows=fitted.dropped_rows + record.cut, notes=notes)
 
 
 def _check_length(u: Segments, y: Segments, order: int | None, past: int | None) -> None:

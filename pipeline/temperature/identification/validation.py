@@ -191,11 +191,6 @@ def excitation(u: Segments, past: int) -> RecordExcitation:
     return RecordExcitation(rank, stacked.shape[1] * past, condition, np.array([r for r, _ in alone]), levels)
 
 
-def _block_resampled(errors: np.ndarray, block: int, length: int, rng: np.random.Generator) -> np.ndarray:
-    starts = rng.integers(0, len(errors) - block + 1, size=-(-length // block))
-    return np.concatenate([errors[s : s + block] for s in starts])[:length]
-
-
 def bootstrap_spread(
     u: Segments,
     y: Segments,
@@ -233,7 +228,8 @@ def bootstrap_spread(
     for _ in range(count):
         rebuilt = []
         for a, x0 in zip(u, identified.x0, strict=True):
-            e = _block_resampled(errors, block, len(a), rng)
+            starts = rng.integers(0, len(errors) - block + 1, size=-(-len(a) // block))
+            e = np.concatenate([errors[s : s + block] for s in starts])[: len(a)]
             x = linear_recurrence(plant.A, a @ plant.B.T + plant.b + e @ plant.K.T, x0)[:-1]
             rebuilt.append(x @ plant.C.T + a @ plant.D.T + plant.d + e)
         family.append(_reidentified(u, rebuilt, identified, order or identified.order))
@@ -363,7 +359,8 @@ def advice(
                 "the model misses more than half of its movement; "
                 "look for an input or disturbance that is not recorded"
             )
-        if still_percent is not None and _inputs_add_nothing(fit_percent[o], still_percent[o]):
+        # the recorded inputs take less than `ADDS` off the error of the free response
+        if still_percent is not None and 100.0 - fit_percent[o] > (1.0 - ADDS) * (100.0 - still_percent[o]):
             sentences.append(
                 f"the fit of {output} on the hold-out, {fit_percent[o]:.0f} %, is that of the free response "
                 f"alone: with every input held at its mean in each stretch it is "
@@ -384,11 +381,6 @@ def advice(
             "move one at a time, or with different sequences"
         )
     return sentences
-
-
-def _inputs_add_nothing(fit_percent: float, still_percent: float) -> bool:
-    """The recorded inputs take less than `ADDS` off the error of the free response."""
-    return 100.0 - fit_percent > (1.0 - ADDS) * (100.0 - still_percent)
 
 
 def _of_colour(tests: Residuals, outputs: Sequence[str], order_given: bool) -> list[str]:

@@ -318,10 +318,9 @@ def chosen(
 
 def between(champion: np.ndarray, challenger: np.ndarray, plant: np.ndarray, *, seed: int) -> Paired:
     """The challenger's improvement over the champion on the same cases, paired by plant."""
-    floor = 1e-9
     return paired(
-        np.maximum(champion, floor),
-        np.maximum(challenger, floor),
+        np.maximum(champion, 1e-9),
+        np.maximum(challenger, 1e-9),
         [str(index) for index in plant],
         rng=np.random.default_rng(seed),
     )
