@@ -131,7 +131,7 @@ def figures(
         "refused": None if kernel else best.refusal,
         "rank": kernel.rank if kernel else None,
         "identifiable": kernel.unknowns if kernel else None,
-        "samples_needed": kernel.samples_needed if kernel else None,
+        "samples_needed": kernel.unknowns if kernel else None,
         "condition": kernel.condition if kernel else None,
         "candidates": {
             c.state: {

@@ -181,10 +181,6 @@ class Regression(NamedTuple):
     samples: int
     condition: float
 
-    @property
-    def samples_needed(self) -> int:
-        return self.unknowns
-
     def stored(self) -> dict[str, tuple[np.ndarray, str, str]]:
         """The regression as named arrays with unit and meaning, for an
         artifact; `restored` reads them back."""
