@@ -33,8 +33,13 @@ import scipy.signal
 from benchmarks import results
 from benchmarks.results import Row
 from pipeline.store import artifacts, params
-from pipeline.temperature.controllers.half_vector import quadratic_gram
-from pipeline.temperature.controllers.kernel import Tuples, regress, tuples_with_reference, value_iteration
+from pipeline.temperature.controllers.kernel import (
+    Tuples,
+    quadratic_gram,
+    regress,
+    tuples_with_reference,
+    value_iteration,
+)
 from pipeline.temperature.published import GAMMA, REFERENCE
 from pipeline.temperature.study import data_sets
 from tests.temperature import naive
@@ -183,7 +188,7 @@ def plants(count: int, folder: Path) -> Work:
     """Subspace + LQG as deployed on so many plants of the judging half, with its figures."""
     from pipeline.temperature.controllers.table import design_controllers
     from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights
-    from pipeline.temperature.test_set import cases, panel
+    from pipeline.temperature.test_set import panel
     from stages.evaluate_temperature import read_weights
     from stages.tune_weights import load_design_problem
 
@@ -197,7 +202,7 @@ def plants(count: int, folder: Path) -> Work:
     design = design_controllers(problem, tuned)[0]["subspace_lqg"]
     half = setting.rehearsal.judging
     at = panel.rests(design.model, half, setting.limits)
-    return lambda: cases.play(design, at, half, setting)
+    return lambda: panel.play(design, at, half, setting)
 
 
 def lines(count: int, folder: Path) -> Work:

@@ -118,7 +118,7 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     from pipeline.runtime.replay import GaplessLog
     from pipeline.temperature.controllers.window import at_mean_disturbances
     from pipeline.temperature.identification.segments import segments, without_gaps
-    from pipeline.temperature.test_set import cases
+    from pipeline.temperature.test_set import panel
 
     declared, family = loaded.machine, loaded.problem.family
     machine, schema = wire(declared), tables.record(declared.acting, declared.outputs)
@@ -134,9 +134,9 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     rules = certify.require(half, record, setting.settled, settings.plants, settings.resamples)
     models = certificate_evidence.window_models(machine, record, rules, rng)
     if loaded.simulated:
-        spread = cases.spread_of(loaded.panel)
+        spread = panel.spread_of(loaded.panel)
     else:
-        spread = cases.spread_around(loaded.panel, loaded.problem.plant)
+        spread = panel.spread_around(loaded.panel, loaded.problem.plant)
     plants = support_logs.forecasting_plants(family, spread, np.random.default_rng(settings.seed))
     disturbances = ", ".join(one.name for one in declared.disturbances)
     conditions = DISTURBED.format(names=disturbances) if disturbances else UNDISTURBED

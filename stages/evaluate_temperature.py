@@ -19,8 +19,8 @@ from stages.tune_weights import load_design_problem
 if TYPE_CHECKING:
     from pipeline.runtime.signals import Machine
     from pipeline.temperature.controllers.problem import Design, DesignProblem
-    from pipeline.temperature.test_set.cases import CaseConditions
     from pipeline.temperature.test_set.evaluation import ControllerOutcome
+    from pipeline.temperature.test_set.panel import CaseConditions
 
 
 class EvaluateTemperature(Section):
@@ -68,9 +68,9 @@ def read_weights(path: str | Path) -> Weights:
 def wire(declared: Plant) -> Machine:
     """Section `plant` as a controller knows it."""
     from pipeline.runtime.signals import Machine, Signal
-    from pipeline.temperature.test_set import cases
+    from pipeline.temperature.test_set import panel
 
-    low, high = cases.output_limits(declared)
+    low, high = panel.output_limits(declared)
     return Machine(
         tuple(Signal(one.name, one.unit, one.low, one.high) for one in declared.inputs),
         tuple(
@@ -191,7 +191,7 @@ def redesigns(names: list[str], loaded: EvaluationInputs) -> dict[str, dict[str,
     """By controller that takes the identified plant, the extra cost in percent that the plant's bands leave
     open, None if it is without bound, and of how many resamples of the record another controller comes."""
     from pipeline.temperature.controllers.table import BY_NAME
-    from pipeline.temperature.redesign import redesigned
+    from pipeline.temperature.test_set.evaluation import redesigned
 
     found = {}
     for name in (name for name in names if BY_NAME[name].learned_from == "plant"):

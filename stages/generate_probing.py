@@ -78,7 +78,7 @@ def design(
     experiment unsafe is a reason in the figures, not an error."""
     import numpy as np
 
-    from pipeline.temperature import experiment, forecast
+    from pipeline.temperature import experiment
 
     lacking = [o.name for o in machine.outputs if o.low is None or o.high is None]
     if lacking:
@@ -95,8 +95,10 @@ def design(
         settings.shortest_steps,
         None if centre is None else np.array(centre),
     )
-    names = experiment.Names([i.name for i in machine.inputs], [o.name for o in machine.outputs])
-    doubt = forecast.Doubt(settings.doubt_input_gain, settings.doubt_ambient_degC, settings.doubt_delay_steps)
+    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+    doubt = experiment.Doubt(
+        settings.doubt_input_gain, settings.doubt_ambient_degC, settings.doubt_delay_steps
+    )
     try:
         family = experiment.family_of(
             plants,
@@ -104,7 +106,8 @@ def design(
             reach=limits.high - limits.low,
             longest=settings.samples,
             doubt=doubt,
-            names=names,
+            inputs=inputs,
+            outputs=outputs,
         )
         plan = experiment.design(family, wish, limits, np.random.default_rng(settings.seed))
     except (ValueError, np.linalg.LinAlgError) as error:
@@ -119,11 +122,9 @@ def design(
         else dither_figures(machine, dither),
     }
     added = (
-        {}
-        if dither is None or dither.reason
-        else columns(dither.u, [f"{n}_dither" for n in names.inputs], step)
+        {} if dither is None or dither.reason else columns(dither.u, [f"{n}_dither" for n in inputs], step)
     )
-    return columns(plan.u, names.inputs, step) if plan.written else {}, added, figures
+    return columns(plan.u, inputs, step) if plan.written else {}, added, figures
 
 
 def refuse(settings: GenerateProbing, reason: str) -> tuple[Columns, Columns, dict[str, Any]]:
@@ -140,7 +141,7 @@ def design_dither(
 
     from pipeline.temperature import experiment
     from pipeline.temperature.controllers import baseline
-    from pipeline.temperature.identification.trust import horizon
+    from pipeline.temperature.identification.validation import horizon
 
     try:
         rise = horizon(family.model, wish.samples)

@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pipeline.store.tables import Schema
-    from pipeline.temperature.identification.judgement import ModelJudgement
     from pipeline.temperature.identification.model_choice import Identified
-    from pipeline.temperature.identification.trust import Steps
+    from pipeline.temperature.identification.validation import ModelJudgement, Steps
     from pipeline.temperature.plant import Plant
 
     Segments = list[np.ndarray]
@@ -91,9 +90,9 @@ def identify(
     Raises ValueError if the record does not determine the plant."""
     import numpy as np
 
-    from pipeline.temperature.identification import model_choice, trust, validation
-    from pipeline.temperature.identification.judgement import judge
+    from pipeline.temperature.identification import model_choice, validation
     from pipeline.temperature.identification.segments import split
+    from pipeline.temperature.identification.validation import judge
     from pipeline.temperature.plant import at_disturbances, observability
 
     acting, inputs = [signal.name for signal in machine.acting], len(machine.inputs)
@@ -131,7 +130,7 @@ def identify(
     left_out = [
         at_disturbances(one, inputs, level) for one in validation.left_out_plants(record.u, record.y, fitted)
     ]
-    steps = trust.steps(plant, spread, max(map(len, record.u)), left_out=left_out)
+    steps = validation.steps(plant, spread, max(map(len, record.u)), left_out=left_out)
     page_tables = {
         "order": (tables.ORDER, model_choice.rows(chosen)),
         **judgement_tables(machine, last[1], judgement),
@@ -164,27 +163,27 @@ def read_record(settings: IdentifyPlant, machine: Machine, path: str) -> RecordS
 
 
 def judgement_tables(machine: Machine, measured: Segments, judgement: ModelJudgement) -> Tables:
-    from pipeline.temperature.identification import trust
+    from pipeline.temperature.identification import validation
 
     inputs, outputs = [s.name for s in machine.acting], [o.name for o in machine.outputs]
-    ahead = trust.holdout_rows(measured, judgement.holdout, outputs, machine.sample_time_s)
+    ahead = validation.holdout_rows(measured, judgement.holdout, outputs, machine.sample_time_s)
     return {
         "holdout": (tables.holdout(machine.outputs), ahead),
-        "residuals": (tables.RESIDUALS, trust.residual_rows(judgement.residuals, outputs, inputs)),
+        "residuals": (tables.RESIDUALS, validation.residual_rows(judgement.residuals, outputs, inputs)),
     }
 
 
 def model_tables(machine: Machine, u: Segments, plant: Plant, spread: list[Plant], steps: Steps) -> Tables:
-    from pipeline.temperature.identification import trust
+    from pipeline.temperature.identification import validation
 
     inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
     responses, moved = (steps, outputs, inputs, machine.sample_time_s), [a[:, : len(inputs)] for a in u]
     return {
-        "steps": (tables.STEPS, trust.step_rows(*responses)),
-        "dynamics": (tables.DYNAMICS, trust.dynamics_rows(*responses)),
-        "first_order": (tables.FIRST_ORDER, trust.first_order_rows(*responses)),
-        "poles": (tables.POLES, trust.pole_rows(plant, spread)),
-        "levels": (tables.LEVELS, trust.level_rows(trust.input_levels(moved), inputs)),
+        "steps": (tables.STEPS, validation.step_rows(*responses)),
+        "dynamics": (tables.DYNAMICS, validation.dynamics_rows(*responses)),
+        "first_order": (tables.FIRST_ORDER, validation.first_order_rows(*responses)),
+        "poles": (tables.POLES, validation.pole_rows(plant, spread)),
+        "levels": (tables.LEVELS, validation.level_rows(validation.input_levels(moved), inputs)),
     }
 
 
@@ -198,7 +197,7 @@ def fit_figures(
 ) -> dict[str, Any]:
     import numpy as np
 
-    from pipeline.temperature.identification import order, trust, validation
+    from pipeline.temperature.identification import order, validation
     from pipeline.temperature.plant import controllability
 
     inputs, outputs = [s.name for s in machine.acting], [o.name for o in machine.outputs]
@@ -219,9 +218,9 @@ def fit_figures(
         "delays": dict(zip(inputs, fitted.delays, strict=True)),
         "notes": list(dict.fromkeys([*record.notes, *fitted.notes])),
         "ahead_steps": settings.ahead_steps,
-        **trust.fit_figures(judgement.holdout, outputs),
+        **validation.fit_figures(judgement.holdout, outputs),
         "fit_holdout_inputs_held": dict(zip(outputs, judgement.still.tolist(), strict=True)),
-        **trust.outcome_figures(judgement.residuals, judgement.excitation, outputs, inputs),
+        **validation.outcome_figures(judgement.residuals, judgement.excitation, outputs, inputs),
         "controllable": controllability(fitted.plant).passed,
         "largest_pole": np.abs(np.linalg.eigvals(fitted.plant.A)).max(),
         "advice": validation.advice(
@@ -239,7 +238,7 @@ def fit_figures(
 def warnings(machine: Machine, fitted: Identified, steps: Steps) -> dict[str, Any]:
     """Whether the record was taken in closed loop, and the gains that physics forbids."""
     from pipeline.temperature.identification.closed_loop import LEVEL_CLOSED
-    from pipeline.temperature.identification.trust import forbidden_gains
+    from pipeline.temperature.identification.validation import forbidden_gains
 
     names, feedback = [i.name for i in machine.inputs], fitted.feedback
     forbidden = forbidden_gains(

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pipeline.temperature.controllers.window import WindowModel
-    from pipeline.temperature.judging import KernelCandidate, Sufficiency
+    from pipeline.temperature.test_set.scorecard import KernelCandidate, Sufficiency
 
 
 class LearnKernel(Section):
@@ -59,9 +59,9 @@ def main() -> None:
     with artifacts.stage("learn_kernel") as out:
         import numpy as np
 
-        from pipeline.temperature import judging
         from pipeline.temperature.controllers import window
         from pipeline.temperature.identification import model_choice
+        from pipeline.temperature.test_set import scorecard
         from pipeline.temperature.test_set.scorecard import CommonCost
 
         settings = params.load(LearnKernel, "learn_kernel")
@@ -80,22 +80,31 @@ def main() -> None:
         start_degC = (
             panel.training.starts_degC[0] if simulated else float(np.nanquantile(np.vstack(y), COLD_SHARE))
         )
-        check = judging.CheckRun(start_degC, np.array([o.reference for o in machine.outputs]), panel.steps)
         long = window.learn(
             u, y, longest=settings.longest_window, offset=settings.offset, gain_spread=settings.gain_spread
         )
-        enough = judging.sufficiency(
+        scenarios = scorecard.panel(
+            [window.predictor(long)],
+            starts=[start_degC],
+            references=[[o.reference for o in machine.outputs]],
+            noise=[0.0],
+            seeds=[0],
+            steps=panel.steps,
+            hold=0,
+            cells=False,
+        )
+        enough = scorecard.sufficiency(
             u,
             y,
             long,
             yardstick,
-            check,
+            scenarios,
             allowed=settings.allowed_gap_percent / 100,
             offset=settings.offset,
             gain_spread=settings.gain_spread,
         )
-        candidates = judging.kernel_candidates(
-            u, y, long, yardstick, check, largest=settings.largest_kernel_window, offset=settings.offset
+        candidates = scorecard.kernel_candidates(
+            u, y, long, yardstick, scenarios, largest=settings.largest_kernel_window, offset=settings.offset
         )
         best = min(candidates, key=lambda candidate: candidate.gap)
         artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(long))
@@ -122,7 +131,7 @@ def figures(
         "refused": None if kernel else best.refusal,
         "rank": kernel.rank if kernel else None,
         "identifiable": kernel.unknowns if kernel else None,
-        "samples_needed": kernel.samples_needed if kernel else None,
+        "samples_needed": kernel.unknowns if kernel else None,
         "condition": kernel.condition if kernel else None,
         "candidates": {
             c.state: {

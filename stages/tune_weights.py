@@ -17,7 +17,7 @@ from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights, r
 if TYPE_CHECKING:
     from pipeline.temperature.controllers.printer_pid import HeaterPid
     from pipeline.temperature.controllers.problem import DesignProblem
-    from pipeline.temperature.test_set.cases import CaseConditions
+    from pipeline.temperature.test_set.panel import CaseConditions
     from pipeline.temperature.test_set.tuning import SearchResult
 
 
@@ -79,7 +79,7 @@ def load_design_problem(
     study's; otherwise cases follow from the record of ingest."""
     from pipeline.temperature.identification.segments import segments, without_gaps
     from pipeline.temperature.plant import baam
-    from pipeline.temperature.test_set import cases
+    from pipeline.temperature.test_set.panel import conditions, design_problem, from_declaration, from_record
 
     models = read_models(
         "datasets/identify_plant/plant.parquet",
@@ -91,16 +91,16 @@ def load_design_problem(
     truth, family = None, models["family"]
     if simulated:
         truth = baam()._replace(sample_time_s=machine.sample_time_s)
-        rehearsal = cases.from_declaration(panel, machine, truth, family)
+        rehearsal = from_declaration(panel, machine, truth, family)
     else:
         schema = tables.record(machine.acting, machine.outputs)
         record = artifacts.read_table("datasets/ingest/record.parquet", schema)
         u, y, recordings = segments(
             record, [s.name for s in machine.acting], [o.name for o in machine.outputs]
         )
-        rehearsal = cases.from_record(panel, machine, family, *without_gaps(u, y, recordings))
-    setting = cases.conditions(tuning, machine, tracking, panel, rehearsal, family)
-    return setting, cases.design_problem(models, tracking, setting, truth)
+        rehearsal = from_record(panel, machine, family, *without_gaps(u, y, recordings))
+    setting = conditions(tuning, machine, tracking, panel, rehearsal, family)
+    return setting, design_problem(models, tracking, setting, truth)
 
 
 def search_all(

@@ -21,7 +21,7 @@ PLAIN = {"settings", "tables", "records", "made"}
 # of a loop, what saves and loads networks, frames and recordings
 FILES = {"files", "recordings"}
 # methods that pose the temperature loop's cases, from its settings
-POSE = {f"pipeline/temperature/test_set/{name}.py" for name in ("cases", "controller_search", "evaluation")}
+POSE = {f"pipeline/temperature/test_set/{name}.py" for name in ("controller_search", "evaluation", "panel")}
 # room -> rooms that it may know beside itself; own: the methods of its loop, files: what saves networks
 MAY_KNOW: dict[str, set[str]] = {
     "statistics": set(),

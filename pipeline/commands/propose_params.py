@@ -31,7 +31,7 @@ from pipeline.recordings.resampling import resample
 from pipeline.store import artifacts, params
 from pipeline.store.params_text import inserted, replaced
 from pipeline.temperature import tables
-from pipeline.temperature.test_set.time_scale import time_constant
+from pipeline.temperature.identification.first_order import time_constant
 
 RAW = Path("datasets/raw/temperature")
 # what the files hold before anybody has touched them: the study's machine

@@ -20,7 +20,7 @@ from pipeline.temperature.controllers import table, window
 from pipeline.temperature.controllers.problem import Design
 from pipeline.temperature.settings import Panel, Tracking, TuneWeights, recorded
 from pipeline.temperature.settings import Plant as Machine
-from pipeline.temperature.test_set import cases, evaluation, panel
+from pipeline.temperature.test_set import evaluation, panel
 from stages.ingest import Ingest, recording_wish
 from stages.tune_weights import read_models
 
@@ -137,7 +137,7 @@ class FrozenPanel(NamedTuple):
     tracking: Tracking
     settings: Panel
     tuning: TuneWeights
-    rehearsal: cases.Rehearsal
+    rehearsal: panel.Rehearsal
     records: list[tuple[np.ndarray, np.ndarray]]
 
 
@@ -179,7 +179,7 @@ def frozen_panel(holdout: HoldOut) -> FrozenPanel:
     records = [] if simulated else _holdout_records(holdout, machine)
     truth = plant.baam()._replace(sample_time_s=machine.sample_time_s)
     nominal = [truth] if simulated else _panel_plants(records, machine)
-    spread = cases.spread_of(settings) if simulated else cases.spread_around(settings, nominal[0])
+    spread = panel.spread_of(settings) if simulated else panel.spread_around(settings, nominal[0])
     rng = np.random.default_rng(holdout.seed)
     plants = panel.padded(panel.drawn(nominal, holdout.plants, spread, cells=simulated, rng=rng))
     noise = np.full(len(machine.outputs), holdout.noise_degC)
@@ -200,7 +200,7 @@ def frozen_panel(holdout: HoldOut) -> FrozenPanel:
         settings.model_dump(exclude={"training", "judging"}),
         {key: value for key, value in tuning.model_dump().items() if key.startswith("allow_")},
     )
-    rehearsal = cases.Rehearsal(asked, asked, settings.band_degC, None, 0.0, noise, [], "declared")
+    rehearsal = panel.Rehearsal(asked, asked, settings.band_degC, None, 0.0, noise, [], "declared")
     return FrozenPanel(joblib.hash(made_from), machine, tracking, settings, tuning, rehearsal, records)
 
 
@@ -252,15 +252,15 @@ def judged(frozen: FrozenPanel, folder: Path, name: str) -> evaluation.Controlle
     return evaluation.evaluate(name, design._replace(plain=None), setting)[1]
 
 
-def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[Design, cases.CaseConditions]:
+def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[Design, panel.CaseConditions]:
     machine, tracking = frozen.machine, frozen.tracking
     models = _models(folder, name, machine)
-    setting = cases.conditions(
+    setting = panel.conditions(
         frozen.tuning, machine, tracking, frozen.settings, frozen.rehearsal, models["family"]
     )
     values, tuned_for = _tuned(folder / "tune_weights/weights.json", name, machine)
     # what it was tuned for, not what it is judged by
-    problem = cases.design_problem(models, tracking, setting, None)._replace(
+    problem = panel.design_problem(models, tracking, setting, None)._replace(
         horizon=int(tuned_for.get("horizon_steps", frozen.settings.steps)),
         noise=np.array(tuned_for.get("noise_degC", frozen.rehearsal.noise), float),
     )

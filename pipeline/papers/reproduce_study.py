@@ -7,7 +7,7 @@ Its figures as published; its learners on noise-free and on many noisy data sets
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from joblib import delayed
@@ -33,7 +33,6 @@ class ReproduceStudy(Section):
     data_sets: int = Field(ge=1, le=1000)
     initial: int = Field(ge=4, le=5000)
     evaluations: int = Field(ge=8, le=5000)
-    acquisition: Literal["expected_improvement", "upper_confidence_bound"]
     q_low: float = Field(gt=0, le=1e6)
     q_high: float = Field(gt=0, le=1e6)
     r_low: float = Field(gt=0, le=1e6)
@@ -101,7 +100,8 @@ def _parity(settings: ReproduceStudy) -> tuning.SearchResult:
             study.tuning_objective,
             low,
             high,
-            tuning.SearchSettings(settings.initial, settings.evaluations, settings.acquisition),
+            initial=settings.initial,
+            evaluations=settings.evaluations,
             rng=np.random.default_rng(settings.seed),
             on_step=lambda _: bar.update(),
         )

@@ -10,7 +10,7 @@ from pipeline.runtime.machine import Exported, plants_sha256
 from pipeline.runtime.signals import Machine
 from pipeline.temperature.controllers.problem import Design
 from pipeline.temperature.plant import Plant
-from pipeline.temperature.test_set.cases import CaseConditions, deploy
+from pipeline.temperature.test_set.panel import CaseConditions, deploy
 from pipeline.temperature.test_set.scorecard import closed_loop
 
 # what takes over if the law is left: the control that the machine has, or a PI in its place

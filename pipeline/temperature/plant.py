@@ -2,13 +2,10 @@
 BAAM study, simulation and plant spread."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-
-if TYPE_CHECKING:
-    import control
 
 
 class Plant(NamedTuple):
@@ -41,47 +38,6 @@ class Plant(NamedTuple):
     @property
     def p(self) -> int:
         return self.C.shape[0]
-
-    def to_control(self, input_names: Sequence[str], output_names: Sequence[str]) -> "control.StateSpace":
-        """The plant as a control.StateSpace with named signals and its sample time, for a notebook to go on.
-
-        python-control knows linear systems only: b, d and K stay behind. Its y is then the distance from the
-        outputs at rest, and `from_control` takes b, d and K back.
-        """
-        import control
-
-        for kind, names, size in (("input", input_names, self.m), ("output", output_names, self.p)):
-            if len(names) != size:
-                raise ValueError(
-                    f"to_control: expected {size} {kind} names but found {len(names)}; "
-                    f"give one for each {kind}"
-                )
-        return control.ss(
-            self.A,
-            self.B,
-            self.C,
-            self.D,
-            self.sample_time_s,
-            inputs=list(input_names),
-            outputs=list(output_names),
-        )
-
-    @classmethod
-    def from_control(cls, system: "control.StateSpace", *, b=None, d=None, K=None) -> "Plant":
-        """The plant of a discrete control.StateSpace; b (n,), d (p,) and K (n, p) are zero where left out."""
-        import control
-
-        if not isinstance(system, control.StateSpace):
-            raise ValueError(
-                f"from_control: expected a control.StateSpace but found {type(system).__name__}; "
-                "convert it with control.ss"
-            )
-        if system.dt is None or system.dt is True or not system.dt > 0:
-            raise ValueError(
-                f"from_control: expected a discrete system with a sample time in seconds but found "
-                f"dt = {system.dt}; sample it with control.sample_system, or give its dt"
-            )
-        return plant(system.A, system.B, system.C, system.D, b, d, K, float(system.dt))
 
 
 def plant(A, B, C, D=None, b=None, d=None, K=None, sample_time_s: float = 1.0) -> Plant:

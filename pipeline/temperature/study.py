@@ -2,7 +2,6 @@
 noisy data sets; the yardstick beside the paper's figures."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,15 +17,7 @@ from pipeline.temperature.controllers.kernel import (
 from pipeline.temperature.plant import baam
 from pipeline.temperature.probing import study_probe, study_signal
 from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, PublishedFigures
-from pipeline.temperature.test_set.scorecard import (
-    CommonCost,
-    Scenarios,
-    cost,
-    optimum,
-    panel,
-    regret,
-    simulate,
-)
+from pipeline.temperature.test_set.scorecard import CommonCost, Scenarios, cost, optimum, panel, simulate
 from pipeline.temperature.test_set.tuning import SearchResult, fitness
 from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
 
@@ -55,7 +46,7 @@ def study_panel(
 def gap(law: Law, scenarios: Scenarios) -> np.ndarray:
     """J / J* - 1 of each scenario, unclipped, Q = R = I."""
     run = simulate(scenarios, law)
-    return regret(cost(scenarios, run, YARDSTICK), optimum(scenarios, YARDSTICK))
+    return cost(scenarios, run, YARDSTICK) / optimum(scenarios, YARDSTICK) - 1
 
 
 def data_sets(rng: np.random.Generator, samples: int, sets: int) -> tuple[np.ndarray, np.ndarray]:
@@ -77,20 +68,10 @@ def law_of(kernel: Kernel, N: int) -> Law:
     return window_law(kernel.K, kernel.K_r, kernel.k, N)
 
 
-class Exact(NamedTuple):
+def exact() -> dict[str, dict[str, float]]:
     """J over 1,000 (100) steps from 20 °C, Q = R = I: the optimum that knows the state, and the observer that
-    does not; and two prices of the start."""
-
-    optimal_J1000: float
-    optimal_J100: float
-    observer_J1000: float
-    observer_published_start_J1000: float
-    zero_history_gap: float
-
-
-def exact() -> Exact:
-    """The model-based figures of the common yardstick, and what a wrong start costs: the paper's 50 °C
-    estimate, and a window filled with u = 0 and y(0)."""
+    does not; and what a wrong start costs: the paper's 50 °C estimate, and a window filled with u = 0 and
+    y(0)."""
     plant, scenarios = baam(), study_panel(REFERENCE[None])
     best = gains(plant, np.eye(5), np.eye(7), GAMMA)
     short = scenarios._replace(steps=100)
@@ -99,33 +80,30 @@ def exact() -> Exact:
     K, K_r = exact_gains(plant, best, 2)
     history = window_law(K, K_r, best.k, 2)
     empty = history._replace(start_u=np.zeros_like(history.start_u))
-    J = [float(cost(scenarios, simulate(scenarios, run), YARDSTICK).J[0]) for run in (law, from_50)]
-    return Exact(
-        float(optimum(scenarios, YARDSTICK).J[0]),
-        float(optimum(short, YARDSTICK).J[0]),
-        *J,
-        float(gap(empty, scenarios)[0]),
-    )
+    J = [float(cost(scenarios, simulate(scenarios, run), YARDSTICK)[0]) for run in (law, from_50)]
+    return {
+        "optimal": {
+            "J1000": float(optimum(scenarios, YARDSTICK)[0]),
+            "J100": float(optimum(short, YARDSTICK)[0]),
+        },
+        "observer": dict(zip(("J1000", "J1000_from_50_degC"), J, strict=True)),
+        "takeover": {"zero_history_gap": float(gap(empty, scenarios)[0])},
+    }
 
 
-class NoiseFree(NamedTuple):
-    """Gaps of Algorithm 2 on noise-free data: window of 2 on 500 and of 6 on 1,610 samples for the study's
-    reference; one set of 540 for random references."""
-
-    gap: float
-    gap_window_6: float
-    any_reference_gap: float
-
-
-def noise_free(u: np.ndarray, y: np.ndarray, rng: np.random.Generator, *, references: int = 20) -> NoiseFree:
-    """From the study's own record u (T, 7), y (T, 5) without its first row; the
-    worst of `references` drawn from 100 to 220 °C."""
+def noise_free(
+    u: np.ndarray, y: np.ndarray, rng: np.random.Generator, *, references: int = 20
+) -> dict[str, float]:
+    """Gaps of Algorithm 2 from the study's own record u (T, 7), y (T, 5) without its first row: `gap` and
+    `gap_window_6` with a window of 2 on 500 and of 6 on 1,610 samples for the study's reference;
+    `any_reference_gap`, from 540 samples, is the worst of `references` drawn from 100 to 220 °C."""
     one, many = study_panel(REFERENCE[None]), study_panel(rng.uniform(100.0, 220.0, (references, 5)))
-    figures = []
-    for N, samples, scenarios in ((2, 500, one), (6, 1610, one), (2, 540, many)):
+    gaps = {}
+    sets = {"gap": (2, 500, one), "gap_window_6": (6, 1610, one), "any_reference_gap": (2, 540, many)}
+    for name, (N, samples, scenarios) in sets.items():
         rows = slice(0, samples + N)
-        figures.append(float(np.abs(gap(law_of(kernel_of(u[rows], y[rows], N), N), scenarios)).max()))
-    return NoiseFree(*figures)
+        gaps[name] = float(np.abs(gap(law_of(kernel_of(u[rows], y[rows], N), N), scenarios)).max())
+    return gaps
 
 
 NOISE = (0.1, 0.5)
@@ -154,7 +132,7 @@ def under_noise(
         run = simulate(scenarios, law)
         late = (run.y - scenarios.r)[500:]
         result[name] = (
-            float(regret(cost(scenarios, run, YARDSTICK), optimum(scenarios, YARDSTICK))[0]),
+            float((cost(scenarios, run, YARDSTICK) / optimum(scenarios, YARDSTICK) - 1)[0]),
             float(np.sqrt((late**2).mean())),
         )
     return result
@@ -176,8 +154,8 @@ def rows(
 
 def metrics(
     as_published: dict[str, PublishedFigures],
-    exact: Exact,
-    noise_free: NoiseFree,
+    exact: dict[str, dict[str, float]],
+    noise_free: dict[str, float],
     table: dict[str, list],
     *,
     failures: int,
@@ -189,17 +167,8 @@ def metrics(
         "as_published": {name: column._asdict() for name, column in as_published.items()},
         "printed": PRINTED,
         "algorithm_1": {"failures": failures, "of": starts},
-        "optimal": {"J1000": exact.optimal_J1000, "J100": exact.optimal_J100},
-        "observer": {
-            "J1000": exact.observer_J1000,
-            "J1000_from_50_degC": exact.observer_published_start_J1000,
-        },
-        "takeover": {"zero_history_gap": exact.zero_history_gap},
-        "kernel": {
-            "gap": noise_free.gap,
-            "gap_window_6": noise_free.gap_window_6,
-            "any_reference_gap": noise_free.any_reference_gap,
-        },
+        **exact,
+        "kernel": {**noise_free},
         "window": {},
         "kernel_predicted_state": {},
     }
@@ -262,7 +231,7 @@ def scaled_weights(scale: float = 0.4) -> dict[str, float]:
     law = observer_law(plant, other, observer_gain(plant, TAU))
     run = simulate(scenarios, law)
     J = [
-        cost(scenarios, run, CommonCost(np.full(5, factor), np.full(7, factor), GAMMA)).J[0]
+        cost(scenarios, run, CommonCost(np.full(5, factor), np.full(7, factor), GAMMA))[0]
         for factor in (1.0, scale)
     ]
     return {

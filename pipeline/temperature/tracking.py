@@ -104,35 +104,25 @@ def riccati(
     )
 
 
-def gains(plant: Plant, Q: np.ndarray, R: np.ndarray, gamma: float, F: np.ndarray | None = None) -> Gains:
-    """The optimal u = -K_x x - K_r r - k for (3) with r(t+1) = F r(t) (default:
-    constant): discrete Riccati equation on sqrt(gamma) (A, B).
+def gains(plant: Plant, Q: np.ndarray, R: np.ndarray, gamma: float) -> Gains:
+    """The optimal u = -K_x x - K_r r - k for (3) with r constant: discrete Riccati equation on sqrt(gamma)
+    (A, B).
 
     With w = [r; 1], x+ = A x + B u + E w and y - r = C x + G w:
 
-    K_w = S^-1 gamma B'(P E + P_xw F_w)
-    P_xw = C'QG + gamma (A - B K_x)'(P E + P_xw F_w)
+    K_w = S^-1 gamma B'(P E + P_xw)
+    P_xw = C'QG + gamma (A - B K_x)'(P E + P_xw)
     """
     _strictly_proper(plant)
-    p, F = plant.p, np.eye(plant.p) if F is None else F
+    p = plant.p
     P = riccati(np.sqrt(gamma) * plant.A, np.sqrt(gamma) * plant.B, plant.C.T @ Q @ plant.C, R)
     S = R + gamma * plant.B.T @ P @ plant.B
     K_x = np.linalg.solve(S, gamma * plant.B.T @ P @ plant.A)
     E, G = np.column_stack([np.zeros((plant.n, p)), plant.b]), np.column_stack([-np.eye(p), plant.d])
-    F_w = scipy.linalg.block_diag(F, 1.0)
     closed = gamma * (plant.A - plant.B @ K_x).T
-    P_xw = stein(closed, F_w, plant.C.T @ Q @ G + closed @ P @ E)
-    K_w = np.linalg.solve(S, gamma * plant.B.T @ (P @ E + P_xw @ F_w))
+    P_xw = np.linalg.solve(np.eye(plant.n) - closed, plant.C.T @ Q @ G + closed @ P @ E)
+    K_w = np.linalg.solve(S, gamma * plant.B.T @ (P @ E + P_xw))
     return Gains(K_x, K_w[:, :p], K_w[:, p], P)
-
-
-def stein(A: np.ndarray, F: np.ndarray, C: np.ndarray) -> np.ndarray:
-    """X with X = A X F + C; one linear solve where F is the identity (a
-    constant reference), by Kronecker products otherwise."""
-    if np.array_equal(F, np.eye(len(F))):
-        return np.linalg.solve(np.eye(len(A)) - A, C)
-    x = np.linalg.solve(np.eye(C.size) - np.kron(F.T, A), C.ravel(order="F"))
-    return x.reshape(C.shape, order="F")
 
 
 def augmented(plant: Plant, Q: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

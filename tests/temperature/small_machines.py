@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.identification.model_choice import Settings, identify
+from pipeline.temperature.identification.model_choice import Settings, identify, within_limits
 from pipeline.temperature.identification.validation import bootstrap_spread, one_step_errors
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.tracking import Law
@@ -185,7 +185,8 @@ class IdentifiedMachine(NamedTuple):
 def identified_record(u: np.ndarray, y: np.ndarray, sample_time_s: float, limits) -> IdentifiedMachine:
     """As stage identify_plant does it, on all of the record."""
     settings = Settings(feedthrough=None, refinement="validated")
-    fit = identify([u], [y], sample_time_s=sample_time_s, settings=settings, limits=limits)
+    (u,), _ = within_limits([u], limits)
+    fit = identify([u], [y], sample_time_s=sample_time_s, settings=settings)
     rng = np.random.default_rng(1)
     family = bootstrap_spread([u], [y], fit, count=FAMILY, order=fit.order + 1, rng=rng)
     errors = np.vstack(one_step_errors(fit.plant, [u], [y]))

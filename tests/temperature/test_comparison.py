@@ -4,7 +4,7 @@ known distributions."""
 import numpy as np
 import pytest
 
-from pipeline.temperature.test_set.comparison import (
+from pipeline.temperature.test_set.scorecard import (
     banded,
     between,
     chosen,

@@ -17,18 +17,10 @@ from pipeline.temperature.controllers.kernel import regress
 from pipeline.temperature.controllers.problem import DesignProblem
 from pipeline.temperature.controllers.table import BY_NAME, CONTROLLERS, PAIR
 from pipeline.temperature.plant import baam
-from pipeline.temperature.redesign import redesigned
 from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights
 from pipeline.temperature.study import data_sets
-from pipeline.temperature.test_set import (
-    best,
-    cases,
-    comparison,
-    controller_search,
-    evaluation,
-    panel,
-    scorecard,
-)
+from pipeline.temperature.test_set import best, controller_search, evaluation, panel, scorecard
+from pipeline.temperature.test_set.evaluation import redesigned
 from stages import evaluate_temperature, tune_weights
 from stages.evaluate_temperature import EvaluateTemperature
 
@@ -43,7 +35,7 @@ def section(kind, name: str):
 
 class Small(NamedTuple):
     machine: Plant
-    setting: cases.CaseConditions
+    setting: panel.CaseConditions
     problem: DesignProblem
 
     @property
@@ -85,11 +77,11 @@ def small(inputs: int = 7) -> Small:
     kernel = regress(window.predicted_tuples(long, [u], [y]))
     models = {"plant": truth, "family": [truth, truth], "window": long, "kernel": kernel, "printer_pid": ()}
     tracking = section(Tracking, "tracking")
-    rehearsal = cases.from_declaration(halves, machine, truth, [truth])
-    setting = cases.conditions(
+    rehearsal = panel.from_declaration(halves, machine, truth, [truth])
+    setting = panel.conditions(
         section(TuneWeights, "tune_weights"), machine, tracking, halves, rehearsal, [truth, truth]
     )
-    problem = cases.design_problem(models, tracking, setting, truth)
+    problem = panel.design_problem(models, tracking, setting, truth)
     return Small(machine, setting, problem)
 
 
@@ -190,7 +182,7 @@ def test_the_deciding_figures_of_the_summary_are_those_of_the_rows(stored, name)
         assert told["median"] in [number(ranked[place]) for place in middle], figure
         assert told["q90"] == number(ranked[round(0.9 * (len(ranked) - 1))]), figure
         assert told["worst"] == number(ranked[-1]), figure
-        band = comparison.banded(
+        band = scorecard.banded(
             values, mine["plant"][applies], seed=settings.seed, resamples=settings.resamples
         )
         assert (told["low"], told["high"]) == (number(band.low), number(band.high)), figure
@@ -218,14 +210,14 @@ def test_best_pair_and_deciding_plant_follow_from_the_costs_of_the_rows(stored):
     rows, summary = stored
     seed, able = section(EvaluateTemperature, "evaluate_temperature").seed, summary["best_reason"]["passes"]
     costs, plant = without(rows, None)
-    assert summary["best"] == comparison.chosen(costs, plant, able, seed=seed).best
-    pair = comparison.pair(*PAIR, costs, plant, seed=seed)._asdict()
+    assert summary["best"] == scorecard.chosen(costs, plant, able, seed=seed).best
+    pair = scorecard.pair(*PAIR, costs, plant, seed=seed)._asdict()
     assert {key: summary["pair"][key] for key in pair} == pair
-    decides = comparison.deciding_plant(costs[PAIR[0]], costs[PAIR[1]], plant)
+    decides = scorecard.deciding_plant(costs[PAIR[0]], costs[PAIR[1]], plant)
     assert summary["deciding"]["plant"] == decides
     others, left = without(rows, decides)
-    assert summary["deciding"]["best_without"] == comparison.chosen(others, left, able, seed=seed).best
-    assert summary["deciding"]["pair_without"] == comparison.pair(*PAIR, others, left, seed=seed).winner
+    assert summary["deciding"]["best_without"] == scorecard.chosen(others, left, able, seed=seed).best
+    assert summary["deciding"]["pair_without"] == scorecard.pair(*PAIR, others, left, seed=seed).winner
 
 
 def test_a_contestant_passes_by_its_ninety_percent_quantiles_and_breaks_a_rule_by_any_one_of_them(stored):
@@ -474,9 +466,9 @@ def test_a_reference_that_the_declared_machine_cannot_hold_is_named_with_what_bi
         update={name: getattr(halves, name).model_copy(update=half) for name in ("judging", "training")}
     )
     truth = given.problem.plant
-    assert cases.from_declaration(halves, given.machine, baam(), [truth]).infeasible == []
+    assert panel.from_declaration(halves, given.machine, baam(), [truth]).infeasible == []
     weak = [signal.model_copy(update={"high": 0.5}) for signal in given.machine.inputs]
-    missed = cases.from_declaration(
+    missed = panel.from_declaration(
         halves, given.machine.model_copy(update={"inputs": weak}), baam(), [truth]
     ).infeasible
     assert [one["output"] for one in missed]

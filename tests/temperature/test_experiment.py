@@ -9,15 +9,15 @@ import yaml
 
 from pipeline import cli
 from pipeline.store import artifacts, params
-from pipeline.temperature import experiment, forecast, tracking
+from pipeline.temperature import experiment, tracking
 from pipeline.temperature.controllers import baseline
-from pipeline.temperature.experiment import ExperimentLimits, Names, Wish
+from pipeline.temperature.experiment import ExperimentLimits, Wish
 from pipeline.temperature.plant import hold_output, plant, simulate
 from pipeline.temperature.settings import GenerateProbing, Plant, Tracking
 from stages import generate_probing
 from tests.temperature.test_propose_params import tree  # noqa: F401  the params files as shipped
 
-DOUBT = forecast.Doubt(0.15, 8.0, 1)
+DOUBT = experiment.Doubt(0.15, 8.0, 1)
 ROOM, TAU, LATE = 25.0, 120.0, 3
 HOLDS_200 = 38.0  # percent: left alone at 50 it would reach 255 °C
 
@@ -60,9 +60,9 @@ def wish(reference, samples=1500, **more):
 
 
 def family_of(plants, u, y, samples=1500):
-    names = Names(["heater"], ["zone"])
+    names = {"inputs": ["heater"], "outputs": ["zone"]}
     return experiment.family_of(
-        plants, ([u], [y]), reach=np.full(1, 100.0), longest=samples, doubt=DOUBT, names=names
+        plants, ([u], [y]), reach=np.full(1, 100.0), longest=samples, doubt=DOUBT, **names
     )
 
 
@@ -116,8 +116,8 @@ def test_a_lower_limit_takes_a_smaller_amplitude_or_a_cooler_centre_and_still_te
 def test_the_forecast_of_a_member_is_its_simulation_within_the_doubt(heated):
     family, x = heated
     tried = design(family, 260.0)
-    none = forecast.Doubt(0.0, 0.0, 0)
-    exact = forecast.forecast(
+    none = experiment.Doubt(0.0, 0.0, 0)
+    exact = experiment.forecast(
         family.plants[:1], of_model(family.begin), tried.u, doubt=none, fastest=100.0, width=np.zeros(1)
     )
     y = simulate(hot_end(), tried.u, x)[1]
@@ -129,9 +129,9 @@ def test_doubt_about_gains_is_exact_a_forecast_with_it_equals_the_worst_member(h
     family, _ = heated
     u = np.repeat([[38.0], [43.0], [33.0]], 300, axis=0)
     still = of_model(family.begin)
-    doubt = forecast.Doubt(0.15, 0.0, 0)
-    bound = forecast.forecast([hot_end()], still, u, doubt=doubt, fastest=1.0, width=np.zeros(1))
-    more = forecast.forecast(
+    doubt = experiment.Doubt(0.15, 0.0, 0)
+    bound = experiment.forecast([hot_end()], still, u, doubt=doubt, fastest=1.0, width=np.zeros(1))
+    more = experiment.forecast(
         [hot_end()], still, 1.15 * u, doubt=doubt._replace(input_gain=0.0), fastest=1.0,
         width=np.zeros(1),
     )  # fmt: skip
@@ -176,7 +176,7 @@ def test_an_amplitude_that_teaches_nothing_is_not_written(heated):
     family, _ = heated
     noisy = family._replace(band=family.band._replace(noise=np.array([500.0]), error=np.array([0.1])))
     # a sensor of 500 °C noise whose band is set aside: safe, but of no use
-    noisy = noisy._replace(band=forecast.Band(np.array([30.0]), np.array([0.1])))
+    noisy = noisy._replace(band=experiment.Band(np.array([30.0]), np.array([0.1])))
     tried = experiment.design(noisy, wish(200.0, samples=120), limits(0.0, 320.0), np.random.default_rng(1))
     assert not tried.written and "would leave its gain unknown" in tried.reason
 

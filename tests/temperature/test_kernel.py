@@ -153,7 +153,7 @@ def test_whitening_keeps_the_range_and_makes_the_second_moment_the_identity():
 def test_the_study_s_window_of_six_has_rank_56_of_79(record):
     data = regress(tuples([record[0]], [record[1]], 6))
     # [past u; past y; u]: 7 x 6 + 6 states + 7, no reference
-    assert (data.rank, data.unknowns, data.samples_needed) == (55, 1540, 1540)
+    assert (data.rank, data.unknowns) == (55, 1540)
     assert data.entries == 79 * 80 // 2
     assert data.condition < 1e6  # 6.6e13 without whitening
     reference = tuples_with_reference([record[0]], [record[1]], 6, REFERENCE, I5)
@@ -221,16 +221,15 @@ def test_the_kernel_learned_without_noise_is_the_exact_one(record, N, samples):
     np.testing.assert_allclose(solution.k, 0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("F", [np.eye(2), TURN], ids=["constant reference", "turning and decaying reference"])
 @pytest.mark.parametrize(
     ("machine", "offset"),
     [(SMALL, False), (SMALL, True), (OFFSET, True)],
     ids=["no offset", "offset 0 learned", "offset"],
 )
-def test_the_learned_law_is_the_optimal_one_for_any_generator_and_offset(machine, offset, F):
+def test_the_learned_law_is_the_optimal_one_for_any_offset(machine, offset):
     x, u, y = small_record(machine)
-    solution = value_iteration(regress(tuples([u], [y], 2, offset=offset)), Q2, R2, 0.9, F=F, tolerance=1e-12)
-    best = gains(machine, Q2, R2, 0.9, F)
+    solution = value_iteration(regress(tuples([u], [y], 2, offset=offset)), Q2, R2, 0.9, tolerance=1e-12)
+    best = gains(machine, Q2, R2, 0.9)
     w = windows([u], [y], 2)[0]
     # 1e-12 on the gain at stop leaves 1e-11 of a contraction 0.9;
     # whitening multiplies rounding by its condition of 1e3

@@ -9,7 +9,6 @@ import pytest
 
 from pipeline.temperature import plant as plants
 from pipeline.temperature.plant import (
-    Plant,
     at_disturbances,
     baam,
     controllability,
@@ -166,43 +165,10 @@ def test_a_matrix_of_the_wrong_shape_is_named():
 # ---- python-control
 
 
-NAMES = ["heater", "motor"], ["sensor"]
-
-
-def test_a_plant_comes_back_from_control_with_its_names_and_sample_time():
-    plain = SMALL._replace(sample_time_s=0.5)
-    system = plain.to_control(*NAMES)
-    assert (system.input_labels, system.output_labels, system.dt) == (*NAMES, 0.5)
-    back = Plant.from_control(system, b=plain.b, d=plain.d, K=plain.K)
-    for name in Plant._fields:
-        np.testing.assert_array_equal(getattr(back, name), getattr(plain, name))
-    assert not np.any(Plant.from_control(system).b)
-
-
 def test_control_s_forced_response_is_the_simulation():
     machine, rng = baam(), np.random.default_rng(0)
     u, x0 = rng.standard_normal((40, 7)), rng.standard_normal(6)
-    names = [f"input_{i}" for i in range(7)], [f"sensor_{i}" for i in range(5)]
-    response = control.forced_response(
-        machine.to_control(*names), np.arange(40) * machine.sample_time_s, u.T, x0
-    )
+    system = control.ss(machine.A, machine.B, machine.C, machine.D, machine.sample_time_s)
+    response = control.forced_response(system, np.arange(40) * machine.sample_time_s, u.T, x0)
     # rounding of 40 steps
     np.testing.assert_allclose(response.outputs.T, simulate(machine, u, x0)[1], atol=1e-11)
-
-
-@pytest.mark.parametrize(
-    ("system", "sentence"),
-    [
-        (lambda: control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]), "found dt = 0; sample it"),
-        (lambda: control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], True), "found dt = True"),
-        (lambda: control.tf([1.0], [1.0, -0.5], 1.0), "found TransferFunction; convert it with control.ss"),
-    ],
-)
-def test_a_system_without_states_or_sample_time_is_refused(system, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        Plant.from_control(system())
-
-
-def test_a_name_for_each_signal_is_wanted():
-    with pytest.raises(ValueError, match="to_control: expected 2 input names but found 1"):
-        SMALL.to_control(["heater"], ["sensor"])

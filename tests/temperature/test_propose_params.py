@@ -13,9 +13,9 @@ from pipeline.commands import propose_params
 from pipeline.store import artifacts, params
 from pipeline.store.params_text import replaced
 from pipeline.temperature import tables
+from pipeline.temperature.identification.first_order import time_constant
 from pipeline.temperature.settings import GenerateProbing, Panel, Plant, TuneWeights, given_centre
 from pipeline.temperature.test_set import best
-from pipeline.temperature.test_set.time_scale import time_constant
 from stages.identify_plant import IdentifyPlant
 from stages.ingest import Ingest
 from tests.recordings.klipper_machine import BED, EXTRUDER, print_log

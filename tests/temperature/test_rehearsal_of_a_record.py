@@ -10,7 +10,7 @@ from pipeline.temperature.controllers import baseline, controller, governor
 from pipeline.temperature.plant import strictly_proper
 from pipeline.temperature.settings import Panel, Tracking, TuneWeights
 from pipeline.temperature.settings import Plant as Machine
-from pipeline.temperature.test_set import cases, panel
+from pipeline.temperature.test_set import panel
 from pipeline.temperature.test_set.scenario_defaults import steady_map
 from tests.temperature import small_machines
 from tests.temperature.small_machines import BED
@@ -40,16 +40,16 @@ def family():
     return [strictly_proper(one) for one in (of.plant, *of.family)]
 
 
-def rehearsal(family, reference: float = 70.0, **more: float) -> cases.Rehearsal:
+def rehearsal(family, reference: float = 70.0, **more: float) -> panel.Rehearsal:
     u, y = small_machines.record(BED)
     second = ([u], [y + more["warmer"]]) if "warmer" in more else ([], [])
     numbers = [0, 1][: 1 + len(second[0])]
-    return cases.from_record(settings(), owner(reference), family, [u, *second[0]], [y, *second[1]], numbers)
+    return panel.from_record(settings(), owner(reference), family, [u, *second[0]], [y, *second[1]], numbers)
 
 
-def shared(family, judged: cases.Rehearsal) -> cases.CaseConditions:
+def shared(family, judged: panel.Rehearsal) -> panel.CaseConditions:
     tuning, tracking = params.load(TuneWeights, "tune_weights", FILE), params.load(Tracking, "tracking", FILE)
-    return cases.conditions(tuning, owner(70.0), tracking, settings(), judged, family)
+    return panel.conditions(tuning, owner(70.0), tracking, settings(), judged, family)
 
 
 def test_no_plant_starts_where_its_inputs_could_not_hold_it(family):
@@ -83,7 +83,7 @@ def test_a_reference_out_of_reach_is_named_with_the_heater_at_its_limit(family):
 def test_the_ambient_differs_by_as_much_as_recordings_do(family):
     """Twelve degrees between two recordings are more than the eight of the panel."""
 
-    def ambients(of: cases.Rehearsal) -> float:
+    def ambients(of: panel.Rehearsal) -> float:
         rests = [steady_map(plant)[1][0] for plant in of.judging.plants]
         return float(np.ptp(rests))
 

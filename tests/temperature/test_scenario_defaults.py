@@ -1,8 +1,6 @@
 """What a rehearsal on somebody's record asks: scales near the machine's own, cases that the machine itself
 can hold, references beyond reach named with what keeps them away."""
 
-import re
-
 import numpy as np
 import pytest
 
@@ -29,7 +27,7 @@ def scale_of(machine: SmallMachine) -> MachineScale:
     return machine_scale([of.u], [of.y], of.plant, machine.sample_time_s, [0])
 
 
-def cases_of(machine: SmallMachine, reference=None, low=np.nan, high=np.nan) -> CaseDefaults:
+def cases_of(machine: SmallMachine, reference=None, low=-np.inf, high=np.inf) -> CaseDefaults:
     asked = np.asarray(machine.reference if reference is None else reference, float)
     return defaults(
         scale_of(machine),
@@ -167,19 +165,21 @@ def test_a_reference_beyond_reach_names_the_zone_s_own_heater_at_its_upper_limit
     asked[0] = hottest(machine)[0] + 60.0
     if machine.m > machine.p:  # a fan cools: the linear model holds a hotter end than the machine does
         asked[0] += 60.0
-    first, *others = cases_of(machine, asked).infeasible
+    cases = cases_of(machine, asked)
+    first, *others = cases.infeasible
     assert (first.output, first.input, first.limit) == (0, 0, "high")
-    assert first.judged_degC < first.reachable_degC < first.asked_degC
+    assert cases.references[0, 0] < first.reachable_degC < first.asked_degC
     assert [(entry.input, entry.limit) for entry in others] == ([(1, "low")] if machine is CHAMBER else [])
 
 
 def test_a_zone_beyond_reach_pulls_no_other_above_its_reference():
     """Least squares would heat the chamber to 157 °C, to help the bed. A bed that is held back for its
     headroom heats the chamber less, and that is named too."""
-    bed, chamber = cases_of(CHAMBER, [240.0, 150.0]).infeasible
+    cases = cases_of(CHAMBER, [240.0, 150.0])
+    bed, chamber = cases.infeasible
     assert (bed.output, bed.input, chamber.output, chamber.input) == (0, 0, 1, 1)
     assert chamber.reachable_degC == pytest.approx(150.0, abs=0.1)  # what counts as reached
-    assert chamber.judged_degC < 150.0
+    assert cases.references[0, 1] < 150.0
 
 
 def test_the_judged_reference_can_be_held_with_fifteen_percent_less_gain():
@@ -202,7 +202,7 @@ def test_fewer_inputs_than_references_are_named_as_that():
     two = np.ones(2)
     scale = MachineScale(20 * two, two, 0 * two, 100 * two, 0.1 * two, 0 * two)
     limits = np.zeros(1), np.full(1, 100.0)
-    cases = defaults(scale, machine, limits, np.array([50.0, 80.0]), np.nan * two, np.nan * two, 1.0)
+    cases = defaults(scale, machine, limits, np.array([50.0, 80.0]), -np.inf * two, np.inf * two, 1.0)
     assert [(entry.input, entry.limit) for entry in cases.infeasible] == [(None, "inputs")]
 
 
@@ -211,7 +211,7 @@ def test_a_fan_that_should_do_less_than_nothing_is_named_at_its_lower_limit():
     one = np.ones(1)
     scale = MachineScale(20 * one, one, 0 * one, 100 * one, 0.1 * one, 0 * one)
     limits = np.zeros(1), np.full(1, 100.0)
-    (only,) = defaults(scale, machine, limits, np.array([120.0]), np.nan * one, np.nan * one, 1.0).infeasible
+    (only,) = defaults(scale, machine, limits, np.array([120.0]), -np.inf * one, np.inf * one, 1.0).infeasible
     assert (only.input, only.limit) == (0, "low")
     assert only.reachable_degC == pytest.approx(100.0)
 
@@ -237,7 +237,6 @@ def test_pi_settles_the_machine_itself_within_the_rule(machine):
 def test_eight_time_constants_fit_and_the_settled_window_lies_after_the_rule(machine):
     cases, tau = cases_of(machine), scale_of(machine).time_constant_s.max()
     assert STEPS[0] <= cases.steps <= STEPS[1]
-    assert cases.notes == ()
     assert cases.steps * machine.sample_time_s >= 8 * tau
     assert 5 / 6 * cases.steps * machine.sample_time_s > cases.settling_s
 
@@ -260,20 +259,19 @@ def test_the_band_is_that_of_noise_or_span_and_at_most_one_degree():
 
     def band(noise, span):
         scale = MachineScale(20 * one, one, 0 * one, span * one, noise * one, 0 * one)
-        return defaults(scale, machine, limits, 0.5 * span * one, np.nan * one, np.nan * one, 1.0).band_degC
+        return defaults(scale, machine, limits, 0.5 * span * one, -np.inf * one, np.inf * one, 1.0).band_degC
 
     assert band(0.1, 10.0) == pytest.approx(0.3)
     assert band(0.01, 60.0) == pytest.approx(0.6)
     assert band(0.1, 300.0) == band(2.0, 10.0) == 1.0
 
 
-def test_a_machine_too_slow_for_its_sample_time_is_told_which_would_do():
+def test_a_case_has_at_most_three_thousand_steps_however_slow_the_machine():
     one = np.ones(1)
     machine, limits = plant([[0.9999]], [[0.0001]], [[1.0]]), (np.zeros(1), np.full(1, 100.0))
     scale = MachineScale(10_000 * one, one, 0 * one, 80 * one, 0.1 * one, 0 * one)
-    cases = defaults(scale, machine, limits, 50 * one, np.nan * one, np.nan * one, 1.0)
+    cases = defaults(scale, machine, limits, 50 * one, -np.inf * one, np.inf * one, 1.0)
     assert cases.steps == 3000
-    assert re.search(r"8 time constants of 10000 s are 80002 steps.*sample_time_s to 26.7", cases.notes[0])
 
 
 def test_an_integrating_machine_has_references_too():
@@ -281,6 +279,6 @@ def test_an_integrating_machine_has_references_too():
     one = np.ones(1)
     machine, limits = plant([[1.0]], [[0.01]], [[1.0]]), (np.zeros(1), np.full(1, 100.0))
     scale = MachineScale(500 * one, one, 20 * one, 80 * one, 0.1 * one, 0 * one)
-    cases = defaults(scale, machine, limits, 60 * one, np.nan * one, np.nan * one, 1.0)
+    cases = defaults(scale, machine, limits, 60 * one, -np.inf * one, np.inf * one, 1.0)
     assert cases.infeasible == [] and cases.references[0, 0] == 60.0
     assert np.isfinite(cases.starts).all()

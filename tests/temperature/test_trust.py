@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
-from pipeline.temperature.identification.trust import (
+from pipeline.temperature.identification.validation import (
     dynamics_rows,
+    excitation,
     fit_figures,
     fit_of_held_inputs,
     fit_with_band,
@@ -16,11 +17,12 @@ from pipeline.temperature.identification.trust import (
     pole_rows,
     residual_lags,
     residual_rows,
+    residual_tests,
+    step_response,
     step_rows,
     steps,
     two_points,
 )
-from pipeline.temperature.identification.validation import excitation, residual_tests, step_response
 from pipeline.temperature.plant import plant, simulate
 from tests.temperature.fits import nrmse, predict_fit, simulate_fit
 from tests.temperature.test_validation import HEATER, innovations_record

@@ -11,11 +11,56 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.linalg.blas
 import scipy.linalg.lapack
 
-from pipeline.temperature.controllers.half_vector import ROOT2, quadratic_gram, skron, smat, svec
 from pipeline.temperature.plant import Plant, observability_matrix
-from pipeline.temperature.tracking import ControllerDesign, Gains, Law, stein
+from pipeline.temperature.tracking import ControllerDesign, Gains, Law
+
+ROOT2 = np.sqrt(2.0)
+
+
+def svec(S: np.ndarray) -> np.ndarray:
+    """Half-vector of a symmetric S (d, d): upper triangle by rows, sqrt 2 off the
+    diagonal, so that svec(S) . svec(T) = trace(S T)."""
+    i, j = np.triu_indices(len(S))
+    return S[i, j] * np.where(i == j, 1.0, ROOT2)
+
+
+def smat(h: np.ndarray, d: int) -> np.ndarray:
+    """The symmetric (d, d) matrix whose half-vector is h."""
+    i, j = np.triu_indices(d)
+    S = np.empty((d, d))
+    S[i, j] = S[j, i] = h / np.where(i == j, 1.0, ROOT2)
+    return S
+
+
+def skron(X: np.ndarray) -> np.ndarray:
+    """The matrix with svec((X z)(X z)') = skron(X) svec(z z'), for X (a, d): shape (a (a+1)/2, d (d+1)/2)."""
+    (p, q), (k, j) = np.triu_indices(X.shape[0]), np.triu_indices(X.shape[1])
+    product = X[p][:, k] * X[q][:, j]
+    off = k != j
+    product[:, off] = (product[:, off] + X[p][:, j[off]] * X[q][:, k[off]]) / ROOT2
+    return product * np.where(p == q, 1.0, ROOT2)[:, None]
+
+
+def quadratic_gram(Z: np.ndarray, *, block: int = 1024) -> np.ndarray:
+    """Sum over samples of svec(z z') svec(z z')' for Z (d, samples), accumulated in blocks: memory does not
+    grow with the number of samples."""
+    d, samples = Z.shape
+    i, j = np.triu_indices(d)
+    gram, features = np.zeros((len(i), len(i)), order="F"), np.empty((len(i), block))
+    starts = np.concatenate([[0], np.cumsum(np.arange(d, 0, -1))])
+    for first in range(0, samples, block):
+        z = np.ascontiguousarray(Z[:, first : first + block])
+        phi = features[:, : z.shape[1]]
+        for row in range(d):
+            np.multiply(z[row], z[row:], out=phi[starts[row] : starts[row + 1]])
+        gram = scipy.linalg.blas.dsyrk(1.0, phi.T, beta=1.0, c=gram, trans=1, lower=1, overwrite_c=1)
+    weight = np.where(i == j, 1.0, ROOT2)
+    gram += np.tril(gram, -1).T
+    return gram * weight * weight[:, None]
+
 
 # ---- data -> regression
 
@@ -135,10 +180,6 @@ class Regression(NamedTuple):
     entries: int
     samples: int
     condition: float
-
-    @property
-    def samples_needed(self) -> int:
-        return self.unknowns
 
     def stored(self) -> dict[str, tuple[np.ndarray, str, str]]:
         """The regression as named arrays with unit and meaning, for an
@@ -352,17 +393,18 @@ def value_iteration(
     R: np.ndarray,
     gamma: float,
     *,
-    F: np.ndarray | None = None,
     tolerance: float = 1e-6,
     max_iterations: int = 2000,
-    H0=None,
 ) -> Kernel:
     """Algorithm 2, steps 5-9: h <- h_0 + gamma G svec(P(H)) until the gain changes by less than `tolerance`,
-    relatively; then the reference's share of (32).
+    relatively; then the gains in the machine's units. A constant reference enters the value as 2 v'H_vr r,
+    exact for every r:
 
-    Q (p, p), R (m, m) weights, F (p, p) of r(t+1) = F r (default: constant). Stops on the gain, not
-    on H, which creeps on at gamma^k. Raises ValueError where the value grows without bound: the
-    data describe no plant that these weights can hold.
+    H_vr = -output'Q + gamma step'P_sr
+    P_sr = [I -K'] H_vr
+
+    Q (p, p), R (m, m) weights. Stops on the gain, not on H, which creeps on at gamma^k. Raises ValueError
+    where the value grows without bound: the data describe no plant that these weights can hold.
     """
     q, m = len(data.W), len(data.u_scale)
     h_0 = data.G_e @ svec(Q) + data.G_u @ svec(R)
@@ -373,7 +415,7 @@ def value_iteration(
     weight_v = np.where(row_v == column_v, 1.0, ROOT2)
     place, unweighted = smat(np.arange(len(h_0), dtype=float), q + m), smat(np.ones(len(h_0)), q + m)
     place = np.rint(place / unweighted).astype(int)
-    H = smat(h_0, q + m) if H0 is None else H0
+    H = smat(h_0, q + m)
     K, P = _greedy(H, q)
     for iteration in range(1, max_iterations + 1):  # noqa: B007 (reported after the loop)
         h = h_0 + gamma * ((data.step.T @ P @ data.step)[row_v, column_v] * weight_v)
@@ -391,37 +433,13 @@ def value_iteration(
             f"value iteration did not settle in {iteration} iterations (last relative change of the gain "
             f"{change:.1g}); record longer, or lower the window"
         )
-    return _kernel(data, H, K, Q, gamma, np.eye(data.output.shape[0]) if F is None else F, iteration, change)
-
-
-def _kernel(
-    data: Regression,
-    H: np.ndarray,
-    K: np.ndarray,
-    Q: np.ndarray,
-    gamma: float,
-    F: np.ndarray,
-    iterations: int,
-    change: float,
-) -> Kernel:
-    """Gains in the machine's units. The reference enters the value as 2 v'H_vr r, exact for every r:
-
-    H_vr = -output'Q + gamma step'P_sr F
-    P_sr = [I -K'] H_vr"""
-    q = len(data.W)
     closed = np.hstack([np.eye(q), -K.T])
+    P_sr = np.linalg.solve(np.eye(q) - gamma * closed @ data.step.T, -closed @ data.output.T @ Q)
+    H_ur = (-data.output.T @ Q + gamma * data.step.T @ P_sr)[q:]
     u = data.u_scale[:, None]
-
-    def share(F: np.ndarray) -> np.ndarray:
-        P_sr = stein(gamma * closed @ data.step.T, F, -closed @ data.output.T @ Q)
-        H_ur = (-data.output.T @ Q + gamma * data.step.T @ P_sr @ F)[q:]
-        return u * np.linalg.solve(H[q:, q:], H_ur)
-
-    K_w = u * (K @ data.W)
-    # e = y - base: the base is a reference too, but one that stays whatever F does
-    return Kernel(
-        H, K_w[:, :-1], share(F), K_w[:, -1] - share(np.eye(len(F))) @ data.base, iterations, change
-    )
+    K_r, K_w = u * np.linalg.solve(H[q:, q:], H_ur), u * (K @ data.W)
+    # e = y - base: the base is a reference too
+    return Kernel(H, K_w[:, :-1], K_r, K_w[:, -1] - K_r @ data.base, iteration, change)
 
 
 def window_law(K: np.ndarray, K_r: np.ndarray, k: np.ndarray, N: int, *, integral: float = 0.0) -> Law:

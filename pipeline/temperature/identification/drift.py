@@ -64,7 +64,7 @@ def chosen_rate(
     u, y = shifted(u, y, structure.delays)
     direct, settings = (
         any(structure.feedthrough),
-        FitSettings(structure.feedthrough, structure.offset, validation.max_radius, VALIDATED_STEPS),
+        FitSettings(structure.feedthrough, structure.offset, max_iterations=VALIDATED_STEPS),
     )
     errors = []
     for train_u, train_y, test_u, test_y in folds(u, y, validation.blocks, validation.recordings):

@@ -108,7 +108,7 @@ class Settings(NamedTuple):
     """What is given and what is chosen. None leaves order, window `past` and feed-through to the data.
 
     `refinement` "prediction" or "simulation" moves the plant to the least errors of that kind. "validated"
-    does so only where the left-out `blocks` prefer it. `max_radius` bounds every pole. `recordings` labels
+    does so only where the left-out `blocks` prefer it. `recordings` labels
     the segments: of several recordings, whole ones are left out. The first `inputs` columns of u are moved by
     people or controllers, all where None; the others are measured disturbances.
     """
@@ -119,7 +119,6 @@ class Settings(NamedTuple):
     offset: bool = True
     refinement: Literal["none", "prediction", "simulation", "validated"] = "none"
     max_order: int = 12
-    max_radius: float | None = None
     blocks: int = 5
     recordings: tuple[int, ...] = ()
     inputs: int | None = None
@@ -196,15 +195,9 @@ def within_limits(
     Clipping at a known limit loses nothing; masking the same samples would cut
     the record wherever the actuator stands at its stop.
     """
-    low, high = (np.asarray(side, float) for side in limits)
-    m, notes = u[0].shape[1], []
-    if low.shape != (m,) or high.shape != (m,) or not (low < high).all():
-        raise ValueError(
-            f"limits: expected {m} low and {m} high limits with low < high but found {low.tolist()} and "
-            f"{high.tolist()}; give one pair for each input"
-        )
+    (low, high), notes = (np.asarray(side, float) for side in limits), []
     rows, rounding = np.vstack(u), 1e-6 * (high - low)
-    for j in range(m):
+    for j in range(len(low)):
         beyond = int(((rows[:, j] < low[j] - rounding[j]) | (rows[:, j] > high[j] + rounding[j])).sum())
         if beyond:
             notes.append(
@@ -220,41 +213,31 @@ def identify(
     *,
     sample_time_s: float,
     settings: Settings = DEFAULTS,
-    limits: tuple[Sequence[float], Sequence[float]] | None = None,
     names: Sequence[str] = (),
 ) -> Identified:
     """The plant that a record shows, by the rules at the head of this module; u segments (T, m), y segments
     (T, p), NaN where a sample is masked.
 
-    PBSID makes the start, in innovation form. `limits` (low, high) of the actuators clip u. Works in closed
-    loop, unless refined on simulation errors. Raises ValueError for a constant or collinear input, a constant
-    output, a record too short for the order, and shapes that do not agree.
+    PBSID makes the start, in innovation form. Works in closed loop, unless refined on simulation errors.
+    Raises ValueError for a constant or collinear input, a constant output, and a record too short for the
+    order.
     """
-    record = _prepared(u, y, settings, limits, names)
-    choice, reasons, feedback = _chosen(record, settings)
-    fitted = _fit_all(record.u, record.y, choice, sample_time_s, settings.max_radius)
+    record = _prepared(u, y, settings, names)
+    choice, reasons, validation, feedback = _chosen(record, settings)
+    fitted = _fit_all(record.u, record.y, choice, sample_time_s)
     rate = 0.0
     if choice.table:
-        validation = _validation(record, settings, feedback)
         rate = chosen_rate(record.u, record.y, choice.structure, choice.order, choice.fit, validation)
     fitted = fitted._replace(feedback=feedback, drift=rate, reasons=tuple(reasons))
-    return _with_remarks(fitted, record._replace(notes=record.notes + reasons), names)
+    return _remarked(fitted, record, reasons, names)
 
 
-def refit(
-    u: Segments,
-    y: Segments,
-    identified: Identified,
-    *,
-    max_radius: float | None = None,
-    limits: tuple[Sequence[float], Sequence[float]] | None = None,
-    names: Sequence[str] = (),
-) -> Identified:
+def refit(u: Segments, y: Segments, identified: Identified, *, names: Sequence[str] = ()) -> Identified:
     """What was chosen on a part of the record (window, feed-through, dead times, order, refinement) fitted to
     all of it, nothing chosen anew; as `identify` otherwise."""
     past, offset, table = identified.past, identified.offset, identified.order_table
     settings = Settings(order=identified.order, past=past, offset=offset)
-    record = _prepared(u, y, settings, limits, names)
+    record = _prepared(u, y, settings, names)
     structure = ModelStructure(past, identified.feedthrough, offset, identified.delays)
     data = (
         None
@@ -263,9 +246,9 @@ def refit(
     )
     exact = data is not None and windows(data)[1]
     choice = ModelChoice(structure, identified.order, identified.fit, exact, table)
-    fitted = _fit_all(record.u, record.y, choice, identified.plant.sample_time_s, max_radius)
+    fitted = _fit_all(record.u, record.y, choice, identified.plant.sample_time_s)
     fitted = fitted._replace(feedback=identified.feedback, drift=identified.drift, reasons=identified.reasons)
-    return _with_remarks(fitted, record._replace(notes=[*record.notes, *identified.reasons]), names)
+    return _remarked(fitted, record, identified.reasons, names)
 
 
 class _Record(NamedTuple):
@@ -278,12 +261,10 @@ class _Record(NamedTuple):
     recordings: tuple[int, ...]
 
 
-def _prepared(u, y, settings: Settings, limits, names) -> _Record:
-    """The record as it can be identified, checked: clipped at the limits, cut at masked inputs."""
+def _prepared(u, y, settings: Settings, names) -> _Record:
+    """The record as it can be identified, checked: cut at masked inputs."""
     u, y = [np.atleast_2d(np.asarray(a, float)) for a in u], [np.atleast_2d(np.asarray(b, float)) for b in y]
-    _check_shapes(u, y)
     samples = sum(map(len, u))
-    u, notes = within_limits(u, limits, names=names) if limits is not None else (u, [])
     pieces = [gapless([a], [b]) for a, b in zip(u, y, strict=True)]
     labels = settings.recordings or (0,) * len(u)
     recordings = tuple(label for label, (a, _) in zip(labels, pieces, strict=True) for _ in a)
@@ -292,14 +273,15 @@ def _prepared(u, y, settings: Settings, limits, names) -> _Record:
     _check_length(u, y, settings.order, settings.past)
     check_inputs(u, offset=settings.offset, names=names)
     check_outputs(y)
-    if cut:
-        notes = [*notes, f"{cut} samples with a masked input, or without any output, were cut out"]
-    return _Record(u, y, cut, notes, recordings)
+    remark = f"{cut} samples with a masked input, or without any output, were cut out"
+    return _Record(u, y, cut, [remark] if cut else [], recordings)
 
 
-def _chosen(record: _Record, settings: Settings) -> tuple[ModelChoice, list[str], ClosedLoop | None]:
-    """What the rules choose, a sentence for each choice that a user should know of, and whether the inputs
-    answer the outputs (None of a noise-free record)."""
+def _chosen(
+    record: _Record, settings: Settings
+) -> tuple[ModelChoice, list[str], Validation, ClosedLoop | None]:
+    """What the rules choose, a sentence for each choice that a user should know of, how candidates were
+    judged, and whether the inputs answer the outputs (None of a noise-free record)."""
     u, y = record.u, record.y
     pasts, exact = _windows(u, y, settings.order, settings.past, settings.offset)
     none = (False,) * y[0].shape[1]
@@ -315,6 +297,7 @@ def _chosen(record: _Record, settings: Settings) -> tuple[ModelChoice, list[str]
         structure, settings.order, settings.refinement.replace("none", "subspace"), False, []
     )
     validated, notes = settings.refinement == "validated", []
+    validation = Validation(settings.blocks, record.recordings, closed)
     # a rank beyond max_order is a nonlinearity without noise: the order is then a choice, as with noise
     if exact and (rank := _exact_rank(u, y, structure)) <= settings.max_order:
         notes.append(
@@ -325,15 +308,9 @@ def _chosen(record: _Record, settings: Settings) -> tuple[ModelChoice, list[str]
         choice = ModelChoice(structure, settings.order or rank, kind, True, [])
     elif settings.order is None or validated:
         structures = [structure._replace(past=n, feedthrough=d) for n in pasts for d in direct]
-        validation = _validation(record, settings, feedback)
         best, table = _best_candidate(u, y, structures, settings, validation)
         choice = ModelChoice(best.structure, best.order, best.fit if validated else choice.fit, False, table)
-    return choice, notes + _reasons(choice, direct, closed), feedback
-
-
-def _validation(record: _Record, settings: Settings, feedback: ClosedLoop | None) -> Validation:
-    closed = feedback is not None and feedback.closed
-    return Validation(settings.blocks, record.recordings, closed, settings.max_radius)
+    return choice, notes + _reasons(choice, direct, closed), validation, feedback
 
 
 def _reasons(choice: ModelChoice, direct: list[tuple[bool, ...]], closed: bool) -> list[str]:
@@ -494,12 +471,10 @@ def _candidates(
     return range(1, largest + 1), delays | {dead_time(model, furthest), tuple(quiet.tolist())}
 
 
-def _fit_all(
-    u: Segments, y: Segments, choice: ModelChoice, sample_time_s: float, max_radius: float | None
-) -> Identified:
+def _fit_all(u: Segments, y: Segments, choice: ModelChoice, sample_time_s: float) -> Identified:
     """One fit of the chosen model on all of the record."""
     structure, order, kind, exact, table = choice
-    past, settings = structure.past, FitSettings(structure.feedthrough, structure.offset, max_radius, 30)
+    past, settings = structure.past, FitSettings(structure.feedthrough, structure.offset, max_iterations=30)
     us, ys = shifted(u, y, structure.delays)
     data = lagged(us, ys, past, feedthrough=any(structure.feedthrough), offset=structure.offset, exact=exact)
     sub = subspace(data, past)
@@ -530,15 +505,11 @@ def _fit_all(
     )
 
 
-def _with_remarks(fitted: Identified, record: _Record, names: Sequence[str]) -> Identified:
-    return fitted._replace(
-        dropped_rows=fitted.dropped_rows + record.cut, notes=record.notes + _remarks(fitted, names)
-    )
-
-
-def _remarks(fitted: Identified, names: Sequence[str]) -> list[str]:
-    """What a user should know of the fit, a sentence each."""
-    notes = []
+def _remarked(
+    fitted: Identified, record: _Record, reasons: Sequence[str], names: Sequence[str]
+) -> Identified:
+    """The fit with what a user should know of it, a sentence each."""
+    notes = [*record.notes, *reasons]
     if fitted.dropped_rows:
         notes.append(f"{fitted.dropped_rows} rows touch a masked sample and were left out of the fit")
     notes += [
@@ -568,27 +539,7 @@ def _remarks(fitted: Identified, names: Sequence[str]) -> list[str]:
             f"the largest pole is {radius - 1:.2g} outside the unit circle; refine with a limit, "
             "or record longer, before simulating far ahead"
         )
-    return notes
-
-
-def _check_shapes(u: Segments, y: Segments) -> None:
-    if not u or len(u) != len(y):
-        raise ValueError(
-            f"identify: expected as many segments of u as of y, at least one, but found {len(u)} and {len(y)}"
-        )
-    for k, (a, b) in enumerate(zip(u, y, strict=True)):
-        if (
-            a.ndim != 2
-            or b.ndim != 2
-            or len(a) != len(b)
-            or a.shape[1] != u[0].shape[1]
-            or b.shape[1] != y[0].shape[1]
-            or 0 in (a.shape[1], b.shape[1])
-        ):
-            raise ValueError(
-                f"identify: segment {k} has u of shape {a.shape} and y of shape {b.shape}; "
-                f"expected (T, {u[0].shape[1]}) and (T, {y[0].shape[1]}), one column at least"
-            )
+    return fitted._replace(dropped_rows=fitted.dropped_rows + record.cut, notes=notes)
 
 
 def _check_length(u: Segments, y: Segments, order: int | None, past: int | None) -> None:

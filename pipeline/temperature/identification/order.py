@@ -67,13 +67,11 @@ class ModelStructure(NamedTuple):
 
 class Validation(NamedTuple):
     """How candidates are judged: `blocks` left out in turn, or whole recordings where `recordings` labels the
-    segments with more than one; on simulated outputs, of a record in `closed` loop on predicted ones too.
-    `max_radius` bounds their poles."""
+    segments with more than one; on simulated outputs, of a record in `closed` loop on predicted ones too."""
 
     blocks: int = 5
     recordings: tuple[int, ...] = ()
     closed: bool = False
-    max_radius: float | None = None
 
 
 class OrderCandidate(NamedTuple):
@@ -124,7 +122,10 @@ def windows(data: Lagged) -> tuple[tuple[int, ...], bool]:
         if np.sum(errors**2) < NOISE_FREE * whole:
             return (past,), True
         count, numbers = p * k + p * (p + 1) / 2, data.rows * p
-        misfit = data.rows * log_det(errors.T @ errors / data.rows)
+        S = errors.T @ errors / data.rows
+        # a noise-free direction counts as rounding
+        S = S + np.eye(p) * (1e-15 * np.trace(S) + np.finfo(float).tiny)
+        misfit = data.rows * float(np.linalg.slogdet(S)[1])
         schwarz = min(schwarz, (misfit + count * np.log(data.rows), past))
         if numbers > count + 1:
             akaike = min(akaike, (misfit + 2 * count * numbers / (numbers - count - 1), past))
@@ -145,11 +146,6 @@ def feedthrough_shows(u: Segments, y: Segments, past: int, offset: bool) -> tupl
         power.append(np.sum(one_step(data, past)[1] ** 2, axis=0))
     gain = data.rows * np.log(np.maximum(power[0], 1e-300) / np.maximum(power[1], 1e-300))
     return tuple((gain > np.log(data.rows) * data.m).tolist())
-
-
-def log_det(S: np.ndarray) -> float:
-    """log det of a covariance (p, p); a noise-free direction counts as rounding."""
-    return float(np.linalg.slogdet(S + np.eye(len(S)) * (1e-15 * np.trace(S) + np.finfo(float).tiny))[1])
 
 
 def dead_time(plant: Plant, longest: int, share: float = 0.05) -> tuple[int, ...]:
@@ -330,18 +326,6 @@ def prediction_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
     return np.nan_to_num(np.array(shares), nan=1.0)
 
 
-def closed_loop_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
-    """Geometric means of `simulation_errors` and `prediction_errors`. Under feedback a simulation is right in
-    part because u holds the noise of y; one step ahead it is not, but slow modes gain little there."""
-    return np.sqrt(simulation_errors(plant, u, y) * prediction_errors(plant, u, y))
-
-
-def largest_radius(u: Segments) -> float:
-    """e^(3/T): a mode may grow 20-fold over the longest segment of T samples while a plant is refined, no
-    more."""
-    return float(np.exp(3.0 / max(map(len, u))))
-
-
 def fit(
     kind: Fit, start: Plant, u: Segments, y: Segments, settings: FitSettings, *, gain: bool = True
 ) -> Plant:
@@ -353,7 +337,8 @@ def fit(
     within it; a fit that may not cross it from the start stops at it, up to 6 points short on the hold-out of
     the study's record (measured). `gain` False leaves a plant refined on simulation errors without K.
     """
-    radius = settings.max_radius or largest_radius(u)
+    # a mode may grow 20-fold over the longest segment while a plant is refined, no more
+    radius = settings.max_radius or float(np.exp(3.0 / max(map(len, u))))
     if kind == "subspace":
         return stabilised(start, radius) if settings.max_radius else start
     start = stabilised(start, radius)
@@ -403,11 +388,8 @@ def cross_validate(
     A structure whose window does not fit into what remains of the record has no rows.
     """
     u, y = shifted(u, y, structure.delays)
-    settings, errors = (
-        FitSettings(structure.feedthrough, structure.offset, validation.max_radius, VALIDATED_STEPS),
-        {},
-    )
-    judged = closed_loop_errors if validation.closed else simulation_errors
+    settings = FitSettings(structure.feedthrough, structure.offset, max_iterations=VALIDATED_STEPS)
+    errors = {}
     for train_u, train_y, test_u, test_y in folds(u, y, validation.blocks, validation.recordings):
         try:
             data = lagged(
@@ -424,7 +406,12 @@ def cross_validate(
             start = realise(data, basis[:order], 1.0, structure.feedthrough)
             for kind in kinds:
                 plant = fit(kind, start, train_u, train_y, settings, gain=False)
-                whole, about_mean = judged(plant, test_u, test_y).mean(axis=(1, 2))
+                shares = simulation_errors(plant, test_u, test_y)
+                if validation.closed:
+                    # under feedback a simulation is right in part because u holds the noise of y; one step
+                    # ahead it is not, but slow modes gain little there
+                    shares = np.sqrt(shares * prediction_errors(plant, test_u, test_y))
+                whole, about_mean = shares.mean(axis=(1, 2))
                 errors.setdefault((order, kind), []).append(
                     (max((whole + about_mean) / 2, SMALLEST), max(about_mean, SMALLEST))
                 )

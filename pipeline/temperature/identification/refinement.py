@@ -385,10 +385,9 @@ def refine(
 
     Errors are weighted by the covariance of the starting model's (the full one for predictions, its diagonal
     for simulation). The predictor stays stable, and so does A within `max_radius` where given (it must hold
-    at the start). With `simulation` K is left zero: `kalman_gain` fits it. NaN in y is a masked sample; in u
-    it is refused. Raises ValueError where u holds NaN, or the start violates `max_radius`.
+    at the start). With `simulation` K is left zero: `kalman_gain` fits it. NaN in y is a masked sample; u has
+    none.
     """
-    _check_start(plant, u, settings.max_radius)
     m, ahead = plant.m, criterion == "prediction"
     rows = np.broadcast_to(np.asarray(settings.feedthrough, bool), (plant.p,))
     # a full weight would mix the rows of D that are free with those that are zero
@@ -415,20 +414,6 @@ def refine(
     )
     refined = _plant_of(best, problem, plant, ahead=ahead)
     return refined._replace(D=np.where(rows[:, None], refined.D, plant.D)), costs
-
-
-def _check_start(plant: Plant, u: Sequence[np.ndarray], max_radius: float | None) -> None:
-    if any(not np.isfinite(a).all() for a in u):
-        raise ValueError(
-            "refine: expected inputs without gaps but found NaN in u; "
-            "split the record into segments at the gaps"
-        )
-    radius = np.abs(np.linalg.eigvals(plant.A)).max()
-    if max_radius is not None and radius > max_radius:
-        raise ValueError(
-            f"refine: the start has a pole at {radius:.6f}, "
-            f"outside max_radius {max_radius}; start from a stabilised plant"
-        )
 
 
 class _Weighted(NamedTuple):

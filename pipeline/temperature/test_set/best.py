@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.temperature.test_set.comparison import chosen
+from pipeline.temperature.test_set.scorecard import chosen
 
 # limits that a simulation of the temperature loop can check, as the comparison resolves them
 CHECKED = ("settled_error_degC", "peak_error_degC", "settling_s", "heating_s", "overshoot_degC",

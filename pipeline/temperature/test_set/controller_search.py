@@ -10,8 +10,8 @@ from pipeline.temperature.controllers import table
 from pipeline.temperature.controllers.controller import Rest
 from pipeline.temperature.controllers.problem import Design, DesignProblem, weights
 from pipeline.temperature.settings import TuneWeights
-from pipeline.temperature.test_set import comparison, panel, scorecard, tuning
-from pipeline.temperature.test_set.cases import CaseConditions, play
+from pipeline.temperature.test_set import panel, scorecard, tuning
+from pipeline.temperature.test_set.panel import CaseConditions, play
 
 # of a parameter's range, in logarithms: so near to an end the search is called bound by it
 AT_BOUND = 0.02
@@ -52,7 +52,8 @@ def search(
             cost,
             low,
             high,
-            tuning.SearchSettings(initial, evaluations - last),
+            initial=initial,
+            evaluations=evaluations - last,
             rng=np.random.default_rng(settings.seed),
             start=first,
         )
@@ -88,7 +89,7 @@ def _cost(design: Design, rests: Sequence[Rest], settings: TuneWeights, setting:
         )
     figures = play(design, rests, training, setting)[1]
     costs = panel.costs(figures, setting.allowance)
-    return comparison.mean_and_worst(costs, training.plant, weight=settings.worst_case)
+    return scorecard.mean_and_worst(costs, training.plant, weight=settings.worst_case)
 
 
 def tuned_values(name: str, result: tuning.SearchResult, problem: DesignProblem) -> dict[str, Any]:

@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.temperature.controllers import table
-from pipeline.temperature.controllers.problem import Design
+from pipeline.temperature.controllers.problem import Design, DesignProblem
+from pipeline.temperature.controllers.table import BY_NAME
+from pipeline.temperature.plant import Plant
 from pipeline.temperature.settings import Plant as Machine
-from pipeline.temperature.test_set import comparison, panel, scorecard
-from pipeline.temperature.test_set.cases import CaseConditions, play
+from pipeline.temperature.test_set import panel, scorecard
 
 FIGURES = {
     "settled_error": "settled_error_degC",
@@ -45,17 +46,17 @@ class ControllerOutcome(NamedTuple):
     rollout: panel.Rollout
 
 
-def evaluate(name: str, design: Design, setting: CaseConditions) -> tuple[str, ControllerOutcome]:
+def evaluate(name: str, design: Design, setting: panel.CaseConditions) -> tuple[str, ControllerOutcome]:
     """One controller on the judging half, with its name."""
     cases = setting.rehearsal.judging
-    rollout, figures = play(design, panel.rests(design.model, cases, setting.limits), cases, setting)
+    rollout, figures = panel.play(design, panel.rests(design.model, cases, setting.limits), cases, setting)
     margins = [] if design.holds else scorecard.margins(cases.plants, design.law, grid=80)
     return name, ControllerOutcome(
         figures, panel.costs(figures, setting.allowance), margins, _gaps(design, setting), rollout
     )
 
 
-def _gaps(design: Design, setting: CaseConditions) -> np.ndarray | None:
+def _gaps(design: Design, setting: panel.CaseConditions) -> np.ndarray | None:
     """J / J* - 1 in percent on every plant, by CONVENTION; inf if the loop is unstable there."""
     if design.plain is None:
         return None
@@ -81,14 +82,14 @@ def _gaps(design: Design, setting: CaseConditions) -> np.ndarray | None:
     yardstick = scorecard.CommonCost(np.ones(p), np.ones(m), setting.gamma)
     run = scorecard.simulate(scenarios, law)
     J, best = scorecard.cost(scenarios, run, yardstick), scorecard.optimum(scenarios, yardstick)
-    gaps = 100.0 * scorecard.regret(J, best)
+    gaps = 100.0 * (J / best - 1)
     return np.where(np.isfinite(gaps) & (gaps < 1e6), gaps, np.inf)
 
 
 # ---- figures of one controller
 
 
-def _columns(one: ControllerOutcome, setting: CaseConditions) -> dict[str, np.ndarray]:
+def _columns(one: ControllerOutcome, setting: panel.CaseConditions) -> dict[str, np.ndarray]:
     """The figures of FIGURES by column of the table, in its units."""
     f = one.figures
     return {
@@ -107,13 +108,18 @@ def _columns(one: ControllerOutcome, setting: CaseConditions) -> dict[str, np.nd
 
 
 def summarise(
-    one: ControllerOutcome, setting: CaseConditions, tuned: Mapping[str, Any], *, seed: int, resamples: int
+    one: ControllerOutcome,
+    setting: panel.CaseConditions,
+    tuned: Mapping[str, Any],
+    *,
+    seed: int,
+    resamples: int,
 ) -> dict[str, Any]:
     """The figures of a controller over all cases, with the parameters that its search found."""
     cases, columns = setting.rehearsal.judging, _columns(one, setting)
     figures = {}
     for name, column in FIGURES.items():
-        band = comparison.banded(columns[column], cases.plant, seed=seed, resamples=resamples)
+        band = scorecard.banded(columns[column], cases.plant, seed=seed, resamples=resamples)
         figures[name] = {
             **{key: _number(getattr(band, key)) for key in ("median", "q90", "low", "high", "worst")},
             "worst_case": _case(cases, band.worst_case),
@@ -137,7 +143,7 @@ def summarise(
     }
 
 
-def _gap(one: ControllerOutcome, setting: CaseConditions) -> dict[str, Any] | None:
+def _gap(one: ControllerOutcome, setting: panel.CaseConditions) -> dict[str, Any] | None:
     if one.gaps is None:
         return None
     median, q90 = np.quantile(one.gaps, [0.5, 0.9], method="nearest")
@@ -184,7 +190,7 @@ def decide(
     results: Mapping[str, ControllerOutcome],
     entrants: list[str],
     summary: Mapping[str, Any],
-    setting: CaseConditions,
+    setting: panel.CaseConditions,
     seed: int,
 ) -> dict[str, Any]:
     """The pair, and the plant that decides, with the pair's answer without it."""
@@ -195,7 +201,7 @@ def decide(
     one, two = a, b
     if not (a in costs and b in costs):
         one, two = entrants[max(len(entrants) - 2, 0)], entrants[-1]
-    index = comparison.deciding_plant(costs[one], costs[two], block)
+    index = scorecard.deciding_plant(costs[one], costs[two], block)
     rest = block != index
     without = {name: values[rest] for name, values in costs.items()}
     pair = _pair(a, b, costs, block, summary, seed)
@@ -223,7 +229,7 @@ def _pair(
                 "plants": len(np.unique(block)), "figures": {}}  # fmt: skip
     figures = summary["contestants"]
     return {
-        **comparison.pair(a, b, costs, block, seed=seed)._asdict(),
+        **scorecard.pair(a, b, costs, block, seed=seed)._asdict(),
         "plants": len(np.unique(block)),
         "figures": {
             name: [figures[one][name]["q90"] for one in (a, b)]
@@ -242,7 +248,7 @@ def typical_case(results: Mapping[str, ControllerOutcome], entrants: Sequence[st
 
 
 def case_columns(
-    results: Mapping[str, ControllerOutcome], setting: CaseConditions, zones: Sequence[str]
+    results: Mapping[str, ControllerOutcome], setting: panel.CaseConditions, zones: Sequence[str]
 ) -> dict[str, Any]:
     """The cases as columns: one row a controller and case."""
     cases, count = setting.rehearsal.judging, len(results)
@@ -267,7 +273,7 @@ def case_columns(
 def trajectory_columns(
     results: Mapping[str, ControllerOutcome],
     shown: Mapping[str, int],
-    setting: CaseConditions,
+    setting: panel.CaseConditions,
     machine: Machine,
 ) -> dict[str, Any]:
     """The cases {label: number} under every controller, as columns."""
@@ -289,3 +295,45 @@ def trajectory_columns(
         )
         columns[f"{signal.name}_applied"] = np.concatenate([run.u[:, case, k] for *_, run, case in parts])
     return columns
+
+
+REDESIGNS = 7  # plants of the spread that a controller is designed from anew
+BROKEN = 2.0  # times the cost, from which a record that cannot be told from this one gives another controller
+
+
+class Redesigned(NamedTuple):
+    """`excess`: the median extra cost as a share; `broken` of `of` plants give a controller that costs BROKEN
+    times as much, or none."""
+
+    excess: float
+    broken: int
+    of: int
+
+
+def redesigned(
+    name: str, problem: DesignProblem, values: Mapping[str, float], setting: panel.CaseConditions
+) -> Redesigned:
+    """What the bands of the identified plant leave open of a controller's closed loop: with J the mean cost
+    of the controller on the training cases, and J_k that of the same controller designed from plant k of the
+    spread, REDESIGNS of them, the median of max(J_k / J - 1, 0).
+
+    A PI controller takes gain and lag from a plant, a model-based one all of it: each is charged with the
+    doubt in what it takes. The spread is resampled in blocks, so the colour of the residuals is in it."""
+    cases = setting.rehearsal.training
+
+    def cost(plant: Plant) -> float:
+        try:
+            made = BY_NAME[name].design(problem._replace(plant=plant), values)
+        except ValueError:  # this plant allows no such controller
+            return float("inf")
+        if made is None:
+            return float("inf")
+        figures = panel.play(made, panel.rests(made.model, cases, setting.limits), cases, setting)[1]
+        return float(panel.costs(figures, setting.allowance).mean())
+
+    own = cost(problem.plant)
+    ratios = np.array([cost(plant) for plant in problem.family[1 : 1 + REDESIGNS]]) / own
+    if not ratios.size:
+        return Redesigned(float("inf"), 0, 0)
+    excess = float(np.quantile(np.maximum(ratios - 1.0, 0.0), 0.5, method="nearest"))
+    return Redesigned(excess, int((ratios >= BROKEN).sum()), len(ratios))

@@ -12,9 +12,9 @@ import numpy as np
 import scipy.optimize
 
 from pipeline.temperature.controllers.baseline import rises
+from pipeline.temperature.identification.first_order import time_constant
 from pipeline.temperature.identification.validation import one_step_errors, simulated
 from pipeline.temperature.plant import Plant, hold_output, strictly_proper
-from pipeline.temperature.test_set.time_scale import time_constant
 
 RANGE = (0.01, 0.99)  # quantiles that count as recorded: a spike, or one sample of a start, is none
 ONE_DEVIATION = (0.1587, 0.8413)  # quantiles of a normal one standard deviation either side of its median
@@ -61,7 +61,7 @@ class MachineScale(NamedTuple):
 
 class Infeasible(NamedTuple):
     """A reference of output `output` that cannot be held, or not beside the others: `reachable_degC` is the
-    nearest within limits, `judged_degC` the reference in its place, with headroom.
+    nearest within limits.
 
     `input` is the one at its `limit` "low" or "high" that would move it most; None where the limit is not of
     an input: "output low" or "output high" of the machine's own limits, or "inputs", fewer than the
@@ -71,7 +71,6 @@ class Infeasible(NamedTuple):
     output: int
     asked_degC: float
     reachable_degC: float
-    judged_degC: float
     input: int | None
     limit: str
 
@@ -80,7 +79,6 @@ class CaseDefaults(NamedTuple):
     """What the cases of a rehearsal are: starts (k, p) at which the plant is held, references (j, p), both
     steady states within the limits of inputs and outputs by the model; settling_s the rule's limit, band_degC
     the band of settling; ramp_degC_per_step (p,) from the lower reference, one ramp a run; `sequence` (3, p).
-    notes: sentences where a default could not be had.
     """
 
     starts: np.ndarray
@@ -92,7 +90,6 @@ class CaseDefaults(NamedTuple):
     ramp_degC_per_step: np.ndarray
     sinusoid: tuple[np.ndarray, int]  # about the middle of the two references: amplitude (p,) in °C, steps
     sequence: np.ndarray
-    notes: tuple[str, ...]
 
 
 # ---- the machine, from its record
@@ -158,7 +155,7 @@ def defaults(
     sample_time_s: float,
 ) -> CaseDefaults:
     """Starts, references and rules for one machine; `limits` low and high (m,) of the inputs in percent,
-    output_low and output_high (p,) in °C, NaN where the owner declares none.
+    output_low and output_high (p,) in °C, infinite where the owner declares none.
 
     starts: the coldest of the record, as a machine is switched on, and the middle of its range, or the
     nearest to it that the inputs can hold. references: the declared one where it can be held; in its place
@@ -167,9 +164,10 @@ def defaults(
     their middle, so small that its heat is no more than the way between them needs. sequence: lower, higher,
     middle. All references lie between two states that can be held, so that they can be held too.
     """
-    band, span = _band(scale), scale.high_degC - scale.low_degC
-    outputs = _declared(output_low, -np.inf), _declared(output_high, np.inf)
-    bounds, careful = Bounds(*limits, *outputs), _drawn_in(Bounds(*limits, *outputs), band)
+    span = scale.high_degC - scale.low_degC
+    widest = np.maximum(BAND_NOISE * scale.noise_degC, BAND_SHARE * span).max()
+    band, bounds = float(min(widest, WIDEST_BAND_DEGC)), Bounds(*limits, output_low, output_high)
+    careful = _drawn_in(bounds, band)
     middle = _nearest(model, scale.low_degC + MIDDLE * span, careful)[0]
     asked = np.asarray(asked_reference, float)
     reached, u = _nearest(model, asked, bounds)
@@ -179,12 +177,13 @@ def defaults(
         first, u_first = _nearest(model, held_back, bounds)
         # a zone within reach may need the heat of one that is held back
         entries = [
-            _missed(model, int(o), asked, (reached, first), (u if missed[o] else u_first), bounds)
+            _missed(model, int(o), asked, reached, first, (u if missed[o] else u_first), bounds)
             for o in np.flatnonzero(missed | (np.abs(first - asked) > REACHED_DEGC))
         ]
     lower = _nearest(model, first - LOWER_SHARE * span, careful)[0]
     slowest, delay = float(scale.time_constant_s.max()), float(scale.delay_s.max())
-    steps, notes = _steps(slowest, delay, sample_time_s)
+    needed = int(np.ceil((TIME_CONSTANTS * slowest + 2 * delay) / sample_time_s))
+    steps = min(max(needed, STEPS[0]), STEPS[1])
     return CaseDefaults(
         starts=np.stack([scale.low_degC, middle]),
         references=np.stack([first, lower]),
@@ -198,7 +197,6 @@ def defaults(
             max(round(PERIOD * slowest / sample_time_s), 4),
         ),
         sequence=np.stack([lower, first, (first + lower) / 2]),
-        notes=notes,
     )
 
 
@@ -225,11 +223,11 @@ def unreachable(
 ) -> list[Infeasible]:
     """References that a machine cannot hold where they are judged as they were asked; arguments as
     `defaults`."""
-    bounds = Bounds(*limits, _declared(output_low, -np.inf), _declared(output_high, np.inf))
+    bounds = Bounds(*limits, output_low, output_high)
     asked = np.asarray(asked_reference, float)
     reached, u = _nearest(model, asked, bounds)
     missed = np.flatnonzero(np.abs(reached - asked) > REACHED_DEGC)
-    return [_missed(model, int(o), asked, (reached, reached), u, bounds) for o in missed]
+    return [_missed(model, int(o), asked, reached, reached, u, bounds) for o in missed]
 
 
 class Bounds(NamedTuple):
@@ -249,30 +247,6 @@ def _drawn_in(bounds: Bounds, band: float) -> Bounds:
     high = np.where(bounds.high > 0, np.maximum((1 - HEADROOM) * bounds.high, low), bounds.high)
     room = np.minimum(band, (bounds.output_high - bounds.output_low) / 2)
     return Bounds(low, high, bounds.output_low + room, bounds.output_high - room)
-
-
-def _declared(limit: np.ndarray, otherwise: float) -> np.ndarray:
-    limit = np.asarray(limit, float)
-    return np.where(np.isfinite(limit), limit, otherwise)
-
-
-def _band(scale: MachineScale) -> float:
-    """BAND_NOISE deviations of the noise or BAND_SHARE of the span, of the zone that needs most, but at most
-    WIDEST_BAND_DEGC."""
-    span = scale.high_degC - scale.low_degC
-    return float(min(np.maximum(BAND_NOISE * scale.noise_degC, BAND_SHARE * span).max(), WIDEST_BAND_DEGC))
-
-
-def _steps(slowest_s: float, delay_s: float, sample_time_s: float) -> tuple[int, tuple[str, ...]]:
-    """Steps of a case, TIME_CONSTANTS of them and two delays, within STEPS; a sentence where they do not
-    fit."""
-    needed = int(np.ceil((TIME_CONSTANTS * slowest_s + 2 * delay_s) / sample_time_s))
-    if needed <= STEPS[1]:
-        return max(needed, STEPS[0]), ()
-    return STEPS[1], (
-        f"{TIME_CONSTANTS:g} time constants of {slowest_s:.0f} s are {needed} steps, and a case has at most "
-        f"{STEPS[1]}; set plant.sample_time_s to {sample_time_s * needed / STEPS[1]:.1f} or more",
-    )
 
 
 def steady_map(model: Plant) -> tuple[np.ndarray, np.ndarray]:
@@ -320,14 +294,14 @@ def _missed(
     model: Plant,
     o: int,
     asked: np.ndarray,
-    reached_and_judged: tuple[np.ndarray, np.ndarray],
+    reached: np.ndarray,
+    judged: np.ndarray,
     u: np.ndarray,
     bounds: Bounds,
 ) -> Infeasible:
     """What keeps output o from its reference: a declared limit of its own, or the input of u at its limit, in
     the direction that would help, whose range moves it most."""
-    reached, judged = reached_and_judged
-    figures = o, float(asked[o]), float(reached[o]), float(judged[o])
+    figures = o, float(asked[o]), float(reached[o])
     if asked[o] > bounds.output_high[o]:
         return Infeasible(*figures, None, "output high")
     if asked[o] < bounds.output_low[o]:

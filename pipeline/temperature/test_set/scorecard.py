@@ -1,15 +1,21 @@
 """One panel, one yardstick, every law: unclipped and without integrator, where the discrete Riccati equation
 gives the optimum (regret J / J* - 1); costs only under the same weights, judged by true outputs. Then the
-margins of a law on a plant. What a controller does as deployed is panel.py's.
+margins of a law on a plant; which controller is best, what tells model-based and data-driven apart, and which
+plant decides; and what a record is enough for. What a controller does as deployed is panel.py's.
+
+Cases of one plant stand or fall together: plants are the blocks of every test and of every band.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 
+from pipeline.statistics import Paired, paired
+from pipeline.temperature.controllers import kernel
+from pipeline.temperature.controllers import window as window_route
 from pipeline.temperature.plant import Plant, hold_output, hold_state
 from pipeline.temperature.tracking import Gains, Law, gains
 
@@ -40,13 +46,6 @@ class CommonCost(NamedTuple):
     q: np.ndarray
     r: np.ndarray
     gamma: float
-
-
-class Cost(NamedTuple):
-    """J of each scenario, together with the yardstick that it was computed with."""
-
-    J: np.ndarray
-    yardstick: CommonCost
 
 
 class PanelRun(NamedTuple):
@@ -138,15 +137,15 @@ def simulate(panel: Scenarios, law: Law) -> PanelRun:
     return PanelRun(y, u)
 
 
-def cost(panel: Scenarios, run: PanelRun, yardstick: CommonCost) -> Cost:
-    """(3) of every scenario: discounted, on true outputs and applied inputs."""
+def cost(panel: Scenarios, run: PanelRun, yardstick: CommonCost) -> np.ndarray:
+    """(3) of every scenario (s,): discounted, on true outputs and applied inputs."""
     error = run.y - panel.r
     stage = error**2 @ yardstick.q + run.u**2 @ yardstick.r
-    return Cost(yardstick.gamma ** np.arange(len(stage)) @ stage, yardstick)
+    return yardstick.gamma ** np.arange(len(stage)) @ stage
 
 
-def optimum(panel: Scenarios, yardstick: CommonCost) -> Cost:
-    """J* of every scenario: the Riccati law of its own plant, which knows the state, unclipped."""
+def optimum(panel: Scenarios, yardstick: CommonCost) -> np.ndarray:
+    """J* of every scenario (s,): the Riccati law of its own plant, which knows the state, unclipped."""
     best = [
         gains(plant, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma) for plant in panel.plants
     ]
@@ -168,24 +167,6 @@ def _state_feedback(panel: Scenarios, best: Sequence[Gains]) -> PanelRun:
     return PanelRun(y, u)
 
 
-def regret(J: Cost, best: Cost) -> np.ndarray:
-    """J / J* - 1 (scenarios,). Raises ValueError where the two were computed under different weights: such
-    costs say nothing about each other."""
-    a, b = J.yardstick, best.yardstick
-    if not (np.array_equal(a.q, b.q) and np.array_equal(a.r, b.r) and a.gamma == b.gamma):
-        raise ValueError(
-            f"costs under different weights cannot be compared: one was computed with q = {_short(a.q)}, "
-            f"r = {_short(a.r)}, gamma = {a.gamma:g}, the other with "
-            f"q = {_short(b.q)}, r = {_short(b.r)}, gamma = {b.gamma:g}; "
-            "compute both under one yardstick (section tracking of params.expert.yaml)"
-        )
-    return J.J / best.J - 1
-
-
-def _short(values: np.ndarray) -> str:
-    return np.array2string(np.asarray(values), precision=3, threshold=4, edgeitems=2)
-
-
 # ---- margins
 
 
@@ -204,17 +185,12 @@ class Margins(NamedTuple):
 def margins(plants: Sequence[Plant], law: Law, *, grid: int = 240) -> list[Margins]:
     """Of each plant: disk margin 1 / max |S - I/2| (Seiler, Packard, Gahinet 2020, skew 0) and delay margin
     min (pi + arg lambda(L)) / omega over |lambda(L)| = 1."""
-    omega = _frequencies(grid)
+    # rad a step: even in logarithms where loops of heaters cross, then even to pi
+    slow = np.geomspace(1e-4, 0.3, grid // 2, endpoint=False)
+    omega = np.concatenate([slow, np.linspace(0.3, np.pi, grid - grid // 2)])
     z = np.exp(1j * omega)
     K = law_response(law, z)
     return [_margins(plant, law, omega, z, K) for plant in plants]
-
-
-def _frequencies(grid: int) -> np.ndarray:
-    """rad a step: even in logarithms where loops of heaters cross, then even to pi."""
-    return np.concatenate(
-        [np.geomspace(1e-4, 0.3, grid // 2, endpoint=False), np.linspace(0.3, np.pi, grid - grid // 2)]
-    )
 
 
 def _structured(M: np.ndarray, *, sweeps: int = 12) -> np.ndarray:
@@ -307,3 +283,204 @@ def _delay_margin(omega: np.ndarray, loci: np.ndarray) -> float:
     last = (np.angle(loci[-1]) + np.pi) / omega[-1]
     lags = np.concatenate([lag[crossing], last[size[-1] > 1]])
     return float(lags.min()) if lags.size else float("inf")
+
+
+LEVEL = 0.05
+
+
+class ControllerChoice(NamedTuple):
+    """`best` is None where nobody passes; `nearest` is the cheapest of the others that pass, None where
+    there is none, and `against` the test of the best one against it."""
+
+    best: str | None
+    nearest: str | None
+    against: Paired | None
+
+
+def chosen(
+    costs: Mapping[str, np.ndarray], plant: np.ndarray, passes: Mapping[str, bool], *, seed: int
+) -> ControllerChoice:
+    """The first of those that pass, in the order of `costs` (simplest first), that no more complex one beats:
+    one replaces it where its costs (s,) are lower beyond chance, paired by plant, one-sided at LEVEL."""
+    able = [name for name in costs if passes[name]]
+    if not able:
+        return ControllerChoice(None, None, None)
+    best = able[0]
+    for name in able[1:]:
+        if between(costs[best], costs[name], plant, seed=seed).p < LEVEL:
+            best = name
+    others = [name for name in able if name != best]
+    if not others:
+        return ControllerChoice(best, None, None)
+    nearest = min(others, key=lambda name: float(costs[name].mean()))
+    return ControllerChoice(best, nearest, between(costs[nearest], costs[best], plant, seed=seed))
+
+
+def between(champion: np.ndarray, challenger: np.ndarray, plant: np.ndarray, *, seed: int) -> Paired:
+    """The challenger's improvement over the champion on the same cases, paired by plant."""
+    return paired(
+        np.maximum(champion, 1e-9),
+        np.maximum(challenger, 1e-9),
+        [str(index) for index in plant],
+        rng=np.random.default_rng(seed),
+    )
+
+
+class Pair(NamedTuple):
+    """Of two contestants a and b the cheaper one beyond chance, None where nobody is; by how many percent of
+    the other's cost, with the ends of the 90 % interval and the two-sided p."""
+
+    a: str
+    b: str
+    winner: str | None
+    difference: float
+    low: float
+    high: float
+    p: float
+
+
+def pair(a: str, b: str, costs: Mapping[str, np.ndarray], plant: np.ndarray, *, seed: int) -> Pair:
+    """The pair's difference is that of the cheaper one, whether or not it is beyond chance."""
+    forward = between(costs[b], costs[a], plant, seed=seed)
+    backward = between(costs[a], costs[b], plant, seed=seed)
+    cheaper, result = (a, forward) if forward.improvement_percent >= 0 else (b, backward)
+    p = min(1.0, 2 * result.p)
+    winner = cheaper if p < LEVEL else None
+    return Pair(a, b, winner, result.improvement_percent, result.low_percent, result.high_percent, p)
+
+
+def deciding_plant(a: np.ndarray, b: np.ndarray, plant: np.ndarray) -> int:
+    """The plant on which the costs (s,) of two contestants differ most in the direction in which they differ
+    on the whole: without it the verdict is told too."""
+    ratio = np.log(np.maximum(a, 1e-9) / np.maximum(b, 1e-9))
+    by_plant = np.array([ratio[plant == index].mean() for index in np.unique(plant)])
+    return int(np.unique(plant)[(np.sign(by_plant.sum() or 1.0) * by_plant).argmax()])
+
+
+class QuantileBand(NamedTuple):
+    """Median and 90 % quantile over all cases, the 90 % band of that quantile with plants resampled as
+    blocks, the worst, and the case that has it; inf where a run never settles."""
+
+    median: float
+    q90: float
+    low: float
+    high: float
+    worst: float
+    worst_case: int
+
+
+def banded(values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int = 200) -> QuantileBand:
+    """Of a figure (s,); NaN where it does not apply. Less is better."""
+    applies = np.flatnonzero(~np.isnan(values))
+    values, plant = values[applies], plant[applies]
+    median, q90 = np.quantile(values, [0.5, 0.9], method="nearest")
+    blocks = [values[plant == index] for index in np.unique(plant)]
+    drawn = np.random.default_rng(seed).integers(0, len(blocks), (resamples, len(blocks)))
+    quantiles = [
+        np.quantile(np.concatenate([blocks[k] for k in row]), 0.9, method="nearest") for row in drawn
+    ]
+    low, high = np.quantile(quantiles, [0.05, 0.95], method="nearest")
+    worst = int(np.argmax(values))
+    return QuantileBand(
+        float(median), float(q90), float(low), float(high), float(values[worst]), int(applies[worst])
+    )
+
+
+def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> float:
+    """One number for a search: the geometric mean of the plants' costs, as the paired test counts them, and
+    with `weight` that of the costliest quarter, which moves smoothly where the single worst plant would jump.
+    One plant that no controller holds cannot set the gains of all."""
+    by_plant = np.sort([np.log(max(costs[plant == index].mean(), 1e-9)) for index in np.unique(plant)])
+    tail = by_plant[-max(1, len(by_plant) // 4) :].mean()
+    return float(np.exp((by_plant.mean() + weight * tail) / (1 + weight)))
+
+
+class Sufficiency(NamedTuple):
+    """Whether the record of `samples` is long enough.
+
+    `half_gap` is the extra cost of a controller learned from half of the record, on the model learned from
+    all of it. The excess falls as one over the samples. At `needed` samples it would be the excess allowed.
+    """
+
+    half_gap: float
+    samples: int
+    needed: int
+
+
+def sufficiency(
+    u: Sequence[np.ndarray],
+    y: Sequence[np.ndarray],
+    learned: window_route.WindowModel,
+    yardstick: CommonCost,
+    scenarios: Scenarios,
+    *,
+    allowed: float,
+    offset: bool,
+    gain_spread: float,
+) -> Sufficiency:
+    """Whether the record is long enough for its noise, by the record alone. A controller is learned from each
+    half of it and judged on `scenarios` of the model learned from all of it."""
+    best = optimum(scenarios, yardstick)
+    gaps = []
+    for part in (0, 1):
+        half_u, half_y = (
+            [rows[part * len(rows) // 2 : (part + 1) * len(rows) // 2] for rows in signal]
+            for signal in (u, y)
+        )
+        half = window_route.learn(half_u, half_y, longest=learned.N, offset=offset, gain_spread=gain_spread)
+        law = window_route.law(half, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
+        run = simulate(scenarios, law)
+        gaps.append((cost(scenarios, run, yardstick) / best - 1)[0])
+    half_gap = float(np.mean(gaps))
+    # never fewer than twice the numbers of one output's predictor:
+    # below that the half-record test itself means nothing
+    needed = max(
+        np.ceil(learned.samples * min(half_gap / 2 / allowed, 1e3)), 2 * (learned.Theta.shape[1] + offset)
+    )
+    return Sufficiency(half_gap, learned.samples, int(needed))
+
+
+class KernelCandidate(NamedTuple):
+    """One state that Algorithm 2 was tried on: the regression, the gap of its gain on the window's model, and
+    the reason of a refusal. The gap of a refused candidate is infinite."""
+
+    state: str
+    learned: kernel.Regression | None
+    gap: float
+    refusal: str
+
+
+def kernel_candidates(
+    u: Sequence[np.ndarray],
+    y: Sequence[np.ndarray],
+    long: window_route.WindowModel,
+    yardstick: CommonCost,
+    scenarios: Scenarios,
+    *,
+    largest: int,
+    offset: bool,
+) -> list[KernelCandidate]:
+    """Algorithm 2 on windows of 1 to `largest` samples and on the predicted state, all from one record. The
+    model of the long window judges each, on `scenarios` of it.
+
+    Without noise the shortest window that holds the plant's state is exact. With noise longer windows are
+    biased; the predicted state is not.
+    """
+    model = window_route.predictor(long)
+    best = optimum(scenarios, yardstick)
+    tried = [
+        (f"window of {N}", lambda N=N: kernel.tuples(u, y, N, offset=offset)) for N in range(1, largest + 1)
+    ]
+    tried.append(("predicted state", lambda: window_route.predicted_tuples(long, u, y, offset=offset)))
+    candidates = []
+    for state, features in tried:
+        try:
+            learned = kernel.regress(features())
+            law = kernel.controller(learned, yardstick.gamma, model).design(yardstick.q, yardstick.r, 0.0)
+        except ValueError as refusal:
+            candidates.append(KernelCandidate(state, None, float("inf"), str(refusal)))
+            continue
+        run = simulate(scenarios, law)
+        gap = float((cost(scenarios, run, yardstick) / best - 1)[0])
+        candidates.append(KernelCandidate(state, learned, gap if np.isfinite(gap) else float("inf"), ""))
+    return candidates

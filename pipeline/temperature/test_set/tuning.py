@@ -10,13 +10,11 @@ itself, the paper's tuned weights are 4.96 % (model-based) and 39.8 % (data-driv
 started from. The search is worth having for other costs (settling, overshoot, limits, the worst plant of a
 spread); (37) tests it, because there the answer is known.
 
-Two searches. `expected_improvement` works on log-weights, since weights act by their ratios and span
-decades: a Gaussian process with a Matern 5/2 kernel and one length per weight, and expected improvement
-inside a trust region that grows on success and shrinks on failure (Eriksson et al. 2019, TuRBO). A
-prior holds the lengths to a plausible size: 50 points in 12 dimensions do not determine 12 lengths, and
-without it the likelihood calls half of the weights irrelevant and the search ends 100 to 3,000 above
-the optimum of (37), not 1 to 34. `upper_confidence_bound` is the published search (39)-(43): the
-weights as they are, its fixed kernel, the whole box.
+The search works on log-weights, since weights act by their ratios and span decades: a Gaussian process with a
+Matern 5/2 kernel and one length per weight, and expected improvement inside a trust region that grows on
+success and shrinks on failure (Eriksson et al. 2019, TuRBO). A prior holds the lengths to a plausible size:
+50 points in 12 dimensions do not determine 12 lengths, and without it the likelihood calls half of the
+weights irrelevant and the search ends 100 to 3,000 above the optimum of (37), not 1 to 34.
 
 A candidate may fail (an unstable loop, a cost that is not finite). It enters the history as NaN with its
 reason, and never the model of the cost: a second Gaussian process learns from the marks "worked" and "failed"
@@ -27,7 +25,7 @@ on two such problems (8 and 12 weights) it ended 3,000 and 40 times further from
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -36,8 +34,6 @@ import scipy.special
 from scipy.spatial.distance import cdist
 
 from pipeline.temperature.plant import Plant
-
-Acquisition = Literal["expected_improvement", "upper_confidence_bound"]
 
 
 class History(NamedTuple):
@@ -48,16 +44,6 @@ class History(NamedTuple):
     cost: np.ndarray
     failed: tuple[str, ...]
     incumbent: np.ndarray
-
-
-class SearchSettings(NamedTuple):
-    """The first `initial` of all `evaluations` candidates are a scrambled Sobol set. `exploration` is epsilon
-    of (42), which the paper does not give."""
-
-    initial: int
-    evaluations: int
-    acquisition: Acquisition = "expected_improvement"
-    exploration: float = 2.0
 
 
 class SearchResult(NamedTuple):
@@ -107,7 +93,7 @@ def fitness(
 
 
 class _Surrogate(NamedTuple):
-    """A Gaussian process and its data; kappa(s) -> kappa, kappa'.
+    """A Gaussian process and its data, with kappa of `_matern`.
 
     k(x, x') = variance kappa(s)
     s = sum_j ((x_j - x'_j) / length_j)^2"""
@@ -117,15 +103,10 @@ class _Surrogate(NamedTuple):
     inverse: np.ndarray  # (k, k)  L^-1, K = L L'
     variance: float
     length: np.ndarray  # (d,)
-    kappa: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-
-
-def _squared_exponential(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    k = np.exp(-0.5 * s)
-    return k, -0.5 * k
 
 
 def _matern(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """kappa and its slope."""
     r = np.sqrt(5 * s)
     decay = np.exp(-r)
     return (1 + r + r * r / 3) * decay, -5 / 6 * (1 + r) * decay
@@ -133,7 +114,7 @@ def _matern(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _posterior(gp: _Surrogate, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation (41) at x (k, d)."""
-    k = gp.variance * gp.kappa(cdist(x / gp.length, gp.points / gp.length, "sqeuclidean"))[0]
+    k = gp.variance * _matern(cdist(x / gp.length, gp.points / gp.length, "sqeuclidean"))[0]
     v = k @ gp.inverse.T
     return k @ gp.weights, np.sqrt(np.maximum(gp.variance - (v * v).sum(axis=1), 1e-14 * gp.variance))
 
@@ -141,7 +122,7 @@ def _posterior(gp: _Surrogate, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _posterior_slopes(gp: _Surrogate, x: np.ndarray) -> tuple[float, float, np.ndarray, np.ndarray]:
     """Mean and standard deviation (41) at one x (d,), and their gradients (d,)."""
     apart = (x - gp.points) / gp.length
-    kappa, slope = gp.kappa((apart * apart).sum(axis=1))
+    kappa, slope = _matern((apart * apart).sum(axis=1))
     k, dk = gp.variance * kappa, 2 * gp.variance * slope[:, None] * apart / gp.length
     v = gp.inverse @ k
     std = np.sqrt(max(gp.variance - v @ v, 1e-14 * gp.variance))
@@ -156,14 +137,13 @@ def _surrogate(points: np.ndarray, values: np.ndarray, kernel) -> _Surrogate:
     fitted = GaussianProcessRegressor(kernel, alpha=1e-10, optimizer=None).fit(points, values)
     inverse = scipy.linalg.solve_triangular(fitted.L_, np.eye(len(values)), lower=True)
     variance, matern = fitted.kernel_.k1.k1.constant_value, fitted.kernel_.k1.k2
-    kappa = _matern if matern.nu == 2.5 else _squared_exponential
-    return _Surrogate(points, fitted.alpha_, inverse, variance, matern.length_scale, kappa)
+    return _Surrogate(points, fitted.alpha_, inverse, variance, matern.length_scale)
 
 
-def _kernel(length: np.ndarray, *, nu: float, noise: float, variance: float = 1.0):
+def _kernel(length: np.ndarray, *, noise: float, variance: float = 1.0):
     from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
-    return ConstantKernel(variance, (1e-2, 1e3)) * Matern(length, (0.05, 50.0), nu=nu) + WhiteKernel(
+    return ConstantKernel(variance, (1e-2, 1e3)) * Matern(length, (0.05, 50.0), nu=2.5) + WhiteKernel(
         noise, (1e-9, 1e-1)
     )
 
@@ -218,11 +198,6 @@ def _expected_improvement(mean, std, *, best: float):
     z = (best - mean) / std
     log_h, ratio = _log_improvement(z)
     return -(np.log(std) + log_h), ratio / std, (ratio * z - 1) / std
-
-
-def _upper_confidence_bound(mean, std, *, exploration: float):
-    """a = mu - epsilon k, k the posterior variance (42)."""
-    return mean - exploration * std**2, np.ones_like(mean), -2 * exploration * std
 
 
 def _success(mean, std):
@@ -281,71 +256,26 @@ class _TrustRegion(NamedTuple):
         return _TrustRegion(self.side, successes, failures)
 
 
-class _Search(NamedTuple):
-    """Where and how is searched: in the unit cube of log-weights by expected improvement, or among the
-    weights themselves as published."""
-
-    lower: np.ndarray
-    upper: np.ndarray
-    acquisition: Acquisition
-    exploration: float
-
-    @property
-    def local(self) -> bool:
-        return self.acquisition == "expected_improvement"
-
-    @property
-    def box(self) -> tuple[np.ndarray, np.ndarray]:
-        return (
-            (np.zeros_like(self.lower), np.ones_like(self.upper)) if self.local else (self.lower, self.upper)
-        )
-
-    def points(self, theta: np.ndarray) -> np.ndarray:
-        return np.log(theta / self.lower) / np.log(self.upper / self.lower) if self.local else theta
-
-    def theta(self, point: np.ndarray) -> np.ndarray:
-        return np.clip(
-            self.lower * (self.upper / self.lower) ** point if self.local else point, self.lower, self.upper
-        )
-
-    def kernel(self):
-        """Where its fit starts; as published (39), exp(-|theta - theta'|^2), and it
-        stays so (noise: for the Cholesky factor only)."""
-        d = len(self.lower)
-        if self.local:
-            return _kernel(np.full(d, np.sqrt(d)), nu=2.5, noise=1e-6, variance=10.0)
-        return _kernel(np.full(d, np.sqrt(0.5)), nu=np.inf, noise=1e-8)
-
-
-def _design(search: _Search, rng: np.random.Generator, count: int) -> np.ndarray:
+def _design(rng: np.random.Generator, d: int, count: int) -> np.ndarray:
     """The first points (count, d): a scrambled Sobol sequence."""
     from scipy.stats import qmc  # here: the import takes seconds
 
-    low, high = search.box
-    return (
-        low
-        + (high - low)
-        * qmc.Sobol(len(low), scramble=True, rng=rng).random_base2(int(np.ceil(np.log2(count))))[:count]
-    )
+    return qmc.Sobol(d, scramble=True, rng=rng).random_base2(int(np.ceil(np.log2(count))))[:count]
 
 
-def _terms(search: _Search, points: np.ndarray, costs: np.ndarray, kernel) -> list[Term]:
+def _terms(points: np.ndarray, costs: np.ndarray, kernel) -> list[Term]:
     """What the next candidate should be good at: the acquisition of the costs
     seen so far, and to work, where some have failed."""
     worked, terms = np.isfinite(costs), []
     if worked.any():
         values = _standardised(costs[worked])
-        rule = partial(_expected_improvement, best=values.min())
-        if not search.local:
-            rule = partial(_upper_confidence_bound, exploration=search.exploration)
-        terms.append((_surrogate(points[worked], values, kernel), rule))
+        improvement = partial(_expected_improvement, best=values.min())
+        terms.append((_surrogate(points[worked], values, kernel), improvement))
     if not worked.all():
         length = np.clip(
             kernel.k1.k2.length_scale / 2, 0.05 * np.sqrt(points.shape[1]), np.sqrt(points.shape[1])
         )
-        terms.append(
-            (_surrogate(points, np.where(worked, 0.0, -2.0), _kernel(length, nu=2.5, noise=1e-2)), _success)
-        )
+        terms.append((_surrogate(points, np.where(worked, 0.0, -2.0), _kernel(length, noise=1e-2)), _success))
     return terms
 
 
@@ -354,31 +284,25 @@ def _standardised(costs: np.ndarray) -> np.ndarray:
 
 
 def _next(
-    search: _Search,
-    points: np.ndarray,
-    costs: np.ndarray,
-    kernel,
-    region: _TrustRegion,
-    rng: np.random.Generator,
+    points: np.ndarray, costs: np.ndarray, kernel, region: _TrustRegion, rng: np.random.Generator
 ) -> np.ndarray:
-    """The next point (d,): in the trust region, longer where the cost changes
-    slowly; as published, or while nothing worked, anywhere.
+    """The next point (d,) of the unit cube: in the trust region, longer where the cost changes slowly; while
+    nothing worked, anywhere.
 
     512 points screen the box, half of them ten times nearer to its centre;
     about 20 coordinates of each differ from the centre's.
     """
-    low, high = search.box
-    centre = low + (high - low) * rng.random(len(low))
+    d = points.shape[1]
+    low, high, centre = np.zeros(d), np.ones(d), rng.random(d)
     if np.isfinite(costs).any():
         centre = points[np.nanargmin(costs)]
-        if search.local:
-            length = kernel.k1.k2.length_scale
-            half = region.side / 2 * np.clip(length / np.exp(np.log(length).mean()), 0.25, 4.0)
-            low, high = np.maximum(centre - half, low), np.minimum(centre + half, high)
-    candidates = low + (high - low) * rng.random((512, len(low)))
+        length = kernel.k1.k2.length_scale
+        half = region.side / 2 * np.clip(length / np.exp(np.log(length).mean()), 0.25, 4.0)
+        low, high = np.maximum(centre - half, low), np.minimum(centre + half, high)
+    candidates = low + (high - low) * rng.random((512, d))
     candidates[256:] = centre + 0.1 * (candidates[256:] - centre)
-    candidates = np.where(rng.random(candidates.shape) < 20 / len(low), candidates, centre)
-    return _least(_terms(search, points, costs, kernel), candidates, low, high)
+    candidates = np.where(rng.random(candidates.shape) < 20 / d, candidates, centre)
+    return _least(_terms(points, costs, kernel), candidates, low, high)
 
 
 def _evaluated(cost: Callable[[np.ndarray], float], theta: np.ndarray) -> tuple[float, str]:
@@ -397,109 +321,64 @@ def _extended(history: History, theta: np.ndarray, value: float, reason: str) ->
     )
 
 
-def _recommended(search: _Search, history: History, kernel) -> SearchResult:
-    """The candidate of least cost; as published the one of least posterior mean (43).
-
-    (43) is taken over the candidates: over the whole box the mean is least where no data hold it up
-    (BAAM: F = 155,000-208,000 there, 153,000-154,000 so).
-    """
-    worked = np.flatnonzero(np.isfinite(history.cost))
-    if not worked.size:
-        last = history.failed[-1]
-        raise ValueError(
-            f"minimise: all {len(history.cost)} candidates failed, the last because: {last}; "
-            "widen the bounds or correct the cost"
-        )
-    merit = history.cost[worked]
-    if not search.local:
-        points = search.points(history.theta[worked])
-        merit = _posterior(_surrogate(points, _standardised(merit), kernel), points)[0]
-    best = worked[np.argmin(merit)]
-    return SearchResult(history.theta[best], float(history.cost[best]), history)
-
-
-def _checked(
-    lower, upper, settings: SearchSettings, start: History | None
-) -> tuple[np.ndarray, np.ndarray, History]:
-    initial, evaluations, acquisition, _ = settings
-    lower, upper = np.asarray(lower, float), np.asarray(upper, float)
-    if (
-        lower.ndim != 1
-        or lower.shape != upper.shape
-        or not lower.size
-        or not ((lower > 0) & (lower < upper) & np.isfinite(upper)).all()
-    ):
-        raise ValueError(
-            "minimise: expected bounds 0 < lower < upper of one length, "
-            f"found lower {lower} and upper {upper}; correct them"
-        )
-    if not 1 <= initial <= evaluations:
-        raise ValueError(
-            f"minimise: expected 1 <= initial <= evaluations, found {initial} of {evaluations}; "
-            "change one of them"
-        )
-    if acquisition not in get_args(Acquisition):
-        raise ValueError(
-            f"minimise: acquisition {acquisition!r} is unknown, expected {' or '.join(get_args(Acquisition))}"
-        )
-    start = History(np.empty((0, len(lower))), np.empty(0), (), np.empty(0)) if start is None else start
-    count = len(start.cost)
-    sound = start.theta.shape == (count, len(lower)) and len(start.failed) == count <= evaluations
-    if not sound or not ((start.theta >= lower) & (start.theta <= upper)).all():
-        raise ValueError(
-            f"minimise: the history to go on from has theta {start.theta.shape}, "
-            f"{count} costs and {len(start.failed)} reasons, "
-            f"expected at most {evaluations} candidates of {len(lower)} weights within the bounds; start anew"
-        )
-    return lower, upper, start
-
-
 def minimise(
     cost: Callable[[np.ndarray], float],
     lower: np.ndarray,
     upper: np.ndarray,
-    settings: SearchSettings,
     *,
+    initial: int,
+    evaluations: int,
     rng: np.random.Generator,
     on_step: Callable[[History], None] | None = None,
     start: History | None = None,
 ) -> SearchResult:
-    """The weights of least cost among the candidates evaluated between lower (d,) and upper (d,).
+    """The weights of least cost among the candidates evaluated between lower (d,) > 0 and upper (d,); the
+    first `initial` of them are a scrambled Sobol set.
 
     `cost(theta)` takes weights (d,); a ValueError from it, or a number that is not finite, is a failure of
     the candidate. `on_step(history)` is called after every evaluation. With that history as `start` and a
     generator of the same seed, a run that was stopped goes on as if it had not been. The model costs O(k^3)
     after k candidates: meant for hundreds. Raises ValueError where every candidate failed.
     """
-    lower, upper, start = _checked(lower, upper, settings, start)
-    initial, evaluations, acquisition, exploration = settings
-    search = _Search(lower, upper, acquisition, exploration)
+    if initial > evaluations:
+        raise ValueError(
+            f"minimise: expected initial <= evaluations, found {initial} of {evaluations}; change one of them"
+        )
+    lower, upper, d = np.asarray(lower, float), np.asarray(upper, float), len(lower)
+    span = np.log(upper / lower)
+    nothing = History(np.empty((0, d)), np.empty(0), (), np.empty(0))
+    start, history = nothing if start is None else start, nothing
     # a generator for each candidate: what is drawn does not depend on where a run was stopped
     first, *later = rng.spawn(1 + evaluations)
-    design, kernel, region, fitted = _design(search, first, initial), search.kernel(), _TrustRegion(), False
-    history = History(start.theta[:0], start.cost[:0], (), start.cost[:0])
+    design, region, fitted = _design(first, d, initial), _TrustRegion(), False
+    kernel = _kernel(np.full(d, np.sqrt(d)), noise=1e-6, variance=10.0)
     for index in range(evaluations):
-        points, worked = search.points(history.theta), np.isfinite(history.cost)
-        if search.local and index >= initial and worked.any() and (not fitted or (index - initial) % 5 == 0):
-            kernel, fitted = (
-                _likeliest(kernel, points[worked], _standardised(history.cost[worked]), 5 if fitted else 30),
-                True,
-            )
+        points, worked = np.log(history.theta / lower) / span, np.isfinite(history.cost)
+        if index >= initial and worked.any() and (not fitted or (index - initial) % 5 == 0):
+            values = _standardised(history.cost[worked])
+            kernel, fitted = _likeliest(kernel, points[worked], values, 5 if fitted else 30), True
         if index < len(start.cost):
             theta, value, reason = start.theta[index], float(start.cost[index]), start.failed[index]
         else:
-            theta = search.theta(
+            point = (
                 design[index]
                 if index < initial
-                else _next(search, points, history.cost, kernel, region, later[index])
+                else _next(points, history.cost, kernel, region, later[index])
             )
+            theta = np.clip(lower * (upper / lower) ** point, lower, upper)
             value, reason = _evaluated(cost, theta)
         if index >= initial:
             region = region.after(bool(value < np.fmin.reduce(history.cost, initial=np.inf)))
         history = _extended(history, theta, value, reason)
         if on_step is not None and index >= len(start.cost):
             on_step(history)
-    return _recommended(search, history, kernel)
+    if not np.isfinite(history.cost).any():
+        raise ValueError(
+            f"minimise: all {evaluations} candidates failed, the last because: {history.failed[-1]}; "
+            "widen the bounds or correct the cost"
+        )
+    best = np.nanargmin(history.cost)
+    return SearchResult(history.theta[best], float(history.cost[best]), history)
 
 
 def polished(
