@@ -112,7 +112,7 @@ CASES = Schema(
             "peak_degC",
             FLOAT,
             "degC",
-            "largest error of the last 100 steps, worst output; missing where unstable",
+            "largest error of the last 50 steps, worst output; missing where unstable",
             low=0,
             nullable=True,
         ),

@@ -352,7 +352,7 @@ def test_an_engineer_s_figures_by_hand():
     assert result.heating[0] == 5 and np.isnan([result.settling[0], result.at_limits[0]]).all()
     assert result.overshoot[0] == pytest.approx(3.0)
     assert result.settled_error[0] == pytest.approx(0.2)  # |mean(0.5, -0.2, 0.3)|
-    assert result.peak[0] == pytest.approx(0.5)
+    assert result.peak[0] == pytest.approx(0.3)  # of the last two
     # commands as applied 100, 50, 0, 5 and then still
     assert result.travel[0] == pytest.approx((50 + 50 + 5) / 8)
     warm = figures_of(y, cases._replace(start=np.array([1])), wished=wished, r=100.0)

@@ -526,7 +526,7 @@ def figures(
     band: float,
     settled: int = 100,
 ) -> Figures:
-    """Settled error: |mean of the last `settled` steps - r|. Peak: largest |y - r| of these steps. Settling
+    """Settled error: |mean of the last `settled` steps - r|. Peak: largest |y - r| of the later half of them. Settling
     and heating: the last step outside `band` °C of the target, for GLANCE steps at least, counted from each
     new reference, the longest of them. Overshoot: past the target in the direction of the step. At limits:
     share of (input, step) wished outside. Energy: mean input. Travel: mean |u(t+1) - u(t)|, of the input that
@@ -556,7 +556,7 @@ def figures(
     return Figures(
         late.max(axis=1),
         late.argmax(axis=1),
-        np.abs(error[-settled:]).max(axis=(0, 2)),
+        np.abs(error[-((settled + 1) // 2) :]).max(axis=(0, 2)),
         np.where(cold, np.nan, settling),
         np.where(cold, settling, np.nan),
         overshoot,
