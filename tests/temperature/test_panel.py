@@ -348,21 +348,29 @@ def test_an_engineer_s_figures_by_hand():
     y = [20.0, 60, 103, 100.5, 98, 100.5, 100.5, 99.8, 100.3]
     wished = [120.0, 50, -10, 5, 5, 5, 5, 5, 5]
     result = figures_of(y, cases, wished=wished, r=100.0)
-    # out of the band for the last time at sample 4, from cold: no settling of its own, and no time at limits
-    assert result.heating[0] == 5 and np.isnan([result.settling[0], result.at_limits[0]]).all()
+    # in the band from sample 3 on, but for a glance; from cold: no settling of its own, no time at limits
+    assert result.heating[0] == 3 and np.isnan([result.settling[0], result.at_limits[0]]).all()
     assert result.overshoot[0] == pytest.approx(3.0)
     assert result.settled_error[0] == pytest.approx(0.2)  # |mean(0.5, -0.2, 0.3)|
     assert result.peak[0] == pytest.approx(0.3)  # of the last two
     # commands as applied 100, 50, 0, 5 and then still
     assert result.travel[0] == pytest.approx((50 + 50 + 5) / 8)
     warm = figures_of(y, cases._replace(start=np.array([1])), wished=wished, r=100.0)
-    assert warm.settling[0] == 5 and np.isnan(warm.heating[0])
+    assert warm.settling[0] == 3 and np.isnan(warm.heating[0])
     assert warm.at_limits[0] == pytest.approx(100 * 2 / 9)
     assert result.energy[0] == pytest.approx((100 + 50 + 6 * 5) / 9)
     assert result.rms[0] == pytest.approx(np.sqrt(((np.array(y) - 100) ** 2).mean()))
     assert result.crossing[0] == pytest.approx(1.0)  # 103 against 102
     # 4 samples outside by far, none on the edge of 0.1 either side
     assert result.outside[0] == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize(("samples", "settled"), [(4, 2.0), (5, 27.0)])
+def test_what_leaves_the_band_for_fewer_than_five_samples_has_settled(samples, settled):
+    y = np.full(60, 100.0)
+    y[:2], y[22 : 22 + samples] = 20.0, 102.0
+    cases = asked([MACHINE], [[20.0]], [[100.0]], steps=60)
+    assert figures_of(y, cases, r=100.0).heating[0] == settled
 
 
 def test_settling_is_of_the_reachable_target_and_the_settled_error_of_the_reference():

@@ -89,7 +89,8 @@ def warm_up(machine: Plant, *, noise: float, steps: int = 900, to=(60.0, 200.0))
 
 
 def run_of(cases: panel.Cases, made, limits: ActuatorLimits) -> panel.Rollout:
-    aims = [aim(made, NOWHERE, reference) for reference in (*cases.references, constant(cases.starts[0]))]
+    starts = [constant(start) for start in cases.starts]
+    aims = [aim(made, NOWHERE, reference) for reference in (*cases.references, *starts)]
     return panel.rolled_out(deployed(made, limits, integral_limit=1.0), cases, aims)
 
 

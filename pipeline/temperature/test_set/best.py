@@ -69,7 +69,7 @@ def limits_of(pace: Mapping[str, Any], declared: Mapping[str, Any]) -> dict[str,
     settling_s = declared["settling_s"] or pace["settling_s"]
     return {name: declared[name] for name in CHECKED} | {
         "settling_s": settling_s,
-        "heating_s": declared["heating_s"] or settling_s + pace["heat_up_s"],
+        "heating_s": declared["heating_s"] or settling_s + pace.get("heat_up_s", 0.0),
         "delay_margin_s": pace["delay_margin_share"] * declared["delay_margin_s"],
         "source": pace["source"],
     }

@@ -571,11 +571,10 @@ def figures(
 
 
 def lasting(outside: np.ndarray) -> np.ndarray:
-    """Of (steps, s) the runs of GLANCE steps and more; as it is where there are fewer steps."""
-    if len(outside) < GLANCE:
-        return outside
-    long = np.lib.stride_tricks.sliding_window_view(outside, GLANCE, axis=0).all(axis=-1)
-    runs = [np.pad(long, ((k, GLANCE - 1 - k), (0, 0))) for k in range(GLANCE)]
+    """Of (steps, s) the runs of GLANCE steps and more, and the one that is there from the beginning."""
+    padded = np.pad(outside, ((GLANCE - 1, 0), (0, 0)), constant_values=True)
+    ends = np.lib.stride_tricks.sliding_window_view(padded, GLANCE, axis=0).all(axis=-1)
+    runs = [np.pad(ends[k:], ((0, min(k, len(ends))), (0, 0))) for k in range(GLANCE)]
     return np.any(runs, axis=0, keepdims=True)[0]
 
 
