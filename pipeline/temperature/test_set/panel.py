@@ -526,12 +526,12 @@ def figures(
     band: float,
     settled: int = 100,
 ) -> Figures:
-    """Settled error: |mean of the last `settled` steps - r|. Peak: largest |y - r| of the later half of them. Settling
-    and heating: the last step outside `band` °C of the target, for GLANCE steps at least, counted from each
-    new reference, the longest of them. Overshoot: past the target in the direction of the step. At limits:
-    share of (input, step) wished outside. Energy: mean input. Travel: mean |u(t+1) - u(t)|, of the input that
-    moves most. Dip: largest |y - r| of all steps. Crossing: how far y lies beyond low, high (p,). Outside:
-    steps outside the band, an edge of a fifth of it counted in part: smooth."""
+    """Settled error: |mean of the last `settled` steps - r|. Peak: largest |y - r| of the later half of them.
+    Settling and heating: the last step outside `band` °C of the target, for GLANCE steps at least, counted
+    from each new reference, the longest of them. Overshoot: past the target in the direction of the step. At
+    limits: share of (input, step) wished outside. Energy: mean input. Travel: mean |u(t+1) - u(t)|, of the
+    input that moves most. Dip: largest |y - r| of all steps. Crossing: how far y lies beyond low, high (p,).
+    Outside: steps outside the band, an edge of a fifth of it counted in part: smooth."""
     error = rollout.y - rollout.r
     late = np.abs(error[-settled:].mean(axis=0))
     off = rollout.y - rollout.target
@@ -573,9 +573,11 @@ def figures(
 def lasting(outside: np.ndarray) -> np.ndarray:
     """Of (steps, s) the runs of GLANCE steps and more, and the one that is there from the beginning."""
     padded = np.pad(outside, ((GLANCE - 1, 0), (0, 0)), constant_values=True)
-    ends = np.lib.stride_tricks.sliding_window_view(padded, GLANCE, axis=0).all(axis=-1)
-    runs = [np.pad(ends[k:], ((0, min(k, len(ends))), (0, 0))) for k in range(GLANCE)]
-    return np.any(runs, axis=0, keepdims=True)[0]
+    ends = np.array(np.lib.stride_tricks.sliding_window_view(padded, GLANCE, axis=0).all(axis=-1))
+    lasts = ends.copy()
+    for k in range(1, GLANCE):
+        lasts[:-k] |= ends[k:]
+    return lasts
 
 
 class Allowance(NamedTuple):
