@@ -501,6 +501,7 @@ def main() -> None:
     parser.add_argument("--limits", type=int, default=0, help="draws of the limits for each fit")
     parser.add_argument("--out", type=Path, default=Path("."))
     asked, seen = parser.parse_args(), Counter[str]()
+    asked.out.mkdir(parents=True, exist_ok=True)
     tables: dict[str, list[dict[str, Any]]] = {"machines": [], "fits": []}
     for seed in asked.seeds:
         tables["machines"].append(judge(seed, compare=asked.compare))
