@@ -53,7 +53,11 @@ def draw(inputs: Mapping[str, Any], seed: int) -> dict[str, Any]:
     def lose(stages: Mapping[str, Any]) -> dict[str, Any]:
         return {name: value for name, value in stages.items() if rng.uniform() >= stage_share}
 
-    metrics = scale(lose(inputs["metrics"]), rng, deviation, key_share)
+    # one more figure of a stage draws no other stage anew
+    metrics = {
+        name: scale(stage, np.random.default_rng([35, seed, *name.encode()]), deviation, key_share)
+        for name, stage in lose(inputs["metrics"]).items()
+    }
     if "evaluate_temperature" in metrics:  # a machine that is hard to control, in some draws
         hard = float(rng.choice((0.0, 0.0, 0.0, 2.0, 4.0)))
         metrics["evaluate_temperature"] = scale(metrics["evaluate_temperature"], rng, 0.0, 0.0, by=hard)
