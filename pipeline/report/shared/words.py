@@ -74,7 +74,7 @@ FIXED = {
     ),
     "false_stops": (
         "False stops",
-        "Each controller runs with its supervisor on eight healthy machines, through set-point changes, a "
+        "Each controller runs with its supervisor on four healthy machines, through set-point changes, a "
         "door, a fan and another room. Counted are the runs in which the supervisor leaves the law.",
     ),
     "cost": (
