@@ -518,8 +518,10 @@ def judge_sensors(
         steady = k.total[1, :, j] - k.total[0, :, j] ** 2 / age[:, 0]
         floor = noise[:, j] + MISFIT**2 * square + 1e-12
         better = age[:, 0] * np.log(honest[:, heaters].min(axis=1) / np.maximum(steady, floor))
-        # what moves a heater is a reading that moved: nothing honest keeps one equal meanwhile
-        clear = still[:, j] & ((better >= CLEARER) | (k.repeats[j] >= age[:, 0]))
+        # what moves a heater is a reading that moved: nothing honest keeps one equal meanwhile, unless its
+        # steps hide what the law makes up for
+        equal = (k.repeats[j] >= age[:, 0]) & (known_steps(k.quantum)[j] <= s.noise_degC[j])
+        clear = still[:, j] & ((better >= CLEARER) | equal)
         if clear.any():
             window = int(np.where(clear, np.abs(moves[:, j]), -1.0).argmax())
             say_still(k, int(j), moves[window, j])

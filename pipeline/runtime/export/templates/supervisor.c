@@ -343,8 +343,10 @@ static void judge_sensors(supervisor_kept *k, double moves[WINDOWS][OUTPUTS], in
                 }
             steady = one->total[1][j] - one->total[0][j] * one->total[0][j] / age;
             at_least = noise_of(k, w, j) + MISFIT * MISFIT * square + 1e-12;
-            /* what moves a heater is a reading that moved: nothing honest keeps one equal meanwhile */
-            if ((k->repeats[j] >= age || age * log(honest / largest(steady, at_least)) >= CLEARER)
+            /* what moves a heater is a reading that moved: nothing honest keeps one equal meanwhile,
+               unless its steps hide what the law makes up for */
+            if (((k->repeats[j] >= age && steps_of(k, j) <= supervisor_noise[j])
+                 || age * log(honest / largest(steady, at_least)) >= CLEARER)
                 && (at < 0 || fabs(moves[w][j]) > fabs(moves[at][j])))
                 at = w;
         }
