@@ -136,11 +136,12 @@ def test_a_recorded_machines_panel_is_drawn_around_its_hold_out_recordings_once_
     assert 0.6 < min(rises) < 0.95 and 1.02 < max(rises) < 1.3
 
 
-def test_the_margin_that_guards_is_that_of_the_median_plant_as_the_page_asks(project):
+def test_the_margin_that_guards_is_that_of_the_weakest_tenth_of_plants_as_the_page_asks(project):
     margins = judge.judged(judge.frozen_panel(project.holdout), Path("datasets"), "varx_riccati").margins
     strict = project.model_copy(update={"rule": project.rule.model_copy(update={"least_disk_margin": 1.9})})
     guards = judge.judge(strict.loops["temperature"], strict).measure(Path("datasets")).guards
-    assert guards["margin_short_of_least"] == 1.9 - np.median([margin.disk for margin in margins])
+    disks = sorted(margin.disk for margin in margins)
+    assert guards["margin_short_of_least"] == 1.9 - disks[round(0.1 * (len(disks) - 1))]
     assert len({margin.disk for margin in margins}) == project.holdout.plants
 
 
@@ -302,8 +303,10 @@ def test_every_plant_start_and_reference_is_a_case_and_the_dearest_plant_guards(
     reference = judge.frozen_panel(settings.holdout).machine.outputs[0].reference
     assert set(evidence.cases) == {
         f"plant {p}, {start:g} °C to {reference + offset:g} °C"
-        for p in range(3) for start in (20.0, 60.0) for offset in (0.0, 7.0)
-    }  # fmt: skip
+        for p in range(3)
+        for start in (20.0, 60.0)
+        for offset in (0.0, 7.0)
+    } | {f"plant {p}, {reference:g} °C to {reference:g} °C" for p in range(3)}  # disturbed there
     by_plant = [
         np.mean([cost for block, cost in evidence.cases.values() if block == f"plant {p}"]) for p in range(3)
     ]

@@ -185,7 +185,7 @@ class IdentifiedMachine(NamedTuple):
 def identified_record(u: np.ndarray, y: np.ndarray, sample_time_s: float, limits) -> IdentifiedMachine:
     """As stage identify_plant does it, on all of the record."""
     settings = Settings(feedthrough=None, refinement="validated")
-    (u,), _ = within_limits([u], limits)
+    (u,), _ = ([u], []) if limits is None else within_limits([u], limits)
     fit = identify([u], [y], sample_time_s=sample_time_s, settings=settings)
     rng = np.random.default_rng(1)
     family = bootstrap_spread([u], [y], fit, count=FAMILY, order=fit.order + 1, rng=rng)
