@@ -75,7 +75,7 @@ def test_figures_stand_beside_the_accepted_ones_with_bands_and_digits_that_bands
     assert "Settling at most 60 s 6 s 5–8 9.0 s 8.5–9.5 +3 s · worse" in text
     assert "Cost as deployed none 2.00 1.80–2.20 2.00 1.80–2.20 unchanged" in text
     assert text.count("subspace + LQG") >= 2
-    assert "1 of 17 figures moved beyond their noise." in text
+    assert "1 of 23 figures moved beyond their noise." in text
 
 
 def test_a_figure_without_a_band_is_neither_better_nor_worse(accepted):
