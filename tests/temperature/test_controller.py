@@ -52,7 +52,16 @@ def guard() -> Governor:
 def cases(
     plants: list[Plant], questions: panel.Questions, *, noise: float = 0.1, steps: int = 60
 ) -> panel.Cases:
-    return panel.asked(plants, questions, noise=np.full(5, noise), seed=1, steps=steps, hold=20, cells=False)
+    return panel.asked(
+        plants,
+        questions,
+        noise=np.full(5, noise),
+        seed=1,
+        steps=steps,
+        hold=20,
+        cells=False,
+        structures=(panel.Structure(),),
+    )
 
 
 def constants(*references: np.ndarray, starts: tuple[float, ...] = (90.0,)) -> panel.Questions:
@@ -288,7 +297,8 @@ def replayed(ready: Deployed, asked: panel.Cases, model: Plant, case: int) -> np
         reference = asked.references[asked.asked[case, np.flatnonzero(asked.begin[case] <= t)[-1]]]
         r = reference if len(reference.w0) > 1 else reference.H[:, 0]
         u = commands[t] = controller.step(plant.C @ x + plant.d + noise[asked.hold + t], r, t)
-        x = plant.A @ x + plant.B @ u + plant.b
+        outside = asked.warms[asked.plant[case]] * asked.outside[t, case]
+        x = plant.A @ x + plant.B @ u + plant.b + outside
     return commands
 
 
@@ -316,7 +326,7 @@ def test_the_object_asks_for_what_the_panel_judged(
     asked = cases(plants, every_kind(), steps=45)
     judged = played(ready, asked, model).u
     commands = np.stack([replayed(ready, asked, model, case) for case in range(count)], axis=1)
-    assert set(asked.kind[:count]) == {"constant", "ramp", "sinusoid", "sequence"}
+    assert set(asked.kind[:count]) == {"constant", "ramp", "sinusoid", "sequence", "disturbed"}
     # of the range of 100 percent: sums in another order differ in the last digits
     np.testing.assert_allclose(commands, judged[:, :count], rtol=0, atol=1e-9 * 100)
 
