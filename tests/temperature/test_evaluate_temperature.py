@@ -488,7 +488,7 @@ def test_what_the_bands_of_a_plant_leave_open_of_a_loop_grows_with_the_bands(giv
 
     small, large = found(0.02), found(0.3)
     assert found(0.0) == (0.0, 0, 6)
-    assert small.excess < 0.01 < large.excess and small.broken == 0
+    assert small.excess < 0.01 and small.broken == 0 < large.broken
 
 
 def test_a_resample_of_the_record_that_gives_another_controller_is_counted(given):
