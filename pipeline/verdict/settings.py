@@ -14,7 +14,7 @@ class ReportRules(params.Section):
     resolves settling_s and heating_s where they are null."""
 
     settled_error_degC: float = Field(gt=0, le=1000)
-    peak_error_degC: float = Field(2.0, gt=0, le=1000)  # an accepted run of before has none
+    peak_error_degC: float = Field(gt=0, le=1000)
     settling_s: float | None = Field(gt=0, le=1e6)
     heating_s: float | None = Field(None, gt=0, le=1e6)
     overshoot_degC: float = Field(gt=0, le=1000)
