@@ -498,3 +498,11 @@ def test_a_resample_of_the_record_that_gives_another_controller_is_counted(given
     problem = given.problem._replace(family=[one, one, exchanged, one])
     found = redesigned("pi", problem, {"gain_factor": 1.0, "reset_factor": 1.0}, given.setting)
     assert (found.broken, found.of) == (1, 3) and found.excess == 0
+
+
+def test_the_margin_that_is_judged_is_that_of_the_plant_that_a_tenth_lie_below():
+    found = [scorecard.Margins(0.1 * k, float("inf") if k > 5 else float(k), True, 0.9) for k in range(11)]
+    told = evaluation._margin_figures(found)
+    assert told is not None
+    assert told["disk"] == {"q10": 0.1, "median": 0.5, "worst": 0.0}
+    assert told["delay_s"] == {"q10": 1.0, "median": 5.0, "worst": 0.0}
