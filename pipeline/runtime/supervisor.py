@@ -62,12 +62,11 @@ SAME_STEPS, SAME_NOISE = 1.5, 6.0  # steps and deviations within which a reading
 FOLLOWS = (0.7, 1.4)  # share of the forecast's move by which a sensor is cleared
 CLEARED_S = 60.0  # for how long it is cleared then
 # why readings miss the forecast: a heater lacks a share, or gives one of what it could add; heat of the
-# surroundings as a share of the input's range; samples late; a heater that differs from the model by a share;
+# surroundings as a share of the input's range, at once or growing; samples late; a heater that differs from the model by a share;
 # a step of the reading in degC
-LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS = range(6)
-LEAST = np.array([0.35, 0.6, -0.3, -8.0, -0.25, -1e3])
-MOST = np.array([1.3, 1.5, 0.3, 8.0, 0.25, 1e3])
-MORE_THAN_ALL = 1.05  # of its command: no heater lacks so much, and its sensor is in doubt
+LACKS, GIVES, HEAT, GROWS, LATE, DIFFERS, SHIFTS = range(7)
+LEAST = np.array([0.35, 0.6, -0.3, -0.3, -8.0, -0.25, -1e3])
+MOST = np.array([1.0, 1.5, 0.3, 0.3, 8.0, 0.25, 1e3])
 CLEARER = 16.0  # of -2 log likelihood, by which a fault must explain better than what is none
 MISFIT = 0.15  # of what readings miss, which even the right cause leaves: no model is the machine
 DOUBT = 0.25  # share of what inputs did lately by which a forecast may be wrong
@@ -81,6 +80,7 @@ MOST_STEP_DEGC = 5.0  # what moves by more at first was perhaps switched on
 MISSING, AT_LIMIT = 0.4, 0.1
 MISSING_FOR, DOOR_S = 60, 110.0  # for so many samples, and longer than a door is open
 FAR_DEGC = 1e4  # no machine is so hot: its model is unstable, and no reading corrects it
+BACK_S = 30.0  # without a cause, after which the law takes over again
 RETURNS = 3  # times an hour that heaters which went off are tried again
 LEAK = 0.9999  # of the drift, kept a step
 HURRIED = 0.1  # of an innovation, by which the drift follows in manual
@@ -97,7 +97,7 @@ class Supervision(NamedTuple):
     a reading is one. Pairs (q,) of an output `of_input` and an input `input_of`: first the output in which
     each input has the largest share, then the outputs that are left, with the input that moves them most.
     `heat` (m, p) is the share of the inputs' range that a drift of 1 stands for, `missing_for` the samples
-    for which heat must be missing; `back_s` the time without the cause after which the law takes over again.
+    for which heat must be missing.
     """
 
     A: np.ndarray
@@ -123,7 +123,6 @@ class Supervision(NamedTuple):
     missing_for: int
     sample_time_s: float
     reach_degC: float
-    back_s: float
 
     def coarser(self, quantum: np.ndarray) -> np.ndarray:
         """How often the sensors' noise (p,) their readings deviate, with steps of `quantum` (p,) in degC."""
@@ -191,7 +190,6 @@ def supervision(
         missing_for=max(MISSING_FOR, int(np.ceil(DOOR_S / machine.sample_time_s))),
         sample_time_s=machine.sample_time_s,
         reach_degC=max(0.5, 3 * float(noise.max())),
-        back_s=max(30 * machine.sample_time_s, 10.0),
     )
 
 
@@ -227,10 +225,11 @@ class Kept(NamedTuple):
     as forecast, returns how often it was trusted again, the last time at returned_s.
 
     Windows (K): states (2, K, n), from the drift as it was and from its mean; given and unit (K, n, m), the
-    responses to the inputs and to one percent of each; before (K, q) the former a sample ago; began, first,
+    responses to the inputs and to one percent of each; before (K, q) the former a sample ago, grown (K, q) the
+    sum of the latter; began, first,
     least, most (K, p) the forecast and the reading at first, the least and the most reading; away (K, p)
-    samples in a row in which the forecast was away from it; square (K, q) the sum of r^2, causes (K, q, 6)
-    that of each cause's signature squared, cross (K, K, q, 6) that of r of a window times the signature of a
+    samples in a row in which the forecast was away from it; square (K, q) the sum of r^2, causes (K, q, 7)
+    that of each cause's signature squared, cross (K, K, q, 7) that of r of a window times the signature of a
     cause that began with another; age (K,) in samples, -1 for none.
 
     shown (2, m): samples in a row in which a heater was stuck on, or weak; missing (m,) samples in a
@@ -259,6 +258,7 @@ class Kept(NamedTuple):
     given: np.ndarray
     unit: np.ndarray
     before: np.ndarray
+    grown: np.ndarray
     began: np.ndarray
     first: np.ndarray
     least: np.ndarray
@@ -304,6 +304,7 @@ def kept(s: Supervision) -> Kept:
         given=np.zeros((K, n, m)),
         unit=np.zeros((K, n, m)),
         before=np.zeros((K, q)),
+        grown=np.zeros((K, q)),
         began=np.zeros((K, p)),
         first=np.zeros((K, p)),
         least=np.zeros((K, p)),
@@ -370,7 +371,7 @@ def begin_window(s: Supervision, k: Kept, at: int) -> None:
     start = k.x + s.M @ k.e
     k.states[:, at] = start
     k.states[1, at, -len(s.d) :] = k.slow
-    for part in (k.given, k.unit, k.before, k.away, k.square, k.causes, k.cross):
+    for part in (k.given, k.unit, k.before, k.grown, k.away, k.square, k.causes, k.cross):
         part[at] = 0
     k.cross[:, at] = k.total[:, at] = 0.0
     k.began[at] = s.C @ start + s.d
@@ -400,7 +401,19 @@ def compare(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     given, unit = ((s.C @ part)[:, own, inputs] for part in (k.given, k.unit))
     span = (s.high - s.low)[inputs]
     step = np.where(runs, 1.0, 0.0) * np.ones_like(given)
-    signatures = np.stack([-given, span * unit - given, span * unit, k.before - given, -given, step], axis=2)
+    k.grown[...] += unit / (WINDOWS * SPACING)
+    signatures = np.stack(
+        [
+            -given,
+            span * unit - given,
+            span * unit,
+            span * k.grown,
+            k.before - given,
+            -given,
+            step,
+        ],
+        axis=2,
+    )
     moved = np.where(counts, y - k.began, 0.0)
     k.total[...] += moved, moved * moved
     k.before[:] = given
@@ -479,7 +492,7 @@ def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
         elif cause == GIVES:
             say(k, ON, int(i), share)
         else:
-            say(k, WEAK, int(i), -share if share > MORE_THAN_ALL else share)
+            say(k, WEAK, int(i), share)
 
 
 def judge_heat(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
@@ -528,12 +541,12 @@ def judge_sensors(
 
 
 def forget(s: Supervision, k: Kept) -> None:
-    """Causes that are gone: after `back_s` without them, or, if the heaters are off for them, as soon as the
+    """Causes that are gone: after BACK_S without them, or, if the heaters are off for them, as soon as the
     output moves as forecast again. A heater is tried again RETURNS times an hour; from then on a person is
     waited for."""
     if not k.counters[ACTIVE]:
         return
-    gone = (k.since >= 0) & (k.clock_s[1] - k.last > s.back_s)
+    gone = (k.since >= 0) & (k.clock_s[1] - k.last > BACK_S)
     for kind in (STILL, DEAF, ON, WEAK):
         for signal in np.flatnonzero(k.since[kind] >= 0):
             j = s.of_input[signal] if kind in OF_INPUT else signal

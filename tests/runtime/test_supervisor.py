@@ -372,7 +372,7 @@ def test_the_law_comes_back_from_a_sensor_that_answers_again_without_a_bump():
     assert run.go(8, reading=put(1, lambda y, k: np.nan))[-1].mode == "off"
     modes = [one.mode for one in run.go(60)]
     back = modes.index("law")
-    assert 29 <= back <= 31 and set(modes[back:]) == {"law"}  # after back_s of 30 s, and for good
+    assert 29 <= back <= 31 and set(modes[back:]) == {"law"}  # after BACK_S, and for good
     assert {one.mode for one in run.go(300)} == {"law"}
     np.testing.assert_allclose(run.true(), R, atol=1.0)
 

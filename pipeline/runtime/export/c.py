@@ -387,8 +387,8 @@ def _law(name: str, deployed: Deployed) -> str:
 # names in tables.h of the constants of supervisor.py
 OF_SUPERVISOR = (
     "SPACING", "STILL_AFTER", "FIT_AFTER", "STEPS_STILL", "NOISE_STILL", "SAME_STEPS", "SAME_NOISE",
-    "CLEARED_S", "CLEARER", "MORE_THAN_ALL", "MISFIT", "DOUBT", "RESTS", "REPEATED", "SHOWN", "SLOWLY",
-    "EARLY", "JUMP", "RETURNS", "MOST_STEP_DEGC", "MISSING", "AT_LIMIT", "FAR_DEGC",
+    "CLEARED_S", "CLEARER", "MISFIT", "DOUBT", "RESTS", "REPEATED", "SHOWN", "SLOWLY",
+    "EARLY", "JUMP", "BACK_S", "RETURNS", "MOST_STEP_DEGC", "MISSING", "AT_LIMIT", "FAR_DEGC",
 )  # fmt: skip
 OF_OBSERVER = (
     "A",
@@ -414,7 +414,7 @@ def supervising(s: supervisor.Supervision) -> str:
     text = "\n/* ---- the supervisor, as supervisor.Supervision has it */\n\n"
     text += "".join(define(name, getattr(supervisor, name)) for name in OF_SUPERVISOR)
     text += define("FOLLOWS_LEAST", supervisor.FOLLOWS[0]) + define("FOLLOWS_MOST", supervisor.FOLLOWS[1])
-    text += define("REACH_DEGC", s.reach_degC) + define("SUPERVISOR_BACK_S", s.back_s)
+    text += define("REACH_DEGC", s.reach_degC)
     text += table("explanation_least", supervisor.LEAST) + table("explanation_most", supervisor.MOST)
     text += define("MISSING_FOR", s.missing_for)
     text += integers("supervisor_of_input", s.of_input) + integers("supervisor_input_of", s.input_of)

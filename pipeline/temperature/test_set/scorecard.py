@@ -370,8 +370,10 @@ class QuantileBand(NamedTuple):
 
 
 def banded(values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int = 200) -> QuantileBand:
-    """Of a figure (s,); NaN where it does not apply. Less is better."""
+    """Of a figure (s,); NaN where it does not apply, and all NaN if it applies nowhere. Less is better."""
     applies = np.flatnonzero(~np.isnan(values))
+    if not len(applies):
+        return QuantileBand(np.nan, np.nan, np.nan, np.nan, np.nan, 0)
     values, plant = values[applies], plant[applies]
     median, q90 = np.quantile(values, [0.5, 0.9], method="nearest")
     blocks = [values[plant == index] for index in np.unique(plant)]

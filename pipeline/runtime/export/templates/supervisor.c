@@ -196,6 +196,8 @@ static void compare(supervisor_kept *k, const double *y, const int *counts)
             signature[w][LACKS] = signature[w][DIFFERS] = -given;
             signature[w][GIVES] = span * unit - given;
             signature[w][HEAT] = span * unit;
+            one->grown[i] += unit / (WINDOWS * SPACING);
+            signature[w][GROWS] = span * one->grown[i];
             signature[w][LATE] = one->before[i] - given;
             signature[w][SHIFTS] = one->age < 0 ? 0.0 : 1.0;
             one->before[i] = given;
@@ -425,8 +427,8 @@ static void judge_heaters(supervisor_kept *k, const double *y, const int *counts
         say_still(k, supervisor_of_input[of], moves[at][supervisor_of_input[of]]);
     else if (at >= 0 && gives[at][of])
         say(k, HEATER_STUCK_ON, of, share[at][of]);
-    else if (at >= 0) /* the sensor is in doubt if more than all is lacking */
-        say(k, HEATER_WEAK, of, share[at][of] > MORE_THAN_ALL ? -share[at][of] : share[at][of]);
+    else if (at >= 0)
+        say(k, HEATER_WEAK, of, share[at][of]);
 }
 
 /* Whether a heater is tried again: the heaters are off for this cause and its output moves as forecast, or
@@ -453,7 +455,7 @@ static void forget(supervisor_kept *k)
         for (signal = 0; signal < SIGNALS; signal++) {
             int counted = kind == SENSOR_STILL || kind == SENSOR_DEAF || kind == HEATER_STUCK_ON
                           || kind == HEATER_WEAK;
-            int gone = k->clock_s[1] - k->last[kind][signal] > SUPERVISOR_BACK_S;
+            int gone = k->clock_s[1] - k->last[kind][signal] > BACK_S;
             if (k->since[kind][signal] < 0 || !(counted ? tried_again(k, kind, signal, gone) : gone))
                 continue;
             k->since[kind][signal] = k->last[kind][signal] = -1.0;

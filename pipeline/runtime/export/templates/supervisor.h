@@ -5,12 +5,12 @@ enum { SENSOR_OPEN, SENSOR_STILL, SENSOR_DEAF, HEATER_STUCK_ON, HEATER_WEAK, REF
 enum { MODE_LAW, MODE_OWN, MODE_OFF };
 
 /* Why readings miss a forecast: faults of a heater, then what is no fault */
-enum { LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS, EXPLANATIONS };
+enum { LACKS, GIVES, HEAT, GROWS, LATE, DIFFERS, SHIFTS, EXPLANATIONS };
 
 /* A forecast that no reading corrects, and what readings missed of it (supervisor.Kept) */
 typedef struct {
     double state[2][WATCH], given[WATCH][INPUTS], unit[WATCH][INPUTS]; /* responses to inputs and one percent */
-    double before[PAIRS], began[OUTPUTS], first[OUTPUTS], least[OUTPUTS], most[OUTPUTS], total[2][OUTPUTS];
+    double before[PAIRS], grown[PAIRS], began[OUTPUTS], first[OUTPUTS], least[OUTPUTS], most[OUTPUTS], total[2][OUTPUTS];
     double square[PAIRS], causes[PAIRS][EXPLANATIONS], cross[WINDOWS][PAIRS][EXPLANATIONS];
     int age, away[OUTPUTS];
 } forecast_window;
