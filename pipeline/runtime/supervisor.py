@@ -403,16 +403,7 @@ def compare(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     step = np.where(runs, 1.0, 0.0) * np.ones_like(given)
     k.grown[...] += unit / (WINDOWS * SPACING)
     signatures = np.stack(
-        [
-            -given,
-            span * unit - given,
-            span * unit,
-            span * k.grown,
-            k.before - given,
-            -given,
-            step,
-        ],
-        axis=2,
+        [-given, span * unit - given, span * unit, span * k.grown, k.before - given, -given, step], axis=2
     )
     moved = np.where(counts, y - k.began, 0.0)
     k.total[...] += moved, moved * moved

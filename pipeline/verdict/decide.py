@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from pipeline.temperature.test_set.best import SAME_STRUCTURE, fragile
 from pipeline.verdict import identification
 from pipeline.verdict.controllers import YARDSTICKS, heading, in_a_sentence
 from pipeline.verdict.digits import with_unit
@@ -168,12 +169,17 @@ def _unstable_sentence(figures: Figures, name: str) -> str:
 
 def choose(figures: Figures, held: Mapping[str, Standing], incumbent: str = "") -> str | None:
     """Who should run: the best that passes, ties to the simpler; the incumbent if none is better beyond the
-    bands of the cost. None if nobody passes."""
+    bands of the cost, and not the weaker of two of one structure. None if nobody passes."""
     fit = [name for name, standing in held.items() if standing.passes and name not in YARDSTICKS]
     if not fit:
         return None
     best = entry(comparison(figures), "best")
     if best not in fit:
+        weaker = [
+            fragile(pair, entry(comparison(figures), "contestants"), dict.fromkeys(fit, True))
+            for pair in SAME_STRUCTURE
+        ]
+        fit = [name for name in fit if name not in weaker]
         cheapest = min(fit, key=lambda name: _cost(held[name]).value)
         best = next(name for name in fit if _cost(held[name]).low <= _cost(held[cheapest]).high)
     if incumbent in fit and _cost(held[incumbent]).low <= _cost(held[best]).high:

@@ -9,8 +9,16 @@ import numpy as np
 from pipeline.temperature.test_set.scorecard import chosen
 
 # limits that a simulation of the temperature loop can check, as the comparison resolves them
-CHECKED = ("settled_error_degC", "peak_error_degC", "settling_s", "heating_s", "overshoot_degC",
-           "at_limits_percent",           "disk_margin", "delay_margin_s")  # fmt: skip
+CHECKED = (
+    "settled_error_degC",
+    "peak_error_degC",
+    "settling_s",
+    "heating_s",
+    "overshoot_degC",
+    "at_limits_percent",
+    "disk_margin",
+    "delay_margin_s",
+)
 # controllers of one structure: of two that pass the one with the larger margins may be named
 SAME_STRUCTURE = (("pi_simc", "pi"),)
 
