@@ -62,8 +62,8 @@ SAME_STEPS, SAME_NOISE = 1.5, 6.0  # steps and deviations within which a reading
 FOLLOWS = (0.7, 1.4)  # share of the forecast's move by which a sensor is cleared
 CLEARED_S = 60.0  # for how long it is cleared then
 # why readings miss the forecast: a heater lacks a share, or gives one of what it could add; heat of the
-# surroundings as a share of the input's range, at once or growing; samples late; a heater that differs from the model by a share;
-# a step of the reading in degC
+# surroundings as a share of the input's range, at once or growing; samples late; a heater that differs from
+# the model by a share; a step of the reading in degC
 LACKS, GIVES, HEAT, GROWS, LATE, DIFFERS, SHIFTS = range(7)
 LEAST = np.array([0.35, 0.6, -0.3, -0.3, -8.0, -0.25, -1e3])
 MOST = np.array([1.0, 1.5, 0.3, 0.3, 8.0, 0.25, 1e3])
@@ -224,13 +224,13 @@ class Kept(NamedTuple):
     NaN: a large one, perhaps of power-on), bad readings in a row, cleared_s the time at which it last moved
     as forecast, returns how often it was trusted again, the last time at returned_s.
 
-    Windows (K): states (2, K, n), from the drift as it was and from its mean; given and unit (K, n, m), the
-    responses to the inputs and to one percent of each; before (K, q) the former a sample ago, grown (K, q) the
-    sum of the latter; began, first,
-    least, most (K, p) the forecast and the reading at first, the least and the most reading; away (K, p)
-    samples in a row in which the forecast was away from it; square (K, q) the sum of r^2, causes (K, q, 7)
-    that of each cause's signature squared, cross (K, K, q, 7) that of r of a window times the signature of a
-    cause that began with another; age (K,) in samples, -1 for none.
+    Windows (K): states (2, K, n), from the drift as it was and from its mean; given and unit (K, n, m),
+    the responses to the inputs and to one percent of each; before (K, q) the former a sample ago, grown
+    (K, q) the sum of the latter; began, first, least, most (K, p) the forecast and the reading at first,
+    the least and the most reading; away (K, p) samples in a row in which the forecast was away from it;
+    square (K, q) the sum of r^2, causes (K, q, 7) that of each cause's signature squared, cross (K, K, q,
+    7) that of r of a window times the signature of a cause that began with another; age (K,) in samples,
+    -1 for none.
 
     shown (2, m): samples in a row in which a heater was stuck on, or weak; missing (m,) samples in a
     row in which its heat was. asked (m,) the last command,

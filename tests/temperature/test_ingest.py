@@ -248,7 +248,7 @@ def test_a_recording_beyond_its_budget_is_quarantined_and_the_others_go_on(
     raw = folder(tmp_path, 2)
     # what is loaded at the first call counts there: the budget is that of a warm child
     read_folder(raw, JOB, INLINE, memo=tmp_path / "warm", budget=BUDGET)
-    # its text alone is beyond the budget: with little left, Python asks for memory again and again, for minutes
+    # its text alone is beyond the budget: with a little left, Python asks for memory for minutes
     k = np.arange(1_000_000)
     artifacts.write_csv(raw / "long.csv", {"time_s": k, "heater": k % 7, "zone": 20 + k % 5})
     monkeypatch.setattr(recording_folders, "_one", reader)
