@@ -116,7 +116,7 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     from pipeline.runtime import certificate_evidence, certify, support_logs
     from pipeline.runtime.certificate import EvidenceRecord
     from pipeline.runtime.replay import GaplessLog
-    from pipeline.temperature.controllers.window import at_mean_disturbances
+    from pipeline.temperature.controllers import feed_forward
     from pipeline.temperature.identification.segments import segments, without_gaps
     from pipeline.temperature.test_set import panel
 
@@ -126,7 +126,8 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     pieces = without_gaps(*segments(artifacts.read_table(RECORD, schema), *names))
     acting, y, recordings = certify.cut_at_missing(*pieces)
     u = [piece[:, : len(declared.inputs)] for piece in acting]
-    undisturbed = at_mean_disturbances(acting, y, len(declared.inputs))
+    m = len(declared.inputs)
+    undisturbed = feed_forward.at_mean(feed_forward.learn(acting, y, m), acting, y, m)
     parts = certify.split_newest(u, undisturbed, recordings)
     record = EvidenceRecord(machine.inputs, machine.outputs, machine.sample_time_s, *parts)
     setting, rng = loaded.setting, np.random.default_rng(settings.seed)

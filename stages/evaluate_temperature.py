@@ -4,6 +4,7 @@ trajectories.parquet, and its figures as figures.json and summary.json."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -78,6 +79,7 @@ def wire(declared: Plant) -> Machine:
             for one, least, most in zip(declared.outputs, low, high, strict=True)
         ),
         declared.sample_time_s,
+        tuple(Signal(one.name, one.unit, -math.inf, math.inf) for one in declared.disturbances),
     )
 
 

@@ -17,6 +17,7 @@ from pipeline.temperature.settings import Panel, Plant, Tracking, recorded
 if TYPE_CHECKING:
     import numpy as np
 
+    from pipeline.temperature.controllers.feed_forward import Told
     from pipeline.temperature.controllers.window import WindowModel
     from pipeline.temperature.test_set.scorecard import KernelCandidate, Sufficiency
 
@@ -35,13 +36,19 @@ RECORD = "datasets/ingest/record.parquet"
 COLD_SHARE = 0.1  # quantile of the recorded temperatures at which a check run starts on somebody's machine
 
 
-def read_record(machine: Plant) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Segments u (T, m) and y (T, p). Window and kernel know inputs alone: what disturbances do counts as
-    noise."""
-    from pipeline.temperature.identification.segments import segments
+def read_record(machine: Plant) -> tuple[list[np.ndarray], list[np.ndarray], Told | None]:
+    """Segments u (T, m) and y (T, p), and what disturbances do. Window and kernel know inputs alone: y is as
+    it would be with every disturbance at its mean."""
+    from pipeline.temperature.controllers import feed_forward
+    from pipeline.temperature.identification.segments import segments, without_gaps
 
     table = artifacts.read_table(RECORD, tables.record(machine.acting, machine.outputs))
-    return segments(table, [i.name for i in machine.inputs], [o.name for o in machine.outputs])[:2]
+    pieces = segments(table, [s.name for s in machine.acting], [o.name for o in machine.outputs])
+    if not machine.disturbances:
+        return pieces[0], pieces[1], None
+    m, (acting, y, _) = len(machine.inputs), without_gaps(*pieces)
+    told = feed_forward.learn(acting, y, m)
+    return [a[:, :m] for a in acting], feed_forward.at_mean(told, acting, y, m), told
 
 
 # figures of control that git keeps and that runs are compared by
@@ -59,7 +66,7 @@ def main() -> None:
     with artifacts.stage("learn_kernel") as out:
         import numpy as np
 
-        from pipeline.temperature.controllers import window
+        from pipeline.temperature.controllers import feed_forward, window
         from pipeline.temperature.identification import model_choice
         from pipeline.temperature.test_set import scorecard
         from pipeline.temperature.test_set.scorecard import CommonCost
@@ -71,7 +78,7 @@ def main() -> None:
         inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
         q, r = np.full(len(outputs), tracking.yardstick_q), np.full(len(inputs), tracking.yardstick_r)
         yardstick = CommonCost(q, r, tracking.gamma)
-        u, y = read_record(machine)
+        u, y, told = read_record(machine)
         with artifacts.about(RECORD):
             model_choice.check_inputs(u, offset=settings.offset, names=inputs)
             model_choice.check_outputs(y, names=outputs)
@@ -108,6 +115,8 @@ def main() -> None:
         )
         best = min(candidates, key=lambda candidate: candidate.gap)
         artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(long))
+        if told is not None:
+            artifacts.write_arrays(out / "feed_forward.parquet", "feed_forward", 1, feed_forward.stored(told))
         if best.learned is not None:
             artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, best.learned.stored())
         artifacts.write_metrics("learn_kernel", figures(settings, long, enough, candidates, best), METRICS)

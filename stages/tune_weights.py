@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from pipeline.temperature.test_set.panel import CaseConditions
     from pipeline.temperature.test_set.tuning import SearchResult
 
+# what disturbances do, if some are measured
+TOLD = "datasets/learn_kernel/feed_forward.parquet"
+
 
 def read_models(
     plant_path: str | Path,
@@ -77,6 +80,7 @@ def load_design_problem(
 ) -> tuple[CaseConditions, DesignProblem]:
     """What controllers are tuned and judged on, and what they are designed from. A simulated machine is the
     study's; otherwise cases follow from the record of ingest."""
+    from pipeline.temperature.controllers import feed_forward
     from pipeline.temperature.identification.segments import segments, without_gaps
     from pipeline.temperature.plant import baam
     from pipeline.temperature.test_set.panel import conditions, design_problem, from_declaration, from_record
@@ -88,7 +92,9 @@ def load_design_problem(
         "datasets/ingest/printer_pid.json",
         machine,
     )
-    truth, family = None, models["family"]
+    truth, family, told = None, models["family"], None
+    if artifacts.exists(TOLD):
+        told = feed_forward.restored(artifacts.read_arrays(TOLD, "feed_forward", 1))
     if simulated:
         truth = baam()._replace(sample_time_s=machine.sample_time_s)
         rehearsal = from_declaration(panel, machine, truth, family)
@@ -98,8 +104,8 @@ def load_design_problem(
         u, y, recordings = segments(
             record, [s.name for s in machine.acting], [o.name for o in machine.outputs]
         )
-        rehearsal = from_record(panel, machine, family, *without_gaps(u, y, recordings))
-    setting = conditions(tuning, machine, tracking, panel, rehearsal, family)
+        rehearsal = from_record(panel, machine, family, *without_gaps(u, y, recordings), told)
+    setting = conditions(tuning, machine, tracking, panel, rehearsal, family, told)
     return setting, design_problem(models, tracking, setting, truth)
 
 

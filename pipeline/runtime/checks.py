@@ -15,7 +15,7 @@ from pipeline.runtime.export import vectors
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.signals import DEGC, PERCENT
 from pipeline.runtime.supervised import Supervised
-from pipeline.temperature.controllers.controller import RunningController
+from pipeline.temperature.controllers.controller import RunningController, fed_forward
 from pipeline.temperature.test_set import panel
 
 SAME = 1e-9  # of an input's range, by which commands in another order of sums may differ
@@ -44,13 +44,20 @@ def commands(
     for reading in held[:-1]:
         running.watch(u, reading, first.H @ first.w0)
     running.hand_over(held[-1], at=cases.starts[cases.start[case]])
-    given = np.empty((cases.steps, len(u)))
+    given, forward = np.empty((cases.steps, len(u))), forward_of(made, cases, case)
     for t in range(cases.steps):
         number = cases.asked[case, np.flatnonzero(cases.begin[case] <= t)[-1]]
         reference = cases.references[number]
         r = reference if len(reference.w0) > 1 else reference.H[:, 0]
+        running.forward = forward[t]
         given[t] = running.step(measured[t], r, t, applied[t])
     return given
+
+
+def forward_of(made: Exported, cases: panel.Cases, case: int) -> np.ndarray:
+    """What is fed forward (steps, m) in one case."""
+    usual = 0.0 if made.controller.forward is None else made.controller.forward.mean
+    return fed_forward(made.controller, cases.told[:, case] + usual)
 
 
 def check_same(made: Exported, difference: float) -> None:
@@ -78,8 +85,8 @@ def python_difference(made: Exported, code: str) -> float:
         "output_unit": DEGC,
         "rehearsal": made.simulated,
     }
-    one = vectors.played(lambda: Supervised(made, rehearsal=True), made.model, at, script)
-    other = vectors.played(lambda: module["controller"](**wired), made.model, at, script)
+    one = vectors.played(lambda: Supervised(made, rehearsal=True), made, at, script)
+    other = vectors.played(lambda: module["controller"](**wired), made, at, script)
     return float(np.abs(one.u - other.u).max())
 
 

@@ -17,10 +17,12 @@ def play(exported: Exported, cases: panel.Cases) -> dict[str, Any]:
     """How many of `cases` there are, in how many the law was left, the share of their samples that it was
     left for, in percent, and the first reason of the first of them with its plant. A sample at a time."""
     cases = panel.some(cases, KINDS, PLANTS)
+    made = exported.controller.forward
     running = [Supervised(exported, rehearsal=True) for _ in cases.plant]
     at_rest = panel.rests(exported.model, cases, exported.controller.limits)
     r, target, _ = panel.schedule(cases, panel.aims(exported.controller.law, at_rest, cases))
     held = panel.held_readings(cases)
+    told = cases.told + (0.0 if made is None else made.mean)
     for measured in held[:-1]:
         for k, one in enumerate(running):
             one.watch(cases.u0[k], measured[k], r[0, k])
@@ -31,6 +33,7 @@ def play(exported: Exported, cases: panel.Cases) -> dict[str, Any]:
     def drive(t: int, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         u = np.empty_like(cases.u0)
         for k, one in enumerate(running):
+            one.tell(told[t, k])
             decision = one.step(measured[k], r[t, k], t * exported.machine.sample_time_s)
             u[k] = decision.u
             if decision.mode != "law":

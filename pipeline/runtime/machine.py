@@ -85,11 +85,17 @@ def check(exported: Exported) -> None:
             )
         for signal in signals:
             _check_signal(signal, kind, unit)
-    names = [signal.name for signal in (*machine.inputs, *machine.outputs)]
+    names = [signal.name for signal in (*machine.inputs, *machine.outputs, *machine.disturbances)]
     if twice := sorted({name for name in names if names.count(name) > 1 or not name.strip()}):
         raise ValueError(
             f"controller {exported.name}: signal {twice[0]!r} should be a name used once; give every input "
             "and output a name of its own"
+        )
+    forward, told = exported.controller.forward, len(machine.disturbances)
+    if forward is not None and len(forward.mean) != told:
+        raise ValueError(
+            f"controller {exported.name}: it is told {len(forward.mean)} disturbances but the machine names "
+            f"{told}; name every disturbance that it was learned with, in order"
         )
     _check_sample_time(exported)
     _check_limits(exported)
@@ -274,6 +280,7 @@ def _parts(exported: Exported) -> tuple[str, dict[str, np.ndarray]]:
             for i, one in enumerate(machine.inputs)
         ],
         "outputs": [_declared(one) for one in machine.outputs],
+        "disturbances": [_declared(one) for one in machine.disturbances],
         "integral_limit_degC": float(exported.controller.integral_limit),
         "governor": exported.controller.governor is not None,
         "fallback": exported.fallback is not None,
@@ -301,7 +308,7 @@ def _number(value: float) -> float | None:
 def _exported(about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Exported:
     kinds = typing.get_type_hints(Exported)
     try:
-        inputs, outputs = (
+        inputs, outputs, disturbances = (
             tuple(
                 Signal(
                     one["name"],
@@ -311,11 +318,13 @@ def _exported(about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Exp
                 )
                 for one in about[side]
             )
-            for side in ("inputs", "outputs")
+            for side in ("inputs", "outputs", "disturbances")
         )
         records = {name: _rebuilt(kinds[name], name, arrays, about["words"]) for name in RECORDS}
         plain = {name: about[name] for name in ("name", "simulated", "plant_sha256", "spread_sha256")}
-        return Exported(machine=Machine(inputs, outputs, about["sample_time_s"]), **records, **plain)
+        return Exported(
+            machine=Machine(inputs, outputs, about["sample_time_s"], disturbances), **records, **plain
+        )
     except KeyError as error:
         raise ValueError(f"{error.args[0]} is missing; export the controller again") from None
 

@@ -16,8 +16,10 @@ class Signal(NamedTuple):
 
 
 class Machine(NamedTuple):
-    """What a controller is wired to: its signals in order, and the time between two samples."""
+    """What a controller is wired to: its signals in order, the time between two samples, and the measured
+    disturbances that it is told."""
 
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
     sample_time_s: float
+    disturbances: tuple[Signal, ...] = ()

@@ -71,6 +71,12 @@ class Supervised:
         self._out: list[int] = []
         self._in_reach = np.full(len(exported.machine.outputs), np.nan)
 
+    def tell(self, disturbances: np.ndarray) -> None:
+        """The measured disturbances (q,) from this sample on, in the machine's order, NaN where one gives no
+        number. Raises ValueError for another number of them."""
+        told = _numbers(disturbances, (len(self.exported.machine.disturbances),), "disturbances")
+        self.law.tell(told)
+
     def watch(self, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> None:
         """One sample in manual, as RunningController has it; what is wrong is told by the first `step`.
         Raises ValueError as `step` does, and if inputs u (m,) are not finite; it then remembers nothing."""
@@ -81,6 +87,7 @@ class Supervised:
         filled = follow(self.supervision, k, y, None, 0)
         k.asked[:] = u
         k.clock_s[1] += self.supervision.sample_time_s
+        k.forward[:] = self.law.forward
         self.law.watch(u, filled, r_now)
 
     def hand_over(self, y: np.ndarray) -> None:
@@ -139,7 +146,7 @@ class Supervised:
         else:
             u = self._safe(mode, before, y, r_now, n)
             self.law.watch(u, y, r_now)
-        k.asked[:], k.counters[MODE] = u, mode
+        k.asked[:], k.forward[:], k.counters[MODE] = u, self.law.forward, mode
         k.counters[RUNS] += 1
         return u, mode
 
@@ -149,8 +156,10 @@ class Supervised:
             return self.exported.controller.limits.low.copy()
         if before != OWN:
             self.own = RunningController(self.own.controller, self.own.model)
+            self.own.forward = self.law.forward
             self.own.watch(self.kept.asked, y, r)
             self.own.hand_over(y)
+        self.own.forward = self.law.forward
         return self.own.step(y, r, n)
 
     def _target(self, r: np.ndarray | Reference) -> tuple[np.ndarray, np.ndarray]:
@@ -226,6 +235,7 @@ class Supervised:
         self.law, self.own = law, own
         for name, part in memory.items():
             part[...] = arrays[name]
+        self.law.forward = self.kept.forward.copy()
         self._reference = Reference(*(aim[name] for name in Reference._fields))
         self._w, self._Y, self._beyond, self._in_reach = (
             aim[name] for name in ("w", "Y", "beyond", "in_reach")

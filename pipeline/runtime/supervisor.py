@@ -234,7 +234,8 @@ class Kept(NamedTuple):
 
     shown (2, m): samples in a row in which a heater was stuck on, or weak; missing (m,) samples in a
     row in which its heat was. asked (m,) the last command,
-    usual (m,) its mean, stirred (m,) how far it was from it lately.
+    usual (m,) its mean, stirred (m,) how far it was from it lately; forward (m,) what was added to it for
+    disturbances, which it makes up for: forecasts run without both.
     counters (6,): samples, mode, 1 once the clock was read, causes that are there, samples under the law, 1
     after a gap of the clock that is none.
     clock_s (2,): the clock at the last sample, and the supervisor's own time, which never falls.
@@ -274,6 +275,7 @@ class Kept(NamedTuple):
     asked: np.ndarray
     usual: np.ndarray
     stirred: np.ndarray
+    forward: np.ndarray
     counters: np.ndarray
     clock_s: np.ndarray
 
@@ -320,6 +322,7 @@ def kept(s: Supervision) -> Kept:
         asked=np.zeros(m),
         usual=np.zeros(m),
         stirred=np.zeros(m),
+        forward=np.zeros(m),
         counters=np.zeros(6, int),
         clock_s=np.zeros(2),
     )
@@ -559,7 +562,7 @@ def follow(s: Supervision, k: Kept, y: np.ndarray, applied: np.ndarray | None, s
     """One sample of outputs y (p,), inputs `applied` since the one before, none of `samples` in manual; y
     (p,) with what does not count as forecast."""
     u = k.asked if applied is None else np.where(np.isfinite(applied), applied, k.asked)
-    u = np.minimum(np.maximum(u, s.low), s.high)
+    u = np.minimum(np.maximum(u, s.low), s.high) - k.forward
     silent = np.isnan(k.y)
     counts = read(s, k, y)
     begins = k.counters[SAMPLES] == 0 or (silent & counts).any()

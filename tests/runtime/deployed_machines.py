@@ -11,7 +11,7 @@ from pipeline.runtime.machine import Exported, controller_sha256, plants_sha256
 from pipeline.runtime.signals import Machine, Signal
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline, printer_pid
-from pipeline.temperature.controllers.controller import Deployed, compact, deployed
+from pipeline.temperature.controllers.controller import Deployed, FeedForward, compact, deployed
 from pipeline.temperature.controllers.governor import (
     ActuatorLimits,
     Governor,
@@ -26,7 +26,7 @@ from pipeline.temperature.tracking import Law, still_law
 INTEGRAL_LIMIT = 1.0
 NOISE = 0.1
 STRENGTH = Strength(0.85, 1.15, 0.1)
-LAWS = ("lqg", "window", "pi", "printer_pid", "hold", "slow", "tight")
+LAWS = ("lqg", "window", "pi", "printer_pid", "told", "hold", "slow", "tight")
 
 
 def block_and_sensor(*, zones: int, sample_time_s: float = 1.0) -> Plant:
@@ -70,7 +70,7 @@ def _windowed(model: Plant) -> tuple[Law, Plant]:
 
 
 def _law(kind: str, model: Plant, limits: ActuatorLimits) -> tuple[Law, Plant]:
-    if kind in ("lqg", "slow", "tight", "study"):
+    if kind in ("lqg", "slow", "tight", "told", "study"):
         made = tracking.model_based(model, 0.99, tau=1.0)
         effort = 1e-4 if kind == "tight" else 0.1
         return made.design(np.ones(model.p), np.full(model.m, effort), 0.05), model
@@ -94,8 +94,8 @@ def exported(
     kind: str = "lqg", *, zones: int = 2, simulated: bool = True, sample_time_s: float = 1.0
 ) -> Exported:
     """A controller of `zones` heaters and sensors by a law of LAWS; "slow" has a rate limit, "tight" outputs
-    that may rise 5 degC above where its episodes begin. "study": the study's machine, more inputs than
-    outputs."""
+    that may rise 5 degC above where its episodes begin; "told" a fan and a feed to make up for. "study": the
+    study's machine, more inputs than outputs."""
     plant_ = baam() if kind == "study" else block_and_sensor(zones=zones, sample_time_s=sample_time_s)
     limits = limits_of(plant_.m, rate=4.0 if kind == "slow" else np.inf)
     law, model = _law(kind, plant_, limits)
@@ -105,13 +105,16 @@ def exported(
         tuple(Signal(f"heater_{i + 1}", "percent", 0.0, 100.0) for i in range(plant_.m)),
         tuple(Signal(f"sensor_{i + 1}", "degC", 0.0, 250.0) for i in range(plant_.p)),
         sample_time_s,
+        tuple(Signal(name, "percent", -np.inf, np.inf) for name in ("fan", "feed") if kind == "told"),
     )
+    forward = FeedForward(np.array([[0.1, 2.0], [0.05, -0.5]]), np.array([40.0, 1.5]))
+    forward = forward if kind == "told" else None
     return Exported(
         name=kind,
         machine=machine,
-        controller=_deployed(law, limits, watched, holds=kind == "hold"),
+        controller=_deployed(law, limits, watched, holds=kind == "hold", forward=forward),
         model=model,
-        fallback=None if kind == "pi" else _deployed(_pi(plant_, limits), limits, watched),
+        fallback=None if kind == "pi" else _deployed(_pi(plant_, limits), limits, watched, forward=forward),
         supervision=supervisor.supervision(plant_, machine, np.full(plant_.p, NOISE)),
         simulated=simulated,
         plant_sha256=plants_sha256([plant_]),
@@ -119,8 +122,17 @@ def exported(
     )
 
 
-def _deployed(law: Law, limits: ActuatorLimits, watched: Governor | None, *, holds: bool = False) -> Deployed:
-    return deployed(law, limits, integral_limit=INTEGRAL_LIMIT, governor=watched, holds=holds)
+def _deployed(
+    law: Law,
+    limits: ActuatorLimits,
+    watched: Governor | None,
+    *,
+    holds: bool = False,
+    forward: FeedForward | None = None,
+) -> Deployed:
+    return deployed(
+        law, limits, integral_limit=INTEGRAL_LIMIT, governor=watched, holds=holds, forward=forward
+    )
 
 
 def passed(of: Exported) -> Certificate:

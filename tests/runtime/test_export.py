@@ -90,7 +90,7 @@ def test_c_without_a_warning_asks_for_what_the_object_asked_for(kind, tmp_path):
 def test_the_golden_vectors_reach_limits_safe_modes_and_hand_overs():
     of = exported()
     script = vectors.script(of, episodes=EPISODES, steps=STEPS, rng=np.random.default_rng(4))
-    done = vectors.played(lambda: Supervised(of, rehearsal=True), of.model, vectors.start(of), script)
+    done = vectors.played(lambda: Supervised(of, rehearsal=True), of, vectors.start(of), script)
     assert (done.u == 0).any() and (done.u == 100).any()
     assert len(set(done.mode)) >= 3 and np.bitwise_or.reduce(done.causes).bit_count() >= 4
     assert {vectors.HAND_OVER, vectors.RESTORE, vectors.BEGIN} <= set(script.do)
@@ -273,8 +273,8 @@ def test_the_python_file_is_the_object_bit_by_bit(kind, tmp_path):
     module = loaded(tmp_path, of)
     script = vectors.script(of, episodes=4, steps=STEPS, rng=np.random.default_rng(2))
     at = vectors.start(of)
-    ours = vectors.played(lambda: Supervised(of, rehearsal=True), of.model, at, script)
-    theirs = vectors.played(lambda: module.controller(**whose(of), rehearsal=True), of.model, at, script)
+    ours = vectors.played(lambda: Supervised(of, rehearsal=True), of, at, script)
+    theirs = vectors.played(lambda: module.controller(**whose(of), rehearsal=True), of, at, script)
     assert np.array_equal(ours.u, theirs.u)
     assert np.array_equal(ours.mode, theirs.mode) and np.array_equal(ours.causes, theirs.causes)
 

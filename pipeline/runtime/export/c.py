@@ -18,7 +18,7 @@ from pipeline.runtime.export.names import identifier
 from pipeline.runtime.machine import Exported, check, check_certificate
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers import governor as governing
-from pipeline.temperature.controllers.controller import Deployed, Rest, aim, constant
+from pipeline.temperature.controllers.controller import Deployed, FeedForward, Rest, aim, constant
 from pipeline.temperature.controllers.governor import Governor
 from pipeline.temperature.plant import Plant, strictly_proper
 from pipeline.temperature.tracking import Law
@@ -136,6 +136,7 @@ class ArrayLengths(NamedTuple):
 
     inputs: int
     outputs: int
+    disturbances: int
     memory: int
     members: int
     watched: int
@@ -161,7 +162,8 @@ def sizes(exported: Exported) -> ArrayLengths:
         max(m, p),
         len(exported.supervision.of_input),
     )
-    return ArrayLengths(m, p, memory, *governed, *supervised)
+    told = len(exported.machine.disturbances)
+    return ArrayLengths(m, p, told, memory, *governed, *supervised)
 
 
 def governor_of(exported: Exported) -> Governor | None:
@@ -197,7 +199,8 @@ def machine_header(exported: Exported, certificate_sha256: str) -> str:
     text += define("BEADLINE_INPUT_UNIT", machine.inputs[0].unit)
     text += define("BEADLINE_OUTPUT_UNIT", machine.outputs[0].unit)
     text += "\n/* Inputs and outputs in the order of every array */\n"
-    for kind, signals in (("INPUT", machine.inputs), ("OUTPUT", machine.outputs)):
+    kinds = {"INPUT": machine.inputs, "OUTPUT": machine.outputs, "DISTURBANCE": machine.disturbances}
+    for kind, signals in kinds.items():
         text += "".join(define(f"{kind}_{identifier(one.name)}", i) for i, one in enumerate(signals))
     text += "\n/* Lengths of arrays */\n"
     for name, value in at._asdict().items():
@@ -218,7 +221,15 @@ def tables(exported: Exported) -> str:
     text += "\n/* ---- the safe mode own */\n\n" + define("HAS_FALLBACK", int(exported.fallback is not None))
     text += "#define the_fallback the_law\n" if exported.fallback is None else ""
     text += _law("the_fallback", exported.fallback) if exported.fallback is not None else ""
-    return text + supervising(exported.supervision)
+    return text + _forward("forward", exported) + supervising(exported.supervision)
+
+
+def _forward(name: str, exported: Exported) -> str:
+    """Gain and mean of what is fed forward, as controller.FeedForward has them."""
+    m, q = len(exported.machine.inputs), len(exported.machine.disturbances)
+    forward = exported.controller.forward or FeedForward(np.zeros((m, q)), np.zeros(q))
+    gain = forward.gain if q else np.zeros((m, 1))
+    return table(f"{name}_gain", gain) + table(f"{name}_mean", forward.mean)
 
 
 def plant_header(exported: Exported) -> str:
@@ -228,6 +239,7 @@ def plant_header(exported: Exported) -> str:
     arrays = {"A": model.A, "B": model.B, "C": model.C, "b": model.b, "d": model.d}
     text += define("STATES", model.n)
     text += table("input_range", np.array([one.high - one.low for one in exported.machine.inputs]))
+    text += _forward("plant", exported)
     return text + "".join(table(f"plant_{name}", values) for name, values in arrays.items())
 
 

@@ -15,7 +15,8 @@ import numpy as np
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.supervised import Supervised
 from pipeline.runtime.supervisor import KINDS, MODES
-from pipeline.temperature.plant import Plant, hold_output, strictly_proper
+from pipeline.temperature.controllers.controller import fed_forward
+from pipeline.temperature.plant import hold_output, strictly_proper
 
 # what is done at a sample: in manual; a step; before it hand over, restore, or acknowledge; begin anew
 WATCH, STEP, HAND_OVER, RESTORE, ACKNOWLEDGE, BEGIN = range(6)
@@ -29,7 +30,8 @@ UNSURE = 1e-9  # degC: what no reading is known to, and more than rounding of an
 
 class Script(NamedTuple):
     """By sample (T,): do, t_s, told (1: the controller reads back what was applied); r, add, reading (T, p)
-    in degC, reading NaN where it is the plant's; manual, share, extra (T, m)."""
+    in degC, reading NaN where it is the plant's; manual, share, extra (T, m); disturbances (T, q) that it is
+    told, NaN for one that is not known. They take from the inputs what is fed forward."""
 
     do: np.ndarray
     t_s: np.ndarray
@@ -40,6 +42,7 @@ class Script(NamedTuple):
     manual: np.ndarray
     share: np.ndarray
     extra: np.ndarray
+    disturbances: np.ndarray
 
 
 class Played(NamedTuple):
@@ -110,6 +113,7 @@ def episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script:
         manual=np.clip(at.u + 0.05 * (high - low) * rng.normal(size=(steps, m)), low, high),
         share=np.ones((steps, m)),
         extra=np.zeros((steps, m)),
+        disturbances=_told(exported, steps, rng),
     )
     first = int(rng.integers(MANUAL + 20, max(steps - 40, MANUAL + 21)))
     if rng.random() < 0.7:  # shortly before the reference changes, as a fault shows then
@@ -129,6 +133,20 @@ def _reach(exported: Exported) -> np.ndarray:
     )
     span = np.where(np.isfinite(top - bottom), top - bottom, 300 * exported.supervision.noise_degC)
     return 0.52 * span
+
+
+def _told(exported: Exported, steps: int, rng: np.random.Generator) -> np.ndarray:
+    """Disturbances (T, q) in steps, each of which feeds a twentieth of an input's range forward at most; one
+    in ten samples of the second half is not known."""
+    forward = exported.controller.forward
+    if forward is None:
+        return np.zeros((steps, len(exported.machine.disturbances)))
+    span = np.array([one.high - one.low for one in exported.machine.inputs])
+    most = 0.05 / np.maximum(np.abs(forward.gain / span[:, None]).sum(axis=0), 1e-9)
+    levels = rng.uniform(-1, 1, (-(-steps // 20), len(most)))
+    told = forward.mean + np.repeat(levels, 20, axis=0)[:steps] * np.minimum(most, 1e6)
+    told[steps // 2 :][rng.random((steps - steps // 2, len(most))) < 0.1] = np.nan
+    return told
 
 
 FAULTS = ("none", "lost", "frozen", "frozen", "cold", "on", "on", "off", "off", "weak", "late", "jump")
@@ -157,9 +175,10 @@ def fault(made: Script, kind: str, when: slice, exported: Exported, rng: np.rand
         made.t_s[when.start :] += 500.0 * T
 
 
-def played(make: Any, model: Plant, at: EpisodeStart, script: Script) -> Played:
-    """The script run on `model` with the object that `make()` gives."""
-    plant = strictly_proper(model)
+def played(make: Any, exported: Exported, at: EpisodeStart, script: Script) -> Played:
+    """The script run on the model of a controller, with the object that `make()` gives."""
+    plant = strictly_proper(exported.model)
+    forward = fed_forward(exported.controller, script.disturbances)
     T, m = script.manual.shape
     out = Played(np.zeros((T, m)), np.zeros(T, int), np.zeros(T, int))
     x, u, y = at.x, at.u, at.y
@@ -170,17 +189,20 @@ def played(make: Any, model: Plant, at: EpisodeStart, script: Script) -> Played:
         applied = script.share[t] * u + script.extra[t] if t else u
         y = _read(plant.C @ x + plant.d + script.add[t], script.reading[t], y)
         if script.do[t] in (WATCH, BEGIN):
+            one.tell(script.disturbances[t])
             u = script.manual[t]
             one.watch(u, y, script.r[t])
         else:
+            one.tell(script.disturbances[t])
             one = _before(one, make, script.do[t], y)
+            one.tell(script.disturbances[t])
             told = applied if script.told[t] and script.do[t] != HAND_OVER else None
             decision = one.step(y, script.r[t], script.t_s[t], told)
             u = decision.u
             out.mode[t] = MODES.index(decision.mode)
             out.causes[t] = sum({1 << KINDS.index(cause.kind) for cause in decision.causes})
         out.u[t] = u
-        x = plant.A @ x + plant.B @ (script.share[t] * u + script.extra[t]) + plant.b
+        x = plant.A @ x + plant.B @ (script.share[t] * u + script.extra[t] - forward[t]) + plant.b
     return out
 
 
@@ -208,6 +230,7 @@ def as_csv(at: EpisodeStart, script: Script, done: Played) -> str:
     for t in range(len(script.do)):
         whole = [str(int(column[t])) for column in columns]
         parts = (script.r, script.add, script.reading, script.manual, script.share, script.extra, done.u)
+        parts += (script.disturbances,)
         numbers = np.concatenate([[script.t_s[t]], *(part[t] for part in parts)])
         lines.append(",".join(whole + list(map(repr, numbers.tolist()))))
     return "\n".join(lines) + "\n"
@@ -224,10 +247,10 @@ def play_often(exported: Exported, make: Any, script: Script, *, replays: int = 
     """
     at, rng = start(exported), np.random.default_rng(0)
     span = np.array([signal.high - signal.low for signal in exported.machine.inputs])
-    one, differs = played(make, exported.model, at, script), 0.0
+    one, differs = played(make, exported, at, script), 0.0
     for _ in range(replays):
         shift = UNSURE * rng.choice([-1.0, 1.0], script.add.shape)
-        other = played(make, exported.model, at, script._replace(add=script.add + shift))
+        other = played(make, exported, at, script._replace(add=script.add + shift))
         same = np.array_equal(one.mode, other.mode) and np.array_equal(one.causes, other.causes)
         differs = max(differs, float((np.abs(one.u - other.u) / span).max()) if same else np.inf)
         if differs > OWN_GAINS:

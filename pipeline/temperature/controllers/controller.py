@@ -10,6 +10,9 @@ With memory z, measured y, and the reference r(t) = H w(t), w(t+1) = F w(t) (see
     xi(t+1) = xi + integral (clip(y* - y) + clip(beyond(P (u - u wished))))
     z(t+1) = A z + B_u u + B_y y + B_r r + c
 
+Of disturbances d that are measured, F (d - mean d) is added to u before it is cut, and what the law remembers
+is u without it (FeedForward).
+
 The target y* = Y w is the reference, or the nearest one that the inputs can hold. P = pinv(-K_r) says by how
 many °C another reference would have asked for the input that was applied: back-calculation, which acts on
 what lies beyond the integrator's own limit. What was applied, not what was wished, enters the memory.
@@ -172,6 +175,14 @@ def _leaking(balance: np.ndarray) -> np.ndarray:
 AS_WISHED = 1e-9  # of an input's range, within which a command is the one that was wished
 
 
+class FeedForward(NamedTuple):
+    """What makes up for measured disturbances at rest: F = `gain` (m, q) in percent a unit of each, and their
+    `mean` (q,), at which nothing is added."""
+
+    gain: np.ndarray
+    mean: np.ndarray
+
+
 class Deployed(NamedTuple):
     """A law with what it runs under: `integral_limit` °C is the largest error, and the largest
     back-calculated shift, that the integrator sees; `back` (p, m) is P of the module's formula; `shift` is k
@@ -186,6 +197,7 @@ class Deployed(NamedTuple):
     shift: int
     governor: Governor | None
     holds: bool = False
+    forward: FeedForward | None = None
 
 
 def deployed(
@@ -195,9 +207,20 @@ def deployed(
     integral_limit: float,
     governor: Governor | None = None,
     holds: bool = False,
+    forward: FeedForward | None = None,
 ) -> Deployed:
     back = np.linalg.pinv(-law.K_r) if np.any(law.K_r) else np.zeros(law.K_r.T.shape)
-    return Deployed(law, limits, integral_limit, back, _shift(law.A), governor, holds)
+    return Deployed(law, limits, integral_limit, back, _shift(law.A), governor, holds, forward)
+
+
+def fed_forward(controller: Deployed, disturbances: np.ndarray) -> np.ndarray:
+    """F (d - mean d) (..., m) in percent of disturbances d (..., q); of one that is not told, NaN, its
+    mean is taken."""
+    m = controller.law.D.shape[0]
+    if controller.forward is None or controller.holds:
+        return np.zeros((*np.shape(disturbances)[:-1], m))
+    gain, mean = controller.forward
+    return np.where(np.isnan(disturbances), 0.0, disturbances - mean) @ gain.T
 
 
 def compact(law: Law, N: int) -> Law:
@@ -241,21 +264,30 @@ class ControllerState(NamedTuple):
 
 
 def watched(
-    controller: Deployed, state: ControllerState | None, u: np.ndarray, y: np.ndarray, r: np.ndarray
+    controller: Deployed,
+    state: ControllerState | None,
+    u: np.ndarray,
+    y: np.ndarray,
+    r: np.ndarray,
+    forward: np.ndarray | float = 0.0,
 ) -> ControllerState:
-    """The state after one sample in manual: inputs u (s, m) applied, outputs y (s, p) measured before, and
-    reference r (s, p). The first one starts it."""
-    law, family = controller.law, controller.governor
+    """The state after one sample in manual: inputs u (s, m) applied, outputs y (s, p) measured before,
+    reference r (s, p), and what would be fed `forward` (s, m). The first one starts it."""
+    law, family, acts = controller.law, controller.governor, u - forward
     if state is None:
-        z = u @ law.start_u.T + y @ law.start_y.T + law.start
+        z = acts @ law.start_u.T + y @ law.start_y.T + law.start
         x = np.zeros((0, len(u), 0)) if family is None else started(family, y)
         state = ControllerState(z, np.zeros(y.shape), u, x)
-    x = state.x if family is None else observed(family, state.x, u, y)
-    return ControllerState(_remembered(controller, state.z, u, y, r), state.xi, u, x)
+    x = state.x if family is None else observed(family, state.x, acts, y)
+    return ControllerState(_remembered(controller, state.z, acts, y, r), state.xi, u, x)
 
 
 def handed_over(
-    controller: Deployed, state: ControllerState, y: np.ndarray, here: Sequence[Aim]
+    controller: Deployed,
+    state: ControllerState,
+    y: np.ndarray,
+    here: Sequence[Aim],
+    forward: np.ndarray | float = 0.0,
 ) -> ControllerState:
     """The state in which the law takes over from manual without a bump: xi starts where the law, aimed at
     where the machine is (`here`, an Aim of each case's y), would go on with the input of manual, up to
@@ -264,12 +296,13 @@ def handed_over(
     law = controller.law
     if controller.holds or not np.any(law.integral):
         return state
+    acts = state.u - forward
     if law.conditional:
-        return state._replace(xi=state.u @ controller.back.T)
+        return state._replace(xi=acts @ controller.back.T)
     feed = np.array([one.feed[:, 0] for one in here])
     wished = feed - state.z @ law.K.T - y @ law.D.T
     most = controller.integral_limit
-    return state._replace(xi=np.clip((state.u - wished) @ controller.back.T, -most, most))
+    return state._replace(xi=np.clip((acts - wished) @ controller.back.T, -most, most))
 
 
 def batch_step(
@@ -279,23 +312,25 @@ def batch_step(
     r: np.ndarray,
     feed: np.ndarray,
     y_star: np.ndarray,
+    forward: np.ndarray | float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, ControllerState]:
     """Inputs (s, m) to apply, inputs wished, and the state a sample on, from measured y, reference r, target
-    y_star (s, p) and feed w (s, m)."""
+    y_star (s, p), feed w (s, m) and what is fed `forward` (s, m)."""
     law, limits = controller.law, controller.limits
     if controller.holds:
         return state.u, state.u, state
     wished = feed - state.z @ law.K.T - y @ law.D.T - state.xi @ law.K_r.T
     low = np.maximum(limits.low, np.minimum(state.u - limits.rate, limits.high))
     high = np.minimum(limits.high, np.maximum(state.u + limits.rate, limits.low))
-    u = np.minimum(np.maximum(wished, low), high)
+    u = np.minimum(np.maximum(wished + forward, low), high)
     x, family = state.x, controller.governor
     if family is not None:
         x = corrected(family, x, y)
-        u = governed(family, x, u, y_star, low, high)
-        x = predicted(family, x, u)
-    xi = _integrated(controller, state.xi, y_star - y, u, wished)
-    return u, wished, ControllerState(_remembered(controller, state.z, u, y, r), xi, u, x)
+        u = governed(family, x, u - forward, y_star, low - forward, high - forward) + forward
+        x = predicted(family, x, u - forward)
+    xi = _integrated(controller, state.xi, y_star - y, u - forward, wished)
+    after = _remembered(controller, state.z, u - forward, y, r)
+    return u, wished + forward, ControllerState(after, xi, u, x)
 
 
 def _integrated(controller: Deployed, xi, error, u, wished):
@@ -382,20 +417,27 @@ class RunningController:
         self._state: ControllerState | None = None
         self._reference: Reference | None = None
         self._w, self._t = np.zeros(0), 0
+        self.forward = np.zeros(len(law.D))
+
+    def tell(self, disturbances: np.ndarray) -> None:
+        """The disturbances d (q,) from this sample on, NaN for one that is not known."""
+        self.forward = fed_forward(self.controller, np.asarray(disturbances, float))
 
     def watch(self, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> None:
         """One sample in manual: inputs u (m,) applied, outputs y (p,) measured before, reference r (p,).
         Raises ValueError for another number of them, or one that is not finite, and remembers nothing."""
         m, p = self.controller.law.D.shape
         u, r = _finite(u, m, "inputs in percent"), _finite(r, p, REFERENCES)
-        self._state = watched(self.controller, self._state, u[None], self._measured(y)[None], r[None])
+        self._state = watched(
+            self.controller, self._state, u[None], self._measured(y)[None], r[None], self.forward
+        )
 
     def hand_over(self, y: np.ndarray, at: np.ndarray | None = None) -> None:
         """From manual to the law without a bump, at outputs y (p,) measured now, where the machine stands at
         `at` (p,), by itself y. Raises ValueError before any watch."""
         y = self._measured(y)
         here = self._aimed(constant(y if at is None else at))[1]
-        self._state = handed_over(self.controller, self._remembers(), y[None], [here])
+        self._state = handed_over(self.controller, self._remembers(), y[None], [here], self.forward)
 
     def step(
         self, y: np.ndarray, r: np.ndarray | Reference, t: int, applied: np.ndarray | None = None
@@ -413,15 +455,19 @@ class RunningController:
         if self._rated:
             low = np.maximum(low, np.minimum(before - limits.rate, limits.high))
             high = np.minimum(high, np.maximum(before + limits.rate, limits.low))
-        u = np.minimum(np.maximum(wished, low), high)
+        forward = self.forward
+        u = np.minimum(np.maximum(wished + forward, low), high)
         if family is not None:
             x = corrected(family, x, y[None])
-            u = governed(family, x, u[None], y_star[None], low[None], high[None])[0]
-        acts = u if applied is None else applied
+            inner = (u - forward)[None], y_star[None], (low - forward)[None], (high - forward)[None]
+            u = governed(family, x, *inner)[0] + forward
+        given = u if applied is None else applied
+        acts = given - forward
         if family is not None:
             x = predicted(family, x, acts[None])
         xi = _integrated(controller, state.xi, (y_star - y)[None], acts[None], wished[None])
-        self._state = ControllerState(self._kept(state.z[0], acts, y, now)[None], xi, acts[None], x)
+        after = self._kept(state.z[0], acts, y, now)
+        self._state = ControllerState(after[None], xi, given[None], x)
         return u.copy()
 
     def saved(self) -> dict[str, np.ndarray]:

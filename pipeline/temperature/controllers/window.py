@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg.lapack
 
 from pipeline.temperature.controllers.kernel import Tuples, window_law, window_shift, windows
-from pipeline.temperature.plant import Plant, observability_matrix, simulate
+from pipeline.temperature.plant import Plant, observability_matrix
 from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.tracking import ControllerDesign, Law, gains
 
@@ -29,9 +29,6 @@ class WindowModel(NamedTuple):
     N: int
     samples: int
     table: np.ndarray
-
-
-LONGEST_TOLD, ENOUGH = 24, 20  # samples of a window that is told the disturbances, and for each column
 
 
 def learn(
@@ -169,34 +166,6 @@ def observer_form(window: WindowModel, sample_time_s: float = 1.0) -> tuple[Plan
             T[rows, N * m + lag * p : N * m + (lag + 1) * p] = A_l[i + lag]
     b = of_y @ window.theta_0
     return make_plant(A, B, C, b=b, d=window.theta_0, K=of_y, sample_time_s=sample_time_s), T
-
-
-def at_mean_disturbances(
-    acting: Sequence[np.ndarray], y: Sequence[np.ndarray], inputs: int
-) -> list[np.ndarray]:
-    """y (T, p) of each piece as it would be with every disturbance at its mean, as a controller meets them.
-    `acting` (T, m + q) has the disturbances d after the `inputs` m.
-
-    A window model of the record, which is told them, says what they did:
-
-    e(t) = sum_i A_i e(t-i) + E_i (d(t-i) - mean d), at rest before the first sample
-
-    If that model is unstable, or the record too short for one, y is as recorded.
-    """
-    q, columns = acting[0].shape[1] - inputs, acting[0].shape[1] + y[0].shape[1]
-    longest = min(LONGEST_TOLD, sum(map(len, y)) // (ENOUGH * columns), min(map(len, y)) - 1)
-    if q == 0 or longest < 1:
-        return list(y)
-    model = observer_form(learn(acting, y, longest=longest, offset=True))[0]
-    effect = model._replace(B=model.B[:, inputs:], D=model.D[:, inputs:], b=0 * model.b, d=0 * model.d)
-    if np.abs(np.linalg.eigvals(effect.A)).max() >= 1:
-        return list(y)
-    mean = np.vstack(acting)[:, inputs:].mean(axis=0)
-    moves = [piece[:, inputs:] - mean for piece in acting]
-    rests = [np.linalg.solve(np.eye(effect.n) - effect.A, effect.B @ move[0]) for move in moves]
-    return [
-        piece - simulate(effect, move, rest)[1] for piece, move, rest in zip(y, moves, rests, strict=True)
-    ]
 
 
 def law(window: WindowModel, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral: float = 0.0) -> Law:

@@ -21,21 +21,24 @@ from pipeline.temperature.controllers.controller import (
     ActuatorLimits,
     Aim,
     Deployed,
+    FeedForward,
     Reference,
     Rest,
     aim,
     batch_step,
     constant,
     deployed,
+    fed_forward,
     handed_over,
     ramp,
     rest,
     sinusoid,
     watched,
 )
+from pipeline.temperature.controllers.feed_forward import Told
 from pipeline.temperature.controllers.governor import Governor, OutputLimits, Strength, governor
 from pipeline.temperature.controllers.problem import Design, DesignProblem
-from pipeline.temperature.plant import Plant, hold_output, hold_state
+from pipeline.temperature.plant import Plant, hold_output, hold_state, simulate
 from pipeline.temperature.settings import Half, Panel, Tracking, TuneWeights
 from pipeline.temperature.settings import Plant as Machine
 from pipeline.temperature.test_set.scenario_defaults import (
@@ -216,7 +219,8 @@ class Cases(NamedTuple):
     (s, g), which one; noise (s,) in °C drawn from `seed` (s,); `start` (s,) which start, 0 the coldest.
     `warms` (plants, n) is what surroundings that are 1 °C warmer add to a state each step, `outside` (steps,
     s) by how many °C they are, `rise` in °C from the coldest start to the first reference; `structure`
-    (plants, 5) of each plant.
+    (plants, 5) of each plant. `told` (steps, s, q) are the measured disturbances less their mean, `pushed`
+    (steps, s, p) what they do to the outputs in °C.
     """
 
     plants: list[Plant]
@@ -238,6 +242,8 @@ class Cases(NamedTuple):
     outside: np.ndarray
     rise: float
     structure: np.ndarray
+    told: np.ndarray
+    pushed: np.ndarray
 
     @property
     def cold(self) -> np.ndarray:
@@ -256,10 +262,12 @@ def asked(
     cells: bool,
     limits: ActuatorLimits | None = None,
     structures: Sequence[Structure] = STRUCTURES,
+    told: Told | None = None,
 ) -> Cases:
     """The questions put to every plant, which has one of `structures` in turn. Where states are `cells`, a
     start holds every cell at one temperature, otherwise every output, or what comes nearest within `limits`,
-    the coldest start aside: a machine that is switched on need not be held; noise (p,) in °C."""
+    the coldest start aside: a machine that is switched on need not be held; noise (p,) in °C. `told` are the
+    disturbances that are measured."""
     starts = np.vstack([questions.starts, questions.constants[:1]])
     references = [constant(r) for r in questions.constants]
     rows = [("constant", a, [j]) for a in range(len(questions.starts)) for j in range(len(references))]
@@ -290,6 +298,9 @@ def asked(
     count, kind = len(plants), np.array([row[0] for row in rows])
     rise = max(float((questions.constants[0] - questions.starts[0]).mean()), 0.0)
     outside = np.outer(surroundings(steps, rise), kind == "disturbed")
+    signal, push = (
+        np.einsum("tq,s->tsq", part, kind == "disturbed") for part in pushed(told, steps, plants[0].p)
+    )
     return Cases(
         list(plants),
         np.repeat(np.arange(count), len(rows)),
@@ -310,7 +321,22 @@ def asked(
         np.tile(outside, count),
         rise,
         np.array([structures[k % len(structures)] for k in range(count)]),
+        np.tile(signal, (1, count, 1)),
+        np.tile(push, (1, count, 1)),
     )
+
+
+def pushed(told: Told | None, steps: int, p: int) -> tuple[np.ndarray, np.ndarray]:
+    """While the part fan of `surroundings` is on, measured disturbances go to their highest level one after
+    the other, and stay there, less their mean (steps, q); and what that does to the outputs in °C
+    (steps, p)."""
+    if told is None:
+        return np.zeros((steps, 0)), np.zeros((steps, p))
+    q = len(told.high)
+    first, last = FAN[0], FAN[1]
+    t = np.arange(steps)[:, None] / steps
+    signal = (told.high - told.mean) * ((t >= first + (last - first) / (q + 1) * np.arange(q)) & (t < last))
+    return signal, simulate(told.effect, signal, np.zeros(told.effect.n))[1]
 
 
 def surroundings(steps: int, rise: float) -> np.ndarray:
@@ -417,7 +443,8 @@ def schedule(cases: Cases, aimed: Sequence[Aim]) -> tuple[np.ndarray, np.ndarray
 def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Rollout:
     """Every case at once under one controller; `aimed` from `aims`."""
     r, target, feed = schedule(cases, aimed)
-    held = held_readings(cases)
+    usual = 0.0 if controller.forward is None else controller.forward.mean
+    held, forward = held_readings(cases), fed_forward(controller, cases.told + usual)
     state = watched(controller, None, cases.u0, held[0], r[0])
     for measured in held[1:-1]:
         state = watched(controller, state, cases.u0, measured, r[0])
@@ -425,7 +452,7 @@ def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Roll
 
     def drive(t: int, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         nonlocal state
-        applied, wished, state = batch_step(controller, state, measured, r[t], feed[t], target[t])
+        applied, wished, state = batch_step(controller, state, measured, r[t], feed[t], target[t], forward[t])
         if not np.abs(state.z).max(initial=0.0) < 1e9:
             state = state._replace(z=np.clip(np.nan_to_num(state.z), -1e9, 1e9))
         return applied, wished
@@ -464,7 +491,7 @@ def simulated(
     y, measured = np.empty((steps, s, p)), np.empty((steps, s, p))
     applied, wished = np.empty((steps, s, m)), np.empty((steps, s, m))
     for t in range(steps):
-        y[t] = (np.matmul(x.reshape(count, each, -1), C) + d).reshape(-1, p)
+        y[t] = (np.matmul(x.reshape(count, each, -1), C) + d).reshape(-1, p) + cases.pushed[t]
         measured[t] = in_steps(y[t] + noise[t], step_degC[:, None])
         applied[t], wished[t] = drive(t, measured[t])
         given = in_steps(applied[t], duty)
@@ -486,6 +513,8 @@ def some(cases: Cases, kinds: Sequence[str], plants: int) -> Cases:
         plants=cases.plants[:plants],
         each=int(keep[: cases.each].sum()),
         outside=cases.outside[:, keep],
+        told=cases.told[:, keep],
+        pushed=cases.pushed[:, keep],
         **{name: getattr(cases, name)[keep] for name in rows},
     )
 
@@ -631,8 +660,8 @@ class Rehearsal(NamedTuple):
 class CaseConditions(NamedTuple):
     """What all controllers share, tuned and judged: the rehearsal, limits of inputs and outputs (low, high
     (p,) in °C), the governor, the integrator's limit in °C, the settled window in steps, what the cost counts
-    as one, the discount, the sample time, and the share of the declared delay margins that is asked here
-    (`faster`)."""
+    as one, the discount, the sample time, the share of the declared delay margins that is asked here
+    (`faster`), and what makes up for measured disturbances."""
 
     rehearsal: Rehearsal
     limits: ActuatorLimits
@@ -644,6 +673,7 @@ class CaseConditions(NamedTuple):
     gamma: float
     sample_time_s: float
     faster: float
+    forward: FeedForward | None
 
 
 def faster(settings: Panel, rehearsal: Rehearsal) -> float:
@@ -659,8 +689,9 @@ def conditions(
     settings: Panel,
     rehearsal: Rehearsal,
     family: Sequence[Plant],
+    told: Told | None = None,
 ) -> CaseConditions:
-    """`family`: the identified plant first, then its spread."""
+    """`family`: the identified plant first, then its spread; `told`: the disturbances that are measured."""
     band = rehearsal.band_degC / settings.band_degC
     late = (rehearsal.settling_s or settings.settling_s) / settings.settling_s
     # a slow machine is allowed its time, a small one its degrees
@@ -686,6 +717,7 @@ def conditions(
         tracking.gamma,
         machine.sample_time_s,
         faster(settings, rehearsal),
+        told.forward if told else None,
     )
 
 
@@ -713,6 +745,7 @@ def deploy(design: Design, setting: CaseConditions) -> Deployed:
         integral_limit=setting.integral_limit,
         governor=setting.governor if design.governed else None,
         holds=design.holds,
+        forward=setting.forward,
     )
 
 
@@ -833,6 +866,7 @@ def _half(
     steps: int,
     declared: PlantSpread,
     limits: ActuatorLimits | None = None,
+    told: Told | None = None,
 ) -> Cases:
     """One half of the panel: cases of `steps` at most, on plants that lie around those of `around` as
     `declared` says; starts are held within `limits`."""
@@ -850,6 +884,7 @@ def _half(
         hold=settings.hold_steps,
         cells=cells,
         limits=limits,
+        told=told,
     )
 
 
@@ -890,6 +925,7 @@ def from_record(
     u: Sequence[np.ndarray],
     y: Sequence[np.ndarray],
     recordings: Sequence[int],
+    told: Told | None = None,
 ) -> Rehearsal:
     """Somebody's machine: both halves are drawn around plants of the identified family, and starts,
     references, band, settling limit and length follow from the record: segments u (T, m and more:
@@ -932,6 +968,7 @@ def from_record(
             steps=asked.steps,
             declared=spread,
             limits=limits,
+            told=told,
         )
         for half, around, question in (
             (settings.judging, family[1::2], questions),

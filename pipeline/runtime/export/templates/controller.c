@@ -78,6 +78,20 @@ beadline_result beadline_init(beadline_controller *c, const beadline_machine *ma
     return BEADLINE_DONE;
 }
 
+beadline_result beadline_tell(beadline_controller *c, const double *disturbances)
+{
+    int i, q;
+    if (!c->ready)
+        return BEADLINE_NOT_READY;
+    for (i = 0; i < INPUTS; i++) {
+        c->law.forward[i] = 0.0;
+        for (q = 0; q < DISTURBANCES; q++)
+            if (isfinite(disturbances[q]))
+                c->law.forward[i] += forward_gain[i][q] * (disturbances[q] - forward_mean[q]);
+    }
+    return BEADLINE_DONE;
+}
+
 /* The target of reference r, found anew where r changed, and whether it is in reach */
 static void turn_to(beadline_controller *c, const double *r)
 {
@@ -109,6 +123,7 @@ beadline_result beadline_watch(beadline_controller *c, const double *u, const do
     follow(&c->kept, y, NULL, 0, filled);
     c->kept.clock_s[1] += BEADLINE_SAMPLE_TIME_S;
     memcpy(c->kept.asked, u, sizeof c->kept.asked);
+    memcpy(c->kept.forward, c->law.forward, sizeof c->kept.forward);
     law_watch(&the_law, &c->law, u, filled, r);
     return BEADLINE_DONE;
 }
@@ -143,6 +158,7 @@ beadline_result beadline_restore(beadline_controller *c, const beadline_controll
     if (!all_finite(saved->law.z, MEMORY + OUTPUTS + INPUTS) || !all_finite(saved->kept.x, WATCH))
         return BEADLINE_BAD_INPUT;
     *c = *saved;
+    memcpy(c->law.forward, c->kept.forward, sizeof c->law.forward);
     if (c->kept.mode != MODE_OWN)
         c->fallback.seen = 0; /* the fallback begins anew, as where the object is restored */
     return BEADLINE_DONE;
@@ -158,9 +174,11 @@ static void be_safe(beadline_controller *c, int mode, const double *y, const dou
     }
     if (k->mode != MODE_OWN) {
         memset(&c->fallback, 0, sizeof c->fallback);
+        memcpy(c->fallback.forward, c->law.forward, sizeof c->law.forward);
         law_watch(&the_fallback, &c->fallback, k->asked, y, r);
         law_hand_over(&the_fallback, &c->fallback, y);
     }
+    memcpy(c->fallback.forward, c->law.forward, sizeof c->law.forward);
     law_step(&the_fallback, &c->fallback, y, r, u);
 }
 
@@ -178,6 +196,7 @@ static int drive(beadline_controller *c, const double *y, const double *r, doubl
         law_watch(&the_law, &c->law, u, y, r);
     }
     memcpy(k->asked, u, sizeof k->asked);
+    memcpy(k->forward, c->law.forward, sizeof k->forward);
     k->mode = mode;
     return mode;
 }

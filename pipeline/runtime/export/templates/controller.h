@@ -5,6 +5,7 @@
  *     beadline_watch                   each sample in manual, at least one
  *     beadline_hand_over               once, when the law takes over
  *     beadline_step                    each sample from then on
+ *     beadline_tell                    before each of them, if machine.h has DISTURBANCES
  *
  * All that it remembers lies in a beadline_controller: to save it, copy it; beadline_restore goes on from the
  * copy. One thread at a time may use one.
@@ -61,6 +62,9 @@ typedef struct {
 
 /* Makes c ready. `rehearsal` 1: a controller of a simulated plant may run, beside a simulation only. */
 beadline_result beadline_init(beadline_controller *c, const beadline_machine *machine, int rehearsal);
+
+/* The disturbances from this sample on, in the order of machine.h, NAN for one that is not known */
+beadline_result beadline_tell(beadline_controller *c, const double *disturbances);
 
 /* One sample in manual: inputs u were applied, outputs y measured before, reference r */
 beadline_result beadline_watch(beadline_controller *c, const double *u, const double *y, const double *r);

@@ -4,7 +4,8 @@
  *     xi(t+1) = xi + integral (clip(y* - y) + clip(beyond(P (u - u wished))))
  *     z(t+1) = A z + B_u u + B_y y + B_r r + c
  *
- * The target y* is the reference, or the nearest one that the inputs can hold; feed rests there.
+ * The target y* is the reference, or the nearest one that the inputs can hold; feed rests there. What makes up for
+ * disturbances, `forward`, is added to u before it is cut; the law remembers u without it.
  */
 
 /* What a law is made of, matrices row after row; tables.h holds them. Letters as above. */
@@ -522,13 +523,22 @@ static void govern(const member_state *x, const double *y_star, const double *lo
 
 /* ---- a sample at a time */
 
+/* Inputs less what is fed forward */
+static void without_forward(const law_state *s, const double *u, double *acts)
+{
+    int i;
+    for (i = 0; i < INPUTS; i++)
+        acts[i] = u[i] - s->forward[i];
+}
+
 static void remember(const law *l, law_state *s, const double *u, const double *y, const double *r)
 {
-    double z[MEMORY];
+    double z[MEMORY], acts[INPUTS];
     int i;
     for (i = 0; i < l->memories; i++)
         z[i] = l->c[i];
-    add_product(z, l->B_u, u, l->memories, INPUTS);
+    without_forward(s, u, acts);
+    add_product(z, l->B_u, acts, l->memories, INPUTS);
     add_product(z, l->B_y, y, l->memories, OUTPUTS);
     add_product(z, l->B_r, r, l->memories, OUTPUTS);
     if (l->shift)
@@ -543,12 +553,13 @@ static void remember(const law *l, law_state *s, const double *u, const double *
 
 static void law_watch(const law *l, law_state *s, const double *u, const double *y, const double *r)
 {
+    double acts[INPUTS];
+    without_forward(s, u, acts);
     if (!s->seen) {
         int i;
-        memset(s, 0, sizeof *s);
         for (i = 0; i < l->memories; i++)
             s->z[i] = l->start[i];
-        add_product(s->z, l->start_u, u, l->memories, INPUTS);
+        add_product(s->z, l->start_u, acts, l->memories, INPUTS);
         add_product(s->z, l->start_y, y, l->memories, OUTPUTS);
         if (l->governed)
             start_governor(s->x, y);
@@ -556,7 +567,7 @@ static void law_watch(const law *l, law_state *s, const double *u, const double 
     }
     if (l->governed) {
         correct(s->x, y);
-        predict(s->x, u);
+        predict(s->x, acts);
     }
     remember(l, s, u, y, r);
 }
@@ -577,14 +588,15 @@ static void wish(const law *l, const law_state *s, const double *feed, const dou
 
 static void law_hand_over(const law *l, law_state *s, const double *y)
 {
-    double feed[INPUTS], y_star[OUTPUTS], shift[INPUTS], most = l->integral_limit;
+    double feed[INPUTS], y_star[OUTPUTS], shift[INPUTS], acts[INPUTS], most = l->integral_limit;
     int i, j;
     if (l->holds || !l->integrates)
         return;
     aim(l, y, feed, y_star);
     wish(l, s, feed, y, NULL, shift);
+    without_forward(s, s->u, acts);
     for (i = 0; i < INPUTS; i++)
-        shift[i] = l->conditional ? s->u[i] : s->u[i] - shift[i];
+        shift[i] = l->conditional ? acts[i] : acts[i] - shift[i];
     for (j = 0; j < OUTPUTS; j++) {
         s->xi[j] = dot(l->back + j * INPUTS, shift, INPUTS);
         if (!l->conditional)
@@ -630,7 +642,7 @@ static void integrate(const law *l, law_state *s, const double *error, const dou
 
 static void law_step(const law *l, law_state *s, const double *y, const double *r, double *u)
 {
-    double wished[INPUTS], low[INPUTS], high[INPUTS], error[OUTPUTS];
+    double wished[INPUTS], low[INPUTS], high[INPUTS], error[OUTPUTS], acts[INPUTS];
     int i, j;
     if (!s->aimed || memcmp(s->r, r, sizeof s->r)) {
         aim(l, r, s->feed, s->y_star);
@@ -645,15 +657,21 @@ static void law_step(const law *l, law_state *s, const double *y, const double *
     for (i = 0; i < INPUTS; i++) {
         low[i] = fmax(l->low[i], fmin(s->u[i] - l->rate[i], l->high[i]));
         high[i] = fmin(l->high[i], fmax(s->u[i] + l->rate[i], l->low[i]));
-        u[i] = cut(wished[i], low[i], high[i]);
+        u[i] = cut(wished[i] + s->forward[i], low[i], high[i]);
+        low[i] -= s->forward[i];
+        high[i] -= s->forward[i];
     }
+    without_forward(s, u, acts);
     if (l->governed) {
         correct(s->x, y);
-        govern(s->x, s->y_star, low, high, u);
-        predict(s->x, u);
+        govern(s->x, s->y_star, low, high, acts);
+        for (i = 0; i < INPUTS; i++)
+            u[i] = acts[i] + s->forward[i];
+        without_forward(s, u, acts);
+        predict(s->x, acts);
     }
     for (j = 0; j < OUTPUTS; j++)
         error[j] = s->y_star[j] - y[j];
-    integrate(l, s, error, u, wished);
+    integrate(l, s, error, acts, wished);
     remember(l, s, u, y, r);
 }

@@ -10,6 +10,7 @@ typedef struct {
 typedef struct {
     double z[MEMORY], xi[OUTPUTS], u[INPUTS];
     double r[OUTPUTS], feed[INPUTS], y_star[OUTPUTS];
+    double forward[INPUTS]; /* what makes up for the disturbances */
     member_state x[MEMBERS];
     int seen, aimed;
 } law_state;

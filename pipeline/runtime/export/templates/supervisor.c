@@ -507,7 +507,8 @@ static void follow(supervisor_kept *k, const double *y, const double *applied, i
         begins |= isnan(k->y[j]) && isfinite(y[j]) && y[j] >= supervisor_coldest[j] && y[j] <= supervisor_hottest[j];
     for (i = 0; i < INPUTS; i++)
         u[i] = cut(applied && isfinite(applied[i]) ? applied[i] : k->asked[i], supervisor_low[i],
-                   supervisor_high[i]);
+                   supervisor_high[i])
+               - k->forward[i];
     read_sensors(k, y, counts);
     for (step = 0; k->samples && step < (samples > 1 ? samples : 1); step++) {
         advance(k, u);

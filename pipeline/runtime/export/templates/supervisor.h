@@ -21,7 +21,7 @@ typedef struct {
     double x[WATCH], e[OUTPUTS], slow[OUTPUTS], expected[OUTPUTS];
     double y[OUTPUTS], quantum[OUTPUTS], cleared_s[OUTPUTS], returned_s[OUTPUTS];
     forecast_window window[WINDOWS];
-    double asked[INPUTS], usual[INPUTS], stirred[INPUTS], clock_s[2];
+    double asked[INPUTS], usual[INPUTS], stirred[INPUTS], forward[INPUTS], clock_s[2];
     int repeats[OUTPUTS], bad[OUTPUTS], returns[OUTPUTS], shown[2][INPUTS], missing[INPUTS];
     int samples, mode, clocked, insane, active; /* active: causes that are there */
 } supervisor_kept;

@@ -12,7 +12,7 @@
 
 #define TOLERANCE 1e-9 /* of each input's range */
 #define WHOLE 4
-#define NUMBERS (1 + 3 * OUTPUTS + 4 * INPUTS)
+#define NUMBERS (1 + 3 * OUTPUTS + 4 * INPUTS + DISTURBANCES)
 #define LINE ((WHOLE + NUMBERS + STATES) * 32)
 
 enum { WATCH_ONLY, STEP, HAND_OVER, RESTORE, ACKNOWLEDGE, BEGIN };
@@ -42,16 +42,21 @@ static void measure(const double *x, double *y)
             y[j] += plant_C[j][i] * x[i];
 }
 
-static void heat(double *x, const double *applied)
+/* The disturbances take from the inputs what is fed forward */
+static void heat(double *x, const double *applied, const double *disturbances)
 {
-    double after[STATES];
-    int i, j;
+    double after[STATES], acts[INPUTS];
+    int i, j, q;
+    for (j = 0; j < INPUTS; j++)
+        for (q = 0, acts[j] = applied[j]; q < DISTURBANCES; q++)
+            if (isfinite(disturbances[q]))
+                acts[j] -= plant_gain[j][q] * (disturbances[q] - plant_mean[q]);
     for (i = 0; i < STATES; i++) {
         after[i] = plant_b[i];
         for (j = 0; j < STATES; j++)
             after[i] += plant_A[i][j] * x[j];
         for (j = 0; j < INPUTS; j++)
-            after[i] += plant_B[i][j] * applied[j];
+            after[i] += plant_B[i][j] * acts[j];
     }
     memcpy(x, after, sizeof after);
 }
@@ -107,7 +112,7 @@ static void play(const double *row, const double *start, played *p)
 {
     const double *number = row + WHOLE, *r = number + 1, *add = r + OUTPUTS, *reading = add + OUTPUTS;
     const double *manual = reading + OUTPUTS, *share = manual + INPUTS, *extra = share + INPUTS;
-    const double *expected = extra + INPUTS;
+    const double *expected = extra + INPUTS, *disturbances = expected + INPUTS;
     double y[OUTPUTS], applied[INPUTS];
     int i, j, what = (int)row[0], differs = 0, wrong_mode, wrong_cause;
     clock_t began;
@@ -127,10 +132,13 @@ static void play(const double *row, const double *start, played *p)
     }
     memcpy(p->y, y, sizeof y);
     if (what == WATCH_ONLY || what == BEGIN) {
+        beadline_tell(&controller, disturbances);
         memcpy(p->u, manual, sizeof p->u);
         beadline_watch(&controller, p->u, y, r);
     } else {
+        beadline_tell(&controller, disturbances);
         before(what, y);
+        beadline_tell(&controller, disturbances);
         began = clock();
         beadline_step(&controller, y, r, number[0], row[1] > 0 && what != HAND_OVER ? applied : NULL,
                       &decision);
@@ -154,7 +162,7 @@ static void play(const double *row, const double *start, played *p)
         p->differing++;
     if (differs && p->first < 0)
         p->first = p->rows;
-    heat(p->x, applied);
+    heat(p->x, applied, disturbances);
     p->rows++;
 }
 
