@@ -13,8 +13,10 @@ from pipeline.recordings.resampling import resample
 from pipeline.runtime import machine, replay, supervisor, support
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.replay import GaplessLog
+from pipeline.runtime.signals import Signal
 from pipeline.runtime.support_file import read_support
 from pipeline.store import artifacts, params
+from pipeline.temperature.controllers.controller import fed_forward
 from pipeline.temperature.settings import Plant
 from stages.ingest import Ingest
 
@@ -64,21 +66,27 @@ HOTTEST_DEGC = 2000.0
 
 
 def recorded(path: Path, made: Exported) -> tuple[Table, str]:
-    """The recording on the controller's sample time, with `<output> reference` where it has them, and which
-    columns those were. Raises ValueError naming a signal that is missing."""
-    sources, settings, time = _sources(made)
+    """The recording on the controller's sample time, with disturbances and `<output> reference` where it has
+    them, and which columns references were. Raises ValueError naming a signal that is missing."""
     wired = made.machine
+    sources, settings, time = _sources(made, [*wired.inputs, *wired.outputs])
+    told = _sources(made, wired.disturbances)[0]
     inputs, outputs = [one.name for one in wired.inputs], [one.name for one in wired.outputs]
     raw, named = None, ""
-    for ending in ENDINGS:
-        wanted = [_reference(one, ending) for one in sources if one.signal in outputs]
-        try:
-            raw, named = read(path, [*sources, *wanted], time=time, decimal=settings), ending
+    asked = [[_reference(one, ending) for one in sources if one.signal in outputs] for ending in ENDINGS]
+    tried = [(also, ending) for also, ending in zip([*asked, []], [*ENDINGS, ""], strict=True)]
+    for beside in [told, []] if told else [[]]:
+        for also, ending in tried:
+            try:
+                raw, named = read(path, [*sources, *beside, *also], time=time, decimal=settings), ending
+                break
+            except ValueError:
+                continue
+        if raw is not None:
             break
-        except ValueError:
-            continue
     raw = raw or read(path, sources, time=time, decimal=settings)
-    held = [*inputs, *(f"{name} reference" for name in outputs if named)]
+    beside = [one.signal for one in told if one.signal in raw.signals]
+    held = [*inputs, *beside, *(f"{name} reference" for name in outputs if named)]
     table = resample(raw, sample_time_s=wired.sample_time_s, inputs=held, outputs=outputs)
     return table, named
 
@@ -91,10 +99,9 @@ def _reference(source: Source, ending: str) -> Source:
     return source._replace(signal=f"{source.signal} reference", source=f"{stem}{ending}")
 
 
-def _sources(made: Exported) -> tuple[list[Source], str, str]:
-    """Where a recording has the machine's signals: as ingest.mapping says where params.yaml is of this
+def _sources(made: Exported, signals: Sequence[Signal]) -> tuple[list[Source], str, str]:
+    """Where a recording has these signals: as ingest.mapping says where params.yaml is of this
     machine, otherwise under their own names; the decimal mark and the clock."""
-    signals = [*made.machine.inputs, *made.machine.outputs]
     plain = [Source(one.name, one.name, one.unit) for one in signals]
     if not Path(params.FILE).exists():
         return plain, "", ""
@@ -144,31 +151,46 @@ def replayed(
     )
     masked = np.stack([table.masked[one.name] for one in (*wired.inputs, *wired.outputs)], axis=1).any(axis=1)
     u, y, r = (_filled(part) for part in (u, y, r))
+    forward, lacking = _forward(made, table)
     runs, offs, told = [], [], []
     observers = support.design_observers(within.spread, within.steps) if within else None
     cuts = np.flatnonzero(np.diff(table.segment)) + 1
-    for log in map(GaplessLog, np.split(u, cuts), np.split(y, cuts), np.split(r, cuts)):
+    acts = u - forward
+    logs = map(GaplessLog, *(np.split(part, cuts) for part in (acts, y, r)))
+    for log, fed in zip(logs, np.split(forward, cuts), strict=True):
         offs.append(_check_log(within, log, observers))
         if offs[-1].abstains:
-            runs.append((replay.Replayed(log.u, log.u, log.u, log.r), np.zeros(log.u.shape, int)))
+            runs.append((replay.Replayed(*[log.u + fed] * 3, log.r), np.zeros(log.u.shape, int)))
             continue
-        run = replay.replayed(made.controller, made.model, log, hold=min(HOLD, len(log.u)))
+        run = replay.replayed(made.controller, made.model, log, hold=min(HOLD, len(log.u)), forward=fed)
         runs.append((run, replay.why(made.controller, log, run)))
     joined = replay.Replayed(*(np.concatenate(part) for part in zip(*(run for run, _ in runs), strict=True)))
     length = np.array([len(one.off) for one in offs])
     abstains = bool(length[[one.abstains for one in offs]].sum() > 0.5 * length.sum())
-    cause = _causes(made, GaplessLog(u, y, r), cuts)
+    cause = _causes(made, GaplessLog(acts, y, r), cuts)
     # of several segments the longest that is off speaks; of none the longest
     spoken = max(offs, key=lambda one: (one.abstains == abstains, len(one.off)))
     told += support.reasons(spoken)
     if within is None:
         told.append("The folder holds no support: whether the recording is off it is not known.")
+    if lacking:
+        told.append(f"The recording lacks {', '.join(lacking)}: nothing is fed forward for what they did.")
     if masked.any():
         told.append(f"{int(masked.sum())} samples lack a signal; the last value stands for it.")
     return ReplayedRecording(
         table.time_s, u, joined.wished, joined.asked, np.concatenate([why for _, why in runs]), y, r,
         joined.target, np.concatenate([one.off for one in offs]), cause, abstains, tuple(told),
     )  # fmt: skip
+
+
+def _forward(made: Exported, table: Table) -> tuple[np.ndarray, list[str]]:
+    """What the controller feeds forward (T, m), and the disturbances that the recording lacks."""
+    names = [one.name for one in made.machine.disturbances]
+    nothing = np.full(len(table.time_s), np.nan)
+    told = [table.values.get(name, nothing) for name in names]
+    d = np.stack(told, axis=1) if told else np.zeros((len(nothing), 0))
+    lacking = [name for name in names if name not in table.values]
+    return fed_forward(made.controller, d), lacking
 
 
 def _check_log(

@@ -100,28 +100,34 @@ class Replayed(NamedTuple):
 WHY = ("", "limit", "rate", "governor")
 
 
-def replayed(controller: Deployed, model: Plant, log: GaplessLog, *, hold: int = 30) -> Replayed:
+def replayed(
+    controller: Deployed, model: Plant, log: GaplessLog, *, hold: int = 30, forward: np.ndarray | float = 0.0
+) -> Replayed:
     """What the controller would have asked on a log. It watches the first `hold` samples, for which nothing
-    is asked: they are as recorded."""
+    is asked: they are as recorded. `forward` (T, m) is what is fed forward: the inputs of the log are without
+    it, those that are asked for with it."""
     T = len(log.u)
     hold = min(hold, T)
     feeds, target, bump = _aimed(controller, model, log, hold)
     if controller.holds or T == hold:
         still = np.repeat(log.u[max(hold - 1, 0)][None], T, axis=0)
         still[:hold] = log.u[:hold]
+        still += forward
         return Replayed(still, still, still, target)
     base = _without_integral(controller, log, feeds)
     wished = base - _integral(controller, log, base, target, hold, bump) @ controller.law.K_r.T
-    limits, before = controller.limits, np.vstack([log.u[:1], log.u[:-1]])
-    low = np.maximum(limits.low, np.minimum(before - limits.rate, limits.high))
-    high = np.minimum(limits.high, np.maximum(before + limits.rate, limits.low))
+    given, limits = log.u + forward, controller.limits
+    before = np.vstack([given[:1], given[:-1]])
+    low = np.maximum(limits.low, np.minimum(before - limits.rate, limits.high)) - forward
+    high = np.minimum(limits.high, np.maximum(before + limits.rate, limits.low)) - forward
     limited = np.minimum(np.maximum(wished, low), high)
     asked = limited
     if controller.governor is not None:
         asked = _governed(controller.governor, log, limited, target, low, high)
-    for part in (wished, limited, asked):
-        part[:hold] = log.u[:hold]
-    return Replayed(wished, limited, asked, target)
+    parts = [part + forward for part in (wished, limited, asked)]
+    for part in parts:
+        part[:hold] = given[:hold]
+    return Replayed(*parts, target)
 
 
 def why(controller: Deployed, log: GaplessLog, run: Replayed) -> np.ndarray:

@@ -204,6 +204,7 @@ def follow(
         ctypes.c_uint64(noise), T, COLD, 0, pointer(r), pointer(outside), 0, 0, T, ctypes.c_double(0.0),
         pointer(visible), *map(pointer, (y, sensor, u)),
         *[ctypes.c_void_p(row.ctypes.data) for row in modes], (ctypes.c_int * 2)(),
+        pointer(normal_life.told(folder, machine, outside)),
     )  # fmt: skip
     if result:
         raise RuntimeError(f"a call of the exported controller ended with result {result}")

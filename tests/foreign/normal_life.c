@@ -69,7 +69,8 @@ static double sure_degC(const thermal_parts *p, int j, int age, double visible)
 int normal_life(const thermal_parts *p, double degC, uint64_t seed, int steps, int cold, int patience,
                 const double *r, const double *outside, int kind, int signal, int earliest, double beyond,
                 const double *visible, double *y, double *sensor, double *u, signed char *modes,
-                signed char *causes, signed char *signals, signed char *acknowledged, life_fault *fault)
+                signed char *causes, signed char *signals, signed char *acknowledged, life_fault *fault,
+                const double *told)
 {
     static beadline_controller c;
     beadline_machine machine = {BEADLINE_PLANT_SHA256, BEADLINE_INPUT_UNIT, BEADLINE_OUTPUT_UNIT,
@@ -128,6 +129,8 @@ int normal_life(const thermal_parts *p, double degC, uint64_t seed, int steps, i
                     fault->shows = k;
             }
         }
+        if (DISTURBANCES)
+            result = beadline_tell(&c, told + k * DISTURBANCES);
         causes[k] = signals[k] = -1;
         acknowledged[k] = 0;
         if (k < cold) {

@@ -24,7 +24,7 @@ import numpy as np
 
 from pipeline.runtime.supervisor import KINDS, MODES
 from tests.foreign import thermal_machines
-from tests.foreign.thermal_machines import Machine, draw, pointer, sampled
+from tests.foreign.thermal_machines import FAN, Machine, draw, pointer, sampled
 from tests.mission import toy_temperature
 
 HERE = Path(__file__).parent
@@ -181,6 +181,16 @@ def sample_time_s(folder: Path) -> float:
     return float(found[1])
 
 
+def told(folder: Path, machine: Machine, outside: np.ndarray) -> np.ndarray:
+    """What the exported C is told of what acts from outside (T, 4): (T, q) in the order of its machine.h."""
+    header = (folder / "c/machine.h").read_text()
+    names = [name.lower() for name in re.findall(r"#define DISTURBANCE_(\w+) \d+", header)]
+    columns = {name: (column, 1.0) for name, (column, _) in machine.recorded.items()}
+    columns["fan"] = FAN, 100.0  # percent, as written
+    signals = [outside[:, columns[name][0]] * columns[name][1] for name in names]
+    return np.column_stack(signals) if signals else np.zeros((len(outside), 1))
+
+
 def scenario(
     machine: Machine, seed: int, hours: float, nth: int
 ) -> tuple[np.ndarray, np.ndarray, int, np.random.Generator]:
@@ -215,6 +225,7 @@ def play(
         ctypes.byref(parts), ctypes.c_double(machine.room_degC), ctypes.c_uint64(noise), T, COLD,
         round(PATIENCE_S / dt), pointer(r), pointer(outside), kind, signal, earliest, ctypes.c_double(beyond),
         pointer(visible), *map(pointer, (y, sensor, u)), *numbers, at,
+        pointer(told(folder, machine, outside)),
     )  # fmt: skip
     if result:
         raise RuntimeError(f"machine {seed}: a call of the exported controller ended with result {result}")

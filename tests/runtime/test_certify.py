@@ -11,7 +11,6 @@ from pipeline.runtime import certify as measuring
 from pipeline.runtime.export import c
 from pipeline.runtime.machine import Exported, check
 from pipeline.temperature.controllers.table import BY_NAME, design_controllers
-from pipeline.temperature.controllers.window import at_mean_disturbances
 from stages import certify
 from tests.runtime.deployed_machines import exported
 from tests.temperature.test_evaluate_temperature import judged, small
@@ -97,25 +96,3 @@ def test_a_record_is_cut_where_a_sample_of_an_output_is_missing():
     inputs, outputs, numbers = measuring.cut_at_missing([u, u[:50]], [y, y[:50]], [0, 1])
     assert [(part[0, 0], part[-1, 0]) for part in inputs] == [(0, 299), (351, 499), (0, 49)]
     assert all(np.isfinite(part).all() for part in outputs) and numbers == [0, 0, 1]
-
-
-def test_what_a_fan_did_is_taken_off_the_record_and_what_a_heater_did_stays():
-    rng, samples = np.random.default_rng(3), 6000
-    heater = np.repeat(rng.uniform(20, 60, samples // 60), 60)
-    fan = np.repeat(rng.choice([0.0, 100.0], samples // 200), 200)
-    y, alone = np.full(samples, 100.0), np.full(samples, 100.0)
-    for t in range(1, samples):
-        noise = rng.normal(0, 0.05)
-        y[t] = 0.98 * y[t - 1] + 0.05 * heater[t - 1] - 0.006 * (fan[t - 1] - fan.mean()) + noise
-        alone[t] = 0.98 * alone[t - 1] + 0.05 * heater[t - 1] + noise
-    acting, outputs = [np.column_stack([heater, fan])], [y[:, None]]
-    undisturbed = at_mean_disturbances(acting, outputs, 1)[0][:, 0]
-    later = slice(500, None)  # the fan's first state is taken as one of long standing
-    assert np.abs(y - alone)[later].max() > 10
-    assert np.abs(undisturbed - alone)[later].max() < 1.0
-    assert at_mean_disturbances([heater[:, None]], outputs, 1)[0] is outputs[0]
-
-
-def test_a_record_too_short_to_say_what_a_fan_does_stays_as_it_is():
-    y = [np.zeros((30, 1))]
-    assert at_mean_disturbances([np.zeros((30, 2))], y, 1)[0] is y[0]
