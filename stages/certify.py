@@ -28,15 +28,12 @@ if TYPE_CHECKING:
     from pipeline.runtime.certificate_evidence import WindowModels
     from pipeline.runtime.replay import GaplessLog
     from pipeline.runtime.signals import Machine
+    from pipeline.temperature.controllers.feed_forward import Told
     from pipeline.temperature.controllers.problem import Design
     from pipeline.temperature.plant import Plant as PlantModel
 
 RECORD = "datasets/ingest/record.parquet"
 # the conditions that a certificate names
-DISTURBED = (
-    "Made with {names} at their mean: what they did to the temperatures was learned and taken off the "
-    "record. The controller does not read them."
-)
 UNDISTURBED = "No fan, feed or other disturbance is declared: what one does to the temperatures is not shown."
 # what the setpoint loop's files are made of: without them the temperature loop is certified alone
 SEEN = (
@@ -127,7 +124,8 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     acting, y, recordings = certify.cut_at_missing(*pieces)
     u = [piece[:, : len(declared.inputs)] for piece in acting]
     m = len(declared.inputs)
-    undisturbed = feed_forward.at_mean(feed_forward.learn(acting, y, m), acting, y, m)
+    told = feed_forward.learn(acting, y, m)
+    undisturbed = feed_forward.at_mean(told, acting, y, m)
     parts = certify.split_newest(u, undisturbed, recordings)
     record = EvidenceRecord(machine.inputs, machine.outputs, machine.sample_time_s, *parts)
     setting, rng = loaded.setting, np.random.default_rng(settings.seed)
@@ -139,10 +137,32 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     else:
         spread = panel.spread_around(loaded.panel, loaded.problem.plant)
     plants = support_logs.forecasting_plants(family, spread, np.random.default_rng(settings.seed))
-    disturbances = ", ".join(one.name for one in declared.disturbances)
-    conditions = DISTURBED.format(names=disturbances) if disturbances else UNDISTURBED
     recorded = [GaplessLog(*log) for log in zip(u, y, y, strict=True)]
-    return Common(machine, record, rules, models, rng, plants, recorded, conditions)
+    return Common(machine, record, rules, models, rng, plants, recorded, conditions(declared, told))
+
+
+def conditions(declared: Plant, told: Told | None) -> str:
+    """What the controller knows of disturbances, in words, and what of them it makes up for."""
+    names = ", ".join(one.name for one in declared.disturbances)
+    if not names:
+        return UNDISTURBED
+    if told is None:
+        return f"What {names} do is not determined by the record: nothing makes up for it."
+    learned, left = [], []
+    for k, one in enumerate(declared.disturbances):
+        moved = [
+            f"{heater.name} {told.gain[i, k]:+.3g} ± {1.645 * told.deviation[i, k]:.2g} %"
+            for i, heater in enumerate(declared.inputs)
+            if told.forward.gain[i, k]
+        ]
+        if moved:
+            learned.append(f"{one.name} ({', '.join(moved)} a {one.unit})")
+        else:
+            left.append(one.name)
+    told_to_it = f"Fed forward: {'; '.join(learned)}, with 90 % bands; tell them to the controller."
+    open_still = f"The record does not tell what {', '.join(left)} do: nothing makes up for it."
+    sentences = [told_to_it] * bool(learned) + [open_still] * bool(left)
+    return " ".join([*sentences, "What disturbances did was taken off the record."])
 
 
 def certify_controller(

@@ -4,6 +4,7 @@ whatever the weights, so that new weights need no pass over the data."""
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
@@ -119,7 +120,27 @@ def main() -> None:
             artifacts.write_arrays(out / "feed_forward.parquet", "feed_forward", 1, feed_forward.stored(told))
         if best.learned is not None:
             artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, best.learned.stored())
-        artifacts.write_metrics("learn_kernel", figures(settings, long, enough, candidates, best), METRICS)
+        shown = figures(settings, long, enough, candidates, best)
+        shown["forward"] = forward_figures(machine, told)
+        artifacts.write_metrics("learn_kernel", shown, METRICS)
+
+
+def forward_figures(machine: Plant, told: Told | None) -> dict[str, Any]:
+    """By disturbance and input what makes up for it in percent a unit, its deviation, and whether it is fed
+    forward."""
+    if told is None:
+        return {}
+    return {
+        one.name: {
+            heater.name: {
+                "gain": float(told.gain[i, k]),
+                "deviation": None if math.isnan(told.deviation[i, k]) else float(told.deviation[i, k]),
+                "fed_forward": bool(told.forward.gain[i, k]),
+            }
+            for i, heater in enumerate(machine.inputs)
+        }
+        for k, one in enumerate(machine.disturbances)
+    }
 
 
 def figures(
