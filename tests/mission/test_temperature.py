@@ -127,6 +127,48 @@ def test_a_record_with_a_declared_disturbance_leads_to_a_file_or_to_the_rule_tha
     assert told["temperature"]["files"] or told["temperature"]["why"]
 
 
+def fan_dip_degC(folder: Path, name: str, *, told: bool) -> float:
+    """The largest error of the true temperature after the fan's step from 0 to 100 %, under an exported
+    controller on the machine of the record."""
+    made: dict = {"__name__": "exported"}
+    code = (folder / "datasets/certify/temperature" / name / "python/controller.py").read_text(
+        encoding="utf-8"
+    )
+    exec(compile(code, "controller.py", "exec"), made)
+    machine, dt = hot_end.HotEnd(np.random.default_rng(5)), made["SAMPLE_TIME_S"]
+    running = made["controller"](
+        plant_sha256=made["PLANT_SHA256"],
+        sample_time_s=dt,
+        input_unit="percent",
+        output_unit="degC",
+        rehearsal=made["SIMULATED"],
+    )
+    r, begins, errors = np.array([LIMITS["reference"]]), 1200.0, []
+    for k in range(int(1800 / dt)):
+        fan = 100.0 if k * dt >= begins else 0.0
+        running.tell([fan if told else np.nan])
+        y, u = np.array([machine.read()]), np.zeros(1)
+        if k < 20:
+            running.watch(u, y, r)
+        else:
+            if k == 20:
+                running.hand_over(y)
+            u = running.step(y, r, k * dt).u
+        if k * dt >= begins:
+            errors.append(abs(machine.block - r[0]))
+        machine.advance(float(u[0]), fan, dt)
+    return max(errors)
+
+
+def test_a_fan_that_is_told_is_made_up_for_on_the_machine(disturbed_project, tmp_path):
+    folder = shutil.copytree(disturbed_project, tmp_path / "copy", symlinks=True)
+    learned = metrics(folder, "learn_kernel")["forward"][FAN]["heater_1"]
+    assert learned["fed_forward"] and learned["gain"] > 5 * learned["deviation"]
+    play(folder, "certify")
+    for name in ("pi", "subspace_lqg", "varx_riccati"):
+        assert fan_dip_degC(folder, name, told=True) < 0.5 * fan_dip_degC(folder, name, told=False)
+
+
 # ---- the next experiment
 
 TIGHT_DEGC = 235.0  # so near that the experiment must heed it
