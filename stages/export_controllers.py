@@ -3,7 +3,8 @@ the certificate under the limits of section `report`. Reads datasets/verdict/tem
 datasets/certify and, of the deposition loop, what compose_parts wrote.
 
 Writes datasets/export_controllers: temperature/ (controller.json, arrays.safetensors, support.safetensors,
-certificate.json, c/, python/), setpoint/, and exported.json, which says what there is, and why not."""
+certificate.json, state_space/, c/, python/), setpoint/, and exported.json, which says what there is, and why
+not."""
 
 import shutil
 from collections.abc import Iterator
@@ -46,7 +47,8 @@ def main() -> None:
 def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
     """Files of the controller that the verdict names. If the verdict names none because the certificate of
     its controller is refused, that certificate alone."""
-    from pipeline.runtime import certificate, certified
+    from pipeline.runtime import certificate, certified, machine
+    from pipeline.runtime.export import state_space
 
     verdict = artifacts.read_json(VERDICTS / "temperature.json")
     name = verdict["winner"] or verdict.get("refused")
@@ -68,6 +70,10 @@ def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
     artifacts.write_text(folder / "certificate.json", certificate.to_json(decided))
     if decided.verdict == "passed":
         copy(source, folder, certificate.sha256(decided))
+        made = machine.read(folder)[0]
+        for file, content in state_space.files(made).items():
+            with artifacts.beside(folder / "state_space" / file) as temporary:
+                temporary.write_bytes(content)
     return describe(
         name,
         certificate=summarise(decided),
