@@ -150,13 +150,22 @@ def init(arguments: argparse.Namespace) -> None:
 
 
 def first_experiment(arguments: argparse.Namespace) -> None:
-    """A staircase for a machine of which there is no record yet: which input, which level, for how long, and
-    at which temperature to stop. No model is behind it."""
+    """An experiment for a machine of which there is no good record: for Klipper G-code of targets, for any
+    other machine a staircase of inputs with the temperatures at which to stop. No model is behind it."""
     from pipeline.commands import first_experiment as first
+    from pipeline.temperature.settings import check_output_limits
+    from stages.ingest import Ingest
 
-    plan = first.staircase(params.load(Plant, "plant"), arguments.hold)
-    artifacts.write_csv(arguments.out, first.columns(plan))
-    print(first.instructions(plan, str(arguments.out)))
+    machine = params.load(Plant, "plant")
+    check_output_limits(machine, "recordings")
+    if heaters := first.heaters(machine, params.load(Ingest, "ingest").mapping):
+        plan, file = first.targets(heaters, arguments.minutes), arguments.out.with_suffix(".gcode")
+        artifacts.write_text(file, first.gcode(plan, arguments.ramp))
+        print(first.printed(plan, str(file)))
+        return
+    steps = first.staircase(machine, arguments.hold)
+    artifacts.write_csv(arguments.out, first.columns(steps))
+    print(first.instructions(steps, str(arguments.out)))
 
 
 def compose(arguments: argparse.Namespace) -> None:
@@ -551,7 +560,13 @@ def main() -> None:
     command = commands.add_parser(
         "first-experiment", help=first_experiment.__doc__, description=first_experiment.__doc__
     )
-    command.add_argument("--hold", type=float, default=300.0, help="seconds of a step at most (300)")
+    command.add_argument("--minutes", type=float, default=60.0, help="length of the G-code (60)")
+    command.add_argument(
+        "--ramp", type=float, default=0.0, help="°C a minute of the G-code's targets (0: none)"
+    )
+    command.add_argument(
+        "--hold", type=float, default=300.0, help="seconds of a step of inputs at most (300)"
+    )
     command.add_argument("--out", type=Path, default=Path("first_experiment.csv"), metavar="FILE")
     command.set_defaults(run=first_experiment)
     command = commands.add_parser("compose", help=compose.__doc__, description=compose.__doc__)
