@@ -93,7 +93,7 @@ def identify(
     from pipeline.temperature.identification import model_choice, validation
     from pipeline.temperature.identification.segments import split
     from pipeline.temperature.identification.validation import judge
-    from pipeline.temperature.plant import at_disturbances, observability
+    from pipeline.temperature.plant import at_disturbances, observable_part
 
     acting, inputs = [signal.name for signal in machine.acting], len(machine.inputs)
     record = read_record(settings, machine, path)
@@ -114,8 +114,6 @@ def identify(
     rng = np.random.default_rng(settings.seed)
     judgement = judge(chosen, first, last, ahead_steps=settings.ahead_steps, rng=rng)
     fitted = model_choice.refit(record.u, record.y, chosen, names=acting)
-    if not (observed := observability(fitted.plant)).passed:
-        raise ValueError(f"{path}: {observed.reason}")
     family = validation.bootstrap_spread(
         record.u,
         record.y,
@@ -126,7 +124,8 @@ def identify(
     )
     # controllers do not know the disturbances: at their mean they are part of the offsets
     level = np.vstack(record.u).mean(axis=0)[inputs:]
-    plant, *spread = (at_disturbances(one, inputs, level) for one in (fitted.plant, *family))
+    seen = observable_part(fitted.plant)
+    plant, *spread = (at_disturbances(one, inputs, level) for one in (seen, *family))
     left_out = [
         at_disturbances(one, inputs, level) for one in validation.left_out_plants(record.u, record.y, fitted)
     ]

@@ -62,8 +62,8 @@ def targets(of: Mapping[str, Output], minutes: float) -> Targets:
         if not coolest < hottest:
             raise ValueError(
                 f"params.yaml: plant.outputs: {output.name} has reference {output.reference:g} and high "
-                f"{high:g}, expected {BELOW_LIMIT_DEGC:g} °C and more between the coolest target, {coolest:g}, "
-                "and high; set high to the max_temp of the firmware"
+                f"{high:g}, expected {BELOW_LIMIT_DEGC:g} °C and more between the coolest target, "
+                f"{coolest:g}, and high; set high to the max_temp of the firmware"
             )
         spans[name] = coolest, hottest
     scale, count = 60.0 * minutes / sum(HOLDS), len(TARGETS)

@@ -156,6 +156,16 @@ def observability(plant: Plant) -> RankTest:
     )
 
 
+def observable_part(plant: Plant) -> Plant:
+    """The plant without the states that never show in y, which move no other state: its inputs and outputs
+    are related as before. The delays of an input that no output answers leave such states."""
+    test = observability(plant)
+    if test.passed:
+        return plant
+    V = np.linalg.svd(observability_matrix(plant.A, plant.C, plant.n))[2][: test.rank]
+    return plant._replace(A=V @ plant.A @ V.T, B=V @ plant.B, C=plant.C @ V.T, b=V @ plant.b, K=V @ plant.K)
+
+
 def controllability(plant: Plant) -> RankTest:
     """Rank test of [B AB ... A^(n-1)B] (10) with its singular values;
     fails with a reason where some state obeys no input."""

@@ -16,6 +16,7 @@ from pipeline.temperature.plant import (
     hold_state,
     markov_parameters,
     observability,
+    observable_part,
     plant,
     simulate,
     strictly_proper,
@@ -172,3 +173,17 @@ def test_control_s_forced_response_is_the_simulation():
     response = control.forced_response(system, np.arange(40) * machine.sample_time_s, u.T, x0)
     # rounding of 40 steps
     np.testing.assert_allclose(response.outputs.T, simulate(machine, u, x0)[1], atol=1e-11)
+
+
+def test_the_observable_part_answers_as_the_whole():
+    late = SMALL._replace(
+        A=np.block([[SMALL.A, np.zeros((2, 1))], [np.ones((1, 2)), np.full((1, 1), 0.5)]]),
+        B=np.vstack([SMALL.B, np.ones((1, SMALL.m))]),
+        C=np.hstack([SMALL.C, np.zeros((SMALL.p, 1))]),
+        b=np.r_[SMALL.b, 3.0],
+        K=np.vstack([SMALL.K, np.ones((1, SMALL.p))]),
+    )
+    part = observable_part(late)
+    assert part.n == 2 and observability(part).passed and not observability(late).passed
+    assert markov_parameters(part, 30) == pytest.approx(markov_parameters(late, 30), abs=1e-12)
+    assert observable_part(SMALL) is SMALL
