@@ -34,7 +34,11 @@ if TYPE_CHECKING:
 
 RECORD = "datasets/ingest/record.parquet"
 # the conditions that a certificate names
-UNDISTURBED = "No fan, feed or other disturbance is declared: what one does to the temperatures is not shown."
+UNDISTURBED = (
+    "No fan, feed or other disturbance is declared: what one does to the temperatures is not shown, and "
+    "nothing makes up for it. Put the printed G-code beside klippy.log and run init again, or record a "
+    "column and name it in plant.disturbances."
+)
 # what the setpoint loop's files are made of: without them the temperature loop is certified alone
 SEEN = (
     "datasets/train_classifier/weights.safetensors",
@@ -147,7 +151,7 @@ def conditions(declared: Plant, told: Told | None) -> str:
     if not names:
         return UNDISTURBED
     if told is None:
-        return f"What {names} do is not determined by the record: nothing makes up for it."
+        return f"The record does not tell what these do: {names}. Nothing makes up for it."
     learned, left = [], []
     for k, one in enumerate(declared.disturbances):
         moved = [
@@ -160,7 +164,7 @@ def conditions(declared: Plant, told: Told | None) -> str:
         else:
             left.append(one.name)
     told_to_it = f"Fed forward: {'; '.join(learned)}, with 90 % bands; tell them to the controller."
-    open_still = f"The record does not tell what {', '.join(left)} do: nothing makes up for it."
+    open_still = f"The record does not tell what these do: {', '.join(left)}. Nothing makes up for it."
     sentences = [told_to_it] * bool(learned) + [open_still] * bool(left)
     return " ".join([*sentences, "What disturbances did was taken off the record."])
 

@@ -10,7 +10,10 @@ from pipeline.runtime import assembly, bands, certified, checks
 from pipeline.runtime import certify as measuring
 from pipeline.runtime.export import c
 from pipeline.runtime.machine import Exported, check
+from pipeline.temperature.controllers.feed_forward import Told
 from pipeline.temperature.controllers.table import BY_NAME, design_controllers
+from pipeline.temperature.plant import plant
+from pipeline.temperature.settings import Input, Output, Plant, PlantSignal
 from stages import certify
 from tests.runtime.deployed_machines import exported
 from tests.temperature.test_evaluate_temperature import judged, small
@@ -96,3 +99,18 @@ def test_a_record_is_cut_where_a_sample_of_an_output_is_missing():
     inputs, outputs, numbers = measuring.cut_at_missing([u, u[:50]], [y, y[:50]], [0, 1])
     assert [(part[0, 0], part[-1, 0]) for part in inputs] == [(0, 299), (351, 499), (0, 49)]
     assert all(np.isfinite(part).all() for part in outputs) and numbers == [0, 0, 1]
+
+
+def test_the_certificate_says_what_is_fed_forward_and_what_is_not():
+    heater = Input(name="heater", unit="percent", low=0, high=100)
+    hot_end = Output(name="hotend", unit="degC", reference=210, low=0, high=280)
+    declared = Plant(inputs=[heater], outputs=[hot_end], sample_time_s=1.0)
+    assert "Put the printed G-code beside klippy.log" in certify.conditions(declared, None)
+    fan, room = PlantSignal(name="fan", unit="percent"), PlantSignal(name="room", unit="degC")
+    declared = declared.model_copy(update={"disturbances": [fan, room]})
+    effect = plant([[0.9]], [[0.0, 0.0]], [[1.0]])
+    told = Told(effect, np.zeros(2), np.ones(2), np.array([[0.129, 0.2]]), np.array([[0.006, 0.5]]))
+    said = certify.conditions(declared, told)
+    assert "Fed forward: fan (heater +0.129 ± 0.0099 % a percent), with 90 % bands; tell them to" in said
+    assert "The record does not tell what these do: room. Nothing makes up for it. What dist" in said
+    assert certify.conditions(declared, None).startswith("The record does not tell what these do: fan, room.")
