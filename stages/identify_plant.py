@@ -93,7 +93,7 @@ def identify(
     from pipeline.temperature.identification import model_choice, validation
     from pipeline.temperature.identification.segments import split
     from pipeline.temperature.identification.validation import judge
-    from pipeline.temperature.plant import at_disturbances, observable_part
+    from pipeline.temperature.plant import at_disturbances, bandwidth_rad_s, observable_part
 
     acting, inputs = [signal.name for signal in machine.acting], len(machine.inputs)
     record = read_record(settings, machine, path)
@@ -136,6 +136,7 @@ def identify(
         **model_tables(machine, record.u, plant, spread, steps),
     }
     figures = fit_figures(settings, machine, record, chosen, fitted, judgement)
+    figures["bandwidth_rad_s"] = bandwidth_rad_s(plant)
     return plant, spread, page_tables, figures | warnings(machine, fitted, steps)
 
 

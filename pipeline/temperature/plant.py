@@ -177,6 +177,19 @@ def controllability(plant: Plant) -> RankTest:
     )
 
 
+def bandwidth_rad_s(plant: Plant) -> float | None:
+    """The frequency in rad/s above which the largest singular value of y = G u is below 0.707 of its steady
+    value; None if it is nowhere below, up to half the sampling rate."""
+    import control  # takes a second to load
+
+    T = plant.sample_time_s
+    system = control.ss(plant.A, plant.B, plant.C, plant.D, T)
+    omega = np.concatenate([[0.0], np.geomspace(1e-5, 1.0, 600) * np.pi / T])
+    largest = np.linalg.svd(system(np.exp(1j * omega * T), squeeze=False).transpose(2, 0, 1))[1][:, 0]
+    below = np.flatnonzero(largest < np.sqrt(0.5) * largest[0])
+    return float(omega[below[0]]) if len(below) and np.isfinite(largest[0]) else None
+
+
 def strictly_proper(plant: Plant) -> Plant:
     """The plant as a controller meets it: each output is sampled just before the input of its step is
     applied, so that D u acts on it one sample later, as the state w(t+1) = u(t).

@@ -70,9 +70,3 @@ def test_both_files_hold_the_same_and_are_the_same_each_time():
     assert told["systems"]["plant"]["outputs"] == ["sensor_1", "sensor_2"]
     assert read["Ts"] == told["sample_time_s"] == 1.0
     assert state_space.files(of) == files and b"Created on" not in files["systems.mat"]
-
-
-def test_the_bandwidth_of_a_first_order_plant_is_one_over_its_time_constant():
-    a = np.exp(-1 / 200.0)
-    plant = control.ss([[a]], [[1 - a]], [[1.0]], [[0.0]], 1.0)
-    assert state_space.bandwidth_rad_s(plant, 1.0) == pytest.approx(1 / 200.0, rel=0.02)

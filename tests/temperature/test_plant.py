@@ -11,6 +11,7 @@ from pipeline.temperature import plant as plants
 from pipeline.temperature.plant import (
     at_disturbances,
     baam,
+    bandwidth_rad_s,
     controllability,
     hold_output,
     hold_state,
@@ -187,3 +188,14 @@ def test_the_observable_part_answers_as_the_whole():
     assert part.n == 2 and observability(part).passed and not observability(late).passed
     assert markov_parameters(part, 30) == pytest.approx(markov_parameters(late, 30), abs=1e-12)
     assert observable_part(SMALL) is SMALL
+
+
+def test_the_bandwidth_of_a_first_order_plant_is_one_over_its_time_constant():
+    a = np.exp(-1 / 200.0)
+    first = plant([[a]], [[1 - a]], [[1.0]], sample_time_s=1.0)
+    assert bandwidth_rad_s(first) == pytest.approx(1 / 200.0, rel=0.02)
+    slower = first._replace(sample_time_s=3.0)
+    assert bandwidth_rad_s(slower) == pytest.approx(1 / 600.0, rel=0.02)
+    both = plant(np.diag([a, a**4]), np.diag([1 - a, 2 * (1 - a**4)]), np.eye(2))
+    assert bandwidth_rad_s(both) == pytest.approx(4 / 200.0, rel=0.03)  # the stronger one is the faster
+    assert bandwidth_rad_s(plant([[0.0]], [[1.0]], [[1.0]])) is None

@@ -241,6 +241,12 @@ def poles(sources: Sources) -> Picture:
         f"Crosses: the model; dots: {count(plants, 'plant')} of the spread, each with one state more than "
         "the model, whose pole is pale."
     )
+    bandwidth = lookup(sources.metrics["identify_plant"], "bandwidth_rad_s")
+    if isinstance(bandwidth, float):
+        caption += (
+            f" Bandwidth by singular values: {short(bandwidth, 3)} rad/s, a time constant of "
+            f"{short(1 / bandwidth, 3)} s."
+        )
     return Picture("poles", title, text, shown, caption, page.origin(sources.source("poles")))
 
 

@@ -14,7 +14,7 @@ import scipy.io
 
 from pipeline.runtime.export.c import at_rest, feeds
 from pipeline.runtime.machine import Exported
-from pipeline.temperature.plant import strictly_proper
+from pipeline.temperature.plant import bandwidth_rad_s, strictly_proper
 
 NOTE = "Deviations from rest. Limits, governor, supervisor and what is fed forward are left out."
 HEADER = b"MATLAB 5.0 MAT-file, beadline".ljust(116)  # scipy's own holds the date
@@ -53,13 +53,12 @@ def files(exported: Exported) -> dict[str, bytes]:
 
 
 def described(exported: Exported) -> dict[str, Any]:
-    """What systems.json holds: matrices row by row, names, poles, and the bandwidth of the plant: by
-    singular values, rad/s above which the largest is below 0.707 of its steady value."""
+    """What systems.json holds: matrices row by row, names, poles, and the bandwidth of the plant."""
     made = systems(exported)
     return {
         "sample_time_s": exported.machine.sample_time_s,
         "note": NOTE,
-        "bandwidth_rad_s": bandwidth_rad_s(made["plant"], exported.machine.sample_time_s),
+        "bandwidth_rad_s": bandwidth_rad_s(exported.model),
         "systems": {
             name: {key: getattr(one, key).tolist() for key in "ABCD"}
             | {"inputs": one.input_labels, "outputs": one.output_labels}
@@ -67,17 +66,6 @@ def described(exported: Exported) -> dict[str, Any]:
             for name, one in made.items()
         },
     }
-
-
-def bandwidth_rad_s(plant: control.StateSpace, sample_time_s: float) -> float | None:
-    """Of a plant with inputs and outputs of any number; None if no frequency below half the sampling rate is
-    so slow, or fast."""
-    omega = np.geomspace(1e-5, 1.0, 600) * np.pi / sample_time_s
-    largest = np.linalg.svd(plant(np.exp(1j * omega * sample_time_s), squeeze=False).transpose(2, 0, 1))[1][
-        :, 0
-    ]
-    below = np.flatnonzero(largest < np.sqrt(0.5) * largest[0])
-    return float(omega[below[0]]) if len(below) else None
 
 
 def mat(exported: Exported) -> bytes:
