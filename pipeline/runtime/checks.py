@@ -39,7 +39,7 @@ def commands(
     limits."""
     running, held = RunningController(made.controller, made.model), panel.held_readings(cases)[:, case]
     u, first = cases.u0[case], cases.references[cases.asked[case, 0]]
-    noise, step_degC = panel.noise_of(cases)[cases.hold :, case], cases.structure[cases.plant[case], 3]
+    noise, step_degC = panel.noise_of(cases)[cases.hold :, case], cases.structure[cases.plant[case], 4]
     measured = panel.in_steps(outputs + noise, step_degC)
     for reading in held[:-1]:
         running.watch(u, reading, first.H @ first.w0)

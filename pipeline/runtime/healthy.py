@@ -10,7 +10,7 @@ from pipeline.runtime.supervised import Supervised
 from pipeline.temperature.test_set import panel
 
 KINDS = ("sequence", "disturbed")  # set-point changes, and a door, a fan and another room
-PLANTS = 4  # one of each structure
+PLANTS = 5  # one of each structure
 
 
 def play(exported: Exported, cases: panel.Cases) -> dict[str, Any]:

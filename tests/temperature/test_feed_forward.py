@@ -17,6 +17,7 @@ from pipeline.temperature.controllers.controller import (
 from pipeline.temperature.controllers.controller import aim as aimed
 from pipeline.temperature.controllers.governor import ActuatorLimits
 from pipeline.temperature.plant import plant
+from pipeline.temperature.test_set import panel
 from pipeline.temperature.tracking import model_based
 from tests.foreign import thermal_machines
 from tests.foreign.thermal_machines import FAN, at_rest, draw, quiet
@@ -109,6 +110,16 @@ def learned_of_needed(seed: int) -> list[float]:
         watt = [at_rest(machine.parts, machine.reference_degC, tuple(one))[1][0] for one in (off, on)]
         shares.append(gain * largest * unit * machine.parts.power[0] / (100 * (watt[1] - watt[0])))
     return shares
+
+
+def test_the_test_set_moves_what_is_told_to_its_highest_level():
+    effect = plant([[0.9]], [[-0.006]], [[1.0]])
+    told = feed_forward.Told(effect, np.array([40.0]), np.array([100.0]), np.ones((1, 1)), np.zeros((1, 1)))
+    signal, push = panel.pushed(told, 1000, 1)
+    first, last = (int(1000 * share) for share in panel.FAN[:2])
+    assert set(signal[first:last, 0]) == {60.0} and not signal[:first].any() and not signal[last:].any()
+    assert push[last - 1, 0] == pytest.approx(-0.006 * 60 / 0.1)
+    assert not panel.pushed(None, 10, 2)[1].any()
 
 
 # ---- in the law

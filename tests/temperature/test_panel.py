@@ -26,7 +26,13 @@ def asked(plants, starts, references, *, steps, hold=1, noise=0.0, seed=1, cells
     keep = made.kind != "disturbed"
     own = ("plant", "kind", "start", "x0", "u0", "begin", "asked")
     parts = {name: getattr(made, name)[keep] for name in own}
-    return made._replace(each=made.each - 1, outside=made.outside[:, keep], **parts)
+    return made._replace(
+        each=made.each - 1,
+        outside=made.outside[:, keep],
+        told=made.told[:, keep],
+        pushed=made.pushed[:, keep],
+        **parts,
+    )
 
 
 def asked_all(plants, starts, references, steps, hold, noise, seed, cells, structures, kinds) -> Cases:
@@ -303,13 +309,28 @@ def test_a_slow_wall_and_radiation_end_where_their_equations_say(structure, ends
     np.testing.assert_allclose(run.y[-1, 0, 0], ends, atol=1e-3)
 
 
+def test_material_carries_heat_from_one_output_to_the_next_and_later():
+    twice = plant(0.9 * np.eye(2), 0.1 * np.eye(2), np.eye(2), b=[2.0, 2.0])
+    flows = (panel.Structure(carried=0.1),)
+    cases = asked_all([twice], [[20.0, 20.0]], [[100.0, 60.0]], 2000, 1, 0.0, 1, False, flows, {})
+    limits = ActuatorLimits(np.zeros(2), np.full(2, 200.0), np.full(2, np.inf))
+    law = still_law(2, 2)
+    aims = panel.aims(law, panel.rests(twice, cases, limits), cases)
+    y = panel.rolled_out(deployed(law, limits, integral_limit=1.0), cases, aims).y[:, 0]
+    # the second one's rise: r = 40 + 0.1 (80 - r)
+    np.testing.assert_allclose(y[-1], [100.0, 20 + 48 / 1.1], atol=1e-3)
+    late = int(panel.LATE * 2000)
+    np.testing.assert_allclose(y[late - 1, 1], 60.0, atol=0.1)  # nothing of it has come yet
+
+
 def test_a_sensor_in_steps_is_what_is_measured_and_a_duty_in_steps_what_heats():
     run, _ = played(panel.Structure(step_degC=0.25, duty=0.1), 50, static(0.3))
     measured, y = run.measured[:, 0, 0], run.y[:, 0, 0]
     np.testing.assert_array_equal(measured, 0.25 * np.round(y / 0.25))
     # 80 percent hold the reference: the heater gives whole steps of 8
     given = (y[1:] - 0.9 * y[:-1] - 2.0) / 0.1
-    np.testing.assert_allclose(given, 8 * np.round(run.u[:-1, 0, 0] / 8), atol=1e-9)
+    steps = np.round(run.u[:-1, 0, 0] / 8)
+    np.testing.assert_allclose(given, 8 * np.where(steps < panel.DEAD, 0, steps), atol=1e-9)
     assert np.abs(given - run.u[:-1, 0, 0]).max() > 1
 
 

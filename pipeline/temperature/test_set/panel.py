@@ -2,7 +2,7 @@
 controller as it runs (controller.py).
 
 Plants, drawn uniformly around a nominal one: each input's gain, the speed of the whole plant, more heat lost,
-a sample of delay on every input in a part of them, another ambient. Three in four have a structure that no
+a sample of delay on every input in a part of them, another ambient. Four in five have a structure that no
 controller's model holds beside that (STRUCTURES). Cases of each: constant references from several starts, the
 coldest first, a ramp, a sinusoid, a sequence of references, and a door, a fan and another room while a
 reference is held; sensor noise.
@@ -63,18 +63,28 @@ GLANCE = 5  # samples: what is outside the band for fewer is noise that the cont
 class Structure(NamedTuple):
     """What a machine has that no model here holds: a slow wall that passes on a share `wall` of how much
     warmer the outputs are than at the start, with a time constant of `slower` runs; heat radiated, a share
-    `radiates` of the rise where the outputs are a whole rise from the start; sensors in steps of `step_degC`;
-    inputs in steps of a share `duty` of what holds the first reference."""
+    `radiates` of the rise where the outputs are a whole rise from the start; material that carries heat from
+    each output to the next, a share `carried` of how much more the former has warmed, LATE of a run before;
+    sensors in steps of `step_degC`; inputs in steps of a share `duty` of what holds the first reference, of
+    which the first DEAD give nothing."""
 
     wall: float = 0.0
     slower: float = 0.5
     radiates: float = 0.0
+    carried: float = 0.0
     step_degC: float = 0.0
     duty: float = 0.0
 
 
 # of the plants, in turn
-STRUCTURES = (Structure(), Structure(wall=0.1), Structure(radiates=0.1), Structure(step_degC=0.25, duty=0.01))
+STRUCTURES = (
+    Structure(),
+    Structure(wall=0.1),
+    Structure(radiates=0.1),
+    Structure(carried=0.1),
+    Structure(step_degC=0.25, duty=0.01),
+)
+LATE, DEAD = 0.03, 3
 
 
 class PlantSpread(NamedTuple):
@@ -217,10 +227,11 @@ class Cases(NamedTuple):
 
     `references` and of each case `begin` (s, g), the step at which its g-th reference begins, and `asked`
     (s, g), which one; noise (s,) in °C drawn from `seed` (s,); `start` (s,) which start, 0 the coldest.
-    `warms` (plants, n) is what surroundings that are 1 °C warmer add to a state each step, `outside` (steps,
-    s) by how many °C they are, `rise` in °C from the coldest start to the first reference; `structure`
-    (plants, 5) of each plant. `told` (steps, s, q) are the measured disturbances less their mean, `pushed`
-    (steps, s, p) what they do to the outputs in °C.
+    `warms` (plants, n) is what surroundings that are 1 °C warmer add to a state each step, `outside`
+    (steps, s) by how many °C they are, `rise` in °C from the coldest start to the first reference;
+    `structure` (plants, 6) of each plant; `carries` (plants, p, n) what warms one output by 1 °C. `told`
+    (steps, s, q) are the measured disturbances less their mean, `pushed` (steps, s, p) what they do to
+    the outputs in °C.
     """
 
     plants: list[Plant]
@@ -242,6 +253,7 @@ class Cases(NamedTuple):
     outside: np.ndarray
     rise: float
     structure: np.ndarray
+    carries: np.ndarray
     told: np.ndarray
     pushed: np.ndarray
 
@@ -321,6 +333,7 @@ def asked(
         np.tile(outside, count),
         rise,
         np.array([structures[k % len(structures)] for k in range(count)]),
+        np.stack([carrying(plant) for plant in plants]),
         np.tile(signal, (1, count, 1)),
         np.tile(push, (1, count, 1)),
     )
@@ -353,6 +366,14 @@ def warmed(plant: Plant, *, cells: bool) -> np.ndarray:
     inner = _undelayed(plant)
     warmer = np.ones(inner.n) if cells else reached_state(inner) @ np.ones(inner.p)
     return np.r_[warmer - inner.A @ warmer, np.zeros(plant.n - inner.n)]
+
+
+def carrying(plant: Plant) -> np.ndarray:
+    """What adds to the state (p, n) each step of a plant of `delayed`, output by output, so that it alone
+    ends 1 °C warmer."""
+    inner = _undelayed(plant)
+    warmer = reached_state(inner)
+    return np.pad((warmer - inner.A @ warmer).T, ((0, 0), (0, plant.n - inner.n)))
 
 
 def _undelayed(plant: Plant) -> Plant:
@@ -465,7 +486,7 @@ def held_readings(cases: Cases) -> np.ndarray:
     over."""
     C, d = (np.stack([getattr(plant, name) for plant in cases.plants])[cases.plant] for name in ("C", "d"))
     held = np.einsum("spn,sn->sp", C, cases.x0) + d
-    return in_steps(held + noise_of(cases)[: cases.hold + 1], cases.structure[cases.plant, 3][:, None])
+    return in_steps(held + noise_of(cases)[: cases.hold + 1], cases.structure[cases.plant, 4][:, None])
 
 
 def simulated(
@@ -482,10 +503,12 @@ def simulated(
         np.stack([getattr(plant, name) for plant in cases.plants]).transpose(0, 2, 1) for name in "ABC"
     )
     b, d = (np.stack([getattr(plant, name) for plant in cases.plants])[:, None] for name in "bd")
-    wall_share, slower, radiates, step_degC, duty = cases.structure[cases.plant].T
+    wall_share, slower, radiates, carried, step_degC, duty = cases.structure[cases.plant].T
     # the last case of each plant is held at the first reference
     duty = (duty * np.abs(cases.u0[each - 1 :: each]).max(axis=1)[cases.plant])[:, None]
     warms, pace = cases.warms[cases.plant], 1 / (slower * steps)
+    carries, late = carried[:, None, None] * cases.carries[cases.plant], max(round(LATE * steps), 1)
+    flows = bool(carried.any()) and p > 1
     x, wall, rise = cases.x0, np.zeros(s), max(cases.rise, 1.0)
     noise = noise_of(cases)[cases.hold :]
     y, measured = np.empty((steps, s, p)), np.empty((steps, s, p))
@@ -495,11 +518,15 @@ def simulated(
         measured[t] = in_steps(y[t] + noise[t], step_degC[:, None])
         applied[t], wished[t] = drive(t, measured[t])
         given = in_steps(applied[t], duty)
+        given = np.where(np.abs(given) < DEAD * duty, 0.0, given)
         x = np.matmul(x.reshape(count, each, -1), A) + np.matmul(given.reshape(count, each, m), B) + b
         warmer = np.clip((y[t] - y[0]).mean(axis=1), -1e4, 1e4)
         wall += pace * (warmer - wall)
         outside = cases.outside[t] + wall_share * wall - radiates * warmer**2 / rise
         x = x.reshape(s, -1) + warms * outside[:, None]
+        if flows and t >= late:
+            warmed_by = np.clip(y[t - late] - y[0], -1e4, 1e4)
+            x += np.einsum("sp,spn->sn", warmed_by[:, :-1] - warmed_by[:, 1:], carries[:, 1:])
         if not np.abs(x).max() < 1e9:
             x = np.clip(np.nan_to_num(x), -1e9, 1e9)
     return Rollout(y, r, target, wished, applied, measured)
