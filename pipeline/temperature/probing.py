@@ -8,32 +8,6 @@ import numpy as np
 from pipeline.temperature.plant import Plant
 
 
-def study_signal(
-    rng: np.random.Generator,
-    samples: int,
-    inputs: int,
-    *,
-    amplitudes: np.ndarray,
-    bandwidth: float,
-    variance: float,
-    redrawn: bool = True,
-) -> np.ndarray:
-    """omega_pr (samples, inputs) of (51), (52): a sinusoid at the bandwidth, one for each further amplitude
-    at a random frequency below it, and Gaussian noise.
-
-    `redrawn` draws the frequencies anew every step, as the study's script does (nearly white); without it
-    they are fixed, as the text reads. bandwidth in rad a step.
-    """
-    t = np.arange(samples)[:, None]
-    signal = np.sqrt(variance) * rng.standard_normal((samples, inputs)) + amplitudes[0] * np.sin(
-        bandwidth * t
-    )
-    for amplitude in amplitudes[1:]:
-        omega = rng.uniform(0.0, bandwidth, (samples if redrawn else 1, inputs))
-        signal += amplitude * np.sin(omega * t)
-    return signal
-
-
 def multisine(
     rng: np.random.Generator, samples: int, inputs: int, *, amplitude: float, lowest: float = 0.0
 ) -> np.ndarray:
@@ -109,21 +83,6 @@ def probe(
         limited += int((u[t] != wanted).sum())
         last, x = u[t], plant.A @ x + plant.B @ u[t] + plant.b
     return Probe(u, y, limited / signal.size)
-
-
-def study_probe(
-    plant: Plant, signal: np.ndarray, K_data: np.ndarray, *, x0: np.ndarray, noise: np.ndarray
-) -> Probe:
-    """u = -K_data x + omega_pr (50), which reads the true state and knows no limits: for parity and
-    benchmarks only. signal and noise may carry a batch axis: signal (samples, batch, m), noise (samples,
-    batch, p) give u and y of the same shapes."""
-    closed = (plant.A - plant.B @ K_data).T
-    x = np.empty((len(signal), *signal.shape[1:-1], plant.n))
-    x[0] = x0
-    drive = signal @ plant.B.T
-    for t in range(len(signal) - 1):
-        x[t + 1] = x[t] @ closed + drive[t]
-    return Probe(signal - x @ K_data.T, x @ plant.C.T + noise, 0.0)
 
 
 class Excitation(NamedTuple):

@@ -125,39 +125,6 @@ def gains(plant: Plant, Q: np.ndarray, R: np.ndarray, gamma: float) -> Gains:
     return Gains(K_x, K_w[:, :p], K_w[:, p], P)
 
 
-def augmented(plant: Plant, Q: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """T, B_1 of (12) and Q_1 of (14) for the state [x; r]."""
-    CQ = plant.C.T @ Q
-    T = scipy.linalg.block_diag(plant.A, F)
-    return T, np.vstack([plant.B, np.zeros((plant.p, plant.m))]), np.block([[CQ @ plant.C, -CQ], [-CQ.T, Q]])
-
-
-class Iterated(NamedTuple):
-    """K (m, n+p) of u = -K [x; r] (15), and how many policies were evaluated; `settled`
-    is False where the limit of iterations ended it."""
-
-    K: np.ndarray
-    iterations: int
-    settled: bool
-
-
-def algorithm_1(plant: Plant, Q, R, gamma, K0, *, tolerance: float, max_iterations: int = 100) -> Iterated:
-    """Algorithm 1 as the study's script runs it: its Lyapunov equation carries gamma in place of sqrt(gamma),
-    and it stops on the one-norm of K's change.
-
-    From a K0 under which the cost is infinite, the P of (ii) is no cost, and the iteration can settle on a
-    gain that does not stabilise: nothing here notices.
-    """
-    T, B_1, Q_1 = augmented(plant, Q, np.eye(plant.p))
-    K = K0
-    for j in range(1, max_iterations + 1):
-        P = scipy.linalg.solve_discrete_lyapunov(gamma * (T - B_1 @ K).T, Q_1 + K.T @ R @ K)
-        K, previous = np.linalg.solve(R + gamma * B_1.T @ P @ B_1, gamma * B_1.T @ P @ T), K
-        if np.linalg.norm(K - previous, 1) < tolerance:
-            return Iterated(K, j, True)
-    return Iterated(K, max_iterations, False)
-
-
 def still_law(m: int, p: int) -> Law:
     """A law that asks for nothing and remembers nothing: what doing nothing is judged as."""
     none = np.zeros((0, 0))
@@ -175,11 +142,6 @@ def still_law(m: int, p: int) -> Law:
         start_y=np.zeros((0, p)),
         start=np.zeros(0),
     )
-
-
-def stabilises(plant: Plant, K_x: np.ndarray) -> bool:
-    """Whether every eigenvalue of A - B K_x lies inside the unit circle."""
-    return bool(np.abs(np.linalg.eigvals(plant.A - plant.B @ K_x)).max() < 1)
 
 
 def observer_gain(plant: Plant, tau: float) -> np.ndarray:

@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from pipeline.papers.study import data_sets
 from pipeline.runtime import replay, support
 from pipeline.runtime.replay import GaplessLog
 from pipeline.temperature import tracking
@@ -12,7 +13,6 @@ from pipeline.temperature.controllers import baseline, controller, governor, win
 from pipeline.temperature.controllers.controller import Deployed, RunningController, compact, deployed
 from pipeline.temperature.controllers.governor import ActuatorLimits
 from pipeline.temperature.plant import Plant, baam
-from pipeline.temperature.study import data_sets
 from pipeline.temperature.test_set import panel
 
 LIMITS = ActuatorLimits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))

@@ -6,9 +6,9 @@ import re
 import numpy as np
 import pytest
 
+from pipeline.papers.published import REFERENCE
 from pipeline.temperature.controllers.baseline import NOISE_SHARE, Tuning, pairing, pi_law
 from pipeline.temperature.plant import baam, plant
-from pipeline.temperature.published import REFERENCE
 
 LOW, HIGH = np.zeros(7), np.full(7, 100.0)
 

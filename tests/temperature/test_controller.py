@@ -8,7 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipeline.temperature import study, tracking
+from pipeline.papers import study
+from pipeline.papers.published import REFERENCE
+from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline, window
 from pipeline.temperature.controllers.controller import (
     ControllerState,
@@ -28,7 +30,6 @@ from pipeline.temperature.controllers.controller import (
 from pipeline.temperature.controllers.governor import ActuatorLimits, Governor, OutputLimits, governor
 from pipeline.temperature.plant import Plant, baam, hold_state
 from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.published import REFERENCE
 from pipeline.temperature.test_set import panel
 from pipeline.temperature.tracking import Law
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import pipeline.store.execution
+from pipeline.papers.study import data_sets
 from pipeline.store import artifacts, params
 from pipeline.temperature import tables
 from pipeline.temperature.controllers import table, window
@@ -18,7 +19,6 @@ from pipeline.temperature.controllers.problem import DesignProblem
 from pipeline.temperature.controllers.table import BY_NAME, CONTROLLERS, PAIR
 from pipeline.temperature.plant import baam
 from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights
-from pipeline.temperature.study import data_sets
 from pipeline.temperature.test_set import best, controller_search, evaluation, panel, scorecard
 from pipeline.temperature.test_set.evaluation import redesigned
 from stages import evaluate_temperature, tune_weights

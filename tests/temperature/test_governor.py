@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from pipeline.papers.published import REFERENCE
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline
 from pipeline.temperature.controllers.controller import Deployed, deployed
@@ -25,7 +26,6 @@ from pipeline.temperature.controllers.governor import (
 )
 from pipeline.temperature.plant import Plant, baam
 from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.published import REFERENCE
 from pipeline.temperature.test_set import panel
 
 LIMITS = ActuatorLimits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))

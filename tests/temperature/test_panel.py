@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pipeline.papers.published import GAMMA, REFERENCE, TAU
 from pipeline.temperature.controllers.controller import ActuatorLimits, constant, deployed, ramp, sinusoid
 from pipeline.temperature.plant import baam, plant, simulate
-from pipeline.temperature.published import GAMMA, REFERENCE, TAU
 from pipeline.temperature.test_set import panel
 from pipeline.temperature.test_set.panel import Allowance, Cases, Figures, PlantSpread, Questions, Rollout
 from pipeline.temperature.test_set.scorecard import closed_loop

@@ -6,20 +6,11 @@ import re
 import numpy as np
 import pytest
 
+from pipeline.papers.published import GAMMA, K_DATA, REFERENCE
+from pipeline.papers.study import gap, study_panel, study_probe, study_signal
 from pipeline.temperature.controllers import window as window_route
 from pipeline.temperature.plant import baam, simulate
-from pipeline.temperature.probing import (
-    InputLimits,
-    OperatingPoint,
-    excitation,
-    multisine,
-    prbs,
-    probe,
-    study_probe,
-    study_signal,
-)
-from pipeline.temperature.published import GAMMA, K_DATA, REFERENCE
-from pipeline.temperature.study import gap, study_panel
+from pipeline.temperature.probing import InputLimits, OperatingPoint, excitation, multisine, prbs, probe
 from pipeline.temperature.tracking import feasible_target
 
 LOW, HIGH = np.zeros(7), np.full(7, 100.0)

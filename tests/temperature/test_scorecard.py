@@ -7,11 +7,11 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
+from pipeline.papers.published import GAMMA, REFERENCE, TAU
+from pipeline.papers.study import data_sets
 from pipeline.temperature.controllers import window as window_route
 from pipeline.temperature.controllers.kernel import window_law
 from pipeline.temperature.plant import Plant, baam, plant
-from pipeline.temperature.published import GAMMA, REFERENCE, TAU
-from pipeline.temperature.study import data_sets
 from pipeline.temperature.test_set import scorecard
 from pipeline.temperature.test_set.scorecard import (
     CommonCost,

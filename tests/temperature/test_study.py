@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.papers import files, made, reproduce_study
+from pipeline.papers import files, made, reproduce_study, study
+from pipeline.papers.published import GAMMA, REFERENCE
 from pipeline.papers.reproduce_study import ReproduceStudy
 from pipeline.store import params
-from pipeline.temperature import study
-from pipeline.temperature.published import GAMMA, REFERENCE
 from pipeline.temperature.test_set import tuning
 from tests.house import expected_of_paper
 

@@ -5,25 +5,121 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.papers.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, PublishedFigures
 from pipeline.temperature.controllers import window as window_route
-from pipeline.temperature.controllers.kernel import (
-    Kernel,
-    exact_gains,
-    regress,
-    tuples,
-    value_iteration,
-    window_law,
-)
-from pipeline.temperature.plant import baam
-from pipeline.temperature.probing import study_probe, study_signal
-from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, PublishedFigures
+from pipeline.temperature.controllers.kernel import Kernel, regress, tuples, value_iteration, window_law
+from pipeline.temperature.plant import Plant, baam, observability_matrix
+from pipeline.temperature.probing import Probe
 from pipeline.temperature.test_set.scorecard import CommonCost, Scenarios, cost, optimum, panel, simulate
-from pipeline.temperature.test_set.tuning import SearchResult, fitness
-from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
+from pipeline.temperature.test_set.tuning import SearchResult
+from pipeline.temperature.tracking import Gains, Law, gains, observer_gain, observer_law
 
 OUTPUTS, INPUTS = 5, 7
 YARDSTICK = CommonCost(np.ones(OUTPUTS), np.ones(INPUTS), GAMMA)
 AMPLITUDES, BANDWIDTH, VARIANCE = np.arange(100.0, 0.0, -10.0), 1.65, 1.5
+
+
+def study_signal(
+    rng: np.random.Generator,
+    samples: int,
+    inputs: int,
+    *,
+    amplitudes: np.ndarray,
+    bandwidth: float,
+    variance: float,
+    redrawn: bool = True,
+) -> np.ndarray:
+    """omega_pr (samples, inputs) of (51), (52): a sinusoid at the bandwidth, one for each further amplitude
+    at a random frequency below it, and Gaussian noise.
+
+    `redrawn` draws the frequencies anew every step, as the study's script does (nearly white); without it
+    they are fixed, as the text reads. bandwidth in rad a step.
+    """
+    t = np.arange(samples)[:, None]
+    signal = np.sqrt(variance) * rng.standard_normal((samples, inputs)) + amplitudes[0] * np.sin(
+        bandwidth * t
+    )
+    for amplitude in amplitudes[1:]:
+        omega = rng.uniform(0.0, bandwidth, (samples if redrawn else 1, inputs))
+        signal += amplitude * np.sin(omega * t)
+    return signal
+
+
+def study_probe(
+    plant: Plant, signal: np.ndarray, K_data: np.ndarray, *, x0: np.ndarray, noise: np.ndarray
+) -> Probe:
+    """u = -K_data x + omega_pr (50), which reads the true state and knows no limits: for parity and
+    benchmarks only. signal and noise may carry a batch axis: signal (samples, batch, m), noise (samples,
+    batch, p) give u and y of the same shapes."""
+    closed = (plant.A - plant.B @ K_data).T
+    x = np.empty((len(signal), *signal.shape[1:-1], plant.n))
+    x[0] = x0
+    drive = signal @ plant.B.T
+    for t in range(len(signal) - 1):
+        x[t + 1] = x[t] @ closed + drive[t]
+    return Probe(signal - x @ K_data.T, x @ plant.C.T + noise, 0.0)
+
+
+def reconstruction(plant: Plant, N: int) -> np.ndarray:
+    """M (n, N (m+p)) with x(t) = M [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)] (23)-(28), exact where N
+    reaches the observability index (b = d = 0)."""
+    n, m, p = plant.n, plant.m, plant.p
+    powers = [np.eye(n)]
+    for _ in range(N):
+        powers.append(plant.A @ powers[-1])
+    U_N = np.hstack([powers[lag] @ plant.B for lag in range(N)])
+    W_N = observability_matrix(plant.A, plant.C, N).reshape(N, p, n)[::-1].reshape(N * p, n)
+    D_N = np.zeros((N * p, N * m))
+    for row in range(N):
+        for column in range(row + 1, N):
+            D_N[row * p : (row + 1) * p, column * m : (column + 1) * m] = (
+                plant.C @ powers[column - row - 1] @ plant.B
+            )
+    back = powers[N] @ np.linalg.pinv(W_N)
+    return np.hstack([U_N - back @ D_N, back])
+
+
+def exact_gains(plant: Plant, gains: Gains, N: int) -> tuple[np.ndarray, np.ndarray]:
+    """K (m, N (m+p)) and K_r (m, p) of (32) from the model: what a
+    learned kernel should give on noise-free data."""
+    return gains.K_x @ reconstruction(plant, N), gains.K_r
+
+
+def fitness(
+    plant: Plant,
+    K_x: np.ndarray,
+    K_r: np.ndarray,
+    *,
+    reference: np.ndarray,
+    gamma: float,
+    steps: int,
+    x0: np.ndarray,
+    k=0.0,
+) -> float:
+    """F = sum_{t=0..l} gamma^t (|y(t) - r|^2 + |u(t)|^2)
+
+    of u = -K_x x - K_r r - k with the state known and r constant (37).
+
+    K_x (m, n), K_r (m, p), k (m,), reference r (p,) in °C, x0 (n,), steps = l >= 0: l + 1 terms. With
+    z = [x; 1] the loop is z(t+1) = M z(t), so that all z come from log2(l) products, Z <- [Z, M^i Z]. Raises
+    ValueError where the closed loop is unstable.
+    """
+    A_cl = plant.A - plant.B @ K_x
+    radius = np.abs(np.linalg.eigvals(A_cl)).max()
+    if not radius < 1:
+        raise ValueError(
+            f"fitness: the closed loop is unstable, spectral radius {radius:.6g}, expected below 1; "
+            "choose other weights"
+        )
+    u_r = -K_r @ reference - k
+    M = np.block([[A_cl, (plant.B @ u_r + plant.b)[:, None]], [np.zeros((1, plant.n)), np.ones((1, 1))]])
+    offset = plant.D @ u_r + plant.d - reference
+    stage = np.block([[plant.C - plant.D @ K_x, offset[:, None]], [-K_x, u_r[:, None]]])  # z -> [y - r; u]
+    Z = np.append(x0, 1.0)[:, None]
+    while Z.shape[1] <= steps:
+        Z, M = np.hstack([Z, M @ Z]), M @ M
+    terms = ((stage @ Z[:, : steps + 1]) ** 2).sum(axis=0)
+    return float(gamma ** np.arange(steps + 1) @ terms)
 
 
 def study_panel(
