@@ -114,8 +114,8 @@ def identify(
     rng = np.random.default_rng(settings.seed)
     judgement = judge(chosen, first, last, ahead_steps=settings.ahead_steps, rng=rng)
     fitted = model_choice.refit(record.u, record.y, chosen, names=acting)
-    if not (observed := observability(fitted.plant)).passed:
-        raise ValueError(f"{path}: {observed.reason}")
+    if hidden := observability(fitted.plant)[1]:
+        raise ValueError(f"{path}: {hidden}")
     family = validation.bootstrap_spread(
         record.u,
         record.y,
@@ -221,7 +221,7 @@ def fit_figures(
         **validation.fit_figures(judgement.holdout, outputs),
         "fit_holdout_inputs_held": dict(zip(outputs, judgement.still.tolist(), strict=True)),
         **validation.outcome_figures(judgement.residuals, judgement.excitation, outputs, inputs),
-        "controllable": controllability(fitted.plant).passed,
+        "controllable": not controllability(fitted.plant)[1],
         "largest_pole": np.abs(np.linalg.eigvals(fitted.plant.A)).max(),
         "advice": validation.advice(
             judgement.residuals,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pipeline.temperature.controllers.window import WindowModel
-    from pipeline.temperature.test_set.scorecard import KernelCandidate, Sufficiency
+    from pipeline.temperature.test_set.scorecard import KernelCandidate
 
 
 class LearnKernel(Section):
@@ -93,7 +93,7 @@ def main() -> None:
             hold=0,
             cells=False,
         )
-        enough = scorecard.sufficiency(
+        half_gap, needed = scorecard.sufficiency(
             u,
             y,
             long,
@@ -110,13 +110,15 @@ def main() -> None:
         artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(long))
         if best.learned is not None:
             artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, best.learned.stored())
-        artifacts.write_metrics("learn_kernel", figures(settings, long, enough, candidates, best), METRICS)
+        told = figures(settings, long, half_gap, needed, candidates, best)
+        artifacts.write_metrics("learn_kernel", told, METRICS)
 
 
 def figures(
     settings: LearnKernel,
     long: WindowModel,
-    enough: Sufficiency,
+    half_gap: float,
+    needed: int,
     candidates: list[KernelCandidate],
     best: KernelCandidate,
 ) -> dict[str, Any]:
@@ -125,8 +127,8 @@ def figures(
         "window": long.N,
         "samples": long.samples,
         "allowed_gap_percent": settings.allowed_gap_percent,
-        "half_record_gap_percent": 100 * enough.half_gap,
-        "samples_needed_for_noise": enough.needed,
+        "half_record_gap_percent": 100 * half_gap,
+        "samples_needed_for_noise": needed,
         "state": best.state if kernel else None,
         "refused": None if kernel else best.refusal,
         "rank": kernel.rank if kernel else None,

@@ -127,14 +127,7 @@ def observability_matrix(A: np.ndarray, C: np.ndarray, blocks: int) -> np.ndarra
     return np.vstack(rows)
 
 
-class RankTest(NamedTuple):
-    passed: bool
-    rank: int
-    singular_values: np.ndarray
-    reason: str
-
-
-def _rank_test(matrix: np.ndarray, n: int, name: str, remedy: str) -> RankTest:
+def _rank_test(matrix: np.ndarray, n: int, name: str, remedy: str) -> tuple[int, str]:
     sv = np.linalg.svd(matrix, compute_uv=False)
     rank = int((sv > sv[0] * max(matrix.shape) * np.finfo(float).eps).sum()) if sv[0] > 0 else 0
     reason = (
@@ -143,11 +136,11 @@ def _rank_test(matrix: np.ndarray, n: int, name: str, remedy: str) -> RankTest:
         else f"the plant is not {name}: rank {rank} of {n}, smallest singular values "
         f"{np.array2string(sv[-2:], precision=2)}; {remedy}"
     )
-    return RankTest(rank == n, rank, sv, reason)
+    return rank, reason
 
 
-def observability(plant: Plant) -> RankTest:
-    """Rank test of (7) with its singular values; fails with a reason where some state never shows in y."""
+def observability(plant: Plant) -> tuple[int, str]:
+    """The rank of (7), and the reason where some state never shows in y, empty where all do."""
     return _rank_test(
         observability_matrix(plant.A, plant.C, plant.n),
         plant.n,
@@ -156,9 +149,9 @@ def observability(plant: Plant) -> RankTest:
     )
 
 
-def controllability(plant: Plant) -> RankTest:
-    """Rank test of [B AB ... A^(n-1)B] (10) with its singular values;
-    fails with a reason where some state obeys no input."""
+def controllability(plant: Plant) -> tuple[int, str]:
+    """The rank of [B AB ... A^(n-1)B] (10), and the reason where some state obeys no input, empty where all
+    do."""
     return _rank_test(
         observability_matrix(plant.A.T, plant.B.T, plant.n),
         plant.n,

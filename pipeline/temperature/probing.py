@@ -8,13 +8,10 @@ import numpy as np
 from pipeline.temperature.plant import Plant
 
 
-def multisine(
-    rng: np.random.Generator, samples: int, inputs: int, *, amplitude: float, lowest: float = 0.0
-) -> np.ndarray:
-    """(samples, inputs) within +-amplitude: equal power at every frequency of the record from `lowest` (rad a
-    step) up, random phases, other lines for each input."""
+def multisine(rng: np.random.Generator, samples: int, inputs: int, *, amplitude: float) -> np.ndarray:
+    """(samples, inputs) within +-amplitude: equal power at every frequency of the record, random phases,
+    other lines for each input."""
     lines = np.arange(1, (samples + 1) // 2)
-    lines = lines[2 * np.pi * lines / samples >= lowest]
     spectrum = np.zeros((samples // 2 + 1, inputs), complex)
     for channel in range(inputs):
         own = lines[channel::inputs]
@@ -41,39 +38,23 @@ class Probe(NamedTuple):
     limited: float
 
 
-class OperatingPoint(NamedTuple):
-    """State x (n,) at the start, and the inputs u (m,) and outputs y (p,) that probing stays around."""
-
-    x: np.ndarray
-    u: np.ndarray
-    y: np.ndarray
-
-
-class InputLimits(NamedTuple):
-    """low (m,) <= u <= high (m,), and at most `rate` percent a step."""
-
-    low: np.ndarray
-    high: np.ndarray
-    rate: float
-
-
 def probe(
     plant: Plant,
     signal: np.ndarray,
-    point: OperatingPoint,
-    limits: InputLimits,
+    point: tuple[np.ndarray, np.ndarray, np.ndarray],
+    limits: tuple[np.ndarray, np.ndarray, float],
     *,
     feedback: np.ndarray,
     noise: np.ndarray,
 ) -> Probe:
-    """u = point.u + feedback (point.y - y measured) + signal, within the limits: outputs stay near point.y,
-    from measurements only.
+    """u = u_centre + feedback (y_centre - y measured) + signal, within the limits: outputs stay near
+    y_centre, from measurements only.
 
-    feedback (m, p) in percent per °C; noise (samples, p) in °C. What is
+    point: state x (n,) at the start, u_centre (m,) and y_centre (p,); limits: low (m,) <= u <= high (m,), and
+    at most so many percent a step; feedback (m, p) in percent per °C; noise (samples, p) in °C. What is
     applied is what is recorded, so that limits bias nothing.
     """
-    x, u_centre, y_centre = point
-    low, high, rate = limits
+    (x, u_centre, y_centre), (low, high, rate) = point, limits
     last = u_centre
     u, y, limited = np.empty_like(signal), np.empty((len(signal), plant.p)), 0
     for t in range(len(signal)):

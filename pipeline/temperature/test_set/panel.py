@@ -580,36 +580,14 @@ def lasting(outside: np.ndarray) -> np.ndarray:
     return lasts
 
 
-class Allowance(NamedTuple):
-    """What the cost counts as one: steps outside the band, °C of overshoot and of settled error, percent of
-    commands outside the limits, percent of mean input, percent of travel a step, °C of r.m.s. error where the
-    reference makes no step."""
-
-    outside: float
-    overshoot: float
-    settled_error: float
-    at_limits: float
-    energy: float
-    travel: float
-    rms: float
-
-
-def costs(results: Figures, allowance: Allowance) -> np.ndarray:
+def costs(results: Figures, allowance: Mapping[str, float]) -> np.ndarray:
     """The declared cost of each case (s,): the sum of figure / allowance of what applies to it; 1e4 at
-    most."""
+    most. `allowance` has by the names of Figures what the cost counts as one; `rms` counts where the
+    reference makes no step, `outside` and `overshoot` where it does."""
+    one = {name: getattr(results, name) / unit for name, unit in allowance.items()}
     moving = np.isnan(results.overshoot)
-    response = np.where(
-        moving,
-        results.rms / allowance.rms,
-        results.outside / allowance.outside + np.nan_to_num(results.overshoot) / allowance.overshoot,
-    )
-    total = (
-        response
-        + results.settled_error / allowance.settled_error
-        + np.nan_to_num(results.at_limits) / allowance.at_limits
-        + results.energy / allowance.energy
-        + results.travel / allowance.travel
-    )
+    response = np.where(moving, one["rms"], one["outside"] + np.nan_to_num(one["overshoot"]))
+    total = response + one["settled_error"] + np.nan_to_num(one["at_limits"]) + one["energy"] + one["travel"]
     return np.minimum(np.nan_to_num(total, nan=1e4, posinf=1e4), 1e4)
 
 
@@ -640,7 +618,7 @@ class CaseConditions(NamedTuple):
     governor: Governor
     integral_limit: float
     settled: int
-    allowance: Allowance
+    allowance: dict[str, float]
     gamma: float
     sample_time_s: float
     faster: float
@@ -664,15 +642,15 @@ def conditions(
     band = rehearsal.band_degC / settings.band_degC
     late = (rehearsal.settling_s or settings.settling_s) / settings.settling_s
     # a slow machine is allowed its time, a small one its degrees
-    allowance = Allowance(
-        outside=tuning.allow_settling_s * late / machine.sample_time_s,
-        overshoot=tuning.allow_overshoot_degC * band,
-        settled_error=tuning.allow_settled_error_degC * band,
-        at_limits=tuning.allow_at_limits_percent,
-        energy=tuning.allow_effort_percent,
-        travel=tuning.allow_travel_percent,
-        rms=tuning.allow_overshoot_degC * band,
-    )
+    allowance = {
+        "outside": tuning.allow_settling_s * late / machine.sample_time_s,
+        "overshoot": tuning.allow_overshoot_degC * band,
+        "settled_error": tuning.allow_settled_error_degC * band,
+        "at_limits": tuning.allow_at_limits_percent,
+        "energy": tuning.allow_effort_percent,
+        "travel": tuning.allow_travel_percent,
+        "rms": tuning.allow_overshoot_degC * band,
+    }
     # nearer to a reference than its noise no forecast can tell an overshoot
     overshoot = max(tracking.governor_overshoot_degC * band, 3 * float(rehearsal.noise.max()))
     return CaseConditions(

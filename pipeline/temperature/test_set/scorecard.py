@@ -7,7 +7,7 @@ Cases of one plant stand or fall together: plants are the blocks of every test a
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -326,27 +326,23 @@ def between(champion: np.ndarray, challenger: np.ndarray, plant: np.ndarray, *, 
     )
 
 
-class Pair(NamedTuple):
-    """Of two contestants a and b the cheaper one beyond chance, None where nobody is; by how many percent of
-    the other's cost, with the ends of the 90 % interval and the two-sided p."""
-
-    a: str
-    b: str
-    winner: str | None
-    difference: float
-    low: float
-    high: float
-    p: float
-
-
-def pair(a: str, b: str, costs: Mapping[str, np.ndarray], plant: np.ndarray, *, seed: int) -> Pair:
-    """The pair's difference is that of the cheaper one, whether or not it is beyond chance."""
+def pair(a: str, b: str, costs: Mapping[str, np.ndarray], plant: np.ndarray, *, seed: int) -> dict[str, Any]:
+    """Of two contestants a and b the `winner`, the cheaper one beyond chance, None where nobody is; by how
+    many percent of the other's cost the cheaper one is so (`difference`), beyond chance or not, with the ends
+    `low` and `high` of the 90 % interval and the two-sided `p`."""
     forward = between(costs[b], costs[a], plant, seed=seed)
     backward = between(costs[a], costs[b], plant, seed=seed)
     cheaper, result = (a, forward) if forward.improvement_percent >= 0 else (b, backward)
     p = min(1.0, 2 * result.p)
-    winner = cheaper if p < LEVEL else None
-    return Pair(a, b, winner, result.improvement_percent, result.low_percent, result.high_percent, p)
+    return {
+        "a": a,
+        "b": b,
+        "winner": cheaper if p < LEVEL else None,
+        "difference": result.improvement_percent,
+        "low": result.low_percent,
+        "high": result.high_percent,
+        "p": p,
+    }
 
 
 def deciding_plant(a: np.ndarray, b: np.ndarray, plant: np.ndarray) -> int:
@@ -357,23 +353,16 @@ def deciding_plant(a: np.ndarray, b: np.ndarray, plant: np.ndarray) -> int:
     return int(np.unique(plant)[(np.sign(by_plant.sum() or 1.0) * by_plant).argmax()])
 
 
-class QuantileBand(NamedTuple):
-    """Median and 90 % quantile over all cases, the 90 % band of that quantile with plants resampled as
-    blocks, the worst, and the case that has it; inf where a run never settles."""
-
-    median: float
-    q90: float
-    low: float
-    high: float
-    worst: float
-    worst_case: int
-
-
-def banded(values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int = 200) -> QuantileBand:
-    """Of a figure (s,); NaN where it does not apply, and all NaN if it applies nowhere. Less is better."""
+def banded(
+    values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int = 200
+) -> tuple[dict[str, float], int]:
+    """Of a figure (s,), less of which is better, `median` and 90 % quantile `q90` over all cases, the ends
+    `low` and `high` of the 90 % band of that quantile with plants resampled as blocks, and the `worst`, inf
+    where a run never settles; and the case that has it. Values are NaN where the figure does not apply; all
+    of the band is NaN if it applies nowhere."""
     applies = np.flatnonzero(~np.isnan(values))
     if not len(applies):
-        return QuantileBand(np.nan, np.nan, np.nan, np.nan, np.nan, 0)
+        return dict.fromkeys(("median", "q90", "low", "high", "worst"), np.nan), 0
     values, plant = values[applies], plant[applies]
     median, q90 = np.quantile(values, [0.5, 0.9], method="nearest")
     blocks = [values[plant == index] for index in np.unique(plant)]
@@ -383,9 +372,8 @@ def banded(values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int =
     ]
     low, high = np.quantile(quantiles, [0.05, 0.95], method="nearest")
     worst = int(np.argmax(values))
-    return QuantileBand(
-        float(median), float(q90), float(low), float(high), float(values[worst]), int(applies[worst])
-    )
+    band = {"median": median, "q90": q90, "low": low, "high": high, "worst": values[worst]}
+    return {name: float(value) for name, value in band.items()}, int(applies[worst])
 
 
 def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> float:
@@ -395,18 +383,6 @@ def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> fl
     by_plant = np.sort([np.log(max(costs[plant == index].mean(), 1e-9)) for index in np.unique(plant)])
     tail = by_plant[-max(1, len(by_plant) // 4) :].mean()
     return float(np.exp((by_plant.mean() + weight * tail) / (1 + weight)))
-
-
-class Sufficiency(NamedTuple):
-    """Whether the record of `samples` is long enough.
-
-    `half_gap` is the extra cost of a controller learned from half of the record, on the model learned from
-    all of it. The excess falls as one over the samples. At `needed` samples it would be the excess allowed.
-    """
-
-    half_gap: float
-    samples: int
-    needed: int
 
 
 def sufficiency(
@@ -419,9 +395,10 @@ def sufficiency(
     allowed: float,
     offset: bool,
     gain_spread: float,
-) -> Sufficiency:
-    """Whether the record is long enough for its noise, by the record alone. A controller is learned from each
-    half of it and judged on `scenarios` of the model learned from all of it."""
+) -> tuple[float, int]:
+    """Whether the record is long enough for its noise, by the record alone: the extra cost of a controller
+    learned from half of it, the mean of both halves, on `scenarios` of the model learned from all of it; and
+    at how many samples it would be the excess `allowed`, as it falls as one over the samples."""
     best = optimum(scenarios, yardstick)
     gaps = []
     for part in (0, 1):
@@ -439,7 +416,7 @@ def sufficiency(
     needed = max(
         np.ceil(learned.samples * min(half_gap / 2 / allowed, 1e3)), 2 * (learned.Theta.shape[1] + offset)
     )
-    return Sufficiency(half_gap, learned.samples, int(needed))
+    return half_gap, int(needed)
 
 
 class KernelCandidate(NamedTuple):

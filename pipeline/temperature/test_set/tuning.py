@@ -266,7 +266,7 @@ def _next(
     return _least(_terms(points, costs, kernel), candidates, low, high)
 
 
-def _evaluated(cost: Callable[[np.ndarray], float], theta: np.ndarray) -> tuple[float, str]:
+def evaluate(cost: Callable[[np.ndarray], float], theta: np.ndarray) -> tuple[float, str]:
     """The cost, or NaN and the reason why there is none."""
     try:
         value = float(cost(theta.copy()))
@@ -327,7 +327,7 @@ def minimise(
                 else _next(points, history.cost, kernel, region, later[index])
             )
             theta = np.clip(lower * (upper / lower) ** point, lower, upper)
-            value, reason = _evaluated(cost, theta)
+            value, reason = evaluate(cost, theta)
         if index >= initial:
             region = region.after(bool(value < np.fmin.reduce(history.cost, initial=np.inf)))
         history = _extended(history, theta, value, reason)
@@ -368,7 +368,7 @@ def polished(
         way = left.pop(0)
         there = np.clip(point + side * way, 0.0, 1.0)
         theta = np.clip(lower * (upper / lower) ** there, lower, upper)
-        value, reason = _evaluated(cost, theta)
+        value, reason = evaluate(cost, theta)
         history = _extended(history, theta, value, reason)
         if value < best:
             point, best = there, value
