@@ -196,6 +196,21 @@ def at_disturbances(plant: Plant, inputs: int, level: np.ndarray) -> Plant:
     )
 
 
+def padded(plants: Sequence[Plant]) -> list[Plant]:
+    """The plants with one order: states that nothing moves and nobody sees fill up the smaller ones."""
+    most = max(plant.n for plant in plants)
+    return [
+        plant._replace(
+            A=np.pad(plant.A, (0, most - plant.n)),
+            B=np.pad(plant.B, ((0, most - plant.n), (0, 0))),
+            C=np.pad(plant.C, ((0, 0), (0, most - plant.n))),
+            b=np.pad(plant.b, (0, most - plant.n)),
+            K=np.pad(plant.K, ((0, most - plant.n), (0, 0))),
+        )
+        for plant in plants
+    ]
+
+
 def hold_state(plant: Plant, x: np.ndarray) -> np.ndarray:
     """The steady input u (m,) of least norm that holds the plant at state x (n,): (I - A) x = B u + b; the
     nearest one where none is exact."""

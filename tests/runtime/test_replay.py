@@ -12,7 +12,7 @@ from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline, controller, governor, window
 from pipeline.temperature.controllers.controller import Deployed, RunningController, compact, deployed
 from pipeline.temperature.controllers.governor import ActuatorLimits
-from pipeline.temperature.plant import Plant, baam
+from pipeline.temperature.plant import Plant, baam, padded
 from pipeline.temperature.test_set import panel
 
 LIMITS = ActuatorLimits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
@@ -131,7 +131,7 @@ def test_a_reference_that_never_holds_still_is_refused():
 @cache
 def within() -> support.Support:
     rng = np.random.default_rng(5)
-    plants = panel.padded(panel.drawn([baam()], 8, SPREAD, cells=True, rng=rng))
+    plants = padded(panel.drawn([baam()], 8, SPREAD, cells=True, rng=rng))
     parts = np.array_split(np.arange(len(log().u)), 3)
     return support.support(plants, [GaplessLog(*(part[rows] for part in log())) for rows in parts], NOISE)
 

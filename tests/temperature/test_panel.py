@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.papers.published import GAMMA, REFERENCE, TAU
 from pipeline.temperature.controllers.controller import ActuatorLimits, constant, deployed, ramp, sinusoid
-from pipeline.temperature.plant import baam, plant, simulate
+from pipeline.temperature.plant import baam, padded, plant, simulate
 from pipeline.temperature.test_set import panel
 from pipeline.temperature.test_set.panel import Cases, Figures, PlantSpread, Questions, Rollout
 from pipeline.temperature.test_set.scorecard import closed_loop
@@ -104,7 +104,7 @@ def test_the_same_seed_draws_the_same_plants_and_another_others(drawn):
 def test_plants_of_different_order_do_after_padding_what_they_did_before():
     small, large = plant([[0.9]], [[1.0]], [[1.0]]), plant(np.diag([0.9, 0.5]), [[1.0], [1.0]], [[1.0, 1.0]])
     u = np.random.default_rng(1).uniform(0, 1, (20, 1))
-    for before, after in zip((small, large), panel.padded([small, large]), strict=True):
+    for before, after in zip((small, large), padded([small, large]), strict=True):
         assert after.n == 2
         np.testing.assert_allclose(
             simulate(after, u, np.zeros(2))[1], simulate(before, u, np.zeros(before.n))[1], rtol=1e-12

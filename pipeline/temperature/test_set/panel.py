@@ -35,7 +35,7 @@ from pipeline.temperature.controllers.controller import (
 )
 from pipeline.temperature.controllers.governor import Governor, OutputLimits, Strength, governor
 from pipeline.temperature.controllers.problem import Design, DesignProblem
-from pipeline.temperature.plant import Plant, hold_output, hold_state
+from pipeline.temperature.plant import Plant, hold_output, hold_state, padded
 from pipeline.temperature.settings import Half, Panel, Tracking, TuneWeights
 from pipeline.temperature.settings import Plant as Machine
 from pipeline.temperature.test_set.scenario_defaults import (
@@ -175,21 +175,6 @@ def corners(nominal: Sequence[Plant], spread: PlantSpread) -> tuple[list[Plant],
     weakest = (1 - spread.input_gain) / (1 + spread.slower)
     strongest = (1 + spread.input_gain) / (1 - spread.slower)
     return padded(family), Strength(weakest, strongest, spread.input_gain)
-
-
-def padded(plants: Sequence[Plant]) -> list[Plant]:
-    """The plants with one order: states that nothing moves and nobody sees fill up the smaller ones."""
-    most = max(plant.n for plant in plants)
-    return [
-        plant._replace(
-            A=np.pad(plant.A, (0, most - plant.n)),
-            B=np.pad(plant.B, ((0, most - plant.n), (0, 0))),
-            C=np.pad(plant.C, ((0, 0), (0, most - plant.n))),
-            b=np.pad(plant.b, (0, most - plant.n)),
-            K=np.pad(plant.K, ((0, most - plant.n), (0, 0))),
-        )
-        for plant in plants
-    ]
 
 
 # ---- what they are asked
