@@ -120,8 +120,8 @@ def design_dither(family: Family) -> tuple[Dither | None, str]:
 
     try:
         rise = horizon(family.model, family.asked.samples)
-        pi = baseline.controller(family.model, (family.low, family.high), horizon=rise)
-        law = pi.design(np.ones(family.model.p), np.ones(family.model.m), 0.0)
+        pairs = baseline.pairing(family.model, family.low, family.high, horizon=rise)
+        law = baseline.pi_law(pairs, inputs=family.model.m)
         return experiment.dither(family, law, np.random.default_rng(family.asked.seed)), ""
     except (ValueError, np.linalg.LinAlgError) as error:
         return None, f"no simple controller to add it to: {' '.join(str(error).split())}"

@@ -1,14 +1,13 @@
 """Linear-quadratic tracking of a known model: Riccati gains, observer, Algorithm 1 of seed 1, and the
 feasible target within the limits of the inputs."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 import scipy.linalg.lapack
 
-from pipeline.temperature.plant import Plant, strictly_proper
+from pipeline.temperature.plant import Plant
 
 
 class Gains(NamedTuple):
@@ -56,17 +55,6 @@ class Law(NamedTuple):
     start: np.ndarray
     integral: float | np.ndarray = 0.0
     conditional: bool = False
-
-
-class ControllerDesign(NamedTuple):
-    """One way to control. `design(q, r, integral)` gives its law for weights diag(q), diag(r); `integral` is
-    the outer integrator's share of the error a step, 0 in the unclipped run. Its feasible targets are
-    computed on `model`.
-    """
-
-    name: str
-    design: Callable[[np.ndarray, np.ndarray, float], Law]
-    model: Plant
 
 
 def riccati(
@@ -186,26 +174,14 @@ def observer_law(plant: Plant, gains: Gains, L: np.ndarray, *, integral: float =
     )
 
 
-def model_based(plant: Plant, gamma: float, *, tau: float) -> ControllerDesign:
-    """Riccati gains of an identified model, and an observer that stands its errors (robust_observer_gain),
-    started where inputs may have brought it. Feed-through counts as one sample of delay."""
-    plant = strictly_proper(plant)
-    observed = _observed("model_based", plant, gamma, robust_observer_gain(plant, tau))
-    return observed._replace(
-        design=lambda q, r, integral: started_reached(observed.design(q, r, integral), plant)
-    )
-
-
-def exact_model(plant: Plant, gamma: float, *, tau: float) -> ControllerDesign:
-    """The paper's controller, told the true plant: Riccati gains and (8)."""
-    return _observed("exact_model", plant, gamma, observer_gain(plant, tau))
-
-
-def _observed(name: str, plant: Plant, gamma: float, L: np.ndarray) -> ControllerDesign:
-    def design(q: np.ndarray, r: np.ndarray, integral: float) -> Law:
-        return observer_law(plant, gains(plant, np.diag(q), np.diag(r), gamma), L, integral=integral)
-
-    return ControllerDesign(name, design, plant)
+def model_based(
+    plant: Plant, q: np.ndarray, r: np.ndarray, integral: float, *, gamma: float, tau: float
+) -> Law:
+    """Riccati gains of an identified model without feed-through for weights diag(q), diag(r), and an observer
+    that stands its errors (robust_observer_gain), started where inputs may have brought it. `integral` is the
+    outer integrator's share of the error a step."""
+    best, L = gains(plant, np.diag(q), np.diag(r), gamma), robust_observer_gain(plant, tau)
+    return started_reached(observer_law(plant, best, L, integral=integral), plant)
 
 
 def started_reached(law: Law, plant: Plant, *, forgets: float = 0.01) -> Law:

@@ -30,18 +30,17 @@ def guard() -> governor.Governor:
 
 @cache
 def ready(name: str) -> tuple[Deployed, Plant]:
-    ones = np.ones(5), np.ones(7)
     if name == "pi":
-        made = baseline.controller(baam(), (LIMITS.low, LIMITS.high), horizon=600)
-        return deployed(made.design(*ones, 0.05), SLOW, integral_limit=1.0), made.model
+        pairs = baseline.pairing(baam(), LIMITS.low, LIMITS.high, horizon=600)
+        return deployed(baseline.pi_law(pairs, inputs=7), SLOW, integral_limit=1.0), baam()
     if name == "window":
         u, y = data_sets(np.random.default_rng(1), 1500, 1)
         learned = window.learn([u[:, 0]], [y[:, 0]], longest=4)
-        made = window.controller(learned, 0.99)
-        law = compact(made.design(*ones, 0.05), learned.N)
-        return deployed(law, LIMITS, integral_limit=1.0, governor=guard()), made.model
-    made = tracking.model_based(baam(), 0.99, tau=1.0)
-    return deployed(made.design(*ones, 0.05), LIMITS, integral_limit=1.0, governor=guard()), made.model
+        law = compact(window.law(learned, np.eye(5), np.eye(7), 0.99, integral=0.05), learned.N)
+        model = window.observer_form(learned)[0]
+        return deployed(law, LIMITS, integral_limit=1.0, governor=guard()), model
+    law = tracking.model_based(baam(), np.ones(5), np.ones(7), 0.05, gamma=0.99, tau=1.0)
+    return deployed(law, LIMITS, integral_limit=1.0, governor=guard()), baam()
 
 
 @cache

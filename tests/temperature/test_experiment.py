@@ -73,6 +73,11 @@ def family_of(plants, u, y):
     return experiment.family_of(plants, ([u], [y]), ASKED, MACHINE)
 
 
+def pi_of(model, horizon):
+    pairs = baseline.pairing(model, np.zeros(1), np.full(1, 100.0), horizon=horizon)
+    return baseline.pi_law(pairs, inputs=1)
+
+
 @pytest.fixture(scope="module")
 def heated():
     """The hot end's record, its family, and the true state at its end."""
@@ -156,9 +161,7 @@ def test_what_hardly_settles_is_refused_open_loop_and_offered_around_its_control
     tried = experiment.design(family, np.random.default_rng(1))
     assert not tried.written and not len(tried.u)
     assert "without its controller zone may" in tried.reason and "hardly settles by itself" in tried.reason
-    law = baseline.controller(plants[0], (np.zeros(1), np.full(1, 100.0)), horizon=300).design(
-        None, None, 0.0
-    )
+    law = pi_of(plants[0], 300)
     added = experiment.dither(family, law, np.random.default_rng(1))
     assert not added.reason and added.amplitude.min() > 0
     assert 60 <= added.extremes.lowest.min() and added.extremes.highest.max() <= 140
@@ -166,9 +169,7 @@ def test_what_hardly_settles_is_refused_open_loop_and_offered_around_its_control
 
 def test_a_dither_that_the_controller_cannot_hold_is_refused(heated):
     family, _ = heated
-    law = baseline.controller(hot_end(), (np.zeros(1), np.full(1, 100.0)), horizon=600).design(
-        None, None, 0.0
-    )
+    law = pi_of(hot_end(), 600)
     added = experiment.dither(wanted(family, 200.0, 199.9, 200.1), law, np.random.default_rng(1))
     assert not len(added.u) and "its limits are 199.9 and 200.1" in added.reason
 

@@ -48,10 +48,10 @@ def heater_guard(strength: Strength, *, high: float = 100.0, rate: float = np.in
     return governor(family, ONE._replace(rate=np.full(1, rate)), outputs, strength)
 
 
-def law(name: str) -> tracking.ControllerDesign:
+def law(name: str) -> tracking.Law:
     if name == "pi":
-        return baseline.controller(baam(), (LIMITS.low, LIMITS.high), horizon=600)
-    return tracking.model_based(baam(), 0.99, tau=1.0)
+        return baseline.pi_law(baseline.pairing(baam(), LIMITS.low, LIMITS.high, horizon=600), inputs=7)
+    return tracking.model_based(baam(), np.ones(5), np.ones(7), 0.1, gamma=0.99, tau=1.0)
 
 
 def played(ready: Deployed, asked: panel.Cases, model: Plant) -> panel.Rollout:
@@ -254,10 +254,8 @@ def bars(
     plants = panel.drawn([baam()], 12, SPREAD, cells=True, rng=np.random.default_rng(6))
     questions = panel.Questions(np.outer(starts, np.ones(5)), REFERENCE[None], None, None, None)
     asked = undisturbed(plants, questions, np.full(5, NOISE), steps, hold=30, cells=True)
-    contestant = law(name)
-    design = contestant.design(np.ones(5), np.ones(7), 0.1)
-    ready = deployed(design, LIMITS, integral_limit=1.0, governor=guard)
-    return played(ready, asked, contestant.model), asked
+    ready = deployed(law(name), LIMITS, integral_limit=1.0, governor=guard)
+    return played(ready, asked, baam()), asked
 
 
 @pytest.mark.parametrize("name", ["lqg", "pi"])
@@ -274,7 +272,7 @@ def test_the_same_law_without_its_governor_overshoots_by_tens_of_degrees():
     plants = panel.drawn([baam()], 4, SPREAD, cells=True, rng=np.random.default_rng(6))
     questions = panel.Questions(np.full((1, 5), 20.0), REFERENCE[None], None, None, None)
     asked = undisturbed(plants, questions, np.full(5, NOISE), 40, hold=30, cells=True)
-    design = law("lqg").design(np.ones(5), np.ones(7), 0.1)
+    design = law("lqg")
     out = played(deployed(design, LIMITS, integral_limit=1.0), asked, baam())
     assert (out.y - REFERENCE).max() > 20.0
 
@@ -312,7 +310,7 @@ def test_dead_time_does_not_make_it_hunt():
     family, strength = panel.corners([slow], spread)
     outputs = OutputLimits(np.full(1, -np.inf), np.full(1, 250.0), np.full(1, 0.15), 0.5)
     guard = governor(family, limits, outputs, strength)
-    design = tracking.model_based(slow, 0.999, tau=0.1).design(np.ones(1), np.full(1, 0.01), 0.05)
+    design = tracking.model_based(slow, np.ones(1), np.full(1, 0.01), 0.05, gamma=0.999, tau=0.1)
     results = []
     for one in (None, guard):
         out = played(deployed(design, limits, integral_limit=1.0, governor=one), asked, slow)

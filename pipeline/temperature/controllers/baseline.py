@@ -15,7 +15,7 @@ import numpy as np
 import scipy.optimize
 
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
-from pipeline.temperature.tracking import ControllerDesign, Law
+from pipeline.temperature.tracking import Law
 
 RISEN = 0.8  # of the largest excursion: up to there a response is fitted; later a slow tail would be tau
 LEVEL = 0.9  # of the band over a family that may not hold zero where a sign is certain
@@ -260,19 +260,3 @@ def pi_law(pairs: Pairing, *, inputs: int) -> Law:
         start=np.zeros(0),
         integral=1 / pairs.reset,
     )
-
-
-def controller(
-    plant: Plant,
-    limits: tuple[np.ndarray, np.ndarray],
-    *,
-    horizon: int,
-    family: Sequence[Plant] = (),
-    noise_degC: np.ndarray | None = None,
-    tuning: Tuning = SIMC,
-) -> ControllerDesign:
-    """PI a zone, tuned by SIMC; the weights mean nothing to it. `limits` low and high (m,), the rest as in
-    `pairing`."""
-    pairs = pairing(plant, *limits, horizon=horizon, family=family, noise_degC=noise_degC, tuning=tuning)
-    law = pi_law(pairs, inputs=plant.m)
-    return ControllerDesign("baseline", lambda q, r, integral: law, strictly_proper(plant))

@@ -14,8 +14,7 @@ import scipy.linalg
 import scipy.linalg.blas
 import scipy.linalg.lapack
 
-from pipeline.temperature.plant import Plant
-from pipeline.temperature.tracking import ControllerDesign, Law
+from pipeline.temperature.tracking import Law
 
 ROOT2 = np.sqrt(2.0)
 
@@ -446,14 +445,7 @@ def window_law(K: np.ndarray, K_r: np.ndarray, k: np.ndarray, N: int, *, integra
     )
 
 
-def controller(learned: Regression, gamma: float, model: Plant) -> ControllerDesign:
-    """Algorithm 2; its feasible targets are computed on `model`."""
-
-    def design(q: np.ndarray, r: np.ndarray, integral: float) -> Law:
-        solution = value_iteration(learned, np.diag(q), np.diag(r), gamma)
-        return window_law(solution.K, solution.K_r, solution.k, learned.N, integral=integral)
-
-    return ControllerDesign("kernel", design, model)
-
-
-# ---- the exact kernel, for truth
+def law(learned: Regression, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral: float = 0.0) -> Law:
+    """Algorithm 2 on the window of past inputs and outputs."""
+    solution = value_iteration(learned, Q, R, gamma)
+    return window_law(solution.K, solution.K_r, solution.k, learned.N, integral=integral)

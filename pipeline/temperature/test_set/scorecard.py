@@ -445,7 +445,6 @@ def kernel_candidates(
     Without noise the shortest window that holds the plant's state is exact. With noise longer windows are
     biased; the predicted state is not.
     """
-    model = window_route.predictor(long)
     best = optimum(scenarios, yardstick)
     tried = [
         (f"window of {N}", lambda N=N: kernel.tuples(u, y, N, offset=offset)) for N in range(1, largest + 1)
@@ -455,7 +454,7 @@ def kernel_candidates(
     for state, features in tried:
         try:
             learned = kernel.regress(features())
-            law = kernel.controller(learned, yardstick.gamma, model).design(yardstick.q, yardstick.r, 0.0)
+            law = kernel.law(learned, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
         except ValueError as refusal:
             candidates.append(KernelCandidate(state, None, float("inf"), str(refusal)))
             continue
