@@ -61,16 +61,20 @@ def main() -> None:
 
         from pipeline.temperature.controllers import window
         from pipeline.temperature.identification import model_choice
+        from pipeline.temperature.plant import hold_output
         from pipeline.temperature.test_set import scorecard
-        from pipeline.temperature.test_set.scorecard import CommonCost
+        from pipeline.temperature.test_set.scorecard import CommonCost, Scenarios
 
         settings = params.load(LearnKernel, "learn_kernel")
         machine = recorded(params.load(Plant, "plant"), RECORD)
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
         simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
         inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
-        q, r = np.full(len(outputs), tracking.yardstick_q), np.full(len(inputs), tracking.yardstick_r)
-        yardstick = CommonCost(q, r, tracking.gamma)
+        yardstick = CommonCost(
+            np.full(len(outputs), tracking.yardstick_q),
+            np.full(len(inputs), tracking.yardstick_r),
+            tracking.gamma,
+        )
         u, y = read_record(machine)
         with artifacts.about(RECORD):
             model_choice.check_inputs(u, offset=settings.offset, names=inputs)
@@ -83,16 +87,10 @@ def main() -> None:
         long = window.learn(
             u, y, longest=settings.longest_window, offset=settings.offset, gain_spread=settings.gain_spread
         )
-        scenarios = scorecard.panel(
-            [window.predictor(long)],
-            starts=[start_degC],
-            references=[[o.reference for o in machine.outputs]],
-            noise=[0.0],
-            seeds=[0],
-            steps=panel.steps,
-            hold=0,
-            cells=False,
-        )
+        model = window.predictor(long)
+        x0, u0 = hold_output(model, np.full(model.p, start_degC))
+        r = np.array([[o.reference for o in machine.outputs]], float)
+        scenarios = Scenarios([model], np.zeros(1, int), x0[None], u0[None], r, panel.steps, hold=0)
         half_gap, needed = scorecard.sufficiency(
             u,
             y,

@@ -8,9 +8,9 @@ import numpy as np
 from pipeline.papers.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, PublishedFigures
 from pipeline.temperature.controllers import window as window_route
 from pipeline.temperature.controllers.kernel import Kernel, regress, tuples, value_iteration, window_law
-from pipeline.temperature.plant import Plant, baam, observability_matrix
+from pipeline.temperature.plant import Plant, baam, hold_output, hold_state, observability_matrix
 from pipeline.temperature.probing import Probe
-from pipeline.temperature.test_set.scorecard import CommonCost, Scenarios, cost, optimum, panel, simulate
+from pipeline.temperature.test_set.scorecard import CommonCost, Scenarios, cost, optimum, simulate
 from pipeline.temperature.test_set.tuning import SearchResult
 from pipeline.temperature.tracking import Gains, Law, gains, observer_gain, observer_law
 
@@ -122,6 +122,41 @@ def fitness(
     return float(gamma ** np.arange(steps + 1) @ terms)
 
 
+def panel(
+    plants: Sequence[Plant],
+    *,
+    starts: Sequence[float],
+    references: Sequence[Sequence[float]],
+    noise: Sequence[float],
+    seeds: Sequence[int],
+    steps: int,
+    hold: int,
+    cells: bool,
+) -> Scenarios:
+    """Every plant x start x reference x noise level, once without noise and once a seed with it.
+
+    A start is a temperature in °C at which the plant is held by its steady input: of every cell where the
+    states are `cells`, of every sensor otherwise. Each scenario draws its noise from its own seed, so that
+    every controller sees the same.
+    """
+    rows = []
+    for index, plant in enumerate(plants):
+        for start in starts:
+            x0, u0 = (np.full(plant.n, start), None) if cells else hold_output(plant, np.full(plant.p, start))
+            u0 = hold_state(plant, x0) if u0 is None else u0
+            for reference in references:
+                for level in noise:
+                    rows += [
+                        (index, x0, u0, reference, level, seed)
+                        for seed in (seeds if level > 0 else seeds[:1])
+                    ]
+    index, x0, u0, r, level, seed = (np.array(column) for column in zip(*rows, strict=True))
+    shape = hold + steps, len(references[0])
+    unit = {int(one): np.random.default_rng(one).standard_normal(shape) for one in np.unique(seed)}
+    drawn = np.stack([size * unit[int(one)] for size, one in zip(level, seed, strict=True)], axis=1)
+    return Scenarios(list(plants), index, x0, u0, np.asarray(r, float), steps, hold, drawn)
+
+
 def study_panel(
     references: np.ndarray, *, noise: float = 0.0, seeds: tuple[int, ...] = (0,), hold: int = 0
 ) -> Scenarios:
@@ -226,7 +261,7 @@ def under_noise(
     result = {}
     for name, law in zip(ROUTES, laws, strict=True):
         run = simulate(scenarios, law)
-        late = (run.y - scenarios.r)[500:]
+        late = (run[0] - scenarios.r)[500:]
         result[name] = (
             float((cost(scenarios, run, YARDSTICK) / optimum(scenarios, YARDSTICK) - 1)[0]),
             float(np.sqrt((late**2).mean())),

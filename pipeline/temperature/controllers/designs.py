@@ -35,7 +35,7 @@ def pi(problem: DesignProblem, values: Mapping[str, float]) -> Design:
         horizon=problem.horizon,
         family=problem.family,
         noise_degC=problem.noise,
-        tuning=baseline.Tuning(**values),
+        **values,
     )
     return Design(baseline.pi_law(pairs, inputs=problem.plant.m), problem.plant)
 

@@ -73,9 +73,6 @@ def _gaps(design: Design, setting: panel.CaseConditions) -> np.ndarray | None:
         cases.x0[rows],
         cases.u0[rows],
         np.repeat(cases.references[cases.asked[rows[0], 0]].H.T, len(rows), axis=0),
-        np.zeros(len(rows)),
-        np.zeros(len(rows), int),
-        np.zeros(len(rows)),
         cases.steps,
         cases.hold,
     )

@@ -16,13 +16,15 @@ import scipy.sparse
 from pipeline.statistics import Paired, paired
 from pipeline.temperature.controllers import kernel
 from pipeline.temperature.controllers import window as window_route
-from pipeline.temperature.plant import Plant, hold_output, hold_state
+from pipeline.temperature.plant import Plant
 from pipeline.temperature.tracking import Gains, Law, gains
+
+Run = tuple[np.ndarray, np.ndarray]  # true outputs and inputs (steps, scenarios, p or m)
 
 
 class Scenarios(NamedTuple):
     """Scenarios, one a row: plant[i] of `plants` (all of one order), held at x0 by u0, reference r, sensor
-    noise of `noise` °C drawn from `seed`.
+    noise (hold + steps, s, p) in °C.
 
     The controller watches the hold for `hold` steps before it takes over: its memory then holds what a
     machine would have put there. It runs for `steps`.
@@ -33,11 +35,9 @@ class Scenarios(NamedTuple):
     x0: np.ndarray
     u0: np.ndarray
     r: np.ndarray
-    noise: np.ndarray
-    seed: np.ndarray
-    start: np.ndarray
     steps: int
     hold: int
+    noise: np.ndarray | float = 0.0
 
 
 class CommonCost(NamedTuple):
@@ -48,68 +48,7 @@ class CommonCost(NamedTuple):
     gamma: float
 
 
-class PanelRun(NamedTuple):
-    """True outputs y and inputs u (steps, scenarios, p or m)."""
-
-    y: np.ndarray
-    u: np.ndarray
-
-
-def panel(
-    plants: Sequence[Plant],
-    *,
-    starts: Sequence[float],
-    references: Sequence[Sequence[float]],
-    noise: Sequence[float],
-    seeds: Sequence[int],
-    steps: int,
-    hold: int,
-    cells: bool,
-) -> Scenarios:
-    """Every plant x start x reference x noise level, once without noise and once a seed with it.
-
-    A start is a temperature in °C at which the plant is held by its steady input: of every cell where the
-    states are `cells`, of every sensor otherwise.
-    """
-    rows = []
-    for index, plant in enumerate(plants):
-        for start in starts:
-            x0, u0 = (np.full(plant.n, start), None) if cells else hold_output(plant, np.full(plant.p, start))
-            u0 = hold_state(plant, x0) if u0 is None else u0
-            for reference in references:
-                for level in noise:
-                    rows += [
-                        (index, x0, u0, reference, level, seed, start)
-                        for seed in (seeds if level > 0 else seeds[:1])
-                    ]
-    index, x0, u0, r, level, seed, start = (np.array(column) for column in zip(*rows, strict=True))
-    return Scenarios(
-        list(plants),
-        index,
-        x0,
-        u0,
-        np.asarray(r, float),
-        level.astype(float),
-        seed,
-        start.astype(float),
-        steps,
-        hold,
-    )
-
-
-def disturbances(panel: Scenarios) -> np.ndarray:
-    """Sensor noise (hold + steps, scenarios, p): each scenario draws from its
-    own seed, so that every controller sees the same."""
-    unit = {
-        int(seed): np.random.default_rng(seed).standard_normal((panel.hold + panel.steps, panel.r.shape[1]))
-        for seed in np.unique(panel.seed)
-    }
-    return np.stack(
-        [level * unit[int(seed)] for level, seed in zip(panel.noise, panel.seed, strict=True)], axis=1
-    )
-
-
-def simulate(panel: Scenarios, law: Law) -> PanelRun:
+def simulate(panel: Scenarios, law: Law) -> Run:
     """Every scenario at once under one law with its own feed-forward; nothing limits the inputs, and xi stays
     zero."""
     A, B, C, b, d = (
@@ -117,7 +56,7 @@ def simulate(panel: Scenarios, law: Law) -> PanelRun:
     )
     steps, (scenarios, p) = panel.steps, panel.r.shape
     y, u = np.empty((steps, scenarios, p)), np.empty((steps, scenarios, law.K.shape[0]))
-    x, noise = panel.x0.copy(), disturbances(panel)
+    x, noise = panel.x0.copy(), np.broadcast_to(panel.noise, (panel.hold + steps, scenarios, p))
     held = np.einsum("sij,sj->si", C, x) + d
     z = panel.u0 @ law.start_u.T + (held + noise[0]) @ law.start_y.T + law.start
     # the memory of a window is a shift: as a sparse matrix it costs a copy, not a product
@@ -134,13 +73,13 @@ def simulate(panel: Scenarios, law: Law) -> PanelRun:
         if not np.abs(x).max() < 1e9:
             x = np.clip(np.nan_to_num(x), -1e9, 1e9)
             z = np.clip(np.nan_to_num(z), -1e9, 1e9)
-    return PanelRun(y, u)
+    return y, u
 
 
-def cost(panel: Scenarios, run: PanelRun, yardstick: CommonCost) -> np.ndarray:
+def cost(panel: Scenarios, run: Run, yardstick: CommonCost) -> np.ndarray:
     """(3) of every scenario (s,): discounted, on true outputs and applied inputs."""
-    error = run.y - panel.r
-    stage = error**2 @ yardstick.q + run.u**2 @ yardstick.r
+    y, u = run
+    stage = (y - panel.r) ** 2 @ yardstick.q + u**2 @ yardstick.r
     return yardstick.gamma ** np.arange(len(stage)) @ stage
 
 
@@ -152,7 +91,7 @@ def optimum(panel: Scenarios, yardstick: CommonCost) -> np.ndarray:
     return cost(panel, _state_feedback(panel, best), yardstick)
 
 
-def _state_feedback(panel: Scenarios, best: Sequence[Gains]) -> PanelRun:
+def _state_feedback(panel: Scenarios, best: Sequence[Gains]) -> Run:
     plants = [panel.plants[i] for i in panel.plant]
     A, B, C, b, d = (
         np.stack([getattr(plant, name) for plant in plants]) for name in ("A", "B", "C", "b", "d")
@@ -164,7 +103,7 @@ def _state_feedback(panel: Scenarios, best: Sequence[Gains]) -> PanelRun:
         y[t] = np.einsum("sij,sj->si", C, x) + d
         u[t] = -np.einsum("sij,sj->si", K_x, x) - feed
         x = np.einsum("sij,sj->si", A, x) + np.einsum("sij,sj->si", B, u[t]) + b
-    return PanelRun(y, u)
+    return y, u
 
 
 # ---- margins
