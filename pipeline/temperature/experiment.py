@@ -28,15 +28,16 @@ import scipy.optimize
 
 from pipeline.temperature.identification.first_order import response
 from pipeline.temperature.identification.order import LARGEST_RADIUS, stabilised
-from pipeline.temperature.identification.refinement import Predictor, estimate_state, respond, simulation_form
-from pipeline.temperature.identification.subspace import Segments, gapless
-from pipeline.temperature.identification.validation import (
-    horizon,
+from pipeline.temperature.identification.refinement import (
+    Predictor,
+    estimate_state,
     one_step_errors,
+    respond,
     simulated,
-    step_response,
-    two_points,
+    simulation_form,
 )
+from pipeline.temperature.identification.subspace import Segments, gapless
+from pipeline.temperature.identification.validation import horizon, step_response, two_points
 from pipeline.temperature.plant import Plant, padded, strictly_proper
 from pipeline.temperature.settings import GenerateProbing
 from pipeline.temperature.settings import Plant as Machine

@@ -21,10 +21,10 @@ from pipeline.temperature.identification.refinement import (
     kalman_gain,
     linear_recurrence,
     refine,
+    simulated,
     simulation_form,
 )
 from pipeline.temperature.identification.subspace import lagged
-from pipeline.temperature.identification.validation import simulated
 from pipeline.temperature.plant import baam, markov_parameters, plant, simulate
 from tests.temperature.moesp import moesp, moesp_singular_values, varx
 

@@ -19,9 +19,9 @@ from pipeline.temperature.identification.refinement import (
     estimate_state,
     filled,
     linear_recurrence,
+    one_step_errors,
     prediction_form,
-    respond,
-    simulation_form,
+    simulated,
 )
 from pipeline.temperature.identification.subspace import Segments, lagged, realise, subspace
 from pipeline.temperature.plant import Plant, markov_parameters
@@ -68,52 +68,22 @@ class RecordExcitation(NamedTuple):
     levels: np.ndarray
 
 
-def simulated(plant: Plant, u: np.ndarray, y: np.ndarray, *, means_removed: bool = False) -> np.ndarray:
-    """ŷ (T, p) of the plant under u (T, m) alone, from the initial state that fits all of y (T, p) best (the
-    rule of SLICOT's IB01CD and of MATLAB's compare).
+def predicted_ahead(plant: Plant, u: np.ndarray, y: np.ndarray, steps: int) -> np.ndarray:
+    """ŷ(t | outputs up to t - steps) (T, p), inputs known throughout.
 
-    With `means_removed` the initial state is fitted to the error
-    without its mean, for a score that removes it.
+    The state, disturbances in it included, comes from the Kalman predictor on past outputs only. It starts at
+    the one that fits the first max(3 n, 30) one-step predictions; callers leave these rows out of a score.
+    NaN in y passes as a missing measurement.
     """
-    model, v = simulation_form(plant, []), drives("simulation", u, y)
-    return respond(model, v, estimate_state(model, v, y, free_mean=means_removed))[1]
-
-
-def predicted_ahead(
-    plant: Plant, u: np.ndarray, y: np.ndarray, steps: int, *, x0: np.ndarray | None = None
-) -> np.ndarray:
-    """ŷ(t | outputs up to t - steps) (T, p), inputs known throughout;
-    the first `steps` - 1 rows start from x0.
-
-    The state, disturbances in it included, comes from the Kalman predictor on past outputs only. x0 defaults
-    to the state that fits the first max(3 n, 30) one-step predictions; callers leave these rows out of a
-    score. NaN in y passes as a missing measurement.
-    """
-    model = prediction_form(plant, [])
-    if x0 is None:
-        first = min(max(3 * plant.n, 30), len(u))
-        start = drives(
-            "prediction",
-            u[:first],
-            np.where(np.isfinite(y[:first]), y[:first], np.nanmean(y[:first], axis=0)),
-        )
-        x0 = estimate_state(model, start, y[:first])
+    model, first = prediction_form(plant, []), max(3 * plant.n, 30)
+    begun = np.where(np.isfinite(y[:first]), y[:first], np.nanmean(y[:first], axis=0))
+    x0 = estimate_state(model, drives("prediction", u[:first], begun), y[:first])
     y_filled = filled(plant, u, y, x0)
     # x(t | y up to t-1)
     x = linear_recurrence(model.F, drives("prediction", u, y_filled) @ model.G.T, x0)[:-1]
     for ahead in range(1, min(steps, len(u))):  # row t then holds x(t | y up to t-1-ahead)
         x[ahead:] = x[ahead - 1 : -1] @ plant.A.T + u[ahead - 1 : -1] @ plant.B.T + plant.b
     return x @ plant.C.T + u @ plant.D.T + plant.d
-
-
-def one_step_errors(plant: Plant, u: Segments, y: Segments) -> list[np.ndarray]:
-    """e(t) = y(t) - ŷ(t | t-1) (T, p) of each segment, the initial
-    state fitted to the segment; NaN where y is masked."""
-    model, out = prediction_form(plant, []), []
-    for a, b in zip(u, y, strict=True):
-        v = drives("prediction", a, filled(plant, a, b, np.zeros(plant.n)))
-        out.append(b - respond(model, v, estimate_state(model, v, b))[1])
-    return out
 
 
 def _correlation(a: np.ndarray, b: np.ndarray, lag: int) -> float:
