@@ -210,13 +210,13 @@ def test_best_pair_and_deciding_plant_follow_from_the_costs_of_the_rows(stored):
     rows, summary = stored
     seed, able = section(EvaluateTemperature, "evaluate_temperature").seed, summary["best_reason"]["passes"]
     costs, plant = without(rows, None)
-    assert summary["best"] == scorecard.chosen(costs, plant, able, seed=seed).best
+    assert summary["best"] == scorecard.chosen(costs, plant, able, seed=seed)[0]
     pair = scorecard.pair(*PAIR, costs, plant, seed=seed)
     assert {key: summary["pair"][key] for key in pair} == pair
     decides = scorecard.deciding_plant(costs[PAIR[0]], costs[PAIR[1]], plant)
     assert summary["deciding"]["plant"] == decides
     others, left = without(rows, decides)
-    assert summary["deciding"]["best_without"] == scorecard.chosen(others, left, able, seed=seed).best
+    assert summary["deciding"]["best_without"] == scorecard.chosen(others, left, able, seed=seed)[0]
     assert summary["deciding"]["pair_without"] == scorecard.pair(*PAIR, others, left, seed=seed)["winner"]
 
 

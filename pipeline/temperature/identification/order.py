@@ -86,10 +86,6 @@ class OrderCandidate(NamedTuple):
     about_mean: tuple[float, ...] = ()
 
     @property
-    def delays(self) -> tuple[int, ...]:
-        return self.structure.delays
-
-    @property
     def error(self) -> float:
         """Geometric mean over the blocks: a block that a disturbance spoils for
         every candidate then weighs no more than the others."""

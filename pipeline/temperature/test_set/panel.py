@@ -594,8 +594,9 @@ class Rehearsal(NamedTuple):
 class CaseConditions(NamedTuple):
     """What all controllers share, tuned and judged: the rehearsal, limits of inputs and outputs (low, high
     (p,) in °C), the governor, the integrator's limit in °C, the settled window in steps, what the cost counts
-    as one, the discount, the sample time, and the share of the declared delay margins that is asked here
-    (`faster`)."""
+    as one, the discount, the sample time, and the share of the declared delay margins that is asked here:
+    below 1 (`faster`) of a machine that must settle sooner than the panel's, as a hair dryer, whose whole
+    answer is over within 1 s."""
 
     rehearsal: Rehearsal
     limits: ActuatorLimits
@@ -607,12 +608,6 @@ class CaseConditions(NamedTuple):
     gamma: float
     sample_time_s: float
     faster: float
-
-
-def faster(settings: Panel, rehearsal: Rehearsal) -> float:
-    """Share of a declared delay margin that is asked of a machine: below 1 for one that must settle sooner
-    than the panel's. The whole answer of a hair dryer is over within 1 s."""
-    return min((rehearsal.settling_s or settings.settling_s) / settings.settling_s, 1.0)
 
 
 def conditions(
@@ -648,7 +643,7 @@ def conditions(
         allowance,
         tracking.gamma,
         machine.sample_time_s,
-        faster(settings, rehearsal),
+        min(late, 1.0),
     )
 
 

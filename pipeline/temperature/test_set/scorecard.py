@@ -227,32 +227,25 @@ def _delay_margin(omega: np.ndarray, loci: np.ndarray) -> float:
 LEVEL = 0.05
 
 
-class ControllerChoice(NamedTuple):
-    """`best` is None where nobody passes; `nearest` is the cheapest of the others that pass, None where
-    there is none, and `against` the test of the best one against it."""
-
-    best: str | None
-    nearest: str | None
-    against: Paired | None
-
-
 def chosen(
     costs: Mapping[str, np.ndarray], plant: np.ndarray, passes: Mapping[str, bool], *, seed: int
-) -> ControllerChoice:
+) -> tuple[str | None, str | None, Paired | None]:
     """The first of those that pass, in the order of `costs` (simplest first), that no more complex one beats:
-    one replaces it where its costs (s,) are lower beyond chance, paired by plant, one-sided at LEVEL."""
+    one replaces it where its costs (s,) are lower beyond chance, paired by plant, one-sided at LEVEL. Then
+    the cheapest of the others that pass, and the test of the first one against it; None where nobody passes,
+    or no other."""
     able = [name for name in costs if passes[name]]
     if not able:
-        return ControllerChoice(None, None, None)
+        return None, None, None
     best = able[0]
     for name in able[1:]:
         if between(costs[best], costs[name], plant, seed=seed).p < LEVEL:
             best = name
     others = [name for name in able if name != best]
     if not others:
-        return ControllerChoice(best, None, None)
+        return best, None, None
     nearest = min(others, key=lambda name: float(costs[name].mean()))
-    return ControllerChoice(best, nearest, between(costs[nearest], costs[best], plant, seed=seed))
+    return best, nearest, between(costs[nearest], costs[best], plant, seed=seed)
 
 
 def between(champion: np.ndarray, challenger: np.ndarray, plant: np.ndarray, *, seed: int) -> Paired:
