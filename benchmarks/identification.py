@@ -245,7 +245,7 @@ def subspace_plants(u: np.ndarray, y: np.ndarray) -> Iterator[tuple[str, Plant]]
                 data = lagged([u], [y], past, feedthrough=feedthrough)
             except ValueError:
                 continue
-            basis = subspace(data, past).basis
+            basis = subspace(data, past)[0]
             for order in range(1, min(12, len(basis)) + 1):
                 yield "n4sid", stabilised(realise(data, basis[:order], 1.0), LARGEST_RADIUS)
     for block_rows in (10, 15):

@@ -668,15 +668,6 @@ def expected_gap(model: Plant, taught: Lesson, gamma: float) -> float:
     return float(sum(designed(other) / best - 1 for other in others))
 
 
-def expected_gap_percent(model: Plant, lesson: Lesson, gamma: float) -> float | None:
-    """`expected_gap` in percent; None if no controller of the perturbed model holds the machine."""
-    try:
-        gap = expected_gap(model, lesson, gamma)
-    except (ValueError, np.linalg.LinAlgError):
-        return None
-    return 100 * gap if np.isfinite(gap) else None
-
-
 # ---- the experiment
 
 

@@ -98,12 +98,8 @@ def windows(
     within its segment and free of NaN (masked samples)."""
     rows = []
     for us, ys in zip(u, y, strict=True):
-        past = (
-            [np.hstack([signal[N - lag : len(us) - lag] for lag in range(1, N + 1)]) for signal in (us, ys)]
-            if len(us) > N
-            else None
-        )
-        if past is not None:
+        if len(us) > N:
+            past = [signal[N - lag : len(us) - lag] for signal in (us, ys) for lag in range(1, N + 1)]
             rows.append(np.hstack([*past, us[N:], ys[N:]]))
     if not rows:
         raise ValueError(

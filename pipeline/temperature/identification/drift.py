@@ -68,7 +68,7 @@ def chosen_rate(
             data = lagged(train_u, train_y, structure.past, feedthrough=direct, offset=structure.offset)
         except ValueError:  # what is left of the record is too short
             return 0.0
-        start = realise(data, subspace(data, structure.past).basis[:order], 1.0, structure.feedthrough)
+        start = realise(data, subspace(data, structure.past)[0][:order], 1.0, structure.feedthrough)
         plant = fit(kind, start, train_u, train_y, settings, gain=False)
         if np.abs(np.linalg.eigvals(plant.A)).max() > 1 - INTEGRATES:
             return 0.0

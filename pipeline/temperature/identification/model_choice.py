@@ -62,7 +62,6 @@ from pipeline.temperature.identification.refinement import (
 from pipeline.temperature.identification.subspace import (
     Lagged,
     Segments,
-    Subspace,
     complete_runs,
     gapless,
     lagged,
@@ -321,7 +320,7 @@ def _exact_rank(u: Segments, y: Segments, structure: ModelStructure) -> int:
     data = lagged(
         u, y, structure.past, feedthrough=any(structure.feedthrough), offset=structure.offset, exact=True
     )
-    values = subspace(data, structure.past).singular_values
+    _, values = subspace(data, structure.past)
     return max(int((values > EXACT_RANK * values[0]).sum()), 1)
 
 
@@ -347,19 +346,13 @@ def _best_candidate(
     structures = _with_slow_window(u, y, structures, settings)
     for structure in structures:
         data = lagged(u, y, structure.past, feedthrough=any(structure.feedthrough), offset=structure.offset)
-        sub = subspace(data, structure.past)
-        singular_values[structure.past, structure.feedthrough] = sub.singular_values
-        orders, delays = _candidates(data, sub, structure, settings)
+        basis, values = subspace(data, structure.past)
+        singular_values[structure.past, structure.feedthrough] = values
+        orders, delays = _candidates(data, basis, values, structure, settings)
         for d in sorted(delays):
             delayed = structure._replace(delays=d)
             table += cross_validate(
-                u,
-                y,
-                orders,
-                delayed,
-                ("subspace",),
-                singular_values=sub.singular_values,
-                validation=validation,
+                u, y, orders, delayed, ("subspace",), singular_values=values, validation=validation
             )
     if not table and validation.recordings:
         # what is left without one recording is too short: blocks of every recording instead
@@ -399,11 +392,9 @@ def _with_slow_window(
     if settings.past:
         return structures
     data = lagged(u, y, first.past, feedthrough=any(first.feedthrough), offset=first.offset)
-    sub = subspace(data, first.past)
-    determined = max(
-        1, min(int((sub.singular_values > noise_edge(data, first.past)).sum()), settings.max_order)
-    )
-    model = realise(data, sub.basis[:determined], 1.0, first.feedthrough)
+    basis, values = subspace(data, first.past)
+    determined = max(1, min(int((values > noise_edge(data, first.past)).sum()), settings.max_order))
+    model = realise(data, basis[:determined], 1.0, first.feedthrough)
     past = slow_window(model, longest_window(u, y))
     if past < 1.5 * first.past:
         return structures
@@ -444,16 +435,16 @@ def _better_fit(start: OrderCandidate, refined: list[OrderCandidate]) -> OrderCa
 
 
 def _candidates(
-    data: Lagged, sub: Subspace, structure: ModelStructure, settings: Settings
+    data: Lagged, basis: np.ndarray, values: np.ndarray, structure: ModelStructure, settings: Settings
 ) -> tuple[Sequence[int], set[tuple[int, ...]]]:
     """Orders and dead times worth trying: those asked for, or those that stand out of the noise."""
     delays = {structure.delays}
     if settings.order is not None:
         return [settings.order], delays
-    above_noise = int((sub.singular_values > noise_edge(data, structure.past)).sum())
-    largest = max(1, min(above_noise, settings.max_order, len(sub.singular_values)))
+    above_noise = int((values > noise_edge(data, structure.past)).sum())
+    largest = max(1, min(above_noise, settings.max_order, len(values)))
     furthest = max(data.past // 2, 1)
-    model = realise(data, sub.basis[:largest], 1.0, structure.feedthrough)
+    model = realise(data, basis[:largest], 1.0, structure.feedthrough)
     quiet = np.minimum(tested_dead_times(data, furthest)[0], dead_time(model, furthest, 0.25))
     return range(1, largest + 1), delays | {dead_time(model, furthest), tuple(quiet.tolist())}
 
@@ -464,13 +455,13 @@ def _fit_all(u: Segments, y: Segments, choice: ModelChoice, sample_time_s: float
     past, settings = structure.past, FitSettings(structure.feedthrough, structure.offset, max_iterations=30)
     us, ys = shifted(u, y, structure.delays)
     data = lagged(us, ys, past, feedthrough=any(structure.feedthrough), offset=structure.offset, exact=exact)
-    sub = subspace(data, past)
-    if order > len(sub.singular_values):
+    basis, singular_values = subspace(data, past)
+    if order > len(singular_values):
         raise ValueError(
             f"order {order} needs a longer window: {past} past samples give at most "
-            f"{len(sub.singular_values)} states; raise past"
+            f"{len(singular_values)} states; raise past"
         )
-    start = realise(data, sub.basis[:order], sample_time_s, structure.feedthrough)
+    start = realise(data, basis[:order], sample_time_s, structure.feedthrough)
     plant = with_delays(fit(kind, start, us, ys, settings), structure.delays)
     model = simulation_form(plant, [])
     return Identified(
@@ -482,7 +473,7 @@ def _fit_all(u: Segments, y: Segments, choice: ModelChoice, sample_time_s: float
         feedthrough=structure.feedthrough,
         offset=structure.offset,
         fit=kind,
-        singular_values=sub.singular_values,
+        singular_values=singular_values,
         noise_edge=noise_edge(data, past),
         order_table=table,
         x0=[estimate_state(model, drives("simulation", a, b), b) for a, b in zip(u, y, strict=True)],

@@ -391,7 +391,7 @@ def cross_validate(
             )
         except ValueError:
             return []
-        basis = subspace(data, structure.past).basis
+        basis = subspace(data, structure.past)[0]
         for order in orders:
             start = realise(data, basis[:order], 1.0, structure.feedthrough)
             for kind in kinds:

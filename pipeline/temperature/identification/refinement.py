@@ -448,7 +448,7 @@ def _weighted(
     y_full = y
     if ahead:
         y_full = [
-            b if np.isfinite(b).all() else filled(plant, a, b, _first_state(plant, start, criterion, a, b))
+            b if np.isfinite(b).all() else filled(plant, a, b, _first_state(start, criterion, a, b))
             for a, b in zip(u, y, strict=True)
         ]
     v = [drives(criterion, a, b) for a, b in zip(u, y_full, strict=True)]
@@ -535,7 +535,7 @@ def kalman_gain(
     return plant._replace(K=K)
 
 
-def _first_state(plant, start, criterion, u, y):
+def _first_state(start, criterion, u, y):
     rows = np.isfinite(y).all(1)
     stop = len(rows) if rows.all() else max(int(np.argmin(rows)), 1)
     return estimate_state(start, drives(criterion, u[:stop], np.nan_to_num(y[:stop])), y[:stop])

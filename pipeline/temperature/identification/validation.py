@@ -252,7 +252,7 @@ def _reidentified(u: Segments, y: Segments, identified, order: int) -> Plant:
     us, ys = shifted(u, y, identified.delays)
     direct = identified.feedthrough
     data = lagged(us, ys, identified.past, feedthrough=any(direct), offset=identified.offset)
-    basis = subspace(data, identified.past).basis[:order]
+    basis = subspace(data, identified.past)[0][:order]
     start = stabilised(realise(data, basis, identified.plant.sample_time_s, direct), LARGEST_RADIUS)
     settings = FitSettings(direct, identified.offset, LARGEST_RADIUS, RESAMPLED_STEPS)
     refitted = fit(identified.fit, start, us, ys, settings, gain=False)
@@ -836,17 +836,6 @@ def outcome_figures(
     }
 
 
-class ModelJudgement(NamedTuple):
-    """The chosen model on the last part of the record, and what the first part excites; `still` (p,): its fit
-    with the inputs held."""
-
-    holdout: Holdout
-    residuals: Residuals
-    excitation: RecordExcitation
-    samples: int
-    still: np.ndarray
-
-
 def judge(
     chosen: Identified,
     first: tuple[Segments, Segments],
@@ -854,13 +843,13 @@ def judge(
     *,
     ahead_steps: int,
     rng: np.random.Generator,
-) -> ModelJudgement:
-    """The model that (u, y) of `first` chose, on (u, y) of `last`."""
+) -> tuple[Holdout, Residuals, RecordExcitation, np.ndarray]:
+    """The model that (u, y) of `first` chose, on (u, y) of `last`; what the first part excites; and the fit
+    (p,) of the model with the inputs held."""
     closed = chosen.feedback is not None and chosen.feedback.closed
-    return ModelJudgement(
+    return (
         holdout(chosen.plant, *last, ahead_steps, block=2 * chosen.past, rng=rng, drift=chosen.drift),
         residual_tests(chosen.plant, *last, lags=residual_lags(last[0]), closed=closed),
         excitation(first[0], chosen.past),
-        sum(map(len, last[0])),
         fit_of_held_inputs(chosen.plant, *last),
     )

@@ -17,7 +17,7 @@ from pipeline.statistics import Paired, paired
 from pipeline.temperature.controllers import kernel
 from pipeline.temperature.controllers import window as window_route
 from pipeline.temperature.plant import Plant
-from pipeline.temperature.tracking import Gains, Law, gains
+from pipeline.temperature.tracking import Law, gains
 
 Run = tuple[np.ndarray, np.ndarray]  # true outputs and inputs (steps, scenarios, p or m)
 
@@ -88,10 +88,6 @@ def optimum(panel: Scenarios, yardstick: CommonCost) -> np.ndarray:
     best = [
         gains(plant, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma) for plant in panel.plants
     ]
-    return cost(panel, _state_feedback(panel, best), yardstick)
-
-
-def _state_feedback(panel: Scenarios, best: Sequence[Gains]) -> Run:
     plants = [panel.plants[i] for i in panel.plant]
     A, B, C, b, d = (
         np.stack([getattr(plant, name) for plant in plants]) for name in ("A", "B", "C", "b", "d")
@@ -103,7 +99,7 @@ def _state_feedback(panel: Scenarios, best: Sequence[Gains]) -> Run:
         y[t] = np.einsum("sij,sj->si", C, x) + d
         u[t] = -np.einsum("sij,sj->si", K_x, x) - feed
         x = np.einsum("sij,sj->si", A, x) + np.einsum("sij,sj->si", B, u[t]) + b
-    return y, u
+    return cost(panel, (y, u), yardstick)
 
 
 # ---- margins
