@@ -227,7 +227,7 @@ def fit_figures(
         "advice": validation.advice(
             residuals,
             excited,
-            held_out.fit[0],
+            held_out.fits["fit_holdout"][0],
             outputs=outputs,
             inputs=inputs,
             still_percent=still,
@@ -256,7 +256,7 @@ def warnings(machine: Machine, fitted: Identified, steps: Steps) -> dict[str, An
             "level": LEVEL_CLOSED / (2 * len(names)),
             "p_value": dict(zip(names, answers, strict=False)),
         },
-        "forbidden_gains": [gain._asdict() for gain in forbidden],
+        "forbidden_gains": forbidden,
     }
 
 

@@ -12,17 +12,21 @@ from pipeline.temperature.settings import PlantSignal
 def record(inputs: Sequence[PlantSignal], outputs: Sequence[PlantSignal]) -> Schema:
     """The table that ingest writes: one row a sample. A masked value stays as
     recorded; the flag beside it says not to use it."""
+    faulty = "is not to be used here: missing, or found faulty"
     columns = [
         Column("recording", TEXT, NONE, "file below datasets/raw that the sample is from"),
         Column("segment", INDEX, NONE, "stretch of that recording without a gap, counted from 0", low=0),
         Column("time_s", FLOAT, "s", "time since the recording began"),
+        *(
+            column
+            for role, signals in (("input", inputs), ("output", outputs))
+            for signal in signals
+            for column in (
+                Column(signal.name, FLOAT, signal.unit, f"{role} {signal.name}", nullable=True),
+                Column(f"{signal.name}_masked", BOOL, NONE, f"{signal.name} {faulty}"),
+            )
+        ),
     ]
-    for role, signal in [*(("input", one) for one in inputs), *(("output", one) for one in outputs)]:
-        faulty = f"{signal.name} is not to be used here: missing, or found faulty"
-        columns += [
-            Column(signal.name, FLOAT, signal.unit, f"{role} {signal.name}", nullable=True),
-            Column(f"{signal.name}_masked", BOOL, NONE, faulty),
-        ]
     return Schema("record", 1, tuple(columns))
 
 

@@ -3,7 +3,7 @@ what they must beat, residual tests, excitation, step responses and poles with b
 and as columns; and a sentence of advice for each test that failed."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.optimize
@@ -398,23 +398,20 @@ ENDS = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
 
 
 class Holdout(NamedTuple):
-    """What held-out segments say of a plant, fits in percent.
+    """What held-out segments say of a plant.
 
-    simulated, ahead: predictions (T, p) of each segment, the second NaN over its start-up; fit, ahead_fit (3,
-    p): value and the ends of its 90 % band; held_fit (p,): the last value seen so many steps before, held,
-    over the rows of ahead_fit. NaN where no segment outlasts the start-up. free_mean_fit (3, p): of the
-    same simulation with the mean of each segment's error taken off, what another ambient alone would cost.
-    Its start is the simulation's: one fitted beside a free mean lets slow modes draw any ramp.
-    drift_fit (3, p): of the simulation with a drift tracked up to so many steps before, NaN without one.
+    simulated, ahead: predictions (T, p) of each segment, the second NaN over its start-up. fits: by the name
+    of the figure, (3, p) in percent, value and the ends of its 90 % band, of the simulation
+    (`fit_holdout`); of the predictions ahead (`..._ahead`), NaN where no segment outlasts the start-up; of
+    the last value seen so many steps before, held, over the same rows (`..._held`); of the simulation with
+    the mean of each segment's error taken off (`..._free_mean`), what another ambient alone would cost: its
+    start is the simulation's, as one fitted beside a free mean lets slow modes draw any ramp; and of the
+    simulation with a drift tracked up to so many steps before (`..._drift`), NaN without one.
     """
 
     simulated: list[np.ndarray]
     ahead: list[np.ndarray]
-    fit: np.ndarray
-    ahead_fit: np.ndarray
-    held_fit: np.ndarray
-    free_mean_fit: np.ndarray
-    drift_fit: np.ndarray
+    fits: dict[str, np.ndarray]
 
 
 class Steps(NamedTuple):
@@ -438,19 +435,6 @@ class Steps(NamedTuple):
     delay: np.ndarray
     significant: np.ndarray
     first_order: StepModels
-
-
-class ForbiddenGain(NamedTuple):
-    """A steady effect that physics forbids: of `input` on `output`, in °C per percent with its band, and why.
-    `certain`: the whole band is forbidden, not the value alone."""
-
-    output: str
-    input: str
-    gain: float
-    low: float
-    high: float
-    certain: bool
-    reason: str
 
 
 def held(y: np.ndarray, steps: int) -> np.ndarray:
@@ -512,10 +496,15 @@ def holdout(
         simulated_with_drift(plant, a, b, drift, steps) if drift else np.full(b.shape, np.nan)
         for a, b in zip(u, y, strict=True)
     ]
-    fits = [
-        fit_with_band(y, part, block=block, rng=rng) for part in (simulations, ahead, last, free, drifting)
-    ]
-    return Holdout(simulations, ahead, fits[0], fits[1], fits[2][0], *fits[3:])
+    parts = {
+        "fit_holdout": simulations,
+        "fit_holdout_ahead": ahead,
+        "fit_holdout_held": last,
+        "fit_holdout_free_mean": free,
+        "fit_holdout_drift": drifting,
+    }
+    fits = {name: fit_with_band(y, part, block=block, rng=rng) for name, part in parts.items()}
+    return Holdout(simulations, ahead, fits)
 
 
 def fit_of_held_inputs(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
@@ -623,19 +612,29 @@ def forbidden_gains(
     inputs: Sequence[str],
     heats: Sequence[bool],
     ranges: Sequence[float],
-) -> list[ForbiddenGain]:
-    """The effects of inputs that `heats` marks which are negative, or which over the input's range (percent)
-    are larger than `LARGEST_RISE_DEGC`."""
+) -> list[dict[str, Any]]:
+    """The steady effects that physics forbids, of inputs that `heats` marks: negative ones, and those that
+    over the input's range (percent) are larger than `LARGEST_RISE_DEGC`. `gain` in °C per percent with its
+    band, and why; `certain`: the whole band is forbidden, not the value alone."""
     flagged = []
     for j, name in enumerate(inputs):
         for o, output in enumerate(outputs if heats[j] else ()):
             gain, low, high = (float(part) for part in steps.gain[:, o, j])
             largest = LARGEST_RISE_DEGC / ranges[j]
-            if gain < 0:
-                flagged.append(ForbiddenGain(output, name, gain, low, high, high < 0, "a heater that cools"))
-            elif gain > largest:
-                reason = f"more than {LARGEST_RISE_DEGC:g} °C over the input's range"
-                flagged.append(ForbiddenGain(output, name, gain, low, high, low > largest, reason))
+            if not (gain < 0 or gain > largest):
+                continue
+            too_much = f"more than {LARGEST_RISE_DEGC:g} °C over the input's range"
+            flagged.append(
+                {
+                    "output": output,
+                    "input": name,
+                    "gain": gain,
+                    "low": low,
+                    "high": high,
+                    "certain": high < 0 if gain < 0 else low > largest,
+                    "reason": "a heater that cools" if gain < 0 else too_much,
+                }
+            )
     return flagged
 
 
@@ -664,14 +663,12 @@ def holdout_rows(
         "segment": np.repeat(np.arange(len(measured), dtype=np.int32), [len(y) for y in measured]),
         "time_s": np.concatenate([sample_time_s * np.arange(len(y)) for y in measured]),
     }
-    for channel, name in enumerate(outputs):
-        for kind, part in (
-            ("measured", measured),
-            ("simulated", predictions.simulated),
-            ("ahead", predictions.ahead),
-        ):
-            columns[f"{name}_{kind}"] = np.concatenate([y[:, channel] for y in part])
-    return columns
+    kinds = {"measured": measured, "simulated": predictions.simulated, "ahead": predictions.ahead}
+    return columns | {
+        f"{name}_{kind}": np.concatenate([y[:, channel] for y in part])
+        for channel, name in enumerate(outputs)
+        for kind, part in kinds.items()
+    }
 
 
 def residual_rows(tests: Residuals, outputs: Sequence[str], inputs: Sequence[str]) -> dict[str, list]:
@@ -797,17 +794,12 @@ def level_rows(levels: np.ndarray, inputs: Sequence[str]) -> dict[str, np.ndarra
 def fit_figures(judged: Holdout, outputs: Sequence[str]) -> dict[str, dict | None]:
     """Fits on the hold-out by output, with their bands and what they must beat; those
     ahead are None where no segment was long enough, that of a drift where there is none."""
-    named = {
-        "fit_holdout": judged.fit,
-        "fit_holdout_free_mean": judged.free_mean_fit,
-        "fit_holdout_drift": judged.drift_fit,
-        "fit_holdout_ahead": judged.ahead_fit,
-    }
-    figures = {key: dict(zip(outputs, part[0].tolist(), strict=True)) for key, part in named.items()}
+    banded = [f"fit_holdout{end}" for end in ("", "_free_mean", "_drift", "_ahead")]
+    figures = {key: dict(zip(outputs, judged.fits[key][0].tolist(), strict=True)) for key in banded}
     figures |= {
-        f"{key}_band": dict(zip(outputs, part[1:].T.tolist(), strict=True)) for key, part in named.items()
+        f"{key}_band": dict(zip(outputs, judged.fits[key][1:].T.tolist(), strict=True)) for key in banded
     }
-    figures["fit_holdout_held"] = dict(zip(outputs, judged.held_fit.tolist(), strict=True))
+    figures["fit_holdout_held"] = dict(zip(outputs, judged.fits["fit_holdout_held"][0].tolist(), strict=True))
     return {key: part if np.isfinite(list(part.values())).all() else None for key, part in figures.items()}
 
 
