@@ -32,16 +32,10 @@ import scipy.signal
 
 from benchmarks import results
 from benchmarks.results import Row
+from pipeline.papers.published import GAMMA, REFERENCE, tuples_with_reference
+from pipeline.papers.study import data_sets
 from pipeline.store import artifacts, params
-from pipeline.temperature.controllers.kernel import (
-    Tuples,
-    quadratic_gram,
-    regress,
-    tuples_with_reference,
-    value_iteration,
-)
-from pipeline.temperature.published import GAMMA, REFERENCE
-from pipeline.temperature.study import data_sets
+from pipeline.temperature.controllers.kernel import Tuples, quadratic_gram, regress, value_iteration
 from tests.temperature import naive
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -20,13 +20,13 @@ import numpy as np
 
 from benchmarks import results
 from benchmarks.results import Row
+from pipeline.papers.published import K_DATA
+from pipeline.papers.study import study_probe, study_signal
 from pipeline.temperature.identification.model_choice import Settings, identify
 from pipeline.temperature.identification.order import LARGEST_RADIUS, stabilised
 from pipeline.temperature.identification.subspace import lagged, realise, subspace
 from pipeline.temperature.plant import Plant, baam, markov_parameters
 from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.probing import study_probe, study_signal
-from pipeline.temperature.published import K_DATA
 from tests.foreign.records import RECORDS
 from tests.temperature.fits import predict_fit, resampled, simulate_fit
 from tests.temperature.moesp import moesp, varx
@@ -245,7 +245,7 @@ def subspace_plants(u: np.ndarray, y: np.ndarray) -> Iterator[tuple[str, Plant]]
                 data = lagged([u], [y], past, feedthrough=feedthrough)
             except ValueError:
                 continue
-            basis = subspace(data, past).basis
+            basis = subspace(data, past)[0]
             for order in range(1, min(12, len(basis)) + 1):
                 yield "n4sid", stabilised(realise(data, basis[:order], 1.0), LARGEST_RADIUS)
     for block_rows in (10, 15):

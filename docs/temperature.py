@@ -8,11 +8,12 @@ The temperature stages do the same with recordings, tuned weights and a panel of
 import matplotlib
 import numpy as np
 
-from pipeline.temperature import plant, probing, study, tracking
+from pipeline.papers import study
+from pipeline.papers.published import K_DATA
+from pipeline.temperature import plant, probing, tracking
 from pipeline.temperature.controllers import controller, kernel, window
 from pipeline.temperature.controllers.baseline import pairing, pi_law
 from pipeline.temperature.identification.model_choice import Settings, identify
-from pipeline.temperature.published import K_DATA
 from pipeline.temperature.test_set import panel
 
 matplotlib.use("Agg")
@@ -26,7 +27,7 @@ low, high = np.zeros(machine.m), np.full(machine.m, 100.0)
 # study's feedback keeps the temperatures in reach; all of it would hide the slow poles from the record.
 signal = probing.multisine(rng, 6000, machine.m, amplitude=10.0)
 noise = 0.1 * rng.standard_normal((6000, machine.p))
-record = probing.study_probe(machine, signal, 0.05 * K_DATA, x0=np.full(machine.n, 50.0), noise=noise)
+record = study.study_probe(machine, signal, 0.05 * K_DATA, x0=np.full(machine.n, 50.0), noise=noise)
 u, y = record.u, record.y
 
 # %% Three models come from one record: a subspace model, a long VARX window, and the kernel of Algorithm 2.

@@ -198,9 +198,9 @@ def redesigns(names: list[str], loaded: EvaluationInputs) -> dict[str, dict[str,
     found = {}
     for name in (name for name in names if BY_NAME[name].learned_from == "plant"):
         values = {one.name: loaded.weights[name][one.name] for one in BY_NAME[name].parameters}
-        one = redesigned(name, loaded.problem, values, loaded.setting)
-        percent = 100.0 * one.excess if one.excess < float("inf") else None
-        found[name] = {"excess_percent": percent, "broken": one.broken, "of": one.of}
+        excess, broken, of = redesigned(name, loaded.problem, values, loaded.setting)
+        percent = 100.0 * excess if excess < float("inf") else None
+        found[name] = {"excess_percent": percent, "broken": broken, "of": of}
     return found
 
 

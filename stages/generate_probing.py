@@ -24,7 +24,7 @@ from pipeline.temperature.settings import (
 if TYPE_CHECKING:
     import numpy as np
 
-    from pipeline.temperature.experiment import Dither, Experiment, ExperimentLimits, Family, Lesson, Wish
+    from pipeline.temperature.experiment import Dither, Experiment, Family, Lesson
     from pipeline.temperature.plant import Plant as Model
 
 EXCITED = 12  # lags over which the experiment's excitation is counted
@@ -83,48 +83,25 @@ def design(
     lacking = [o.name for o in machine.outputs if o.low is None or o.high is None]
     if lacking:
         return refuse(settings, f"declare low and high of {', '.join(lacking)} under plant.outputs")
-    low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
-    y_low, y_high = np.array([(o.low, o.high) for o in machine.outputs], float).T
-    limits = experiment.ExperimentLimits(low, high, settings.rate_percent_per_step, y_low, y_high)
     centre = given_centre(settings, machine)
-    wish = experiment.Wish(
-        np.array([o.reference for o in machine.outputs], float),
-        settings.amplitude_percent,
-        settings.samples,
-        settings.signal,
-        settings.shortest_steps,
-        None if centre is None else np.array(centre),
-    )
-    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
-    doubt = experiment.Doubt(
-        settings.doubt_input_gain, settings.doubt_ambient_degC, settings.doubt_delay_steps
-    )
     try:
-        family = experiment.family_of(
-            plants,
-            (list(u), list(y)),
-            reach=limits.high - limits.low,
-            longest=settings.samples,
-            doubt=doubt,
-            inputs=inputs,
-            outputs=outputs,
-        )
-        plan = experiment.design(family, wish, limits, np.random.default_rng(settings.seed))
+        family = experiment.family_of(plants, (list(u), list(y)), settings, machine, centre)
+        plan = experiment.design(family, np.random.default_rng(settings.seed))
     except (ValueError, np.linalg.LinAlgError) as error:
         return refuse(settings, " ".join(str(error).split()))
-    dither, why_not = design_dither(family, wish, limits, settings.seed)
+    dither, why_not = design_dither(family)
     step = machine.sample_time_s
     figures = {
         "source": settings.source,
-        "next_experiment": plan_figures(machine, limits, family, plan, tracking.gamma),
+        "next_experiment": plan_figures(machine, family, plan, tracking.gamma),
         "closed_loop": {"written": False, "reason": why_not}
         if dither is None
         else dither_figures(machine, dither),
     }
-    added = (
-        {} if dither is None or dither.reason else columns(dither.u, [f"{n}_dither" for n in inputs], step)
-    )
-    return columns(plan.u, inputs, step) if plan.written else {}, added, figures
+    played = columns(plan.u, family.inputs, step) if plan.written else {}
+    if dither is None or dither.reason:
+        return played, {}, figures
+    return played, columns(dither.u, [f"{name}_dither" for name in family.inputs], step), figures
 
 
 def refuse(settings: GenerateProbing, reason: str) -> tuple[Columns, Columns, dict[str, Any]]:
@@ -132,9 +109,7 @@ def refuse(settings: GenerateProbing, reason: str) -> tuple[Columns, Columns, di
     return {}, {}, {"source": settings.source, "next_experiment": none, "closed_loop": none}
 
 
-def design_dither(
-    family: Family, wish: Wish, limits: ExperimentLimits, seed: int
-) -> tuple[Dither | None, str]:
+def design_dither(family: Family) -> tuple[Dither | None, str]:
     """What may be added to the commands of a PI a zone, tuned by SIMC; None with the reason if the machine
     has none."""
     import numpy as np
@@ -144,10 +119,10 @@ def design_dither(
     from pipeline.temperature.identification.validation import horizon
 
     try:
-        rise = horizon(family.model, wish.samples)
-        pi = baseline.controller(family.model, (limits.low, limits.high), horizon=rise)
-        law = pi.design(np.ones(family.model.p), np.ones(family.model.m), 0.0)
-        return experiment.dither(family, law, wish, limits, np.random.default_rng(seed)), ""
+        rise = horizon(family.model, family.asked.samples)
+        pairs = baseline.pairing(family.model, family.low, family.high, horizon=rise)
+        law = baseline.pi_law(pairs, inputs=family.model.m)
+        return experiment.dither(family, law, np.random.default_rng(family.asked.seed)), ""
     except (ValueError, np.linalg.LinAlgError) as error:
         return None, f"no simple controller to add it to: {' '.join(str(error).split())}"
 
@@ -169,15 +144,13 @@ def by_signal(signals: Sequence[PlantSignal], values: np.ndarray) -> dict[str, f
     }
 
 
-def plan_figures(
-    machine: Plant, limits: ExperimentLimits, family: Family, plan: Experiment, gamma: float
-) -> dict[str, Any]:
+def plan_figures(machine: Plant, family: Family, plan: Experiment, gamma: float) -> dict[str, Any]:
     import numpy as np
 
-    from pipeline.temperature.experiment import expected_gap_percent
+    from pipeline.temperature.experiment import expected_gap
     from pipeline.temperature.probing import excitation
 
-    inputs, outputs, begin = machine.inputs, machine.outputs, family.begin
+    inputs, outputs, begin, asked = machine.inputs, machine.outputs, family.begin, family.asked
     figures = {
         "written": plan.written,
         "reason": plan.reason,
@@ -185,10 +158,14 @@ def plan_figures(
         "lowest_degC": by_signal(outputs, plan.extremes.lowest),
         "limit_degC": {
             o.name: {"low": low, "high": high}
-            for o, low, high in zip(outputs, limits.y_low, limits.y_high, strict=True)
+            for o, low, high in zip(outputs, family.y_low, family.y_high, strict=True)
         },
         "band_degC": by_signal(outputs, family.band.width),
-        "doubt": family.doubt,
+        "doubt": {
+            "input_gain": asked.doubt_input_gain,
+            "ambient_degC": asked.doubt_ambient_degC,
+            "delay_steps": asked.doubt_delay_steps,
+        },
         "start_percent": by_signal(inputs, begin.u),
         "start_degC": by_signal(outputs, begin.y),
         "slowest_time_constant_s": family.seconds(family.pace.slowest),
@@ -200,6 +177,10 @@ def plan_figures(
     order = max(min(EXCITED, most), 1)
     lag = max(min(round(family.pace.fastest / EXCITED), most // order), 1)
     rank = excitation(plan.u[::lag], order)
+    try:
+        gap = expected_gap(family.model, plan.lesson, gamma)
+    except (ValueError, np.linalg.LinAlgError):  # no controller of a perturbed model holds the machine
+        gap = np.inf
     return figures | {
         "centre_percent": by_signal(inputs, plan.centre),
         "amplitude_percent": by_signal(inputs, plan.amplitude),
@@ -214,7 +195,7 @@ def plan_figures(
         "level_percent_per_band": excitation(plan.u, 1).level,
         "information": plan.lesson.information,
         "expected_error_percent": expected_errors(machine, family, plan.lesson),
-        "expected_gap_percent": expected_gap_percent(family.model, plan.lesson, gamma),
+        "expected_gap_percent": 100 * gap if np.isfinite(gap) else None,
     }
 
 
@@ -234,12 +215,12 @@ def expected_errors(machine: Plant, family: Family, lesson: Lesson) -> dict[str,
 
 
 def dither_figures(machine: Plant, dither: Dither) -> dict[str, Any]:
-    figures: dict[str, Any] = {"written": not dither.reason, "reason": dither.reason}
-    if dither.extremes is not None:
-        figures |= {
-            "highest_degC": by_signal(machine.outputs, dither.extremes.highest),
-            "lowest_degC": by_signal(machine.outputs, dither.extremes.lowest),
-        }
+    figures: dict[str, Any] = {
+        "written": not dither.reason,
+        "reason": dither.reason,
+        "highest_degC": by_signal(machine.outputs, dither.extremes.highest),
+        "lowest_degC": by_signal(machine.outputs, dither.extremes.lowest),
+    }
     if dither.reason:
         return figures
     return figures | {

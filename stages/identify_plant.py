@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from pipeline.store.tables import Schema
     from pipeline.temperature.identification.model_choice import Identified
-    from pipeline.temperature.identification.validation import ModelJudgement, Steps
+    from pipeline.temperature.identification.validation import Holdout, RecordExcitation, Residuals, Steps
     from pipeline.temperature.plant import Plant
 
     Segments = list[np.ndarray]
@@ -132,10 +132,10 @@ def identify(
     steps = validation.steps(plant, spread, max(map(len, record.u)), left_out=left_out)
     page_tables = {
         "order": (tables.ORDER, model_choice.rows(chosen)),
-        **judgement_tables(machine, last[1], judgement),
+        **judgement_tables(machine, last[1], judgement[0], judgement[1]),
         **model_tables(machine, record.u, plant, spread, steps),
     }
-    figures = fit_figures(settings, machine, record, chosen, fitted, judgement)
+    figures = fit_figures(settings, machine, record, fitted, sum(map(len, last[0])), judgement)
     figures["bandwidth_rad_s"] = bandwidth_rad_s(plant)
     return plant, spread, page_tables, figures | warnings(machine, fitted, steps)
 
@@ -162,14 +162,14 @@ def read_record(settings: IdentifyPlant, machine: Machine, path: str) -> RecordS
 # ---- tables and figures
 
 
-def judgement_tables(machine: Machine, measured: Segments, judgement: ModelJudgement) -> Tables:
+def judgement_tables(machine: Machine, measured: Segments, held_out: Holdout, residuals: Residuals) -> Tables:
     from pipeline.temperature.identification import validation
 
     inputs, outputs = [s.name for s in machine.acting], [o.name for o in machine.outputs]
-    ahead = validation.holdout_rows(measured, judgement.holdout, outputs, machine.sample_time_s)
+    ahead = validation.holdout_rows(measured, held_out, outputs, machine.sample_time_s)
     return {
         "holdout": (tables.holdout(machine.outputs), ahead),
-        "residuals": (tables.RESIDUALS, validation.residual_rows(judgement.residuals, outputs, inputs)),
+        "residuals": (tables.RESIDUALS, validation.residual_rows(residuals, outputs, inputs)),
     }
 
 
@@ -191,9 +191,9 @@ def fit_figures(
     settings: IdentifyPlant,
     machine: Machine,
     record: RecordSegments,
-    chosen: Identified,
     fitted: Identified,
-    judgement: ModelJudgement,
+    samples_holdout: int,
+    judgement: tuple[Holdout, Residuals, RecordExcitation, np.ndarray],
 ) -> dict[str, Any]:
     import numpy as np
 
@@ -201,6 +201,7 @@ def fit_figures(
     from pipeline.temperature.plant import controllability
 
     inputs, outputs = [s.name for s in machine.acting], [o.name for o in machine.outputs]
+    held_out, residuals, excited, still = judgement
     return {
         "order": fitted.order,
         "order_tolerance_percent": 100 * order.WORTH_A_STATE,
@@ -214,22 +215,22 @@ def fit_figures(
         "dropped_rows": fitted.dropped_rows,
         "samples": record.recorded,
         "samples_cut": record.recorded - sum(map(len, record.u)),
-        "samples_holdout": judgement.samples,
+        "samples_holdout": samples_holdout,
         "delays": dict(zip(inputs, fitted.delays, strict=True)),
         "notes": list(dict.fromkeys([*record.notes, *fitted.notes])),
         "ahead_steps": settings.ahead_steps,
-        **validation.fit_figures(judgement.holdout, outputs),
-        "fit_holdout_inputs_held": dict(zip(outputs, judgement.still.tolist(), strict=True)),
-        **validation.outcome_figures(judgement.residuals, judgement.excitation, outputs, inputs),
-        "controllable": controllability(fitted.plant).passed,
+        **validation.fit_figures(held_out, outputs),
+        "fit_holdout_inputs_held": dict(zip(outputs, still.tolist(), strict=True)),
+        **validation.outcome_figures(residuals, excited, outputs, inputs),
+        "controllable": not controllability(fitted.plant)[1],
         "largest_pole": np.abs(np.linalg.eigvals(fitted.plant.A)).max(),
         "advice": validation.advice(
-            judgement.residuals,
-            judgement.excitation,
-            judgement.holdout.fit[0],
+            residuals,
+            excited,
+            held_out.fits["fit_holdout"][0],
             outputs=outputs,
             inputs=inputs,
-            still_percent=judgement.still,
+            still_percent=still,
             order_given=settings.order > 0,
         ),
     }
@@ -255,7 +256,7 @@ def warnings(machine: Machine, fitted: Identified, steps: Steps) -> dict[str, An
             "level": LEVEL_CLOSED / (2 * len(names)),
             "p_value": dict(zip(names, answers, strict=False)),
         },
-        "forbidden_gains": [gain._asdict() for gain in forbidden],
+        "forbidden_gains": forbidden,
     }
 
 

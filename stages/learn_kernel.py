@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from pipeline.temperature.controllers.feed_forward import Told
     from pipeline.temperature.controllers.window import WindowModel
-    from pipeline.temperature.test_set.scorecard import KernelCandidate, Sufficiency
+    from pipeline.temperature.test_set.scorecard import KernelCandidate
 
 
 class LearnKernel(Section):
@@ -69,16 +69,20 @@ def main() -> None:
 
         from pipeline.temperature.controllers import feed_forward, window
         from pipeline.temperature.identification import model_choice
+        from pipeline.temperature.plant import hold_output
         from pipeline.temperature.test_set import scorecard
-        from pipeline.temperature.test_set.scorecard import CommonCost
+        from pipeline.temperature.test_set.scorecard import CommonCost, Scenarios
 
         settings = params.load(LearnKernel, "learn_kernel")
         machine = recorded(params.load(Plant, "plant"), RECORD)
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
         simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
         inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
-        q, r = np.full(len(outputs), tracking.yardstick_q), np.full(len(inputs), tracking.yardstick_r)
-        yardstick = CommonCost(q, r, tracking.gamma)
+        yardstick = CommonCost(
+            np.full(len(outputs), tracking.yardstick_q),
+            np.full(len(inputs), tracking.yardstick_r),
+            tracking.gamma,
+        )
         u, y, told = read_record(machine)
         with artifacts.about(RECORD):
             model_choice.check_inputs(u, offset=settings.offset, names=inputs)
@@ -91,17 +95,11 @@ def main() -> None:
         long = window.learn(
             u, y, longest=settings.longest_window, offset=settings.offset, gain_spread=settings.gain_spread
         )
-        scenarios = scorecard.panel(
-            [window.predictor(long)],
-            starts=[start_degC],
-            references=[[o.reference for o in machine.outputs]],
-            noise=[0.0],
-            seeds=[0],
-            steps=panel.steps,
-            hold=0,
-            cells=False,
-        )
-        enough = scorecard.sufficiency(
+        model = window.predictor(long)
+        x0, u0 = hold_output(model, np.full(model.p, start_degC))
+        r = np.array([[o.reference for o in machine.outputs]], float)
+        scenarios = Scenarios([model], np.zeros(1, int), x0[None], u0[None], r, panel.steps, hold=0)
+        half_gap, needed = scorecard.sufficiency(
             u,
             y,
             long,
@@ -120,7 +118,7 @@ def main() -> None:
             artifacts.write_arrays(out / "feed_forward.parquet", "feed_forward", 1, feed_forward.stored(told))
         if best.learned is not None:
             artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, best.learned.stored())
-        shown = figures(settings, long, enough, candidates, best)
+        shown = figures(settings, long, half_gap, needed, candidates, best)
         shown["forward"] = forward_figures(machine, told)
         artifacts.write_metrics("learn_kernel", shown, METRICS)
 
@@ -146,7 +144,8 @@ def forward_figures(machine: Plant, told: Told | None) -> dict[str, Any]:
 def figures(
     settings: LearnKernel,
     long: WindowModel,
-    enough: Sufficiency,
+    half_gap: float,
+    needed: int,
     candidates: list[KernelCandidate],
     best: KernelCandidate,
 ) -> dict[str, Any]:
@@ -155,8 +154,8 @@ def figures(
         "window": long.N,
         "samples": long.samples,
         "allowed_gap_percent": settings.allowed_gap_percent,
-        "half_record_gap_percent": 100 * enough.half_gap,
-        "samples_needed_for_noise": enough.needed,
+        "half_record_gap_percent": 100 * half_gap,
+        "samples_needed_for_noise": needed,
         "state": best.state if kernel else None,
         "refused": None if kernel else best.refusal,
         "rank": kernel.rank if kernel else None,

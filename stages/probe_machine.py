@@ -41,7 +41,7 @@ def probe_study(settings: GenerateProbing, machine: Plant) -> tuple[Probe, dict[
     import numpy as np
 
     from pipeline.temperature.plant import baam
-    from pipeline.temperature.probing import InputLimits, OperatingPoint, excitation, multisine, prbs, probe
+    from pipeline.temperature.probing import excitation, multisine, prbs, probe
     from pipeline.temperature.tracking import feasible_target
 
     rng = np.random.default_rng(settings.seed)
@@ -61,13 +61,13 @@ def probe_study(settings: GenerateProbing, machine: Plant) -> tuple[Probe, dict[
     target = feasible_target(plant, np.array([o.reference for o in machine.outputs]), low, high)
     given = given_centre(settings, machine)
     centre = target.u if given is None else np.array(given)
-    limits = InputLimits(
+    limits = (
         np.maximum(low, centre - amplitude),
         np.minimum(high, centre + amplitude),
         settings.rate_percent_per_step,
     )
     noise = settings.noise_degC * rng.standard_normal((len(signal), plant.p))
-    point = OperatingPoint(target.x, centre, target.y)
+    point = target.x, centre, target.y
     feedback = settings.feedback_percent_per_degC * np.eye(plant.m, plant.p)
     run = probe(plant, signal, point, limits, feedback=feedback, noise=noise)
     excited = excitation(run.u, 12)

@@ -181,7 +181,7 @@ def frozen_panel(holdout: HoldOut) -> FrozenPanel:
     nominal = [truth] if simulated else _panel_plants(records, machine)
     spread = panel.spread_of(settings) if simulated else panel.spread_around(settings, nominal[0])
     rng = np.random.default_rng(holdout.seed)
-    plants = panel.padded(panel.drawn(nominal, holdout.plants, spread, cells=simulated, rng=rng))
+    plants = plant.padded(panel.drawn(nominal, holdout.plants, spread, cells=simulated, rng=rng))
     noise = np.full(len(machine.outputs), holdout.noise_degC)
     asked = panel.asked(
         plants,

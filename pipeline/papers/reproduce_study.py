@@ -14,12 +14,11 @@ from joblib import delayed
 from pydantic import Field
 from tqdm import tqdm
 
-from pipeline.papers import files
+from pipeline.papers import files, published, study
 from pipeline.papers.study_draws import read_published
 from pipeline.store import params
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution, Section
-from pipeline.temperature import published, study
 from pipeline.temperature.test_set import tuning
 
 # samples of a data set of the study, and starts of its algorithm 1

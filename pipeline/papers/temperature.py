@@ -4,7 +4,7 @@ what stands behind the numbers.
 `./run dvc repro datasets/papers/dvc.yaml:temperature` writes datasets/papers/temperature.json, which
 reports/papers.html shows; some minutes. The paper's scripts (it prints their address) draw with R's generator
 after set.seed, which is emulated here, so that their data are the same to rounding. Written apart from
-pipeline/temperature/published.py and kernel.py: the tests hold the two against each other.
+pipeline/papers/published.py and kernel.py: the tests hold the two against each other.
 
 What the printed data-driven figures take, found by trying: the least squares run over the rows 7 to 15,084 of
 a record, n_dat + l rows with l = 84, not over M = 15,000; value iteration stops when the 1-norm of the change
@@ -19,12 +19,21 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
-from pipeline.papers import files
+from pipeline.papers import files, study
+from pipeline.papers.published import (
+    GAMMA,
+    IDENTITY,
+    K_DATA,
+    REFERENCE,
+    TAU,
+    TUNED_DATA,
+    TUNED_MODEL,
+    algorithm_1,
+    stabilises,
+)
 from pipeline.papers.study_draws import read_published
-from pipeline.temperature import study
 from pipeline.temperature.plant import baam
-from pipeline.temperature.published import GAMMA, IDENTITY, K_DATA, REFERENCE, TAU, TUNED_DATA, TUNED_MODEL
-from pipeline.temperature.tracking import algorithm_1, gains, observer_gain, stabilises
+from pipeline.temperature.tracking import gains, observer_gain
 
 COMMAND = "./run dvc repro datasets/papers/dvc.yaml:temperature"
 N, SAMPLES, LENGTH, SCALE, MU, STOP = 6, 15_000, 84, 1000.0, 1e-4, 1e-3

@@ -26,8 +26,7 @@ from pipeline.temperature.controllers.controller import (
 from pipeline.temperature.controllers.kernel import Tuples, regress, value_iteration, window_shift, windows
 from pipeline.temperature.controllers.problem import DesignProblem
 from pipeline.temperature.controllers.window import WindowModel, observer_form, predictor
-from pipeline.temperature.plant import Plant, hold_output, observability_matrix
-from pipeline.temperature.test_set.panel import padded
+from pipeline.temperature.plant import Plant, hold_output, observability_matrix, padded
 from pipeline.temperature.tracking import gains
 
 Segments = Sequence[np.ndarray]

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.runtime.machine import Exported
 from pipeline.runtime.replay import GaplessLog
 from pipeline.temperature.controllers.governor import ActuatorLimits
-from pipeline.temperature.plant import Plant
+from pipeline.temperature.plant import Plant, padded
 from pipeline.temperature.test_set import panel
 
 FORECASTING, HONEST_LOGS = 24, 200  # plants, and logs at most
@@ -17,7 +17,7 @@ FORECASTING, HONEST_LOGS = 24, 200  # plants, and logs at most
 def forecasting_plants(
     family: Sequence[Plant], spread: panel.PlantSpread, rng: np.random.Generator
 ) -> list[Plant]:
-    return panel.padded(panel.drawn(family, FORECASTING, spread, cells=False, rng=rng))
+    return padded(panel.drawn(family, FORECASTING, spread, cells=False, rng=rng))
 
 
 def honest_logs(made: Exported, half: panel.Cases, limits: ActuatorLimits) -> list[GaplessLog]:

@@ -20,7 +20,7 @@ with g the doubt about gains, which act on all heat from now on: exact in the ga
 """
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -28,16 +28,19 @@ import scipy.optimize
 
 from pipeline.temperature.identification.first_order import response
 from pipeline.temperature.identification.order import LARGEST_RADIUS, stabilised
-from pipeline.temperature.identification.refinement import Predictor, estimate_state, respond, simulation_form
-from pipeline.temperature.identification.subspace import Segments, gapless
-from pipeline.temperature.identification.validation import (
-    horizon,
+from pipeline.temperature.identification.refinement import (
+    Predictor,
+    estimate_state,
     one_step_errors,
+    respond,
     simulated,
-    step_response,
-    two_points,
+    simulation_form,
 )
-from pipeline.temperature.plant import Plant, strictly_proper
+from pipeline.temperature.identification.subspace import Segments, gapless
+from pipeline.temperature.identification.validation import horizon, step_response, two_points
+from pipeline.temperature.plant import Plant, padded, strictly_proper
+from pipeline.temperature.settings import GenerateProbing
+from pipeline.temperature.settings import Plant as Machine
 from pipeline.temperature.tracking import Law, aimed, feasible_target, gains
 
 TAIL = 3000  # samples at the end of the record that the present state is taken from
@@ -45,15 +48,6 @@ LATEST = 20  # samples at its very end by which each member is set right
 STORED = 6e6  # numbers of a family's responses that are held at once; beyond, every k-th sample is looked at
 SURE = 0.99  # share of the record's simulation errors that the band holds
 SIGMAS = 3.0  # of the sensor's noise
-
-
-class Doubt(NamedTuple):
-    """What a family identified from one record does not hold: input gains that are 1 +- input_gain times as
-    large from now on, an ambient that moves by +- ambient_degC, inputs that act up to delay_steps later."""
-
-    input_gain: float
-    ambient_degC: float
-    delay_steps: int
 
 
 class Start(NamedTuple):
@@ -180,54 +174,43 @@ def truncated(whole: Answers, samples: int) -> Answers:
     return Answers(whole.at[:last], whole.free[:, :last], step, ramp, probe, peak)
 
 
-def ambient(doubt: Doubt, at: np.ndarray, fastest: float) -> np.ndarray:
+def ambient(family: "Family", at: np.ndarray) -> np.ndarray:
     """How far the ambient may have moved each output at the samples `at`: (k,) in °C."""
-    return doubt.ambient_degC * -np.expm1(-at / max(fastest, 1e-9))
+    return family.asked.doubt_ambient_degC * -np.expm1(-at / max(family.pace.fastest, 1e-9))
 
 
-def open_loop(
-    family: Answers,
-    begin: Start,
-    centre: np.ndarray,
-    amplitude: np.ndarray,
-    *,
-    doubt: Doubt,
-    fastest: float,
-    width: np.ndarray,
-) -> Extremes:
+def open_loop(family: "Family", reach: Answers, centre: np.ndarray, amplitude: np.ndarray) -> Extremes:
     """Extremes under the ramp from the last inputs to `centre` (m,) and the signal of `amplitude` (m,) about
-    it; `width` (p,) is the band of noise and model error."""
-    moves = (centre - begin.u)[:, None, None] * family.ramp + amplitude[:, None, None] * family.probe
-    of_each = begin.u[:, None, None] * family.step + moves
-    moved = ambient(doubt, family.at, fastest)[:, None] + width
-    return _bounds(family.free, of_each, moves, family.at, doubt, moved)
+    it."""
+    begin = family.begin
+    moves = (centre - begin.u)[:, None, None] * reach.ramp + amplitude[:, None, None] * reach.probe
+    return _bounds(family, reach.free, begin.u[:, None, None] * reach.step + moves, moves, reach.at)
 
 
-def forecast(
-    family: Sequence[Plant], begin: Start, u: np.ndarray, *, doubt: Doubt, fastest: float, width: np.ndarray
-) -> Extremes:
+def forecast(family: "Family", u: np.ndarray) -> Extremes:
     """Extremes under the inputs u (T, m) themselves, every sample looked at."""
-    at = np.arange(len(u))
+    at, begin = np.arange(len(u)), family.begin
     none = np.column_stack([np.zeros_like(u), np.ones(len(u))])
-    moved = ambient(doubt, at, fastest)[:, None] + width
-    highest, lowest = np.full(len(width), -np.inf), np.full(len(width), np.inf)
-    for member, x0, bias in zip(family, begin.x, begin.bias, strict=True):
+    of_members = []
+    for member, x0, bias in zip(family.plants, begin.x, begin.bias, strict=True):
         free = respond(simulation_form(member, []), none, x0)[1] + bias
         answer, moves = _alone(member, u), _alone(member, u - begin.u)
-        own = _bounds(free[None], answer[None], moves[None], at, doubt, moved)
-        highest, lowest = np.maximum(highest, own.highest), np.minimum(lowest, own.lowest)
-    return Extremes(highest, lowest)
+        of_members.append(_bounds(family, free[None], answer[None], moves[None], at))
+    highest, lowest = zip(*of_members, strict=True)
+    return Extremes(np.max(highest, axis=0), np.min(lowest, axis=0))
 
 
 def _bounds(
-    free: np.ndarray, of_each: np.ndarray, moves: np.ndarray, at: np.ndarray, doubt: Doubt, moved: np.ndarray
+    family: "Family", free: np.ndarray, of_each: np.ndarray, moves: np.ndarray, at: np.ndarray
 ) -> Extremes:
     """Extremes of free (members, k, p) and what each input adds, of_each (members, m, k, p), with the doubt
-    about its gain, and about the delay of its moves, of the same shape; moved (k, p) is what may come from
-    elsewhere."""
-    reach = doubt.input_gain * np.abs(of_each).sum(axis=1) + moved
-    if doubt.delay_steps:
-        lags = np.maximum(doubt.delay_steps / np.maximum(np.diff(at), 1), 1.0)[:, None]
+    about its gain, and about the delay of its moves, of the same shape; with the ambient, and the band of
+    noise and model error."""
+    asked = family.asked
+    moved = ambient(family, at)[:, None] + family.band.width
+    reach = asked.doubt_input_gain * np.abs(of_each).sum(axis=1) + moved
+    if asked.doubt_delay_steps:
+        lags = np.maximum(asked.doubt_delay_steps / np.maximum(np.diff(at), 1), 1.0)[:, None]
         reach[:, 1:] += lags * np.abs(np.diff(moves, axis=2)).sum(axis=1)
     middle = free + of_each.sum(axis=1)
     return Extremes((middle + reach).max(axis=(0, 1)), (middle - reach).min(axis=(0, 1)))
@@ -236,81 +219,61 @@ def _bounds(
 # ---- around a running controller
 
 
-class ForecastLoop(NamedTuple):
-    """A controller at work: its law, aimed at reference r (p,), and the inputs' limits low and high (m,)."""
-
-    law: Law
-    reference: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-
 def closed_loop(
-    family: Sequence[Plant],
-    loop: ForecastLoop,
+    family: "Family",
+    law: Law,
+    r: np.ndarray,
     dither: np.ndarray,
     noise: np.ndarray,
     *,
-    doubt: Doubt,
-    disturbance: np.ndarray,
     stop: Extremes | None = None,
 ) -> tuple[Extremes, float]:
-    """Extremes of the true outputs while dither (T, m) is added to the commands of a controller that holds
-    the reference, and the largest share of (sample, input) at a limit over the members; noise (T, p) is what
-    the controller measures beside them.
+    """Extremes of the true outputs while dither (T, m) is added to the commands of a law that is aimed at r
+    (p,) and holds it, and the largest share of (sample, input) at a limit over the members; noise (T, p) is
+    what the controller measures beside them.
 
     Every member runs with all gains up, all down, and each alone up and down; with the ambient as it was, or
-    moved by `disturbance` (T,) up with the gains and down with them; its inputs on time, and late. It starts
-    at rest, held by the law; a member that the law cannot hold there starts as near as it can. The forecast
-    ends where an output leaves `stop`.
+    moved (`ambient`) up with the gains and down with them; its inputs on time, and late. It starts at rest,
+    held by the law; a member that the law cannot hold there starts as near as it can. The forecast ends where
+    an output leaves `stop`.
     """
-    m = family[0].m
+    m, asked = family.model.m, family.asked
     gains = np.vstack([np.zeros((3, m)), np.ones(m), -np.ones(m), np.eye(m), -np.eye(m)])
     ambients = np.r_[0.0, 1.0, -1.0, 1.0, -1.0, np.zeros(2 * m)]
-    n = max(member.n for member in family)
     plants = [
         one._replace(B=one.B * scale, D=one.D * scale)
-        for one in (_padded(member, n) for member in family)
-        for scale in 1 + doubt.input_gain * gains
+        for one in padded(family.plants)
+        for scale in 1 + asked.doubt_input_gain * gains
     ]
-    driven = dither, noise, np.tile(ambients, len(family)), disturbance
-    runs = [_run(plants, loop, driven, late, stop) for late in sorted({0, doubt.delay_steps})]
-    highest, lowest = (pick([run[k] for run in runs], axis=0) for k, pick in ((0, np.max), (1, np.min)))
-    return Extremes(highest, lowest), max(run[2] for run in runs)
-
-
-def _padded(plant: Plant, n: int) -> Plant:
-    """The plant with n states, those added at rest and unseen."""
-    more = n - plant.n
-    return plant._replace(
-        A=np.pad(plant.A, (0, more)),
-        B=np.pad(plant.B, ((0, more), (0, 0))),
-        C=np.pad(plant.C, ((0, 0), (0, more))),
-        b=np.pad(plant.b, (0, more)),
-        K=np.pad(plant.K, ((0, more), (0, 0))),
-    )
+    disturbance = np.outer(ambient(family, np.arange(len(dither))), np.tile(ambients, len(family.plants)))
+    held = law, r, (family.low, family.high)
+    late = sorted({0, asked.doubt_delay_steps})
+    runs = [_run(plants, held, (dither, noise, disturbance), steps, stop) for steps in late]
+    highest, lowest, limited = zip(*runs, strict=True)
+    return Extremes(np.max(highest, axis=0), np.min(lowest, axis=0)), max(limited)
 
 
 def _run(
     plants: Sequence[Plant],
-    loop: ForecastLoop,
-    driven: tuple[np.ndarray, ...],
+    held: tuple[Law, np.ndarray, tuple[np.ndarray, np.ndarray]],
+    driven: tuple[np.ndarray, np.ndarray, np.ndarray],
     late: int,
     stop: Extremes | None,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Highest and lowest (p,), and the largest limited share, of plants of one order, run side by side."""
-    law, r = loop.law, loop.reference
-    dither, noise, ambients, disturbance = driven
+    """Highest and lowest (p,), and the largest limited share, of plants of one order, run side by side; held:
+    law, reference, limits of the inputs; driven: dither, noise, and by how much the ambient moves each plant
+    (T, plants)."""
+    (law, r, (low, high)), (dither, noise, disturbance) = held, driven
     A, B, C, D = (np.stack([getattr(plant, name) for plant in plants]) for name in "ABCD")
     b, d = (np.stack([getattr(plant, name) for plant in plants]) for name in "bd")
-    rest = [_at_rest(plant, loop) for plant in plants]
+    rest = [_at_rest(plant, law, r, low, high) for plant in plants]
     x, z, xi, u = (np.stack(part) for part in zip(*rest, strict=True))
     waiting = [u.copy() for _ in range(late)]
     highest, lowest = np.full(len(r), -np.inf), np.full(len(r), np.inf)
     limited = np.zeros(len(plants))
     for t in range(len(dither)):
         y = np.einsum("kpn,kn->kp", C, x) + np.einsum("kpm,km->kp", D, u) + d
-        y += (disturbance[t] * ambients)[:, None]
+        y += disturbance[t][:, None]
         highest, lowest = np.maximum(highest, y.max(axis=0)), np.minimum(lowest, y.min(axis=0))
         if not np.abs(y).max() < 1e6:  # a loop that runs away has left every limit
             break
@@ -318,7 +281,7 @@ def _run(
             break
         measured = y + noise[t]
         wanted = -z @ law.K.T - measured @ law.D.T - (r + xi) @ law.K_r.T - law.k + dither[t]
-        applied = np.clip(wanted, loop.low, loop.high)
+        applied = np.clip(wanted, low, high)
         limited += (applied != wanted).mean(axis=1)
         z = z @ law.A.T + applied @ law.B_u.T + measured @ law.B_y.T + r @ law.B_r.T + law.c
         # an integrator that would push a cut command further rests (conditional integration)
@@ -331,10 +294,11 @@ def _run(
     return highest, lowest, float(limited.max() / len(dither))
 
 
-def _at_rest(plant: Plant, loop: ForecastLoop) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _at_rest(
+    plant: Plant, law: Law, r: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """State, memory, integrator and input of a plant that the law holds with its outputs as near the
     reference as its integrator can bring them."""
-    law, r = loop.law, loop.reference
     balance = np.eye(plant.n) - plant.A
     if np.linalg.cond(balance) > 1e13:
         balance = balance + 1e-9 * np.eye(plant.n)
@@ -347,7 +311,7 @@ def _at_rest(plant: Plant, loop: ForecastLoop) -> tuple[np.ndarray, np.ndarray, 
         z = np.linalg.solve(np.eye(len(law.A)) - law.A, law.B_u @ held + law.B_y @ r + law.B_r @ r + law.c)
         held = held - law.K @ z
     xi = np.linalg.lstsq(gain @ -law.K_r, r - offset - gain @ held, rcond=1e-9)[0]
-    u = np.clip(held - law.K_r @ xi, loop.low, loop.high)
+    u = np.clip(held - law.K_r @ xi, low, high)
     return np.linalg.solve(balance, plant.B @ u + plant.b), z, xi, u
 
 
@@ -361,29 +325,6 @@ DRAWS = 30  # phases drawn for a multisine, of which the flattest is taken
 USEFUL = 0.3  # largest expected standard error of an input's strongest gain; beyond it nothing is learned
 STEPS = 6  # halvings of each search for an amplitude
 FAIR = 0.4  # of the wanted amplitudes: a shorter experiment is tried below it
-
-
-class ExperimentLimits(NamedTuple):
-    """Of the inputs low and high (m,) in percent and rate in percent a step; of the outputs y_low and y_high
-    (p,) in °C."""
-
-    low: np.ndarray
-    high: np.ndarray
-    rate: float
-    y_low: np.ndarray
-    y_high: np.ndarray
-
-
-class Wish(NamedTuple):
-    """What is asked for: outputs near the reference (p,), amplitudes of at most `amplitude` percent, at most
-    `samples` samples of this kind of signal, no hold shorter than `shortest` samples; or a centre (m,)."""
-
-    reference: np.ndarray
-    amplitude: float
-    samples: int
-    signal: Literal["multisine", "prbs"]
-    shortest: int
-    centre: np.ndarray | None = None
 
 
 class Pace(NamedTuple):
@@ -431,20 +372,28 @@ class Dither(NamedTuple):
 
     u: np.ndarray
     reason: str
-    extremes: Extremes | None
+    extremes: Extremes
     amplitude: np.ndarray
     limited: float
 
 
 class Family(NamedTuple):
-    """The identified plants, the model first; their pace; what they do not hold; where the record leaves the
-    machine; the band of noise and model error; and the names of inputs and outputs."""
+    """The identified plants, the model first; their pace; where the record leaves the machine; the band of
+    noise and model error. Then what the experiment is for: what is asked of it, with the doubt about what the
+    plants do not hold; the limits of inputs low and high (m,) in percent and of outputs y_low and y_high (p,)
+    in °C, the references (p,), and a given centre (m,); the names of inputs and outputs."""
 
     plants: Sequence[Plant]
     pace: Pace
-    doubt: Doubt
     begin: Start
     band: Band
+    asked: GenerateProbing
+    low: np.ndarray
+    high: np.ndarray
+    y_low: np.ndarray
+    y_high: np.ndarray
+    reference: np.ndarray
+    centre: list[float] | None
     inputs: Sequence[str]
     outputs: Sequence[str]
 
@@ -459,23 +408,34 @@ class Family(NamedTuple):
 def family_of(
     plants: Sequence[Plant],
     record: tuple[Segments, Segments],
-    *,
-    reach: np.ndarray,
-    longest: int,
-    doubt: Doubt,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
+    asked: GenerateProbing,
+    machine: Machine,
+    centre: list[float] | None = None,
 ) -> Family:
-    """The family for experiments of at most `longest` samples on the machine of this record (u, y); reach
-    (m,) is each input's range.
+    """The family for experiments on the machine of this record (u, y), every output of which has limits.
 
     A pole of the model outside the unit circle is drawn onto it, as in the bootstrap: no heated part heats
     itself. Where the machine does run away, the model then misses the record, and the band says so. Raises
     ValueError where no stretch of the record has all inputs.
     """
     plants = [stabilised(plant, LARGEST_RADIUS) for plant in plants]
-    speed = pace(plants, reach, longest)
-    return Family(plants, speed, doubt, start(plants, *record), band(plants[0], *record), inputs, outputs)
+    low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
+    y_low, y_high = np.array([(o.low, o.high) for o in machine.outputs], float).T
+    return Family(
+        plants,
+        pace(plants, high - low, asked.samples),
+        start(plants, *record),
+        band(plants[0], *record),
+        asked,
+        low,
+        high,
+        y_low,
+        y_high,
+        np.array([o.reference for o in machine.outputs], float),
+        centre,
+        [i.name for i in machine.inputs],
+        [o.name for o in machine.outputs],
+    )
 
 
 def pace(plants: Sequence[Plant], reach: np.ndarray, longest: int) -> Pace:
@@ -494,13 +454,14 @@ def pace(plants: Sequence[Plant], reach: np.ndarray, longest: int) -> Pace:
 # ---- the signal
 
 
-def signal(rng: np.random.Generator, samples: int, wish: Wish, speed: Pace) -> np.ndarray:
+def signal(rng: np.random.Generator, samples: int, asked: GenerateProbing, speed: Pace) -> np.ndarray:
     """(samples, m) of amplitude 1 and about zero mean, with its power where each input is answered."""
     # the fastest time constant that each input shows; the fastest of all where it shows none
     tau = np.where(speed.seen, speed.time_constant, np.inf).min(axis=0)
     tau = np.where(np.isfinite(tau), tau, speed.fastest)
-    if wish.signal == "prbs":
-        holds = np.clip(np.round(HOLD * tau), wish.shortest, max(samples // SWITCHES, wish.shortest))
+    if asked.signal == "prbs":
+        shortest = asked.shortest_steps
+        holds = np.clip(np.round(HOLD * tau), shortest, max(samples // SWITCHES, shortest))
         return np.column_stack([_binary(rng, samples, int(hold)) for hold in holds])
     return np.column_stack([_flattest(rng, samples, own) for own in _lines(samples, CORNERS / tau)])
 
@@ -534,8 +495,11 @@ def _flattest(rng: np.random.Generator, samples: int, lines: np.ndarray) -> np.n
     return best
 
 
-def shaped(raw: np.ndarray, ramp: int, step: float) -> np.ndarray:
-    """The signal from the end of the ramp on, moving by at most `step` of its amplitude a sample."""
+def shaped(family: "Family", rng: np.random.Generator, samples: int, ramp: int) -> np.ndarray:
+    """The signal (samples, m) of amplitude 1 from the end of the ramp on, within the rate of the inputs at
+    the amplitude that is asked."""
+    raw, rate = signal(rng, samples, family.asked, family.pace), family.asked.rate_percent_per_step
+    step = rate / max(family.asked.amplitude_percent, rate / 2)
     out, last = np.zeros_like(raw), np.zeros(raw.shape[1])
     for t in range(ramp, len(raw)):
         last = np.clip(raw[t], last - step, last + step)
@@ -546,17 +510,19 @@ def shaped(raw: np.ndarray, ramp: int, step: float) -> np.ndarray:
 # ---- centre and amplitudes
 
 
-def caps(family: Family, reach: Answers, wish: Wish, limits: ExperimentLimits) -> np.ndarray:
+def caps(family: Family, reach: Answers) -> np.ndarray:
     """Amplitudes (m,) that are wanted: the asked one, or what moves an output by half of what its limits
     leave beside band and ambient; 0 where they leave nothing."""
-    spare = limits.y_high - limits.y_low - 2 * (family.band.width + family.doubt.ambient_degC)
-    peak = reach.peak.max(axis=0) * (1 + family.doubt.input_gain)
+    spare = family.y_high - family.y_low - 2 * (family.band.width + family.asked.doubt_ambient_degC)
+    peak = reach.peak.max(axis=0) * (1 + family.asked.doubt_input_gain)
     room = np.maximum(spare, 0.0)[:, None] / 2 / np.maximum(peak, np.finfo(float).tiny)
-    return np.minimum(np.minimum(wish.amplitude, (limits.high - limits.low) / 2), room.min(axis=0))
+    return np.minimum(
+        np.minimum(family.asked.amplitude_percent, (family.high - family.low) / 2), room.min(axis=0)
+    )
 
 
 def programme(
-    family: Family, reach: Answers, wish: Wish, limits: ExperimentLimits, cap: np.ndarray, least: float | None
+    family: Family, reach: Answers, cap: np.ndarray, least: float | None
 ) -> tuple[np.ndarray, float] | None:
     """Centre (m,) and share of the wanted amplitudes by a linear programme; None where no centre is within
     the limits even without a signal.
@@ -564,18 +530,18 @@ def programme(
     Unknowns [centre; w >= |centre|; q >= |y - reference|; share]. Without `least` the share is maximised;
     with it the distance q from the references is minimised at a share of at least that.
     """
-    m, p, begin, g = len(cap), len(limits.y_low), family.begin, family.doubt.input_gain
+    m, p, begin, g = len(cap), len(family.y_low), family.begin, family.asked.doubt_input_gain
     instants = np.unique(np.linspace(0, len(reach.at) - 1, 7).round().astype(int)[1:])
     rise = reach.ramp[:, :, instants].transpose(0, 2, 3, 1).reshape(-1, m)
     from_step = (reach.step[:, :, instants] * begin.u[:, None, None]).transpose(0, 2, 3, 1).reshape(-1, m)
     at_u = reach.free[:, instants].reshape(-1) + from_step.sum(axis=1)
     swing = (1 + g) * np.repeat(reach.peak[:, None], len(instants), axis=1).reshape(-1, m) @ cap
-    moved = ambient(family.doubt, reach.at[instants], family.pace.fastest)[:, None] + family.band.width
+    moved = ambient(family, reach.at[instants])[:, None] + family.band.width
     # the ramp answers as if the centre had come from zero; what the last inputs leave beside it dies away
     beside = np.abs(from_step - rise * begin.u).sum(axis=1)
     slack = np.tile(moved[None], (len(reach.free), 1, 1)).reshape(-1) + g * beside
     count = len(at_u)
-    high, low = (np.tile(side, count // p) for side in (limits.y_high, limits.y_low))
+    high, low = (np.tile(side, count // p) for side in (family.y_high, family.y_low))
     none = np.zeros((count, p))
     # y = at_u + rise (centre - u), and the doubt about it
     upper = np.hstack([rise, g * np.abs(rise), none, swing[:, None]])
@@ -588,9 +554,9 @@ def programme(
         rows.append(np.hstack([sign * eye, -eye, wide, np.zeros((m, 1))]))
         right.append(np.zeros(m))
         rows.append(np.hstack([sign * rise[end], np.zeros((p, m)), -np.eye(p), np.zeros((p, 1))]))
-        right.append(sign * (wish.reference - at_u[end] + rise[end] @ begin.u))
+        right.append(sign * (family.reference - at_u[end] + rise[end] @ begin.u))
         rows.append(np.hstack([sign * eye, 0 * eye, wide, cap[:, None]]))
-        right.append(limits.high if sign > 0 else -limits.low)
+        right.append(family.high if sign > 0 else -family.low)
     cost = np.r_[
         np.zeros(2 * m), np.zeros(p) if least is None else np.ones(p), -1.0 if least is None else 0.0
     ]
@@ -598,61 +564,42 @@ def programme(
     found = scipy.optimize.linprog(cost, np.vstack(rows), np.concatenate(right), bounds=bounds)
     if found.x is None:
         return None
-    return np.clip(found.x[:m], limits.low, limits.high), float(found.x[-1])
+    return np.clip(found.x[:m], family.low, family.high), float(found.x[-1])
 
 
-def centres(
-    family: Family, reach: Answers, wish: Wish, limits: ExperimentLimits, cap: np.ndarray
-) -> list[np.ndarray]:
+def centres(family: Family, reach: Answers, cap: np.ndarray) -> list[np.ndarray]:
     """Centres (m,) to try in this order: the one that is given; else that of the linear programme, what holds
     the references by the model, and the last inputs."""
-    if wish.centre is not None:
-        return [np.clip(wish.centre, limits.low, limits.high)]
-    held = feasible_target(family.model, wish.reference, limits.low, limits.high).u
-    fallback = [held, np.clip(family.begin.u, limits.low, limits.high)]
-    widest = programme(family, reach, wish, limits, cap, None)
+    if family.centre is not None:
+        return [np.clip(family.centre, family.low, family.high)]
+    held = feasible_target(family.model, family.reference, family.low, family.high).u
+    fallback = [held, np.clip(family.begin.u, family.low, family.high)]
+    widest = programme(family, reach, cap, None)
     if widest is None:
         return fallback
-    nearest = programme(family, reach, wish, limits, cap, ENOUGH * widest[1])
+    nearest = programme(family, reach, cap, ENOUGH * widest[1])
     return [(nearest or widest)[0], *fallback]
 
 
-def _extremes(family: Family, reach: Answers, centre: np.ndarray, amplitude: np.ndarray) -> Extremes:
-    return open_loop(
-        reach,
-        family.begin,
-        centre,
-        amplitude,
-        doubt=family.doubt,
-        fastest=family.pace.fastest,
-        width=family.band.width,
-    )
+def within(extremes: Extremes, family: Family) -> bool:
+    return bool((extremes.highest <= family.y_high).all() and (extremes.lowest >= family.y_low).all())
 
 
-def within(extremes: Extremes, limits: ExperimentLimits) -> bool:
-    return bool((extremes.highest <= limits.y_high).all() and (extremes.lowest >= limits.y_low).all())
-
-
-def safe_amplitude(
-    family: Family, reach: Answers, centre: np.ndarray, limits: ExperimentLimits, cap: np.ndarray
-) -> np.ndarray:
+def safe_amplitude(family: Family, reach: Answers, centre: np.ndarray, cap: np.ndarray) -> np.ndarray:
     """The largest amplitudes (m,) found that stay within the limits: a common share of `cap` first, then each
     input as far as it can beyond that; 0 where even the centre alone leaves them."""
-    room = np.minimum(cap, np.maximum(np.minimum(limits.high - centre, centre - limits.low), 0.0))
+    room = np.minimum(cap, np.maximum(np.minimum(family.high - centre, centre - family.low), 0.0))
 
     def largest(amplitude, toward):
         """How far from `amplitude` toward `toward` is safe, between 0 and 1."""
         safe, beyond = 0.0, 1.0
-        if within(_extremes(family, reach, centre, toward), limits):
+        if within(open_loop(family, reach, centre, toward), family):
             return 1.0
         for _ in range(STEPS):
             middle = (safe + beyond) / 2
             tried = amplitude + middle * (toward - amplitude)
-            safe, beyond = (
-                (middle, beyond)
-                if within(_extremes(family, reach, centre, tried), limits)
-                else (safe, middle)
-            )
+            allowed = within(open_loop(family, reach, centre, tried), family)
+            safe, beyond = (middle, beyond) if allowed else (safe, middle)
         return safe
 
     amplitude = largest(0.0 * room, room) * room
@@ -721,48 +668,38 @@ def expected_gap(model: Plant, taught: Lesson, gamma: float) -> float:
     return float(sum(designed(other) / best - 1 for other in others))
 
 
-def expected_gap_percent(model: Plant, lesson: Lesson, gamma: float) -> float | None:
-    """`expected_gap` in percent; None if no controller of the perturbed model holds the machine."""
-    try:
-        gap = expected_gap(model, lesson, gamma)
-    except (ValueError, np.linalg.LinAlgError):
-        return None
-    return 100 * gap if np.isfinite(gap) else None
-
-
 # ---- the experiment
 
 
-def design(family: Family, wish: Wish, limits: ExperimentLimits, rng: np.random.Generator) -> Experiment:
+def design(family: Family, rng: np.random.Generator) -> Experiment:
     """The longest experiment that is safe and moves the machine by a fair share of what is wanted; of
     shorter ones the one that teaches most where none does."""
-    if reason := _nothing_left(family, limits):
+    if reason := _nothing_left(family):
         nothing, unknown = np.zeros((0, family.model.m)), np.full(family.model.p, np.nan)
         still = np.zeros(family.model.m)
         return Experiment(nothing, reason, Extremes(unknown, unknown), still, still, unknown, None)
-    samples, speed = wish.samples, family.pace
-    rise = ramp_samples(limits, samples)
+    samples, speed = family.asked.samples, family.pace
+    rise = ramp_samples(family, samples)
     ramp = np.clip((1.0 + np.arange(samples)) / rise, 0.0, 1.0)
-    step = limits.rate / max(wish.amplitude, limits.rate / 2)
-    played = shaped(signal(rng, samples, wish, speed), rise, step)
+    played = shaped(family, rng, samples, rise)
     whole = answers(family.plants, family.begin, ramp, played)
     tries = []
-    shortest = min(max(4 * rise, int(5 * speed.fastest), 50), wish.samples)
+    shortest = min(max(4 * rise, int(5 * speed.fastest), 50), family.asked.samples)
     while samples >= shortest:
-        reach = truncated(whole, samples) if samples < wish.samples else whole
-        tried = _designed(family, reach, wish, limits, (ramp[:samples], played[:samples], rise))
+        reach = truncated(whole, samples) if samples < family.asked.samples else whole
+        tried = _designed(family, reach, (ramp[:samples], played[:samples], rise))
         tries.append(tried)
-        if tried.written and (tried.amplitude >= FAIR * caps(family, reach, wish, limits)).all():
+        if tried.written and (tried.amplitude >= FAIR * caps(family, reach)).all():
             break
         samples //= 2
     taught = [one.lesson.information if one.written and one.lesson is not None else 0.0 for one in tries]
     return tries[int(np.argmax(taught))]
 
 
-def _nothing_left(family: Family, limits: ExperimentLimits) -> str:
+def _nothing_left(family: Family) -> str:
     """Why no experiment can be forecast: the model itself misses the record by what the limits are apart;
     empty where it does not."""
-    spare = limits.y_high - limits.y_low - 2 * family.band.width
+    spare = family.y_high - family.y_low - 2 * family.band.width
     o = int(np.argmin(np.where(np.isfinite(spare), spare, -np.inf)))
     if spare[o] > 0:
         return ""
@@ -772,42 +709,34 @@ def _nothing_left(family: Family, limits: ExperimentLimits) -> str:
     )
 
 
-def ramp_samples(limits: ExperimentLimits, samples: int) -> int:
+def ramp_samples(family: Family, samples: int) -> int:
     """Samples of the ramp: the widest range of an input within the rate, half of the experiment at most."""
-    needed = np.ceil((limits.high - limits.low).max() / limits.rate)
+    needed = np.ceil((family.high - family.low).max() / family.asked.rate_percent_per_step)
     return int(max(min(needed, samples / 2), 1))
 
 
-def _designed(
-    family: Family,
-    reach: Answers,
-    wish: Wish,
-    limits: ExperimentLimits,
-    shapes: tuple[np.ndarray, np.ndarray, int],
-) -> Experiment:
+def _designed(family: Family, reach: Answers, shapes: tuple[np.ndarray, np.ndarray, int]) -> Experiment:
     """The experiment of one length; shapes: ramp (T,), signal (T, m), and where the ramp ends."""
     ramp, played, rise = shapes
-    cap = caps(family, reach, wish, limits)
-    tried = centres(family, reach, wish, limits, cap)
+    cap = caps(family, reach)
+    tried = centres(family, reach, cap)
     for centre in tried:
-        amplitude = safe_amplitude(family, reach, centre, limits, cap)
+        amplitude = safe_amplitude(family, reach, centre, cap)
         if amplitude.any():
             break
     else:
-        return _left(family, reach, tried[0], limits)
+        return _left(family, reach, tried[0])
     begin = family.begin
     for _ in range(STEPS):
         u = np.clip(
-            begin.u + ramp[:, None] * (centre - begin.u) + amplitude * played, limits.low, limits.high
+            begin.u + ramp[:, None] * (centre - begin.u) + amplitude * played, family.low, family.high
         )
-        extremes = forecast(
-            family.plants, begin, u, doubt=family.doubt, fastest=family.pace.fastest, width=family.band.width
-        )
-        if within(extremes, limits):
+        extremes = forecast(family, u)
+        if within(extremes, family):
             break
         amplitude = 0.9 * amplitude  # between the samples that the search looked at it was hotter
     else:
-        return _left(family, reach, centre, limits)
+        return _left(family, reach, centre)
     taught = lesson(u[rise:], family.pace, family.band.noise)
     target = reach.free[0, -1] + begin.u @ reach.step[0, :, -1]
     target = target + (centre - begin.u) @ reach.ramp[0, :, -1]
@@ -829,21 +758,21 @@ def _teaches_little(family: Family, amplitude: np.ndarray, taught: Lesson) -> st
     )
 
 
-def _left(family: Family, reach: Answers, centre: np.ndarray, limits: ExperimentLimits) -> Experiment:
+def _left(family: Family, reach: Answers, centre: np.ndarray) -> Experiment:
     """The refusal of an experiment whose centre alone leaves a limit, with the output that leaves it most."""
     still = np.zeros(family.model.m)
-    extremes = _extremes(family, reach, centre, still)
-    above, below = extremes.highest - limits.y_high, limits.y_low - extremes.lowest
+    extremes = open_loop(family, reach, centre, still)
+    above, below = extremes.highest - family.y_high, family.y_low - extremes.lowest
     hot = above.max() >= below.max()
     o = int((above if hot else below).argmax())
-    reached, limit = (extremes.highest[o], limits.y_high[o]) if hot else (extremes.lowest[o], limits.y_low[o])
+    reached, limit = (extremes.highest[o], family.y_high[o]) if hot else (extremes.lowest[o], family.y_low[o])
     radius = np.abs(np.linalg.eigvals(family.model.A)).max()
     slow = -np.log(max(radius, np.finfo(float).tiny)) * reach.at[-1] < 1.0
     why = (
         "the machine hardly settles by itself, so that small errors grow"
         if slow
         else f"{family.band.width[o]:.3g} degC of it are noise and model error, "
-        f"{family.doubt.ambient_degC:g} ambient"
+        f"{family.asked.doubt_ambient_degC:g} ambient"
     )
     reason = (
         f"without its controller {family.outputs[o]} may {'reach' if hot else 'fall to'} "
@@ -857,42 +786,31 @@ def _left(family: Family, reach: Answers, centre: np.ndarray, limits: Experiment
 # ---- around the running controller
 
 
-def dither(
-    family: Family, law: Law, wish: Wish, limits: ExperimentLimits, rng: np.random.Generator
-) -> Dither:
+def dither(family: Family, law: Law, rng: np.random.Generator) -> Dither:
     """The signal to add to the commands of a controller such as `law` that holds the references, or the
     nearest that the inputs can hold; its amplitudes are halved until the forecast around the family stays
     within the limits."""
-    m, samples = family.model.m, wish.samples
-    rise = ramp_samples(limits, samples)
-    step = limits.rate / max(wish.amplitude, limits.rate / 2)
-    played = shaped(signal(rng, samples, wish, family.pace), rise, step)
-    target = feasible_target(family.model, wish.reference, limits.low, limits.high)
-    loop = ForecastLoop(aimed(law, target.y, target.u, target.y), target.y, limits.low, limits.high)
+    m, samples = family.model.m, family.asked.samples
+    rise = ramp_samples(family, samples)
+    played = shaped(family, rng, samples, rise)
+    target = feasible_target(family.model, family.reference, family.low, family.high)
+    law = aimed(law, target.y, target.u, target.y)
     noise = family.band.noise * rng.standard_normal((samples, family.model.p))
-    disturbance = ambient(family.doubt, np.arange(samples), family.pace.fastest)
-    wanted = np.full(m, min(wish.amplitude, *((limits.high - limits.low) / 2)))
+    wanted = np.full(m, min(family.asked.amplitude_percent, *((family.high - family.low) / 2)))
     nothing, wide = np.zeros((0, m)), SIGMAS * family.band.noise
     for share in [0.5**k for k in range(STEPS)] + [0.0]:
-        extremes, limited = closed_loop(
-            family.plants,
-            loop,
-            share * wanted * played,
-            noise,
-            doubt=family.doubt,
-            disturbance=disturbance,
-            stop=Extremes(limits.y_high - wide, limits.y_low + wide) if share else None,
-        )
+        stop = Extremes(family.y_high - wide, family.y_low + wide) if share else None
+        extremes, limited = closed_loop(family, law, target.y, share * wanted * played, noise, stop=stop)
         extremes = Extremes(extremes.highest + wide, extremes.lowest - wide)
-        if share and within(extremes, limits):
+        if share and within(extremes, family):
             return Dither(share * wanted * played, "", extremes, share * wanted, limited)
-    if within(extremes, limits):
+    if within(extremes, family):
         reason = f"a dither of {wanted.max() * 0.5 ** (STEPS - 1):.2g} percent already leaves the limits"
         return Dither(nothing, reason, extremes, 0.0 * wanted, limited)
-    o = int(np.maximum(extremes.highest - limits.y_high, limits.y_low - extremes.lowest).argmax())
+    o = int(np.maximum(extremes.highest - family.y_high, family.y_low - extremes.lowest).argmax())
     low, high = (np.clip(side[o], -1e4, 1e4) for side in (extremes.lowest, extremes.highest))
     reason = (
         f"over the family the controller itself lets {family.outputs[o]} go from {low:.0f} to "
-        f"{high:.0f} degC, and its limits are {limits.y_low[o]:g} and {limits.y_high[o]:g}"
+        f"{high:.0f} degC, and its limits are {family.y_low[o]:g} and {family.y_high[o]:g}"
     )
     return Dither(nothing, reason, extremes, 0.0 * wanted, limited)

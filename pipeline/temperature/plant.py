@@ -127,14 +127,7 @@ def observability_matrix(A: np.ndarray, C: np.ndarray, blocks: int) -> np.ndarra
     return np.vstack(rows)
 
 
-class RankTest(NamedTuple):
-    passed: bool
-    rank: int
-    singular_values: np.ndarray
-    reason: str
-
-
-def _rank_test(matrix: np.ndarray, n: int, name: str, remedy: str) -> RankTest:
+def _rank_test(matrix: np.ndarray, n: int, name: str, remedy: str) -> tuple[int, str]:
     sv = np.linalg.svd(matrix, compute_uv=False)
     rank = int((sv > sv[0] * max(matrix.shape) * np.finfo(float).eps).sum()) if sv[0] > 0 else 0
     reason = (
@@ -143,11 +136,11 @@ def _rank_test(matrix: np.ndarray, n: int, name: str, remedy: str) -> RankTest:
         else f"the plant is not {name}: rank {rank} of {n}, smallest singular values "
         f"{np.array2string(sv[-2:], precision=2)}; {remedy}"
     )
-    return RankTest(rank == n, rank, sv, reason)
+    return rank, reason
 
 
-def observability(plant: Plant) -> RankTest:
-    """Rank test of (7) with its singular values; fails with a reason where some state never shows in y."""
+def observability(plant: Plant) -> tuple[int, str]:
+    """The rank of (7), and the reason where some state never shows in y, empty where all do."""
     return _rank_test(
         observability_matrix(plant.A, plant.C, plant.n),
         plant.n,
@@ -159,16 +152,16 @@ def observability(plant: Plant) -> RankTest:
 def observable_part(plant: Plant) -> Plant:
     """The plant without the states that never show in y, which move no other state: its inputs and outputs
     are related as before. The delays of an input that no output answers leave such states."""
-    test = observability(plant)
-    if test.passed:
+    rank, hidden = observability(plant)
+    if not hidden:
         return plant
-    V = np.linalg.svd(observability_matrix(plant.A, plant.C, plant.n))[2][: test.rank]
+    V = np.linalg.svd(observability_matrix(plant.A, plant.C, plant.n))[2][:rank]
     return plant._replace(A=V @ plant.A @ V.T, B=V @ plant.B, C=plant.C @ V.T, b=V @ plant.b, K=V @ plant.K)
 
 
-def controllability(plant: Plant) -> RankTest:
-    """Rank test of [B AB ... A^(n-1)B] (10) with its singular values;
-    fails with a reason where some state obeys no input."""
+def controllability(plant: Plant) -> tuple[int, str]:
+    """The rank of [B AB ... A^(n-1)B] (10), and the reason where some state obeys no input, empty where all
+    do."""
     return _rank_test(
         observability_matrix(plant.A.T, plant.B.T, plant.n),
         plant.n,
@@ -224,6 +217,21 @@ def at_disturbances(plant: Plant, inputs: int, level: np.ndarray) -> Plant:
         b=plant.b + plant.B[:, inputs:] @ level,
         d=plant.d + plant.D[:, inputs:] @ level,
     )
+
+
+def padded(plants: Sequence[Plant]) -> list[Plant]:
+    """The plants with one order: states that nothing moves and nobody sees fill up the smaller ones."""
+    most = max(plant.n for plant in plants)
+    return [
+        plant._replace(
+            A=np.pad(plant.A, (0, most - plant.n)),
+            B=np.pad(plant.B, ((0, most - plant.n), (0, 0))),
+            C=np.pad(plant.C, ((0, 0), (0, most - plant.n))),
+            b=np.pad(plant.b, (0, most - plant.n)),
+            K=np.pad(plant.K, ((0, most - plant.n), (0, 0))),
+        )
+        for plant in plants
+    ]
 
 
 def hold_state(plant: Plant, x: np.ndarray) -> np.ndarray:

@@ -8,39 +8,10 @@ import numpy as np
 from pipeline.temperature.plant import Plant
 
 
-def study_signal(
-    rng: np.random.Generator,
-    samples: int,
-    inputs: int,
-    *,
-    amplitudes: np.ndarray,
-    bandwidth: float,
-    variance: float,
-    redrawn: bool = True,
-) -> np.ndarray:
-    """omega_pr (samples, inputs) of (51), (52): a sinusoid at the bandwidth, one for each further amplitude
-    at a random frequency below it, and Gaussian noise.
-
-    `redrawn` draws the frequencies anew every step, as the study's script does (nearly white); without it
-    they are fixed, as the text reads. bandwidth in rad a step.
-    """
-    t = np.arange(samples)[:, None]
-    signal = np.sqrt(variance) * rng.standard_normal((samples, inputs)) + amplitudes[0] * np.sin(
-        bandwidth * t
-    )
-    for amplitude in amplitudes[1:]:
-        omega = rng.uniform(0.0, bandwidth, (samples if redrawn else 1, inputs))
-        signal += amplitude * np.sin(omega * t)
-    return signal
-
-
-def multisine(
-    rng: np.random.Generator, samples: int, inputs: int, *, amplitude: float, lowest: float = 0.0
-) -> np.ndarray:
-    """(samples, inputs) within +-amplitude: equal power at every frequency of the record from `lowest` (rad a
-    step) up, random phases, other lines for each input."""
+def multisine(rng: np.random.Generator, samples: int, inputs: int, *, amplitude: float) -> np.ndarray:
+    """(samples, inputs) within +-amplitude: equal power at every frequency of the record, random phases,
+    other lines for each input."""
     lines = np.arange(1, (samples + 1) // 2)
-    lines = lines[2 * np.pi * lines / samples >= lowest]
     spectrum = np.zeros((samples // 2 + 1, inputs), complex)
     for channel in range(inputs):
         own = lines[channel::inputs]
@@ -67,39 +38,23 @@ class Probe(NamedTuple):
     limited: float
 
 
-class OperatingPoint(NamedTuple):
-    """State x (n,) at the start, and the inputs u (m,) and outputs y (p,) that probing stays around."""
-
-    x: np.ndarray
-    u: np.ndarray
-    y: np.ndarray
-
-
-class InputLimits(NamedTuple):
-    """low (m,) <= u <= high (m,), and at most `rate` percent a step."""
-
-    low: np.ndarray
-    high: np.ndarray
-    rate: float
-
-
 def probe(
     plant: Plant,
     signal: np.ndarray,
-    point: OperatingPoint,
-    limits: InputLimits,
+    point: tuple[np.ndarray, np.ndarray, np.ndarray],
+    limits: tuple[np.ndarray, np.ndarray, float],
     *,
     feedback: np.ndarray,
     noise: np.ndarray,
 ) -> Probe:
-    """u = point.u + feedback (point.y - y measured) + signal, within the limits: outputs stay near point.y,
-    from measurements only.
+    """u = u_centre + feedback (y_centre - y measured) + signal, within the limits: outputs stay near
+    y_centre, from measurements only.
 
-    feedback (m, p) in percent per °C; noise (samples, p) in °C. What is
+    point: state x (n,) at the start, u_centre (m,) and y_centre (p,); limits: low (m,) <= u <= high (m,), and
+    at most so many percent a step; feedback (m, p) in percent per °C; noise (samples, p) in °C. What is
     applied is what is recorded, so that limits bias nothing.
     """
-    x, u_centre, y_centre = point
-    low, high, rate = limits
+    (x, u_centre, y_centre), (low, high, rate) = point, limits
     last = u_centre
     u, y, limited = np.empty_like(signal), np.empty((len(signal), plant.p)), 0
     for t in range(len(signal)):
@@ -109,21 +64,6 @@ def probe(
         limited += int((u[t] != wanted).sum())
         last, x = u[t], plant.A @ x + plant.B @ u[t] + plant.b
     return Probe(u, y, limited / signal.size)
-
-
-def study_probe(
-    plant: Plant, signal: np.ndarray, K_data: np.ndarray, *, x0: np.ndarray, noise: np.ndarray
-) -> Probe:
-    """u = -K_data x + omega_pr (50), which reads the true state and knows no limits: for parity and
-    benchmarks only. signal and noise may carry a batch axis: signal (samples, batch, m), noise (samples,
-    batch, p) give u and y of the same shapes."""
-    closed = (plant.A - plant.B @ K_data).T
-    x = np.empty((len(signal), *signal.shape[1:-1], plant.n))
-    x[0] = x0
-    drive = signal @ plant.B.T
-    for t in range(len(signal) - 1):
-        x[t + 1] = x[t] @ closed + drive[t]
-    return Probe(signal - x @ K_data.T, x @ plant.C.T + noise, 0.0)
 
 
 class Excitation(NamedTuple):

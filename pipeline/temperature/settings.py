@@ -123,7 +123,6 @@ class Tracking(Section):
     gamma: float = Field(gt=0, le=1)
     yardstick_q: float = Field(gt=0, le=1e6)
     yardstick_r: float = Field(gt=0, le=1e6)
-    integral: float = Field(ge=0, le=1)
     integral_limit_degC: float = Field(gt=0, le=1000)
     governor_overshoot_degC: float = Field(gt=0, le=1000)
     observer_tau: float = Field(gt=0, le=1000)

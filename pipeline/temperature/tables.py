@@ -12,22 +12,21 @@ from pipeline.temperature.settings import PlantSignal
 def record(inputs: Sequence[PlantSignal], outputs: Sequence[PlantSignal]) -> Schema:
     """The table that ingest writes: one row a sample. A masked value stays as
     recorded; the flag beside it says not to use it."""
+    faulty = "is not to be used here: missing, or found faulty"
     columns = [
         Column("recording", TEXT, NONE, "file below datasets/raw that the sample is from"),
         Column("segment", INDEX, NONE, "stretch of that recording without a gap, counted from 0", low=0),
         Column("time_s", FLOAT, "s", "time since the recording began"),
-    ]
-    for role, signals in (("input", inputs), ("output", outputs)):
-        for signal in signals:
-            columns.append(Column(signal.name, FLOAT, signal.unit, f"{role} {signal.name}", nullable=True))
-            columns.append(
-                Column(
-                    f"{signal.name}_masked",
-                    BOOL,
-                    NONE,
-                    f"{signal.name} is not to be used here: missing, or found faulty",
-                )
+        *(
+            column
+            for role, signals in (("input", inputs), ("output", outputs))
+            for signal in signals
+            for column in (
+                Column(signal.name, FLOAT, signal.unit, f"{role} {signal.name}", nullable=True),
+                Column(f"{signal.name}_masked", BOOL, NONE, f"{signal.name} {faulty}"),
             )
+        ),
+    ]
     return Schema("record", 1, tuple(columns))
 
 
@@ -201,32 +200,20 @@ ORDER = Schema(
 def holdout(outputs: Sequence[PlantSignal]) -> Schema:
     """The part of the record that judged the model: measured, simulated from its inputs alone, and predicted
     from outputs so many steps before."""
+    kinds = {
+        "measured": "as recorded",
+        "simulated": "by the model, from the inputs alone",
+        "ahead": "by the model, identify_plant.ahead_steps before",
+    }
     columns = [
         Column("segment", INDEX, NONE, "stretch of the record", low=0),
         Column("time_s", FLOAT, "s", "time since the hold-out began"),
+        *(
+            Column(f"{one.name}_{kind}", FLOAT, one.unit, f"{one.name} {meaning}", nullable=True)
+            for one in outputs
+            for kind, meaning in kinds.items()
+        ),
     ]
-    for signal in outputs:
-        columns.append(
-            Column(f"{signal.name}_measured", FLOAT, signal.unit, f"{signal.name} as recorded", nullable=True)
-        )
-        columns.append(
-            Column(
-                f"{signal.name}_simulated",
-                FLOAT,
-                signal.unit,
-                f"{signal.name} by the model, from the inputs alone",
-                nullable=True,
-            )
-        )
-        columns.append(
-            Column(
-                f"{signal.name}_ahead",
-                FLOAT,
-                signal.unit,
-                f"{signal.name} by the model, identify_plant.ahead_steps before",
-                nullable=True,
-            )
-        )
     return Schema("holdout", 2, tuple(columns))
 
 

@@ -1,14 +1,13 @@
 """Linear-quadratic tracking of a known model: Riccati gains, observer, Algorithm 1 of seed 1, and the
 feasible target within the limits of the inputs."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 import scipy.linalg.lapack
 
-from pipeline.temperature.plant import Plant, strictly_proper
+from pipeline.temperature.plant import Plant
 
 
 class Gains(NamedTuple):
@@ -56,17 +55,6 @@ class Law(NamedTuple):
     start: np.ndarray
     integral: float | np.ndarray = 0.0
     conditional: bool = False
-
-
-class ControllerDesign(NamedTuple):
-    """One way to control. `design(q, r, integral)` gives its law for weights diag(q), diag(r); `integral` is
-    the outer integrator's share of the error a step, 0 in the unclipped run. Its feasible targets are
-    computed on `model`.
-    """
-
-    name: str
-    design: Callable[[np.ndarray, np.ndarray, float], Law]
-    model: Plant
 
 
 def riccati(
@@ -125,39 +113,6 @@ def gains(plant: Plant, Q: np.ndarray, R: np.ndarray, gamma: float) -> Gains:
     return Gains(K_x, K_w[:, :p], K_w[:, p], P)
 
 
-def augmented(plant: Plant, Q: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """T, B_1 of (12) and Q_1 of (14) for the state [x; r]."""
-    CQ = plant.C.T @ Q
-    T = scipy.linalg.block_diag(plant.A, F)
-    return T, np.vstack([plant.B, np.zeros((plant.p, plant.m))]), np.block([[CQ @ plant.C, -CQ], [-CQ.T, Q]])
-
-
-class Iterated(NamedTuple):
-    """K (m, n+p) of u = -K [x; r] (15), and how many policies were evaluated; `settled`
-    is False where the limit of iterations ended it."""
-
-    K: np.ndarray
-    iterations: int
-    settled: bool
-
-
-def algorithm_1(plant: Plant, Q, R, gamma, K0, *, tolerance: float, max_iterations: int = 100) -> Iterated:
-    """Algorithm 1 as the study's script runs it: its Lyapunov equation carries gamma in place of sqrt(gamma),
-    and it stops on the one-norm of K's change.
-
-    From a K0 under which the cost is infinite, the P of (ii) is no cost, and the iteration can settle on a
-    gain that does not stabilise: nothing here notices.
-    """
-    T, B_1, Q_1 = augmented(plant, Q, np.eye(plant.p))
-    K = K0
-    for j in range(1, max_iterations + 1):
-        P = scipy.linalg.solve_discrete_lyapunov(gamma * (T - B_1 @ K).T, Q_1 + K.T @ R @ K)
-        K, previous = np.linalg.solve(R + gamma * B_1.T @ P @ B_1, gamma * B_1.T @ P @ T), K
-        if np.linalg.norm(K - previous, 1) < tolerance:
-            return Iterated(K, j, True)
-    return Iterated(K, max_iterations, False)
-
-
 def still_law(m: int, p: int) -> Law:
     """A law that asks for nothing and remembers nothing: what doing nothing is judged as."""
     none = np.zeros((0, 0))
@@ -175,11 +130,6 @@ def still_law(m: int, p: int) -> Law:
         start_y=np.zeros((0, p)),
         start=np.zeros(0),
     )
-
-
-def stabilises(plant: Plant, K_x: np.ndarray) -> bool:
-    """Whether every eigenvalue of A - B K_x lies inside the unit circle."""
-    return bool(np.abs(np.linalg.eigvals(plant.A - plant.B @ K_x)).max() < 1)
 
 
 def observer_gain(plant: Plant, tau: float) -> np.ndarray:
@@ -224,26 +174,14 @@ def observer_law(plant: Plant, gains: Gains, L: np.ndarray, *, integral: float =
     )
 
 
-def model_based(plant: Plant, gamma: float, *, tau: float) -> ControllerDesign:
-    """Riccati gains of an identified model, and an observer that stands its errors (robust_observer_gain),
-    started where inputs may have brought it. Feed-through counts as one sample of delay."""
-    plant = strictly_proper(plant)
-    observed = _observed("model_based", plant, gamma, robust_observer_gain(plant, tau))
-    return observed._replace(
-        design=lambda q, r, integral: started_reached(observed.design(q, r, integral), plant)
-    )
-
-
-def exact_model(plant: Plant, gamma: float, *, tau: float) -> ControllerDesign:
-    """The paper's controller, told the true plant: Riccati gains and (8)."""
-    return _observed("exact_model", plant, gamma, observer_gain(plant, tau))
-
-
-def _observed(name: str, plant: Plant, gamma: float, L: np.ndarray) -> ControllerDesign:
-    def design(q: np.ndarray, r: np.ndarray, integral: float) -> Law:
-        return observer_law(plant, gains(plant, np.diag(q), np.diag(r), gamma), L, integral=integral)
-
-    return ControllerDesign(name, design, plant)
+def model_based(
+    plant: Plant, q: np.ndarray, r: np.ndarray, integral: float, *, gamma: float, tau: float
+) -> Law:
+    """Riccati gains of an identified model without feed-through for weights diag(q), diag(r), and an observer
+    that stands its errors (robust_observer_gain), started where inputs may have brought it. `integral` is the
+    outer integrator's share of the error a step."""
+    best, L = gains(plant, np.diag(q), np.diag(r), gamma), robust_observer_gain(plant, tau)
+    return started_reached(observer_law(plant, best, L, integral=integral), plant)
 
 
 def started_reached(law: Law, plant: Plant, *, forgets: float = 0.01) -> Law:

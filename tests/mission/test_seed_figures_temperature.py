@@ -5,9 +5,9 @@ import csv
 import numpy as np
 import pytest
 
+from pipeline.papers import published
 from pipeline.papers import temperature as paper
-from pipeline.temperature import published
-from pipeline.temperature.published import IDENTITY, TUNED_DATA, TUNED_MODEL
+from pipeline.papers.published import IDENTITY, TUNED_DATA, TUNED_MODEL
 
 
 @pytest.fixture(scope="module")

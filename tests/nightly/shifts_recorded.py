@@ -11,7 +11,7 @@ import scipy.linalg
 
 from pipeline.store import artifacts, params
 from pipeline.temperature.plant import Plant, hold_output, plant
-from pipeline.temperature.probing import InputLimits, OperatingPoint, prbs, probe
+from pipeline.temperature.probing import prbs, probe
 from tests.nightly.toy_nights import SETTINGS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -51,8 +51,8 @@ def recording(
     run = probe(
         truth,
         signal,
-        OperatingPoint(x0, u0, REFERENCE + aim_degC),
-        InputLimits(np.zeros(2), np.full(2, 100.0), 20.0),
+        (x0, u0, REFERENCE + aim_degC),
+        (np.zeros(2), np.full(2, 100.0), 20.0),
         feedback=0.5 * np.eye(2),
         noise=noise,
     )

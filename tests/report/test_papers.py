@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from pipeline.papers import deposition as papers_deposition
+from pipeline.papers import published
 from pipeline.papers import setpoint as papers_setpoint
 from pipeline.papers import temperature as papers_temperature
+from pipeline.papers.study import exact_gains
 from pipeline.papers.study_draws import read_published
 from pipeline.report.papers import page, rows, setpoint
 from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS
 from pipeline.report.shared.sources import Sources
 from pipeline.store import params
-from pipeline.temperature import published
-from pipeline.temperature.controllers.kernel import exact_gains
 from pipeline.temperature.plant import baam
 from pipeline.temperature.tracking import gains
 from pipeline.verdict.verdict import Missing

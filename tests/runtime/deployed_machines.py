@@ -19,7 +19,8 @@ from pipeline.temperature.controllers.governor import (
     Strength,
     governor,
 )
-from pipeline.temperature.controllers.window import controller, learn
+from pipeline.temperature.controllers.window import law as varx_law
+from pipeline.temperature.controllers.window import learn, observer_form
 from pipeline.temperature.plant import Plant, baam, plant
 from pipeline.temperature.tracking import Law, still_law
 
@@ -65,15 +66,14 @@ def _windowed(model: Plant) -> tuple[Law, Plant]:
         y[t] = model.C @ x + model.d + rng.normal(0, NOISE, model.p)
         x = model.A @ x + model.B @ u[t] + model.b
     learned = learn([u], [y], longest=6)
-    made = controller(learned, 0.99)
-    return compact(made.design(np.ones(model.p), np.full(model.m, 0.1), 0.05), learned.N), made.model
+    made = varx_law(learned, np.eye(model.p), 0.1 * np.eye(model.m), 0.99, integral=0.05)
+    return compact(made, learned.N), observer_form(learned)[0]
 
 
 def _law(kind: str, model: Plant, limits: ActuatorLimits) -> tuple[Law, Plant]:
     if kind in ("lqg", "slow", "tight", "told", "study"):
-        made = tracking.model_based(model, 0.99, tau=1.0)
-        effort = 1e-4 if kind == "tight" else 0.1
-        return made.design(np.ones(model.p), np.full(model.m, effort), 0.05), model
+        effort = np.full(model.m, 1e-4 if kind == "tight" else 0.1)
+        return tracking.model_based(model, np.ones(model.p), effort, 0.05, gamma=0.99, tau=1.0), model
     if kind == "window":
         return _windowed(model)
     if kind == "pi":
@@ -85,8 +85,8 @@ def _law(kind: str, model: Plant, limits: ActuatorLimits) -> tuple[Law, Plant]:
 
 
 def _pi(model: Plant, limits: ActuatorLimits) -> Law:
-    made = baseline.controller(model, (limits.low, limits.high), horizon=300)
-    return made.design(np.ones(model.p), np.ones(model.m), 0.0)
+    pairs = baseline.pairing(model, limits.low, limits.high, horizon=300)
+    return baseline.pi_law(pairs, inputs=model.m)
 
 
 @cache

@@ -60,7 +60,7 @@ LIMITS = ActuatorLimits(np.zeros(2), np.full(2, 100.0), np.full(2, np.inf))
 
 
 def designed(of: Plant, *, effort: float = 0.3, integral: float = 0.05) -> Exported:
-    law = tracking.model_based(of, 0.99, tau=1.0).design(np.ones(2), np.full(2, effort), integral)
+    law = tracking.model_based(of, np.ones(2), np.full(2, effort), integral, gamma=0.99, tau=1.0)
     made = controller.deployed(law, LIMITS, integral_limit=2.0)
     return Exported(
         "subspace_lqg", Machine(*SIGNALS, 1.0), made, of, None, None, False, plants_sha256([of]), "spread"

@@ -5,14 +5,14 @@ from functools import cache
 import numpy as np
 import pytest
 
+from pipeline.papers.study import data_sets
 from pipeline.runtime import replay, support
 from pipeline.runtime.replay import GaplessLog
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline, controller, governor, window
 from pipeline.temperature.controllers.controller import Deployed, RunningController, compact, deployed
 from pipeline.temperature.controllers.governor import ActuatorLimits
-from pipeline.temperature.plant import Plant, baam
-from pipeline.temperature.study import data_sets
+from pipeline.temperature.plant import Plant, baam, padded
 from pipeline.temperature.test_set import panel
 
 LIMITS = ActuatorLimits(np.zeros(7), np.full(7, 100.0), np.full(7, np.inf))
@@ -30,18 +30,17 @@ def guard() -> governor.Governor:
 
 @cache
 def ready(name: str) -> tuple[Deployed, Plant]:
-    ones = np.ones(5), np.ones(7)
     if name == "pi":
-        made = baseline.controller(baam(), (LIMITS.low, LIMITS.high), horizon=600)
-        return deployed(made.design(*ones, 0.05), SLOW, integral_limit=1.0), made.model
+        pairs = baseline.pairing(baam(), LIMITS.low, LIMITS.high, horizon=600)
+        return deployed(baseline.pi_law(pairs, inputs=7), SLOW, integral_limit=1.0), baam()
     if name == "window":
         u, y = data_sets(np.random.default_rng(1), 1500, 1)
         learned = window.learn([u[:, 0]], [y[:, 0]], longest=4)
-        made = window.controller(learned, 0.99)
-        law = compact(made.design(*ones, 0.05), learned.N)
-        return deployed(law, LIMITS, integral_limit=1.0, governor=guard()), made.model
-    made = tracking.model_based(baam(), 0.99, tau=1.0)
-    return deployed(made.design(*ones, 0.05), LIMITS, integral_limit=1.0, governor=guard()), made.model
+        law = compact(window.law(learned, np.eye(5), np.eye(7), 0.99, integral=0.05), learned.N)
+        model = window.observer_form(learned)[0]
+        return deployed(law, LIMITS, integral_limit=1.0, governor=guard()), model
+    law = tracking.model_based(baam(), np.ones(5), np.ones(7), 0.05, gamma=0.99, tau=1.0)
+    return deployed(law, LIMITS, integral_limit=1.0, governor=guard()), baam()
 
 
 @cache
@@ -131,7 +130,7 @@ def test_a_reference_that_never_holds_still_is_refused():
 @cache
 def within() -> support.Support:
     rng = np.random.default_rng(5)
-    plants = panel.padded(panel.drawn([baam()], 8, SPREAD, cells=True, rng=rng))
+    plants = padded(panel.drawn([baam()], 8, SPREAD, cells=True, rng=rng))
     parts = np.array_split(np.arange(len(log().u)), 3)
     return support.support(plants, [GaplessLog(*(part[rows] for part in log())) for rows in parts], NOISE)
 

@@ -17,6 +17,7 @@ from pipeline.runtime import machine, support
 from pipeline.runtime.replay import GaplessLog
 from pipeline.runtime.support_file import write_support
 from pipeline.store import artifacts
+from pipeline.temperature.plant import padded
 from pipeline.temperature.test_set import panel
 from tests.runtime.deployed_machines import block_and_sensor, exported, passed
 
@@ -29,7 +30,7 @@ def folder(tmp_path, monkeypatch):
     of, rng = exported("pi"), np.random.default_rng(2)
     folder = tmp_path / "controller"
     machine.write(folder, of, passed(of))
-    plants = panel.padded(
+    plants = padded(
         panel.drawn([of.model], 8, panel.PlantSpread(0.15, 0.2, 0.0, 0.0, 5.0), cells=False, rng=rng)
     )
     logs = [rolled(seed) for seed in range(4)]

@@ -26,12 +26,12 @@ WIRED = Machine(
 
 
 def exported(*, fallback: bool = True) -> Exported:
-    made = baseline.controller(MODEL, (LOW, HIGH), horizon=400, noise_degC=np.full(2, NOISE))
-    law = made.design(np.ones(2), np.ones(2), 0.0)
+    pairs = baseline.pairing(MODEL, LOW, HIGH, horizon=400, noise_degC=np.full(2, NOISE))
+    law = baseline.pi_law(pairs, inputs=2)
     deployed = controller.deployed(law, ActuatorLimits(LOW, HIGH, np.full(2, np.inf)), integral_limit=1.0)
     watched = supervision(MODEL, WIRED, np.full(2, NOISE))
     own = deployed if fallback else None
-    return Exported("pi", WIRED, deployed, made.model, own, watched, True, "", "")
+    return Exported("pi", WIRED, deployed, MODEL, own, watched, True, "", "")
 
 
 class Run:

@@ -8,9 +8,9 @@ import joblib
 import numpy as np
 import pytest
 
+from pipeline.papers import study
 from pipeline.store import execution
 from pipeline.store.execution import run_all
-from pipeline.temperature import study
 from tests.cluster import Cluster
 from tests.temperature.test_ingest import INLINE
 

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.temperature.identification.refinement import simulated
 from pipeline.temperature.identification.subspace import Segments
-from pipeline.temperature.identification.validation import predicted_ahead, simulated
+from pipeline.temperature.identification.validation import predicted_ahead
 from pipeline.temperature.plant import Plant
 
 

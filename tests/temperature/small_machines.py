@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.temperature.identification.model_choice import Settings, identify, within_limits
-from pipeline.temperature.identification.validation import bootstrap_spread, one_step_errors
+from pipeline.temperature.identification.refinement import one_step_errors
+from pipeline.temperature.identification.validation import bootstrap_spread
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.tracking import Law
 

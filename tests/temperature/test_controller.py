@@ -8,7 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipeline.temperature import study, tracking
+from pipeline.papers import study
+from pipeline.papers.published import REFERENCE
+from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline, window
 from pipeline.temperature.controllers.controller import (
     ControllerState,
@@ -28,7 +30,6 @@ from pipeline.temperature.controllers.controller import (
 from pipeline.temperature.controllers.governor import ActuatorLimits, Governor, OutputLimits, governor
 from pipeline.temperature.plant import Plant, baam, hold_state
 from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.published import REFERENCE
 from pipeline.temperature.test_set import panel
 from pipeline.temperature.tracking import Law
 
@@ -39,7 +40,7 @@ ONE5, ONE7 = np.ones(5), np.ones(7)
 
 
 def lqg(plant: Plant, *, tau: float = 1.0, integral: float = 0.05) -> Law:
-    return tracking.model_based(plant, 0.99, tau=tau).design(ONE5, ONE7, integral)
+    return tracking.model_based(plant, ONE5, ONE7, integral, gamma=0.99, tau=tau)
 
 
 @cache
@@ -97,7 +98,7 @@ HEATER = make_plant([[0.95]], [[0.5]], [[1.0]])
 @pytest.mark.parametrize("aimed_high", [5.0, 50.0], ids=["target within reach", "target as asked"])
 def test_back_calculation_ends_the_wind_up_of_the_integrator(aimed_high: float):
     """100 °C would need 10 percent, the input has 5, for 200 samples; then 30 °C, which 3 percent hold."""
-    law = tracking.model_based(HEATER, 0.99, tau=1.0).design(np.ones(1), np.ones(1), 0.1)
+    law = tracking.model_based(HEATER, np.ones(1), np.ones(1), 0.1, gamma=0.99, tau=1.0)
     narrow = ActuatorLimits(np.zeros(1), np.full(1, 5.0), np.full(1, np.inf))
     aims = [
         aim(law, rest(HEATER, constant(r), narrow._replace(high=np.full(1, aimed_high))), constant(r))
@@ -229,7 +230,7 @@ def test_conditional_integration_adds_the_error_where_no_limit_holds_it():
 def test_the_compact_law_of_a_window_asks_for_what_the_window_asks_for_case_by_case():
     u, y = study.data_sets(np.random.default_rng(1), 1500, 1)
     learned = window.learn([u[:, 0]], [y[:, 0]], longest=4)
-    law = window.controller(learned, 0.99).design(ONE5, ONE7, 0.05)
+    law = window.law(learned, np.diag(ONE5), np.diag(ONE7), 0.99, integral=0.05)
     rng = np.random.default_rng(2)
     readings, target = 150 + rng.standard_normal((12, 3, 5)), np.tile(REFERENCE, (3, 1))
     inputs = []
@@ -275,12 +276,12 @@ def test_a_sequence_reaches_every_reference():
 def laws() -> dict[str, tuple[Plant, Law]]:
     u, y = study.data_sets(np.random.default_rng(1), 1500, 1)
     learned = window.learn([u[:, 0]], [y[:, 0]], longest=4)
-    varx = window.controller(learned, 0.99)
-    pi = baseline.controller(baam(), (LIMITS.low, LIMITS.high), horizon=600)
+    varx = window.law(learned, np.diag(ONE5), np.diag(ONE7), 0.99, integral=0.05)
+    pairs = baseline.pairing(baam(), LIMITS.low, LIMITS.high, horizon=600)
     return {
         "lqg": (baam(), lqg(baam())),
-        "varx": (varx.model, compact(varx.design(ONE5, ONE7, 0.05), learned.N)),
-        "pi": (pi.model, pi.design(ONE5, ONE7, 0.05)),
+        "varx": (window.observer_form(learned)[0], compact(varx, learned.N)),
+        "pi": (baam(), baseline.pi_law(pairs, inputs=7)),
     }
 
 

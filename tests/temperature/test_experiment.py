@@ -11,13 +11,21 @@ from pipeline import cli
 from pipeline.store import artifacts, params
 from pipeline.temperature import experiment, tracking
 from pipeline.temperature.controllers import baseline
-from pipeline.temperature.experiment import ExperimentLimits, Wish
 from pipeline.temperature.plant import hold_output, plant, simulate
 from pipeline.temperature.settings import GenerateProbing, Plant, Tracking
 from stages import generate_probing
 from tests.temperature.test_propose_params import tree  # noqa: F401  the params files as shipped
 
-DOUBT = experiment.Doubt(0.15, 8.0, 1)
+ASKED = GenerateProbing(
+    source="recordings", seed=1, signal="prbs", samples=1500, amplitude_percent=5.0, shortest_steps=1,
+    rate_percent_per_step=5.0, noise_degC=0.1, feedback_percent_per_degC=0.0, centre_percent=None,
+    doubt_input_gain=0.15, doubt_ambient_degC=8.0, doubt_delay_steps=1,
+)  # fmt: skip
+MACHINE = Plant(
+    inputs=[{"name": "heater", "unit": "percent", "low": 0, "high": 100}],
+    outputs=[{"name": "zone", "unit": "degC", "reference": 200, "low": 0, "high": 300}],
+    sample_time_s=1.0,
+)
 ROOM, TAU, LATE = 25.0, 120.0, 3
 HOLDS_200 = 38.0  # percent: left alone at 50 it would reach 255 °C
 
@@ -51,19 +59,23 @@ def record_of(truth, y0, samples=1500, noise=0.1, moves=8.0, feedback=0.0):
     return u, y + noise * rng.standard_normal(y.shape), x
 
 
-def limits(low, high):
-    return ExperimentLimits(np.zeros(1), np.full(1, 100.0), 5.0, np.array([low]), np.array([high]))
-
-
-def wish(reference, samples=1500, **more):
-    return Wish(np.array([reference]), 5.0, samples, "prbs", 1, **more)
-
-
-def family_of(plants, u, y, samples=1500):
-    names = {"inputs": ["heater"], "outputs": ["zone"]}
-    return experiment.family_of(
-        plants, ([u], [y]), reach=np.full(1, 100.0), longest=samples, doubt=DOUBT, **names
+def wanted(family, reference, low, high, **asked):
+    """The family, asked for an experiment about the reference within these limits."""
+    return family._replace(
+        asked=family.asked.model_copy(update=asked),
+        reference=np.array([reference]),
+        y_low=np.array([low]),
+        y_high=np.array([high]),
     )
+
+
+def family_of(plants, u, y):
+    return experiment.family_of(plants, ([u], [y]), ASKED, MACHINE)
+
+
+def pi_of(model, horizon):
+    pairs = baseline.pairing(model, np.zeros(1), np.full(1, 100.0), horizon=horizon)
+    return baseline.pi_law(pairs, inputs=1)
 
 
 @pytest.fixture(scope="module")
@@ -74,13 +86,19 @@ def heated():
     return family_of(plants, u, y), x
 
 
-def of_model(begin):
-    """The start of the family's first member alone."""
-    return begin._replace(x=begin.x[:1], bias=begin.bias[:1])
+def of_model(family, **doubt):
+    """The family's first member alone, without a band and with these doubts alone."""
+    none = {"doubt_input_gain": 0.0, "doubt_ambient_degC": 0.0, "doubt_delay_steps": 0}
+    return family._replace(
+        plants=family.plants[:1],
+        begin=family.begin._replace(x=family.begin.x[:1], bias=family.begin.bias[:1]),
+        band=experiment.Band(np.zeros(1), np.zeros(1)),
+        asked=family.asked.model_copy(update=none | doubt),
+    )
 
 
 def design(family, high, **more):
-    return experiment.design(family, wish(200.0, **more), limits(0.0, high), np.random.default_rng(1))
+    return experiment.design(wanted(family, 200.0, 0.0, high, **more), np.random.default_rng(1))
 
 
 # ---- safe
@@ -94,7 +112,9 @@ def test_a_hot_end_at_38_percent_is_never_driven_above_its_limit(heated, high, g
     assert tried.written
     # from now on the heater has another gain, which is what is doubted
     y = simulate(hot_end(), gain * tried.u, x)[1]
-    warmed = DOUBT.ambient_degC * -np.expm1(-np.arange(len(y)) / TAU)  # by an ambient that moved at the start
+    warmed = ASKED.doubt_ambient_degC * -np.expm1(
+        -np.arange(len(y)) / TAU
+    )  # by an ambient that moved at the start
     assert (y[:, 0] + warmed).max() <= high
     assert tried.extremes.lowest <= y.min() and y.max() <= tried.extremes.highest
 
@@ -116,10 +136,7 @@ def test_a_lower_limit_takes_a_smaller_amplitude_or_a_cooler_centre_and_still_te
 def test_the_forecast_of_a_member_is_its_simulation_within_the_doubt(heated):
     family, x = heated
     tried = design(family, 260.0)
-    none = experiment.Doubt(0.0, 0.0, 0)
-    exact = experiment.forecast(
-        family.plants[:1], of_model(family.begin), tried.u, doubt=none, fastest=100.0, width=np.zeros(1)
-    )
+    exact = experiment.forecast(of_model(family), tried.u)
     y = simulate(hot_end(), tried.u, x)[1]
     # the state at the end of the record is estimated from outputs with 0.1 °C of noise
     np.testing.assert_allclose([exact.highest[0], exact.lowest[0]], [y.max(), y.min()], atol=0.1)
@@ -128,13 +145,8 @@ def test_the_forecast_of_a_member_is_its_simulation_within_the_doubt(heated):
 def test_doubt_about_gains_is_exact_a_forecast_with_it_equals_the_worst_member(heated):
     family, _ = heated
     u = np.repeat([[38.0], [43.0], [33.0]], 300, axis=0)
-    still = of_model(family.begin)
-    doubt = experiment.Doubt(0.15, 0.0, 0)
-    bound = experiment.forecast([hot_end()], still, u, doubt=doubt, fastest=1.0, width=np.zeros(1))
-    more = experiment.forecast(
-        [hot_end()], still, 1.15 * u, doubt=doubt._replace(input_gain=0.0), fastest=1.0,
-        width=np.zeros(1),
-    )  # fmt: skip
+    bound = experiment.forecast(of_model(family, doubt_input_gain=0.15), u)
+    more = experiment.forecast(of_model(family), 1.15 * u)
     np.testing.assert_allclose(bound.highest, more.highest, rtol=1e-12)  # the same sums in another order
 
 
@@ -145,29 +157,26 @@ def test_what_hardly_settles_is_refused_open_loop_and_offered_around_its_control
     u, y, _ = record_of(integrator(), 100.0, feedback=1.0, moves=3.0)
     plants = [integrator(), integrator(0.1), integrator(-0.1)]
     family = family_of(plants, u, y)
-    tried = experiment.design(family, wish(100.0), limits(60.0, 140.0), np.random.default_rng(1))
+    family = wanted(family, 100.0, 60.0, 140.0)
+    tried = experiment.design(family, np.random.default_rng(1))
     assert not tried.written and not len(tried.u)
     assert "without its controller zone may" in tried.reason and "hardly settles by itself" in tried.reason
-    law = baseline.controller(plants[0], (np.zeros(1), np.full(1, 100.0)), horizon=300).design(
-        None, None, 0.0
-    )
-    added = experiment.dither(family, law, wish(100.0), limits(60.0, 140.0), np.random.default_rng(1))
+    law = pi_of(plants[0], 300)
+    added = experiment.dither(family, law, np.random.default_rng(1))
     assert not added.reason and added.amplitude.min() > 0
     assert 60 <= added.extremes.lowest.min() and added.extremes.highest.max() <= 140
 
 
 def test_a_dither_that_the_controller_cannot_hold_is_refused(heated):
     family, _ = heated
-    law = baseline.controller(hot_end(), (np.zeros(1), np.full(1, 100.0)), horizon=600).design(
-        None, None, 0.0
-    )
-    added = experiment.dither(family, law, wish(200.0), limits(199.9, 200.1), np.random.default_rng(1))
+    law = pi_of(hot_end(), 600)
+    added = experiment.dither(wanted(family, 200.0, 199.9, 200.1), law, np.random.default_rng(1))
     assert not len(added.u) and "its limits are 199.9 and 200.1" in added.reason
 
 
 def test_a_limit_that_the_machine_may_leave_with_no_signal_at_all_is_refused_with_output_and_figure(heated):
     # the reference is below what the ambient alone may add, and a limit at both sides leaves no other centre
-    tried = experiment.design(heated[0], wish(200.0), limits(195.0, 206.0), np.random.default_rng(1))
+    tried = experiment.design(wanted(heated[0], 200.0, 195.0, 206.0), np.random.default_rng(1))
     assert not tried.written
     assert "even with no signal played" in tried.reason and "zone" in tried.reason
 
@@ -177,7 +186,7 @@ def test_an_amplitude_that_teaches_nothing_is_not_written(heated):
     noisy = family._replace(band=family.band._replace(noise=np.array([500.0]), error=np.array([0.1])))
     # a sensor of 500 °C noise whose band is set aside: safe, but of no use
     noisy = noisy._replace(band=experiment.Band(np.array([30.0]), np.array([0.1])))
-    tried = experiment.design(noisy, wish(200.0, samples=120), limits(0.0, 320.0), np.random.default_rng(1))
+    tried = design(noisy, 320.0, samples=120)
     assert not tried.written and "would leave its gain unknown" in tried.reason
 
 
@@ -230,9 +239,8 @@ def test_power_lies_where_the_plant_answers():
         np.array([[100.0]]), np.zeros((1, 1)), np.ones((1, 1)), np.ones((1, 1), bool), 100, 100
     )
     for kind in ("prbs", "multisine"):
-        signal = experiment.signal(
-            np.random.default_rng(0), 4000, wish(0.0)._replace(signal=kind), speed
-        )[:, 0]  # fmt: skip
+        asked = ASKED.model_copy(update={"signal": kind})
+        signal = experiment.signal(np.random.default_rng(0), 4000, asked, speed)[:, 0]
         assert abs(signal.mean()) < 0.02 and np.abs(signal).max() == pytest.approx(1.0)
         power = np.abs(np.fft.rfft(signal)) ** 2
         slow = 2 * np.pi * np.arange(len(power)) / 4000 < 10 / 100.0  # ten times the corner frequency
@@ -243,7 +251,7 @@ def test_power_lies_where_the_plant_answers():
 def test_band_limited_amplitude_teaches_more_than_the_white_signal_of_the_same_amplitude(heated):
     family, _ = heated
     rng, noise = np.random.default_rng(0), family.band.noise
-    own = experiment.signal(rng, 1500, wish(200.0), family.pace)
+    own = experiment.signal(rng, 1500, ASKED, family.pace)
     white = rng.choice([-1.0, 1.0], (1500, 1))
     assert (
         experiment.lesson(own, family.pace, noise).information
@@ -256,7 +264,7 @@ def test_the_expected_errors_are_those_of_fitted_first_order_models():
     speed = experiment.Pace(
         np.array([[tau]]), np.zeros((1, 1)), np.array([[K]]), np.ones((1, 1), bool), tau, tau
     )
-    u = experiment.signal(rng, 1500, wish(0.0), speed)
+    u = experiment.signal(rng, 1500, ASKED, speed)
     truth = experiment.response(u[:, 0], tau, 0.0, 1.0)
     slope = (experiment.response(u[:, 0], 1.01 * tau, 0.0, 1.0) - truth) / 0.01
     J = np.column_stack([K * truth, K * slope, np.ones(len(truth))])

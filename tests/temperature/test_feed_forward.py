@@ -129,7 +129,7 @@ HEATER = plant([[0.98]], [[0.05]], [[1.0]], d=[25.0], K=[[0.1]])
 
 def ready(rate: float = np.inf, forward: FeedForward | None = None):
     limits = ActuatorLimits(np.zeros(1), np.full(1, 100.0), np.full(1, rate))
-    law = model_based(HEATER, 0.99, tau=1.0).design(np.ones(1), np.full(1, 0.1), 0.05)
+    law = model_based(HEATER, np.ones(1), np.full(1, 0.1), 0.05, gamma=0.99, tau=1.0)
     return deployed(law, limits, integral_limit=1.0, forward=forward)
 
 

@@ -164,7 +164,7 @@ def controlled(of: Blocks, *, effort: float, gain: float, lag: float, watched: b
     """A linear-quadratic law from cold to a target 3 °C below its limit."""
     target, k, rng = np.full(of.zones, level(of)), of.zones, np.random.default_rng(5)
     known = model(of)
-    design = tracking.model_based(known, 0.99, tau=1.0).design(np.ones(k), np.full(k, effort), 0.05)
+    design = tracking.model_based(known, np.ones(k), np.full(k, effort), 0.05, gamma=0.99, tau=1.0)
     limits = ActuatorLimits(np.zeros(k), np.full(k, 100.0), np.full(k, np.inf))
     watch = guard(of, level(of) + 3.0) if watched else None
     running = RunningController(deployed(design, limits, integral_limit=1.0, governor=watch), known)

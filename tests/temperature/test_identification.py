@@ -3,6 +3,8 @@ import re
 import numpy as np
 import pytest
 
+from pipeline.papers.published import K_DATA
+from pipeline.papers.study import study_probe, study_signal
 from pipeline.temperature.identification.model_choice import Settings, identify, refit, within_limits
 from pipeline.temperature.identification.order import (
     ModelStructure,
@@ -19,13 +21,11 @@ from pipeline.temperature.identification.refinement import (
     kalman_gain,
     linear_recurrence,
     refine,
+    simulated,
     simulation_form,
 )
 from pipeline.temperature.identification.subspace import lagged
-from pipeline.temperature.identification.validation import simulated
 from pipeline.temperature.plant import baam, markov_parameters, plant, simulate
-from pipeline.temperature.probing import study_probe, study_signal
-from pipeline.temperature.published import K_DATA
 from tests.temperature.moesp import moesp, moesp_singular_values, varx
 
 

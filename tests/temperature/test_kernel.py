@@ -6,17 +6,16 @@ import re
 import numpy as np
 import pytest
 
+from pipeline.papers.published import GAMMA, REFERENCE, tuples_with_reference
+from pipeline.papers.study import data_sets, exact_gains, reconstruction
 from pipeline.temperature.controllers import kernel as kernels
 from pipeline.temperature.controllers.kernel import (
-    exact_gains,
     quadratic_gram,
-    reconstruction,
     regress,
     skron,
     smat,
     svec,
     tuples,
-    tuples_with_reference,
     value_iteration,
     whitening,
     window_law,
@@ -24,8 +23,6 @@ from pipeline.temperature.controllers.kernel import (
     windows,
 )
 from pipeline.temperature.plant import baam, plant, simulate
-from pipeline.temperature.published import GAMMA, REFERENCE
-from pipeline.temperature.study import data_sets
 from pipeline.temperature.tracking import gains
 from tests.temperature import naive
 

@@ -6,8 +6,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.temperature import published
-from pipeline.temperature.published import (
+from pipeline.papers import published
+from pipeline.papers.published import (
     IDENTITY,
     TUNED_DATA,
     TUNED_MODEL,

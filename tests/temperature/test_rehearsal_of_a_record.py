@@ -126,15 +126,16 @@ def test_the_governor_is_the_same_in_other_units_of_the_inputs(family):
 def test_the_governor_holds_no_output_of_a_slow_machine_off_its_reference(family):
     judged = rehearsal(family)
     setting, asked = shared(family, judged), judged.judging
-    made = baseline.controller(
+    pairs = baseline.pairing(
         family[0],
-        (setting.limits.low, setting.limits.high),
+        setting.limits.low,
+        setting.limits.high,
         horizon=600,
         family=family,
         noise_degC=judged.noise,
     )
-    law = made.design(np.ones(1), np.ones(1), 0.0)
-    aims = panel.aims(law, panel.rests(made.model, asked, setting.limits), asked)
+    law = baseline.pi_law(pairs, inputs=1)
+    aims = panel.aims(law, panel.rests(family[0], asked, setting.limits), asked)
     errors, overshoots = [], []
     for guard in (None, setting.governor):
         deployed = controller.deployed(

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.temperature.identification.drift import simulated_with_drift, tracked
 from pipeline.temperature.identification.model_choice import Settings, identify
-from pipeline.temperature.identification.validation import simulated
+from pipeline.temperature.identification.refinement import simulated
 
 
 def test_the_drift_is_the_mean_over_its_warm_up_and_then_exponential_smoothing():

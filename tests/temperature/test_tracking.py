@@ -9,11 +9,10 @@ import pytest
 import scipy.linalg
 import scipy.optimize
 
+from pipeline.papers.published import GAMMA, K_DATA, REFERENCE, TAU, algorithm_1, stabilises
 from pipeline.temperature.plant import baam, hold_state, markov_parameters, plant, simulate
-from pipeline.temperature.published import GAMMA, K_DATA, REFERENCE, TAU
 from pipeline.temperature.tracking import (
     aimed,
-    algorithm_1,
     bounded_least_squares,
     feasible_target,
     gains,
@@ -22,7 +21,6 @@ from pipeline.temperature.tracking import (
     reached_state,
     riccati,
     robust_observer_gain,
-    stabilises,
     started_reached,
     still_law,
 )

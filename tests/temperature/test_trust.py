@@ -55,15 +55,19 @@ def test_fits_are_those_of_validation_and_lie_in_their_bands():
     y[200:210] = np.nan
     us, ys = [u[:500], u[500:]], [y[:500], y[500:]]
     judged = holdout(HEATER, us, ys, 7, block=20, rng=np.random.default_rng(0))
-    np.testing.assert_allclose(judged.fit[0], simulate_fit(HEATER, us, ys), rtol=1e-12)
-    np.testing.assert_allclose(judged.ahead_fit[0], predict_fit(HEATER, us, ys, 7), rtol=1e-12)
-    for part in (judged.fit, judged.ahead_fit):
+    np.testing.assert_allclose(judged.fits["fit_holdout"][0], simulate_fit(HEATER, us, ys), rtol=1e-12)
+    np.testing.assert_allclose(
+        judged.fits["fit_holdout_ahead"][0], predict_fit(HEATER, us, ys, 7), rtol=1e-12
+    )
+    for part in (judged.fits["fit_holdout"], judged.fits["fit_holdout_ahead"]):
         assert (part[1] < part[0]).all() and (part[0] < part[2]).all()
     # the start-up of predict_fit: 30 samples and the steps, in each segment
     assert np.flatnonzero(np.isfinite(judged.ahead[0][:, 0]))[0] == 37
     last = [np.where(np.isfinite(judged.ahead[k]), held(ys[k], 7), np.nan) for k in range(2)]
     np.testing.assert_allclose(
-        judged.held_fit, nrmse(np.vstack([b[37:] for b in ys]), np.vstack([b[37:] for b in last])), rtol=1e-12
+        judged.fits["fit_holdout_held"][0],
+        nrmse(np.vstack([b[37:] for b in ys]), np.vstack([b[37:] for b in last])),
+        rtol=1e-12,
     )
 
 
@@ -74,9 +78,9 @@ def test_a_free_mean_moves_the_simulation_that_is_shown_and_draws_no_ramp():
     y = (3.0 - 0.02 * t)[:, None] + 0.02 * np.random.default_rng(0).standard_normal((200, 1))
     judged = holdout(slow, [u], [y], 7, block=20, rng=np.random.default_rng(0))
     moved = judged.simulated[0] + (y - judged.simulated[0]).mean(axis=0)
-    np.testing.assert_allclose(judged.free_mean_fit[0], nrmse(y, moved), rtol=1e-12)
+    np.testing.assert_allclose(judged.fits["fit_holdout_free_mean"][0], nrmse(y, moved), rtol=1e-12)
     # a state fitted beside a constant drew the ramp of 4 °C with a fit of 90 %
-    assert judged.free_mean_fit[0, 0] < 20
+    assert judged.fits["fit_holdout_free_mean"][0, 0] < 20
 
 
 def test_where_inputs_stand_still_the_fit_is_that_of_held_inputs_and_elsewhere_it_is_not():
@@ -85,7 +89,9 @@ def test_where_inputs_stand_still_the_fit_is_that_of_held_inputs_and_elsewhere_i
     x = [simulate(HEATER, part, np.array([5.0, -3.0]))[1] for part in np.split(still, 6)]
     judged = holdout(HEATER, np.split(still, 6), x, 7, block=20, rng=np.random.default_rng(0))
     # both are the same simulation: rounding
-    np.testing.assert_allclose(fit_of_held_inputs(HEATER, np.split(still, 6), x), judged.fit[0], atol=1e-6)
+    np.testing.assert_allclose(
+        fit_of_held_inputs(HEATER, np.split(still, 6), x), judged.fits["fit_holdout"][0], atol=1e-6
+    )
     assert fit_of_held_inputs(HEATER, [u[200:]], [y[200:]])[0] < 30
 
 
@@ -107,7 +113,7 @@ def test_a_hold_out_without_a_segment_long_enough_has_no_fit_ahead_and_is_writte
     u, y = innovations_record(HEATER, 60, 0.1, 3)
     judged = holdout(HEATER, [u], [y], 60, block=20, rng=np.random.default_rng(0))
     figures = fit_figures(judged, ["T1"])
-    assert figures["fit_holdout"]["T1"] == judged.fit[0, 0]
+    assert figures["fit_holdout"]["T1"] == judged.fits["fit_holdout"][0, 0]
     assert (
         figures["fit_holdout_ahead"] is None
         and figures["fit_holdout_ahead_band"] is None

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime
 
+from pipeline.papers import study
 from pipeline.temperature.plant import baam, plant
 from pipeline.temperature.test_set import tuning
 from pipeline.temperature.tracking import gains
@@ -36,7 +37,7 @@ def index(design, q, r, steps=100):
 
 def fitness_of_baam(theta):
     design = designed(theta)
-    return tuning.fitness(
+    return study.fitness(
         BAAM, design.K_x, design.K_r, reference=REFERENCE, gamma=GAMMA, steps=100, x0=np.full(6, 20.0)
     )
 
@@ -57,7 +58,7 @@ def bowl(optimum, lower, upper, curvature):
 @pytest.mark.parametrize("steps", [0, 1, 7, 8, 100])
 def test_fitness_is_the_sum_of_37_term_by_term(steps):
     design = designed(np.linspace(0.05, 0.4, 12))
-    value = tuning.fitness(
+    value = study.fitness(
         BAAM, design.K_x, design.K_r, reference=REFERENCE, gamma=GAMMA, steps=steps, x0=np.full(6, 20.0)
     )
     # two orders of the same sum of at most 101 positive terms: rounding only
@@ -68,7 +69,7 @@ def test_fitness_counts_the_offsets_of_a_plant_worked_by_hand():
     # x+ = u / 2 + 1, y = x + 2, u = -3 - 1 r with r = 1: u = -4, x = 4, -1, -1; y - r =
     # 5, 0, 0; F = 25 + 16 + (0 + 16) / 2 + (0 + 16) / 4
     shifted = plant([[0.0]], [[0.5]], [[1.0]], b=[1.0], d=[2.0])
-    cost = tuning.fitness(
+    cost = study.fitness(
         shifted,
         np.zeros((1, 1)),
         np.ones((1, 1)),
@@ -88,7 +89,7 @@ def test_an_unstable_loop_has_no_fitness():
         r"weights",
     ):
         K_x, K_r = np.zeros((1, 1)), np.zeros((1, 1))
-        tuning.fitness(
+        study.fitness(
             plant([[1.5]], [[1.0]], [[1.0]]),
             K_x,
             K_r,

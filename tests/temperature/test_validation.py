@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from pipeline.temperature.identification.model_choice import Settings, identify
+from pipeline.temperature.identification.refinement import drives, estimate_state, prediction_form
 from pipeline.temperature.identification.validation import (
     advice,
     bootstrap_spread,
@@ -55,8 +56,9 @@ def test_the_true_plant_simulates_its_own_noise_free_record_in_full_from_any_sta
 
 def test_prediction_ahead_is_the_kalman_recursion_written_out():
     u, y = innovations_record(HEATER, 60, 0.1, 1)
-    predicted, x0 = predicted_ahead(HEATER, u, y, 3, x0=np.zeros(2)), np.zeros(2)
-    t, x = 40, x0
+    model, first = prediction_form(HEATER, []), 30
+    predicted = predicted_ahead(HEATER, u, y, 3)
+    t, x = 40, estimate_state(model, drives("prediction", u[:first], y[:first]), y[:first])
     for k in range(t - 2):  # x(t-2 | y up to t-3)
         x = HEATER.A @ x + HEATER.B @ u[k] + HEATER.b + HEATER.K @ (y[k] - HEATER.C @ x - HEATER.d)
     for k in (t - 2, t - 1):

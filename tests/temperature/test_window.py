@@ -4,12 +4,12 @@ state that it hands to Algorithm 2."""
 import numpy as np
 import pytest
 
+from pipeline.papers.published import GAMMA
+from pipeline.papers.study import data_sets
 from pipeline.temperature.controllers import window as window_route
 from pipeline.temperature.controllers.kernel import windows
 from pipeline.temperature.controllers.window import law, learn, predicted_tuples, predictor
 from pipeline.temperature.plant import baam, plant, simulate
-from pipeline.temperature.published import GAMMA
-from pipeline.temperature.study import data_sets
 from pipeline.temperature.tracking import gains
 
 I5, I7 = np.eye(5), np.eye(7)

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.optimize
 
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
-from pipeline.temperature.tracking import ControllerDesign, Law
+from pipeline.temperature.tracking import Law
 
 RISEN = 0.8  # of the largest excursion: up to there a response is fitted; later a slow tail would be tau
 LEVEL = 0.9  # of the band over a family that may not hold zero where a sign is certain
@@ -43,18 +43,6 @@ class Pairing(NamedTuple):
     delay: np.ndarray
 
 
-class Tuning(NamedTuple):
-    """What a search may change of SIMC, each a number or one an output (p,): tau_c = `tau_c_factor` times
-    max(theta, one sample); `gain_factor` multiplies K_c, `reset_factor` T_i."""
-
-    tau_c_factor: float | np.ndarray = 1.0
-    gain_factor: float | np.ndarray = 1.0
-    reset_factor: float | np.ndarray = 1.0
-
-
-SIMC = Tuning()
-
-
 class Rise(NamedTuple):
     """slope tau (1 - exp(-(t - delay) / tau)), the model of one step response; samples, `until` the one up
     to which it was fitted."""
@@ -73,7 +61,8 @@ def pairing(
     horizon: int,
     family: Sequence[Plant] = (),
     noise_degC: np.ndarray | None = None,
-    tuning: Tuning = SIMC,
+    gain_factor: float | np.ndarray = 1.0,
+    reset_factor: float | np.ndarray = 1.0,
 ) -> Pairing:
     """Pairs whose full ranges heat fastest (the largest product of slopes, which no unit changes), one input
     an output, and SIMC on k = slope tau, tau and theta of each pair's step response:
@@ -83,8 +72,9 @@ def pairing(
     tau_c = max(theta, one sample)
 
     (Skogestad 2003, table 1). A held input is late by half a sample, which theta counts; it is no less than
-    one. tau_c is longer where a standard deviation of the sensor's noise (p,) would otherwise move the input
-    by more than `NOISE_SHARE` of its range: so quick a loop is no longer what the record shows.
+    one. A search may multiply K_c and T_i, by one number or one an output (p,). tau_c is longer where a
+    standard deviation of the sensor's noise (p,) would otherwise move the input by more than `NOISE_SHARE` of
+    its range: so quick a loop is no longer what the record shows.
 
     A pair counts where its sign is certain: its response goes one way, and the band of the rise over `family`
     does not hold zero. Modes slower than 2 `horizon` samples count as integrators. Raises ValueError where
@@ -100,7 +90,9 @@ def pairing(
     # the gain in percent per °C at which noise moves the input by its share: the inverse may be zero
     noise = np.zeros(plant.p) if noise_degC is None else noise_degC
     per_gain = noise / (NOISE_SHARE * (high - low)[inputs])
-    return _settings([fitted[o][i] for o, i in enumerate(inputs)], inputs, per_gain, tuning)
+    return _settings(
+        [fitted[o][i] for o, i in enumerate(inputs)], inputs, per_gain, gain_factor, reset_factor
+    )
 
 
 def rises(plant: Plant, horizon: int) -> list[list[Rise]]:
@@ -226,15 +218,21 @@ def _assigned(effect: np.ndarray, certain: np.ndarray) -> np.ndarray:
     return inputs
 
 
-def _settings(fitted: list[Rise], inputs: np.ndarray, per_gain: np.ndarray, tuning: Tuning) -> Pairing:
+def _settings(
+    fitted: list[Rise],
+    inputs: np.ndarray,
+    per_gain: np.ndarray,
+    gain_factor: float | np.ndarray,
+    reset_factor: float | np.ndarray,
+) -> Pairing:
     """SIMC on each pair, with tau_c so long that no gain in percent per °C is above 1 / `per_gain` (p,)."""
     slope, tau, delay = (
         np.array([getattr(rise, name) for rise in fitted]) for name in ("slope", "time_constant", "delay")
     )
     theta = np.maximum(delay + 0.5, 1.0)
-    tau_c = np.maximum(tuning.tau_c_factor * theta, per_gain / np.abs(slope) - theta)
-    gain = tuning.gain_factor / (slope * (tau_c + theta))
-    reset = tuning.reset_factor * np.minimum(tau, 4 * (tau_c + theta))
+    tau_c = np.maximum(theta, per_gain / np.abs(slope) - theta)
+    gain = gain_factor / (slope * (tau_c + theta))
+    reset = reset_factor * np.minimum(tau, 4 * (tau_c + theta))
     return Pairing(inputs, gain, reset, slope, tau, delay)
 
 
@@ -260,19 +258,3 @@ def pi_law(pairs: Pairing, *, inputs: int) -> Law:
         start=np.zeros(0),
         integral=1 / pairs.reset,
     )
-
-
-def controller(
-    plant: Plant,
-    limits: tuple[np.ndarray, np.ndarray],
-    *,
-    horizon: int,
-    family: Sequence[Plant] = (),
-    noise_degC: np.ndarray | None = None,
-    tuning: Tuning = SIMC,
-) -> ControllerDesign:
-    """PI a zone, tuned by SIMC; the weights mean nothing to it. `limits` low and high (m,), the rest as in
-    `pairing`."""
-    pairs = pairing(plant, *limits, horizon=horizon, family=family, noise_degC=noise_degC, tuning=tuning)
-    law = pi_law(pairs, inputs=plant.m)
-    return ControllerDesign("baseline", lambda q, r, integral: law, strictly_proper(plant))

@@ -316,21 +316,36 @@ def batch_step(
 ) -> tuple[np.ndarray, np.ndarray, ControllerState]:
     """Inputs (s, m) to apply, inputs wished, and the state a sample on, from measured y, reference r, target
     y_star (s, p), feed w (s, m) and what is fed `forward` (s, m)."""
-    law, limits = controller.law, controller.limits
+    law = controller.law
     if controller.holds:
         return state.u, state.u, state
     wished = feed - state.z @ law.K.T - y @ law.D.T - state.xi @ law.K_r.T
+    u, x = _allowed(controller, state, wished, y, y_star, forward)
+    acts = u - forward
+    x = x if controller.governor is None else predicted(controller.governor, x, acts)
+    xi = _integrated(controller, state.xi, y_star - y, acts, wished)
+    after = ControllerState(_remembered(controller, state.z, acts, y, r), xi, u, x)
+    return u, wished + forward, after
+
+
+def _allowed(
+    controller: Deployed,
+    state: ControllerState,
+    wished: np.ndarray,
+    y: np.ndarray,
+    y_star: np.ndarray,
+    forward: np.ndarray | float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs (s, m) as near to those wished, with what is fed `forward`, as the limits and the governor
+    allow, and the governor's memory corrected by y (s, p)."""
+    limits, family = controller.limits, controller.governor
     low = np.maximum(limits.low, np.minimum(state.u - limits.rate, limits.high))
     high = np.minimum(limits.high, np.maximum(state.u + limits.rate, limits.low))
     u = np.minimum(np.maximum(wished + forward, low), high)
-    x, family = state.x, controller.governor
-    if family is not None:
-        x = corrected(family, x, y)
-        u = governed(family, x, u - forward, y_star, low - forward, high - forward) + forward
-        x = predicted(family, x, u - forward)
-    xi = _integrated(controller, state.xi, y_star - y, u - forward, wished)
-    after = _remembered(controller, state.z, u - forward, y, r)
-    return u, wished + forward, ControllerState(after, xi, u, x)
+    if family is None:
+        return u, state.x
+    x = corrected(family, state.x, y)
+    return governed(family, x, u - forward, y_star, low - forward, high - forward) + forward, x
 
 
 def _integrated(controller: Deployed, xi, error, u, wished):
@@ -412,7 +427,6 @@ class RunningController:
         self.binding: tuple[tuple[int, float], ...] = ()
         self._asks = np.hstack([law.K, law.D, law.K_r])
         self._keeps = np.hstack([law.B_u, law.B_y, law.B_r, *([] if controller.shift else [law.A])])
-        self._rated = bool(np.isfinite(controller.limits.rate).any())
         self._aims: dict[bytes, tuple[Rest, Aim]] = {}
         self._state: ControllerState | None = None
         self._reference: Reference | None = None
@@ -447,28 +461,17 @@ class RunningController:
         or of another machine, where t falls, or nothing was watched before."""
         y, state = self._measured(y), self._remembers()
         feed, y_star, now = self._target(r, t)
-        controller, limits, before = self.controller, self.controller.limits, state.u[0]
+        controller, family = self.controller, self.controller.governor
         if controller.holds:
-            return before.copy()
-        wished = feed - self._asks @ np.concatenate((state.z[0], y, state.xi[0]))
-        low, high, x, family = limits.low, limits.high, state.x, controller.governor
-        if self._rated:
-            low = np.maximum(low, np.minimum(before - limits.rate, limits.high))
-            high = np.minimum(high, np.maximum(before + limits.rate, limits.low))
-        forward = self.forward
-        u = np.minimum(np.maximum(wished + forward, low), high)
-        if family is not None:
-            x = corrected(family, x, y[None])
-            inner = (u - forward)[None], y_star[None], (low - forward)[None], (high - forward)[None]
-            u = governed(family, x, *inner)[0] + forward
-        given = u if applied is None else applied
-        acts = given - forward
-        if family is not None:
-            x = predicted(family, x, acts[None])
-        xi = _integrated(controller, state.xi, (y_star - y)[None], acts[None], wished[None])
-        after = self._kept(state.z[0], acts, y, now)
-        self._state = ControllerState(after[None], xi, given[None], x)
-        return u.copy()
+            return state.u[0].copy()
+        wished = (feed - self._asks @ np.concatenate((state.z[0], y, state.xi[0])))[None]
+        u, x = _allowed(controller, state, wished, y[None], y_star[None], self.forward)
+        given = u if applied is None else applied[None]
+        acts = given - self.forward
+        x = x if family is None else predicted(family, x, acts)
+        xi = _integrated(controller, state.xi, (y_star - y)[None], acts, wished)
+        self._state = ControllerState(self._kept(state.z[0], acts[0], y, now)[None], xi, given, x)
+        return u[0].copy()
 
     def saved(self) -> dict[str, np.ndarray]:
         """All that it remembers, as arrays. Raises ValueError before the first watch."""

@@ -1,11 +1,16 @@
 """How each controller of the house is designed from a problem, at the values of its search."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
+
+import numpy as np
 
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline, controller, kernel, window
 from pipeline.temperature.controllers import printer_pid as klipper
 from pipeline.temperature.controllers.problem import Design, DesignProblem, unit_weights, weights
+from pipeline.temperature.plant import strictly_proper
+from pipeline.temperature.tracking import Law
 
 
 def hold(problem: DesignProblem, values: Mapping[str, float]) -> Design:
@@ -18,51 +23,61 @@ def printer_pid(problem: DesignProblem, values: Mapping[str, float]) -> Design |
     if not problem.printer_pid:
         return None
     limits = problem.limits.low, problem.limits.high
-    made = klipper.controller(problem.printer_pid, problem.plant, limits)
-    return Design(made.design(*unit_weights(problem)), made.model, governed=False)
+    law = klipper.law_of_printer(problem.printer_pid, problem.plant, limits)
+    return Design(law, problem.plant, governed=False)
 
 
 def pi(problem: DesignProblem, values: Mapping[str, float]) -> Design:
-    made = baseline.controller(
+    pairs = baseline.pairing(
         problem.plant,
-        (problem.limits.low, problem.limits.high),
+        problem.limits.low,
+        problem.limits.high,
         horizon=problem.horizon,
         family=problem.family,
         noise_degC=problem.noise,
-        tuning=baseline.Tuning(**values),
+        **values,
     )
-    return Design(made.design(*unit_weights(problem)), made.model)
+    return Design(baseline.pi_law(pairs, inputs=problem.plant.m), problem.plant)
 
 
 def subspace_lqg(problem: DesignProblem, values: Mapping[str, float]) -> Design:
-    made = tracking.model_based(problem.plant, problem.gamma, tau=values["observer_tau"])
-    law = made.design(*weights(problem, values), values["integral"])
-    return Design(law, made.model, lambda: made.design(*unit_weights(problem)))
+    tau = values["observer_tau"]
+    law = partial(tracking.model_based, problem.plant, gamma=problem.gamma, tau=tau)
+    return Design(
+        law(*weights(problem, values), values["integral"]), problem.plant, lambda: law(*unit_weights(problem))
+    )
 
 
 def varx_riccati(problem: DesignProblem, values: Mapping[str, float]) -> Design:
-    made, N = window.controller(problem.window, problem.gamma), problem.window.N
-    law = controller.compact(made.design(*weights(problem, values), values["integral"]), N)
-    model = made.model._replace(sample_time_s=problem.plant.sample_time_s)
-    return Design(law, model, lambda: made.design(*unit_weights(problem)))
+    return _of_window(problem, values, partial(window.law, problem.window), problem.window.N)
 
 
 def learned_kernel(problem: DesignProblem, values: Mapping[str, float]) -> Design | None:
     """Its steady inputs come from the window that was learned from the same record."""
     if problem.kernel is None:
         return None
-    made = kernel.controller(problem.kernel, problem.gamma, window.observer_form(problem.window)[0])
-    law = made.design(*weights(problem, values), values["integral"])
-    model = made.model._replace(sample_time_s=problem.plant.sample_time_s)
+    return _of_window(problem, values, partial(kernel.law, problem.kernel), problem.kernel.N)
+
+
+def _of_window(
+    problem: DesignProblem, values: Mapping[str, float], law: Callable[..., Law], N: int
+) -> Design:
+    """The design of law(Q, R, gamma, integral=...) on a window of N samples."""
+    (q, r), (ones_q, ones_r, _) = weights(problem, values), unit_weights(problem)
+    made = law(np.diag(q), np.diag(r), problem.gamma, integral=values["integral"])
+    model, _ = window.observer_form(problem.window, problem.plant.sample_time_s)
     return Design(
-        controller.compact(law, problem.kernel.N), model, lambda: made.design(*unit_weights(problem))
+        controller.compact(made, N), model, lambda: law(np.diag(ones_q), np.diag(ones_r), problem.gamma)
     )
 
 
 def exact_model(problem: DesignProblem, values: Mapping[str, float]) -> Design | None:
+    """Told the true plant; without integrator the paper's controller: Riccati gains and the observer (8)."""
     if problem.truth is None:
         return None
-    made = tracking.model_based(problem.truth, problem.gamma, tau=values["observer_tau"])
-    law = made.design(*weights(problem, values), values["integral"])
-    paper = tracking.exact_model(problem.truth, problem.gamma, tau=problem.exact_tau)
-    return Design(law, made.model, lambda: paper.design(*unit_weights(problem)))
+    plant, gamma = strictly_proper(problem.truth), problem.gamma
+    q, r = weights(problem, values)
+    law = tracking.model_based(plant, q, r, values["integral"], gamma=gamma, tau=values["observer_tau"])
+    L = tracking.observer_gain(plant, problem.exact_tau)
+    best = partial(tracking.gains, plant, np.eye(plant.p), np.eye(plant.m), gamma)
+    return Design(law, plant, lambda: tracking.observer_law(plant, best(), L))

@@ -298,20 +298,11 @@ def observed(family: Governor, memory: np.ndarray, u: np.ndarray, y: np.ndarray)
     return predicted(family, corrected(family, memory, y), u)
 
 
-class GovernorEvidence(NamedTuple):
-    """Of each member, case and output (f, s, p): the share of the way from strongest to weakest that the
-    inputs are at least, by least squares, and at most; and whether the member counts (f, s)."""
-
-    least: np.ndarray
-    middle: np.ndarray
-    most: np.ndarray
-    counts: np.ndarray
-
-
-def evidence(family: Governor, memory: np.ndarray) -> GovernorEvidence:
-    """What the innovations tell: least squares, every innovation up to `doubt` off in the direction that
-    matters. A member does not count where the best member's squares are a quarter of its own, and its own
-    more than noise."""
+def evidence(family: Governor, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What the innovations tell of each member, case and output (f, s, p): the share of the way from
+    strongest to weakest that the inputs are at least, by least squares, and at most, every innovation up to
+    `doubt` off in the direction that matters; and whether the member counts (f, s). It does not where the
+    best member's squares are a quarter of its own, and its own more than noise."""
     p = len(family.low)
     sums = memory[:, :, -4 * p :]
     product, square, size, own = (sums[:, :, k * p : (k + 1) * p] for k in range(4))
@@ -320,7 +311,7 @@ def evidence(family: Governor, memory: np.ndarray) -> GovernorEvidence:
     rest = (own - middle * (2 * product - middle * square)).sum(axis=2)
     counts = rest <= CONTRADICTED * rest.min(axis=0) + (family.doubt**2).sum()
     least, most = (np.clip((product + off) * share, 0.0, 1.0) for off in (-doubt, doubt))
-    return GovernorEvidence(least, middle, most, counts)
+    return least, middle, most, counts
 
 
 # ---- what it allows
@@ -337,22 +328,22 @@ def governed(
     is kept as far as those inputs go.
     """
     q, rows = family.start.shape[2], family.above.shape[1]
-    told = evidence(family, memory)
+    least, middle, most, counts = evidence(family, memory)
     ahead = np.matmul(memory[:, :, :q], family.ahead)
     free, lacks = (
         part.reshape(*part.shape[:2], y_star.shape[1], -1)
         for part in (ahead[:, :, :rows], ahead[:, :, rows:])
     )
     # where an output is, is measured: how strong the inputs are is in doubt for what is still to come
-    free, lacks = free - (told.middle * lacks[..., 0])[..., None], lacks - lacks[..., :1]
+    free, lacks = free - (middle * lacks[..., 0])[..., None], lacks - lacks[..., :1]
     now = free[..., 0] + family.offset[:, None]
     floor, cap = _walls(family, now, y_star)
     per_member = (len(free), 1, *free.shape[2:])
     strongest, less = family.strength.strongest, family.strength.strongest - family.strength.weakest
-    bare = -(free - told.most[..., None] * lacks) - family.below.reshape(per_member)
-    below = _Side(bare, strongest - less * told.most, family.fall, told.counts, -floor)
-    bare = free - told.least[..., None] * lacks + family.above.reshape(per_member)
-    above = _Side(bare, strongest - less * told.least, family.rise, told.counts, cap)
+    bare = -(free - most[..., None] * lacks) - family.below.reshape(per_member)
+    below = _Side(bare, strongest - less * most, family.fall, counts, -floor)
+    bare = free - least[..., None] * lacks + family.above.reshape(per_member)
+    above = _Side(bare, strongest - less * least, family.rise, counts, cap)
     u, raised = _projected(below, -u, -high)
     u, lowered = _projected(above, -u, low)
     # where an input is lowered for one output and was raised for another, others may do what it did

@@ -14,8 +14,7 @@ import scipy.linalg
 import scipy.linalg.blas
 import scipy.linalg.lapack
 
-from pipeline.temperature.plant import Plant, observability_matrix
-from pipeline.temperature.tracking import ControllerDesign, Gains, Law
+from pipeline.temperature.tracking import Law
 
 ROOT2 = np.sqrt(2.0)
 
@@ -99,12 +98,8 @@ def windows(
     within its segment and free of NaN (masked samples)."""
     rows = []
     for us, ys in zip(u, y, strict=True):
-        past = (
-            [np.hstack([signal[N - lag : len(us) - lag] for lag in range(1, N + 1)]) for signal in (us, ys)]
-            if len(us) > N
-            else None
-        )
-        if past is not None:
+        if len(us) > N:
+            past = [signal[N - lag : len(us) - lag] for signal in (us, ys) for lag in range(1, N + 1)]
             rows.append(np.hstack([*past, us[N:], ys[N:]]))
     if not rows:
         raise ValueError(
@@ -127,27 +122,6 @@ def tuples(u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: int, *, offset: 
     features = np.eye(w.shape[1] + offset, w.shape[1] + 1)
     base = y_now.mean(axis=0) * offset
     return Tuples(np.hstack([w, one]), u_now, y_now - base, np.hstack([w_next, one]), features, N, base)
-
-
-def tuples_with_reference(
-    u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: int, r: np.ndarray, F: np.ndarray
-) -> Tuples:
-    """The published form: s = [past u; past y; r] with one reference r (p,), r(t+1) = F r, e = y - r. Its
-    kernel serves this reference only."""
-    plain = tuples(u, y, N)
-    rows = (len(plain.s), 1)
-    features = np.vstack(
-        [plain.features, np.hstack([np.zeros((len(r), plain.features.shape[1] - 1)), r[:, None]])]
-    )
-    return Tuples(
-        np.hstack([plain.s, np.tile(r, rows)]),
-        plain.u,
-        plain.e - r,
-        np.hstack([plain.s_next, np.tile(F @ r, rows)]),
-        features,
-        N,
-        r,
-    )
 
 
 class Regression(NamedTuple):
@@ -467,39 +441,7 @@ def window_law(K: np.ndarray, K_r: np.ndarray, k: np.ndarray, N: int, *, integra
     )
 
 
-def controller(learned: Regression, gamma: float, model: Plant) -> ControllerDesign:
-    """Algorithm 2; its feasible targets are computed on `model`."""
-
-    def design(q: np.ndarray, r: np.ndarray, integral: float) -> Law:
-        solution = value_iteration(learned, np.diag(q), np.diag(r), gamma)
-        return window_law(solution.K, solution.K_r, solution.k, learned.N, integral=integral)
-
-    return ControllerDesign("kernel", design, model)
-
-
-# ---- the exact kernel, for truth
-
-
-def reconstruction(plant: Plant, N: int) -> np.ndarray:
-    """M (n, N (m+p)) with x(t) = M [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)] (23)-(28), exact where N
-    reaches the observability index (b = d = 0)."""
-    n, m, p = plant.n, plant.m, plant.p
-    powers = [np.eye(n)]
-    for _ in range(N):
-        powers.append(plant.A @ powers[-1])
-    U_N = np.hstack([powers[lag] @ plant.B for lag in range(N)])
-    W_N = observability_matrix(plant.A, plant.C, N).reshape(N, p, n)[::-1].reshape(N * p, n)
-    D_N = np.zeros((N * p, N * m))
-    for row in range(N):
-        for column in range(row + 1, N):
-            D_N[row * p : (row + 1) * p, column * m : (column + 1) * m] = (
-                plant.C @ powers[column - row - 1] @ plant.B
-            )
-    back = powers[N] @ np.linalg.pinv(W_N)
-    return np.hstack([U_N - back @ D_N, back])
-
-
-def exact_gains(plant: Plant, gains: Gains, N: int) -> tuple[np.ndarray, np.ndarray]:
-    """K (m, N (m+p)) and K_r (m, p) of (32) from the model: what a
-    learned kernel should give on noise-free data."""
-    return gains.K_x @ reconstruction(plant, N), gains.K_r
+def law(learned: Regression, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral: float = 0.0) -> Law:
+    """Algorithm 2 on the window of past inputs and outputs."""
+    solution = value_iteration(learned, Q, R, gamma)
+    return window_law(solution.K, solution.K_r, solution.k, learned.N, integral=integral)

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.plant import Plant, strictly_proper
-from pipeline.temperature.tracking import ControllerDesign, Law
+from pipeline.temperature.plant import Plant
+from pipeline.temperature.tracking import Law
 
 # Klipper reads a heater's thermistor so often (klippy/extras/adc_temperature.py, REPORT_TIME)
 KLIPPER_S = 0.3
@@ -37,21 +37,12 @@ class HeaterPid(NamedTuple):
     smooth_s: float
 
 
-def controller(
-    pids: tuple[HeaterPid, ...], plant: Plant, limits: tuple[np.ndarray, np.ndarray]
-) -> ControllerDesign:
-    """The PIDs of all heaters; weights and the outer integrator mean nothing to it. `limits` low and high
-    (m,) in percent. Raises ValueError where the heaters' PIDs are not the whole control of the machine."""
-    plant = strictly_proper(plant)
+def law_of_printer(pids: tuple[HeaterPid, ...], plant: Plant, limits: tuple[np.ndarray, np.ndarray]) -> Law:
+    """The PIDs of all heaters as one law. `limits` low and high (m,) in percent. Raises ValueError where the
+    heaters' PIDs are not the whole control of the machine."""
     pids = tuple(sorted(pids, key=lambda pid: pid.output))
-    _check(pids, plant, limits)
-    made = law(pids, sample_time_s=plant.sample_time_s)
-    return ControllerDesign("printer_pid", lambda q, r, integral: made, plant)
-
-
-def _check(pids: tuple[HeaterPid, ...], plant: Plant, limits: tuple[np.ndarray, np.ndarray]) -> None:
-    outputs, inputs = [pid.output for pid in pids], sorted(pid.input for pid in pids)
-    if outputs != list(range(plant.p)) or inputs != list(range(plant.m)):
+    inputs = sorted(pid.input for pid in pids)
+    if [pid.output for pid in pids] != list(range(plant.p)) or inputs != list(range(plant.m)):
         raise ValueError(
             f"the printer's own PID needs one PID for each of the {plant.p} outputs and {plant.m} inputs; "
             f"found those of {len(pids)} heaters in the log"
@@ -67,6 +58,7 @@ def _check(pids: tuple[HeaterPid, ...], plant: Plant, limits: tuple[np.ndarray, 
                 f"the printer's own PID ends at {pid.most_percent:g} % of duty (max_power), but input "
                 f"{pid.input + 1} may go to {limits[1][pid.input]:g} %; set its high in plant.inputs to that"
             )
+    return law(pids, sample_time_s=plant.sample_time_s)
 
 
 def law(pids: tuple[HeaterPid, ...], *, sample_time_s: float) -> Law:

@@ -16,7 +16,7 @@ import scipy.linalg.lapack
 from pipeline.temperature.controllers.kernel import Tuples, window_law, window_shift, windows
 from pipeline.temperature.plant import Plant, observability_matrix
 from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.tracking import ControllerDesign, Law, gains
+from pipeline.temperature.tracking import Law, gains
 
 
 class WindowModel(NamedTuple):
@@ -174,15 +174,6 @@ def law(window: WindowModel, Q: np.ndarray, R: np.ndarray, gamma: float, *, inte
     model, T = observer_form(window)
     K_x, K_r, k, _ = gains(model, Q, R, gamma)
     return window_law(K_x @ T, K_r, k, window.N, integral=integral)
-
-
-def controller(window: WindowModel, gamma: float) -> ControllerDesign:
-    """VARX window and Riccati."""
-    return ControllerDesign(
-        "window",
-        lambda q, r, integral: law(window, np.diag(q), np.diag(r), gamma, integral=integral),
-        observer_form(window)[0],
-    )
 
 
 def predicted_tuples(

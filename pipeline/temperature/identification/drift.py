@@ -23,13 +23,7 @@ from pipeline.temperature.identification.order import (
     folds,
     shifted,
 )
-from pipeline.temperature.identification.refinement import (
-    FitSettings,
-    drives,
-    estimate_state,
-    respond,
-    simulation_form,
-)
+from pipeline.temperature.identification.refinement import FitSettings, simulated
 from pipeline.temperature.identification.subspace import Segments, lagged, realise, subspace
 from pipeline.temperature.plant import Plant
 
@@ -74,7 +68,7 @@ def chosen_rate(
             data = lagged(train_u, train_y, structure.past, feedthrough=direct, offset=structure.offset)
         except ValueError:  # what is left of the record is too short
             return 0.0
-        start = realise(data, subspace(data, structure.past).basis[:order], 1.0, structure.feedthrough)
+        start = realise(data, subspace(data, structure.past)[0][:order], 1.0, structure.feedthrough)
         plant = fit(kind, start, train_u, train_y, settings, gain=False)
         if np.abs(np.linalg.eigvals(plant.A)).max() > 1 - INTEGRATES:
             return 0.0
@@ -94,7 +88,7 @@ def _errors_ahead(plant: Plant, u: Segments, y: Segments, past: int) -> list[flo
     for a, b in zip(u, y, strict=True):
         if len(a) < 4 * past:
             continue
-        error = simulation_error(plant, a, b)
+        error = b - simulated(plant, a, b, means_removed=True)
         left[0].append(error[2 * past :])
         for k, times in enumerate(SLOWER, 1):
             left[k].append((error - tracked(error, 1.0 / (times * past), past))[2 * past :])
@@ -104,16 +98,11 @@ def _errors_ahead(plant: Plant, u: Segments, y: Segments, past: int) -> list[flo
     ]
 
 
-def simulation_error(plant: Plant, u: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """y - ŷ (T, p) of free simulation, its initial state fitted with a free mean: the drift has the mean."""
-    model, v = simulation_form(plant, []), drives("simulation", u, y)
-    return y - respond(model, v, estimate_state(model, v, y, free_mean=True))[1]
-
-
 def simulated_with_drift(plant: Plant, u: np.ndarray, y: np.ndarray, rate: float, ahead: int) -> np.ndarray:
     """ŷ(t) + w(t | y up to t - ahead) (T, p); NaN over the warm-up of 1/rate samples, or a third of the
     segment where that is shorter, and `ahead` more."""
-    error = simulation_error(plant, u, y)
+    # the drift has the mean of the error
+    error = y - simulated(plant, u, y, means_removed=True)
     predicted = y - error + tracked(error, rate, ahead)
     predicted[: min(int(np.ceil(1.0 / rate)), len(y) // 3) + ahead] = np.nan
     return predicted

@@ -62,7 +62,6 @@ from pipeline.temperature.identification.refinement import (
 from pipeline.temperature.identification.subspace import (
     Lagged,
     Segments,
-    Subspace,
     complete_runs,
     gapless,
     lagged,
@@ -222,14 +221,14 @@ def identify(
     Raises ValueError for a constant or collinear input, a constant output, and a record too short for the
     order.
     """
-    record = _prepared(u, y, settings, names)
-    choice, reasons, validation, feedback = _chosen(record, settings)
-    fitted = _fit_all(record.u, record.y, choice, sample_time_s)
+    u, y, recordings, cut = _prepared(u, y, settings, names)
+    choice, reasons, validation, feedback = _chosen(u, y, recordings, settings)
+    fitted = _fit_all(u, y, choice, sample_time_s)
     rate = 0.0
     if choice.table:
-        rate = chosen_rate(record.u, record.y, choice.structure, choice.order, choice.fit, validation)
+        rate = chosen_rate(u, y, choice.structure, choice.order, choice.fit, validation)
     fitted = fitted._replace(feedback=feedback, drift=rate, reasons=tuple(reasons))
-    return _remarked(fitted, record, reasons, names)
+    return _remarked(fitted, cut, names)
 
 
 def refit(u: Segments, y: Segments, identified: Identified, *, names: Sequence[str] = ()) -> Identified:
@@ -237,32 +236,21 @@ def refit(u: Segments, y: Segments, identified: Identified, *, names: Sequence[s
     all of it, nothing chosen anew; as `identify` otherwise."""
     past, offset, table = identified.past, identified.offset, identified.order_table
     settings = Settings(order=identified.order, past=past, offset=offset)
-    record = _prepared(u, y, settings, names)
+    u, y, _, cut = _prepared(u, y, settings, names)
     structure = ModelStructure(past, identified.feedthrough, offset, identified.delays)
-    data = (
-        None
-        if table
-        else lagged(record.u, record.y, past, feedthrough=any(structure.feedthrough), offset=offset)
-    )
-    exact = data is not None and windows(data)[1]
+    direct = any(structure.feedthrough)
+    exact = not table and windows(lagged(u, y, past, feedthrough=direct, offset=offset))[1]
     choice = ModelChoice(structure, identified.order, identified.fit, exact, table)
-    fitted = _fit_all(record.u, record.y, choice, identified.plant.sample_time_s)
+    fitted = _fit_all(u, y, choice, identified.plant.sample_time_s)
     fitted = fitted._replace(feedback=identified.feedback, drift=identified.drift, reasons=identified.reasons)
-    return _remarked(fitted, record, identified.reasons, names)
+    return _remarked(fitted, cut, names)
 
 
-class _Record(NamedTuple):
-    """A record as it can be identified; `cut` samples were left out, and `notes` say what was done."""
-
-    u: list[np.ndarray]
-    y: list[np.ndarray]
-    cut: int
-    notes: list[str]
-    recordings: tuple[int, ...]
-
-
-def _prepared(u, y, settings: Settings, names) -> _Record:
-    """The record as it can be identified, checked: cut at masked inputs."""
+def _prepared(
+    u: Segments, y: Segments, settings: Settings, names: Sequence[str]
+) -> tuple[list[np.ndarray], list[np.ndarray], tuple[int, ...], int]:
+    """The record as it can be identified, checked: cut at masked inputs; the recording of each piece, and how
+    many samples were left out."""
     u, y = [np.atleast_2d(np.asarray(a, float)) for a in u], [np.atleast_2d(np.asarray(b, float)) for b in y]
     samples = sum(map(len, u))
     pieces = [gapless([a], [b]) for a, b in zip(u, y, strict=True)]
@@ -273,16 +261,14 @@ def _prepared(u, y, settings: Settings, names) -> _Record:
     _check_length(u, y, settings.order, settings.past)
     check_inputs(u, offset=settings.offset, names=names)
     check_outputs(y)
-    remark = f"{cut} samples with a masked input, or without any output, were cut out"
-    return _Record(u, y, cut, [remark] if cut else [], recordings)
+    return u, y, recordings, cut
 
 
 def _chosen(
-    record: _Record, settings: Settings
+    u: Segments, y: Segments, recordings: tuple[int, ...], settings: Settings
 ) -> tuple[ModelChoice, list[str], Validation, ClosedLoop | None]:
     """What the rules choose, a sentence for each choice that a user should know of, how candidates were
     judged, and whether the inputs answer the outputs (None of a noise-free record)."""
-    u, y = record.u, record.y
     pasts, exact = _windows(u, y, settings.order, settings.past, settings.offset)
     none = (False,) * y[0].shape[1]
     feedback = None if exact else closed_loop(u, y, pasts[0], offset=settings.offset, inputs=settings.inputs)
@@ -297,7 +283,7 @@ def _chosen(
         structure, settings.order, settings.refinement.replace("none", "subspace"), False, []
     )
     validated, notes = settings.refinement == "validated", []
-    validation = Validation(settings.blocks, record.recordings, closed)
+    validation = Validation(settings.blocks, recordings, closed)
     # a rank beyond max_order is a nonlinearity without noise: the order is then a choice, as with noise
     if exact and (rank := _exact_rank(u, y, structure)) <= settings.max_order:
         notes.append(
@@ -334,7 +320,7 @@ def _exact_rank(u: Segments, y: Segments, structure: ModelStructure) -> int:
     data = lagged(
         u, y, structure.past, feedthrough=any(structure.feedthrough), offset=structure.offset, exact=True
     )
-    values = subspace(data, structure.past).singular_values
+    _, values = subspace(data, structure.past)
     return max(int((values > EXACT_RANK * values[0]).sum()), 1)
 
 
@@ -360,19 +346,13 @@ def _best_candidate(
     structures = _with_slow_window(u, y, structures, settings)
     for structure in structures:
         data = lagged(u, y, structure.past, feedthrough=any(structure.feedthrough), offset=structure.offset)
-        sub = subspace(data, structure.past)
-        singular_values[structure.past, structure.feedthrough] = sub.singular_values
-        orders, delays = _candidates(data, sub, structure, settings)
+        basis, values = subspace(data, structure.past)
+        singular_values[structure.past, structure.feedthrough] = values
+        orders, delays = _candidates(data, basis, values, structure, settings)
         for d in sorted(delays):
             delayed = structure._replace(delays=d)
             table += cross_validate(
-                u,
-                y,
-                orders,
-                delayed,
-                ("subspace",),
-                singular_values=sub.singular_values,
-                validation=validation,
+                u, y, orders, delayed, ("subspace",), singular_values=values, validation=validation
             )
     if not table and validation.recordings:
         # what is left without one recording is too short: blocks of every recording instead
@@ -412,11 +392,9 @@ def _with_slow_window(
     if settings.past:
         return structures
     data = lagged(u, y, first.past, feedthrough=any(first.feedthrough), offset=first.offset)
-    sub = subspace(data, first.past)
-    determined = max(
-        1, min(int((sub.singular_values > noise_edge(data, first.past)).sum()), settings.max_order)
-    )
-    model = realise(data, sub.basis[:determined], 1.0, first.feedthrough)
+    basis, values = subspace(data, first.past)
+    determined = max(1, min(int((values > noise_edge(data, first.past)).sum()), settings.max_order))
+    model = realise(data, basis[:determined], 1.0, first.feedthrough)
     past = slow_window(model, longest_window(u, y))
     if past < 1.5 * first.past:
         return structures
@@ -457,16 +435,16 @@ def _better_fit(start: OrderCandidate, refined: list[OrderCandidate]) -> OrderCa
 
 
 def _candidates(
-    data: Lagged, sub: Subspace, structure: ModelStructure, settings: Settings
+    data: Lagged, basis: np.ndarray, values: np.ndarray, structure: ModelStructure, settings: Settings
 ) -> tuple[Sequence[int], set[tuple[int, ...]]]:
     """Orders and dead times worth trying: those asked for, or those that stand out of the noise."""
     delays = {structure.delays}
     if settings.order is not None:
         return [settings.order], delays
-    above_noise = int((sub.singular_values > noise_edge(data, structure.past)).sum())
-    largest = max(1, min(above_noise, settings.max_order, len(sub.singular_values)))
+    above_noise = int((values > noise_edge(data, structure.past)).sum())
+    largest = max(1, min(above_noise, settings.max_order, len(values)))
     furthest = max(data.past // 2, 1)
-    model = realise(data, sub.basis[:largest], 1.0, structure.feedthrough)
+    model = realise(data, basis[:largest], 1.0, structure.feedthrough)
     quiet = np.minimum(tested_dead_times(data, furthest)[0], dead_time(model, furthest, 0.25))
     return range(1, largest + 1), delays | {dead_time(model, furthest), tuple(quiet.tolist())}
 
@@ -477,13 +455,13 @@ def _fit_all(u: Segments, y: Segments, choice: ModelChoice, sample_time_s: float
     past, settings = structure.past, FitSettings(structure.feedthrough, structure.offset, max_iterations=30)
     us, ys = shifted(u, y, structure.delays)
     data = lagged(us, ys, past, feedthrough=any(structure.feedthrough), offset=structure.offset, exact=exact)
-    sub = subspace(data, past)
-    if order > len(sub.singular_values):
+    basis, singular_values = subspace(data, past)
+    if order > len(singular_values):
         raise ValueError(
             f"order {order} needs a longer window: {past} past samples give at most "
-            f"{len(sub.singular_values)} states; raise past"
+            f"{len(singular_values)} states; raise past"
         )
-    start = realise(data, sub.basis[:order], sample_time_s, structure.feedthrough)
+    start = realise(data, basis[:order], sample_time_s, structure.feedthrough)
     plant = with_delays(fit(kind, start, us, ys, settings), structure.delays)
     model = simulation_form(plant, [])
     return Identified(
@@ -495,7 +473,7 @@ def _fit_all(u: Segments, y: Segments, choice: ModelChoice, sample_time_s: float
         feedthrough=structure.feedthrough,
         offset=structure.offset,
         fit=kind,
-        singular_values=sub.singular_values,
+        singular_values=singular_values,
         noise_edge=noise_edge(data, past),
         order_table=table,
         x0=[estimate_state(model, drives("simulation", a, b), b) for a, b in zip(u, y, strict=True)],
@@ -505,11 +483,10 @@ def _fit_all(u: Segments, y: Segments, choice: ModelChoice, sample_time_s: float
     )
 
 
-def _remarked(
-    fitted: Identified, record: _Record, reasons: Sequence[str], names: Sequence[str]
-) -> Identified:
-    """The fit with what a user should know of it, a sentence each."""
-    notes = [*record.notes, *reasons]
+def _remarked(fitted: Identified, cut: int, names: Sequence[str]) -> Identified:
+    """The fit with what a user should know of it, a sentence each; `cut` samples were left out."""
+    remark = f"{cut} samples with a masked input, or without any output, were cut out"
+    notes = [*([remark] if cut else []), *fitted.reasons]
     if fitted.dropped_rows:
         notes.append(f"{fitted.dropped_rows} rows touch a masked sample and were left out of the fit")
     notes += [
@@ -539,7 +516,7 @@ def _remarked(
             f"the largest pole is {radius - 1:.2g} outside the unit circle; refine with a limit, "
             "or record longer, before simulating far ahead"
         )
-    return fitted._replace(dropped_rows=fitted.dropped_rows + record.cut, notes=notes)
+    return fitted._replace(dropped_rows=fitted.dropped_rows + cut, notes=notes)
 
 
 def _check_length(u: Segments, y: Segments, order: int | None, past: int | None) -> None:

@@ -11,13 +11,11 @@ from pipeline.temperature.identification.refinement import (
     Criterion,
     FitSettings,
     drives,
-    estimate_state,
-    filled,
     fit_inputs,
     fitted_state,
     free_response,
     kalman_gain,
-    prediction_form,
+    one_step_errors,
     refine,
     respond,
     simulation_form,
@@ -86,10 +84,6 @@ class OrderCandidate(NamedTuple):
     singular_value: float
     errors: tuple[float, ...]
     about_mean: tuple[float, ...] = ()
-
-    @property
-    def delays(self) -> tuple[int, ...]:
-        return self.structure.delays
 
     @property
     def error(self) -> float:
@@ -315,14 +309,10 @@ def folds(
 def prediction_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
     """For each segment and output, the size of the one-step error as a share of the output's variation, at
     most 1; shape (segments, p). The initial state is fitted to the segment."""
-    model, shares = prediction_form(plant, []), []
-    for a, b in zip(u, y, strict=True):
-        v = drives("prediction", a, filled(plant, a, b, np.zeros(plant.n)))
-        with np.errstate(over="ignore", invalid="ignore"):
-            error = b - respond(model, v, estimate_state(model, v, b))[1]
-        spread = np.maximum(np.nanstd(b, axis=0), np.finfo(float).tiny)
-        with np.errstate(over="ignore", invalid="ignore"):
-            shares.append(np.minimum(np.sqrt(np.nanmean(error**2, axis=0)) / spread, 1.0))
+    spreads = [np.maximum(np.nanstd(b, axis=0), np.finfo(float).tiny) for b in y]
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = zip(one_step_errors(plant, u, y), spreads, strict=True)
+        shares = [np.minimum(np.sqrt(np.nanmean(e**2, axis=0)) / spread, 1.0) for e, spread in errors]
     return np.nan_to_num(np.array(shares), nan=1.0)
 
 
@@ -401,7 +391,7 @@ def cross_validate(
             )
         except ValueError:
             return []
-        basis = subspace(data, structure.past).basis
+        basis = subspace(data, structure.past)[0]
         for order in orders:
             start = realise(data, basis[:order], 1.0, structure.feedthrough)
             for kind in kinds:

@@ -373,6 +373,27 @@ def filled(plant: Plant, u: np.ndarray, y: np.ndarray, x0: np.ndarray) -> np.nda
     return y
 
 
+def simulated(plant: Plant, u: np.ndarray, y: np.ndarray, *, means_removed: bool = False) -> np.ndarray:
+    """ŷ (T, p) of the plant under u (T, m) alone, from the initial state that fits all of y (T, p) best (the
+    rule of SLICOT's IB01CD and of MATLAB's compare).
+
+    With `means_removed` the initial state is fitted to the error without its mean, for a score that removes
+    it.
+    """
+    model, v = simulation_form(plant, []), drives("simulation", u, y)
+    return respond(model, v, estimate_state(model, v, y, free_mean=means_removed))[1]
+
+
+def one_step_errors(plant: Plant, u: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """e(t) = y(t) - ŷ(t | t-1) (T, p) of each segment, the initial state fitted to the segment; NaN where y
+    is masked."""
+    model, out = prediction_form(plant, []), []
+    for a, b in zip(u, y, strict=True):
+        v = drives("prediction", a, filled(plant, a, b, np.zeros(plant.n)))
+        out.append(b - respond(model, v, estimate_state(model, v, b))[1])
+    return out
+
+
 def refine(
     plant: Plant,
     u: Sequence[np.ndarray],
@@ -391,8 +412,9 @@ def refine(
     m, ahead = plant.m, criterion == "prediction"
     rows = np.broadcast_to(np.asarray(settings.feedthrough, bool), (plant.p,))
     # a full weight would mix the rows of D that are free with those that are zero
-    problem = _weighted(plant, u, y, criterion, diagonal=not ahead or bool(rows.any() and not rows.all()))
-    free = np.zeros(problem.start.H.shape, bool)
+    diagonal = not ahead or bool(rows.any() and not rows.all())
+    start, v, y, weights = _weighted(plant, u, y, criterion, diagonal=diagonal)
+    free = np.zeros(start.H.shape, bool)
     free[:, : m + 1] = free_entries(plant.p, m, settings.feedthrough, offset=settings.offset)
 
     def admissible(F, G, C):
@@ -404,36 +426,29 @@ def refine(
         return np.abs(np.linalg.eigvals(A)).max() <= settings.max_radius
 
     best, costs = gauss_newton(
-        problem.start,
-        problem.v,
-        problem.y,
+        start,
+        v,
+        y,
         free=free,
         admissible=admissible,
         max_iterations=settings.max_iterations,
         tolerance=settings.tolerance,
     )
-    refined = _plant_of(best, problem, plant, ahead=ahead)
+    refined = _plant_of(best, weights, plant, ahead=ahead)
     return refined._replace(D=np.where(rows[:, None], refined.D, plant.D)), costs
 
 
-class _Weighted(NamedTuple):
+def _weighted(
+    plant: Plant, u, y, criterion: Criterion, *, diagonal: bool
+) -> tuple[Predictor, list[np.ndarray], list[np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """What Gauss-Newton solves: the starting predictor, its drives and the outputs, in units in which the
-    starting errors have covariance I; `unweight` leads back."""
-
-    start: Predictor
-    v: list[np.ndarray]
-    y: list[np.ndarray]
-    weight: np.ndarray
-    unweight: np.ndarray
-
-
-def _weighted(plant: Plant, u, y, criterion: Criterion, *, diagonal: bool) -> _Weighted:
+    starting errors have covariance I; and the weight (p, p) that leads there, and back."""
     m, ahead = plant.m, criterion == "prediction"
     start = prediction_form(plant, []) if ahead else simulation_form(plant, [])
     y_full = y
     if ahead:
         y_full = [
-            b if np.isfinite(b).all() else filled(plant, a, b, _first_state(plant, start, criterion, a, b))
+            b if np.isfinite(b).all() else filled(plant, a, b, _first_state(start, criterion, a, b))
             for a, b in zip(u, y, strict=True)
         ]
     v = [drives(criterion, a, b) for a, b in zip(u, y_full, strict=True)]
@@ -444,14 +459,14 @@ def _weighted(plant: Plant, u, y, criterion: Criterion, *, diagonal: bool) -> _W
         start = start._replace(G=np.hstack([start.G[:, : m + 1], start.G[:, m + 1 :] @ unweight]))
         v = [np.hstack([a[:, : m + 1], a[:, m + 1 :] @ weight.T]) for a in v]
     start = start._replace(C=weight @ start.C, H=weight @ start.H, x0=x0)
-    return _Weighted(start, v, [b @ weight.T for b in y], weight, unweight)
+    return start, v, [b @ weight.T for b in y], (weight, unweight)
 
 
-def _plant_of(best: Predictor, problem: _Weighted, plant: Plant, *, ahead: bool) -> Plant:
+def _plant_of(best: Predictor, weights: tuple[np.ndarray, np.ndarray], plant: Plant, *, ahead: bool) -> Plant:
     """The plant whose weighted predictor or simulator is `best`, in the units of `plant`."""
-    m = plant.m
-    C, H = problem.unweight @ best.C, problem.unweight @ best.H
-    K = best.G[:, m + 1 :] @ problem.weight if ahead else np.zeros((plant.n, plant.p))
+    m, (weight, unweight) = plant.m, weights
+    C, H = unweight @ best.C, unweight @ best.H
+    K = best.G[:, m + 1 :] @ weight if ahead else np.zeros((plant.n, plant.p))
     D, d = H[:, :m], H[:, m]
     A, B, b = best.F + K @ C, best.G[:, :m] + K @ D, best.G[:, m] + K @ d
     return Plant(A, B, C, D, b, d, K, plant.sample_time_s)
@@ -520,7 +535,7 @@ def kalman_gain(
     return plant._replace(K=K)
 
 
-def _first_state(plant, start, criterion, u, y):
+def _first_state(start, criterion, u, y):
     rows = np.isfinite(y).all(1)
     stop = len(rows) if rows.all() else max(int(np.argmin(rows)), 1)
     return estimate_state(start, drives(criterion, u[:stop], np.nan_to_num(y[:stop])), y[:stop])

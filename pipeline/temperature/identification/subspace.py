@@ -172,17 +172,10 @@ def one_step(data: Lagged, past: int) -> tuple[np.ndarray, np.ndarray]:
     return coefficients, data.R[:, data.now_y] - data.R[:, features] @ coefficients
 
 
-class Subspace(NamedTuple):
-    """What the singular value decomposition of the extended predictor leaves: states = basis[:n] z for order
-    n, and all singular values in units of noise."""
-
-    basis: np.ndarray
-    singular_values: np.ndarray
-
-
-def subspace(data: Lagged, future: int) -> Subspace:
+def subspace(data: Lagged, future: int) -> tuple[np.ndarray, np.ndarray]:
     """PBSID-opt (Chiuso 2007): the predictor's coefficients shifted into Gamma_f K, weighted by the noise,
-    times the past, and its singular values.
+    times the past; by its singular value decomposition the basis with states = basis[:n] z for order n, and
+    all singular values in units of noise.
 
     Row block i holds the coefficients of lags i+1, i+2, ... : the effect that the past still has i steps
     ahead. The coefficients' error adds to the singular values about as much as a (future p) x (past (m+p))
@@ -201,10 +194,8 @@ def subspace(data: Lagged, future: int) -> Subspace:
         extended[i, :, : (past - i) * q] = phi[:, i * q :]
     extended = extended.reshape(future * p, past * q)
     U, singular_values, _ = np.linalg.svd(extended @ data.R[:, data.lags(1, past)].T, full_matrices=False)
-    return Subspace(
-        (U.T @ extended) / np.sqrt(np.maximum(singular_values, np.finfo(float).tiny))[:, None],
-        singular_values,
-    )
+    basis = (U.T @ extended) / np.sqrt(np.maximum(singular_values, np.finfo(float).tiny))[:, None]
+    return basis, singular_values
 
 
 def _least_squares(regressors: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@ what they must beat, residual tests, excitation, step responses and poles with b
 and as columns; and a sentence of advice for each test that failed."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.optimize
@@ -19,9 +19,9 @@ from pipeline.temperature.identification.refinement import (
     estimate_state,
     filled,
     linear_recurrence,
+    one_step_errors,
     prediction_form,
-    respond,
-    simulation_form,
+    simulated,
 )
 from pipeline.temperature.identification.subspace import Segments, lagged, realise, subspace
 from pipeline.temperature.plant import Plant, markov_parameters
@@ -68,52 +68,22 @@ class RecordExcitation(NamedTuple):
     levels: np.ndarray
 
 
-def simulated(plant: Plant, u: np.ndarray, y: np.ndarray, *, means_removed: bool = False) -> np.ndarray:
-    """ŷ (T, p) of the plant under u (T, m) alone, from the initial state that fits all of y (T, p) best (the
-    rule of SLICOT's IB01CD and of MATLAB's compare).
+def predicted_ahead(plant: Plant, u: np.ndarray, y: np.ndarray, steps: int) -> np.ndarray:
+    """ŷ(t | outputs up to t - steps) (T, p), inputs known throughout.
 
-    With `means_removed` the initial state is fitted to the error
-    without its mean, for a score that removes it.
+    The state, disturbances in it included, comes from the Kalman predictor on past outputs only. It starts at
+    the one that fits the first max(3 n, 30) one-step predictions; callers leave these rows out of a score.
+    NaN in y passes as a missing measurement.
     """
-    model, v = simulation_form(plant, []), drives("simulation", u, y)
-    return respond(model, v, estimate_state(model, v, y, free_mean=means_removed))[1]
-
-
-def predicted_ahead(
-    plant: Plant, u: np.ndarray, y: np.ndarray, steps: int, *, x0: np.ndarray | None = None
-) -> np.ndarray:
-    """ŷ(t | outputs up to t - steps) (T, p), inputs known throughout;
-    the first `steps` - 1 rows start from x0.
-
-    The state, disturbances in it included, comes from the Kalman predictor on past outputs only. x0 defaults
-    to the state that fits the first max(3 n, 30) one-step predictions; callers leave these rows out of a
-    score. NaN in y passes as a missing measurement.
-    """
-    model = prediction_form(plant, [])
-    if x0 is None:
-        first = min(max(3 * plant.n, 30), len(u))
-        start = drives(
-            "prediction",
-            u[:first],
-            np.where(np.isfinite(y[:first]), y[:first], np.nanmean(y[:first], axis=0)),
-        )
-        x0 = estimate_state(model, start, y[:first])
+    model, first = prediction_form(plant, []), max(3 * plant.n, 30)
+    begun = np.where(np.isfinite(y[:first]), y[:first], np.nanmean(y[:first], axis=0))
+    x0 = estimate_state(model, drives("prediction", u[:first], begun), y[:first])
     y_filled = filled(plant, u, y, x0)
     # x(t | y up to t-1)
     x = linear_recurrence(model.F, drives("prediction", u, y_filled) @ model.G.T, x0)[:-1]
     for ahead in range(1, min(steps, len(u))):  # row t then holds x(t | y up to t-1-ahead)
         x[ahead:] = x[ahead - 1 : -1] @ plant.A.T + u[ahead - 1 : -1] @ plant.B.T + plant.b
     return x @ plant.C.T + u @ plant.D.T + plant.d
-
-
-def one_step_errors(plant: Plant, u: Segments, y: Segments) -> list[np.ndarray]:
-    """e(t) = y(t) - ŷ(t | t-1) (T, p) of each segment, the initial
-    state fitted to the segment; NaN where y is masked."""
-    model, out = prediction_form(plant, []), []
-    for a, b in zip(u, y, strict=True):
-        v = drives("prediction", a, filled(plant, a, b, np.zeros(plant.n)))
-        out.append(b - respond(model, v, estimate_state(model, v, b))[1])
-    return out
 
 
 def _correlation(a: np.ndarray, b: np.ndarray, lag: int) -> float:
@@ -282,7 +252,7 @@ def _reidentified(u: Segments, y: Segments, identified, order: int) -> Plant:
     us, ys = shifted(u, y, identified.delays)
     direct = identified.feedthrough
     data = lagged(us, ys, identified.past, feedthrough=any(direct), offset=identified.offset)
-    basis = subspace(data, identified.past).basis[:order]
+    basis = subspace(data, identified.past)[0][:order]
     start = stabilised(realise(data, basis, identified.plant.sample_time_s, direct), LARGEST_RADIUS)
     settings = FitSettings(direct, identified.offset, LARGEST_RADIUS, RESAMPLED_STEPS)
     refitted = fit(identified.fit, start, us, ys, settings, gain=False)
@@ -428,23 +398,20 @@ ENDS = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
 
 
 class Holdout(NamedTuple):
-    """What held-out segments say of a plant, fits in percent.
+    """What held-out segments say of a plant.
 
-    simulated, ahead: predictions (T, p) of each segment, the second NaN over its start-up; fit, ahead_fit (3,
-    p): value and the ends of its 90 % band; held_fit (p,): the last value seen so many steps before, held,
-    over the rows of ahead_fit. NaN where no segment outlasts the start-up. free_mean_fit (3, p): of the
-    same simulation with the mean of each segment's error taken off, what another ambient alone would cost.
-    Its start is the simulation's: one fitted beside a free mean lets slow modes draw any ramp.
-    drift_fit (3, p): of the simulation with a drift tracked up to so many steps before, NaN without one.
+    simulated, ahead: predictions (T, p) of each segment, the second NaN over its start-up. fits: by the name
+    of the figure, (3, p) in percent, value and the ends of its 90 % band, of the simulation
+    (`fit_holdout`); of the predictions ahead (`..._ahead`), NaN where no segment outlasts the start-up; of
+    the last value seen so many steps before, held, over the same rows (`..._held`); of the simulation with
+    the mean of each segment's error taken off (`..._free_mean`), what another ambient alone would cost: its
+    start is the simulation's, as one fitted beside a free mean lets slow modes draw any ramp; and of the
+    simulation with a drift tracked up to so many steps before (`..._drift`), NaN without one.
     """
 
     simulated: list[np.ndarray]
     ahead: list[np.ndarray]
-    fit: np.ndarray
-    ahead_fit: np.ndarray
-    held_fit: np.ndarray
-    free_mean_fit: np.ndarray
-    drift_fit: np.ndarray
+    fits: dict[str, np.ndarray]
 
 
 class Steps(NamedTuple):
@@ -468,19 +435,6 @@ class Steps(NamedTuple):
     delay: np.ndarray
     significant: np.ndarray
     first_order: StepModels
-
-
-class ForbiddenGain(NamedTuple):
-    """A steady effect that physics forbids: of `input` on `output`, in °C per percent with its band, and why.
-    `certain`: the whole band is forbidden, not the value alone."""
-
-    output: str
-    input: str
-    gain: float
-    low: float
-    high: float
-    certain: bool
-    reason: str
 
 
 def held(y: np.ndarray, steps: int) -> np.ndarray:
@@ -542,10 +496,15 @@ def holdout(
         simulated_with_drift(plant, a, b, drift, steps) if drift else np.full(b.shape, np.nan)
         for a, b in zip(u, y, strict=True)
     ]
-    fits = [
-        fit_with_band(y, part, block=block, rng=rng) for part in (simulations, ahead, last, free, drifting)
-    ]
-    return Holdout(simulations, ahead, fits[0], fits[1], fits[2][0], *fits[3:])
+    parts = {
+        "fit_holdout": simulations,
+        "fit_holdout_ahead": ahead,
+        "fit_holdout_held": last,
+        "fit_holdout_free_mean": free,
+        "fit_holdout_drift": drifting,
+    }
+    fits = {name: fit_with_band(y, part, block=block, rng=rng) for name, part in parts.items()}
+    return Holdout(simulations, ahead, fits)
 
 
 def fit_of_held_inputs(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
@@ -653,19 +612,29 @@ def forbidden_gains(
     inputs: Sequence[str],
     heats: Sequence[bool],
     ranges: Sequence[float],
-) -> list[ForbiddenGain]:
-    """The effects of inputs that `heats` marks which are negative, or which over the input's range (percent)
-    are larger than `LARGEST_RISE_DEGC`."""
+) -> list[dict[str, Any]]:
+    """The steady effects that physics forbids, of inputs that `heats` marks: negative ones, and those that
+    over the input's range (percent) are larger than `LARGEST_RISE_DEGC`. `gain` in °C per percent with its
+    band, and why; `certain`: the whole band is forbidden, not the value alone."""
     flagged = []
     for j, name in enumerate(inputs):
         for o, output in enumerate(outputs if heats[j] else ()):
             gain, low, high = (float(part) for part in steps.gain[:, o, j])
             largest = LARGEST_RISE_DEGC / ranges[j]
-            if gain < 0:
-                flagged.append(ForbiddenGain(output, name, gain, low, high, high < 0, "a heater that cools"))
-            elif gain > largest:
-                reason = f"more than {LARGEST_RISE_DEGC:g} °C over the input's range"
-                flagged.append(ForbiddenGain(output, name, gain, low, high, low > largest, reason))
+            if not (gain < 0 or gain > largest):
+                continue
+            too_much = f"more than {LARGEST_RISE_DEGC:g} °C over the input's range"
+            flagged.append(
+                {
+                    "output": output,
+                    "input": name,
+                    "gain": gain,
+                    "low": low,
+                    "high": high,
+                    "certain": high < 0 if gain < 0 else low > largest,
+                    "reason": "a heater that cools" if gain < 0 else too_much,
+                }
+            )
     return flagged
 
 
@@ -694,14 +663,12 @@ def holdout_rows(
         "segment": np.repeat(np.arange(len(measured), dtype=np.int32), [len(y) for y in measured]),
         "time_s": np.concatenate([sample_time_s * np.arange(len(y)) for y in measured]),
     }
-    for channel, name in enumerate(outputs):
-        for kind, part in (
-            ("measured", measured),
-            ("simulated", predictions.simulated),
-            ("ahead", predictions.ahead),
-        ):
-            columns[f"{name}_{kind}"] = np.concatenate([y[:, channel] for y in part])
-    return columns
+    kinds = {"measured": measured, "simulated": predictions.simulated, "ahead": predictions.ahead}
+    return columns | {
+        f"{name}_{kind}": np.concatenate([y[:, channel] for y in part])
+        for channel, name in enumerate(outputs)
+        for kind, part in kinds.items()
+    }
 
 
 def residual_rows(tests: Residuals, outputs: Sequence[str], inputs: Sequence[str]) -> dict[str, list]:
@@ -827,17 +794,12 @@ def level_rows(levels: np.ndarray, inputs: Sequence[str]) -> dict[str, np.ndarra
 def fit_figures(judged: Holdout, outputs: Sequence[str]) -> dict[str, dict | None]:
     """Fits on the hold-out by output, with their bands and what they must beat; those
     ahead are None where no segment was long enough, that of a drift where there is none."""
-    named = {
-        "fit_holdout": judged.fit,
-        "fit_holdout_free_mean": judged.free_mean_fit,
-        "fit_holdout_drift": judged.drift_fit,
-        "fit_holdout_ahead": judged.ahead_fit,
-    }
-    figures = {key: dict(zip(outputs, part[0].tolist(), strict=True)) for key, part in named.items()}
+    banded = [f"fit_holdout{end}" for end in ("", "_free_mean", "_drift", "_ahead")]
+    figures = {key: dict(zip(outputs, judged.fits[key][0].tolist(), strict=True)) for key in banded}
     figures |= {
-        f"{key}_band": dict(zip(outputs, part[1:].T.tolist(), strict=True)) for key, part in named.items()
+        f"{key}_band": dict(zip(outputs, judged.fits[key][1:].T.tolist(), strict=True)) for key in banded
     }
-    figures["fit_holdout_held"] = dict(zip(outputs, judged.held_fit.tolist(), strict=True))
+    figures["fit_holdout_held"] = dict(zip(outputs, judged.fits["fit_holdout_held"][0].tolist(), strict=True))
     return {key: part if np.isfinite(list(part.values())).all() else None for key, part in figures.items()}
 
 
@@ -866,17 +828,6 @@ def outcome_figures(
     }
 
 
-class ModelJudgement(NamedTuple):
-    """The chosen model on the last part of the record, and what the first part excites; `still` (p,): its fit
-    with the inputs held."""
-
-    holdout: Holdout
-    residuals: Residuals
-    excitation: RecordExcitation
-    samples: int
-    still: np.ndarray
-
-
 def judge(
     chosen: Identified,
     first: tuple[Segments, Segments],
@@ -884,13 +835,13 @@ def judge(
     *,
     ahead_steps: int,
     rng: np.random.Generator,
-) -> ModelJudgement:
-    """The model that (u, y) of `first` chose, on (u, y) of `last`."""
+) -> tuple[Holdout, Residuals, RecordExcitation, np.ndarray]:
+    """The model that (u, y) of `first` chose, on (u, y) of `last`; what the first part excites; and the fit
+    (p,) of the model with the inputs held."""
     closed = chosen.feedback is not None and chosen.feedback.closed
-    return ModelJudgement(
+    return (
         holdout(chosen.plant, *last, ahead_steps, block=2 * chosen.past, rng=rng, drift=chosen.drift),
         residual_tests(chosen.plant, *last, lags=residual_lags(last[0]), closed=closed),
         excitation(first[0], chosen.past),
-        sum(map(len, last[0])),
         fit_of_held_inputs(chosen.plant, *last),
     )

@@ -42,17 +42,18 @@ def best_by_limits(
     }
     plant = table["plant"][rows[order[0]]]
     rest = plant != compared["deciding"]["plant"]
-    choice = chosen(costs, plant, eligible, seed=seed)
-    again = chosen({name: values[rest] for name, values in costs.items()}, plant[rest], eligible, seed=seed)
+    best, nearest, against = chosen(costs, plant, eligible, seed=seed)
+    others = {name: values[rest] for name, values in costs.items()}
     reason = {
         "passes": able,
-        "leading": chosen(costs, plant, dict.fromkeys(order, True), seed=seed).best,
-        "nearest": choice.nearest,
-        "improvement_percent": choice.against.improvement_percent if choice.against else None,
-        "p": choice.against.p if choice.against else None,
+        "leading": chosen(costs, plant, dict.fromkeys(order, True), seed=seed)[0],
+        "nearest": nearest,
+        "improvement_percent": against.improvement_percent if against else None,
+        "p": against.p if against else None,
     }
-    deciding = {**compared["deciding"], "best_without": again.best}
-    return {"limits": limits, "best": choice.best, "best_reason": reason, "deciding": deciding}
+    without = chosen(others, plant[rest], eligible, seed=seed)[0]
+    deciding = {**compared["deciding"], "best_without": without}
+    return {"limits": limits, "best": best, "best_reason": reason, "deciding": deciding}
 
 
 def fragile(pair: tuple[str, str], figures: Mapping[str, Any], able: Mapping[str, bool]) -> str:

@@ -31,8 +31,8 @@ def search(
     low, start, high = table.bounds(controller, problem)
     try:
         design = controller.design(problem, table.parameters(controller, start))
-    except ValueError as reason:
-        return name, str(reason)
+    except ValueError as refusal:
+        return name, str(refusal)
     if design is None:
         return name, ""
     rests = panel.rests(design.model, setting.rehearsal.training, setting.limits)
@@ -44,7 +44,8 @@ def search(
         far = np.log(theta / start) / np.log(high / low)
         return _cost(candidate, rests, settings, setting) * (1 + NEARER * float(far @ far))
 
-    first = tuning.History(start[None], *_first(cost, start))
+    value, reason = tuning.evaluate(cost, start)
+    first = tuning.History(start[None], np.array([value]), (reason,), np.array([value]))
     initial, evaluations = settings.practical_initial, settings.practical_evaluations
     last = min(round(POLISHED * evaluations), evaluations - initial)
     try:
@@ -58,17 +59,8 @@ def search(
             start=first,
         )
         return name, tuning.polished(cost, result, low, high, evaluations=last)
-    except ValueError as reason:  # every candidate failed: the others go on
-        return name, str(reason)
-
-
-def _first(cost, start: np.ndarray) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
-    """The declared start as the first candidate."""
-    try:
-        value, reason = cost(start), ""
-    except ValueError as failure:
-        value, reason = np.nan, str(failure)
-    return np.array([value]), (reason,), np.array([value])
+    except ValueError as failure:  # every candidate failed: the others go on
+        return name, str(failure)
 
 
 def _cost(design: Design, rests: Sequence[Rest], settings: TuneWeights, setting: CaseConditions) -> float:

@@ -73,9 +73,6 @@ def _gaps(design: Design, setting: panel.CaseConditions) -> np.ndarray | None:
         cases.x0[rows],
         cases.u0[rows],
         np.repeat(cases.references[cases.asked[rows[0], 0]].H.T, len(rows), axis=0),
-        np.zeros(len(rows)),
-        np.zeros(len(rows), int),
-        np.zeros(len(rows)),
         cases.steps,
         cases.hold,
     )
@@ -119,10 +116,10 @@ def summarise(
     cases, columns = setting.rehearsal.judging, _columns(one, setting)
     figures = {}
     for name, column in FIGURES.items():
-        band = scorecard.banded(columns[column], cases.plant, seed=seed, resamples=resamples)
+        band, worst = scorecard.banded(columns[column], cases.plant, seed=seed, resamples=resamples)
         figures[name] = {
-            **{key: _number(getattr(band, key)) for key in ("median", "q90", "low", "high", "worst")},
-            "worst_case": _case(cases, band.worst_case),
+            **{key: _number(value) for key, value in band.items()},
+            "worst_case": _case(cases, worst),
         }
     steps = np.fmax(one.figures.settling, one.figures.heating)
     crossing, noise = one.figures.crossing, setting.rehearsal.noise.max()
@@ -229,7 +226,7 @@ def _pair(
                 "plants": len(np.unique(block)), "figures": {}}  # fmt: skip
     figures = summary["contestants"]
     return {
-        **scorecard.pair(a, b, costs, block, seed=seed)._asdict(),
+        **scorecard.pair(a, b, costs, block, seed=seed),
         "plants": len(np.unique(block)),
         "figures": {
             name: [figures[one][name]["q90"] for one in (a, b)]
@@ -301,21 +298,13 @@ REDESIGNS = 7  # plants of the spread that a controller is designed from anew
 BROKEN = 2.0  # times the cost, from which a record that cannot be told from this one gives another controller
 
 
-class Redesigned(NamedTuple):
-    """`excess`: the median extra cost as a share; `broken` of `of` plants give a controller that costs BROKEN
-    times as much, or none."""
-
-    excess: float
-    broken: int
-    of: int
-
-
 def redesigned(
     name: str, problem: DesignProblem, values: Mapping[str, float], setting: panel.CaseConditions
-) -> Redesigned:
+) -> tuple[float, int, int]:
     """What the bands of the identified plant leave open of a controller's closed loop: with J the mean cost
     of the controller on the training cases, and J_k that of the same controller designed from plant k of the
-    spread, REDESIGNS of them, the median of max(J_k / J - 1, 0).
+    spread, REDESIGNS of them, the median of max(J_k / J - 1, 0); and how many plants, of how many, give a
+    controller that costs BROKEN times as much, or none.
 
     A PI controller takes gain and lag from a plant, a model-based one all of it: each is charged with the
     doubt in what it takes. The spread is resampled in blocks, so the colour of the residuals is in it."""
@@ -334,6 +323,6 @@ def redesigned(
     own = cost(problem.plant)
     ratios = np.array([cost(plant) for plant in problem.family[1 : 1 + REDESIGNS]]) / own
     if not ratios.size:
-        return Redesigned(float("inf"), 0, 0)
+        return float("inf"), 0, 0
     excess = float(np.quantile(np.maximum(ratios - 1.0, 0.0), 0.5, method="nearest"))
-    return Redesigned(excess, int((ratios >= BROKEN).sum()), len(ratios))
+    return excess, int((ratios >= BROKEN).sum()), len(ratios)

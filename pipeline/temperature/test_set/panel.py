@@ -38,7 +38,7 @@ from pipeline.temperature.controllers.controller import (
 from pipeline.temperature.controllers.feed_forward import Told
 from pipeline.temperature.controllers.governor import Governor, OutputLimits, Strength, governor
 from pipeline.temperature.controllers.problem import Design, DesignProblem
-from pipeline.temperature.plant import Plant, hold_output, hold_state, simulate
+from pipeline.temperature.plant import Plant, hold_output, hold_state, padded, simulate
 from pipeline.temperature.settings import Half, Panel, Tracking, TuneWeights
 from pipeline.temperature.settings import Plant as Machine
 from pipeline.temperature.test_set.scenario_defaults import (
@@ -188,21 +188,6 @@ def corners(nominal: Sequence[Plant], spread: PlantSpread) -> tuple[list[Plant],
     weakest = (1 - spread.input_gain) / (1 + spread.slower)
     strongest = (1 + spread.input_gain) / (1 - spread.slower)
     return padded(family), Strength(weakest, strongest, spread.input_gain)
-
-
-def padded(plants: Sequence[Plant]) -> list[Plant]:
-    """The plants with one order: states that nothing moves and nobody sees fill up the smaller ones."""
-    most = max(plant.n for plant in plants)
-    return [
-        plant._replace(
-            A=np.pad(plant.A, (0, most - plant.n)),
-            B=np.pad(plant.B, ((0, most - plant.n), (0, 0))),
-            C=np.pad(plant.C, ((0, 0), (0, most - plant.n))),
-            b=np.pad(plant.b, (0, most - plant.n)),
-            K=np.pad(plant.K, ((0, most - plant.n), (0, 0))),
-        )
-        for plant in plants
-    ]
 
 
 # ---- what they are asked
@@ -636,36 +621,14 @@ def lasting(outside: np.ndarray) -> np.ndarray:
     return lasts
 
 
-class Allowance(NamedTuple):
-    """What the cost counts as one: steps outside the band, °C of overshoot and of settled error, percent of
-    commands outside the limits, percent of mean input, percent of travel a step, °C of r.m.s. error where the
-    reference makes no step."""
-
-    outside: float
-    overshoot: float
-    settled_error: float
-    at_limits: float
-    energy: float
-    travel: float
-    rms: float
-
-
-def costs(results: Figures, allowance: Allowance) -> np.ndarray:
+def costs(results: Figures, allowance: Mapping[str, float]) -> np.ndarray:
     """The declared cost of each case (s,): the sum of figure / allowance of what applies to it; 1e4 at
-    most."""
+    most. `allowance` has by the names of Figures what the cost counts as one; `rms` counts where the
+    reference makes no step, `outside` and `overshoot` where it does."""
+    one = {name: getattr(results, name) / unit for name, unit in allowance.items()}
     moving = np.isnan(results.overshoot)
-    response = np.where(
-        moving,
-        results.rms / allowance.rms,
-        results.outside / allowance.outside + np.nan_to_num(results.overshoot) / allowance.overshoot,
-    )
-    total = (
-        response
-        + results.settled_error / allowance.settled_error
-        + np.nan_to_num(results.at_limits) / allowance.at_limits
-        + results.energy / allowance.energy
-        + results.travel / allowance.travel
-    )
+    response = np.where(moving, one["rms"], one["outside"] + np.nan_to_num(one["overshoot"]))
+    total = response + one["settled_error"] + np.nan_to_num(one["at_limits"]) + one["energy"] + one["travel"]
     return np.minimum(np.nan_to_num(total, nan=1e4, posinf=1e4), 1e4)
 
 
@@ -687,8 +650,9 @@ class Rehearsal(NamedTuple):
 class CaseConditions(NamedTuple):
     """What all controllers share, tuned and judged: the rehearsal, limits of inputs and outputs (low, high
     (p,) in °C), the governor, the integrator's limit in °C, the settled window in steps, what the cost counts
-    as one, the discount, the sample time, the share of the declared delay margins that is asked here
-    (`faster`), and what makes up for measured disturbances."""
+    as one, the discount, the sample time, the share of the declared delay margins that is asked here, below 1
+    (`faster`) of a machine that must settle sooner than the panel's, as a hair dryer, whose whole answer is
+    over within 1 s, and what makes up for measured disturbances."""
 
     rehearsal: Rehearsal
     limits: ActuatorLimits
@@ -696,17 +660,11 @@ class CaseConditions(NamedTuple):
     governor: Governor
     integral_limit: float
     settled: int
-    allowance: Allowance
+    allowance: dict[str, float]
     gamma: float
     sample_time_s: float
     faster: float
     forward: FeedForward | None
-
-
-def faster(settings: Panel, rehearsal: Rehearsal) -> float:
-    """Share of a declared delay margin that is asked of a machine: below 1 for one that must settle sooner
-    than the panel's. The whole answer of a hair dryer is over within 1 s."""
-    return min((rehearsal.settling_s or settings.settling_s) / settings.settling_s, 1.0)
 
 
 def conditions(
@@ -722,15 +680,15 @@ def conditions(
     band = rehearsal.band_degC / settings.band_degC
     late = (rehearsal.settling_s or settings.settling_s) / settings.settling_s
     # a slow machine is allowed its time, a small one its degrees
-    allowance = Allowance(
-        outside=tuning.allow_settling_s * late / machine.sample_time_s,
-        overshoot=tuning.allow_overshoot_degC * band,
-        settled_error=tuning.allow_settled_error_degC * band,
-        at_limits=tuning.allow_at_limits_percent,
-        energy=tuning.allow_effort_percent,
-        travel=tuning.allow_travel_percent,
-        rms=tuning.allow_overshoot_degC * band,
-    )
+    allowance = {
+        "outside": tuning.allow_settling_s * late / machine.sample_time_s,
+        "overshoot": tuning.allow_overshoot_degC * band,
+        "settled_error": tuning.allow_settled_error_degC * band,
+        "at_limits": tuning.allow_at_limits_percent,
+        "energy": tuning.allow_effort_percent,
+        "travel": tuning.allow_travel_percent,
+        "rms": tuning.allow_overshoot_degC * band,
+    }
     # nearer to a reference than its noise no forecast can tell an overshoot
     overshoot = max(tracking.governor_overshoot_degC * band, 3 * float(rehearsal.noise.max()))
     return CaseConditions(
@@ -743,7 +701,7 @@ def conditions(
         allowance,
         tracking.gamma,
         machine.sample_time_s,
-        faster(settings, rehearsal),
+        min(late, 1.0),
         told.forward if told else None,
     )
 

@@ -13,7 +13,7 @@ import scipy.optimize
 
 from pipeline.temperature.controllers.baseline import rises
 from pipeline.temperature.identification.first_order import time_constant
-from pipeline.temperature.identification.validation import one_step_errors, simulated
+from pipeline.temperature.identification.refinement import one_step_errors, simulated
 from pipeline.temperature.plant import Plant, hold_output, strictly_proper
 
 RANGE = (0.01, 0.99)  # quantiles that count as recorded: a spike, or one sample of a start, is none

@@ -7,7 +7,7 @@ Cases of one plant stand or fall together: plants are the blocks of every test a
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -16,13 +16,15 @@ import scipy.sparse
 from pipeline.statistics import Paired, paired
 from pipeline.temperature.controllers import kernel
 from pipeline.temperature.controllers import window as window_route
-from pipeline.temperature.plant import Plant, hold_output, hold_state
-from pipeline.temperature.tracking import Gains, Law, gains
+from pipeline.temperature.plant import Plant
+from pipeline.temperature.tracking import Law, gains
+
+Run = tuple[np.ndarray, np.ndarray]  # true outputs and inputs (steps, scenarios, p or m)
 
 
 class Scenarios(NamedTuple):
     """Scenarios, one a row: plant[i] of `plants` (all of one order), held at x0 by u0, reference r, sensor
-    noise of `noise` °C drawn from `seed`.
+    noise (hold + steps, s, p) in °C.
 
     The controller watches the hold for `hold` steps before it takes over: its memory then holds what a
     machine would have put there. It runs for `steps`.
@@ -33,11 +35,9 @@ class Scenarios(NamedTuple):
     x0: np.ndarray
     u0: np.ndarray
     r: np.ndarray
-    noise: np.ndarray
-    seed: np.ndarray
-    start: np.ndarray
     steps: int
     hold: int
+    noise: np.ndarray | float = 0.0
 
 
 class CommonCost(NamedTuple):
@@ -48,68 +48,7 @@ class CommonCost(NamedTuple):
     gamma: float
 
 
-class PanelRun(NamedTuple):
-    """True outputs y and inputs u (steps, scenarios, p or m)."""
-
-    y: np.ndarray
-    u: np.ndarray
-
-
-def panel(
-    plants: Sequence[Plant],
-    *,
-    starts: Sequence[float],
-    references: Sequence[Sequence[float]],
-    noise: Sequence[float],
-    seeds: Sequence[int],
-    steps: int,
-    hold: int,
-    cells: bool,
-) -> Scenarios:
-    """Every plant x start x reference x noise level, once without noise and once a seed with it.
-
-    A start is a temperature in °C at which the plant is held by its steady input: of every cell where the
-    states are `cells`, of every sensor otherwise.
-    """
-    rows = []
-    for index, plant in enumerate(plants):
-        for start in starts:
-            x0, u0 = (np.full(plant.n, start), None) if cells else hold_output(plant, np.full(plant.p, start))
-            u0 = hold_state(plant, x0) if u0 is None else u0
-            for reference in references:
-                for level in noise:
-                    rows += [
-                        (index, x0, u0, reference, level, seed, start)
-                        for seed in (seeds if level > 0 else seeds[:1])
-                    ]
-    index, x0, u0, r, level, seed, start = (np.array(column) for column in zip(*rows, strict=True))
-    return Scenarios(
-        list(plants),
-        index,
-        x0,
-        u0,
-        np.asarray(r, float),
-        level.astype(float),
-        seed,
-        start.astype(float),
-        steps,
-        hold,
-    )
-
-
-def disturbances(panel: Scenarios) -> np.ndarray:
-    """Sensor noise (hold + steps, scenarios, p): each scenario draws from its
-    own seed, so that every controller sees the same."""
-    unit = {
-        int(seed): np.random.default_rng(seed).standard_normal((panel.hold + panel.steps, panel.r.shape[1]))
-        for seed in np.unique(panel.seed)
-    }
-    return np.stack(
-        [level * unit[int(seed)] for level, seed in zip(panel.noise, panel.seed, strict=True)], axis=1
-    )
-
-
-def simulate(panel: Scenarios, law: Law) -> PanelRun:
+def simulate(panel: Scenarios, law: Law) -> Run:
     """Every scenario at once under one law with its own feed-forward; nothing limits the inputs, and xi stays
     zero."""
     A, B, C, b, d = (
@@ -117,7 +56,7 @@ def simulate(panel: Scenarios, law: Law) -> PanelRun:
     )
     steps, (scenarios, p) = panel.steps, panel.r.shape
     y, u = np.empty((steps, scenarios, p)), np.empty((steps, scenarios, law.K.shape[0]))
-    x, noise = panel.x0.copy(), disturbances(panel)
+    x, noise = panel.x0.copy(), np.broadcast_to(panel.noise, (panel.hold + steps, scenarios, p))
     held = np.einsum("sij,sj->si", C, x) + d
     z = panel.u0 @ law.start_u.T + (held + noise[0]) @ law.start_y.T + law.start
     # the memory of a window is a shift: as a sparse matrix it costs a copy, not a product
@@ -134,13 +73,13 @@ def simulate(panel: Scenarios, law: Law) -> PanelRun:
         if not np.abs(x).max() < 1e9:
             x = np.clip(np.nan_to_num(x), -1e9, 1e9)
             z = np.clip(np.nan_to_num(z), -1e9, 1e9)
-    return PanelRun(y, u)
+    return y, u
 
 
-def cost(panel: Scenarios, run: PanelRun, yardstick: CommonCost) -> np.ndarray:
+def cost(panel: Scenarios, run: Run, yardstick: CommonCost) -> np.ndarray:
     """(3) of every scenario (s,): discounted, on true outputs and applied inputs."""
-    error = run.y - panel.r
-    stage = error**2 @ yardstick.q + run.u**2 @ yardstick.r
+    y, u = run
+    stage = (y - panel.r) ** 2 @ yardstick.q + u**2 @ yardstick.r
     return yardstick.gamma ** np.arange(len(stage)) @ stage
 
 
@@ -149,10 +88,6 @@ def optimum(panel: Scenarios, yardstick: CommonCost) -> np.ndarray:
     best = [
         gains(plant, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma) for plant in panel.plants
     ]
-    return cost(panel, _state_feedback(panel, best), yardstick)
-
-
-def _state_feedback(panel: Scenarios, best: Sequence[Gains]) -> PanelRun:
     plants = [panel.plants[i] for i in panel.plant]
     A, B, C, b, d = (
         np.stack([getattr(plant, name) for plant in plants]) for name in ("A", "B", "C", "b", "d")
@@ -164,7 +99,7 @@ def _state_feedback(panel: Scenarios, best: Sequence[Gains]) -> PanelRun:
         y[t] = np.einsum("sij,sj->si", C, x) + d
         u[t] = -np.einsum("sij,sj->si", K_x, x) - feed
         x = np.einsum("sij,sj->si", A, x) + np.einsum("sij,sj->si", B, u[t]) + b
-    return PanelRun(y, u)
+    return cost(panel, (y, u), yardstick)
 
 
 # ---- margins
@@ -288,32 +223,25 @@ def _delay_margin(omega: np.ndarray, loci: np.ndarray) -> float:
 LEVEL = 0.05
 
 
-class ControllerChoice(NamedTuple):
-    """`best` is None where nobody passes; `nearest` is the cheapest of the others that pass, None where
-    there is none, and `against` the test of the best one against it."""
-
-    best: str | None
-    nearest: str | None
-    against: Paired | None
-
-
 def chosen(
     costs: Mapping[str, np.ndarray], plant: np.ndarray, passes: Mapping[str, bool], *, seed: int
-) -> ControllerChoice:
+) -> tuple[str | None, str | None, Paired | None]:
     """The first of those that pass, in the order of `costs` (simplest first), that no more complex one beats:
-    one replaces it where its costs (s,) are lower beyond chance, paired by plant, one-sided at LEVEL."""
+    one replaces it where its costs (s,) are lower beyond chance, paired by plant, one-sided at LEVEL. Then
+    the cheapest of the others that pass, and the test of the first one against it; None where nobody passes,
+    or no other."""
     able = [name for name in costs if passes[name]]
     if not able:
-        return ControllerChoice(None, None, None)
+        return None, None, None
     best = able[0]
     for name in able[1:]:
         if between(costs[best], costs[name], plant, seed=seed).p < LEVEL:
             best = name
     others = [name for name in able if name != best]
     if not others:
-        return ControllerChoice(best, None, None)
+        return best, None, None
     nearest = min(others, key=lambda name: float(costs[name].mean()))
-    return ControllerChoice(best, nearest, between(costs[nearest], costs[best], plant, seed=seed))
+    return best, nearest, between(costs[nearest], costs[best], plant, seed=seed)
 
 
 def between(champion: np.ndarray, challenger: np.ndarray, plant: np.ndarray, *, seed: int) -> Paired:
@@ -326,27 +254,23 @@ def between(champion: np.ndarray, challenger: np.ndarray, plant: np.ndarray, *, 
     )
 
 
-class Pair(NamedTuple):
-    """Of two contestants a and b the cheaper one beyond chance, None where nobody is; by how many percent of
-    the other's cost, with the ends of the 90 % interval and the two-sided p."""
-
-    a: str
-    b: str
-    winner: str | None
-    difference: float
-    low: float
-    high: float
-    p: float
-
-
-def pair(a: str, b: str, costs: Mapping[str, np.ndarray], plant: np.ndarray, *, seed: int) -> Pair:
-    """The pair's difference is that of the cheaper one, whether or not it is beyond chance."""
+def pair(a: str, b: str, costs: Mapping[str, np.ndarray], plant: np.ndarray, *, seed: int) -> dict[str, Any]:
+    """Of two contestants a and b the `winner`, the cheaper one beyond chance, None where nobody is; by how
+    many percent of the other's cost the cheaper one is so (`difference`), beyond chance or not, with the ends
+    `low` and `high` of the 90 % interval and the two-sided `p`."""
     forward = between(costs[b], costs[a], plant, seed=seed)
     backward = between(costs[a], costs[b], plant, seed=seed)
     cheaper, result = (a, forward) if forward.improvement_percent >= 0 else (b, backward)
     p = min(1.0, 2 * result.p)
-    winner = cheaper if p < LEVEL else None
-    return Pair(a, b, winner, result.improvement_percent, result.low_percent, result.high_percent, p)
+    return {
+        "a": a,
+        "b": b,
+        "winner": cheaper if p < LEVEL else None,
+        "difference": result.improvement_percent,
+        "low": result.low_percent,
+        "high": result.high_percent,
+        "p": p,
+    }
 
 
 def deciding_plant(a: np.ndarray, b: np.ndarray, plant: np.ndarray) -> int:
@@ -357,23 +281,16 @@ def deciding_plant(a: np.ndarray, b: np.ndarray, plant: np.ndarray) -> int:
     return int(np.unique(plant)[(np.sign(by_plant.sum() or 1.0) * by_plant).argmax()])
 
 
-class QuantileBand(NamedTuple):
-    """Median and 90 % quantile over all cases, the 90 % band of that quantile with plants resampled as
-    blocks, the worst, and the case that has it; inf where a run never settles."""
-
-    median: float
-    q90: float
-    low: float
-    high: float
-    worst: float
-    worst_case: int
-
-
-def banded(values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int = 200) -> QuantileBand:
-    """Of a figure (s,); NaN where it does not apply, and all NaN if it applies nowhere. Less is better."""
+def banded(
+    values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int = 200
+) -> tuple[dict[str, float], int]:
+    """Of a figure (s,), less of which is better, `median` and 90 % quantile `q90` over all cases, the ends
+    `low` and `high` of the 90 % band of that quantile with plants resampled as blocks, and the `worst`, inf
+    where a run never settles; and the case that has it. Values are NaN where the figure does not apply; all
+    of the band is NaN if it applies nowhere."""
     applies = np.flatnonzero(~np.isnan(values))
     if not len(applies):
-        return QuantileBand(np.nan, np.nan, np.nan, np.nan, np.nan, 0)
+        return dict.fromkeys(("median", "q90", "low", "high", "worst"), np.nan), 0
     values, plant = values[applies], plant[applies]
     median, q90 = np.quantile(values, [0.5, 0.9], method="nearest")
     blocks = [values[plant == index] for index in np.unique(plant)]
@@ -383,9 +300,8 @@ def banded(values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int =
     ]
     low, high = np.quantile(quantiles, [0.05, 0.95], method="nearest")
     worst = int(np.argmax(values))
-    return QuantileBand(
-        float(median), float(q90), float(low), float(high), float(values[worst]), int(applies[worst])
-    )
+    band = {"median": median, "q90": q90, "low": low, "high": high, "worst": values[worst]}
+    return {name: float(value) for name, value in band.items()}, int(applies[worst])
 
 
 def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> float:
@@ -395,18 +311,6 @@ def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> fl
     by_plant = np.sort([np.log(max(costs[plant == index].mean(), 1e-9)) for index in np.unique(plant)])
     tail = by_plant[-max(1, len(by_plant) // 4) :].mean()
     return float(np.exp((by_plant.mean() + weight * tail) / (1 + weight)))
-
-
-class Sufficiency(NamedTuple):
-    """Whether the record of `samples` is long enough.
-
-    `half_gap` is the extra cost of a controller learned from half of the record, on the model learned from
-    all of it. The excess falls as one over the samples. At `needed` samples it would be the excess allowed.
-    """
-
-    half_gap: float
-    samples: int
-    needed: int
 
 
 def sufficiency(
@@ -419,9 +323,10 @@ def sufficiency(
     allowed: float,
     offset: bool,
     gain_spread: float,
-) -> Sufficiency:
-    """Whether the record is long enough for its noise, by the record alone. A controller is learned from each
-    half of it and judged on `scenarios` of the model learned from all of it."""
+) -> tuple[float, int]:
+    """Whether the record is long enough for its noise, by the record alone: the extra cost of a controller
+    learned from half of it, the mean of both halves, on `scenarios` of the model learned from all of it; and
+    at how many samples it would be the excess `allowed`, as it falls as one over the samples."""
     best = optimum(scenarios, yardstick)
     gaps = []
     for part in (0, 1):
@@ -439,7 +344,7 @@ def sufficiency(
     needed = max(
         np.ceil(learned.samples * min(half_gap / 2 / allowed, 1e3)), 2 * (learned.Theta.shape[1] + offset)
     )
-    return Sufficiency(half_gap, learned.samples, int(needed))
+    return half_gap, int(needed)
 
 
 class KernelCandidate(NamedTuple):
@@ -468,7 +373,6 @@ def kernel_candidates(
     Without noise the shortest window that holds the plant's state is exact. With noise longer windows are
     biased; the predicted state is not.
     """
-    model = window_route.predictor(long)
     best = optimum(scenarios, yardstick)
     tried = [
         (f"window of {N}", lambda N=N: kernel.tuples(u, y, N, offset=offset)) for N in range(1, largest + 1)
@@ -478,7 +382,7 @@ def kernel_candidates(
     for state, features in tried:
         try:
             learned = kernel.regress(features())
-            law = kernel.controller(learned, yardstick.gamma, model).design(yardstick.q, yardstick.r, 0.0)
+            law = kernel.law(learned, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
         except ValueError as refusal:
             candidates.append(KernelCandidate(state, None, float("inf"), str(refusal)))
             continue

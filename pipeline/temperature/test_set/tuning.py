@@ -33,8 +33,6 @@ import scipy.optimize
 import scipy.special
 from scipy.spatial.distance import cdist
 
-from pipeline.temperature.plant import Plant
-
 
 class History(NamedTuple):
     """In order of evaluation: theta (k, d), cost (k,), NaN if failed, failed: k
@@ -53,43 +51,6 @@ class SearchResult(NamedTuple):
     theta: np.ndarray
     cost: float
     history: History
-
-
-def fitness(
-    plant: Plant,
-    K_x: np.ndarray,
-    K_r: np.ndarray,
-    *,
-    reference: np.ndarray,
-    gamma: float,
-    steps: int,
-    x0: np.ndarray,
-    k=0.0,
-) -> float:
-    """F = sum_{t=0..l} gamma^t (|y(t) - r|^2 + |u(t)|^2)
-
-    of u = -K_x x - K_r r - k with the state known and r constant (37).
-
-    K_x (m, n), K_r (m, p), k (m,), reference r (p,) in °C, x0 (n,), steps = l >= 0: l + 1 terms. With
-    z = [x; 1] the loop is z(t+1) = M z(t), so that all z come from log2(l) products, Z <- [Z, M^i Z]. Raises
-    ValueError where the closed loop is unstable.
-    """
-    A_cl = plant.A - plant.B @ K_x
-    radius = np.abs(np.linalg.eigvals(A_cl)).max()
-    if not radius < 1:
-        raise ValueError(
-            f"fitness: the closed loop is unstable, spectral radius {radius:.6g}, expected below 1; "
-            "choose other weights"
-        )
-    u_r = -K_r @ reference - k
-    M = np.block([[A_cl, (plant.B @ u_r + plant.b)[:, None]], [np.zeros((1, plant.n)), np.ones((1, 1))]])
-    offset = plant.D @ u_r + plant.d - reference
-    stage = np.block([[plant.C - plant.D @ K_x, offset[:, None]], [-K_x, u_r[:, None]]])  # z -> [y - r; u]
-    Z = np.append(x0, 1.0)[:, None]
-    while Z.shape[1] <= steps:
-        Z, M = np.hstack([Z, M @ Z]), M @ M
-    terms = ((stage @ Z[:, : steps + 1]) ** 2).sum(axis=0)
-    return float(gamma ** np.arange(steps + 1) @ terms)
 
 
 class _Surrogate(NamedTuple):
@@ -305,7 +266,7 @@ def _next(
     return _least(_terms(points, costs, kernel), candidates, low, high)
 
 
-def _evaluated(cost: Callable[[np.ndarray], float], theta: np.ndarray) -> tuple[float, str]:
+def evaluate(cost: Callable[[np.ndarray], float], theta: np.ndarray) -> tuple[float, str]:
     """The cost, or NaN and the reason why there is none."""
     try:
         value = float(cost(theta.copy()))
@@ -366,7 +327,7 @@ def minimise(
                 else _next(points, history.cost, kernel, region, later[index])
             )
             theta = np.clip(lower * (upper / lower) ** point, lower, upper)
-            value, reason = _evaluated(cost, theta)
+            value, reason = evaluate(cost, theta)
         if index >= initial:
             region = region.after(bool(value < np.fmin.reduce(history.cost, initial=np.inf)))
         history = _extended(history, theta, value, reason)
@@ -407,7 +368,7 @@ def polished(
         way = left.pop(0)
         there = np.clip(point + side * way, 0.0, 1.0)
         theta = np.clip(lower * (upper / lower) ** there, lower, upper)
-        value, reason = _evaluated(cost, theta)
+        value, reason = evaluate(cost, theta)
         history = _extended(history, theta, value, reason)
         if value < best:
             point, best = there, value

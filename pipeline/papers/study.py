@@ -5,25 +5,156 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.papers.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, PublishedFigures
 from pipeline.temperature.controllers import window as window_route
-from pipeline.temperature.controllers.kernel import (
-    Kernel,
-    exact_gains,
-    regress,
-    tuples,
-    value_iteration,
-    window_law,
-)
-from pipeline.temperature.plant import baam
-from pipeline.temperature.probing import study_probe, study_signal
-from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, PublishedFigures
-from pipeline.temperature.test_set.scorecard import CommonCost, Scenarios, cost, optimum, panel, simulate
-from pipeline.temperature.test_set.tuning import SearchResult, fitness
-from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
+from pipeline.temperature.controllers.kernel import Kernel, regress, tuples, value_iteration, window_law
+from pipeline.temperature.plant import Plant, baam, hold_output, hold_state, observability_matrix
+from pipeline.temperature.probing import Probe
+from pipeline.temperature.test_set.scorecard import CommonCost, Scenarios, cost, optimum, simulate
+from pipeline.temperature.test_set.tuning import SearchResult
+from pipeline.temperature.tracking import Gains, Law, gains, observer_gain, observer_law
 
 OUTPUTS, INPUTS = 5, 7
 YARDSTICK = CommonCost(np.ones(OUTPUTS), np.ones(INPUTS), GAMMA)
 AMPLITUDES, BANDWIDTH, VARIANCE = np.arange(100.0, 0.0, -10.0), 1.65, 1.5
+
+
+def study_signal(
+    rng: np.random.Generator,
+    samples: int,
+    inputs: int,
+    *,
+    amplitudes: np.ndarray,
+    bandwidth: float,
+    variance: float,
+    redrawn: bool = True,
+) -> np.ndarray:
+    """omega_pr (samples, inputs) of (51), (52): a sinusoid at the bandwidth, one for each further amplitude
+    at a random frequency below it, and Gaussian noise.
+
+    `redrawn` draws the frequencies anew every step, as the study's script does (nearly white); without it
+    they are fixed, as the text reads. bandwidth in rad a step.
+    """
+    t = np.arange(samples)[:, None]
+    signal = np.sqrt(variance) * rng.standard_normal((samples, inputs)) + amplitudes[0] * np.sin(
+        bandwidth * t
+    )
+    for amplitude in amplitudes[1:]:
+        omega = rng.uniform(0.0, bandwidth, (samples if redrawn else 1, inputs))
+        signal += amplitude * np.sin(omega * t)
+    return signal
+
+
+def study_probe(
+    plant: Plant, signal: np.ndarray, K_data: np.ndarray, *, x0: np.ndarray, noise: np.ndarray
+) -> Probe:
+    """u = -K_data x + omega_pr (50), which reads the true state and knows no limits: for parity and
+    benchmarks only. signal and noise may carry a batch axis: signal (samples, batch, m), noise (samples,
+    batch, p) give u and y of the same shapes."""
+    closed = (plant.A - plant.B @ K_data).T
+    x = np.empty((len(signal), *signal.shape[1:-1], plant.n))
+    x[0] = x0
+    drive = signal @ plant.B.T
+    for t in range(len(signal) - 1):
+        x[t + 1] = x[t] @ closed + drive[t]
+    return Probe(signal - x @ K_data.T, x @ plant.C.T + noise, 0.0)
+
+
+def reconstruction(plant: Plant, N: int) -> np.ndarray:
+    """M (n, N (m+p)) with x(t) = M [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)] (23)-(28), exact where N
+    reaches the observability index (b = d = 0)."""
+    n, m, p = plant.n, plant.m, plant.p
+    powers = [np.eye(n)]
+    for _ in range(N):
+        powers.append(plant.A @ powers[-1])
+    U_N = np.hstack([powers[lag] @ plant.B for lag in range(N)])
+    W_N = observability_matrix(plant.A, plant.C, N).reshape(N, p, n)[::-1].reshape(N * p, n)
+    D_N = np.zeros((N * p, N * m))
+    for row in range(N):
+        for column in range(row + 1, N):
+            D_N[row * p : (row + 1) * p, column * m : (column + 1) * m] = (
+                plant.C @ powers[column - row - 1] @ plant.B
+            )
+    back = powers[N] @ np.linalg.pinv(W_N)
+    return np.hstack([U_N - back @ D_N, back])
+
+
+def exact_gains(plant: Plant, gains: Gains, N: int) -> tuple[np.ndarray, np.ndarray]:
+    """K (m, N (m+p)) and K_r (m, p) of (32) from the model: what a
+    learned kernel should give on noise-free data."""
+    return gains.K_x @ reconstruction(plant, N), gains.K_r
+
+
+def fitness(
+    plant: Plant,
+    K_x: np.ndarray,
+    K_r: np.ndarray,
+    *,
+    reference: np.ndarray,
+    gamma: float,
+    steps: int,
+    x0: np.ndarray,
+    k=0.0,
+) -> float:
+    """F = sum_{t=0..l} gamma^t (|y(t) - r|^2 + |u(t)|^2)
+
+    of u = -K_x x - K_r r - k with the state known and r constant (37).
+
+    K_x (m, n), K_r (m, p), k (m,), reference r (p,) in °C, x0 (n,), steps = l >= 0: l + 1 terms. With
+    z = [x; 1] the loop is z(t+1) = M z(t), so that all z come from log2(l) products, Z <- [Z, M^i Z]. Raises
+    ValueError where the closed loop is unstable.
+    """
+    A_cl = plant.A - plant.B @ K_x
+    radius = np.abs(np.linalg.eigvals(A_cl)).max()
+    if not radius < 1:
+        raise ValueError(
+            f"fitness: the closed loop is unstable, spectral radius {radius:.6g}, expected below 1; "
+            "choose other weights"
+        )
+    u_r = -K_r @ reference - k
+    M = np.block([[A_cl, (plant.B @ u_r + plant.b)[:, None]], [np.zeros((1, plant.n)), np.ones((1, 1))]])
+    offset = plant.D @ u_r + plant.d - reference
+    stage = np.block([[plant.C - plant.D @ K_x, offset[:, None]], [-K_x, u_r[:, None]]])  # z -> [y - r; u]
+    Z = np.append(x0, 1.0)[:, None]
+    while Z.shape[1] <= steps:
+        Z, M = np.hstack([Z, M @ Z]), M @ M
+    terms = ((stage @ Z[:, : steps + 1]) ** 2).sum(axis=0)
+    return float(gamma ** np.arange(steps + 1) @ terms)
+
+
+def panel(
+    plants: Sequence[Plant],
+    *,
+    starts: Sequence[float],
+    references: Sequence[Sequence[float]],
+    noise: Sequence[float],
+    seeds: Sequence[int],
+    steps: int,
+    hold: int,
+    cells: bool,
+) -> Scenarios:
+    """Every plant x start x reference x noise level, once without noise and once a seed with it.
+
+    A start is a temperature in °C at which the plant is held by its steady input: of every cell where the
+    states are `cells`, of every sensor otherwise. Each scenario draws its noise from its own seed, so that
+    every controller sees the same.
+    """
+    rows = []
+    for index, plant in enumerate(plants):
+        for start in starts:
+            x0, u0 = (np.full(plant.n, start), None) if cells else hold_output(plant, np.full(plant.p, start))
+            u0 = hold_state(plant, x0) if u0 is None else u0
+            for reference in references:
+                for level in noise:
+                    rows += [
+                        (index, x0, u0, reference, level, seed)
+                        for seed in (seeds if level > 0 else seeds[:1])
+                    ]
+    index, x0, u0, r, level, seed = (np.array(column) for column in zip(*rows, strict=True))
+    shape = hold + steps, len(references[0])
+    unit = {int(one): np.random.default_rng(one).standard_normal(shape) for one in np.unique(seed)}
+    drawn = np.stack([size * unit[int(one)] for size, one in zip(level, seed, strict=True)], axis=1)
+    return Scenarios(list(plants), index, x0, u0, np.asarray(r, float), steps, hold, drawn)
 
 
 def study_panel(
@@ -130,7 +261,7 @@ def under_noise(
     result = {}
     for name, law in zip(ROUTES, laws, strict=True):
         run = simulate(scenarios, law)
-        late = (run.y - scenarios.r)[500:]
+        late = (run[0] - scenarios.r)[500:]
         result[name] = (
             float((cost(scenarios, run, YARDSTICK) / optimum(scenarios, YARDSTICK) - 1)[0]),
             float(np.sqrt((late**2).mean())),

@@ -7,13 +7,15 @@ leaves u'Ru undiscounted, discounts e'Qe one step late, takes y(0) for 50 °C at
 seven steps under u = -K_data x that drive the barrel to 0 °C, where 80 % of it accrues.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 
-from pipeline.temperature.controllers.kernel import regress, tuples_with_reference, value_iteration
-from pipeline.temperature.plant import baam
-from pipeline.temperature.tracking import algorithm_1, observer_gain, stabilises
+from pipeline.temperature.controllers.kernel import Tuples, regress, tuples, value_iteration
+from pipeline.temperature.plant import Plant, baam
+from pipeline.temperature.tracking import observer_gain
 
 GAMMA, TAU = 0.99, 0.002
 REFERENCE = np.array([150.0, 160.0, 170.0, 175.0, 180.0])
@@ -54,6 +56,65 @@ class PublishedFigures(NamedTuple):
     J100: float
     J1000: float
     error: float
+
+
+def augmented(plant: Plant, Q: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """T, B_1 of (12) and Q_1 of (14) for the state [x; r]."""
+    CQ = plant.C.T @ Q
+    T = scipy.linalg.block_diag(plant.A, F)
+    return T, np.vstack([plant.B, np.zeros((plant.p, plant.m))]), np.block([[CQ @ plant.C, -CQ], [-CQ.T, Q]])
+
+
+class Iterated(NamedTuple):
+    """K (m, n+p) of u = -K [x; r] (15), and how many policies were evaluated; `settled`
+    is False where the limit of iterations ended it."""
+
+    K: np.ndarray
+    iterations: int
+    settled: bool
+
+
+def algorithm_1(plant: Plant, Q, R, gamma, K0, *, tolerance: float, max_iterations: int = 100) -> Iterated:
+    """Algorithm 1 as the study's script runs it: its Lyapunov equation carries gamma in place of sqrt(gamma),
+    and it stops on the one-norm of K's change.
+
+    From a K0 under which the cost is infinite, the P of (ii) is no cost, and the iteration can settle on a
+    gain that does not stabilise: nothing here notices.
+    """
+    T, B_1, Q_1 = augmented(plant, Q, np.eye(plant.p))
+    K = K0
+    for j in range(1, max_iterations + 1):
+        P = scipy.linalg.solve_discrete_lyapunov(gamma * (T - B_1 @ K).T, Q_1 + K.T @ R @ K)
+        K, previous = np.linalg.solve(R + gamma * B_1.T @ P @ B_1, gamma * B_1.T @ P @ T), K
+        if np.linalg.norm(K - previous, 1) < tolerance:
+            return Iterated(K, j, True)
+    return Iterated(K, max_iterations, False)
+
+
+def stabilises(plant: Plant, K_x: np.ndarray) -> bool:
+    """Whether every eigenvalue of A - B K_x lies inside the unit circle."""
+    return bool(np.abs(np.linalg.eigvals(plant.A - plant.B @ K_x)).max() < 1)
+
+
+def tuples_with_reference(
+    u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: int, r: np.ndarray, F: np.ndarray
+) -> Tuples:
+    """The published form: s = [past u; past y; r] with one reference r (p,), r(t+1) = F r, e = y - r. Its
+    kernel serves this reference only."""
+    plain = tuples(u, y, N)
+    rows = (len(plain.s), 1)
+    features = np.vstack(
+        [plain.features, np.hstack([np.zeros((len(r), plain.features.shape[1] - 1)), r[:, None]])]
+    )
+    return Tuples(
+        np.hstack([plain.s, np.tile(r, rows)]),
+        plain.u,
+        plain.e - r,
+        np.hstack([plain.s_next, np.tile(F @ r, rows)]),
+        features,
+        N,
+        r,
+    )
 
 
 def model_based(weights: tuple[np.ndarray, np.ndarray], K0: np.ndarray) -> PublishedFigures:
