@@ -84,12 +84,34 @@ def design(
     if lacking:
         return refuse(settings, f"declare low and high of {', '.join(lacking)} under plant.outputs")
     centre = given_centre(settings, machine)
+    asked = experiment.Wish(
+        samples=settings.samples,
+        signal=settings.signal,
+        amplitude_percent=settings.amplitude_percent,
+        rate_percent_per_step=settings.rate_percent_per_step,
+        shortest_steps=settings.shortest_steps,
+        doubt_input_gain=settings.doubt_input_gain,
+        doubt_ambient_degC=settings.doubt_ambient_degC,
+        doubt_delay_steps=settings.doubt_delay_steps,
+    )
+    low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
+    y_low, y_high = np.array([(o.low, o.high) for o in machine.outputs], float).T
+    reference = np.array([o.reference for o in machine.outputs], float)
+    names = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
     try:
-        family = experiment.family_of(plants, (list(u), list(y)), settings, machine, centre)
+        family = experiment.family_of(
+            plants,
+            (list(u), list(y)),
+            asked,
+            (low, high, y_low, y_high),
+            reference,
+            centre=centre,
+            names=names,
+        )
         plan = experiment.design(family, np.random.default_rng(settings.seed))
     except (ValueError, np.linalg.LinAlgError) as error:
         return refuse(settings, " ".join(str(error).split()))
-    dither, why_not = design_dither(family)
+    dither, why_not = design_dither(family, settings.seed)
     step = machine.sample_time_s
     figures = {
         "source": settings.source,
@@ -109,7 +131,7 @@ def refuse(settings: GenerateProbing, reason: str) -> tuple[Columns, Columns, di
     return {}, {}, {"source": settings.source, "next_experiment": none, "closed_loop": none}
 
 
-def design_dither(family: Family) -> tuple[Dither | None, str]:
+def design_dither(family: Family, seed: int) -> tuple[Dither | None, str]:
     """What may be added to the commands of a PI a zone, tuned by SIMC; None with the reason if the machine
     has none."""
     import numpy as np
@@ -122,7 +144,7 @@ def design_dither(family: Family) -> tuple[Dither | None, str]:
         rise = horizon(family.model, family.asked.samples)
         pairs = baseline.pairing(family.model, family.low, family.high, horizon=rise)
         law = baseline.pi_law(pairs, inputs=family.model.m)
-        return experiment.dither(family, law, np.random.default_rng(family.asked.seed)), ""
+        return experiment.dither(family, law, np.random.default_rng(seed)), ""
     except (ValueError, np.linalg.LinAlgError) as error:
         return None, f"no simple controller to add it to: {' '.join(str(error).split())}"
 

@@ -20,7 +20,7 @@ with g the doubt about gains, which act on all heat from now on: exact in the ga
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -39,8 +39,6 @@ from pipeline.temperature.identification.refinement import (
 from pipeline.temperature.identification.subspace import Segments, gapless
 from pipeline.temperature.identification.validation import horizon, step_response, two_points
 from pipeline.temperature.plant import Plant, padded, strictly_proper
-from pipeline.temperature.settings import GenerateProbing
-from pipeline.temperature.settings import Plant as Machine
 from pipeline.temperature.tracking import Law, aimed, feasible_target, gains
 
 TAIL = 3000  # samples at the end of the record that the present state is taken from
@@ -48,6 +46,23 @@ LATEST = 20  # samples at its very end by which each member is set right
 STORED = 6e6  # numbers of a family's responses that are held at once; beyond, every k-th sample is looked at
 SURE = 0.99  # share of the record's simulation errors that the band holds
 SIGMAS = 3.0  # of the sensor's noise
+
+
+class Wish(NamedTuple):
+    """What is asked for: at most `samples` samples of this kind of signal, amplitudes of at most
+    `amplitude_percent`, inputs that move by at most `rate_percent_per_step` and are held for no fewer than
+    `shortest_steps`. And what a family identified from one record does not hold: input gains that are 1 +-
+    doubt_input_gain times as large from now on, an ambient that moves by +- doubt_ambient_degC, inputs that
+    act up to doubt_delay_steps later."""
+
+    samples: int
+    signal: Literal["multisine", "prbs"]
+    amplitude_percent: float
+    rate_percent_per_step: float
+    shortest_steps: int
+    doubt_input_gain: float
+    doubt_ambient_degC: float
+    doubt_delay_steps: int
 
 
 class Start(NamedTuple):
@@ -387,7 +402,7 @@ class Family(NamedTuple):
     pace: Pace
     begin: Start
     band: Band
-    asked: GenerateProbing
+    asked: Wish
     low: np.ndarray
     high: np.ndarray
     y_low: np.ndarray
@@ -408,34 +423,24 @@ class Family(NamedTuple):
 def family_of(
     plants: Sequence[Plant],
     record: tuple[Segments, Segments],
-    asked: GenerateProbing,
-    machine: Machine,
+    asked: Wish,
+    limits: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    reference: np.ndarray,
+    *,
     centre: list[float] | None = None,
+    names: tuple[Sequence[str], Sequence[str]],
 ) -> Family:
-    """The family for experiments on the machine of this record (u, y), every output of which has limits.
+    """The family for experiments on the machine of this record (u, y); limits, names: low and high of the
+    inputs, then of the outputs, as in Family.
 
     A pole of the model outside the unit circle is drawn onto it, as in the bootstrap: no heated part heats
     itself. Where the machine does run away, the model then misses the record, and the band says so. Raises
     ValueError where no stretch of the record has all inputs.
     """
     plants = [stabilised(plant, LARGEST_RADIUS) for plant in plants]
-    low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
-    y_low, y_high = np.array([(o.low, o.high) for o in machine.outputs], float).T
-    return Family(
-        plants,
-        pace(plants, high - low, asked.samples),
-        start(plants, *record),
-        band(plants[0], *record),
-        asked,
-        low,
-        high,
-        y_low,
-        y_high,
-        np.array([o.reference for o in machine.outputs], float),
-        centre,
-        [i.name for i in machine.inputs],
-        [o.name for o in machine.outputs],
-    )
+    speed = pace(plants, limits[1] - limits[0], asked.samples)
+    begin, width = start(plants, *record), band(plants[0], *record)
+    return Family(plants, speed, begin, width, asked, *limits, reference, centre, *names)
 
 
 def pace(plants: Sequence[Plant], reach: np.ndarray, longest: int) -> Pace:
@@ -454,7 +459,7 @@ def pace(plants: Sequence[Plant], reach: np.ndarray, longest: int) -> Pace:
 # ---- the signal
 
 
-def signal(rng: np.random.Generator, samples: int, asked: GenerateProbing, speed: Pace) -> np.ndarray:
+def signal(rng: np.random.Generator, samples: int, asked: Wish, speed: Pace) -> np.ndarray:
     """(samples, m) of amplitude 1 and about zero mean, with its power where each input is answered."""
     # the fastest time constant that each input shows; the fastest of all where it shows none
     tau = np.where(speed.seen, speed.time_constant, np.inf).min(axis=0)

@@ -16,16 +16,7 @@ from pipeline.temperature.settings import GenerateProbing, Plant, Tracking
 from stages import generate_probing
 from tests.temperature.test_propose_params import tree  # noqa: F401  the params files as shipped
 
-ASKED = GenerateProbing(
-    source="recordings", seed=1, signal="prbs", samples=1500, amplitude_percent=5.0, shortest_steps=1,
-    rate_percent_per_step=5.0, noise_degC=0.1, feedback_percent_per_degC=0.0, centre_percent=None,
-    doubt_input_gain=0.15, doubt_ambient_degC=8.0, doubt_delay_steps=1,
-)  # fmt: skip
-MACHINE = Plant(
-    inputs=[{"name": "heater", "unit": "percent", "low": 0, "high": 100}],
-    outputs=[{"name": "zone", "unit": "degC", "reference": 200, "low": 0, "high": 300}],
-    sample_time_s=1.0,
-)
+ASKED = experiment.Wish(1500, "prbs", 5.0, 5.0, 1, 0.15, 8.0, 1)
 ROOM, TAU, LATE = 25.0, 120.0, 3
 HOLDS_200 = 38.0  # percent: left alone at 50 it would reach 255 °C
 
@@ -62,7 +53,7 @@ def record_of(truth, y0, samples=1500, noise=0.1, moves=8.0, feedback=0.0):
 def wanted(family, reference, low, high, **asked):
     """The family, asked for an experiment about the reference within these limits."""
     return family._replace(
-        asked=family.asked.model_copy(update=asked),
+        asked=family.asked._replace(**asked),
         reference=np.array([reference]),
         y_low=np.array([low]),
         y_high=np.array([high]),
@@ -70,7 +61,9 @@ def wanted(family, reference, low, high, **asked):
 
 
 def family_of(plants, u, y):
-    return experiment.family_of(plants, ([u], [y]), ASKED, MACHINE)
+    limits = np.zeros(1), np.full(1, 100.0), np.zeros(1), np.full(1, 300.0)
+    names = ["heater"], ["zone"]
+    return experiment.family_of(plants, ([u], [y]), ASKED, limits, np.full(1, 200.0), names=names)
 
 
 def pi_of(model, horizon):
@@ -93,7 +86,7 @@ def of_model(family, **doubt):
         plants=family.plants[:1],
         begin=family.begin._replace(x=family.begin.x[:1], bias=family.begin.bias[:1]),
         band=experiment.Band(np.zeros(1), np.zeros(1)),
-        asked=family.asked.model_copy(update=none | doubt),
+        asked=family.asked._replace(**(none | doubt)),
     )
 
 
@@ -239,7 +232,7 @@ def test_power_lies_where_the_plant_answers():
         np.array([[100.0]]), np.zeros((1, 1)), np.ones((1, 1)), np.ones((1, 1), bool), 100, 100
     )
     for kind in ("prbs", "multisine"):
-        asked = ASKED.model_copy(update={"signal": kind})
+        asked = ASKED._replace(signal=kind)
         signal = experiment.signal(np.random.default_rng(0), 4000, asked, speed)[:, 0]
         assert abs(signal.mean()) < 0.02 and np.abs(signal).max() == pytest.approx(1.0)
         power = np.abs(np.fft.rfft(signal)) ** 2
