@@ -72,8 +72,7 @@ def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
         copy(source, folder, certificate.sha256(decided))
         made = machine.read(folder)[0]
         for file, content in state_space.files(made).items():
-            with artifacts.beside(folder / "state_space" / file) as temporary:
-                temporary.write_bytes(content)
+            artifacts.write_bytes(folder / "state_space" / file, content)
     return describe(
         name,
         certificate=summarise(decided),

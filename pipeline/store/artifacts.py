@@ -272,6 +272,11 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
+def write_bytes(path: str | Path, content: bytes) -> None:
+    with beside(path) as temporary:
+        temporary.write_bytes(content)
+
+
 def write_folder(path: str | Path, files: Mapping[str, str | bytes]) -> None:
     """A folder below reports/ that holds exactly these files, texts in UTF-8, once the stage ends well: what
     an earlier run left in it goes. Outside a stage it is no longer whole if a write fails."""

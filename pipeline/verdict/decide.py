@@ -5,7 +5,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from pipeline.temperature.test_set.best import SAME_STRUCTURE, fragile
 from pipeline.verdict import identification
 from pipeline.verdict.controllers import YARDSTICKS, heading, in_a_sentence
 from pipeline.verdict.digits import with_unit
@@ -175,11 +174,8 @@ def choose(figures: Figures, held: Mapping[str, Standing], incumbent: str = "") 
         return None
     best = entry(comparison(figures), "best")
     if best not in fit:
-        weaker = [
-            fragile(pair, entry(comparison(figures), "contestants"), dict.fromkeys(fit, True))
-            for pair in SAME_STRUCTURE
-        ]
-        fit = [name for name in fit if name not in weaker]
+        bears_less = entry(comparison(figures), "bears_less") or {}
+        fit = [name for name in fit if bears_less.get(name) not in fit]
         cheapest = min(fit, key=lambda name: _cost(held[name]).value)
         best = next(name for name in fit if _cost(held[name]).low <= _cost(held[cheapest]).high)
     if incumbent in fit and _cost(held[incumbent]).low <= _cost(held[best]).high:

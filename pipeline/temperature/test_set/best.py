@@ -26,15 +26,18 @@ SAME_STRUCTURE = (("pi_simc", "pi"),)
 def best_by_limits(
     compared: Mapping[str, Any], table: Mapping[str, np.ndarray], declared: Mapping[str, Any], seed: int
 ) -> dict[str, Any]:
-    """Of the figures of evaluate_temperature what a limit can change: `limits`, `best`, `best_reason` and, in
-    `deciding`, the best one without that plant.
+    """Of the figures of evaluate_temperature what a limit can change: `limits`, `best`, `best_reason`, in
+    `deciding` the best one without that plant, and `bears_less`: {name: the one of its structure that bears
+    more}.
 
     `table` has the cases, one row a controller and case; `declared` has the limits of section `report`.
     """
     order, limits = compared["order"], limits_of(compared["pace"], declared)
     able = {name: passes(compared["contestants"][name], limits) for name in order}
-    weaker = [fragile(pair, compared["contestants"], able) for pair in SAME_STRUCTURE]
-    eligible = {name: held and name not in weaker for name, held in able.items()}
+    known = {name: compared["contestants"][name]["margins"] is not None for name in order}
+    weaker = {fragile(pair, compared["contestants"], known): pair for pair in SAME_STRUCTURE}
+    bears_less = {name: pair[1 - pair.index(name)] for name, pair in weaker.items() if name}
+    eligible = {name: held and not able.get(bears_less.get(name, ""), False) for name, held in able.items()}
     rows = {name: table["contestant"] == name for name in order}
     # a cost that is missing is without end
     costs = {
@@ -53,7 +56,13 @@ def best_by_limits(
     }
     without = chosen(others, plant[rest], eligible, seed=seed)[0]
     deciding = {**compared["deciding"], "best_without": without}
-    return {"limits": limits, "best": best, "best_reason": reason, "deciding": deciding}
+    return {
+        "limits": limits,
+        "best": choice.best,
+        "best_reason": reason,
+        "deciding": deciding,
+        "bears_less": bears_less,
+    }
 
 
 def fragile(pair: tuple[str, str], figures: Mapping[str, Any], able: Mapping[str, bool]) -> str:
