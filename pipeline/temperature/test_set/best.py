@@ -58,7 +58,7 @@ def best_by_limits(
     deciding = {**compared["deciding"], "best_without": without}
     return {
         "limits": limits,
-        "best": choice.best,
+        "best": best,
         "best_reason": reason,
         "deciding": deciding,
         "bears_less": bears_less,
