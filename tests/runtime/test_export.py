@@ -49,8 +49,8 @@ def written(folder: Path, of: Exported, *, episodes: int = EPISODES, steps: int 
     return folder
 
 
-def made(folder: Path, target: str = "test") -> subprocess.CompletedProcess:
-    return subprocess.run(["make", "-s", target], cwd=folder, capture_output=True, text=True)
+def made(folder: Path, *targets: str) -> subprocess.CompletedProcess:
+    return subprocess.run(["make", "-s", *targets], cwd=folder, capture_output=True, text=True)
 
 
 def loaded(folder: Path, of: Exported) -> ModuleType:

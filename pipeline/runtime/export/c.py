@@ -3,7 +3,8 @@
 law.c and controller.c are the same for every machine, and are read beside controller.py and supervisor.py,
 whose letters they keep. machine.h says which machine they are made for; tables.h holds its numbers, each as
 the shortest decimal that reads back bit by bit. golden.csv holds what the object of `pipeline` did, and
-test_controller.c asks for the same within 1e-9 of each signal's range.
+test_controller.c asks for the same within 1e-9 of each signal's range. With -DBEADLINE_SINGLE a `real` is a
+float, for boards; its tolerance stands in test_controller.c.
 """
 
 from collections.abc import Mapping
@@ -27,6 +28,8 @@ TEMPLATES = Path(__file__).with_name("templates")
 PARTS = ("law.h", "law.c", "supervisor.h", "supervisor.c")
 COPIED = ("test_controller.c", "Makefile")
 WIDTH = 110
+# the governor's bound of rounding errors in °C: a forecast of 250 °C in single precision is sure to 3e-5
+SINGLE_EXACT = "BY_PRECISION({}, 3e-5)"
 # of several columns least_squares takes at most INPUTS, which gcc does not see: of one it warns of a second
 ONE_INPUT = '#if defined(__GNUC__)\n#pragma GCC diagnostic ignored "-Warray-bounds"\n#endif\n\n'
 
@@ -112,18 +115,20 @@ def _braced(array: np.ndarray, depth: int) -> str:
     return indent + "{\n" + ",\n".join(_braced(part, depth + 1) for part in array) + "\n" + indent + "}"
 
 
-def table(name: str, values: np.ndarray, *, flat: bool = False) -> str:
-    """`static const double name[a][b] = {...};`; `flat`: row after row. C has no empty array: where there is
-    no number, one 0 stands."""
+def table(name: str, values: np.ndarray, *, flat: bool = False, of: str = "real") -> str:
+    """`static const real name[a][b] = {...};`; `flat`: row after row; `of`: the type. C has no empty array:
+    without a number, one 0 stands."""
     array = np.asarray(values, float)
     array = array.reshape(-1) if flat or not array.size else array
     array = array if array.size else np.zeros(1)
     shape = "".join(f"[{length}]" for length in array.shape)
-    return f"static const double {name}{shape} =\n{_braced(array, 0)};\n"
+    return f"static const {of} {name}{shape} =\n{_braced(array, 0)};\n"
 
 
-def define(name: str, value: float | int | str) -> str:
-    text = f'"{value}"' if isinstance(value, str) else str(value) if isinstance(value, int) else number(value)
+def define(name: str, value: float | int | str, real: str = "REAL({})") -> str:
+    """`#define name value`; `real`: how a float is written, which has the precision of the build."""
+    whole = f'"{value}"' if isinstance(value, str) else str(value)
+    text = real.format(number(value)) if isinstance(value, float) else whole
     return f"#define {name} {text}\n"
 
 
@@ -195,7 +200,7 @@ def machine_header(exported: Exported, certificate_sha256: str) -> str:
     text += define("BEADLINE_SPREAD_SHA256", exported.spread_sha256)
     text += "/* 1: the plant was simulated, and the controller runs in a rehearsal only */\n"
     text += define("BEADLINE_SIMULATED", int(exported.simulated))
-    text += define("BEADLINE_SAMPLE_TIME_S", float(machine.sample_time_s))
+    text += define("BEADLINE_SAMPLE_TIME_S", float(machine.sample_time_s), "{}")
     text += define("BEADLINE_INPUT_UNIT", machine.inputs[0].unit)
     text += define("BEADLINE_OUTPUT_UNIT", machine.outputs[0].unit)
     text += "\n/* Inputs and outputs in the order of every array */\n"
@@ -224,12 +229,12 @@ def tables(exported: Exported) -> str:
     return text + _forward("forward", exported) + supervising(exported.supervision)
 
 
-def _forward(name: str, exported: Exported) -> str:
+def _forward(name: str, exported: Exported, *, of: str = "real") -> str:
     """Gain and mean of what is fed forward, as controller.FeedForward has them."""
     m, q = len(exported.machine.inputs), len(exported.machine.disturbances)
     forward = exported.controller.forward or FeedForward(np.zeros((m, q)), np.zeros(q))
     gain = forward.gain if q else np.zeros((m, 1))
-    return table(f"{name}_gain", gain) + table(f"{name}_mean", forward.mean)
+    return table(f"{name}_gain", gain, of=of) + table(f"{name}_mean", forward.mean, of=of)
 
 
 def plant_header(exported: Exported) -> str:
@@ -238,9 +243,9 @@ def plant_header(exported: Exported) -> str:
     text = "/* The model that the test heats: x(t+1) = A x + B u + b, y = C x + d. Do not edit. */\n\n"
     arrays = {"A": model.A, "B": model.B, "C": model.C, "b": model.b, "d": model.d}
     text += define("STATES", model.n)
-    text += table("input_range", np.array([one.high - one.low for one in exported.machine.inputs]))
-    text += _forward("plant", exported)
-    return text + "".join(table(f"plant_{name}", values) for name, values in arrays.items())
+    span = np.array([one.high - one.low for one in exported.machine.inputs])
+    text += table("input_range", span, of="double") + _forward("plant", exported, of="double")
+    return text + "".join(table(f"plant_{name}", values, of="double") for name, values in arrays.items())
 
 
 def _aiming(exported: Exported) -> str:
@@ -251,15 +256,16 @@ def _aiming(exported: Exported) -> str:
     return "".join(
         [
             "/* ---- the feasible target, as tracking.feasible_target has it */\n\n",
-            define("AIM_TOLERANCE", 1e-3),
-            define("AIM_FINEST", 1e-3),
-            define("AIM_FIRST", narrowest / 4),
-            define("AIM_WIDEST", 0.49 * narrowest),
-            define("ROUNDING", tracking.ROUNDING),
-            define("FALL", tracking.FALL),
-            table("aim_rows", np.vstack([rows, tracking.LIGHT * np.eye(exported.model.m)])),
-            table("aim_rest", rest),
-            table("aim_d", exported.model.d),
+            define("AIM_TOLERANCE", 1e-3, "{}"),
+            define("AIM_FINEST", 1e-3, "{}"),
+            define("AIM_FIRST", narrowest / 4, "{}"),
+            define("AIM_WIDEST", 0.49 * narrowest, "{}"),
+            define("LIGHT", tracking.LIGHT, "{}"),
+            define("ROUNDING", tracking.ROUNDING, "{}"),
+            define("FALL", tracking.FALL, "{}"),
+            table("aim_rows", rows, of="double"),
+            table("aim_rest", rest, of="double"),
+            table("aim_d", exported.model.d, of="double"),
         ]
     )
 
@@ -294,7 +300,7 @@ def _governing(exported: Exported) -> str:
     family, at = governor_of(exported), sizes(exported)
     text = "\n/* ---- the governor, as governor.Governor has it; members first */\n\n"
     text += define("SWEEPS", governing.SWEEPS) + define("ROUNDS", governing.ROUNDS)
-    text += define("EXACT", governing.EXACT) + define("CONTRADICTED", governing.CONTRADICTED)
+    text += define("EXACT", governing.EXACT, SINGLE_EXACT) + define("CONTRADICTED", governing.CONTRADICTED)
     text += define("ARRIVED", governing.ARRIVED)
     strength = family.strength if family is not None else governing.Strength(1.0, 1.0, 0.0)
     text += define("FORGETS", float(family.forgets) if family is not None else 0.0)

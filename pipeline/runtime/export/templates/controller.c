@@ -2,7 +2,7 @@
  * and supervisor.py; tables.h holds the numbers. */
 #include "controller.h"
 
-#include <math.h>
+#include <tgmath.h>
 #include <string.h>
 
 @law.c@
@@ -44,7 +44,7 @@ static void forget_all(supervisor_kept *k)
     int kind, signal;
     for (kind = 0; kind < KINDS; kind++)
         for (signal = 0; signal < SIGNALS; signal++)
-            k->since[kind][signal] = k->last[kind][signal] = -1.0;
+            k->since[kind][signal] = k->last[kind][signal] = -1;
     memset(k->amount, 0, sizeof k->amount);
     memset(k->returns, 0, sizeof k->returns);
     memset(k->shown, 0, sizeof k->shown);
@@ -59,7 +59,8 @@ beadline_result beadline_init(beadline_controller *c, const beadline_machine *ma
     memset(c, 0, sizeof *c);
     if (strcmp(machine->plant_sha256, BEADLINE_PLANT_SHA256))
         return BEADLINE_OTHER_PLANT;
-    if (machine->sample_time_s < BEADLINE_SAMPLE_TIME_S || machine->sample_time_s > BEADLINE_SAMPLE_TIME_S)
+    if (machine->sample_time_s < (real)BEADLINE_SAMPLE_TIME_S
+        || machine->sample_time_s > (real)BEADLINE_SAMPLE_TIME_S)
         return BEADLINE_OTHER_SAMPLE_TIME;
     if (strcmp(machine->input_unit, BEADLINE_INPUT_UNIT)
         || strcmp(machine->output_unit, BEADLINE_OUTPUT_UNIT))
@@ -72,19 +73,19 @@ beadline_result beadline_init(beadline_controller *c, const beadline_machine *ma
     for (j = 0; j < OUTPUTS; j++) {
         c->kept.y[j] = NAN;
         c->kept.quantum[j] = INFINITY;
-        c->kept.cleared_s[j] = c->kept.returned_s[j] = -INFINITY;
+        c->kept.cleared[j] = c->kept.returned[j] = NEVER;
     }
     c->ready = 1;
     return BEADLINE_DONE;
 }
 
-beadline_result beadline_tell(beadline_controller *c, const double *disturbances)
+beadline_result beadline_tell(beadline_controller *c, const real *disturbances)
 {
     int i, q;
     if (!c->ready)
         return BEADLINE_NOT_READY;
     for (i = 0; i < INPUTS; i++) {
-        c->law.forward[i] = 0.0;
+        c->law.forward[i] = 0;
         for (q = 0; q < DISTURBANCES; q++)
             if (isfinite(disturbances[q]))
                 c->law.forward[i] += forward_gain[i][q] * (disturbances[q] - forward_mean[q]);
@@ -93,16 +94,16 @@ beadline_result beadline_tell(beadline_controller *c, const double *disturbances
 }
 
 /* The target of reference r, found anew where r changed, and whether it is in reach */
-static void turn_to(beadline_controller *c, const double *r)
+static void turn_to(beadline_controller *c, const real *r)
 {
-    double u[INPUTS];
+    real u[INPUTS];
     int j, reached = 1;
     if (c->aimed && !memcmp(c->r, r, sizeof c->r))
         return;
     memcpy(c->r, r, sizeof c->r);
     feasible_target(&the_law, r, u, c->y_star);
     for (j = 0; j < OUTPUTS; j++) {
-        double outside = fmax(r[j] - supervisor_hottest[j], supervisor_coldest[j] - r[j]);
+        real outside = fmax(r[j] - supervisor_hottest[j], supervisor_coldest[j] - r[j]);
         c->beyond[j] = fmax(fabs(c->y_star[j] - r[j]), outside);
         reached &= c->beyond[j] <= REACH_DEGC;
     }
@@ -112,25 +113,25 @@ static void turn_to(beadline_controller *c, const double *r)
     c->aimed = 1;
 }
 
-beadline_result beadline_watch(beadline_controller *c, const double *u, const double *y, const double *r)
+beadline_result beadline_watch(beadline_controller *c, const real *u, const real *y, const real *r)
 {
-    double filled[OUTPUTS];
+    real filled[OUTPUTS];
     if (!c->ready)
         return BEADLINE_NOT_READY;
     if (!all_finite(u, INPUTS) || !all_finite(r, OUTPUTS))
         return BEADLINE_BAD_INPUT;
     turn_to(c, r);
     follow(&c->kept, y, NULL, 0, filled);
-    c->kept.clock_s[1] += BEADLINE_SAMPLE_TIME_S;
+    c->kept.now += SAMPLE_TIME;
     memcpy(c->kept.asked, u, sizeof c->kept.asked);
     memcpy(c->kept.forward, c->law.forward, sizeof c->kept.forward);
     law_watch(&the_law, &c->law, u, filled, r);
     return BEADLINE_DONE;
 }
 
-beadline_result beadline_hand_over(beadline_controller *c, const double *y)
+beadline_result beadline_hand_over(beadline_controller *c, const real *y)
 {
-    double filled[OUTPUTS];
+    real filled[OUTPUTS];
     int j;
     if (!c->ready || !c->law.seen)
         return BEADLINE_NOT_READY;
@@ -165,7 +166,7 @@ beadline_result beadline_restore(beadline_controller *c, const beadline_controll
 }
 
 /* Inputs of a safe mode; off, too, if there is no control of the machine's own */
-static void be_safe(beadline_controller *c, int mode, const double *y, const double *r, double *u)
+static void be_safe(beadline_controller *c, int mode, const real *y, const real *r, real *u)
 {
     supervisor_kept *k = &c->kept;
     if (mode == MODE_OFF || !HAS_FALLBACK) {
@@ -183,7 +184,7 @@ static void be_safe(beadline_controller *c, int mode, const double *y, const dou
 }
 
 /* Inputs of the mode that the causes ask for; the law watches where it does not drive */
-static int drive(beadline_controller *c, const double *y, const double *r, double *u)
+static int drive(beadline_controller *c, const real *y, const real *r, real *u)
 {
     supervisor_kept *k = &c->kept;
     int mode = find_mode(k);
@@ -202,7 +203,7 @@ static int drive(beadline_controller *c, const double *y, const double *r, doubl
 }
 
 /* Every cause that is there, the first kind first */
-static void tell_causes(const beadline_controller *c, double t_s, beadline_decision *d)
+static void tell_causes(const beadline_controller *c, beadline_clock t, beadline_decision *d)
 {
     const supervisor_kept *k = &c->kept;
     int kind, signal;
@@ -213,21 +214,21 @@ static void tell_causes(const beadline_controller *c, double t_s, beadline_decis
                 one->kind = kind;
                 one->signal = signal;
                 one->amount = k->amount[kind][signal];
-                one->since_s = t_s - (k->clock_s[1] - k->since[kind][signal]);
+                one->since = t - (beadline_clock)(k->now - k->since[kind][signal]);
             }
 }
 
-beadline_result beadline_step(beadline_controller *c, const double *y, const double *r, double t_s,
-                              const double *applied, beadline_decision *decision)
+beadline_result beadline_step(beadline_controller *c, const real *y, const real *r, beadline_clock t,
+                              const real *applied, beadline_decision *decision)
 {
     supervisor_kept *k = &c->kept;
-    double filled[OUTPUTS];
+    real filled[OUTPUTS];
     int j, samples, out_of_reach, farthest = 0;
     if (!c->ready || !c->law.seen)
         return BEADLINE_NOT_READY;
-    if (!all_finite(r, OUTPUTS) || !isfinite(t_s))
+    if (!all_finite(r, OUTPUTS) || !TELLS(t))
         return BEADLINE_BAD_INPUT;
-    samples = pass_time(k, t_s);
+    samples = pass_time(k, t);
     turn_to(c, r);
     follow(k, y, applied, samples, filled);
     for (j = 1; j < OUTPUTS; j++)
@@ -243,6 +244,6 @@ beadline_result beadline_step(beadline_controller *c, const double *y, const dou
     decision->causes = 0;
     decision->mode = drive(c, filled, out_of_reach ? c->in_reach : r, decision->u);
     if (decision->mode != MODE_LAW)
-        tell_causes(c, t_s, decision);
+        tell_causes(c, t, decision);
     return BEADLINE_DONE;
 }

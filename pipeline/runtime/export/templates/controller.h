@@ -15,6 +15,32 @@
 
 #include "machine.h"
 
+/* Every number is a `real`. With -DBEADLINE_SINGLE it is a float, and a clock counts whole milliseconds: a
+ * float of seconds has no milliseconds left after a day. The clock may wrap round. */
+#ifdef BEADLINE_SINGLE
+#include <stdint.h>
+typedef float real;
+typedef uint32_t beadline_clock; /* ms */
+typedef int64_t moment;          /* ms of the controller's own time, which never falls */
+#define REAL(number) number##f
+#define BY_PRECISION(double_precision, single_precision) single_precision##f
+#define SECOND REAL(1e3)
+#define SECONDS(s) ((moment)(SECOND * (s) + REAL(0.5)))
+#define NEVER (INT64_MIN / 2)
+#define TELLS(clock) 1
+#else
+typedef double real;
+typedef double beadline_clock; /* s */
+typedef double moment;
+#define REAL(number) number
+#define BY_PRECISION(double_precision, single_precision) double_precision
+#define SECOND 1.0
+#define SECONDS(s) (s)
+#define NEVER (-INFINITY)
+#define TELLS(clock) isfinite(clock)
+#endif
+#define SAMPLE_TIME SECONDS((real)BEADLINE_SAMPLE_TIME_S)
+
 @law.h@
 @supervisor.h@
 /* ---- the controller */
@@ -22,8 +48,8 @@
 typedef struct {
     law_state law, fallback;
     supervisor_kept kept;
-    double r[OUTPUTS], y_star[OUTPUTS];       /* reference and target */
-    double beyond[OUTPUTS], in_reach[OUTPUTS]; /* degC beyond reach; the last reference in reach */
+    real r[OUTPUTS], y_star[OUTPUTS];       /* reference and target */
+    real beyond[OUTPUTS], in_reach[OUTPUTS]; /* degC beyond reach; the last reference in reach */
     int aimed, has_reached, ready;
 } beadline_controller;
 
@@ -43,7 +69,7 @@ typedef enum {
 /* The machine as the caller knows it */
 typedef struct {
     const char *plant_sha256, *input_unit, *output_unit;
-    double sample_time_s;
+    real sample_time_s;
     int inputs, outputs;
 } beadline_machine;
 
@@ -51,11 +77,12 @@ typedef struct {
  * its command, is negative if its sensor may be at fault as well. */
 typedef struct {
     int kind, signal;
-    double amount, since_s;
+    real amount;
+    beadline_clock since;
 } beadline_cause;
 
 typedef struct {
-    double u[INPUTS]; /* percent, to apply */
+    real u[INPUTS]; /* percent, to apply */
     int mode, causes;
     beadline_cause cause[KINDS * SIGNALS];
 } beadline_decision;
@@ -64,19 +91,19 @@ typedef struct {
 beadline_result beadline_init(beadline_controller *c, const beadline_machine *machine, int rehearsal);
 
 /* The disturbances from this sample on, in the order of machine.h, NAN for one that is not known */
-beadline_result beadline_tell(beadline_controller *c, const double *disturbances);
+beadline_result beadline_tell(beadline_controller *c, const real *disturbances);
 
 /* One sample in manual: inputs u were applied, outputs y measured before, reference r */
-beadline_result beadline_watch(beadline_controller *c, const double *u, const double *y, const double *r);
+beadline_result beadline_watch(beadline_controller *c, const real *u, const real *y, const real *r);
 
 /* From manual to the law without a bump, at outputs y measured now */
-beadline_result beadline_hand_over(beadline_controller *c, const double *y);
+beadline_result beadline_hand_over(beadline_controller *c, const real *y);
 
-/* What to apply from outputs y measured at t_s of the machine's clock, NAN where a sensor gives none, under
+/* What to apply from outputs y measured at t of the machine's clock, NAN where a sensor gives none, under
  * the constant reference r. `applied`: inputs that acted since the last sample, NULL where nothing reads them
  * back. */
-beadline_result beadline_step(beadline_controller *c, const double *y, const double *r, double t_s,
-                              const double *applied, beadline_decision *decision);
+beadline_result beadline_step(beadline_controller *c, const real *y, const real *r, beadline_clock t,
+                              const real *applied, beadline_decision *decision);
 
 /* A person has mended what was wrong: every cause is forgotten */
 beadline_result beadline_acknowledge(beadline_controller *c);

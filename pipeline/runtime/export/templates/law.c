@@ -14,53 +14,53 @@ typedef struct {
     int shift;       /* A moves z on by so many entries; 0: A is a full matrix */
     int conditional; /* conditional integration: aims at the reference itself */
     int integrates, holds, governed;
-    double integral_limit; /* degC: largest error and largest shift that xi sees */
-    const double *A, *B_u, *B_y, *B_r, *c;
-    const double *K, *D, *K_r, *integral, *back; /* back: P */
-    const double *start_u, *start_y, *start;
-    const double *low, *high, *rate;                /* percent, and percent a sample */
-    const double *feed_u, *feed_y, *feed_r, *feed_0; /* feed = feed_u u + feed_y y* + feed_r r + feed_0 */
+    real integral_limit; /* degC: largest error and largest shift that xi sees */
+    const real *A, *B_u, *B_y, *B_r, *c;
+    const real *K, *D, *K_r, *integral, *back; /* back: P */
+    const real *start_u, *start_y, *start;
+    const real *low, *high, *rate;                /* percent, and percent a sample */
+    const real *feed_u, *feed_y, *feed_r, *feed_0; /* feed = feed_u u + feed_y y* + feed_r r + feed_0 */
 } law;
 
 #include "tables.h"
 
 /* ---- arithmetic */
 
-static double cut(double value, double low, double high)
+static real cut(real value, real low, real high)
 {
     return fmin(fmax(value, low), high);
 }
 
 /* y += M x, M of `rows` rows and `columns` columns, row after row */
-static void add_product(double *y, const double *M, const double *x, int rows, int columns)
+static void add_product(real *y, const real *M, const real *x, int rows, int columns)
 {
     int i, j;
     for (i = 0; i < rows; i++) {
-        const double *row = M + i * columns;
-        double sum = 0.0;
+        const real *row = M + i * columns;
+        real sum = 0;
         for (j = 0; j < columns; j++)
             sum += row[j] * x[j];
         y[i] += sum;
     }
 }
 
-static void add(double *y, const double *x, int count)
+static void add(real *y, const real *x, int count)
 {
     int i;
     for (i = 0; i < count; i++)
         y[i] += x[i];
 }
 
-static double dot(const double *a, const double *b, int count)
+static real dot(const real *a, const real *b, int count)
 {
-    double sum = 0.0;
+    real sum = 0;
     int i;
     for (i = 0; i < count; i++)
         sum += a[i] * b[i];
     return sum;
 }
 
-static int all_finite(const double *values, int count)
+static int all_finite(const real *values, int count)
 {
     int i;
     for (i = 0; i < count; i++)
@@ -69,7 +69,10 @@ static int all_finite(const double *values, int count)
     return 1;
 }
 
-/* ---- the feasible target: bounded least squares (Stark and Parker 1995) */
+/* ---- the feasible target: bounded least squares (Stark and Parker 1995)
+ *
+ * In double precision in either build: a plant that almost integrates rests on outputs 1e5 times as large as those
+ * that count. It is found anew only for a new reference. */
 
 #define ROWS (OUTPUTS + INPUTS)
 
@@ -78,22 +81,22 @@ static void least_squares(double A[ROWS][INPUTS], double *b, int columns, double
 {
     int i, j, k;
     for (k = 0; k < columns; k++) {
-        double v[ROWS], size = 0.0, length = 0.0, sum, diagonal;
+        double v[ROWS], size = 0, length = 0, sum, diagonal;
         for (i = k; i < ROWS; i++)
             size += A[i][k] * A[i][k];
         diagonal = A[k][k] > 0 ? -sqrt(size) : sqrt(size);
         for (i = k; i < ROWS; i++)
-            v[i] = A[i][k] - (i == k ? diagonal : 0.0);
+            v[i] = A[i][k] - (i == k ? diagonal : 0);
         for (i = k; i < ROWS; i++)
             length += v[i] * v[i];
         for (j = k + 1; j < columns && length > 0; j++) {
-            sum = 0.0;
+            sum = 0;
             for (i = k; i < ROWS; i++)
                 sum += v[i] * A[i][j];
             for (i = k; i < ROWS; i++)
                 A[i][j] -= v[i] * (2 * sum / length);
         }
-        sum = 0.0;
+        sum = 0;
         for (i = k; i < ROWS; i++)
             sum += v[i] * b[i];
         for (i = k; i < ROWS && length > 0; i++)
@@ -108,9 +111,15 @@ static void least_squares(double A[ROWS][INPUTS], double *b, int columns, double
     }
 }
 
+/* A number of the rows: what outputs rest on, then LIGHT for each input, so that of equally good ones the
+ * smaller is the target */
+static double row_of(int i, int j)
+{
+    return i < OUTPUTS ? aim_rows[i][j] : i - OUTPUTS == j ? LIGHT : 0;
+}
+
 /* One bounded problem: min |rows x - right|^2, low <= x <= high; `at` is -1, 1 where x stands at low, high */
 typedef struct {
-    const double (*rows)[INPUTS];
     double right[ROWS], low[INPUTS], high[INPUTS], x[INPUTS], gain[INPUTS], cost;
     int at[INPUTS];
 } bounded;
@@ -127,9 +136,9 @@ static int solve_free(const bounded *b, double *z, int *index)
         right[i] = b->right[i];
         for (j = 0; j < INPUTS; j++)
             if (b->at[j])
-                right[i] -= b->rows[i][j] * b->x[j];
+                right[i] -= row_of(i, j) * b->x[j];
         for (j = 0; j < count; j++)
-            A[i][j] = b->rows[i][index[j]];
+            A[i][j] = row_of(i, index[j]);
     }
     least_squares(A, right, count, z);
     return count;
@@ -140,19 +149,22 @@ static void look(bounded *b)
 {
     double miss[ROWS], terms[ROWS];
     int i, j;
-    b->cost = 0.0;
+    b->cost = 0;
     for (i = 0; i < ROWS; i++) {
-        miss[i] = dot(b->rows[i], b->x, INPUTS) - b->right[i];
+        miss[i] = 0;
         terms[i] = fabs(b->right[i]);
-        for (j = 0; j < INPUTS; j++)
-            terms[i] += fabs(b->rows[i][j] * b->x[j]);
+        for (j = 0; j < INPUTS; j++) {
+            miss[i] += row_of(i, j) * b->x[j];
+            terms[i] += fabs(row_of(i, j) * b->x[j]);
+        }
+        miss[i] -= b->right[i];
         b->cost += 0.5 * miss[i] * miss[i];
     }
     for (j = 0; j < INPUTS; j++) {
-        double gradient = 0.0, doubt = 0.0;
+        double gradient = 0, doubt = 0;
         for (i = 0; i < ROWS; i++) {
-            gradient += b->rows[i][j] * miss[i];
-            doubt += fabs(b->rows[i][j]) * terms[i];
+            gradient += row_of(i, j) * miss[i];
+            doubt += fabs(row_of(i, j)) * terms[i];
         }
         b->gain[j] = gradient * b->at[j] - ROUNDING * doubt;
     }
@@ -196,14 +208,14 @@ static void minimise(bounded *b)
         return;
     for (j = 0; j < INPUTS; j++) {
         b->at[j] = b->x[j] <= b->low[j] ? -1 : b->x[j] >= b->high[j] ? 1 : 0;
-        b->x[j] = cut(b->x[j], b->low[j], b->high[j]);
+        b->x[j] = fmin(fmax(b->x[j], b->low[j]), b->high[j]);
     }
     do {
         count = solve_free(b, z, index);
         for (k = 0, cuts = 0; k < count; k++) {
             j = index[k];
             b->at[j] = z[k] < b->low[j] ? -1 : z[k] > b->high[j] ? 1 : 0;
-            b->x[j] = cut(z[k], b->low[j], b->high[j]);
+            b->x[j] = fmin(fmax(z[k], b->low[j]), b->high[j]);
             cuts += b->at[j] != 0;
         }
     } while (cuts && count > cuts);
@@ -226,34 +238,39 @@ static void minimise(bounded *b)
 }
 
 /* Steady inputs at least `slack` from their limits, and the outputs they hold; returns |y - r| */
-static double steady(const law *l, const double *r, double slack, double *u, double *y)
+static double steady(const law *l, const real *r, double slack, real *u, real *y)
 {
     bounded b;
-    double miss = 0.0;
+    double miss = 0;
     int i, j;
-    b.rows = aim_rows;
     for (i = 0; i < OUTPUTS; i++)
-        b.right[i] = r[i] - aim_d[i] - aim_rest[i];
+        b.right[i] = (double)r[i] - aim_d[i] - aim_rest[i];
     for (j = 0; j < INPUTS; j++) {
-        b.right[OUTPUTS + j] = 0.0;
-        b.low[j] = l->low[j] + fmin(slack, AIM_WIDEST);
-        b.high[j] = l->high[j] - fmin(slack, AIM_WIDEST);
+        b.right[OUTPUTS + j] = 0;
+        b.low[j] = (double)l->low[j] + fmin(slack, AIM_WIDEST);
+        b.high[j] = (double)l->high[j] - fmin(slack, AIM_WIDEST);
     }
     minimise(&b);
     for (i = 0; i < OUTPUTS; i++) {
-        y[i] = dot(aim_rows[i], b.x, INPUTS) + aim_rest[i] + aim_d[i];
-        miss += (y[i] - r[i]) * (y[i] - r[i]);
+        double rests = 0;
+        for (j = 0; j < INPUTS; j++)
+            rests += aim_rows[i][j] * b.x[j];
+        rests = rests + aim_rest[i] + aim_d[i];
+        y[i] = (real)rests;
+        miss += (rests - (double)r[i]) * (rests - (double)r[i]);
     }
-    memcpy(u, b.x, sizeof b.x);
+    for (j = 0; j < INPUTS; j++)
+        u[j] = (real)b.x[j];
     return sqrt(miss);
 }
 
 /* The target y_star nearest to r that the inputs can hold, and among those the one that keeps them as far
  * from their limits as `AIM_TOLERANCE` degC of reach allow; u holds it */
-static void feasible_target(const law *l, const double *r, double *u, double *y_star)
+static void feasible_target(const law *l, const real *r, real *u, real *y_star)
 {
-    double wider_u[INPUTS], wider_y[OUTPUTS], slack = 0.0, step = AIM_FIRST;
-    double reach = steady(l, r, 0.0, u, y_star) + AIM_TOLERANCE;
+    real wider_u[INPUTS], wider_y[OUTPUTS];
+    double slack = 0, step = AIM_FIRST;
+    double reach = steady(l, r, 0, u, y_star) + AIM_TOLERANCE;
     while (step > AIM_FINEST) {
         double miss = steady(l, r, slack + step, wider_u, wider_y);
         if (slack + step <= AIM_WIDEST && miss <= reach) {
@@ -267,9 +284,9 @@ static void feasible_target(const law *l, const double *r, double *u, double *y_
 }
 
 /* feed of the formula and its target for a constant reference r */
-static void aim(const law *l, const double *r, double *feed, double *y_star)
+static void aim(const law *l, const real *r, real *feed, real *y_star)
 {
-    double u[INPUTS];
+    real u[INPUTS];
     feasible_target(l, r, u, y_star);
     if (l->conditional)
         memcpy(y_star, r, OUTPUTS * sizeof *r);
@@ -282,18 +299,18 @@ static void aim(const law *l, const double *r, double *feed, double *y_star)
 /* ---- the governor: keeps the forecast of a family of plants within the limits of the outputs */
 
 typedef struct {
-    double bare[MEMBERS][FORECASTS], strength[MEMBERS][OUTPUTS], wall[MEMBERS][OUTPUTS];
+    real bare[MEMBERS][FORECASTS], strength[MEMBERS][OUTPUTS], wall[MEMBERS][OUTPUTS];
     int counts[MEMBERS];
-    const double (*rows)[FORECASTS][INPUTS];
-    const double (*least)[FORECASTS];
+    const real (*rows)[FORECASTS][INPUTS];
+    const real (*least)[FORECASTS];
 } side;
 
 typedef struct {
-    double least[MEMBERS][OUTPUTS], middle[MEMBERS][OUTPUTS], most[MEMBERS][OUTPUTS];
+    real least[MEMBERS][OUTPUTS], middle[MEMBERS][OUTPUTS], most[MEMBERS][OUTPUTS];
     int counts[MEMBERS];
 } evidence;
 
-static void start_governor(member_state *x, const double *y)
+static void start_governor(member_state *x, const real *y)
 {
     int f;
     memset(x, 0, MEMBERS * sizeof *x);
@@ -304,21 +321,21 @@ static void start_governor(member_state *x, const double *y)
 }
 
 /* Members at their strongest x, and by how much less at their weakest, once y is measured */
-static void correct(member_state *x, const double *y)
+static void correct(member_state *x, const real *y)
 {
     int f, i, j;
     for (f = 0; f < MEMBERS; f++) {
         member_state *s = &x[f];
-        double e[OUTPUTS], calm[OUTPUTS], lacks[OUTPUTS], lacks_calm[OUTPUTS];
+        real e[OUTPUTS], calm[OUTPUTS], lacks[OUTPUTS], lacks_calm[OUTPUTS];
         for (j = 0; j < OUTPUTS; j++) {
-            double strength, surprise = governor_surprise[j];
+            real strength, surprise = governor_surprise[j];
             e[j] = y[j] - governor_offset[f][j] - dot(governor_C[f][j], s->strongest, WATCHED);
             lacks[j] = dot(governor_C[f][j], s->lacks, WATCHED);
             s->sums[0][j] = (1 - FORGETS) * s->sums[0][j] - e[j] * lacks[j];
             s->sums[1][j] = (1 - FORGETS) * s->sums[1][j] + lacks[j] * lacks[j];
             s->sums[2][j] = (1 - FORGETS) * s->sums[2][j] + fabs(lacks[j]);
             s->sums[3][j] = (1 - FORGETS) * s->sums[3][j] + e[j] * e[j];
-            strength = cut(s->sums[0][j] / (s->sums[1][j] + 1e-12), 0.0, 1.0);
+            strength = cut(s->sums[0][j] / (s->sums[1][j] + REAL(1e-12)), 0, 1);
             calm[j] = cut(e[j] + strength * lacks[j], -surprise, surprise);
             lacks_calm[j] = cut(lacks[j], -surprise, surprise);
         }
@@ -331,11 +348,11 @@ static void correct(member_state *x, const double *y)
 }
 
 /* Members a sample on, inputs u applied */
-static void predict(member_state *x, const double *u)
+static void predict(member_state *x, const real *u)
 {
     int f;
     for (f = 0; f < MEMBERS; f++) {
-        double strongest[WATCHED], lacks[WATCHED] = {0};
+        real strongest[WATCHED], lacks[WATCHED] = {0};
         memcpy(strongest, governor_b[f], sizeof strongest);
         add_product(strongest, governor_A[f][0], x[f].strongest, WATCHED, WATCHED);
         add_product(strongest, governor_B[f][0], u, WATCHED, INPUTS);
@@ -350,18 +367,18 @@ static void predict(member_state *x, const double *u)
  * which members count */
 static void weigh(const member_state *x, evidence *told)
 {
-    double rest[MEMBERS], best = INFINITY, noise = 0.0;
+    real rest[MEMBERS], best = INFINITY, noise = 0;
     int f, j;
     for (f = 0; f < MEMBERS; f++) {
-        rest[f] = 0.0;
+        rest[f] = 0;
         for (j = 0; j < OUTPUTS; j++) {
-            double product = x[f].sums[0][j], square = x[f].sums[1][j];
-            double share = 1 / (square + 1e-12), doubt = governor_doubt[j] * x[f].sums[2][j] + 1e-9;
-            double middle = cut(product * share, 0.0, 1.0);
+            real product = x[f].sums[0][j], square = x[f].sums[1][j];
+            real share = 1 / (square + REAL(1e-12)), doubt = governor_doubt[j] * x[f].sums[2][j] + REAL(1e-9);
+            real middle = cut(product * share, 0, 1);
             rest[f] += x[f].sums[3][j] - middle * (2 * product - middle * square);
             told->middle[f][j] = middle;
-            told->least[f][j] = cut((product - doubt) * share, 0.0, 1.0);
-            told->most[f][j] = cut((product + doubt) * share, 0.0, 1.0);
+            told->least[f][j] = cut((product - doubt) * share, 0, 1);
+            told->most[f][j] = cut((product + doubt) * share, 0, 1);
         }
         best = fmin(best, rest[f]);
     }
@@ -372,32 +389,32 @@ static void weigh(const member_state *x, evidence *told)
 }
 
 /* Floor and cap of an output that is forecast `now`, where its target is y_star */
-static void walls(int j, double now, double y_star, double *floor_at, double *cap_at)
+static void walls(int j, real now, real y_star, real *floor_at, real *cap_at)
 {
-    double near = governor_near[j];
-    double leaving = -(y_star - now) < ARRIVED * OVERSHOOT ? near : OVERSHOOT;
-    double arriving = y_star - now < ARRIVED * OVERSHOOT ? near : OVERSHOOT;
-    double low = y_star - leaving, high = y_star + arriving;
+    real near = governor_near[j];
+    real leaving = -(y_star - now) < ARRIVED * OVERSHOOT ? near : OVERSHOOT;
+    real arriving = y_star - now < ARRIVED * OVERSHOOT ? near : OVERSHOOT;
+    real low = y_star - leaving, high = y_star + arriving;
     *floor_at = fmax(governor_low[j], now < low - OVERSHOOT ? -INFINITY : low);
     *cap_at = fmin(governor_high[j], now > high + OVERSHOOT ? now : high);
 }
 
-static void look_ahead(const member_state *x, const double *y_star, side *below, side *above)
+static void look_ahead(const member_state *x, const real *y_star, side *below, side *above)
 {
     evidence told;
     int f, j, k;
     weigh(x, &told);
     for (f = 0; f < MEMBERS; f++)
         for (j = 0; j < OUTPUTS; j++) {
-            double least = told.least[f][j], middle = told.middle[f][j], most = told.most[f][j];
-            const double(*ahead)[WATCHED] = &governor_ahead[f][j * INSTANTS];
-            double lacks_now = dot(ahead[0], x[f].lacks, WATCHED), floor_at, cap_at;
-            double now = dot(ahead[0], x[f].strongest, WATCHED) - middle * lacks_now + governor_offset[f][j];
+            real least = told.least[f][j], middle = told.middle[f][j], most = told.most[f][j];
+            const real(*ahead)[WATCHED] = &governor_ahead[f][j * INSTANTS];
+            real lacks_now = dot(ahead[0], x[f].lacks, WATCHED), floor_at, cap_at;
+            real now = dot(ahead[0], x[f].strongest, WATCHED) - middle * lacks_now + governor_offset[f][j];
             walls(j, now, y_star[j], &floor_at, &cap_at);
             for (k = 0; k < INSTANTS; k++) {
                 int row = j * INSTANTS + k;
-                double bare = dot(ahead[k], x[f].strongest, WATCHED) - middle * lacks_now;
-                double lacks = dot(ahead[k], x[f].lacks, WATCHED) - lacks_now;
+                real bare = dot(ahead[k], x[f].strongest, WATCHED) - middle * lacks_now;
+                real lacks = dot(ahead[k], x[f].lacks, WATCHED) - lacks_now;
                 below->bare[f][row] = -(bare - most * lacks) - governor_below[f][row];
                 above->bare[f][row] = bare - least * lacks + governor_above[f][row];
             }
@@ -415,20 +432,20 @@ static void look_ahead(const member_state *x, const double *y_star, side *below,
 }
 
 /* What of a row lowers the output: an input that hardly moves it is not shut for its sake */
-static double helps(const side *s, int f, int row, int i)
+static real helps(const side *s, int f, int row, int i)
 {
-    double effect = s->rows[f][row][i];
-    return effect > s->least[f][row] && effect > 0 ? effect : 0.0;
+    real effect = s->rows[f][row][i];
+    return effect > s->least[f][row] && effect > 0 ? effect : 0;
 }
 
 /* Rows by which an output may rise, each as far as the inputs that help can keep it */
-static void find_room(const side *s, const double *u, const double *low, double room[MEMBERS][FORECASTS])
+static void find_room(const side *s, const real *u, const real *low, real room[MEMBERS][FORECASTS])
 {
     int f, i, row;
     for (f = 0; f < MEMBERS; f++)
         for (row = 0; row < FORECASTS; row++) {
             int j = row / INSTANTS;
-            double kept = 0.0, other = 0.0;
+            real kept = 0, other = 0;
             for (i = 0; i < INPUTS; i++) {
                 kept += low[i] * helps(s, f, row, i);
                 other += u[i] * (s->rows[f][row][i] - helps(s, f, row, i));
@@ -439,10 +456,10 @@ static void find_room(const side *s, const double *u, const double *low, double 
 }
 
 /* One projection of u onto the most violated row of output j */
-static void project_output(const side *s, double room[MEMBERS][FORECASTS], int j, const double *low,
-                           double *u)
+static void project_output(const side *s, real room[MEMBERS][FORECASTS], int j, const real *low,
+                           real *u)
 {
-    double most = -INFINITY, size = 0.0, direction[INPUTS];
+    real most = -INFINITY, size = 0, direction[INPUTS];
     int f, i, row, worst_f = -1, worst = 0;
     for (f = 0; f < MEMBERS; f++)
         for (row = j * INSTANTS; row < (j + 1) * INSTANTS; row++)
@@ -456,7 +473,7 @@ static void project_output(const side *s, double room[MEMBERS][FORECASTS], int j
                 worst = row;
             }
     for (i = 0; i < INPUTS; i++) {
-        direction[i] = u[i] > low[i] + EXACT ? helps(s, worst_f, worst, i) : 0.0;
+        direction[i] = u[i] > low[i] + EXACT ? helps(s, worst_f, worst, i) : 0;
         size += direction[i] * direction[i];
     }
     for (i = 0; i < INPUTS && size > 0; i++)
@@ -464,9 +481,9 @@ static void project_output(const side *s, double room[MEMBERS][FORECASTS], int j
 }
 
 /* Cuts u until every row is kept as far as the inputs go; returns whether a row touched it */
-static int project(const side *s, const double *low, double *u)
+static int project(const side *s, const real *low, real *u)
 {
-    double room[MEMBERS][FORECASTS];
+    real room[MEMBERS][FORECASTS];
     int f, j, row, sweep, touched = 0;
     for (f = 0; f < MEMBERS; f++)
         for (row = 0; row < FORECASTS && s->counts[f]; row++) {
@@ -492,7 +509,7 @@ static int project(const side *s, const double *low, double *u)
     return 1;
 }
 
-static void negate(double *u)
+static void negate(real *u)
 {
     int i;
     for (i = 0; i < INPUTS; i++)
@@ -500,11 +517,11 @@ static void negate(double *u)
 }
 
 /* u as near to what was asked as the forecasts allow, within low..high; the high limit has the last word */
-static void govern(const member_state *x, const double *y_star, const double *low, const double *high,
-                   double *u)
+static void govern(const member_state *x, const real *y_star, const real *low, const real *high,
+                   real *u)
 {
     side below, above;
-    double negative_high[INPUTS];
+    real negative_high[INPUTS];
     int i, raised, lowered, round;
     look_ahead(x, y_star, &below, &above);
     for (i = 0; i < INPUTS; i++)
@@ -524,16 +541,16 @@ static void govern(const member_state *x, const double *y_star, const double *lo
 /* ---- a sample at a time */
 
 /* Inputs less what is fed forward */
-static void without_forward(const law_state *s, const double *u, double *acts)
+static void without_forward(const law_state *s, const real *u, real *acts)
 {
     int i;
     for (i = 0; i < INPUTS; i++)
         acts[i] = u[i] - s->forward[i];
 }
 
-static void remember(const law *l, law_state *s, const double *u, const double *y, const double *r)
+static void remember(const law *l, law_state *s, const real *u, const real *y, const real *r)
 {
-    double z[MEMORY], acts[INPUTS];
+    real z[MEMORY], acts[INPUTS];
     int i;
     for (i = 0; i < l->memories; i++)
         z[i] = l->c[i];
@@ -551,9 +568,9 @@ static void remember(const law *l, law_state *s, const double *u, const double *
         s->u[i] = u[i];
 }
 
-static void law_watch(const law *l, law_state *s, const double *u, const double *y, const double *r)
+static void law_watch(const law *l, law_state *s, const real *u, const real *y, const real *r)
 {
-    double acts[INPUTS];
+    real acts[INPUTS];
     without_forward(s, u, acts);
     if (!s->seen) {
         int i;
@@ -573,10 +590,10 @@ static void law_watch(const law *l, law_state *s, const double *u, const double 
 }
 
 /* u wished at target feed, without xi's part where `xi` is NULL */
-static void wish(const law *l, const law_state *s, const double *feed, const double *y, const double *xi,
-                 double *u)
+static void wish(const law *l, const law_state *s, const real *feed, const real *y, const real *xi,
+                 real *u)
 {
-    double asked[INPUTS] = {0};
+    real asked[INPUTS] = {0};
     int i;
     add_product(asked, l->K, s->z, INPUTS, l->memories);
     add_product(asked, l->D, y, INPUTS, OUTPUTS);
@@ -586,9 +603,9 @@ static void wish(const law *l, const law_state *s, const double *feed, const dou
         u[i] = feed[i] - asked[i];
 }
 
-static void law_hand_over(const law *l, law_state *s, const double *y)
+static void law_hand_over(const law *l, law_state *s, const real *y)
 {
-    double feed[INPUTS], y_star[OUTPUTS], shift[INPUTS], acts[INPUTS], most = l->integral_limit;
+    real feed[INPUTS], y_star[OUTPUTS], shift[INPUTS], acts[INPUTS], most = l->integral_limit;
     int i, j;
     if (l->holds || !l->integrates)
         return;
@@ -605,10 +622,10 @@ static void law_hand_over(const law *l, law_state *s, const double *y)
 }
 
 /* xi a sample on where the command is cut: it rests there, and -K_r xi stays within the limits */
-static void integrate_conditionally(const law *l, law_state *s, const double *error, const double *u,
-                                    const double *wished)
+static void integrate_conditionally(const law *l, law_state *s, const real *error, const real *u,
+                                    const real *wished)
 {
-    double after[OUTPUTS], share[INPUTS], within;
+    real after[OUTPUTS], share[INPUTS], within;
     int i, j, inside;
     for (j = 0; j < OUTPUTS; j++)
         after[j] = s->xi[j] + l->integral[j] * error[j];
@@ -623,9 +640,9 @@ static void integrate_conditionally(const law *l, law_state *s, const double *er
     }
 }
 
-static void integrate(const law *l, law_state *s, const double *error, const double *u, const double *wished)
+static void integrate(const law *l, law_state *s, const real *error, const real *u, const real *wished)
 {
-    double excess[INPUTS], shift, most = l->integral_limit;
+    real excess[INPUTS], shift, most = l->integral_limit;
     int i, j;
     if (l->conditional) {
         integrate_conditionally(l, s, error, u, wished);
@@ -640,9 +657,9 @@ static void integrate(const law *l, law_state *s, const double *error, const dou
     }
 }
 
-static void law_step(const law *l, law_state *s, const double *y, const double *r, double *u)
+static void law_step(const law *l, law_state *s, const real *y, const real *r, real *u)
 {
-    double wished[INPUTS], low[INPUTS], high[INPUTS], error[OUTPUTS], acts[INPUTS];
+    real wished[INPUTS], low[INPUTS], high[INPUTS], error[OUTPUTS], acts[INPUTS];
     int i, j;
     if (!s->aimed || memcmp(s->r, r, sizeof s->r)) {
         aim(l, r, s->feed, s->y_star);

@@ -3,14 +3,14 @@
 /* One plant of the governor's family: its state with the inputs at their strongest, by how much less at their
  * weakest, and four sums of what its innovations told */
 typedef struct {
-    double strongest[WATCHED], lacks[WATCHED], sums[4][OUTPUTS];
+    real strongest[WATCHED], lacks[WATCHED], sums[4][OUTPUTS];
 } member_state;
 
 /* All that a law remembers */
 typedef struct {
-    double z[MEMORY], xi[OUTPUTS], u[INPUTS];
-    double r[OUTPUTS], feed[INPUTS], y_star[OUTPUTS];
-    double forward[INPUTS]; /* what makes up for the disturbances */
+    real z[MEMORY], xi[OUTPUTS], u[INPUTS];
+    real r[OUTPUTS], feed[INPUTS], y_star[OUTPUTS];
+    real forward[INPUTS]; /* what makes up for the disturbances */
     member_state x[MEMBERS];
     int seen, aimed;
 } law_state;

@@ -10,20 +10,20 @@ static const char *const reasons[KINDS] = {
     "the reference is out of reach: the last one in reach stays"
 };
 
-static double largest(double a, double b)
+static real largest(real a, real b)
 {
     return a > b ? a : b;
 }
 
 /* A cause is there now; what was said first of it stays */
-static void say(supervisor_kept *k, int kind, int signal, double amount)
+static void say(supervisor_kept *k, int kind, int signal, real amount)
 {
     if (k->since[kind][signal] < 0) {
-        k->since[kind][signal] = k->clock_s[1];
+        k->since[kind][signal] = k->now;
         k->amount[kind][signal] = amount;
         k->active++;
     }
-    k->last[kind][signal] = k->clock_s[1];
+    k->last[kind][signal] = k->now;
 }
 
 static void end_windows(supervisor_kept *k)
@@ -35,33 +35,34 @@ static void end_windows(supervisor_kept *k)
 
 /* Whole samples since the last one; a clock that tells no time between two samples counts as one, and the
  * first time forecasts begin anew */
-static int pass_time(supervisor_kept *k, double t_s)
+static int pass_time(supervisor_kept *k, beadline_clock t)
 {
-    double gap_s, gap;
+    beadline_clock passed;
+    real gap;
     int sane;
     if (!k->clocked) {
-        k->clock_s[0] = t_s - BEADLINE_SAMPLE_TIME_S;
+        k->clock = t - SAMPLE_TIME;
         k->clocked = 1;
     }
-    gap_s = t_s - k->clock_s[0];
-    gap = gap_s / BEADLINE_SAMPLE_TIME_S;
+    passed = t - k->clock;
+    gap = passed / (SECOND * (real)BEADLINE_SAMPLE_TIME_S);
     sane = gap >= EARLY && gap <= JUMP;
-    k->clock_s[0] = t_s;
-    k->clock_s[1] += sane ? gap_s : BEADLINE_SAMPLE_TIME_S;
+    k->clock = t;
+    k->now += sane ? passed : SAMPLE_TIME;
     if (!sane && !k->insane)
         end_windows(k);
     k->insane = !sane;
-    return sane && gap > 1.5 ? (int)(gap + 0.5) : 1;
+    return sane && gap > REAL(1.5) ? (int)(gap + REAL(0.5)) : 1;
 }
 
 /* Steps of a sensor in degC; large ones as long as they are not known */
-static double steps_of(const supervisor_kept *k, int j)
+static real steps_of(const supervisor_kept *k, int j)
 {
     return isfinite(k->quantum[j]) ? k->quantum[j] : MOST_STEP_DEGC;
 }
 
 /* Which outputs count now; says which gives no number, or one out of its range */
-static void read_sensors(supervisor_kept *k, const double *y, int *counts)
+static void read_sensors(supervisor_kept *k, const real *y, int *counts)
 {
     int j;
     for (j = 0; j < OUTPUTS; j++) {
@@ -70,12 +71,12 @@ static void read_sensors(supervisor_kept *k, const double *y, int *counts)
         if (k->bad[j] >= REPEATED)
             say(k, SENSOR_OPEN, j, y[j]);
         if (good) {
-            double move = fabs(y[j] - k->y[j]);
+            real move = fabs(y[j] - k->y[j]);
             if (isinf(k->quantum[j]) && move > MOST_STEP_DEGC)
                 k->quantum[j] = NAN; /* perhaps it was switched on */
-            else if (move > 1e-9)
+            else if (move > REAL(1e-9))
                 k->quantum[j] = fmin(k->quantum[j], move);
-            k->repeats[j] = move < 1e-12 ? k->repeats[j] + 1 : 0;
+            k->repeats[j] = move < REAL(1e-12) ? k->repeats[j] + 1 : 0;
             k->y[j] = y[j];
         }
         counts[j] = good && k->since[SENSOR_OPEN][j] < 0 && k->since[SENSOR_STILL][j] < 0
@@ -83,7 +84,7 @@ static void read_sensors(supervisor_kept *k, const double *y, int *counts)
     }
 }
 
-static double forecast(const double *state, int j)
+static real forecast(const real *state, int j)
 {
     return dot(supervisor_C[j], state, WATCH) + supervisor_d[j];
 }
@@ -107,18 +108,18 @@ static void begin_window(supervisor_kept *k, int at)
         memset(k->window[w].cross[at], 0, sizeof one->cross[at]);
 }
 
-static void move_state(double *x, const double *on)
+static void move_state(real *x, const real *on)
 {
-    double after[WATCH];
+    real after[WATCH];
     memcpy(after, on, sizeof after);
     add_product(after, supervisor_A[0], x, WATCH, WATCH);
     memcpy(x, after, sizeof after);
 }
 
 /* response(t+1) = A response + B by, column by column */
-static void move_response(double response[WATCH][INPUTS], const double *by)
+static void move_response(real response[WATCH][INPUTS], const real *by)
 {
-    double after[WATCH][INPUTS];
+    real after[WATCH][INPUTS];
     int i, j, l;
     for (i = 0; i < WATCH; i++)
         for (l = 0; l < INPUTS; l++)
@@ -131,15 +132,15 @@ static void move_response(double response[WATCH][INPUTS], const double *by)
 }
 
 /* Observer and windows a sample on, inputs u applied */
-static void advance(supervisor_kept *k, const double *u)
+static void advance(supervisor_kept *k, const real *u)
 {
-    double on[WATCH], above[INPUTS], ones[INPUTS];
+    real on[WATCH], above[INPUTS], ones[INPUTS];
     int i, w;
     memcpy(on, supervisor_b, sizeof on);
     add_product(on, supervisor_B[0], u, WATCH, INPUTS);
     for (i = 0; i < INPUTS; i++) {
         above[i] = u[i] - supervisor_low[i];
-        ones[i] = 1.0;
+        ones[i] = 1;
     }
     for (w = 0; w < WINDOWS; w++) {
         forecast_window *one = &k->window[w];
@@ -156,9 +157,9 @@ static void advance(supervisor_kept *k, const double *u)
 }
 
 /* The response of output j to input i, of a window's given or unit */
-static double response_of(const double *response, int j, int i)
+static real response_of(const real *response, int j, int i)
 {
-    double sum = 0.0;
+    real sum = 0;
     int n;
     for (n = 0; n < WATCH; n++)
         sum += supervisor_C[j][n] * response[n * INPUTS + i];
@@ -166,15 +167,15 @@ static double response_of(const double *response, int j, int i)
 }
 
 /* Readings that count against every window: what moved, and the sums of the fits */
-static void compare(supervisor_kept *k, const double *y, const int *counts)
+static void compare(supervisor_kept *k, const real *y, const int *counts)
 {
-    double signature[WINDOWS][EXPLANATIONS], missed[WINDOWS];
+    real signature[WINDOWS][SIGNATURES], missed[WINDOWS];
     int i, j, w, v, f;
     for (w = 0; w < WINDOWS; w++)
         for (j = 0; j < OUTPUTS && k->window[w].age >= 0; j++)
             if (counts[j]) {
                 forecast_window *one = &k->window[w];
-                double moved = y[j] - one->began[j];
+                real moved = y[j] - one->began[j];
                 one->least[j] = fmin(one->least[j], y[j]);
                 one->most[j] = fmax(one->most[j], y[j]);
                 one->total[0][j] += moved;
@@ -182,61 +183,61 @@ static void compare(supervisor_kept *k, const double *y, const int *counts)
             }
     for (i = 0; i < PAIRS; i++) {
         int input = supervisor_input_of[i];
-        double span = supervisor_high[input] - supervisor_low[input];
+        real span = supervisor_high[input] - supervisor_low[input];
         j = supervisor_of_input[i];
         for (w = 0; w < WINDOWS; w++) {
             forecast_window *one = &k->window[w];
-            double given = 0.0, unit = 0.0;
-            missed[w] = 0.0;
+            real given = 0, unit = 0;
+            missed[w] = 0;
             if (one->age >= 0) {
                 given = response_of(one->given[0], j, input);
                 unit = response_of(one->unit[0], j, input);
-                missed[w] = counts[j] ? y[j] - forecast(one->state[1], j) : 0.0;
+                missed[w] = counts[j] ? y[j] - forecast(one->state[1], j) : 0;
             }
-            signature[w][LACKS] = signature[w][DIFFERS] = -given;
-            signature[w][GIVES] = span * unit - given;
-            signature[w][HEAT] = span * unit;
+            signature[w][OF_LACKS] = -given;
+            signature[w][OF_HEAT] = span * unit;
+            one->gives[i] += (span * unit - given) * (span * unit - given);
             one->grown[i] += unit / (WINDOWS * SPACING);
-            signature[w][GROWS] = span * one->grown[i];
-            signature[w][LATE] = one->before[i] - given;
-            signature[w][SHIFTS] = one->age < 0 ? 0.0 : 1.0;
+            signature[w][OF_GROWS] = span * one->grown[i];
+            signature[w][OF_LATE] = one->before[i] - given;
+            signature[w][OF_SHIFTS] = one->age < 0 ? 0 : 1;
             one->before[i] = given;
             one->square[i] += missed[w] * missed[w];
-            for (f = 0; f < EXPLANATIONS; f++)
+            for (f = 0; f < SIGNATURES; f++)
                 one->causes[i][f] += signature[w][f] * signature[w][f];
         }
         for (w = 0; w < WINDOWS; w++)
             for (v = 0; v < WINDOWS; v++)
-                for (f = 0; f < EXPLANATIONS; f++)
+                for (f = 0; f < SIGNATURES; f++)
                     k->window[w].cross[v][i][f] += missed[w] * signature[v][f];
     }
 }
 
 /* How often its noise a reading deviates, with its steps */
-static double coarser(const supervisor_kept *k, int j)
+static real coarser(const supervisor_kept *k, int j)
 {
-    return largest(1.0, steps_of(k, j) / sqrt(12.0) / supervisor_noise[j]);
+    return largest(1, steps_of(k, j) / sqrt(REAL(12.0)) / supervisor_noise[j]);
 }
 
 /* By how many degC a reading may vary that stands still */
-static double same_degC(const supervisor_kept *k, int j)
+static real same_degC(const supervisor_kept *k, int j)
 {
     return largest(SAME_STEPS * steps_of(k, j), SAME_NOISE * supervisor_noise[j]);
 }
 
 /* By how many degC a forecast must move, or be missed, before a sensor or heater is judged */
-static double threshold(const supervisor_kept *k, int w, int j)
+static real threshold(const supervisor_kept *k, int w, int j)
 {
     int age = k->window[w].age < 0 ? 0 : k->window[w].age;
-    double least = largest(STEPS_STILL * steps_of(k, j), NOISE_STILL * supervisor_noise[j]);
+    real least = largest(STEPS_STILL * steps_of(k, j), NOISE_STILL * supervisor_noise[j]);
     if (age > WINDOWS * SPACING)
         age = WINDOWS * SPACING;
     return largest(least, NOISE_STILL * supervisor_unsure[age][j] * coarser(k, j));
 }
 
-static double doubt_of(const supervisor_kept *k, int w, int j)
+static real doubt_of(const supervisor_kept *k, int w, int j)
 {
-    double doubt = 0.0;
+    real doubt = 0;
     int i;
     for (i = 0; i < INPUTS; i++)
         doubt += DOUBT * fabs(response_of(k->window[w].unit[0], j, i)) * k->stirred[i];
@@ -244,9 +245,9 @@ static double doubt_of(const supervisor_kept *k, int w, int j)
 }
 
 /* Squares that noise and a wandering forecast leave of what a window missed */
-static double noise_of(const supervisor_kept *k, int w, int j)
+static real noise_of(const supervisor_kept *k, int w, int j)
 {
-    double deviation = 2 * supervisor_noise[j], wander;
+    real deviation = 2 * supervisor_noise[j], wander;
     int age = k->window[w].age < 0 ? 0 : k->window[w].age;
     wander = supervisor_wander[age > WINDOWS * SPACING ? WINDOWS * SPACING : age][j];
     return ((age < 1 ? 1 : age) * (deviation * deviation) + wander) * (coarser(k, j) * coarser(k, j));
@@ -254,27 +255,27 @@ static double noise_of(const supervisor_kept *k, int w, int j)
 
 /* By how many degC both forecasts of a window, from the drift as it was and from its mean, are above y, or below
  * it if negative; 0 if y lies between them */
-static double both_ahead(const forecast_window *one, int j, double y)
+static real both_ahead(const forecast_window *one, int j, real y)
 {
-    double first = forecast(one->state[0], j) - y, second = forecast(one->state[1], j) - y;
-    if (first * second <= 0.0)
-        return 0.0;
+    real first = forecast(one->state[0], j) - y, second = forecast(one->state[1], j) - y;
+    if (first * second <= 0)
+        return 0;
     return fabs(first) < fabs(second) ? first : second;
 }
 
 /* Clears sensors that move as forecast; how far each forecast has moved, and from which readings stand away */
-static void clear_sensors(supervisor_kept *k, const int *counts, double moves[WINDOWS][OUTPUTS],
+static void clear_sensors(supervisor_kept *k, const int *counts, real moves[WINDOWS][OUTPUTS],
                           int still[WINDOWS][OUTPUTS])
 {
     int j, w;
     for (w = 0; w < WINDOWS; w++)
         for (j = 0; j < OUTPUTS; j++) {
             forecast_window *one = &k->window[w];
-            double least = threshold(k, w, j), move = forecast(one->state[0], j) - one->began[j];
+            real least = threshold(k, w, j), move = forecast(one->state[0], j) - one->began[j];
             int large = one->age > 0 && fabs(move) >= least;
-            double share = (k->y[j] - one->first[j]) / (large ? move : 1.0);
+            real share = (k->y[j] - one->first[j]) / (large ? move : 1);
             if (large && share >= FOLLOWS_LEAST && share <= FOLLOWS_MOST && k->bad[j] == 0)
-                k->cleared_s[j] = k->clock_s[1];
+                k->cleared[j] = k->now;
             one->away[j] = large ? one->away[j] + 1 : 0;
             moves[w][j] = both_ahead(one, j, one->began[j]);
             move = fabs(moves[w][j]);
@@ -294,25 +295,28 @@ static int unmoved(const supervisor_kept *k, int w, int j)
 
 /* What an explanation leaves of the squares that a window missed, and its amount; no explanation begins before
  * the window does */
-static double left_of(const supervisor_kept *k, int w, int v, int i, int f, double *amount)
+static real left_of(const supervisor_kept *k, int w, int v, int i, int f, real *amount)
 {
+    static const int of[EXPLANATIONS] = {OF_LACKS, OF_LACKS, OF_HEAT, OF_GROWS, OF_LATE, OF_LACKS, OF_SHIFTS};
     const forecast_window *one = &k->window[w], *other = &k->window[v];
-    double cross = one->cross[v][i][f], square = other->causes[i][f];
-    *amount = cut(cross / largest(square, 1e-12), explanation_least[f], explanation_most[f]);
+    real cross = one->cross[v][i][of[f]], square = f == GIVES ? other->gives[i] : other->causes[i][of[f]];
+    if (f == GIVES)
+        cross += one->cross[v][i][OF_HEAT];
+    *amount = cut(cross / largest(square, REAL(1e-12)), explanation_least[f], explanation_most[f]);
     if (other->age > one->age || other->age < REPEATED)
-        return 1e300;
+        return INFINITY;
     return one->square[i] - 2 * *amount * cross + *amount * *amount * square;
 }
 
-static double floor_of(const supervisor_kept *k, int w, int i)
+static real floor_of(const supervisor_kept *k, int w, int i)
 {
-    return noise_of(k, w, supervisor_of_input[i]) + MISFIT * MISFIT * k->window[w].square[i] + 1e-12;
+    return noise_of(k, w, supervisor_of_input[i]) + MISFIT * MISFIT * k->window[w].square[i] + REAL(1e-12);
 }
 
 /* The least that anything that is no fault leaves */
-static double honest_of(const supervisor_kept *k, int w, int i)
+static real honest_of(const supervisor_kept *k, int w, int i)
 {
-    double amount, at_least = floor_of(k, w, i), best = largest(k->window[w].square[i], at_least);
+    real amount, at_least = floor_of(k, w, i), best = largest(k->window[w].square[i], at_least);
     int v, f;
     for (v = 0; v < WINDOWS; v++)
         for (f = HEAT; f < EXPLANATIONS; f++)
@@ -321,20 +325,20 @@ static double honest_of(const supervisor_kept *k, int w, int i)
 }
 
 /* An output stands still, or shows noise alone, while its forecast moves: its sensor, or its heater */
-static void say_still(supervisor_kept *k, int j, double moves_degC)
+static void say_still(supervisor_kept *k, int j, real moves_degC)
 {
     say(k, k->repeats[j] >= STILL_AFTER / 2 ? SENSOR_STILL : SENSOR_DEAF, j, moves_degC);
 }
 
 /* Says which sensors stand still, as long as nothing that is no fault explains that as well */
-static void judge_sensors(supervisor_kept *k, double moves[WINDOWS][OUTPUTS], int still[WINDOWS][OUTPUTS])
+static void judge_sensors(supervisor_kept *k, real moves[WINDOWS][OUTPUTS], int still[WINDOWS][OUTPUTS])
 {
     int i, j, w;
     for (j = 0; j < OUTPUTS; j++) {
         int at = -1;
         for (w = 0; w < WINDOWS; w++) {
             const forecast_window *one = &k->window[w];
-            double age = one->age < 1 ? 1 : one->age, honest = INFINITY, square = 0.0, steady, at_least;
+            real age = one->age < 1 ? 1 : one->age, honest = INFINITY, square = 0, steady, at_least;
             if (!still[w][j] || !unmoved(k, w, j)
                 || fabs(moves[w][j]) < SAME_STEPS * (one->most[j] - one->least[j]))
                 continue;
@@ -344,7 +348,7 @@ static void judge_sensors(supervisor_kept *k, double moves[WINDOWS][OUTPUTS], in
                     square = largest(square, one->square[i]);
                 }
             steady = one->total[1][j] - one->total[0][j] * one->total[0][j] / age;
-            at_least = noise_of(k, w, j) + MISFIT * MISFIT * square + 1e-12;
+            at_least = noise_of(k, w, j) + MISFIT * MISFIT * square + REAL(1e-12);
             /* what moves a heater is a reading that moved: nothing honest keeps one equal meanwhile,
                unless its steps hide what the law makes up for */
             if (((k->repeats[j] >= age && steps_of(k, j) <= supervisor_noise[j])
@@ -358,15 +362,15 @@ static void judge_sensors(supervisor_kept *k, double moves[WINDOWS][OUTPUTS], in
 }
 
 /* Says whose heat is missing for long, as long as its output does not rise */
-static void judge_heat(supervisor_kept *k, const double *y, const int *counts)
+static void judge_heat(supervisor_kept *k, const real *y, const int *counts)
 {
     int i, j, w, oldest = 0;
     for (w = 1; w < WINDOWS; w++)
         if (k->window[w].age > k->window[oldest].age)
             oldest = w;
     for (i = 0; i < INPUTS; i++) {
-        double lost = -dot(supervisor_heat[i], k->x + WATCH - OUTPUTS, OUTPUTS), told;
-        double least = k->asked[i] >= supervisor_high[i] ? AT_LIMIT : MISSING;
+        real lost = -dot(supervisor_heat[i], k->x + WATCH - OUTPUTS, OUTPUTS), told;
+        real least = k->asked[i] >= supervisor_high[i] ? AT_LIMIT : MISSING;
         j = supervisor_of_input[i];
         if (counts[j] && k->window[oldest].age >= (WINDOWS - 1) * SPACING
             && y[j] - k->window[oldest].first[j] <= same_degC(k, j) && lost >= least)
@@ -380,26 +384,26 @@ static void judge_heat(supervisor_kept *k, const double *y, const int *counts)
 }
 
 /* Says which heater heats otherwise than it was told: the one that explains most */
-static void judge_heaters(supervisor_kept *k, const double *y, const int *counts,
-                          double moves[WINDOWS][OUTPUTS])
+static void judge_heaters(supervisor_kept *k, const real *y, const int *counts,
+                          real moves[WINDOWS][OUTPUTS])
 {
-    double share[WINDOWS][INPUTS];
+    real share[WINDOWS][INPUTS];
     int clear[WINDOWS][INPUTS], gives[WINDOWS][INPUTS], shows[2][INPUTS] = {{0}};
     int i, w, v, f, at = -1, of = 0;
     for (i = 0; i < INPUTS; i++)
         for (w = 0; w < WINDOWS; w++) {
             const forecast_window *one = &k->window[w];
             int j = supervisor_of_input[i];
-            double at_least = floor_of(k, w, i), best = 1e300, amount;
-            double needed = largest(threshold(k, w, j), doubt_of(k, w, j));
+            real at_least = floor_of(k, w, i), best = INFINITY, amount;
+            real needed = largest(threshold(k, w, j), doubt_of(k, w, j));
             clear[w][i] = gives[w][i] = 0;
-            share[w][i] = 0.0;
+            share[w][i] = 0;
             if (one->age < FIT_AFTER || !counts[j]
                 || fabs(y[j] - forecast(one->state[1], j)) < needed)
                 continue;
             for (f = LACKS; f <= GIVES; f++)
                 for (v = 0; v < WINDOWS; v++) {
-                    double left = largest(left_of(k, w, v, i, f, &amount), at_least);
+                    real left = largest(left_of(k, w, v, i, f, &amount), at_least);
                     if (left < best) {
                         best = left;
                         share[w][i] = amount;
@@ -409,7 +413,7 @@ static void judge_heaters(supervisor_kept *k, const double *y, const int *counts
             /* a heater that is stuck on heats, and by more than the drift of either forecast */
             if (gives[w][i] && (y[j] - one->least[j] <= same_degC(k, j) || -both_ahead(one, j, y[j]) < needed))
                 continue;
-            clear[w][i] = best < 1e300 && best <= 2 * at_least && one->age * log(honest_of(k, w, i) / best) >= CLEARER;
+            clear[w][i] = best < INFINITY && best <= 2 * at_least && one->age * log(honest_of(k, w, i) / best) >= CLEARER;
             if (clear[w][i])
                 shows[!gives[w][i]][i] = 1;
         }
@@ -436,14 +440,14 @@ static void judge_heaters(supervisor_kept *k, const double *y, const int *counts
 static int tried_again(supervisor_kept *k, int kind, int signal, int gone)
 {
     int j = kind == HEATER_STUCK_ON || kind == HEATER_WEAK ? supervisor_of_input[signal] : signal;
-    int rested = k->clock_s[1] - k->returned_s[j] > 3600.0;
+    int rested = k->now - k->returned[j] > SECONDS(REAL(3600.0));
     int heated = kind == HEATER_WEAK && k->amount[kind][signal] >= 0;
-    int over = heated ? gone : k->cleared_s[j] > k->last[kind][signal];
+    int over = heated ? gone : k->cleared[j] > k->last[kind][signal];
     if (!over || (!rested && k->returns[j] >= RETURNS))
         return 0;
     k->returns[j] = rested ? 1 : k->returns[j] + 1;
-    k->returned_s[j] = k->clock_s[1];
-    k->cleared_s[j] = -INFINITY; /* what cooled as forecast may yet be out of place */
+    k->returned[j] = k->now;
+    k->cleared[j] = NEVER; /* what cooled as forecast may yet be out of place */
     return 1;
 }
 
@@ -455,10 +459,10 @@ static void forget(supervisor_kept *k)
         for (signal = 0; signal < SIGNALS; signal++) {
             int counted = kind == SENSOR_STILL || kind == SENSOR_DEAF || kind == HEATER_STUCK_ON
                           || kind == HEATER_WEAK;
-            int gone = k->clock_s[1] - k->last[kind][signal] > BACK_S;
+            int gone = k->now - k->last[kind][signal] > SECONDS(BACK_S);
             if (k->since[kind][signal] < 0 || !(counted ? tried_again(k, kind, signal, gone) : gone))
                 continue;
-            k->since[kind][signal] = k->last[kind][signal] = -1.0;
+            k->since[kind][signal] = k->last[kind][signal] = -1;
             k->active--;
             any = 1;
         }
@@ -466,9 +470,9 @@ static void forget(supervisor_kept *k)
         end_windows(k);
 }
 
-static void follow_law(supervisor_kept *k, const double *u, const double *y, const int *counts)
+static void follow_law(supervisor_kept *k, const real *u, const real *y, const int *counts)
 {
-    double moves[WINDOWS][OUTPUTS];
+    real moves[WINDOWS][OUTPUTS];
     int still[WINDOWS][OUTPUTS], i, j;
     for (j = 0; j < OUTPUTS; j++)
         k->slow[j] += SLOWLY * (k->x[WATCH - OUTPUTS + j] - k->slow[j]);
@@ -486,11 +490,11 @@ static void follow_law(supervisor_kept *k, const double *u, const double *y, con
 /* The observer at the last readings, as if inputs had reached them */
 static void begin_anew(supervisor_kept *k)
 {
-    double from[OUTPUTS];
+    real from[OUTPUTS];
     int j;
     for (j = 0; j < OUTPUTS; j++) {
         from[j] = isfinite(k->y[j]) ? k->y[j] : supervisor_d[j];
-        k->slow[j] = 0.0;
+        k->slow[j] = 0;
     }
     memcpy(k->x, supervisor_start_0, sizeof k->x);
     add_product(k->x, supervisor_start[0], from, WATCH, OUTPUTS);
@@ -499,9 +503,9 @@ static void begin_anew(supervisor_kept *k)
 
 /* One sample of outputs y, inputs `applied` since the one before, none of `samples` in manual; `filled` is y
  * with what does not count as forecast */
-static void follow(supervisor_kept *k, const double *y, const double *applied, int samples, double *filled)
+static void follow(supervisor_kept *k, const real *y, const real *applied, int samples, real *filled)
 {
-    double u[INPUTS];
+    real u[INPUTS];
     int counts[OUTPUTS], begins = !k->samples, i, j, step;
     for (j = 0; j < OUTPUTS; j++)
         begins |= isnan(k->y[j]) && isfinite(y[j]) && y[j] >= supervisor_coldest[j] && y[j] <= supervisor_hottest[j];
@@ -530,12 +534,12 @@ static void follow(supervisor_kept *k, const double *y, const double *applied, i
         memcpy(k->slow, k->x + WATCH - OUTPUTS, sizeof k->slow);
         for (i = 0; i < INPUTS; i++) {
             k->usual[i] = k->samples < 2 ? u[i] : k->usual[i] + SLOWLY * (u[i] - k->usual[i]);
-            k->stirred[i] = 0.0;
+            k->stirred[i] = 0;
         }
     } else
         follow_law(k, u, filled, counts);
     for (j = 0; j < OUTPUTS; j++)
-        k->e[j] = counts[j] ? filled[j] - k->expected[j] : 0.0;
+        k->e[j] = counts[j] ? filled[j] - k->expected[j] : 0;
     forget(k);
     if (samples && k->samples % SPACING == 0)
         begin_window(k, k->samples / SPACING % WINDOWS);
@@ -551,7 +555,7 @@ static int find_mode(supervisor_kept *k)
             if (k->since[kind][signal] < 0)
                 continue;
             if (kind == HEATER_WEAK && k->amount[kind][signal] >= 0
-                && k->last[kind][signal] - k->cleared_s[supervisor_of_input[signal]] > CLEARED_S)
+                && k->last[kind][signal] - k->cleared[supervisor_of_input[signal]] > SECONDS(CLEARED_S))
                 k->amount[kind][signal] = -k->amount[kind][signal];
             if (kind < HEATER_WEAK || (kind == HEATER_WEAK && k->amount[kind][signal] < 0))
                 mode = MODE_OFF;

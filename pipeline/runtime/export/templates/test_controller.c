@@ -8,9 +8,15 @@
 #include <string.h>
 #include <time.h>
 
+/* test_plant.h: the machine is simulated in double precision by either build */
 #include "test_plant.h"
 
-#define TOLERANCE 1e-9 /* of each input's range */
+/* Of each input's range. A forecast of 250 degC in single precision is sure to 3e-5 degC. If an output is at a
+ * limit, the governor divides that by the effect of a percent. A law that swings there magnifies it: golden.csv
+ * has no episode with a gain of more than 1000 ranges per degC. One row in a hundred may differ by so much. */
+#define TOLERANCE BY_PRECISION(1e-9, 1e-3)
+#define MAGNIFIED BY_PRECISION(1e-9, 3e-2)
+#define MAY_DIFFER BY_PRECISION(0.0, 1e-2)
 #define WHOLE 4
 #define NUMBERS (1 + 3 * OUTPUTS + 4 * INPUTS + DISTURBANCES)
 #define LINE ((WHOLE + NUMBERS + STATES) * 32)
@@ -61,6 +67,24 @@ static void heat(double *x, const double *applied, const double *disturbances)
     memcpy(x, after, sizeof after);
 }
 
+static const real *as_real(real *to, const double *from, int count)
+{
+    int i;
+    for (i = 0; i < count; i++)
+        to[i] = (real)from[i];
+    return to;
+}
+
+/* The machine's clock; one of milliseconds wraps round on the way */
+static beadline_clock clock_at(double t_s)
+{
+#ifdef BEADLINE_SINGLE
+    return (beadline_clock)(uint64_t)(1e3 * t_s + 4294900000.5);
+#else
+    return t_s;
+#endif
+}
+
 /* What the machine says of itself; anything else is refused */
 static int refuses_others(void)
 {
@@ -89,7 +113,7 @@ static int causes_of(const beadline_decision *d)
 }
 
 /* What is done before a step; the other copy is spoilt, so that nothing of it can be read */
-static void before(int what, const double *y)
+static void before(int what, const real *y)
 {
     if (what == HAND_OVER)
         beadline_hand_over(&controller, y);
@@ -114,6 +138,7 @@ static void play(const double *row, const double *start, played *p)
     const double *manual = reading + OUTPUTS, *share = manual + INPUTS, *extra = share + INPUTS;
     const double *expected = extra + INPUTS, *disturbances = expected + INPUTS;
     double y[OUTPUTS], applied[INPUTS];
+    real told[DISTURBANCES + 1], seen[OUTPUTS], asked[OUTPUTS], acted[INPUTS];
     int i, j, what = (int)row[0], differs = 0, wrong_mode, wrong_cause;
     clock_t began;
     if (what == BEGIN) {
@@ -131,19 +156,24 @@ static void play(const double *row, const double *start, played *p)
             y[j] = reading[j] > 0 ? NAN : p->y[j];
     }
     memcpy(p->y, y, sizeof y);
+    as_real(told, disturbances, DISTURBANCES);
+    as_real(seen, y, OUTPUTS);
+    as_real(asked, r, OUTPUTS);
     if (what == WATCH_ONLY || what == BEGIN) {
-        beadline_tell(&controller, disturbances);
+        beadline_tell(&controller, told);
         memcpy(p->u, manual, sizeof p->u);
-        beadline_watch(&controller, p->u, y, r);
+        beadline_watch(&controller, as_real(acted, p->u, INPUTS), seen, asked);
     } else {
-        beadline_tell(&controller, disturbances);
-        before(what, y);
-        beadline_tell(&controller, disturbances);
+        beadline_tell(&controller, told);
+        before(what, seen);
+        beadline_tell(&controller, told);
         began = clock();
-        beadline_step(&controller, y, r, number[0], row[1] > 0 && what != HAND_OVER ? applied : NULL,
-                      &decision);
+        as_real(acted, applied, INPUTS);
+        beadline_step(&controller, seen, asked, clock_at(number[0]),
+                      row[1] > 0 && what != HAND_OVER ? acted : NULL, &decision);
         p->seconds += (double)(clock() - began) / CLOCKS_PER_SEC;
-        memcpy(p->u, decision.u, sizeof p->u);
+        for (i = 0; i < INPUTS; i++)
+            p->u[i] = (double)decision.u[i];
         wrong_mode = decision.mode != (int)row[2];
         wrong_cause = (decision.mode == MODE_LAW ? 0 : causes_of(&decision)) != (int)row[3];
         p->modes += wrong_mode;
@@ -193,5 +223,6 @@ int main(int count, char **arguments)
     printf("\"rows_differ\": %ld, \"first_differs\": %ld, ", p.differing, p.first);
     printf("\"step_us\": %.3f, \"state_bytes\": %lu}\n", p.rows ? 1e6 * p.seconds / (double)p.rows : 0.0,
            (unsigned long)sizeof controller);
-    return !(p.rows > 0 && p.largest <= TOLERANCE && p.modes == 0 && p.causes == 0);
+    return !(p.rows > 0 && p.largest <= MAGNIFIED && p.modes == 0 && p.causes == 0
+             && (double)p.differing <= MAY_DIFFER * (double)p.rows);
 }
