@@ -101,10 +101,13 @@ class Adc:
     def setup_minmax(self, *_, minval=0.0, maxval=1.0, **__):
         self.range = minval, maxval
 
-    setup_adc_sample = setup_minmax
+    def setup_adc_sample(self, report_s, *_, **limits):
+        self.setup_minmax(**limits)
 
-    def setup_adc_callback(self, report_s, callback=None):
-        self.report_s, self.callback = report_s, callback
+    def setup_adc_callback(self, *given):
+        *report_s, self.callback = given
+        # Klipper of 2026 is given a list of reports
+        self.report_s, self.lists = (report_s or [0.3])[0], not report_s
         reactor = self.mcu.printer.get_reactor()
         reactor.register_timer(self._report, reactor.monotonic() + 0.7)
 
@@ -118,7 +121,7 @@ class Adc:
         self.last = value, now_s
         if not low <= value <= high:
             self.mcu.printer.invoke_shutdown("ADC out of range")
-        self.callback(now_s, value)
+        self.callback(*([[(now_s, value)]] if self.lists else [now_s, value]))
         return now_s + self.report_s
 
 
@@ -141,6 +144,12 @@ class Mcu:
 
     def estimated_print_time(self, eventtime):
         return eventtime
+
+    def seconds_to_clock(self, seconds):
+        return round(1e6 * seconds)
+
+    def calibrate_clock(self, *_):
+        return 0.0, 1e6
 
     def get_printer(self):
         return self.printer
@@ -185,8 +194,10 @@ def virtual_reactor():
 
         def _dispatch_loop(self):
             self._g_dispatch = greenlet.getcurrent()
+            # `busy`, which Klipper of 2026 no longer asks for
+            busy = [True] * (self._check_timers.__code__.co_argcount - 2)
             while self._process:
-                self._check_timers(self.now_s, True)
+                self._check_timers(self.now_s, *busy)
                 while not self._async_queue.empty():
                     self._got_pipe_signal(self.now_s)
                 self.now_s = min(max(self.now_s + 1e-5, self._next_timer), self.now_s + 1.0)
@@ -230,6 +241,7 @@ class Run:
         module = "printer" if SCENARIO["kalico"] else "klippy"
         self.printer = klippy(module).Printer(self.reactor, None, arguments)
         self.printer.lookup_object("gcode").register_output_handler(self.said.append)
+        self.printer.register_event_handler("klippy:shutdown", self._shut_down)
         self.reactor.register_callback(self._traced)
         self.reactor.register_callback(self._play)
         ended = self.printer.run()
@@ -237,6 +249,11 @@ class Run:
         self.machine.duty = self.machine.fan = self.machine.feed_W = 0.0
         self.reactor.finalize()
         return ended
+
+    def _shut_down(self):
+        """Steps that go on after a shutdown take no time; those that a crash cut off never end."""
+        ends_s = self.reactor.monotonic() + 10.0
+        self.reactor.register_callback(lambda eventtime: self.printer.request_exit("exit"), ends_s)
 
     def _add_mcu(self, config):
         printer = config.get_printer()

@@ -192,6 +192,6 @@ def test_a_fan_under_pi_with_feed_forward_beside_pid_calibrate(firmware, tmp_pat
             error = y[last_s < 300] - TARGET_DEGC
             overshoot = y[(last_s > 300) & (last_s < 600)].max() - TARGET_DEGC
             figures[i, j] = -error.min(), np.sqrt((error**2).mean()), overshoot
-    dip, rms, overshoot = (figures[:, 0] / figures[:, 1]).T
-    # a PID with derivative reacts faster to what 20 % is left of; its overshoot is the price
-    assert dip.max() < 1.7 and rms.max() < 1.75 and overshoot.max() < 0.5, figures.round(2)
+    dip, rms = (figures[:, 0, :2] / figures[:, 1, :2]).T
+    # a PID with derivative reacts faster to the fifth that is left
+    assert dip.max() < 1.7 and rms.max() < 1.75 and figures[:, 0, 2].max() < 1.0, figures.round(2).tolist()
