@@ -8,7 +8,7 @@ from tests.klipper import trees
 from tests.klipper.machines import FILAMENT_J_PER_MM, HOT_ENDS, TARGET_DEGC, exported
 from tests.runtime.deployed_machines import passed
 
-pytestmark = [pytest.mark.klipper, pytest.mark.xdist_group("klipper")]
+pytestmark = pytest.mark.klipper
 HEATED = [["gcode", f"M104 S{TARGET_DEGC:g}"], ["wait", 300]]
 OBJECTS = ["extruder", "beadline"]
 OWN_PID = [22.2, 1.08, 114.0]  # of trees.PRINTER
