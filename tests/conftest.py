@@ -166,10 +166,10 @@ def beadline(tmp_path, monkeypatch, capfd):
 
 
 def pytest_collection_modifyitems(config, items):
-    """Tests marked slow or full run with -m slow or -m full, or when they are named by ::."""
+    """Tests marked slow, full or klipper run with -m and that mark, or when they are named by ::."""
     if config.option.markexpr or any("::" in argument for argument in config.args):
         return
-    longer = [item for item in items if item.get_closest_marker("slow") or item.get_closest_marker("full")]
+    longer = [item for item in items if any(map(item.get_closest_marker, ("slow", "full", "klipper")))]
     if longer:
         config.hook.pytest_deselected(items=longer)
         items[:] = [item for item in items if item not in longer]

@@ -26,6 +26,7 @@ import scipy.optimize
 from pipeline.runtime.certificate import Certificate, sha256
 from pipeline.runtime.export import python
 from pipeline.runtime.machine import Exported, check, check_certificate
+from pipeline.runtime.signals import PERCENT, Signal
 from pipeline.temperature.controllers import baseline
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
 
@@ -73,6 +74,7 @@ def settings(
         "[beadline]",
         f"heater: {section}",
         f"plant: {exported.plant_sha256}",
+        *(_disturbance_line(one, section) for one in exported.machine.disturbances),
         *(["# rehearsal: True  # the plant was simulated: never on a printer"] if exported.simulated else []),
         "",
         "# For comparison only, PI by SIMC from the same model. [beadline] does not need it:",
@@ -83,6 +85,12 @@ def settings(
     if heater_power_W is not None:
         lines += _mpc_lines(mpc(exported.model, heater_power_W), heater_power_W, section)
     return "\n".join(lines) + "\n"
+
+
+def _disturbance_line(signal: Signal, section: str) -> str:
+    """What measures a disturbance, from its unit; an owner changes it to another fan or extruder, or none."""
+    sources = {PERCENT: "fan", "mm/s": section if section == "extruder" else "none"}
+    return f"disturbance_{signal.name}: {sources.get(signal.unit, 'none')}  # in {signal.unit}"
 
 
 def module(exported: Exported, certificate: Certificate) -> dict[str, str]:
