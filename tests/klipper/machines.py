@@ -54,8 +54,7 @@ def model(parts: Parts) -> Plant:
 def exported(parts: Parts, *, told: bool = True) -> Exported:
     """PI by SIMC; `told` part fan and filament."""
     made, limits = model(parts), limits_of(1)
-    law = baseline.controller(made, (limits.low, limits.high), horizon=300)
-    law = law.design(np.ones(1), np.ones(1), 0.0)
+    law = baseline.pi_law(baseline.pairing(made, limits.low, limits.high, horizon=300), inputs=1)
     blown = parts.convection_W * parts.fan * (TARGET_DEGC - parts.room_degC) ** 1.25
     gain = SHORT * np.array([[blown, 100 * FILAMENT_J_PER_MM]]) / parts.power_W
     disturbances = (Signal("part_fan", "percent", -np.inf, np.inf), Signal("feed", "mm/s", -np.inf, np.inf))
