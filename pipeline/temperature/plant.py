@@ -172,15 +172,17 @@ def controllability(plant: Plant) -> tuple[int, str]:
 
 def bandwidth_rad_s(plant: Plant) -> float | None:
     """The frequency in rad/s above which the largest singular value of y = G u is below 0.707 of its steady
-    value; None if it is nowhere below, up to half the sampling rate."""
+    value; None if it is nowhere below, up to half the sampling rate, or the plant never comes to rest."""
     import control  # takes a second to load
 
     T = plant.sample_time_s
+    if np.abs(np.linalg.eigvals(plant.A)).max() >= 1:
+        return None
     system = control.ss(plant.A, plant.B, plant.C, plant.D, T)
     omega = np.concatenate([[0.0], np.geomspace(1e-5, 1.0, 600) * np.pi / T])
     largest = np.linalg.svd(system(np.exp(1j * omega * T), squeeze=False).transpose(2, 0, 1))[1][:, 0]
     below = np.flatnonzero(largest < np.sqrt(0.5) * largest[0])
-    return float(omega[below[0]]) if len(below) and np.isfinite(largest[0]) else None
+    return float(omega[below[0]]) if len(below) else None
 
 
 def strictly_proper(plant: Plant) -> Plant:

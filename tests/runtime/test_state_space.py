@@ -70,3 +70,11 @@ def test_both_files_hold_the_same_and_are_the_same_each_time():
     assert told["systems"]["plant"]["outputs"] == ["sensor_1", "sensor_2"]
     assert read["Ts"] == told["sample_time_s"] == 1.0
     assert state_space.files(of) == files and b"Created on" not in files["systems.mat"]
+
+
+def test_names_with_dots_are_written_with_underscores():
+    of = exported()
+    inputs = tuple(one._replace(name=f"extruder.pwm{k}") for k, one in enumerate(of.machine.inputs))
+    files = state_space.files(of._replace(machine=of.machine._replace(inputs=inputs)))
+    plant = json.loads(files["systems.json"])["systems"]["plant"]
+    assert plant["inputs"] == ["extruder_pwm0", "extruder_pwm1"]

@@ -197,3 +197,5 @@ def test_the_bandwidth_of_a_first_order_plant_is_one_over_its_time_constant():
     both = plant(np.diag([a, a**4]), np.diag([1 - a, 2 * (1 - a**4)]), np.eye(2))
     assert bandwidth_rad_s(both) == pytest.approx(4 / 200.0, rel=0.03)  # the stronger one is the faster
     assert bandwidth_rad_s(plant([[0.0]], [[1.0]], [[1.0]])) is None
+    for restless in (1.0, 1.01):
+        assert bandwidth_rad_s(plant([[restless]], [[1.0]], [[1.0]])) is None
