@@ -20,6 +20,7 @@ from pipeline.store.params import Section
 from pipeline.temperature import tables
 from pipeline.temperature.settings import Plant
 from stages.evaluate_temperature import EvaluationInputs, load_problem, wire
+from stages.tune_weights import read_told
 
 if TYPE_CHECKING:
     import numpy as np
@@ -128,7 +129,8 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     acting, y, recordings = certify.cut_at_missing(*pieces)
     u = [piece[:, : len(declared.inputs)] for piece in acting]
     m = len(declared.inputs)
-    told = feed_forward.learn(acting, y, m)
+    # what the controllers are given, not what these pieces would say
+    told = read_told()
     undisturbed = feed_forward.at_mean(told, acting, y, m)
     parts = certify.split_newest(u, undisturbed, recordings)
     record = EvidenceRecord(machine.inputs, machine.outputs, machine.sample_time_s, *parts)

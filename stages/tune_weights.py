@@ -15,6 +15,7 @@ from pipeline.temperature import tables
 from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights, recorded
 
 if TYPE_CHECKING:
+    from pipeline.temperature.controllers.feed_forward import Told
     from pipeline.temperature.controllers.printer_pid import HeaterPid
     from pipeline.temperature.controllers.problem import DesignProblem
     from pipeline.temperature.test_set.panel import CaseConditions
@@ -75,12 +76,20 @@ def heater_pids(stored: Mapping[str, Any], machine: Plant) -> tuple[HeaterPid, .
     )
 
 
+def read_told() -> Told | None:
+    """What measured disturbances do, as learn_kernel found it; None if it found nothing."""
+    from pipeline.temperature.controllers import feed_forward
+
+    if not artifacts.exists(TOLD):
+        return None
+    return feed_forward.restored(artifacts.read_arrays(TOLD, "feed_forward", 1))
+
+
 def load_design_problem(
     machine: Plant, panel: Panel, tracking: Tracking, tuning: TuneWeights, *, simulated: bool
 ) -> tuple[CaseConditions, DesignProblem]:
     """What controllers are tuned and judged on, and what they are designed from. A simulated machine is the
     study's; otherwise cases follow from the record of ingest."""
-    from pipeline.temperature.controllers import feed_forward
     from pipeline.temperature.identification.segments import segments, without_gaps
     from pipeline.temperature.plant import baam
     from pipeline.temperature.test_set.panel import conditions, design_problem, from_declaration, from_record
@@ -92,9 +101,7 @@ def load_design_problem(
         "datasets/ingest/printer_pid.json",
         machine,
     )
-    truth, family, told = None, models["family"], None
-    if artifacts.exists(TOLD):
-        told = feed_forward.restored(artifacts.read_arrays(TOLD, "feed_forward", 1))
+    truth, family, told = None, models["family"], read_told()
     if simulated:
         truth = baam()._replace(sample_time_s=machine.sample_time_s)
         rehearsal = from_declaration(panel, machine, truth, family)

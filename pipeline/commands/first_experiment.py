@@ -54,6 +54,8 @@ def heaters(machine: Plant, mapping: Mapping[str, Any]) -> dict[str, Output]:
 def targets(of: Mapping[str, Output], minutes: float) -> Targets:
     """Targets for `minutes`. The hottest is ABOVE_DEGC above the reference, and BELOW_LIMIT_DEGC below the
     declared limit at most. Raises ValueError if an output has no limit, or one below its reference."""
+    if not 10 <= minutes <= 600:
+        raise ValueError(f"--minutes is {minutes:g}, expected 10 to 600; an hour is enough for a hot end")
     spans = {}
     for name, output in of.items():
         high = _number(output.high)
@@ -85,6 +87,8 @@ def targets(of: Mapping[str, Output], minutes: float) -> Targets:
 def gcode(plan: Targets, ramp_degC_per_min: float) -> str:
     """The experiment as G-code for Klipper and Kalico. With a ramp above 0 a target goes there in steps of
     1 °C."""
+    if not 0 <= ramp_degC_per_min <= 1000:
+        raise ValueError(f"--ramp is {ramp_degC_per_min:g} °C a minute, expected 0 (none) to 1000")
     lines, before = [f"; {summary(plan)}"], dict.fromkeys(plan.steps[0][0], ROOM_DEGC)
     for targets_degC, fan, hold_s in plan.steps:
         lines.append(f"M106 S{round(2.55 * fan)}" if fan else "M107")

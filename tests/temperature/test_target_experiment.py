@@ -48,6 +48,15 @@ def test_the_hottest_target_stays_below_the_limit():
         first.targets({"extruder": tight.model_copy(update={"high": 190})}, 60)
 
 
+def test_a_length_or_ramp_that_is_none_is_refused():
+    for minutes in (-5.0, 0.0, float("nan"), 1e6):
+        with pytest.raises(ValueError, match="--minutes is .*expected 10 to 600"):
+            first.targets(HOT_END, minutes)
+    for ramp in (-1.0, float("nan")):
+        with pytest.raises(ValueError, match="--ramp is .*expected 0"):
+            first.gcode(first.targets(HOT_END, 60), ramp)
+
+
 def test_a_ramp_is_kept():
     rows = played(first.gcode(first.targets(HOT_END, 60), 30.0))
     targets = np.array([25.0, *[target for _, target, _ in rows]])
