@@ -64,6 +64,30 @@ def test_a_disturbance_that_does_nothing_is_not_fed_forward():
     assert forward.gain[0, 0] > 0.1 and forward.gain[0, 1] == 0.0
 
 
+@pytest.mark.parametrize(
+    "useless",
+    [
+        lambda acting: 0 * acting[:, :1] + 50.0,
+        lambda acting: 2.0 * acting[:, :1] + 3.0,
+        lambda acting: 0 * acting[:, :1],
+    ],
+    ids=["always 50", "the duty again", "always 0"],
+)
+def test_what_stands_still_or_repeats_the_heater_is_neither_taken_off_nor_fed_forward(useless):
+    acting, y, _ = record()
+    alone = feed_forward.learn([acting], [y], 1)
+    told = feed_forward.learn([np.column_stack([acting, useless(acting)])], [y], 1)
+    assert told.gain[0, 0] == pytest.approx(alone.gain[0, 0]) and told.forward.gain[0, 1] == 0.0
+    assert not told.effect.B[:, 1].any() and not told.effect.D[:, 1].any()
+    assert feed_forward.learn([np.column_stack([acting[:, :1], useless(acting)])], [y], 1) is None
+
+
+def test_a_short_piece_of_the_record_does_not_shorten_the_window():
+    acting, y, _ = record()
+    pieces = feed_forward.learn([acting, acting[:3]], [y, y[:3]], 1)
+    assert np.array_equal(pieces.effect.A, feed_forward.learn([acting], [y], 1).effect.A)
+
+
 def test_none_is_learned_without_disturbances_and_from_a_short_record():
     acting, y, _ = record()
     assert feed_forward.learn([acting[:, :1]], [y], 1) is None

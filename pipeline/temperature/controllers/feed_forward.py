@@ -21,6 +21,7 @@ from pipeline.temperature.plant import Plant, plant, simulate
 LONGEST, ENOUGH = 24, 20  # samples of the window, and for each of its columns
 BLOCKS = 8  # left out one by one: how sure a gain is
 DETERMINED = 2.0  # deviations from zero of a gain that is fed forward
+OWN = 0.005  # share of a disturbance's variance that inputs and other disturbances do not explain
 
 
 class Told(NamedTuple):
@@ -41,24 +42,43 @@ class Told(NamedTuple):
 
 
 def learn(acting: Sequence[np.ndarray], y: Sequence[np.ndarray], inputs: int) -> Told | None:
-    """Of segments y (T, p) and `acting` (T, m + q), the disturbances after the `inputs` m. None if there are
-    none, the record is too short for a window model, or that is unstable."""
-    q, columns = acting[0].shape[1] - inputs, acting[0].shape[1] + y[0].shape[1]
-    longest = min(LONGEST, sum(map(len, y)) // (ENOUGH * columns), min(map(len, y)) - 1)
-    if q == 0 or longest < 1:
+    """Of segments y (T, p) and `acting` (T, m + q), the disturbances after the `inputs` m. One that stands
+    still, or only repeats other signals, has no effect and no gain. None if all do, the record is too short
+    for a window model, or that is unstable."""
+    whole = np.vstack(acting)
+    q, columns = whole.shape[1] - inputs, whole.shape[1] + y[0].shape[1]
+    tells = [k for k in range(q) if _own_share(whole, inputs + k) >= OWN]
+    longest = min(LONGEST, len(whole) // (ENOUGH * columns), max(map(len, y)) - 1)
+    if not tells or longest < 1:
         return None
+    kept = [*range(inputs), *(inputs + k for k in tells)]
+    acting = [piece[:, kept] for piece in acting]
     model = _stable(acting, y, longest)
     if model is None:
         return None
-    effect = model._replace(B=model.B[:, inputs:], D=model.D[:, inputs:], b=0 * model.b, d=0 * model.d)
-    d = np.vstack(acting)[:, inputs:]
+    B, D = np.zeros((model.n, q)), np.zeros((model.p, q))
+    B[:, tells], D[:, tells] = model.B[:, inputs:], model.D[:, inputs:]
+    effect = model._replace(B=B, D=D, b=0 * model.b, d=0 * model.d)
     left = [_stable(*_without(acting, y, k), longest) for k in range(BLOCKS)]
     gains = np.array([_forward(one, inputs) for one in left if one is not None])
-    gain = _forward(model, inputs)
+    gain, deviation = np.zeros((inputs, q)), np.full((inputs, q), np.nan)
+    gain[:, tells] = _forward(model, inputs)
     # jackknife over blocks; a block without which there is no stable model leaves everything open
-    whole = len(gains) == BLOCKS
-    deviation = np.sqrt((BLOCKS - 1) * gains.var(axis=0)) if whole else np.full(gain.shape, np.nan)
+    if len(gains) == BLOCKS:
+        deviation[:, tells] = np.sqrt((BLOCKS - 1) * gains.var(axis=0))
+    d = whole[:, inputs:]
     return Told(effect, d.mean(axis=0), np.quantile(d, 0.95, axis=0), gain, deviation)
+
+
+def _own_share(whole: np.ndarray, column: int) -> float:
+    """Share of a column's variance that the other columns (T, .) and a constant do not explain; 0 if it
+    stands still."""
+    others = np.column_stack([np.delete(whole, column, axis=1), np.ones(len(whole))])
+    scale = np.maximum(np.abs(others).max(axis=0), 1e-300)
+    mine = whole[:, column]
+    left = mine - others @ (np.linalg.lstsq(others / scale, mine, rcond=None)[0] / scale)
+    moves = np.ptp(mine) > 1e-9 * max(float(np.abs(mine).max()), 1.0)
+    return float(left.var() / mine.var()) if moves else 0.0
 
 
 def _stable(acting: Sequence[np.ndarray], y: Sequence[np.ndarray], longest: int) -> Plant | None:
