@@ -162,12 +162,17 @@ def conditions(declared: Plant, told: Told | None) -> str:
             if told.forward.gain[i, k]
         ]
         if moved:
-            learned.append(f"{one.name} ({', '.join(moved)} a {one.unit})")
+            unit = "unit" if one.unit == "1" else one.unit
+            learned.append(f"{one.name} ({', '.join(moved)} for each {unit})")
         else:
             left.append(one.name)
-    told_to_it = f"Fed forward: {'; '.join(learned)}, with 90 % bands; tell them to the controller."
-    open_still = f"The record does not tell what these do: {', '.join(left)}. Nothing makes up for it."
-    sentences = [told_to_it] * bool(learned) + [open_still] * bool(left)
+    sentences = []
+    if learned:
+        sentences.append(f"Fed forward: {'; '.join(learned)}, with 90 % bands. Tell them to the controller.")
+    if left:
+        sentences.append(
+            f"The record does not tell what these do: {', '.join(left)}. Nothing makes up for it."
+        )
     return " ".join([*sentences, "What disturbances did was taken off the record."])
 
 

@@ -122,7 +122,7 @@ def identify(
         order=fitted.order + 1,
         rng=np.random.default_rng(settings.seed),
     )
-    # controllers do not know the disturbances: at their mean they are part of the offsets
+    # the model holds no disturbances: at their mean they are part of the offsets
     level = np.vstack(record.u).mean(axis=0)[inputs:]
     seen = observable_part(fitted.plant)
     plant, *spread = (at_disturbances(one, inputs, level) for one in (seen, *family))

@@ -343,7 +343,7 @@ def _questions_on_disturbances(proposal: Proposal) -> list[str]:
     return [
         f"plant.disturbances {', '.join(names)}: does the controller move it, or is it only recorded? Move "
         "to plant.inputs, in percent, what a controller moves; leave out what does not act on the "
-        "temperatures. A controller does not read these signals: the certificate says so"
+        "temperatures. The controller is to be told these signals, and makes up for what they do"
     ]
 
 

@@ -40,9 +40,9 @@ class Exported(NamedTuple):
     """A controller as it leaves the house.
 
     `controller` is the contestant `name` as it was judged: law, limits, integral limit, governor. References
-    are aimed at on `model`, and the supervisor's forecasts run on it. `fallback` is PI by SIMC under the
-    same limits, the safe mode "own"; None: the heaters go off. `simulated`: the plant was drawn, not
-    recorded.
+    are aimed at on `model`, and the supervisor's forecasts run on it. `fallback` is the machine's own PID or
+    a PI under the same limits, the safe mode "own"; None: the heaters go off. `simulated`: the plant was
+    drawn, not recorded.
     """
 
     name: str

@@ -62,11 +62,11 @@ SAME_STEPS, SAME_NOISE = 1.5, 6.0  # steps and deviations within which a reading
 FOLLOWS = (0.7, 1.4)  # share of the forecast's move by which a sensor is cleared
 CLEARED_S = 60.0  # for how long it is cleared then
 # why readings miss the forecast: a heater lacks a share, or gives one of what it could add; heat of the
-# surroundings as a share of the input's range, at once or growing; samples late; a heater that differs from
-# the model by a share; a step of the reading in degC
-LACKS, GIVES, HEAT, GROWS, LATE, DIFFERS, SHIFTS = range(7)
-LEAST = np.array([0.35, 0.6, -0.3, -0.3, -8.0, -0.25, -1e3])
-MOST = np.array([1.0, 1.5, 0.3, 0.3, 8.0, 0.25, 1e3])
+# surroundings as a share of the input's range; samples late; a heater that differs from the model by a share;
+# a step of the reading in degC
+LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS = range(6)
+LEAST = np.array([0.35, 0.6, -0.3, -8.0, -0.25, -1e3])
+MOST = np.array([1.0, 1.5, 0.3, 8.0, 0.25, 1e3])
 CLEARER = 16.0  # of -2 log likelihood, by which a fault must explain better than what is none
 MISFIT = 0.15  # of what readings miss, which even the right cause leaves: no model is the machine
 DOUBT = 0.25  # share of what inputs did lately by which a forecast may be wrong
@@ -225,12 +225,11 @@ class Kept(NamedTuple):
     as forecast, returns how often it was trusted again, the last time at returned_s.
 
     Windows (K): states (2, K, n), from the drift as it was and from its mean; given and unit (K, n, m),
-    the responses to the inputs and to one percent of each; before (K, q) the former a sample ago, grown
-    (K, q) the sum of the latter; began, first, least, most (K, p) the forecast and the reading at first,
-    the least and the most reading; away (K, p) samples in a row in which the forecast was away from it;
-    square (K, q) the sum of r^2, causes (K, q, 7) that of each cause's signature squared, cross (K, K, q,
-    7) that of r of a window times the signature of a cause that began with another; age (K,) in samples,
-    -1 for none.
+    the responses to the inputs and to one percent of each; before (K, q) the former a sample ago;
+    began, first, least, most (K, p) the forecast and the reading at first, the least and the most reading;
+    away (K, p) samples in a row in which the forecast was away from it; square (K, q) the sum of r^2, causes
+    (K, q, 6) that of each cause's signature squared, cross (K, K, q, 6) that of r of a window times the
+    signature of a cause that began with another; age (K,) in samples, -1 for none.
 
     shown (2, m): samples in a row in which a heater was stuck on, or weak; missing (m,) samples in a
     row in which its heat was. asked (m,) the last command,
@@ -259,7 +258,6 @@ class Kept(NamedTuple):
     given: np.ndarray
     unit: np.ndarray
     before: np.ndarray
-    grown: np.ndarray
     began: np.ndarray
     first: np.ndarray
     least: np.ndarray
@@ -306,7 +304,6 @@ def kept(s: Supervision) -> Kept:
         given=np.zeros((K, n, m)),
         unit=np.zeros((K, n, m)),
         before=np.zeros((K, q)),
-        grown=np.zeros((K, q)),
         began=np.zeros((K, p)),
         first=np.zeros((K, p)),
         least=np.zeros((K, p)),
@@ -374,7 +371,7 @@ def begin_window(s: Supervision, k: Kept, at: int) -> None:
     start = k.x + s.M @ k.e
     k.states[:, at] = start
     k.states[1, at, -len(s.d) :] = k.slow
-    for part in (k.given, k.unit, k.before, k.grown, k.away, k.square, k.causes, k.cross):
+    for part in (k.given, k.unit, k.before, k.away, k.square, k.causes, k.cross):
         part[at] = 0
     k.cross[:, at] = k.total[:, at] = 0.0
     k.began[at] = s.C @ start + s.d
@@ -404,10 +401,7 @@ def compare(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     given, unit = ((s.C @ part)[:, own, inputs] for part in (k.given, k.unit))
     span = (s.high - s.low)[inputs]
     step = np.where(runs, 1.0, 0.0) * np.ones_like(given)
-    k.grown[...] += unit / (WINDOWS * SPACING)
-    signatures = np.stack(
-        [-given, span * unit - given, span * unit, span * k.grown, k.before - given, -given, step], axis=2
-    )
+    signatures = np.stack([-given, span * unit - given, span * unit, k.before - given, -given, step], axis=2)
     moved = np.where(counts, y - k.began, 0.0)
     k.total[...] += moved, moved * moved
     k.before[:] = given

@@ -111,6 +111,6 @@ def test_the_certificate_says_what_is_fed_forward_and_what_is_not():
     effect = plant([[0.9]], [[0.0, 0.0]], [[1.0]])
     told = Told(effect, np.zeros(2), np.ones(2), np.array([[0.129, 0.2]]), np.array([[0.006, 0.5]]))
     said = certify.conditions(declared, told)
-    assert "Fed forward: fan (heater +0.129 ± 0.0099 % a percent), with 90 % bands; tell them to" in said
+    assert "Fed forward: fan (heater +0.129 ± 0.0099 % for each percent), with 90 % bands. Tell" in said
     assert "The record does not tell what these do: room. Nothing makes up for it. What dist" in said
     assert certify.conditions(declared, None).startswith("The record does not tell what these do: fan, room.")

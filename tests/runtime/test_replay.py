@@ -99,6 +99,26 @@ def test_a_replay_asks_what_the_object_would_have_asked(name, monkeypatch):
     np.testing.assert_array_equal(held[np.abs(run.asked - run.wished).max(axis=1) == 0], 0)
 
 
+@pytest.mark.parametrize("name", ["pi", "lqg"])
+def test_a_replay_feeds_forward_as_the_object_does(name):
+    made, model = ready(name)
+    of, rng = log(), np.random.default_rng(8)
+    forward = np.repeat(rng.uniform(-3, 3, (len(of.u) // 50, 7)), 50, axis=0)
+    running, asked = RunningController(made, model), of.u.copy()
+    for t in range(len(of.u)):
+        running.forward = forward[t]
+        if t < 30:
+            running.watch(of.u[t], of.y[t], of.r[t])
+            continue
+        if t == 30:
+            running.hand_over(of.y[t])
+        asked[t] = running.step(of.y[t], of.r[t], t, of.u[t])
+    inner = of._replace(u=of.u - forward)
+    run = replay.replayed(made, model, inner, hold=30, forward=forward)
+    assert np.abs(run.asked - asked).max() < 1e-7
+    assert np.abs(run.asked - replay.replayed(made, model, of, hold=30).asked).max() > 1
+
+
 def test_chunks_are_the_recursion_sample_by_sample():
     rng = np.random.default_rng(0)
     A, drive, z = (

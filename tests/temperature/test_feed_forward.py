@@ -18,7 +18,7 @@ from pipeline.temperature.controllers.controller import aim as aimed
 from pipeline.temperature.controllers.governor import ActuatorLimits
 from pipeline.temperature.plant import plant
 from pipeline.temperature.test_set import panel
-from pipeline.temperature.tracking import model_based
+from pipeline.temperature.tracking import model_based, still_law
 from tests.foreign import thermal_machines
 from tests.foreign.thermal_machines import FAN, at_rest, draw, quiet
 
@@ -144,6 +144,26 @@ def test_the_test_set_moves_what_is_told_to_its_highest_level():
     assert set(signal[first:last, 0]) == {60.0} and not signal[:first].any() and not signal[last:].any()
     assert push[last - 1, 0] == pytest.approx(-0.006 * 60 / 0.1)
     assert not panel.pushed(None, 10, 2)[1].any()
+
+
+@pytest.mark.parametrize("short", [1.0, 0.0])
+def test_on_the_test_set_a_disturbance_moves_the_machine_by_what_is_not_made_up_for(short):
+    """With nothing fed forward, by all of it; with the exact gain by nothing, in the end of its time."""
+    law, effect = still_law(1, 1), plant([[0.98]], [[-0.006]], [[1.0]])
+    told = feed_forward.Told(effect, np.zeros(1), np.array([100.0]), np.full((1, 1), 0.12), np.zeros((1, 1)))
+    machine = panel.delayed(HEATER, late=False)
+    questions = panel.Questions(np.array([[25.0]]), np.array([[75.0]]), None, None, None)
+    cases = panel.asked(
+        [machine], questions, noise=np.zeros(1), seed=1, steps=4000, hold=5, cells=False, told=told,
+        structures=(panel.Structure(),),
+    )  # fmt: skip
+    cases = cases._replace(outside=0 * cases.outside)
+    limits = ActuatorLimits(np.zeros(1), np.full(1, 100.0), np.full(1, np.inf))
+    forward = FeedForward((1 - short) * told.gain, told.mean)
+    controller = deployed(law, limits, integral_limit=1.0, forward=forward)
+    aims = panel.aims(law, panel.rests(HEATER, cases, limits), cases)
+    y = panel.rolled_out(controller, cases, aims).y[:, cases.kind == "disturbed", 0]
+    assert y[int(panel.FAN[1] * 4000) - 1] == pytest.approx(75.0 - short * 0.006 * 100 / 0.02, abs=0.1)
 
 
 # ---- in the law

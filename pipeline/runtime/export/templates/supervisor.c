@@ -197,8 +197,6 @@ static void compare(supervisor_kept *k, const real *y, const int *counts)
             signature[w][OF_LACKS] = -given;
             signature[w][OF_HEAT] = span * unit;
             one->gives[i] += (span * unit - given) * (span * unit - given);
-            one->grown[i] += unit / (WINDOWS * SPACING);
-            signature[w][OF_GROWS] = span * one->grown[i];
             signature[w][OF_LATE] = one->before[i] - given;
             signature[w][OF_SHIFTS] = one->age < 0 ? 0 : 1;
             one->before[i] = given;
@@ -297,7 +295,7 @@ static int unmoved(const supervisor_kept *k, int w, int j)
  * the window does */
 static real left_of(const supervisor_kept *k, int w, int v, int i, int f, real *amount)
 {
-    static const int of[EXPLANATIONS] = {OF_LACKS, OF_LACKS, OF_HEAT, OF_GROWS, OF_LATE, OF_LACKS, OF_SHIFTS};
+    static const int of[EXPLANATIONS] = {OF_LACKS, OF_LACKS, OF_HEAT, OF_LATE, OF_LACKS, OF_SHIFTS};
     const forecast_window *one = &k->window[w], *other = &k->window[v];
     real cross = one->cross[v][i][of[f]], square = f == GIVES ? other->gives[i] : other->causes[i][of[f]];
     if (f == GIVES)

@@ -5,15 +5,15 @@ enum { SENSOR_OPEN, SENSOR_STILL, SENSOR_DEAF, HEATER_STUCK_ON, HEATER_WEAK, REF
 enum { MODE_LAW, MODE_OWN, MODE_OFF };
 
 /* Why readings miss a forecast: faults of a heater, then what is no fault */
-enum { LACKS, GIVES, HEAT, GROWS, LATE, DIFFERS, SHIFTS, EXPLANATIONS };
+enum { LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS, EXPLANATIONS };
 
 /* Signatures whose sums are kept: DIFFERS has that of LACKS, and GIVES that of LACKS and HEAT together */
-enum { OF_LACKS, OF_HEAT, OF_GROWS, OF_LATE, OF_SHIFTS, SIGNATURES };
+enum { OF_LACKS, OF_HEAT, OF_LATE, OF_SHIFTS, SIGNATURES };
 
 /* A forecast that no reading corrects, and what readings missed of it (supervisor.Kept) */
 typedef struct {
     real state[2][WATCH], given[WATCH][INPUTS], unit[WATCH][INPUTS]; /* responses to inputs and one percent */
-    real before[PAIRS], grown[PAIRS], began[OUTPUTS], first[OUTPUTS], least[OUTPUTS], most[OUTPUTS], total[2][OUTPUTS];
+    real before[PAIRS], began[OUTPUTS], first[OUTPUTS], least[OUTPUTS], most[OUTPUTS], total[2][OUTPUTS];
     real square[PAIRS], causes[PAIRS][SIGNATURES], gives[PAIRS], cross[WINDOWS][PAIRS][SIGNATURES];
     int age, away[OUTPUTS];
 } forecast_window;
