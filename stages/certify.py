@@ -1,7 +1,7 @@
 """Certify every controller of the temperature loop that a verdict could name, and prepare the files of each:
 reads what evaluate_temperature read and wrote, and of the setpoint loop what train_classifier, train_agent
 and evaluate_setpoint wrote. No limit of section `report` enters: what is measured is compared with the limits
-by the stages verdict and export_controllers (pipeline/runtime/certified.py).
+by the stages verdict and export_controllers (pipeline/deploy/certified.py).
 
 Writes datasets/certify: temperature/<controller>/ (measured.json, controller.json, arrays.safetensors,
 support.safetensors, c/, python/; the place of the certificate's SHA-256 is marked), setpoint/, and
@@ -25,10 +25,10 @@ from stages.tune_weights import read_told
 if TYPE_CHECKING:
     import numpy as np
 
-    from pipeline.runtime.certificate import EvidenceRecord, Rules
-    from pipeline.runtime.certificate_evidence import WindowModels
-    from pipeline.runtime.replay import GaplessLog
-    from pipeline.runtime.signals import Machine
+    from pipeline.deploy.certificate import EvidenceRecord, Rules
+    from pipeline.deploy.certificate_evidence import WindowModels
+    from pipeline.deploy.replay import GaplessLog
+    from pipeline.deploy.signals import Machine
     from pipeline.temperature.controllers.feed_forward import Told
     from pipeline.temperature.controllers.problem import Design
     from pipeline.temperature.plant import Plant as PlantModel
@@ -115,9 +115,9 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     """What no controller changes."""
     import numpy as np
 
-    from pipeline.runtime import certificate_evidence, certify, support_logs
-    from pipeline.runtime.certificate import EvidenceRecord
-    from pipeline.runtime.replay import GaplessLog
+    from pipeline.deploy import certificate_evidence, certify, support_logs
+    from pipeline.deploy.certificate import EvidenceRecord
+    from pipeline.deploy.replay import GaplessLog
     from pipeline.temperature.controllers import feed_forward
     from pipeline.temperature.identification.segments import segments, without_gaps
     from pipeline.temperature.test_set import panel
@@ -180,9 +180,20 @@ def certify_controller(
     folder: Path, name: str, designs: dict[str, Design], loaded: EvaluationInputs, common: Common
 ) -> tuple[str, dict[str, Any]]:
     """Measures one controller and writes its folder; its name, and what certified.json says of it."""
-    from pipeline.runtime import assembly, bands, certified, certify, checks, machine, support, support_logs
-    from pipeline.runtime.export import c, python, vectors
-    from pipeline.runtime.support_file import write_support
+    from pipeline.deploy import (
+        assembly,
+        bands,
+        certified,
+        certify,
+        checks,
+        machine,
+        support,
+        support_logs,
+        to_c,
+        to_python,
+        vectors,
+    )
+    from pipeline.deploy.support_file import write_support
     from pipeline.temperature.controllers.table import BY_NAME
 
     setting, problem, half = loaded.setting, loaded.problem, loaded.setting.rehearsal.judging
@@ -208,9 +219,9 @@ def certify_controller(
         )
         honest = support_logs.honest_logs(made, half, setting.limits)
         within = support.support(common.plants, honest, setting.rehearsal.noise, common.recorded)
-        sources = c.code(made, certified.PLACE) | {"golden.csv": vectors.golden(made)}
+        sources = to_c.code(made, certified.PLACE) | {"golden.csv": vectors.golden(made)}
         checks.check_compiled(made, sources)
-        code = python.code(made, certified.PLACE)
+        code = to_python.code(made, certified.PLACE)
         differences = {"judged": difference, "python": checks.python_difference(made, code)}
     except ValueError as reason:
         return name, _not_measured(str(reason))
@@ -246,7 +257,7 @@ def judged_case(name: str, declared: Plant) -> tuple[int, np.ndarray, np.ndarray
 def certify_setpoint(folder: Path, seed: int) -> dict[str, Any]:
     """The files of the default controller, which have no certificate, and how far they are from the
     networks."""
-    from pipeline.runtime import setpoint_checks
+    from pipeline.deploy import setpoint_checks
     from pipeline.setpoint.agents.files import restore_agents
     from pipeline.setpoint.controllers import build_controllers
     from pipeline.setpoint.settings import EvaluateSetpoint

@@ -18,7 +18,7 @@ from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights, r
 from stages.tune_weights import load_design_problem
 
 if TYPE_CHECKING:
-    from pipeline.runtime.signals import Machine
+    from pipeline.deploy.signals import Machine
     from pipeline.temperature.controllers.problem import Design, DesignProblem
     from pipeline.temperature.test_set.evaluation import ControllerOutcome
     from pipeline.temperature.test_set.panel import CaseConditions
@@ -68,7 +68,7 @@ def read_weights(path: str | Path) -> Weights:
 
 def wire(declared: Plant) -> Machine:
     """Section `plant` as a controller knows it."""
-    from pipeline.runtime.signals import Machine, Signal
+    from pipeline.deploy.signals import Machine, Signal
     from pipeline.temperature.test_set import panel
 
     low, high = panel.output_limits(declared)
@@ -159,7 +159,7 @@ def evaluate_all(
     from joblib import delayed
     from tqdm import tqdm
 
-    from pipeline.runtime.assembly import own_control
+    from pipeline.deploy.assembly import own_control
     from pipeline.store.execution import run_all
     from pipeline.temperature.controllers.table import design_controllers
 
@@ -176,7 +176,7 @@ def judge(
     name: str, design: Design, own: Design | None, loaded: EvaluationInputs
 ) -> tuple[str, ControllerOutcome, dict[str, Any] | None]:
     """One controller alone and under its supervisor, which the one that does nothing has none of."""
-    from pipeline.runtime import assembly, healthy
+    from pipeline.deploy import assembly, healthy
     from pipeline.temperature.test_set.evaluation import evaluate
 
     setting = loaded.setting

@@ -17,7 +17,7 @@ from pipeline.temperature.settings import TemperatureRules
 from stages.certify import NOT_ASKED
 
 if TYPE_CHECKING:
-    from pipeline.runtime.certificate import Certificate
+    from pipeline.deploy.certificate import Certificate
 
 MARKED = ("c/machine.h", "c/README.txt", "python/controller.py")  # which hold the certificate's SHA-256
 VERDICTS, CERTIFY = Path("datasets/verdict"), Path("datasets/certify")
@@ -47,8 +47,7 @@ def main() -> None:
 def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
     """Files of the controller that the verdict names. If the verdict names none because the certificate of
     its controller is refused, that certificate alone."""
-    from pipeline.runtime import certificate, certified, machine
-    from pipeline.runtime.export import state_space
+    from pipeline.deploy import certificate, certified, machine, state_space
 
     verdict = artifacts.read_json(VERDICTS / "temperature.json")
     name = verdict["winner"] or verdict.get("refused")
@@ -125,7 +124,7 @@ def describe(
 
 
 def summarise(decided: "Certificate") -> dict[str, Any]:
-    from pipeline.runtime import certificate
+    from pipeline.deploy import certificate
 
     return {
         "sha256": certificate.sha256(decided),
@@ -145,7 +144,7 @@ def summarise(decided: "Certificate") -> dict[str, Any]:
 
 def copy(source: Path, folder: Path, certificate_sha256: str) -> None:
     """The prepared files, with the SHA-256 in its marked places."""
-    from pipeline.runtime.certified import fill
+    from pipeline.deploy.certified import fill
 
     for path in files_below(source):
         name = path.relative_to(source).as_posix()

@@ -53,7 +53,7 @@ def judge_comparison(evidence: "Evidence") -> dict[str, Any]:
 
 def certificates(rules: Any) -> dict[str, dict[str, dict[str, Any]]]:
     """{loop: {controller: {"passed", "why"}}} by the limits of `report`; {} if certify did not run."""
-    from pipeline.runtime import certified
+    from pipeline.deploy import certified
 
     if not artifacts.exists(CERTIFIED):
         return {}

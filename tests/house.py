@@ -32,7 +32,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "constants": {"own", "plain", "files", "store", "statistics"},
     "files": {"own", "plain", "constants", "store", "statistics", "recordings"},
     "verdict": {"plain", "constants", "store", "statistics"},
-    "runtime": {"verdict", "methods", "plain", "constants", "store", "statistics"},
+    "deploy": {"verdict", "methods", "plain", "constants", "store", "statistics"},
     "report": {"verdict", "plain", "constants", "store", "statistics"},
     "papers": {"methods", "plain", "constants", "files", "store", "statistics", "stages"},
 }
@@ -75,7 +75,7 @@ EDGE = {"artifacts", "params", "recordings"}
 FRAME = "stages/__init__.py"
 # the frame of a stage and around_dvc import the standard library alone; params_text dumps to a text
 WRITERS = {"pipeline/store/artifacts.py", "pipeline/store/params_text.py", "pipeline/around_dvc.py", FRAME}
-WRITERS |= {"pipeline/runtime/checks.py"}  # into a temporary folder that is compiled
+WRITERS |= {"pipeline/deploy/checks.py"}  # into a temporary folder that is compiled
 # MT19937: R's generator, with which the script of a paper draws
 GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64", "MT19937"}
 # the one file of metrics, with a column a value; the figures of other stages are outs
@@ -92,7 +92,7 @@ PLACES = ("stages/", "pipeline/verdict/", "pipeline/report/")
 # the second pipeline: results that no recording changes, and no stage of the root asks for
 PAPERS = "datasets/papers/dvc.yaml"
 # a stage depends on these rooms whole, and on at most 8 files or folders of a loop's methods
-SHARED, MOST_METHODS = {"store", "recordings", "verdict", "runtime", "report"}, 8
+SHARED, MOST_METHODS = {"store", "recordings", "verdict", "deploy", "report"}, 8
 
 
 # ---- the syntax tree
@@ -110,7 +110,7 @@ class File(NamedTuple):
             return top
         path, loop = "/".join(rest).rstrip("/"), room in LOOPS
         kinds = {"constants": loop and path in CONSTANTS, "files": loop and path.rpartition("/")[2] in FILES}
-        kinds["plain"] = room in (*LOOPS, "runtime", "nightly", "papers") and path in PLAIN
+        kinds["plain"] = room in (*LOOPS, "deploy", "nightly", "papers") and path in PLAIN
         return next((f"{room}/{kind}" for kind, holds in kinds.items() if holds), room)
 
 

@@ -255,7 +255,7 @@ def test_every_command_of_the_readme_and_the_documents_exists_with_its_options(r
 
 def test_no_page_and_no_document_advises_to_deploy(root):
     pages = [*(root / "pipeline/report/templates").glob("*"), *(root / "docs").rglob("*"), root / "README.md"]
-    advice = re.compile(r"\bdeploy\b", re.IGNORECASE)
+    advice = re.compile(r"(?<!pipeline/)\bdeploy\b", re.IGNORECASE)  # but for the folder of the code
     assert not [
         path.name for path in pages if path.is_file() and advice.search(path.read_text(encoding="utf-8"))
     ]

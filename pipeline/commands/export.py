@@ -3,10 +3,9 @@ the setpoint loop. The stage export_controllers writes the same files."""
 
 from pathlib import Path
 
-from pipeline.runtime import certificate, machine
-from pipeline.runtime.certificate import Certificate
-from pipeline.runtime.export import c, klipper, python, setpoint, vectors
-from pipeline.runtime.machine import Exported
+from pipeline.deploy import certificate, machine, to_c, to_klipper, to_python, to_setpoint, vectors
+from pipeline.deploy.certificate import Certificate
+from pipeline.deploy.machine import Exported
 from pipeline.store import artifacts
 
 SIMULATED = "Pass (simulation): it was made for a simulated plant, and runs only if `rehearsal` is set."
@@ -56,12 +55,12 @@ def files(made: Exported, shown: Certificate, to: str, section: str, power_W: fl
     """The files of one form, name to text. Raises ValueError, naming what is missing, where the machine or
     the certificate does not allow it."""
     if to == "c":
-        texts = c.files(made, shown, vectors.golden(made))
+        texts = to_c.files(made, shown, vectors.golden(made))
         return texts | {"README.txt": f"{texts['README.txt']}\n{PLACING[to]}"}
     if to == "python":
-        return {"controller.py": python.text(made, shown), "README.txt": PLACING[to]}
-    section_text = klipper.settings(made, shown, section=section, heater_power_W=power_W)
-    return {klipper.FILE: section_text, **klipper.module(made, shown), "README.txt": PLACING[to]}
+        return {"controller.py": to_python.text(made, shown), "README.txt": PLACING[to]}
+    section_text = to_klipper.settings(made, shown, section=section, heater_power_W=power_W)
+    return {to_klipper.FILE: section_text, **to_klipper.module(made, shown), "README.txt": PLACING[to]}
 
 
 def export(folder: Path, to: str, out: Path | None, section: str, power_W: float | None) -> str:
@@ -91,7 +90,7 @@ def export(folder: Path, to: str, out: Path | None, section: str, power_W: float
 
 def shows_frames(folder: Path) -> bool:
     """Whether a controller's folder is that of the setpoint loop, whose recordings are frames."""
-    return (folder / setpoint.CLASSIFIER).exists() and not (folder / machine.CONTROLLER).exists()
+    return (folder / to_setpoint.CLASSIFIER).exists() and not (folder / machine.CONTROLLER).exists()
 
 
 def _export_readers(folder: Path, to: str, target: Path) -> str:
@@ -101,9 +100,9 @@ def _export_readers(folder: Path, to: str, target: Path) -> str:
             f"{folder}: classifier, filter and agent of the setpoint loop run in Python alone, found --to "
             f"{to}; write --to python"
         )
-    names = [name for name in setpoint.FILES if name != setpoint.AGENT or (folder / name).exists()]
-    made = {name: artifacts.read_weights(folder / name, setpoint.FILES[name][0])[0] for name in names}
+    names = [name for name in to_setpoint.FILES if name != to_setpoint.AGENT or (folder / name).exists()]
+    made = {name: artifacts.read_weights(folder / name, to_setpoint.FILES[name][0])[0] for name in names}
     with artifacts.together(target) as place:
-        setpoint.write(place, made)
+        to_setpoint.write(place, made)
     written = ", ".join(str(path) for path in sorted(target.iterdir()) if path.is_file())
     return f"{', '.join(name.partition('.')[0] for name in names)}. {UNCERTIFIED}\nwritten: {written}"

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipeline.deploy import machine, replay, supervisor, support
+from pipeline.deploy.machine import Exported
+from pipeline.deploy.replay import GaplessLog
+from pipeline.deploy.signals import Signal
+from pipeline.deploy.support_file import read_support
 from pipeline.recordings.recordings import Source, Table, read
 from pipeline.recordings.resampling import resample
-from pipeline.runtime import machine, replay, supervisor, support
-from pipeline.runtime.machine import Exported
-from pipeline.runtime.replay import GaplessLog
-from pipeline.runtime.signals import Signal
-from pipeline.runtime.support_file import read_support
 from pipeline.store import artifacts, params
 from pipeline.temperature.controllers.controller import fed_forward
 from pipeline.temperature.settings import Plant

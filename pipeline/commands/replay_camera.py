@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.commands.shadow import deploy
-from pipeline.runtime.export import setpoint
-from pipeline.runtime.setpoint_checks import BELIEF
+from pipeline.deploy import to_setpoint
+from pipeline.deploy.setpoint_checks import BELIEF
 from pipeline.setpoint.agents.bayes import Filter
 from pipeline.setpoint.agents.files import restore_agents
 from pipeline.store import artifacts
@@ -18,16 +18,16 @@ def ready(folder: Path) -> deploy.Ready:
     """The loop that evaluate_setpoint judged, without the levels of a camera, which were not exported. Raises
     ValueError where the folder's numbers are others, and where a stage has not run."""
     judged = deploy.ready(None)
-    for name, arrays in setpoint.weights(deploy.trained().model, _decider(judged)).items():
-        _check(folder / name, setpoint.FILES[name][0], arrays)
+    for name, arrays in to_setpoint.weights(deploy.trained().model, _decider(judged)).items():
+        _check(folder / name, to_setpoint.FILES[name][0], arrays)
     return judged
 
 
-def _decider(judged: deploy.Ready) -> setpoint.Decider:
+def _decider(judged: deploy.Ready) -> to_setpoint.Decider:
     """The filter of the default, or our agent with that by which it sees."""
     name, parameters = judged.deployed.name, judged.deployed.parameters
     if name == BELIEF:
-        return setpoint.BeliefAgent(
+        return to_setpoint.BeliefAgent(
             restore_agents("datasets/train_agent/weights.safetensors").belief, parameters
         )
     if not isinstance(parameters, Filter):

@@ -4,14 +4,14 @@ what makes up for fan and filament, 20 % short as one of a record may be."""
 import numpy as np
 import scipy.linalg
 
-from pipeline.runtime import supervisor
-from pipeline.runtime.machine import Exported, plants_sha256
-from pipeline.runtime.signals import Machine, Signal
+from pipeline.deploy import supervisor
+from pipeline.deploy.machine import Exported, plants_sha256
+from pipeline.deploy.signals import Machine, Signal
 from pipeline.temperature.controllers import baseline
 from pipeline.temperature.controllers.controller import FeedForward, deployed
 from pipeline.temperature.plant import Plant, plant
+from tests.deploy.deployed_machines import guard, limits_of
 from tests.foreign.hot_end import KELVIN, Parts
-from tests.runtime.deployed_machines import guard, limits_of
 
 TARGET_DEGC, SAMPLE_S, NOISE_DEGC = 210.0, 1.0, 0.1
 FILAMENT_J_PER_MM = 1.5  # what a mm of filament takes away

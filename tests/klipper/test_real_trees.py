@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeline.runtime.export import klipper
+from pipeline.deploy import to_klipper
+from tests.deploy.deployed_machines import passed
 from tests.klipper import trees
 from tests.klipper.machines import FILAMENT_J_PER_MM, HOT_ENDS, TARGET_DEGC, exported
-from tests.runtime.deployed_machines import passed
 
 pytestmark = pytest.mark.klipper
 HEATED = [["gcode", f"M104 S{TARGET_DEGC:g}"], ["wait", 300]]
@@ -28,7 +28,10 @@ def played(
     """What came of the steps, with the exported module and its settings as they are exported."""
     of, files, settings = exported(parts, told=told), {}, ""
     if module:
-        files, settings = klipper.module(of, passed(of)), klipper.settings(of, passed(of), section="extruder")
+        files, settings = (
+            to_klipper.module(of, passed(of)),
+            to_klipper.settings(of, passed(of), section="extruder"),
+        )
     folder.mkdir(exist_ok=True)
     tree = trees.with_module(firmware, folder, files)
     return trees.play(tree, folder, steps, config=change(settings), parts=parts._asdict(), **options)
@@ -173,7 +176,7 @@ def test_pid_calibrate_save_config_and_restart_while_hot_keep_the_heater_s_own_p
     trees.with_module(firmware, tmp_path / "gone", {})
     out = trees.play(firmware, tmp_path / "True", [["pid"], *HEATED], parts=HOT_ENDS[3]._asdict())
     assert out["answers"][0] == pids[0][-1] and out["states"][-1][1] == "ready"
-    assert not (tmp_path / "True" / klipper.FILE).exists()
+    assert not (tmp_path / "True" / to_klipper.FILE).exists()
 
 
 def test_a_fan_under_pi_with_feed_forward_beside_pid_calibrate(firmware, tmp_path):

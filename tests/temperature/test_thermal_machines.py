@@ -7,10 +7,10 @@ import shutil
 import numpy as np
 import pytest
 
-from pipeline.runtime.export import c
+from pipeline.deploy import to_c
+from tests.deploy import deployed_machines
 from tests.foreign import normal_life, thermal_machines
 from tests.foreign.thermal_machines import DOOR, FAN, FLOW, ROOM, Machine, State, draw, drive, quiet, start
-from tests.runtime import deployed_machines
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine; install gcc")
 SEEDS = range(1, 7)  # every structure once
@@ -190,7 +190,7 @@ def lives(tmp_path_factory):
     """A life without a fault and one with a heater stuck on: two zones, and a controller of other zones."""
     folder = tmp_path_factory.mktemp("life")
     (folder / "c").mkdir()
-    for name, text in c.code(deployed_machines.exported("pi", zones=2), "no certificate").items():
+    for name, text in to_c.code(deployed_machines.exported("pi", zones=2), "no certificate").items():
         (folder / "c" / name).write_text(text)
     return [normal_life.play(folder, 5, 2.0, fault=fault) for fault in ("no fault", "heater stuck on")]
 

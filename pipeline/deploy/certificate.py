@@ -1,0 +1,286 @@
+"""The certificate of a controller: what was measured of it, on which evidence, and whether it is exported.
+
+This module is the document: the record that it rests on, its rules, their results, and its JSON. certify.py
+measures; certified.py compares with the limits, in the declared order of RULES. The first rule that fails
+refuses the controller. The evidence is "recorded" or "simulated".
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from pipeline.deploy.signals import Signal
+
+VERSION, LOOP = 1, "temperature"
+Segments = Sequence[np.ndarray]
+
+
+class EvidenceRecord(NamedTuple):
+    """What a certificate rests on: the signals as they were recorded, and segments without gaps. The newest
+    segments come from the machine as it is today, with the wiring that the controller will have."""
+
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    sample_time_s: float
+    u: list[np.ndarray]  # segments (T, m), from which the models were learned
+    y: list[np.ndarray]  # segments (T, p) in °C
+    newest_u: list[np.ndarray]
+    newest_y: list[np.ndarray]
+    cold_degC: np.ndarray | None = None  # (p,) readings of the cold machine, if somebody took them
+
+
+class Rules(NamedTuple):
+    """How a controller is measured, and the limits that no params file changes. From rest at `start` each of
+    `references` is held for `steps` samples."""
+
+    references: np.ndarray  # (g, p) °C
+    start: np.ndarray  # (p,) °C
+    steps: int = 300
+    settled: int = 50  # the last samples, over which the settled error is the mean error
+    crossing_degC: float = 1.0  # allowed beyond the limits of outputs
+    failing: float = 0.1  # share of the plants that may miss a limit
+    tail: float = 0.5  # share of a margin's limit that is required on the newest record alone
+    plants: int = 1000
+    poles_of: int = 24
+    resamples: int = 200
+    longest_window: int = 24
+    samples: float = 5.0  # for each unknown of a window model
+    moves: float = 0.002  # least share of an input's range that it moves by itself
+    ahead: int = 20
+    # share of the newest record's movement over `ahead` samples that the model may miss beyond what the
+    # record's own window model misses
+    unexplained: float = 0.5
+    noise: float = 0.3  # deviation of a settled mean as a share of the settled error's limit
+    room_degC: tuple[float, float] = (5.0, 45.0)  # of a cold machine
+    # without a cold reading: what the record's window models may extrapolate to at rest without inputs, wider
+    # by the error of a straight line from hot to cold
+    extrapolated_degC: tuple[float, float] = (-50.0, 110.0)
+    reach: float = 0.5  # of the recorded span, by which references may lie beyond it
+
+
+class RuleResult(NamedTuple):
+    """One rule: the figure, the limit, and a sentence. `asked` is False if an earlier rule refused."""
+
+    name: str
+    passed: bool
+    found: float | None
+    limit: float | None
+    unit: str
+    sentence: str
+    asked: bool = True
+
+
+class Poles(NamedTuple):
+    """The largest poles of one closed loop, [real, imaginary]; `of` is "model", "spread", "record" or
+    "newest"."""
+
+    of: str
+    radius: float
+    poles: tuple[tuple[float, float], ...]
+
+
+class MarginsFound(NamedTuple):
+    """MIMO disk margin and delay margin over family and record: median, the one that nine of ten reach, and
+    the least; a delay margin without end is None."""
+
+    plants: int
+    disk: tuple[float, float, float]
+    delay_s: tuple[float | None, float | None, float | None]
+
+
+class WorstPlants(NamedTuple):
+    """Over `plants` sampled plants: settled error in °C, median, 99 % quantile and worst, how many settle
+    worse than allowed, and how many did not stay finite."""
+
+    plants: int
+    settled_error_degC: tuple[float, float, float]
+    failing: int
+    diverged: int
+
+
+class Violation(NamedTuple):
+    """By how many °C a sampled plant crosses a limit of an output at most, and how many do by more than
+    allowed."""
+
+    output: str
+    worst_degC: float
+    plants: int
+
+
+class GainBands(NamedTuple):
+    """Bands of the learned gains u = -K w - K_r r at `level`, by `resamples` of the record: rows by input,
+    columns `on` a signal so many samples before, or a reference."""
+
+    level: float
+    resamples: int
+    on: tuple[str, ...]
+    gain: tuple[tuple[float, ...], ...]
+    low: tuple[tuple[float, ...], ...]
+    high: tuple[tuple[float, ...], ...]
+
+
+class Certificate(NamedTuple):
+    """What was shown of a controller. Fields that no rule came to are empty or None."""
+
+    version: int
+    loop: str
+    controller: str
+    controller_sha256: str
+    plant_sha256: str
+    spread_sha256: str
+    evidence: Literal["simulated", "recorded"]
+    sample_time_s: float
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    samples: tuple[int, int]
+    poles: tuple[Poles, ...]
+    margins: MarginsFound | None
+    worst: WorstPlants | None
+    violations: tuple[Violation, ...]
+    bands: GainBands | None
+    rules: tuple[RuleResult, ...]
+    verdict: Literal["passed", "refused"]
+    first_failed: str | None
+    conditions: str  # one sentence: which disturbances were recorded, and what the controller knows of them
+
+
+RULES = (
+    "signals",
+    "units",
+    "sample_time",
+    "limits",
+    "samples",
+    "excitation",
+    "reach",
+    "noise",
+    "room",
+    "unexplained",
+    "coloured",
+    "newest",
+    "poles",
+    "disk_margin",
+    "delay_margin",
+    "settled_error",
+    "violations",
+)
+
+
+# ---- one rule
+
+
+def at_most(name: str, found: float, limit: float, unit: str, good: str, bad: str) -> RuleResult:
+    return result(name, bool(found <= limit), found, limit, unit, good, bad)
+
+
+def at_least(name: str, found: float, limit: float, unit: str, good: str, bad: str) -> RuleResult:
+    return result(name, bool(found >= limit), found, limit, unit, good, bad)
+
+
+def result(
+    name: str, passed: bool, found: float | None, limit: float | None, unit: str, good: str, bad: str
+) -> RuleResult:
+    return RuleResult(name, passed, _finite(found), _finite(limit), unit, good if passed else bad)
+
+
+def _finite(value: float | None) -> float | None:
+    """JSON knows no infinity."""
+    return None if value is None or not np.isfinite(value) else float(value)
+
+
+# ---- as JSON
+
+
+def to_json(certificate: Certificate) -> str:
+    """Canonical JSON: sorted keys, no blanks; limits that are not declared are null."""
+    return json.dumps(
+        plain(certificate), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+    )
+
+
+def sha256(certificate: Certificate) -> str:
+    """Of the canonical JSON."""
+    return hashlib.sha256(to_json(certificate).encode()).hexdigest()
+
+
+def from_json(text: str) -> Certificate:
+    """Raises ValueError where the text is no certificate of this version, saying what is missing."""
+    try:
+        about = json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"the certificate is no JSON ({error}); certify the controller again") from None
+    version = about.get("version") if isinstance(about, dict) else None
+    if version != VERSION:
+        raise ValueError(
+            f"expected a certificate of version {VERSION} but found {version}; certify the controller again"
+        )
+    missing = [name for name in Certificate._fields if name not in about]
+    if missing:
+        raise ValueError(f"the certificate has no {missing[0]}; certify the controller again")
+    try:
+        certificate = rebuilt(about)
+        _check(certificate)
+    except (TypeError, KeyError, ValueError) as error:
+        raise ValueError(f"the certificate cannot be read ({error}); certify the controller again") from None
+    return certificate
+
+
+def _check(certificate: Certificate) -> None:
+    """Raises ValueError if the verdict is not that of the rules, or the rules are of another version."""
+    first = next((one.name for one in certificate.rules if not one.passed), None)
+    if certificate.first_failed != first or certificate.verdict != ("refused" if first else "passed"):
+        raise ValueError(f"its verdict {certificate.verdict} is not that of its rules")
+    if tuple(one.name for one in certificate.rules) != RULES:
+        raise ValueError("its rules are not those of this version")
+
+
+def rebuilt(about: dict[str, Any]) -> Certificate:
+    """The certificate of a JSON object."""
+
+    def signals(entries: list[dict[str, Any]]) -> tuple[Signal, ...]:
+        return tuple(
+            Signal(
+                one["name"],
+                one["unit"],
+                -np.inf if one["low"] is None else one["low"],
+                np.inf if one["high"] is None else one["high"],
+            )
+            for one in entries
+        )
+
+    margins, worst = about["margins"], about["worst"]
+    made = {name: about[name] for name in Certificate._fields}
+    made |= {
+        "inputs": signals(about["inputs"]),
+        "outputs": signals(about["outputs"]),
+        "samples": tuple(about["samples"]),
+        "poles": tuple(
+            Poles(one["of"], one["radius"], tuple((a, b) for a, b in one["poles"])) for one in about["poles"]
+        ),
+        "margins": margins
+        and MarginsFound(margins["plants"], tuple(margins["disk"]), tuple(margins["delay_s"])),
+        "worst": worst
+        and WorstPlants(**(worst | {"settled_error_degC": tuple(worst["settled_error_degC"])})),
+        "violations": tuple(Violation(**one) for one in about["violations"]),
+        "bands": about["bands"]
+        and GainBands(**{name: _tuples(part) for name, part in about["bands"].items()}),
+        "rules": tuple(RuleResult(**one) for one in about["rules"]),
+    }
+    return Certificate(**made)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def plain(value: Any) -> Any:
+    """Values as JSON has them; numbers that are not finite are null."""
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return {name: plain(part) for name, part in value._asdict().items()}
+    if isinstance(value, tuple | list):
+        return [plain(part) for part in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value

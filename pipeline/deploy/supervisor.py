@@ -1,0 +1,628 @@
+"""The supervisor round a law: six faults that a firmware does not see, each with its safe mode, its reason in
+one sentence, and the way back.
+
+An observer of the model follows the machine. Every few samples a forecast starts from it that no reading
+corrects (a window). As long as a window lasts, readings are held against it:
+
+* A sensor stands still if the forecast moves by three of its steps, or four deviations of its noise, and the
+  reading does not move with it, with its noise on top or without. If readings in steps finer than their
+  noise are all equal, the forecast need not be surer than that.
+* What readings r miss of the forecast is explained by one cause that began when one of the windows did, by
+  least squares:
+
+      r = -a g              a heater lacks the share a of what it is told
+      r = a (high U - g)    it gives a share a of what it could add: 1 if it is stuck on
+      r = q U               a fan, a door, filament or the room take or give q percent: no fault
+      r = -tau (g - g')     the machine is late by tau samples: no fault
+      r = c                 what the sensor sees of air or filament at once: no fault
+
+  with g the response to the input since then, g' that a sample ago, U that to one percent. A heater is
+  at fault if that explains the readings clearly better than what is no fault.
+* A window has two forecasts, from the drift as it was when it began and from its mean. Slow masses, such as
+  the walls of a chamber, move the machine between the two. A sensor stands still only if both move the same
+  way. A heater is stuck on only if the readings rise above both.
+* The drift follows any slow loss of heat. A sensor that drifts, or sticks with noise just below its
+  reference, looks like such a loss. So the drift has a bound that does not adapt: if more heat is missing
+  than a fan or filament takes, for longer than a door is open, and the readings do not rise, then the heater
+  or its sensor is in doubt.
+
+`Kept` is all that is remembered: arrays of fixed size, plain arithmetic.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from pipeline.deploy.signals import Machine
+from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
+from pipeline.temperature.tracking import reached_state, riccati
+
+KINDS = (
+    "sensor_open",
+    "sensor_still",
+    "sensor_deaf",
+    "heater_stuck_on",
+    "heater_weak",
+    "reference_out_of_reach",
+)
+OPEN, STILL, DEAF, ON, WEAK, REACH = range(len(KINDS))
+OF_INPUT = (ON, WEAK)
+# "own": the machine's own control, or PI
+MODES = ("law", "own", "off")
+LAW, OWN, OFF = range(3)
+
+WINDOWS, SPACING = 6, 6  # forecasts side by side, and samples from one to the next
+STILL_AFTER = 10  # samples for which a forecast must have been away before a sensor stands still
+FIT_AFTER = 12  # samples of a window before it tells of a heater
+STEPS_STILL, NOISE_STILL = 3.0, 4.0  # steps and deviations that a forecast must move
+SAME_STEPS, SAME_NOISE = 1.5, 6.0  # steps and deviations within which a reading has not moved
+FOLLOWS = (0.7, 1.4)  # share of the forecast's move by which a sensor is cleared
+CLEARED_S = 60.0  # for how long it is cleared then
+# why readings miss the forecast: a heater lacks a share, or gives one of what it could add; heat of the
+# surroundings as a share of the input's range; samples late; a heater that differs from the model by a share;
+# a step of the reading in degC
+LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS = range(6)
+LEAST = np.array([0.35, 0.6, -0.3, -8.0, -0.25, -1e3])
+MOST = np.array([1.0, 1.5, 0.3, 8.0, 0.25, 1e3])
+CLEARER = 16.0  # of -2 log likelihood, by which a fault must explain better than what is none
+MISFIT = 0.15  # of what readings miss, which even the right cause leaves: no model is the machine
+DOUBT = 0.25  # share of what inputs did lately by which a forecast may be wrong
+RESTS = 1 / 40  # share a sample by which that is forgotten
+REPEATED = 3  # samples in a row with a reading that is none
+SHOWN = 6  # samples in a row that show a fault
+SLOWLY = 1 / 60  # share a sample of the mean drift, from which heat is counted
+EARLY, JUMP = 0.5, 10.0  # shares of the sample time between which two samples are apart
+MOST_STEP_DEGC = 5.0  # what moves by more at first was perhaps switched on
+# shares of an input's range, of heat that is missing; with the heater at its limit
+MISSING, AT_LIMIT = 0.4, 0.1
+MISSING_FOR, DOOR_S = 60, 110.0  # for so many samples, and longer than a door is open
+FAR_DEGC = 1e4  # no machine is so hot: its model is unstable, and no reading corrects it
+BACK_S = 30.0  # without a cause, after which the law takes over again
+RETURNS = 3  # times an hour that heaters which went off are tried again
+LEAK = 0.9999  # of the drift, kept a step
+HURRIED = 0.1  # of an innovation, by which the drift follows in manual
+
+
+class Supervision(NamedTuple):
+    """What a machine is watched by.
+
+    A (n, n), B (n, m), C (p, n), b (n,), d (p,): the model with a drift w (p) in degC a step as its last
+    states; L, M (n, p) move its state by an innovation, from one sample to the next and at once; `hurried` is
+    added to L in manual; `unsure` (WINDOWS SPACING + 1, p) in degC is the deviation of a forecast by its age,
+    `wander` the sum of four times its squares.
+    It starts at start y + start_0. low, high (m,) in percent; `coldest`, `hottest` (p,) in degC between which
+    a reading is one. Pairs (q,) of an output `of_input` and an input `input_of`: first the output in which
+    each input has the largest share, then the outputs that are left, with the input that moves them most.
+    `heat` (m, p) is the share of the inputs' range that a drift of 1 stands for, `missing_for` the samples
+    for which heat must be missing.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    b: np.ndarray
+    d: np.ndarray
+    L: np.ndarray
+    M: np.ndarray
+    hurried: np.ndarray
+    unsure: np.ndarray
+    wander: np.ndarray
+    start: np.ndarray
+    start_0: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    coldest: np.ndarray
+    hottest: np.ndarray
+    noise_degC: np.ndarray
+    of_input: np.ndarray
+    input_of: np.ndarray
+    heat: np.ndarray
+    missing_for: int
+    sample_time_s: float
+    reach_degC: float
+
+    def coarser(self, quantum: np.ndarray) -> np.ndarray:
+        """How often the sensors' noise (p,) their readings deviate, with steps of `quantum` (p,) in degC."""
+        return np.maximum(1.0, known_steps(quantum) / np.sqrt(12) / self.noise_degC)
+
+
+def known_steps(quantum: np.ndarray) -> np.ndarray:
+    """Steps of sensors (p,) in degC; large ones as long as they are not known."""
+    return np.where(np.isfinite(quantum), quantum, MOST_STEP_DEGC)
+
+
+def supervision(
+    model: Plant, machine: Machine, noise_degC: np.ndarray, *, drift: float = 0.05, follows: float = 0.3
+) -> Supervision:
+    """The observer of the stationary Riccati equation: outputs are moved a step by `follows` of the sensors'
+    noise (p,), along the state that inputs reach, and the drift wanders by `drift` of it. Raises ValueError
+    for noise that is no number above zero."""
+    noise = np.broadcast_to(np.asarray(noise_degC, float), (model.p,)).copy()
+    if not (np.isfinite(noise).all() and (noise > 0).all()):
+        raise ValueError(
+            f"supervision: expected the sensors' noise in degC above zero, found {noise}; estimate it from "
+            "a hold of the record"
+        )
+    plant = strictly_proper(model)
+    n, m, p = plant.n, plant.m, plant.p
+    likely, sensors = reached_state(plant), np.diag(np.maximum(noise, 1e-3) ** 2)
+    A = np.block([[plant.A, likely], [np.zeros((p, n)), LEAK * np.eye(p)]])
+    C = np.hstack([plant.C, np.zeros((p, p))])
+    moved = likely * follows * noise
+    P = riccati(A.T, C.T, scipy.linalg.block_diag(moved @ moved.T, np.diag((drift * noise) ** 2)), sensors)
+    M = P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
+    heat = np.vstack([likely, np.zeros((p, p))])
+    pulses = np.abs(markov_parameters(plant, 60)).max(axis=0)
+    shares = pulses / np.maximum(pulses.max(axis=1, keepdims=True), 1e-300)
+    of_input = (shares + 1e-6 * pulses / max(pulses.max(), 1e-300)).argmax(axis=0)
+    others = np.setdiff1d(np.arange(p), of_input)
+    span = np.array([one.high - one.low for one in machine.inputs])
+    drifts = markov_parameters(plant._replace(B=likely), 60).sum(axis=0)
+    lost = np.linalg.pinv(markov_parameters(plant, 60).sum(axis=0)) @ drifts
+    unsure, spread = np.empty((WINDOWS * SPACING + 1, p)), P - M @ C @ P
+    for age in range(len(unsure)):
+        unsure[age] = np.sqrt(np.maximum(np.diag(C @ spread @ C.T), 0.0))
+        spread = A @ spread @ A.T
+    return Supervision(
+        A=A,
+        B=np.vstack([plant.B, np.zeros((p, m))]),
+        C=C,
+        b=np.r_[plant.b, np.zeros(p)],
+        d=plant.d,
+        L=A @ M,
+        M=M,
+        hurried=np.vstack([np.zeros((n, p)), HURRIED * np.eye(p) - (A @ M)[n:]]),
+        unsure=unsure,
+        wander=np.cumsum((2 * unsure) ** 2, axis=0),
+        start=heat,
+        start_0=-heat @ plant.d,
+        low=np.array([one.low for one in machine.inputs]),
+        high=np.array([one.high for one in machine.inputs]),
+        coldest=np.array([one.low for one in machine.outputs]),
+        hottest=np.array([one.high for one in machine.outputs]),
+        noise_degC=noise,
+        of_input=np.r_[of_input, others],
+        input_of=np.r_[np.arange(m), pulses[others].argmax(axis=1)],
+        heat=lost / span[:, None],
+        missing_for=max(MISSING_FOR, int(np.ceil(DOOR_S / machine.sample_time_s))),
+        sample_time_s=machine.sample_time_s,
+        reach_degC=max(0.5, 3 * float(noise.max())),
+    )
+
+
+class Cause(NamedTuple):
+    """What is wrong: its kind (KINDS), the signal's name, the reason in one sentence, and the time since
+    when."""
+
+    kind: str
+    signal: str
+    sentence: str
+    since_s: float
+
+
+class Decision(NamedTuple):
+    """Inputs u (m,) to apply in percent, the mode (MODES), and its causes."""
+
+    u: np.ndarray
+    mode: str
+    causes: tuple[Cause, ...]
+
+
+# ---- what is remembered
+
+
+class Kept(NamedTuple):
+    """All that the supervisor remembers, arrays that are changed in place.
+
+    By kind and signal (k, w): since and last in s of the supervisor's own time, -1 if not so; amount.
+
+    The observer: x (n,), the innovation e (p,) before, the mean drift `slow` (p,), the forecast `expected`
+    (p,). By output (p,): y the last reading and its repeats, quantum the smallest move seen (infinite: none;
+    NaN: a large one, perhaps of power-on), bad readings in a row, cleared_s the time at which it last moved
+    as forecast, returns how often it was trusted again, the last time at returned_s.
+
+    Windows (K): states (2, K, n), from the drift as it was and from its mean; given and unit (K, n, m),
+    the responses to the inputs and to one percent of each; before (K, q) the former a sample ago;
+    began, first, least, most (K, p) the forecast and the reading at first, the least and the most reading;
+    away (K, p) samples in a row in which the forecast was away from it; square (K, q) the sum of r^2, causes
+    (K, q, 6) that of each cause's signature squared, cross (K, K, q, 6) that of r of a window times the
+    signature of a cause that began with another; age (K,) in samples, -1 for none.
+
+    shown (2, m): samples in a row in which a heater was stuck on, or weak; missing (m,) samples in a
+    row in which its heat was. asked (m,) the last command,
+    usual (m,) its mean, stirred (m,) how far it was from it lately; forward (m,) what was added to it for
+    disturbances, which it makes up for: forecasts run without both.
+    counters (6,): samples, mode, 1 once the clock was read, causes that are there, samples under the law, 1
+    after a gap of the clock that is none.
+    clock_s (2,): the clock at the last sample, and the supervisor's own time, which never falls.
+    """
+
+    since: np.ndarray
+    last: np.ndarray
+    amount: np.ndarray
+    x: np.ndarray
+    e: np.ndarray
+    slow: np.ndarray
+    expected: np.ndarray
+    y: np.ndarray
+    quantum: np.ndarray
+    repeats: np.ndarray
+    bad: np.ndarray
+    cleared_s: np.ndarray
+    returns: np.ndarray
+    returned_s: np.ndarray
+    states: np.ndarray
+    given: np.ndarray
+    unit: np.ndarray
+    before: np.ndarray
+    began: np.ndarray
+    first: np.ndarray
+    least: np.ndarray
+    most: np.ndarray
+    away: np.ndarray
+    square: np.ndarray
+    causes: np.ndarray
+    cross: np.ndarray
+    total: np.ndarray
+    age: np.ndarray
+    shown: np.ndarray
+    missing: np.ndarray
+    asked: np.ndarray
+    usual: np.ndarray
+    stirred: np.ndarray
+    forward: np.ndarray
+    counters: np.ndarray
+    clock_s: np.ndarray
+
+
+SAMPLES, MODE, CLOCKED, ACTIVE, RUNS, INSANE = range(6)
+
+
+def kept(s: Supervision) -> Kept:
+    """A memory that has seen nothing."""
+    n, m, p, q, K = len(s.A), len(s.low), len(s.d), len(s.of_input), WINDOWS
+    w, k = max(m, p), len(KINDS)
+    return Kept(
+        since=np.full((k, w), -1.0),
+        last=np.full((k, w), -1.0),
+        amount=np.zeros((k, w)),
+        x=np.zeros(n),
+        e=np.zeros(p),
+        slow=np.zeros(p),
+        expected=np.zeros(p),
+        y=np.full(p, np.nan),
+        quantum=np.full(p, np.inf),
+        repeats=np.zeros(p, int),
+        bad=np.zeros(p, int),
+        cleared_s=np.full(p, -np.inf),
+        returns=np.zeros(p, int),
+        returned_s=np.full(p, -np.inf),
+        states=np.zeros((2, K, n)),
+        given=np.zeros((K, n, m)),
+        unit=np.zeros((K, n, m)),
+        before=np.zeros((K, q)),
+        began=np.zeros((K, p)),
+        first=np.zeros((K, p)),
+        least=np.zeros((K, p)),
+        most=np.zeros((K, p)),
+        away=np.zeros((K, p), int),
+        square=np.zeros((K, q)),
+        causes=np.zeros((K, q, len(LEAST))),
+        cross=np.zeros((K, K, q, len(LEAST))),
+        total=np.zeros((2, K, p)),
+        age=np.full(K, -1),
+        shown=np.zeros((2, m), int),
+        missing=np.zeros(m, int),
+        asked=np.zeros(m),
+        usual=np.zeros(m),
+        stirred=np.zeros(m),
+        forward=np.zeros(m),
+        counters=np.zeros(6, int),
+        clock_s=np.zeros(2),
+    )
+
+
+# ---- a sample
+
+
+def say(k: Kept, kind: int, signal: int, amount: float = 0.0) -> None:
+    """A cause is there now; what was said first of it stays."""
+    if k.since[kind, signal] < 0:
+        k.since[kind, signal], k.amount[kind, signal] = k.clock_s[1], amount
+        k.counters[ACTIVE] += 1
+    k.last[kind, signal] = k.clock_s[1]
+
+
+def pass_time(s: Supervision, k: Kept, t_s: float) -> int:
+    """Whole samples since the last one, by which the supervisor's own time goes on. A clock that tells no
+    time between two samples, or a long one, counts as one; the first time forecasts begin anew."""
+    if not k.counters[CLOCKED]:
+        k.clock_s[0], k.counters[CLOCKED] = t_s - s.sample_time_s, 1
+    gap_s = t_s - k.clock_s[0]
+    gap = gap_s / s.sample_time_s
+    sane = EARLY <= gap <= JUMP
+    k.clock_s[0] = t_s
+    k.clock_s[1] += gap_s if sane else s.sample_time_s
+    if not sane and not k.counters[INSANE]:
+        k.age[:] = -1
+    k.counters[INSANE] = 0 if sane else 1
+    return int(gap + 0.5) if sane and gap > 1.5 else 1
+
+
+def read(s: Supervision, k: Kept, y: np.ndarray) -> np.ndarray:
+    """Whether each output (p,) counts now; says which gives no number, or one out of its range."""
+    counts = np.isfinite(y) & (y >= s.coldest) & (y <= s.hottest)
+    k.bad[:] = np.where(counts, 0, k.bad + 1)
+    for j in np.flatnonzero(k.bad >= REPEATED):
+        say(k, OPEN, j, y[j])
+    moves = np.where(counts, np.abs(y - k.y), np.inf)
+    first = np.isposinf(k.quantum) & (moves > MOST_STEP_DEGC) & np.isfinite(moves)
+    k.quantum[:] = np.where(first, np.nan, np.fmin(k.quantum, np.where(moves > 1e-9, moves, np.inf)))
+    k.repeats[:] = np.where(counts & (moves < 1e-12), k.repeats + 1, np.where(counts, 0, k.repeats))
+    k.y[:] = np.where(counts, y, k.y)
+    return counts & ((k.since[[OPEN, STILL, DEAF], : len(y)] < 0).all(axis=0))
+
+
+def begin_window(s: Supervision, k: Kept, at: int) -> None:
+    """A forecast from where the machine is now."""
+    start = k.x + s.M @ k.e
+    k.states[:, at] = start
+    k.states[1, at, -len(s.d) :] = k.slow
+    for part in (k.given, k.unit, k.before, k.away, k.square, k.causes, k.cross):
+        part[at] = 0
+    k.cross[:, at] = k.total[:, at] = 0.0
+    k.began[at] = s.C @ start + s.d
+    # a sensor may be far from its forecast: whether it moves is told from its own readings
+    k.first[at] = k.least[at] = k.most[at] = np.where(np.isfinite(k.y), k.y, k.began[at])
+    k.age[at] = 0
+
+
+def advance(s: Supervision, k: Kept, u: np.ndarray) -> None:
+    """Observer and windows a sample on, inputs u (m,) applied."""
+    on = s.B @ u + s.b
+    k.x[:] = s.A @ k.x + on + s.L @ k.e
+    runs = k.age >= 0
+    k.states[:] = np.where(runs[:, None], k.states @ s.A.T + on, 0.0)
+    k.given[:] = np.where(runs[:, None, None], s.A @ k.given + s.B * (u - s.low), 0.0)
+    k.unit[:] = np.where(runs[:, None, None], s.A @ k.unit + s.B, 0.0)
+    k.age[:] = np.where(runs, k.age + 1, -1)
+
+
+def compare(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
+    """Readings y (p,) that count against every window: what moved, and the sums of the fits."""
+    k.least[:] = np.where(counts, np.minimum(k.least, y), k.least)
+    k.most[:] = np.where(counts, np.maximum(k.most, y), k.most)
+    own, inputs = s.of_input, s.input_of
+    runs = (k.age >= 0)[:, None]
+    missed = np.where(counts & runs, y - k.states[1] @ s.C.T - s.d, 0.0)[:, own]
+    given, unit = ((s.C @ part)[:, own, inputs] for part in (k.given, k.unit))
+    span = (s.high - s.low)[inputs]
+    step = np.where(runs, 1.0, 0.0) * np.ones_like(given)
+    signatures = np.stack([-given, span * unit - given, span * unit, k.before - given, -given, step], axis=2)
+    moved = np.where(counts, y - k.began, 0.0)
+    k.total[...] += moved, moved * moved
+    k.before[:] = given
+    k.square[...] += missed * missed
+    k.causes[...] += signatures * signatures
+    k.cross[...] += missed[:, None, :, None] * signatures
+
+
+def threshold(s: Supervision, k: Kept) -> np.ndarray:
+    """By how many degC (K, p) a forecast must move, or be missed, before a sensor or heater is judged."""
+    least = np.maximum(STEPS_STILL * known_steps(k.quantum), NOISE_STILL * s.noise_degC)
+    unsure = s.unsure[np.minimum(np.maximum(k.age, 0), len(s.unsure) - 1)]
+    return np.maximum(least, NOISE_STILL * unsure * s.coarser(k.quantum))
+
+
+def both_ahead(s: Supervision, k: Kept, y: np.ndarray) -> np.ndarray:
+    """By how many degC (K, p) both forecasts, from the drift as it was and from its mean, are above y (p,) or
+    (K, p), or below it if negative; 0 if y lies between them."""
+    first, second = k.states @ s.C.T + s.d - y
+    return np.where(first * second > 0, np.where(np.abs(first) < np.abs(second), first, second), 0.0)
+
+
+def clear_sensors(s: Supervision, k: Kept) -> None:
+    """Clears sensors that move as forecast, and counts the samples for which each forecast was away."""
+    moves, moved = k.states[0] @ s.C.T + s.d - k.began, k.y - k.first
+    large = (np.abs(moves) >= threshold(s, k)) & (k.age > 0)[:, None]
+    share = moved / np.where(large, moves, 1.0)
+    follows = large & (share >= FOLLOWS[0]) & (share <= FOLLOWS[1])
+    k.cleared_s[:] = np.where(follows.any(axis=0) & (k.bad == 0), k.clock_s[1], k.cleared_s)
+    k.away[:] = np.where(large, k.away + 1, 0)
+
+
+def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
+    """Says which sensors stand still while the forecast moves, and which heater heats otherwise than it was
+    told: what explains clearly better than anything that is no fault."""
+    judge_heat(s, k, y, counts)
+    clear_sensors(s, k)
+    own, age, m = s.of_input, np.maximum(k.age, 1)[:, None], len(s.low)
+    old, moves = counts & (age >= FIT_AFTER), both_ahead(s, k, k.began)
+    least = np.maximum(threshold(s, k), DOUBT * np.abs(s.C @ k.unit) @ k.stirred)
+    tells = old & (np.abs(y - k.states[1] @ s.C.T - s.d) >= least)
+    # a healthy sensor repeats itself for long only if its steps are coarser than its noise
+    equal = old & (k.repeats >= age) & (known_steps(k.quantum) <= s.noise_degC)
+    equal &= np.abs(moves) >= NOISE_STILL * s.noise_degC
+    still = (k.away >= STILL_AFTER) & (np.abs(moves) >= least) & counts | equal
+    if not (tells.any() or still.any()):
+        k.shown[:] = 0
+        return
+    amount = np.clip(k.cross / np.maximum(k.causes, 1e-12), LEAST, MOST)
+    left = k.square[:, None, :, None] - 2 * amount * k.cross + amount**2 * k.causes
+    wander = s.wander[np.minimum(np.maximum(k.age, 0), len(s.wander) - 1)]
+    noise = (age * (2 * s.noise_degC) ** 2 + wander) * s.coarser(k.quantum) ** 2
+    floor = noise[:, own] + MISFIT**2 * k.square + 1e-12
+    later = (k.age[None, :] <= k.age[:, None]) & (k.age >= REPEATED)[None, :]
+    left = np.where(later[:, :, None, None], np.maximum(left, floor[:, None, :, None]), 1e300)
+    honest = np.minimum(left[..., HEAT:].min(axis=(1, 3)), np.maximum(k.square, floor))
+    same = k.most - k.least <= same_degC(s, k)
+    # a heater that is stuck on heats, and by more than the drift of either forecast
+    heats = (y - k.least > same_degC(s, k)) & (-both_ahead(s, k, y) >= least)
+    judge_sensors(s, k, moves, still & same, honest, noise)
+    left, honest, floor = left[:, :, :m], honest[:, :m], floor[:, :m]
+    explained = left[..., :HEAT].min(axis=1)
+    best = explained.min(axis=2)
+    gives = explained[..., GIVES] < explained[..., LACKS]
+    tells = tells[:, own[:m]] & (heats[:, own[:m]] | ~gives)
+    clear = (age * np.log(honest / best) >= CLEARER) & tells & (best <= 2 * floor) & (best < 1e300)
+    shows = np.stack([(clear & gives).any(axis=0), (clear & ~gives).any(axis=0)])
+    k.shown[:] = np.where(shows, k.shown + 1, 0)
+    shown = clear & (k.shown.max(axis=0) >= SHOWN)
+    if shown.any():
+        window, i = np.unravel_index(np.where(shown, k.square[:, :m], -1.0).argmax(), shown.shape)
+        cause = GIVES if gives[window, i] else LACKS
+        share = float(amount[window, left[window, :, i, cause].argmin(), i, cause])
+        if same[window, own[i]]:
+            say_still(k, int(own[i]), moves[window, own[i]])
+        elif cause == GIVES:
+            say(k, ON, int(i), share)
+        else:
+            say(k, WEAK, int(i), share)
+
+
+def judge_heat(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
+    """Says whose heat is missing for long: more than disturbances take, or some of it while the heater is at
+    its limit, as long as its output does not rise."""
+    m, p, window = len(s.low), len(s.d), int(k.age.argmax())
+    own, span = s.of_input[:m], s.high - s.low
+    lost = -s.heat @ k.x[-p:]
+    rises = (k.age[window] < (WINDOWS - 1) * SPACING) | (y - k.first[window] > same_degC(s, k))
+    least = np.where(k.asked >= s.high, AT_LIMIT, MISSING)
+    k.missing[:] = np.where(counts[own] & ~rises[own] & (lost >= least), k.missing + 1, 0)
+    for i in np.flatnonzero(k.missing >= s.missing_for):
+        say(k, WEAK, int(i), lost[i] / max((k.usual[i] - s.low[i]) / span[i], lost[i]))
+
+
+def say_still(k: Kept, j: int, moves_degC: float) -> None:
+    """An output stands still, or shows noise alone, while its forecast moves: its sensor, or its heater."""
+    say(k, STILL if k.repeats[j] >= STILL_AFTER // 2 else DEAF, j, moves_degC)
+
+
+def same_degC(s: Supervision, k: Kept) -> np.ndarray:
+    """By how many degC (p,) a reading may vary that stands still."""
+    return np.maximum(SAME_STEPS * known_steps(k.quantum), SAME_NOISE * s.noise_degC)
+
+
+def judge_sensors(
+    s: Supervision, k: Kept, moves: np.ndarray, still: np.ndarray, honest: np.ndarray, noise: np.ndarray
+) -> None:
+    """Says which sensors stand still (K, p) as long as nothing that is no fault, which leaves `honest` (K, m)
+    of what they miss, explains that as well; `noise` (K, p) of it is none of anything."""
+    age = np.maximum(k.age, 1)[:, None]
+    still = still & (np.abs(moves) >= SAME_STEPS * (k.most - k.least))
+    for j in np.flatnonzero(still.any(axis=0)):
+        heaters = np.flatnonzero(s.of_input == j)
+        square = k.square[:, heaters].max(axis=1)
+        steady = k.total[1, :, j] - k.total[0, :, j] ** 2 / age[:, 0]
+        floor = noise[:, j] + MISFIT**2 * square + 1e-12
+        better = age[:, 0] * np.log(honest[:, heaters].min(axis=1) / np.maximum(steady, floor))
+        # what moves a heater is a reading that moved: nothing honest keeps one equal meanwhile, unless its
+        # steps hide what the law makes up for
+        equal = (k.repeats[j] >= age[:, 0]) & (known_steps(k.quantum)[j] <= s.noise_degC[j])
+        clear = still[:, j] & ((better >= CLEARER) | equal)
+        if clear.any():
+            window = int(np.where(clear, np.abs(moves[:, j]), -1.0).argmax())
+            say_still(k, int(j), moves[window, j])
+
+
+def forget(s: Supervision, k: Kept) -> None:
+    """Causes that are gone: after BACK_S without them, or, if the heaters are off for them, as soon as the
+    output moves as forecast again. A heater is tried again RETURNS times an hour; from then on a person is
+    waited for."""
+    if not k.counters[ACTIVE]:
+        return
+    gone = (k.since >= 0) & (k.clock_s[1] - k.last > BACK_S)
+    for kind in (STILL, DEAF, ON, WEAK):
+        for signal in np.flatnonzero(k.since[kind] >= 0):
+            j = s.of_input[signal] if kind in OF_INPUT else signal
+            rested = k.clock_s[1] - k.returned_s[j] > 3600.0
+            heated = kind == WEAK and k.amount[WEAK, signal] >= 0  # under the machine's own control
+            over = gone[kind, signal] if heated else k.cleared_s[j] > k.last[kind, signal]
+            again = gone[kind, signal] = bool(over) and (rested or k.returns[j] < RETURNS)
+            if again:
+                k.returns[j] = 1 if rested else k.returns[j] + 1
+                k.returned_s[j] = k.clock_s[1]
+                k.cleared_s[j] = -np.inf  # what cooled as forecast may yet be out of place
+    if gone.any():
+        k.since[gone] = k.last[gone] = -1.0
+        k.counters[ACTIVE] -= int(gone.sum())
+        k.age[:] = -1
+
+
+def follow(s: Supervision, k: Kept, y: np.ndarray, applied: np.ndarray | None, samples: int) -> np.ndarray:
+    """One sample of outputs y (p,), inputs `applied` since the one before, none of `samples` in manual; y
+    (p,) with what does not count as forecast."""
+    u = k.asked if applied is None else np.where(np.isfinite(applied), applied, k.asked)
+    u = np.minimum(np.maximum(u, s.low), s.high) - k.forward
+    silent = np.isnan(k.y)
+    counts = read(s, k, y)
+    begins = k.counters[SAMPLES] == 0 or (silent & counts).any()
+    for step in range(max(samples, 1) if k.counters[SAMPLES] else 0):
+        advance(s, k, u)
+        if samples == 0:
+            k.x[...] += s.hurried @ k.e
+        elif step:
+            k.e[:] = 0.0
+    k.expected[:] = s.C @ k.x + s.d
+    if begins or (np.abs(k.expected) > FAR_DEGC).any():
+        k.x[:] = s.start @ np.where(np.isfinite(k.y), k.y, s.d) + s.start_0
+        k.expected[:], k.slow[:], k.age[:] = s.C @ k.x + s.d, 0.0, -1
+    filled = np.where(counts, y, k.expected)
+    if samples == 0:
+        k.age[:] = -1
+        k.slow[:] = k.x[-len(s.d) :]
+        k.usual[:] = u if k.counters[SAMPLES] < 2 else k.usual + SLOWLY * (u - k.usual)
+        k.stirred[:] = 0.0
+    else:
+        k.slow[...] += SLOWLY * (k.x[-len(s.d) :] - k.slow)
+        k.usual[...] += SLOWLY * (u - k.usual)
+        k.stirred[:] = np.maximum(np.abs(u - k.usual), (1 - RESTS) * k.stirred)
+        compare(s, k, filled, counts)
+        judge(s, k, filled, counts)
+    k.e[:] = np.where(counts, filled - k.expected, 0.0)
+    forget(s, k)
+    if samples and k.counters[SAMPLES] % SPACING == 0:
+        begin_window(s, k, k.counters[SAMPLES] // SPACING % WINDOWS)
+    k.counters[SAMPLES] += 1
+    return filled
+
+
+def choose_mode(s: Supervision, k: Kept) -> int:
+    """The safe mode of the causes that are there: the heaters go off if a sensor is in doubt, or a heater is
+    and its sensor has not moved as forecast for CLEARED_S; otherwise the machine's own control takes over."""
+    if not k.counters[ACTIVE]:
+        return LAW
+    doubtful = (k.since[[OPEN, STILL, DEAF, ON]] >= 0).any()
+    for i in np.flatnonzero(k.since[WEAK] >= 0):
+        if k.amount[WEAK, i] >= 0 and k.last[WEAK, i] - k.cleared_s[s.of_input[i]] > CLEARED_S:
+            k.amount[WEAK, i] = -k.amount[WEAK, i]
+    uncleared = (k.amount[WEAK][k.since[WEAK] >= 0] < 0).any()
+    return OFF if doubtful or uncleared else OWN
+
+
+# ---- in words
+
+
+def sentence(s: Supervision, machine: Machine, kind: int, signal: int, amount: float) -> str:
+    """Why, in one sentence."""
+    if kind in OF_INPUT:
+        heater, zone = machine.inputs[signal].name, machine.outputs[s.of_input[signal]].name
+    else:
+        zone = machine.outputs[signal].name
+        heater = machine.inputs[s.input_of[(s.of_input == signal).argmax()]].name
+    if kind == OPEN and not np.isfinite(amount):
+        return f"{zone} gives no number."
+    return {
+        OPEN: f"{zone} reads {amount:.1f} degC, outside its limits.",
+        STILL: f"{zone} stands still while its model moves by {amount:+.1f} degC: {zone}, or {heater}.",
+        DEAF: f"{zone} shows noise alone while its model moves by {amount:+.1f} degC: {zone}, or {heater}.",
+        ON: f"{heater} gives {100 * amount:.0f} % of what it could add: it is stuck on, and only the "
+        "mains can stop it.",
+        WEAK: f"{heater} lacks {100 * abs(amount):.0f} % of what it is told"
+        + (f", or {zone} is out of place." if amount < 0 else "."),
+        REACH: f"{zone} is asked for {amount:.1f} degC more or less than its limits and the inputs can hold: "
+        "the last reference in reach stays.",
+    }[kind]

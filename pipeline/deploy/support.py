@@ -1,0 +1,337 @@
+"""Where a recording is off the support of what a controller was learned from and judged on: temperatures and
+commands beyond those of the record, and outputs that no plant of its spread would have had.
+
+Plants of the spread forecast the outputs a few samples ahead, each from its own observer and with the inputs
+that were applied. f_k (p,) is what plant k of K forecasts more than their mean, e (p,) the machine's miss of
+that mean. Two questions follow.
+
+Sample by sample: is e larger than the plants differ? S (p, p) is the covariance of the f_k, R what the noise
+of the sensors adds:
+
+    d^2 = e' (S + R)^-1 e
+
+A forecast is off if d is larger than nearly always on the controller's own plants.
+
+For the log as a whole: the machine is one plant all the time. If it were of the spread, one mixture c (K,)
+would explain all its misses, with a rest as large as on honest logs:
+
+    e = sum_k c_k f_k + rest,   c ~ N(0, I / (K - 1))
+
+The most likely c is a ridge regression. `misfit` is the mean square of the rest, `departure` the mean square
+of c, in units of the spread. Swapped sensors misfit; a gain far from the spread departs.
+
+Every observer takes a steady disagreement for weather (another ambient, more heat lost). So a log in which
+nothing moves cannot say which sensor is which, or what a heater's percent is worth: it is judged by its
+ranges alone."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from pipeline.deploy.replay import BLOCK, GaplessLog, scanned
+from pipeline.temperature.controllers.governor import instants
+from pipeline.temperature.plant import Plant, markov_parameters
+from pipeline.temperature.tracking import reached_state, riccati
+
+TEMPERATURE, COMMAND, FORECAST = 1, 2, 4
+BEYOND = 0.1  # of a range: signals may leave it by so much
+NEARLY_ALL = 0.99  # of the forecasts on honest plants are no further off
+HONEST = 0.96  # of honest logs keep every limit
+LEAST_SHARE = 0.05  # of a log, beyond whose ranges it is off
+LEAST_FIGURES = (0.05, 1.5, 1.0)  # below which no log is off, whatever the honest ones were
+FEW, FEW_LOGS = 1.5, 30
+ENOUGH = 100
+STILL = 3.0  # of `rest`, within which outputs stay, and would by their inputs, where nothing moves
+TAU, DRIFT, LEAK, UNHURRIED = 0.2, 0.06, 1e-4, 16  # of the observers, as of the governor's
+AT_ONCE = 4  # forecasts begin so often within the steps that one goes
+MOST_SAMPLES = 60_000  # of a long log forecasts are judged in stretches, so many samples in all
+STRETCH = 2_000
+
+
+class Support(NamedTuple):
+    """low, high (p,) in °C of temperatures and (m,) in percent of commands; `spread` are the plants that
+    forecast, `steps` samples ahead, with sensors' noise (p,) in °C; `furthest` d is allowed; `rest` (p,) in
+    °C what honest logs leave unexplained; `allowed` (3,) the limits of a log's `figures`."""
+
+    temperature_low: np.ndarray
+    temperature_high: np.ndarray
+    command_low: np.ndarray
+    command_high: np.ndarray
+    spread: tuple[Plant, ...]
+    noise: np.ndarray
+    steps: int
+    furthest: float
+    rest: np.ndarray
+    allowed: np.ndarray
+
+
+class FamilyForecasts(NamedTuple):
+    """Forecasts of a log: the sample at which each begins (a,), what each plant forecasts more than their
+    mean (K, a, p), and the machine's miss of the mean (a, p), in °C."""
+
+    start: np.ndarray
+    apart: np.ndarray
+    miss: np.ndarray
+
+
+def horizon(spread: Sequence[Plant]) -> int:
+    """Samples after which an input has shown what it does: the furthest instant of the governor, of the
+    middle one of the plants. Further ahead weather and doubt about the plants cover what is wrong."""
+    return int(np.median([instants([one])[-1] for one in spread]))
+
+
+def forecasts(observers: "Observers", log: GaplessLog, steps: int) -> FamilyForecasts:
+    """Forecasts over `steps` samples, AT_ONCE of them under way at a time; none in the first 2 `steps`, while
+    the observers find the machine."""
+    start = np.arange(2 * steps, len(log.u) - steps, max(steps // AT_ONCE, 1))
+    outputs = _forecast(observers, log, start, steps)
+    mean = outputs.mean(axis=0)
+    return FamilyForecasts(start, outputs - mean, log.y[start + steps] - mean)
+
+
+def distances(run: FamilyForecasts, noise: np.ndarray) -> np.ndarray:
+    """d (a,) of every forecast, with sensors' noise (p,)."""
+    S = np.einsum("kai,kaj->aij", run.apart, run.apart) / (len(run.apart) - 1)
+    near = S + np.diag((NOISES * noise) ** 2)
+    whitened = np.linalg.solve(near, run.miss[..., None])[..., 0]
+    return np.sqrt(np.einsum("ai,ai->a", run.miss, whitened))
+
+
+NOISES = 2.0  # deviations: of the sample that is forecast, and of those from which
+
+
+def fit_mixture(run: FamilyForecasts, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mixture c (K,) of the plants that explains all forecasts best, each output in units of `rest` (p,),
+    and the rest (a, p) in °C:
+
+        c = (w F'F + (K - 1) I)^-1 w F'e
+
+    The rest is alike from one forecast to the next: a long log counts as one of ENOUGH forecasts, w = ENOUGH
+    / their number. Otherwise little errors that never change would pass for another machine."""
+    K = len(run.apart)
+    F, weight = (run.apart / rest).reshape(K, -1), min(ENOUGH / len(run.start), 1.0)
+    c = np.linalg.solve(weight * F @ F.T + (K - 1) * np.eye(K), weight * F @ (run.miss / rest).ravel())
+    return c, run.miss - np.tensordot(c, run.apart, axes=1)
+
+
+def figures(run: FamilyForecasts, noise: np.ndarray, furthest: float, rest: np.ndarray) -> np.ndarray:
+    """Of a log: the share of forecasts further off than `furthest`, its misfit, and its departure."""
+    if not len(run.start):
+        return np.zeros(3)
+    c, left = fit_mixture(run, rest)
+    return np.array(
+        [(distances(run, noise) > furthest).mean(), ((left / rest) ** 2).mean(), (len(c) - 1) * (c**2).mean()]
+    )
+
+
+class Observers(NamedTuple):
+    """Observers L of the states [x; w] of K plants, one behind the other: w (p,) in °C a step is a drift that
+    the plant does not explain, so that a steady disagreement (another ambient, more heat lost) vanishes from
+    its forecasts, as in temperature.governor. `first` (K, n, p) finds x of the first outputs."""
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    b: np.ndarray
+    d: np.ndarray
+    L: np.ndarray
+    first: np.ndarray
+
+
+def design_observers(spread: Sequence[Plant], steps: int) -> Observers:
+    """The observers of plants of one order: the same for every log."""
+    return Observers(
+        *(np.stack(part) for part in zip(*(_design_observer(one, steps) for one in spread), strict=True))
+    )
+
+
+def _design_observer(plant: Plant, steps: int) -> tuple[np.ndarray, ...]:
+    """Process noise comes in by the inputs, sensors are TAU percent^2 of every input noisier, and the drift
+    wanders a step by DRIFT of what a percent of every input does at most."""
+    n, p, slower = plant.n, plant.p, max(steps / UNHURRIED, 1.0)
+    likely = reached_state(plant)
+    A = np.block([[plant.A, likely], [np.zeros((p, n)), (1 - LEAK) * np.eye(p)]])
+    C = np.hstack([plant.C, np.zeros((p, p))])
+    pulse = (np.abs(markov_parameters(plant, steps)).max(axis=0) ** 2).sum(axis=1)
+    noise = scipy.linalg.block_diag(plant.B @ plant.B.T, (DRIFT / slower) ** 2 * np.diag(pulse))
+    sensors = TAU * slower**2 * pulse.mean() * np.eye(p)
+    P = riccati(A.T, C.T, noise, sensors)
+    L = A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
+    none = np.zeros((p, plant.m))
+    return A, np.vstack([plant.B, none]), C, np.r_[plant.b, np.zeros(p)], plant.d, L, likely
+
+
+def _forecast(observers: Observers, log: GaplessLog, start: np.ndarray, steps: int) -> np.ndarray:
+    """Outputs (K, a, p) that the plants forecast `steps` samples after each start (a,)."""
+    K, p = observers.d.shape
+    away = (log.y[0] - observers.d)[..., None]
+    x = np.concatenate([np.matmul(observers.first, away)[..., 0], np.zeros((K, p))], axis=1)
+    moved, states = observers.A - observers.L @ observers.C, np.empty((K, len(start), x.shape[1]))
+    B, b, L = observers.B.swapaxes(1, 2), observers.b[:, None], observers.L.swapaxes(1, 2)
+    for first in range(0, len(log.u), BLOCK // K):
+        rows = slice(first, first + BLOCK // K)
+        inside = np.flatnonzero((start >= rows.start) & (start < rows.stop))
+        drive = np.matmul(log.u[rows], B) + np.matmul(log.y[rows] - observers.d[:, None], L) + b
+        walked = scanned(moved, drive, x)
+        states[:, inside], x = walked[:, start[inside] - first], walked[:, -1]
+    for step in range(steps):
+        states = np.matmul(states, observers.A.swapaxes(1, 2)) + np.matmul(log.u[start + step], B) + b
+    return np.matmul(states, observers.C.swapaxes(1, 2)) + observers.d[:, None]
+
+
+def support(
+    spread: Sequence[Plant],
+    honest: Sequence[GaplessLog],
+    noise_degC: np.ndarray,
+    seen: Sequence[GaplessLog] = (),
+) -> Support:
+    """Of logs of the controller's own plants, whose sensors have noise (p,), and of recordings of the machine
+    that were `seen`: these are on support whatever the plants say. Raises ValueError where no log is long
+    enough."""
+    steps = horizon(spread)
+    observers, noise = design_observers(spread, steps), np.asarray(noise_degC, float)
+    groups = [
+        [forecasts(observers, log, steps) for log in logs if len(log.u) > 4 * steps]
+        for logs in (honest, [piece for log in seen for piece in _pieces(log, steps)])
+    ]
+    groups = [runs for runs in groups if runs]
+    if not groups:
+        raise ValueError(
+            f"support: expected a log of more than {4 * steps} samples to tell what an honest one is, found "
+            "none; record longer"
+        )
+    furthest = max(
+        float(np.quantile(np.concatenate([distances(run, noise) for run in runs]), NEARLY_ALL))
+        for runs in groups
+    )
+    rest = np.max([_rest(runs, noise) for runs in groups], axis=0)
+    limits = [
+        _seldom_above(np.array([figures(run, noise, furthest, rest) for run in runs])) for runs in groups
+    ]
+    ranges = []
+    for parts in ([log.y for log in (*honest, *seen)], [log.u for log in (*honest, *seen)]):
+        low, high = (
+            getattr(np, side)([getattr(part, side)(axis=0) for part in parts], axis=0)
+            for side in ("min", "max")
+        )
+        ranges += [low - BEYOND * (high - low), high + BEYOND * (high - low)]
+    allowed = np.max([LEAST_FIGURES, *limits], axis=0)
+    return Support(*ranges, tuple(spread), noise, steps, furthest, rest, allowed)
+
+
+def _pieces(log: GaplessLog, steps: int) -> list[GaplessLog]:
+    """A recording whole, and in up to PIECES parts, each long enough to be judged by itself: what a mixture
+    may be, and leave, differs with the length."""
+    count = min(max(len(log.u) // (5 * steps), 1), PIECES)
+    parts = [GaplessLog(*part) for part in zip(*(np.array_split(one, count) for one in log), strict=True)]
+    return [log, *parts] if count > 1 else parts
+
+
+PIECES = 8
+
+
+def _rest(runs: Sequence[FamilyForecasts], noise: np.ndarray) -> np.ndarray:
+    """Deviation (p,) in °C of what mixtures leave of honest logs; at least the sensors' noise, of which they
+    leave less where forecasts are few."""
+    rest, least = NOISES * noise, noise + 1e-9
+    for _ in range(3):
+        left = [(fit_mixture(run, np.maximum(rest, least))[1] ** 2).mean(axis=0) for run in runs]
+        rest = np.sqrt(np.mean(left, axis=0))
+    return np.maximum(rest, least)
+
+
+def _seldom_above(found: np.ndarray) -> np.ndarray:
+    """Limits (k,), all at one quantile, of which few new logs pass any: of many honest ones' figures (n, k)
+    those that a share HONEST of them keep; of few, the largest and more."""
+    n = len(found)
+    if n < FEW_LOGS:
+        return FEW * found.max(axis=0)
+    ranked = np.sort(found, axis=0)
+    kept = [(found <= limits).all(axis=1).mean() >= HONEST for limits in ranked]
+    return ranked[int(np.argmax(kept))]
+
+
+class SupportCheck(NamedTuple):
+    """What is said of a log: by sample (T,) the sum of TEMPERATURE, COMMAND and FORECAST; its `figures` over
+    what they may be (3,), above 1 off support, 0 where it is judged by its ranges alone; the share of samples
+    outside the ranges; `abstains`: a replay of it says nothing of this controller; `still`: so little moves
+    that it cannot be told whether signals are wired or scaled as they were; `short`: too short for a
+    forecast."""
+
+    off: np.ndarray
+    figures: np.ndarray
+    outside: float
+    abstains: bool
+    still: bool
+    short: bool = False
+
+
+def check_log(within: Support, log: GaplessLog, observers: Observers) -> SupportCheck:
+    """Where a log is off support, by the observers of its plants. One too short for a forecast is judged by
+    its ranges alone."""
+    off = np.zeros(len(log.u), np.int8)
+    for low, high, values, kind in (
+        (within.temperature_low, within.temperature_high, log.y, TEMPERATURE),
+        (within.command_low, within.command_high, log.u, COMMAND),
+    ):
+        off[((values < low) | (values > high)).any(axis=1)] |= kind
+    every, runs = max(within.steps // AT_ONCE, 1), []
+    for first, part in _stretches(log):
+        runs.append(forecasts(observers, part, within.steps))
+        far = distances(runs[-1], within.noise) > within.furthest
+        for start in first + runs[-1].start[far]:
+            off[start + within.steps - every : start + within.steps] |= FORECAST
+    joined = FamilyForecasts(
+        *(np.concatenate(part, axis=-2 if part[0].ndim > 1 else 0) for part in zip(*runs, strict=True))
+    )
+    outside = float((off & (TEMPERATURE | COMMAND) != 0).mean()) if len(off) else 0.0
+    if still := not any(_moves(within, part) for _, part in _stretches(log)):
+        off &= ~np.int8(FORECAST)
+        return SupportCheck(off, np.zeros(3), outside, outside > LEAST_SHARE, still)
+    over = figures(joined, within.noise, within.furthest, within.rest) / within.allowed
+    off_support = bool((over > 1).any()) or outside > LEAST_SHARE
+    return SupportCheck(off, over, outside, off_support, still, not len(joined.start))
+
+
+def _moves(within: Support, log: GaplessLog) -> bool:
+    """Whether an output moved, or its inputs would have moved it on a plant of the spread."""
+    plant = within.spread[0]
+    drive = (log.u - log.u.mean(axis=0)) @ plant.B.T
+    answer = scanned(plant.A, drive, np.zeros(plant.n)) @ plant.C.T
+    return any(bool((part.std(axis=0) > STILL * within.rest).any()) for part in (log.y, answer))
+
+
+def reasons(checked: SupportCheck) -> list[str]:
+    """Why a log is off support, the strongest reason first; or what could not be told of it."""
+    found = [(checked.outside / LEAST_SHARE, OUTSIDE)] + list(zip(checked.figures, OF_FIGURES, strict=True))
+    over = sorted((one for one in found if one[0] > 1), key=lambda one: -one[0])
+    unknown = [text for so, text in ((checked.still, STILL_TOLD), (checked.short, SHORT_TOLD)) if so]
+    return [sentence.format(times) for times, sentence in over] + unknown
+
+
+OUTSIDE = "Temperatures or commands lie outside what was seen, {:.2g} times as often as they may."
+OF_FIGURES = (
+    "Forecasts miss by more than the plants of the spread differ, {:.2g} times as often as they may.",
+    "What no plant of the spread explains is {:.2g} times what it may be: signals may be swapped, or the "
+    "machine is another.",
+    "Gains or time constants lie outside the spread, by {:.2g} times of what they may.",
+)
+STILL_TOLD = (
+    "Next to nothing moves in the recording: swapped sensors or heaters, a wrong unit or another gain could "
+    "not be told from it."
+)
+SHORT_TOLD = (
+    "The recording is too short for a forecast: swapped sensors or heaters, a wrong unit or another gain "
+    "could not be told from it."
+)
+
+
+def _stretches(log: GaplessLog) -> list[tuple[int, GaplessLog]]:
+    """The log whole, or of a long one stretches evenly apart, each with its first sample."""
+    T = len(log.u)
+    if T <= MOST_SAMPLES:
+        return [(0, log)]
+    firsts = np.linspace(0, T - STRETCH, MOST_SAMPLES // STRETCH).astype(int)
+    return [(int(at), GaplessLog(*(part[at : at + STRETCH] for part in log))) for at in firsts]

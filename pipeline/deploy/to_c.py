@@ -1,0 +1,446 @@
+"""A controller as C99 without heap: a folder that `make test` compiles and checks.
+
+law.c and controller.c are the same for every machine, and are read beside controller.py and supervisor.py,
+whose letters they keep. machine.h says which machine they are made for; tables.h holds its numbers, each as
+the shortest decimal that reads back bit by bit. golden.csv holds what the object of `pipeline` did, and
+test_controller.c asks for the same within 1e-9 of each signal's range. With -DBEADLINE_SINGLE a `real` is a
+float, for boards; its tolerance stands in test_controller.c.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.deploy import supervisor
+from pipeline.deploy.certificate import Certificate, sha256
+from pipeline.deploy.machine import Exported, check, check_certificate
+from pipeline.deploy.names import identifier
+from pipeline.temperature import tracking
+from pipeline.temperature.controllers import governor as governing
+from pipeline.temperature.controllers.controller import Deployed, FeedForward, Rest, aim, constant
+from pipeline.temperature.controllers.governor import Governor
+from pipeline.temperature.plant import Plant, strictly_proper
+from pipeline.temperature.tracking import Law
+
+TEMPLATES = Path(__file__).with_name("templates")
+PARTS = ("law.h", "law.c", "supervisor.h", "supervisor.c")
+COPIED = ("test_controller.c", "Makefile")
+WIDTH = 110
+# the governor's bound of rounding errors in °C: a forecast of 250 °C in single precision is sure to 3e-5
+SINGLE_EXACT = "BY_PRECISION({}, 3e-5)"
+# of several columns least_squares takes at most INPUTS, which gcc does not see: of one it warns of a second
+ONE_INPUT = '#if defined(__GNUC__)\n#pragma GCC diagnostic ignored "-Warray-bounds"\n#endif\n\n'
+
+
+def files(exported: Exported, certificate: Certificate, golden: str) -> dict[str, str]:
+    """The folder's files, name to text; `golden` is golden.csv (vectors.py). Raises ValueError where the
+    certificate was not passed, or is of another controller."""
+    check(exported)
+    check_certificate(exported, certificate)
+    return code(exported, sha256(certificate)) | {"golden.csv": golden}
+
+
+def code(exported: Exported, certificate_sha256: str) -> dict[str, str]:
+    """The folder's files without golden.csv."""
+    return {name: _template(name) for name in COPIED} | {
+        "controller.h": _assembled("controller.h"),
+        "controller.c": _assembled("controller.c"),
+        "machine.h": machine_header(exported, certificate_sha256),
+        "tables.h": tables(exported),
+        "test_plant.h": plant_header(exported),
+        "README.txt": readme(exported, certificate_sha256),
+    }
+
+
+def _template(name: str) -> str:
+    return (TEMPLATES / name).read_text(encoding="utf-8")
+
+
+def _assembled(name: str) -> str:
+    """A file with its parts in place, each marked @part@."""
+    text = _template(name)
+    for part in PARTS:
+        text = text.replace(f"@{part}@", _template(part).rstrip())
+    return text
+
+
+def readme(exported: Exported, certificate_sha256: str) -> str:
+    """README.txt: what it is for, how it is called, and how its stack and its steps are measured."""
+    signals = "".join(
+        f"{kind:<8}{one.name}, {one.unit}, {one.low:g} to {one.high:g}\n"
+        for kind, group in (("input", exported.machine.inputs), ("output", exported.machine.outputs))
+        for one in group
+    )
+    simulated = "The plant was simulated: beadline_init asks for rehearsal = 1, beside a simulation only.\n"
+    parts = {
+        "contestant": exported.name,
+        "sample_time": f"{exported.machine.sample_time_s:g}",
+        "signals": signals,
+        "certificate": certificate_sha256,
+        "plant": exported.plant_sha256,
+        "simulated": simulated if exported.simulated else "",
+    }
+    text = _template("README.txt")
+    for name, value in parts.items():
+        text = text.replace(f"@{name}@", value)
+    return text
+
+
+# ---- the text of numbers
+
+
+def number(value: float) -> str:
+    """The shortest decimal that reads back as the same double."""
+    if np.isinf(value):
+        return "-INFINITY" if value < 0 else "INFINITY"
+    return repr(float(value))
+
+
+def _wrapped(items: list[str], indent: str) -> str:
+    lines, line = [], indent
+    for item in items:
+        if len(line) + len(item) + 2 > WIDTH and line.strip():
+            lines.append(line.rstrip())
+            line = indent
+        line += item + ", "
+    return "\n".join([*lines, line.rstrip(" ,")])
+
+
+def _braced(array: np.ndarray, depth: int) -> str:
+    indent = "    " * depth
+    if array.ndim == 1:
+        return indent + "{\n" + _wrapped([number(v) for v in array], indent + "    ") + "\n" + indent + "}"
+    return indent + "{\n" + ",\n".join(_braced(part, depth + 1) for part in array) + "\n" + indent + "}"
+
+
+def table(name: str, values: np.ndarray, *, flat: bool = False, of: str = "real") -> str:
+    """`static const real name[a][b] = {...};`; `flat`: row after row; `of`: the type. C has no empty array:
+    without a number, one 0 stands."""
+    array = np.asarray(values, float)
+    array = array.reshape(-1) if flat or not array.size else array
+    array = array if array.size else np.zeros(1)
+    shape = "".join(f"[{length}]" for length in array.shape)
+    return f"static const {of} {name}{shape} =\n{_braced(array, 0)};\n"
+
+
+def define(name: str, value: float | int | str, real: str = "REAL({})") -> str:
+    """`#define name value`; `real`: how a float is written, which has the precision of the build."""
+    whole = f'"{value}"' if isinstance(value, str) else str(value)
+    text = real.format(number(value)) if isinstance(value, float) else whole
+    return f"#define {name} {text}\n"
+
+
+# ---- machine.h
+
+
+class ArrayLengths(NamedTuple):
+    """Lengths of the arrays: `watched` states of a governor's member, `instants` it looks ahead an output;
+    `watch` states of the supervisor's observer, `windows` of its forecasts, `pairs` of input and output."""
+
+    inputs: int
+    outputs: int
+    disturbances: int
+    memory: int
+    members: int
+    watched: int
+    instants: int
+    watch: int
+    windows: int
+    signals: int
+    pairs: int
+
+
+def sizes(exported: Exported) -> ArrayLengths:
+    m, p = exported.controller.law.D.shape
+    laws = [one for one in (exported.controller, exported.fallback) if one is not None]
+    memory = max([1, *(len(one.law.A) for one in laws)])
+    family = governor_of(exported)
+    governed = (1, p, 1)
+    if family is not None:
+        f, q = family.start_0.shape
+        governed = (f, q // 2, family.above.shape[1] // p)
+    supervised = (
+        len(exported.supervision.A),
+        supervisor.WINDOWS,
+        max(m, p),
+        len(exported.supervision.of_input),
+    )
+    told = len(exported.machine.disturbances)
+    return ArrayLengths(m, p, told, memory, *governed, *supervised)
+
+
+def governor_of(exported: Exported) -> Governor | None:
+    """The governor of law and fallback, which share one. Raises ValueError where they have two."""
+    found = [one.governor for one in (exported.controller, exported.fallback) if one is not None]
+    found = [one for one in found if one is not None]
+    for other in found[1:]:
+        if not all(map(np.array_equal, found[0], other)):
+            raise ValueError(
+                f"controller {exported.name}: law and fallback have different governors; expected one for "
+                "both, deploy them in one setting"
+            )
+    return found[0] if found else None
+
+
+def machine_header(exported: Exported, certificate_sha256: str) -> str:
+    machine, at = exported.machine, sizes(exported)
+    lines = [
+        "/* The machine that this controller is made for; beadline_init refuses others. Do not edit.",
+        f" * Contestant {exported.name}. */",
+        "#ifndef BEADLINE_MACHINE_H",
+        "#define BEADLINE_MACHINE_H",
+        "",
+    ]
+    text = "\n".join(lines) + "\n"
+    text += define("BEADLINE_CONTESTANT", exported.name)
+    text += define("BEADLINE_CERTIFICATE_SHA256", certificate_sha256)
+    text += define("BEADLINE_PLANT_SHA256", exported.plant_sha256)
+    text += define("BEADLINE_SPREAD_SHA256", exported.spread_sha256)
+    text += "/* 1: the plant was simulated, and the controller runs in a rehearsal only */\n"
+    text += define("BEADLINE_SIMULATED", int(exported.simulated))
+    text += define("BEADLINE_SAMPLE_TIME_S", float(machine.sample_time_s), "{}")
+    text += define("BEADLINE_INPUT_UNIT", machine.inputs[0].unit)
+    text += define("BEADLINE_OUTPUT_UNIT", machine.outputs[0].unit)
+    text += "\n/* Inputs and outputs in the order of every array */\n"
+    kinds = {"INPUT": machine.inputs, "OUTPUT": machine.outputs, "DISTURBANCE": machine.disturbances}
+    for kind, signals in kinds.items():
+        text += "".join(define(f"{kind}_{identifier(one.name)}", i) for i, one in enumerate(signals))
+    text += "\n/* Lengths of arrays */\n"
+    for name, value in at._asdict().items():
+        text += define(name.upper(), value)
+    return text + "#define FORECASTS (OUTPUTS * INSTANTS)\n\n#endif\n"
+
+
+# ---- tables.h
+
+
+def tables(exported: Exported) -> str:
+    """Laws, target, governor and supervisor in numbers."""
+    text = "/* The numbers of one controller. Generated; do not edit. Included by controller.c only. */\n\n"
+    if len(exported.machine.inputs) == 1:
+        text += ONE_INPUT
+    text += _aiming(exported) + _governing(exported)
+    text += "\n/* ---- the law */\n\n" + _law("the_law", exported.controller)
+    text += "\n/* ---- the safe mode own */\n\n" + define("HAS_FALLBACK", int(exported.fallback is not None))
+    text += "#define the_fallback the_law\n" if exported.fallback is None else ""
+    text += _law("the_fallback", exported.fallback) if exported.fallback is not None else ""
+    return text + _forward("forward", exported) + supervising(exported.supervision)
+
+
+def _forward(name: str, exported: Exported, *, of: str = "real") -> str:
+    """Gain and mean of what is fed forward, as controller.FeedForward has them."""
+    m, q = len(exported.machine.inputs), len(exported.machine.disturbances)
+    forward = exported.controller.forward or FeedForward(np.zeros((m, q)), np.zeros(q))
+    gain = forward.gain if q else np.zeros((m, 1))
+    return table(f"{name}_gain", gain, of=of) + table(f"{name}_mean", forward.mean, of=of)
+
+
+def plant_header(exported: Exported) -> str:
+    """test_plant.h: the model, which test_controller.c heats."""
+    model = strictly_proper(exported.model)
+    text = "/* The model that the test heats: x(t+1) = A x + B u + b, y = C x + d. Do not edit. */\n\n"
+    arrays = {"A": model.A, "B": model.B, "C": model.C, "b": model.b, "d": model.d}
+    text += define("STATES", model.n)
+    span = np.array([one.high - one.low for one in exported.machine.inputs])
+    text += table("input_range", span, of="double") + _forward("plant", exported, of="double")
+    return text + "".join(table(f"plant_{name}", values, of="double") for name, values in arrays.items())
+
+
+def _aiming(exported: Exported) -> str:
+    """What feasible_target needs: outputs at rest are aim_rows u + aim_rest + aim_d."""
+    limits = exported.controller.limits
+    rows, rest = at_rest(exported.model)
+    narrowest = float((limits.high - limits.low).min())
+    return "".join(
+        [
+            "/* ---- the feasible target, as tracking.feasible_target has it */\n\n",
+            define("AIM_TOLERANCE", 1e-3, "{}"),
+            define("AIM_FINEST", 1e-3, "{}"),
+            define("AIM_FIRST", narrowest / 4, "{}"),
+            define("AIM_WIDEST", 0.49 * narrowest, "{}"),
+            define("LIGHT", tracking.LIGHT, "{}"),
+            define("ROUNDING", tracking.ROUNDING, "{}"),
+            define("FALL", tracking.FALL, "{}"),
+            table("aim_rows", rows, of="double"),
+            table("aim_rest", rest, of="double"),
+            table("aim_d", exported.model.d, of="double"),
+        ]
+    )
+
+
+def at_rest(model: Plant) -> tuple[np.ndarray, np.ndarray]:
+    """G (p, m) and g (p,): the outputs on which constant inputs u rest are G u + g + d."""
+    balance = np.eye(model.n) - model.A
+    if np.linalg.cond(balance) > 1e13:
+        balance = balance + 1e-9 * np.eye(model.n)
+    per_u, rest = np.linalg.solve(balance, model.B), np.linalg.solve(balance, model.b)
+    return model.C @ per_u + model.D, model.C @ rest
+
+
+def feeds(law: Law) -> dict[str, np.ndarray]:
+    """feed = feed_u u + feed_y y* + feed_r r + feed_0 of `controller.aim` for constant references."""
+    m, p = law.D.shape
+    bare, none = law._replace(c=np.zeros(len(law.c))), np.zeros(p)
+
+    def feed(of: Law, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
+        return aim(of, Rest(u[:, None], y[:, None], none, ()), constant(r)).feed[:, 0]
+
+    still = np.zeros(m)
+    return {
+        "feed_u": np.column_stack([feed(bare, one, none, none) for one in np.eye(m)]),
+        "feed_y": np.column_stack([feed(bare, still, one, none) for one in np.eye(p)]),
+        "feed_r": np.column_stack([feed(bare, still, none, one) for one in np.eye(p)]),
+        "feed_0": feed(law, still, none, none),
+    }
+
+
+def _governing(exported: Exported) -> str:
+    family, at = governor_of(exported), sizes(exported)
+    text = "\n/* ---- the governor, as governor.Governor has it; members first */\n\n"
+    text += define("SWEEPS", governing.SWEEPS) + define("ROUNDS", governing.ROUNDS)
+    text += define("EXACT", governing.EXACT, SINGLE_EXACT) + define("CONTRADICTED", governing.CONTRADICTED)
+    text += define("ARRIVED", governing.ARRIVED)
+    strength = family.strength if family is not None else governing.Strength(1.0, 1.0, 0.0)
+    text += define("FORGETS", float(family.forgets) if family is not None else 0.0)
+    text += define("OVERSHOOT", float(family.overshoot) if family is not None else 0.0)
+    text += define("STRONGEST", strength.strongest) + define("WEAKEST", strength.weakest)
+    halves = member_halves(family) if family is not None else _no_members(at)
+    return text + "".join(table(f"governor_{name}", values) for name, values in halves.items())
+
+
+def _no_members(at: ArrayLengths) -> dict[str, np.ndarray]:
+    """The tables of `member_halves` where nothing is governed."""
+    f, n, p, m, h = at.members, at.watched, at.outputs, at.inputs, at.outputs * at.instants
+    shapes = {
+        "C": (f, p, n), "L": (f, n, p), "A": (f, n, n), "B": (f, n, m), "B_lacks": (f, n, m), "b": (f, n),
+        "start": (f, n, p), "start_0": (f, n), "ahead": (f, h, n), "offset": (f, p), "above": (f, h),
+        "below": (f, h), "rise": (f, h, m), "fall": (f, h, m), "rise_least": (f, h), "fall_least": (f, h),
+        "low": (p,), "high": (p,), "surprise": (p,), "doubt": (p,), "near": (p,),
+    }  # fmt: skip
+    return {name: np.zeros(shape) for name, shape in shapes.items()}
+
+
+def member_halves(family: Governor) -> dict[str, np.ndarray]:
+    """The matrices of a Governor without what is known to be zero or said twice: state and what it lacks at
+    the weakest move alike, so that each block stands once. Raises ValueError for a governor of another form.
+    """
+    f, p = family.offset.shape
+    n = family.start_0.shape[1] // 2
+    C, A = (part.transpose(0, 2, 1)[:, : len(part[0].T) // 2, :n] for part in (family.see, family.move))
+    ahead = family.ahead.transpose(0, 2, 1)[:, : family.above.shape[1], :n]
+    quick, slow = family.correct[:, :p, :n], family.correct[:, p : 2 * p, :n]
+    L = (quick + slow).transpose(0, 2, 1)
+    B, B_lacks = (family.push.transpose(0, 2, 1)[:, part] for part in (slice(n), slice(n, None)))
+    halves = {
+        "C": C, "L": L, "A": A, "B": B, "B_lacks": B_lacks, "b": family.rest[:, :n],
+        "start": family.start.transpose(0, 2, 1)[:, :n], "start_0": family.start_0[:, :n],
+        "ahead": ahead, "offset": family.offset, "above": family.above, "below": family.below,
+        "rise": family.rise.transpose(0, 2, 1), "fall": family.fall.transpose(0, 2, 1),
+        "rise_least": _least(family.rise), "fall_least": _least(family.fall),
+        "low": family.low, "high": family.high, "surprise": family.surprise, "doubt": family.doubt,
+        "near": family.near,
+    }  # fmt: skip
+    if not _same_form(family, halves, n, p):
+        raise ValueError(
+            "the governor's members should hold a state and what it lacks in equal blocks, but these do not; "
+            "make it with pipeline.temperature.controllers.governor.governor"
+        )
+    return halves
+
+
+def _least(rows: np.ndarray) -> np.ndarray:
+    """Effects (f, p h) from which on an input counts, as governor._swept has them, of rows (f, m, p h)."""
+    return governing.WEAK * np.maximum(rows, 0.0).max(axis=1)
+
+
+def _same_form(family: Governor, halves: Mapping[str, np.ndarray], n: int, p: int) -> bool:
+    def twice(block: np.ndarray) -> np.ndarray:
+        none = np.zeros_like(block)
+        return np.concatenate(
+            [np.concatenate([block, none], axis=2), np.concatenate([none, block], axis=2)], axis=1
+        )
+
+    quick, slow = halves["L"].copy(), halves["L"].copy()
+    quick[:, n - p :], slow[:, : n - p] = 0.0, 0.0
+    gain = np.concatenate([quick, slow], axis=2).transpose(0, 2, 1)
+    pairs = (
+        (family.see.transpose(0, 2, 1), twice(halves["C"])),
+        (family.move.transpose(0, 2, 1), twice(halves["A"])),
+        (family.ahead.transpose(0, 2, 1), twice(halves["ahead"])),
+        (family.correct, twice(gain) * np.repeat([1.0, -1.0], n)),
+    )
+    zero = (family.rest[:, n:], family.start[:, :, n:], family.start_0[:, n:])
+    return all(np.array_equal(a, b) for a, b in pairs) and not any(map(np.any, zero))
+
+
+def _law(name: str, deployed: Deployed) -> str:
+    """`static const law <name>` with its matrices."""
+    law, limits = deployed.law, deployed.limits
+    q, (_, p) = len(law.A), law.D.shape
+    A = np.zeros(0) if deployed.shift else law.A
+    arrays = {
+        "A": A, "B_u": law.B_u, "B_y": law.B_y, "B_r": law.B_r, "c": law.c, "K": law.K, "D": law.D,
+        "K_r": law.K_r, "integral": np.broadcast_to(np.asarray(law.integral, float), (p,)),
+        "back": deployed.back, "start_u": law.start_u, "start_y": law.start_y, "start": law.start,
+        "low": limits.low, "high": limits.high, "rate": limits.rate, **feeds(law),
+    }  # fmt: skip
+    text = "".join(table(f"{name}_{key}", values, flat=True) for key, values in arrays.items())
+    flags = (
+        q,
+        deployed.shift,
+        int(law.conditional),
+        int(bool(np.any(law.integral))),
+        int(deployed.holds),
+        int(deployed.governor is not None),
+    )
+    fields = [str(flag) for flag in flags] + [number(deployed.integral_limit)]
+    fields += [f"{name}_{key}" for key in arrays]
+    return text + f"static const law {name} = {{\n{_wrapped(fields, '    ')}\n}};\n"
+
+
+# ---- the supervisor in numbers
+
+# names in tables.h of the constants of supervisor.py
+OF_SUPERVISOR = (
+    "SPACING", "STILL_AFTER", "FIT_AFTER", "STEPS_STILL", "NOISE_STILL", "SAME_STEPS", "SAME_NOISE",
+    "CLEARED_S", "CLEARER", "MISFIT", "DOUBT", "RESTS", "REPEATED", "SHOWN", "SLOWLY",
+    "EARLY", "JUMP", "BACK_S", "RETURNS", "MOST_STEP_DEGC", "MISSING", "AT_LIMIT", "FAR_DEGC",
+)  # fmt: skip
+OF_OBSERVER = (
+    "A",
+    "B",
+    "C",
+    "b",
+    "d",
+    "L",
+    "M",
+    "hurried",
+    "unsure",
+    "wander",
+    "start",
+    "start_0",
+    "low",
+    "high",
+    "heat",
+)
+
+
+def supervising(s: supervisor.Supervision) -> str:
+    """Supervision with the constants that its step takes from its module."""
+    text = "\n/* ---- the supervisor, as supervisor.Supervision has it */\n\n"
+    text += "".join(define(name, getattr(supervisor, name)) for name in OF_SUPERVISOR)
+    text += define("FOLLOWS_LEAST", supervisor.FOLLOWS[0]) + define("FOLLOWS_MOST", supervisor.FOLLOWS[1])
+    text += define("REACH_DEGC", s.reach_degC)
+    text += table("explanation_least", supervisor.LEAST) + table("explanation_most", supervisor.MOST)
+    text += define("MISSING_FOR", s.missing_for)
+    text += integers("supervisor_of_input", s.of_input) + integers("supervisor_input_of", s.input_of)
+    arrays = {name: getattr(s, name) for name in OF_OBSERVER}
+    arrays |= {"coldest": s.coldest, "hottest": s.hottest, "noise": s.noise_degC}
+    return text + "".join(table(f"supervisor_{name}", values) for name, values in arrays.items())
+
+
+def integers(name: str, values: np.ndarray) -> str:
+    items = [str(int(value)) for value in values]
+    return f"static const int {name}[{len(items)}] = {{\n{_wrapped(items, '    ')}\n}};\n"
