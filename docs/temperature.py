@@ -11,8 +11,10 @@ import numpy as np
 from pipeline.papers import study
 from pipeline.papers.published import K_DATA
 from pipeline.temperature import plant, probing, tracking
-from pipeline.temperature.controllers import controller, kernel, window
+from pipeline.temperature.controllers import kernel, window
 from pipeline.temperature.controllers.baseline import pairing, pi_law
+from pipeline.temperature.controllers.law import ActuatorLimits
+from pipeline.temperature.controllers.law import deployed as limited
 from pipeline.temperature.identification.model_choice import Settings, identify
 from pipeline.temperature.test_set import panel
 
@@ -57,7 +59,7 @@ for name, gap in gaps.items():
     print(f"{name:15} {100 * gap:9.4f} % above the optimum")
 
 # %% As deployed: heaters give 0 to 100 %, and every law aims at the nearest temperatures that can be held.
-limits = controller.ActuatorLimits(low, high, rate=np.full(machine.m, np.inf))
+limits = ActuatorLimits(low, high, rate=np.full(machine.m, np.inf))
 questions = panel.Questions(np.full((1, machine.p), 20.0), references, None, None, None)
 true = panel.delayed(machine, late=False)
 cases = panel.asked([true], questions, noise=np.full(machine.p, 0.1), seed=1, steps=1000, hold=30, cells=True)
@@ -65,7 +67,7 @@ rests = panel.rests(model, cases, limits)
 figure, axes = pyplot.subplots(2, 2, figsize=(9, 6), sharex=True, sharey=True)
 runs = {}
 for axis, (name, law) in zip(axes.flat, (laws | {"PI, SIMC": pi_simc}).items(), strict=True):
-    deployed = controller.deployed(law, limits, integral_limit=1.0)
+    deployed = limited(law, limits, integral_limit=1.0)
     runs[name] = panel.rolled_out(deployed, cases, panel.aims(law, rests, cases))
     axis.plot(runs[name].y[:, 0])
     axis.set_prop_cycle(None)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pipeline.deploy.certificate import EvidenceRecord, Rules
     from pipeline.deploy.certificate_evidence import WindowModels
     from pipeline.deploy.replay import GaplessLog
-    from pipeline.deploy.signals import Machine
+    from pipeline.deploy.supervise import Machine
     from pipeline.temperature.controllers.feed_forward import Told
     from pipeline.temperature.controllers.problem import Design
     from pipeline.temperature.plant import Plant as PlantModel

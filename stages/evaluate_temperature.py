@@ -18,7 +18,7 @@ from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights, r
 from stages.tune_weights import load_design_problem
 
 if TYPE_CHECKING:
-    from pipeline.deploy.signals import Machine
+    from pipeline.deploy.supervise import Machine
     from pipeline.temperature.controllers.problem import Design, DesignProblem
     from pipeline.temperature.test_set.evaluation import ControllerOutcome
     from pipeline.temperature.test_set.panel import CaseConditions
@@ -68,7 +68,7 @@ def read_weights(path: str | Path) -> Weights:
 
 def wire(declared: Plant) -> Machine:
     """Section `plant` as a controller knows it."""
-    from pipeline.deploy.signals import Machine, Signal
+    from pipeline.deploy.supervise import Machine, Signal
     from pipeline.temperature.test_set import panel
 
     low, high = panel.output_limits(declared)

@@ -40,9 +40,9 @@ def probe_study(settings: GenerateProbing, machine: Plant) -> tuple[Probe, dict[
     ValueError if the machine is another."""
     import numpy as np
 
+    from pipeline.temperature.controllers.law import feasible_target
     from pipeline.temperature.plant import baam
     from pipeline.temperature.probing import excitation, multisine, prbs, probe
-    from pipeline.temperature.tracking import feasible_target
 
     rng = np.random.default_rng(settings.seed)
     count, amplitude = len(machine.inputs), settings.amplitude_percent

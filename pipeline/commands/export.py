@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pipeline.deploy import certificate, machine, to_c, to_klipper, to_python, to_setpoint, vectors
 from pipeline.deploy.certificate import Certificate
-from pipeline.deploy.machine import Exported
+from pipeline.deploy.supervise import Exported
 from pipeline.store import artifacts
 
 SIMULATED = "Pass (simulation): it was made for a simulated plant, and runs only if `rehearsal` is set."

@@ -8,15 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deploy import machine, replay, supervisor, support
-from pipeline.deploy.machine import Exported
+from pipeline.deploy import machine, replay, supervise, support
 from pipeline.deploy.replay import GaplessLog
-from pipeline.deploy.signals import Signal
+from pipeline.deploy.supervise import Exported, Signal
 from pipeline.deploy.support_file import read_support
 from pipeline.recordings.recordings import Source, Table, read
 from pipeline.recordings.resampling import resample
 from pipeline.store import artifacts, params
-from pipeline.temperature.controllers.controller import fed_forward
+from pipeline.temperature.controllers.law import fed_forward
 from pipeline.temperature.settings import Plant
 from stages.ingest import Ingest
 
@@ -28,7 +27,7 @@ STRETCH = 1_000
 
 class ReplayedRecording(NamedTuple):
     """One recording replayed. By sample: time_s (T,), applied, wished, asked (T, m), why (T, m) of
-    replay.WHY, measured, reference, target (T, p), off (T,) of support, cause (T,) of supervisor.KINDS or -1.
+    replay.WHY, measured, reference, target (T, p), off (T,) of support, cause (T,) of supervise.KINDS or -1.
     `abstains` where the recording is off support; `told` are sentences."""
 
     time_s: np.ndarray
@@ -216,17 +215,17 @@ def _filled(values: np.ndarray) -> np.ndarray:
 
 def _causes(made: Exported, log: GaplessLog, cuts: np.ndarray) -> np.ndarray:
     """The first cause (T,) that the supervisor has under the recorded inputs, as an index of
-    supervisor.KINDS; -1 if it has none, and at samples that it did not watch."""
+    supervise.KINDS; -1 if it has none, and at samples that it did not watch."""
     T, cause = len(log.u), np.full(len(log.u), -1, np.int8)
     starts = [0] if T <= WATCHED else np.linspace(0, T - STRETCH, WATCHED // STRETCH).astype(int)
     length = T if T <= WATCHED else STRETCH
     s = made.supervision
     for start in starts:
-        k = supervisor.kept(s)
+        k = supervise.kept(s)
         for t in range(int(start), int(start) + length):
             if t in cuts:
-                k = supervisor.kept(s)
-            supervisor.follow(s, k, log.y[t], None, int(k.counters[supervisor.SAMPLES] >= HOLD))
+                k = supervise.kept(s)
+            supervise.follow(s, k, log.y[t], None, int(k.counters[supervise.SAMPLES] >= HOLD))
             k.asked[:] = log.u[t]
             k.clock_s[1] += s.sample_time_s
             active = np.flatnonzero((k.since >= 0).any(axis=1))
@@ -267,7 +266,7 @@ def summary(done: ReplayedRecording, made: Exported, path: Path) -> dict[str, An
         },
         "causes": {
             kind: float((done.cause == k).mean())
-            for k, kind in enumerate(supervisor.KINDS)
+            for k, kind in enumerate(supervise.KINDS)
             if (done.cause == k).any()
         },
         "notes": list(done.told),
@@ -289,7 +288,7 @@ def signals(done: ReplayedRecording, made: Exported) -> dict[str, tuple[np.ndarr
         columns[f"{one.name}_reference"] = (done.reference[:, j], "degC", "what was asked for")
         columns[f"{one.name}_target"] = (done.target[:, j], "degC", "the nearest that the inputs can hold")
     columns["off_support"] = (done.off, "1", "1 temperature, 2 command, 4 forecast, summed")
-    columns["cause"] = (done.cause, "1", "of the supervisor: -1 none, " + _codes(supervisor.KINDS))
+    columns["cause"] = (done.cause, "1", "of the supervisor: -1 none, " + _codes(supervise.KINDS))
     return columns
 
 

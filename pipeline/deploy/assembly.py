@@ -4,15 +4,19 @@ for."""
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import scipy.linalg
 
-from pipeline.deploy import supervisor
-from pipeline.deploy.machine import Exported, plants_sha256
-from pipeline.deploy.signals import Machine
+from pipeline.deploy.machine import canonical, plants_sha256
+from pipeline.deploy.supervise import DOOR_S, MISSING_FOR, SPACING, WINDOWS, Exported, Machine, Supervision
+from pipeline.temperature.controllers.law import Plant
 from pipeline.temperature.controllers.problem import Design
-from pipeline.temperature.plant import Plant
+from pipeline.temperature.plant import markov_parameters, strictly_proper
 from pipeline.temperature.test_set.panel import CaseConditions, deploy
 from pipeline.temperature.test_set.scorecard import closed_loop
+from pipeline.temperature.tracking import reached_state, riccati
 
+LEAK = 0.9999  # of the drift, kept a step
+HURRIED = 0.1  # of an innovation, by which the drift follows in manual
 # what takes over if the law is left: the control that the machine has, or a PI in its place
 OWN_CONTROL = ("printer_pid", "pi", "pi_simc")
 
@@ -39,14 +43,75 @@ def assemble(
 ) -> Exported:
     """The controller as it was judged. `fallback` is the safe mode "own"; None: the heaters go off. `family`
     is the identified plant, then its spread."""
-    return Exported(
-        name,
-        machine,
-        deploy(design, setting),
-        design.model,
-        deploy(fallback, setting) if fallback else None,
-        supervisor.supervision(design.model, machine, setting.rehearsal.noise),
-        simulated,
-        plants_sha256(family[:1]),
-        plants_sha256(family[1:]),
+    return canonical(
+        Exported(
+            name,
+            machine,
+            deploy(design, setting),
+            design.model,
+            deploy(fallback, setting) if fallback else None,
+            supervision(design.model, machine, setting.rehearsal.noise),
+            simulated,
+            plants_sha256(family[:1]),
+            plants_sha256(family[1:]),
+        )
+    )
+
+
+def supervision(
+    model: Plant, machine: Machine, noise_degC: np.ndarray, *, drift: float = 0.05, follows: float = 0.3
+) -> Supervision:
+    """The observer of the stationary Riccati equation: outputs are moved a step by `follows` of the sensors'
+    noise (p,), along the state that inputs reach, and the drift wanders by `drift` of it. Raises ValueError
+    for noise that is no number above zero."""
+    noise = np.broadcast_to(np.asarray(noise_degC, float), (model.p,)).copy()
+    if not (np.isfinite(noise).all() and (noise > 0).all()):
+        raise ValueError(
+            f"supervision: expected the sensors' noise in degC above zero, found {noise}; estimate it from "
+            "a hold of the record"
+        )
+    plant = strictly_proper(model)
+    n, m, p = plant.n, plant.m, plant.p
+    likely, sensors = reached_state(plant), np.diag(np.maximum(noise, 1e-3) ** 2)
+    A = np.block([[plant.A, likely], [np.zeros((p, n)), LEAK * np.eye(p)]])
+    C = np.hstack([plant.C, np.zeros((p, p))])
+    moved = likely * follows * noise
+    P = riccati(A.T, C.T, scipy.linalg.block_diag(moved @ moved.T, np.diag((drift * noise) ** 2)), sensors)
+    M = P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
+    heat = np.vstack([likely, np.zeros((p, p))])
+    pulses = np.abs(markov_parameters(plant, 60)).max(axis=0)
+    shares = pulses / np.maximum(pulses.max(axis=1, keepdims=True), 1e-300)
+    of_input = (shares + 1e-6 * pulses / max(pulses.max(), 1e-300)).argmax(axis=0)
+    others = np.setdiff1d(np.arange(p), of_input)
+    span = np.array([one.high - one.low for one in machine.inputs])
+    drifts = markov_parameters(plant._replace(B=likely), 60).sum(axis=0)
+    lost = np.linalg.pinv(markov_parameters(plant, 60).sum(axis=0)) @ drifts
+    unsure, spread = np.empty((WINDOWS * SPACING + 1, p)), P - M @ C @ P
+    for age in range(len(unsure)):
+        unsure[age] = np.sqrt(np.maximum(np.diag(C @ spread @ C.T), 0.0))
+        spread = A @ spread @ A.T
+    return Supervision(
+        A=A,
+        B=np.vstack([plant.B, np.zeros((p, m))]),
+        C=C,
+        b=np.r_[plant.b, np.zeros(p)],
+        d=plant.d,
+        L=A @ M,
+        M=M,
+        hurried=np.vstack([np.zeros((n, p)), HURRIED * np.eye(p) - (A @ M)[n:]]),
+        unsure=unsure,
+        wander=np.cumsum((2 * unsure) ** 2, axis=0),
+        start=heat,
+        start_0=-heat @ plant.d,
+        low=np.array([one.low for one in machine.inputs]),
+        high=np.array([one.high for one in machine.inputs]),
+        coldest=np.array([one.low for one in machine.outputs]),
+        hottest=np.array([one.high for one in machine.outputs]),
+        noise_degC=noise,
+        of_input=np.r_[of_input, others],
+        input_of=np.r_[np.arange(m), pulses[others].argmax(axis=1)],
+        heat=lost / span[:, None],
+        missing_for=max(MISSING_FOR, int(np.ceil(DOOR_S / machine.sample_time_s))),
+        sample_time_s=machine.sample_time_s,
+        reach_degC=max(0.5, 3 * float(noise.max())),
     )

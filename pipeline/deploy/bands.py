@@ -14,8 +14,10 @@ import numpy as np
 import scipy.linalg
 import scipy.stats
 
-from pipeline.temperature.controllers.controller import (
+from pipeline.temperature.controllers.kernel import Tuples, regress, value_iteration, window_shift, windows
+from pipeline.temperature.controllers.law import (
     Deployed,
+    Plant,
     aim,
     batch_step,
     constant,
@@ -23,10 +25,9 @@ from pipeline.temperature.controllers.controller import (
     rest,
     watched,
 )
-from pipeline.temperature.controllers.kernel import Tuples, regress, value_iteration, window_shift, windows
 from pipeline.temperature.controllers.problem import DesignProblem
 from pipeline.temperature.controllers.window import WindowModel, observer_form, predictor
-from pipeline.temperature.plant import Plant, hold_output, observability_matrix, padded
+from pipeline.temperature.plant import hold_output, observability_matrix, padded
 from pipeline.temperature.tracking import gains
 
 Segments = Sequence[np.ndarray]

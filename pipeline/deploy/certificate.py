@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from pipeline.deploy.signals import Signal
+from pipeline.deploy.supervise import Signal
 
 VERSION, LOOP = 1, "temperature"
 Segments = Sequence[np.ndarray]

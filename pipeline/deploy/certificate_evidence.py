@@ -12,11 +12,11 @@ import numpy as np
 
 from pipeline.deploy import bands
 from pipeline.deploy.certificate import EvidenceRecord, RuleResult, Rules, Segments, at_least, at_most, result
-from pipeline.deploy.machine import Exported
-from pipeline.deploy.signals import Machine
+from pipeline.deploy.supervise import Exported, Machine
+from pipeline.temperature.controllers.law import Plant
 from pipeline.temperature.controllers.window import learn, predictor
 from pipeline.temperature.identification.validation import one_step_errors, predicted_ahead
-from pipeline.temperature.plant import Plant, strictly_proper
+from pipeline.temperature.plant import strictly_proper
 from pipeline.temperature.tracking import robust_observer_gain
 
 LAGS = 5  # of errors and inputs from which a coloured error could have been foretold

@@ -24,10 +24,10 @@ from pipeline.deploy.certificate import (
     result,
 )
 from pipeline.deploy.certificate_evidence import reference_steps
-from pipeline.deploy.machine import Exported
-from pipeline.temperature.controllers.controller import Deployed
+from pipeline.deploy.supervise import Exported
+from pipeline.temperature.controllers.law import Deployed, Plant
 from pipeline.temperature.controllers.window import observer_form
-from pipeline.temperature.plant import Plant, strictly_proper
+from pipeline.temperature.plant import strictly_proper
 from pipeline.temperature.test_set import scorecard
 
 POLES_SHOWN = 12  # of each plant, the largest

@@ -12,8 +12,9 @@ from pipeline.deploy import bands, certificate_evidence, certificate_loop
 from pipeline.deploy.certificate import LOOP, VERSION, Certificate, EvidenceRecord, Rules
 from pipeline.deploy.certificate_evidence import WindowModels
 from pipeline.deploy.certified import MeasuredController
-from pipeline.deploy.machine import Exported, controller_sha256
-from pipeline.temperature.plant import Plant
+from pipeline.deploy.machine import controller_sha256
+from pipeline.deploy.supervise import Exported
+from pipeline.temperature.controllers.law import Plant
 from pipeline.temperature.test_set import panel
 
 NEWEST = 0.25  # of a single recording: its end stands for the machine as it is today

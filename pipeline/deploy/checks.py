@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.deploy import vectors
-from pipeline.deploy.machine import Exported
-from pipeline.deploy.signals import DEGC, PERCENT
-from pipeline.deploy.supervised import Supervised
-from pipeline.temperature.controllers.controller import RunningController, fed_forward
+from pipeline.deploy.supervise import DEGC, PERCENT, Exported, Supervised
+from pipeline.temperature.controllers.law import RunningController, fed_forward
 from pipeline.temperature.test_set import panel
 
 SAME = 1e-9  # of an input's range, by which commands in another order of sums may differ

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.deploy.machine import Exported
-from pipeline.deploy.supervised import Supervised
+from pipeline.deploy.supervise import Exported, Supervised
 from pipeline.temperature.test_set import panel
 
 KINDS = ("sequence", "disturbed")  # set-point changes, and a door, a fan and another room

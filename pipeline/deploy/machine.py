@@ -14,46 +14,22 @@ from __future__ import annotations
 
 import hashlib
 import json
-import types
-import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from safetensors.numpy import save as as_bytes
 
 from pipeline.deploy import certificate as certificates
 from pipeline.deploy.certificate import Certificate
-from pipeline.deploy.signals import DEGC, PERCENT, Machine, Signal
-from pipeline.deploy.supervisor import Supervision
+from pipeline.deploy.supervise import DEGC, PERCENT, Exported, Signal, restored
 from pipeline.store import artifacts
-from pipeline.temperature.controllers.controller import Deployed
-from pipeline.temperature.plant import Plant
+from pipeline.temperature.controllers.law import Plant
 
 VERSION = 1
 CONTROLLER, ARRAYS, CERTIFICATE = "controller.json", "arrays.safetensors", "certificate.json"
 EXPORTED = "exported.json"  # beside the folders of the loops: what there is, and why not
-
-
-class Exported(NamedTuple):
-    """A controller as it leaves the house.
-
-    `controller` is the contestant `name` as it was judged: law, limits, integral limit, governor. References
-    are aimed at on `model`, and the supervisor's forecasts run on it. `fallback` is the machine's own PID or
-    a PI under the same limits, the safe mode "own"; None: the heaters go off. `simulated`: the plant was
-    drawn, not recorded.
-    """
-
-    name: str
-    machine: Machine
-    controller: Deployed
-    model: Plant
-    fallback: Deployed | None
-    supervision: Supervision
-    simulated: bool
-    plant_sha256: str
-    spread_sha256: str
 
 
 def plants_sha256(plants: Sequence[Plant]) -> str:
@@ -204,7 +180,7 @@ def write(folder: str | Path, exported: Exported, certificate: Certificate) -> N
 
 def write_controller(folder: str | Path, exported: Exported) -> None:
     """controller.json and arrays.safetensors."""
-    text, arrays = _parts(exported)
+    text, arrays = parts(exported)
     artifacts.write_text(Path(folder) / CONTROLLER, text)
     artifacts.write_weights(Path(folder) / ARRAYS, "controller", arrays, {})
 
@@ -236,7 +212,10 @@ def read(folder: str | Path) -> tuple[Exported, Certificate]:
                 f"{CONTROLLER} and {ARRAYS} have {digest}; they were changed since, export the controller "
                 "again"
             )
-        exported = _exported(about, arrays)
+        try:
+            exported = restored(about, arrays)
+        except KeyError as error:
+            raise ValueError(f"{error.args[0]} is missing; export the controller again") from None
         check(exported)
         check_certificate(exported, certificate)
     return exported, certificate
@@ -251,9 +230,13 @@ def _why_none(folder: Path) -> str:
 
 def controller_sha256(exported: Exported) -> str:
     """SHA-256 of controller.json and arrays.safetensors, one after the other, as `write` writes them."""
-    text, arrays = _parts(exported)
-    packed = as_bytes(dict(sorted(arrays.items())), {"beadline": "schema=controller"})
-    return hashlib.sha256(text.encode() + packed).hexdigest()
+    text, arrays = parts(exported)
+    return hashlib.sha256(text.encode() + packed(arrays)).hexdigest()
+
+
+def packed(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """arrays.safetensors."""
+    return as_bytes(dict(sorted(arrays.items())), {"beadline": "schema=controller"})
 
 
 def _digest(folder: Path) -> str:
@@ -263,12 +246,8 @@ def _digest(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def _parts(exported: Exported) -> tuple[str, dict[str, np.ndarray]]:
-    """The text of controller.json, and the arrays."""
-    arrays: dict[str, np.ndarray] = {}
-    words: dict[str, Any] = {}
-    for name in RECORDS:
-        _flatten(name, getattr(exported, name), arrays, words)
+def parts(exported: Exported) -> tuple[str, dict[str, np.ndarray]]:
+    """The text of controller.json, and the arrays by dotted names."""
     machine, rate = exported.machine, exported.controller.limits.rate
     about = {
         "version": VERSION,
@@ -286,9 +265,16 @@ def _parts(exported: Exported) -> tuple[str, dict[str, np.ndarray]]:
         "fallback": exported.fallback is not None,
         "plant_sha256": exported.plant_sha256,
         "spread_sha256": exported.spread_sha256,
-        "words": words,
     }
-    return json.dumps(about, indent=2, ensure_ascii=False, allow_nan=False) + "\n", arrays
+    text = json.dumps(about, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    names = ("controller", "model", "fallback", "supervision")
+    return text, {k: v for name in names for k, v in _flatten(name, getattr(exported, name)).items()}
+
+
+def canonical(exported: Exported) -> Exported:
+    """The controller with its arrays in the order of their files: products of matrices round by that."""
+    text, arrays = parts(exported)
+    return restored(json.loads(text), arrays)
 
 
 def _declared(signal: Signal) -> dict[str, Any]:
@@ -305,70 +291,11 @@ def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _exported(about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Exported:
-    kinds = typing.get_type_hints(Exported)
-    try:
-        inputs, outputs, disturbances = (
-            tuple(
-                Signal(
-                    one["name"],
-                    one["unit"],
-                    -np.inf if one["low"] is None else one["low"],
-                    np.inf if one["high"] is None else one["high"],
-                )
-                for one in about[side]
-            )
-            for side in ("inputs", "outputs", "disturbances")
-        )
-        records = {name: _rebuilt(kinds[name], name, arrays, about["words"]) for name in RECORDS}
-        plain = {name: about[name] for name in ("name", "simulated", "plant_sha256", "spread_sha256")}
-        return Exported(
-            machine=Machine(inputs, outputs, about["sample_time_s"], disturbances), **records, **plain
-        )
-    except KeyError as error:
-        raise ValueError(f"{error.args[0]} is missing; export the controller again") from None
-
-
-# ---- records as named arrays
-
-# the fields of Exported that are records of arrays
-RECORDS = ("controller", "model", "fallback", "supervision")
-
-
-def _flatten(place: str, value: Any, arrays: dict[str, np.ndarray], words: dict[str, Any]) -> None:
-    """Arrays and numbers of a record under dotted names, text among `words`; None leaves no trace."""
+def _flatten(place: str, value: Any) -> dict[str, np.ndarray]:
+    """Arrays and numbers of a record under dotted names; None leaves no trace."""
     if value is None:
-        return
-    if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        for name, part in value._asdict().items():
-            _flatten(f"{place}.{name}", part, arrays, words)
-    elif isinstance(value, np.ndarray | np.generic | bool | int | float):
-        arrays[place] = np.ascontiguousarray(value).reshape(np.shape(value))
-    else:
-        words[place] = value
-
-
-def _rebuilt(kind: Any, place: str, arrays: Mapping[str, np.ndarray], words: Mapping[str, Any]) -> Any:
-    """What `_flatten` took apart, of type `kind`."""
-    options = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
-    record = next((one for one in options if hasattr(one, "_fields")), None)
-    if record is not None:
-        if type(None) in options and not any(key.startswith(f"{place}.") for key in (*arrays, *words)):
-            return None
-        hints = typing.get_type_hints(record)
-        return record(
-            **{name: _rebuilt(hints[name], f"{place}.{name}", arrays, words) for name in record._fields}
-        )
-    if place in arrays:
-        array = arrays[place]
-        return array if array.ndim else array.item()
-    if place in words:
-        value = words[place]
-        return _tuples(value) if isinstance(value, list) else value
-    if type(None) in options:
-        return None
-    raise KeyError(place)
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+        return {}
+    if not hasattr(value, "_asdict"):
+        return {place: np.ascontiguousarray(value).reshape(np.shape(value))}
+    fields = value._asdict().items()
+    return {k: v for name, part in fields for k, v in _flatten(f"{place}.{name}", part).items()}

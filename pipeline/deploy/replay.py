@@ -1,7 +1,7 @@
 """What a controller would have asked on a recorded machine, sample by sample.
 
 The law sees what the machine measured and what it was really given: its memory, its integrator and its
-governor go on from the recorded inputs, as those of `temperature.controller.RunningController` do where
+governor go on from the recorded inputs, as those of `controllers.law.RunningController` do where
 another hand moves the heaters. What it asks at a sample is therefore what it would have applied there; of a
 recording of its own closed loop it is that loop's commands.
 
@@ -14,17 +14,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.controllers.controller import (
+from pipeline.temperature.controllers.law import (
     AS_WISHED,
     Aim,
     Deployed,
+    Governor,
+    Plant,
     Reference,
     aim,
     constant,
+    corrected,
+    governed,
+    predicted,
     rest,
+    started,
 )
-from pipeline.temperature.controllers.governor import Governor, corrected, governed, predicted, started
-from pipeline.temperature.plant import Plant
 
 # ---- in chunks
 
@@ -250,7 +254,7 @@ BY_HAND, MOST_AT_ONCE = 128, 1 << 13
 def _conditional(
     controller: Deployed, log: GaplessLog, base: np.ndarray, target: np.ndarray, xi: np.ndarray, hold: int
 ) -> np.ndarray:
-    """xi (T, p) of a law with conditional integration (tracking.Law): it rests where the command is cut."""
+    """xi (T, p) of a law with conditional integration (law.Law): it rests where the command is cut."""
     law, limits, back = controller.law, controller.limits, controller.back
     at, moves = back @ log.u[max(hold - 1, 0)], law.K_r != 0
     for t in range(hold, len(xi)):

@@ -12,7 +12,7 @@ import control
 import numpy as np
 import scipy.io
 
-from pipeline.deploy.machine import Exported
+from pipeline.deploy.supervise import Exported
 from pipeline.deploy.to_c import at_rest, feeds
 from pipeline.temperature.plant import bandwidth_rad_s, strictly_proper
 

@@ -32,7 +32,8 @@ import scipy.linalg
 
 from pipeline.deploy.replay import BLOCK, GaplessLog, scanned
 from pipeline.temperature.controllers.governor import instants
-from pipeline.temperature.plant import Plant, markov_parameters
+from pipeline.temperature.controllers.law import Plant
+from pipeline.temperature.plant import markov_parameters
 from pipeline.temperature.tracking import reached_state, riccati
 
 TEMPERATURE, COMMAND, FORECAST = 1, 2, 4

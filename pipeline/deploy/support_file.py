@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.deploy import machine, support
-from pipeline.deploy.machine import Exported
+from pipeline.deploy.supervise import Exported
 from pipeline.store import artifacts
 
 SUPPORT = "support.safetensors"

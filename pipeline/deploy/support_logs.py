@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.deploy.machine import Exported
 from pipeline.deploy.replay import GaplessLog
-from pipeline.temperature.controllers.governor import ActuatorLimits
-from pipeline.temperature.plant import Plant, padded
+from pipeline.deploy.supervise import Exported
+from pipeline.temperature.controllers.law import ActuatorLimits, Plant
+from pipeline.temperature.plant import padded
 from pipeline.temperature.test_set import panel
 
 FORECASTING, HONEST_LOGS = 24, 200  # plants, and logs at most

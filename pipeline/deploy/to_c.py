@@ -1,6 +1,6 @@
 """A controller as C99 without heap: a folder that `make test` compiles and checks.
 
-law.c and controller.c are the same for every machine, and are read beside controller.py and supervisor.py,
+law.c and controller.c are the same for every machine, and are read beside law.py and supervise.py,
 whose letters they keep. machine.h says which machine they are made for; tables.h holds its numbers, each as
 the shortest decimal that reads back bit by bit. golden.csv holds what the object of `pipeline` did, and
 test_controller.c asks for the same within 1e-9 of each signal's range. With -DBEADLINE_SINGLE a `real` is a
@@ -13,16 +13,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.deploy import supervisor
+from pipeline.deploy import supervise
 from pipeline.deploy.certificate import Certificate, sha256
-from pipeline.deploy.machine import Exported, check, check_certificate
+from pipeline.deploy.machine import check, check_certificate
 from pipeline.deploy.names import identifier
-from pipeline.temperature import tracking
-from pipeline.temperature.controllers import governor as governing
-from pipeline.temperature.controllers.controller import Deployed, FeedForward, Rest, aim, constant
-from pipeline.temperature.controllers.governor import Governor
-from pipeline.temperature.plant import Plant, strictly_proper
-from pipeline.temperature.tracking import Law
+from pipeline.deploy.supervise import Exported
+from pipeline.temperature.controllers import law
+from pipeline.temperature.controllers.law import (
+    Deployed,
+    FeedForward,
+    Governor,
+    Law,
+    Plant,
+    Rest,
+    aim,
+    constant,
+)
+from pipeline.temperature.plant import strictly_proper
 
 TEMPLATES = Path(__file__).with_name("templates")
 PARTS = ("law.h", "law.c", "supervisor.h", "supervisor.c")
@@ -163,7 +170,7 @@ def sizes(exported: Exported) -> ArrayLengths:
         governed = (f, q // 2, family.above.shape[1] // p)
     supervised = (
         len(exported.supervision.A),
-        supervisor.WINDOWS,
+        supervise.WINDOWS,
         max(m, p),
         len(exported.supervision.of_input),
     )
@@ -255,14 +262,14 @@ def _aiming(exported: Exported) -> str:
     narrowest = float((limits.high - limits.low).min())
     return "".join(
         [
-            "/* ---- the feasible target, as tracking.feasible_target has it */\n\n",
+            "/* ---- the feasible target, as law.feasible_target has it */\n\n",
             define("AIM_TOLERANCE", 1e-3, "{}"),
             define("AIM_FINEST", 1e-3, "{}"),
             define("AIM_FIRST", narrowest / 4, "{}"),
             define("AIM_WIDEST", 0.49 * narrowest, "{}"),
-            define("LIGHT", tracking.LIGHT, "{}"),
-            define("ROUNDING", tracking.ROUNDING, "{}"),
-            define("FALL", tracking.FALL, "{}"),
+            define("LIGHT", law.LIGHT, "{}"),
+            define("ROUNDING", law.ROUNDING, "{}"),
+            define("FALL", law.FALL, "{}"),
             table("aim_rows", rows, of="double"),
             table("aim_rest", rest, of="double"),
             table("aim_d", exported.model.d, of="double"),
@@ -280,7 +287,7 @@ def at_rest(model: Plant) -> tuple[np.ndarray, np.ndarray]:
 
 
 def feeds(law: Law) -> dict[str, np.ndarray]:
-    """feed = feed_u u + feed_y y* + feed_r r + feed_0 of `controller.aim` for constant references."""
+    """feed = feed_u u + feed_y y* + feed_r r + feed_0 of `law.aim` for constant references."""
     m, p = law.D.shape
     bare, none = law._replace(c=np.zeros(len(law.c))), np.zeros(p)
 
@@ -298,11 +305,11 @@ def feeds(law: Law) -> dict[str, np.ndarray]:
 
 def _governing(exported: Exported) -> str:
     family, at = governor_of(exported), sizes(exported)
-    text = "\n/* ---- the governor, as governor.Governor has it; members first */\n\n"
-    text += define("SWEEPS", governing.SWEEPS) + define("ROUNDS", governing.ROUNDS)
-    text += define("EXACT", governing.EXACT, SINGLE_EXACT) + define("CONTRADICTED", governing.CONTRADICTED)
-    text += define("ARRIVED", governing.ARRIVED)
-    strength = family.strength if family is not None else governing.Strength(1.0, 1.0, 0.0)
+    text = "\n/* ---- the governor, as law.Governor has it; members first */\n\n"
+    text += define("SWEEPS", law.SWEEPS) + define("ROUNDS", law.ROUNDS)
+    text += define("EXACT", law.EXACT, SINGLE_EXACT) + define("CONTRADICTED", law.CONTRADICTED)
+    text += define("ARRIVED", law.ARRIVED)
+    strength = family.strength if family is not None else law.Strength(1.0, 1.0, 0.0)
     text += define("FORGETS", float(family.forgets) if family is not None else 0.0)
     text += define("OVERSHOOT", float(family.overshoot) if family is not None else 0.0)
     text += define("STRONGEST", strength.strongest) + define("WEAKEST", strength.weakest)
@@ -351,8 +358,8 @@ def member_halves(family: Governor) -> dict[str, np.ndarray]:
 
 
 def _least(rows: np.ndarray) -> np.ndarray:
-    """Effects (f, p h) from which on an input counts, as governor._swept has them, of rows (f, m, p h)."""
-    return governing.WEAK * np.maximum(rows, 0.0).max(axis=1)
+    """Effects (f, p h) from which on an input counts, as law._swept has them, of rows (f, m, p h)."""
+    return law.LEAST_EFFECT * np.maximum(rows, 0.0).max(axis=1)
 
 
 def _same_form(family: Governor, halves: Mapping[str, np.ndarray], n: int, p: int) -> bool:
@@ -402,7 +409,7 @@ def _law(name: str, deployed: Deployed) -> str:
 
 # ---- the supervisor in numbers
 
-# names in tables.h of the constants of supervisor.py
+# names in tables.h of the constants of supervise.py
 OF_SUPERVISOR = (
     "SPACING", "STILL_AFTER", "FIT_AFTER", "STEPS_STILL", "NOISE_STILL", "SAME_STEPS", "SAME_NOISE",
     "CLEARED_S", "CLEARER", "MISFIT", "DOUBT", "RESTS", "REPEATED", "SHOWN", "SLOWLY",
@@ -427,13 +434,13 @@ OF_OBSERVER = (
 )
 
 
-def supervising(s: supervisor.Supervision) -> str:
+def supervising(s: supervise.Supervision) -> str:
     """Supervision with the constants that its step takes from its module."""
-    text = "\n/* ---- the supervisor, as supervisor.Supervision has it */\n\n"
-    text += "".join(define(name, getattr(supervisor, name)) for name in OF_SUPERVISOR)
-    text += define("FOLLOWS_LEAST", supervisor.FOLLOWS[0]) + define("FOLLOWS_MOST", supervisor.FOLLOWS[1])
+    text = "\n/* ---- the supervisor, as supervise.Supervision has it */\n\n"
+    text += "".join(define(name, getattr(supervise, name)) for name in OF_SUPERVISOR)
+    text += define("FOLLOWS_LEAST", supervise.FOLLOWS[0]) + define("FOLLOWS_MOST", supervise.FOLLOWS[1])
     text += define("REACH_DEGC", s.reach_degC)
-    text += table("explanation_least", supervisor.LEAST) + table("explanation_most", supervisor.MOST)
+    text += table("explanation_least", supervise.LEAST) + table("explanation_most", supervise.MOST)
     text += define("MISSING_FOR", s.missing_for)
     text += integers("supervisor_of_input", s.of_input) + integers("supervisor_input_of", s.input_of)
     arrays = {name: getattr(s, name) for name in OF_OBSERVER}

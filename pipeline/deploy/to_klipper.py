@@ -25,10 +25,11 @@ import scipy.optimize
 
 from pipeline.deploy import to_python
 from pipeline.deploy.certificate import Certificate, sha256
-from pipeline.deploy.machine import Exported, check, check_certificate
-from pipeline.deploy.signals import PERCENT, Signal
+from pipeline.deploy.machine import check, check_certificate
+from pipeline.deploy.supervise import PERCENT, Exported, Signal
 from pipeline.temperature.controllers import baseline
-from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
+from pipeline.temperature.controllers.law import Plant
+from pipeline.temperature.plant import markov_parameters, strictly_proper
 
 FILE = "beadline.cfg"  # never printer.cfg: that one is the owner's
 MODULE = Path(__file__).parent / "templates" / "beadline.py.txt"  # for klippy/extras/

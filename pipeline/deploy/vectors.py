@@ -12,10 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deploy.machine import Exported
-from pipeline.deploy.supervised import Supervised
-from pipeline.deploy.supervisor import KINDS, MODES
-from pipeline.temperature.controllers.controller import fed_forward
+from pipeline.deploy.supervise import KINDS, MODES, Exported, Supervised
+from pipeline.temperature.controllers.law import fed_forward
 from pipeline.temperature.plant import hold_output, strictly_proper
 
 # what is done at a sample: in manual; a step; before it hand over, restore, or acknowledge; begin anew

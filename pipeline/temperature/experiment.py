@@ -26,6 +26,7 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
+from pipeline.temperature.controllers.law import feasible_target
 from pipeline.temperature.identification.first_order import response
 from pipeline.temperature.identification.order import LARGEST_RADIUS, stabilised
 from pipeline.temperature.identification.refinement import (
@@ -39,7 +40,7 @@ from pipeline.temperature.identification.refinement import (
 from pipeline.temperature.identification.subspace import Segments, gapless
 from pipeline.temperature.identification.validation import horizon, step_response, two_points
 from pipeline.temperature.plant import Plant, padded, strictly_proper
-from pipeline.temperature.tracking import Law, aimed, feasible_target, gains
+from pipeline.temperature.tracking import Law, aimed, gains
 
 TAIL = 3000  # samples at the end of the record that the present state is taken from
 LATEST = 20  # samples at its very end by which each member is set right

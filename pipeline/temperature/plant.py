@@ -2,42 +2,11 @@
 BAAM study, simulation and plant spread."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 
-
-class Plant(NamedTuple):
-    """x(t+1) = A x + B u + b + K e
-    y = C x + D u + d + e
-
-    Seed 1, (1), with an offset and the innovation form of an identified model.
-
-    A (n, n), B (n, m), C (p, n), D (p, m), b (n,), d (p,), K (n, p) the Kalman gain; one step is
-    `sample_time_s` seconds, u in percent of duty, y in °C.
-    """
-
-    A: np.ndarray
-    B: np.ndarray
-    C: np.ndarray
-    D: np.ndarray
-    b: np.ndarray
-    d: np.ndarray
-    K: np.ndarray
-    sample_time_s: float = 1.0
-
-    @property
-    def n(self) -> int:
-        return self.A.shape[0]
-
-    @property
-    def m(self) -> int:
-        return self.B.shape[1]
-
-    @property
-    def p(self) -> int:
-        return self.C.shape[0]
+from pipeline.temperature.controllers.law import Plant
 
 
 def plant(A, B, C, D=None, b=None, d=None, K=None, sample_time_s: float = 1.0) -> Plant:

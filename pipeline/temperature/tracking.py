@@ -1,5 +1,4 @@
-"""Linear-quadratic tracking of a known model: Riccati gains, observer, Algorithm 1 of seed 1, and the
-feasible target within the limits of the inputs."""
+"""Linear-quadratic tracking of a known model: Riccati gains, observer, Algorithm 1 of seed 1."""
 
 from typing import NamedTuple
 
@@ -7,7 +6,7 @@ import numpy as np
 import scipy.linalg
 import scipy.linalg.lapack
 
-from pipeline.temperature.plant import Plant
+from pipeline.temperature.controllers.law import Law, Plant
 
 
 class Gains(NamedTuple):
@@ -18,43 +17,6 @@ class Gains(NamedTuple):
     K_r: np.ndarray
     k: np.ndarray
     P: np.ndarray
-
-
-class Law(NamedTuple):
-    """A controller as it runs: memory z, measured y, reference r, and
-    the input that was really applied (clipped or not).
-
-    u = -K z - D y - K_r (r + xi) - k
-    z(t+1) = A z + B_u u_applied + B_y y + B_r r + c
-    xi(t+1) = xi + integral (r - y)
-
-    Shapes with q memories: A (q, q), B_u (q, m), B_y (q, p), B_r (q, p), c (q,), K (m, q),
-    D (m, p), K_r (m, p), k (m,). It takes over from a plant that was held by u0 at y0
-    with z = start_u u0 + start_y y0 + start and xi = 0.
-
-    `integral` is the share of the error that xi takes a step: the outer integrator's, or that of a law with
-    integral action of its own, which puts its gain into K_r; where outputs take different shares, (p,) of
-    them, with no fewer inputs than outputs. No eigenvalue of A may be 1, because `aimed` solves (I - A) z for
-    the memory at rest: what integrates belongs into xi.
-
-    `conditional`: the law aims at no target. xi starts where -K_r xi is u0, takes every error in full, but
-    rests where the command is cut, and -K_r xi stays within the limits (conditional integration).
-    """
-
-    A: np.ndarray
-    B_u: np.ndarray
-    B_y: np.ndarray
-    B_r: np.ndarray
-    c: np.ndarray
-    K: np.ndarray
-    D: np.ndarray
-    K_r: np.ndarray
-    k: np.ndarray
-    start_u: np.ndarray
-    start_y: np.ndarray
-    start: np.ndarray
-    integral: float | np.ndarray = 0.0
-    conditional: bool = False
 
 
 def riccati(
@@ -202,129 +164,6 @@ def reached_state(plant: Plant, *, forgets: float = 0.01) -> np.ndarray:
     radius = max(1.0, np.abs(np.linalg.eigvals(plant.A)).max())
     W = scipy.linalg.solve_discrete_lyapunov((1 - forgets) / radius * plant.A, plant.B @ plant.B.T)
     return W @ plant.C.T @ np.linalg.pinv(plant.C @ W @ plant.C.T, hermitian=True)
-
-
-class Target(NamedTuple):
-    """A steady state x (n,), u (m,) inside the limits with y (p,) as near the reference as the limits allow;
-    `miss` (p,) is y - r in °C, `slack` the distance of u from the nearest limit in percent."""
-
-    x: np.ndarray
-    u: np.ndarray
-    y: np.ndarray
-    miss: np.ndarray
-    slack: float
-
-
-def feasible_target(
-    plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, *, tolerance: float = 1e-3
-) -> Target:
-    """min |C x + d - r|^2 over x = A x + B u + b, low <= u <= high, and among its solutions one that keeps
-    all inputs as far from their limits as it can.
-
-    The unlimited optimum asks heaters for negative heat; aimed at this target instead, the same gains settle
-    on the reference (temperature notes, 6). The slack costs at most `tolerance` °C of reach.
-    """
-    nearest = _steady(plant, r, low, high, 0.0)
-    reach, slack, step = np.linalg.norm(nearest.miss) + tolerance, 0.0, (high - low).min() / 4
-    widest = 0.49 * (high - low).min()
-    while step > 1e-3:
-        wider = _steady(plant, r, low, high, slack + step)
-        # a target that the middle of the limits reaches as well has all the slack there is
-        if slack + step <= widest and np.linalg.norm(wider.miss) <= reach:
-            nearest, slack = wider, slack + step
-        else:
-            step /= 2
-    return nearest
-
-
-def _steady(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, slack: float) -> Target:
-    """Bounded least squares over u, the state eliminated: x = (I - A)^-1 (B u + b); a plant that only
-    integrates is taken to leak 1e-9 a step."""
-    balance = np.eye(plant.n) - plant.A
-    if np.linalg.cond(balance) > 1e13:
-        balance = balance + 1e-9 * np.eye(plant.n)
-    per_u, at_rest = np.linalg.solve(balance, plant.B), np.linalg.solve(balance, plant.b)
-    rows = np.vstack([plant.C @ per_u + plant.D, LIGHT * np.eye(plant.m)])
-    right = np.concatenate([r - plant.d - plant.C @ at_rest, np.zeros(plant.m)])
-    slack = min(slack, 0.49 * (high - low).min())
-    u = bounded_least_squares(rows, right, low + slack, high - slack)
-    x = per_u @ u + at_rest
-    y = plant.C @ x + plant.D @ u + plant.d
-    return Target(x, u, y, y - r, slack)
-
-
-# °C by which a percent of an input counts beside what outputs miss: of equally good inputs, the smaller
-LIGHT = 1e-6
-# shares below which a gradient, of what its terms come to, and a fall of the cost may be rounding
-ROUNDING, FALL = 1e-13, 1e-15
-
-
-def bounded_least_squares(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """x (n,) that minimises |A x - b|^2 within low..high (n,); A (rows, n), b (rows,): bounded-variable least
-    squares (Stark and Parker 1995), step by step as scipy.optimize.lsq_linear(method="bvls") takes them, so
-    that an exported file needs numpy only.
-
-    But for one thing: what stands at a limit is set free only for a gradient that is more than rounding can
-    be. Where more inputs than outputs are free, as good as any is what is found first; which of them rounding
-    prefers is another on another CPU, and in C.
-    """
-    x = np.linalg.lstsq(A, b, rcond=-1)[0]
-    if np.all((x >= low) & (x <= high)):
-        return x
-    at = np.zeros(len(x))
-    at[x <= low], at[x >= high] = -1, 1
-    x = np.where(at < 0, low, np.where(at > 0, high, x))
-    _settle_free(A, b, low, high, x, at)
-    miss = A @ x - b
-    cost, g = 0.5 * np.dot(miss, miss), A.T @ miss
-    for _ in range(len(x)):
-        doubt = ROUNDING * (np.abs(A).T @ (np.abs(A) @ np.abs(x) + np.abs(b)))
-        if np.max(g * at - doubt) <= 0:
-            break
-        at[np.argmax(g * at - doubt)] = 0
-        while _moved_until_bound(A, b, low, high, x, at):
-            pass
-        miss = A @ x - b
-        before, cost, g = cost, 0.5 * np.dot(miss, miss), A.T @ miss
-        if before - cost < FALL * before:
-            break
-    return x
-
-
-def _settle_free(
-    A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, x: np.ndarray, at: np.ndarray
-) -> None:
-    """Least squares of what is free; what leaves its limits is put there, until nothing does."""
-    while (at == 0).any():
-        free = np.flatnonzero(at == 0)
-        z = np.linalg.lstsq(A[:, free], b - A.dot(x * (at != 0)), rcond=None)[0]
-        below, above = z < low[free], z > high[free]
-        x[free] = np.where(below, low[free], np.where(above, high[free], z))
-        at[free[below]], at[free[above]] = -1, 1
-        if not (below | above).any():
-            break
-
-
-def _moved_until_bound(
-    A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, x: np.ndarray, at: np.ndarray
-) -> bool:
-    """Moves x to the least squares of what is free, or until an input meets a limit; whether one did."""
-    free = np.flatnonzero(at == 0)
-    z = np.linalg.lstsq(A[:, free], b - A.dot(x * (at != 0)), rcond=None)[0]
-    below, above = np.flatnonzero(z < low[free]), np.flatnonzero(z > high[free])
-    beyond = np.r_[below, above]
-    if not beyond.size:
-        x[free] = z
-        return False
-    wall = np.r_[low[free][below], high[free][above]]
-    share = (wall - x[free][beyond]) / (z[beyond] - x[free][beyond])
-    first = int(np.argmin(share))
-    x_free = x[free].copy()
-    x_free *= 1 - share[first]
-    x_free += share[first] * z
-    x[free] = x_free
-    at[free[beyond[first]]] = -1 if first < below.size else 1
-    return True
 
 
 def aimed(law: Law, r: np.ndarray, u: np.ndarray, y: np.ndarray) -> Law:

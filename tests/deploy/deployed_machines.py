@@ -5,19 +5,21 @@ from functools import cache
 import numpy as np
 import scipy.linalg
 
-from pipeline.deploy import supervisor
+from pipeline.deploy.assembly import supervision
 from pipeline.deploy.certificate import RULES, VERSION, Certificate, RuleResult
-from pipeline.deploy.machine import Exported, controller_sha256, plants_sha256
-from pipeline.deploy.signals import Machine, Signal
+from pipeline.deploy.machine import canonical, controller_sha256, plants_sha256
+from pipeline.deploy.supervise import Exported, Machine, Signal
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline, printer_pid
-from pipeline.temperature.controllers.controller import Deployed, FeedForward, compact, deployed
-from pipeline.temperature.controllers.governor import (
+from pipeline.temperature.controllers.governor import OutputLimits, governor
+from pipeline.temperature.controllers.law import (
     ActuatorLimits,
+    Deployed,
+    FeedForward,
     Governor,
-    OutputLimits,
     Strength,
-    governor,
+    compact,
+    deployed,
 )
 from pipeline.temperature.controllers.window import law as varx_law
 from pipeline.temperature.controllers.window import learn, observer_form
@@ -109,16 +111,20 @@ def exported(
     )
     forward = FeedForward(np.array([[0.1, 2.0], [0.05, -0.5]]), np.array([40.0, 1.5]))
     forward = forward if kind == "told" else None
-    return Exported(
-        name=kind,
-        machine=machine,
-        controller=_deployed(law, limits, watched, holds=kind == "hold", forward=forward),
-        model=model,
-        fallback=None if kind == "pi" else _deployed(_pi(plant_, limits), limits, watched, forward=forward),
-        supervision=supervisor.supervision(plant_, machine, np.full(plant_.p, NOISE)),
-        simulated=simulated,
-        plant_sha256=plants_sha256([plant_]),
-        spread_sha256=plants_sha256([]),
+    return canonical(
+        Exported(
+            name=kind,
+            machine=machine,
+            controller=_deployed(law, limits, watched, holds=kind == "hold", forward=forward),
+            model=model,
+            fallback=None
+            if kind == "pi"
+            else _deployed(_pi(plant_, limits), limits, watched, forward=forward),
+            supervision=supervision(plant_, machine, np.full(plant_.p, NOISE)),
+            simulated=simulated,
+            plant_sha256=plants_sha256([plant_]),
+            spread_sha256=plants_sha256([]),
+        )
     )
 
 

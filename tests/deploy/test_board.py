@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.deploy import to_c
-from pipeline.deploy.machine import Exported
+from pipeline.deploy.supervise import Exported
 from pipeline.temperature.controllers.governor import OutputLimits, governor
 from pipeline.temperature.test_set import panel
 from tests.deploy.deployed_machines import NOISE, STRENGTH, exported

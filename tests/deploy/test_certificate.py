@@ -8,11 +8,11 @@ import pytest
 
 from pipeline.deploy import bands, certificate, certificate_evidence, certified, certify, machine
 from pipeline.deploy.certificate import Certificate, EvidenceRecord, Rules, from_json, sha256, to_json
-from pipeline.deploy.machine import Exported, plants_sha256
-from pipeline.deploy.signals import Machine, Signal
+from pipeline.deploy.machine import plants_sha256
+from pipeline.deploy.supervise import Exported, Machine, Signal
 from pipeline.temperature import plant, tracking
-from pipeline.temperature.controllers import controller, kernel, window
-from pipeline.temperature.controllers.governor import ActuatorLimits
+from pipeline.temperature.controllers import kernel, window
+from pipeline.temperature.controllers.law import ActuatorLimits, deployed
 from pipeline.temperature.plant import Plant, hold_output, simulate
 
 REFERENCE = np.array([180.0, 170.0])
@@ -61,7 +61,7 @@ LIMITS = ActuatorLimits(np.zeros(2), np.full(2, 100.0), np.full(2, np.inf))
 
 def designed(of: Plant, *, effort: float = 0.3, integral: float = 0.05) -> Exported:
     law = tracking.model_based(of, np.ones(2), np.full(2, effort), integral, gamma=0.99, tau=1.0)
-    made = controller.deployed(law, LIMITS, integral_limit=2.0)
+    made = deployed(law, LIMITS, integral_limit=2.0)
     return Exported(
         "subspace_lqg", Machine(*SIGNALS, 1.0), made, of, None, None, False, plants_sha256([of]), "spread"
     )
@@ -207,7 +207,7 @@ def fierce(factor: float) -> Exported:
     made = designed(zones())
     law = made.controller.law
     law = law._replace(K=factor * law.K, K_r=factor * law.K_r)
-    return made._replace(controller=controller.deployed(law, LIMITS, integral_limit=2.0))
+    return made._replace(controller=deployed(law, LIMITS, integral_limit=2.0))
 
 
 def test_a_loop_that_does_not_settle_on_the_newest_record_is_refused():

@@ -8,7 +8,8 @@ import pytest
 
 from pipeline.deploy import assembly, bands, certified, checks, to_c
 from pipeline.deploy import certify as measuring
-from pipeline.deploy.machine import Exported, check
+from pipeline.deploy.machine import check
+from pipeline.deploy.supervise import Exported
 from pipeline.temperature.controllers.feed_forward import Told
 from pipeline.temperature.controllers.table import BY_NAME, design_controllers
 from pipeline.temperature.plant import plant

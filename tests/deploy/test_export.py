@@ -19,14 +19,12 @@ import pytest
 import scipy.optimize
 
 from pipeline.commands import export
-from pipeline.deploy import to_c, to_klipper, to_python, vectors
+from pipeline.deploy import supervise, to_c, to_klipper, to_python, vectors
 from pipeline.deploy.certificate import sha256
-from pipeline.deploy.machine import Exported
-from pipeline.deploy.supervised import Supervised
-from pipeline.deploy.supervisor import KINDS, MODES
+from pipeline.deploy.supervise import KINDS, MODES, Exported, Supervised
 from pipeline.deploy.vectors import TOLERANCE
-from pipeline.temperature import tracking
-from pipeline.temperature.controllers.controller import ramp
+from pipeline.temperature.controllers import law
+from pipeline.temperature.controllers.law import ramp, sinusoid
 from pipeline.temperature.plant import Plant, hold_output
 from tests.deploy.deployed_machines import LAWS, block_and_sensor, exported, limits_of, passed, refused
 
@@ -218,9 +216,9 @@ def test_the_target_is_the_bounded_least_squares_solution(slack):
     model, references = redundant(rng)
     G, rest = to_c.at_rest(model)
     for r in references:
-        ours = tracking._steady(model, r, limits.low, limits.high, slack)
+        ours = law._steady(model, r, limits.low, limits.high, slack)
         theirs = scipy.optimize.lsq_linear(
-            np.vstack([G, tracking.LIGHT * np.eye(6)]),
+            np.vstack([G, law.LIGHT * np.eye(6)]),
             np.r_[r - rest - model.d, np.zeros(6)],
             (limits.low + slack, limits.high - slack),
             method="bvls",
@@ -238,8 +236,8 @@ def test_which_of_equally_good_inputs_is_the_target_is_not_left_to_rounding(tmp_
     of = exported("study")
     limits, target = of.controller.limits, compiled_target(tmp_path, of)
     for r in np.random.default_rng(3).uniform(0, 260, (60, 5)):
-        u = tracking.feasible_target(of.model, r, limits.low, limits.high).u
-        near = tracking.feasible_target(of.model, r + 1e-12, limits.low, limits.high).u
+        u = law.feasible_target(of.model, r, limits.low, limits.high).u
+        near = law.feasible_target(of.model, r + 1e-12, limits.low, limits.high).u
         # a percent of inputs of which 1e-9 of range is asked
         assert np.abs(near - u).max() < 1e-9 and np.abs(target(r) - u).max() < 1e-9
 
@@ -285,7 +283,7 @@ def test_the_python_file_imports_numpy_and_the_language_only(tmp_path):
     nodes = [one for one in ast.walk(ast.parse(text)) if isinstance(one, ast.Import | ast.ImportFrom)]
     names = [one.module if isinstance(one, ast.ImportFrom) else one.names[0].name for one in nodes]
     assert set(names) == {
-        "__future__", "base64", "math", "collections.abc", "typing", "numpy",
+        "__future__", "base64", "collections.abc", "json", "numpy", "typing",
     }  # fmt: skip
     assert sha256(passed(of)) in text and of.plant_sha256 in text
 
@@ -314,14 +312,35 @@ def test_a_simulated_controller_runs_in_a_rehearsal_only(tmp_path):
     assert loaded(tmp_path, real).controller(**whose(real)) is not None
 
 
-def test_the_python_file_refuses_a_reference_that_moves(tmp_path):
+def test_the_python_file_follows_a_reference_that_moves_as_the_object_does(tmp_path):
     of = exported()
-    module = loaded(tmp_path, of)
-    one = module.controller(**whose(of), rehearsal=True)
-    at = vectors.start(of)
-    one.watch(at.u, at.y, at.y)
-    with pytest.raises(ValueError, match="expected a constant reference but found one of 2 states"):
-        one.step(at.y, module.Reference(*ramp(at.y, np.ones(2))), 1.0)
+    module, at = loaded(tmp_path, of), vectors.start(of)
+    moves = ramp(at.y, np.full(2, 0.1)), sinusoid(at.y, np.ones(2), 40.0)
+    for reference in moves:
+        asked = []
+        for one, r in (
+            (Supervised(of, rehearsal=True), reference),
+            (module.controller(**whose(of), rehearsal=True), module.Reference(*reference)),
+        ):
+            one.watch(at.u, at.y, at.y)
+            one.hand_over(at.y)
+            asked.append([one.step(at.y, r, float(t)).u for t in range(50)])
+        assert np.array_equal(*asked) and np.ptp(asked[0], axis=0).min() > 0.1
+
+
+def test_the_python_file_holds_to_the_letter_what_the_stages_run():
+    of, parts = exported(), [to_python.exported_part(module) for module in (law, supervise)]
+    text = to_python.code(of, "0" * 64)
+    assert all(len(part) > 10_000 and part in text for part in parts)
+    named = [{name for node in ast.parse(part).body for name in _names(node)} for part in parts]
+    assert not named[0] & named[1]  # one file has one name for each
+
+
+def _names(node: ast.stmt) -> list[str]:
+    """What a statement of a module names."""
+    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        return [node.name]
+    return [one.id for one in ast.walk(node) if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store)]
 
 
 @pytest.mark.parametrize("export", [lambda of, why: to_c.files(of, why, ""), to_python.text])

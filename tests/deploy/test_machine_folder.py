@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.deploy import machine
-from pipeline.deploy.machine import Exported
-from pipeline.deploy.signals import Signal
+from pipeline.deploy.supervise import Exported, Signal
 from tests.deploy.deployed_machines import LAWS, exported, passed, refused
 
 

@@ -9,9 +9,15 @@ from pipeline.deploy import replay, support
 from pipeline.deploy.replay import GaplessLog
 from pipeline.papers.study import data_sets
 from pipeline.temperature import tracking
-from pipeline.temperature.controllers import baseline, controller, governor, window
-from pipeline.temperature.controllers.controller import Deployed, RunningController, compact, deployed
-from pipeline.temperature.controllers.governor import ActuatorLimits
+from pipeline.temperature.controllers import baseline, governor, window
+from pipeline.temperature.controllers import law as laws
+from pipeline.temperature.controllers.law import (
+    ActuatorLimits,
+    Deployed,
+    RunningController,
+    compact,
+    deployed,
+)
 from pipeline.temperature.plant import Plant, baam, padded
 from pipeline.temperature.test_set import panel
 
@@ -22,7 +28,7 @@ SPREAD = panel.PlantSpread(0.15, 0.2, 0.005, 0.5, 8.0)
 NOISE = np.full(5, 0.1)
 
 
-def guard() -> governor.Governor:
+def guard() -> laws.Governor:
     family, strength = panel.corners([baam()], SPREAD)
     outputs = governor.OutputLimits(np.full(5, -np.inf), np.full(5, 190.0), np.full(5, 0.3), 0.5)
     return governor.governor(family, LIMITS, outputs, strength)
@@ -72,14 +78,10 @@ def by_the_object(made: Deployed, model: Plant, of: GaplessLog, hold: int) -> np
         feed, y_star, _ = running._now
         law, u = made.law, of.u[t][None]
         wished = feed - law.K @ before.z[0] - law.D @ of.y[t] - law.K_r @ before.xi[0]
-        x = (
-            before.x
-            if made.governor is None
-            else governor.observed(made.governor, before.x, u, of.y[t][None])
-        )
-        xi = controller._integrated(made, before.xi, (y_star - of.y[t])[None], u, wished[None])
-        z = controller._remembered(made, before.z, u, of.y[t][None], of.r[t][None])
-        running._state = controller.ControllerState(z, xi, u, x)
+        x = before.x if made.governor is None else laws.observed(made.governor, before.x, u, of.y[t][None])
+        xi = laws._integrated(made, before.xi, (y_star - of.y[t])[None], u, wished[None])
+        z = laws._remembered(made, before.z, u, of.y[t][None], of.r[t][None])
+        running._state = laws.ControllerState(z, xi, u, x)
     return asked
 
 

@@ -9,7 +9,7 @@ import pytest
 import scipy.io
 
 from pipeline.deploy import state_space
-from pipeline.temperature.controllers.controller import RunningController
+from pipeline.temperature.controllers.law import RunningController
 from pipeline.temperature.plant import hold_output, strictly_proper
 from pipeline.temperature.test_set.scorecard import closed_loop
 from tests.deploy.deployed_machines import exported

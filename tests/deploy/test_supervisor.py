@@ -4,13 +4,12 @@ named, each with its safe mode and the way back."""
 import numpy as np
 import pytest
 
-from pipeline.deploy import supervisor
-from pipeline.deploy.machine import Exported
-from pipeline.deploy.signals import Machine, Signal
-from pipeline.deploy.supervised import Supervised
-from pipeline.deploy.supervisor import supervision
-from pipeline.temperature.controllers import baseline, controller
-from pipeline.temperature.controllers.governor import ActuatorLimits
+from pipeline.deploy import supervise
+from pipeline.deploy.assembly import supervision
+from pipeline.deploy.supervise import Exported, Machine, Signal, Supervised
+from pipeline.temperature.controllers import baseline
+from pipeline.temperature.controllers.law import ActuatorLimits, Reference, ramp
+from pipeline.temperature.controllers.law import deployed as deploy
 from pipeline.temperature.plant import plant
 from pipeline.temperature.test_set.panel import delayed
 
@@ -28,7 +27,7 @@ WIRED = Machine(
 def exported(*, fallback: bool = True) -> Exported:
     pairs = baseline.pairing(MODEL, LOW, HIGH, horizon=400, noise_degC=np.full(2, NOISE))
     law = baseline.pi_law(pairs, inputs=2)
-    deployed = controller.deployed(law, ActuatorLimits(LOW, HIGH, np.full(2, np.inf)), integral_limit=1.0)
+    deployed = deploy(law, ActuatorLimits(LOW, HIGH, np.full(2, np.inf)), integral_limit=1.0)
     watched = supervision(MODEL, WIRED, np.full(2, NOISE))
     own = deployed if fallback else None
     return Exported("pi", WIRED, deployed, MODEL, own, watched, True, "", "")
@@ -91,7 +90,7 @@ def steps_of(t: int) -> np.ndarray:
     return R + (8.0 if t // 60 % 2 else -4.0)
 
 
-def first(decisions) -> tuple[int, supervisor.Cause]:
+def first(decisions) -> tuple[int, supervise.Cause]:
     """The sample of the first safe mode, and its cause."""
     at = next(k for k, one in enumerate(decisions) if one.mode != "law")
     return at, decisions[at].causes[0]
@@ -305,17 +304,17 @@ def test_a_sensor_that_no_input_moves_most_is_judged_too():
     model = plant([[0.98, 0.003], [0.01, 0.978]], [[0.055], [0.02]], np.eye(2), d=[ROOM, ROOM])
     s = supervision(model, WIRED._replace(inputs=WIRED.inputs[:1]), np.full(2, NOISE))
     assert s.of_input.tolist() == [0, 1] and s.input_of.tolist() == [0, 0]
-    k, rng = supervisor.kept(s), np.random.default_rng(0)
+    k, rng = supervise.kept(s), np.random.default_rng(0)
     x, held = np.array([60.0, 40.0]), 0.0
     for t in range(400):
         u = np.array([40.0 + 30.0 * (t // 60 % 2)])
         y = x + ROOM + NOISE * rng.standard_normal(2)
         held = y[1] if t < 230 else held
         y[1] = held + NOISE * rng.standard_normal() * (t >= 230)
-        supervisor.pass_time(s, k, float(t))
-        supervisor.follow(s, k, y, u, int(t >= 30))
+        supervise.pass_time(s, k, float(t))
+        supervise.follow(s, k, y, u, int(t >= 30))
         x = model.A @ x + model.B @ u
-    assert k.since[supervisor.DEAF, 1] >= 230.0 and (k.since >= 0).sum() == 1
+    assert k.since[supervise.DEAF, 1] >= 230.0 and (k.since >= 0).sum() == 1
 
 
 @pytest.mark.parametrize("gap", [1.6, 0.0, 1000.0])
@@ -333,7 +332,7 @@ def test_a_sensor_that_begins_with_its_power_on_value_has_no_steps_of_that_size(
     run = Run(seed=0)
     run.supervised.kept.y[1] = 85.0 + R[1]
     run.go(1)
-    assert run.supervised.kept.quantum[1] <= supervisor.MOST_STEP_DEGC
+    assert run.supervised.kept.quantum[1] <= supervise.MOST_STEP_DEGC
 
 
 def test_an_acknowledgement_hides_no_dead_sensor():
@@ -382,13 +381,13 @@ def test_a_sensor_that_moves_as_forecast_again_is_trusted_three_times():
     for time in range(4):
         run.x[:2] = R - ROOM
         run.go(200, r=steps_of)
-        if run.supervised.kept.counters[supervisor.ACTIVE]:
+        if run.supervised.kept.counters[supervise.ACTIVE]:
             break
         run.go(60 - run.t % 60 - 5, r=steps_of)
         run.go(45, reading=stuck(0.0), r=steps_of)
         run.go(200, r=steps_of)
-        active = bool(run.supervised.kept.counters[supervisor.ACTIVE])
-        assert active == (time == supervisor.RETURNS), time
+        active = bool(run.supervised.kept.counters[supervise.ACTIVE])
+        assert active == (time == supervise.RETURNS), time
 
 
 def test_what_only_the_mains_can_stop_stays_until_a_person_acknowledges_it():
@@ -486,27 +485,27 @@ def test_what_is_refused_changes_nothing():
 def test_an_unstable_model_stays_finite_while_its_sensor_is_lost():
     model = plant(np.diag([1.02, 0.98]), np.diag([0.055, 0.065]), np.eye(2), d=[ROOM, ROOM])
     s = supervision(model, WIRED, np.full(2, NOISE))
-    k = supervisor.kept(s)
+    k = supervise.kept(s)
     for t in range(3000):
         y = np.array([150.0 if t < 100 else np.nan, 150.0])
-        supervisor.pass_time(s, k, float(t))
-        filled = supervisor.follow(s, k, y, np.array([50.0, 40.0]), 1)
-    assert (np.abs(filled) <= supervisor.FAR_DEGC).all() and np.isfinite(k.x).all()
+        supervise.pass_time(s, k, float(t))
+        filled = supervise.follow(s, k, y, np.array([50.0, 40.0]), 1)
+    assert (np.abs(filled) <= supervise.FAR_DEGC).all() and np.isfinite(k.x).all()
 
 
 def test_what_was_said_first_of_a_cause_stays_and_counts_once():
-    k = supervisor.kept(exported().supervision)
-    supervisor.say(k, supervisor.STILL, 1, 2.0)
-    supervisor.say(k, supervisor.STILL, 1, 7.0)
-    assert k.amount[supervisor.STILL, 1] == 2.0
-    assert k.counters[supervisor.ACTIVE] == 1 and (k.since >= 0).sum() == 1
+    k = supervise.kept(exported().supervision)
+    supervise.say(k, supervise.STILL, 1, 2.0)
+    supervise.say(k, supervise.STILL, 1, 7.0)
+    assert k.amount[supervise.STILL, 1] == 2.0
+    assert k.counters[supervise.ACTIVE] == 1 and (k.since >= 0).sum() == 1
 
 
 def test_a_moving_reference_that_is_given_anew_each_sample_goes_on():
-    slow = controller.ramp(R, np.array([0.05, -0.03]))
+    slow = ramp(R, np.array([0.05, -0.03]))
     once, anew = Run(seed=6), Run(seed=6)
     same = once.go(40, r=lambda t: slow)
-    copies = anew.go(40, r=lambda t: controller.Reference(*(part.copy() for part in slow)))
+    copies = anew.go(40, r=lambda t: Reference(*(part.copy() for part in slow)))
     for one, other in zip(same, copies, strict=True):
         np.testing.assert_array_equal(one.u, other.u)
     assert np.abs(same[-1].u - same[0].u).max() > 0.1

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deploy.supervisor import KINDS, MODES
+from pipeline.deploy.supervise import KINDS, MODES
 from tests.foreign import thermal_machines
 from tests.foreign.thermal_machines import FAN, Machine, draw, pointer, sampled
 from tests.mission import toy_temperature

@@ -4,11 +4,11 @@ what makes up for fan and filament, 20 % short as one of a record may be."""
 import numpy as np
 import scipy.linalg
 
-from pipeline.deploy import supervisor
-from pipeline.deploy.machine import Exported, plants_sha256
-from pipeline.deploy.signals import Machine, Signal
+from pipeline.deploy.assembly import supervision
+from pipeline.deploy.machine import plants_sha256
+from pipeline.deploy.supervise import Exported, Machine, Signal
 from pipeline.temperature.controllers import baseline
-from pipeline.temperature.controllers.controller import FeedForward, deployed
+from pipeline.temperature.controllers.law import FeedForward, deployed
 from pipeline.temperature.plant import Plant, plant
 from tests.deploy.deployed_machines import guard, limits_of
 from tests.foreign.hot_end import KELVIN, Parts
@@ -76,7 +76,7 @@ def exported(parts: Parts, *, told: bool = True) -> Exported:
         ),
         model=made,
         fallback=None,
-        supervision=supervisor.supervision(made, machine, np.full(1, NOISE_DEGC)),
+        supervision=supervision(made, machine, np.full(1, NOISE_DEGC)),
         simulated=False,
         plant_sha256=plants_sha256([made]),
         spread_sha256=plants_sha256([]),

@@ -11,10 +11,13 @@ import pytest
 from pipeline.papers import study
 from pipeline.papers.published import REFERENCE
 from pipeline.temperature import tracking
-from pipeline.temperature.controllers import baseline, window
-from pipeline.temperature.controllers.controller import (
+from pipeline.temperature.controllers import baseline, law, window
+from pipeline.temperature.controllers.governor import OutputLimits, governor
+from pipeline.temperature.controllers.law import (
+    ActuatorLimits,
     ControllerState,
     Deployed,
+    Governor,
     RunningController,
     aim,
     batch_step,
@@ -27,7 +30,6 @@ from pipeline.temperature.controllers.controller import (
     sinusoid,
     watched,
 )
-from pipeline.temperature.controllers.governor import ActuatorLimits, Governor, OutputLimits, governor
 from pipeline.temperature.plant import Plant, baam, hold_state
 from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.test_set import panel
@@ -330,6 +332,24 @@ def test_the_object_asks_for_what_the_panel_judged(
     assert set(asked.kind[:count]) == {"constant", "ramp", "sinusoid", "sequence", "disturbed"}
     # of the range of 100 percent: sums in another order differ in the last digits
     np.testing.assert_allclose(commands, judged[:, :count], rtol=0, atol=1e-9 * 100)
+
+
+@pytest.mark.parametrize(
+    "F",
+    [
+        ramp(ONE5, ONE5).F,
+        sinusoid(ONE5, ONE5, 60.0).F,
+        np.eye(3),
+        np.random.default_rng(1).normal(size=(6, 6)),
+    ],
+    ids=["ramp", "sinusoid", "constants", "any"],
+)
+def test_a_reference_s_matrix_is_triangular_in_a_unitary_basis(F):
+    """F = V S V*; numpy has no Schur form, and an exported file has numpy only."""
+    S, V = law._triangular(F)
+    np.testing.assert_array_equal(S, np.triu(S))
+    np.testing.assert_allclose(V @ V.conj().T, np.eye(len(F)), atol=1e-12)
+    np.testing.assert_allclose(V @ S @ V.conj().T, F, atol=1e-12)
 
 
 @pytest.mark.parametrize("reference", [REFERENCE, sinusoid(REFERENCE, np.full(5, 3.0), 60.0)], ids=["r", "F"])

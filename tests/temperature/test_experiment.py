@@ -9,8 +9,9 @@ import yaml
 
 from pipeline import cli
 from pipeline.store import artifacts, params
-from pipeline.temperature import experiment, tracking
+from pipeline.temperature import experiment
 from pipeline.temperature.controllers import baseline
+from pipeline.temperature.controllers.law import feasible_target
 from pipeline.temperature.plant import hold_output, plant, simulate
 from pipeline.temperature.settings import GenerateProbing, Plant, Tracking
 from stages import generate_probing
@@ -287,7 +288,7 @@ def test_exact_knowledge_leaves_no_gap_and_a_wrong_gain_leaves_one(heated):
 
 def test_a_target_in_the_middle_of_the_limits_is_found():
     weak = plant([[0.9]], [[1e-7]], [[1.0]], b=[2.0])
-    target = tracking.feasible_target(weak, np.array([20.0]), np.zeros(1), np.full(1, 100.0))
+    target = feasible_target(weak, np.array([20.0]), np.zeros(1), np.full(1, 100.0))
     assert target.slack <= 49.0 and abs(target.miss[0]) < 1e-2
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.temperature.controllers import feed_forward
-from pipeline.temperature.controllers.controller import (
+from pipeline.temperature.controllers.law import (
+    ActuatorLimits,
     FeedForward,
     RunningController,
     batch_step,
@@ -14,8 +15,7 @@ from pipeline.temperature.controllers.controller import (
     rest,
     watched,
 )
-from pipeline.temperature.controllers.controller import aim as aimed
-from pipeline.temperature.controllers.governor import ActuatorLimits
+from pipeline.temperature.controllers.law import aim as aimed
 from pipeline.temperature.plant import plant
 from pipeline.temperature.test_set import panel
 from pipeline.temperature.tracking import model_based, still_law

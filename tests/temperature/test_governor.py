@@ -9,17 +9,16 @@ import pytest
 from pipeline.papers.published import REFERENCE
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers import baseline
-from pipeline.temperature.controllers.controller import Deployed, deployed
-from pipeline.temperature.controllers.governor import (
+from pipeline.temperature.controllers.governor import OutputLimits, governor, instants
+from pipeline.temperature.controllers.law import (
     ActuatorLimits,
+    Deployed,
     Governor,
-    OutputLimits,
     Strength,
     corrected,
+    deployed,
     evidence,
     governed,
-    governor,
-    instants,
     observed,
     predicted,
     started,

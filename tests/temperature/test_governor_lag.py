@@ -9,15 +9,15 @@ import scipy.linalg
 
 from pipeline.temperature import tracking
 from pipeline.temperature.controllers import governor as governing
-from pipeline.temperature.controllers.controller import RunningController, deployed
-from pipeline.temperature.controllers.governor import (
+from pipeline.temperature.controllers.governor import OutputLimits, governor
+from pipeline.temperature.controllers.law import (
     ActuatorLimits,
     Governor,
-    OutputLimits,
+    RunningController,
     Strength,
     corrected,
+    deployed,
     governed,
-    governor,
     predicted,
     started,
 )

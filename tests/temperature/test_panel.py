@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.papers.published import GAMMA, REFERENCE, TAU
-from pipeline.temperature.controllers.controller import ActuatorLimits, constant, deployed, ramp, sinusoid
+from pipeline.temperature.controllers.law import ActuatorLimits, constant, deployed, ramp, sinusoid
 from pipeline.temperature.plant import baam, padded, plant, simulate
 from pipeline.temperature.test_set import panel
 from pipeline.temperature.test_set.panel import Cases, Figures, PlantSpread, Questions, Rollout

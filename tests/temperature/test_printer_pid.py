@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.temperature.controllers.controller import (
+from pipeline.temperature.controllers.law import (
     ActuatorLimits,
     Rest,
     RunningController,

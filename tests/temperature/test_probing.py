@@ -9,9 +9,9 @@ import pytest
 from pipeline.papers.published import GAMMA, K_DATA, REFERENCE
 from pipeline.papers.study import gap, study_panel, study_probe, study_signal
 from pipeline.temperature.controllers import window as window_route
+from pipeline.temperature.controllers.law import feasible_target
 from pipeline.temperature.plant import baam, simulate
 from pipeline.temperature.probing import excitation, multisine, prbs, probe
-from pipeline.temperature.tracking import feasible_target
 
 LOW, HIGH = np.zeros(7), np.full(7, 100.0)
 

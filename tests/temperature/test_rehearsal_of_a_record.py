@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.store import params
-from pipeline.temperature.controllers import baseline, controller, governor
+from pipeline.temperature.controllers import baseline, governor
+from pipeline.temperature.controllers import law as laws
 from pipeline.temperature.plant import strictly_proper
 from pipeline.temperature.settings import Panel, Tracking, TuneWeights
 from pipeline.temperature.settings import Plant as Machine
@@ -111,14 +112,14 @@ def test_the_governor_is_the_same_in_other_units_of_the_inputs(family):
     allowed = []
     for unit in (1.0, 10.0):
         guarded = [panel.delayed(family[0]._replace(B=family[0].B / unit), late) for late in (False, True)]
-        limits = governor.ActuatorLimits(np.zeros(1), np.full(1, 100.0 * unit), np.full(1, np.inf))
+        limits = laws.ActuatorLimits(np.zeros(1), np.full(1, 100.0 * unit), np.full(1, np.inf))
         outputs = governor.OutputLimits(np.full(1, -np.inf), np.full(1, 40.4), noise, 0.5)
-        made = governor.governor(guarded, limits, outputs, governor.Strength(0.7, 1.4, 0.15))
-        memory = governor.started(made, y)
+        made = governor.governor(guarded, limits, outputs, laws.Strength(0.7, 1.4, 0.15))
+        memory = laws.started(made, y)
         for _ in range(20):
-            memory = governor.observed(made, memory, np.full((1, 1), 20.0 * unit), y)
+            memory = laws.observed(made, memory, np.full((1, 1), 20.0 * unit), y)
         asked = limits.high[None], limits.low[None], limits.high[None]
-        allowed.append(governor.governed(made, memory, asked[0], target, *asked[1:]) / unit)
+        allowed.append(laws.governed(made, memory, asked[0], target, *asked[1:]) / unit)
     assert 0 < allowed[0][0, 0] < 100
     np.testing.assert_allclose(allowed[1], allowed[0], rtol=1e-6)  # two Riccati equations solved to 1e-9
 
@@ -138,9 +139,7 @@ def test_the_governor_holds_no_output_of_a_slow_machine_off_its_reference(family
     aims = panel.aims(law, panel.rests(family[0], asked, setting.limits), asked)
     errors, overshoots = [], []
     for guard in (None, setting.governor):
-        deployed = controller.deployed(
-            law, setting.limits, integral_limit=setting.integral_limit, governor=guard
-        )
+        deployed = laws.deployed(law, setting.limits, integral_limit=setting.integral_limit, governor=guard)
         figures = panel.figures(
             panel.rolled_out(deployed, asked, aims),
             asked,

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from pipeline.temperature.controllers import baseline
+from pipeline.temperature.controllers.law import feasible_target
 from pipeline.temperature.identification.model_choice import Settings, identify
 from pipeline.temperature.plant import plant
 from pipeline.temperature.test_set.scenario_defaults import (
@@ -15,7 +16,7 @@ from pipeline.temperature.test_set.scenario_defaults import (
     machine_scale,
     steady_map,
 )
-from pipeline.temperature.tracking import aimed, feasible_target
+from pipeline.temperature.tracking import aimed
 from tests.temperature import small_machines
 from tests.temperature.small_machines import BED, CHAMBER, HOT_END, KIT, MACHINES, SmallMachine
 

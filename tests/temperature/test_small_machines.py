@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from pipeline.temperature.controllers import baseline
+from pipeline.temperature.controllers.law import feasible_target
 from pipeline.temperature.identification.model_choice import identify
 from pipeline.temperature.plant import strictly_proper
 from pipeline.temperature.test_set.scorecard import closed_loop
-from pipeline.temperature.tracking import aimed, feasible_target
+from pipeline.temperature.tracking import aimed
 from tests.temperature import small_machines
 from tests.temperature.fits import resampled
 from tests.temperature.small_machines import HOT_END, KIT, MACHINES

@@ -10,11 +10,10 @@ import scipy.linalg
 import scipy.optimize
 
 from pipeline.papers.published import GAMMA, K_DATA, REFERENCE, TAU, algorithm_1, stabilises
+from pipeline.temperature.controllers.law import bounded_least_squares, feasible_target
 from pipeline.temperature.plant import baam, hold_state, markov_parameters, plant, simulate
 from pipeline.temperature.tracking import (
     aimed,
-    bounded_least_squares,
-    feasible_target,
     gains,
     observer_gain,
     observer_law,

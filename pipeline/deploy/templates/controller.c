@@ -1,5 +1,5 @@
-/* The controller of controller.h. Letters and names are those of the project's controller.py, governor.py
- * and supervisor.py; tables.h holds the numbers. */
+/* The controller of controller.h. Letters and names are those of the project's law.py and
+ * supervise.py; tables.h holds the numbers. */
 #include "controller.h"
 
 #include <tgmath.h>

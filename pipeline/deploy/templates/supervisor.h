@@ -10,7 +10,7 @@ enum { LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS, EXPLANATIONS };
 /* Signatures whose sums are kept: DIFFERS has that of LACKS, and GIVES that of LACKS and HEAT together */
 enum { OF_LACKS, OF_HEAT, OF_LATE, OF_SHIFTS, SIGNATURES };
 
-/* A forecast that no reading corrects, and what readings missed of it (supervisor.Kept) */
+/* A forecast that no reading corrects, and what readings missed of it (supervise.Kept) */
 typedef struct {
     real state[2][WATCH], given[WATCH][INPUTS], unit[WATCH][INPUTS]; /* responses to inputs and one percent */
     real before[PAIRS], began[OUTPUTS], first[OUTPUTS], least[OUTPUTS], most[OUTPUTS], total[2][OUTPUTS];
@@ -18,7 +18,7 @@ typedef struct {
     int age, away[OUTPUTS];
 } forecast_window;
 
-/* All that the supervisor remembers (supervisor.Kept) */
+/* All that the supervisor remembers (supervise.Kept) */
 typedef struct {
     moment since[KINDS][SIGNALS], last[KINDS][SIGNALS], cleared[OUTPUTS], returned[OUTPUTS], now;
     real amount[KINDS][SIGNALS];

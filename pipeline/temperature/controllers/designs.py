@@ -6,8 +6,9 @@ from functools import partial
 import numpy as np
 
 from pipeline.temperature import tracking
-from pipeline.temperature.controllers import baseline, controller, kernel, window
+from pipeline.temperature.controllers import baseline, kernel, window
 from pipeline.temperature.controllers import printer_pid as klipper
+from pipeline.temperature.controllers.law import compact
 from pipeline.temperature.controllers.problem import Design, DesignProblem, unit_weights, weights
 from pipeline.temperature.plant import strictly_proper
 from pipeline.temperature.tracking import Law
@@ -66,9 +67,7 @@ def _of_window(
     (q, r), (ones_q, ones_r, _) = weights(problem, values), unit_weights(problem)
     made = law(np.diag(q), np.diag(r), problem.gamma, integral=values["integral"])
     model, _ = window.observer_form(problem.window, problem.plant.sample_time_s)
-    return Design(
-        controller.compact(made, N), model, lambda: law(np.diag(ones_q), np.diag(ones_r), problem.gamma)
-    )
+    return Design(compact(made, N), model, lambda: law(np.diag(ones_q), np.diag(ones_r), problem.gamma))
 
 
 def exact_model(problem: DesignProblem, values: Mapping[str, float]) -> Design | None:

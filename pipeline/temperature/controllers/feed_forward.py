@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.temperature.controllers import window
-from pipeline.temperature.controllers.controller import FeedForward
+from pipeline.temperature.controllers.law import FeedForward
 from pipeline.temperature.plant import Plant, plant, simulate
 
 LONGEST, ENOUGH = 24, 20  # samples of the window, and for each of its columns

@@ -19,16 +19,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from pipeline.temperature.plant import Plant, markov_parameters
+from pipeline.temperature.controllers.law import ActuatorLimits, Governor, Plant, Strength
+from pipeline.temperature.plant import markov_parameters
 from pipeline.temperature.tracking import reached_state, riccati
-
-
-class ActuatorLimits(NamedTuple):
-    """low (m,) <= u <= high (m,) in percent, and at most `rate` (m,) percent a step; inf: none."""
-
-    low: np.ndarray
-    high: np.ndarray
-    rate: np.ndarray
 
 
 class OutputLimits(NamedTuple):
@@ -42,80 +35,16 @@ class OutputLimits(NamedTuple):
     overshoot: float
 
 
-class Strength(NamedTuple):
-    """All inputs act `weakest` to `strongest` times as they do on the member; beside that each input differs
-    from the others by a factor within 1 +- `each`."""
-
-    weakest: float
-    strongest: float
-    each: float
-
-
-class Governor(NamedTuple):
-    """A family of f plants with their observers, and the rows by which they look ahead; `governor` makes it.
-
-    A member remembers s = [x, w, xi, v] of size q = 2 (n + p). x is its state at its strongest and w (p) in
-    °C a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction);
-    xi and v are by how much less x and w would be at its weakest. Before y is measured s forecasts
-    [C x + d, C xi]:
-
-        s <- s + [e, clip(e + lambda C xi), C xi, clip(C xi)] correct,   s(t+1) = s move + u push + rest
-
-    with innovation e = y - C x - d, lambda in 0..1 between strongest and weakest, and an observer of the
-    stationary Riccati equation. w and v see up to `surprise` only: what is larger belongs to a transient, and
-    there to the strength of the inputs.
-
-    Its output j, h instants ahead and at its strongest, is s ahead + above + strongest u rise, with lowest
-    inputs from the next step on, and with `below` and `fall` in their places with highest; the second half of
-    `ahead` tells what the weakest lacks. Rows run over outputs, then instants, of which the first is now.
-
-    Shapes: see (f, q, 2 p), offset (f, p), correct (f, 4 p, q), move (f, q, q), push (f, m, q), rest (f, q),
-    start (f, p, q), start_0 (f, q), ahead (f, q, 2 p h), above, below (f, p h), rise, fall (f, m, p h); low,
-    high, surprise, doubt (p,) in °C, margins taken off: `doubt` is by how much an innovation may be off for
-    reasons other than the inputs' strength.
-    """
-
-    see: np.ndarray
-    offset: np.ndarray
-    correct: np.ndarray
-    move: np.ndarray
-    push: np.ndarray
-    rest: np.ndarray
-    start: np.ndarray
-    start_0: np.ndarray
-    ahead: np.ndarray
-    above: np.ndarray
-    below: np.ndarray
-    rise: np.ndarray
-    fall: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    surprise: np.ndarray
-    doubt: np.ndarray
-    near: np.ndarray
-    forgets: float
-    strength: Strength
-    overshoot: float
-
-
 # steps ahead at most
 LONGEST = 120
 # shares of its peak from which on a pulse response is looked at, and up to which closely
 REACHED, SHOULDER = 0.2, 0.9
-# projections over all outputs, and over both sides: inputs mostly move one output each, so that a few suffice
-SWEEPS, ROUNDS = 8, 2
-# percent by which rows are equal, or missed: one case by itself takes the same steps as among many
-EXACT = 1e-9
 # share of what the innovations told that is forgotten a step, and of the drift, and with them the observer's
 # constants: for a furthest look ahead of so many steps; a machine that needs more is watched as much longer
 FORGETS, LEAK, UNHURRIED = 0.005, 1e-4, 16
-# squares of innovations beyond those of the best member from which a member does not count
-CONTRADICTED = 4.0
-# overshoots from its target within which an output has arrived; how many it may go beyond it then, where the
-# whole range of the inputs for one sample moves it by fewer overshoots than this
-ARRIVED, LET_GO, BARELY = 2.0, 4.0, 20.0
-# an input that moves an output by less than this share of the strongest one is not held back for it
-WEAK = 0.05
+# overshoots that an output which has arrived may go beyond its target, if the whole range of the inputs for
+# one sample moves it by fewer overshoots than BARELY
+LET_GO, BARELY = 4.0, 20.0
 
 
 def governor(
@@ -252,180 +181,3 @@ def _ahead(plant: Plant, limits: ActuatorLimits, strength: Strength, at: np.ndar
         "rise": np.where(u < 0, weaker * u, u).T,
         "fall": np.where(u < 0, u / weaker, u).T,
     }
-
-
-# ---- what it remembers
-
-
-def started(family: Governor, y: np.ndarray) -> np.ndarray:
-    """Memory (f, s, q + 4 p) of the members at measured outputs y (s, p): s of Governor, then four sums an
-    output, of -e C xi, (C xi)^2, |C xi| and e^2, older ones forgotten."""
-    memory = np.matmul(y, family.start) + family.start_0[:, None]
-    return np.concatenate([memory, np.zeros((*memory.shape[:2], 4 * y.shape[1]))], axis=2)
-
-
-def corrected(family: Governor, memory: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The memory once outputs y (s, p) are measured."""
-    q, p = family.start.shape[2], y.shape[1]
-    s = memory[:, :, :q]
-    forecast = np.matmul(s, family.see)
-    e = y - family.offset[:, None] - forecast[:, :, :p]
-    lacks = forecast[:, :, p:]
-    after = np.empty_like(memory)
-    sums = (1 - family.forgets) * memory[:, :, q:]
-    for k, news in enumerate((-e * lacks, lacks * lacks, np.abs(lacks), e * e)):
-        sums[:, :, k * p : (k + 1) * p] += news
-    strength = np.clip(sums[:, :, :p] / (sums[:, :, p : 2 * p] + 1e-12), 0.0, 1.0)
-    left = e + strength * lacks
-    calm, lacks_calm = (np.minimum(np.maximum(v, -family.surprise), family.surprise) for v in (left, lacks))
-    news = np.concatenate([e, calm, lacks, lacks_calm], axis=2)
-    after[:, :, :q] = s + np.matmul(news, family.correct)
-    after[:, :, q:] = sums
-    return after
-
-
-def predicted(family: Governor, memory: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """The corrected memory a sample on, inputs u (s, m) applied."""
-    q = family.start.shape[2]
-    after = memory.copy()
-    after[:, :, :q] = np.matmul(memory[:, :, :q], family.move) + np.matmul(u, family.push)
-    after[:, :, :q] += family.rest[:, None]
-    return after
-
-
-def observed(family: Governor, memory: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The memory a sample after inputs u (s, m) were applied where y (s, p) was measured."""
-    return predicted(family, corrected(family, memory, y), u)
-
-
-def evidence(family: Governor, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What the innovations tell of each member, case and output (f, s, p): the share of the way from
-    strongest to weakest that the inputs are at least, by least squares, and at most, every innovation up to
-    `doubt` off in the direction that matters; and whether the member counts (f, s). It does not where the
-    best member's squares are a quarter of its own, and its own more than noise."""
-    p = len(family.low)
-    sums = memory[:, :, -4 * p :]
-    product, square, size, own = (sums[:, :, k * p : (k + 1) * p] for k in range(4))
-    share, doubt = 1 / (square + 1e-12), family.doubt * size + 1e-9
-    middle = np.clip(product * share, 0.0, 1.0)
-    rest = (own - middle * (2 * product - middle * square)).sum(axis=2)
-    counts = rest <= CONTRADICTED * rest.min(axis=0) + (family.doubt**2).sum()
-    least, most = (np.clip((product + off) * share, 0.0, 1.0) for off in (-doubt, doubt))
-    return least, middle, most, counts
-
-
-# ---- what it allows
-
-
-def governed(
-    family: Governor, memory: np.ndarray, u: np.ndarray, y_star: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
-    """Commands (s, m) as near to u (s, m) as the rows allow, within low..high (s, m); the memory corrected by
-    what was measured, y_star (s, p) targets.
-
-    Projections onto the most violated row of each output in turn. Only inputs whose lowering helps are
-    lowered for a high limit, and raised for a low one; the high limit has the last word. What cannot be kept
-    is kept as far as those inputs go.
-    """
-    q, rows = family.start.shape[2], family.above.shape[1]
-    least, middle, most, counts = evidence(family, memory)
-    ahead = np.matmul(memory[:, :, :q], family.ahead)
-    free, lacks = (
-        part.reshape(*part.shape[:2], y_star.shape[1], -1)
-        for part in (ahead[:, :, :rows], ahead[:, :, rows:])
-    )
-    # where an output is, is measured: how strong the inputs are is in doubt for what is still to come
-    free, lacks = free - (middle * lacks[..., 0])[..., None], lacks - lacks[..., :1]
-    now = free[..., 0] + family.offset[:, None]
-    floor, cap = _walls(family, now, y_star)
-    per_member = (len(free), 1, *free.shape[2:])
-    strongest, less = family.strength.strongest, family.strength.strongest - family.strength.weakest
-    bare = -(free - most[..., None] * lacks) - family.below.reshape(per_member)
-    below = _Side(bare, strongest - less * most, family.fall, counts, -floor)
-    bare = free - least[..., None] * lacks + family.above.reshape(per_member)
-    above = _Side(bare, strongest - less * least, family.rise, counts, cap)
-    u, raised = _projected(below, -u, -high)
-    u, lowered = _projected(above, -u, low)
-    # where an input is lowered for one output and was raised for another, others may do what it did
-    both = np.intersect1d(raised, lowered, assume_unique=True)
-    if both.size:
-        below, above, one = below.of(both), above.of(both), u[both]
-        for _ in range(ROUNDS):
-            one = -_projected(below, -one, -high[both])[0]
-            one = _projected(above, one, low[both])[0]
-        u[both] = one
-    return u
-
-
-def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high; and `overshoot` beyond
-    the target, `near` where an output has arrived at it. What is up to a further `overshoot` off goes back,
-    so that small errors of the forecast do not add up; what is further off comes back as the law says, and
-    what is too hot gets no hotter. What is far too cold is left to the law: to keep it from cooling, inputs
-    of other outputs would have to heat, which those outputs' caps forbid, and both would swing."""
-    arriving, leaving = (
-        np.where(sign * (y_star - now) < ARRIVED * family.overshoot, family.near, family.overshoot)
-        for sign in (1.0, -1.0)
-    )
-    floor, cap = y_star - leaving, y_star + arriving
-    return (
-        np.maximum(family.low, np.where(now < floor - family.overshoot, -np.inf, floor)),
-        np.minimum(family.high, np.where(now > cap + family.overshoot, now, cap)),
-    )
-
-
-class _Side(NamedTuple):
-    """What is forecast from above, or negated from below: bare (f, s, p, h) without the command, of which
-    strength (f, s, p) times u rows (f, m, p h) is to come; members that count (f, s); the wall (f, s, p)."""
-
-    bare: np.ndarray
-    strength: np.ndarray
-    rows: np.ndarray
-    counts: np.ndarray
-    wall: np.ndarray
-
-    def of(self, cases: np.ndarray) -> "_Side":
-        bare, strength, rows, counts, wall = self
-        return _Side(bare[:, cases], strength[:, cases], rows, counts[:, cases], wall[:, cases])
-
-
-def _projected(side: _Side, u: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """u (s, m) of `governed` for one side: bare + strength rows u <= wall where that can be kept; and which
-    cases a row touched."""
-    driven = np.matmul(u, side.rows).reshape(side.bare.shape)
-    over = side.bare + side.strength[..., None] * driven > side.wall[..., None]
-    touched = np.flatnonzero((over.any(axis=(2, 3)) & side.counts).any(axis=0))
-    if touched.size:
-        u = u.copy()
-        u[touched] = _swept(side.of(touched), u[touched], low[touched])
-    return u, touched
-
-
-def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
-    """The projections of `governed` for cases that a row touches: u, low (s, m)."""
-    f, s, p, h = side.bare.shape
-    m = u.shape[1]
-    rows = side.rows.reshape(f, m, p, h)
-    # what hardly moves an output is not shut for its sake
-    helps = np.where(rows > WEAK * np.maximum(rows, 0.0).max(axis=1, keepdims=True), rows, 0.0)
-    helps = np.maximum(helps, 0.0)
-    least = np.matmul(low, helps.reshape(f, m, -1)) + np.matmul(u, (rows - helps).reshape(f, m, -1))
-    room = (side.wall[..., None] - side.bare) / side.strength[..., None]
-    room = np.where(side.counts[..., None, None], np.maximum(room, least.reshape(room.shape)), np.inf)
-    helps = helps.transpose(2, 0, 3, 1).reshape(p, f * h, m)
-    for _ in range(SWEEPS):
-        over = np.matmul(u, side.rows).reshape(room.shape) - room
-        at_fault = (over > EXACT).any(axis=(0, 3))  # (s, p)
-        if not at_fault.any():
-            break
-        for j in np.flatnonzero(at_fault.any(axis=0)):
-            excess = np.matmul(u, rows[:, :, j]) - room[:, :, j]
-            excess = excess.transpose(1, 0, 2).reshape(s, f * h)
-            most = excess.max(axis=1)
-            worst = (excess >= most[:, None] - EXACT).argmax(axis=1)
-            direction = helps[j, worst] * (u > low + EXACT)
-            size = (direction**2).sum(axis=1)
-            # an output that is at fault in another case alone waits for the next sweep, as it does by itself
-            step = np.where(at_fault[:, j] & (most > EXACT), most, 0.0) / np.where(size > 0, size, np.inf)
-            u = np.maximum(u - step[:, None] * direction, low)
-    return u

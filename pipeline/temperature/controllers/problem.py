@@ -10,8 +10,8 @@ import numpy as np
 from pipeline.temperature.plant import markov_parameters
 
 if TYPE_CHECKING:
-    from pipeline.temperature.controllers.governor import ActuatorLimits
     from pipeline.temperature.controllers.kernel import Regression
+    from pipeline.temperature.controllers.law import ActuatorLimits
     from pipeline.temperature.controllers.printer_pid import HeaterPid
     from pipeline.temperature.controllers.window import WindowModel
     from pipeline.temperature.plant import Plant

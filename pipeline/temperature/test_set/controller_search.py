@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.temperature.controllers import table
-from pipeline.temperature.controllers.controller import Rest
+from pipeline.temperature.controllers.law import Rest
 from pipeline.temperature.controllers.problem import Design, DesignProblem, weights
 from pipeline.temperature.settings import TuneWeights
 from pipeline.temperature.test_set import panel, scorecard, tuning

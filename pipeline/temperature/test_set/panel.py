@@ -1,5 +1,5 @@
 """The panel: the plants that nobody learned or tuned on, what they are asked, and what comes out, with every
-controller as it runs (controller.py).
+controller as it runs (law.py).
 
 Plants, drawn uniformly around a nominal one: each input's gain, the speed of the whole plant, more heat lost,
 a sample of delay on every input in a part of them, another ambient. Four in five have a structure that no
@@ -17,17 +17,22 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from pipeline.temperature.controllers.controller import (
+from pipeline.temperature.controllers.feed_forward import Told
+from pipeline.temperature.controllers.governor import OutputLimits, governor
+from pipeline.temperature.controllers.law import (
     ActuatorLimits,
     Aim,
     Deployed,
     FeedForward,
+    Governor,
     Reference,
     Rest,
+    Strength,
     aim,
     batch_step,
     constant,
     deployed,
+    feasible_target,
     fed_forward,
     handed_over,
     ramp,
@@ -35,8 +40,6 @@ from pipeline.temperature.controllers.controller import (
     sinusoid,
     watched,
 )
-from pipeline.temperature.controllers.feed_forward import Told
-from pipeline.temperature.controllers.governor import Governor, OutputLimits, Strength, governor
 from pipeline.temperature.controllers.problem import Design, DesignProblem
 from pipeline.temperature.plant import Plant, hold_output, hold_state, padded, simulate
 from pipeline.temperature.settings import Half, Panel, Tracking, TuneWeights
@@ -50,7 +53,7 @@ from pipeline.temperature.test_set.scenario_defaults import (
     machine_scale,
     unreachable,
 )
-from pipeline.temperature.tracking import Law, feasible_target, reached_state
+from pipeline.temperature.tracking import Law, reached_state
 
 RESTLESS = 1e-8  # reciprocal condition of I - A below which a plant has no rest of its own
 # the surroundings while a reference is held: from, until (shares of the run), share of the rise by which they

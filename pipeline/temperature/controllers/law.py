@@ -22,19 +22,457 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 
-from pipeline.temperature.controllers.governor import (
-    ActuatorLimits,
-    Governor,
-    corrected,
-    governed,
-    observed,
-    predicted,
-    started,
-)
-from pipeline.temperature.plant import Plant
-from pipeline.temperature.tracking import Law, feasible_target
+# ---- exported to the letter from here on
+
+
+class Plant(NamedTuple):
+    """x(t+1) = A x + B u + b + K e
+    y = C x + D u + d + e
+
+    Seed 1, (1), with an offset and the innovation form of an identified model.
+
+    A (n, n), B (n, m), C (p, n), D (p, m), b (n,), d (p,), K (n, p) the Kalman gain; one step is
+    `sample_time_s` seconds, u in percent of duty, y in °C.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    b: np.ndarray
+    d: np.ndarray
+    K: np.ndarray
+    sample_time_s: float = 1.0
+
+    @property
+    def n(self) -> int:
+        return self.A.shape[0]
+
+    @property
+    def m(self) -> int:
+        return self.B.shape[1]
+
+    @property
+    def p(self) -> int:
+        return self.C.shape[0]
+
+
+class Law(NamedTuple):
+    """A controller as it runs: memory z, measured y, reference r, and
+    the input that was really applied (clipped or not).
+
+    u = -K z - D y - K_r (r + xi) - k
+    z(t+1) = A z + B_u u_applied + B_y y + B_r r + c
+    xi(t+1) = xi + integral (r - y)
+
+    Shapes with q memories: A (q, q), B_u (q, m), B_y (q, p), B_r (q, p), c (q,), K (m, q),
+    D (m, p), K_r (m, p), k (m,). It takes over from a plant that was held by u0 at y0
+    with z = start_u u0 + start_y y0 + start and xi = 0.
+
+    `integral` is the share of the error that xi takes a step: the outer integrator's, or that of a law with
+    integral action of its own, which puts its gain into K_r; where outputs take different shares, (p,) of
+    them, with no fewer inputs than outputs. No eigenvalue of A may be 1, because `aimed` solves (I - A) z for
+    the memory at rest: what integrates belongs into xi.
+
+    `conditional`: the law aims at no target. xi starts where -K_r xi is u0, takes every error in full, but
+    rests where the command is cut, and -K_r xi stays within the limits (conditional integration).
+    """
+
+    A: np.ndarray
+    B_u: np.ndarray
+    B_y: np.ndarray
+    B_r: np.ndarray
+    c: np.ndarray
+    K: np.ndarray
+    D: np.ndarray
+    K_r: np.ndarray
+    k: np.ndarray
+    start_u: np.ndarray
+    start_y: np.ndarray
+    start: np.ndarray
+    integral: float | np.ndarray = 0.0
+    conditional: bool = False
+
+
+# ---- the target
+
+
+class Target(NamedTuple):
+    """A steady state x (n,), u (m,) inside the limits with y (p,) as near the reference as the limits allow;
+    `miss` (p,) is y - r in °C, `slack` the distance of u from the nearest limit in percent."""
+
+    x: np.ndarray
+    u: np.ndarray
+    y: np.ndarray
+    miss: np.ndarray
+    slack: float
+
+
+def feasible_target(
+    plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, *, tolerance: float = 1e-3
+) -> Target:
+    """min |C x + d - r|^2 over x = A x + B u + b, low <= u <= high, and among its solutions one that keeps
+    all inputs as far from their limits as it can.
+
+    The unlimited optimum asks heaters for negative heat; aimed at this target instead, the same gains settle
+    on the reference (temperature notes, 6). The slack costs at most `tolerance` °C of reach.
+    """
+    nearest = _steady(plant, r, low, high, 0.0)
+    reach, slack, step = np.linalg.norm(nearest.miss) + tolerance, 0.0, (high - low).min() / 4
+    widest = 0.49 * (high - low).min()
+    while step > 1e-3:
+        wider = _steady(plant, r, low, high, slack + step)
+        # a target that the middle of the limits reaches as well has all the slack there is
+        if slack + step <= widest and np.linalg.norm(wider.miss) <= reach:
+            nearest, slack = wider, slack + step
+        else:
+            step /= 2
+    return nearest
+
+
+def _steady(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, slack: float) -> Target:
+    """Bounded least squares over u, the state eliminated: x = (I - A)^-1 (B u + b); a plant that only
+    integrates is taken to leak 1e-9 a step."""
+    balance = np.eye(plant.n) - plant.A
+    if np.linalg.cond(balance) > 1e13:
+        balance = balance + 1e-9 * np.eye(plant.n)
+    per_u, at_rest = np.linalg.solve(balance, plant.B), np.linalg.solve(balance, plant.b)
+    rows = np.vstack([plant.C @ per_u + plant.D, LIGHT * np.eye(plant.m)])
+    right = np.concatenate([r - plant.d - plant.C @ at_rest, np.zeros(plant.m)])
+    slack = min(slack, 0.49 * (high - low).min())
+    u = bounded_least_squares(rows, right, low + slack, high - slack)
+    x = per_u @ u + at_rest
+    y = plant.C @ x + plant.D @ u + plant.d
+    return Target(x, u, y, y - r, slack)
+
+
+# °C by which a percent of an input counts beside what outputs miss: of equally good inputs, the smaller
+LIGHT = 1e-6
+# shares below which a gradient, of what its terms come to, and a fall of the cost may be rounding
+ROUNDING, FALL = 1e-13, 1e-15
+
+
+def bounded_least_squares(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """x (n,) that minimises |A x - b|^2 within low..high (n,); A (rows, n), b (rows,): bounded-variable least
+    squares (Stark and Parker 1995), step by step as scipy.optimize.lsq_linear(method="bvls") takes them, so
+    that an exported file needs numpy only.
+
+    But for one thing: what stands at a limit is set free only for a gradient that is more than rounding can
+    be. Where more inputs than outputs are free, as good as any is what is found first; which of them rounding
+    prefers is another on another CPU, and in C.
+    """
+    x = np.linalg.lstsq(A, b, rcond=-1)[0]
+    if np.all((x >= low) & (x <= high)):
+        return x
+    at = np.zeros(len(x))
+    at[x <= low], at[x >= high] = -1, 1
+    x = np.where(at < 0, low, np.where(at > 0, high, x))
+    _settle_free(A, b, low, high, x, at)
+    miss = A @ x - b
+    cost, g = 0.5 * np.dot(miss, miss), A.T @ miss
+    for _ in range(len(x)):
+        doubt = ROUNDING * (np.abs(A).T @ (np.abs(A) @ np.abs(x) + np.abs(b)))
+        if np.max(g * at - doubt) <= 0:
+            break
+        at[np.argmax(g * at - doubt)] = 0
+        while _moved_until_bound(A, b, low, high, x, at):
+            pass
+        miss = A @ x - b
+        before, cost, g = cost, 0.5 * np.dot(miss, miss), A.T @ miss
+        if before - cost < FALL * before:
+            break
+    return x
+
+
+def _settle_free(
+    A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, x: np.ndarray, at: np.ndarray
+) -> None:
+    """Least squares of what is free; what leaves its limits is put there, until nothing does."""
+    while (at == 0).any():
+        free = np.flatnonzero(at == 0)
+        z = np.linalg.lstsq(A[:, free], b - A.dot(x * (at != 0)), rcond=None)[0]
+        below, above = z < low[free], z > high[free]
+        x[free] = np.where(below, low[free], np.where(above, high[free], z))
+        at[free[below]], at[free[above]] = -1, 1
+        if not (below | above).any():
+            break
+
+
+def _moved_until_bound(
+    A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, x: np.ndarray, at: np.ndarray
+) -> bool:
+    """Moves x to the least squares of what is free, or until an input meets a limit; whether one did."""
+    free = np.flatnonzero(at == 0)
+    z = np.linalg.lstsq(A[:, free], b - A.dot(x * (at != 0)), rcond=None)[0]
+    below, above = np.flatnonzero(z < low[free]), np.flatnonzero(z > high[free])
+    beyond = np.r_[below, above]
+    if not beyond.size:
+        x[free] = z
+        return False
+    wall = np.r_[low[free][below], high[free][above]]
+    share = (wall - x[free][beyond]) / (z[beyond] - x[free][beyond])
+    first = int(np.argmin(share))
+    x_free = x[free].copy()
+    x_free *= 1 - share[first]
+    x_free += share[first] * z
+    x[free] = x_free
+    at[free[beyond[first]]] = -1 if first < below.size else 1
+    return True
+
+
+# ---- the governor: what it is, and what it remembers
+
+
+class ActuatorLimits(NamedTuple):
+    """low (m,) <= u <= high (m,) in percent, and at most `rate` (m,) percent a step; inf: none."""
+
+    low: np.ndarray
+    high: np.ndarray
+    rate: np.ndarray
+
+
+class Strength(NamedTuple):
+    """All inputs act `weakest` to `strongest` times as they do on the member; beside that each input differs
+    from the others by a factor within 1 +- `each`."""
+
+    weakest: float
+    strongest: float
+    each: float
+
+
+class Governor(NamedTuple):
+    """A family of f plants with their observers, and the rows by which they look ahead; `governor` makes it.
+
+    A member remembers s = [x, w, xi, v] of size q = 2 (n + p). x is its state at its strongest and w (p) in
+    °C a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction);
+    xi and v are by how much less x and w would be at its weakest. Before y is measured s forecasts
+    [C x + d, C xi]:
+
+        s <- s + [e, clip(e + lambda C xi), C xi, clip(C xi)] correct,   s(t+1) = s move + u push + rest
+
+    with innovation e = y - C x - d, lambda in 0..1 between strongest and weakest, and an observer of the
+    stationary Riccati equation. w and v see up to `surprise` only: what is larger belongs to a transient, and
+    there to the strength of the inputs.
+
+    Its output j, h instants ahead and at its strongest, is s ahead + above + strongest u rise, with lowest
+    inputs from the next step on, and with `below` and `fall` in their places with highest; the second half of
+    `ahead` tells what the weakest lacks. Rows run over outputs, then instants, of which the first is now.
+
+    Shapes: see (f, q, 2 p), offset (f, p), correct (f, 4 p, q), move (f, q, q), push (f, m, q), rest (f, q),
+    start (f, p, q), start_0 (f, q), ahead (f, q, 2 p h), above, below (f, p h), rise, fall (f, m, p h); low,
+    high, surprise, doubt (p,) in °C, margins taken off: `doubt` is by how much an innovation may be off for
+    reasons other than the inputs' strength.
+    """
+
+    see: np.ndarray
+    offset: np.ndarray
+    correct: np.ndarray
+    move: np.ndarray
+    push: np.ndarray
+    rest: np.ndarray
+    start: np.ndarray
+    start_0: np.ndarray
+    ahead: np.ndarray
+    above: np.ndarray
+    below: np.ndarray
+    rise: np.ndarray
+    fall: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    surprise: np.ndarray
+    doubt: np.ndarray
+    near: np.ndarray
+    forgets: float
+    strength: Strength
+    overshoot: float
+
+
+# projections over all outputs, and over both sides: inputs mostly move one output each, so that a few suffice
+SWEEPS, ROUNDS = 8, 2
+# percent by which rows are equal, or missed: one case by itself takes the same steps as among many
+EXACT = 1e-9
+# squares of innovations beyond those of the best member from which a member does not count
+CONTRADICTED = 4.0
+# overshoots from its target within which an output has arrived
+ARRIVED = 2.0
+# an input that moves an output by less than this share of the strongest one is not held back for it
+LEAST_EFFECT = 0.05
+
+
+def started(family: Governor, y: np.ndarray) -> np.ndarray:
+    """Memory (f, s, q + 4 p) of the members at measured outputs y (s, p): s of Governor, then four sums an
+    output, of -e C xi, (C xi)^2, |C xi| and e^2, older ones forgotten."""
+    memory = np.matmul(y, family.start) + family.start_0[:, None]
+    return np.concatenate([memory, np.zeros((*memory.shape[:2], 4 * y.shape[1]))], axis=2)
+
+
+def corrected(family: Governor, memory: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The memory once outputs y (s, p) are measured."""
+    q, p = family.start.shape[2], y.shape[1]
+    s = memory[:, :, :q]
+    forecast = np.matmul(s, family.see)
+    e = y - family.offset[:, None] - forecast[:, :, :p]
+    lacks = forecast[:, :, p:]
+    after = np.empty_like(memory)
+    sums = (1 - family.forgets) * memory[:, :, q:]
+    for k, news in enumerate((-e * lacks, lacks * lacks, np.abs(lacks), e * e)):
+        sums[:, :, k * p : (k + 1) * p] += news
+    strength = np.clip(sums[:, :, :p] / (sums[:, :, p : 2 * p] + 1e-12), 0.0, 1.0)
+    left = e + strength * lacks
+    calm, lacks_calm = (np.minimum(np.maximum(v, -family.surprise), family.surprise) for v in (left, lacks))
+    news = np.concatenate([e, calm, lacks, lacks_calm], axis=2)
+    after[:, :, :q] = s + np.matmul(news, family.correct)
+    after[:, :, q:] = sums
+    return after
+
+
+def predicted(family: Governor, memory: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """The corrected memory a sample on, inputs u (s, m) applied."""
+    q = family.start.shape[2]
+    after = memory.copy()
+    after[:, :, :q] = np.matmul(memory[:, :, :q], family.move) + np.matmul(u, family.push)
+    after[:, :, :q] += family.rest[:, None]
+    return after
+
+
+def observed(family: Governor, memory: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The memory a sample after inputs u (s, m) were applied where y (s, p) was measured."""
+    return predicted(family, corrected(family, memory, y), u)
+
+
+def evidence(family: Governor, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What the innovations tell of each member, case and output (f, s, p): the share of the way from
+    strongest to weakest that the inputs are at least, by least squares, and at most, every innovation up to
+    `doubt` off in the direction that matters; and whether the member counts (f, s). It does not where the
+    best member's squares are a quarter of its own, and its own more than noise."""
+    p = len(family.low)
+    sums = memory[:, :, -4 * p :]
+    product, square, size, own = (sums[:, :, k * p : (k + 1) * p] for k in range(4))
+    share, doubt = 1 / (square + 1e-12), family.doubt * size + 1e-9
+    middle = np.clip(product * share, 0.0, 1.0)
+    rest = (own - middle * (2 * product - middle * square)).sum(axis=2)
+    counts = rest <= CONTRADICTED * rest.min(axis=0) + (family.doubt**2).sum()
+    least, most = (np.clip((product + off) * share, 0.0, 1.0) for off in (-doubt, doubt))
+    return least, middle, most, counts
+
+
+# ---- what it allows
+
+
+def governed(
+    family: Governor, memory: np.ndarray, u: np.ndarray, y_star: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Commands (s, m) as near to u (s, m) as the rows allow, within low..high (s, m); the memory corrected by
+    what was measured, y_star (s, p) targets.
+
+    Projections onto the most violated row of each output in turn. Only inputs whose lowering helps are
+    lowered for a high limit, and raised for a low one; the high limit has the last word. What cannot be kept
+    is kept as far as those inputs go.
+    """
+    q, rows = family.start.shape[2], family.above.shape[1]
+    least, middle, most, counts = evidence(family, memory)
+    ahead = np.matmul(memory[:, :, :q], family.ahead)
+    free, lacks = (
+        part.reshape(*part.shape[:2], y_star.shape[1], -1)
+        for part in (ahead[:, :, :rows], ahead[:, :, rows:])
+    )
+    # where an output is, is measured: how strong the inputs are is in doubt for what is still to come
+    free, lacks = free - (middle * lacks[..., 0])[..., None], lacks - lacks[..., :1]
+    now = free[..., 0] + family.offset[:, None]
+    floor, cap = _walls(family, now, y_star)
+    per_member = (len(free), 1, *free.shape[2:])
+    strongest, less = family.strength.strongest, family.strength.strongest - family.strength.weakest
+    bare = -(free - most[..., None] * lacks) - family.below.reshape(per_member)
+    below = _Side(bare, strongest - less * most, family.fall, counts, -floor)
+    bare = free - least[..., None] * lacks + family.above.reshape(per_member)
+    above = _Side(bare, strongest - less * least, family.rise, counts, cap)
+    u, raised = _projected(below, -u, -high)
+    u, lowered = _projected(above, -u, low)
+    # where an input is lowered for one output and was raised for another, others may do what it did
+    both = np.intersect1d(raised, lowered, assume_unique=True)
+    if both.size:
+        below, above, one = below.of(both), above.of(both), u[both]
+        for _ in range(ROUNDS):
+            one = -_projected(below, -one, -high[both])[0]
+            one = _projected(above, one, low[both])[0]
+        u[both] = one
+    return u
+
+
+def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high; and `overshoot` beyond
+    the target, `near` where an output has arrived at it. What is up to a further `overshoot` off goes back,
+    so that small errors of the forecast do not add up; what is further off comes back as the law says, and
+    what is too hot gets no hotter. What is far too cold is left to the law: to keep it from cooling, inputs
+    of other outputs would have to heat, which those outputs' caps forbid, and both would swing."""
+    arriving, leaving = (
+        np.where(sign * (y_star - now) < ARRIVED * family.overshoot, family.near, family.overshoot)
+        for sign in (1.0, -1.0)
+    )
+    floor, cap = y_star - leaving, y_star + arriving
+    return (
+        np.maximum(family.low, np.where(now < floor - family.overshoot, -np.inf, floor)),
+        np.minimum(family.high, np.where(now > cap + family.overshoot, now, cap)),
+    )
+
+
+class _Side(NamedTuple):
+    """What is forecast from above, or negated from below: bare (f, s, p, h) without the command, of which
+    strength (f, s, p) times u rows (f, m, p h) is to come; members that count (f, s); the wall (f, s, p)."""
+
+    bare: np.ndarray
+    strength: np.ndarray
+    rows: np.ndarray
+    counts: np.ndarray
+    wall: np.ndarray
+
+    def of(self, cases: np.ndarray) -> "_Side":
+        bare, strength, rows, counts, wall = self
+        return _Side(bare[:, cases], strength[:, cases], rows, counts[:, cases], wall[:, cases])
+
+
+def _projected(side: _Side, u: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """u (s, m) of `governed` for one side: bare + strength rows u <= wall where that can be kept; and which
+    cases a row touched."""
+    driven = np.matmul(u, side.rows).reshape(side.bare.shape)
+    over = side.bare + side.strength[..., None] * driven > side.wall[..., None]
+    touched = np.flatnonzero((over.any(axis=(2, 3)) & side.counts).any(axis=0))
+    if touched.size:
+        u = u.copy()
+        u[touched] = _swept(side.of(touched), u[touched], low[touched])
+    return u, touched
+
+
+def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """The projections of `governed` for cases that a row touches: u, low (s, m)."""
+    f, s, p, h = side.bare.shape
+    m = u.shape[1]
+    rows = side.rows.reshape(f, m, p, h)
+    # what hardly moves an output is not shut for its sake
+    helps = np.where(rows > LEAST_EFFECT * np.maximum(rows, 0.0).max(axis=1, keepdims=True), rows, 0.0)
+    helps = np.maximum(helps, 0.0)
+    least = np.matmul(low, helps.reshape(f, m, -1)) + np.matmul(u, (rows - helps).reshape(f, m, -1))
+    room = (side.wall[..., None] - side.bare) / side.strength[..., None]
+    room = np.where(side.counts[..., None, None], np.maximum(room, least.reshape(room.shape)), np.inf)
+    helps = helps.transpose(2, 0, 3, 1).reshape(p, f * h, m)
+    for _ in range(SWEEPS):
+        over = np.matmul(u, side.rows).reshape(room.shape) - room
+        at_fault = (over > EXACT).any(axis=(0, 3))  # (s, p)
+        if not at_fault.any():
+            break
+        for j in np.flatnonzero(at_fault.any(axis=0)):
+            excess = np.matmul(u, rows[:, :, j]) - room[:, :, j]
+            excess = excess.transpose(1, 0, 2).reshape(s, f * h)
+            most = excess.max(axis=1)
+            worst = (excess >= most[:, None] - EXACT).argmax(axis=1)
+            direction = helps[j, worst] * (u > low + EXACT)
+            size = (direction**2).sum(axis=1)
+            # an output that is at fault in another case alone waits for the next sweep, as it does by itself
+            step = np.where(at_fault[:, j] & (most > EXACT), most, 0.0) / np.where(size > 0, size, np.inf)
+            u = np.maximum(u - step[:, None] * direction, low)
+    return u
+
 
 # ---- references
 
@@ -69,7 +507,7 @@ def ramp(r: np.ndarray, slope: np.ndarray) -> Reference:
 def sinusoid(mean: np.ndarray, amplitude: np.ndarray, period: float) -> Reference:
     """mean + amplitude sin(2 pi t / period): mean, amplitude (p,) °C, period in steps."""
     c, s = np.cos(2 * np.pi / period), np.sin(2 * np.pi / period)
-    F = scipy.linalg.block_diag(np.eye(1), np.array([[c, -s], [s, c]]))
+    F = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
     return Reference(
         F, np.column_stack([mean, np.zeros_like(amplitude), amplitude]), np.array([1.0, 1.0, 0.0])
     )
@@ -92,7 +530,7 @@ class Rest(NamedTuple):
 
 
 def rest(model: Plant, reference: Reference, limits: ActuatorLimits, *, tolerance: float = 0.01) -> Rest:
-    """The steady input of the constant part by a bounded quadratic programme (tracking.feasible_target), and
+    """The steady input of the constant part by a bounded quadratic programme (feasible_target), and
     of what moves by the regulator equations X F = A X + B U, C X = H (Francis 1977)."""
     target = feasible_target(model, reference.H[:, 0], limits.low, limits.high)
     Y = reference.H.copy()
@@ -131,8 +569,17 @@ def aim(law: Law, at: Rest, reference: Reference) -> Aim:
 
 
 def _triangular(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """S, V with F = V S V*, S upper triangular; as it is where F is the identity of one state."""
-    return (F + 0j, np.eye(1) + 0j) if len(F) == 1 else scipy.linalg.schur(F, output="complex")
+    """S, V with F = V S V*, S upper triangular and V unitary: an eigenvalue at a time, whose eigenvector
+    becomes the next column of V (Golub and Van Loan 2013, 7.1)."""
+    k = len(F)
+    S, V = F + 0j, np.eye(k) + 0j
+    for j in range(k - 1):
+        value = np.linalg.eigvals(S[j:, j:])[0]
+        v = np.linalg.svd(S[j:, j:] - value * np.eye(k - j))[2][-1].conj()
+        Q = np.eye(k) + 0j
+        Q[j:, j:] = np.linalg.qr(np.column_stack([v, np.eye(k - j)]))[0]
+        S, V = Q.conj().T @ S @ Q, V @ Q
+    return np.triu(S), V
 
 
 def _sylvester(A: np.ndarray, F: np.ndarray, G: np.ndarray) -> np.ndarray:
@@ -349,7 +796,7 @@ def _allowed(
 
 
 def _integrated(controller: Deployed, xi, error, u, wished):
-    """xi (s, p) a sample on: the module's formula, or conditional integration (tracking.Law)."""
+    """xi (s, p) a sample on: the module's formula, or conditional integration (Law)."""
     law, most = controller.law, controller.integral_limit
     if law.conditional:
         after = xi + law.integral * error
