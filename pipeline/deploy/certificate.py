@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from pipeline.deploy.supervise import Signal
+from pipeline.deploy.supervise import Signal, signal
 
 VERSION, LOOP = 1, "temperature"
 Segments = Sequence[np.ndarray]
@@ -73,57 +73,17 @@ class RuleResult(NamedTuple):
     asked: bool = True
 
 
-class Poles(NamedTuple):
-    """The largest poles of one closed loop, [real, imaginary]; `of` is "model", "spread", "record" or
-    "newest"."""
-
-    of: str
-    radius: float
-    poles: tuple[tuple[float, float], ...]
-
-
-class MarginsFound(NamedTuple):
-    """MIMO disk margin and delay margin over family and record: median, the one that nine of ten reach, and
-    the least; a delay margin without end is None."""
-
-    plants: int
-    disk: tuple[float, float, float]
-    delay_s: tuple[float | None, float | None, float | None]
-
-
-class WorstPlants(NamedTuple):
-    """Over `plants` sampled plants: settled error in °C, median, 99 % quantile and worst, how many settle
-    worse than allowed, and how many did not stay finite."""
-
-    plants: int
-    settled_error_degC: tuple[float, float, float]
-    failing: int
-    diverged: int
-
-
-class Violation(NamedTuple):
-    """By how many °C a sampled plant crosses a limit of an output at most, and how many do by more than
-    allowed."""
-
-    output: str
-    worst_degC: float
-    plants: int
-
-
-class GainBands(NamedTuple):
-    """Bands of the learned gains u = -K w - K_r r at `level`, by `resamples` of the record: rows by input,
-    columns `on` a signal so many samples before, or a reference."""
-
-    level: float
-    resamples: int
-    on: tuple[str, ...]
-    gain: tuple[tuple[float, ...], ...]
-    low: tuple[tuple[float, ...], ...]
-    high: tuple[tuple[float, ...], ...]
-
-
 class Certificate(NamedTuple):
-    """What was shown of a controller. Fields that no rule came to are empty or None."""
+    """What was shown of a controller. Fields that no rule came to are empty or None.
+
+    `poles`, of each closed loop: {"of": "model", "spread", "record" or "newest", "radius", "poles": the
+    largest, [real, imaginary]}. `margins` of family and record, median, the one that nine of ten reach, and
+    least: {"plants", "disk", "delay_s"}, None without end. `worst`, settled errors in °C of sampled plants,
+    median, 99 % quantile and worst: {"plants", "settled_error_degC", "failing", "diverged"}. `violations`, by
+    how many °C plants cross a limit: {"output", "worst_degC", "plants": how many do by more than allowed}.
+    `bands` of learned gains u = -K w - K_r r: {"level", "resamples", "on": a signal so many samples before,
+    or a reference, "gain", "low", "high": rows by input}.
+    """
 
     version: int
     loop: str
@@ -136,11 +96,11 @@ class Certificate(NamedTuple):
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
     samples: tuple[int, int]
-    poles: tuple[Poles, ...]
-    margins: MarginsFound | None
-    worst: WorstPlants | None
-    violations: tuple[Violation, ...]
-    bands: GainBands | None
+    poles: tuple[dict[str, Any], ...]
+    margins: dict[str, Any] | None
+    worst: dict[str, Any] | None
+    violations: tuple[dict[str, Any], ...]
+    bands: dict[str, Any] | None
     rules: tuple[RuleResult, ...]
     verdict: Literal["passed", "refused"]
     first_failed: str | None
@@ -238,47 +198,19 @@ def _check(certificate: Certificate) -> None:
 
 def rebuilt(about: dict[str, Any]) -> Certificate:
     """The certificate of a JSON object."""
-
-    def signals(entries: list[dict[str, Any]]) -> tuple[Signal, ...]:
-        return tuple(
-            Signal(
-                one["name"],
-                one["unit"],
-                -np.inf if one["low"] is None else one["low"],
-                np.inf if one["high"] is None else one["high"],
-            )
-            for one in entries
-        )
-
-    margins, worst = about["margins"], about["worst"]
-    made = {name: about[name] for name in Certificate._fields}
-    made |= {
-        "inputs": signals(about["inputs"]),
-        "outputs": signals(about["outputs"]),
-        "samples": tuple(about["samples"]),
-        "poles": tuple(
-            Poles(one["of"], one["radius"], tuple((a, b) for a, b in one["poles"])) for one in about["poles"]
-        ),
-        "margins": margins
-        and MarginsFound(margins["plants"], tuple(margins["disk"]), tuple(margins["delay_s"])),
-        "worst": worst
-        and WorstPlants(**(worst | {"settled_error_degC": tuple(worst["settled_error_degC"])})),
-        "violations": tuple(Violation(**one) for one in about["violations"]),
-        "bands": about["bands"]
-        and GainBands(**{name: _tuples(part) for name, part in about["bands"].items()}),
-        "rules": tuple(RuleResult(**one) for one in about["rules"]),
-    }
+    made: dict[str, Any] = {name: about[name] for name in Certificate._fields}
+    made |= {name: tuple(about[name]) for name in ("samples", "poles", "violations")}
+    made |= {side: tuple(map(signal, about[side])) for side in ("inputs", "outputs")}
+    made["rules"] = tuple(RuleResult(**one) for one in about["rules"])
     return Certificate(**made)
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def plain(value: Any) -> Any:
     """Values as JSON has them; numbers that are not finite are null."""
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
         return {name: plain(part) for name, part in value._asdict().items()}
+    if isinstance(value, dict):
+        return {name: plain(part) for name, part in value.items()}
     if isinstance(value, tuple | list):
         return [plain(part) for part in value]
     if isinstance(value, float | np.floating):

@@ -11,18 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.deploy import bands
-from pipeline.deploy.certificate import (
-    EvidenceRecord,
-    GainBands,
-    MarginsFound,
-    Poles,
-    RuleResult,
-    Rules,
-    Violation,
-    WorstPlants,
-    at_most,
-    result,
-)
+from pipeline.deploy.certificate import EvidenceRecord, RuleResult, Rules, at_most, result
 from pipeline.deploy.certificate_evidence import reference_steps
 from pipeline.deploy.supervise import Exported
 from pipeline.temperature.controllers.law import Deployed, Plant
@@ -55,7 +44,11 @@ def of_loop(
     spread = [plant for of, plant in plants if of == "spread"]
     settled, crossing = _settled_and_crossing(exported, spread, of_record, rules, rng)
     violations = tuple(
-        Violation(signal.name, float(crossing[:, o].max()), int((crossing[:, o] > rules.crossing_degC).sum()))
+        {
+            "output": signal.name,
+            "worst_degC": float(crossing[:, o].max()),
+            "plants": int((crossing[:, o] > rules.crossing_degC).sum()),
+        }
         for o, signal in enumerate(exported.machine.outputs)
         if np.isfinite([signal.low, signal.high]).any()
     )
@@ -64,50 +57,51 @@ def of_loop(
     figures = {
         name: {"margins": [found[0], found[1], of_newest[0]], "tail": rules.tail}
         for name, found, of_newest in (
-            ("disk_margin", margins.disk, newest.disk),
-            ("delay_margin", margins.delay_s, newest.delay_s),
+            ("disk_margin", margins["disk"], newest["disk"]),
+            ("delay_margin", margins["delay_s"], newest["delay_s"]),
         )
     }
     figures["settled_error"] = {"degC": settled.tolist(), "failing": rules.failing}
     return fields, [_of_poles(poles, rules), _of_violations(crossing, rules)], figures
 
 
-def _poles(of: str, plant: Plant, controller: Deployed) -> Poles:
+def _poles(of: str, plant: Plant, controller: Deployed) -> dict[str, Any]:
     whole = plant.A if controller.holds else scorecard.closed_loop(plant, controller.law)
     found = np.linalg.eigvals(whole)
     found = found[np.lexsort((-found.imag, -np.abs(found).round(10)))]
-    shown = tuple((float(one.real), float(one.imag)) for one in found[:POLES_SHOWN])
-    return Poles(of, float(np.abs(found).max()), shown)
+    shown = [[float(one.real), float(one.imag)] for one in found[:POLES_SHOWN]]
+    return {"of": of, "radius": float(np.abs(found).max()), "poles": shown}
 
 
-def _of_poles(poles: Sequence[Poles], rules: Rules) -> RuleResult:
+def _of_poles(poles: Sequence[dict[str, Any]], rules: Rules) -> RuleResult:
     """All of model and spread within the unit circle, and of the plants of the record and its newest part all
     but a share `rules.failing`: a resample's slowest pole may lie outside by chance."""
-    declared = [one for one in poles if one.of in ("model", "spread")]
-    sampled = [one for one in poles if one.of in ("record", "newest")]
-    outside = [sum(one.radius >= 1 for one in part) for part in (declared, sampled)]
-    worst = max(poles, key=lambda one: one.radius)
+    declared = [one for one in poles if one["of"] in ("model", "spread")]
+    sampled = [one for one in poles if one["of"] in ("record", "newest")]
+    outside = [sum(one["radius"] >= 1 for one in part) for part in (declared, sampled)]
+    worst = max(poles, key=lambda one: one["radius"])
     return result(
         "poles",
         outside[0] == 0 and outside[1] <= rules.failing * len(sampled),
-        worst.radius,
+        worst["radius"],
         1.0,
         "1",
         f"On {len(poles) - outside[1]} of {len(poles)} plants, model and spread among them, every pole lies "
         "within the unit circle.",
         f"On {outside[0]} of {len(declared)} plants of model and spread, and {outside[1]} of {len(sampled)} "
-        f"of the record, a pole lies outside the unit circle, at {worst.radius:.4f}.",
+        f"of the record, a pole lies outside the unit circle, at {worst['radius']:.4f}.",
     )
 
 
-def _margins(plants: Sequence[Plant], controller: Deployed) -> MarginsFound:
+def _margins(plants: Sequence[Plant], controller: Deployed) -> dict[str, Any]:
     found = scorecard.margins(plants, controller.law, grid=60)
-    disk = np.sort([one.disk for one in found])
-    delay = np.sort([one.delay_s for one in found])
-    tenth = len(found) // 10
-    picked = [[float(part[k]) for k in (len(found) // 2, tenth, 0)] for part in (disk, delay)]
-    late = [one if np.isfinite(one) else None for one in picked[1]]
-    return MarginsFound(len(found), (picked[0][0], picked[0][1], picked[0][2]), (late[0], late[1], late[2]))
+    picked = len(found) // 2, len(found) // 10, 0
+    disk, delay = (np.sort([getattr(one, name) for one in found]) for name in ("disk", "delay_s"))
+    return {
+        "plants": len(found),
+        "disk": [float(disk[k]) for k in picked],
+        "delay_s": [float(delay[k]) if np.isfinite(delay[k]) else None for k in picked],
+    }
 
 
 def _of_violations(crossing: np.ndarray, rules: Rules) -> RuleResult:
@@ -146,11 +140,11 @@ def _settled_and_crossing(
     return settled, np.maximum(np.maximum(low - lowest, highest - high), 0.0)
 
 
-def _worst(settled: np.ndarray) -> WorstPlants:
+def _worst(settled: np.ndarray) -> dict[str, Any]:
     """How many plants fail is decided by the limit (certified.py): 0 until then."""
     figures = [float(np.quantile(settled, share, method="higher")) for share in (0.5, 0.99, 1.0)]
     diverged = int((settled >= bands.DIVERGED).sum())
-    return WorstPlants(len(settled), (figures[0], figures[1], figures[2]), 0, diverged)
+    return {"plants": len(settled), "settled_error_degC": figures, "failing": 0, "diverged": diverged}
 
 
 def gain_bands(
@@ -159,12 +153,14 @@ def gain_bands(
     learning: bands.GainRoute,
     rules: Rules,
     rng: np.random.Generator,
-) -> GainBands:
+) -> dict[str, Any]:
     found = bands.bands(record.u, record.y, learning, resamples=rules.resamples, rng=rng)
     machine, N = exported.machine, learning.N
     inputs, outputs = [one.name for one in machine.inputs], [one.name for one in machine.outputs]
     on = [f"{name} {lag} before" for lag in range(1, N + 1) for name in inputs]
     on += [f"{name} {lag} before" for lag in range(1, N + 1) for name in outputs]
     on += [f"reference of {name}" for name in outputs]
-    gain, low, high = (tuple(tuple(float(f"{one:.6g}") for one in row) for row in part) for part in found[:3])
-    return GainBands(found.level, found.resamples, tuple(on), gain, low, high)
+    gain, low, high = ([[float(f"{one:.6g}") for one in row] for row in part] for part in found[:3])
+    return {
+        "level": found.level, "resamples": found.resamples, "on": on, "gain": gain, "low": low, "high": high
+    }  # fmt: skip

@@ -63,7 +63,7 @@ def decide(
     if "settled_error" not in done or decided.worst is None:
         return decided._replace(poles=(), margins=None, worst=None, violations=(), bands=None)
     failing = int((np.array(figures["settled_error"]["degC"]) > settled_error_degC).sum())
-    return decided._replace(worst=decided.worst._replace(failing=failing))
+    return decided._replace(worst=decided.worst | {"failing": failing})
 
 
 def _of_noise(figures: Mapping[str, Any], limit_degC: float) -> RuleResult:

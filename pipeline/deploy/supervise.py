@@ -68,6 +68,14 @@ class Signal(NamedTuple):
     high: float
 
 
+def signal(about: Mapping[str, Any]) -> Signal:
+    """The signal of a JSON object, in which null is a limit that is not declared."""
+    low, high = about["low"], about["high"]
+    return Signal(
+        about["name"], about["unit"], -np.inf if low is None else low, np.inf if high is None else high
+    )
+
+
 class Machine(NamedTuple):
     """What a controller is wired to: its signals in order, the time between two samples, and the measured
     disturbances that it is told."""
@@ -209,18 +217,8 @@ RECORDS = {
 def restored(about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Exported:
     """The controller of controller.json and of its arrays by dotted names. Raises KeyError if one is
     missing."""
-    inputs, outputs, disturbances = (
-        tuple(
-            Signal(
-                one["name"],
-                one["unit"],
-                -np.inf if one["low"] is None else one["low"],
-                np.inf if one["high"] is None else one["high"],
-            )
-            for one in about[side]
-        )
-        for side in ("inputs", "outputs", "disturbances")
-    )
+    sides = (tuple(map(signal, about[side])) for side in ("inputs", "outputs", "disturbances"))
+    inputs, outputs, disturbances = sides
     return Exported(
         machine=Machine(inputs, outputs, about["sample_time_s"], disturbances),
         **{name: _record(name, arrays) for name in ("controller", "model", "fallback", "supervision")},

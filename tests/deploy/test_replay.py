@@ -88,9 +88,8 @@ def by_the_object(made: Deployed, model: Plant, of: GaplessLog, hold: int) -> np
 @pytest.mark.parametrize("name", ["pi", "window", "lqg"])
 def test_a_replay_asks_what_the_object_would_have_asked(name, monkeypatch):
     made, model = ready(name)
-    # chunks much shorter than the log, so that their seams lie in it
-    monkeypatch.setattr(replay, "CHUNK", 64)
-    monkeypatch.setattr(replay, "BLOCK", 256)
+    # chunks of the governor much shorter than the log, so that their seams lie in it
+    monkeypatch.setattr(replay, "SIDE_BY_SIDE", 40)
     run = replay.replayed(made, model, log(), hold=30)
     expected = by_the_object(made, model, log(), 30)
     assert np.abs(run.asked - expected).max() < 1e-9 * 100
@@ -132,9 +131,6 @@ def test_chunks_are_the_recursion_sample_by_sample():
     for t in range(1203):
         np.testing.assert_allclose(walked[t], z, atol=1e-11)
         z = A @ z + drive[t]
-    shifting = np.eye(6, k=2)
-    by_shift, plain = (replay.scanned(shifting, np.tile(drive, 2)[:, :6], np.ones(6), k) for k in (2, 0))
-    np.testing.assert_allclose(by_shift, plain, atol=1e-12)
 
 
 def test_a_reference_that_never_holds_still_is_refused():

@@ -760,18 +760,21 @@ def batch_step(
     feed: np.ndarray,
     y_star: np.ndarray,
     forward: np.ndarray | float = 0.0,
+    applied: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, ControllerState]:
     """Inputs (s, m) to apply, inputs wished, and the state a sample on, from measured y, reference r, target
-    y_star (s, p), feed w (s, m) and what is fed `forward` (s, m)."""
+    y_star (s, p), feed w (s, m) and what is fed `forward` (s, m); `applied` (s, m) if the machine is given
+    others."""
     law = controller.law
     if controller.holds:
         return state.u, state.u, state
     wished = feed - state.z @ law.K.T - y @ law.D.T - state.xi @ law.K_r.T
     u, x = _allowed(controller, state, wished, y, y_star, forward)
-    acts = u - forward
+    given = u if applied is None else applied
+    acts = given - forward
     x = x if controller.governor is None else predicted(controller.governor, x, acts)
     xi = _integrated(controller, state.xi, y_star - y, acts, wished)
-    after = ControllerState(_remembered(controller, state.z, acts, y, r), xi, u, x)
+    after = ControllerState(_remembered(controller, state.z, acts, y, r), xi, given, x)
     return u, wished + forward, after
 
 
