@@ -1,7 +1,7 @@
 """Certify every controller of the temperature loop that a verdict could name, and prepare the files of each:
 reads what evaluate_temperature read and wrote, and of the setpoint loop what train_classifier, train_agent
 and evaluate_setpoint wrote. No limit of section `report` enters: what is measured is compared with the limits
-by the stages verdict and export_controllers (pipeline/deploy/certified.py).
+by the stages verdict and export_controllers (pipeline/deploy/certificate.py).
 
 Writes datasets/certify: temperature/<controller>/ (measured.json, controller.json, arrays.safetensors,
 support.safetensors, c/, python/; the place of the certificate's SHA-256 is marked), setpoint/, and
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pipeline.deploy.certificate import EvidenceRecord, Rules
-    from pipeline.deploy.certificate_evidence import WindowModels
+    from pipeline.deploy.certify import WindowModels
     from pipeline.deploy.replay import GaplessLog
     from pipeline.deploy.supervise import Machine
     from pipeline.temperature.controllers.feed_forward import Told
@@ -115,7 +115,7 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     """What no controller changes."""
     import numpy as np
 
-    from pipeline.deploy import certificate_evidence, certify, support_logs
+    from pipeline.deploy import certify, support
     from pipeline.deploy.certificate import EvidenceRecord
     from pipeline.deploy.replay import GaplessLog
     from pipeline.temperature.controllers import feed_forward
@@ -137,12 +137,12 @@ def prepare(loaded: EvaluationInputs, settings: Certify) -> Common:
     setting, rng = loaded.setting, np.random.default_rng(settings.seed)
     half = setting.rehearsal.judging
     rules = certify.require(half, record, setting.settled, settings.plants, settings.resamples)
-    models = certificate_evidence.window_models(machine, record, rules, rng)
+    models = certify.window_models(machine, record, rules, rng)
     if loaded.simulated:
         spread = panel.spread_of(loaded.panel)
     else:
         spread = panel.spread_around(loaded.panel, loaded.problem.plant)
-    plants = support_logs.forecasting_plants(family, spread, np.random.default_rng(settings.seed))
+    plants = support.forecasting_plants(family, spread, np.random.default_rng(settings.seed))
     recorded = [GaplessLog(*log) for log in zip(u, y, y, strict=True)]
     return Common(machine, record, rules, models, rng, plants, recorded, conditions(declared, told))
 
@@ -183,17 +183,16 @@ def certify_controller(
     from pipeline.deploy import (
         assembly,
         bands,
-        certified,
+        certificate,
         certify,
         checks,
         machine,
         support,
-        support_logs,
         to_c,
         to_python,
         vectors,
     )
-    from pipeline.deploy.support_file import write_support
+    from pipeline.deploy.support import write_support
     from pipeline.temperature.controllers.table import BY_NAME
 
     setting, problem, half = loaded.setting, loaded.problem, loaded.setting.rehearsal.judging
@@ -217,15 +216,15 @@ def certify_controller(
             delay_share=setting.faster,
             conditions=common.conditions,
         )
-        honest = support_logs.honest_logs(made, half, setting.limits)
+        honest = support.honest_logs(made, half, setting.limits)
         within = support.support(common.plants, honest, setting.rehearsal.noise, common.recorded)
-        sources = to_c.code(made, certified.PLACE) | {"golden.csv": vectors.golden(made)}
+        sources = to_c.code(made, certificate.PLACE) | {"golden.csv": vectors.golden(made)}
         checks.check_compiled(made, sources)
-        code = to_python.code(made, certified.PLACE)
+        code = to_python.code(made, certificate.PLACE)
         differences = {"judged": difference, "python": checks.python_difference(made, code)}
     except ValueError as reason:
         return name, _not_measured(str(reason))
-    certified.write(folder, measured)
+    certificate.write(folder, measured)
     machine.write_controller(folder, made)
     write_support(folder, within, measured.draft.controller_sha256)
     for file, text in sources.items():
@@ -257,7 +256,7 @@ def judged_case(name: str, declared: Plant) -> tuple[int, np.ndarray, np.ndarray
 def certify_setpoint(folder: Path, seed: int) -> dict[str, Any]:
     """The files of the default controller, which have no certificate, and how far they are from the
     networks."""
-    from pipeline.deploy import setpoint_checks
+    from pipeline.deploy import to_setpoint
     from pipeline.setpoint.agents.files import restore_agents
     from pipeline.setpoint.controllers import build_controllers
     from pipeline.setpoint.settings import EvaluateSetpoint
@@ -274,8 +273,8 @@ def certify_setpoint(folder: Path, seed: int) -> dict[str, Any]:
     baselines = params.load(EvaluateSetpoint, "evaluate_setpoint").baselines
     default = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
     built = build_controllers(baselines, agents, learned).get(default)
-    decides = setpoint_checks.decider(default, built and built.parameters, agents.belief, agents.belief_dqn)
-    return setpoint_checks.write(folder, default, model, decides, seed)
+    decides = to_setpoint.decider(default, built and built.parameters, agents.belief, agents.belief_dqn)
+    return to_setpoint.write_checked(folder, default, model, decides, seed)
 
 
 if __name__ == "__main__":

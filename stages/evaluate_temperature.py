@@ -176,7 +176,7 @@ def judge(
     name: str, design: Design, own: Design | None, loaded: EvaluationInputs
 ) -> tuple[str, ControllerOutcome, dict[str, Any] | None]:
     """One controller alone and under its supervisor, which the one that does nothing has none of."""
-    from pipeline.deploy import assembly, healthy
+    from pipeline.deploy import assembly
     from pipeline.temperature.test_set.evaluation import evaluate
 
     setting = loaded.setting
@@ -186,7 +186,7 @@ def judge(
     made = assembly.assemble(
         name, design, own, wire(loaded.machine), setting, loaded.problem.family, simulated=loaded.simulated
     )
-    return name, outcome, healthy.play(made, setting.rehearsal.judging)
+    return name, outcome, assembly.play(made, setting.rehearsal.judging)
 
 
 def redesigns(names: list[str], loaded: EvaluationInputs) -> dict[str, dict[str, Any]]:

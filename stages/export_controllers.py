@@ -47,7 +47,7 @@ def main() -> None:
 def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
     """Files of the controller that the verdict names. If the verdict names none because the certificate of
     its controller is refused, that certificate alone."""
-    from pipeline.deploy import certificate, certified, machine, state_space
+    from pipeline.deploy import certificate, machine, state_space
 
     verdict = artifacts.read_json(VERDICTS / "temperature.json")
     name = verdict["winner"] or verdict.get("refused")
@@ -60,8 +60,8 @@ def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
     if not one["measured"]:
         return describe(name, why=one["why"], unit="percent")
     rules = params.load(TemperatureRules, "report")
-    decided = certified.decide(
-        certified.read(source),
+    decided = certificate.decide(
+        certificate.read(source),
         settled_error_degC=rules.settled_error_degC,
         disk_margin=rules.disk_margin,
         delay_margin_s=rules.delay_margin_s,
@@ -75,7 +75,7 @@ def export_temperature(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
     return describe(
         name,
         certificate=summarise(decided),
-        why=certified.refusal(decided),
+        why=certificate.refusal(decided),
         files=hashes(folder) if decided.verdict == "passed" else {},
         largest_difference=one["largest_difference"],
         unit="percent",
@@ -144,7 +144,7 @@ def summarise(decided: "Certificate") -> dict[str, Any]:
 
 def copy(source: Path, folder: Path, certificate_sha256: str) -> None:
     """The prepared files, with the SHA-256 in its marked places."""
-    from pipeline.deploy.certified import fill
+    from pipeline.deploy.certificate import fill
 
     for path in files_below(source):
         name = path.relative_to(source).as_posix()

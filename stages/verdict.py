@@ -53,11 +53,11 @@ def judge_comparison(evidence: "Evidence") -> dict[str, Any]:
 
 def certificates(rules: Any) -> dict[str, dict[str, dict[str, Any]]]:
     """{loop: {controller: {"passed", "why"}}} by the limits of `report`; {} if certify did not run."""
-    from pipeline.deploy import certified
+    from pipeline.deploy import certificate
 
     if not artifacts.exists(CERTIFIED):
         return {}
-    temperature = certified.results(
+    temperature = certificate.results(
         "datasets/certify",
         settled_error_degC=rules.settled_error_degC,
         disk_margin=rules.disk_margin,

@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.deploy import machine, replay, supervise, support
 from pipeline.deploy.replay import GaplessLog
 from pipeline.deploy.supervise import Exported, Signal
-from pipeline.deploy.support_file import read_support
+from pipeline.deploy.support import read_support
 from pipeline.recordings.recordings import Source, Table, read
 from pipeline.recordings.resampling import resample
 from pipeline.store import artifacts, params

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.commands.shadow import deploy
 from pipeline.deploy import to_setpoint
-from pipeline.deploy.setpoint_checks import BELIEF
+from pipeline.deploy.to_setpoint import BELIEF
 from pipeline.setpoint.agents.bayes import Filter
 from pipeline.setpoint.agents.files import restore_agents
 from pipeline.store import artifacts

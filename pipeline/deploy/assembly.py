@@ -1,16 +1,28 @@
 """A controller of the comparison as it is exported: with its safe mode, its supervisor and the machine it is
-for."""
+for; and played on healthy machines of the test set. As long as the supervisor finds no fault there, what runs
+is the law, and the law's figures are those of what runs."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import scipy.linalg
 
 from pipeline.deploy.machine import canonical, plants_sha256
-from pipeline.deploy.supervise import DOOR_S, MISSING_FOR, SPACING, WINDOWS, Exported, Machine, Supervision
+from pipeline.deploy.supervise import (
+    DOOR_S,
+    MISSING_FOR,
+    SPACING,
+    WINDOWS,
+    Exported,
+    Machine,
+    Supervised,
+    Supervision,
+)
 from pipeline.temperature.controllers.law import Plant
 from pipeline.temperature.controllers.problem import Design
 from pipeline.temperature.plant import markov_parameters, strictly_proper
+from pipeline.temperature.test_set import panel
 from pipeline.temperature.test_set.panel import CaseConditions, deploy
 from pipeline.temperature.test_set.scorecard import closed_loop
 from pipeline.temperature.tracking import reached_state, riccati
@@ -115,3 +127,46 @@ def supervision(
         sample_time_s=machine.sample_time_s,
         reach_degC=max(0.5, 3 * float(noise.max())),
     )
+
+
+KINDS = ("sequence", "disturbed")  # set-point changes, and a door, a fan and another room
+PLANTS = 5  # one of each structure
+
+
+def play(exported: Exported, cases: panel.Cases) -> dict[str, Any]:
+    """How many of `cases` there are, in how many the law was left, the share of their samples that it was
+    left for, in percent, and the first reason of the first of them with its plant. A sample at a time."""
+    cases = panel.some(cases, KINDS, PLANTS)
+    made = exported.controller.forward
+    running = [Supervised(exported, rehearsal=True) for _ in cases.plant]
+    at_rest = panel.rests(exported.model, cases, exported.controller.limits)
+    r, target, _ = panel.schedule(cases, panel.aims(exported.controller.law, at_rest, cases))
+    held = panel.held_readings(cases)
+    told = cases.told + (0.0 if made is None else made.mean)
+    for measured in held[:-1]:
+        for k, one in enumerate(running):
+            one.watch(cases.u0[k], measured[k], r[0, k])
+    for k, one in enumerate(running):
+        one.hand_over(held[-1, k])
+    left, first = np.zeros(len(running), int), [""] * len(running)
+
+    def drive(t: int, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        u = np.empty_like(cases.u0)
+        for k, one in enumerate(running):
+            one.tell(told[t, k])
+            decision = one.step(measured[k], r[t, k], t * exported.machine.sample_time_s)
+            u[k] = decision.u
+            if decision.mode != "law":
+                left[k] += 1
+                first[k] = first[k] or decision.causes[0].sentence
+        return u, u
+
+    panel.simulated(cases, drive, r, target)
+    at = int(np.argmax(left > 0))
+    return {
+        "cases": len(left),
+        "left": int((left > 0).sum()),
+        "percent": 100.0 * float(left.mean()) / cases.steps,
+        "why": first[at],
+        "plant": int(cases.plant[at]) if left.any() else None,
+    }

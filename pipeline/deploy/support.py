@@ -25,15 +25,20 @@ nothing moves cannot say which sensor is which, or what a heater's percent is wo
 ranges alone."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 
+from pipeline.deploy import machine
 from pipeline.deploy.replay import BLOCK, GaplessLog, scanned
+from pipeline.deploy.supervise import Exported
+from pipeline.store import artifacts
 from pipeline.temperature.controllers.governor import instants
-from pipeline.temperature.controllers.law import Plant
-from pipeline.temperature.plant import markov_parameters
+from pipeline.temperature.controllers.law import ActuatorLimits, Plant
+from pipeline.temperature.plant import markov_parameters, padded
+from pipeline.temperature.test_set import panel
 from pipeline.temperature.tracking import reached_state, riccati
 
 TEMPERATURE, COMMAND, FORECAST = 1, 2, 4
@@ -336,3 +341,70 @@ def _stretches(log: GaplessLog) -> list[tuple[int, GaplessLog]]:
         return [(0, log)]
     firsts = np.linspace(0, T - STRETCH, MOST_SAMPLES // STRETCH).astype(int)
     return [(int(at), GaplessLog(*(part[at : at + STRETCH] for part in log))) for at in firsts]
+
+
+FORECASTING, HONEST_LOGS = 24, 200  # plants, and logs at most
+
+
+def forecasting_plants(
+    family: Sequence[Plant], spread: panel.PlantSpread, rng: np.random.Generator
+) -> list[Plant]:
+    return padded(panel.drawn(family, FORECASTING, spread, cells=False, rng=rng))
+
+
+def honest_logs(made: Exported, half: panel.Cases, limits: ActuatorLimits) -> list[GaplessLog]:
+    """Logs of cases of the judging half under the controller as deployed, from the hold on."""
+    aims = panel.aims(made.controller.law, panel.rests(made.model, half, limits), half)
+    run, held = panel.rolled_out(made.controller, half, aims), panel.held_readings(half)[:-1]
+    logs = []
+    for case in np.unique(np.linspace(0, len(half.plant) - 1, HONEST_LOGS).astype(int)):
+        still = np.ones((half.hold, 1))
+        parts = (still * half.u0[case], run.u[:, case]), (held[:, case], run.measured[:, case]), (
+            still * run.r[0, case], run.r[:, case],
+        )  # fmt: skip
+        logs.append(GaplessLog(*(np.concatenate(part) for part in parts)))
+    return logs
+
+
+# ---- the file
+
+SUPPORT = "support.safetensors"
+
+
+def write_support(folder: Path, within: Support, controller_sha256: str) -> None:
+    """support.safetensors of a controller's folder."""
+    plants = {
+        f"spread.{name}": np.stack([np.asarray(getattr(one, name), float) for one in within.spread])
+        for name in within.spread[0]._fields
+    }
+    numbers = {k: np.asarray(v, float) for k, v in within._asdict().items() if k != "spread"}
+    artifacts.write_weights(
+        folder / SUPPORT, "support 2", plants | numbers, {"controller": controller_sha256}
+    )
+
+
+def read_support(folder: Path, made: Exported) -> Support | None:
+    """What `write_support` wrote; None where there is none. Raises ValueError where it is of another
+    controller."""
+    if not artifacts.exists(folder / SUPPORT):
+        return None
+    arrays, about = artifacts.read_weights(folder / SUPPORT, "support 2")
+    if about.get("controller") != machine.controller_sha256(made):
+        raise ValueError(f"{folder / SUPPORT}: it is of another controller than the folder; export it again")
+    names = type(made.model)._fields
+    plants = tuple(
+        type(made.model)(*(arrays[f"spread.{name}"][i] for name in names))
+        for i in range(len(arrays["spread.A"]))
+    )
+    return Support(
+        arrays["temperature_low"],
+        arrays["temperature_high"],
+        arrays["command_low"],
+        arrays["command_high"],
+        plants,
+        arrays["noise"],
+        int(arrays["steps"]),
+        float(arrays["furthest"]),
+        arrays["rest"],
+        arrays["allowed"],
+    )

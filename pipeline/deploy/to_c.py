@@ -7,6 +7,7 @@ test_controller.c asks for the same within 1e-9 of each signal's range. With -DB
 float, for boards; its tolerance stands in test_controller.c.
 """
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,6 @@ import numpy as np
 from pipeline.deploy import supervise
 from pipeline.deploy.certificate import Certificate, sha256
 from pipeline.deploy.machine import check, check_certificate
-from pipeline.deploy.names import identifier
 from pipeline.deploy.supervise import Exported
 from pipeline.temperature.controllers import law
 from pipeline.temperature.controllers.law import (
@@ -451,3 +451,8 @@ def supervising(s: supervise.Supervision) -> str:
 def integers(name: str, values: np.ndarray) -> str:
     items = [str(int(value)) for value in values]
     return f"static const int {name}[{len(items)}] = {{\n{_wrapped(items, '    ')}\n}};\n"
+
+
+def identifier(name: str) -> str:
+    """`name` in capitals, with _ for what no identifier may hold."""
+    return re.sub(r"\W", "_", name, flags=re.ASCII).upper()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from pipeline.deploy import bands, certificate, certificate_evidence, certified, certify, machine
+from pipeline.deploy import bands, certificate, certify, machine
 from pipeline.deploy.certificate import Certificate, EvidenceRecord, Rules, from_json, sha256, to_json
 from pipeline.deploy.machine import plants_sha256
 from pipeline.deploy.supervise import Exported, Machine, Signal
@@ -83,15 +83,15 @@ def measure(
     rules: Rules = RULES,
     family: Sequence[Plant] = FAMILY,
     learning: bands.GainRoute | None = None,
-) -> certified.MeasuredController:
+) -> certificate.MeasuredController:
     made, rng = exported or designed(zones()), np.random.default_rng(1)
-    models = certificate_evidence.window_models(made.machine, record, rules, rng)
+    models = certify.window_models(made.machine, record, rules, rng)
     return certify.measure(made, family, record, rules, models, rng, learning=learning)
 
 
 def decided(*given, limits: dict[str, float] = ALLOWED, **more) -> Certificate:
     """The certificate of measured figures under limits."""
-    return certified.decide(measure(*given, **more), **limits)
+    return certificate.decide(measure(*given, **more), **limits)
 
 
 @pytest.fixture(scope="module")

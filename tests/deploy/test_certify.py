@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipeline.deploy import assembly, bands, certified, checks, to_c
+from pipeline.deploy import assembly, bands, certificate, checks, to_c
 from pipeline.deploy import certify as measuring
 from pipeline.deploy.machine import check
 from pipeline.deploy.supervise import Exported
@@ -87,7 +87,7 @@ def test_only_learned_gains_have_bands():
 
 def test_c_with_other_golden_vectors_is_refused():
     of = exported()
-    files = to_c.code(of, certified.PLACE) | {"golden.csv": "0.0\n1,2,3\n"}
+    files = to_c.code(of, certificate.PLACE) | {"golden.csv": "0.0\n1,2,3\n"}
     if checks.find_compiler():
         with pytest.raises(ValueError, match="the exported C of lqg does not pass its golden vectors"):
             checks.check_compiled(of, files)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.commands import export, replay
-from pipeline.deploy import certificate, certified, machine, to_c, to_python
+from pipeline.deploy import certificate, machine, to_c, to_python
 from pipeline.store import artifacts
 from stages import export_controllers
 from tests.deploy.deployed_machines import exported, passed
@@ -38,11 +38,11 @@ def project(tmp_path, monkeypatch):
             inputs=draft.inputs, outputs=draft.outputs,
         )
     )  # fmt: skip
-    certified.write(folder, measured)
+    certificate.write(folder, measured)
     machine.write_controller(folder, of)
-    for name, text in to_c.code(of, certified.PLACE).items():
+    for name, text in to_c.code(of, certificate.PLACE).items():
         artifacts.write_text(folder / "c" / name, text)
-    artifacts.write_text(folder / "python/controller.py", to_python.code(of, certified.PLACE))
+    artifacts.write_text(folder / "python/controller.py", to_python.code(of, certificate.PLACE))
     found = {"measured": True, "why": "", "largest_difference": {"judged": 0.0, "python": 0.0}}
     cooled = {"measured": False, "why": "It cannot be designed.", "largest_difference": {}}
     told = {"temperature": {"lqg": found, "pi": cooled}, "setpoint": SETPOINT}
@@ -73,7 +73,7 @@ def test_the_files_of_the_named_controller_are_copied_with_its_certificate(proje
     read, shown = machine.read(folder)
     assert read.name == "lqg" and certificate.sha256(shown) == temperature["certificate"]["sha256"]
     assert not any(
-        certified.PLACE.encode() in path.read_bytes() for path in folder.rglob("*") if path.is_file()
+        certificate.PLACE.encode() in path.read_bytes() for path in folder.rglob("*") if path.is_file()
     )
     digest = certificate.sha256(shown)
     for name, text in to_c.code(read, digest).items():
@@ -124,19 +124,19 @@ def test_loops_that_are_off_are_not_asked(project, on):
 
 
 def test_the_results_of_all_controllers_are_read_without_measuring(project):
-    found = certified.results(project / "datasets/certify", **ALLOWED)
+    found = certificate.results(project / "datasets/certify", **ALLOWED)
     assert found == {
         "lqg": {"passed": True, "why": ""},
         "pi": {"passed": False, "why": "It cannot be designed."},
     }
-    tight = certified.results(project / "datasets/certify", **ALLOWED | {"disk_margin": 1.9})
+    tight = certificate.results(project / "datasets/certify", **ALLOWED | {"disk_margin": 1.9})
     assert "refused by its rule disk margin" in tight["lqg"]["why"]
-    assert certified.results(project / "none", **ALLOWED) == {}
+    assert certificate.results(project / "none", **ALLOWED) == {}
 
 
 def test_measured_figures_are_the_same_after_a_round_trip(project):
-    stored = certified.read(project / "datasets/certify/temperature/lqg")
-    assert certified.decide(stored, **ALLOWED).rules == decided().rules
+    stored = certificate.read(project / "datasets/certify/temperature/lqg")
+    assert certificate.decide(stored, **ALLOWED).rules == decided().rules
 
 
 # ---- commands

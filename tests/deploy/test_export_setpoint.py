@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.commands import export
-from pipeline.deploy import agent_reader, flow_filter, flow_reader, setpoint_checks, to_setpoint
+from pipeline.deploy import agent_reader, flow_filter, flow_reader, to_setpoint
 from pipeline.setpoint.agents import agent, bayes, belief_agent
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
 from pipeline.setpoint.simulation.simulator import TEMPERATURE_LIMITS, Observation
@@ -193,14 +193,14 @@ def test_from_key_areas_on_our_agent_decides_as_exported(model, our_agent, tmp_p
 def test_the_stage_exports_what_was_chosen(model, our_agent, tmp_path):
     """Our agent with its network where it is the default, the filter where a filter is, nothing else."""
     parameters = {
-        setpoint_checks.BELIEF: our_agent.network,
+        to_setpoint.BELIEF: our_agent.network,
         "Bayes": bayes.class_filter(**CLASS_FILTER),
         "proportional": (),
     }
     found = []
     for name, values in parameters.items():
-        decides = setpoint_checks.decider(name, values, our_agent.belief, our_agent.network)
-        found.append(setpoint_checks.write(tmp_path / name, name, model, decides, 1))
+        decides = to_setpoint.decider(name, values, our_agent.belief, our_agent.network)
+        found.append(to_setpoint.write_checked(tmp_path / name, name, model, decides, 1))
     learned, filtered, none = found
     files = [{path.name for path in (tmp_path / name).glob("*")} for name in parameters]
     both = {"agent.safetensors", "agent_reader.py"}
@@ -213,7 +213,7 @@ def test_the_stage_exports_what_was_chosen(model, our_agent, tmp_path):
 def test_another_network_is_told_by_its_values(our_agent, model, tmp_path):
     to_setpoint.write(tmp_path, to_setpoint.weights(model, our_agent))
     other = our_agent._replace(network=belief_agent.BeliefNetwork(2, jax.random.key(4)))
-    assert setpoint_checks.of_agent(tmp_path, other, np.random.default_rng(1)) > 1e-3
+    assert to_setpoint.of_agent(tmp_path, other, np.random.default_rng(1)) > 1e-3
 
 
 def test_the_command_exports_the_folder_of_the_stage(model, our_agent, tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.deploy import assembly, healthy
+from pipeline.deploy import assembly
 from pipeline.temperature.controllers.problem import Design
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.test_set import panel
@@ -21,13 +21,13 @@ def asked(*plants: Plant) -> panel.Cases:
 def test_what_runs_on_healthy_machines_is_the_law():
     """One of each structure: a slow wall, radiation, a sensor and a duty in steps."""
     cases = asked(MODEL, MODEL, MODEL, MODEL)
-    found = healthy.play(exported(), cases)
+    found = assembly.play(exported(), cases)
     assert found == {"cases": 8, "left": 0, "percent": 0.0, "why": "", "plant": None}
 
 
 def test_a_machine_that_lacks_half_of_a_heater_is_left_and_the_reason_said():
     weak = MODEL._replace(B=MODEL.B * [0.3, 1.0])
-    found = healthy.play(exported(), asked(MODEL, weak))
+    found = assembly.play(exported(), asked(MODEL, weak))
     assert found["left"] > 0 and found["percent"] > 0
     assert found["plant"] == 1 and "heater_1" in found["why"]
 
@@ -42,7 +42,7 @@ def test_what_takes_over_is_the_first_control_that_holds_its_model():
     assert assembly.own_control({"pi": unstable, "hold": Design(still_law(2, 2), MODEL)}) is None
 
 
-@pytest.mark.parametrize("kinds", [("disturbed",), healthy.KINDS])
+@pytest.mark.parametrize("kinds", [("disturbed",), assembly.KINDS])
 def test_some_cases_of_some_plants_are_those_cases(kinds):
     cases = asked(MODEL, MODEL, MODEL)
     few = panel.some(cases, kinds, 2)

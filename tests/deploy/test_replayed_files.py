@@ -15,7 +15,7 @@ from pipeline import cli
 from pipeline.commands import replay
 from pipeline.deploy import machine, support
 from pipeline.deploy.replay import GaplessLog
-from pipeline.deploy.support_file import write_support
+from pipeline.deploy.support import write_support
 from pipeline.store import artifacts
 from pipeline.temperature.plant import padded
 from pipeline.temperature.test_set import panel
