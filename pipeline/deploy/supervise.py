@@ -48,6 +48,7 @@ from pipeline.temperature.controllers.law import (
     Strength,
     constant,
     rest,
+    same,
 )
 
 # ---- exported to the letter from here on
@@ -710,8 +711,7 @@ class Supervised:
         self.own = None if exported.fallback is None else RunningController(exported.fallback, exported.model)
         self.kept = kept(self.supervision)
         self._reference: Reference | None = None
-        self._w, self._Y, self._beyond = np.zeros(1), np.zeros((0, 1)), np.zeros(0)
-        self._out: list[int] = []
+        self._w, self._beyond = np.zeros(1), np.zeros(0)
         self._in_reach = np.full(len(exported.machine.outputs), np.nan)
 
     def tell(self, disturbances: np.ndarray) -> None:
@@ -726,7 +726,7 @@ class Supervised:
         k = self.kept
         y = self._accepted(y, r)
         u = _numbers(u, k.asked.shape, "inputs in percent", finite=True)
-        r_now, _ = self._target(r)
+        r_now = self._target(r)
         filled = follow(self.supervision, k, y, None, 0)
         k.asked[:] = u
         k.clock_s[1] += self.supervision.sample_time_s
@@ -760,9 +760,9 @@ class Supervised:
         if not k.counters[SAMPLES]:
             raise ValueError("the supervisor has seen no sample; call watch with each sample in manual first")
         samples = pass_time(s, k, t_s)
-        r_now, _ = self._target(r)
+        r_now = self._target(r)
         filled = follow(s, k, y, applied, samples)
-        if self._out:
+        if self._out():
             j = int(self._beyond.argmax())
             say(k, REACH, j, self._beyond[j])
             if not np.isfinite(self._in_reach).all():
@@ -805,29 +805,25 @@ class Supervised:
         self.own.forward = self.law.forward
         return self.own.step(y, r, n)
 
-    def _target(self, r: np.ndarray | Reference) -> tuple[np.ndarray, np.ndarray]:
-        """The reference r and the target y* (p,) now: the nearest that the inputs can hold."""
+    def _target(self, r: np.ndarray | Reference) -> np.ndarray:
+        """The reference r (p,) now, and whether the inputs can hold it."""
         mine = self._reference
-        if isinstance(r, Reference):
-            same = mine is not None and (r is mine or all(map(np.array_equal, r, mine)))
-        else:
-            r = np.asarray(r, float)
-            same = mine is not None and len(self._w) == 1 and bool((mine.H[:, 0] == r).all())
-        if mine is None or not same:
-            mine = r if isinstance(r, Reference) else constant(r)
-            at = rest(self.exported.model, mine, self.exported.controller.limits)
-            self._reference, self._w = mine, np.array(mine.w0, float)
-            self._Y, r0 = at.Y, mine.H @ mine.w0
+        r = r if isinstance(r, Reference) else np.asarray(r, float)
+        if mine is None or not same(mine, r):
+            mine = self._reference = r if isinstance(r, Reference) else constant(r)
+            self._w, r0 = np.array(mine.w0, float), mine.H @ mine.w0
+            miss = rest(self.exported.model, mine, self.exported.controller.limits).miss
             outside = np.maximum(r0 - self.supervision.hottest, self.supervision.coldest - r0)
-            self._beyond = np.maximum(np.abs(at.miss), outside)
-            self._out = [int(j) for j in np.flatnonzero(self._beyond > self.supervision.reach_degC)]
-            if not self._out:
+            self._beyond = np.maximum(np.abs(miss), outside)
+            if not self._out():
                 self._in_reach = r0
-            self._now = mine.H @ self._w, self._Y @ self._w
         elif len(self._w) > 1:
             self._w = mine.F @ self._w
-            self._now = mine.H @ self._w, self._Y @ self._w
-        return self._now
+        return mine.H @ self._w
+
+    def _out(self) -> bool:
+        """Whether an output's reference is out of reach."""
+        return bool((self._beyond > self.supervision.reach_degC).any())
 
     def _causes(self, t_s: float) -> tuple[Cause, ...]:
         """Every cause that is there, the first of KINDS first."""
@@ -845,7 +841,7 @@ class Supervised:
         if self.own is not None and self.kept.counters[MODE] == OWN:
             arrays |= {f"own.{name}": part for name, part in self.own.saved().items()}
         arrays |= {name: np.array(part) for name, part in self.kept._asdict().items()}
-        aimed = {"beyond": self._beyond, "in_reach": self._in_reach, "Y": self._Y, "w": self._w}
+        aimed = {"beyond": self._beyond, "in_reach": self._in_reach, "w": self._w}
         aimed |= {} if self._reference is None else self._reference._asdict()
         return arrays | {f"aim.{name}": np.array(part) for name, part in aimed.items()}
 
@@ -865,7 +861,7 @@ class Supervised:
             if "." in name:
                 parts[name.partition(".")[0]][name.partition(".")[2]] = np.array(part)
         aim = parts["aim"]
-        if lost := {*Reference._fields, "w", "Y", "beyond", "in_reach"} - set(aim):
+        if lost := {*Reference._fields, "w", "beyond", "in_reach"} - set(aim):
             raise ValueError(
                 f"the supervisor expects to be restored from aim.{', aim.'.join(sorted(lost))}; "
                 "restore what a supervisor of the same controller saved"
@@ -880,8 +876,4 @@ class Supervised:
             part[...] = arrays[name]
         self.law.forward = self.kept.forward.copy()
         self._reference = Reference(*(aim[name] for name in Reference._fields))
-        self._w, self._Y, self._beyond, self._in_reach = (
-            aim[name] for name in ("w", "Y", "beyond", "in_reach")
-        )
-        self._out = [int(j) for j in np.flatnonzero(self._beyond > self.supervision.reach_degC)]
-        self._now = self._reference.H @ self._w, self._Y @ self._w
+        self._w, self._beyond, self._in_reach = (aim[name] for name in ("w", "beyond", "in_reach"))

@@ -513,6 +513,13 @@ def sinusoid(mean: np.ndarray, amplitude: np.ndarray, period: float) -> Referenc
     )
 
 
+def same(reference: Reference, r: np.ndarray | Reference) -> bool:
+    """Whether r, a Reference or (p,) °C for ever, is the reference that there was."""
+    if isinstance(r, Reference):
+        return r is reference or all(map(np.array_equal, r, reference))
+    return len(reference.w0) == 1 and bool((reference.H[:, 0] == r).all())
+
+
 # ---- what a law rests at
 
 
@@ -872,16 +879,13 @@ class RunningController:
     AIMS = 64
 
     def __init__(self, controller: Deployed, model: Plant):
-        law = controller.law
         self.controller, self.model = controller, model
         self.binding: tuple[tuple[int, float], ...] = ()
-        self._asks = np.hstack([law.K, law.D, law.K_r])
-        self._keeps = np.hstack([law.B_u, law.B_y, law.B_r, *([] if controller.shift else [law.A])])
         self._aims: dict[bytes, tuple[Rest, Aim]] = {}
         self._state: ControllerState | None = None
         self._reference: Reference | None = None
         self._w, self._t = np.zeros(0), 0
-        self.forward = np.zeros(len(law.D))
+        self.forward = np.zeros(len(controller.law.D))
 
     def tell(self, disturbances: np.ndarray) -> None:
         """The disturbances d (q,) from this sample on, NaN for one that is not known."""
@@ -910,17 +914,11 @@ class RunningController:
         has them; `applied` (m,) if the machine is given others. Raises ValueError where y or r is not finite
         or of another machine, where t falls, or nothing was watched before."""
         y, state = self._measured(y), self._remembers()
-        feed, y_star, now = self._target(r, t)
-        controller, family = self.controller, self.controller.governor
-        if controller.holds:
-            return state.u[0].copy()
-        wished = (feed - self._asks @ np.concatenate((state.z[0], y, state.xi[0])))[None]
-        u, x = _allowed(controller, state, wished, y[None], y_star[None], self.forward)
-        given = u if applied is None else applied[None]
-        acts = given - self.forward
-        x = x if family is None else predicted(family, x, acts)
-        xi = _integrated(controller, state.xi, (y_star - y)[None], acts, wished)
-        self._state = ControllerState(self._kept(state.z[0], acts[0], y, now)[None], xi, given, x)
+        feed, y_star, now = (part[None] for part in self._target(r, t))
+        given = None if applied is None else applied[None]
+        u, _, self._state = batch_step(
+            self.controller, state, y[None], now, feed, y_star, self.forward, given
+        )
         return u[0].copy()
 
     def saved(self) -> dict[str, np.ndarray]:
@@ -965,26 +963,14 @@ class RunningController:
             )
         return y
 
-    def _kept(self, z: np.ndarray, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
-        """z (q,) a sample on."""
-        shift, c = self.controller.shift, self.controller.law.c
-        if not shift:
-            return self._keeps @ np.concatenate((u, y, r, z)) + c
-        after = self._keeps @ np.concatenate((u, y, r)) + c
-        after[:-shift] += z[shift:]
-        return after
-
     def _target(self, r: np.ndarray | Reference, t: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Feed (m,), target y* (p,) and reference (p,) at sample t."""
         mine = self._reference
         if mine is not None and t < self._t:
             raise ValueError(f"sample {t} comes after sample {self._t}; count samples upwards")
-        if isinstance(r, Reference):
-            same = mine is not None and (r is mine or all(map(np.array_equal, r, mine)))
-        else:
+        if not isinstance(r, Reference):
             r = _vector(r, self.controller.law.D.shape[1], REFERENCES)
-            same = mine is not None and len(self._w) == 1 and bool((mine.H[:, 0] == r).all())
-        if mine is None or not same:
+        if mine is None or not same(mine, r):
             mine = self._turned(r if isinstance(r, Reference) else constant(r), t)
         if len(self._w) > 1:
             w = self._w
