@@ -29,17 +29,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 
 from pipeline.deploy import machine
 from pipeline.deploy.replay import BLOCK, GaplessLog, scanned
 from pipeline.deploy.supervise import Exported
 from pipeline.store import artifacts
-from pipeline.temperature.controllers.governor import instants
+from pipeline.temperature.controllers.governor import instants, observer
 from pipeline.temperature.controllers.law import ActuatorLimits, Plant
-from pipeline.temperature.plant import markov_parameters, padded
+from pipeline.temperature.plant import padded
 from pipeline.temperature.test_set import panel
-from pipeline.temperature.tracking import reached_state, riccati
 
 TEMPERATURE, COMMAND, FORECAST = 1, 2, 4
 BEYOND = 0.1  # of a range: signals may leave it by so much
@@ -154,19 +152,12 @@ def design_observers(spread: Sequence[Plant], steps: int) -> Observers:
 
 
 def _design_observer(plant: Plant, steps: int) -> tuple[np.ndarray, ...]:
-    """Process noise comes in by the inputs, sensors are TAU percent^2 of every input noisier, and the drift
-    wanders a step by DRIFT of what a percent of every input does at most."""
-    n, p, slower = plant.n, plant.p, max(steps / UNHURRIED, 1.0)
-    likely = reached_state(plant)
-    A = np.block([[plant.A, likely], [np.zeros((p, n)), (1 - LEAK) * np.eye(p)]])
-    C = np.hstack([plant.C, np.zeros((p, p))])
-    pulse = (np.abs(markov_parameters(plant, steps)).max(axis=0) ** 2).sum(axis=1)
-    noise = scipy.linalg.block_diag(plant.B @ plant.B.T, (DRIFT / slower) ** 2 * np.diag(pulse))
-    sensors = TAU * slower**2 * pulse.mean() * np.eye(p)
-    P = riccati(A.T, C.T, noise, sensors)
-    L = A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
-    none = np.zeros((p, plant.m))
-    return A, np.vstack([plant.B, none]), C, np.r_[plant.b, np.zeros(p)], plant.d, L, likely
+    """The governor's observer, slower for forecasts over more `steps`."""
+    slower = max(steps / UNHURRIED, 1.0)
+    A, C, M = observer(plant, tau=TAU * slower**2, drift=DRIFT / slower, leak=LEAK, lags=steps)
+    none = np.zeros((plant.p, plant.m))
+    likely = A[: plant.n, plant.n :]
+    return A, np.vstack([plant.B, none]), C, np.r_[plant.b, np.zeros(plant.p)], plant.d, A @ M, likely
 
 
 def _forecast(observers: Observers, log: GaplessLog, start: np.ndarray, steps: int) -> np.ndarray:

@@ -8,9 +8,7 @@ float, for boards; its tolerance stands in test_controller.c.
 """
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -142,40 +140,29 @@ def define(name: str, value: float | int | str, real: str = "REAL({})") -> str:
 # ---- machine.h
 
 
-class ArrayLengths(NamedTuple):
+def sizes(exported: Exported) -> dict[str, int]:
     """Lengths of the arrays: `watched` states of a governor's member, `instants` it looks ahead an output;
     `watch` states of the supervisor's observer, `windows` of its forecasts, `pairs` of input and output."""
-
-    inputs: int
-    outputs: int
-    disturbances: int
-    memory: int
-    members: int
-    watched: int
-    instants: int
-    watch: int
-    windows: int
-    signals: int
-    pairs: int
-
-
-def sizes(exported: Exported) -> ArrayLengths:
     m, p = exported.controller.law.D.shape
     laws = [one for one in (exported.controller, exported.fallback) if one is not None]
-    memory = max([1, *(len(one.law.A) for one in laws)])
-    family = governor_of(exported)
-    governed = (1, p, 1)
+    family, watched = governor_of(exported), exported.supervision
+    members, states, instants = 1, p, 1
     if family is not None:
-        f, q = family.start_0.shape
-        governed = (f, q // 2, family.above.shape[1] // p)
-    supervised = (
-        len(exported.supervision.A),
-        supervise.WINDOWS,
-        max(m, p),
-        len(exported.supervision.of_input),
-    )
-    told = len(exported.machine.disturbances)
-    return ArrayLengths(m, p, told, memory, *governed, *supervised)
+        members, states = len(family.start_0), family.start_0.shape[1] // 2
+        instants = family.above.shape[1] // p
+    return {
+        "inputs": m,
+        "outputs": p,
+        "disturbances": len(exported.machine.disturbances),
+        "memory": max([1, *(len(one.law.A) for one in laws)]),
+        "members": members,
+        "watched": states,
+        "instants": instants,
+        "watch": len(watched.A),
+        "windows": supervise.WINDOWS,
+        "signals": max(m, p),
+        "pairs": len(watched.of_input),
+    }
 
 
 def governor_of(exported: Exported) -> Governor | None:
@@ -192,32 +179,33 @@ def governor_of(exported: Exported) -> Governor | None:
 
 
 def machine_header(exported: Exported, certificate_sha256: str) -> str:
-    machine, at = exported.machine, sizes(exported)
-    lines = [
-        "/* The machine that this controller is made for; beadline_init refuses others. Do not edit.",
-        f" * Contestant {exported.name}. */",
-        "#ifndef BEADLINE_MACHINE_H",
-        "#define BEADLINE_MACHINE_H",
-        "",
-    ]
-    text = "\n".join(lines) + "\n"
-    text += define("BEADLINE_CONTESTANT", exported.name)
-    text += define("BEADLINE_CERTIFICATE_SHA256", certificate_sha256)
-    text += define("BEADLINE_PLANT_SHA256", exported.plant_sha256)
-    text += define("BEADLINE_SPREAD_SHA256", exported.spread_sha256)
-    text += "/* 1: the plant was simulated, and the controller runs in a rehearsal only */\n"
-    text += define("BEADLINE_SIMULATED", int(exported.simulated))
-    text += define("BEADLINE_SAMPLE_TIME_S", float(machine.sample_time_s), "{}")
-    text += define("BEADLINE_INPUT_UNIT", machine.inputs[0].unit)
-    text += define("BEADLINE_OUTPUT_UNIT", machine.outputs[0].unit)
-    text += "\n/* Inputs and outputs in the order of every array */\n"
+    machine = exported.machine
     kinds = {"INPUT": machine.inputs, "OUTPUT": machine.outputs, "DISTURBANCE": machine.disturbances}
-    for kind, signals in kinds.items():
-        text += "".join(define(f"{kind}_{identifier(one.name)}", i) for i, one in enumerate(signals))
-    text += "\n/* Lengths of arrays */\n"
-    for name, value in at._asdict().items():
-        text += define(name.upper(), value)
-    return text + "#define FORECASTS (OUTPUTS * INSTANTS)\n\n#endif\n"
+    return "".join(
+        [
+            "/* The machine that this controller is made for; beadline_init refuses others. Do not edit.\n",
+            f" * Contestant {exported.name}. */\n",
+            "#ifndef BEADLINE_MACHINE_H\n#define BEADLINE_MACHINE_H\n\n",
+            define("BEADLINE_CONTESTANT", exported.name),
+            define("BEADLINE_CERTIFICATE_SHA256", certificate_sha256),
+            define("BEADLINE_PLANT_SHA256", exported.plant_sha256),
+            define("BEADLINE_SPREAD_SHA256", exported.spread_sha256),
+            "/* 1: the plant was simulated, and the controller runs in a rehearsal only */\n",
+            define("BEADLINE_SIMULATED", int(exported.simulated)),
+            define("BEADLINE_SAMPLE_TIME_S", float(machine.sample_time_s), "{}"),
+            define("BEADLINE_INPUT_UNIT", machine.inputs[0].unit),
+            define("BEADLINE_OUTPUT_UNIT", machine.outputs[0].unit),
+            "\n/* Inputs and outputs in the order of every array */\n",
+            *(
+                define(f"{kind}_{identifier(one.name)}", i)
+                for kind, signals in kinds.items()
+                for i, one in enumerate(signals)
+            ),
+            "\n/* Lengths of arrays */\n",
+            *(define(name.upper(), value) for name, value in sizes(exported).items()),
+            "#define FORECASTS (OUTPUTS * INSTANTS)\n\n#endif\n",
+        ]
+    )
 
 
 # ---- tables.h
@@ -225,15 +213,22 @@ def machine_header(exported: Exported, certificate_sha256: str) -> str:
 
 def tables(exported: Exported) -> str:
     """Laws, target, governor and supervisor in numbers."""
-    text = "/* The numbers of one controller. Generated; do not edit. Included by controller.c only. */\n\n"
-    if len(exported.machine.inputs) == 1:
-        text += ONE_INPUT
-    text += _aiming(exported) + _governing(exported)
-    text += "\n/* ---- the law */\n\n" + _law("the_law", exported.controller)
-    text += "\n/* ---- the safe mode own */\n\n" + define("HAS_FALLBACK", int(exported.fallback is not None))
-    text += "#define the_fallback the_law\n" if exported.fallback is None else ""
-    text += _law("the_fallback", exported.fallback) if exported.fallback is not None else ""
-    return text + _forward("forward", exported) + supervising(exported.supervision)
+    own = exported.fallback
+    return "".join(
+        [
+            "/* The numbers of one controller. Generated; do not edit. Included by controller.c only. */\n\n",
+            ONE_INPUT if len(exported.machine.inputs) == 1 else "",
+            _aiming(exported),
+            _governing(exported),
+            "\n/* ---- the law */\n\n",
+            _law("the_law", exported.controller),
+            "\n/* ---- the safe mode own */\n\n",
+            define("HAS_FALLBACK", int(own is not None)),
+            "#define the_fallback the_law\n" if own is None else _law("the_fallback", own),
+            _forward("forward", exported),
+            supervising(exported.supervision),
+        ]
+    )
 
 
 def _forward(name: str, exported: Exported, *, of: str = "real") -> str:
@@ -279,10 +274,7 @@ def _aiming(exported: Exported) -> str:
 
 def at_rest(model: Plant) -> tuple[np.ndarray, np.ndarray]:
     """G (p, m) and g (p,): the outputs on which constant inputs u rest are G u + g + d."""
-    balance = np.eye(model.n) - model.A
-    if np.linalg.cond(balance) > 1e13:
-        balance = balance + 1e-9 * np.eye(model.n)
-    per_u, rest = np.linalg.solve(balance, model.B), np.linalg.solve(balance, model.b)
+    per_u, rest = law.state_at_rest(model)
     return model.C @ per_u + model.D, model.C @ rest
 
 
@@ -304,22 +296,32 @@ def feeds(law: Law) -> dict[str, np.ndarray]:
 
 
 def _governing(exported: Exported) -> str:
-    family, at = governor_of(exported), sizes(exported)
-    text = "\n/* ---- the governor, as law.Governor has it; members first */\n\n"
-    text += define("SWEEPS", law.SWEEPS) + define("ROUNDS", law.ROUNDS)
-    text += define("EXACT", law.EXACT, SINGLE_EXACT) + define("CONTRADICTED", law.CONTRADICTED)
-    text += define("ARRIVED", law.ARRIVED)
-    strength = family.strength if family is not None else law.Strength(1.0, 1.0, 0.0)
-    text += define("FORGETS", float(family.forgets) if family is not None else 0.0)
-    text += define("OVERSHOOT", float(family.overshoot) if family is not None else 0.0)
-    text += define("STRONGEST", strength.strongest) + define("WEAKEST", strength.weakest)
-    halves = member_halves(family) if family is not None else _no_members(at)
-    return text + "".join(table(f"governor_{name}", values) for name, values in halves.items())
+    family = governor_of(exported)
+    forgets, overshoot, strength = 0.0, 0.0, law.Strength(1.0, 1.0, 0.0)
+    if family is not None:
+        forgets, overshoot, strength = float(family.forgets), float(family.overshoot), family.strength
+    halves = member_halves(family) if family is not None else _no_members(sizes(exported))
+    return "".join(
+        [
+            "\n/* ---- the governor, as law.Governor has it; members first */\n\n",
+            define("SWEEPS", law.SWEEPS),
+            define("ROUNDS", law.ROUNDS),
+            define("EXACT", law.EXACT, SINGLE_EXACT),
+            define("CONTRADICTED", law.CONTRADICTED),
+            define("ARRIVED", law.ARRIVED),
+            define("FORGETS", forgets),
+            define("OVERSHOOT", overshoot),
+            define("STRONGEST", strength.strongest),
+            define("WEAKEST", strength.weakest),
+            *(table(f"governor_{name}", values) for name, values in halves.items()),
+        ]
+    )
 
 
-def _no_members(at: ArrayLengths) -> dict[str, np.ndarray]:
+def _no_members(at: dict[str, int]) -> dict[str, np.ndarray]:
     """The tables of `member_halves` where nothing is governed."""
-    f, n, p, m, h = at.members, at.watched, at.outputs, at.inputs, at.outputs * at.instants
+    f, n, p, m = (at[name] for name in ("members", "watched", "outputs", "inputs"))
+    h = p * at["instants"]
     shapes = {
         "C": (f, p, n), "L": (f, n, p), "A": (f, n, n), "B": (f, n, m), "B_lacks": (f, n, m), "b": (f, n),
         "start": (f, n, p), "start_0": (f, n), "ahead": (f, h, n), "offset": (f, p), "above": (f, h),
@@ -331,8 +333,7 @@ def _no_members(at: ArrayLengths) -> dict[str, np.ndarray]:
 
 def member_halves(family: Governor) -> dict[str, np.ndarray]:
     """The matrices of a Governor without what is known to be zero or said twice: state and what it lacks at
-    the weakest move alike, so that each block stands once. Raises ValueError for a governor of another form.
-    """
+    the weakest move alike, so that each block stands once. Golden vectors tell if it has another form."""
     f, p = family.offset.shape
     n = family.start_0.shape[1] // 2
     C, A = (part.transpose(0, 2, 1)[:, : len(part[0].T) // 2, :n] for part in (family.see, family.move))
@@ -340,7 +341,7 @@ def member_halves(family: Governor) -> dict[str, np.ndarray]:
     quick, slow = family.correct[:, :p, :n], family.correct[:, p : 2 * p, :n]
     L = (quick + slow).transpose(0, 2, 1)
     B, B_lacks = (family.push.transpose(0, 2, 1)[:, part] for part in (slice(n), slice(n, None)))
-    halves = {
+    return {
         "C": C, "L": L, "A": A, "B": B, "B_lacks": B_lacks, "b": family.rest[:, :n],
         "start": family.start.transpose(0, 2, 1)[:, :n], "start_0": family.start_0[:, :n],
         "ahead": ahead, "offset": family.offset, "above": family.above, "below": family.below,
@@ -349,37 +350,11 @@ def member_halves(family: Governor) -> dict[str, np.ndarray]:
         "low": family.low, "high": family.high, "surprise": family.surprise, "doubt": family.doubt,
         "near": family.near,
     }  # fmt: skip
-    if not _same_form(family, halves, n, p):
-        raise ValueError(
-            "the governor's members should hold a state and what it lacks in equal blocks, but these do not; "
-            "make it with pipeline.temperature.controllers.governor.governor"
-        )
-    return halves
 
 
 def _least(rows: np.ndarray) -> np.ndarray:
     """Effects (f, p h) from which on an input counts, as law._swept has them, of rows (f, m, p h)."""
     return law.LEAST_EFFECT * np.maximum(rows, 0.0).max(axis=1)
-
-
-def _same_form(family: Governor, halves: Mapping[str, np.ndarray], n: int, p: int) -> bool:
-    def twice(block: np.ndarray) -> np.ndarray:
-        none = np.zeros_like(block)
-        return np.concatenate(
-            [np.concatenate([block, none], axis=2), np.concatenate([none, block], axis=2)], axis=1
-        )
-
-    quick, slow = halves["L"].copy(), halves["L"].copy()
-    quick[:, n - p :], slow[:, : n - p] = 0.0, 0.0
-    gain = np.concatenate([quick, slow], axis=2).transpose(0, 2, 1)
-    pairs = (
-        (family.see.transpose(0, 2, 1), twice(halves["C"])),
-        (family.move.transpose(0, 2, 1), twice(halves["A"])),
-        (family.ahead.transpose(0, 2, 1), twice(halves["ahead"])),
-        (family.correct, twice(gain) * np.repeat([1.0, -1.0], n)),
-    )
-    zero = (family.rest[:, n:], family.start[:, :, n:], family.start_0[:, n:])
-    return all(np.array_equal(a, b) for a, b in pairs) and not any(map(np.any, zero))
 
 
 def _law(name: str, deployed: Deployed) -> str:
@@ -436,16 +411,23 @@ OF_OBSERVER = (
 
 def supervising(s: supervise.Supervision) -> str:
     """Supervision with the constants that its step takes from its module."""
-    text = "\n/* ---- the supervisor, as supervise.Supervision has it */\n\n"
-    text += "".join(define(name, getattr(supervise, name)) for name in OF_SUPERVISOR)
-    text += define("FOLLOWS_LEAST", supervise.FOLLOWS[0]) + define("FOLLOWS_MOST", supervise.FOLLOWS[1])
-    text += define("REACH_DEGC", s.reach_degC)
-    text += table("explanation_least", supervise.LEAST) + table("explanation_most", supervise.MOST)
-    text += define("MISSING_FOR", s.missing_for)
-    text += integers("supervisor_of_input", s.of_input) + integers("supervisor_input_of", s.input_of)
     arrays = {name: getattr(s, name) for name in OF_OBSERVER}
     arrays |= {"coldest": s.coldest, "hottest": s.hottest, "noise": s.noise_degC}
-    return text + "".join(table(f"supervisor_{name}", values) for name, values in arrays.items())
+    return "".join(
+        [
+            "\n/* ---- the supervisor, as supervise.Supervision has it */\n\n",
+            *(define(name, getattr(supervise, name)) for name in OF_SUPERVISOR),
+            define("FOLLOWS_LEAST", supervise.FOLLOWS[0]),
+            define("FOLLOWS_MOST", supervise.FOLLOWS[1]),
+            define("REACH_DEGC", s.reach_degC),
+            table("explanation_least", supervise.LEAST),
+            table("explanation_most", supervise.MOST),
+            define("MISSING_FOR", s.missing_for),
+            integers("supervisor_of_input", s.of_input),
+            integers("supervisor_input_of", s.input_of),
+            *(table(f"supervisor_{name}", values) for name, values in arrays.items()),
+        ]
+    )
 
 
 def integers(name: str, values: np.ndarray) -> str:

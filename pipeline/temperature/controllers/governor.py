@@ -120,12 +120,26 @@ def instants(family: Sequence[Plant]) -> np.ndarray:
     return np.unique(np.r_[0, between[between < last], last])
 
 
-def _drifting(plant: Plant, leak: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def drifting(plant: Plant, leak: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """A, C of the state [x; w]: w (p) in °C a step warms the outputs along the state that inputs most likely
     reach; it leaks, so that no mode of it stands still unseen."""
     n, p = plant.n, plant.p
     A = np.block([[plant.A, reached_state(plant)], [np.zeros((p, n)), (1 - leak) * np.eye(p)]])
     return A, np.hstack([plant.C, np.zeros((p, p))])
+
+
+def observer(
+    plant: Plant, *, tau: float, drift: float, leak: float, lags: int = LONGEST
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A, C of the state [x; w], and M (n + p, p) that moves it by an innovation at once: process noise comes
+    in by the inputs, sensors are tau percent^2 of every input noisier, and the drift wanders a step by
+    `drift` of what a percent of every input does at most within `lags` steps."""
+    A, C = drifting(plant, leak)
+    pulse = (np.abs(markov_parameters(plant, lags)).max(axis=0) ** 2).sum(axis=1)
+    noise = scipy.linalg.block_diag(plant.B @ plant.B.T, drift**2 * np.diag(pulse))
+    sensors = tau * pulse.mean() * np.eye(plant.p)
+    P = riccati(A.T, C.T, noise, sensors)
+    return A, C, P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
 
 
 def _watching(
@@ -134,12 +148,7 @@ def _watching(
     """The part of a Governor by which one member follows the machine."""
     n, m, p = plant.n, plant.m, plant.p
     likely = reached_state(plant)
-    A, C = _drifting(plant, leak)
-    pulse = (np.abs(markov_parameters(plant, LONGEST)).max(axis=0) ** 2).sum(axis=1)
-    noise = scipy.linalg.block_diag(plant.B @ plant.B.T, drift**2 * np.diag(pulse))
-    sensors = tau * pulse.mean() * np.eye(p)
-    P = riccati(A.T, C.T, noise, sensors)
-    L = P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
+    A, C, L = observer(plant, tau=tau, drift=drift, leak=leak)
     less, none = strength.strongest - strength.weakest, np.zeros((p, m))
     quick, slow = (np.vstack(parts) for parts in ((L[:n], 0 * L[n:]), (0 * L[:n], L[n:])))
     one, other = np.array([[1.0], [0.0]]), np.array([[0.0], [1.0]])
@@ -160,7 +169,7 @@ def _ahead(plant: Plant, limits: ActuatorLimits, strength: Strength, at: np.ndar
     straight line that the slowest of them needs. An input that helps is taken to act less than one that
     hurts, by what `each` leaves open."""
     n, m, p = plant.n, plant.m, plant.p
-    A, C = _drifting(plant)
+    A, C = drifting(plant)
     B, b = np.vstack([plant.B, np.zeros((p, m))]), np.r_[plant.b, np.zeros(p)]
     rows = {name: [] for name in ("x", "u", "left", "right")}
     power, driven, left, right = np.eye(n + p), np.zeros((n + p, m)), np.zeros((n + p, m)), np.zeros(n + p)

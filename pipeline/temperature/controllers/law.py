@@ -132,12 +132,8 @@ def feasible_target(
 
 
 def _steady(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, slack: float) -> Target:
-    """Bounded least squares over u, the state eliminated: x = (I - A)^-1 (B u + b); a plant that only
-    integrates is taken to leak 1e-9 a step."""
-    balance = np.eye(plant.n) - plant.A
-    if np.linalg.cond(balance) > 1e13:
-        balance = balance + 1e-9 * np.eye(plant.n)
-    per_u, at_rest = np.linalg.solve(balance, plant.B), np.linalg.solve(balance, plant.b)
+    """Bounded least squares over u, the state eliminated."""
+    per_u, at_rest = state_at_rest(plant)
     rows = np.vstack([plant.C @ per_u + plant.D, LIGHT * np.eye(plant.m)])
     right = np.concatenate([r - plant.d - plant.C @ at_rest, np.zeros(plant.m)])
     slack = min(slack, 0.49 * (high - low).min())
@@ -145,6 +141,13 @@ def _steady(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, slac
     x = per_u @ u + at_rest
     y = plant.C @ x + plant.D @ u + plant.d
     return Target(x, u, y, y - r, slack)
+
+
+def state_at_rest(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+    """X (n, m), x (n,): the state on which constant inputs u rest is X u + x = (I - A)^-1 (B u + b); a plant
+    that only integrates is taken to leak 1e-9 a step."""
+    balance = _leaking(np.eye(plant.n) - plant.A)
+    return np.linalg.solve(balance, plant.B), np.linalg.solve(balance, plant.b)
 
 
 # °C by which a percent of an input counts beside what outputs miss: of equally good inputs, the smaller
