@@ -32,7 +32,6 @@ class EvidenceRecord(NamedTuple):
     y: list[np.ndarray]  # segments (T, p) in °C
     newest_u: list[np.ndarray]
     newest_y: list[np.ndarray]
-    cold_degC: np.ndarray | None = None  # (p,) readings of the cold machine, if somebody took them
 
 
 class Rules(NamedTuple):
@@ -57,9 +56,8 @@ class Rules(NamedTuple):
     # record's own window model misses
     unexplained: float = 0.5
     noise: float = 0.3  # deviation of a settled mean as a share of the settled error's limit
-    room_degC: tuple[float, float] = (5.0, 45.0)  # of a cold machine
-    # without a cold reading: what the record's window models may extrapolate to at rest without inputs, wider
-    # by the error of a straight line from hot to cold
+    # what the record's window models may extrapolate to at rest without inputs: a room, wider by the error of
+    # a straight line from hot to cold
     extrapolated_degC: tuple[float, float] = (-50.0, 110.0)
     reach: float = 0.5  # of the recorded span, by which references may lie beyond it
 

@@ -301,7 +301,7 @@ def _window_models(
     newest = record.newest_u, record.newest_y
     own = _own_model(*newest, min(N, _longest(*newest, rules)), rules.ahead)
     noise_degC = np.sqrt(np.median(np.einsum("sii->si", sampled.covariance), axis=0))
-    room = _of_room(record, sampled, [one.name for one in machine.outputs], rules)
+    room = _of_room(sampled, [one.name for one in machine.outputs], rules)
     return WindowModels(sampled, own, [*results, room], noise_degC)
 
 
@@ -408,29 +408,20 @@ def _of_reach(machine: Machine, record: EvidenceRecord, rules: Rules) -> RuleRes
     )
 
 
-def _of_room(
-    record: EvidenceRecord, sampled: bands.Predictors, outputs: Sequence[str], rules: Rules
-) -> RuleResult:
+def _of_room(sampled: bands.Predictors, outputs: Sequence[str], rules: Rules) -> RuleResult:
     """A cold machine is as warm as its room. A reading in °F or K is not."""
-    if record.cold_degC is not None:
-        low = high = np.asarray(record.cold_degC, float)
-        limit, said = rules.room_degC, "A cold machine reads"
-    else:
-        low, high = _extrapolated(sampled, len(outputs))
-        limit, said = (
-            rules.extrapolated_degC,
-            "With its inputs off, drawn out from where it was recorded, it is at",
-        )
-    off = np.maximum(low - limit[1], limit[0] - high)
+    (low, high), (coldest, hottest) = _extrapolated(sampled, len(outputs)), rules.extrapolated_degC
+    off = np.maximum(low - hottest, coldest - high)
+    said = "With its inputs off, drawn out from where it was"
     worst = int(off.argmax())
     return at_most(
         "room",
         float(off[worst]),
         0.0,
         "degC outside what a room may be",
-        f"{said} what a room may be.",
-        f"{said} {low[worst]:.0f} to {high[worst]:.0f} °C on {outputs[worst]}, which is no room: "
-        "the sensor is in another unit, or something heats that is not recorded.",
+        f"{said} recorded, it is at what a room may be.",
+        f"{said} recorded, it is at {low[worst]:.0f} to {high[worst]:.0f} °C on {outputs[worst]}, which is "
+        "no room: the sensor is in another unit, or something heats that is not recorded.",
     )
 
 

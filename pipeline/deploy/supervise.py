@@ -695,7 +695,7 @@ def _numbers(
 class Supervised:
     """A controller on one machine with its supervisor, a sample at a time.
 
-    As controller.RunningController: in manual, `watch` each sample; then `hand_over` once, then `step` each
+    As law.RunningController: in manual, `watch` each sample; then `hand_over` once, then `step` each
     sample. Where a cause asks for a safe mode, the law watches, and takes over again without a bump when the
     cause has been gone for its declared time, or after `acknowledge`.
     """

@@ -133,7 +133,7 @@ def figures(run: FamilyForecasts, noise: np.ndarray, furthest: float, rest: np.n
 class Observers(NamedTuple):
     """Observers L of the states [x; w] of K plants, one behind the other: w (p,) in °C a step is a drift that
     the plant does not explain, so that a steady disagreement (another ambient, more heat lost) vanishes from
-    its forecasts, as in temperature.governor. `first` (K, n, p) finds x of the first outputs."""
+    its forecasts, as the governor's. `first` (K, n, p) finds x of the first outputs."""
 
     A: np.ndarray
     B: np.ndarray

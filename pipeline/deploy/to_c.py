@@ -232,7 +232,7 @@ def tables(exported: Exported) -> str:
 
 
 def _forward(name: str, exported: Exported, *, of: str = "real") -> str:
-    """Gain and mean of what is fed forward, as controller.FeedForward has them."""
+    """Gain and mean of what is fed forward, as law.FeedForward has them."""
     m, q = len(exported.machine.inputs), len(exported.machine.disturbances)
     forward = exported.controller.forward or FeedForward(np.zeros((m, q)), np.zeros(q))
     gain = forward.gain if q else np.zeros((m, 1))

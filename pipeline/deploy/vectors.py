@@ -1,7 +1,7 @@
 """Golden vectors: what the object does on its own model, with noise, changed references, faults, hand-overs.
 
 A script says what happens to machine and controller at each sample. `played` runs it with any object that has
-the calls of supervised.Supervised; the C test runs the same script with the exported code. Both close the
+the calls of supervise.Supervised; the C test runs the same script with the exported code. Both close the
 loop themselves: outputs fed to a law that is unstable by itself would tell rounding errors apart, no more.
 
     x(t+1) = A x + B (share u + extra) + b,   y = C x + d + add, or what `reading` says

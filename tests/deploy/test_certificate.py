@@ -70,7 +70,7 @@ def designed(of: Plant, *, effort: float = 0.3, integral: float = 0.05) -> Expor
 def evidence(of: Plant, *, newest: Plant | None = None, samples: int = 800) -> EvidenceRecord:
     u, y = recorded(of, samples, 1)
     newest_u, newest_y = recorded(newest or of, 500, 2)
-    return EvidenceRecord(*SIGNALS, 1.0, [u], [y], [newest_u], [newest_y], np.full(2, ROOM))
+    return EvidenceRecord(*SIGNALS, 1.0, [u], [y], [newest_u], [newest_y])
 
 
 HONEST = evidence(zones())
@@ -173,13 +173,11 @@ def test_noise_that_hides_the_settled_error_is_refused():
     assert "hides the settled error" in refused_by("noise", decided(record=noisy))
 
 
-def test_a_cold_machine_that_is_no_room_is_refused_and_so_is_one_drawn_out_to_kelvin():
-    warm = HONEST._replace(cold_degC=np.array([24.0, 75.2]))
-    assert "75 to 75 °C on zone_2, which is no room" in refused_by("room", decided(record=warm))
-    kelvin = scaled(HONEST, y=lambda part: part + 273.15)._replace(cold_degC=None)
+def test_a_machine_that_drawn_out_to_cold_is_no_room_is_refused():
+    kelvin = scaled(HONEST, y=lambda part: part + 273.15)
     rules = RULES._replace(references=RULES.references + 273.15, start=RULES.start + 273.15)
     assert "no room" in refused_by("room", decided(record=kelvin, rules=rules))
-    assert decided(record=HONEST._replace(cold_degC=None)).verdict == "passed"
+    assert decided().verdict == "passed"
 
 
 @pytest.mark.parametrize(
@@ -298,8 +296,9 @@ def test_a_controller_passes_to_its_folder_only_with_its_own_passed_certificate(
         machine.check_certificate(made._replace(simulated=True), passed)
     with pytest.raises(ValueError, match="another controller"):
         machine.check_certificate(fierce(1.1), passed)
-    with pytest.raises(ValueError, match="refused by rule room"):
-        machine.check_certificate(made, decided(record=HONEST._replace(cold_degC=np.array([24.0, 75.2]))))
+    with pytest.raises(ValueError, match="refused by rule reach"):
+        far = RULES._replace(references=RULES.references + 60.0)
+        machine.check_certificate(made, decided(rules=far))
 
 
 def test_a_record_of_another_shape_is_refused_in_a_sentence():
