@@ -9,7 +9,6 @@ Memory and integrator go through a recording sample by sample. The governor, whi
 in chunks side by side, each of which starts early enough.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -32,51 +31,7 @@ from pipeline.temperature.controllers.law import (
     watched,
 )
 
-# ---- in chunks
-
-CHUNK = 500  # samples at most that are walked one by one, for all chunks of a block at once
-BLOCK = 1 << 17  # samples whose memories are held at once
 MOST_REFERENCES = 500  # each is aimed at by a quadratic programme
-
-
-def scanned(A: np.ndarray, drive: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """z (..., T + 1, q) with z(0) = first (..., q) and z(t+1) = A z(t) + drive(t), A (..., q, q), drive
-    (..., T, q).
-
-    Every chunk goes from zero; then the chunks' ends are joined one after the other; then every chunk goes
-    from where it starts."""
-    *sides, T, q = drive.shape
-    length = min(max(math.isqrt(T), 1), CHUNK)
-    chunks = -(-T // length)
-    padded = np.zeros((*sides, chunks * length, q))
-    padded[..., :T, :] = drive
-    by_chunk = padded.reshape(*sides, chunks, length, q)
-    still = np.zeros((*sides, chunks, q))
-    ends = _walked(A, by_chunk, still, keep=False)[..., 0, :]
-    far, starts = np.linalg.matrix_power(A, length), np.empty((*sides, chunks, q))
-    at = first
-    for chunk in range(chunks):
-        starts[..., chunk, :] = at
-        at = np.matmul(far, at[..., None])[..., 0] + ends[..., chunk, :]
-    walked = _walked(A, by_chunk, starts, keep=True).reshape(*sides, chunks * length, q)
-    return np.concatenate([first[..., None, :], walked[..., :T, :]], axis=-2)
-
-
-def _walked(A: np.ndarray, drive: np.ndarray, z: np.ndarray, *, keep: bool) -> np.ndarray:
-    """z after each sample (..., s, c, q) of chunks with drive (..., s, c, q), from z (..., s, q); the last
-    alone unless `keep`."""
-    *sides, length, q = drive.shape
-    walked = np.empty((*sides, length if keep else 1, q))
-    for t in range(length):
-        z = drive[..., t, :] + np.matmul(z, A.swapaxes(-1, -2))
-        if keep:
-            walked[..., t, :] = z
-    if not keep:
-        walked[..., 0, :] = z
-    return walked
-
-
-# ---- what it would have asked
 
 
 class GaplessLog(NamedTuple):

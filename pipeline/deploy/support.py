@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.deploy import machine
-from pipeline.deploy.replay import BLOCK, GaplessLog, scanned
+from pipeline.deploy.replay import GaplessLog
 from pipeline.deploy.supervise import Exported
 from pipeline.store import artifacts
 from pipeline.temperature.controllers.governor import instants, observer
@@ -52,6 +52,7 @@ TAU, DRIFT, LEAK, UNHURRIED = 0.2, 0.06, 1e-4, 16  # of the observers, as of the
 AT_ONCE = 4  # forecasts begin so often within the steps that one goes
 MOST_SAMPLES = 60_000  # of a long log forecasts are judged in stretches, so many samples in all
 STRETCH = 2_000
+BLOCK = 1 << 17  # samples whose states are held at once, of all plants
 
 
 class Support(NamedTuple):
@@ -158,6 +159,17 @@ def _design_observer(plant: Plant, steps: int) -> tuple[np.ndarray, ...]:
     none = np.zeros((plant.p, plant.m))
     likely = A[: plant.n, plant.n :]
     return A, np.vstack([plant.B, none]), C, np.r_[plant.b, np.zeros(plant.p)], plant.d, A @ M, likely
+
+
+def scanned(A: np.ndarray, drive: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """z (..., T + 1, q) with z(0) = first (..., q) and z(t+1) = A z(t) + drive(t), A (..., q, q), drive
+    (..., T, q)."""
+    *sides, T, q = drive.shape
+    z = np.empty((*sides, T + 1, q))
+    z[..., 0, :] = first
+    for t in range(T):
+        z[..., t + 1, :] = np.matmul(A, z[..., t, :, None])[..., 0] + drive[..., t, :]
+    return z
 
 
 def _forecast(observers: Observers, log: GaplessLog, start: np.ndarray, steps: int) -> np.ndarray:

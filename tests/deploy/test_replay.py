@@ -120,14 +120,14 @@ def test_a_replay_feeds_forward_as_the_object_does(name):
     assert np.abs(run.asked - replay.replayed(made, model, of, hold=30).asked).max() > 1
 
 
-def test_chunks_are_the_recursion_sample_by_sample():
+def test_states_are_the_recursion_sample_by_sample():
     rng = np.random.default_rng(0)
     A, drive, z = (
         0.9 * np.linalg.qr(rng.standard_normal((4, 4)))[0],
         rng.standard_normal((1203, 4)),
         np.ones(4),
     )
-    walked = replay.scanned(A, drive, z)
+    walked = support.scanned(A, drive, z)
     for t in range(1203):
         np.testing.assert_allclose(walked[t], z, atol=1e-11)
         z = A @ z + drive[t]
