@@ -37,6 +37,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.temperature.controllers.law import (
+    INPUTS,
+    REFERENCES,
     ActuatorLimits,
     Deployed,
     FeedForward,
@@ -47,6 +49,7 @@ from pipeline.temperature.controllers.law import (
     RunningController,
     Strength,
     constant,
+    numbers,
     rest,
     same,
 )
@@ -675,23 +678,6 @@ def sentence(s: Supervision, machine: Machine, kind: int, signal: int, amount: f
 # ---- the object that runs
 
 
-def _numbers(
-    values: np.ndarray | float, shape: tuple[int, ...], what: str, *, finite: bool = False
-) -> np.ndarray:
-    """An array of a shape. Raises ValueError for another, and if `finite` is asked for and one is not."""
-    array = np.asarray(values, float)
-    if array.shape != shape:
-        raise ValueError(
-            f"the supervisor expects {shape[0] if shape else 'one'} {what} but was given an array of shape "
-            f"{array.shape}; give one a signal, NaN for a sensor that does not answer"
-        )
-    if finite and not np.isfinite(array).all():
-        raise ValueError(
-            f"the supervisor expects finite {what} but was given {array}; keep the last that was"
-        )
-    return array
-
-
 class Supervised:
     """A controller on one machine with its supervisor, a sample at a time.
 
@@ -717,7 +703,7 @@ class Supervised:
     def tell(self, disturbances: np.ndarray) -> None:
         """The measured disturbances (q,) from this sample on, in the machine's order, NaN where one gives no
         number. Raises ValueError for another number of them."""
-        told = _numbers(disturbances, (len(self.exported.machine.disturbances),), "disturbances")
+        told = numbers(disturbances, (len(self.exported.machine.disturbances),), "disturbances")
         self.law.tell(told)
 
     def watch(self, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> None:
@@ -725,7 +711,7 @@ class Supervised:
         Raises ValueError as `step` does, and if inputs u (m,) are not finite; it then remembers nothing."""
         k = self.kept
         y = self._accepted(y, r)
-        u = _numbers(u, k.asked.shape, "inputs in percent", finite=True)
+        u = numbers(u, k.asked.shape, INPUTS, finite=True)
         r_now = self._target(r)
         filled = follow(self.supervision, k, y, None, 0)
         k.asked[:] = u
@@ -755,8 +741,8 @@ class Supervised:
         or t_s is not finite, and remembers nothing."""
         s, k = self.supervision, self.kept
         y = self._accepted(y, r)
-        _numbers(t_s, (), "time in s", finite=True)
-        applied = None if applied is None else _numbers(applied, k.asked.shape, "inputs in percent")
+        numbers(t_s, (), "time in s", finite=True)
+        applied = None if applied is None else numbers(applied, k.asked.shape, INPUTS)
         if not k.counters[SAMPLES]:
             raise ValueError("the supervisor has seen no sample; call watch with each sample in manual first")
         samples = pass_time(s, k, t_s)
@@ -775,8 +761,8 @@ class Supervised:
         """Outputs y (p,), NaN where a sensor gives none. Raises ValueError for another number of them, or if
         the reference r is not p finite numbers."""
         p = self.kept.y.shape
-        _numbers(r.H @ r.w0 if isinstance(r, Reference) else r, p, "references in °C", finite=True)
-        return _numbers(y, p, "temperatures")
+        numbers(r.H @ r.w0 if isinstance(r, Reference) else r, p, REFERENCES, finite=True)
+        return numbers(y, p, "temperatures in °C")
 
     def _drive(self, y: np.ndarray, r: np.ndarray | Reference, r_now: np.ndarray) -> tuple[np.ndarray, int]:
         """Inputs of the mode, and the mode; the law watches where it does not drive."""

@@ -528,7 +528,9 @@ def test_bad_input_is_refused_in_a_sentence():
         with pytest.raises(ValueError, match="noise in degC above zero"):
             supervision(MODEL, WIRED, np.array(noise))
     run = Run()
-    with pytest.raises(ValueError, match=r"expects 2 temperatures but was given an array of shape \(3,\)"):
+    with pytest.raises(
+        ValueError, match=r"expects 2 temperatures in °C but was given an array of shape \(3,\)"
+    ):
         run.supervised.step(np.zeros(3), R, 0.0)
     saved = Run(seed=2).supervised
     saved.step(R, R, 0.0)

@@ -840,26 +840,25 @@ def _remembered(controller: Deployed, z, u, y, r):
 
 # ---- what a machine runs
 
-REFERENCES = "references in °C"
+INPUTS, REFERENCES = "inputs in percent", "references in °C"
 
 
-def _vector(values: np.ndarray, count: int, what: str) -> np.ndarray:
-    values = np.asarray(values, float)
-    if values.shape != (count,):
+def numbers(
+    values: np.ndarray | float, shape: tuple[int, ...], what: str, *, finite: bool = False
+) -> np.ndarray:
+    """An array of a shape. Raises ValueError for another, and if `finite` is asked for and one is not."""
+    array = np.asarray(values, float)
+    if array.shape != shape:
         raise ValueError(
-            f"the controller expects {count} {what} but was given an array of shape {values.shape}; "
-            "give it those of the machine that it was designed for, in the order of section plant"
+            f"the controller expects {shape[0] if shape else 'one'} {what} but was given an array of shape "
+            f"{array.shape}; give it those of the machine that it was designed for, in the order of section "
+            "plant, NaN for a sensor that does not answer"
         )
-    return values
-
-
-def _finite(values: np.ndarray, count: int, what: str) -> np.ndarray:
-    values = _vector(values, count, what)
-    if not np.isfinite(values).all():
+    if finite and not np.isfinite(array).all():
         raise ValueError(
-            f"the controller expects finite {what} but was given {values}; keep the last ones that were"
+            f"the controller expects finite {what} but was given {array}; keep the last ones that were"
         )
-    return values
+    return array
 
 
 def _shapes(controller: Deployed) -> dict[str, tuple[int, ...]]:
@@ -898,7 +897,7 @@ class RunningController:
         """One sample in manual: inputs u (m,) applied, outputs y (p,) measured before, reference r (p,).
         Raises ValueError for another number of them, or one that is not finite, and remembers nothing."""
         m, p = self.controller.law.D.shape
-        u, r = _finite(u, m, "inputs in percent"), _finite(r, p, REFERENCES)
+        u, r = numbers(u, (m,), INPUTS, finite=True), numbers(r, (p,), REFERENCES, finite=True)
         self._state = watched(
             self.controller, self._state, u[None], self._measured(y)[None], r[None], self.forward
         )
@@ -958,7 +957,7 @@ class RunningController:
         return self._state
 
     def _measured(self, y: np.ndarray) -> np.ndarray:
-        y = _vector(y, self.controller.law.D.shape[1], "temperatures in °C")
+        y = numbers(y, self.controller.law.D.shape[1:], "temperatures in °C")
         if not np.isfinite(y.sum()):
             raise ValueError(
                 f"the controller expects finite temperatures in °C but measured {y}; "
@@ -972,7 +971,7 @@ class RunningController:
         if mine is not None and t < self._t:
             raise ValueError(f"sample {t} comes after sample {self._t}; count samples upwards")
         if not isinstance(r, Reference):
-            r = _vector(r, self.controller.law.D.shape[1], REFERENCES)
+            r = numbers(r, self.controller.law.D.shape[1:], REFERENCES)
         if mine is None or not same(mine, r):
             mine = self._turned(r if isinstance(r, Reference) else constant(r), t)
         if len(self._w) > 1:
@@ -985,7 +984,7 @@ class RunningController:
 
     def _turned(self, reference: Reference, t: int) -> Reference:
         mine = Reference(*(np.array(part, float) for part in reference))
-        _finite(mine.H @ mine.w0, self.controller.law.D.shape[1], REFERENCES)
+        numbers(mine.H @ mine.w0, self.controller.law.D.shape[1:], REFERENCES, finite=True)
         at, self._aim = self._aimed(mine)
         self._reference = mine
         self.binding, self._t = at.binding, t
