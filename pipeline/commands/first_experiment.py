@@ -89,7 +89,7 @@ def gcode(plan: Targets, ramp_degC_per_min: float) -> str:
     1 °C."""
     if not 0 <= ramp_degC_per_min <= 1000:
         raise ValueError(f"--ramp is {ramp_degC_per_min:g} °C a minute, expected 0 (none) to 1000")
-    lines, before = [f"; {summary(plan)}"], dict.fromkeys(plan.steps[0][0], ROOM_DEGC)
+    lines, before = [f"; {summary(plan).replace('°', 'deg')}"], dict.fromkeys(plan.steps[0][0], ROOM_DEGC)
     for targets_degC, fan, hold_s in plan.steps:
         lines.append(f"M106 S{round(2.55 * fan)}" if fan else "M107")
         ways = {

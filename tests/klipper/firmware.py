@@ -8,7 +8,8 @@ clock, which jumps to the next timer, and the pins: the heater, the fans and the
 hot end. A pin that is not set again within its longest duration shuts the printer down, as theirs does.
 
 A step of the scenario is the name of a method of Run and what it is given: ["gcode", text], ["wait", s],
-["feed", mm/s, s, W], ["status", objects]. Its answer and the printer's state after it come back.
+["feed", mm/s, s], ["print", file], ["status", objects]. Its answer and the printer's state after it come
+back. Filament takes `feed_J_per_mm` of the scenario away from the hot end, as it moves.
 """
 
 import importlib
@@ -32,6 +33,7 @@ for name in SCENARIO["without"]:
 TRACE_S = 0.3
 FULL_SCALE_DEGC = 500.0  # of the analog input: [adc_temperature linear] of the configuration
 E_LINE_MM = 5.0
+WALL_S = 1.8e9  # of the wall clock, when the firmware's own clock is at 0
 
 
 def klippy(name):
@@ -44,14 +46,17 @@ class Machine(HotEnd):
 
     def __init__(self, parts, seed):
         super().__init__(np.random.default_rng(seed), parts)
-        self.at_s, self.duty, self.fan, self.feed_W = None, 0.0, 0.0, 0.0
+        self.at_s, self.duty, self.fan, self.taken_J = None, 0.0, 0.0, 0.0
 
     def until(self, now_s):
         self.at_s = now_s if self.at_s is None else self.at_s
-        while now_s - self.at_s > 0.049:
+        count = int((now_s - self.at_s + 0.001) / 0.05)
+        for _ in range(count):
             self.advance(100 * self.duty, 100 * self.fan, 0.05)
-            self.block -= 0.05 * self.feed_W / self.parts.block_J_per_K
+            self.block -= self.taken_J / count / self.parts.block_J_per_K
             self.at_s += 0.05
+        if count:
+            self.taken_J = 0.0
 
 
 class Pwm:
@@ -129,7 +134,7 @@ class Mcu:
     """Pins, and a clock that is the host's."""
 
     def __init__(self, printer, machine):
-        self.printer, self.machine, self.pwm, self.flushed = printer, machine, {}, []
+        self.printer, self.machine, self.pwm, self.flushed, self.fed_mm = printer, machine, {}, [], 0.0
 
     def setup_pin(self, kind, given):
         if kind == "adc":
@@ -140,7 +145,18 @@ class Mcu:
         for name, pin in self.pwm.items():
             if name in ("duty", "fan"):
                 setattr(self.machine, name, pin.at(now_s))
+        filament = self.filament(now_s)
+        if filament > self.fed_mm:
+            self.machine.taken_J += SCENARIO["feed_J_per_mm"] * (filament - self.fed_mm)
+            self.fed_mm = filament
         self.machine.until(now_s)
+
+    def filament(self, now_s):
+        """The farthest that the extruder has pushed so far, in mm: what was pulled back is warm."""
+        motion = self.printer.lookup_object("motion_report", None)
+        queues = getattr(motion, "trapqs", None) or getattr(motion, "dtrapqs", {})
+        position = queues["extruder"].get_trapq_position(now_s)[0] if "extruder" in queues else None
+        return 0.0 if position is None else position[0]
 
     def estimated_print_time(self, eventtime):
         return eventtime
@@ -219,13 +235,21 @@ class Client:
         self.last, self.count = data.get("params", data), self.count + 1
 
 
+class Rollover:
+    """Where klippy keeps what it writes again at the head of each day's log; with one it logs the settings."""
+
+    def set_rollover_info(self, *_):
+        """Nothing: a scenario is shorter than a day."""
+
+
 class Run:
     """One scenario, over restarts."""
 
     def __init__(self):
         self.machine = Machine(Parts(**SCENARIO["parts"]), SCENARIO["seed"])
         self.steps, self.answers, self.states, self.trace = list(SCENARIO["steps"]), [], [], []
-        self.said, self.printer, self.reactor, self.now_s = [], None, None, 1000.0
+        self.said, self.printer, self.reactor, self.now_s = [], None, None, SCENARIO["start_s"]
+        time.time = lambda: WALL_S + self.reactor.monotonic()
 
     def start(self):
         """A start of the program; what it ended with."""
@@ -239,14 +263,14 @@ class Run:
             "log_file": None,
         }
         module = "printer" if SCENARIO["kalico"] else "klippy"
-        self.printer = klippy(module).Printer(self.reactor, None, arguments)
+        self.printer = klippy(module).Printer(self.reactor, Rollover(), arguments)
         self.printer.lookup_object("gcode").register_output_handler(self.said.append)
         self.printer.register_event_handler("klippy:shutdown", self._shut_down)
         self.reactor.register_callback(self._traced)
         self.reactor.register_callback(self._play)
         ended = self.printer.run()
         self.now_s = self.reactor.monotonic() + 3.0
-        self.machine.duty = self.machine.fan = self.machine.feed_W = 0.0
+        self.machine.duty = self.machine.fan = self.machine.taken_J = 0.0
         self.reactor.finalize()
         return ended
 
@@ -295,14 +319,19 @@ class Run:
         while self.reactor.monotonic() < end_s and not self.printer.is_shutdown():
             self.reactor.pause(min(self.reactor.monotonic() + 1.0, end_s))
 
-    def _feed(self, mm_per_s, seconds, watts):
+    def _feed(self, mm_per_s, seconds):
         gcode, end_s = self.printer.lookup_object("gcode"), self.reactor.monotonic() + seconds
         gcode.run_script("M83")
-        self.machine.feed_W = watts
         while self.reactor.monotonic() < end_s and not self.printer.is_shutdown():
             gcode.run_script(f"G1 E{E_LINE_MM} F{60 * mm_per_s}")
             self.reactor.pause(self.reactor.monotonic() + 0.01)
-        self.machine.feed_W = 0.0
+
+    def _print(self, file):
+        """Prints a file of the virtual SD card to its end."""
+        self.printer.lookup_object("gcode").run_script(f"SDCARD_PRINT_FILE FILENAME={file}")
+        card = self.printer.lookup_object("virtual_sdcard")
+        while card.is_active() and not self.printer.is_shutdown():
+            self.reactor.pause(self.reactor.monotonic() + 1.0)
 
     def _subscribe(self, objects):
         hooks, text = self.printer.lookup_object("webhooks"), {"objects": dict.fromkeys(objects)}
@@ -342,7 +371,7 @@ class Run:
 
 def main():
     log = open(SCENARIO["log"], "a", encoding="utf-8")  # noqa: SIM115
-    logging.basicConfig(stream=log, level=logging.INFO)
+    logging.basicConfig(stream=log, level=logging.INFO, format="%(message)s")  # as klippy's own
     run, began = Run(), time.process_time()
     ended, starts = "", 0
     while starts == 0 or ended in ("restart", "firmware_restart"):

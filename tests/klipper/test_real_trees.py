@@ -6,7 +6,7 @@ import pytest
 from pipeline.deploy import to_klipper
 from tests.deploy.deployed_machines import passed
 from tests.klipper import trees
-from tests.klipper.machines import FILAMENT_J_PER_MM, HOT_ENDS, TARGET_DEGC, exported
+from tests.klipper.machines import HOT_ENDS, TARGET_DEGC, exported
 
 pytestmark = pytest.mark.klipper
 HEATED = [["gcode", f"M104 S{TARGET_DEGC:g}"], ["wait", 300]]
@@ -64,8 +64,7 @@ def test_it_drives_the_heater_and_answers_subscribers(firmware, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("disturb", "rest"),
-    [([["gcode", "M106 S255"], ["wait", 120]], "fan"), ([["feed", 3, 60, 3 * FILAMENT_J_PER_MM]], "feed")],
+    ("disturb", "rest"), [([["gcode", "M106 S255"], ["wait", 120]], "fan"), ([["feed", 3, 60]], "feed")]
 )
 def test_a_fan_and_filament_that_are_told_dip_at_most_half_as_much(firmware, tmp_path, disturb, rest):
     dips = []
@@ -78,9 +77,20 @@ def test_a_fan_and_filament_that_are_told_dip_at_most_half_as_much(firmware, tmp
 
 
 def test_what_is_told_is_the_mean_over_a_sample(firmware, tmp_path):
-    steps = [*HEATED, ["gcode", "M106 S102"], ["wait", 10], ["feed", 3, 20, 4.5], ["status", ["beadline"]]]
+    steps = [*HEATED, ["gcode", "M106 S102"], ["wait", 10], ["feed", 3, 20], ["status", ["beadline"]]]
     told = played(firmware, tmp_path, steps)["answers"][-1]["beadline"]["disturbances"]
     assert told["part_fan"] == pytest.approx(40, abs=0.1) and told["feed"] == pytest.approx(3, abs=0.1)
+
+
+def test_filament_that_moves_again_after_a_rest_is_told_as_it_moves(firmware, tmp_path):
+    """The firmware forgets where an extruder stands that has not moved for some time."""
+    status = ["status", ["beadline"]]
+    steps = [*HEATED, ["feed", 3, 30], ["wait", 1000], status, ["feed", 3, 2], status, ["feed", 3, 30]]
+    out = played(firmware, tmp_path, steps)
+    rested, began = (out["answers"][k]["beadline"]["disturbances"]["feed"] for k in (4, 6))
+    assert rested == 0.0 and 0.0 <= began < 10.0
+    time_s, y = block(out)
+    assert y[time_s > 298].min() > TARGET_DEGC - 2.0
 
 
 @pytest.mark.parametrize(

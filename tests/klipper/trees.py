@@ -27,6 +27,9 @@ temperature1: 0
 voltage1: 0
 temperature2: 500
 voltage2: 5
+[virtual_sdcard]
+path: {gcodes}
+[motion_report]
 [fan]
 pin: fan
 [extruder]
@@ -160,13 +163,17 @@ def play(
     config: str = "",
     parts: dict[str, float] | None = None,
     seed: int = 1,
+    feed_J_per_mm: float = 1.5,
+    start_s: float = 1000.0,
     without: tuple[str, ...] = (),
 ) -> dict[str, Any]:
     """What firmware.py says of the steps: answers, states (text, kind), starts, CPU seconds, and trace: rows
     of time in s, block and reading in °C, target and duty. A printer.cfg in `folder` is kept."""
     printer = folder / "printer.cfg"
     if not printer.exists():
-        printer.write_text(PRINTER + config, encoding="utf-8")
+        (folder / "gcodes").mkdir(exist_ok=True)
+        text = PRINTER.format(gcodes=folder / "gcodes") + config
+        printer.write_text(text, encoding="utf-8")
     standard = [one for one in sys.path if "site-packages" not in one and one.startswith(sys.base_prefix)]
     scenario = {
         "path": [*_path(of.klippy, of.libraries), str(HOME.parent / "foreign"), *standard],
@@ -176,6 +183,8 @@ def play(
         "log": str(folder / "klippy.log"),
         "parts": parts or {},
         "seed": seed,
+        "feed_J_per_mm": feed_J_per_mm,
+        "start_s": start_s,
         "steps": steps,
         "without": without,
     }
@@ -184,7 +193,7 @@ def play(
         input=json.dumps(scenario),
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
     )
     if done.returncode:
         raise RuntimeError(f"{done.stderr[-3000:]}\n{(folder / 'klippy.log').read_text()[-3000:]}")
