@@ -236,7 +236,7 @@ class Client:
 
 
 class Rollover:
-    """Where klippy keeps what it writes again at the head of each day's log; with one it logs the settings."""
+    """Where klippy keeps what it writes again each day; with one it logs the settings."""
 
     def set_rollover_info(self, *_):
         """Nothing: a scenario is shorter than a day."""
@@ -355,13 +355,15 @@ class Run:
         controller.step = None if how == "raises" else lambda *given: step(*given)._replace(u=nan)
 
     def _listen(self):
-        """From now on the controller's sample times are kept, for the answer of `heard`."""
+        """From now on the controller's sample times and what it is told are kept, for `heard`."""
         controller = self.printer.lookup_object("beadline").controller
         step, self.times = controller.step, []
+        tell, self.told = controller.tell, []
+        controller.tell = lambda told: self.told.append(list(told)) or tell(told)
         controller.step = lambda y, r, t_s: self.times.append(t_s) or step(y, r, t_s)
 
     def _heard(self):
-        return self.times
+        return {"times": self.times, "told": self.told}
 
     def _pid(self):
         control = self.printer.lookup_object("heaters").lookup_heater("extruder").control

@@ -1,4 +1,4 @@
-"""The owner of a printer, from klippy.log to prints under the exported controller, in the firmwares' own trees.
+"""The owner of a printer, from klippy.log to prints under the exported controller, in the firmwares' trees.
 
     ./run --group dev python -m tests.klipper.owner --seeds 901-920
 

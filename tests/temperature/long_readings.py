@@ -1,4 +1,4 @@
-"""Readers of recordings that come to no end for one of them; a child process finds them by this module's name."""
+"""Readers of recordings that come to no end for one of them; a child process finds them by this module."""
 
 import signal
 from pathlib import Path
