@@ -84,8 +84,8 @@ def test_what_is_told_is_the_mean_over_a_sample(firmware, tmp_path):
 
 def test_filament_that_moves_again_after_a_rest_is_told_as_it_moves(firmware, tmp_path):
     """The firmware forgets where an extruder stands that has not moved for some time."""
-    rest = [["gcode", "SET_IDLE_TIMEOUT TIMEOUT=9999"], ["wait", 1000]]
-    steps = [["listen"], *HEATED, ["feed", 3, 30], *rest, ["feed", 3, 30], ["heard"]]
+    rests = [step for k in range(12) for step in (["feed", 3, 10], ["wait", 45.0 + 0.13 * k])]
+    steps = [["listen"], *HEATED, *rests, ["feed", 3, 30], ["heard"]]
     told = np.array(played(firmware, tmp_path, steps)["answers"][-1]["told"], float)
     assert told[-20:-5, 1].mean() == pytest.approx(3.0, abs=0.1)
     assert told[:, 1].min() >= 0.0 and told[:, 1].max() < 12.0
