@@ -29,7 +29,8 @@ from pipeline.temperature.tracking import Law, still_law
 INTEGRAL_LIMIT = 1.0
 NOISE = 0.1
 STRENGTH = Strength(0.85, 1.15, 0.1)
-LAWS = ("lqg", "window", "pi", "printer_pid", "told", "hold", "slow", "tight")
+LAWS = ("lqg", "window", "pi", "printer_pid", "told", "told_pid", "hold", "slow", "tight")
+PIDS, TOLD = ("printer_pid", "told_pid"), ("told", "told_pid")
 
 
 def block_and_sensor(*, zones: int, sample_time_s: float = 1.0) -> Plant:
@@ -80,7 +81,7 @@ def _law(kind: str, model: Plant, limits: ActuatorLimits) -> tuple[Law, Plant]:
         return _windowed(model)
     if kind == "pi":
         return _pi(model, limits), model
-    if kind == "printer_pid":
+    if kind in PIDS:
         pids = tuple(printer_pid.HeaterPid(i, i, 3.0, 0.05, 8.0, 100.0, 1.0) for i in range(model.m))
         return printer_pid.law(pids, sample_time_s=model.sample_time_s), model
     return still_law(model.m, model.p), model
@@ -96,21 +97,21 @@ def exported(
     kind: str = "lqg", *, zones: int = 2, simulated: bool = True, sample_time_s: float = 1.0
 ) -> Exported:
     """A controller of `zones` heaters and sensors by a law of LAWS; "slow" has a rate limit, "tight" outputs
-    that may rise 5 degC above where its episodes begin; "told" a fan and a feed to make up for. "study": the
+    that may rise 5 degC above where its episodes begin; TOLD a fan and a feed to make up for. "study": the
     study's machine, more inputs than outputs."""
     plant_ = baam() if kind == "study" else block_and_sensor(zones=zones, sample_time_s=sample_time_s)
     limits = limits_of(plant_.m, rate=4.0 if kind == "slow" else np.inf)
     law, model = _law(kind, plant_, limits)
     high = 130.0 if kind == "tight" else 250.0
-    watched = None if kind in ("hold", "printer_pid") else guard(plant_, limits, high)
+    watched = None if kind in ("hold", *PIDS) else guard(plant_, limits, high)
     machine = Machine(
         tuple(Signal(f"heater_{i + 1}", "percent", 0.0, 100.0) for i in range(plant_.m)),
         tuple(Signal(f"sensor_{i + 1}", "degC", 0.0, 250.0) for i in range(plant_.p)),
         sample_time_s,
-        tuple(Signal(name, "percent", -np.inf, np.inf) for name in ("fan", "feed") if kind == "told"),
+        tuple(Signal(name, "percent", -np.inf, np.inf) for name in ("fan", "feed") if kind in TOLD),
     )
     forward = FeedForward(np.array([[0.1, 2.0], [0.05, -0.5]]), np.array([40.0, 1.5]))
-    forward = forward if kind == "told" else None
+    forward = forward if kind in TOLD else None
     return canonical(
         Exported(
             name=kind,

@@ -634,7 +634,8 @@ static void integrate_conditionally(const law *l, law_state *s, const real *erro
     for (j = 0; j < OUTPUTS; j++) {
         within = dot(l->back + j * INPUTS, share, INPUTS);
         for (i = 0, inside = 0; i < INPUTS; i++)
-            inside |= fabs(u[i] - wished[i]) <= 0 && l->K_r[i * OUTPUTS + j] != 0;
+            inside |= fabs(u[i] - wished[i]) <= BY_PRECISION(1e-9, 1e-5) * (l->high[i] - l->low[i])
+                      && l->K_r[i * OUTPUTS + j] != 0;
         if (inside)
             s->xi[j] = within;
     }
