@@ -59,12 +59,10 @@ SHIPPED: dict[str, Any] = {
     "ingest.max_gap_s": 5.0,
     "report.overshoot_degC": 5.0,
 }
-# Klipper measures its heaters, and can run a controller, at multiples of this; its log has a line a second
-KLIPPER_STEP_S, KLIPPER_KINDS = 0.3, ("klippy.log", "Moonraker JSON")
 # samples a time constant of the fastest output: as many are taken if the clock allows, and at least as many
 MOST_SAMPLES, FEWEST_SAMPLES = 200, 10
 # what firmware without limits in its log leaves to the owner
-FIRMWARE_KINDS = (*KLIPPER_KINDS, "serial.log")
+FIRMWARE_KINDS = ("klippy.log", "Moonraker JSON", "serial.log")
 GAP_SAMPLES = 3  # shortest gap of samples that ends a segment
 ABSOLUTE_ZERO_DEGC = -273.15
 # the next experiment: no move smaller or larger, in percent; samples that the stage takes
@@ -121,7 +119,7 @@ def proposed(paths: Sequence[Path], *, sample_time: str = "") -> Initialised:
             )
     kind = recordings[0].kind
     remarks = [note.message for one in recordings for note in one.notes if note.kind in (CODE, NOT_RECORDED)]
-    scale = _scale(paths, proposal, step_s=KLIPPER_STEP_S if kind in KLIPPER_KINDS else 0.0)
+    scale = _scale(paths, proposal)
     return Initialised(
         _values(proposal, scale),
         [*remarks, *_open_questions(proposal, scale, kind, timed=not proposal.time or bool(sample_time))],
@@ -145,30 +143,17 @@ def _widest(recordings: Sequence[Inspected]) -> Proposal:
 # ---- pace and range
 
 
-def sample_time_s(clock_s: float, fastest_s: float, step_s: float = 0.0) -> float:
-    """The sample time in s: a multiple of the record's own clock, with MOST_SAMPLES in the fastest time
-    constant if the clock has as many, and FEWEST_SAMPLES unless the clock has fewer.
-
-    `step_s` is the interval of which the firmware runs multiples, 0 for none. If no multiple of both clocks
-    is short enough, it is the first multiple of step_s that is no shorter than the clock.
-    """
-    longest = fastest_s / FEWEST_SAMPLES
-    common = next((k for k in range(1, 101) if step_s and _is_multiple(k * clock_s, step_s)), 0)
-    if step_s and not (common and common * clock_s <= longest):
-        return _rounded(step_s * np.ceil(clock_s / step_s - 1e-6))
-    unit = max(common, 1) * clock_s
-    return _rounded(unit * max(1, round(fastest_s / MOST_SAMPLES / unit)))
-
-
-def _is_multiple(time_s: float, step_s: float) -> bool:
-    return abs(time_s / step_s - round(time_s / step_s)) < 1e-6
+def sample_time_s(clock_s: float, fastest_s: float) -> float:
+    """The sample time in s: the multiple of the record's own clock with MOST_SAMPLES in the fastest time
+    constant, if the clock has as many."""
+    return _rounded(clock_s * max(1, round(fastest_s / MOST_SAMPLES / clock_s)))
 
 
 def _rounded(time_s: float) -> float:
     return float(f"{time_s:.9g}")
 
 
-def _scale(paths: Sequence[Path], proposal: Proposal, *, step_s: float = 0.0) -> MachinePace:
+def _scale(paths: Sequence[Path], proposal: Proposal) -> MachinePace:
     inputs = [s.name for s in proposal.signals if s.role == "input"]
     outputs = [s for s in proposal.signals if s.role == "output"]
     sources = [Source(s.name, s.source, s.unit, s.scale, s.offset) for s in proposal.signals]
@@ -204,7 +189,7 @@ def _scale(paths: Sequence[Path], proposal: Proposal, *, step_s: float = 0.0) ->
     ]
     if len(still) < len(y):
         constants = {name: tau for name, tau in constants.items() if name not in still}
-    sample_time = sample_time_s(interval, min(constants.values()), step_s)
+    sample_time = sample_time_s(interval, min(constants.values()))
     lows = [np.nanmin(np.concatenate(segments)) for segments in y.values()]
     highs = [np.nanmax(np.concatenate(segments)) for segments in y.values()]
     rows = np.vstack(u)
@@ -298,7 +283,7 @@ def _open_questions(proposal: Proposal, scale: MachinePace, kind: str, *, timed:
             "the sample time: the file has no time, and 1.0 s was assumed, on which all times rest that were "
             "written; if it is another, run init again with --time 'every 0.08 s' --force"
         )
-    questions += _questions_on_time(scale, kind)
+    questions += _questions_on_time(scale)
     questions += _questions_on_inputs([s for s in proposal.signals if s.role == "input"])
     questions += _questions_on_disturbances(proposal)
     questions += _questions_on_limits([s for s in proposal.signals if s.role == "output"], kind)
@@ -313,20 +298,14 @@ def _open_questions(proposal: Proposal, scale: MachinePace, kind: str, *, timed:
     return questions
 
 
-def _questions_on_time(scale: MachinePace, kind: str) -> list[str]:
+def _questions_on_time(scale: MachinePace) -> list[str]:
     """How the record comes to the sample time, if it is not the record's own, and whether it is too long."""
     clock, time, fastest = scale.clock_s, scale.sample_time_s, min(scale.time_constants_s.values())
     nth = {1: "each", 2: "every 2nd", 3: "every 3rd"}.get(round(time / clock), f"every {time / clock:.0f}th")
-    way = f"{nth} is taken" if _is_multiple(time, clock) else "temperatures are interpolated between two"
     questions = []
-    if kind in KLIPPER_KINDS:
+    if time > clock:
         questions.append(
-            f"plant.sample_time_s {time:g} s: Klipper runs a controller at multiples of {KLIPPER_STEP_S:g} s "
-            f"and the log has a line every {clock:g} s, of which {way}"
-        )
-    elif time > clock:
-        questions.append(
-            f"plant.sample_time_s {time:g} s: the file has a sample every {clock:g} s, of which {way}"
+            f"plant.sample_time_s {time:g} s: the file has a sample every {clock:g} s, of which {nth} is taken"
         )
     if time > fastest / FEWEST_SAMPLES:
         questions.append(

@@ -59,7 +59,7 @@ def test_a_klippy_log_fills_the_files_and_keeps_their_comments(tree, monkeypatch
     limits = {signal.name: (signal.reference, signal.low, signal.high) for signal in machine.outputs}
     # 15 °C below max_temp, at which the firmware switches everything off
     assert limits == {"temperature_bed": (60, 0, 115), "temperature_extruder": (200, 0, 245)}
-    assert machine.sample_time_s == 3.0
+    assert machine.sample_time_s == 1.0
     mapping = params.load(Ingest, "ingest").mapping
     assert mapping["temperature_bed"].set_point == "heater_bed.target"
     assert params.value("generate_probing.source", one_of=("simulated", "recordings")) == "recordings"
@@ -74,28 +74,22 @@ def test_a_klippy_log_fills_the_files_and_keeps_their_comments(tree, monkeypatch
     assert "where each should settle" in to_decide
     assert "high is 15 °C below the firmware's cut-off (max_temp)" in to_decide
     assert "temperature_bed 130, temperature_extruder 260 °C" in to_decide
-    assert (
-        "Klipper runs a controller at multiples of 0.3 s and the log has a line every 1 s, of which "
-        "every 3rd is taken" in to_decide
-    )
 
 
 @pytest.mark.parametrize(
-    ("clock_s", "fastest_s", "step_s", "sample_time_s"),
+    ("clock_s", "fastest_s", "sample_time_s"),
     [
-        (1.0, 150.0, 0.0, 1.0),
-        (0.1, 150.0, 0.0, 0.8),  # 200 samples in the fastest time constant
-        (0.04, 2.0, 0.0, 0.04),
-        (5.0, 20.0, 0.0, 5.0),  # the record has no more; it is asked about
-        (1.0, 150.0, 0.3, 3.0),  # a multiple of both clocks
-        (1.0, 20.0, 0.3, 1.2),  # 3 s would be too long
-        (1.0, 2000.0, 0.3, 9.0),
+        (1.0, 150.0, 1.0),
+        (0.1, 150.0, 0.8),  # 200 samples in the fastest time constant
+        (0.04, 2.0, 0.04),
+        (5.0, 20.0, 5.0),  # the record has no more; it is asked about
+        (1.0, 2000.0, 10.0),
     ],
 )
-def test_the_sample_time_is_a_multiple_of_the_clock_that_the_machine_and_the_firmware_allow(
-    clock_s, fastest_s, step_s, sample_time_s
+def test_the_sample_time_is_a_multiple_of_the_clock_that_the_machine_allows(
+    clock_s, fastest_s, sample_time_s
 ):
-    assert propose_params.sample_time_s(clock_s, fastest_s, step_s) == pytest.approx(sample_time_s)
+    assert propose_params.sample_time_s(clock_s, fastest_s) == pytest.approx(sample_time_s)
 
 
 def test_a_record_too_slow_for_the_machine_is_asked_about(tree, monkeypatch, capsys):
@@ -373,10 +367,10 @@ def test_the_record_is_the_print_without_a_conversion(printer):
     )
     assert set(record["recording"]) == {"klippy.log"}
     lines = [line for line in (printer / "klippy.log").read_text().splitlines() if line.startswith("Stats")]
-    assert len(record["time_s"]) == -(-len(lines) // 3)
+    assert len(record["time_s"]) == len(lines)
     temperatures = [float(line.rpartition("extruder:")[2].split("temp=")[1].split()[0]) for line in lines]
     # Klipper's 0.3 s and the log's 1 s meet every 3 s, so that nothing is interpolated
-    np.testing.assert_array_equal(record["temperature_extruder"], temperatures[::3])
+    np.testing.assert_array_equal(record["temperature_extruder"], temperatures)
     findings = artifacts.read_json(printer / "datasets/ingest/figures.json")
     assert findings["quarantined"] == 0
 
