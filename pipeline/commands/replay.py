@@ -15,7 +15,7 @@ from pipeline.deploy.support import read_support
 from pipeline.recordings.recordings import Source, Table, read
 from pipeline.recordings.resampling import resample
 from pipeline.store import artifacts, params
-from pipeline.temperature.controllers.law import fed_forward
+from pipeline.temperature.controllers.law import all_fed_forward
 from pipeline.temperature.settings import Plant
 from stages.ingest import Ingest
 
@@ -189,7 +189,7 @@ def _forward(made: Exported, table: Table) -> tuple[np.ndarray, list[str]]:
     told = [table.values.get(name, nothing) for name in names]
     d = np.stack(told, axis=1) if told else np.zeros((len(nothing), 0))
     lacking = [name for name in names if name not in table.values]
-    return fed_forward(made.controller, d), lacking
+    return all_fed_forward(made.controller, d), lacking
 
 
 def _check_log(

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.deploy import vectors
 from pipeline.deploy.supervise import DEGC, PERCENT, Exported, Supervised
-from pipeline.temperature.controllers.law import RunningController, fed_forward
+from pipeline.temperature.controllers.law import RunningController, all_fed_forward
 from pipeline.temperature.test_set import panel
 
 SAME = 1e-9  # of an input's range, by which commands in another order of sums may differ
@@ -55,7 +55,7 @@ def commands(
 def forward_of(made: Exported, cases: panel.Cases, case: int) -> np.ndarray:
     """What is fed forward (steps, m) in one case."""
     usual = 0.0 if made.controller.forward is None else made.controller.forward.mean
-    return fed_forward(made.controller, cases.told[:, case] + usual)
+    return all_fed_forward(made.controller, cases.told[:, case] + usual)
 
 
 def check_same(made: Exported, difference: float) -> None:

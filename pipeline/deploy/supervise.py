@@ -767,7 +767,7 @@ class Supervised:
     def _drive(self, y: np.ndarray, r: np.ndarray | Reference, r_now: np.ndarray) -> tuple[np.ndarray, int]:
         """Inputs of the mode, and the mode; the law watches where it does not drive."""
         k, mode = self.kept, choose_mode(self.supervision, self.kept)
-        before, n = k.counters[MODE], int(k.counters[RUNS])
+        before, n, forward = k.counters[MODE], int(k.counters[RUNS]), self.law.forward
         if mode == LAW:
             if before != LAW:
                 self.law.hand_over(y)
@@ -775,7 +775,7 @@ class Supervised:
         else:
             u = self._safe(mode, before, y, r_now, n)
             self.law.watch(u, y, r_now)
-        k.asked[:], k.forward[:], k.counters[MODE] = u, self.law.forward, mode
+        k.asked[:], k.forward[:], k.counters[MODE] = u, forward, mode
         k.counters[RUNS] += 1
         return u, mode
 
@@ -860,6 +860,5 @@ class Supervised:
         self.law, self.own = law, own
         for name, part in memory.items():
             part[...] = arrays[name]
-        self.law.forward = self.kept.forward.copy()
         self._reference = Reference(*(aim[name] for name in Reference._fields))
         self._w, self._beyond, self._in_reach = (aim[name] for name in ("w", "beyond", "in_reach"))

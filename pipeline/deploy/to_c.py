@@ -232,11 +232,12 @@ def tables(exported: Exported) -> str:
 
 
 def _forward(name: str, exported: Exported, *, of: str = "real") -> str:
-    """Gain and mean of what is fed forward, as law.FeedForward has them."""
+    """Gain, mean and lead of what is fed forward, as law.FeedForward has them."""
     m, q = len(exported.machine.inputs), len(exported.machine.disturbances)
-    forward = exported.controller.forward or FeedForward(np.zeros((m, q)), np.zeros(q))
+    forward = exported.controller.forward or FeedForward(np.zeros((m, q)), np.zeros(q), np.zeros(q))
     gain = forward.gain if q else np.zeros((m, 1))
-    return table(f"{name}_gain", gain, of=of) + table(f"{name}_mean", forward.mean, of=of)
+    parts = {"gain": gain, "mean": forward.mean, "lead": forward.lead}
+    return "".join(table(f"{name}_{part}", values, of=of) for part, values in parts.items())
 
 
 def plant_header(exported: Exported) -> str:

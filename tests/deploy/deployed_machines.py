@@ -110,7 +110,7 @@ def exported(
         sample_time_s,
         tuple(Signal(name, "percent", -np.inf, np.inf) for name in ("fan", "feed") if kind in TOLD),
     )
-    forward = FeedForward(np.array([[0.1, 2.0], [0.05, -0.5]]), np.array([40.0, 1.5]))
+    forward = FeedForward(np.array([[0.1, 2.0], [0.05, -0.5]]), np.array([40.0, 1.5]), np.array([1.5, 0.0]))
     forward = forward if kind in TOLD else None
     return canonical(
         Exported(

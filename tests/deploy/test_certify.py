@@ -109,7 +109,9 @@ def test_the_certificate_says_what_is_fed_forward_and_what_is_not():
     fan, room = PlantSignal(name="fan", unit="percent"), PlantSignal(name="room", unit="degC")
     declared = declared.model_copy(update={"disturbances": [fan, room]})
     effect = plant([[0.9]], [[0.0, 0.0]], [[1.0]])
-    told = Told(effect, np.zeros(2), np.ones(2), np.array([[0.129, 0.2]]), np.array([[0.006, 0.5]]))
+    told = Told(
+        effect, np.zeros(2), np.ones(2), np.array([[0.129, 0.2]]), np.array([[0.006, 0.5]]), np.zeros(2)
+    )
     said = certify.conditions(declared, told)
     assert "Fed forward: fan (heater +0.129 ± 0.0099 % for each percent), with 90 % bands. Tell" in said
     assert "The record does not tell what these do: room. Nothing makes up for it. What dist" in said

@@ -57,6 +57,8 @@ def exported(parts: Parts, *, told: bool = True) -> Exported:
     law = baseline.pi_law(baseline.pairing(made, limits.low, limits.high, horizon=300), inputs=1)
     blown = parts.convection_W * parts.fan * (TARGET_DEGC - parts.room_degC) ** 1.25
     gain = SHORT * np.array([[blown, 100 * FILAMENT_J_PER_MM]]) / parts.power_W
+    # a kick fades by half each sample, and so adds twice its lead: the time constant of the cartridge
+    lead = parts.cartridge_J_per_K / parts.cartridge_to_block_W_per_K / SAMPLE_S / 2
     disturbances = (Signal("part_fan", "percent", -np.inf, np.inf), Signal("feed", "mm/s", -np.inf, np.inf))
     machine = Machine(
         (Signal("heater", "percent", 0.0, 100.0),),
@@ -72,7 +74,7 @@ def exported(parts: Parts, *, told: bool = True) -> Exported:
             limits,
             integral_limit=1.0,
             governor=guard(made, limits, 285.0),
-            forward=FeedForward(gain, np.zeros(2)) if told else None,
+            forward=FeedForward(gain, np.zeros(2), np.full(2, lead)) if told else None,
         ),
         model=made,
         fallback=None,

@@ -11,6 +11,7 @@ from pipeline.temperature.controllers.law import (
     batch_step,
     constant,
     deployed,
+    all_fed_forward,
     fed_forward,
     rest,
     watched,
@@ -54,6 +55,20 @@ def test_the_gain_is_the_ratio_of_the_steady_gains_by_hand():
     assert 0 < told.deviation[0, 0] < 0.2 * told.gain[0, 0]
     assert told.mean == pytest.approx(acting[:, 1].mean()) and told.high == 100.0
     assert np.array_equal(told.forward.gain, told.gain)
+
+
+@pytest.mark.parametrize("lag", [0.0, 3.0, 6.0])
+def test_the_lead_makes_up_for_a_heater_that_acts_later(lag):
+    """Power passes a cartridge of `lag` samples, the fan takes its heat at once. What is missing after a step
+    is the fan's effect over the lag, and the kick, which fades by half, adds twice its lead."""
+    acting, y, _ = record()
+    heater, fan = acting.T
+    rng, stored = np.random.default_rng(4), 40.0
+    for t in range(1, len(y)):
+        stored += (heater[t - 1] - stored) / (lag + 1)
+        y[t] = 0.98 * y[t - 1, 0] + 0.05 * stored - 0.006 * fan[t - 1] + rng.normal(0, 0.05) + 0.01
+    told = feed_forward.learn([acting], [y], 1)
+    assert told.lead == pytest.approx([lag / 2], abs=0.4)
 
 
 def test_a_disturbance_that_does_nothing_is_not_fed_forward():
@@ -138,7 +153,9 @@ def learned_of_needed(seed: int) -> list[float]:
 
 def test_the_test_set_moves_what_is_told_to_its_highest_level():
     effect = plant([[0.9]], [[-0.006]], [[1.0]])
-    told = feed_forward.Told(effect, np.array([40.0]), np.array([100.0]), np.ones((1, 1)), np.zeros((1, 1)))
+    told = feed_forward.Told(
+        effect, np.array([40.0]), np.array([100.0]), np.ones((1, 1)), np.zeros((1, 1)), np.zeros(1)
+    )
     signal, push = panel.pushed(told, 1000, 1)
     first, last = (int(1000 * share) for share in panel.FAN[:2])
     assert set(signal[first:last, 0]) == {60.0} and not signal[:first].any() and not signal[last:].any()
@@ -150,7 +167,9 @@ def test_the_test_set_moves_what_is_told_to_its_highest_level():
 def test_on_the_test_set_a_disturbance_moves_the_machine_by_what_is_not_made_up_for(short):
     """With nothing fed forward, by all of it; with the exact gain by nothing, in the end of its time."""
     law, effect = still_law(1, 1), plant([[0.98]], [[-0.006]], [[1.0]])
-    told = feed_forward.Told(effect, np.zeros(1), np.array([100.0]), np.full((1, 1), 0.12), np.zeros((1, 1)))
+    told = feed_forward.Told(
+        effect, np.zeros(1), np.array([100.0]), np.full((1, 1), 0.12), np.zeros((1, 1)), np.zeros(1)
+    )
     machine = panel.delayed(HEATER, late=False)
     questions = panel.Questions(np.array([[25.0]]), np.array([[75.0]]), None, None, None)
     cases = panel.asked(
@@ -159,7 +178,7 @@ def test_on_the_test_set_a_disturbance_moves_the_machine_by_what_is_not_made_up_
     )  # fmt: skip
     cases = cases._replace(outside=0 * cases.outside)
     limits = ActuatorLimits(np.zeros(1), np.full(1, 100.0), np.full(1, np.inf))
-    forward = FeedForward((1 - short) * told.gain, told.mean)
+    forward = FeedForward((1 - short) * told.gain, told.mean, told.lead)
     controller = deployed(law, limits, integral_limit=1.0, forward=forward)
     aims = panel.aims(law, panel.rests(HEATER, cases, limits), cases)
     y = panel.rolled_out(controller, cases, aims).y[:, cases.kind == "disturbed", 0]
@@ -198,13 +217,13 @@ def dip(controller, told: bool) -> float:
 
 
 def test_a_fan_that_is_made_up_for_leaves_no_dip():
-    controller = ready(forward=FeedForward(np.array([[0.12]]), np.zeros(1)))
+    controller = ready(forward=FeedForward(np.array([[0.12]]), np.zeros(1), np.zeros(1)))
     assert dip(controller, told=False) > 1.0
     assert dip(controller, told=True) < 0.01
 
 
 def test_a_command_with_what_is_fed_forward_keeps_limits_and_rate():
-    controller = ready(4.0, FeedForward(np.array([[5.0]]), np.zeros(1)))
+    controller = ready(4.0, FeedForward(np.array([[5.0]]), np.zeros(1), np.zeros(1)))
     running, r = RunningController(controller, HEATER), np.full(1, 100.0)
     running.watch(np.array([30.0]), np.array([100.0]), r)
     running.hand_over(np.array([100.0]))
@@ -217,13 +236,14 @@ def test_a_command_with_what_is_fed_forward_keeps_limits_and_rate():
 
 
 def test_batch_and_running_feed_forward_alike():
-    controller = ready(forward=FeedForward(np.array([[0.12]]), np.full(1, 30.0)))
+    controller = ready(forward=FeedForward(np.array([[0.12]]), np.full(1, 30.0), np.full(1, 2.0)))
     running, r = RunningController(controller, HEATER), np.full(1, 100.0)
     at = aimed(controller.law, rest(HEATER, constant(r), controller.limits), constant(r))
     state, rng = None, np.random.default_rng(1)
-    for t in range(80):
-        y, fan = np.array([100.0 + rng.normal()]), np.array([100.0 * (t % 20 > 9)])
-        forward = fed_forward(controller, fan[None])
+    fans = 100.0 * (np.arange(80) % 20 > 9)[:, None]
+    fans[33] = np.nan
+    for t, (fan, fed) in enumerate(zip(fans, all_fed_forward(controller, fans), strict=True)):
+        y, forward = np.array([100.0 + rng.normal()]), fed[None]
         running.tell(fan)
         if t < 20:
             u = np.array([30.0 + t])
@@ -234,9 +254,13 @@ def test_batch_and_running_feed_forward_alike():
             feed, target = at.feed.T, at.Y.T
             other, _, state = batch_step(controller, state, y[None], r[None], feed, target, forward)
             assert one == pytest.approx(other[0], abs=1e-9)
+            # one that is saved and restored goes on alike
+            again = RunningController(controller, HEATER)
+            again.restore(running.saved())
+            running = again
 
 
 def test_a_disturbance_that_is_not_known_is_taken_at_its_mean():
-    controller = ready(forward=FeedForward(np.array([[0.12, 1.0]]), np.array([30.0, 2.0])))
+    controller = ready(forward=FeedForward(np.array([[0.12, 1.0]]), np.array([30.0, 2.0]), np.zeros(2)))
     assert fed_forward(controller, np.array([np.nan, 3.0])) == pytest.approx([1.0])
     assert fed_forward(controller, np.array([40.0, np.nan])) == pytest.approx([1.2])

@@ -55,7 +55,7 @@ static void forget_all(supervisor_kept *k)
 
 beadline_result beadline_init(beadline_controller *c, const beadline_machine *machine, int rehearsal)
 {
-    int j;
+    int j, q;
     memset(c, 0, sizeof *c);
     if (strcmp(machine->plant_sha256, BEADLINE_PLANT_SHA256))
         return BEADLINE_OTHER_PLANT;
@@ -70,6 +70,8 @@ beadline_result beadline_init(beadline_controller *c, const beadline_machine *ma
     if (BEADLINE_SIMULATED && !rehearsal)
         return BEADLINE_ONLY_REHEARSAL;
     forget_all(&c->kept);
+    for (q = 0; q < DISTURBANCES; q++)
+        c->law.told[q] = c->law.before[q] = NAN;
     for (j = 0; j < OUTPUTS; j++) {
         c->kept.y[j] = NAN;
         c->kept.quantum[j] = INFINITY;
@@ -79,17 +81,41 @@ beadline_result beadline_init(beadline_controller *c, const beadline_machine *ma
     return BEADLINE_DONE;
 }
 
-beadline_result beadline_tell(beadline_controller *c, const real *disturbances)
+/* What a change of a disturbance adds for some samples */
+static real kick_of(const law_state *s, int q)
+{
+    real moved = s->told[q] - s->before[q];
+    return REAL(0.5) * s->kick[q] + (isfinite(moved) ? moved : 0);
+}
+
+static void feed_forward(law_state *s)
 {
     int i, q;
+    for (i = 0; i < INPUTS; i++)
+        for (q = 0, s->forward[i] = 0; q < DISTURBANCES; q++)
+            if (isfinite(s->told[q]))
+                s->forward[i] += forward_gain[i][q]
+                                 * (s->told[q] - forward_mean[q] + forward_lead[q] * kick_of(s, q));
+}
+
+/* A sample on, with the disturbances as they were told */
+static void pass_disturbances(law_state *s)
+{
+    int q;
+    for (q = 0; q < DISTURBANCES; q++) {
+        s->kick[q] = kick_of(s, q);
+        if (isfinite(s->told[q]))
+            s->before[q] = s->told[q];
+    }
+    feed_forward(s);
+}
+
+beadline_result beadline_tell(beadline_controller *c, const real *disturbances)
+{
     if (!c->ready)
         return BEADLINE_NOT_READY;
-    for (i = 0; i < INPUTS; i++) {
-        c->law.forward[i] = 0;
-        for (q = 0; q < DISTURBANCES; q++)
-            if (isfinite(disturbances[q]))
-                c->law.forward[i] += forward_gain[i][q] * (disturbances[q] - forward_mean[q]);
-    }
+    memcpy(c->law.told, disturbances, DISTURBANCES * sizeof *disturbances);
+    feed_forward(&c->law);
     return BEADLINE_DONE;
 }
 
@@ -126,6 +152,7 @@ beadline_result beadline_watch(beadline_controller *c, const real *u, const real
     memcpy(c->kept.asked, u, sizeof c->kept.asked);
     memcpy(c->kept.forward, c->law.forward, sizeof c->kept.forward);
     law_watch(&the_law, &c->law, u, filled, r);
+    pass_disturbances(&c->law);
     return BEADLINE_DONE;
 }
 
@@ -159,7 +186,6 @@ beadline_result beadline_restore(beadline_controller *c, const beadline_controll
     if (!all_finite(saved->law.z, MEMORY + OUTPUTS + INPUTS) || !all_finite(saved->kept.x, WATCH))
         return BEADLINE_BAD_INPUT;
     *c = *saved;
-    memcpy(c->law.forward, c->kept.forward, sizeof c->law.forward);
     if (c->kept.mode != MODE_OWN)
         c->fallback.seen = 0; /* the fallback begins anew, as where the object is restored */
     return BEADLINE_DONE;
@@ -198,6 +224,7 @@ static int drive(beadline_controller *c, const real *y, const real *r, real *u)
     }
     memcpy(k->asked, u, sizeof k->asked);
     memcpy(k->forward, c->law.forward, sizeof k->forward);
+    pass_disturbances(&c->law);
     k->mode = mode;
     return mode;
 }

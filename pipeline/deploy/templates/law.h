@@ -11,6 +11,7 @@ typedef struct {
     real z[MEMORY], xi[OUTPUTS], u[INPUTS];
     real r[OUTPUTS], feed[INPUTS], y_star[OUTPUTS];
     real forward[INPUTS]; /* what makes up for the disturbances */
+    real told[DISTURBANCES + 1], before[DISTURBANCES + 1], kick[DISTURBANCES + 1];
     member_state x[MEMBERS];
     int seen, aimed;
 } law_state;

@@ -6,7 +6,9 @@ A window model of the record, which is told inputs and disturbances, says both,
 
     y(t) = G_u u + G_d d + ...,    F = -pinv(G_u(1)) G_d(1),
 
-with G(1) the steady gains.
+with G(1) the steady gains. An input acts later than what it makes up for: cold filament is in the block at
+once, a heater's power only after the cartridge. So a change of d adds a kick to F d (law.FeedForward), as
+large as leaves the least error of the outputs over the AHEAD samples after a step of d.
 """
 
 from collections.abc import Sequence
@@ -15,30 +17,33 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.temperature.controllers import window
-from pipeline.temperature.controllers.law import FeedForward
+from pipeline.temperature.controllers.law import FADES, FeedForward
 from pipeline.temperature.plant import Plant, plant, simulate
 
 LONGEST, ENOUGH = 24, 20  # samples of the window, and for each of its columns
 BLOCKS = 8  # left out one by one: how sure a gain is
 DETERMINED = 2.0  # deviations from zero of a gain that is fed forward
+AHEAD, LONGEST_LEAD = 60, 10.0  # samples
 OWN = 0.005  # share of a disturbance's variance that inputs and other disturbances do not explain
 
 
 class Told(NamedTuple):
     """Disturbances d (q,): `effect` moves the outputs, from d less its `mean`, in °C; `high` is the level
-    above which a twentieth of the record lies; `gain` F (m, q) in percent a unit, and its `deviation`."""
+    above which a twentieth of the record lies; `gain` F (m, q) in percent a unit, and its `deviation`;
+    `lead` (q,) in samples."""
 
     effect: Plant
     mean: np.ndarray
     high: np.ndarray
     gain: np.ndarray
     deviation: np.ndarray
+    lead: np.ndarray
 
     @property
     def forward(self) -> FeedForward:
         """What is fed forward; a gain that the record does not tell from zero is not."""
         sure = np.abs(self.gain) >= DETERMINED * self.deviation
-        return FeedForward(np.where(sure, self.gain, 0.0), self.mean)
+        return FeedForward(np.where(sure, self.gain, 0.0), self.mean, self.lead)
 
 
 def learn(acting: Sequence[np.ndarray], y: Sequence[np.ndarray], inputs: int) -> Told | None:
@@ -66,8 +71,10 @@ def learn(acting: Sequence[np.ndarray], y: Sequence[np.ndarray], inputs: int) ->
     # jackknife over blocks; a block without which there is no stable model leaves everything open
     if len(gains) == BLOCKS:
         deviation[:, tells] = np.sqrt((BLOCKS - 1) * gains.var(axis=0))
-    d = whole[:, inputs:]
-    return Told(effect, d.mean(axis=0), np.quantile(d, 0.95, axis=0), gain, deviation)
+    d, lead = whole[:, inputs:], np.zeros(q)
+    # the middle of the models that each lack a block: one of the whole record may be chance
+    lead[tells] = np.median([_lead(one, inputs) for one in left if one is not None] or [[0.0]], axis=0)
+    return Told(effect, d.mean(axis=0), np.quantile(d, 0.95, axis=0), gain, deviation, lead)
 
 
 def _own_share(whole: np.ndarray, column: int) -> float:
@@ -113,6 +120,23 @@ def _forward(model: Plant, inputs: int) -> np.ndarray:
     return -np.linalg.pinv(steady[:, :inputs]) @ steady[:, inputs:]
 
 
+def _lead(model: Plant, inputs: int) -> np.ndarray:
+    """Samples (q,) by which the kick of each disturbance leaves the least squares of the outputs after a step
+    of it, with no feedback."""
+    F, q = _forward(model, inputs), model.B.shape[1] - inputs
+    step, kick, lead = np.ones(AHEAD), FADES ** np.arange(AHEAD), np.zeros(q)
+    still = model._replace(b=0 * model.b, d=0 * model.d)
+    for k in range(q):
+        acts = np.zeros((AHEAD, inputs + q))
+        acts[:, :inputs], acts[:, inputs + k] = step[:, None] * F[:, k], step
+        left = simulate(still, acts, np.zeros(model.n))[1]
+        acts[:, :inputs], acts[:, inputs + k] = kick[:, None] * F[:, k], 0.0
+        mends = simulate(still, acts, np.zeros(model.n))[1]
+        energy = float((mends**2).sum())
+        lead[k] = np.clip(-float((left * mends).sum()) / energy, 0.0, LONGEST_LEAD) if energy > 0 else 0.0
+    return lead
+
+
 def at_mean(
     told: Told | None, acting: Sequence[np.ndarray], y: Sequence[np.ndarray], inputs: int
 ) -> list[np.ndarray]:
@@ -140,9 +164,10 @@ def stored(told: Told) -> dict[str, tuple[np.ndarray, str, str]]:
         "high": (told.high, "unit", "95 % of the record lie below"),
         "gain": (told.gain, "percent per unit", "inputs that make up for a disturbance"),
         "deviation": (told.deviation, "percent per unit", "of the gain"),
+        "lead": (told.lead, "samples", "by which a change adds to what makes up for it"),
     }
 
 
 def restored(arrays: dict[str, np.ndarray]) -> Told:
     effect = plant(*(arrays[name] for name in "ABCD"), sample_time_s=float(arrays["sample_time_s"]))
-    return Told(effect, *(arrays[name] for name in ("mean", "high", "gain", "deviation")))
+    return Told(effect, *(arrays[name] for name in ("mean", "high", "gain", "deviation", "lead")))

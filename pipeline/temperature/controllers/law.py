@@ -633,11 +633,18 @@ AS_WISHED = 1e-9  # of an input's range, within which a command is the one that 
 
 
 class FeedForward(NamedTuple):
-    """What makes up for measured disturbances at rest: F = `gain` (m, q) in percent a unit of each, and their
-    `mean` (q,), at which nothing is added."""
+    """What makes up for measured disturbances d: inputs F (d - mean d + lead e), with F = `gain` (m, q) in
+    percent a unit of each, their `mean` (q,), at which nothing is added, and `lead` (q,) in samples. The kick
+    e of each follows its changes, because an input acts later than what it makes up for:
+
+    e(t) = FADES e(t-1) + d(t) - d(t-1)"""
 
     gain: np.ndarray
     mean: np.ndarray
+    lead: np.ndarray
+
+
+FADES = 0.5  # of a kick a sample later
 
 
 class Deployed(NamedTuple):
@@ -670,14 +677,32 @@ def deployed(
     return Deployed(law, limits, integral_limit, back, _shift(law.A), governor, holds, forward)
 
 
-def fed_forward(controller: Deployed, disturbances: np.ndarray) -> np.ndarray:
-    """F (d - mean d) (..., m) in percent of disturbances d (..., q); of one that is not told, NaN, its
-    mean is taken."""
+def fed_forward(controller: Deployed, disturbances: np.ndarray, kick: np.ndarray | float = 0.0) -> np.ndarray:
+    """F (d - mean d + lead e) (..., m) in percent of disturbances d (..., q) and kicks e; of one that is not
+    told, NaN, the mean is taken."""
     m = controller.law.D.shape[0]
     if controller.forward is None or controller.holds:
         return np.zeros((*np.shape(disturbances)[:-1], m))
-    gain, mean = controller.forward
-    return np.where(np.isnan(disturbances), 0.0, disturbances - mean) @ gain.T
+    gain, mean, lead = controller.forward
+    return np.where(np.isnan(disturbances), 0.0, disturbances - mean + lead * kick) @ gain.T
+
+
+def kicked(kick: np.ndarray, before: np.ndarray, disturbances: np.ndarray) -> np.ndarray:
+    """The kick e (..., q) of a sample on; of a disturbance that was not told before, or is not told now, it
+    fades."""
+    moved = disturbances - before
+    return FADES * kick + np.where(np.isnan(moved), 0.0, moved)
+
+
+def all_fed_forward(controller: Deployed, disturbances: np.ndarray) -> np.ndarray:
+    """What is fed forward (T, ..., m) of disturbances (T, ..., q) sample by sample."""
+    kick = np.zeros(np.shape(disturbances))
+    if controller.forward is not None and controller.forward.lead.any():
+        before = disturbances[0]
+        for t in range(1, len(disturbances)):
+            kick[t] = kicked(kick[t - 1], before, disturbances[t])
+            before = np.where(np.isnan(disturbances[t]), before, disturbances[t])
+    return fed_forward(controller, disturbances, kick)
 
 
 def compact(law: Law, N: int) -> Law:
@@ -888,10 +913,27 @@ class RunningController:
         self._reference: Reference | None = None
         self._w, self._t = np.zeros(0), 0
         self.forward = np.zeros(len(controller.law.D))
+        q = 0 if controller.forward is None else len(controller.forward.mean)
+        # disturbances as told now and a sample ago, and the kick of a sample ago
+        self._told, self._before, self._kick = np.full(q, np.nan), np.full(q, np.nan), np.zeros(q)
 
     def tell(self, disturbances: np.ndarray) -> None:
         """The disturbances d (q,) from this sample on, NaN for one that is not known."""
-        self.forward = fed_forward(self.controller, np.asarray(disturbances, float))
+        if self.controller.forward is not None:
+            self._told = np.array(disturbances, float)
+            self._feed_forward()
+
+    def _feed_forward(self) -> None:
+        kick = kicked(self._kick, self._before, self._told)
+        self.forward = fed_forward(self.controller, self._told, kick)
+
+    def _passed(self) -> None:
+        """A sample on, with the disturbances as they were told; one that is told none is fed `forward`."""
+        if np.isnan(self._told).all() and np.isnan(self._before).all():
+            return
+        self._kick = kicked(self._kick, self._before, self._told)
+        self._before = np.where(np.isnan(self._told), self._before, self._told)
+        self._feed_forward()
 
     def watch(self, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> None:
         """One sample in manual: inputs u (m,) applied, outputs y (p,) measured before, reference r (p,).
@@ -901,6 +943,7 @@ class RunningController:
         self._state = watched(
             self.controller, self._state, u[None], self._measured(y)[None], r[None], self.forward
         )
+        self._passed()
 
     def hand_over(self, y: np.ndarray, at: np.ndarray | None = None) -> None:
         """From manual to the law without a bump, at outputs y (p,) measured now, where the machine stands at
@@ -921,11 +964,13 @@ class RunningController:
         u, _, self._state = batch_step(
             self.controller, state, y[None], now, feed, y_star, self.forward, given
         )
+        self._passed()
         return u[0].copy()
 
     def saved(self) -> dict[str, np.ndarray]:
         """All that it remembers, as arrays. Raises ValueError before the first watch."""
         arrays = self._remembers()._asdict()
+        arrays |= {"told": self._told, "before": self._before, "kick": self._kick}
         if self._reference is not None:
             arrays |= {**self._reference._asdict(), "w": self._w, "t": np.array(self._t)}
         return {name: np.array(part) for name, part in arrays.items()}
@@ -945,6 +990,15 @@ class RunningController:
                 f"the controller expects finite numbers to be restored from but {', '.join(lost)} has some "
                 "that are not; restore an older save, or start with watch"
             )
+        told = [np.array(arrays[name]) for name in ("told", "before", "kick")]
+        if any(part.shape != self._kick.shape for part in told):
+            raise ValueError(
+                f"the controller expects to be restored with {len(self._kick)} disturbances but was given "
+                f"{told[2].size}; restore what a controller of the same law and governor saved"
+            )
+        self._told, self._before, self._kick = told
+        if len(self._kick):
+            self._feed_forward()
         self._state = ControllerState(**mine)
         self._reference = None
         if "w" in arrays:

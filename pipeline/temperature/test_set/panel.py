@@ -29,11 +29,11 @@ from pipeline.temperature.controllers.law import (
     Rest,
     Strength,
     aim,
+    all_fed_forward,
     batch_step,
     constant,
     deployed,
     feasible_target,
-    fed_forward,
     handed_over,
     ramp,
     rest,
@@ -453,7 +453,7 @@ def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Roll
     """Every case at once under one controller; `aimed` from `aims`."""
     r, target, feed = schedule(cases, aimed)
     usual = 0.0 if controller.forward is None else controller.forward.mean
-    held, forward = held_readings(cases), fed_forward(controller, cases.told + usual)
+    held, forward = held_readings(cases), all_fed_forward(controller, cases.told + usual)
     state = watched(controller, None, cases.u0, held[0], r[0])
     for measured in held[1:-1]:
         state = watched(controller, state, cases.u0, measured, r[0])
