@@ -1,13 +1,11 @@
 """What the mission's tests share: a copy of this checkout at toy sizes in a repository of its own, in which
 `./run` works with the environment of this process, and results that are made once for all workers."""
 
-import contextlib
-import fcntl
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -138,31 +136,6 @@ UNMADE = ("kept", "papers", "parts", "published")
 
 def params_of(path: Path) -> dict[str, Any]:
     return yaml.safe_load(path.read_text(encoding="utf-8"))
-
-
-@pytest.fixture(scope="session")
-def made_once(tmp_path_factory) -> Callable[[str, Callable[[Path], None]], Path]:
-    """made_once("owner", make): the folder that `make` filled, by one of the workers for all of them."""
-    base = tmp_path_factory.getbasetemp()
-    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "mission"
-    shared.mkdir(exist_ok=True)
-
-    def made(name: str, make: Callable[[Path], None]) -> Path:
-        with _locked(shared / f"{name}.lock"):
-            if not (shared / f"{name}.done").exists():
-                shutil.rmtree(shared / name, ignore_errors=True)
-                make(shared / name)
-                (shared / f"{name}.done").touch()
-        return shared / name
-
-    return made
-
-
-@contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    with path.open("w") as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
-        yield
 
 
 # ---- an owner's machine of two zones

@@ -110,13 +110,17 @@ def metrics(tree: Path, stage: str) -> dict:
     return artifacts.read_json(tree / f"datasets/{stage}/figures.json")
 
 
-@pytest.fixture(scope="module")
-def kit(root, shared, tmp_path_factory) -> Path:
+@pytest.fixture(scope="session")
+def kit(root, shared, made_once) -> Path:
     """The project after every stage."""
     recording = shared(RECORD)
-    tree = project(root, tmp_path_factory.mktemp("kit"), KIT | SMALL)
-    shutil.copy(recording, tree / "datasets/raw/temperature")
-    return run(tree, *STAGES)
+
+    def make(folder: Path) -> None:
+        tree = project(root, folder, KIT | SMALL)
+        shutil.copy(recording, tree / "datasets/raw/temperature")
+        run(tree, *STAGES)
+
+    return made_once("kit", make)
 
 
 # ---- the record
