@@ -48,6 +48,18 @@ class Machine(HotEnd):
         super().__init__(np.random.default_rng(seed), parts)
         self.at_s, self.duty, self.fan, self.taken_J = None, 0.0, 0.0, 0.0
 
+    def fail(self, what):
+        """A sensor that is slow, loose in its hole or stuck, or a heater that is dead, from now on."""
+        changed = {"slow": ("thermistor_s", 20 * self.parts.thermistor_s), "dead": ("power_W", 0.0)}
+        if what in changed:
+            self.parts = self.parts._replace(**dict([changed[what]]))
+        elif what == "stuck":
+            last = self.read()
+            self.read = lambda: last
+        else:
+            read, room = self.read, self.parts.room_degC
+            self.read = lambda: room + 0.6 * (read() - room)
+
     def until(self, now_s):
         self.at_s = now_s if self.at_s is None else self.at_s
         count = int((now_s - self.at_s + 0.001) / 0.05)
@@ -353,6 +365,9 @@ class Run:
         step = controller.step
         nan = np.array([np.nan])
         controller.step = None if how == "raises" else lambda *given: step(*given)._replace(u=nan)
+
+    def _fail(self, what):
+        self.machine.fail(what)
 
     def _listen(self):
         """From now on the controller's sample times and what it is told are kept, for `heard`."""

@@ -143,6 +143,17 @@ def test_a_missing_numpy_is_one_sentence(firmware, tmp_path):
     assert sentence.startswith("[beadline]: ") and "install numpy" in sentence
 
 
+@pytest.mark.parametrize("what", ["slow", "loose", "stuck", "dead"])
+def test_a_sensor_or_a_heater_that_fails_ends_in_off_or_shutdown(firmware, tmp_path, what):
+    """While the target changes by 10 degC every two minutes; the block stays below what the parts bear."""
+    moves = [step for k in range(8) for step in (["gcode", f"M104 S{200 + 10 * (k % 2)}"], ["wait", 120])]
+    out = played(firmware, tmp_path, [*HEATED, ["fail", what], *moves, ["status", OBJECTS]])
+    shut_down = any(state[1] == "shutdown" for state in out["states"])
+    assert shut_down or out["answers"][-1]["beadline"]["mode"] == "off"
+    duty, hottest = np.array(out["trace"])[:, 4], block(out)[1].max()
+    assert duty[-1] == 0.0 and hottest < 300.0
+
+
 @pytest.mark.parametrize("how", ["raises", "asks for no number"])
 def test_a_controller_that_fails_gives_the_heater_back_to_its_pid(firmware, tmp_path, how):
     steps = [*HEATED, ["break", how], ["wait", 200], ["status", OBJECTS], ["pid"]]
