@@ -305,7 +305,7 @@ def _questions_on_time(scale: MachinePace) -> list[str]:
     questions = []
     if time > clock:
         questions.append(
-            f"plant.sample_time_s {time:g} s: the file has a sample every {clock:g} s, of which {nth} is taken"
+            f"plant.sample_time_s {time:g} s: the file has a sample every {clock:g} s; {nth} is taken"
         )
     if time > fastest / FEWEST_SAMPLES:
         questions.append(
