@@ -321,7 +321,7 @@ def export(arguments: argparse.Namespace) -> None:
     Kalico; what sees and decides in the setpoint loop as weights with readers that need numpy alone."""
     from pipeline.commands.export import export as write
 
-    print(write(arguments.controller, arguments.to, arguments.out, arguments.section, arguments.power))
+    print(write(arguments.controller, arguments.to, arguments.out, arguments.section))
 
 
 def replay(arguments: argparse.Namespace) -> None:
@@ -471,7 +471,6 @@ def _add_export(commands: argparse._SubParsersAction) -> None:
     command.add_argument(
         "--section", default="extruder", choices=("extruder", "heater_bed"), help="of printer.cfg (extruder)"
     )
-    command.add_argument("--power", type=float, metavar="W", help="of the heater, for Kalico's MPC")
     command.set_defaults(run=export)
 
 

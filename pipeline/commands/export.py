@@ -51,7 +51,7 @@ KLIPPER is the folder of Klipper (often ~/klipper), CONFIG that of printer.cfg (
 }
 
 
-def files(made: Exported, shown: Certificate, to: str, section: str, power_W: float | None) -> dict[str, str]:
+def files(made: Exported, shown: Certificate, to: str, section: str) -> dict[str, str]:
     """The files of one form, name to text. Raises ValueError, naming what is missing, where the machine or
     the certificate does not allow it."""
     if to == "c":
@@ -59,16 +59,12 @@ def files(made: Exported, shown: Certificate, to: str, section: str, power_W: fl
         return texts | {"README.txt": f"{texts['README.txt']}\n{PLACING[to]}"}
     if to == "python":
         return {"controller.py": to_python.text(made, shown), "README.txt": PLACING[to]}
-    section_text = to_klipper.settings(made, shown, section=section, heater_power_W=power_W)
+    section_text = to_klipper.settings(made, shown, section=section)
     return {to_klipper.FILE: section_text, **to_klipper.module(made, shown), "README.txt": PLACING[to]}
 
 
-def export(folder: Path, to: str, out: Path | None, section: str, power_W: float | None) -> str:
+def export(folder: Path, to: str, out: Path | None, section: str) -> str:
     """Writes the files of one form, and says which and of what."""
-    if power_W is not None and not 0 < power_W < 1e5:
-        raise ValueError(
-            f"--power: expected the heater's power above 0 W, found {power_W:g}; read it off the heater"
-        )
     target = folder / to if out is None else out
     if target.exists() and not target.is_dir():
         raise ValueError(
@@ -78,7 +74,7 @@ def export(folder: Path, to: str, out: Path | None, section: str, power_W: float
     if shows_frames(folder):
         return _export_readers(folder, to, target)
     made, shown = machine.read(folder)
-    texts = files(made, shown, to, section, power_W)
+    texts = files(made, shown, to, section)
     with artifacts.together(target) as place:
         for name, text in texts.items():
             artifacts.write_text(place / name, text)

@@ -25,7 +25,7 @@ from pipeline.deploy.supervise import KINDS, MODES, Exported, Supervised
 from pipeline.deploy.vectors import TOLERANCE
 from pipeline.temperature.controllers import law
 from pipeline.temperature.controllers.law import ramp, sinusoid
-from pipeline.temperature.plant import Plant, hold_output
+from pipeline.temperature.plant import Plant
 from tests.deploy.deployed_machines import LAWS, block_and_sensor, exported, limits_of, passed, refused
 
 COMPILER = shutil.which("cc")
@@ -357,44 +357,12 @@ def test_nothing_is_exported_without_a_passed_certificate_of_this_controller(exp
 
 # ---- Klipper and Kalico
 
-POWER_W = 40.0
 
-
-def test_kalicos_parameters_are_those_of_the_block():
-    """The model is a block and a sensor: 20 J/K, 0.15 W/K, a lag of 8 s, by construction."""
-    found = to_klipper.mpc(block_and_sensor(zones=1), POWER_W)
-    expected = (20.0, 0.15, 1 / 8)
-    assert np.allclose(found[:3], expected, rtol=1e-6) and found.error < 1e-6
-
-
-@pytest.mark.parametrize("sample_time_s", [0.3, 1.0])
-def test_klippers_pid_settles_the_heater_by_klippers_own_formula(sample_time_s):
-    """Every 0.3 s, duty 0..1, gains divided by 255; from the room to 210 degC, overshoot under 3 degC."""
-    (Kp, Ki), T = to_klipper.pi_gains(exported(zones=1, sample_time_s=sample_time_s)), 0.3
-    plant = block_and_sensor(zones=1, sample_time_s=T)
-    x, integral, y = hold_output(plant, np.array([25.0]))[0], 0.0, []
-    for _ in range(4000):
-        y.append(float(plant.C[0] @ x + plant.d[0]))
-        error = 210.0 - y[-1]
-        wished = (Kp * error + Ki * (integral + T * error)) / 255.0
-        duty = min(max(wished, 0.0), 1.0)
-        integral += T * error if wished == duty else 0.0
-        x = plant.A @ x + plant.B @ [100.0 * duty] + plant.b
-    assert max(y) < 213.0 and abs(y[-1] - 210.0) < 0.2
-    assert max(abs(one - 210.0) for one in y[1500:]) < 2.0
-
-
-def test_the_settings_name_the_options_of_their_documentation():
-    """pid_Kp, pid_Ki, pid_Kd of Klipper's Config_Reference.md; heater_power, block_heat_capacity,
-    ambient_transfer, sensor_responsiveness of Kalico's MPC.md."""
-    of = exported(zones=1)
-    text = to_klipper.settings(of, passed(of), section="extruder", heater_power_W=POWER_W)
+def test_the_settings_name_what_the_module_reads():
+    of = exported("told", zones=1)
+    text = to_klipper.settings(of, passed(of), section="extruder")
     options = re.findall(r"^(?:# )?([a-z]\w+): ", text, re.M)
-    assert options == [
-        "heater", "plant", "rehearsal", "pid_Kp", "pid_Ki", "pid_Kd",
-        "control", "heater_power", "block_heat_capacity", "ambient_transfer", "sensor_responsiveness",
-    ]  # fmt: skip
-    assert "block_heat_capacity: 20  # J/K" in text and "ambient_transfer: 0.15  # W/K" in text
+    assert options == ["heater", "plant", "disturbance_fan", "disturbance_feed", "rehearsal"]
     assert "# rehearsal: True  # the plant was simulated" in text and sha256(passed(of)) in text
 
 
@@ -402,7 +370,7 @@ def test_the_settings_name_the_options_of_their_documentation():
 def test_the_settings_replace_neither_the_owner_s_pid_nor_max_temp(section):
     of = exported(zones=1)
     read = configparser.RawConfigParser()
-    read.read_string(to_klipper.settings(of, passed(of), section=section, heater_power_W=POWER_W))
+    read.read_string(to_klipper.settings(of, passed(of), section=section))
     assert read.sections() == ["beadline"] and set(read["beadline"]) == {"heater", "plant"}
     assert to_klipper.FILE != "printer.cfg"
 
@@ -413,7 +381,7 @@ def test_the_readme_for_klipper_is_followed_there_and_back(tmp_path):
     extras, config = tmp_path / "klipper/klippy/extras", tmp_path / "config"
     for folder in (home, extras, config):
         folder.mkdir(parents=True)
-    for name, text in export.files(of, passed(of), "klipper", "extruder", None).items():
+    for name, text in export.files(of, passed(of), "klipper", "extruder").items():
         (home / name).write_text(text)
     owned = "[extruder]\ncontrol = pid\npid_kp = 22.2\nmax_temp = 260\n\n#*# <--- SAVE_CONFIG --->\n"
     (config / "printer.cfg").write_text(owned)
@@ -435,7 +403,7 @@ def test_the_readme_for_klipper_is_followed_there_and_back(tmp_path):
 def test_the_readme_of_each_form_is_followed_there_and_back(tmp_path, to, place):
     of, home, target = exported(zones=1), tmp_path / "export", tmp_path / place
     home.mkdir(), target.mkdir()
-    for name, text in export.files(of, passed(of), to, "extruder", None).items():
+    for name, text in export.files(of, passed(of), to, "extruder").items():
         (home / name).write_text(text)
     there, back = (home / "README.txt").read_text().replace(f"{place}/", f"{target}/").split("Go back\n")
     for part, count in ((there, {"c": 4, "python": 1}[to]), (back, 0)):
@@ -452,17 +420,8 @@ def test_klipper_gets_no_machine_that_it_cannot_control():
         to_klipper.settings(two, passed(two), section="extruder")
     with pytest.raises(ValueError, match="section fan: expected one of extruder, heater_bed"):
         to_klipper.settings(of, passed(of), section="fan")
-    with pytest.raises(ValueError, match="heater_power: expected watts above zero but found -4"):
-        to_klipper.settings(of, passed(of), section="extruder", heater_power_W=-4.0)
     with pytest.raises(ValueError, match="its certificate was refused by rule poles"):
         to_klipper.settings(of, refused(of, "poles"), section="extruder")
-
-
-def test_kalico_gets_no_model_that_is_no_block_and_sensor():
-    model = block_and_sensor(zones=1)
-    rings = model._replace(A=np.array([[0.98, -0.2], [0.2, 0.98]]))
-    with pytest.raises(ValueError, match="off that of a heater block and a sensor"):
-        to_klipper.mpc(rings, POWER_W)
 
 
 def test_kinds_and_modes_have_the_same_numbers_in_c():

@@ -218,14 +218,14 @@ def test_another_network_is_told_by_its_values(our_agent, model, tmp_path):
 
 def test_the_command_exports_the_folder_of_the_stage(model, our_agent, tmp_path):
     to_setpoint.write(tmp_path / "made", to_setpoint.weights(model, our_agent))
-    told = export.export(tmp_path / "made", "python", tmp_path / "out", "extruder", None)
+    told = export.export(tmp_path / "made", "python", tmp_path / "out", "extruder")
     assert told.startswith("classifier, filter, agent. It has no certificate")
     names = {path.name for path in (tmp_path / "made").iterdir()}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names and len(names) == 6
     for name in names:
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "made" / name).read_bytes()
     with pytest.raises(ValueError, match="run in Python alone, found --to c; write --to python"):
-        export.export(tmp_path / "made", "c", None, "extruder", None)
+        export.export(tmp_path / "made", "c", None, "extruder")
     artifacts.write_text(tmp_path / "made" / "filter.safetensors", "broken")
     with pytest.raises(ValueError, match=r"filter.safetensors holds no whole weights"):
-        export.export(tmp_path / "made", "python", None, "extruder", None)
+        export.export(tmp_path / "made", "python", None, "extruder")
