@@ -453,7 +453,7 @@ def test_a_state_of_another_controller_is_refused(governed: bool):
         in_control(governed=governed).restore(own | {"xi": own["xi"] * np.nan})
 
 
-def test_a_state_is_four_arrays():
+def test_a_state_is_four_arrays_and_what_was_told():
     controller = RunningController(deployed(lqg(baam()), LIMITS, integral_limit=1.0), baam())
     controller.watch(np.full(7, 0.4), np.full(5, 150.0), REFERENCE)
-    assert tuple(controller.saved()) == ControllerState._fields
+    assert tuple(controller.saved()) == (*ControllerState._fields, "told", "before", "kick")
