@@ -17,8 +17,6 @@ GAP_INTERVALS = 3.0
 # silence is no gap
 PERIODIC_SHARE = 0.95
 JITTER_SHARE, JITTER_OFTEN = 0.1, 0.01
-# commands of which more are overtaken by another before the next sample are averaged over the sample
-OVERTAKEN = 0.1
 # a recording of which more than that was left out is a finding, % of its rows or samples
 MOST_CUT_PERCENT = 5.0
 
@@ -85,7 +83,6 @@ def resample(
     commands = _once_a_clock(clocks, inputs, lambda own: _last_command(own, time, sample_time_s))
     neighbours = _once_a_clock(clocks, outputs, lambda own: _neighbours(own, time, sample_time_s))
     effects = _once_a_clock(clocks, inputs, lambda own: _effect(own, time, segment, sample_time_s))
-    averaged = [*averaged, *(n for n in inputs if n not in averaged and _overtaken(effects[n], len(time)))]
     values = {name: raw.signals[name][1][commands[name]] for name in inputs}
     values |= {name: _interpolate(*raw.signals[name], time, neighbours[name]) for name in outputs}
     values |= {name: _means(*raw.signals[name], time, sample_time_s) for name in inputs if name in averaged}
@@ -102,14 +99,6 @@ def resample(
         flags += _flag(name, "missing", time[mask], message)
     table = Table(raw.path, segment, time, values, masked, flags, jitter)
     return mask_mixed(table, {name: raw.signals[name] for name in outputs})
-
-
-def _overtaken(effect: _Effect | None, samples: int) -> bool:
-    """Whether more than OVERTAKEN of the samples lose a command to a later one."""
-    if effect is None:
-        return False
-    k, _, counts = effect
-    return (np.diff(k[counts]) == 0).sum() > OVERTAKEN * samples
 
 
 def hold(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarray:

@@ -54,12 +54,8 @@ KIT = {
 }
 # fewer of the same, so that the test is short
 SMALL = {
-    "panel.steps": 200,
-    "panel.judging.plants": 6,
-    "panel.judging.starts_degC": [20],
-    "panel.judging.sequence_offsets_degC": [0, 5],
+    "panel.judging.plants": 12,
     "panel.training.plants": 4,
-    "panel.training.sequence_offsets_degC": [],
     "tune_weights.practical_initial": 6,
     "tune_weights.practical_evaluations": 10,
 }
@@ -231,7 +227,7 @@ def test_every_contestant_is_judged_as_deployed_on_plants_of_the_record(kit):
     judged = figures["contestants"]
     assert {"hold", "pi_simc", "pi", "subspace_lqg", "varx_riccati"} <= set(judged)
     assert "exact_model" not in judged  # nobody knows the true plant
-    assert not figures["simulated"] and figures["plants"] == 6
+    assert not figures["simulated"] and figures["plants"] == 12
     for name in ("pi_simc", "subspace_lqg", "varx_riccati"):
         # half of what the rule lets a controller miss at its 90 % quantile: 10 candidates are no tuning yet
         assert judged[name]["settled_error"]["median"] < 0.25
