@@ -132,6 +132,7 @@ MOST_STEP_DEGC = 5.0  # what moves by more at first was perhaps switched on
 MISSING, AT_LIMIT = 0.4, 0.1
 MISSING_FOR, DOOR_S = 60, 110.0  # for so many samples, and longer than a door is open
 FAR_DEGC = 1e4  # no machine is so hot: its model is unstable, and no reading corrects it
+SETTLES = 30  # samples from the first, in which the observer finds the machine and no forecast begins
 BACK_S = 30.0  # without a cause, after which the law takes over again
 RETURNS = 3  # times an hour that heaters which went off are tried again
 
@@ -607,9 +608,10 @@ def follow(s: Supervision, k: Kept, y: np.ndarray, applied: np.ndarray | None, s
     silent = np.isnan(k.y)
     counts = read(s, k, y)
     begins = k.counters[SAMPLES] == 0 or (silent & counts).any()
+    settles = samples == 0 or k.counters[SAMPLES] < SETTLES
     for step in range(max(samples, 1) if k.counters[SAMPLES] else 0):
         advance(s, k, u)
-        if samples == 0:
+        if settles and not step:
             k.x[...] += s.hurried @ k.e
         elif step:
             k.e[:] = 0.0
@@ -618,20 +620,18 @@ def follow(s: Supervision, k: Kept, y: np.ndarray, applied: np.ndarray | None, s
         k.x[:] = s.start @ np.where(np.isfinite(k.y), k.y, s.d) + s.start_0
         k.expected[:], k.slow[:], k.age[:] = s.C @ k.x + s.d, 0.0, -1
     filled = np.where(counts, y, k.expected)
-    if samples == 0:
+    k.usual[:] = u if samples == 0 and k.counters[SAMPLES] < 2 else k.usual + SLOWLY * (u - k.usual)
+    k.stirred[:] = 0.0 if samples == 0 else np.maximum(np.abs(u - k.usual), (1 - RESTS) * k.stirred)
+    if settles:
         k.age[:] = -1
         k.slow[:] = k.x[-len(s.d) :]
-        k.usual[:] = u if k.counters[SAMPLES] < 2 else k.usual + SLOWLY * (u - k.usual)
-        k.stirred[:] = 0.0
     else:
         k.slow[...] += SLOWLY * (k.x[-len(s.d) :] - k.slow)
-        k.usual[...] += SLOWLY * (u - k.usual)
-        k.stirred[:] = np.maximum(np.abs(u - k.usual), (1 - RESTS) * k.stirred)
         compare(s, k, filled, counts)
         judge(s, k, filled, counts)
     k.e[:] = np.where(counts, filled - k.expected, 0.0)
     forget(s, k)
-    if samples and k.counters[SAMPLES] % SPACING == 0:
+    if not settles and k.counters[SAMPLES] % SPACING == 0:
         begin_window(s, k, k.counters[SAMPLES] // SPACING % WINDOWS)
     k.counters[SAMPLES] += 1
     return filled

@@ -225,6 +225,7 @@ def tables(exported: Exported) -> str:
             "\n/* ---- the safe mode own */\n\n",
             define("HAS_FALLBACK", int(own is not None)),
             "#define the_fallback the_law\n" if own is None else _law("the_fallback", own),
+            define("FADES", law.FADES),
             _forward("forward", exported),
             supervising(exported.supervision),
         ]
@@ -389,7 +390,7 @@ def _law(name: str, deployed: Deployed) -> str:
 OF_SUPERVISOR = (
     "SPACING", "STILL_AFTER", "FIT_AFTER", "STEPS_STILL", "NOISE_STILL", "SAME_STEPS", "SAME_NOISE",
     "CLEARED_S", "CLEARER", "MISFIT", "DOUBT", "RESTS", "REPEATED", "SHOWN", "SLOWLY",
-    "EARLY", "JUMP", "BACK_S", "RETURNS", "MOST_STEP_DEGC", "MISSING", "AT_LIMIT", "FAR_DEGC",
+    "EARLY", "JUMP", "SETTLES", "BACK_S", "RETURNS", "MOST_STEP_DEGC", "MISSING", "AT_LIMIT", "FAR_DEGC",
 )  # fmt: skip
 OF_OBSERVER = (
     "A",

@@ -12,6 +12,9 @@ from pipeline.temperature.controllers.law import ActuatorLimits, Reference, ramp
 from pipeline.temperature.controllers.law import deployed as deploy
 from pipeline.temperature.plant import plant
 from pipeline.temperature.test_set.panel import delayed
+from tests.foreign.hot_end import HotEnd
+from tests.klipper.machines import HOT_ENDS, TARGET_DEGC
+from tests.klipper.machines import exported as hot_end
 
 LOW, HIGH = np.zeros(2), np.full(2, 100.0)
 NOISE, ROOM, R = 0.1, 20.0, np.array([150.0, 180.0])
@@ -537,3 +540,22 @@ def test_bad_input_is_refused_in_a_sentence():
     arrays = saved.saved() | {"slow": np.zeros(3)}
     with pytest.raises(ValueError, match="restored from slow of shape"):
         run.supervised.restore(arrays)
+
+
+@pytest.mark.parametrize(("stuck_on", "named"), [(False, set()), (True, {"heater_stuck_on"})])
+def test_a_restart_while_hot_is_no_fault_and_a_heater_that_is_stuck_on_then_is_named(stuck_on, named):
+    """Two samples in manual tell little of a hot machine; its heater gives 70 % of what the model says."""
+    parts = HOT_ENDS[0]
+    machine = HotEnd(np.random.default_rng(0), parts._replace(power_W=0.7 * parts.power_W))
+    machine.cartridge = machine.block = machine.thermistor = TARGET_DEGC - 4
+    one, r = Supervised(hot_end(parts), rehearsal=True), np.array([TARGET_DEGC])
+    for _ in range(2):
+        one.watch(np.zeros(1), np.array([machine.read()]), r)
+        machine.advance(0.0, 0.0, 1.0)
+    one.hand_over(np.array([machine.read()]))
+    kinds = set()
+    for t in range(100 if stuck_on else 200):
+        decision = one.step(np.array([machine.read()]), r, float(t))
+        kinds |= {cause.kind for cause in decision.causes}
+        machine.advance(100.0 if stuck_on else decision.u[0], 0.0, 1.0)
+    assert kinds == named

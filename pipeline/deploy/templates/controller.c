@@ -85,7 +85,7 @@ beadline_result beadline_init(beadline_controller *c, const beadline_machine *ma
 static real kick_of(const law_state *s, int q)
 {
     real moved = s->told[q] - s->before[q];
-    return REAL(0.5) * s->kick[q] + (isfinite(moved) ? moved : 0);
+    return FADES * s->kick[q] + (isfinite(moved) ? moved : 0);
 }
 
 static void feed_forward(law_state *s)

@@ -468,16 +468,12 @@ static void forget(supervisor_kept *k)
         end_windows(k);
 }
 
-static void follow_law(supervisor_kept *k, const real *u, const real *y, const int *counts)
+static void follow_law(supervisor_kept *k, const real *y, const int *counts)
 {
     real moves[WINDOWS][OUTPUTS];
-    int still[WINDOWS][OUTPUTS], i, j;
+    int still[WINDOWS][OUTPUTS], j;
     for (j = 0; j < OUTPUTS; j++)
         k->slow[j] += SLOWLY * (k->x[WATCH - OUTPUTS + j] - k->slow[j]);
-    for (i = 0; i < INPUTS; i++) {
-        k->usual[i] += SLOWLY * (u[i] - k->usual[i]);
-        k->stirred[i] = largest(fabs(u[i] - k->usual[i]), (1 - RESTS) * k->stirred[i]);
-    }
     compare(k, y, counts);
     judge_heat(k, y, counts);
     clear_sensors(k, counts, moves, still);
@@ -504,7 +500,7 @@ static void begin_anew(supervisor_kept *k)
 static void follow(supervisor_kept *k, const real *y, const real *applied, int samples, real *filled)
 {
     real u[INPUTS];
-    int counts[OUTPUTS], begins = !k->samples, i, j, step;
+    int counts[OUTPUTS], begins = !k->samples, settles = !samples || k->samples < SETTLES, i, j, step;
     for (j = 0; j < OUTPUTS; j++)
         begins |= isnan(k->y[j]) && isfinite(y[j]) && y[j] >= supervisor_coldest[j] && y[j] <= supervisor_hottest[j];
     for (i = 0; i < INPUTS; i++)
@@ -514,7 +510,7 @@ static void follow(supervisor_kept *k, const real *y, const real *applied, int s
     read_sensors(k, y, counts);
     for (step = 0; k->samples && step < (samples > 1 ? samples : 1); step++) {
         advance(k, u);
-        if (!samples)
+        if (settles && !step)
             add_product(k->x, supervisor_hurried[0], k->e, WATCH, OUTPUTS);
         else if (step)
             memset(k->e, 0, sizeof k->e);
@@ -527,19 +523,19 @@ static void follow(supervisor_kept *k, const real *y, const real *applied, int s
         k->expected[j] = forecast(k->x, j);
         filled[j] = counts[j] ? y[j] : k->expected[j];
     }
-    if (!samples) {
+    for (i = 0; i < INPUTS; i++) {
+        k->usual[i] = !samples && k->samples < 2 ? u[i] : k->usual[i] + SLOWLY * (u[i] - k->usual[i]);
+        k->stirred[i] = samples ? largest(fabs(u[i] - k->usual[i]), (1 - RESTS) * k->stirred[i]) : 0;
+    }
+    if (settles) {
         end_windows(k);
         memcpy(k->slow, k->x + WATCH - OUTPUTS, sizeof k->slow);
-        for (i = 0; i < INPUTS; i++) {
-            k->usual[i] = k->samples < 2 ? u[i] : k->usual[i] + SLOWLY * (u[i] - k->usual[i]);
-            k->stirred[i] = 0;
-        }
     } else
-        follow_law(k, u, filled, counts);
+        follow_law(k, filled, counts);
     for (j = 0; j < OUTPUTS; j++)
         k->e[j] = counts[j] ? filled[j] - k->expected[j] : 0;
     forget(k);
-    if (samples && k->samples % SPACING == 0)
+    if (!settles && k->samples % SPACING == 0)
         begin_window(k, k->samples / SPACING % WINDOWS);
     k->samples++;
 }
