@@ -53,13 +53,11 @@ def trust(evidence: Evidence) -> Verdict:
             ("simulate", "to simulate"),
         )
     }
-    # a rule that some use needs comes before one that is only a reservation
-    needed = [
-        rule
-        for key, rule in rules.items()
-        if any(_needed(key, rule, use) for use in rows(LOOP)[key].needed_for)
-    ]
-    first = deciding(needed) or deciding(rules.values())
+    # a rule that the design needs comes before one that only another use needs, and that before a reservation
+    first = None
+    for use in ("design", "predict", "simulate"):
+        first = first or deciding([rule for key, rule in rules.items() if _needed(key, rule, use)])
+    first = first or deciding(rules.values())
     ended = overall(list(uses.values()))
     if first is None:
         weakest, least = min(
