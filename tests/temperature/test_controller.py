@@ -449,6 +449,8 @@ def test_a_state_of_another_controller_is_refused(governed: bool):
     own = in_control(governed=governed).saved()
     with pytest.raises(ValueError, match="restore what a controller of the same law and governor saved"):
         in_control(governed=governed).restore({"z": own["z"]})
+    with pytest.raises(ValueError, match="restore what a controller of the same law and governor saved"):
+        in_control(governed=governed).restore({name: own[name] for name in own if name != "told"})
     with pytest.raises(ValueError, match="but xi has some that are not"):
         in_control(governed=governed).restore(own | {"xi": own["xi"] * np.nan})
 

@@ -978,28 +978,24 @@ class RunningController:
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Goes on from what another of the same law and governor `saved`. Raises ValueError where its arrays
         are not those of this law and governor, or not finite."""
-        mine = {name: np.array(arrays[name]) for name in ControllerState._fields if name in arrays}
-        given, expected = {name: part.shape for name, part in mine.items()}, _shapes(self.controller)
+        state, told = ControllerState._fields, ("told", "before", "kick")
+        mine = {name: np.array(arrays[name]) for name in (*state, *told) if name in arrays}
+        given = {name: part.shape for name, part in mine.items()}
+        expected = _shapes(self.controller) | dict.fromkeys(told, self._kick.shape)
         if given != expected:
             raise ValueError(
                 f"the controller expects to be restored from arrays of shapes {expected} but was given "
                 f"{given}; restore what a controller of the same law and governor saved"
             )
-        if lost := [name for name, part in mine.items() if not np.isfinite(part).all()]:
+        if lost := [name for name in state if not np.isfinite(mine[name]).all()]:
             raise ValueError(
                 f"the controller expects finite numbers to be restored from but {', '.join(lost)} has some "
                 "that are not; restore an older save, or start with watch"
             )
-        told = [np.array(arrays[name]) for name in ("told", "before", "kick")]
-        if any(part.shape != self._kick.shape for part in told):
-            raise ValueError(
-                f"the controller expects to be restored with {len(self._kick)} disturbances but was given "
-                f"{told[2].size}; restore what a controller of the same law and governor saved"
-            )
-        self._told, self._before, self._kick = told
+        self._told, self._before, self._kick = (mine[name] for name in told)
         if len(self._kick):
             self._feed_forward()
-        self._state = ControllerState(**mine)
+        self._state = ControllerState(*(mine[name] for name in state))
         self._reference = None
         if "w" in arrays:
             reference = Reference(*(np.array(arrays[name]) for name in Reference._fields))
