@@ -88,7 +88,6 @@ def walk(foreign: DepositionMachine, routines: list[dict[str, float]]) -> dict[i
     return errors
 
 
-@pytest.mark.xfail(strict=True, raises=TWICE, reason="routines are told apart by speed and pause alone")
 def test_all_commands_of_next_are_played_for_three_rounds(project):
     errors = walk(machine(), [REFERENCE, *LIKE_THE_SHIPPED])
     for of_routine in errors.values():
@@ -96,7 +95,6 @@ def test_all_commands_of_next_are_played_for_three_rounds(project):
 
 
 @pytest.mark.full
-@pytest.mark.xfail(strict=True, raises=TWICE, reason="routines are told apart by speed and pause alone")
 def test_all_commands_of_the_shipped_routines_are_played_for_three_rounds(shipped):
     slow = PneumaticSyringe(fill_s=2.9, vent_s=2.4)
     errors = walk(machine(slow, frames_hz=10.0), shipped)
@@ -104,11 +102,6 @@ def test_all_commands_of_the_shipped_routines_are_played_for_three_rounds(shippe
         assert of_routine[2] <= 0.2 * of_routine[0]
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=pytest.RaisesExc(Refused, match="material A, routine 0: identify: expected a flow that follows"),
-    reason="the recording of a routine is taken for another one of the same speed and pause",
-)
 def test_the_recording_of_one_routine_alone_is_learned_as_that_routine(project):
     play(machine(), NEXT / "A_routine_1_trial_00.csv", [REFERENCE, *LIKE_THE_SHIPPED], seed=0)
     run_stage("train_ilc")
@@ -117,7 +110,6 @@ def test_the_recording_of_one_routine_alone_is_learned_as_that_routine(project):
     ]  # fmt: skip
 
 
-@pytest.mark.xfail(strict=True, raises=IndexError, reason="the page wants trials of the reference routine")
 def test_the_page_is_written_when_the_reference_routine_is_not_recorded_yet(two_speeds):
     play(machine(), NEXT / "A_routine_1_trial_00.csv", [REFERENCE, SLOWER], seed=0)
     run_stage("train_ilc")
@@ -125,11 +117,6 @@ def test_the_page_is_written_when_the_reference_routine_is_not_recorded_yet(two_
     assert Path("reports/deposition.html").exists()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=pytest.RaisesExc(Refused, match="zero-size array to reduction operation maximum"),
-    reason="the page wants a trial",
-)
 def test_the_pages_of_a_machine_without_a_trial_are_written_and_say_so(project):
     run_stage("report")
     text = page_text(Path("reports/deposition.html"))

@@ -334,7 +334,7 @@ def test_on_a_real_machine_a_part_that_is_not_judged_has_no_figure_anywhere(proj
     assert "Not ready for a supervised trial. First undecided rule: every forecast judged." in text
     assert "is not judged: the part prints at 100 mm/s. What the parts come to is not known." in text
     card = index[index.index("Plunger command to flow at the nozzle") : index.index("Nozzle camera to")]
-    board = text.split("Share of the printing time")[0]
+    board = text.split("Learning, trial after trial")[0]
     assert "square" not in card.split("Flow error ≤")[1] and "Line volume ±3 % not measured" in card
     for figure in ("2.0 %", "12 %"):
         assert figure not in board and figure not in card
