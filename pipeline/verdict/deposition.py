@@ -8,7 +8,7 @@ import pandas as pd
 
 from pipeline.deposition.controllers import COMPOSERS as TABLE
 from pipeline.verdict.digits import THIN, count, number, percent, short
-from pipeline.verdict.evidence import Evidence, lookup, need
+from pipeline.verdict.evidence import Evidence, Figures, lookup, need
 from pipeline.verdict.rules import Reading, Row, at_path, judge, rows
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import (
@@ -45,6 +45,8 @@ USE = {
     "superposition": "the library by superposition",
     "basis": "the basis functions",
 }
+# what is made from the trials of the deposition loop
+COMPOSED = ("library", "learned", "signals", "scores", "tasks", "lines", "conformance")
 # what to do if no trial is recorded yet
 FIRST_TRIALS = (
     "Play the commands of datasets/train_ilc/next, put their recordings into datasets/raw/deposition, and "
@@ -57,6 +59,23 @@ NO_FORECAST = {"reason": "the conformance report has none", "trial": "run ./run 
 def phrase(name: str) -> str:
     """ "the basis functions"; a composer without a phrase goes by its heading."""
     return USE.get(name, NAMES.get(name, name))
+
+
+def untried(figures: Figures) -> bool:
+    """Whether no trial of a real deposition machine is recorded yet."""
+    learning = figures["train_ilc"]
+    return isinstance(learning, Mapping) and not any("pixels" in laws for laws in learning.values())
+
+
+def of_recorded_trials(figures: Figures, tables: Mapping[str, Any]) -> dict[str, Any]:
+    """The tables of a machine whose trials are recorded: a Missing in the place of what no trial of it, or
+    only simulated trials, made."""
+    scores, gap = tables["scores"], None
+    if untried(figures):
+        gap = Missing("not measured", "No trial is recorded yet")
+    elif not isinstance(scores, Missing) and REFERENCE in scores["composer"]:
+        gap = Missing("stale", "It was made from simulated trials", "Run ./run dvc repro compose_parts")
+    return dict(tables) if gap is None else {**tables, **dict.fromkeys(set(COMPOSED) & set(tables), gap)}
 
 
 class Score(NamedTuple):
@@ -130,8 +149,6 @@ class Structure(NamedTuple):
 def structures(evidence: Evidence) -> list[Structure] | Missing:
     """Every material of every part, in the order of the table."""
     table = evidence.tables["scores"]
-    if _untried(evidence):
-        return Missing("not measured", "No trial is recorded yet")
     if isinstance(table, Missing):
         return table
     groups = pd.DataFrame(table).groupby(["part", "material"], sort=False)
@@ -147,16 +164,6 @@ def unknown_streams(evidence: Evidence) -> set[tuple[str, str]]:
     return {
         (part.part, part.material) for part in ([] if isinstance(parts, Missing) else parts) if part.unknown()
     }
-
-
-def _untried(evidence: Evidence) -> bool:
-    """Whether the trials are a machine's own and none is recorded yet."""
-    learning = evidence.figures["train_ilc"]
-    return (
-        evidence.recorded("train_ilc")
-        and not isinstance(learning, Missing)
-        and not any("pixels" in laws for laws in learning.values())
-    )
 
 
 def _structure(rows: pd.DataFrame, rules: ReportRules, conformance: Mapping[str, Any]) -> Structure:
@@ -550,7 +557,7 @@ def verdict(evidence: Evidence) -> Verdict:
             decision=words.undecided,
             lead="Nothing was composed.",
             reason=parts.sentence(),
-            remedy=FIRST_TRIALS if _untried(evidence) else "",
+            remedy=FIRST_TRIALS if machine and untried(evidence.figures) else "",
             rule="",
             winner="",
             note=_price(evidence, []),

@@ -49,7 +49,7 @@ def _judged(sources: Sources, name: str) -> Table | Missing:
     streams = zip(table["part"].tolist(), materials, strict=True)
     rows = np.array([stream not in unknown for stream in streams])
     if not rows.any():
-        return Missing(NOT_JUDGED, "no forecast may be shown: see the first undecided rule")
+        return Missing(NOT_JUDGED, "The verdict says which trial judges it")
     return {column: values[rows] for column, values in table.items()}
 
 

@@ -27,6 +27,7 @@ from pipeline.store import artifacts
 from pipeline.temperature import tables as schemas
 from pipeline.temperature.settings import Plant
 from pipeline.verdict import night
+from pipeline.verdict.deposition import of_recorded_trials
 from pipeline.verdict.evidence import OFF, Evidence, Table, switched_off
 from pipeline.verdict.settings import QUICK_LOOK, ReportRules
 from pipeline.verdict.verdict import LOOPS, Missing, Verdict, read_certificates
@@ -179,6 +180,8 @@ def collect(
             del read[path]
         elif isinstance(tables[name], Missing):
             absent[path] = tables[name]
+    if declared.everything["train_ilc"]["source"] == "recordings":
+        tables = of_recorded_trials(figures, tables)
     # the pages show one routine, a third of all rows; the viewer shows every one
     tables["every_lesson"], tables["lessons"] = tables["lessons"], first_routine(tables["lessons"])
     for name, stage in (("frames", "train_ilc"), ("nozzle_frames", "train_classifier")):
