@@ -2,6 +2,7 @@
 with topics of their own and a turned camera are put into datasets/raw/deposition, and the stage is called
 again."""
 
+import json
 import re
 from pathlib import Path
 
@@ -17,7 +18,6 @@ from tests.mission.toy_deposition import (
     REFERENCE,
     ROOT,
     SHORT,
-    Refused,
     lay_out,
     machine,
     page_text,
@@ -26,9 +26,6 @@ from tests.mission.toy_deposition import (
     run_stage,
 )
 
-TWICE = pytest.RaisesExc(
-    Refused, match=r"_routine_1_trial_00\.mcap: trial 0 of material A is in .*_routine_0_trial_00\.mcap too"
-)
 SLOWER = {"speed_mm_per_s": 5.0, "pause_s": 0.4, **SHORT}
 
 
@@ -122,3 +119,20 @@ def test_the_pages_of_a_machine_without_a_trial_are_written_and_say_so(project):
     text = page_text(Path("reports/deposition.html"))
     assert text.count("datasets/train_ilc/next") == 1, "what to do is said once"
     assert not re.search(r"is predicted|better|worse than|flow error forecast", text)
+
+
+@pytest.mark.full
+def test_every_forecast_of_the_shipped_parts_is_judged_on_the_shipped_machine(tmp_path, monkeypatch):
+    """The lengths and the drive of params.yaml; nothing is filmed, and whole parts are hardly learned."""
+    monkeypatch.chdir(tmp_path)
+    names = tuple(path.stem for path in sorted((ROOT / "datasets/parts").glob("*.gcode")))
+    changes = {"train_ilc.pixel_trials": 0, "compose_parts.full_part_updates": 1, "execution.jobs": 1}
+    lay_out(changes, names)
+    for stage in ("train_ilc", "segment_library", "compose_parts"):
+        run_stage(stage)
+    figures = json.loads(Path("datasets/compose_parts/figures.json").read_text())
+    streams = {(name, material): one for name in names for material, one in figures[name].items()}
+    assert {place[0] for place in streams} == set(names)
+    for place, stream in streams.items():
+        assert stream["judged"]["judged"], f"{place}: {stream['judged']['reason']}"
+        assert stream["true"] <= stream["forecast"]["high"], place

@@ -49,10 +49,11 @@ G0 X-40 Y48
 
 
 class Walk(NamedTuple):
-    """The project's folder, and what was played in each round."""
+    """The project's folder, what was played in each round, and what `beadline compose` printed."""
 
     folder: Path
     rounds: list[list[Played]]
+    composed: str
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +70,8 @@ def walk(tmp_path_factory) -> Walk:
         for name in ("segment_library", "compose_parts", "report"):
             run_stage(name)
         Path("square.gcode").write_text(PROGRAM)
-        beadline("compose", "square.gcode", "--as", "csv,parquet,mcap,gcode", "--out", "jobs")
-    return Walk(folder, rounds)
+        composed = beadline("compose", "square.gcode", "--as", "csv,parquet,mcap,gcode", "--out", "jobs")
+    return Walk(folder, rounds, composed)
 
 
 @pytest.fixture(scope="module")
@@ -232,6 +233,11 @@ def test_no_number_of_a_forecast_is_shown_when_none_is_judged(walk, unjudged):
     shown = (predicted - planned) & set(re.findall(r"\d+\.?\d*", unjudged[0]))
     assert not shown, f"predicted volumes are shown of parts that nobody judged: {sorted(shown)}"
     assert not re.search(r"is predicted|better|worse than", unjudged[0])
+
+
+def test_the_command_line_gives_no_volume_of_a_part_that_is_not_judged(walk):
+    assert "forecast not judged" in walk.composed
+    assert not re.search(r"volume of \d+ lines?|flow error forecast", walk.composed)
 
 
 def test_that_nothing_is_judged_is_said_once(unjudged):
