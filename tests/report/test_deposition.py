@@ -2,6 +2,7 @@
 missing, hostile text, a real machine, sizes."""
 
 import re
+import types
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from pipeline.deposition.parts import extrusion, part_report
 from pipeline.deposition.settings import Printer
 from pipeline.deposition.tables import SIGNALS
 from pipeline.deposition.toolpath import gcode
+from pipeline.report.deposition import change
 from pipeline.store import artifacts, params
 from pipeline.verdict import deposition as rules
 from pipeline.verdict.evidence import Evidence
@@ -211,6 +213,8 @@ def test_without_a_declared_drive_the_verdict_is_open_and_says_what_to_declare(p
     sections = params.read("params.yaml")
     sections["train_ilc"]["source"] = source
     Path("params.yaml").write_text(yaml.safe_dump(sections))
+    if source == "recordings":
+        made.deposition(REAL)
     undeclared = DRIVEN | {"amplitude_mm": None, "speed_mm_per_s": None, "share_percent": 0.0, "enough": True}
     conformance(saturation={"A": undeclared})
     text = page()
@@ -334,10 +338,39 @@ def test_on_a_real_machine_a_part_that_is_not_judged_has_no_figure_anywhere(proj
     assert "Not ready for a supervised trial. First undecided rule: every forecast judged." in text
     assert "is not judged: the part prints at 100 mm/s. What the parts come to is not known." in text
     card = index[index.index("Plunger command to flow at the nozzle") : index.index("Nozzle camera to")]
-    board = text.split("Share of the printing time")[0]
+    board = text.split("Learning, trial after trial")[0]
     assert "square" not in card.split("Flow error ≤")[1] and "Line volume ±3 % not measured" in card
     for figure in ("2.0 %", "12 %"):
         assert figure not in board and figure not in card
+
+
+def test_on_a_real_machine_that_is_not_judged_nothing_is_compared_and_no_line_is_to_be_mended(project):
+    recordings()
+    made.deposition(REAL | {"basis": (120.0, 120.0, 9.0)})  # by its forecast on-off control would be better
+    conformance(shorter_than_lead=4)
+    unjudged()
+    text = page()
+    assert "Not ready for a supervised trial. First undecided rule: every forecast judged." in text
+    assert not re.search(r"Mend these lines|on‑off control comes closest|chose wrongly|·\s*worse", text)
+    part = rules.Structure("square", "A", {"basis": rules.Score(98.0, 98.0, 9.0, judged=False)}, "basis",
+                           params.load(ReportRules, "report"), simulated=False)  # fmt: skip
+    then = {"metrics": {"compose_parts": {"square": {"A": {
+        "chosen": "basis", "basis": {"rms_percent_of_on_off": 17.0}}}}}}  # fmt: skip
+    (move,) = change.moves(types.SimpleNamespace(accepted=then), [part])
+    assert not move.moved and move.text() == "not judged"
+    (known,) = change.moves(types.SimpleNamespace(accepted=then), [part._replace(simulated=True)])
+    assert known.text().startswith("+81")
+
+
+def test_what_simulated_trials_made_is_not_shown_as_a_recorded_machine(project):
+    text = page()
+    assert "2.0 %" in text
+    sections = params.read("params.yaml")
+    sections["train_ilc"]["source"] = "recordings"
+    Path("params.yaml").write_text(yaml.safe_dump(sections))
+    text = page()
+    assert "It was made from simulated trials. Run ./run dvc repro compose_parts." in text
+    assert "Worst printed line" not in text and "Share of the printing time" not in text
 
 
 def test_what_was_measured_of_a_print_stands_beside_its_forecast(project):

@@ -100,15 +100,17 @@ def render(sources: Sources) -> str:
 
 
 def _beforehand(sources: Sources) -> str:
-    before = gamma(sources.evidence)
+    before, lessons = gamma(sources.evidence), sources.tables["lessons"]
+    other = [] if isinstance(lessons, Missing) else sorted(set(lessons["routine"].tolist()) - {0})
+    instead = f"Shown is routine {other[0]}: the reference is not recorded. " if other else ""
     if before is None:
         return (
-            "The convergence of the paper’s law was not tested beforehand; the model inversion identifies "
-            "the machine in its first trials, and repeats the best command where the error rises."
+            f"{instead}The convergence of the paper’s law was not tested beforehand; the model inversion "
+            "identifies the machine in its first trials, and repeats the best command where the error rises."
         )
     return (
-        "Tested before anything ran: with γ = max |Q² (1 − L P)| below 1 the paper’s law shrinks the error "
-        f"at every trial. γ is {number(before['gamma'], 2)} on the nominal plant and up to "
+        f"{instead}Tested before anything ran: with γ = max |Q² (1 − L P)| below 1 the paper’s law shrinks "
+        f"the error at every trial. γ is {number(before['gamma'], 2)} on the nominal plant and up to "
         f"{number(before['gamma_worst'], 2)} over its family, above 1 on "
         f"{percent(before['gamma_above_1_percent'], 2)} of it: there the law may look fine for a dozen "
         "trials and then diverge. "
@@ -124,21 +126,19 @@ def _beforehand(sources: Sources) -> str:
 def _answer(structure: Structure, move: Move | None) -> dict[str, Any]:
     """The basis functions beside the library on one scale, the strip's limit in its middle; the
     worst line's volume of the composer that was chosen."""
-    scores, limit = structure.scores, structure.asked.flow_error_percent
+    scores, limit = structure.known(), structure.asked.flow_error_percent
     question = Question(0, "", structure.part, "%", limit, False, "")
     shown = [
         (
             NAMES[name],
             css,
-            Figure(*3 * (scores[name].error,))
-            if name in scores and not structure.unknown()
-            else Missing("not measured", "no score"),
+            Figure(*3 * (scores[name].error,)) if name in scores else Missing("not measured", "no score"),
         )
         for name, css in ((OURS, "mb"), (LIBRARY, "dd"), ("ilc", "acc"))
     ]
     chosen = scores.get(structure.chosen)
-    line = chosen.worst_line if chosen and not structure.unknown() else None
-    best = "" if structure.unknown() else structure.best()
+    line = chosen.worst_line if chosen else None
+    best = structure.best()
     return {
         "part": structure.part,
         "material": structure.material,
@@ -148,8 +148,8 @@ def _answer(structure: Structure, move: Move | None) -> dict[str, Any]:
                 "css": css,
                 "name": NAMES[name],
                 "value": _value(structure, name),
-                "band": _interval(scores[name]) if name in scores and not structure.unknown() else "",
-                "bad": name in scores and scores[name].error > limit and not structure.unknown(),
+                "band": _interval(scores[name]) if name in scores else "",
+                "bad": name in scores and scores[name].error > limit,
                 "best": name == best,
             }
             for css, name in (("mb", OURS), ("dd", LIBRARY))
@@ -166,11 +166,10 @@ def _answer(structure: Structure, move: Move | None) -> dict[str, Any]:
 
 def _value(structure: Structure, name: str) -> str:
     """The flow error of a composer; of a real machine no figure that its forecast does not stand behind."""
-    if name not in structure.scores:
-        return "not measured"
-    if structure.unknown() and name != "on_off":
-        return NOT_JUDGED
-    return percent(structure.scores[name].error, 2)
+    error = structure.error(name)
+    if error is None:
+        return NOT_JUDGED if name in structure.scores else "not measured"
+    return percent(error, 2)
 
 
 def _interval(score: Score) -> str:
@@ -208,30 +207,20 @@ def scoreboard(parts: list[Structure], asked: ReportRules) -> dict[str, Any]:
 
 
 def _cell(structure: Structure, name: str) -> dict[str, Any]:
-    score = structure.scores.get(name)
+    score = structure.known().get(name)
     if score is None:
         return {
-            "value": "not measured",
+            "value": _value(structure, name),
             "band": "",
             "line": "",
             "best": False,
             "bad": False,
             "line_bad": False,
-            "chosen": False,
+            "chosen": name in structure.scores and name == structure.chosen,
         }
     line, asked = score.worst_line, structure.asked
-    if structure.unknown() and name != "on_off":
-        return {
-            "value": NOT_JUDGED,
-            "band": "",
-            "line": "",
-            "best": False,
-            "bad": False,
-            "line_bad": False,
-            "chosen": name == structure.chosen,
-        }
     return {
-        "value": percent(score.error, 2),
+        "value": _value(structure, name),
         "band": _forecast(score),
         "line": "no line long enough" if line is None else f"worst line {percent(line, 2)}",
         "best": name == structure.best(),
