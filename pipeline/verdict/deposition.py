@@ -522,7 +522,8 @@ def verdict(evidence: Evidence) -> Verdict:
             rules=rules(evidence, []),
         )
     use = winner(parts)
-    beside = LIBRARY if use in (OURS, BASELINE, "") else use
+    # pressure advance has no signals of the library, so it has rules of its own
+    beside = use if use != BASELINE and KIND.get(use) == "baseline" else LIBRARY
     lines = rules(evidence, parts, beside)
     column = 0 if use == OURS else 1
     needs = {row.name: row.needed_for for row in rows(LOOP).values()}
