@@ -37,10 +37,13 @@ OURS, LIBRARY = (
     next(row.name for row in TABLE if row.kind == kind) for kind in ("model-based", "data-driven")
 )
 NAMES = {row.name: row.heading for row in TABLE}
+KIND = {row.name: row.kind for row in TABLE}
 NOT_JUDGED = "not judged"
 # in a sentence
 USE = {
     "on_off": "on\u2011off control",
+    "pressure_advance": "pressure advance",
+    "pressure_advance_lead": "pressure advance with a lead",
     "priority": "the library by its priority rule",
     "superposition": "the library by superposition",
     "basis": "the basis functions",
@@ -211,7 +214,7 @@ def winner(parts: Sequence[Structure]) -> str:
     return next((name for name, error in errors.items() if error <= min(errors.values()) + SAME), "")
 
 
-# ---- the rules: of each a pair, that of the model-based composer and that of the library
+# ---- the rules: of each a pair, that of the model-based composer and that of the library or the one in use
 
 
 Pair = tuple[Rule, Rule]
@@ -234,18 +237,18 @@ class Parts(NamedTuple):
         return [part for part in self.parts if (part.part, part.material) not in self.bound]
 
 
-def rules(evidence: Evidence, parts: Sequence[Structure]) -> tuple[Pair, ...]:
-    """The rules of a run, of the model-based composer and of the library."""
+def rules(evidence: Evidence, parts: Sequence[Structure], beside: str = LIBRARY) -> tuple[Pair, ...]:
+    """The rules of a run, of the model-based composer and of the one beside it."""
     unknown = {(part.part, part.material) for part in parts if part.unknown()}
     bound = {place: least for place, least in _bound(evidence).items() if place not in unknown}
-    return rules_of(Parts(evidence, parts, bound))
+    return rules_of(Parts(evidence, parts, bound), beside)
 
 
-def rules_of(case: Parts) -> tuple[Pair, ...]:
+def rules_of(case: Parts, beside: str = LIBRARY) -> tuple[Pair, ...]:
     """The drive first, then what may be believed. If the drive cannot follow, a signal is held against the
     best that any command could reach within it, else against the flow that is wanted."""
     asked = {key: row for key, row in rows(LOOP).items() if key != "near" or case.bound}
-    return tuple((_rule(case, key, row, OURS), _rule(case, key, row, LIBRARY)) for key, row in asked.items())
+    return tuple((_rule(case, key, row, OURS), _rule(case, key, row, beside)) for key, row in asked.items())
 
 
 def _rule(case: Parts, key: str, row: Row, composer: str) -> Rule:
@@ -362,7 +365,7 @@ def where(structure: Structure) -> str:
 
 
 def _learning(case: Parts, composer: str) -> Reading:
-    laws = ("pixels", "model_inverse") if composer == OURS else ("hoelzle_2009",)
+    laws = ("hoelzle_2009",) if KIND[composer] == "data-driven" else ("pixels", "model_inverse")
     # figures of an earlier version name the best alone
     keys = [f"{law}.{which}_ratio" for law in laws for which in ("last", "best")]
     ratios = next((ratios for key in keys if (ratios := _each(case.evidence, key))), None)
@@ -391,7 +394,7 @@ def gamma(evidence: Evidence) -> dict[str, float] | None:
 def _convergence(case: Parts, composer: str) -> Reading:
     """Ours is tested once its first trials have identified the machine, over the machines that these cannot
     tell apart."""
-    if composer == OURS:
+    if KIND[composer] != "data-driven":
         values, absent = (
             _each(case.evidence, "gamma_model_inverse_worst"),
             (Missing(UNJUDGED, ""), "rolls back"),
@@ -514,7 +517,7 @@ def _printed(case: Parts, composer: str) -> Reading:
     ]
     # the priority rule does not print a line that is shorter than the lead
     short_lines = sum(report.get("shorter_than_lead", 0) for report in conformance.values())
-    lost = len(refused) + (0 if composer == OURS else short_lines)
+    lost = len(refused) + (short_lines if KIND[composer] == "data-driven" else 0)
     return count_of(lost), {
         "text": f"{lost:,} not" if lost else "all",
         "case": "refused" if refused else "short",
@@ -563,8 +566,11 @@ def verdict(evidence: Evidence) -> Verdict:
             note=_price(evidence, []),
             rules=rules(evidence, []),
         )
-    use, lines = winner(parts), rules(evidence, parts)
-    # the column of the model-based composer, also if nothing is known; that of the library for the others
+    use = winner(parts)
+    # pressure advance has no signals of the library, so it has rules of its own
+    beside = use if use not in (BASELINE, "") and KIND.get(use) == "baseline" else LIBRARY
+    lines = rules(evidence, parts, beside)
+    # the column of the model-based composer, also if nothing is known; that of the one beside it for the others
     column = 0 if use in (OURS, "") else 1
     needs = {row.name: row.needed_for for row in rows(LOOP).values()}
     asked = [line[column] for line in lines if column == 0 or "learning" not in needs[line[0].name]]
@@ -579,7 +585,11 @@ def verdict(evidence: Evidence) -> Verdict:
     ]
     state = FAILED if use == BASELINE else overall([rule.state for rule in binding])
     first = None if state == PASSED else deciding(binding) or deciding(judged)
-    reported = first is not None and first.reason and (column == 0 or "machine" in needs[first.name])
+    reported = (
+        first is not None
+        and first.reason
+        and (use == OURS or beside != LIBRARY or "machine" in needs[first.name])
+    )
     summary = _summary(parts, use, machine)
     return Verdict(
         loop=LOOP,

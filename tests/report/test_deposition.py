@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from pipeline.deposition import tables
+from pipeline.deposition.controllers import COMPOSERS
 from pipeline.deposition.parts import extrusion, part_report
 from pipeline.deposition.settings import Printer
 from pipeline.deposition.tables import SIGNALS
@@ -111,6 +112,26 @@ def test_where_the_simple_rule_is_as_good_it_wins(project):
     conformance(shorter_than_lead=0)
     # 2.4 % is within half a point of 2.0 %: the simpler one is taken
     assert "Pass (simulation): the library by its priority rule. All six rules passed." in page()
+
+
+def test_where_pressure_advance_is_as_good_it_wins_by_rules_of_its_own(project):
+    scores = {
+        "on_off": (100.0, None, 60.0), "pressure_advance": (9.0, 8.0, 2.0),
+        "pressure_advance_lead": (2.3, 2.2, 1.0), "priority": (12.0, 12.0, 9.0), "basis": (2.0, 2.5, 1.0),
+        "ilc": (1.5, None, 0.5),
+    }  # fmt: skip
+    made.deposition(scores)
+    text = page()  # a line shorter than the lead is lost to the library, not to pressure advance
+    assert "Pass (simulation): pressure advance with a lead. All six rules passed." in text
+    assert "pressure advance 9.0 %" in text and "Library by its priority rule" not in text
+    made.deposition(scores | {"pressure_advance_lead": (2.3, 2.2, 4.0)})
+    assert "A line of square, material A, is 4.0 % off its volume; ±3 % is allowed." in page()
+
+
+def test_pressure_advance_stands_as_a_slicer_takes_it_with_intervals(project):
+    text = page()
+    assert "0.0452 (0.0410 to 0.0500)" in text and "0.980 (0.950 to 1.010)" in text
+    assert "SET_PRESSURE_ADVANCE ADVANCE=0.0452 SMOOTH_TIME=0.040" in text and "M900 K0.0452" in text
 
 
 def test_on_off_control_may_win_and_then_nothing_is_to_be_printed_by_this_loop(project):
@@ -472,7 +493,7 @@ def test_every_picture_says_what_it_shows_and_every_link_leads_somewhere(project
 def test_a_long_job_stays_within_the_size_of_a_page(project):
     n, rng = 200_000, np.random.default_rng(0)
     angle = np.arange(n) / 500
-    names = [f"{k}_mm3_per_s" for k in ("predicted", "on_off", "priority", "superposition", "basis", "ilc")]
+    names = [f"{k}_mm3_per_s" for k in ("predicted", *(one.name for one in COMPOSERS))]
     columns = {
         "part": ["big"] * n, "tool": np.zeros(n, int), "material": ["A"] * n, "time_s": np.arange(n) / 50,
         "x_mm": 50 * np.cos(angle) * (1 - angle / 800),

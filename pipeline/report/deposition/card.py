@@ -28,7 +28,14 @@ from pipeline.verdict.verdict import PASSED, Missing, Verdict
 MOVES = "Plunger command to flow at the nozzle"
 # how long a stretch of a part is drawn, s
 STRETCH_S = 6.0
-STYLES = {"basis": "line", "priority": "line dd", "superposition": "line dd dash", "on_off": "line bl"}
+STYLES = {
+    "basis": "line",
+    "priority": "line dd",
+    "superposition": "line dd dash",
+    "pressure_advance": "line bl dash",
+    "pressure_advance_lead": "line bl dash",
+    "on_off": "line bl",
+}
 
 Read = Callable[[Structure, str], float | None]
 

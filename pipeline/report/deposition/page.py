@@ -3,6 +3,7 @@ what that took, and the pictures behind it."""
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from markupsafe import Markup
 from pipeline.report.deposition import change as deposition_change
 from pipeline.report.deposition import learning as deposition_learning
 from pipeline.report.deposition import parts as deposition_parts
-from pipeline.report.deposition.marks import HEADS, MARK, PAPER, real
+from pipeline.report.deposition.marks import HEADS, KIND, MARK, PAPER, real
 from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Change, Move
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
@@ -25,6 +26,7 @@ from pipeline.verdict.verdict import Figure, Missing, Question
 
 WORDS = (
     "on_off",
+    "pressure_advance",
     "basis",
     "library",
     "priority",
@@ -52,6 +54,9 @@ CHAIN = (
     ("yield_", "Yield, mm³/s"),
     ("creep_share", "Creep, share"),
 )
+# what a slicer takes, with decimals, and who takes it as a line
+SLICER = {"pressure_advance_s": 4, "smooth_time_s": 3, "flow_ratio": 3}
+SLICERS = ("Klipper", "Marlin", "OrcaSlicer")
 SECTIONS = ("printer", "camera", "train_ilc", "segment_library", "compose_parts")
 
 
@@ -65,7 +70,7 @@ def render(sources: Sources) -> str:
         sources=sources,
         title=f"Deposition: {judged.decision.rstrip('.')}",
         verdict=judged,
-        heads_of_rules=HEADS,
+        heads_of_rules=_heads_of_rules(judged.winner),
         claim=headline.claim(sources, ("deposition",)),
         verdict_mark=MARK.get(judged.winner, "model_based"),
         beforehand=_beforehand(sources),
@@ -83,6 +88,7 @@ def render(sources: Sources) -> str:
         signals=signals(sources),
         assumptions=assumptions(sources),
         chains=chains(sources),
+        slicer=slicer(sources),
         columns=columns(sources),
         maps=deposition_parts.maps(sources),
         stretches=deposition_parts.stretches(sources),
@@ -97,6 +103,13 @@ def render(sources: Sources) -> str:
         from_library=sources.source("library", "learned", "models"),
         from_lines=sources.source("lines", "conformance"),
     )
+
+
+def _heads_of_rules(winner: str) -> tuple[str, ...]:
+    """Of the two columns of rules; the second is of the baseline in use, if one is."""
+    if winner == "on_off" or KIND.get(winner) != "baseline":
+        return HEADS
+    return HEADS[0], NAMES[winner], MARK[winner], HEADS[3]
 
 
 def _beforehand(sources: Sources) -> str:
@@ -190,7 +203,7 @@ def _forecast(score: Score) -> str:
     return f"forecast {percent(score.low, 2)} to {percent(score.high, 2)}"
 
 
-BOARD = ("basis", "priority", "superposition", "on_off", "ilc")
+BOARD = ("basis", "priority", "superposition", "pressure_advance", "pressure_advance_lead", "on_off", "ilc")
 
 
 def scoreboard(parts: list[Structure], asked: ReportRules) -> dict[str, Any]:
@@ -421,6 +434,24 @@ def chains(sources: Sources) -> dict[str, Any]:
         if material["chain"].get("held_out_percent") is not None
     ]
     return {"missing": None, "rows": rows, "heads": heads, "fit": "; ".join(fits)}
+
+
+def slicer(sources: Sources) -> list[dict[str, str]]:
+    """Pressure advance of each material as a slicer takes it, each number with its 90 % interval, and the
+    lines that set it."""
+    materials = lookup(sources.tables["learned"], "slicer")
+    if isinstance(materials, Missing):
+        return []
+    return [
+        {"material": name, "lines": "\n".join(f"{key}: {values[key]}" for key in SLICERS)}
+        | {key: _with_ends(values[key], places) for key, places in SLICER.items()}
+        for name, values in list(materials.items())[:MATERIALS]
+    ]
+
+
+def _with_ends(values: Sequence[float], places: int) -> str:
+    low, value, high = (f"{one:.{places}f}" for one in values)
+    return f"{value} ({low} to {high})"
 
 
 def columns(sources: Sources) -> dict[str, Any]:

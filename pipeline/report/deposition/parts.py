@@ -281,10 +281,7 @@ class Stretch(NamedTuple):
 def _stretch(table: Table, part: str, material: str, chosen: str) -> Stretch:
     rows = (table["part"] == part) & (table["material"] == material)
     t, wanted = table["time_s"][rows], table["wanted_mm3_per_s"][rows]
-    flows = {
-        name: table[f"{name}_mm3_per_s"][rows]
-        for name in ("priority", "superposition", "basis", "ilc", "on_off")
-    }
+    flows = {name: table[f"{name}_mm3_per_s"][rows] for name in NAMES if f"{name}_mm3_per_s" in table}
     middle = float(t[np.argmax(np.abs(np.nan_to_num(flows[chosen]) - wanted))])
     begin = min(max(middle - STRETCH_S / 2, float(t[0])), max(float(t[-1]) - STRETCH_S, float(t[0])))
     near = (t >= begin) & (t <= begin + STRETCH_S)
