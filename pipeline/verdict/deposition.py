@@ -570,7 +570,7 @@ def verdict(evidence: Evidence) -> Verdict:
     # pressure advance has no signals of the library, so it has rules of its own
     beside = use if use not in (BASELINE, "") and KIND.get(use) == "baseline" else LIBRARY
     lines = rules(evidence, parts, beside)
-    # the column of the model-based composer, also if nothing is known; that of the one beside it for the others
+    # the column of the model-based composer, also if nothing is known, or that of the one beside it
     column = 0 if use in (OURS, "") else 1
     needs = {row.name: row.needed_for for row in rows(LOOP).values()}
     asked = [line[column] for line in lines if column == 0 or "learning" not in needs[line[0].name]]
