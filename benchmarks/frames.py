@@ -265,7 +265,9 @@ def pixel_figures(trials: int = 15) -> dict[str, Any]:
 # ---- recorded trials
 
 RECORDED, ROUNDS = 450, 5
-CONDITIONS = TrialConditions("A", "0.6 mm", 0, "on-off", 8.0, 0.6, 0.304, 125.0, 0.0, 90.0, -0.008, 60.0)
+CONDITIONS = TrialConditions(
+    "A", "0.6 mm", 0, "on-off", 0, 8.0, 4.0, 6.0, 0.6, 8.0, 0.304, 125.0, 0.0, 90.0, -0.008, 60.0
+)
 
 
 def rendered(count: int) -> list[np.ndarray]:

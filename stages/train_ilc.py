@@ -182,7 +182,8 @@ def learn_from_recordings(
         figures: dict[str, Any] = {}
         models: dict[str, Any] = {"nominal": extruder.to_json(material.nominal)}
         for index, routine in enumerate(routines):
-            key, end, measured = (material.name, index), f"_{index}" if index else "", []
+            # the first routine that is recorded is shown on the pages
+            key, end, measured = (material.name, index), f"_{index}" if "pixels" in figures else "", []
             for one in groups.get(key, []):
                 earlier = [other.latency for path, other in values.items() if path != one.path]
                 measured.append(measure_trial(one, values[one.path], earlier, routine, printer, camera))

@@ -6,8 +6,9 @@ scores.parquet, and `<name>_mm3_per_s` of signals.parquet. It never changes. Not
 name.
 
 Kinds: a data-driven command was learned trial by trial, on training routines or as a library of their
-signals; a model-based one inverts the identified chain of the extruder; on-off control is the baseline. A
-command that was learned on the very part is the reference: no other composer knows the part beforehand."""
+signals; a model-based one inverts the identified chain of the extruder; on-off control and pressure advance
+are the baselines. A command that was learned on the very part is the reference: no other composer knows the
+part beforehand."""
 
 import importlib
 from collections.abc import Callable
@@ -43,6 +44,14 @@ COMPOSERS = (
     DepositionController(
         "on_off", "On\u2011off", "baseline", "wanted flow over gain",
         "true flow of on-off control; predicted on a real machine",
+    ),
+    DepositionController(
+        "pressure_advance", "Pressure advance", "baseline", "as in Klipper, tuned on the chain",
+        "the same of pressure advance", "pressure_advance.by_advance",
+    ),
+    DepositionController(
+        "pressure_advance_lead", "Pressure advance, lead", "baseline", "the same, sent ahead",
+        "the same of pressure advance sent ahead", "pressure_advance.by_advance_with_lead",
     ),
     DepositionController(
         "priority", "Library, priority", "data-driven", "the paper’s rule",

@@ -59,7 +59,8 @@ class Routine(NamedTuple):
     r is the wanted flow in mm^3/s, speed the gantry's in mm/s, position in mm along the line from where the
     trial begins. The gantry runs at the printing speed before the start and after the stop too, so that ooze
     there lies on the line and is seen; it halts in the pause. printing is True where r > 0. The ramps are
-    centred on the events start_s, pause_s = (begin, end) and stop_s.
+    centred on the events start_s, pause_s = (begin, end) and stop_s. number counts the training routines, the
+    reference is 0.
     """
 
     time_s: np.ndarray
@@ -70,6 +71,20 @@ class Routine(NamedTuple):
     start_s: float
     pause_s: tuple[float, float]
     stop_s: float
+    number: int = 0
+
+    @property
+    def plan(self) -> dict[str, float]:
+        """What tells this routine from others: its number, its speed in mm/s, and how long it is off, on,
+        pauses and is off again, in s."""
+        end_s = len(self.time_s) * float(self.time_s[1])
+        off_s, on_s, pause_s, _, tail_s = np.diff(
+            [0.0, self.start_s, *self.pause_s, self.stop_s, end_s]
+        ).round(9)
+        return {
+            "routine": self.number, "speed_mm_per_s": float(self.speed.max()), "off_s": float(off_s),
+            "on_s": float(on_s), "pause_s": float(pause_s), "tail_s": float(tail_s),
+        }  # fmt: skip
 
 
 def ramp(t: np.ndarray, width_s: float) -> np.ndarray:

@@ -135,8 +135,8 @@ class Printer(Section):
                 speed=t.speed_mm_per_s, bead_area_mm2=self.bead_area_mm2, ramp_s=self.ramp_s,
                 gantry_ramp_s=round(longer_s * t.speed_mm_per_s / fastest, 9),
                 sample_time_s=self.sample_time_s,
-            )
-            for t in trainings
+            )._replace(number=number)
+            for number, t in enumerate(trainings)
         ]  # fmt: skip
 
     def expected_trials(self, routines: Sequence[Routine]) -> dict[str, Any]:
@@ -144,7 +144,7 @@ class Printer(Section):
         return {
             "materials": [material.name for material in self.materials],
             "nozzle": f"{self.nozzle_mm:g}",
-            "routines": [(float(r.speed.max()), r.pause_s[1] - r.pause_s[0]) for r in routines],
+            "routines": [routine.plan for routine in routines],
         }
 
 
@@ -272,8 +272,7 @@ def trial_conditions(
         "nozzle": f"{printer.nozzle_mm:g}",
         "trial": trial,
         "law": law,
-        "speed_mm_per_s": float(routine.speed.max()),
-        "pause_s": round(routine.pause_s[1] - routine.pause_s[0], 9),
+        **routine.plan,
         "bead_area_mm2": printer.bead_area_mm2,
         "px_per_mm": 1 / gain,
         "offset_px": -offset / gain,

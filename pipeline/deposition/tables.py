@@ -98,7 +98,7 @@ FILMED = Schema(
 )
 SIGNALS = Schema(
     "signals",
-    1,
+    2,
     (
         Column("part", TEXT, NONE, "part program"),
         Column("tool", INDEX, NONE, "tool", low=0),
@@ -121,7 +121,7 @@ SCORES = Schema(
     (
         Column("part", TEXT, NONE, "part program"),
         Column("material", TEXT, NONE, "material"),
-        Column("composer", TEXT, NONE, "on_off, priority, superposition, basis, or ilc: full-part ILC"),
+        Column("composer", TEXT, NONE, "name in the table of controllers; ilc: full-part ILC"),
         Column("chosen", BOOL, NONE, "predicted to do best, and taken"),
         Column(
             "rms_percent_of_on_off",

@@ -56,17 +56,24 @@ Values = tuple[np.ndarray, np.ndarray, np.ndarray, list[str], tuple[float, float
 class TrialConditions(NamedTuple):
     """What a trial was run with, kept in the recording's metadata.
 
-    `trial` counts from 0, `law` names what made the command. A bead w_px wide is (w_px - offset_px) /
-    px_per_mm wide, and its section follows from the contact angle; a column of the image lies at gantry
-    position + (column - nozzle_column) mm_per_px, negative where the line trails to higher columns.
+    `trial` counts from 0, `law` names what made the command. `routine` counts the training routines from 0;
+    its plan is off_s, on_s, pause_s of the gantry, on_s again and tail_s, at one speed.
+
+    A bead w_px wide is (w_px - offset_px) / px_per_mm wide, and its section follows from the contact angle;
+    a column of the image lies at gantry position + (column - nozzle_column) mm_per_px, negative where the
+    line trails to higher columns.
     """
 
     material: str
     nozzle: str
     trial: int
     law: str
+    routine: int
     speed_mm_per_s: float
+    off_s: float
+    on_s: float
     pause_s: float
+    tail_s: float
     bead_area_mm2: float
     px_per_mm: float
     offset_px: float
@@ -207,23 +214,25 @@ def group_trials(
     *,
     materials: Sequence[str],
     nozzle: str,
-    routines: Sequence[tuple[float, float]],
+    routines: Sequence[Mapping[str, float]],
 ) -> dict[tuple[str, int], list[TrialRecording]]:
-    """Recordings by (material, number of the routine), in the order of their trials. A routine is
-    (speed in mm/s, pause in s).
+    """Recordings by (material, number of the routine), in the order of their trials. A routine is its plan
+    {field of TrialConditions: value}, at the place of its number.
 
-    Raises ValueError, naming the file, for an unknown material, nozzle or routine, and if a trial is missing
-    or there twice.
+    Raises ValueError, naming the file, for an unknown material, nozzle or routine, a routine that is planned
+    otherwise, and if a trial is missing or there twice.
     """
     groups: dict[tuple[str, int], dict[int, TrialRecording]] = {}
     for recording in recordings:
         conditions = check_conditions(recording)
         number, material = conditions.trial, conditions.material
-        index = _routine(recording.path, conditions, materials, nozzle, routines)
+        index = conditions.routine
+        _check_setup(recording.path, conditions, materials, nozzle, routines)
         trials = groups.setdefault((material, index), {})
         if number in trials:
             raise ValueError(
-                f"{recording.path}: trial {number} of material {material} is in {trials[number].path} too; "
+                f"{recording.path}: trial {number} of material {material}, routine {index}, is in "
+                f"{trials[number].path} too; "
                 "keep one of the two"
             )
         trials[number] = recording
@@ -253,13 +262,13 @@ def check_conditions(recording: TrialRecording) -> TrialConditions:
     return conditions
 
 
-def _routine(
+def _check_setup(
     path: str,
     conditions: TrialConditions,
     materials: Sequence[str],
     nozzle: str,
-    routines: Sequence[tuple[float, float]],
-) -> int:
+    routines: Sequence[Mapping[str, float]],
+) -> None:
     if conditions.material not in materials:
         raise ValueError(
             f"{path}: material {conditions.material} is not among printer.materials {', '.join(materials)}; "
@@ -270,15 +279,23 @@ def _routine(
             f"{path}: expected a nozzle of {nozzle} mm (printer.nozzle_mm), found {conditions.nozzle}; "
             "what one nozzle learned does not hold for another"
         )
-    for index, (speed, pause_s) in enumerate(routines):
-        if max(abs(speed - conditions.speed_mm_per_s), abs(pause_s - conditions.pause_s)) < 1e-6:
-            return index
-    expected = ", ".join(f"{speed:g} mm/s with {pause_s:g} s" for speed, pause_s in routines)
-    raise ValueError(
-        f"{path}: expected one of the routines of train_ilc ({expected}), "
-        f"found {conditions.speed_mm_per_s:g} mm/s with a pause of "
-        f"{conditions.pause_s:g} s; add that routine to printer.routines in params.expert.yaml"
-    )
+    if not 0 <= conditions.routine < len(routines):
+        raise ValueError(
+            f"{path}: expected one of the {len(routines)} routines from 0 on, found routine "
+            f"{conditions.routine}; add it to printer.routines in params.expert.yaml"
+        )
+    plan = routines[conditions.routine]
+    recorded = {name: getattr(conditions, name) for name in plan}
+    if any(abs(recorded[name] - plan[name]) > 1e-6 for name in plan):
+        expected, found = (
+            ", ".join(f"{name} {each[name]:g}" for name in plan if name != "routine")
+            for each in (plan, recorded)
+        )
+        raise ValueError(
+            f"{path}: routine {conditions.routine} was printed with {found}, but the routines of "
+            f"params.expert.yaml have {expected}; write the printed plan there (printer.reference is routine "
+            "0, printer.routines follow), or take the file away"
+        )
 
 
 def first_and_last(recordings: Iterable[TrialRecording]) -> list[Path]:

@@ -8,7 +8,7 @@ import pandas as pd
 
 from pipeline.deposition.controllers import COMPOSERS as TABLE
 from pipeline.verdict.digits import THIN, count, number, percent, short
-from pipeline.verdict.evidence import Evidence, lookup, need
+from pipeline.verdict.evidence import Evidence, Figures, lookup, need
 from pipeline.verdict.rules import Reading, Row, at_path, judge, rows
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import (
@@ -37,14 +37,24 @@ OURS, LIBRARY = (
     next(row.name for row in TABLE if row.kind == kind) for kind in ("model-based", "data-driven")
 )
 NAMES = {row.name: row.heading for row in TABLE}
+KIND = {row.name: row.kind for row in TABLE}
 NOT_JUDGED = "not judged"
 # in a sentence
 USE = {
     "on_off": "on\u2011off control",
+    "pressure_advance": "pressure advance",
+    "pressure_advance_lead": "pressure advance with a lead",
     "priority": "the library by its priority rule",
     "superposition": "the library by superposition",
     "basis": "the basis functions",
 }
+# what is made from the trials of the deposition loop
+COMPOSED = ("library", "learned", "signals", "scores", "tasks", "lines", "conformance")
+# what to do if no trial is recorded yet
+FIRST_TRIALS = (
+    "Play the commands of datasets/train_ilc/next, put their recordings into datasets/raw/deposition, and "
+    "run ./run dvc repro train_ilc."
+)
 # in the place of a forecast that a report of an earlier version does not have
 NO_FORECAST = {"reason": "the conformance report has none", "trial": "run ./run dvc repro compose_parts"}
 
@@ -52,6 +62,23 @@ NO_FORECAST = {"reason": "the conformance report has none", "trial": "run ./run 
 def phrase(name: str) -> str:
     """ "the basis functions"; a composer without a phrase goes by its heading."""
     return USE.get(name, NAMES.get(name, name))
+
+
+def untried(figures: Figures) -> bool:
+    """Whether no trial of a real deposition machine is recorded yet."""
+    learning = figures["train_ilc"]
+    return isinstance(learning, Mapping) and not any("pixels" in laws for laws in learning.values())
+
+
+def of_recorded_trials(figures: Figures, tables: Mapping[str, Any]) -> dict[str, Any]:
+    """The tables of a machine whose trials are recorded: a Missing in the place of what no trial of it, or
+    only simulated trials, made."""
+    scores, gap = tables["scores"], None
+    if untried(figures):
+        gap = Missing("not measured", "No trial is recorded yet")
+    elif not isinstance(scores, Missing) and REFERENCE in scores["composer"]:
+        gap = Missing("stale", "It was made from simulated trials", "Run ./run dvc repro compose_parts")
+    return dict(tables) if gap is None else {**tables, **dict.fromkeys(set(COMPOSED) & set(tables), gap)}
 
 
 class Score(NamedTuple):
@@ -89,27 +116,30 @@ class Structure(NamedTuple):
         true flow is not known."""
         return not self.simulated and not self.judged()
 
+    def known(self) -> Mapping[str, Score]:
+        """The scores that may be shown and compared: none if nothing tells how the chosen composer does."""
+        return {} if self.unknown() else self.scores
+
     def error(self, composer: str) -> float | None:
-        """The flow error of a composer; None if it has none."""
-        return self.scores[composer].error if composer in self.scores else None
+        """The flow error of a composer; None if it has none that is known."""
+        return self.known()[composer].error if composer in self.known() else None
 
     def worst_line(self, composer: str) -> float | None:
         """The volume error of its worst line; None if no line was judged."""
-        return self.scores[composer].worst_line if composer in self.scores else None
+        return self.known()[composer].worst_line if composer in self.known() else None
 
     def best(self) -> str:
         """The composer, on-off control too, with the least error; what
         learned the part itself is a yardstick."""
+        scores = self.known()
         return min(
-            (name for name in COMPOSERS if name in self.scores),
-            key=lambda name: self.scores[name].error,
-            default="",
+            (name for name in COMPOSERS if name in scores), key=lambda name: scores[name].error, default=""
         )
 
     def state(self) -> str:
         """Of the composer that was chosen, by flow, volume, and whether its forecast is judged."""
-        score = self.scores.get(self.chosen)
-        if score is None or self.unknown():
+        score = self.known().get(self.chosen)
+        if score is None:
             return OPEN
         if (
             score.error > self.asked.flow_error_percent
@@ -129,6 +159,14 @@ def structures(evidence: Evidence) -> list[Structure] | Missing:
     told = {} if isinstance(conformance, Missing) else conformance
     parts = [_structure(rows, evidence.rules, told) for _, rows in groups]
     return parts or Missing("not measured", "no part was composed", "Copy a part program to datasets/parts")
+
+
+def unknown_streams(evidence: Evidence) -> set[tuple[str, str]]:
+    """(part, material) of the forecasts that nobody may show a figure of."""
+    parts = structures(evidence)
+    return {
+        (part.part, part.material) for part in ([] if isinstance(parts, Missing) else parts) if part.unknown()
+    }
 
 
 def _structure(rows: pd.DataFrame, rules: ReportRules, conformance: Mapping[str, Any]) -> Structure:
@@ -176,7 +214,7 @@ def winner(parts: Sequence[Structure]) -> str:
     return next((name for name, error in errors.items() if error <= min(errors.values()) + SAME), "")
 
 
-# ---- the rules: of each a pair, that of the model-based composer and that of the library
+# ---- the rules: of each a pair, that of the model-based composer and that of the library or the one in use
 
 
 Pair = tuple[Rule, Rule]
@@ -191,20 +229,26 @@ class Parts(NamedTuple):
     bound: Mapping[tuple[str, str], float]
 
     @property
+    def unknown(self) -> set[tuple[str, str]]:
+        return {(part.part, part.material) for part in self.parts if part.unknown()}
+
+    @property
     def followed(self) -> list[Structure]:
         return [part for part in self.parts if (part.part, part.material) not in self.bound]
 
 
-def rules(evidence: Evidence, parts: Sequence[Structure]) -> tuple[Pair, ...]:
-    """The rules of a run, of the model-based composer and of the library."""
-    return rules_of(Parts(evidence, parts, _bound(evidence)))
+def rules(evidence: Evidence, parts: Sequence[Structure], beside: str = LIBRARY) -> tuple[Pair, ...]:
+    """The rules of a run, of the model-based composer and of the one beside it."""
+    unknown = {(part.part, part.material) for part in parts if part.unknown()}
+    bound = {place: least for place, least in _bound(evidence).items() if place not in unknown}
+    return rules_of(Parts(evidence, parts, bound), beside)
 
 
-def rules_of(case: Parts) -> tuple[Pair, ...]:
+def rules_of(case: Parts, beside: str = LIBRARY) -> tuple[Pair, ...]:
     """The drive first, then what may be believed. If the drive cannot follow, a signal is held against the
     best that any command could reach within it, else against the flow that is wanted."""
     asked = {key: row for key, row in rows(LOOP).items() if key != "near" or case.bound}
-    return tuple((_rule(case, key, row, OURS), _rule(case, key, row, LIBRARY)) for key, row in asked.items())
+    return tuple((_rule(case, key, row, OURS), _rule(case, key, row, beside)) for key, row in asked.items())
 
 
 def _rule(case: Parts, key: str, row: Row, composer: str) -> Rule:
@@ -321,7 +365,7 @@ def where(structure: Structure) -> str:
 
 
 def _learning(case: Parts, composer: str) -> Reading:
-    laws = ("pixels", "model_inverse") if composer == OURS else ("hoelzle_2009",)
+    laws = ("hoelzle_2009",) if KIND[composer] == "data-driven" else ("pixels", "model_inverse")
     # figures of an earlier version name the best alone
     keys = [f"{law}.{which}_ratio" for law in laws for which in ("last", "best")]
     ratios = next((ratios for key in keys if (ratios := _each(case.evidence, key))), None)
@@ -350,7 +394,7 @@ def gamma(evidence: Evidence) -> dict[str, float] | None:
 def _convergence(case: Parts, composer: str) -> Reading:
     """Ours is tested once its first trials have identified the machine, over the machines that these cannot
     tell apart."""
-    if composer == OURS:
+    if KIND[composer] != "data-driven":
         values, absent = (
             _each(case.evidence, "gamma_model_inverse_worst"),
             (Missing(UNJUDGED, ""), "rolls back"),
@@ -429,13 +473,16 @@ def _drive(case: Parts, composer: str) -> Reading:
     ramp = conformance[worst.part].get("ramp_that_would_do_s", {}).get(worst.material)
     least = case.bound.get((worst.part, worst.material))
     best = (
-        "no signal can make up for it"
+        "what that costs is not judged"
+        if (worst.part, worst.material) in case.unknown
+        else "no signal can make up for it"
         if least is None
         else f"the best signal within it leaves {percent(least, 2)} of on\u2011off control’s flow error"
     )
     # a drive that follows what is asked for up to a little: how much that little is
-    leaves = [saturation.get("least_percent") for saturation in saturations.values()]
-    followed = worst.enough and all(share is not None for share in leaves)
+    shares = [one.get("least_percent") for place, one in saturations.items() if place not in case.unknown]
+    leaves = [share for share in shares if share is not None]
+    followed = worst.enough and len(leaves) == len(saturations)
     return count_of(sum(not stream.enough for stream in streams)), {
         "allowed": worst.limit(),
         "text": f"leaves {percent(max(leaves), 2)}" if followed else worst.text(),
@@ -470,10 +517,11 @@ def _printed(case: Parts, composer: str) -> Reading:
     ]
     # the priority rule does not print a line that is shorter than the lead
     short_lines = sum(report.get("shorter_than_lead", 0) for report in conformance.values())
-    lost = len(refused) + (0 if composer == OURS else short_lines)
+    lost = len(refused) + (short_lines if KIND[composer] == "data-driven" else 0)
     return count_of(lost), {
         "text": f"{lost:,} not" if lost else "all",
-        "lines": count(len(refused), "line was", "lines were").capitalize(),
+        "case": "refused" if refused else "short",
+        "lines": count(len(refused) or short_lines, "line was", "lines were").capitalize(),
         "first": f", the first in {refused[0][0]}: {refused[0][1]}" if refused else "",
     }
 
@@ -512,17 +560,20 @@ def verdict(evidence: Evidence) -> Verdict:
             decision=words.undecided,
             lead="Nothing was composed.",
             reason=parts.sentence(),
-            remedy="",
+            remedy=FIRST_TRIALS if machine and untried(evidence.figures) else "",
             rule="",
             winner="",
             note=_price(evidence, []),
             rules=rules(evidence, []),
         )
-    use, lines = winner(parts), rules(evidence, parts)
-    # the column of the model-based composer, and that of the library for the others
-    column = 0 if use == OURS else 1
+    use = winner(parts)
+    # pressure advance has no signals of the library, so it has rules of its own
+    beside = use if use not in (BASELINE, "") and KIND.get(use) == "baseline" else LIBRARY
+    lines = rules(evidence, parts, beside)
+    # the column of the model-based composer, also if nothing is known, or that of the one beside it
+    column = 0 if use in (OURS, "") else 1
     needs = {row.name: row.needed_for for row in rows(LOOP).values()}
-    asked = [line[column] for line in lines if use == OURS or "learning" not in needs[line[0].name]]
+    asked = [line[column] for line in lines if column == 0 or "learning" not in needs[line[0].name]]
     judged = [rule for rule in asked if rule.state != UNJUDGED]
     # what cannot be measured on a machine's own trials does not hold them up; a drive can be declared, and a
     # forecast that is not judged has a trial that judges it
@@ -534,12 +585,16 @@ def verdict(evidence: Evidence) -> Verdict:
     ]
     state = FAILED if use == BASELINE else overall([rule.state for rule in binding])
     first = None if state == PASSED else deciding(binding) or deciding(judged)
-    reported = first is not None and first.reason and (column == 0 or "machine" in needs[first.name])
+    reported = (
+        first is not None
+        and first.reason
+        and (use == OURS or beside != LIBRARY or "machine" in needs[first.name])
+    )
     summary = _summary(parts, use, machine)
     return Verdict(
         loop=LOOP,
         state=state,
-        decision=_decision(state, use if worst(_known(parts), use) else "", words),
+        decision=_decision(state, use, words),
         lead=_lead(state, first, len(judged), condition=len(judged) < len(asked)),
         reason=f"{first.reason} {summary}" if reported else summary,
         remedy=first.remedy if first else "",
@@ -548,11 +603,6 @@ def verdict(evidence: Evidence) -> Verdict:
         note=_price(evidence, parts),
         rules=lines,
     )
-
-
-def _known(parts: Sequence[Structure]) -> list[Structure]:
-    """The parts of which it is known what they come to."""
-    return [part for part in parts if not part.unknown()]
 
 
 def _decision(state: str, use: str, words: Words) -> str:
@@ -588,7 +638,6 @@ def _peak(evidence: Evidence) -> float:
 def _summary(parts: Sequence[Structure], use: str, machine: bool) -> str:
     """The composer in use with its figure and its yardsticks: on-off control, the
     others, and what learning each structure reaches."""
-    parts = _known(parts)
     found = worst(parts, use)
     if found is None:
         return "What the parts come to is not known."
@@ -664,7 +713,7 @@ def _price(evidence: Evidence, parts: Sequence[Structure]) -> str:
     missed = [
         part
         for part in parts
-        if part.chosen
+        if part.chosen in part.known()
         and part.chosen != part.best()
         and part.scores[part.chosen].error > part.scores[part.best()].error + SAME
     ]

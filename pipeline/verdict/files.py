@@ -8,6 +8,7 @@ from pipeline.setpoint.tables import SCOREBOARD
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant, recorded
 from pipeline.temperature.tables import DYNAMICS, RESIDUALS
+from pipeline.verdict.deposition import of_recorded_trials
 from pipeline.verdict.evidence import OFF, Evidence, switched_off
 from pipeline.verdict.settings import QUICK_LOOK, ReportRules
 from pipeline.verdict.verdict import Missing, read_certificates
@@ -43,9 +44,13 @@ def read_evidence(stored: str = "") -> Evidence:
     figures = {stage: _read(path, stage, artifacts.read_json) for stage, path in paths.items()}
     off = {stage for stage in paths if switched_off(figures[stage])}
     places = {name: (path, path.split("/")[1], _reader(schema)) for name, (path, schema) in TABLES.items()}
+    figures |= dict.fromkeys(off, OFF)
+    tables = {name: OFF if place[1] in off else _read(*place) for name, place in places.items()}
+    if params.read()["train_ilc"]["source"] == "recordings":
+        tables = of_recorded_trials(figures, tables)
     return Evidence(
-        {**figures, **dict.fromkeys(off, OFF)},
-        {name: OFF if place[1] in off else _read(*place) for name, place in places.items()},
+        figures,
+        tables,
         recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet"),
         params.load(ReportRules, "report"),
         params.read(),

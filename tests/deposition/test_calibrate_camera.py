@@ -94,7 +94,7 @@ def test_recordings_of_the_lines_do_in_place_of_pictures(calibrate, pictures):
         names.append(f"line_{k}.mcap")
         signals = trial_files.TrialSignals(time, 8 * time, np.full(10, 8.0), np.zeros(10))
         conditions = trial_files.TrialConditions(
-            "A", "0.6", 0, "", 8.0, 0.6, 0.3, 95.0, 0.0, 90.0, -0.0105, 30.0
+            "A", "0.6", 0, "", 0, 8.0, 4.0, 6.0, 0.6, 8.0, 0.3, 95.0, 0.0, 90.0, -0.0105, 30.0
         )
         trial_files.write_trial(names[-1], conditions, noisy, signals, encoding="png")
     status, said, wrong = calibrate(*names, "--widths", "0.5,0.9,1.2")

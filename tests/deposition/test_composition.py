@@ -14,6 +14,7 @@ from pipeline.deposition.parts.composition import PartSettings, commands, compos
 from pipeline.deposition.parts.conformance import conform
 from pipeline.deposition.parts.library import Basis, Library
 from pipeline.deposition.parts.library import learned as learned_command
+from pipeline.deposition.parts.pressure_advance import LEADS
 from pipeline.deposition.toolpath import gcode
 from pipeline.deposition.toolpath.motion import plan
 from tests.deposition.trained import (
@@ -269,7 +270,7 @@ def test_every_composed_command_follows_and_beats_one_that_is_obeyed_as_it_comes
             slewed = obeyed(free[composer], drive, sample_time_s=TS)
             near, cut = (percent_of_on_off(PLANT, v, stream.r) for v in (u, slewed))
             print(part, composer, near, cut)
-            if composer != "priority":
+            if composer not in ("priority", *LEADS):  # a firmware does not plan around its drive
                 assert near < 0.9 * cut, composer
 
 

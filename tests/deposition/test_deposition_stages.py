@@ -206,7 +206,9 @@ def test_a_folder_of_trials_that_contradict_each_other_is_refused_by_file(projec
     for changes, words in [
         ({"material": "C"}, ("material C", "printer.materials", "A")),
         ({"nozzle": "0.2"}, ("nozzle of 0.8 mm", "0.2")),
-        ({"pause_s": 3.0}, ("routines", "3 s")),
+        ({"pause_s": 3.0}, ("routine 0", "pause_s 3,", "printer.reference")),
+        ({"on_s": 3.5}, ("routine 0", "on_s 3.5", "printer.reference")),
+        ({"routine": 7}, ("3 routines", "routine 7", "printer.routines")),
         ({"trial": 0, "law": "again"}, ("trial 0", "keep one")),
         ({"trial": 2}, ("trial 1", "missing")),
     ]:

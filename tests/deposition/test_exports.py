@@ -12,6 +12,7 @@ import pytest
 
 from pipeline.commands import compose
 from pipeline.deposition.parts import extrusion, leads, part_motion, part_report
+from pipeline.deposition.parts.forecast import ForecastJudgement
 from pipeline.deposition.settings import ComposeParts, Printer
 from pipeline.deposition.toolpath import gcode, motion
 from pipeline.deposition.toolpath.gcode import Kind
@@ -138,7 +139,11 @@ def test_dots_are_not_told_in_percent(tmp_path, machine):
     text = "G21\nG90\nM83\nG0 X5 F480\nG1 X45 E40 F480\nG0 X60\nG1 X60.02 E.02\nG0 X80\nG1 X120 E40\nG0 X0\n"
     lines = part(tmp_path, machine, text).conformance.lines
     assert np.isnan(lines.error_percent).tolist() == [False, True, False]
-    text = part_report.summary_lines(part(tmp_path, machine, text))
+    done = part(tmp_path, machine, text)
+    assert "volume of" not in part_report.summary_lines(done)  # a dot was not trained: nothing is judged
+    (stream,) = done.composed.streams
+    judged = stream._replace(judged=ForecastJudgement(True, "", ""))
+    text = part_report.summary_lines(done._replace(composed=done.composed._replace(streams=(judged,))))
     assert "of all lines the worst is line 7" not in text and re.search(r"worst is line [59]:", text)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from pipeline.deposition.controllers import COMPOSERS
 from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
 from pipeline.store import artifacts, params
 from pipeline.temperature import tables
@@ -542,6 +543,16 @@ def deposition(scores=None):
     ]
     known = {"material": "A", "nozzle_mm": 0.8, "chain": {"extruder": chain, "held_out_percent": 0.6}}
     learned = {"sample_time_s": 0.02, "marks": {"Stop": [0.56, 0.58]}, "materials": [known], "checks": checks}
+    learned["slicer"] = {
+        "A": {
+            "pressure_advance_s": [0.041, 0.0452, 0.05],
+            "smooth_time_s": [0.03, 0.04, 0.2],
+            "flow_ratio": [0.95, 0.98, 1.01],
+            "Klipper": "SET_PRESSURE_ADVANCE ADVANCE=0.0452 SMOOTH_TIME=0.040",
+            "Marlin": "M900 K0.0452",
+            "OrcaSlicer": "pressure_advance = 0.0452",
+        }
+    }
     artifacts.write_json("datasets/segment_library/learned.json", learned)
     _composed(
         time,
@@ -559,10 +570,9 @@ def deposition(scores=None):
 
 def _composed(time, wanted, scores):
     folder = Path("datasets/compose_parts")
-    absent = {"superposition": scores["priority"], "ilc": (np.nan,)}
+    absent = {one.name: scores["priority"] for one in COMPOSERS} | {"ilc": (np.nan,)}
     flows = {
-        name: wanted * (1 - (absent | scores)[name][0] / 100)
-        for name in ("on_off", "priority", "superposition", "basis", "ilc")
+        name: wanted * (1 - (absent | scores)[name][0] / 100) for name in (one.name for one in COMPOSERS)
     }
     rows = [
         ("square", 0, "A", t, 8 * t, 0.0, r, r, r, *(flows[name][k] for name in flows))

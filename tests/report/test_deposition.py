@@ -2,6 +2,7 @@
 missing, hostile text, a real machine, sizes."""
 
 import re
+import types
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,12 @@ import pytest
 import yaml
 
 from pipeline.deposition import tables
+from pipeline.deposition.controllers import COMPOSERS
 from pipeline.deposition.parts import extrusion, part_report
 from pipeline.deposition.settings import Printer
 from pipeline.deposition.tables import SIGNALS
 from pipeline.deposition.toolpath import gcode
+from pipeline.report.deposition import change
 from pipeline.store import artifacts, params
 from pipeline.verdict import deposition as rules
 from pipeline.verdict.evidence import Evidence
@@ -109,6 +112,26 @@ def test_where_the_simple_rule_is_as_good_it_wins(project):
     conformance(shorter_than_lead=0)
     # 2.4 % is within half a point of 2.0 %: the simpler one is taken
     assert "Pass (simulation): the library by its priority rule. All six rules passed." in page()
+
+
+def test_where_pressure_advance_is_as_good_it_wins_by_rules_of_its_own(project):
+    scores = {
+        "on_off": (100.0, None, 60.0), "pressure_advance": (9.0, 8.0, 2.0),
+        "pressure_advance_lead": (2.3, 2.2, 1.0), "priority": (12.0, 12.0, 9.0), "basis": (2.0, 2.5, 1.0),
+        "ilc": (1.5, None, 0.5),
+    }  # fmt: skip
+    made.deposition(scores)
+    text = page()  # a line shorter than the lead is lost to the library, not to pressure advance
+    assert "Pass (simulation): pressure advance with a lead. All six rules passed." in text
+    assert "pressure advance 9.0 %" in text and "Library by its priority rule" not in text
+    made.deposition(scores | {"pressure_advance_lead": (2.3, 2.2, 4.0)})
+    assert "A line of square, material A, is 4.0 % off its volume; ±3 % is allowed." in page()
+
+
+def test_pressure_advance_stands_as_a_slicer_takes_it_with_intervals(project):
+    text = page()
+    assert "0.0452 (0.0410 to 0.0500)" in text and "0.980 (0.950 to 1.010)" in text
+    assert "SET_PRESSURE_ADVANCE ADVANCE=0.0452 SMOOTH_TIME=0.040" in text and "M900 K0.0452" in text
 
 
 def test_on_off_control_may_win_and_then_nothing_is_to_be_printed_by_this_loop(project):
@@ -211,6 +234,8 @@ def test_without_a_declared_drive_the_verdict_is_open_and_says_what_to_declare(p
     sections = params.read("params.yaml")
     sections["train_ilc"]["source"] = source
     Path("params.yaml").write_text(yaml.safe_dump(sections))
+    if source == "recordings":
+        made.deposition(REAL)
     undeclared = DRIVEN | {"amplitude_mm": None, "speed_mm_per_s": None, "share_percent": 0.0, "enough": True}
     conformance(saturation={"A": undeclared})
     text = page()
@@ -334,10 +359,39 @@ def test_on_a_real_machine_a_part_that_is_not_judged_has_no_figure_anywhere(proj
     assert "Not ready for a supervised trial. First undecided rule: every forecast judged." in text
     assert "is not judged: the part prints at 100 mm/s. What the parts come to is not known." in text
     card = index[index.index("Plunger command to flow at the nozzle") : index.index("Nozzle camera to")]
-    board = text.split("Share of the printing time")[0]
+    board = text.split("Learning, trial after trial")[0]
     assert "square" not in card.split("Flow error ≤")[1] and "Line volume ±3 % not measured" in card
     for figure in ("2.0 %", "12 %"):
         assert figure not in board and figure not in card
+
+
+def test_on_a_real_machine_that_is_not_judged_nothing_is_compared_and_no_line_is_to_be_mended(project):
+    recordings()
+    made.deposition(REAL | {"basis": (120.0, 120.0, 9.0)})  # by its forecast on-off control would be better
+    conformance(shorter_than_lead=4)
+    unjudged()
+    text = page()
+    assert "Not ready for a supervised trial. First undecided rule: every forecast judged." in text
+    assert not re.search(r"Mend these lines|on‑off control comes closest|chose wrongly|·\s*worse", text)
+    part = rules.Structure("square", "A", {"basis": rules.Score(98.0, 98.0, 9.0, judged=False)}, "basis",
+                           params.load(ReportRules, "report"), simulated=False)  # fmt: skip
+    then = {"metrics": {"compose_parts": {"square": {"A": {
+        "chosen": "basis", "basis": {"rms_percent_of_on_off": 17.0}}}}}}  # fmt: skip
+    (move,) = change.moves(types.SimpleNamespace(accepted=then), [part])
+    assert not move.moved and move.text() == "not judged"
+    (known,) = change.moves(types.SimpleNamespace(accepted=then), [part._replace(simulated=True)])
+    assert known.text().startswith("+81")
+
+
+def test_what_simulated_trials_made_is_not_shown_as_a_recorded_machine(project):
+    text = page()
+    assert "2.0 %" in text
+    sections = params.read("params.yaml")
+    sections["train_ilc"]["source"] = "recordings"
+    Path("params.yaml").write_text(yaml.safe_dump(sections))
+    text = page()
+    assert "It was made from simulated trials. Run ./run dvc repro compose_parts." in text
+    assert "Worst printed line" not in text and "Share of the printing time" not in text
 
 
 def test_what_was_measured_of_a_print_stands_beside_its_forecast(project):
@@ -439,7 +493,7 @@ def test_every_picture_says_what_it_shows_and_every_link_leads_somewhere(project
 def test_a_long_job_stays_within_the_size_of_a_page(project):
     n, rng = 200_000, np.random.default_rng(0)
     angle = np.arange(n) / 500
-    names = [f"{k}_mm3_per_s" for k in ("predicted", "on_off", "priority", "superposition", "basis", "ilc")]
+    names = [f"{k}_mm3_per_s" for k in ("predicted", *(one.name for one in COMPOSERS))]
     columns = {
         "part": ["big"] * n, "tool": np.zeros(n, int), "material": ["A"] * n, "time_s": np.arange(n) / 50,
         "x_mm": 50 * np.cos(angle) * (1 - angle / 800),

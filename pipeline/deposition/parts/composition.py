@@ -1,6 +1,7 @@
 """Part program -> plunger command without learning again: the paper's priority rule, superposition, and basis
 functions; the one whose forecast is least at its upper end is taken."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -9,7 +10,7 @@ import numpy as np
 
 from pipeline.deposition import controllers
 from pipeline.deposition.drive import Drive, at_limit, follows, obeyed
-from pipeline.deposition.parts import basis, forecast
+from pipeline.deposition.parts import basis, forecast, pressure_advance
 from pipeline.deposition.parts.chain import Chain, averaged, identify, simulate
 from pipeline.deposition.parts.forecast import Covered, ForecastJudgement, Missed
 from pipeline.deposition.parts.library import (
@@ -27,6 +28,7 @@ from pipeline.deposition.parts.library import (
     nearest,
     of_task,
 )
+from pipeline.deposition.parts.pressure_advance import LEADS, TunedAdvance
 from pipeline.deposition.toolpath.gcode import Kind, Moves, PartProgram
 from pipeline.deposition.toolpath.motion import Motion, rate, sampled
 from pipeline.deposition.toolpath.tasks import PrintedLines, Tasks, halting, printed_lines, refuse, sequence
@@ -42,8 +44,8 @@ EXCERPT_S = 600.0
 class LearnedMaterial(NamedTuple):
     """What was learned of one material and nozzle: its chain, the gain (mm^3/s per mm) by
     which on-off control set out in the first trial, and the error of the learned trials
-    themselves in % of the steady flow (means over 0.2 s); what fits without a routine missed on it, and what
-    the routines covered."""
+    themselves in % of the steady flow (means over 0.2 s); what fits without a routine missed on it, what the
+    routines covered, and pressure advance as tuned on the chain, by composer."""
 
     material: str
     nozzle_mm: float
@@ -52,6 +54,7 @@ class LearnedMaterial(NamedTuple):
     learned_percent: float
     missed: Missed
     covered: Covered
+    advances: dict[str, TunedAdvance]
 
 
 class LearnedLibrary(NamedTuple):
@@ -133,11 +136,12 @@ class Composed(NamedTuple):
 
 
 def learn(trainings: Sequence[Training], *, sample_time_s: float) -> LearnedLibrary:
-    """Library, chains and checks from all learned trials: what segment_library stores.
+    """Library, chains, pressure advance and checks from all learned trials: what segment_library stores.
 
     Of each material and nozzle at least one routine; two speeds and two pauses make it hold for others.
     """
     library, materials = build(trainings, sample_time_s=sample_time_s), []
+    tune = functools.partial(pressure_advance.tune, sample_time_s=sample_time_s)
     for key in sorted({(t.material, t.nozzle_mm) for t in trainings}):
         mine = [t for t in trainings if (t.material, t.nozzle_mm) == key]
         left = []
@@ -152,14 +156,17 @@ def learn(trainings: Sequence[Training], *, sample_time_s: float) -> LearnedLibr
             )
         )
         chain = identify(mine, sample_time_s=sample_time_s)
+        missed = forecast.missed(mine, chain, sample_time_s=sample_time_s)
+        wanted = [t.r for t in mine]
         materials.append(
             LearnedMaterial(
                 *key,
                 chain,
                 gain,
                 100 * math.sqrt(np.mean(np.square(left))),
-                forecast.missed(mine, chain, sample_time_s=sample_time_s),
+                missed,
                 forecast.covered(mine, sample_time_s=sample_time_s),
+                {name: tune(chain, missed, wanted, lead=lead) for name, lead in LEADS.items()},
             )
         )
     return LearnedLibrary(library, tuple(materials), check(trainings, library))

@@ -55,7 +55,7 @@ def summary_lines(part: ComposedPart) -> str:
                 f"  the command reaches its limit {sat.share_percent:.1f} % of the printing time (peak "
                 f"{sat.peak_over_steady:.1f} x steady); {do}"
             )
-    if checks.judged:
+    if checks.judged and all(stream.judged.judged for stream in composed.streams):
         worst = int(np.argmax(np.nan_to_num(np.abs(lines.error_percent))))
         text.append(
             f"volume of {checks.judged} lines within {checks.worst_line_volume_percent:.1f} % of the plan; "

@@ -11,6 +11,7 @@ from pipeline.deposition.parts.chain import Chain, IdentifiedExtruder
 from pipeline.deposition.parts.composition import LearnedLibrary, LearnedMaterial
 from pipeline.deposition.parts.forecast import Covered, Missed
 from pipeline.deposition.parts.library import Basis, Check, Library, Training
+from pipeline.deposition.parts.pressure_advance import PressureAdvance, TunedAdvance, slicer_settings
 
 COLUMNS = ("task", "material", "nozzle_mm", "speed_mm_per_s", "pause_s", "lead", "length", "signal_mm")
 
@@ -30,6 +31,10 @@ def to_json(learned: LearnedLibrary) -> dict[str, Any]:
         "sample_time_s": learned.library.sample_time_s,
         "marks": {name: list(pair) for name, pair in learned.library.marks.items()},
         "materials": [_material_to_json(material) for material in learned.materials],
+        "slicer": {
+            one.material: slicer_settings(one.advances["pressure_advance"], one.on_off_gain)
+            for one in learned.materials
+        },
         "checks": [finite(check._asdict()) for check in learned.checks],
     }
 
@@ -41,7 +46,11 @@ def _material_to_json(material: LearnedMaterial) -> dict[str, Any]:
     chain |= {"extruder": finite(material.chain.extruder._asdict()), "structure": list(chain["structure"])}
     missed = finite(material.missed._asdict()) | {"by_place": material.missed.by_place.tolist()}
     return finite(values) | {
-        "chain": finite(chain), "missed": missed, "covered": material.covered._asdict()
+        "chain": finite(chain), "missed": missed, "covered": material.covered._asdict(),
+        "advances": {
+            name: {end: one._asdict() for end, one in tuned._asdict().items()}
+            for name, tuned in material.advances.items()
+        },
     }  # fmt: skip
 
 
@@ -93,6 +102,10 @@ def _material(values: Mapping[str, Any]) -> LearnedMaterial:
     missed["by_place"] = np.array(missed["by_place"], float)
     known: dict[str, Any] = dict(values)
     known |= {"chain": Chain(**chain), "missed": Missed(**missed), "covered": Covered(**values["covered"])}
+    known["advances"] = {
+        name: TunedAdvance(**{end: PressureAdvance(**one) for end, one in tuned.items()})
+        for name, tuned in values["advances"].items()
+    }
     return LearnedMaterial(**known)
 
 

@@ -20,7 +20,7 @@ from pipeline.report.shared.card import (
     of_verdict,
 )
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.deposition import LIBRARY, NAMES, OURS, Structure, structures, worst
+from pipeline.verdict.deposition import FIRST_TRIALS, LIBRARY, NAMES, OURS, Structure, structures, worst
 from pipeline.verdict.digits import THIN, band, count, decimals, number, percent
 from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import PASSED, Missing, Verdict
@@ -28,7 +28,14 @@ from pipeline.verdict.verdict import PASSED, Missing, Verdict
 MOVES = "Plunger command to flow at the nozzle"
 # how long a stretch of a part is drawn, s
 STRETCH_S = 6.0
-STYLES = {"basis": "line", "priority": "line dd", "superposition": "line dd dash", "on_off": "line bl"}
+STYLES = {
+    "basis": "line",
+    "priority": "line dd",
+    "superposition": "line dd dash",
+    "pressure_advance": "line bl dash",
+    "pressure_advance_lead": "line bl dash",
+    "on_off": "line bl",
+}
 
 Read = Callable[[Structure, str], float | None]
 
@@ -43,7 +50,7 @@ def card(sources: Sources, verdict: Verdict) -> Card:
             missing=parts.sentence(),
         )  # fmt: skip
     asked = sources.declared.rules
-    known = [part for part in parts if not part.unknown()]
+    known = [part for part in parts if part.known()]
     whose = "forecasts of the identified machine" if real(sources) else "true flow of simulated machines"
     other = worst(known, names[1])
     return of_verdict(
@@ -83,11 +90,11 @@ def _note(name: str) -> str:
 
 
 def _error(part: Structure, name: str) -> float | None:
-    return part.scores[name].error if name in part.scores else None
+    return part.error(name)
 
 
 def _volume(part: Structure, name: str) -> float | None:
-    return part.scores[name].worst_line if name in part.scores else None
+    return part.worst_line(name)
 
 
 def _above(part: Structure, name: str) -> float | None:
@@ -120,7 +127,9 @@ def _cell(values: Sequence[float], unit: str, *, best: bool, limit: float) -> Ca
 
 
 def _step(sources: Sources, verdict: Verdict) -> CardStep:
-    if not verdict.winner:
+    if verdict.remedy == FIRST_TRIALS:
+        return CardStep(verdict.remedy, "./run dvc repro train_ilc")
+    if not verdict.winner and not verdict.remedy:
         return CardStep("Run the stages of this loop.", "./run dvc repro compose_parts")
     if verdict.state != PASSED and verdict.remedy:
         return CardStep(f"{verdict.remedy.rstrip('.')}; then run it again.", "./run dvc repro")
@@ -140,7 +149,7 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     if isinstance(table, Missing):
         return table
     names = shown(verdict.winner or "")
-    found = worst([part for part in parts if not part.unknown()], names[0])
+    found = worst(parts, names[0])
     rows = [] if found is None else _stretch(table, found[1], names[0])
     if found is None or not len(rows):
         return Missing("not measured", "no flow of the part that decides was kept")

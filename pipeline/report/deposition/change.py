@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from pipeline.report.shared.difference import Move
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.deposition import SAME, Structure
+from pipeline.verdict.deposition import NOT_JUDGED, SAME, Structure
 from pipeline.verdict.evidence import lookup
 from pipeline.verdict.verdict import Figure, Missing, Question
 
@@ -29,11 +29,10 @@ def _move(sources: Sources, structure: Structure) -> Move:
         False,
         "",
     )
-    score, before = structure.scores.get(structure.chosen), _accepted(sources, structure)
+    score, before = structure.known().get(structure.chosen), _accepted(sources, structure)
     if score is None:
-        return Move(
-            question, before, Missing("not measured", "no composer was chosen"), False, "not measured"
-        )
+        why = NOT_JUDGED if structure.unknown() else "not measured"
+        return Move(question, before, Missing("not measured", "nothing to compare"), False, why)
     now = Figure(score.error, score.error, score.error)
     if before is None:
         return Move(question, None, now, False, "new")

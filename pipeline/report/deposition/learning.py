@@ -12,7 +12,7 @@ from markupsafe import Markup
 from pipeline.report.deposition.marks import real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
-from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.sources import Sources, first_routine
 from pipeline.verdict.digits import THIN, count, number, percent, short
 from pipeline.verdict.evidence import Table, lookup
 from pipeline.verdict.verdict import Missing
@@ -37,24 +37,22 @@ def _materials(table: Table) -> list[str]:
     return [str(name) for name in dict.fromkeys(table["material"])][:MATERIALS]
 
 
+def _routines(table: Table) -> list[str]:
+    return [str(number) for number in sorted(set(table["routine"].tolist()))]
+
+
 def _laws(table: Table) -> list[str]:
     there = set(table["law"].tolist())
     return [law for law in LAWS if law in there]
 
 
 def _trial(table: Table, material: str, law: str, trial: int) -> Table:
-    """The samples of one trial of the reference routine."""
-    rows = (
-        (table["material"] == material)
-        & (table["law"] == law)
-        & (table["routine"] == 0)
-        & (table["trial"] == trial)
-    )
+    rows = (table["material"] == material) & (table["law"] == law) & (table["trial"] == trial)
     return {name: values[rows] for name, values in table.items()}
 
 
 def _trials(table: Table, material: str, law: str) -> Table:
-    rows = (table["material"] == material) & (table["law"] == law) & (table["routine"] == 0)
+    rows = (table["material"] == material) & (table["law"] == law)
     return {name: values[rows] for name, values in table.items()}
 
 
@@ -67,7 +65,7 @@ def _columns(laws: list[str], draw: Callable[[str, int], list[Markup]]) -> list[
 
 def errors(sources: Sources) -> Picture:
     """Both errors after every update, as share of trial 0's."""
-    table, title = sources.tables["trials"], "Error after each trial"
+    table, title = first_routine(sources.tables["trials"]), "Error after each trial"
     if isinstance(table, Missing):
         return placeholder("learning-error", title, table)
     materials, laws, machine = _materials(table), _laws(table), real(sources)
@@ -118,7 +116,7 @@ def errors(sources: Sources) -> Picture:
 
 
 def _restarts(sources: Sources, law: str, material: str) -> list[int]:
-    """The trials at which a machine was found changed on the reference routine; none in metrics of before."""
+    """The trials at which a machine was found changed on the shown routine; none in metrics of before."""
     metrics = sources.metrics["train_ilc"]
     of_law = metrics.get(material, {}).get(law, {}) if isinstance(metrics, dict) else {}
     return [int(trial) for trial in of_law.get("restarts", [])]
@@ -243,7 +241,7 @@ def commands(sources: Sources) -> Picture:
         page.origin(
             sources.source("lessons"),
             material=materials,
-            routine="0",
+            routine=_routines(table),
             law=law,
             trial=sorted({"0", str(min(1, last)), str(last)}),
             y="command_mm",
@@ -344,7 +342,7 @@ def corner(sources: Sources) -> Picture:
         page.origin(
             sources.source("lessons"),
             material=materials,
-            routine="0",
+            routine=_routines(table),
             law=laws,
             trial=sorted(
                 {str(int(_trials(table, materials[0], law)["trial"].max(initial=0))) for law in laws}
@@ -431,7 +429,7 @@ def measured(sources: Sources) -> Picture:
     """The flow measured from pictures, with its band, against the true one."""
     table, filmed, title = (
         sources.tables["lessons"],
-        sources.tables["filmed"],
+        first_routine(sources.tables["filmed"]),
         "The flow that the pictures told",
     )
     for missing in (table, filmed):
@@ -448,7 +446,7 @@ def measured(sources: Sources) -> Picture:
         panels = []
         for trial in dict.fromkeys((0, last)):
             mine = _trial(table, material, "pixels", trial)
-            here = (filmed["material"] == material) & (filmed["routine"] == 0) & (filmed["trial"] == trial)
+            here = (filmed["material"] == material) & (filmed["trial"] == trial)
             if len(mine["time_s"]) and here.any():
                 panels += _measured_panels(
                     mine,
@@ -478,7 +476,11 @@ def measured(sources: Sources) -> Picture:
         f"Measured flow in mm³/s against time in s{below}. "
         "Grey: the gantry stands, only the volume of the pause is seen, and nothing is learned there.",
         page.origin(
-            sources.source("lessons", "filmed"), material=materials, routine="0", law="pixels", trial="0"
+            sources.source("lessons", "filmed"),
+            material=materials,
+            routine=_routines(table),
+            law="pixels",
+            trial="0",
         ),
     )
 

@@ -6,11 +6,11 @@ from pipeline.report.shared.sources import Sources
 # what stands below a heading
 PAPER = {row.name: row.explanation for row in COMPOSERS}
 # marks of the other pages by kind, the second of a kind hollow: circle data-driven, square model-based and
-# the reference, ring baseline
+# the reference, ring on-off control, a shape of its own every other baseline
 _MARKS = {
     "model-based": ("model_based", "exact_model"),
     "data-driven": ("data_driven", "kernel"),
-    "baseline": ("baseline",),
+    "baseline": ("baseline", "triangle", "diamond"),
     "reference": ("exact_model",),
 }
 _OF_KIND = {kind: [row.name for row in COMPOSERS if row.kind == kind] for kind in _MARKS}

@@ -3,6 +3,7 @@ what that took, and the pictures behind it."""
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from markupsafe import Markup
 from pipeline.report.deposition import change as deposition_change
 from pipeline.report.deposition import learning as deposition_learning
 from pipeline.report.deposition import parts as deposition_parts
-from pipeline.report.deposition.marks import HEADS, MARK, PAPER, real
+from pipeline.report.deposition.marks import HEADS, KIND, MARK, PAPER, real
 from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Change, Move
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
@@ -25,6 +26,7 @@ from pipeline.verdict.verdict import Figure, Missing, Question
 
 WORDS = (
     "on_off",
+    "pressure_advance",
     "basis",
     "library",
     "priority",
@@ -52,6 +54,9 @@ CHAIN = (
     ("yield_", "Yield, mm³/s"),
     ("creep_share", "Creep, share"),
 )
+# what a slicer takes, with decimals, and who takes it as a line
+SLICER = {"pressure_advance_s": 4, "smooth_time_s": 3, "flow_ratio": 3}
+SLICERS = ("Klipper", "Marlin", "OrcaSlicer")
 SECTIONS = ("printer", "camera", "train_ilc", "segment_library", "compose_parts")
 
 
@@ -65,7 +70,7 @@ def render(sources: Sources) -> str:
         sources=sources,
         title=f"Deposition: {judged.decision.rstrip('.')}",
         verdict=judged,
-        heads_of_rules=HEADS,
+        heads_of_rules=_heads_of_rules(judged.winner),
         claim=headline.claim(sources, ("deposition",)),
         verdict_mark=MARK.get(judged.winner, "model_based"),
         beforehand=_beforehand(sources),
@@ -83,6 +88,7 @@ def render(sources: Sources) -> str:
         signals=signals(sources),
         assumptions=assumptions(sources),
         chains=chains(sources),
+        slicer=slicer(sources),
         columns=columns(sources),
         maps=deposition_parts.maps(sources),
         stretches=deposition_parts.stretches(sources),
@@ -99,16 +105,25 @@ def render(sources: Sources) -> str:
     )
 
 
+def _heads_of_rules(winner: str) -> tuple[str, ...]:
+    """Of the two columns of rules; the second is of the baseline in use, if one is."""
+    if winner == "on_off" or KIND.get(winner) != "baseline":
+        return HEADS
+    return HEADS[0], NAMES[winner], MARK[winner], HEADS[3]
+
+
 def _beforehand(sources: Sources) -> str:
-    before = gamma(sources.evidence)
+    before, lessons = gamma(sources.evidence), sources.tables["lessons"]
+    other = [] if isinstance(lessons, Missing) else sorted(set(lessons["routine"].tolist()) - {0})
+    instead = f"Shown is routine {other[0]}: the reference is not recorded. " if other else ""
     if before is None:
         return (
-            "The convergence of the paper’s law was not tested beforehand; the model inversion identifies "
-            "the machine in its first trials, and repeats the best command where the error rises."
+            f"{instead}The convergence of the paper’s law was not tested beforehand; the model inversion "
+            "identifies the machine in its first trials, and repeats the best command where the error rises."
         )
     return (
-        "Tested before anything ran: with γ = max |Q² (1 − L P)| below 1 the paper’s law shrinks the error "
-        f"at every trial. γ is {number(before['gamma'], 2)} on the nominal plant and up to "
+        f"{instead}Tested before anything ran: with γ = max |Q² (1 − L P)| below 1 the paper’s law shrinks "
+        f"the error at every trial. γ is {number(before['gamma'], 2)} on the nominal plant and up to "
         f"{number(before['gamma_worst'], 2)} over its family, above 1 on "
         f"{percent(before['gamma_above_1_percent'], 2)} of it: there the law may look fine for a dozen "
         "trials and then diverge. "
@@ -124,21 +139,19 @@ def _beforehand(sources: Sources) -> str:
 def _answer(structure: Structure, move: Move | None) -> dict[str, Any]:
     """The basis functions beside the library on one scale, the strip's limit in its middle; the
     worst line's volume of the composer that was chosen."""
-    scores, limit = structure.scores, structure.asked.flow_error_percent
+    scores, limit = structure.known(), structure.asked.flow_error_percent
     question = Question(0, "", structure.part, "%", limit, False, "")
     shown = [
         (
             NAMES[name],
             css,
-            Figure(*3 * (scores[name].error,))
-            if name in scores and not structure.unknown()
-            else Missing("not measured", "no score"),
+            Figure(*3 * (scores[name].error,)) if name in scores else Missing("not measured", "no score"),
         )
         for name, css in ((OURS, "mb"), (LIBRARY, "dd"), ("ilc", "acc"))
     ]
     chosen = scores.get(structure.chosen)
-    line = chosen.worst_line if chosen and not structure.unknown() else None
-    best = "" if structure.unknown() else structure.best()
+    line = chosen.worst_line if chosen else None
+    best = structure.best()
     return {
         "part": structure.part,
         "material": structure.material,
@@ -148,8 +161,8 @@ def _answer(structure: Structure, move: Move | None) -> dict[str, Any]:
                 "css": css,
                 "name": NAMES[name],
                 "value": _value(structure, name),
-                "band": _interval(scores[name]) if name in scores and not structure.unknown() else "",
-                "bad": name in scores and scores[name].error > limit and not structure.unknown(),
+                "band": _interval(scores[name]) if name in scores else "",
+                "bad": name in scores and scores[name].error > limit,
                 "best": name == best,
             }
             for css, name in (("mb", OURS), ("dd", LIBRARY))
@@ -166,11 +179,10 @@ def _answer(structure: Structure, move: Move | None) -> dict[str, Any]:
 
 def _value(structure: Structure, name: str) -> str:
     """The flow error of a composer; of a real machine no figure that its forecast does not stand behind."""
-    if name not in structure.scores:
-        return "not measured"
-    if structure.unknown() and name != "on_off":
-        return NOT_JUDGED
-    return percent(structure.scores[name].error, 2)
+    error = structure.error(name)
+    if error is None:
+        return NOT_JUDGED if name in structure.scores else "not measured"
+    return percent(error, 2)
 
 
 def _interval(score: Score) -> str:
@@ -191,7 +203,7 @@ def _forecast(score: Score) -> str:
     return f"forecast {percent(score.low, 2)} to {percent(score.high, 2)}"
 
 
-BOARD = ("basis", "priority", "superposition", "on_off", "ilc")
+BOARD = ("basis", "priority", "superposition", "pressure_advance", "pressure_advance_lead", "on_off", "ilc")
 
 
 def scoreboard(parts: list[Structure], asked: ReportRules) -> dict[str, Any]:
@@ -208,30 +220,20 @@ def scoreboard(parts: list[Structure], asked: ReportRules) -> dict[str, Any]:
 
 
 def _cell(structure: Structure, name: str) -> dict[str, Any]:
-    score = structure.scores.get(name)
+    score = structure.known().get(name)
     if score is None:
         return {
-            "value": "not measured",
+            "value": _value(structure, name),
             "band": "",
             "line": "",
             "best": False,
             "bad": False,
             "line_bad": False,
-            "chosen": False,
+            "chosen": name in structure.scores and name == structure.chosen,
         }
     line, asked = score.worst_line, structure.asked
-    if structure.unknown() and name != "on_off":
-        return {
-            "value": NOT_JUDGED,
-            "band": "",
-            "line": "",
-            "best": False,
-            "bad": False,
-            "line_bad": False,
-            "chosen": name == structure.chosen,
-        }
     return {
-        "value": percent(score.error, 2),
+        "value": _value(structure, name),
         "band": _forecast(score),
         "line": "no line long enough" if line is None else f"worst line {percent(line, 2)}",
         "best": name == structure.best(),
@@ -432,6 +434,24 @@ def chains(sources: Sources) -> dict[str, Any]:
         if material["chain"].get("held_out_percent") is not None
     ]
     return {"missing": None, "rows": rows, "heads": heads, "fit": "; ".join(fits)}
+
+
+def slicer(sources: Sources) -> list[dict[str, str]]:
+    """Pressure advance of each material as a slicer takes it, each number with its 90 % interval, and the
+    lines that set it."""
+    materials = lookup(sources.tables["learned"], "slicer")
+    if isinstance(materials, Missing):
+        return []
+    return [
+        {"material": name, "lines": "\n".join(f"{key}: {values[key]}" for key in SLICERS)}
+        | {key: _with_ends(values[key], places) for key, places in SLICER.items()}
+        for name, values in list(materials.items())[:MATERIALS]
+    ]
+
+
+def _with_ends(values: Sequence[float], places: int) -> str:
+    low, value, high = (f"{one:.{places}f}" for one in values)
+    return f"{value} ({low} to {high})"
 
 
 def columns(sources: Sources) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from pipeline.report.deposition.marks import CSS, MARK, PAPER, real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.deposition import NAMES, asked_of_the_drive
+from pipeline.verdict.deposition import NAMES, NOT_JUDGED, asked_of_the_drive, structures, unknown_streams
 from pipeline.verdict.digits import MINUS, THIN, count, number, percent, short, shortened
 from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import Missing
@@ -39,12 +39,26 @@ def _streams(table: Table) -> list[tuple[str, str]]:
     return list(dict.fromkeys(zip(table["part"].tolist(), table["material"].tolist(), strict=True)))
 
 
+def _judged(sources: Sources, name: str) -> Table | Missing:
+    """The rows of a table of forecasts whose stream is simulated or judged: no other has a figure."""
+    table, unknown = sources.tables[name], unknown_streams(sources.evidence)
+    if isinstance(table, Missing) or not unknown:
+        return table
+    tools = {one["tool"]: one["name"] for one in sources.declared.everything["printer"]["materials"]}
+    materials = [tools.get(tool) for tool in table["tool"].tolist()]
+    streams = zip(table["part"].tolist(), materials, strict=True)
+    rows = np.array([stream not in unknown for stream in streams])
+    if not rows.any():
+        return Missing(NOT_JUDGED, "The verdict says which trial judges it")
+    return {column: values[rows] for column, values in table.items()}
+
+
 # ---- the picture of a part
 
 
 def maps(sources: Sources) -> list[Picture]:
     """Every part from above, coloured by the error of the flow where it prints."""
-    table = sources.tables["signals"]
+    table = _judged(sources, "signals")
     if isinstance(table, Missing):
         return [placeholder("maps", "The parts, coloured by flow error", table)]
     parts = list(dict.fromkeys(table["part"].tolist()))
@@ -197,7 +211,7 @@ def _path(px: np.ndarray, py: np.ndarray) -> str:
 def stretches(sources: Sources) -> Picture:
     """Wanted flow and that of every composer where the chosen one errs most, a row for each stream."""
     table, scores, title = (
-        sources.tables["signals"],
+        _judged(sources, "signals"),
         sources.tables["scores"],
         "Flow where the chosen signal errs most",
     )
@@ -267,10 +281,7 @@ class Stretch(NamedTuple):
 def _stretch(table: Table, part: str, material: str, chosen: str) -> Stretch:
     rows = (table["part"] == part) & (table["material"] == material)
     t, wanted = table["time_s"][rows], table["wanted_mm3_per_s"][rows]
-    flows = {
-        name: table[f"{name}_mm3_per_s"][rows]
-        for name in ("priority", "superposition", "basis", "ilc", "on_off")
-    }
+    flows = {name: table[f"{name}_mm3_per_s"][rows] for name in NAMES if f"{name}_mm3_per_s" in table}
     middle = float(t[np.argmax(np.abs(np.nan_to_num(flows[chosen]) - wanted))])
     begin = min(max(middle - STRETCH_S / 2, float(t[0])), max(float(t[-1]) - STRETCH_S, float(t[0])))
     near = (t >= begin) & (t <= begin + STRETCH_S)
@@ -310,7 +321,7 @@ def _panel(stretch: Stretch, name: str, *, first: bool, top: bool) -> Markup:
 
 def lines(sources: Sources) -> dict[str, Any]:
     """The lines that are furthest from their volume, the worst first."""
-    table = sources.tables["lines"]
+    table = _judged(sources, "lines")
     if isinstance(table, Missing):
         return {"missing": table}
     allowed = sources.declared.rules.line_volume_percent
@@ -376,16 +387,20 @@ def forecasts(sources: Sources) -> dict[str, Any]:
     conformance = sources.tables["conformance"]
     if isinstance(conformance, Missing):
         return {"missing": conformance}
+    unknown, parts = unknown_streams(sources.evidence), structures(sources.evidence)
+    # the verdict gives the reason of the first; here it would stand again
+    said = next((part.why for part in ([] if isinstance(parts, Missing) else parts) if part.unknown()), "")
     rows = [
-        _forecast(part, material, report)
+        _forecast(part, material, report, (part, material) in unknown, said)
         for part, report in conformance.items()
         for material in report.get("saturation", {})
     ]
     return {"missing": None, "rows": rows}
 
 
-def _forecast(part: str, material: str, report: dict[str, Any]) -> Forecast:
-    """One stream out of the conformance report of its part."""
+def _forecast(part: str, material: str, report: dict[str, Any], unknown: bool, said: str) -> Forecast:
+    """One stream out of the conformance report of its part; no figure of the flow if that is unknown, and no
+    reason that is already said."""
     drive = report["saturation"][material]
     asked = asked_of_the_drive(part, material, drive)
     ramp = report.get("ramp_that_would_do_s", {}).get(material)
@@ -399,7 +414,7 @@ def _forecast(part: str, material: str, report: dict[str, Any]) -> Forecast:
         material,
         MARK.get(composer, "baseline"),
         NAMES.get(composer, composer),
-        *_told(report.get("forecast", {}).get(material)),
+        *_told(report.get("forecast", {}).get(material), said),
         time=number(float(report.get("duration_s", 0.0)), 1),
         lines=f"{report.get('printed_lines', 0):,} in {report.get('runs', 0):,}",
         short=number(float(report.get("shorter_than_lead", 0)), 0),
@@ -408,7 +423,9 @@ def _forecast(part: str, material: str, report: dict[str, Any]) -> Forecast:
         limit="not declared" if asked.limit() == "declared" else asked.limit(),
         share=percent(asked.share, 2),
         bad=not asked.enough,
-        error=_beside(drive.get("rms_percent_of_on_off"), drive.get("least_percent")),
+        error=NOT_JUDGED
+        if unknown
+        else _beside(drive.get("rms_percent_of_on_off"), drive.get("least_percent")),
         ramp=remedy,
     )
 
@@ -418,14 +435,16 @@ def _beside(error: float | None, least: float | None) -> str:
     return "" if error is None else percent(error, 2) + ("" if least is None else f" ({percent(least, 2)})")
 
 
-def _told(forecast: dict[str, Any] | None) -> tuple[str, str, str]:
+def _told(forecast: dict[str, Any] | None, said: str) -> tuple[str, str, str]:
     """The forecast interval, or why it is not judged and what would judge it; and what was measured."""
     if forecast is None:
         return "none", "", ""
     measured = forecast.get("measured_percent")
     beside = "" if measured is None else f"measured {percent(float(measured), 2)}"
     if not forecast["judged"]:
-        return "not judged", f"{forecast['reason']}; to judge it, {forecast['trial']}", beside
+        repeated = forecast["reason"] == said
+        why = "" if repeated else f"{forecast['reason']}; to judge it, {forecast['trial']}"
+        return NOT_JUDGED, why, beside
     return f"{percent(forecast['low'], 2)} to {percent(forecast['high'], 2)}", "", beside
 
 

@@ -55,10 +55,11 @@ def _search(table: Table) -> Iterator[tuple[str, Curve]]:
 
 
 def _trials(table: Table) -> Iterator[tuple[str, Curve]]:
-    """The reference routine with the law that is used: `pixels` if the trials were filmed."""
+    """The first recorded routine with the law that is used: `pixels` if the trials were filmed."""
     law = "pixels" if "pixels" in table["law"] else "model_inverse"
     for material in dict.fromkeys(table["material"]):
-        rows = (table["material"] == material) & (table["law"] == law) & (table["routine"] == 0)
+        rows = (table["material"] == material) & (table["law"] == law)
+        rows &= table["routine"] == min(table["routine"][rows], default=0)
         error = table["rms_measured"][rows]
         yield (
             f"Deposition: error of the measured flow, material {material}",

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from pipeline.setpoint.agents.criteria import harm_bar
 from pipeline.verdict.decide import questions
+from pipeline.verdict.deposition import REFERENCE
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.temperature import comparison
 from pipeline.verdict.verdict import Figure, Question
@@ -161,13 +162,14 @@ def _single(value: float) -> Figure:
 
 def deposition(parts: Mapping, laws: Mapping) -> dict[str, Figure]:
     """Worst flow error and worst line of the composers in use, and the share of trial 0's error that is left
-    after learning, in %. Each is the worst material's."""
+    after learning, in %. Each is the worst material's. A real machine's forecast counts only if it is judged.
+    """
     streams = [
         stream
         for part in parts.values()
         if isinstance(part, dict)
         for stream in part.values()
-        if isinstance(stream, dict)
+        if isinstance(stream, dict) and (REFERENCE in stream or section(stream, "judged").get("judged", True))
     ]
     used = [section(stream, str(stream.get("chosen"))) for stream in streams]
     learned = [

@@ -43,6 +43,7 @@ _unmarked = [contestant.name for contestant in CONTESTANTS if not contestant.mar
 MARKS = (
     {"data_driven": "dd", "model_based": "mb", "baseline": "bl", "kernel": "dd"}
     | {contestant.name: contestant.mark for contestant in CONTESTANTS if contestant.mark}
+    | {shape: shape for shape in SHAPES}
     | dict(zip(_unmarked, itertools.cycle(SHAPES), strict=False))
 )
 HOLLOW = {"kernel", *(contestant.name for contestant in CONTESTANTS if contestant.hollow)}

@@ -9,6 +9,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+import pandas as pd
+
 from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
 from pipeline.setpoint.tables import (
     AGENT_CURVE,
@@ -24,6 +27,7 @@ from pipeline.store import artifacts
 from pipeline.temperature import tables as schemas
 from pipeline.temperature.settings import Plant
 from pipeline.verdict import night
+from pipeline.verdict.deposition import of_recorded_trials
 from pipeline.verdict.evidence import OFF, Evidence, Table, switched_off
 from pipeline.verdict.settings import QUICK_LOOK, ReportRules
 from pipeline.verdict.verdict import LOOPS, Missing, Verdict, read_certificates
@@ -176,8 +180,10 @@ def collect(
             del read[path]
         elif isinstance(tables[name], Missing):
             absent[path] = tables[name]
-    # the pages show the reference routine, a third of all rows; the viewer shows every one
-    tables["every_lesson"], tables["lessons"] = tables["lessons"], _first_routine(tables["lessons"])
+    if declared.everything["train_ilc"]["source"] == "recordings":
+        tables = of_recorded_trials(figures, tables)
+    # the pages show one routine, a third of all rows; the viewer shows every one
+    tables["every_lesson"], tables["lessons"] = tables["lessons"], first_routine(tables["lessons"])
     for name, stage in (("frames", "train_ilc"), ("nozzle_frames", "train_classifier")):
         for frame in [] if isinstance(tables[name], Missing) else tables[name]:
             path = frame["path"]
@@ -317,11 +323,14 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
     ]
 
 
-def _first_routine(table: Table | Missing) -> Table | Missing:
-    """The lessons of the reference routine."""
+def first_routine(table: Table | Missing) -> Table | Missing:
+    """The rows of each material's first recorded routine, the reference if that is recorded."""
     if isinstance(table, Missing):
         return table
-    rows = table["routine"] == 0
+    if not len(table["routine"]):
+        return Missing("not measured", "no trial is recorded yet")
+    first = pd.Series(table["routine"]).groupby(np.asarray(table["material"])).transform("min")
+    rows = table["routine"] == first.to_numpy()
     return {name: values[rows] for name, values in table.items()}
 
 

@@ -222,6 +222,12 @@ FIXED = {
         "Wanted flow over the gain known beforehand: what a machine does that knows nothing of its own "
         "slowness. Its error is 100 %.",
     ),
+    "pressure_advance": (
+        "Pressure advance",
+        "The controller of Klipper, Marlin and slicers: the wanted flow and pressure advance times its "
+        "change, smoothed. It is tuned on the identified chain, so it costs no print. With a lead, all of it "
+        "is sent ahead, which no firmware does.",
+    ),
     "basis": (
         "Basis functions",
         "Our composer: the command for any part is built from a few functions of the wanted flow, "

@@ -273,6 +273,8 @@ def _lessons() -> ViewerTable:
 COMPOSERS = (
     ("predicted", "flow predicted for the chosen command"),
     ("on_off", "on-off"),
+    ("pressure_advance", "pressure advance"),
+    ("pressure_advance_lead", "pressure advance with a lead"),
     ("priority", "library by priority"),
     ("superposition", "library by superposition"),
     ("basis", "basis functions"),
