@@ -133,6 +133,8 @@ def printed(plan: Targets, file: str) -> str:
         f"1. Home nothing, load no filament, and print {file} from the printer's own storage.\n"
         "2. When it is done, copy klippy.log and that file into datasets/raw/temperature, and run\n"
         "   ./run dvc repro\n"
+        "With a macro in printer.cfg the printer's screen starts it:\n"
+        f"   [gcode_macro FIRST_EXPERIMENT]\n   gcode: SDCARD_PRINT_FILE FILENAME={file}\n"
         "The filament's feed is not moved: what it does is learned from a print."
     )
 

@@ -100,6 +100,20 @@ def test_the_next_experiment_stands_beside_its_limits_or_says_why_there_is_none(
     assert f"Not written: {reason}" in Page(TEMPERATURE).text
 
 
+def test_prints_without_their_gcode_are_the_next_step(recorded):
+    machine = yaml.safe_load(Path("params.yaml").read_text())["plant"]
+    for output in machine["outputs"]:
+        del output["low"], output["high"]
+    declare("plant", **machine)
+    change("ingest", findings__recording={"printed_file": 2})
+    main()
+    said = "without them part fan and filament feed of two prints are not recorded. ./run beadline init"
+    assert said in Page(INDEX).text
+    change("ingest", findings={})
+    main()
+    assert "Record the next experiment." in Page(INDEX).text
+
+
 def test_a_run_is_not_compared_with_the_accepted_run_of_another_machine(recorded, monkeypatch):
     main()
     monkeypatch.setattr(sys, "argv", ["beadline", "accept"])

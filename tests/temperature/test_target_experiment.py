@@ -35,7 +35,9 @@ def test_length_and_hottest_target_are_those_of_the_file():
     rows = played(first.gcode(plan, 0.0))
     assert rows[-1][0] == pytest.approx(3600, abs=5) and max(target for _, target, _ in rows) == 220
     assert min(target for _, target, _ in rows) == 180 and {0.0, 100.0} <= {fan for *_, fan in rows}
-    assert "60 min; hottest target of extruder 220 °C." in first.printed(plan, "x.gcode")
+    said = first.printed(plan, "x.gcode")
+    assert "60 min; hottest target of extruder 220 °C." in said
+    assert "[gcode_macro FIRST_EXPERIMENT]\n   gcode: SDCARD_PRINT_FILE FILENAME=x.gcode\n" in said
     # a Klipper that counts characters loses its place in others
     assert first.gcode(plan, 0.0).isascii()
     assert first.gcode(plan, 0.0).startswith("; 60 min") and first.gcode(plan, 0.0).endswith(

@@ -22,8 +22,8 @@ from pipeline.report.temperature.deciding import degrees, runs_of, until_settled
 from pipeline.report.temperature.judgement import Judgement, named_before
 from pipeline.report.temperature.scorecard import setting
 from pipeline.verdict.controllers import heading, kind
-from pipeline.verdict.digits import THIN, declared, short, with_unit
-from pipeline.verdict.evidence import Table
+from pipeline.verdict.digits import THIN, count, declared, short, with_unit
+from pipeline.verdict.evidence import Table, lookup
 from pipeline.verdict.temperature import comparison
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, Verdict, state
 from pipeline.verdict.wording import OFF_THE_SCALE, banded, places_of, worded
@@ -34,6 +34,7 @@ PI, IDLE = ("pi_simc", "pi"), "hold"
 # the first two figures of the card; the third is the one that decides, else overshoot
 FIGURES = ("settled_error", "settling")
 NOT_JUDGED = Missing(OPEN, "It was not judged")
+WITHOUT_GCODE = "printed_file"  # what ingest flags: the file of a print is not beside the log
 STYLES = {"dd": "line dd", "mb": "line", "bl": "line bl"}
 
 
@@ -121,7 +122,21 @@ def _step(sources: Sources, verdict: Verdict) -> CardStep:
         return CardStep(
             "Replay it on a recording before a trial.", f"./run beadline replay {folder} RECORDING.csv"
         )
+    if unrecorded := _without_gcode(sources):
+        return CardStep(
+            "Put the printed G-code files beside klippy.log: without them part fan and filament feed of "
+            f"{count(unrecorded, 'print')} are not recorded.",
+            "./run beadline init klippy.log --copy",
+        )
     return CardStep("Record the next experiment.", "./run beadline first-experiment")
+
+
+def _without_gcode(sources: Sources) -> int:
+    """How many prints of the recordings have no G-code file beside them."""
+    found = lookup(sources.metrics["ingest"], "findings")
+    if isinstance(found, Missing):
+        return 0
+    return int(found.get("recording", {}).get(WITHOUT_GCODE, 0))
 
 
 def deciding(sources: Sources, judged: Judgement) -> Deciding | Missing:
