@@ -135,16 +135,23 @@ def _beforehand(sources: Sources) -> str:
 
 
 def _floor(sources: Sources) -> str:
-    """The least error that the declared drive allows, the worst of materials and routines."""
+    """Another kind of machine than printer.command says, and the least error that the declared drive allows,
+    the worst of materials and routines."""
     learning = sources.evidence.figures["train_ilc"]
+    materials = {} if isinstance(learning, Missing) else learning
     ratios = [
         headroom["least_ratio"]
-        for material in ({} if isinstance(learning, Missing) else learning).values()
+        for material in materials.values()
         for headroom in material.get("actuator_headroom", [])
     ]
+    named = "".join(
+        f"Material {name}: {material['command_kind']}. "
+        for name, material in materials.items()
+        if material.get("command_kind")
+    )
     if not ratios:
-        return ""
-    return (
+        return named
+    return named + (
         f"No command within printer.drive leaves less than {percent(100 * max(ratios), 2)} of on-off "
         "control’s error, says the model known beforehand (worst routine). "
     )
