@@ -452,7 +452,7 @@ def _stream(
     material, drive, Ts = share.material, settings.drive, library.sample_time_s
     u = controllers.command(composer)(library, share, drive)
     if settings.command != "pressure":
-        u = u * (share.r.sum() / (material.volume_per_mm * u.sum()))
+        u = obeyed(u * (share.r.sum() / (material.volume_per_mm * u.sum())), drive, sample_time_s=Ts)
     y, on_off = (
         simulate([material.chain.extruder], command[None], sample_time_s=Ts)[0, 0]
         for command in (u, _on_off(share, drive, Ts))
