@@ -167,7 +167,7 @@ def learn_from_recordings(
 ) -> Results:
     """The trials of `folder`, and in `following` the command of the next trial of every material and routine,
     on-off control's if there is none yet."""
-    from pipeline.deposition import extruder
+    from pipeline.deposition import drive, extruder
     from pipeline.deposition.camera import trial_flow
     from pipeline.deposition.learning import training
     from pipeline.recordings import trial_files
@@ -188,13 +188,23 @@ def learn_from_recordings(
                 earlier = [other.latency for path, other in values.items() if path != one.path]
                 measured.append(measure_trial(one, values[one.path], earlier, routine, printer, camera))
             trials, number = [one.trial for one in measured], len(measured)
+            if trials and "pixels" not in figures:
+                with artifacts.about(f"{folder}: material {material.name}, routine {index}"):
+                    figures["command_kind"] = check_kind(trials[0], routine, material, printer)
             law = "model_inverse" if measured else "on_off"
             with artifacts.about(f"{folder}: material {material.name}, routine {index}"):
                 sequence, u, of_step = training.resume(trials, routine, material.nominal, laws)
             name = f"{material.name}_routine_{index}_trial_{number:02d}"
             known = trial_conditions(printer, camera, material, routine, number, law, scale)
             said = trial_files.TrialConditions(**known)
-            trial_files.write_command(following / name, said, time_s=routine.time_s, command_mm=u)
+            sent = drive.sent(u, printer.command, sample_time_s=printer.sample_time_s)
+            trial_files.write_command(
+                following / name,
+                said,
+                time_s=routine.time_s,
+                command_mm=sent,
+                speed=printer.command == "speed",
+            )
             figures[f"routine_{index}"] = {"next": name} | of_step
             if sequence:
                 results[0][key], results[1][key] = [sequence], measured
@@ -203,6 +213,23 @@ def learn_from_recordings(
                 models[f"identified{end}"] = training.model_figures(sequence.model)
         results[2][material.name], results[3][material.name] = models, figures
     return results
+
+
+def check_kind(trial: Trial, routine: Routine, material: PrinterMaterial, printer: Printer) -> str:
+    """The sentence that names what the machine answers to, if its first trial fits that better than
+    printer.command; "" otherwise. Raises ValueError with it if nothing can be learned so."""
+    from pipeline.deposition import drive
+    from pipeline.deposition.learning import command_kind
+
+    Ts = printer.sample_time_s
+    squares = command_kind.errors(
+        drive.sent(trial.u, printer.command, sample_time_s=Ts), trial.y, routine.r,
+        gain=material.gain_mm3_per_s_per_mm, time_constant_s=material.time_constant_s, sample_time_s=Ts,
+    )  # fmt: skip
+    sentence, hopeless = command_kind.wrong_kind(squares, printer.command)
+    if hopeless:
+        raise ValueError(sentence)
+    return sentence
 
 
 def read(recording: TrialRecording, camera: Camera, memo: Path | None = None) -> readings.Readings:
@@ -230,17 +257,20 @@ def measure_trial(
     """The trial of a recording on the clock of its routine, from the readings of its frames; the camera's
     latency from section `camera`, or from this recording and `earlier` ones. Raises ValueError, naming the
     file, if it says nothing of its conditions or shows no bead."""
+    from pipeline.deposition import drive
     from pipeline.deposition.camera import flow, latency, trial_flow
     from pipeline.recordings import trial_files
 
     known, mounting = trial_files.check_conditions(recording), camera.mounting
     scale, late = known.scale, latency.of_camera(camera.latency_s, [*earlier, values.latency])
     with artifacts.about(recording.path):
-        return trial_flow.measure_trial(
+        measured = trial_flow.measure_trial(
             values, recording.signals, routine, mounting, scale=scale,
             view=flow.View(known.mm_per_px, known.nozzle_column), nozzle_mm=printer.nozzle_mm, latency=late,
             contact_angle_deg=known.contact_angle_deg, width_deviation_mm=camera.width_deviation_mm,
         )  # fmt: skip
+    u = drive.command(measured.trial.u, printer.command, sample_time_s=printer.sample_time_s)
+    return measured._replace(trial=measured.trial._replace(u=u))
 
 
 def show_frames(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.deposition import drive
 from pipeline.deposition.parts import leads, part_report, stored
 from pipeline.deposition.parts.composition import Composed, LearnedLibrary
 from pipeline.deposition.parts.part import ComposedPart
@@ -74,8 +75,12 @@ def _write_commands(part: ComposedPart, folder: Path, formats: Collection[str]) 
     """The commands of all tools on one clock, in each of the formats."""
     composed, files = part.composed, []
     time_s = np.arange(len(composed.streams[0].u)) * composed.sample_time_s
+    unit = "mm/s" if composed.command == "speed" else "mm"
     columns = {"time_s": time_s} | {
-        f"T{stream.tool}_{stream.material}_mm": stream.u for stream in composed.streams
+        f"T{stream.tool}_{stream.material}_{unit.replace('/', '_per_')}": drive.sent(
+            stream.u, composed.command, sample_time_s=composed.sample_time_s
+        )
+        for stream in composed.streams
     }
     if "csv" in formats:
         files.append(folder / f"{part.name}.signal.csv")
@@ -83,11 +88,11 @@ def _write_commands(part: ComposedPart, folder: Path, formats: Collection[str]) 
     if "parquet" in formats:
         files.append(folder / f"{part.name}.signal.parquet")
         time = Column("time_s", FLOAT, "s", "time since the plunger may move first")
-        tools = [Column(name, FLOAT, "mm", "plunger command of the tool") for name in list(columns)[1:]]
+        tools = [Column(name, FLOAT, unit, "plunger command of the tool") for name in list(columns)[1:]]
         artifacts.write_table(files[-1], Schema("commands", 1, (time, *tools)), columns)
     if "mcap" in formats:
         files.append(folder / f"{part.name}.signal.mcap")
-        sources = zip(_sources(composed), [stream.u for stream in composed.streams], strict=True)
+        sources = zip(_sources(composed), list(columns.values())[1:], strict=True)
         tables = tables_of(files[-1], time_s, list(sources))
         write_frames(files[-1], tables, dict.fromkeys(tables, TYPES["/plunger"]), time_s, None)
     if "gcode" in formats:
@@ -105,10 +110,18 @@ def _sources(composed: Composed) -> list[Source]:
 
 
 def with_leads(part: ComposedPart) -> str:
-    """The part as G-code whose E is the plunger's place (`leads.text`)."""
-    program, composed = part.program, part.composed
+    """The part as G-code whose E is what is pushed, and at its end the volume of the part over area and
+    identified flow ratio (`leads.text`). A pressure has no flow ratio: E counts the program's own filament,
+    and is the plunger's place if its diameter is not known."""
+    program, composed, area = part.program, part.composed, part.extruded.area_mm2
+    commands = {stream.tool: stream.u for stream in composed.streams}
+    speeds = composed.command != "pressure" or all(tool in area for tool in commands)
+    if composed.command == "pressure" and speeds:
+        commands = {
+            one.tool: one.u * (one.r.sum() / (area[one.tool] * one.u.sum())) for one in composed.streams
+        }
     return leads.text(
-        program.moves, part.planned, {stream.tool: stream.u for stream in composed.streams},
+        program.moves, part.planned, commands, speeds=speeds,
         letter=program.extruder if len(program.extruder) == 1 and program.extruder.isalpha() else "E",
         lead_in_s=composed.lead_in_s, sample_time_s=composed.sample_time_s,
     )  # fmt: skip

@@ -2,12 +2,17 @@
 asks for more."""
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 # of a limit: a command this near to it counts as at it, one this far beyond it as beyond
 NEAR, BEYOND = 0.999, 1 + 1e-9
+
+
+# what a machine answers to: a pressure, given as a place whose standing still presses on; the speed of what
+# it pushes; or the place of it. The last two conserve volume
+CommandKind = Literal["pressure", "speed", "place"]
 
 
 class Drive(NamedTuple):
@@ -20,6 +25,28 @@ class Drive(NamedTuple):
 
 
 UNLIMITED = Drive(math.inf, math.inf, 0.0)
+
+
+def place(v: np.ndarray, *, sample_time_s: float) -> np.ndarray:
+    """The place (T,) in mm, from 0 and linear between samples, of the speed v (T,) in mm/s held between
+    them."""
+    return np.append(0.0, np.cumsum(v[:-1])) * sample_time_s
+
+
+def speed(place_mm: np.ndarray, *, sample_time_s: float) -> np.ndarray:
+    """The speed (T,) in mm/s whose `place` is place_mm (T,), whatever it begins at; the last one is 0."""
+    return np.diff(place_mm, append=place_mm[-1]) / sample_time_s
+
+
+def sent(u: np.ndarray, kind: CommandKind, *, sample_time_s: float) -> np.ndarray:
+    """What is sent to a machine of `kind` for the command u (T,) of laws and composers, which is a speed in
+    mm/s where volume is conserved: its place in mm, or u itself."""
+    return place(u, sample_time_s=sample_time_s) if kind == "place" else u
+
+
+def command(recorded: np.ndarray, kind: CommandKind, *, sample_time_s: float) -> np.ndarray:
+    """The command u (T,) of laws and composers of what was sent; `sent` undone."""
+    return speed(recorded, sample_time_s=sample_time_s) if kind == "place" else recorded
 
 
 def demand(u: np.ndarray, *, sample_time_s: float) -> tuple[float, float]:

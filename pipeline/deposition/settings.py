@@ -6,6 +6,7 @@ Methods take values, no sections: the properties here make what a method takes, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
 
 
 class PrinterMaterial(Section):
-    """What is known of a material before anything is learned: K / (tau s + 1) from
-    plunger displacement to flow, on the printer's nozzle."""
+    """What is known of a material before anything is learned: K / (tau s + 1) from the command to flow, on
+    the printer's nozzle: mm^3/s per mm, or per mm/s of what is pushed."""
 
     name: str = Field(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9_-]+$")
     tool: int = Field(ge=0, le=99)
@@ -50,7 +51,8 @@ class TrainingRoutine(Section):
 
 
 class PlungerDrive(Section):
-    """What the plunger's drive can do: largest |command|, largest speed, and backlash."""
+    """What the plunger's drive can do: largest |command| (a way: its whole travel, where printer.command is a
+    speed or a place), largest speed, and backlash."""
 
     amplitude_mm: float = Field(gt=0, le=1e6)
     speed_mm_per_s: float = Field(gt=0, le=1e6)
@@ -69,6 +71,7 @@ class Printer(Section):
     ramp_s: float = Field(gt=0, le=60)
     longest_ramp_s: float | None = Field(default=None, gt=0, le=60)
     drive: PlungerDrive | None
+    command: Literal["pressure", "speed", "place"] = "pressure"
     acceleration_mm_per_s2: float = Field(gt=0, le=1e6)
     junction_deviation_mm: float = Field(ge=0, le=10)
     gantry_speed_limit_mm_per_s: float = Field(gt=0, le=10_000)
@@ -90,12 +93,31 @@ class Printer(Section):
                 )
         return self
 
+    @pydantic.model_validator(mode="after")
+    def _travels(self):
+        if self.drive is None or self.command == "pressure":
+            return self
+        longest_mm = max(2 * one.on_s * one.speed_mm_per_s for one in (self.reference, *self.routines))
+        gain = min(material.gain_mm3_per_s_per_mm for material in self.materials)
+        travel_mm = longest_mm * self.bead_area_mm2 / gain
+        if travel_mm > self.drive.amplitude_mm:
+            raise ValueError(
+                f"has a drive with a travel of {self.drive.amplitude_mm:g} mm, but a training routine needs "
+                f"{travel_mm:.3g} mm by {self.command}; raise drive.amplitude_mm, or print shorter routines"
+            )
+        return self
+
     @property
     def limits(self) -> Drive:
-        """The drive that commands obey; unlimited if none is declared."""
+        """The drive that commands obey; unlimited if none is declared. If the machine conserves volume, the
+        command is a speed: only its size is limited, and backlash is learned."""
         from pipeline.deposition import drive
 
-        return drive.UNLIMITED if self.drive is None else drive.Drive(**self.drive.model_dump())
+        if self.drive is None:
+            return drive.UNLIMITED
+        if self.command != "pressure":
+            return drive.Drive(self.drive.speed_mm_per_s, math.inf, 0.0)
+        return drive.Drive(**self.drive.model_dump())
 
     @property
     def steady_flow(self) -> float:
@@ -358,5 +380,5 @@ class ComposeParts(Section):
 
         return PartSettings(
             printer.nozzle_mm, printer.bead_area_mm2, printer.ramp_s, self.corner_deg,
-            self.longest_pause_s, printer.limits,
+            self.longest_pause_s, printer.limits, printer.command,
         )  # fmt: skip

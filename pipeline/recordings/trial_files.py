@@ -139,17 +139,18 @@ def write_trial(
 
 
 def write_command(
-    path: str | Path, conditions: TrialConditions, *, time_s: np.ndarray, command_mm: np.ndarray
-) -> None:
-    """The next trial's command u (T,) in mm as path.csv (time_s, displacement_mm) and path.mcap; `path` has
-    no ending. Raises ValueError as write_trial does."""
+    path: str | Path, conditions: TrialConditions, *, time_s: np.ndarray, command_mm: np.ndarray,
+    speed: bool = False,
+) -> None:  # fmt: skip
+    """The next trial's command u (T,) in mm as path.csv (time_s, displacement_mm; speed_mm_per_s if it is a
+    speed) and path.mcap; `path` has no ending. Raises ValueError as write_trial does."""
     tables = tables_of(path, time_s, [(COMMAND, command_mm)])
     write_frames(f"{path}.mcap", tables, TYPES, time_s, None, (SCHEMA, _metadata(path, conditions)))
     artifacts.write_csv(
         f"{path}.csv",
         {
             "time_s": np.asarray(time_s, float),
-            COMMAND.source.partition(":")[2]: np.asarray(command_mm, float),
+            "speed_mm_per_s" if speed else COMMAND.source.partition(":")[2]: np.asarray(command_mm, float),
         },
     )
 

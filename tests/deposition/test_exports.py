@@ -230,11 +230,42 @@ def test_leads_prime_ahead_of_a_line_and_let_back_ahead_of_its_end(tmp_path, mac
     done = part(tmp_path, machine, line(machine[0].bead_area_mm2, length=60))
     m = gcode.parse(compose.with_leads(done)).moves
     first = int(np.argmax((m.start[:, 0] < 5.001) & (m.end[:, 0] > 5.001)))
-    peak = np.cumsum(m.e)[: first + 1].max()
-    steady = np.interp(40, m.end[first:, 0], np.cumsum(m.e)[first:])
-    assert peak > 0.5 * steady, "the plunger is pressed before the line begins"
-    before_end = np.cumsum(m.e)[(m.end[:, 0] > 60) & (m.end[:, 0] <= 64.9)]
+    speed = m.e / np.where(m.length > 0, m.length, np.maximum(np.abs(m.e), 1e-9)) * m.feed
+    peak = speed[: first + 1].max()
+    steady = np.interp(40, m.end[first:, 0], speed[first:])
+    assert peak > 0.5 * steady, "filament is pressed before the line begins"
+    before_end = speed[(m.end[:, 0] > 60) & (m.end[:, 0] <= 64.9)]
     assert before_end.min() < 0.5 * steady, "and let back before it ends"
+
+
+@pytest.mark.parametrize("ends", [1.0, 0.6])
+def test_e_ends_at_the_volume_of_the_part_over_the_area_of_its_filament(tmp_path, machine, ends):
+    bead = ends * machine[0].bead_area_mm2
+    done = part(tmp_path, machine, line(bead, length=60))
+    net = gcode.parse(compose.with_leads(done)).moves.e.sum()
+    assert net * AREA_175 == pytest.approx(60 * bead, rel=0.01)
+
+
+def test_e_of_two_filaments_goes_on_from_tool_to_tool(tmp_path, machine):
+    done = part(
+        tmp_path, machine, "; filament_diameter = 1.75,1.75\n" + TWO.replace("E25", "E3").replace("E15", "E2")
+    )
+    m = gcode.parse(compose.with_leads(done)).moves
+    for tool, volume in ((0, 7 * AREA_175), (1, 3 * AREA_175)):
+        assert m.e[m.tool == tool].sum() * AREA_175 == pytest.approx(volume, rel=0.01)
+
+
+@pytest.mark.parametrize("kind", ["speed", "place"])
+def test_a_machine_that_conserves_volume_is_sent_the_volume_over_its_flow_ratio(tmp_path, machine, kind):
+    printer = machine[0].model_copy(update={"command": kind, "drive": None})
+    done = part(tmp_path, (printer, machine[1]), line(printer.bead_area_mm2, length=60))
+    mm = 60 * printer.bead_area_mm2 / learned(PLANT).materials[0].volume_per_mm
+    compose.write(done, tmp_path / "out", ("csv", "gcode"))
+    signal = np.genfromtxt(tmp_path / "out/job.signal.csv", delimiter=",", names=True)
+    pushed = {"speed": lambda: signal["T0_A_mm_per_s"].sum() * TS, "place": lambda: signal["T0_A_mm"][-1]}
+    assert pushed[kind]() == pytest.approx(mm, rel=0.01)
+    net = gcode.parse((tmp_path / "out/job.leads.gcode").read_text()).moves.e.sum()
+    assert net == pytest.approx(mm, rel=0.01)
 
 
 def test_a_lengthened_ramp_is_several_legs_of_rising_feed(tmp_path, machine):

@@ -200,11 +200,6 @@ def net_e_mm(walk) -> float:
     return net
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=pytest.RaisesExc(AssertionError, match="net E is"),
-    reason="a command is a place whose standing still extrudes for ever: E comes back to 0",
-)
 def test_e_of_the_composed_gcode_presses_out_the_planned_volume(net_e_mm):
     pressed, planned = net_e_mm * np.pi * FILAMENT_MM**2 / 4, LINE_MM * AREA_MM2
     assert pressed == pytest.approx(planned, rel=0.01), (

@@ -144,7 +144,7 @@ def test_figures_6_and_7_the_command_falls_into_the_five_tasks(library):
 def test_figures_9_and_10_the_sequence_is_the_papers_and_prints_the_structure(library):
     tasks, percent = composed_by_priority(library, ROOT / "datasets/parts/fig9.gcode")
     assert tasks == FIGURE_9
-    assert percent <= PRINTED_BOUND and round(percent, 1) == 4.8
+    assert percent <= PRINTED_BOUND and round(percent, 1) == 4.7
 
 
 def test_figure_12_the_tic_tac_toe_needs_all_five_tasks_and_no_new_learning(library):

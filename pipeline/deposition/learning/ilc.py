@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
+import scipy.ndimage
 import scipy.signal
 
 from pipeline.deposition import reachable
@@ -28,6 +29,16 @@ LAG_INVERSE = 10.0
 # no frequency of the learned command has more than this times what the model alone asks for: a machine whose
 # response there is a third of the model's is still learned
 MOST = 3.0
+# a trial is judged by means over so many samples, and by up to this share its measured flow is scaled to the
+# wanted one: white noise and the scale of one picture repeat in no trial
+MEAN_OF, SCALE = 10, 0.02
+# what is left of them, as share of trial 0's error: by so much a trial may be worse than the best
+NOISE = 0.01
+# the law's share of the step from the best command grows by this on a new best; when it has come down to
+# LITTLE, the best command is sent again, to tell a machine that drifts
+GROWTH, LITTLE = 1.5, 0.25
+# the trials before this one show the law the machine
+FIRST_SHARED = 3
 # a trial that lies within so many standard deviations of the last ones, of so many, has not risen
 SCATTER, SCATTER_TRIALS = 3.0, 10
 # but beyond so many times the best error it has, however the last ones scatter: a scatter that grows would
@@ -408,44 +419,74 @@ def rms(e: np.ndarray) -> float:
     return float(np.sqrt(observable @ observable / len(observable)))
 
 
+def repeating_error(r: np.ndarray, y: np.ndarray) -> float:
+    """R.m.s. of r - g y, means over MEAN_OF samples, in mm^3/s: the error of a trial that another one would
+    show too. g, within 1 +- SCALE, is the scale that brings y nearest to r; r, y (T,), NaN where not
+    observable."""
+    observable = np.isfinite(y)
+    flow, target = np.where(observable, y, 0.0), np.where(observable, r, 0.0)
+    scale = flow @ target / max(float(flow @ flow), np.finfo(float).tiny)
+    e = target - np.clip(scale, 1 - SCALE, 1 + SCALE) * flow
+    return rms(scipy.ndimage.uniform_filter1d(e, MEAN_OF)[observable])
+
+
 class LearningState(NamedTuple):
     """The trials to learn from, those of the machine as it is now without those that rose; the one of them
     with the least error; whether each trial has risen; the first trial after each change of the machine;
-    whether the next trial repeats the best command; and how often the law's step is halved."""
+    whether the next trial repeats the best command; the share of the way from the best command to the law's
+    that it goes otherwise; and whether the machine drifts."""
 
     keep: list[int]
     best: int
     risen: list[bool]
     restarts: list[int]
     repeat: bool
-    halvings: int
+    share: float
+    drifts: bool
 
 
 def judge(errors: Sequence[float], *, rise: float) -> LearningState:
     """What the trials so far say of machine and law: a trial has risen whose error exceeds the best by more
-    than `rise` of trial 0's, and what the trials before it scatter or FAR times the best.
+    than `rise` of trial 0's, and what the trials before it scatter or FAR times the best; it is worse where
+    it exceeds (1 + rise) times the best, and NOISE of trial 0's.
 
-    The trial after a rise repeats the best command, and this tells a law from a machine. Where the error of
-    old comes back, the law went too far, or that trial was spoilt: the trial is left out, and the law's steps
-    are halved until as many trials did not rise. Where the repeat rises too, the machine changed: what was
-    learned before the first of the two is left.
+    The law sends again what the drive could not reach, so it goes its way from the best command on: half as
+    far after each trial that is worse, GROWTH times as far after a new best. The trial after a rise, and
+    after a worse one of LITTLE share, repeats the best command, and this tells a law from a machine. Where
+    the error of old comes back, the law went too far, or that trial was spoilt: a trial that rose is left
+    out. Where the repeat is worse, the machine drifts, and the law goes on alone, with half its step after a
+    rise. Where the repeat rises after a rise, the machine changed: what was learned before the first of the
+    two is left.
     """
     keep, best, risen, restarts = [0], 0, [False], []
-    repeat, halvings = False, 0
+    repeat, share, drifts = False, 1.0, False
     for j in range(1, len(errors)):
         usual = _scattered([errors[i] for i in keep[2:]][-SCATTER_TRIALS:])
         risen.append(errors[j] > max(errors[best] + rise * errors[0], min(usual, FAR * errors[best])))
-        if repeat and risen[j]:
+        worse, better = errors[j] > (1 + rise) * errors[best] + NOISE * errors[0], errors[j] < errors[best]
+        if repeat and risen[j] and risen[j - 1]:
             restarts.append(j - 1)
             keep, best = [j - 1, j], min(j - 1, j, key=errors.__getitem__)
-            repeat, halvings = False, 0
-        elif risen[j]:
-            repeat = True
-        else:
+            repeat, share, drifts = False, 1.0, False
+            continue
+        if not risen[j]:
             keep.append(j)
-            best = min(best, j, key=errors.__getitem__)
-            repeat, halvings = False, halvings + 1 if repeat else max(halvings - 1, 0)
-    return LearningState(keep, best, risen, restarts, repeat, halvings)
+            best = j if better else best
+        if repeat and worse:
+            repeat, share, drifts = risen[j], share if risen[j - 1] else 1.0, True
+        elif repeat:
+            repeat = False
+        elif risen[j] or (worse and j >= FIRST_SHARED and not drifts):
+            share /= 2
+            repeat = risen[j] or share <= LITTLE
+        elif drifts or better:
+            share = min((2 if drifts else GROWTH) * share, 1.0)
+    return LearningState(keep, best, risen, restarts, repeat, share, drifts)
+
+
+def state_of(trials: Sequence[Trial], r: np.ndarray, *, rise: float) -> LearningState:
+    """What the trials on the wanted flow r (T,) say (`judge`), by the error that repeats."""
+    return judge([repeating_error(r, trial.y) for trial in trials], rise=rise)
 
 
 def _scattered(errors: list[float]) -> float:
@@ -462,8 +503,8 @@ def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) 
     so that a folder of recordings can be continued.
 
     After a trial that has risen (`judge`) the best command is repeated. If the machine changed, the law is
-    given the trials since alone, and so identifies its model anew; otherwise it goes on, at first with half
-    its step from the best. Learning never stops.
+    given the trials since alone, and so identifies its model anew; otherwise it goes on, by a share of its
+    step from the best command.
     """
     for j, (u, y, _) in enumerate(trials):
         if u.shape != r.shape or y.shape != r.shape or not np.isfinite(y).any():
@@ -472,13 +513,13 @@ def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) 
                 f"some of it observable, but found {u.shape} and {y.shape} "
                 f"with {np.isfinite(y).sum()} observable; leave the trial out or record it again"
             )
-    state = judge([rms(r - trial.y) for trial in trials], rise=rise)
+    state = state_of(trials, r, rise=rise)
     best = trials[state.best].u
     u = law([trials[i] for i in state.keep])
     if state.repeat:
         u = best
-    elif state.halvings:
-        u = best + (u - best) / 2**state.halvings
+    elif state.share < 1:
+        u = best + state.share * (u - best)
     return NextCommand(u, state.best, state.risen[-1], state.restarts)
 
 
@@ -521,7 +562,7 @@ def table(
     drive, rolled_back whether the trial was left for a better one."""
     measured = [rms(r - trial.y) for trial in trials]
     true = [np.nan if trial.truth is None else rms(r - trial.truth) for trial in trials]
-    risen = judge(measured, rise=rise).risen
+    risen = state_of(trials, r, rise=rise).risen
     rows = []
     for j, (u, _, truth) in enumerate(trials):
         ratio = measured[j] / measured[0] if truth is None else true[j] / true[0]

@@ -153,7 +153,7 @@ def figures(sequence: TrialSequence, *, rise: float) -> dict[str, float | list[i
     """The ratios that the loop is judged by: at some trials, of the last, and the least of the machine as it
     is now; the trials at which it was found changed, and what the command needs."""
     rows = sequence.rows
-    restarts = ilc.judge([row.rms_measured for row in rows], rise=rise).restarts
+    restarts = ilc.state_of(sequence.trials, sequence.routine.r, rise=rise).restarts
     now = rows[restarts[-1] if restarts else 0 :]
     best = min(now, key=lambda row: row.ratio)
     return {f"ratio_trial_{j}": rows[j].ratio for j in (2, 3, 4, 8, 15, 30) if j < len(rows)} | {
@@ -226,7 +226,7 @@ def convergence_of_model_inverse(
 
 def _first_trials(sequence: TrialSequence, count: int, settings: LawSettings) -> list[Trial]:
     """The first trials of the machine as it is now: of them the model was identified."""
-    state = ilc.judge([row.rms_measured for row in sequence.rows], rise=settings.rise)
+    state = ilc.state_of(sequence.trials, sequence.routine.r, rise=settings.rise)
     return [sequence.trials[j] for j in state.keep[:count]]
 
 

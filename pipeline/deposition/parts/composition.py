@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.deposition import controllers
-from pipeline.deposition.drive import Drive, at_limit, follows, obeyed
+from pipeline.deposition.drive import CommandKind, Drive, at_limit, follows, obeyed
 from pipeline.deposition.parts import basis, forecast, pressure_advance
 from pipeline.deposition.parts.chain import Chain, averaged, identify, simulate
 from pipeline.deposition.parts.forecast import Covered, ForecastJudgement, Missed
@@ -45,7 +45,8 @@ class LearnedMaterial(NamedTuple):
     """What was learned of one material and nozzle: its chain, the gain (mm^3/s per mm) by
     which on-off control set out in the first trial, and the error of the learned trials
     themselves in % of the steady flow (means over 0.2 s); what fits without a routine missed on it, what the
-    routines covered, and pressure advance as tuned on the chain, by composer."""
+    routines covered, pressure advance as tuned on the chain, by composer, and the volume that came out in
+    the learned trials, in mm^3 a mm of what was pushed (a mm s of pressure)."""
 
     material: str
     nozzle_mm: float
@@ -55,6 +56,7 @@ class LearnedMaterial(NamedTuple):
     missed: Missed
     covered: Covered
     advances: dict[str, TunedAdvance]
+    volume_per_mm: float
 
 
 class LearnedLibrary(NamedTuple):
@@ -68,7 +70,7 @@ class LearnedLibrary(NamedTuple):
 class PartSettings(NamedTuple):
     """How a part is printed: nozzle in mm; the wanted flow is bead area x printing speed, its steps shaped by
     two boxes of ramp_s; a junction is a Corner from corner_deg on; a longer halt than longest_pause_s ends a
-    run; and the drive."""
+    run; the drive, and what the machine answers to."""
 
     nozzle_mm: float
     bead_area_mm2: float
@@ -76,6 +78,7 @@ class PartSettings(NamedTuple):
     corner_deg: float
     longest_pause_s: float
     drive: Drive
+    command: CommandKind = "pressure"
 
 
 class ComposerForecast(NamedTuple):
@@ -124,7 +127,8 @@ class ToolShare(NamedTuple):
 class Composed(NamedTuple):
     """A part: its streams on one clock (sample k at k Ts; the gantry sets out lead_in_s later, which the
     times of lines and tasks contain), and how each composer would do. error_percent (N,) is the predicted
-    error of the library's signal for each task, 0 for what was trained."""
+    error of the library's signal for each task, 0 for what was trained. The commands are speeds in mm/s if
+    the machine answers to a speed or a place."""
 
     streams: tuple[Stream, ...]
     tasks: Tasks
@@ -133,6 +137,7 @@ class Composed(NamedTuple):
     predictions: list[ComposerForecast]
     lead_in_s: float
     sample_time_s: float
+    command: CommandKind = "pressure"
 
 
 def learn(trainings: Sequence[Training], *, sample_time_s: float) -> LearnedLibrary:
@@ -167,9 +172,22 @@ def learn(trainings: Sequence[Training], *, sample_time_s: float) -> LearnedLibr
                 missed,
                 forecast.covered(mine, sample_time_s=sample_time_s),
                 {name: tune(chain, missed, wanted, lead=lead) for name, lead in LEADS.items()},
+                volume_per_mm(mine),
             )
         )
     return LearnedLibrary(library, tuple(materials), check(trainings, library))
+
+
+def volume_per_mm(trainings: Sequence[Training]) -> float:
+    """What came out in all trials but the first over what was sent, mm^3 a mm: the identified flow ratio
+    times the area of what is pushed. Flow that was not observable counts as wanted."""
+    pairs = [
+        (np.where(np.isfinite(y), y, t.r).sum(), u.sum())
+        for t in trainings
+        for u, y in zip(t.u[1:], t.y[1:], strict=True)
+    ]
+    out, sent = np.sum(pairs, axis=0)
+    return float(out / sent)
 
 
 def _of(tasks: Tasks, tool: int, name: str) -> np.ndarray:
@@ -381,13 +399,13 @@ def compose(
             ComposerForecast(tool, material.material, name, *percent, name == best)
             for name, percent in percents.items()
         ]
-        streams.append(_stream(library, share, unshaped, best, drive))
+        streams.append(_stream(library, share, unshaped, best, settings))
         for name in (START, STOP, CORNER, STEADY):
             at = _of(tasks, tool, name)
             error[at] = nearest(
                 library, name, material.material, settings.nozzle_mm, tasks.speed[at], tasks.pause_s[at]
             )[3]
-    return Composed(tuple(streams), tasks, lines, error, predictions, ahead * Ts, Ts)
+    return Composed(tuple(streams), tasks, lines, error, predictions, ahead * Ts, Ts, settings.command)
 
 
 def _wanted(
@@ -426,13 +444,15 @@ def _material(
     )
 
 
-def _stream(library: Library, share: ToolShare, unshaped: np.ndarray, composer: str, drive: Drive) -> Stream:
-    """The share by one composer: its command, and the flows that the chain predicts for it and for on-off."""
-    material, u, Ts = (
-        share.material,
-        controllers.command(composer)(library, share, drive),
-        library.sample_time_s,
-    )
+def _stream(
+    library: Library, share: ToolShare, unshaped: np.ndarray, composer: str, settings: PartSettings
+) -> Stream:
+    """The share by one composer: its command, and the flows that the chain predicts for it and for on-off. If
+    volume is conserved, what is pushed is the share's volume over what came out of the learned trials."""
+    material, drive, Ts = share.material, settings.drive, library.sample_time_s
+    u = controllers.command(composer)(library, share, drive)
+    if settings.command != "pressure":
+        u = obeyed(u * (share.r.sum() / (material.volume_per_mm * u.sum())), drive, sample_time_s=Ts)
     y, on_off = (
         simulate([material.chain.extruder], command[None], sample_time_s=Ts)[0, 0]
         for command in (u, _on_off(share, drive, Ts))

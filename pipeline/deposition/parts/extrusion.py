@@ -1,6 +1,7 @@
 """What E presses out: mm^3 of every move by RepRap's arithmetic, the diameter of what E pushes, and the
 declared bead beside it."""
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -12,11 +13,13 @@ from pipeline.deposition.toolpath.gcode import Kind, Moves, PartProgram
 class Extruded(NamedTuple):
     """What is wanted of every printed move: volume_mm3 (N,), by E where the diameter of what it pushes is
     known, else bead area x length, NaN for moves that do not print; by_e (N,) tells which. source: in words
-    by tool where the diameter is from, or why E does not count."""
+    by tool where the diameter is from, or why E does not count. area_mm2: by tool the volume in mm^3 of 1 mm
+    of E, if that is known."""
 
     volume_mm3: np.ndarray
     by_e: np.ndarray
     source: dict[int, str]
+    area_mm2: dict[int, float]
 
 
 class VolumeDifference(NamedTuple):
@@ -54,7 +57,7 @@ def wanted(
     part made `scale` times as large asks for scale^3 of E's volume."""
     moves, said = program.moves, program.diameter_mm
     printed = (moves.kind == Kind.EXTRUDE) & (moves.length > 0)
-    diameter, source = {}, {}
+    diameter, source, area = {}, {}, {}
     for tool in np.unique(moves.tool[printed]).tolist():
         choices = (
             (asked_mm, "as asked"), (said.get(tool), "as the program says"),
@@ -64,15 +67,16 @@ def wanted(
         if not _lettered(program):
             source[tool] = f"{program.extruder or 'nothing'} drives the extrusion, which tells no volume"
         elif np.all(program.volumetric[printed & (moves.tool == tool)]):
-            source[tool] = "E counts mm^3 (M200)"
+            source[tool], area[tool] = "E counts mm^3 (M200)", 1.0
         elif d is None:
             source[tool] = f"the diameter of what {program.extruder} pushes is not known"
         else:
             diameter[tool], source[tool] = d, f"diameter {d:g} mm, {where}"
+            area[tool] = math.pi * d**2 / 4
     e = volumes(program, diameter) * scale**3
     by_e = printed & np.isfinite(e)
     volume = np.where(by_e, e, np.where(printed, bead_area_mm2 * moves.length, np.nan))
-    return Extruded(volume, by_e, source)
+    return Extruded(volume, by_e, source, area)
 
 
 def _lettered(program: PartProgram) -> bool:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.deposition import drive
 from pipeline.deposition.toolpath.gcode import Kind, Moves
 from pipeline.deposition.toolpath.motion import Motion, sampled
 
@@ -14,6 +15,8 @@ from pipeline.deposition.toolpath.motion import Motion, sampled
 LEAD_SHARE = 0.005
 # how near the gantry is to its planned place at any time, mm: a sixteenth of a nozzle
 WAY_MM = 0.05
+# a place that goes on is followed as near as by what LEAD_SHARE of the largest speed makes of this time
+PLACE_S = 0.1
 
 
 class Legs(NamedTuple):
@@ -37,8 +40,10 @@ def legs(
     lead_in_s: float,
     sample_time_s: float,
     tolerance_mm: float,
+    speeds: bool = False,
 ) -> Legs:
-    """Legs that follow the commands u (T,) of each tool, linear between their samples, within tolerance_mm,
+    """Legs that follow the commands u (T,) of each tool, or, if these are speeds in mm/s, the place that all
+    tools have gone, linear between their samples, within tolerance_mm,
     and the gantry's path exactly but for arcs, which get a leg a sample; along it the gantry is within WAY_MM
     of where it is planned at that time, so that a long ramp is several legs of rising feed. The gantry sets
     out lead_in_s behind the first sample."""
@@ -55,6 +60,8 @@ def legs(
         mine = np.isin(at, [k for k, each in enumerate(tools) if each == tool])
         u[mine[: len(command)].nonzero()[0]] = command[mine[: len(command)]]
         lost = max(lost, float(np.abs(command[~mine[: len(command)]]).max(initial=0.0)))
+    if speeds:
+        u = drive.place(u, sample_time_s=Ts)
     signal = sampled(motion, moves, sample_time_s=Ts)
     ahead = round(lead_in_s / Ts)
     curved = np.flatnonzero(moves.angle[signal.move] != 0) + ahead
@@ -114,32 +121,39 @@ def text(
     letter: str,
     lead_in_s: float,
     sample_time_s: float,
+    speeds: bool = False,
 ) -> str:
-    """The part as G-code whose E, or another letter, is the plunger's place, so that it primes ahead of each
-    line and lets back ahead of its end; what no program can hold stands in its head. Parameters as of
-    `legs`."""
-    tolerance_mm = LEAD_SHARE * max(float(np.abs(u).max()) for u in commands.values())
+    """The part as G-code whose E, or another letter, is the plunger's place, or what was pushed if the
+    commands are speeds, so that it primes ahead of each line and lets back ahead of its end; what no program
+    can hold stands in its head. Parameters as of `legs`."""
+    largest = max(float(np.abs(u).max()) for u in commands.values())
     found = legs(
-        moves, motion, commands, lead_in_s=lead_in_s, sample_time_s=sample_time_s, tolerance_mm=tolerance_mm
-    )
+        moves, motion, commands, lead_in_s=lead_in_s, sample_time_s=sample_time_s,
+        tolerance_mm=LEAD_SHARE * largest * (PLACE_S if speeds else 1.0), speeds=speeds,
+    )  # fmt: skip
+    what, unit = ("what is pushed, in mm", "mm/s") if speeds else ("the plunger's place in mm", "mm")
     head = [
-        f"; {letter} is the plunger's place in mm (absolute), no filament; it moves ahead of the lines.",
+        f"; {letter} is {what} (absolute){'' if speeds else ', no filament'}; it moves ahead of the lines.",
         "; Feeds are means over short legs, ramps too: a firmware that accelerates slower comes late.",
     ]
-    if found.lost_mm > tolerance_mm:
-        head.append(f"; Left out: {found.lost_mm:.3g} mm of a tool's command while another tool was in use.")
-    return "\n".join([*head, *program(found, letter=letter), ""])
+    if found.lost_mm > LEAD_SHARE * largest:
+        head.append(
+            f"; Left out: {found.lost_mm:.3g} {unit} of a tool's command while another tool was in use."
+        )
+    return "\n".join([*head, *program(found, letter=letter, goes_on=speeds), ""])
 
 
-def program(found: Legs, *, letter: str = "E") -> list[str]:
+def program(found: Legs, *, letter: str = "E", goes_on: bool = False) -> list[str]:
     """The legs as lines of G-code in mm, absolute: G1 with the plunger's place behind `letter`, the feed that
-    makes the leg last as long as planned; G4 where nothing moves."""
+    makes the leg last as long as planned; G4 where nothing moves. If it goes on, a tool begins where the one
+    before it ended."""
     lines, held, wait, tool = ["G21", "G90", "M82"], [0.0] * 4, 0.0, None
     columns = zip(*(np.asarray(column).tolist() for column in found[:5]), strict=True)
     for each, position, u, seconds, change in columns:
         if each != tool:
-            lines += [*_waited(wait), f"T{each}", f"G92 {letter}0"]
-            tool, wait, held[3] = each, 0.0, 0.0
+            held[3] = held[3] if goes_on else 0.0
+            lines += [*_waited(wait), f"T{each}", f"G92 {letter}{held[3]:.9g}"]
+            tool, wait = each, 0.0
         if change:
             continue
         to = [*(round(x, 3) for x in position), round(u, 5)]

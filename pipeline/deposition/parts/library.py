@@ -9,6 +9,7 @@ import numpy as np
 import scipy.signal
 
 from pipeline.deposition.extruder import Routine
+from pipeline.deposition.learning.ilc import repeating_error
 
 # in the order of the hierarchy (fig. 7): the first that is active rules
 TASKS = ("Stop", "Start", "Corner", "Steady-State", "No-Flow")
@@ -73,13 +74,13 @@ class Check(NamedTuple):
 
 
 def learned(training: Training) -> tuple[np.ndarray, np.ndarray]:
-    """Command and measured flow (T,) that learning ended with: means over the trials whose
-    measured error is within a tenth of the lowest."""
-    error = np.sqrt(np.nanmean((training.y - training.r) ** 2, axis=1))
+    """Command (T,) of the best trial, by the error that repeats (`ilc.repeating_error`), and the measured
+    flow (T,) that learning ended with: means over the trials whose error is within a tenth of the lowest."""
+    error = np.array([repeating_error(training.r, y) for y in training.y])
     best = error <= 1.1 * error.min()
     observable = np.isfinite(training.y[best])
     y = np.where(observable, training.y[best], 0.0).sum(axis=0) / np.maximum(observable.sum(axis=0), 1)
-    return training.u[best].mean(axis=0), np.where(observable.any(axis=0), y, np.nan)
+    return training.u[error.argmin()], np.where(observable.any(axis=0), y, np.nan)
 
 
 def smoothed(u: np.ndarray, sample_time_s: float) -> np.ndarray:

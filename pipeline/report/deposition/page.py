@@ -116,10 +116,11 @@ def _beforehand(sources: Sources) -> str:
     before, lessons = gamma(sources.evidence), sources.tables["lessons"]
     other = [] if isinstance(lessons, Missing) else sorted(set(lessons["routine"].tolist()) - {0})
     instead = f"Shown is routine {other[0]}: the reference is not recorded. " if other else ""
+    instead += _floor(sources)
     if before is None:
         return (
             f"{instead}The convergence of the paper’s law was not tested beforehand; the model inversion "
-            "identifies the machine in its first trials, and repeats the best command where the error rises."
+            "identifies the machine in its first trials, and returns to the best command if the error rises."
         )
     return (
         f"{instead}Tested before anything ran: with γ = max |Q² (1 − L P)| below 1 the paper’s law shrinks "
@@ -128,8 +129,31 @@ def _beforehand(sources: Sources) -> str:
         f"{percent(before['gamma_above_1_percent'], 2)} of it: there the law may look fine for a dozen "
         "trials and then diverge. "
         "The model inversion identifies the machine in its first trials; its γ counts what its model leaves "
-        "of them, too. Where the error rises it repeats the best command, and where that rises too "
-        "it learns anew."
+        "of them, too. If the error rises, it goes a smaller share of its way from the best command; if the "
+        "best command itself gives a larger error, the machine has changed, and it learns anew."
+    )
+
+
+def _floor(sources: Sources) -> str:
+    """Another kind of machine than printer.command says, and the least error that the declared drive allows,
+    the worst of materials and routines."""
+    learning = sources.evidence.figures["train_ilc"]
+    materials = {} if isinstance(learning, Missing) else learning
+    ratios = [
+        headroom["least_ratio"]
+        for material in materials.values()
+        for headroom in material.get("actuator_headroom", [])
+    ]
+    named = "".join(
+        f"Material {name}: {material['command_kind']}. "
+        for name, material in materials.items()
+        if material.get("command_kind")
+    )
+    if not ratios:
+        return named
+    return named + (
+        f"No command within printer.drive leaves less than {percent(100 * max(ratios), 2)} of on-off "
+        "control’s error, says the model known beforehand (worst routine). "
     )
 
 
