@@ -49,6 +49,8 @@ ROUNDS = 12
 # a coarse row is bead where it stands so many standard deviations of the background above it, one in 10^9
 # rows of noise, and this share of the steps
 SIGNIFICANT, STEEP = 6.0, 0.2
+# a line whose width changes its course by more from block to block, as share of itself and in px, is grain
+RAGGED, RAGGED_PX = 0.1, 2.0
 # a plateau above all levels: no bead
 NONE = 1e9
 # fewer blocks are dirt, not a line; less height is no measurable bead
@@ -61,7 +63,8 @@ class Bead(NamedTuple):
 
     widths is 0 where the block shows background only and NaN where it cannot be read. `width` is the line
     fitted robustly through the widths, at the middle of the blocks that it uses, and `deviation` its standard
-    deviation; both NaN where `reason` is not empty: "no bead", "saturated", "cut by the frame", "blurred".
+    deviation; both NaN where `reason` is not empty: "no bead", "saturated", "cut by the frame", "blurred",
+    "ragged".
     `angle_deg` is the line's direction against the rows, `blur_px` the standard deviation of the edge,
     `contrast` bead less background in levels.
     """
@@ -134,6 +137,18 @@ def calibrate(widths_px: np.ndarray, known_mm: np.ndarray) -> WidthCalibration:
     return WidthCalibration(
         float(gain), float(offset), float(np.sqrt(residuals @ residuals / (len(px) - 2))), residuals
     )
+
+
+def edge_deviation(blur_px: float, contrast: float) -> float:
+    """By how much in px a width may be off at this blur and contrast (in levels of 0..255) beyond noise: a
+    blurred edge has not come to rest where its levels are read, and half a level of rounding moves it.
+
+        3 s Phi(-x / s) + sqrt(2 pi) s / contrast,   s = blur_px, x = the first row that is read
+
+    Of the two edges; half as much again, for so strong a blur is read too low.
+    """
+    unrest = blur_px * float(scipy.special.ndtr(-NEAR[0] / blur_px))
+    return 3 * unrest + math.sqrt(2 * math.pi) * blur_px / abs(contrast)
 
 
 def drawn(frame: np.ndarray, bead: Bead) -> np.ndarray:
@@ -209,6 +224,7 @@ def measure_all(
             "saturated": rough.saturated[i],
             "no bead": few[i],
             "blurred": blur[i] > longest_blur_px,
+            "ragged": not few[i] and _is_ragged((bottom - top)[i, good[i]]),
         }
         reason = next((name for name, holds in reasons.items() if holds), "")
         if reason:
@@ -231,6 +247,12 @@ def measure_all(
                 )
             )
     return out
+
+
+def _is_ragged(widths: np.ndarray) -> bool:
+    """Whether the widths (n,) in px of neighbouring blocks zigzag, as those of grain do and of no line."""
+    bends = np.abs(np.diff(widths, 2))
+    return bool(np.median(bends) > RAGGED * np.median(widths) + RAGGED_PX)
 
 
 def _bead(

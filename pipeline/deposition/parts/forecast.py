@@ -23,7 +23,7 @@ BINS = 12
 # a forecast that may be wrong by more than this, in % of on-off control's error, is not judged: the limit of
 # the rule "Flow error" as params.yaml comes
 LIMIT_PERCENT = 6.0
-# a forecast is for the mean of so many prints, during which a machine that changes goes on to do so
+# a forecast is for so many prints, during which a machine that changes goes on to do so
 PRINTS = 10
 # a flow ripples if it varies within so many s; a machine has come to rest so long after an event
 RIPPLE_S, SETTLED_S = 2.5, 1.0
@@ -31,9 +31,9 @@ RIPPLE_S, SETTLED_S = 2.5, 1.0
 BEYOND, LONGER = 1.25, 3.0
 # of the residual a member carries none, all, or twice: a part excites other shares of it than the routines
 CARRIED = (0.0, 1.0, 2.0)
-# ends and middle of the members' errors: some carry twice the residual, so that three quarters of them hold
-# 90 % of the true errors of extruders of other kinds, and order composers better than the largest does
-QUANTILES = (0.0, 0.5, 0.75)
+# ends and middle of the members' errors: the largest, of members that carry twice the residual, order
+# composers worse than the ninth decile does
+QUANTILES = (0.0, 0.5, 0.9)
 # a longer stream is forecast by fewer members
 LONG, FEW = 30_000, 16
 
@@ -42,9 +42,9 @@ class Missed(NamedTuple):
     """What fits without a routine missed on it, simulated less measured, by_place (F, places) in shares of
     the local flow, and three sizes in % of the error of the first trials, which on-off control makes, each
     without what noise adds to it: all of what was missed, most of it at `event`; by how much the level moves
-    from the mean of the trials to that of the next PRINTS; and the ripple that differs from trial to trial.
-    NaN where fewer than three trials with learned commands tell no noise. `level_percent` is the second in %
-    of the flow."""
+    from the mean of the trials to the last of the next PRINTS; and the ripple that differs from one to
+    another. NaN where fewer than three trials with learned commands tell no noise. `level_percent` is the
+    second in % of the flow."""
 
     by_place: np.ndarray
     held_out_percent: float
@@ -137,7 +137,8 @@ def missed(trainings: Sequence[Training], chain: Chain, *, sample_time_s: float,
     squares = np.concatenate(each)
     shares = [float(squares[np.concatenate(event) == k].sum()) for k in range(len(EVENTS))]
     slope, doubt = np.mean(slopes, axis=0) / (1, len(slopes))
-    moved = math.sqrt(max(slope**2 - doubt, 0.0)) * (len(trainings[0].u) - early + PRINTS) / 2
+    ahead = (max(len(trainings[0].u) - early, 1) - 1) / 2 + PRINTS
+    moved = math.sqrt(max(slope**2 - doubt, 0.0)) * ahead
     wanted = math.sqrt(np.mean([np.mean((training.r / training.r.max()) ** 2) for training in trainings]))
     return Missed(
         np.array(bias),
@@ -299,7 +300,7 @@ def error_percent(
 ) -> tuple[float, float, float]:
     """R.m.s. error of the flows `made` (M, T) in % of that of the flows of on-off control (M, T), member by
     member: 90 % of what may come out lies between the first and the last, the middle of it beside them. Both
-    ends are widened by what may be wrong in all (`Missed.percent`), the last from the upper quartile."""
+    ends are widened by what may be wrong in all (`Missed.percent`)."""
     ratio = np.linalg.norm(made - r, axis=1) / np.maximum(np.linalg.norm(on_off - r, axis=1), 1e-12)
     low, median, high = (float(value) for value in 100 * np.quantile(ratio, QUANTILES))
     doubt = float(np.nan_to_num(missed.percent))
