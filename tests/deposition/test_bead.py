@@ -172,7 +172,9 @@ def test_edges_that_zigzag_are_no_line():
 def test_a_width_may_be_off_by_what_blur_and_rounding_move_its_edges():
     # sharp: half a level of 90 over the steepest row; soft: the first rows read are within the edge
     assert edge_deviation(1.2, 90.0) == pytest.approx(math.sqrt(2 * math.pi) * 1.2 / 90, rel=0.01)
-    assert edge_deviation(5.0, 1e9) == pytest.approx(3 * 5.0 * 0.1587, rel=0.01)
+    assert edge_deviation(3.0, 1e9) == pytest.approx(3 * 3.0 * 0.0478, rel=0.01)
+    # a blur of more than 3.3 px may as well be one of 6
+    assert edge_deviation(3.4, 1e9) == edge_deviation(6.0, 1e9) == pytest.approx(3 * 6.0 * 0.2023, rel=0.01)
     assert edge_deviation(1.2, -9.0) == pytest.approx(10 * edge_deviation(1.2, 90.0), rel=0.01)
 
 

@@ -93,8 +93,9 @@ def test_the_reported_deviation_tells_of_blur_contrast_and_a_line_beside(tmp_pat
         ({"blur_px": 7.0}, r"expected a bead in most of the \d+ frames .* \d+ % have none .*blurred in \d+"),
         (
             {"contrast": 0.1, "ground": "gradient", "dark": False, "angle_deg": 37.0},
-            "in most of the .*ragged in",
+            "in most of the .*faint in",
         ),
+        ({"contrast": 0.04, "ground": "plain", "dark": False}, r"shows a usable bead \(.*faint in \d+"),
         ({"askew": 0.1}, r"looks (9|10) % wider \(4 % allowed\); turn the camera square"),
     ],
 )
@@ -103,6 +104,15 @@ def test_a_trial_that_the_camera_cannot_measure_is_refused_with_its_reasons(tmp_
     path = recorded(tmp_path / "trial.mcap", eye)
     with pytest.raises(ValueError, match=why):
         flow_of(path, settings(tip_px=list(tip_of(eye))))
+
+
+def test_a_bead_before_the_line_begins_is_something_else(turned):
+    camera = settings(tip_px=tip(140.0), rotation_deg=140.0, columns=[76, 200])
+    recording = trial_files.open_trial(turned, **camera.recording)
+    values = train_ilc.read(recording, camera)
+    light = np.where(values.widths == 0, 50.0, values.widths)
+    with pytest.raises(ValueError, match=r"expected a bare stage .* \d+ % .* is a bead, 0.8 mm wide"):
+        train_ilc.measure_trial(recording, values._replace(widths=light), [], ROUTINE, PRINTER, camera)
 
 
 def some_bead(**changes) -> bead.Bead:

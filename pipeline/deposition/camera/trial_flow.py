@@ -19,6 +19,8 @@ from pipeline.deposition.learning.ilc import Trial
 SLACK_S = 0.2
 # of the frames in which the line must be seen at most this share may have no usable bead
 REJECTED = 0.5
+# the stage must be bare this far ahead of the line, mm: what oozes before lies nearer
+AHEAD_MM = 1.0
 # a line that looks wider at one end of the columns than at the other by this share is seen askew
 ASKEW = 0.04
 # by how much in px widths of a calibrated camera and of another one are off beyond what blur and light tell
@@ -63,12 +65,11 @@ def measure_trial(
     at = on_routine_clock(shifted, routine)
     position = np.interp(readings.time_s - late - latency.latency_s, *shifted["position_mm"])
     _check_beads(readings)
-    _check_rejected(
-        readings,
-        position,
-        np.interp([routine.start_s, routine.stop_s], routine.time_s, at["position_mm"]),
-        view,
-    )
+    ends = np.interp([routine.start_s, routine.stop_s], routine.time_s, at["position_mm"])
+    place = position + (float(np.mean(readings.columns)) - view.nozzle_column) * view.mm_per_px
+    along = (place - ends[0]) / (ends[1] - ends[0])
+    _check_rejected(np.array(readings.reasons)[(along >= 0) & (along <= 1)])
+    _check_bare(widths_mm, along < -AHEAD_MM / abs(ends[1] - ends[0]))
     trend = flow.column_trend(position, readings.columns, widths_mm, view)
     if abs(trend) > ASKEW:
         raise ValueError(
@@ -118,11 +119,23 @@ def _check_beads(readings: Readings) -> None:
         )
 
 
-def _check_rejected(readings: Readings, position: np.ndarray, printed: np.ndarray, view: flow.View) -> None:
-    """Raises ValueError if most of the frames whose middle column shows what was `printed` between two
-    places (2,) in mm have no usable bead; the gantry was at position (F,)."""
-    place = position + (float(np.mean(readings.columns)) - view.nozzle_column) * view.mm_per_px
-    reasons = np.array(readings.reasons)[(place >= printed.min()) & (place <= printed.max())]
+def _check_bare(widths_mm: np.ndarray, before: np.ndarray) -> None:
+    """Raises ValueError if most of the widths (F, m) of the frames `before` (F,) the line are those of a bead
+    as wide as half the line or more: then it is no line that is measured."""
+    usual_mm, bare = float(np.median(widths_mm[widths_mm > 0])), widths_mm[before]
+    share = float(np.mean(bare > usual_mm / 2)) if before.any() else 0.0
+    if share > REJECTED:
+        wide_mm = float(np.median(bare[bare > 0]))
+        raise ValueError(
+            f"expected a bare stage before the line begins but {100 * share:.0f} % of what the camera reads "
+            f"there is a bead, {wide_mm:.2g} mm wide: light, dirt or another line passes for it; check light "
+            "and camera.columns, and record the trial again"
+        )
+
+
+def _check_rejected(reasons: np.ndarray) -> None:
+    """Raises ValueError if most of the frames that show the line have one of the `reasons` (F,) why they have
+    no usable bead."""
     rejected = counts(reasons.tolist())
     share = sum(rejected.values()) / max(len(reasons), 1)
     if share > REJECTED:
