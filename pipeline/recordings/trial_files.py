@@ -39,7 +39,7 @@ TYPES = {
 
 READINGS = Schema(
     "trial_readings",
-    1,
+    2,
     (
         Column("time_s", FLOAT, "s", "of the frame, as stamped"),
         Column("reason", TEXT, NONE, "why the frame has no usable bead; empty if it has"),
@@ -47,10 +47,12 @@ READINGS = Schema(
         Column("widths", BYTES, "px", "widths there, 64-bit floats; 0 bare, NaN unread"),
         Column("latency_s", FLOAT, "s", "how late the frames are against the gantry, of the whole recording"),
         Column("latency_deviation_s", FLOAT, "s", "its standard deviation; missing: not told", nullable=True),
+        Column("edge_px", FLOAT, "px", "by how much widths may be off; missing: no bead", nullable=True),
     ),
 )
-# the readings of F frames: time_s (F,), columns (m,), widths (F, m), reasons (F,), latency and its deviation
-Values = tuple[np.ndarray, np.ndarray, np.ndarray, list[str], tuple[float, float]]
+# the readings of F frames: time_s (F,), columns (m,), widths (F, m), reasons (F,), latency and its deviation,
+# and by how much the widths may be off, px
+Values = tuple[np.ndarray, np.ndarray, np.ndarray, list[str], tuple[float, float], float]
 
 
 class TrialConditions(NamedTuple):
@@ -417,7 +419,7 @@ def recall(
 
 
 def _remember(place: Path, values: Values) -> None:
-    time_s, columns, widths, reasons, (latency_s, deviation_s) = values
+    time_s, columns, widths, reasons, (latency_s, deviation_s), edge_px = values
     count = len(time_s)
     table = {
         "time_s": time_s,
@@ -426,6 +428,7 @@ def _remember(place: Path, values: Values) -> None:
         "widths": [row.astype("<f8").tobytes() for row in widths],
         "latency_s": np.full(count, latency_s),
         "latency_deviation_s": np.full(count, deviation_s if np.isfinite(deviation_s) else np.nan),
+        "edge_px": np.full(count, edge_px),
     }
     artifacts.write_table(place, READINGS, table)
 
@@ -445,4 +448,5 @@ def _recall_entry(place: Path) -> Values | None:
         np.stack([np.frombuffer(row, "<f8") for row in table["widths"]]),
         [str(reason) for reason in table["reason"]],
         (float(table["latency_s"][0]), deviation_s if np.isfinite(deviation_s) else np.inf),
+        float(table["edge_px"][0]),
     )

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.deposition.camera.bead import area, calibrate, drawn, gray, measure, measure_all
+from pipeline.deposition.camera.bead import area, calibrate, drawn, edge_deviation, gray, measure, measure_all
 from pipeline.deposition.camera.rendering import HARD, NOMINAL, SimulatedCamera
 
 VIEW = {"columns": (0, 600), "longest_blur_px": 6.0}
@@ -155,6 +155,27 @@ def test_a_frame_that_cannot_be_measured_says_why_and_gives_no_width(frame, reas
 
 
 # ---- other frames
+
+
+def test_edges_that_zigzag_are_no_line():
+    rng = np.random.default_rng(2)
+    rows = np.arange(240)[:, None]
+    half = np.repeat(rng.uniform(10, 60, 40), 8)
+    for widths, reason in ((half, "ragged"), (np.full(320, 30.0), "")):
+        frame = np.where(np.abs(rows - 120) < widths, 160, 70) + rng.normal(0, 2, (240, 320))
+        measured = measure(
+            cv2.GaussianBlur(frame, (0, 0), 1.0).astype(np.uint8), columns=(0, 320), longest_blur_px=6.0
+        )
+        assert measured.reason == reason and (not reason or np.isnan(measured.widths).all())
+
+
+def test_a_width_may_be_off_by_what_blur_and_rounding_move_its_edges():
+    # sharp: half a level of 90 over the steepest row; soft: the first rows read are within the edge
+    assert edge_deviation(1.2, 90.0) == pytest.approx(math.sqrt(2 * math.pi) * 1.2 / 90, rel=0.01)
+    assert edge_deviation(3.0, 1e9) == pytest.approx(3 * 3.0 * 0.0478, rel=0.01)
+    # a blur of more than 3.3 px may as well be one of 6
+    assert edge_deviation(3.4, 1e9) == edge_deviation(6.0, 1e9) == pytest.approx(3 * 6.0 * 0.2023, rel=0.01)
+    assert edge_deviation(1.2, -9.0) == pytest.approx(10 * edge_deviation(1.2, 90.0), rel=0.01)
 
 
 def test_16_bit_and_colour_frames_give_the_same_width():

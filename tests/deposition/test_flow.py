@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.deposition.camera.bead import BLOCK, area, measure
-from pipeline.deposition.camera.flow import Sections, View, deposit_share, estimate, sections
+from pipeline.deposition.camera.flow import Sections, View, column_trend, deposit_share, estimate, sections
 from pipeline.deposition.camera.rendering import HARD, NOMINAL, SimulatedCamera
-from pipeline.deposition.extruder import draw, flow, routine
+from pipeline.deposition.extruder import Extruder, draw, flow, routine
 
 AREA, SPEED = float(area(0.88, 90.0)), 8.0
 NOMINAL_FLOW = AREA * SPEED
@@ -208,6 +208,33 @@ def test_columns_under_the_nozzle_and_unread_blocks_are_left_out():
             nozzle_radius_mm=RADIUS,
             contact_angle_deg=90.0,
         )
+
+
+def test_a_camera_askew_shows_by_places_that_look_wider_at_one_end_of_the_columns():
+    position, columns, rng = np.arange(0, 20, 0.2), np.arange(100.0, 300.0, 8.0), np.random.default_rng(3)
+    place = position[:, None] + (columns - 30) * -0.01
+    line = 0.9 + 0.05 * np.sin(place) + 0.002 * rng.standard_normal(place.shape)
+    line[:, 5] = np.nan
+    square = column_trend(position, columns, line, View(-0.01, 30.0))
+    assert abs(square) < 0.002
+    askew = line * (1 + 0.08 * (columns - columns[0]) / np.ptp(columns))
+    assert column_trend(position, columns, askew, View(-0.01, 30.0)) == pytest.approx(0.08, abs=0.005)
+    assert column_trend(position, columns, 0 * line, View(-0.01, 30.0)) == 0.0
+
+
+def test_the_grain_of_an_empty_bed_is_no_bead_while_the_line_begins_under_the_nozzle():
+    task = reference(off_s=2.0, on_s=4.0, tail_s=2.0)
+    camera, view = SimulatedCamera(NOMINAL, np.random.default_rng([5, 2])), View(-0.008, 30.0)
+    true = flow(Extruder(0.864, 2.7), task.r / 1.08, sample_time_s=0.02)
+    trial = camera.trial(
+        task.time_s, true, task.position, view=view, frame_rate_hz=10, nozzle_mm=(0.4, 0.6),
+        contact_angle_deg=90.0,
+    )  # fmt: skip
+    seen = [
+        measure(frame, columns=(120, 640), longest_blur_px=6.0) for _, frame in itertools.islice(trial, 21)
+    ]
+    # the last is of the moment when the line starts: nothing is in view yet
+    assert [one.reason for one in seen] == ["no bead"] * 20 + ["ragged"]
 
 
 def test_a_gantry_that_comes_back_is_refused():

@@ -70,6 +70,23 @@ def test_a_turned_picture_has_its_point_where_the_pose_says():
     )
 
 
+@pytest.mark.parametrize("dark", [False, True])
+def test_the_rows_end_before_another_line_and_nowhere_without_one(dark):
+    rows = np.arange(240)
+    profile = np.where(np.abs(rows - 120) < 27, 160.0, 70.0)
+    profile[np.abs(rows - 130) < 3] = 230.0  # a specular line parts no bead
+    profile = 230.0 - profile if dark else profile
+    alone = np.tile(profile[:, None], (1, 9)).astype(np.uint8)
+    assert line.clear_rows(alone, 120) == slice(0, 240)
+    beside = alone.copy()
+    beside[186:] = alone[120 - 26]
+    clear = line.clear_rows(beside, 120)
+    assert clear.start == 0 and 120 + 27 + 20 < clear.stop < 186
+    above = line.clear_rows(beside[::-1], 119)
+    assert above.stop == 240 and 54 < above.start < 119 - 27 - 20
+    assert line.clear_rows(np.full((240, 9), 70, np.uint8), 120) == slice(0, 240)
+
+
 def test_the_rows_and_columns_of_a_pose_stay_in_the_picture():
     pose = line.with_room(line.Pose(30.0, 160.0, 120.0, 50.0, 0.0, 0, 150), (240, 320), (60, 140))
     corners = [[c, r, 1.0] for c in (60, 139) for r in (0, pose.rows - 1)]

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.deposition.camera import bead, latency, line, trial_flow
+from pipeline.deposition.camera import bead, excerpts, latency, line, readings, trial_flow
 from pipeline.deposition.extruder import Extruder, flow, routine
 from pipeline.deposition.settings import Camera, Printer, trial_conditions
 from pipeline.recordings import trial_files
@@ -56,6 +56,85 @@ def error(measured: trial_flow.MeasuredTrial) -> float:
     """R.m.s. error of the flow in % of the steady flow, where it could be observed."""
     miss = measured.trial.y - TRUTH
     return 100 * float(np.sqrt(np.nanmean(miss**2))) / ROUTINE.r.max()
+
+
+# widths of EYE as calibration finds them: dark, on grained ground
+BIAS = {"known_widths_mm": [0.5, 0.9, 1.3], "edge_bias_px": [-2.1, 0.3, 0.4]}
+
+
+def steady(tmp_path: Path, **changes) -> tuple[float, float, float]:
+    """(measured - true) mean flow over the steady lines, its scatter there, and the deviation that is
+    reported, all in % of the steady flow."""
+    path = recorded(tmp_path / "trial.mcap", EYE._replace(**changes))
+    measured = flow_of(path, settings(**BIAS))
+    t, (halt, go) = ROUTINE.time_s, ROUTINE.pause_s
+    lines = ((t > ROUTINE.start_s + 1) & (t < halt - 0.3)) | ((t > go + 0.8) & (t < ROUTINE.stop_s - 0.3))
+    miss = 100 * (measured.flow.flow - TRUTH)[lines] / ROUTINE.r.max()
+    said = 100 * float(np.median(measured.flow.deviation)) / ROUTINE.r.max()
+    return float(miss.mean()), float(miss.std()), said
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"blur_px": 3.0}, {"blur_px": 5.0}, {"contrast": 0.1}, {"beside_mm": 1.5}, {"beside_mm": -1.5}],
+)
+def test_the_reported_deviation_tells_of_blur_contrast_and_a_line_beside(tmp_path, changes):
+    bias, scatter, said = steady(tmp_path, **changes)
+    assert said >= abs(bias) / 2
+    if not changes:
+        assert said <= 3 * scatter
+    if "beside_mm" in changes:
+        assert abs(bias) < 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"blur_px": 7.0}, r"expected a bead in most of the \d+ frames .* \d+ % have none .*blurred in \d+"),
+        (
+            {"contrast": 0.1, "ground": "gradient", "dark": False, "angle_deg": 37.0},
+            "in most of the .*faint in",
+        ),
+        ({"contrast": 0.04, "ground": "plain", "dark": False}, r"shows a usable bead \(.*faint in \d+"),
+        ({"askew": 0.1}, r"looks (9|10) % wider \(4 % allowed\); turn the camera square"),
+    ],
+)
+def test_a_trial_that_the_camera_cannot_measure_is_refused_with_its_reasons(tmp_path, changes, why):
+    eye = EYE._replace(**changes)
+    path = recorded(tmp_path / "trial.mcap", eye)
+    with pytest.raises(ValueError, match=why):
+        flow_of(path, settings(tip_px=list(tip_of(eye))))
+
+
+def test_a_bead_before_the_line_begins_is_something_else(turned):
+    camera = settings(tip_px=tip(140.0), rotation_deg=140.0, columns=[76, 200])
+    recording = trial_files.open_trial(turned, **camera.recording)
+    values = train_ilc.read(recording, camera)
+    light = np.where(values.widths == 0, 50.0, values.widths)
+    with pytest.raises(ValueError, match=r"expected a bare stage .* \d+ % .* is a bead, 0.8 mm wide"):
+        train_ilc.measure_trial(recording, values._replace(widths=light), [], ROUTINE, PRINTER, camera)
+
+
+def some_bead(**changes) -> bead.Bead:
+    n = 8
+    usual = bead.Bead(np.arange(n) * 8.0, np.full(n, 55.0), np.full(n, 90.0), np.full(n, 145.0), 55.0, 0.1,
+                      0.0, 1.3, 90.0, "")  # fmt: skip
+    return usual._replace(**changes)
+
+
+def test_an_empty_bed_that_passes_for_a_bead_is_neither_learned_from_nor_shown():
+    grain = some_bead(blur_px=5.8, contrast=60.0, width=218.0, widths=np.full(8, 218.0))
+    seen = [some_bead() for _ in range(12)]
+    out = readings.consistent([grain, *seen])
+    assert out[0].reason == "unlike the other frames" and np.isnan(out[0].widths).all()
+    assert all(one.reason == "" for one in out[1:])
+    faint, other = some_bead(contrast=20.0), some_bead(contrast=-90.0)
+    assert [one.reason for one in readings.consistent([faint, other, *seen])[:3]] == [out[0].reason] * 2 + [
+        ""
+    ]
+    beads = list(zip(np.arange(13) * 0.1, out, strict=True))
+    shown = excerpts.places_to_show(beads, np.arange(13) * 0.1, np.ones(13), travel_mm=1.0)
+    assert shown[0] == "rejected" and shown[1] == "start"
 
 
 @pytest.fixture(scope="module")
@@ -142,5 +221,5 @@ def test_without_a_tip_a_level_line_stays_as_it_lies_and_an_askew_one_is_turned_
         path = recorded(tmp_path / f"{angle:g}.mcap", EYE._replace(angle_deg=angle, ground="striped"))
         recording = trial_files.open_trial(path, **camera.recording)
         frames, gantry = recording.frames, recording.signals["position_mm"]
-        turn = line.pose(camera.mounting, frames.time_s, gantry, frames.pick)
+        turn, _ = line.pose(camera.mounting, frames.time_s, gantry, frames.pick)
         assert (turn is None) if not angle else turn.angle_deg == pytest.approx(angle, abs=2)

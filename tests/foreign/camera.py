@@ -21,7 +21,9 @@ class Eye(NamedTuple):
     """angle_deg: in which direction of the picture the line trails from the tip (0 right, 90 down); tip in px
     of the picture; jpeg: quality of the frames, 0 for none; edge_bias_px: by how much a bead looks wider than
     it is, `widening` more for each mm that it is wider than 0.9; a frame stamped t shows the machine at
-    t - latency_s."""
+    t - latency_s. All stands out from the ground by `contrast` of what it would; another line lies beside_mm
+    beside this one all along, 0 for none; the right of the picture is larger than the left by the share
+    2 askew, as a camera sees it that is not square to the stage."""
 
     angle_deg: float = 0.0
     mirrored: bool = False
@@ -38,6 +40,9 @@ class Eye(NamedTuple):
     noise: float = 3.0
     specular: float = 60.0
     jpeg: int = 0
+    contrast: float = 1.0
+    beside_mm: float = 0.0
+    askew: float = 0.0
 
 
 def tip_of(eye: Eye) -> tuple[float, float]:
@@ -57,9 +62,13 @@ class Stage:
         self.spare = math.ceil(math.hypot(eye.height, eye.width)) + 8
         rows, n = 2 * self.spare, len(width_mm)
         self.bare = _ground(eye, rows, n + 2 * self.spare, rng)
+        if eye.beside_mm:
+            beside = _bead(eye, self.bare, np.full(self.bare.shape[1], 0.88 / eye.mm_per_px), rng)
+            self.bare = np.roll(beside, round(eye.beside_mm / eye.mm_per_px), axis=0)
         wide = np.pad(width_mm, self.spare, mode="edge") / eye.mm_per_px
         self.printed = _bead(eye, self.bare, wide, rng)
         sizes = [cv2.GaussianBlur(part, (0, 0), eye.blur_px) for part in (self.bare, self.printed)]
+        sizes = [_levels(eye)[0] + eye.contrast * (part - _levels(eye)[0]) for part in sizes]
         self.bare, self.printed = (np.clip(np.rint(part), 0, 255).astype(np.uint8) for part in sizes)
         self.bank = np.rint(rng.normal(0, eye.noise, 4 * eye.height * eye.width)).astype(np.int16)
         self.light = _light(eye)
@@ -89,6 +98,12 @@ class Stage:
         picture = cv2.add(picture, self.light, dtype=cv2.CV_16S)
         picture = cv2.add(picture, self.bank[at : at + picture.size].reshape(picture.shape), dtype=cv2.CV_8U)
         cv2.circle(picture, (round(tx), round(ty)), round(OUTER_MM / eye.mm_per_px), 35, -1, cv2.LINE_AA)
+        if eye.askew:
+            h, w, up = eye.height, eye.width, eye.height * eye.askew / 2
+            corners = np.array([[0, 0], [w, 0], [w, h], [0, h]], np.float32)
+            apart = corners + np.array([[0, up], [0, -up], [0, up], [0, -up]], np.float32)
+            M = cv2.getPerspectiveTransform(corners, apart)
+            picture = cv2.warpPerspective(picture, M, (w, h), borderMode=cv2.BORDER_REPLICATE)
         if not eye.jpeg:
             return picture
         ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, eye.jpeg])

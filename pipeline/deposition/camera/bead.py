@@ -49,6 +49,12 @@ ROUNDS = 12
 # a coarse row is bead where it stands so many standard deviations of the background above it, one in 10^9
 # rows of noise, and this share of the steps
 SIGNIFICANT, STEEP = 6.0, 0.2
+# fewer levels (of 0..255) between bead and ground are what rounding and compression make of light and noise
+FAINTEST = 6.0
+# a stronger blur, px, is read too low, up to this one
+RESOLVED_PX, UNRESOLVED_PX = 3.3, 6.0
+# a line whose width changes its course by more from block to block, as share of itself and in px, is grain
+RAGGED, RAGGED_PX = 0.1, 2.0
 # a plateau above all levels: no bead
 NONE = 1e9
 # fewer blocks are dirt, not a line; less height is no measurable bead
@@ -61,7 +67,8 @@ class Bead(NamedTuple):
 
     widths is 0 where the block shows background only and NaN where it cannot be read. `width` is the line
     fitted robustly through the widths, at the middle of the blocks that it uses, and `deviation` its standard
-    deviation; both NaN where `reason` is not empty: "no bead", "saturated", "cut by the frame", "blurred".
+    deviation; both NaN where `reason` is not empty: "no bead", "saturated", "cut by the frame", "blurred",
+    "faint", "ragged".
     `angle_deg` is the line's direction against the rows, `blur_px` the standard deviation of the edge,
     `contrast` bead less background in levels.
     """
@@ -136,6 +143,19 @@ def calibrate(widths_px: np.ndarray, known_mm: np.ndarray) -> WidthCalibration:
     )
 
 
+def edge_deviation(blur_px: float, contrast: float) -> float:
+    """By how much in px a width may be off at this blur and contrast (in levels of 0..255) beyond noise: a
+    blurred edge has not come to rest where its levels are read, and half a level of rounding moves it.
+
+        3 s Phi(-x / s) + sqrt(2 pi) s / contrast,   s = blur_px, x = the first row that is read
+
+    A blur above RESOLVED_PX counts as at least UNRESOLVED_PX.
+    """
+    blur_px = max(blur_px, UNRESOLVED_PX) if blur_px > RESOLVED_PX else blur_px
+    unrest = blur_px * float(scipy.special.ndtr(-NEAR[0] / blur_px))
+    return 3 * unrest + math.sqrt(2 * math.pi) * blur_px / abs(contrast)
+
+
 def drawn(frame: np.ndarray, bead: Bead) -> np.ndarray:
     """The frame as (h, w, 3) uint8 RGB with the measured edges as green lines, for a report; blocks without a
     width stay bare, a rejected frame gets a red border."""
@@ -192,9 +212,9 @@ def measure_all(
     if not frames:
         return []
     g = profiles(frames, columns)
-    n = g.shape[1]
+    n, white = g.shape[1], np.iinfo(frames[0].dtype).max
     where = columns[0] + BLOCK * np.arange(n) + (BLOCK - 1) / 2
-    rough = coarse(g, np.iinfo(frames[0].dtype).max / 255, sign)
+    rough = coarse(g, white / 255, sign)
     # most frames of a trial are bare
     (top, bottom), blur = (
         fine(g, rough) if rough.solid.any() else (rough.rows, np.full(len(frames), math.nan))
@@ -209,6 +229,8 @@ def measure_all(
             "saturated": rough.saturated[i],
             "no bead": few[i],
             "blurred": blur[i] > longest_blur_px,
+            "faint": rough.plateau[i] < FAINTEST * white / 255,
+            "ragged": not few[i] and _is_ragged((bottom - top)[i, good[i]]),
         }
         reason = next((name for name, holds in reasons.items() if holds), "")
         if reason:
@@ -231,6 +253,12 @@ def measure_all(
                 )
             )
     return out
+
+
+def _is_ragged(widths: np.ndarray) -> bool:
+    """Whether the widths (n,) in px of neighbouring blocks zigzag, as those of grain do and of no line."""
+    bends = np.abs(np.diff(widths, 2))
+    return bool(np.median(bends) > RAGGED * np.median(widths) + RAGGED_PX)
 
 
 def _bead(

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.deposition.camera import bead
 from pipeline.deposition.camera.bead import Bead
 from pipeline.deposition.camera.line import Mounting
-from pipeline.deposition.camera.readings import TrialFrames, measure_beads
+from pipeline.deposition.camera.readings import TrialFrames, consistent, measure_beads
 
 
 def excerpts(
@@ -22,13 +22,18 @@ def excerpts(
     """(number, picture (h, w, 3) in RGB, figures) of the frames to show; signals {name: (time_s (n,), values
     (n,))} have the gantry's place and speed, scale is (px_per_mm, offset_px) of the widths."""
     gantry, (px_per_mm, offset_px) = signals["position_mm"], scale
-    beads = [(time, one) for time, _, one in measure_beads(frames, gantry, mounting)]
+    times, beads = [], []
+    for time, _, one in measure_beads(frames, gantry, mounting):
+        times.append(time)
+        beads.append(one)
     if not beads:
         return
+    beads = list(zip(times, consistent(beads), strict=True))
     travel_mm = (np.mean(mounting.columns) - mounting.nozzle_column) * abs(mounting.mm_per_px)
     places = places_to_show(beads, *signals["speed_mm_per_s"], travel_mm=float(travel_mm))
-    for number, (time, picture, one) in enumerate(measure_beads(frames, gantry, mounting)):
+    for number, (time, picture, _) in enumerate(measure_beads(frames, gantry, mounting)):
         if number in places:
+            one = beads[number][1]
             width_mm = float(mounting.true_px(np.array(one.width)) - offset_px) / px_per_mm
             figures = {"blur_px": one.blur_px, "width_mm": width_mm, "deviation_px": one.deviation}
             figures = {name: value if np.isfinite(value) else None for name, value in figures.items()}

@@ -6,6 +6,7 @@ Width belongs to a place, not to a moment: the nozzle at x(t) lays Q(t) dt over 
 against a smoothness prior whose strength the data choose.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,8 @@ GATE = 5.0
 HUBER = 1.345
 # weights and scatter settle in so many rounds
 ROUNDS = 3
+# widths within this share of the median are those of a steady line
+NEAR_USUAL = 0.15
 # log of the strengths that are tried: from no smoothing at all to a straight line
 STRENGTHS = (-8.0, 24.0)
 # prior weight of the amplitudes, far below anything that the data say: one that nobody sees stays 0
@@ -141,6 +144,23 @@ def sections(
     bend = np.convolve(np.pad(A, 1, "edge"), [1.0, -2.0, 1.0], "valid") / 12
     deviation = np.sqrt(slope**2 * scatter**2 / count + blind**2 / 12 + bend**2)
     return Sections(where, A, deviation, count.astype(int), length, int(np.sum(~keep)))
+
+
+def column_trend(position: np.ndarray, columns: np.ndarray, widths: np.ndarray, view: View) -> float:
+    """By which share one place of the line looks wider at the last of the `columns` (m,) than at the first,
+    of widths (F, m) as for `sections`: least squares over readings of the same place, those near the median
+    width. 0 where no place is seen twice. A camera that looks square to the stage shows none."""
+    behind = (columns - view.nozzle_column) * view.mm_per_px
+    usual = float(np.median(widths[widths > 0])) if (widths > 0).any() else math.nan
+    used = np.abs(widths - usual) < NEAR_USUAL * usual
+    if not used.any():
+        return 0.0
+    u = np.broadcast_to((columns - columns[0]) / np.ptp(columns), widths.shape)[used]
+    s = (position[:, None] + behind)[used]
+    place = np.floor((s - s.min()) / (BLOCK * abs(view.mm_per_px))).astype(int)
+    count = np.maximum(np.bincount(place), 1)
+    u, w = (part - (np.bincount(place, part) / count)[place] for part in (u, widths[used] / usual))
+    return float(u @ w / max(u @ u, 1e-9))
 
 
 def _readings(

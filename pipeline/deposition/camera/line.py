@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import scipy.ndimage
 
 from pipeline.deposition.camera.bead import gray
 from pipeline.deposition.camera.latency import Gantry
@@ -34,6 +35,10 @@ WIDE_PX, LEAST_PX = 64, 96
 SAMPLE = 12
 # a line this near to the rows is measured as it lies
 LEVEL_DEG = 4.0
+# share of the difference between the edge biases of two widths by which one between them may be off
+BETWEEN = 0.15
+# of the gap to another line so much is left beside the bead
+GAP = 0.7
 
 
 class ImageLine(NamedTuple):
@@ -294,6 +299,15 @@ class Mounting(NamedTuple):
         known_px, bias_px = np.array(self.edge_bias).T
         return measured_px - np.interp(measured_px, known_px + bias_px, bias_px)
 
+    def bias_deviation_px(self, width_px: float) -> float:
+        """By how much the edge bias of a width may be off: BETWEEN of what it differs by at the known widths
+        around it; 0 if calibration found none."""
+        if len(self.edge_bias) < 2:
+            return 0.0
+        known_px, bias_px = np.array(self.edge_bias).T
+        at = int(np.clip(np.searchsorted(known_px, width_px), 1, len(known_px) - 1))
+        return BETWEEN * float(abs(bias_px[at] - bias_px[at - 1]))
+
     @property
     def hidden_px(self) -> float:
         """So much of the line from the tip on is hidden, px: measured columns begin there."""
@@ -305,17 +319,27 @@ def pose(
     time_s: np.ndarray,
     gantry: Gantry,
     frames: Callable[[Collection[int]], Iterable[tuple[int, np.ndarray]]],
-) -> Pose | None:
-    """How pictures taken at time_s (F,) are turned: as the mounting says, else as the frames with a bead,
-    less those without, show it. `frames` gives (number, picture) for some numbers. None: they are measured as
-    they lie."""
-    if mounting.rotation_deg is not None and not mounting.rotation_deg and mounting.tip_px is None:
-        return None
-    shape, picture = bead_alone(time_s, gantry, frames)
-    if picture is None:
-        return None
+) -> tuple[Pose | None, slice]:
+    """How pictures taken at time_s (F,) are turned, and the rows of the turned picture that hold no other
+    line: as the mounting says, else as the frames with a bead, less those without, show it. `frames` gives
+    (number, picture) for some numbers. None: they are measured as they lie."""
+    along, picture = bead_alone(time_s, gantry, frames)
+    if along is None or picture is None:
+        return None, slice(0, None)
+    turn = _turn(mounting, picture)
+    if turn is None:
+        columns = slice(*mounting.columns)
+        changed = np.abs(picture[:, columns].mean(axis=1) - 128.0)
+        return None, clear_rows(along[:, columns], int(np.argmax(scipy.ndimage.uniform_filter1d(changed, 5))))
+    return turn, clear_rows(turned(along, turn)[:, slice(*mounting.columns)], turn.rows // 2)
+
+
+def _turn(mounting: Mounting, picture: np.ndarray) -> Pose | None:
+    """The pose that the mounting says, or that the bead alone (rows, columns) shows."""
+    shape = (picture.shape[0], picture.shape[1])
     if mounting.rotation_deg is not None:
-        return placed(mounting, shape, mounting.rotation_deg, None)
+        level = not mounting.rotation_deg and mounting.tip_px is None
+        return None if level else placed(mounting, shape, mounting.rotation_deg, None)
     found = find(
         picture, tip=mounting.tip_px, hidden_px=mounting.hidden_px, mask=mask(mounting, shape),
         sign=mounting.sign,
@@ -323,6 +347,27 @@ def pose(
     if found is not None:
         return pose_of_line(mounting, shape, found)
     return None if mounting.tip_px is None else placed(mounting, shape, 0.0, None)
+
+
+def clear_rows(picture: np.ndarray, row: int) -> slice:
+    """The rows around the bead that lies along `row` of a picture (rows, columns) up to most of the gap to
+    the next line on either side, all rows where there is none: a line printed beside it passes for
+    background, or for bead."""
+    profile = np.median(picture, axis=1).astype(float)
+    h, ground = len(profile), float(np.median(profile))
+    rise = float(np.median(profile[max(row - 3, 0) : row + 4])) - ground
+    if abs(rise) < LEAST_CONTRAST:
+        return slice(0, h)
+    # a specular line parts no bead
+    width = h // 16
+    bead = scipy.ndimage.maximum_filter1d((profile - ground) / rise, width) > 0.5
+    bead = scipy.ndimage.minimum_filter1d(bead, width, mode="nearest")
+    ends = []
+    for side in (bead[row::-1], bead[row:]):
+        edge = int(np.argmin(np.append(side, False)))
+        gap = int(np.argmax(np.append(side[edge:], True)))
+        ends.append(edge + round(GAP * gap) if edge + gap < len(side) else len(side))
+    return slice(row + 1 - ends[0], row + ends[1])
 
 
 def pose_of_line(mounting: Mounting, shape: tuple[int, int], found: ImageLine) -> Pose | None:
@@ -360,9 +405,10 @@ def mask(mounting: Mounting, shape: tuple[int, int]) -> np.ndarray | None:
 
 def bead_alone(
     time_s: np.ndarray, gantry: Gantry, frames: Callable[[Collection[int]], Iterable[tuple[int, np.ndarray]]]
-) -> tuple[tuple[int, int], np.ndarray | None]:
-    """Shape of the frames, and the mean of some of them in which the gantry moves along, less that of some
-    before it moved, about the middle level: nozzle, light and what else rides with the camera are gone."""
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """The mean (h, w) of some frames in which the gantry moves along, and the same less the mean of some
+    before it moved, about the middle level: nozzle, light and what else rides with the camera are gone. None
+    where it never moves."""
     x = np.interp(time_s, *gantry)
     travelled = np.abs(x - x[0]) / max(float(np.ptp(x)), 1e-9)
     before, along = np.flatnonzero(travelled < 1e-3), np.flatnonzero((travelled > 0.2) & (travelled < 0.95))
@@ -371,13 +417,12 @@ def bead_alone(
         sample = numbers[np.linspace(0, len(numbers) - 1, min(SAMPLE, len(numbers))).astype(int)]
         kinds |= dict.fromkeys(sample.tolist(), kind)
     pictures: dict[str, list[np.ndarray]] = {"before": [], "along": []}
-    shape = (0, 0)
     for number, frame in frames(kinds):
-        shape = (int(frame.shape[0]), int(frame.shape[1]))
         pictures[kinds[number]].append(frame.astype(np.float32) * (255 / np.iinfo(frame.dtype).max))
     if not pictures["along"]:
-        return shape, None
-    mean = np.mean(pictures["along"], axis=0)
+        return None, None
+    mean = alone = np.mean(pictures["along"], axis=0)
     if pictures["before"]:
-        mean = 128 + (mean - np.mean(pictures["before"], axis=0)) / 2
-    return shape, np.clip(np.rint(mean), 0, 255).astype(np.uint8)
+        alone = 128 + (mean - np.mean(pictures["before"], axis=0)) / 2
+    along, alone = (np.clip(np.rint(one), 0, 255).astype(np.uint8) for one in (mean, alone))
+    return along, alone

@@ -1,5 +1,5 @@
-"""What the frames of a trial say before any flow is worked out: the bead's width in every frame, and how late
-the camera is."""
+"""What the frames of a trial say before any flow is worked out: the bead's width in every frame, how far off
+it may be, and how late the camera is."""
 
 import itertools
 from collections.abc import Collection, Iterator, Sequence
@@ -17,6 +17,9 @@ from pipeline.deposition.camera.line import Mounting, pose
 TOGETHER = 16
 # readings along the line and bands across it, from which the pictures' motion is told: px of one reading
 STEP_PX, BANDS = 4, 16
+# what is this many times as blurred as the bead of most frames, or has this share of its contrast, is no bead
+BLURRED, FAINT = 2.5, 0.4
+UNLIKE = "unlike the other frames"
 
 
 class TrialFrames(Protocol):
@@ -33,20 +36,22 @@ class TrialFrames(Protocol):
 
 class Readings(NamedTuple):
     """The readings of F frames: time_s (F,) as stamped, columns (m,), widths (F, m) in px of the picture as
-    it is measured (0 bare, NaN unread), reasons (F,) why a frame has no usable bead, and the camera's latency
-    as this recording tells it."""
+    it is measured (0 bare, NaN unread), reasons (F,) why a frame has no usable bead, the camera's latency as
+    this recording tells it, and by how much all widths may be off for blur and contrast, px (NaN without a
+    bead)."""
 
     time_s: np.ndarray
     columns: np.ndarray
     widths: np.ndarray
     reasons: list[str]
     latency: Latency
+    edge_px: float
 
     @classmethod
     def from_values(cls, values: tuple) -> "Readings":
-        """Of five plain values, the latency as (latency_s, deviation_s)."""
-        *rest, late = values
-        return cls(*rest, Latency(*late))
+        """Of six plain values, the latency as (latency_s, deviation_s)."""
+        *rest, late, edge_px = values
+        return cls(*rest, Latency(*late), edge_px)
 
 
 def measure_beads(
@@ -54,17 +59,38 @@ def measure_beads(
 ) -> Iterator[tuple[float, np.ndarray, Bead]]:
     """(time, picture as it is measured, bead) of each frame, a few at a time: memory stays flat, and what a
     frame costs beyond its decoding is shared."""
-    turn, rest = pose(mounting, frames.time_s, gantry, frames.pick), iter(frames)
+    turn, rows = pose(mounting, frames.time_s, gantry, frames.pick)
+    rest = iter(frames)
     while batch := list(itertools.islice(rest, TOGETHER)):
         times, pictures = zip(*batch, strict=True)
         pictures = [picture if turn is None else line.turned(picture, turn) for picture in pictures]
         beads = bead.measure_all(
-            pictures,
+            [picture[rows] for picture in pictures],
             columns=(mounting.columns[0], min(mounting.columns[1], pictures[0].shape[1])),
             longest_blur_px=mounting.longest_blur_px,
             sign=mounting.sign,
         )
+        beads = [one._replace(top=one.top + rows.start, bottom=one.bottom + rows.start) for one in beads]
         yield from zip(times, pictures, beads, strict=True)
+
+
+def consistent(beads: Sequence[Bead]) -> list[Bead]:
+    """The beads of one recording; those far more blurred or fainter than most of them, or of the other
+    colour, come back with a reason: grain of an empty bed passes for a bead now and then."""
+    blur, contrast = _typical(beads)
+    return [
+        one
+        if one.reason or (one.blur_px <= BLURRED * blur and one.contrast / contrast >= FAINT)
+        else one._replace(widths=one.widths * np.nan, width=np.nan, deviation=np.nan, reason=UNLIKE)
+        for one in beads
+    ]
+
+
+def _typical(beads: Sequence[Bead]) -> tuple[float, float]:
+    """Median blur in px and contrast of the usable beads; NaN without one."""
+    usable = [(one.blur_px, one.contrast) for one in beads if not one.reason]
+    blur, contrast = np.median(usable, axis=0) if usable else (np.nan, np.nan)
+    return float(blur), float(contrast)
 
 
 def read(frames: TrialFrames, gantry: Gantry, mounting: Mounting) -> Readings:
@@ -77,13 +103,16 @@ def read(frames: TrialFrames, gantry: Gantry, mounting: Mounting) -> Readings:
         beads.append(measured)
         strip = picture[:, first : min(last, picture.shape[1])]
         signals.append(cv2.resize(strip, bands, interpolation=cv2.INTER_AREA).astype(np.float32))
-    time_s = np.array(times)
+    time_s, beads = np.array(times), consistent(beads)
+    blur, contrast = _typical(beads)
+    level = 257 if signals and picture.dtype == np.uint16 else 1
     return Readings(
         time_s,
         beads[0].columns if beads else np.zeros(0),
         np.array([one.widths for one in beads]),
         [one.reason for one in beads],
         _latency(time_s, signals, mounting, gantry),
+        bead.edge_deviation(blur, contrast / level),
     )
 
 

@@ -1,6 +1,7 @@
 """A trial measured from its pictures: readings of its frames and signals of its recording -> the flow that a
 law learns from, on the clock of its routine."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -16,6 +17,14 @@ from pipeline.deposition.learning.ilc import Trial
 
 # a recording may begin and end so much later and earlier than its routine
 SLACK_S = 0.2
+# of the frames in which the line must be seen at most this share may have no usable bead
+REJECTED = 0.5
+# the stage must be bare this far ahead of the line, mm: what oozes before lies nearer
+AHEAD_MM = 1.0
+# a line that looks wider at one end of the columns than at the other by this share is seen askew
+ASKEW = 0.04
+# by how much in px widths of a calibrated camera and of another one are off beyond what blur and light tell
+CALIBRATED_PX, UNCALIBRATED_PX = 0.2, 0.4
 
 
 class MeasuredTrial(NamedTuple):
@@ -46,22 +55,45 @@ def measure_trial(
 ) -> MeasuredTrial:
     """The trial of one recording: readings of its frames, and signals {name: (time_s (n,), values (n,))} on
     clocks of their own. scale is (px_per_mm, offset_px) of the widths. Raises ValueError if no frame shows a
-    bead, and for signals that do not cover the routine."""
+    bead, if most of those taken while the gantry prints show none, if the camera looks askew, and for signals
+    that do not cover the routine."""
     px_per_mm, offset_px = scale
     widths_mm = (mounting.true_px(readings.widths) - offset_px) / px_per_mm
     widths_mm = np.where(readings.widths == 0, 0.0, widths_mm)
     late = clock_shift(*signals["position_mm"], routine)
     shifted = {name: (time_s - late, values) for name, (time_s, values) in signals.items()}
     at = on_routine_clock(shifted, routine)
+    position = np.interp(readings.time_s - late - latency.latency_s, *shifted["position_mm"])
     _check_beads(readings)
+    ends = np.interp([routine.start_s, routine.stop_s], routine.time_s, at["position_mm"])
+    place = position + (float(np.mean(readings.columns)) - view.nozzle_column) * view.mm_per_px
+    along = (place - ends[0]) / (ends[1] - ends[0])
+    _check_rejected(np.array(readings.reasons)[(along >= 0) & (along <= 1)])
+    _check_bare(widths_mm, along < -AHEAD_MM / abs(ends[1] - ends[0]))
+    trend = flow.column_trend(position, readings.columns, widths_mm, view)
+    if abs(trend) > ASKEW:
+        raise ValueError(
+            f"expected a line that looks as wide at one end of the measured columns as at the other but it "
+            f"looks {100 * abs(trend):.0f} % wider ({100 * ASKEW:g} % allowed); turn the camera square to "
+            "the stage and calibrate it, or measure fewer columns (camera.columns)"
+        )
+    calibrated = bool(mounting.edge_bias) or offset_px != 0
+    usual_mm = float(np.median(widths_mm[widths_mm > 0]))
+    doubts_px = (
+        readings.edge_px,
+        CALIBRATED_PX if calibrated else UNCALIBRATED_PX,
+        mounting.bias_deviation_px(usual_mm * px_per_mm),
+    )
+    deviation_mm = math.hypot(
+        width_deviation_mm, *(px / px_per_mm for px in doubts_px), usual_mm * trend / math.sqrt(12)
+    )
     sections = flow.sections(
-        np.interp(readings.time_s - late - latency.latency_s, *shifted["position_mm"]),
-        readings.columns, widths_mm, view=view,
+        position, readings.columns, widths_mm, view=view,
         nozzle_radius_mm=nozzle_mm / 2, contact_angle_deg=contact_angle_deg,
     )  # fmt: skip
     estimate = flow.estimate(
         routine.time_s, at["position_mm"], sections, nozzle_radius_mm=nozzle_mm / 2, shapes=routine.r[None],
-        contact_angle_deg=contact_angle_deg, width_deviation_mm=width_deviation_mm,
+        contact_angle_deg=contact_angle_deg, width_deviation_mm=deviation_mm,
     )  # fmt: skip
     # within a pause only its volume was measured: a law learns nothing there
     y = np.where(estimate.observable, estimate.flow, np.nan)
@@ -84,6 +116,34 @@ def _check_beads(readings: Readings) -> None:
         raise ValueError(
             f"none of {len(readings.time_s)} frames shows a usable bead ({reasons}); "
             "check light, focus, calibration and camera.columns, or record the trial again"
+        )
+
+
+def _check_bare(widths_mm: np.ndarray, before: np.ndarray) -> None:
+    """Raises ValueError if most of the widths (F, m) of the frames `before` (F,) the line are those of a bead
+    as wide as half the line or more: then it is no line that is measured."""
+    usual_mm, bare = float(np.median(widths_mm[widths_mm > 0])), widths_mm[before]
+    share = float(np.mean(bare > usual_mm / 2)) if before.any() else 0.0
+    if share > REJECTED:
+        wide_mm = float(np.median(bare[bare > 0]))
+        raise ValueError(
+            f"expected a bare stage before the line begins but {100 * share:.0f} % of what the camera reads "
+            f"there is a bead, {wide_mm:.2g} mm wide: light, dirt or another line passes for it; check light "
+            "and camera.columns, and record the trial again"
+        )
+
+
+def _check_rejected(reasons: np.ndarray) -> None:
+    """Raises ValueError if most of the frames that show the line have one of the `reasons` (F,) why they have
+    no usable bead."""
+    rejected = counts(reasons.tolist())
+    share = sum(rejected.values()) / max(len(reasons), 1)
+    if share > REJECTED:
+        said = ", ".join(f"{reason} in {count}" for reason, count in sorted(rejected.items()))
+        raise ValueError(
+            f"expected a bead in most of the {len(reasons)} frames that show the line but "
+            f"{100 * share:.0f} % have none that can be measured ({said}); check light, focus, calibration "
+            "and camera.columns, and record the trial again"
         )
 
 

@@ -331,7 +331,7 @@ def _judge(library: Library, share: ToolShare, drive: Drive) -> dict[str, tuple[
     on_off = flows(_on_off(excerpt, drive, Ts))
     return {
         name: forecast.error_percent(
-            flows(controllers.command(name)(library, excerpt, drive)), on_off, excerpt.r
+            flows(controllers.command(name)(library, excerpt, drive)), on_off, excerpt.r, material.missed
         )
         for name in COMPOSERS
     }

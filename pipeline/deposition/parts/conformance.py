@@ -140,10 +140,12 @@ def _intervals(lines: LineVolumes, composed: Composed, learned: LearnedLibrary) 
         made = forecast.each_flow(
             material.chain, material.missed, stream.u, stream.r, sample_time_s=composed.sample_time_s
         )
-        low[mine], high[mine] = forecast.ends(
+        ends = forecast.ends(
             100 * (volume_between(y, start, stop, sample_time_s=composed.sample_time_s) / planned - 1)
             for y in made
         )
+        moved = np.nan_to_num(material.missed.level_percent)
+        low[mine], high[mine] = ends[0] - moved, ends[1] + moved
     return lines._replace(low_percent=low, high_percent=high)
 
 

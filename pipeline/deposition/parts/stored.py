@@ -98,7 +98,7 @@ def _material(values: Mapping[str, Any]) -> LearnedMaterial:
     for name in ("left_out", "members"):
         chain[name] = tuple(_extruder(one) for one in chain[name])
     chain |= {"extruder": _extruder(chain["extruder"]), "structure": tuple(chain["structure"])}
-    missed |= {name: _number(missed[name]) for name in ("ratio", "changed")}
+    missed |= {name: _number(missed[name]) for name in missed if name.endswith("percent")}
     missed["by_place"] = np.array(missed["by_place"], float)
     known: dict[str, Any] = dict(values)
     known |= {"chain": Chain(**chain), "missed": Missed(**missed), "covered": Covered(**values["covered"])}
