@@ -128,7 +128,7 @@ def missed(trainings: Sequence[Training], chain: Chain, *, sample_time_s: float,
         e = np.where(seen, flow - y, 0.0) / training.r.max()
         bias.append(mean_by_place(e, seen, place).mean(axis=0))
         first = np.nan_to_num(training.y[0] - training.r) / training.r.max()
-        steady = seen & (places(training.r, sample_time_s) // BINS == STEADY)
+        steady = seen & (place // BINS == STEADY)
         rows.append(
             (_repeated(e), place // BINS, _slope(e, steady), _ripple(e, steady, sample_time_s), first)
         )
