@@ -55,8 +55,8 @@ def measure_trial(
 ) -> MeasuredTrial:
     """The trial of one recording: readings of its frames, and signals {name: (time_s (n,), values (n,))} on
     clocks of their own. scale is (px_per_mm, offset_px) of the widths. Raises ValueError if no frame shows a
-    bead, if most of those taken while the gantry prints show none, if the camera looks askew, and for signals
-    that do not cover the routine."""
+    bead, if most of those that show the line have none, if the stage ahead of the line is not bare, if the
+    camera looks askew, and for signals that do not cover the routine."""
     px_per_mm, offset_px = scale
     widths_mm = (mounting.true_px(readings.widths) - offset_px) / px_per_mm
     widths_mm = np.where(readings.widths == 0, 0.0, widths_mm)
@@ -71,21 +71,13 @@ def measure_trial(
     _check_rejected(np.array(readings.reasons)[(along >= 0) & (along <= 1)])
     _check_bare(widths_mm, along < -AHEAD_MM / abs(ends[1] - ends[0]))
     trend = flow.column_trend(position, readings.columns, widths_mm, view)
-    if abs(trend) > ASKEW:
-        raise ValueError(
-            f"expected a line that looks as wide at one end of the measured columns as at the other but it "
-            f"looks {100 * abs(trend):.0f} % wider ({100 * ASKEW:g} % allowed); turn the camera square to "
-            "the stage and calibrate it, or measure fewer columns (camera.columns)"
-        )
-    calibrated = bool(mounting.edge_bias) or offset_px != 0
-    usual_mm = float(np.median(widths_mm[widths_mm > 0]))
-    doubts_px = (
+    _check_askew(trend)
+    usual_px = px_per_mm * float(np.median(widths_mm[widths_mm > 0]))
+    doubt_px = math.hypot(
         readings.edge_px,
-        CALIBRATED_PX if calibrated else UNCALIBRATED_PX,
-        mounting.bias_deviation_px(usual_mm * px_per_mm),
-    )
-    deviation_mm = math.hypot(
-        width_deviation_mm, *(px / px_per_mm for px in doubts_px), usual_mm * trend / math.sqrt(12)
+        CALIBRATED_PX if mounting.edge_bias or offset_px else UNCALIBRATED_PX,
+        mounting.bias_deviation_px(usual_px),
+        usual_px * trend / math.sqrt(12),
     )
     sections = flow.sections(
         position, readings.columns, widths_mm, view=view,
@@ -93,7 +85,8 @@ def measure_trial(
     )  # fmt: skip
     estimate = flow.estimate(
         routine.time_s, at["position_mm"], sections, nozzle_radius_mm=nozzle_mm / 2, shapes=routine.r[None],
-        contact_angle_deg=contact_angle_deg, width_deviation_mm=deviation_mm,
+        contact_angle_deg=contact_angle_deg,
+        width_deviation_mm=math.hypot(width_deviation_mm, doubt_px / px_per_mm),
     )  # fmt: skip
     # within a pause only its volume was measured: a law learns nothing there
     y = np.where(estimate.observable, estimate.flow, np.nan)
@@ -130,6 +123,17 @@ def _check_bare(widths_mm: np.ndarray, before: np.ndarray) -> None:
             f"expected a bare stage before the line begins but {100 * share:.0f} % of what the camera reads "
             f"there is a bead, {wide_mm:.2g} mm wide: light, dirt or another line passes for it; check light "
             "and camera.columns, and record the trial again"
+        )
+
+
+def _check_askew(trend: float) -> None:
+    """Raises ValueError if the line looks wider at one end of the columns than at the other by more than
+    ASKEW."""
+    if abs(trend) > ASKEW:
+        raise ValueError(
+            "expected a line that looks as wide at one end of the measured columns as at the other but it "
+            f"looks {100 * abs(trend):.0f} % wider ({100 * ASKEW:g} % allowed); turn the camera square to "
+            "the stage and calibrate it, or measure fewer columns (camera.columns)"
         )
 
 
