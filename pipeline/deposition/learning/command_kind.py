@@ -20,19 +20,20 @@ KNOWN = 3.0
 # STARTS are followed
 GRID = tuple((factor, share) for factor in (0.4, 1.0, 2.5) for share in (0.0, 0.15))
 STARTS = 2
-# the declared kind is wrong if the squares of its error are so many times the least; a screw that leaks is a
-# speed, and looks like a pressure by up to 1.23
-WRONG = {"pressure": 1.1, "speed": 1.4, "place": 2.0}
+# the declared kind is wrong if the squares of its error are so many times the least, by a place or not
+WRONG_PLACE, WRONG = 2.0, 1.15
+# a kind names a machine only if it leaves no more than this share of the flow's squares
+UNEXPLAINED = 0.4
 ANSWERS = {
     "pressure": "its command as to a pressure",
     "speed": "the speed of its plunger",
     "place": "the place of its plunger",
 }
 
-Response = Callable[[np.ndarray, float, float, float], np.ndarray]
+Response = Callable[[np.ndarray, float, float, float, float], np.ndarray]
 
 
-def relaxing(w: np.ndarray, tau: float, yield_: float, exponent: float) -> np.ndarray:
+def relaxing(w: np.ndarray, tau: float, yield_: float, exponent: float, _: float) -> np.ndarray:
     """Flow (T,) over the steady one under a pressure w (T,) that is given, tau in samples:
 
     tau x' = w - x,   q = max(x - yield, 0)^exponent
@@ -41,18 +42,18 @@ def relaxing(w: np.ndarray, tau: float, yield_: float, exponent: float) -> np.nd
     return np.maximum(scipy.signal.lfilter([0.0, 1 - a], [1.0, -a], w) - yield_, 0.0) ** exponent
 
 
-def conserving(w: np.ndarray, tau: float, yield_: float, exponent: float) -> np.ndarray:
+def conserving(w: np.ndarray, tau: float, yield_: float, exponent: float, leak: float) -> np.ndarray:
     """Flow (T,) over the steady one under the volume w (T,) that is pushed, of which what does not come out
     stays as pressure x; tau in samples:
 
-    tau x' = w - q,   q = max(x - yield, 0)^exponent
+    tau x' = w (1 - leak max(x, 0)) - q,   q = max(x - yield, 0)^exponent
     """
     x, out = 0.0, []
     for pushed in w.tolist():
         over = max(x - yield_, 0.0)
         # no more than there is
         q = min(over**exponent, tau * over + max(pushed, 0.0))
-        x += (pushed - q) / tau
+        x += (pushed * (1 - leak * max(x, 0.0)) - q) / tau
         out.append(q)
     return np.array(out)
 
@@ -61,15 +62,16 @@ def errors(
     sent: Sequence[np.ndarray], y: Sequence[np.ndarray], r: Sequence[np.ndarray], *, gain: float,
     time_constant_s: float, sample_time_s: float,
 ) -> dict[CommandKind, float]:  # fmt: skip
-    """Sum of squares that each kind, fitted to all trials, leaves of their flows, as shares of the highest
-    steady flow: of each trial what was sent (T,), in mm or mm/s, measured flow y (T,) and wanted r (T,) in
-    mm^3/s. Flows above MOST count as MOST. gain and time_constant_s are what is known beforehand. Two speeds
-    part the kinds better than one."""
+    """The share that each kind, fitted to all trials, leaves of the sum of squares of their flows. Of each
+    trial: what was sent (T,), in mm or mm/s, measured flow y (T,) and wanted r (T,) in mm^3/s. Flows above
+    MOST count as MOST. gain and time_constant_s are what is known beforehand. Two speeds part the kinds
+    better than one."""
     steady, slow = max(float(one.max()) for one in r), math.log(time_constant_s / sample_time_s)
     observable = [np.isfinite(flow) for flow in y]
     told = [np.minimum(flow[mask] / steady, MOST) for flow, mask in zip(y, observable, strict=True)]
-    low = np.array([-math.log(KNOWN), slow - math.log(KNOWN), 0.0, 0.0, 0.7])
-    high = np.array([math.log(KNOWN), slow + math.log(KNOWN), 0.5, 0.6, 1.8])
+    power = max(float(np.sum(np.concatenate(told) ** 2)), np.finfo(float).tiny)
+    low = np.array([-math.log(KNOWN), slow - math.log(KNOWN), 0.0, 0.0, 0.7, 0.0])
+    high = np.array([math.log(KNOWN), slow + math.log(KNOWN), 0.5, 0.6, 1.8, 0.15])
 
     def squares(commands: Sequence[np.ndarray], response: Response) -> float:
         def left(theta: np.ndarray) -> np.ndarray:
@@ -82,13 +84,13 @@ def errors(
             return np.concatenate(parts)
 
         starts = [
-            np.array([math.log1p(share), slow + math.log(factor), 0.06, share + 0.01, 1.1])
+            np.array([math.log1p(share), slow + math.log(factor), 0.06, share + 0.01, 1.1, 0.03])
             for factor, share in GRID
         ]
         starts.sort(key=lambda theta: float(np.sum(left(theta) ** 2)))
         return min(
-            2 * scipy.optimize.least_squares(
-                left, start, bounds=(low, high), x_scale=[0.1, 0.1, 0.02, 0.05, 0.1], diff_step=1e-4,
+            2 / power * scipy.optimize.least_squares(
+                left, start, bounds=(low, high), x_scale=[0.1, 0.1, 0.02, 0.05, 0.1, 0.03], diff_step=1e-4,
                 max_nfev=25,
             ).cost
             for start in starts[:STARTS]
@@ -111,7 +113,7 @@ def wrong_kind(squares: dict[CommandKind, float], declared: CommandKind) -> tupl
     """
     best = min(KINDS, key=squares.__getitem__)
     places = "place" in (declared, best)
-    if squares[declared] < WRONG["place" if places else declared] * squares[best]:
+    if squares[best] > UNEXPLAINED or squares[declared] < (WRONG_PLACE if places else WRONG) * squares[best]:
         return "", False
     answers = ANSWERS[best]
     if declared == "place":
