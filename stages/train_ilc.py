@@ -181,16 +181,20 @@ def learn_from_recordings(
     for material in printer.materials:
         figures: dict[str, Any] = {}
         models: dict[str, Any] = {"nominal": extruder.to_json(material.nominal)}
+        of_routines: list[list[trial_flow.MeasuredTrial]] = []
         for index, routine in enumerate(routines):
-            # the first routine that is recorded is shown on the pages
-            key, end, measured = (material.name, index), f"_{index}" if "pixels" in figures else "", []
-            for one in groups.get(key, []):
+            of_routines.append([])
+            for one in groups.get((material.name, index), []):
                 earlier = [other.latency for path, other in values.items() if path != one.path]
-                measured.append(measure_trial(one, values[one.path], earlier, routine, printer, camera))
+                measured = measure_trial(one, values[one.path], earlier, routine, printer, camera)
+                of_routines[-1].append(measured)
+        first = [(m[0].trial, r) for m, r in zip(of_routines, routines, strict=True) if m]
+        with artifacts.about(f"{folder}: material {material.name}"):
+            figures["command_kind"] = check_kind(first, material, printer) if first else ""
+        for index, (routine, measured) in enumerate(zip(routines, of_routines, strict=True)):
+            # the first routine that is recorded is shown on the pages
+            key, end = (material.name, index), f"_{index}" if "pixels" in figures else ""
             trials, number = [one.trial for one in measured], len(measured)
-            if trials and "pixels" not in figures:
-                with artifacts.about(f"{folder}: material {material.name}, routine {index}"):
-                    figures["command_kind"] = check_kind(trials[0], routine, material, printer)
             law = "model_inverse" if measured else "on_off"
             with artifacts.about(f"{folder}: material {material.name}, routine {index}"):
                 sequence, u, of_step = training.resume(trials, routine, material.nominal, laws)
@@ -215,15 +219,18 @@ def learn_from_recordings(
     return results
 
 
-def check_kind(trial: Trial, routine: Routine, material: PrinterMaterial, printer: Printer) -> str:
-    """The sentence that names what the machine answers to, if its first trial fits that better than
-    printer.command; "" otherwise. Raises ValueError with it if nothing can be learned so."""
+def check_kind(
+    first: Sequence[tuple[Trial, Routine]], material: PrinterMaterial, printer: Printer
+) -> str:  # fmt: skip
+    """The sentence that names what the machine answers to, if the first trials of all routines fit that
+    better than printer.command; "" otherwise. Raises ValueError with it if nothing can be learned so."""
     from pipeline.deposition import drive
     from pipeline.deposition.learning import command_kind
 
     Ts = printer.sample_time_s
     squares = command_kind.errors(
-        drive.sent(trial.u, printer.command, sample_time_s=Ts), trial.y, routine.r,
+        [drive.sent(trial.u, printer.command, sample_time_s=Ts) for trial, _ in first],
+        [trial.y for trial, _ in first], [routine.r for _, routine in first],
         gain=material.gain_mm3_per_s_per_mm, time_constant_s=material.time_constant_s, sample_time_s=Ts,
     )  # fmt: skip
     sentence, hopeless = command_kind.wrong_kind(squares, printer.command)

@@ -10,16 +10,20 @@ from tests.foreign import displacing, extruders
 from tests.foreign.syringe import PneumaticSyringe
 
 TS = 0.02
-R = routine(
-    off_s=4, on_s=6, pause_s=0.6, tail_s=8, speed=8.0, bead_area_mm2=0.304, ramp_s=0.15, sample_time_s=TS
-).r
-STEADY = float(R.max())
+# two speeds, as the shipped routines have
+WANTED = [
+    routine(
+        off_s=4, on_s=6, pause_s=0.6, tail_s=8, speed=speed, bead_area_mm2=0.304, ramp_s=0.15,
+        sample_time_s=TS,
+    ).r
+    for speed in (8.0, 2.1)
+]  # fmt: skip
+STEADY = float(WANTED[0].max())
 
 
 def squares(true, declared, number, kind="syringe"):
-    """Of the on-off trial of one drawn machine, its time constant known to 30 %."""
+    """Of the on-off trials of one drawn machine, its time constant known to 30 %."""
     rng = np.random.default_rng([41, number, command_kind.KINDS.index(true)])
-    sent = drive.sent(R, declared, sample_time_s=TS)
     if true == "pressure":
         fill_s, vent_s, yield_mm, exponent, valve_s = rng.uniform(
             [0.3, 0.3, 0.05, 0.9, 0.03], [1.5, 1.5, 0.3, 1.3, 0.1]
@@ -27,14 +31,19 @@ def squares(true, declared, number, kind="syringe"):
         syringe = PneumaticSyringe(
             valve_s=valve_s, fill_s=fill_s, vent_s=vent_s, yield_mm=yield_mm, exponent=exponent
         )
-        flow = syringe.flow(np.arange(len(R)) * TS, sent)
         time_constant_s = (fill_s + vent_s) / 2 * rng.uniform(0.75, 1.3)
+        run = lambda sent: syringe.flow(np.arange(len(sent)) * TS, sent)  # noqa: E731
     else:
         time_constant_s = float(np.exp(rng.uniform(np.log(0.2), np.log(1.5))))
         e = displacing.drawn(kind, rng, gain=1.0, time_constant_s=time_constant_s, steady_flow=STEADY)
-        flow = displacing.flow(e, sent, sample_time_s=TS, place=true == "place")
-    y = extruders.seen(flow, np.random.default_rng([9, number]), steady_flow=STEADY)
-    return command_kind.errors(sent, y, R, gain=1.0, time_constant_s=time_constant_s, sample_time_s=TS)
+        run = lambda sent: displacing.flow(e, sent, sample_time_s=TS, place=true == "place")  # noqa: E731
+    noise = np.random.default_rng([9, number])
+    sent = [drive.sent(r, declared, sample_time_s=TS) for r in WANTED]
+    y = [
+        extruders.seen(run(one), noise, steady_flow=float(r.max()))
+        for one, r in zip(sent, WANTED, strict=True)
+    ]
+    return command_kind.errors(sent, y, WANTED, gain=1.0, time_constant_s=time_constant_s, sample_time_s=TS)
 
 
 @pytest.mark.parametrize(

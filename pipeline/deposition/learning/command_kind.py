@@ -1,8 +1,8 @@
-"""What a machine answers to, from its first trial: a pressure, the speed of what is pushed, or its place.
+"""What a machine answers to, from its first trials: a pressure, the speed of what is pushed, or its place.
 Each kind is fitted to the command as it was sent; the kind with the least error names the machine."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import get_args
 
 import numpy as np
@@ -20,18 +20,20 @@ KNOWN = 3.0
 # STARTS are followed
 GRID = tuple((factor, share) for factor in (0.4, 1.0, 2.5) for share in (0.0, 0.15))
 STARTS = 2
-# a kind fits worse if the squares of its error are so many times the least
-WORSE, WRONG = 1.04, 2.0
+# the declared kind is wrong if the squares of its error are so many times the least, by a place or not
+WRONG_PLACE, WRONG = 2.0, 1.15
+# a kind names a machine only if it leaves no more than this share of the flow's squares
+UNEXPLAINED = 0.4
 ANSWERS = {
     "pressure": "its command as to a pressure",
     "speed": "the speed of its plunger",
     "place": "the place of its plunger",
 }
 
-Response = Callable[[np.ndarray, float, float, float], np.ndarray]
+Response = Callable[[np.ndarray, float, float, float, float], np.ndarray]
 
 
-def relaxing(w: np.ndarray, tau: float, yield_: float, exponent: float) -> np.ndarray:
+def relaxing(w: np.ndarray, tau: float, yield_: float, exponent: float, _: float) -> np.ndarray:
     """Flow (T,) over the steady one under a pressure w (T,) that is given, tau in samples:
 
     tau x' = w - x,   q = max(x - yield, 0)^exponent
@@ -40,59 +42,64 @@ def relaxing(w: np.ndarray, tau: float, yield_: float, exponent: float) -> np.nd
     return np.maximum(scipy.signal.lfilter([0.0, 1 - a], [1.0, -a], w) - yield_, 0.0) ** exponent
 
 
-def conserving(w: np.ndarray, tau: float, yield_: float, exponent: float) -> np.ndarray:
+def conserving(w: np.ndarray, tau: float, yield_: float, exponent: float, leak: float) -> np.ndarray:
     """Flow (T,) over the steady one under the volume w (T,) that is pushed, of which what does not come out
     stays as pressure x; tau in samples:
 
-    tau x' = w - q,   q = max(x - yield, 0)^exponent
+    tau x' = w (1 - leak max(x, 0)) - q,   q = max(x - yield, 0)^exponent
     """
     x, out = 0.0, []
     for pushed in w.tolist():
         over = max(x - yield_, 0.0)
         # no more than there is
         q = min(over**exponent, tau * over + max(pushed, 0.0))
-        x += (pushed - q) / tau
+        x += (pushed * (1 - leak * max(x, 0.0)) - q) / tau
         out.append(q)
     return np.array(out)
 
 
 def errors(
-    sent: np.ndarray, y: np.ndarray, r: np.ndarray, *, gain: float, time_constant_s: float,
-    sample_time_s: float,
+    sent: Sequence[np.ndarray], y: Sequence[np.ndarray], r: Sequence[np.ndarray], *, gain: float,
+    time_constant_s: float, sample_time_s: float,
 ) -> dict[CommandKind, float]:  # fmt: skip
-    """Sum of squares that each kind leaves of the flow y (T,) in mm^3/s under what was sent (T,), in mm or
-    mm/s, wanted r (T,), as shares of the steady flow; flows above MOST count as MOST. gain and
-    time_constant_s are what is known beforehand."""
-    observable, steady = np.isfinite(y), float(r.max())
-    told = np.minimum(y[observable] / steady, MOST)
-    t, slow = np.arange(len(r)) * sample_time_s, math.log(time_constant_s / sample_time_s)
-    low = np.array([-math.log(KNOWN), slow - math.log(KNOWN), 0.0, 0.0, 0.7])
-    high = np.array([math.log(KNOWN), slow + math.log(KNOWN), 0.5, 0.6, 1.8])
+    """The share that each kind, fitted to all trials, leaves of the sum of squares of their flows. Of each
+    trial: what was sent (T,), in mm or mm/s, measured flow y (T,) and wanted r (T,) in mm^3/s. Flows above
+    MOST count as MOST. gain and time_constant_s are what is known beforehand. Two speeds part the kinds
+    better than one."""
+    steady, slow = max(float(one.max()) for one in r), math.log(time_constant_s / sample_time_s)
+    observable = [np.isfinite(flow) for flow in y]
+    told = [np.minimum(flow[mask] / steady, MOST) for flow, mask in zip(y, observable, strict=True)]
+    power = max(float(np.sum(np.concatenate(told) ** 2)), np.finfo(float).tiny)
+    low = np.array([-math.log(KNOWN), slow - math.log(KNOWN), 0.0, 0.0, 0.7, 0.0])
+    high = np.array([math.log(KNOWN), slow + math.log(KNOWN), 0.5, 0.6, 1.8, 0.15])
 
-    def squares(command: np.ndarray, response: Response) -> float:
+    def squares(commands: Sequence[np.ndarray], response: Response) -> float:
         def left(theta: np.ndarray) -> np.ndarray:
             K, tau = np.exp(theta[:2]).tolist()
-            w = K * gain / steady * np.interp(t - theta[2], t, command, left=0.0)
-            return np.minimum(response(w, tau, *theta[3:].tolist())[observable], MOST) - told
+            parts = []
+            for command, mask, flow in zip(commands, observable, told, strict=True):
+                t = np.arange(len(command)) * sample_time_s
+                w = K * gain / steady * np.interp(t - theta[2], t, command, left=0.0)
+                parts.append(np.minimum(response(w, tau, *theta[3:].tolist())[mask], MOST) - flow)
+            return np.concatenate(parts)
 
         starts = [
-            np.array([math.log1p(share), slow + math.log(factor), 0.06, share + 0.01, 1.1])
+            np.array([math.log1p(share), slow + math.log(factor), 0.06, share + 0.01, 1.1, 0.03])
             for factor, share in GRID
         ]
         starts.sort(key=lambda theta: float(np.sum(left(theta) ** 2)))
         return min(
-            2 * scipy.optimize.least_squares(
-                left, start, bounds=(low, high), x_scale=[0.1, 0.1, 0.02, 0.05, 0.1], diff_step=1e-4,
+            2 / power * scipy.optimize.least_squares(
+                left, start, bounds=(low, high), x_scale=[0.1, 0.1, 0.02, 0.05, 0.1, 0.03], diff_step=1e-4,
                 max_nfev=25,
             ).cost
             for start in starts[:STARTS]
         )  # fmt: skip
 
-    moved = speed(sent, sample_time_s=sample_time_s)
     return {
         "pressure": squares(sent, relaxing),
         "speed": squares(sent, conserving),
-        "place": squares(moved, conserving),
+        "place": squares([speed(one, sample_time_s=sample_time_s) for one in sent], conserving),
     }
 
 
@@ -102,11 +109,11 @@ def wrong_kind(squares: dict[CommandKind, float], declared: CommandKind) -> tupl
 
     A pressure and a speed both give a steady flow for a steady command. They differ by what the ink's yield
     and its thinning do, so that a machine without either fits both, and neither is named wrong. A command
-    sent as a place does not part them at all.
+    sent as a place hardly parts them.
     """
     best = min(KINDS, key=squares.__getitem__)
-    ratio = squares[declared] / max(squares[best], np.finfo(float).tiny)
-    if ratio < WORSE:
+    places = "place" in (declared, best)
+    if squares[best] > UNEXPLAINED or squares[declared] < (WRONG_PLACE if places else WRONG) * squares[best]:
         return "", False
     answers = ANSWERS[best]
     if declared == "place":
@@ -115,4 +122,4 @@ def wrong_kind(squares: dict[CommandKind, float], declared: CommandKind) -> tupl
         f"this machine answers to {answers}, not to {ANSWERS[declared]}; set printer.command to {best}, "
         "delete the recordings of this kind, and start again"
     )
-    return sentence, ratio >= WRONG and "place" in (declared, best)
+    return sentence, places
