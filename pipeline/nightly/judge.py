@@ -335,15 +335,21 @@ def _holdout_records(h: HoldOut, machine: Machine) -> list[tuple[np.ndarray, np.
             f"{h.recordings}: expected recordings that nothing is trained on, found none; "
             "put one of the machine as commissioned there"
         )
-    segments = record_segments(Path(h.recordings), machine)
-    return [pair for pairs in segments.values() for pair in pairs]
+    return [pair for pairs in record_segments(Path(h.recordings), machine).values() for pair in pairs]
 
 
 def record_segments(
     folder: Path, machine: Machine, *, broken: dict[str, str] | None = None
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-    """{recording: [(u, y), ...]} below a folder, read as the stage `ingest` reads, through its memo; reasons
-    of those that cannot be read go to `broken`."""
+    """{recording: [(u, y), ...]} below a folder, as `read_records` reads them."""
+    return {name: segments(record, machine) for name, record in read_records(folder, machine, broken).items()}
+
+
+def read_records(
+    folder: Path, machine: Machine, broken: dict[str, str] | None = None
+) -> dict[str, dict[str, np.ndarray]]:
+    """{recording: its columns} below a folder, read as the stage `ingest` reads, through its memo; reasons of
+    those that cannot be read go to `broken`. Raises ValueError for the first of them if there is none."""
     settings = params.load(Ingest, "ingest")
     results = recording_folders.read_folder(
         folder,
@@ -352,7 +358,7 @@ def record_segments(
         memo=Path("datasets/memo/ingest"),
         budget=Budget(settings.longest_s, settings.largest_mb),
     )
-    segments = {}
+    records = {}
     for result in results:
         if result.passed_over:
             continue
@@ -361,16 +367,20 @@ def record_segments(
                 raise ValueError(result.reason)
             broken[result.name] = result.reason
             continue
-        segments[result.name] = _segments(result.record, machine)
-    return segments
+        records[result.name] = result.record
+    return records
 
 
-def _segments(record: dict[str, np.ndarray], machine: Machine) -> list[tuple[np.ndarray, np.ndarray]]:
+def segments(
+    record: dict[str, np.ndarray], machine: Machine, *, masked: bool = True
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Inputs (T, m) and outputs (T, p) of each gapless stretch; NaN if an output was not measured, or is
+    masked, unless `masked` is false."""
     u, y = (
         np.stack(
-            [np.where(record[f"{s.name}_masked"], np.nan, record[s.name]) for s in signals], axis=1
+            [np.where(record[f"{s.name}_masked"] & hide, np.nan, record[s.name]) for s in signals], axis=1
         ).astype(float)
-        for signals in (machine.inputs, machine.outputs)
+        for signals, hide in ((machine.inputs, True), (machine.outputs, masked))
     )
     cuts = np.flatnonzero(np.diff(record["segment"])) + 1
     pairs = []

@@ -15,13 +15,15 @@ if TYPE_CHECKING:  # it imports scipy, and a night with nothing new is done with
 # ---- drift
 
 PLANT = "temperature"  # the loop whose recordings tell of the plant's parameters
+SENSOR = "sensor"  # kind of an alarm that stands above every other: a sensor that stands still
 
 
 class Alarm(NamedTuple):
     """A change of one loop: the key by which the next night knows it again, and the recording that shows it.
     Then its cause in words, how many sigmas it is from no change, and what follows from it in words. `kind`
     and `channel` are the cause for a machine to read, empty where it has none: gain, time constant, delay,
-    saturation, offset, noise, ambient, or several with "or" between; a signal's name, or "every input"."""
+    saturation, offset, noise, ambient, sensor, or several with "or" between; a signal's name, or "every
+    input"."""
 
     loop: str
     key: str
@@ -133,7 +135,9 @@ class NightDrift(NamedTuple):
 
     @property
     def alarms(self) -> list[Alarm]:
-        return [alarm for drift in self.loops.values() for alarm in drift.alarms]
+        """A sensor that stands still first."""
+        alarms = [alarm for drift in self.loops.values() for alarm in drift.alarms]
+        return sorted(alarms, key=lambda alarm: alarm.kind != SENSOR)
 
     @property
     def watched(self) -> list[Alarm]:

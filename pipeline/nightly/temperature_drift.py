@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.nightly import baseline, drift, judge, mistakes, pictures
+from pipeline.nightly import baseline, drift, judge, mistakes, pictures, sensors
 from pipeline.nightly.baseline import Baseline
 from pipeline.nightly.camera_drift import CameraChange
 from pipeline.nightly.drift import CauseFit, DriftCause, DriftRecord, Explanation, ProductionModel, Segments
 from pipeline.nightly.inputs import quarantine
 from pipeline.nightly.records import (
+    SENSOR,
     Alarm,
     ClosedLoopChange,
     InnovationChange,
@@ -43,12 +44,14 @@ PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures a
 
 
 class ProductionReference(NamedTuple):
-    """What the champion's own recordings said of its model, and their closed-loop figures; `digest` is that
-    of reference.json, by which the memory of the nights knows it again."""
+    """What the champion's own recordings said of its model, and their closed-loop figures; `steps` (p,) are
+    those of the sensors in °C. `digest` is that of reference.json, by which the memory of the nights knows it
+    again."""
 
     machine: ProductionModel
     own: Baseline
     loop: list[dict[str, list[list[float]]]]
+    steps: np.ndarray
     digest: str
 
 
@@ -113,6 +116,7 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
         "samples": _samples(nights),
         "own": own.to_json(),
         "loop": [_closed_loop(night, machine) for night in nights],
+        "steps": sensors.steps(nights).tolist(),
     }
 
 
@@ -122,7 +126,10 @@ def _read_reference(folder: Path) -> ProductionReference | None:
     if fields.get("version") != baseline.VERSION:
         return None
     machine = ProductionModel(judge.identified(folder), fields["samples"])
-    return ProductionReference(machine, Baseline.read(fields["own"]), fields["loop"], artifacts.sha256(path))
+    steps = np.array(fields.get("steps", [np.inf] * machine.plant.p))
+    return ProductionReference(
+        machine, Baseline.read(fields["own"]), fields["loop"], steps, artifacts.sha256(path)
+    )
 
 
 def _last(segments: Segments) -> Segments:
@@ -166,15 +173,16 @@ def look(
     if not Path(folder).is_dir():
         return drifted, None
     machine, broken = recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet"), {}
-    records = judge.record_segments(Path(folder), machine, broken=broken)
+    records = judge.read_records(Path(folder), machine, broken)
     for path, reason in broken.items():
         if f"{folder}/{path}" in new:
+            _silent(drifted, f"{folder}/{path}", reason, [output.name for output in machine.outputs])
             drifted.quarantined[f"{folder}/{path}"] = quarantine(f"{folder}/{path}", name, reason)
-    good = [
-        path
+    good = {
+        path: records[within]
         for path in new
-        if path not in drifted.quarantined and records.get(path.removeprefix(f"{folder}/"))
-    ]
+        if path not in drifted.quarantined and (within := path.removeprefix(f"{folder}/")) in records
+    }
     if champion is None or not good:
         return drifted, None
     held = _read_reference(champion)
@@ -185,8 +193,12 @@ def look(
         )
         return drifted, None
     nights = _nights(recent, held.digest)
-    for path in good:
-        segments = _last(records[path.removeprefix(f"{folder}/")])
+    for path, record in good.items():
+        if _stand_still(drifted, path, record, held, machine):
+            continue
+        segments = _last(judge.segments(record, machine))
+        if not segments:
+            continue
         try:
             drifted = _one(limits, drifted, path, segments, held, machine, nights, pending)
         except ValueError as error:
@@ -215,6 +227,35 @@ def _estimates(night: Mapping[str, Sequence[float]]) -> dict[str, Estimate]:
 
 def _rounded(night: Mapping[str, Estimate]) -> dict[str, list[float]]:
     return {key: [round(float(part), 6) for part in estimate] for key, estimate in night.items()}
+
+
+def _silent(drifted: LoopDrift, path: str, reason: str, outputs: Sequence[str]) -> None:
+    """An alarm for a recording that cannot be read because a sensor gives no number in it."""
+    for output in outputs:
+        if f"should hold numbers for {output} but all of its" in reason:
+            _doubt(drifted, path, output, f"{output} gives no number.")
+
+
+def _stand_still(
+    drifted: LoopDrift, path: str, record: dict[str, np.ndarray], held: ProductionReference, machine: Plant
+) -> bool:
+    """Whether a sensor stands still in a recording: then that is an alarm, the recording is set aside, and
+    nothing else is asked of it."""
+    readings = _last(judge.segments(record, machine, masked=False))
+    noise = np.exp(held.own.noise.mean(axis=0) / 2)
+    found = sensors.faults(held.machine.plant, machine, readings, noise=noise, steps=held.steps)
+    for fault in found:
+        _doubt(drifted, path, fault.output, fault.sentence)
+    if found:
+        reason = f"{path}: {found[0].sentence} It says nothing of the machine"
+        drifted.quarantined[path] = quarantine(path, drifted.loop, reason)
+    return bool(found)
+
+
+def _doubt(drifted: LoopDrift, path: str, output: str, sentence: str) -> None:
+    cause = f"{sentence} Check the sensor and its wiring before the machine heats again"
+    key = f"{drifted.loop}: sensor {output}"
+    drifted.alarms.append(Alarm(drifted.loop, key, path, cause, 99.9, (), SENSOR, output))
 
 
 def _one(

@@ -107,11 +107,6 @@ def test_a_gain_that_fell_by_a_tenth_is_an_alarm_that_names_the_heater(machine):
 
 
 @pytest.mark.full
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="a sensor that stands still is learned from, or cut, in silence",
-)
 def test_a_frozen_sensor_is_an_alarm_that_names_the_sensor(machine):
     shift = two_zones.record_shift(np.random.default_rng(9))
     ended = night_with(machine, two_zones.freeze(shift, "zone_1_C", after=0.5))
