@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.deploy import assembly, supervise
-from pipeline.deploy.supervise import DEAF, OPEN, SPACING, STILL, WINDOWS, Signal, Supervision
+from pipeline.deploy.supervise import OPEN, SPACING, STILL, WINDOWS, Signal, Supervision
 from pipeline.temperature.controllers.law import Plant
 from pipeline.temperature.plant import strictly_proper
 from pipeline.temperature.settings import Plant as Machine
 
 Segments = Sequence[tuple[np.ndarray, np.ndarray]]
-KINDS = (OPEN, STILL, DEAF)
+KINDS = (OPEN, STILL)
 SPACINGS = (1, 4, 16)  # samples from one that is asked to the next
 GONE = 30  # samples without a number that an honest log may have, all together
 ON = 0.01  # share of a heater's range that is given by one that is on
@@ -42,9 +42,9 @@ class SensorFault(NamedTuple):
 
 
 def steps(records: Sequence[Segments]) -> np.ndarray:
-    """The smallest change (p,) of each sensor in honest records, in °C; infinite if it never moved."""
+    """The smallest change (p,) of each sensor in honest records, in °C; a large one if it never moved."""
     moves = np.concatenate([np.abs(np.diff(y, axis=0)) for record in records for _, y in record])
-    return np.where(moves > 1e-9, moves, np.inf).min(axis=0)
+    return np.where(moves > 1e-9, moves, supervise.MOST_STEP_DEGC).min(axis=0)
 
 
 def faults(
@@ -120,6 +120,5 @@ def _follow(
 def _sentence(s: Supervision, machine: supervise.Machine, kind: int, i: int, reading: float) -> str:
     if kind == OPEN:
         return supervise.sentence(s, machine, OPEN, i, reading)
-    does = "stands still" if kind == STILL else "shows noise alone"
     heater = machine.inputs[s.input_of[int((s.of_input == i).argmax())]].name
-    return f"{machine.outputs[i].name} {does} at {reading:.1f} °C while {heater} heats."
+    return f"{machine.outputs[i].name} stands still at {reading:.1f} °C while {heater} heats."
