@@ -13,6 +13,7 @@ from pipeline.nightly.decision import CaseCosts
 from pipeline.nightly.settings import HoldOut, Nightly, NightlyLoop, PromotionRule
 from pipeline.recordings import recording_folders
 from pipeline.recordings.isolated import Budget
+from pipeline.recordings.recording_folders import RecordingTable
 from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
@@ -342,14 +343,16 @@ def record_segments(
     folder: Path, machine: Machine, *, broken: dict[str, str] | None = None
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
     """{recording: [(u, y), ...]} below a folder, as `read_records` reads them."""
-    return {name: segments(record, machine) for name, record in read_records(folder, machine, broken).items()}
+    records = read_records(folder, machine, broken)
+    return {name: segments(result.record, machine) for name, result in records.items()}
 
 
 def read_records(
     folder: Path, machine: Machine, broken: dict[str, str] | None = None
-) -> dict[str, dict[str, np.ndarray]]:
-    """{recording: its columns} below a folder, read as the stage `ingest` reads, through its memo; reasons of
-    those that cannot be read go to `broken`. Raises ValueError for the first of them if there is none."""
+) -> dict[str, RecordingTable]:
+    """{recording: what was read of it} below a folder, read as the stage `ingest` reads, through its memo;
+    reasons of those that cannot be read go to `broken`. Raises ValueError for the first of them if there is
+    none."""
     settings = params.load(Ingest, "ingest")
     results = recording_folders.read_folder(
         folder,
@@ -367,7 +370,7 @@ def read_records(
                 raise ValueError(result.reason)
             broken[result.name] = result.reason
             continue
-        records[result.name] = result.record
+        records[result.name] = result
     return records
 
 

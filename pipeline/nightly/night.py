@@ -220,7 +220,8 @@ def _compared(job: Job, work: NightWork) -> NightWork:
     paths = {name: sorted(recordings) for name, recordings in new.items() if recordings}
     night = work.night._replace(new_recordings=paths)
     unused = [_unused(job.settings.loops[name], recordings) for name, recordings in paths.items()]
-    return work._replace(new=new, night=night.noted(*filter(None, unused)))
+    idle = [] if paths else ["no new recording: drift was not measured"]
+    return work._replace(new=new, night=night.noted(*filter(None, unused), *idle))
 
 
 def _screened(job: Job, work: NightWork) -> NightWork:
@@ -230,6 +231,7 @@ def _screened(job: Job, work: NightWork) -> NightWork:
     state, night = champion.read(), work.night
     screened = screening.look(job.settings, state.champions, work.new, work.memory, night=night.number)
     quarantined = {**night.quarantined, **screened.drift.quarantined}
+    night = night.noted(*screened.drift.notes)
     digests = inputs.after_quarantine(work.digests, quarantined, job.settings.loops, job.hashes)
     work = work._replace(
         night=night._replace(screened=True, drift=screened.drift, quarantined=quarantined),

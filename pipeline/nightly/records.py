@@ -151,13 +151,17 @@ class NightDrift(NamedTuple):
     def quarantined(self) -> dict[str, str]:
         return {path: reason for drift in self.loops.values() for path, reason in drift.quarantined.items()}
 
+    @property
+    def notes(self) -> list[str]:
+        return [note for drift in self.loops.values() for note in drift.notes]
+
     def to_json(self) -> dict[str, Any]:
         """As reports/metrics/nightly.json and .beadline/nights.json have it."""
         return {
             "alarms": [alarm.to_json() for alarm in self.alarms],
             "watched": [alarm.to_json() for alarm in self.watched],
             "figures": {path: figures.to_json() for path, figures in self.figures.items()},
-            "notes": [note for drift in self.loops.values() for note in drift.notes],
+            "notes": self.notes,
         }
 
     @classmethod

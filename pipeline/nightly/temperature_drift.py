@@ -22,6 +22,7 @@ from pipeline.nightly.records import (
     RecordingFigures,
 )
 from pipeline.nightly.settings import DriftLimits, NightlyLoop
+from pipeline.recordings.recording_folders import RecordingTable
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant, recorded
 
@@ -193,10 +194,11 @@ def look(
         )
         return drifted, None
     nights = _nights(recent, held.digest)
-    for path, record in good.items():
-        if _stand_still(drifted, path, record, held, machine):
+    for path, result in good.items():
+        if _stand_still(drifted, path, result.record, held, machine):
             continue
-        segments = _last(judge.segments(record, machine))
+        segments = _last(judge.segments(result.record, machine))
+        drifted.notes.append(_used(path, result, segments))
         if not segments:
             continue
         try:
@@ -227,6 +229,35 @@ def _estimates(night: Mapping[str, Sequence[float]]) -> dict[str, Estimate]:
 
 def _rounded(night: Mapping[str, Estimate]) -> dict[str, list[float]]:
     return {key: [round(float(part), 6) for part in estimate] for key, estimate in night.items()}
+
+
+def _used(path: str, result: RecordingTable, segments: Segments) -> str:
+    """What share of a recording is held against production: the samples of its last LONGEST that have every
+    signal; and what is masked or cut."""
+    kinds, messages = result.quality["kind"], result.quality["message"]
+    cut = [str(message).partition(" %")[0] for message in messages[kinds == "cut"]]
+    whole = len(result.record["time_s"]) / (1 - min(float(cut[0]) / 100 if cut else 0.0, 0.99))
+    used = sum(int(np.isfinite(y).all(axis=1).sum()) for _, y in segments)
+    masked = np.mean([column for name, column in result.record.items() if name.endswith("_masked")])
+    why = [f"{cut[0]} % cut: damaged rows"] if cut else []
+    why += [f"{100 * masked:.0f} % masked"] if masked >= 0.005 else []
+    return f"used {100 * used / whole:.0f} % of {Path(path).name}" + (f" ({', '.join(why)})" if why else "")
+
+
+def _least(limits: DriftLimits, explained: Explanation, held: ProductionReference, names: SignalNames) -> str:
+    """The smallest changes of a gain and of an offset that would have been an alarm tonight, of the signal
+    that is known least."""
+    words = []
+    for article, kind, unit in (("a", "gain", "%"), ("an", "offset", "°C")):
+        sizes = {
+            _name(fit.cause, names): _limit(limits, fit.cause)
+            + limits.limit_sigmas * _amount(fit, held, ()).deviation
+            for fit in (*explained.others, *(named.fit for named in explained.named))
+            if fit.cause.kind == kind and fit.cause.channel >= 0
+        }
+        worst = max(sizes, key=sizes.__getitem__)
+        words.append(f"{article} {kind} of {worst} from {sizes[worst]:.1f} {unit} on")
+    return " and ".join(words)
 
 
 def _silent(drifted: LoopDrift, path: str, reason: str, outputs: Sequence[str]) -> None:
@@ -280,6 +311,7 @@ def _one(
         segments = mistake.undone
     measured = _measure(limits, segments, held, machine, names)
     drifted.figures[path] = measured.figures
+    drifted.notes.append(f"{Path(path).name} would have shown {measured.least}")
     nights.append(NightChanges({found.key: found.estimate for found in measured.found}, measured.seeming))
     del nights[:-POOLED]
     singly = [
@@ -366,12 +398,14 @@ def _worth(estimate: Estimate) -> float:
 
 class RecordingDrift(NamedTuple):
     """Of one recording: figures for the page, what changed, what each change would be where none is named,
-    and what the closed loop does otherwise beyond what those changes and the air around bring."""
+    and what the closed loop does otherwise beyond what those changes and the air around bring. `least` says
+    which changes would have shown."""
 
     figures: RecordingFigures
     found: list[RecordingChange]
     seeming: dict[str, Estimate]
     loop: list[CameraChange]
+    least: str
 
 
 def _measure(
@@ -391,7 +425,8 @@ def _measure(
     figures = RecordingFigures(
         _parameters(record, explained, held, names), noise, loop.figures, loop.not_applicable
     )
-    return RecordingDrift(figures, [*found, *louder], _seeming(record, explained, held, names), loop.causes)
+    seeming, least = _seeming(record, explained, held, names), _least(limits, explained, held, names)
+    return RecordingDrift(figures, [*found, *louder], seeming, loop.causes, least)
 
 
 def _seeming(

@@ -2,6 +2,7 @@
 aside, or measured against the champion's own nights."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -429,3 +430,19 @@ def test_good_shifts_with_coarse_sensors_are_no_dead_sensors(look):
         shift = nights.a_night(1, 720 + k)
         coarse = {name: np.round(shift[name] * 4) / 4 for name in ("sensor_1", "sensor_2")}
         assert [a for a in look(shift | coarse).drift.alarms if a.kind == SENSOR] == []
+
+
+def test_a_night_says_what_it_used_and_what_would_have_shown(look):
+    shift = nights.a_night(1, 730)
+    silent = np.where((np.arange(600) >= 300) & (np.arange(600) < 320), np.nan, shift["sensor_2"])
+    used, shown = look(shift | {"sensor_2": silent}).drift.notes
+    # 20 of 600 samples lack a signal, one of four
+    assert used == "used 97 % of new.csv (1 % masked)"
+    found = re.fullmatch(
+        r"new.csv would have shown a gain of heater_\d from (\S+) % on "
+        r"and an offset of sensor_\d from (\S+) °C on",
+        shown,
+    )
+    limits = params.load(Nightly, "nightly").drift
+    assert found and limits.parameter_percent < float(found[1]) < 2 * limits.parameter_percent
+    assert limits.offset_degC < float(found[2]) < 2 * limits.offset_degC
