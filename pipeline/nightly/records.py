@@ -477,7 +477,8 @@ class Night(NamedTuple):
 
     def without_measurement(self) -> "Night":
         """The night before its recordings were looked at; what was set aside stays set aside."""
-        return self._replace(new_recordings={}, screened=False, drift=NightDrift({}))
+        notes = tuple(note for note in self.notes if note not in self.drift.notes)
+        return self._replace(new_recordings={}, screened=False, drift=NightDrift({}), notes=notes)
 
     @classmethod
     def read(cls, fields: Mapping[str, Any]) -> "Night":
