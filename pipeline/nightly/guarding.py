@@ -237,7 +237,8 @@ def ready(least_free_mb: float) -> None:
     if free < least_free_mb:
         raise ValueError(
             f"the disk has {free:.0f} MB left, but a night needs {least_free_mb:g} MB "
-            "(nightly.least_free_mb); free some space, or set nightly.keep_gb lower"
+            "(nightly.least_free_mb); free some, or run ./run dvc gc --all-commits, which removes what no "
+            "commit names"
         )
     if not RESERVE.exists() or RESERVE.stat().st_size < RESERVE_BYTES:
         artifacts.write_text(RESERVE, "0" * RESERVE_BYTES)

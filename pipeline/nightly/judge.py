@@ -13,6 +13,7 @@ from pipeline.nightly.decision import CaseCosts
 from pipeline.nightly.settings import HoldOut, Nightly, NightlyLoop, PromotionRule
 from pipeline.recordings import recording_folders
 from pipeline.recordings.isolated import Budget
+from pipeline.recordings.recording_folders import RecordingTable
 from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
@@ -335,15 +336,23 @@ def _holdout_records(h: HoldOut, machine: Machine) -> list[tuple[np.ndarray, np.
             f"{h.recordings}: expected recordings that nothing is trained on, found none; "
             "put one of the machine as commissioned there"
         )
-    segments = record_segments(Path(h.recordings), machine)
-    return [pair for pairs in segments.values() for pair in pairs]
+    return [pair for pairs in record_segments(Path(h.recordings), machine).values() for pair in pairs]
 
 
 def record_segments(
     folder: Path, machine: Machine, *, broken: dict[str, str] | None = None
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-    """{recording: [(u, y), ...]} below a folder, read as the stage `ingest` reads, through its memo; reasons
-    of those that cannot be read go to `broken`."""
+    """{recording: [(u, y), ...]} below a folder, as `read_records` reads them."""
+    records = read_records(folder, machine, broken)
+    return {name: segments(result.record, machine) for name, result in records.items()}
+
+
+def read_records(
+    folder: Path, machine: Machine, broken: dict[str, str] | None = None
+) -> dict[str, RecordingTable]:
+    """{recording: what was read of it} below a folder, read as the stage `ingest` reads, through its memo;
+    reasons of those that cannot be read go to `broken`. Raises ValueError for the first of them if there is
+    none."""
     settings = params.load(Ingest, "ingest")
     results = recording_folders.read_folder(
         folder,
@@ -352,7 +361,7 @@ def record_segments(
         memo=Path("datasets/memo/ingest"),
         budget=Budget(settings.longest_s, settings.largest_mb),
     )
-    segments = {}
+    records = {}
     for result in results:
         if result.passed_over:
             continue
@@ -361,16 +370,20 @@ def record_segments(
                 raise ValueError(result.reason)
             broken[result.name] = result.reason
             continue
-        segments[result.name] = _segments(result.record, machine)
-    return segments
+        records[result.name] = result
+    return records
 
 
-def _segments(record: dict[str, np.ndarray], machine: Machine) -> list[tuple[np.ndarray, np.ndarray]]:
+def segments(
+    record: dict[str, np.ndarray], machine: Machine, *, masked: bool = True
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Inputs (T, m) and outputs (T, p) of each gapless stretch; NaN if an output was not measured, or is
+    masked, unless `masked` is false."""
     u, y = (
         np.stack(
-            [np.where(record[f"{s.name}_masked"], np.nan, record[s.name]) for s in signals], axis=1
+            [np.where(record[f"{s.name}_masked"] & hide, np.nan, record[s.name]) for s in signals], axis=1
         ).astype(float)
-        for signals in (machine.inputs, machine.outputs)
+        for signals, hide in ((machine.inputs, True), (machine.outputs, masked))
     )
     cuts = np.flatnonzero(np.diff(record["segment"])) + 1
     pairs = []

@@ -20,7 +20,6 @@ from pipeline.nightly import (
     remembered,
     reporting,
     reproducing,
-    retention,
     watch,
 )
 from pipeline.nightly.processes import STATE, changed, check_attached, commit, dvc, git
@@ -151,7 +150,7 @@ def _worked(job: Job, work: NightWork) -> NightWork:
     keeps what the steps before it came to."""
     steps = (
         *(_ready, _unchanged, _compared, _screened, _learned, _put_back, _restarted),
-        *(_committed, _pushed, _freed),
+        *(_committed, _pushed),
     )
     for step in steps:
         if work.done:
@@ -161,7 +160,7 @@ def _worked(job: Job, work: NightWork) -> NightWork:
         except Exception as error:  # refused in a sentence, or a mistake of this program
             work = work.failed(error)
             # until the stages have run nothing is changed, and after that production may be
-            work = _undone(work) if step in (_committed, _pushed, _freed) else work
+            work = _undone(work) if step in (_committed, _pushed) else work
     return work
 
 
@@ -221,7 +220,8 @@ def _compared(job: Job, work: NightWork) -> NightWork:
     paths = {name: sorted(recordings) for name, recordings in new.items() if recordings}
     night = work.night._replace(new_recordings=paths)
     unused = [_unused(job.settings.loops[name], recordings) for name, recordings in paths.items()]
-    return work._replace(new=new, night=night.noted(*filter(None, unused)))
+    idle = [] if paths else ["no new recording: drift was not measured"]
+    return work._replace(new=new, night=night.noted(*filter(None, unused), *idle))
 
 
 def _screened(job: Job, work: NightWork) -> NightWork:
@@ -231,6 +231,7 @@ def _screened(job: Job, work: NightWork) -> NightWork:
     state, night = champion.read(), work.night
     screened = screening.look(job.settings, state.champions, work.new, work.memory, night=night.number)
     quarantined = {**night.quarantined, **screened.drift.quarantined}
+    night = night.noted(*screened.drift.notes)
     digests = inputs.after_quarantine(work.digests, quarantined, job.settings.loops, job.hashes)
     work = work._replace(
         night=night._replace(screened=True, drift=screened.drift, quarantined=quarantined),
@@ -437,17 +438,12 @@ def _pushed(job: Job, work: NightWork) -> NightWork:
     return work._replace(night=night)
 
 
-def _freed(job: Job, work: NightWork) -> NightWork:
-    """DVC's cache within nightly.keep_gb."""
-    return work._replace(night=work.night.noted(*retention.freed(job.settings.keep_gb)))
-
-
 # ---- what is remembered
 
 
 def _to_remember(job: Job, work: NightWork) -> Remembered:
     night, last = work.night, job.last
-    known = job.settings.model_dump(mode="json")
+    known = remembered.without_secrets(job.settings)
     if night.outcome == records.FAILED:
         # a recording of a failed night is new again the next one, and must not count as two
         return last._replace(

@@ -15,13 +15,15 @@ if TYPE_CHECKING:  # it imports scipy, and a night with nothing new is done with
 # ---- drift
 
 PLANT = "temperature"  # the loop whose recordings tell of the plant's parameters
+SENSOR = "sensor"  # kind of an alarm that stands above every other: a sensor that stands still
 
 
 class Alarm(NamedTuple):
     """A change of one loop: the key by which the next night knows it again, and the recording that shows it.
     Then its cause in words, how many sigmas it is from no change, and what follows from it in words. `kind`
     and `channel` are the cause for a machine to read, empty where it has none: gain, time constant, delay,
-    saturation, offset, noise, ambient, or several with "or" between; a signal's name, or "every input"."""
+    saturation, offset, noise, ambient, sensor, or several with "or" between; a signal's name, or "every
+    input"."""
 
     loop: str
     key: str
@@ -133,7 +135,9 @@ class NightDrift(NamedTuple):
 
     @property
     def alarms(self) -> list[Alarm]:
-        return [alarm for drift in self.loops.values() for alarm in drift.alarms]
+        """A sensor that stands still first."""
+        alarms = [alarm for drift in self.loops.values() for alarm in drift.alarms]
+        return sorted(alarms, key=lambda alarm: alarm.kind != SENSOR)
 
     @property
     def watched(self) -> list[Alarm]:
@@ -147,13 +151,17 @@ class NightDrift(NamedTuple):
     def quarantined(self) -> dict[str, str]:
         return {path: reason for drift in self.loops.values() for path, reason in drift.quarantined.items()}
 
+    @property
+    def notes(self) -> list[str]:
+        return [note for drift in self.loops.values() for note in drift.notes]
+
     def to_json(self) -> dict[str, Any]:
         """As reports/metrics/nightly.json and .beadline/nights.json have it."""
         return {
             "alarms": [alarm.to_json() for alarm in self.alarms],
             "watched": [alarm.to_json() for alarm in self.watched],
             "figures": {path: figures.to_json() for path, figures in self.figures.items()},
-            "notes": [note for drift in self.loops.values() for note in drift.notes],
+            "notes": self.notes,
         }
 
     @classmethod
@@ -469,7 +477,8 @@ class Night(NamedTuple):
 
     def without_measurement(self) -> "Night":
         """The night before its recordings were looked at; what was set aside stays set aside."""
-        return self._replace(new_recordings={}, screened=False, drift=NightDrift({}))
+        notes = tuple(note for note in self.notes if note not in self.drift.notes)
+        return self._replace(new_recordings={}, screened=False, drift=NightDrift({}), notes=notes)
 
     @classmethod
     def read(cls, fields: Mapping[str, Any]) -> "Night":

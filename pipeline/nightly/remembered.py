@@ -9,15 +9,17 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import pydantic
+import yaml
 
 from pipeline.nightly import records
-from pipeline.nightly.processes import STATE
+from pipeline.nightly.processes import STATE, git
 from pipeline.nightly.records import Alarm, Night
 from pipeline.nightly.settings import Nightly
-from pipeline.store import artifacts
+from pipeline.store import artifacts, params
 
 LAST, NIGHTS, METRICS = STATE / "last.json", STATE / "nights.json", Path("reports/metrics/nightly.json")
 LONGEST_HISTORY = 1000
+SECRET = ("webhook", "heartbeat")
 # how a file that is JSON, but not what was written there, shows itself when it is read
 MISSHAPEN = (
     *(ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError),
@@ -96,11 +98,27 @@ class Remembered(NamedTuple):
         return fields if self.settings else {key: fields[key] for key in fields if key != "settings"}
 
     def known(self) -> Nightly | None:
-        """The parameters as they were last known; None where they never were, or are of another version."""
+        """The parameters as they were last known, the addresses that may hold a secret as the last commit
+        has them; None if they never were known, or are of another version."""
+        if not self.settings:
+            return None
         try:
-            return Nightly.model_validate_json(json.dumps(self.settings)) if self.settings else None
+            return Nightly.model_validate_json(json.dumps({**self.settings, **_committed_addresses()}))
         except pydantic.ValidationError:
             return None
+
+
+def without_secrets(settings: Nightly) -> dict[str, Any]:
+    """The settings as a state file may hold them: whoever knows an address can write to it."""
+    return settings.model_copy(update=dict.fromkeys(SECRET, "")).model_dump(mode="json")
+
+
+def _committed_addresses() -> dict[str, str]:
+    try:
+        sections = yaml.safe_load(git("show", f"HEAD:{params.FILE}", check=False)) or {}
+        return {key: str(sections["nightly"][key]) for key in SECRET}
+    except (yaml.YAMLError, KeyError, TypeError):
+        return dict.fromkeys(SECRET, "")
 
 
 def _rows(rows: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:

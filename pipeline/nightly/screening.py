@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.nightly import champion, pictures, temperature_drift
-from pipeline.nightly.records import LoopDrift, NightDrift
+from pipeline.nightly.records import SENSOR, LoopDrift, NightDrift
 from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.nightly.temperature_drift import REFERENCE
@@ -45,7 +45,7 @@ def look(
     # what each loop recorded since its alarm: a person may accept that as how things are
     since = dict(memory.drifted)
     for name in (name for name, recorded in new.items() if recorded):
-        raised = [alarm.recording for alarm in drift.of(name).alarms]
+        raised = [alarm.recording for alarm in drift.of(name).alarms if alarm.kind != SENSOR]
         since[name] = list(dict.fromkeys([*since.get(name, []), *raised])) if raised else []
     keys = tuple(alarm.key for alarm in (*drift.watched, *drift.alarms))
     return Screening(drift, DriftMemory(keys, tuple(drift.alarms), since, night, recent))

@@ -108,7 +108,6 @@ class Nightly(Section):
     alarm: str = Field(max_length=1000)
     webhook: str = Field(max_length=1000)
     heartbeat: str = Field(max_length=1000)
-    keep_gb: float = Field(ge=0, le=1e6)
     loops: dict[Annotated[str, Field(min_length=1, max_length=40)], NightlyLoop]
     rule: PromotionRule
     holdout: HoldOut

@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.nightly import baseline, drift, judge, mistakes, pictures
+from pipeline.nightly import baseline, drift, judge, mistakes, pictures, sensors
 from pipeline.nightly.baseline import Baseline
 from pipeline.nightly.camera_drift import CameraChange
 from pipeline.nightly.drift import CauseFit, DriftCause, DriftRecord, Explanation, ProductionModel, Segments
 from pipeline.nightly.inputs import quarantine
 from pipeline.nightly.records import (
+    SENSOR,
     Alarm,
     ClosedLoopChange,
     InnovationChange,
@@ -21,6 +22,7 @@ from pipeline.nightly.records import (
     RecordingFigures,
 )
 from pipeline.nightly.settings import DriftLimits, NightlyLoop
+from pipeline.recordings.recording_folders import RecordingTable
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant, recorded
 
@@ -43,12 +45,14 @@ PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures a
 
 
 class ProductionReference(NamedTuple):
-    """What the champion's own recordings said of its model, and their closed-loop figures; `digest` is that
-    of reference.json, by which the memory of the nights knows it again."""
+    """What the champion's own recordings said of its model, and their closed-loop figures; `steps` (p,) are
+    those of the sensors in °C. `digest` is that of reference.json, by which the memory of the nights knows it
+    again."""
 
     machine: ProductionModel
     own: Baseline
     loop: list[dict[str, list[list[float]]]]
+    steps: np.ndarray
     digest: str
 
 
@@ -113,6 +117,7 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
         "samples": _samples(nights),
         "own": own.to_json(),
         "loop": [_closed_loop(night, machine) for night in nights],
+        "steps": sensors.steps(nights).tolist(),
     }
 
 
@@ -122,7 +127,10 @@ def _read_reference(folder: Path) -> ProductionReference | None:
     if fields.get("version") != baseline.VERSION:
         return None
     machine = ProductionModel(judge.identified(folder), fields["samples"])
-    return ProductionReference(machine, Baseline.read(fields["own"]), fields["loop"], artifacts.sha256(path))
+    steps = np.array(fields.get("steps", [np.inf] * machine.plant.p))
+    return ProductionReference(
+        machine, Baseline.read(fields["own"]), fields["loop"], steps, artifacts.sha256(path)
+    )
 
 
 def _last(segments: Segments) -> Segments:
@@ -166,15 +174,16 @@ def look(
     if not Path(folder).is_dir():
         return drifted, None
     machine, broken = recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet"), {}
-    records = judge.record_segments(Path(folder), machine, broken=broken)
+    records = judge.read_records(Path(folder), machine, broken)
     for path, reason in broken.items():
         if f"{folder}/{path}" in new:
+            _silent(drifted, f"{folder}/{path}", reason, [output.name for output in machine.outputs])
             drifted.quarantined[f"{folder}/{path}"] = quarantine(f"{folder}/{path}", name, reason)
-    good = [
-        path
+    good = {
+        path: records[within]
         for path in new
-        if path not in drifted.quarantined and records.get(path.removeprefix(f"{folder}/"))
-    ]
+        if path not in drifted.quarantined and (within := path.removeprefix(f"{folder}/")) in records
+    }
     if champion is None or not good:
         return drifted, None
     held = _read_reference(champion)
@@ -185,8 +194,13 @@ def look(
         )
         return drifted, None
     nights = _nights(recent, held.digest)
-    for path in good:
-        segments = _last(records[path.removeprefix(f"{folder}/")])
+    for path, result in good.items():
+        if _stand_still(drifted, path, result.record, held, machine):
+            continue
+        segments = _last(judge.segments(result.record, machine))
+        drifted.notes.append(_used(path, result, segments))
+        if not segments:
+            continue
         try:
             drifted = _one(limits, drifted, path, segments, held, machine, nights, pending)
         except ValueError as error:
@@ -217,6 +231,64 @@ def _rounded(night: Mapping[str, Estimate]) -> dict[str, list[float]]:
     return {key: [round(float(part), 6) for part in estimate] for key, estimate in night.items()}
 
 
+def _used(path: str, result: RecordingTable, segments: Segments) -> str:
+    """What share of a recording is held against production: the samples of its last LONGEST that have every
+    signal; and what is masked or cut."""
+    kinds, messages = result.quality["kind"], result.quality["message"]
+    cut = [str(message).partition(" %")[0] for message in messages[kinds == "cut"]]
+    whole = len(result.record["time_s"]) / (1 - min(float(cut[0]) / 100 if cut else 0.0, 0.99))
+    used = sum(int(np.isfinite(y).all(axis=1).sum()) for _, y in segments)
+    masked = np.mean([column for name, column in result.record.items() if name.endswith("_masked")])
+    why = [f"{cut[0]} % cut: damaged rows"] if cut else []
+    why += [f"{100 * masked:.0f} % masked"] if masked >= 0.005 else []
+    return f"used {100 * used / whole:.0f} % of {Path(path).name}" + (f" ({', '.join(why)})" if why else "")
+
+
+def _least(limits: DriftLimits, explained: Explanation, held: ProductionReference, names: SignalNames) -> str:
+    """The smallest changes of a gain and of an offset that would have been an alarm tonight, of the signal
+    that is known least."""
+    words = []
+    for article, kind, unit in (("a", "gain", "%"), ("an", "offset", "°C")):
+        sizes = {
+            _name(fit.cause, names): _limit(limits, fit.cause)
+            + limits.limit_sigmas * _amount(fit, held, ()).deviation
+            for fit in (*explained.others, *(named.fit for named in explained.named))
+            if fit.cause.kind == kind and fit.cause.channel >= 0
+        }
+        worst = max(sizes, key=sizes.__getitem__)
+        words.append(f"{article} {kind} of {worst} from {sizes[worst]:.1f} {unit} on")
+    return " and ".join(words)
+
+
+def _silent(drifted: LoopDrift, path: str, reason: str, outputs: Sequence[str]) -> None:
+    """An alarm for a recording that cannot be read because a sensor gives no number in it."""
+    for output in outputs:
+        if f"should hold numbers for {output} but all of its" in reason:
+            _doubt(drifted, path, output, f"{output} gives no number.")
+
+
+def _stand_still(
+    drifted: LoopDrift, path: str, record: dict[str, np.ndarray], held: ProductionReference, machine: Plant
+) -> bool:
+    """Whether a sensor stands still in a recording: then that is an alarm, the recording is set aside, and
+    nothing else is asked of it."""
+    readings = _last(judge.segments(record, machine, masked=False))
+    noise = np.exp(held.own.noise.mean(axis=0) / 2)
+    found = sensors.faults(held.machine.plant, machine, readings, noise=noise, steps=held.steps)
+    for fault in found:
+        _doubt(drifted, path, fault.output, fault.sentence)
+    if found:
+        reason = f"{path}: {found[0].sentence} It says nothing of the machine"
+        drifted.quarantined[path] = quarantine(path, drifted.loop, reason)
+    return bool(found)
+
+
+def _doubt(drifted: LoopDrift, path: str, output: str, sentence: str) -> None:
+    cause = f"{sentence} Check the sensor and its wiring before the machine heats again"
+    key = f"{drifted.loop}: sensor {output}"
+    drifted.alarms.append(Alarm(drifted.loop, key, path, cause, 99.9, (), SENSOR, output))
+
+
 def _one(
     limits: DriftLimits,
     drifted: LoopDrift,
@@ -239,6 +311,7 @@ def _one(
         segments = mistake.undone
     measured = _measure(limits, segments, held, machine, names)
     drifted.figures[path] = measured.figures
+    drifted.notes.append(f"{Path(path).name} would have shown {measured.least}")
     nights.append(NightChanges({found.key: found.estimate for found in measured.found}, measured.seeming))
     del nights[:-POOLED]
     singly = [
@@ -325,12 +398,14 @@ def _worth(estimate: Estimate) -> float:
 
 class RecordingDrift(NamedTuple):
     """Of one recording: figures for the page, what changed, what each change would be where none is named,
-    and what the closed loop does otherwise beyond what those changes and the air around bring."""
+    and what the closed loop does otherwise beyond what those changes and the air around bring. `least` says
+    which changes would have shown."""
 
     figures: RecordingFigures
     found: list[RecordingChange]
     seeming: dict[str, Estimate]
     loop: list[CameraChange]
+    least: str
 
 
 def _measure(
@@ -350,7 +425,8 @@ def _measure(
     figures = RecordingFigures(
         _parameters(record, explained, held, names), noise, loop.figures, loop.not_applicable
     )
-    return RecordingDrift(figures, [*found, *louder], _seeming(record, explained, held, names), loop.causes)
+    seeming, least = _seeming(record, explained, held, names), _least(limits, explained, held, names)
+    return RecordingDrift(figures, [*found, *louder], seeming, loop.causes, least)
 
 
 def _seeming(

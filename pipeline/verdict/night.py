@@ -58,6 +58,10 @@ def drift(nightly: Any) -> Drift:
         if causes:
             text = causes if state == FAILED else f"{causes}; an alarm where the next night finds it again"
             first = f"{text[:1].upper()}{text[1:]}"
+            if alarms[0].get("kind") == "sensor":
+                return Drift(
+                    Missing(FAILED, first, "Mend the sensor first"), "A sensor is dead.", first, when
+                )
             reason = f"The machine has changed: {text}" if state == FAILED else first
             answer = Missing(state, reason, AGAIN if state == FAILED else "")
             return Drift(answer, word, f"{first}.", when)

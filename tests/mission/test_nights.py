@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from tests.foreign import two_zones
-from tests.mission.conftest import STAGES, Project
+from tests.mission.conftest import STAGES, Project, params_of
 from tests.nightly import toy_nights
 
 PROMOTED, DRIFTED, QUARANTINED = 0, 3, 4
@@ -75,7 +76,8 @@ def commissioned(made_once, owner) -> Project:
     def make(folder: Path) -> None:
         project = owner.copy(folder)
         shutil.copy(toy_nights.ROOT / "dvc.yaml", folder / "dvc.yaml")
-        project.keep_stages(*STAGES, "evaluate_temperature")
+        project.keep_stages(*STAGES, "evaluate_temperature", "verdict")
+        without_other_loops(folder / "dvc.yaml")
         for k in range(2):
             shift = two_zones.record_shift(np.random.default_rng(100 + k))
             two_zones.write_csv(folder / f"datasets/holdout/temperature/holdout_{k}.csv", shift)
@@ -85,6 +87,16 @@ def commissioned(made_once, owner) -> Project:
             raise RuntimeError(first.stdout)
 
     return Project(made_once("commissioned", make))
+
+
+def without_other_loops(path: Path) -> None:
+    """dvc.yaml whose stages depend on nothing that no stage in it makes."""
+    stages = params_of(path)["stages"]
+    for stage in stages.values():
+        made = {dep: Path(dep).parts[1] for dep in stage["deps"] if dep.startswith("datasets/")}
+        gone = {dep for dep, maker in made.items() if maker not in (*stages, "raw")}
+        stage["deps"] = [dep for dep in stage["deps"] if dep not in gone]
+    path.write_text(yaml.safe_dump({"stages": stages}, sort_keys=False))
 
 
 @pytest.fixture
@@ -107,11 +119,6 @@ def test_a_gain_that_fell_by_a_tenth_is_an_alarm_that_names_the_heater(machine):
 
 
 @pytest.mark.full
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="a sensor that stands still is learned from, or cut, in silence",
-)
 def test_a_frozen_sensor_is_an_alarm_that_names_the_sensor(machine):
     shift = two_zones.record_shift(np.random.default_rng(9))
     ended = night_with(machine, two_zones.freeze(shift, "zone_1_C", after=0.5))

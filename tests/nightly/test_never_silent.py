@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pipeline.cli import render_night
-from pipeline.nightly import champion, guarding, night, remembered, reporting, reproducing, retention, watch
+from pipeline.nightly import champion, guarding, night, remembered, reporting, reproducing, watch
 from pipeline.nightly.settings import Nightly
 from pipeline.report.nightly import page
 from pipeline.store import params
@@ -110,7 +110,7 @@ def told(project: Project, *words: str) -> None:
     alarm, page_text = json.loads(woken.read_text()), html.unescape(Path("reports/nightly.html").read_text())
     assert alarm["kind"] == "failed" and alarm == json.loads(watch.ALARM.read_text())
     for word in words:
-        assert word in summary and word in alarm["text"] and word in page_text, (word, summary)
+        assert word in summary and word in html.unescape(alarm["text"]) and word in page_text, (word, summary)
     assert "Traceback" not in summary
     assert project.production() == before and project.champion()["run"] == "night-0001"
 
@@ -598,6 +598,22 @@ def test_urls_of_the_parameters_are_not_printed(project, quick):
     assert status == night.FAILED and "nightly.webhook: http://127.0.0.1: Connection refused" in summary
     shown = summary + Path("reports/nightly.html").read_text()
     assert "s3cret" not in shown and "t0ken" not in shown and "no-such-command" in shown
+    remembered_files = [path for path in Path(".beadline").rglob("*") if path.is_file()]
+    assert remembered_files and not any(b"s3cret" in path.read_bytes() for path in remembered_files)
+    # if the parameters are broken, the address is that of the last commit
+    project.run("git", "commit", "-qam", "addresses")
+    known = remembered.last().known()
+    assert (known.webhook, known.heartbeat) == (url, url)
+
+
+def test_a_file_name_is_no_tag_mention_or_picture_in_a_chat(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    name = "<!channel> @all ![x](http://server/picture) & <http://server|shift>.csv"
+    watch.wake("failed", [name], {}, watch.Routes())
+    alarm = json.loads(watch.ALARM.read_text())
+    assert alarm["reasons"] == [name]
+    assert "&lt;!channel&gt;" in alarm["text"] and "<" not in alarm["text"]
+    assert "@all" not in alarm["text"] and "](" not in alarm["text"] and "&amp; &lt;" in alarm["text"]
 
 
 @pytest.mark.parametrize(
@@ -642,70 +658,3 @@ def test_a_recording_that_is_not_used_says_which_parameter_would_use_it(project)
     sections["train_ilc"]["source"] = "recordings"
     Path("params.yaml").write_text(json.dumps(sections))
     assert night._unused(settings, ["datasets/raw/deposition/trial.mcap"]) == ""
-
-
-# ---- the cache
-
-
-def test_of_a_full_cache_earlier_runs_go_and_champions_and_accepted_runs_stay(project, monkeypatch):
-    def outs() -> set[str]:
-        return retention._closure(retention._of_lock(Path("dvc.lock").read_text()))
-
-    def in_cache() -> set[str]:
-        return {path.parent.name + path.name for path in retention.CACHE.rglob("*") if path.is_file()}
-
-    first_run = outs()
-    runs = []
-    for k, values in enumerate(([12.0], [12.5], [13.0], [13.5])):  # worse, each: an earlier run more
-        project.record(f"run {k}", values)
-        assert night.nightly(render_night)[0] == night.OK
-        if k == 0:
-            Path("reports/accepted.json").write_text("{}")
-            project.run("git", "add", "-f", "reports/accepted.json")
-            project.run("git", "commit", "-qm", "accepted")
-        runs.append(outs())
-    mine = project.folder / "mine.bin"
-    mine.write_bytes(b"nobody committed this")
-    project.run(sys.executable, "-m", "dvc", "add", "-q", "mine.bin")
-    for path in retention.CACHE.rglob("*"):
-        os.utime(path, (0, 0))
-    size = sum(path.stat().st_size for path in retention.CACHE.rglob("*") if path.is_file())
-    assert retention.freed(0) == [] and retention.freed(2 * size / 1e9) == []
-    before = in_cache()
-    (note,) = retention.freed(1e-9)
-    gone = before - in_cache()
-    assert (
-        runs[1] & gone
-        and gone <= runs[1] | first_run
-        and "removed" in note
-        and "what is kept needs more" in note
-    )
-    champions = set(retention._files(champion.pointer("toy")["md5"]))
-    # a figure that git keeps stands in dvc.lock and never in the cache
-    assert (champions | runs[0] | runs[2] | runs[3]) & before <= in_cache() and champions <= before
-    project.run(sys.executable, "-m", "dvc", "checkout", "-q")
-    # what was removed can be made again
-    for k in (2, 3):
-        (project.folder / f"datasets/raw/toy/run {k}.csv").unlink()
-    assert night.nightly(render_night)[0] == night.OK and outs() == runs[1]
-
-
-def test_what_somebody_made_today_is_not_removed(project):
-    project.record("second", [12.0])
-    night.nightly(render_night)
-    project.record("third", [13.0])
-    night.nightly(render_night)
-    before = sorted(retention.CACHE.rglob("*"))
-    retention.freed(1e-9)
-    assert sorted(retention.CACHE.rglob("*")) == before
-
-
-def test_where_what_must_be_kept_cannot_be_read_nothing_is_removed(project, monkeypatch):
-    for path in retention.CACHE.rglob("*"):
-        os.utime(path, (0, 0))
-    project.run("git", "branch", "other")
-    Path("dvc.lock").write_text("<<<<<<< HEAD\n")
-    project.run("git", "commit", "-qam", "broken")
-    before = sorted(retention.CACHE.rglob("*"))
-    assert "nothing of DVC's cache was removed" in retention.freed(1e-9)[0]
-    assert sorted(retention.CACHE.rglob("*")) == before

@@ -343,13 +343,13 @@ def test_hold_out_records_are_cut_at_gaps_segments_and_masked_inputs(project):
         record |= {one.name: np.arange(n, dtype=float), f"{one.name}_masked": np.zeros(n, bool)}
     record[f"{machine.inputs[0].name}_masked"][[30, 60, 130]] = True
     record[f"{machine.outputs[0].name}_masked"][45] = True  # an output may miss
-    pairs = judge._segments(record, machine)
+    pairs = judge.segments(record, machine)
     # 30 samples count, 29 do not
     assert [(int(u[0, 0]), len(u)) for u, _ in pairs] == [(0, 30), (61, 39), (100, 30), (131, 69)]
     assert all(np.isfinite(u).all() and len(u) == len(y) for u, y in pairs)
     record[f"{machine.inputs[0].name}_masked"][59] = True
     record[f"{machine.inputs[0].name}_masked"][31] = True
-    assert (32, 27) not in [(int(u[0, 0]), len(u)) for u, _ in judge._segments(record, machine)]
+    assert (32, 27) not in [(int(u[0, 0]), len(u)) for u, _ in judge.segments(record, machine)]
 
 
 def test_a_hold_out_recording_that_cannot_be_read_ends_the_judging_with_its_reason(tmp_path, monkeypatch):

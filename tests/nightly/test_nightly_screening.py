@@ -2,6 +2,7 @@
 aside, or measured against the champion's own nights."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 import yaml
 
 from pipeline.nightly import drift, inputs, screening, temperature_drift
-from pipeline.nightly.records import Alarm
+from pipeline.nightly.records import SENSOR, Alarm
 from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly
 from pipeline.recordings import plain_files
@@ -401,3 +402,47 @@ def test_a_copy_that_is_not_complete_is_no_recording_of_the_night_and_is_not_set
     monkeypatch.setattr(plain_files.time, "sleep", lambda _: growing.write_text("time_s,T1\n0,1\n"))
     assert "is still being written: it stays" in inputs.quarantine(str(growing), "temperature", "too short")
     assert growing.is_file()
+
+
+# ---- a sensor that stands still
+
+
+def spoilt(good: np.ndarray, how: str) -> np.ndarray:
+    """A sensor's readings (T,) that end a third of the way, or where the name says."""
+    at = {"half": len(good) // 2, "all": 0, "no number at all": 0}.get(how, len(good) // 3)
+    ends = {"open": 1000.0, "at zero": 0.0, "no number": np.nan, "no number at all": np.nan}
+    return np.r_[good[:at], np.full(len(good) - at, ends.get(how, good[at]))]
+
+
+@pytest.mark.parametrize("sensor", ["sensor_1", "sensor_2"])
+@pytest.mark.parametrize("how", ["open", "at zero", "third", "half", "all", "no number", "no number at all"])
+def test_a_sensor_that_stands_still_is_the_first_alarm_and_its_record_is_set_aside(look, sensor, how):
+    shift = nights.a_night(1, 700, gain=(0.9, 1.0))  # a drift that would be an alarm of its own
+    result = look(shift | {sensor: spoilt(shift[sensor], how)})
+    alarm = result.drift.alarms[0]
+    assert (alarm.kind, alarm.channel) == (SENSOR, sensor), result.drift.alarms
+    assert "Check the sensor" in alarm.cause and str(NEW) in result.drift.quarantined
+    assert result.memory.drifted == {"temperature": []}  # nobody may accept it as how things are
+
+
+def test_good_shifts_with_coarse_sensors_are_no_dead_sensors(look):
+    for k in range(4):
+        shift = nights.a_night(1, 720 + k)
+        coarse = {name: np.round(shift[name] * 4) / 4 for name in ("sensor_1", "sensor_2")}
+        assert [a for a in look(shift | coarse).drift.alarms if a.kind == SENSOR] == []
+
+
+def test_a_night_says_what_it_used_and_what_would_have_shown(look):
+    shift = nights.a_night(1, 730)
+    silent = np.where((np.arange(600) >= 300) & (np.arange(600) < 320), np.nan, shift["sensor_2"])
+    used, shown = look(shift | {"sensor_2": silent}).drift.notes
+    # 20 of 600 samples lack a signal, one of four
+    assert used == "used 97 % of new.csv (1 % masked)"
+    found = re.fullmatch(
+        r"new.csv would have shown a gain of heater_\d from (\S+) % on "
+        r"and an offset of sensor_\d from (\S+) °C on",
+        shown,
+    )
+    limits = params.load(Nightly, "nightly").drift
+    assert found and limits.parameter_percent < float(found[1]) < 2 * limits.parameter_percent
+    assert limits.offset_degC < float(found[2]) < 2 * limits.offset_degC

@@ -60,7 +60,7 @@ stages:
 SECTIONS = params.read(ROOT / "params.yaml")
 SETTINGS = SECTIONS["nightly"] | {
     "promotion": "at_once", "branch": "nightly", "remote": "", "longest_h": 0.1, "least_free_mb": 1,
-    "watch_h": 36, "alarm": "", "webhook": "", "heartbeat": "", "keep_gb": 0,
+    "watch_h": 36, "alarm": "", "webhook": "", "heartbeat": "",
     "loops": {
         "toy": {
             "artifacts": ["datasets/learn/model.json", "datasets/learn/weights.bin",

@@ -116,3 +116,17 @@ def test_an_alarm_night_says_cause_consequence_and_what_stays(open_page, alarm):
     assert row.count("has changed by") == 1 and "<b>8</b>" in text
     # a figure that is worse than allowed is marked
     assert page.locator("td.bad", has_text="18.9").count() == 1
+
+
+def test_a_sensor_that_stands_still_is_the_pages_first_sentence_and_its_first_alarm():
+    dead = {
+        "loop": "temperature", "key": "k", "recording": FILE, "sigmas": 99.9, "kind": "sensor",
+        "cause": "sensor_2 stands still at 110.0 °C while heater_2 heats.", "channel": "sensor_2",
+    }  # fmt: skip
+    night = ALARM | {"drift": ALARM["drift"] | {"alarms": [*ALARM["drift"]["alarms"], dead]}}
+    settings = params.load(Nightly, "nightly", ROOT / "params.yaml")
+    html = nightly_page.render([Night.read(FIRST), Night.read(night)], ChampionState.read(STATE), settings)
+    assert "Check sensor_2 before the machine heats again; the champions stay." in html
+    assert html.index("sensor_2 stands still at 110.0") < html.index("gain from heater_1 has changed")
+    assert "Alarm: a sensor stands still." in html and "99.9" not in html
+    assert "--accept-drift" not in html

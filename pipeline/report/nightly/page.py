@@ -8,7 +8,16 @@ from typing import Any
 from markupsafe import Markup
 
 from pipeline.nightly import records
-from pipeline.nightly.records import PLANT, Champion, ChampionState, Guard, HistoryLine, LoopDecision, Night
+from pipeline.nightly.records import (
+    PLANT,
+    SENSOR,
+    Champion,
+    ChampionState,
+    Guard,
+    HistoryLine,
+    LoopDecision,
+    Night,
+)
 from pipeline.nightly.settings import Nightly
 from pipeline.report.shared import charts, page
 from pipeline.statistics import Paired
@@ -86,6 +95,8 @@ def _head(night: Night) -> tuple[str, str]:
         return "The night failed; the champions stay.", FAILED
     if drifted:
         what = "The machine has drifted" if drifted == [PLANT] else f"Drift of {', '.join(drifted)}"
+        if dead := _dead_sensors(night):
+            what = f"Check {', '.join(dead)} before the machine heats again"
         return (
             f"{what}; promoted{where}: {promoted}." if promoted else f"{what}; the champions stay."
         ), FAILED
@@ -106,6 +117,10 @@ def _head(night: Night) -> tuple[str, str]:
 def _drifted(night: Night) -> list[str]:
     """The loops that raised an alarm."""
     return list(dict.fromkeys(alarm.loop for alarm in night.drift.alarms))
+
+
+def _dead_sensors(night: Night) -> list[str]:
+    return list(dict.fromkeys(alarm.channel for alarm in night.drift.alarms if alarm.kind == SENSOR))
 
 
 def _verdict(night: Night) -> dict[str, Any]:
@@ -129,6 +144,11 @@ def _verdict(night: Night) -> dict[str, Any]:
 
 def _remedy(night: Night, drifted: Sequence[str]) -> str:
     """What to do; `drifted` are the loops whose alarm stands."""
+    if dead := _dead_sensors(night):
+        return (
+            f"Check {', '.join(dead)}, the wiring and the heater beside it: a controller on a dead sensor "
+            "heats without limit. The recording is set aside, and nothing is promoted while this lasts."
+        )
     if drifted:
         commands = (f'./run beadline nightly --accept-drift {loop} "WHY"' for loop in drifted)
         return (

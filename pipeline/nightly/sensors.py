@@ -1,0 +1,124 @@
+"""Sensors of a recording that stand still while the machine moves: what the supervisor of a controller says,
+asked of the record sample by sample.
+
+The supervisor's forecasts last 36 samples, in which a slow zone hardly moves. A record is there as a whole,
+so it is asked again with samples 4 and 16 times as far apart: the model over s samples is
+
+    x(t+s) = A^s x(t) + (I + A + ... + A^(s-1)) (B u + b),    u the mean of the inputs meanwhile
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.deploy import assembly, supervise
+from pipeline.deploy.supervise import OPEN, SPACING, STILL, WINDOWS, Signal, Supervision
+from pipeline.temperature.controllers.law import Plant
+from pipeline.temperature.plant import strictly_proper
+from pipeline.temperature.settings import Plant as Machine
+
+Segments = Sequence[tuple[np.ndarray, np.ndarray]]
+KINDS = (OPEN, STILL)
+SPACINGS = (1, 4, 16)  # samples from one that is asked to the next
+GONE = 30  # samples without a number that an honest log may have, all together
+ON = 0.01  # share of a heater's range that is given by one that is on
+LASTS = 60  # samples for which a sensor stays in doubt: one that only seems to stand still soon moves again
+
+
+class SensorFault(NamedTuple):
+    """An output that stands still or gives no number: its name, which of KINDS, why in one sentence, and the
+    sample of the record by which that is certain."""
+
+    output: str
+    kind: int
+    sentence: str
+    sample: int
+
+    @property
+    def rank(self) -> tuple[int, int]:
+        """The surest first."""
+        return self.kind, self.sample
+
+
+def steps(records: Sequence[Segments]) -> np.ndarray:
+    """The smallest change (p,) of each sensor in honest records, in °C; a large one if it never moved."""
+    moves = np.concatenate([np.abs(np.diff(y, axis=0)) for record in records for _, y in record])
+    return np.where(moves > 1e-9, moves, supervise.MOST_STEP_DEGC).min(axis=0)
+
+
+def faults(
+    model: Plant, machine: Machine, segments: Segments, *, noise: np.ndarray, steps: np.ndarray
+) -> list[SensorFault]:
+    """The sensors that are in doubt in a record of inputs u (T, m) and readings y (T, p), masked ones too, by
+    the machine's model, the noise (p,) and the steps (p,) of its sensors in °C; the surest first."""
+    wired = supervise.Machine(
+        tuple(Signal(one.name, supervise.PERCENT, one.low, one.high) for one in machine.inputs),
+        tuple(
+            Signal(
+                one.name,
+                supervise.DEGC,
+                -np.inf if one.low is None else one.low,
+                np.inf if one.high is None else one.high,
+            )
+            for one in machine.outputs
+        ),
+        machine.sample_time_s,
+    )
+    found: dict[str, SensorFault] = {}
+    for spacing in SPACINGS:
+        rarer = wired._replace(sample_time_s=spacing * wired.sample_time_s)
+        s = assembly.supervision(_rarer(strictly_proper(model), spacing), rarer, noise)
+        for fault in _follow(s, rarer, segments, spacing, steps):
+            before = found.get(fault.output, fault)
+            found[fault.output] = min(before, fault, key=lambda one: one.rank)
+    return sorted(found.values(), key=lambda one: one.rank)
+
+
+def _rarer(model: Plant, spacing: int) -> Plant:
+    """The model over `spacing` samples."""
+    total, power = np.zeros_like(model.A), np.eye(model.n)
+    for _ in range(spacing):
+        total, power = total + power, power @ model.A
+    return model._replace(
+        A=power, B=total @ model.B, b=total @ model.b, sample_time_s=spacing * model.sample_time_s
+    )
+
+
+def _follow(
+    s: Supervision, machine: supervise.Machine, segments: Segments, spacing: int, steps: np.ndarray
+) -> Iterator[SensorFault]:
+    """Every sensor in doubt, once."""
+    silent, told, begin = np.zeros(len(s.d), int), set(), 0
+    heaters = s.input_of[[int((s.of_input == i).argmax()) for i in range(len(s.d))]]
+    for u, y in segments:
+        k, doubtful = supervise.kept(s), np.zeros((len(KINDS), len(s.d)), int)
+        unfounded = doubtful > 0
+        k.quantum[:] = steps
+        for t in range(0, len(y), spacing):
+            supervise.follow(s, k, y[t], u[max(t - spacing, 0) : max(t, 1)].mean(axis=0), min(t, 1))
+            k.asked[:] = u[t]
+            k.clock_s[1] += s.sample_time_s
+            silent += spacing * (k.bad > 0)
+            there = k.since[list(KINDS), : len(s.d)] >= 0
+            if (there & (doubtful == 0)).any():
+                before = u[max(t - spacing * WINDOWS * SPACING, 0) : t + 1, heaters]
+                # what the model does of itself, of a machine that is cold and off, says nothing
+                off = before.max(axis=0) - s.low[heaters] < ON * (s.high - s.low)[heaters]
+                unfounded[1:] |= (there & (doubtful == 0))[1:] & off
+            unfounded &= there
+            doubtful = np.where(there & ~unfounded, doubtful + spacing, 0)
+            certain = np.vstack([there[:1] & (silent >= GONE), doubtful[1:] >= LASTS])
+            for which, i in np.argwhere(certain):
+                if i not in told:
+                    told.add(i)
+                    words = _sentence(s, machine, KINDS[which], int(i), y[t, i])
+                    yield SensorFault(machine.outputs[i].name, KINDS[which], words, begin + t)
+        begin += len(y)
+
+
+def _sentence(s: Supervision, machine: supervise.Machine, kind: int, i: int, reading: float) -> str:
+    if kind == OPEN:
+        return supervise.sentence(s, machine, OPEN, i, reading)
+    heater = machine.inputs[s.input_of[int((s.of_input == i).argmax())]].name
+    return f"{machine.outputs[i].name} stands still at {reading:.1f} °C while {heater} heats."
