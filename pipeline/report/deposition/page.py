@@ -210,21 +210,10 @@ def _value(structure: Structure, name: str) -> str:
 
 
 def _interval(score: Score) -> str:
-    """The forecast beside a figure of the first screen, as short as a band of the other pages."""
+    """The 90 % interval of the forecast beside a figure, as short as a band of the other pages."""
     if score.predicted is None or (score.judged and (score.low is None or score.high is None)):
         return ""
     return f"{number(score.low, 2)}–{number(score.high, 2)}" if score.judged else NOT_JUDGED
-
-
-def _forecast(score: Score) -> str:
-    """The 90 % interval of the forecast; never its middle alone."""
-    if score.predicted is None:
-        return ""
-    if not score.judged:
-        return "forecast not judged"
-    if score.low is None or score.high is None:
-        return ""
-    return f"forecast {percent(score.low, 2)} to {percent(score.high, 2)}"
 
 
 BOARD = ("basis", "priority", "superposition", "pressure_advance", "pressure_advance_lead", "on_off", "ilc")
@@ -258,7 +247,7 @@ def _cell(structure: Structure, name: str) -> dict[str, Any]:
     line, asked = score.worst_line, structure.asked
     return {
         "value": _value(structure, name),
-        "band": _forecast(score),
+        "band": _interval(score),
         "line": "no line long enough" if line is None else f"worst line {percent(line, 2)}",
         "best": name == structure.best(),
         "bad": score.error > asked.flow_error_percent and name != "on_off",
