@@ -353,7 +353,7 @@ def test_several_forecasts_that_are_not_judged_are_all_named():
 def test_on_a_real_machine_a_part_that_is_not_judged_has_no_figure_anywhere(project):
     recordings()
     text = page()
-    assert "Ready for a supervised trial" in text and "2.0 %" in text
+    assert "Ready for a supervised trial" in text and "2.0 %" in text and "ADVANCE=0.0452" in text
     unjudged()
     text, index = page(), Page(Path("reports/index.html")).text
     assert "Ready for a supervised trial" not in text
@@ -361,6 +361,7 @@ def test_on_a_real_machine_a_part_that_is_not_judged_has_no_figure_anywhere(proj
     assert "is not judged: the part prints at 100 mm/s. What the parts come to is not known." in text
     card = index[index.index("Plunger command to flow at the nozzle") : index.index("Nozzle camera to")]
     board = text.split("Learning, trial after trial")[0]
+    assert "ADVANCE=" not in text and "0.0452" not in text
     assert "square" not in card.split("Flow error ≤")[1] and "Line volume ±3 % not measured" in card
     for figure in ("2.0 %", "12 %"):
         assert figure not in board and figure not in card

@@ -451,12 +451,18 @@ def chains(sources: Sources) -> dict[str, Any]:
 
 def slicer(sources: Sources) -> list[dict[str, str]]:
     """Pressure advance of each material as a slicer takes it, each number with its 90 % interval, and the
-    lines that set it."""
+    lines that set it; no number of a material if no forecast of it is judged."""
     materials = lookup(sources.tables["learned"], "slicer")
     if isinstance(materials, Missing):
         return []
+    parts = structures(sources.evidence)
+    streams = [] if isinstance(parts, Missing) else parts
+    known = {stream.material for stream in streams if not stream.unknown()}
+    unknown = {stream.material for stream in streams} - known
     return [
-        {"material": name, "lines": "\n".join(f"{key}: {values[key]}" for key in SLICERS)}
+        {"material": name, "lines": NOT_JUDGED} | dict.fromkeys(SLICER, NOT_JUDGED)
+        if name in unknown
+        else {"material": name, "lines": "\n".join(f"{key}: {values[key]}" for key in SLICERS)}
         | {key: _with_ends(values[key], places) for key, places in SLICER.items()}
         for name, values in list(materials.items())[:MATERIALS]
     ]
