@@ -11,6 +11,7 @@ import stages
 from pipeline.deposition.settings import ComposeParts, Printer, TrainIlc
 from pipeline.deposition.tables import LIBRARY, LINES, SCORES, SIGNALS, TASKS
 from pipeline.store import artifacts, params
+from stages.segment_library import wait
 
 if TYPE_CHECKING:
     from pipeline.deposition.parts.composition import LearnedLibrary
@@ -37,6 +38,8 @@ def main() -> None:
     with artifacts.stage("compose_parts") as out:
         settings, printer = params.load(ComposeParts, "compose_parts"), params.load(Printer, "printer")
         training = params.load(TrainIlc, "train_ilc")
+        if training.source == "recordings" and not Path("datasets/segment_library/learned.json").exists():
+            return wait(out, "compose_parts", "nothing is learned yet")
         table = artifacts.read_table("datasets/segment_library/library.parquet", LIBRARY)
         learned = stored.restore(table, artifacts.read_json("datasets/segment_library/learned.json"))
         models = artifacts.read_json("datasets/train_ilc/models.json")

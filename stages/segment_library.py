@@ -2,6 +2,7 @@
 library.parquet, the columns of the paper's matrix (3), and learned.json, the identified chain of each
 material, the demarcation and the paper's four assumptions in figures."""
 
+from pathlib import Path
 from typing import Any, Literal
 
 import stages
@@ -27,6 +28,7 @@ class SegmentLibrary(params.Section):
 
 def main() -> None:
     from pipeline.deposition.parts import composition, stored
+    from pipeline.deposition.parts.library import TooFewTrials
 
     with artifacts.stage("segment_library") as out:
         settings = params.load(SegmentLibrary, "segment_library")
@@ -36,14 +38,27 @@ def main() -> None:
         law, routines = "pixels" if recorded else settings.law, printer.training_routines()
         samples = artifacts.read_table("datasets/train_ilc/lessons.parquet", LESSONS)
         with artifacts.about("datasets/train_ilc/lessons.parquet"):
-            trainings = stored.trainings(samples, law, routines, printer.nozzle_mm)
-            learned = composition.learn(trainings, sample_time_s=printer.sample_time_s)
+            try:
+                trainings = stored.trainings(samples, law, routines, printer.nozzle_mm)
+                learned = composition.learn(trainings, sample_time_s=printer.sample_time_s)
+            except TooFewTrials as too_few:
+                if not recorded:
+                    raise
+                return wait(out, "segment_library", str(too_few))
         rest = stored.to_json(learned)
         artifacts.write_table(out / "library.parquet", LIBRARY, stored.to_table(learned.library))
         artifacts.write_json(out / "learned.json", rest)
         figures = {"columns": len(learned.library.columns)} | rest
         figures["materials"] = [material_figures(material) for material in rest["materials"]]
         artifacts.write_metrics("segment_library", figures, METRICS)
+
+
+def wait(out: Path, stage: str, why: str) -> None:
+    """Writes to a stage's folder only what it waits for: the machine's next recordings. The pages then say
+    which files are missing."""
+    artifacts.write_json(out / "waits.json", {"why": why})
+    artifacts.write_json(artifacts.REPORTS / "metrics" / f"{stage}.json", {})
+    print(f"{stage}: waits: {why}")
 
 
 def material_figures(material: dict[str, Any]) -> dict[str, Any]:

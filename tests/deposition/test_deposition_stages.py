@@ -290,12 +290,17 @@ def test_a_trial_in_the_dark_or_in_other_units_is_refused_by_file(project, capsy
         assert all(word in message for word in words), message
 
 
-def test_without_a_trial_the_first_commands_are_written_and_the_library_says_what_to_do(project, capsys):
+def test_without_a_trial_the_first_commands_are_written_and_the_library_waits(project, capsys):
     declare({"train_ilc.source": "recordings"})
     stage("train_ilc")
     assert len(list(Path("datasets/train_ilc/next").glob("*.csv"))) == 3, "one a routine"
-    message = refusal("segment_library", capsys)
-    assert "datasets/train_ilc/next" in message
+    waiting = {"segment_library": "datasets/train_ilc/next", "compose_parts": "nothing is learned"}
+    for name, why in waiting.items():
+        stage(name)
+        said = capsys.readouterr().out
+        assert f"{name}: waits: " in said and why in said
+        assert [file.name for file in Path(f"datasets/{name}").iterdir()] == ["waits.json"]
+        assert json.loads(Path(f"reports/metrics/{name}.json").read_text()) == {}
 
 
 def test_a_part_that_cannot_be_composed_is_listed_and_the_others_go_on(finished, capsys):

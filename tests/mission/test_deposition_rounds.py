@@ -26,6 +26,7 @@ from tests.mission.toy_deposition import (
     run_stage,
 )
 
+ALL = ("train_ilc", "segment_library", "compose_parts", "report")
 SLOWER = {"speed_mm_per_s": 5.0, "pause_s": 0.4, **SHORT}
 
 
@@ -78,9 +79,10 @@ def walk(foreign: DepositionMachine, routines: list[dict[str, float]]) -> dict[i
         ], "next/ holds one command a routine, of this round"
         for one in played:
             errors[one.routine].append(one.printed.error)
-        run_stage("train_ilc")
         before = Path("reports/deposition.html").stat().st_mtime_ns if trial else 0
-        run_stage("report")
+        for stage in ALL:
+            run_stage(stage)
+        assert Path("datasets/segment_library/learned.json").exists() == (trial > 0)
         assert Path("reports/deposition.html").stat().st_mtime_ns > before
     return errors
 
@@ -109,13 +111,14 @@ def test_the_recording_of_one_routine_alone_is_learned_as_that_routine(project):
 
 def test_the_page_is_written_when_the_reference_routine_is_not_recorded_yet(two_speeds):
     play(machine(), NEXT / "A_routine_1_trial_00.csv", [REFERENCE, SLOWER], seed=0)
-    run_stage("train_ilc")
-    run_stage("report")
+    for stage in ALL:
+        run_stage(stage)
     assert Path("reports/deposition.html").exists()
 
 
 def test_the_pages_of_a_machine_without_a_trial_are_written_and_say_so(project):
-    run_stage("report")
+    for stage in ALL:
+        run_stage(stage)
     text = page_text(Path("reports/deposition.html"))
     assert text.count("datasets/train_ilc/next") == 1, "what to do is said once"
     assert not re.search(r"is predicted|better|worse than|flow error forecast", text)

@@ -10,7 +10,7 @@ import scipy.linalg
 import scipy.signal
 
 from pipeline.deposition.extruder import DAMPING, Extruder, lagged
-from pipeline.deposition.parts.library import Training
+from pipeline.deposition.parts.library import TooFewTrials, Training
 
 
 class IdentifiedExtruder(NamedTuple):
@@ -482,11 +482,11 @@ def identify(trainings: Sequence[Training], *, sample_time_s: float) -> Chain:
     out best.
 
     One routine alone cannot be left out: then its rows are. Two speeds part gain from
-    yield, which one speed cannot (they are collinear on one plateau). Raises ValueError
-    without trials, or where the commands do not press.
+    yield, which one speed cannot (they are collinear on one plateau). Raises TooFewTrials
+    without two trials of each, and ValueError where the commands do not press.
     """
     if not trainings or any(len(training.u) < 2 for training in trainings):
-        raise ValueError(
+        raise TooFewTrials(
             "identify: expected routines of at least two trials each but found "
             f"{[len(t.u) for t in trainings]}; run more trials"
         )

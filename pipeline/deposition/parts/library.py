@@ -18,6 +18,10 @@ STOP, START, CORNER, STEADY, NO_FLOW = TASKS
 HOLD_S = 0.1
 
 
+class TooFewTrials(ValueError):
+    """More trials have to be printed before a library can be cut."""
+
+
 class Training(NamedTuple):
     """All trials of one routine on one material and nozzle: commands u (J, T) in mm and measured flows y (J,
     T) in mm^3/s, NaN where not observable."""

@@ -10,7 +10,7 @@ from pipeline.deposition.extruder import Routine
 from pipeline.deposition.parts.chain import Chain, IdentifiedExtruder
 from pipeline.deposition.parts.composition import LearnedLibrary, LearnedMaterial
 from pipeline.deposition.parts.forecast import Covered, Missed
-from pipeline.deposition.parts.library import Basis, Check, Library, Training
+from pipeline.deposition.parts.library import Basis, Check, Library, TooFewTrials, Training
 from pipeline.deposition.parts.pressure_advance import PressureAdvance, TunedAdvance, slicer_settings
 
 COLUMNS = ("task", "material", "nozzle_mm", "speed_mm_per_s", "pause_s", "lead", "length", "signal_mm")
@@ -121,7 +121,7 @@ def trainings(
     samples: Mapping[str, np.ndarray], law: str, routines: Sequence[Routine], nozzle_mm: float
 ) -> list[Training]:
     """All trials of a law, by material and routine, of the columns of lessons.parquet; those of the reference
-    routine only if there is no other. Raises ValueError if there is none."""
+    routine only if there is no other. Raises TooFewTrials if there is none."""
     of_law = samples["law"] == law
     if not of_law.any():
         there = ", ".join(sorted(set(samples["law"])))
@@ -129,7 +129,7 @@ def trainings(
             "print the commands in datasets/train_ilc/next, "
             "and put their recordings into datasets/raw/deposition"
         )
-        raise ValueError(
+        raise TooFewTrials(
             f"expected trials of law {law} (segment_library.law), "
             + (f"found {there}; name one of those" if there else f"found none yet; {do}")
         )
