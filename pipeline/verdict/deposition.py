@@ -53,7 +53,7 @@ COMPOSED = ("library", "learned", "signals", "scores", "tasks", "lines", "confor
 # what to do if no trial is recorded yet
 FIRST_TRIALS = (
     "Play the commands of datasets/train_ilc/next, put their recordings into datasets/raw/deposition, and "
-    "run ./run dvc repro train_ilc."
+    "run ./run dvc repro."
 )
 # in the place of a forecast that a report of an earlier version does not have
 NO_FORECAST = {"reason": "the conformance report has none", "trial": "run ./run dvc repro compose_parts"}

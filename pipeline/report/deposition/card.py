@@ -128,7 +128,7 @@ def _cell(values: Sequence[float], unit: str, *, best: bool, limit: float) -> Ca
 
 def _step(sources: Sources, verdict: Verdict) -> CardStep:
     if verdict.remedy == FIRST_TRIALS:
-        return CardStep(verdict.remedy, "./run dvc repro train_ilc")
+        return CardStep(verdict.remedy, "./run dvc repro")
     if not verdict.winner and not verdict.remedy:
         return CardStep("Run the stages of this loop.", "./run dvc repro compose_parts")
     if verdict.state != PASSED and verdict.remedy:
