@@ -201,13 +201,9 @@ def learn_from_recordings(
             name = f"{material.name}_routine_{index}_trial_{number:02d}"
             known = trial_conditions(printer, camera, material, routine, number, law, scale)
             said = trial_files.TrialConditions(**known)
-            sent = drive.sent(u, printer.command, sample_time_s=printer.sample_time_s)
+            sent = drive.sent(u, printer.kind, sample_time_s=printer.sample_time_s)
             trial_files.write_command(
-                following / name,
-                said,
-                time_s=routine.time_s,
-                command_mm=sent,
-                speed=printer.command == "speed",
+                following / name, said, time_s=routine.time_s, command_mm=sent, speed=printer.kind == "speed"
             )
             figures[f"routine_{index}"] = {"next": name} | of_step
             if sequence:
@@ -229,11 +225,11 @@ def check_kind(
 
     Ts = printer.sample_time_s
     squares = command_kind.errors(
-        [drive.sent(trial.u, printer.command, sample_time_s=Ts) for trial, _ in first],
+        [drive.sent(trial.u, printer.kind, sample_time_s=Ts) for trial, _ in first],
         [trial.y for trial, _ in first], [routine.r for _, routine in first],
         gain=material.gain_mm3_per_s_per_mm, time_constant_s=material.time_constant_s, sample_time_s=Ts,
     )  # fmt: skip
-    sentence, hopeless = command_kind.wrong_kind(squares, printer.command)
+    sentence, hopeless = command_kind.wrong_kind(squares, printer.kind)
     if hopeless:
         raise ValueError(sentence)
     return sentence
@@ -276,7 +272,7 @@ def measure_trial(
             view=flow.View(known.mm_per_px, known.nozzle_column), nozzle_mm=printer.nozzle_mm, latency=late,
             contact_angle_deg=known.contact_angle_deg, width_deviation_mm=camera.width_deviation_mm,
         )  # fmt: skip
-    u = drive.command(measured.trial.u, printer.command, sample_time_s=printer.sample_time_s)
+    u = drive.command(measured.trial.u, printer.kind, sample_time_s=printer.sample_time_s)
     return measured._replace(trial=measured.trial._replace(u=u))
 
 

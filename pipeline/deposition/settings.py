@@ -71,7 +71,7 @@ class Printer(Section):
     ramp_s: float = Field(gt=0, le=60)
     longest_ramp_s: float | None = Field(default=None, gt=0, le=60)
     drive: PlungerDrive | None
-    command: Literal["pressure", "speed", "place"] = "pressure"
+    command: Literal["pressure", "speed", "place"] | None = None
     acceleration_mm_per_s2: float = Field(gt=0, le=1e6)
     junction_deviation_mm: float = Field(ge=0, le=10)
     gantry_speed_limit_mm_per_s: float = Field(gt=0, le=10_000)
@@ -93,9 +93,14 @@ class Printer(Section):
                 )
         return self
 
+    @property
+    def kind(self) -> Literal["pressure", "speed", "place"]:
+        """What the machine answers to; a pressure if `command` is left out."""
+        return self.command or "pressure"
+
     @pydantic.model_validator(mode="after")
     def _travels(self):
-        if self.drive is None or self.command == "pressure":
+        if self.drive is None or self.kind == "pressure":
             return self
         longest_mm = max(2 * one.on_s * one.speed_mm_per_s for one in (self.reference, *self.routines))
         gain = min(material.gain_mm3_per_s_per_mm for material in self.materials)
@@ -103,7 +108,7 @@ class Printer(Section):
         if travel_mm > self.drive.amplitude_mm:
             raise ValueError(
                 f"has a drive with a travel of {self.drive.amplitude_mm:g} mm, but a training routine needs "
-                f"{travel_mm:.3g} mm by {self.command}; raise drive.amplitude_mm, or print shorter routines"
+                f"{travel_mm:.3g} mm by {self.kind}; raise drive.amplitude_mm, or print shorter routines"
             )
         return self
 
@@ -115,7 +120,7 @@ class Printer(Section):
 
         if self.drive is None:
             return drive.UNLIMITED
-        if self.command != "pressure":
+        if self.kind != "pressure":
             return drive.Drive(self.drive.speed_mm_per_s, math.inf, 0.0)
         return drive.Drive(**self.drive.model_dump())
 
@@ -380,5 +385,5 @@ class ComposeParts(Section):
 
         return PartSettings(
             printer.nozzle_mm, printer.bead_area_mm2, printer.ramp_s, self.corner_deg,
-            self.longest_pause_s, printer.limits, printer.command,
+            self.longest_pause_s, printer.limits, printer.kind,
         )  # fmt: skip
