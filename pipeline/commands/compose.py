@@ -22,7 +22,9 @@ FORMATS = ("csv", "parquet", "mcap", "gcode")
 
 
 def read_learned() -> LearnedLibrary:
-    """Library and chains, as segment_library wrote them."""
+    """Library and chains, as segment_library wrote them. Raises ValueError while it waits for trials."""
+    if artifacts.exists(waits := "datasets/segment_library/waits.json"):
+        raise ValueError(f"nothing is learned yet: {artifacts.read_json(waits)['why']}")
     table = artifacts.read_table("datasets/segment_library/library.parquet", LIBRARY)
     return stored.restore(table, artifacts.read_json("datasets/segment_library/learned.json"))
 

@@ -66,7 +66,8 @@ def test_another_kind_of_machine_is_named(true, declared, says):
 def test_a_command_sent_as_a_place_to_a_machine_that_goes_on_is_refused(true):
     sentence, hopeless = command_kind.wrong_kind(squares(true, "place", 0), "place")
     assert hopeless and sentence.startswith(
-        "this machine answers to the speed of its plunger or to a pressure, not to the place of its plunger"
+        "this machine answers to the speed of its plunger or to a pressure, not to the place of its plunger; "
+        "set printer.command to speed for filament or a screw, to pressure for compressed air, delete"
     )
 
 

@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 from pipeline import cli
+from pipeline.commands import compose
 from pipeline.deposition.camera import rendering, simulated_trial
 from pipeline.deposition.drive import Drive, demand, follows
 from pipeline.deposition.extruder import draw, flow
@@ -301,6 +302,8 @@ def test_without_a_trial_the_first_commands_are_written_and_the_library_waits(pr
         assert f"{name}: waits: " in said and why in said
         assert [file.name for file in Path(f"datasets/{name}").iterdir()] == ["waits.json"]
         assert json.loads(Path(f"reports/metrics/{name}.json").read_text()) == {}
+    with pytest.raises(ValueError, match="nothing is learned yet: .*datasets/train_ilc/next"):
+        compose.read_learned()
 
 
 def test_a_part_that_cannot_be_composed_is_listed_and_the_others_go_on(finished, capsys):

@@ -314,11 +314,16 @@ def test_init_proposes_fan_and_feed_as_disturbances_and_ingest_writes_them(
     machine, files = printed
     source = tmp_path / "owner"
     here = {f"gcodes/{name}": content for name, content in files.items()}
-    log = write(source, machine, here | {"gcodes/other.gcode": OTHER})
     for name in ("params.yaml", "params.expert.yaml"):
         shutil.copyfile(root / name, tmp_path / name)
     monkeypatch.chdir(tmp_path)
+    # without the files first, and then as page one's next step says
+    log = write(source, machine, {})
     monkeypatch.setattr("sys.argv", ["beadline", "init", str(log), "--copy"])
+    cli.main()
+    assert "part_fan" not in (tmp_path / "params.yaml").read_text()
+    write(source, machine, here | {"gcodes/other.gcode": OTHER})
+    monkeypatch.setattr("sys.argv", ["beadline", "init", str(log), "--copy", "--force"])
     cli.main()
     raw = tmp_path / "datasets/raw/temperature"
     assert sorted(path.name for path in raw.iterdir()) == ["a.gcode", "b.gcode", "klippy.log"]

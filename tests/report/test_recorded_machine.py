@@ -108,7 +108,7 @@ def test_prints_without_their_gcode_are_the_next_step(recorded):
     change("ingest", findings__recording={"printed_file": 2})
     main()
     said = "without them part fan and filament feed of two prints are not recorded. ./run beadline init"
-    assert said in Page(INDEX).text
+    assert f"{said} klippy.log --copy --force" in Page(INDEX).text
     change("ingest", findings={})
     main()
     assert "Record the next experiment." in Page(INDEX).text

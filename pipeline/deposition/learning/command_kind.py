@@ -115,11 +115,12 @@ def wrong_kind(squares: dict[CommandKind, float], declared: CommandKind) -> tupl
     places = "place" in (declared, best)
     if squares[best] > UNEXPLAINED or squares[declared] < (WRONG_PLACE if places else WRONG) * squares[best]:
         return "", False
-    answers = ANSWERS[best]
+    answers, to = ANSWERS[best], str(best)
     if declared == "place":
         answers = f"{ANSWERS['speed']} or to {ANSWERS['pressure'].removeprefix('its command as to ')}"
+        to = "speed for filament or a screw, to pressure for compressed air"
     sentence = (
-        f"this machine answers to {answers}, not to {ANSWERS[declared]}; set printer.command to {best}, "
+        f"this machine answers to {answers}, not to {ANSWERS[declared]}; set printer.command to {to}, "
         "delete the recordings of this kind, and start again"
     )
     return sentence, places

@@ -126,7 +126,7 @@ def _step(sources: Sources, verdict: Verdict) -> CardStep:
         return CardStep(
             "Put the printed G-code files beside klippy.log: without them part fan and filament feed of "
             f"{count(unrecorded, 'print')} are not recorded.",
-            "./run beadline init klippy.log --copy",
+            "./run beadline init klippy.log --copy --force",
         )
     return CardStep("Record the next experiment.", "./run beadline first-experiment")
 
