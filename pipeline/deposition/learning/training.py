@@ -368,55 +368,31 @@ def join(parts: Iterable[tuple[dict, dict, dict, dict]]) -> tuple[dict, dict, di
 
 def trial_rows(sequences: dict[tuple[str, int], list[TrialSequence]]) -> dict[str, np.ndarray]:
     """One row a trial of every sequence, by (material, number of the routine)."""
-    columns: dict[str, list] = {
-        name: []
-        for name in ("material", "law", "routine", "speed_mm_per_s", "pause_s", *ilc.TrialRow._fields)
-    }
-    for (material, index), of_routine in sequences.items():
-        for sequence in of_routine:
-            routine, law = sequence.routine, sequence.law
-            speed = float(routine.speed.max())
-            pause = round(routine.pause_s[1] - routine.pause_s[0], 9)
-            for row in sequence.rows:
-                for name, value in zip(columns, (material, law, index, speed, pause, *row), strict=True):
-                    columns[name].append(value)
+    names = ("material", "law", "routine", "speed_mm_per_s", "pause_s", *ilc.TrialRow._fields)
+    rows = [
+        (material, one.law, index, one.routine.plan["speed_mm_per_s"], one.routine.plan["pause_s"], *row)
+        for (material, index), of_routine in sequences.items()
+        for one in of_routine
+        for row in one.rows
+    ]
     return {
-        name: np.array(values, object if name in ("material", "law") else None)
-        for name, values in columns.items()
+        name: np.array([row[k] for row in rows], object if k < 2 else None) for k, name in enumerate(names)
     }
 
 
 def sample_rows(sequences: dict[tuple[str, int], list[TrialSequence]]) -> dict[str, np.ndarray]:
     """Every sample of every trial of every sequence: what a library is cut from."""
-    parts: dict[str, list[np.ndarray]] = {
-        name: []
-        for name in (
-            "material",
-            "law",
-            "routine",
-            "trial",
-            "time_s",
-            "wanted_mm3_per_s",
-            "command_mm",
-            "measured_mm3_per_s",
-            "true_mm3_per_s",
+    names = ("material", "law", "routine", "trial", "time_s", "wanted_mm3_per_s")
+    names += ("command_mm", "measured_mm3_per_s", "true_mm3_per_s")
+    parts = [
+        (
+            np.full(len(u), material, object), np.full(len(u), one.law, object), np.full(len(u), index),
+            np.full(len(u), j), one.routine.time_s, one.routine.r, u, y,
+            np.full(len(u), np.nan) if truth is None else truth,
         )
-    }
-    for (material, index), of_routine in sequences.items():
-        for sequence in of_routine:
-            for j, (u, y, truth) in enumerate(sequence.trials):
-                n, r = len(u), sequence.routine
-                names = [np.full(n, text, object) for text in (material, sequence.law)]
-                values = (
-                    *names,
-                    np.full(n, index),
-                    np.full(n, j),
-                    r.time_s,
-                    r.r,
-                    u,
-                    y,
-                    np.full(n, np.nan) if truth is None else truth,
-                )
-                for name, value in zip(parts, values, strict=True):
-                    parts[name].append(value)
-    return {name: np.concatenate(values) if values else np.array([]) for name, values in parts.items()}
+        for (material, index), of_routine in sequences.items()
+        for one in of_routine
+        for j, (u, y, truth) in enumerate(one.trials)
+    ]  # fmt: skip
+    columns = zip(*parts, strict=True) if parts else [[np.array([])]] * len(names)
+    return {name: np.concatenate(values) for name, values in zip(names, columns, strict=True)}

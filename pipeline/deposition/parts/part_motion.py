@@ -139,7 +139,7 @@ def _lost(
 ) -> float:
     """The most that the drive takes of a tool's flow (`reachable.lost`) in the first JUDGED_S of its
     printing."""
-    signal, shares = motion.sampled(plan, moves, sample_time_s=Ts), []
+    signal, shares = motion.sampled(plan, moves, sample_time_s=Ts, rates_only=True), []
     for tool, extruder in extruders.items():
         printed = np.where((moves.kind == Kind.EXTRUDE) & (moves.tool == tool), moves.length, 0.0)
         r = settings.bead_area_mm2 * motion.rate(signal, printed, sample_time_s=Ts)
