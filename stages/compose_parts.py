@@ -59,7 +59,7 @@ def main() -> None:
         )  # fmt: skip
         rng = np.random.default_rng(settings.seed)
         scored = [
-            (part, evaluation.judge(learned, part.composed, part.conformance.lines, judging, rng))
+            (part, evaluation.evaluate(learned, part.composed, part.conformance.lines, judging, rng))
             for part in tqdm(parts, desc="compose_parts: parts", mininterval=2)
         ]
         rows = part_report.rows(scored)

@@ -96,13 +96,13 @@ class ComposerForecast(NamedTuple):
 
 class Stream(NamedTuple):
     """One tool's share of a part, all (T,): wanted flow r (mm^3/s), the same before its steps were shaped,
-    command u (mm), predicted flow y and that of on-off control; the composer that u is from, whether its
-    forecast may be believed, and the share of
-    the time that u is at a limit of the drive."""
+    command u (mm), predicted flow y and that of on-off control; the composer that u is from, what it knows of
+    the material, the share of the time that u is at a limit of the drive, and whether its forecast may be
+    believed."""
 
     tool: int
     material: str
-    nozzle_mm: float
+    learned: LearnedMaterial
     composer: str
     r: np.ndarray
     unshaped: np.ndarray
@@ -310,12 +310,7 @@ def commands(
     learned: LearnedLibrary, composed: Composed, stream: Stream, *, drive: Drive
 ) -> dict[str, np.ndarray]:
     """The command (T,) of every composer for one stream of a part, to set beside the chosen one."""
-    material = next(
-        one
-        for one in learned.materials
-        if (one.material, one.nozzle_mm) == (stream.material, stream.nozzle_mm)
-    )
-    share = ToolShare(stream.tool, material, stream.r, composed.tasks, composed.lines)
+    share = ToolShare(stream.tool, stream.learned, stream.r, composed.tasks, composed.lines)
     return {name: controllers.command(name)(learned.library, share, drive) for name in COMPOSERS}
 
 
@@ -460,7 +455,7 @@ def _stream(
     return Stream(
         share.tool,
         material.material,
-        material.nozzle_mm,
+        material,
         composer,
         share.r,
         unshaped,

@@ -1,7 +1,6 @@
 """A part program composed: volumes by E, the gantry's plan, the commands of all tools, and whether it will
 print."""
 
-import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -12,7 +11,7 @@ from pipeline.deposition.parts.composition import Composed, LearnedLibrary, Part
 from pipeline.deposition.parts.conformance import Conformance
 from pipeline.deposition.parts.extrusion import Extruded
 from pipeline.deposition.toolpath import gcode
-from pipeline.deposition.toolpath.gcode import Moves, PartProgram
+from pipeline.deposition.toolpath.gcode import PartProgram
 from pipeline.deposition.toolpath.motion import Motion
 
 
@@ -85,22 +84,11 @@ def compose(
     report = conformance.conform(
         composed, learned, bead_area_mm2=area, ramp_s=settings.ramp_s, drive=settings.drive,
         shortest_s=shortest_s, largest_error_percent=largest_error_percent,
+        least_mm3=area * settings.nozzle_mm,
     )  # fmt: skip
+    # the lines' own lengths, not those of their beads
+    report = report._replace(lines=report.lines._replace(length_mm=moves.length[composed.lines.move]))
     if not all(one.enough for one in report.saturation.values()):
         ramp_s = part_motion.sufficient_ramp(moves, gantry, settings, learned, materials)
-        report = report._replace(ramp_that_would_do_s=dict.fromkeys(report.saturation, ramp_s))
-    report = in_percent(report, moves, composed, shortest_s=shortest_s, least_mm3=area * settings.nozzle_mm)
+        report = report._replace(ramp_that_would_do_s=ramp_s)
     return ComposedPart(name, program, planned, composed, report, extruded, area)
-
-
-def in_percent(
-    report: Conformance, moves: Moves, composed: Composed, *, shortest_s: float, least_mm3: float
-) -> Conformance:
-    """The report with the lines' own lengths, and without a percent for lines of less than least_mm3: for a
-    dot it means nothing."""
-    lines = report.lines
-    error = np.where(lines.planned_mm3 >= least_mm3, lines.error_percent, np.nan)
-    judged = (lines.duration_s >= shortest_s - 1e-9) & np.isfinite(error)
-    worst = float(np.abs(error[judged]).max()) if judged.any() else math.nan
-    lines = lines._replace(length_mm=moves.length[composed.lines.move], error_percent=error)
-    return report._replace(lines=lines, judged=int(judged.sum()), worst_line_volume_percent=worst)
