@@ -116,7 +116,7 @@ def compose_part(
 def report_with_measured(part: ComposedPart, folder: Path) -> dict[str, Any]:
     """The conformance report of a part, with measured_percent beside the forecast of each material whose
     print was measured."""
-    from pipeline.deposition.parts import part_report, verification
+    from pipeline.deposition.parts import forecast, part_report
     from pipeline.recordings import part_files
 
     report = part_report.report(part)
@@ -125,7 +125,7 @@ def report_with_measured(part: ComposedPart, folder: Path) -> dict[str, Any]:
         if path:
             y, _ = part_files.read_measured(path, len(stream.r), part.composed.sample_time_s)
             with artifacts.about(path):
-                percent = verification.measured_percent(y, stream.on_off, stream.r)
+                percent = forecast.measured_percent(y, stream.on_off, stream.r)
             report["forecast"][stream.material]["measured_percent"] = percent
     return report
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.commands import compose
-from pipeline.deposition.parts import forecast, part_report, verification
+from pipeline.deposition.parts import forecast, part_report
 from pipeline.deposition.parts.composition import LearnedLibrary
 from pipeline.deposition.parts.part import ComposedPart
 from pipeline.deposition.settings import ComposeParts, Printer
@@ -24,8 +24,8 @@ def write(
     for stream in composed.streams:
         material, Ts = stream.learned, composed.sample_time_s
         flows = forecast.flows(material.chain, material.missed, stream.u, stream.r, sample_time_s=Ts)
-        hardest = verification.windows(flows, stream.r, composed.lines, stream.tool, sample_time_s=Ts)
-        text, duration_s = verification.program(
+        hardest = forecast.windows(flows, stream.r, composed.lines, stream.tool, sample_time_s=Ts)
+        text, duration_s = forecast.verification_program(
             part.name, hardest, composed.lines, stream.tool, bead_area_mm2=printer.bead_area_mm2
         )
         path = folder / f"{part.name}_verify_{stream.material}.gcode"
@@ -60,7 +60,7 @@ def next_commands(
         path = print_path(folder, part.name, stream.material)
         if path:
             y, u = read_measured(path, len(stream.r), part.composed.sample_time_s)
-            commands[stream.material] = verification.next_command(
+            commands[stream.material] = forecast.next_command(
                 stream.learned.chain.extruder,
                 stream.u if u is None else u,
                 y,

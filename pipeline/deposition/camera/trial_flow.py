@@ -9,9 +9,8 @@ import numpy as np
 import scipy.signal
 
 from pipeline.deposition.camera import flow
-from pipeline.deposition.camera.latency import Latency
 from pipeline.deposition.camera.line import Mounting
-from pipeline.deposition.camera.readings import Readings
+from pipeline.deposition.camera.readings import Latency, Readings
 from pipeline.deposition.extruder import Routine
 from pipeline.deposition.learning.ilc import Trial
 

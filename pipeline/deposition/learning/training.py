@@ -10,8 +10,7 @@ from pipeline.deposition.drive import Drive, obeyed
 from pipeline.deposition.extruder import Extruder, Routine, disturb, draw, flow, frequency_response, to_json
 from pipeline.deposition.learning import ilc
 from pipeline.deposition.learning.ilc import Law, Trial
-from pipeline.deposition.learning.trial_model import deviations
-from pipeline.deposition.learning.unmodelled import unmodelled
+from pipeline.deposition.learning.trial_model import deviations, unmodelled
 
 # the frequencies of the convergence test reach to half the sampling rate
 FREQUENCIES = 2000
@@ -200,7 +199,7 @@ def convergence_of_model_inverse(
 
     That is the largest |Q (1 - L P (1 + Delta'))| of all |Delta'(f)| <= |Delta(f)|, and Delta is what the
     model leaves of the trials that identified it and of the next one, which it has not seen
-    (`unmodelled.unmodelled`).
+    (`trial_model.unmodelled`).
     """
     e, law, Ts = sequence.model.extruder, settings.model_inverse, settings.sample_time_s
     first = _first_trials(sequence, law.identify_trials + 1, settings)

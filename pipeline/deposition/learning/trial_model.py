@@ -1,10 +1,12 @@
 """What one measured trial tells of the extruder: gain, time constant, total delay and yield by least squares,
-each with its uncertainty; a second-order lag beside the delay; up and down apart."""
+each with its uncertainty; a second-order lag beside the delay; up and down apart; and what the model does not
+know of the machine, as a multiplicative uncertainty of its frequency response."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.ndimage
 import scipy.optimize
 
 from pipeline.deposition.extruder import DAMPING, Extruder, flow, pressed
@@ -19,6 +21,13 @@ LONGEST_DELAY_S = 1.0
 USUAL_LAG_HZ, LAG_SPREAD, LAG_HZ = 3.0, 0.4, (0.3, 20.0)
 # an extruder of another kind still reaches 60 %; noise alone gives 0
 LEAST_FIT_PERCENT = 20.0
+
+# spectra are smoothed over this width: a trial of starts and stops has zeros at single frequencies
+SMOOTHED_HZ = 0.5
+# the highest frequencies, this share of them, hold white noise alone
+NOISE_SHARE = 0.5
+# a frequency is excited where the simulated flow has this many times the power of the noise
+EXCITED = 4.0
 
 
 class TrialModel(NamedTuple):
@@ -238,3 +247,38 @@ def _check(u: list[np.ndarray], y: list[np.ndarray]) -> None:
             "identify: the command never moves, so neither gain nor delay is identified; "
             "record a trial with a start and a stop"
         )
+
+
+def unmodelled(
+    model: TrialModel,
+    u: Sequence[np.ndarray],
+    y: Sequence[np.ndarray],
+    frequency_hz: np.ndarray,
+    *,
+    sample_time_s: float,
+) -> np.ndarray:
+    """|Delta(f)| (F,) of P = P_model (1 + Delta), from the trials that identified the model; 0 at frequencies
+    that they do not excite.
+
+        |Delta|^2 = (S_residual - S_noise) / S_flow
+
+    The residual y - y_model is that of the whole model with its dead band, each spectrum summed over the
+    trials and smoothed over SMOOTHED_HZ; S_noise is the level of the residual at the highest frequencies.
+    What does not repeat and is slow counts as Delta: one trial does not tell it from the machine. u (T,) in
+    mm and y (T,) in mm^3/s of each trial, NaN where not observable; frequency_hz (F,)."""
+    n = max(len(a) for a in u)
+    f = np.fft.rfftfreq(n, sample_time_s)
+    residual, simulated = np.zeros(len(f)), np.zeros(len(f))
+    for a, b in zip(u, y, strict=True):
+        x = flow(model.extruder, np.asarray(a, float), sample_time_s=sample_time_s)
+        left = np.where(np.isfinite(b), b - x, 0.0)
+        residual += np.abs(np.fft.rfft(left, n)) ** 2
+        simulated += np.abs(np.fft.rfft(x, n)) ** 2
+    noise = float(np.mean(residual[f >= (1 - NOISE_SHARE) * f[-1]]))
+    width = max(round(SMOOTHED_HZ / f[1]), 1)
+    residual, simulated = (
+        scipy.ndimage.uniform_filter1d(power, width, mode="nearest") for power in (residual, simulated)
+    )
+    power = np.maximum(residual - noise, 0.0) / np.maximum(simulated, np.finfo(float).tiny)
+    delta = np.where(simulated >= EXCITED * noise, np.sqrt(power), 0.0)
+    return np.interp(frequency_hz, f, delta)
