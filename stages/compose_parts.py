@@ -86,7 +86,7 @@ def compose_part(
     """A part program, composed: X, Y and Z `scale` times as large, feeds `speed` times as fast; with the
     diameter of what E pushes, what drives the extrusion, and the declared bead instead of E, if a person
     requests these. Raises ValueError naming the file, and the line if there is one."""
-    from pipeline.deposition.parts import part
+    from pipeline.deposition.parts import extrusion, part
     from pipeline.recordings.part_files import read_part_program
 
     learned_s = learned.library.sample_time_s
@@ -100,8 +100,8 @@ def compose_part(
         program = part.parse(data, scale=scale, speed=speed, extruder=extruder)
         del data
         declared_mm = printer.filament_mm
-        extruded = part.volumes(
-            program, bead_area_mm2=printer.bead_area_mm2, filament_mm=filament_mm, scale=scale,
+        extruded = extrusion.wanted(
+            program, bead_area_mm2=printer.bead_area_mm2, asked_mm=filament_mm, scale=scale,
             declared_mm={one.tool: declared_mm for one in printer.materials if declared_mm is not None},
             declared_bead=declared_bead,
         )  # fmt: skip

@@ -19,8 +19,6 @@ from pipeline.deposition.toolpath.gcode_words import LineRefusal
 
 # flow this long before a line begins and after it ends is its own, unless a neighbour is nearer
 REACH_S = 1.0
-# ramps longer than this are no ramps of a printed line
-LONGEST_RAMP_S = 10.0
 
 
 class LineVolumes(NamedTuple):

@@ -8,12 +8,12 @@ import numpy as np
 
 from pipeline.deposition import drive
 from pipeline.deposition.controllers import COMPOSERS
-from pipeline.deposition.parts import extrusion, part_motion
+from pipeline.deposition.parts import extrusion
 from pipeline.deposition.parts.composition import Composed, Stream
 from pipeline.deposition.parts.conformance import Conformance
 from pipeline.deposition.parts.evaluation import FULL_PART_ILC, ComposerScore
 from pipeline.deposition.parts.extrusion import Extruded
-from pipeline.deposition.parts.part import ComposedPart
+from pipeline.deposition.parts.part import ComposedPart, slowed_to
 from pipeline.deposition.parts.stored import finite, finite_or_none
 from pipeline.deposition.toolpath import motion
 from pipeline.deposition.toolpath.gcode import PartProgram
@@ -35,7 +35,7 @@ def summary_lines(part: ComposedPart) -> str:
         f"{duration:.1f} s; "
         f"the gantry sets out {composed.lead_in_s:.2f} s after the signal"
     )
-    slow = part_motion.slowed_to(part.planned, part.program.moves)
+    slow = slowed_to(part.planned, part.program.moves)
     if slow is not None:
         text.append(
             f"for the drive, printed lines begin and end at rest and change speed at {slow:.3g} mm/s^2: "
@@ -199,7 +199,7 @@ def report(part: ComposedPart) -> dict[str, Any]:
         "printed_lines": len(lines.line),
         "runs": int(composed.lines.run[-1]) + 1,
         "duration_s": len(composed.streams[0].r) * composed.sample_time_s,
-        "printing_acceleration_mm_per_s2": part_motion.slowed_to(part.planned, part.program.moves),
+        "printing_acceleration_mm_per_s2": slowed_to(part.planned, part.program.moves),
         "worst_line_volume_percent": finite_or_none(checks.worst_line_volume_percent),
         "judged_lines": checks.judged,
         "shorter_than_lead": int(np.sum(lines.shorter_than_lead)),
