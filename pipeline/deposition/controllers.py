@@ -47,11 +47,11 @@ COMPOSERS = (
     ),
     DepositionController(
         "pressure_advance", "Pressure advance", "baseline", "as in Klipper, tuned on the chain",
-        "the same of pressure advance", "pressure_advance.by_advance",
+        "the same of pressure advance", "composition.by_advance",
     ),
     DepositionController(
         "pressure_advance_lead", "Pressure advance, lead", "baseline", "the same, sent ahead",
-        "the same of pressure advance sent ahead", "pressure_advance.by_advance_with_lead",
+        "the same of pressure advance sent ahead", "composition.by_advance_with_lead",
     ),
     DepositionController(
         "priority", "Library, priority", "data-driven", "the paper’s rule",

@@ -142,4 +142,4 @@ def test_a_spiky_learned_command_does_not_hide_the_yield():
 )
 def test_a_trial_that_tells_nothing_is_refused(u, y, sentence):
     with pytest.raises(ValueError, match=sentence):
-        identify(u, y, sample_time_s=TS)
+        identify_with_lag(u, y, sample_time_s=TS)

@@ -43,24 +43,14 @@ class TrialModel(NamedTuple):
     fit_percent: float
 
 
-def identify(
-    u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float, yield_: float | None = None
-) -> TrialModel:
-    """The model that simulates the trials best from rest:
+def identify(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float) -> TrialModel:
+    """The model that simulates the trials best from rest, however well it fits:
 
         min over (K, tau, delay, yield) of sum (max(x - yield, 0) - y)^2
 
     u (T,) in mm and measured flow y (T,) in mm^3/s of each trial; NaN in y is a sample that was not
-    observable. `yield_` in mm^3/s where it is known and not sought. Raises ValueError where a command holds
-    NaN or never moves, or the flow never leaves its noise.
+    observable. Raises ValueError where a command holds NaN or never moves.
     """
-    return _fitting(_first_order(u, y, sample_time_s=sample_time_s, yield_=yield_))
-
-
-def _first_order(
-    u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float, yield_: float | None
-) -> TrialModel:
-    """The model of `identify`, however well it fits."""
     u, y = [np.asarray(a, float) for a in u], [np.asarray(b, float) for b in y]
     _check(u, y)
     observable = [np.isfinite(b) for b in y]
@@ -81,20 +71,14 @@ def _first_order(
     span = float(np.quantile(measured, 0.95))
 
     def four(theta):
-        return (
-            float(np.exp(theta[0])),
-            float(np.exp(theta[1])),
-            float(theta[2]),
-            float(theta[3] * span) if yield_ is None else yield_,
-        )
+        return float(np.exp(theta[0])), float(np.exp(theta[1])), float(theta[2]), float(theta[3] * span)
 
-    n = 4 if yield_ is None else 3
-    low = [np.log(gain) - 3, np.log(tau) - 3, 0.0, 0.0][:n]
-    high = [np.log(gain) + 3, np.log(tau) + 3, LONGEST_DELAY_S, 1.0][:n]
-    start = [np.log(gain), np.log(tau), max(delay, sample_time_s), 0.02][:n]
+    low = [np.log(gain) - 3, np.log(tau) - 3, 0.0, 0.0]
+    high = [np.log(gain) + 3, np.log(tau) + 3, LONGEST_DELAY_S, 1.0]
+    start = [np.log(gain), np.log(tau), max(delay, sample_time_s), 0.02]
     fit = scipy.optimize.least_squares(
         lambda theta: predicted(*four(theta)) - measured, start, bounds=(low, high),
-        x_scale=[0.1, 0.1, 0.02, 0.02][:n], diff_step=1e-4, xtol=1e-7, ftol=1e-9
+        x_scale=[0.1, 0.1, 0.02, 0.02], diff_step=1e-4, xtol=1e-7, ftol=1e-9
     )  # fmt: skip
     K, tau, delay, fitted_yield = four(fit.x)
     extruder = Extruder(K, tau, delay, yield_=fitted_yield)
@@ -108,15 +92,6 @@ def _model(extruder: Extruder, left: np.ndarray, measured: np.ndarray) -> TrialM
     return TrialModel(extruder, float(np.sqrt(np.mean(left**2))), fit_percent)
 
 
-def _fitting(model: TrialModel) -> TrialModel:
-    if model.fit_percent < LEAST_FIT_PERCENT:
-        raise ValueError(
-            "identify: expected a flow that follows the command but the best model fits "
-            f"{model.fit_percent:.0f} %; check that command and frames are of the same trial and clock"
-        )
-    return model
-
-
 def identify_with_lag(
     u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float
 ) -> TrialModel:
@@ -126,7 +101,7 @@ def identify_with_lag(
     LAG_SPREAD)^2: a prior, for a first trial leaves a valley between delay and lag. Without a lag the inverse
     is wrong by half a turn on a machine of third order.
     """
-    first = _first_order(u, y, sample_time_s=sample_time_s, yield_=None)
+    first = identify(u, y, sample_time_s=sample_time_s)
     u, y = [np.asarray(a, float) for a in u], [np.asarray(b, float) for b in y]
     observable = [np.isfinite(b) for b in y]
     measured = np.concatenate([b[mask] for b, mask in zip(y, observable, strict=True)])
@@ -152,7 +127,13 @@ def identify_with_lag(
         errors, start, bounds=(low, high), x_scale=[0.1, 0.1, 0.02, 0.1, 0.02],
         diff_step=1e-4, xtol=1e-7, ftol=1e-9
     )  # fmt: skip
-    return _fitting(_model(extruder(fit.x), fit.fun[:-1], measured))
+    model = _model(extruder(fit.x), fit.fun[:-1], measured)
+    if model.fit_percent < LEAST_FIT_PERCENT:
+        raise ValueError(
+            "identify: expected a flow that follows the command but the best model fits "
+            f"{model.fit_percent:.0f} %; check that command and frames are of the same trial and clock"
+        )
+    return model
 
 
 def lag_delay_s(lag_hz: float) -> float:

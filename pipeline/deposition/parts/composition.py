@@ -276,6 +276,22 @@ def by_basis_functions(library: Library, share: ToolShare, drive: Drive) -> np.n
     return basis.compose(extruder, share.r, sample_time_s=library.sample_time_s, drive=drive)
 
 
+def by_advance(library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
+    """u (T,) in mm of pressure advance for one tool's share of a part, as the drive follows it."""
+    return _by_advance("pressure_advance", library, share, drive)
+
+
+def by_advance_with_lead(library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
+    """The same, sent ahead by the lead."""
+    return _by_advance("pressure_advance_lead", library, share, drive)
+
+
+def _by_advance(name: str, library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
+    numbers = share.material.advances[name].tuned
+    u = pressure_advance.command(numbers, share.r, sample_time_s=library.sample_time_s)
+    return obeyed(u, drive, sample_time_s=library.sample_time_s)
+
+
 def by_priority(library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
     """u (T,) in mm of the library by the priority rule, as the drive can follow it."""
     return _by_library(priority, library, share, drive)

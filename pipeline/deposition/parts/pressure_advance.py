@@ -1,23 +1,16 @@
 """Pressure advance, the controller that owners have: a command in proportion to the wanted flow and to its
 change, smoothed; tuned on the identified chain, so that it costs no further print."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.optimize
 import scipy.signal
 
-from pipeline.deposition.drive import Drive, obeyed
 from pipeline.deposition.parts import basis, forecast
 from pipeline.deposition.parts.chain import Chain, simulate
-
-if TYPE_CHECKING:
-    from pipeline.deposition.parts.composition import ToolShare
-    from pipeline.deposition.parts.library import Library
 
 # composers by whether they have a lead
 LEADS = {"pressure_advance": False, "pressure_advance_lead": True}
@@ -111,21 +104,6 @@ def tune(
     moved = [scipy.optimize.lsq_linear(R, -e @ Q, bounds=within).x for e in np.concatenate(rows, axis=1)]
     ends = [np.clip(x + WIDER * end(moved, axis=0, initial=0.0), *bounds) for end in (np.min, np.max)]
     return TunedAdvance(numbers(ends[0]), numbers(x), numbers(ends[1]))
-
-
-def by_advance(library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
-    """u (T,) in mm of pressure advance for one tool's share of a part, as the drive follows it."""
-    return _by("pressure_advance", library, share, drive)
-
-
-def by_advance_with_lead(library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
-    """The same, sent ahead by the lead."""
-    return _by("pressure_advance_lead", library, share, drive)
-
-
-def _by(name: str, library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
-    u = command(share.material.advances[name].tuned, share.r, sample_time_s=library.sample_time_s)
-    return obeyed(u, drive, sample_time_s=library.sample_time_s)
 
 
 def slicer_settings(advance: TunedAdvance, on_off_gain: float) -> dict[str, str | list[float]]:
