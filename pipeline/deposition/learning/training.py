@@ -49,11 +49,6 @@ class TrialSequence(NamedTuple):
     model: ilc.TrialModel | None
 
 
-def on_off(r: np.ndarray, model: Extruder) -> np.ndarray:
-    """u_0 = r / K (T,) in mm: what a machine does that knows only the gain of its nominal model."""
-    return r / model.gain
-
-
 def hoelzle_2009(routine: Routine, nominal: Extruder, settings: LawSettings) -> Law:
     """The paper's law (2) with Q both ways."""
     return ilc.hoelzle_law(
@@ -101,7 +96,7 @@ def run_trials(
     on_step: Callable[[Trial], None],
 ) -> TrialSequence:
     """`trials` updates from on-off control, with roll-back (`ilc.learn`)."""
-    u0 = on_off(routine.r, nominal)
+    u0 = routine.r / nominal.gain
     done = ilc.learn(law, measure, u0, routine.r, trials=trials, rise=settings.rise, on_step=on_step)
     rows = ilc.table(
         done,
@@ -202,7 +197,9 @@ def convergence_of_model_inverse(
     (`trial_model.unmodelled`).
     """
     e, law, Ts = sequence.model.extruder, settings.model_inverse, settings.sample_time_s
-    first = _first_trials(sequence, law.identify_trials + 1, settings)
+    # of the first trials of the machine as it is now the model was identified
+    keep = ilc.state_of(sequence.trials, sequence.routine.r, rise=settings.rise).keep
+    first = [sequence.trials[j] for j in keep[: law.identify_trials + 1]]
     u, y = [t.u for t in first], [t.y for t in first]
     n = law.identify_trials
     spread = deviations(
@@ -223,12 +220,6 @@ def convergence_of_model_inverse(
     return float(gammas[0]), gammas[1:]
 
 
-def _first_trials(sequence: TrialSequence, count: int, settings: LawSettings) -> list[Trial]:
-    """The first trials of the machine as it is now: of them the model was identified."""
-    state = ilc.state_of(sequence.trials, sequence.routine.r, rise=settings.rise)
-    return [sequence.trials[j] for j in state.keep[:count]]
-
-
 def actuator_headroom(
     routine: Routine, nominal: Extruder, *, worst_ratio: float, settings: LawSettings
 ) -> ilc.ActuatorHeadroom:
@@ -237,7 +228,7 @@ def actuator_headroom(
     control; the sentence names the ramp that would do."""
     headroom = ilc.actuator_headroom(
         routine.r,
-        on_off(routine.r, nominal),
+        routine.r / nominal.gain,
         nominal,
         order=settings.model_inverse.order,
         cutoff_hz=settings.model_inverse.cutoff_hz,
@@ -316,7 +307,7 @@ def resume(
     """What was learned in the trials so far, the next command u (T,) in mm, and its figures: trial 0 is
     on-off control. Raises ValueError if they show another gain than the nominal one by more than
     WRONG_GAIN."""
-    u0 = on_off(routine.r, nominal)
+    u0 = routine.r / nominal.gain
     if not trials:
         first = obeyed(u0, settings.drive, sample_time_s=settings.sample_time_s)
         return None, first, {"best_trial": 0, "rolled_back": False, "restarts": []}

@@ -95,7 +95,7 @@ def _full_part_ilc(
     part = Routine(t, stream.r, np.zeros(len(t)), np.zeros(len(t)), stream.r > 0, 0.0, (0.0, 0.0), 0.0)
     measure = training.simulated(plant, rng, judging.noise, steady_flow=float(stream.r.max()), settings=laws)
     law = training.model_inverse(part, laws)
-    u0 = training.on_off(stream.r, nominal)
+    u0 = stream.r / nominal.gain
     trials = ilc.learn(law, measure, u0, stream.r, trials=judging.updates, rise=laws.rise)
     return ilc.next_step(trials, stream.r, law, rise=laws.rise).u
 
