@@ -112,14 +112,12 @@ def test_without_noise_the_flow_comes_back_everywhere_it_is_observable(name):
     assert 100 * abs((estimated.flow - Q).mean()) / NOMINAL_FLOW < 0.1  # volume is not lost
 
 
-def test_the_volume_of_a_pause_is_known_within_its_deviation_though_its_flow_is_not():
+def test_the_volume_of_a_pause_is_known_though_its_flow_is_not():
     Q = on_off(SHORT)
     estimated = inverted(SHORT, exact_sections(SHORT.time_s, Q, SHORT.position))
-    assert len(estimated.pauses) == 1
-    pause = estimated.pauses[0]
-    inside = (SHORT.time_s >= pause.begin_s) & (SHORT.time_s <= pause.end_s)
-    assert not estimated.observable[inside].any()
-    assert pause.volume == pytest.approx(Q[inside].sum() * 0.02, rel=0.02)
+    inside = np.abs(np.gradient(SHORT.position, 0.02)) <= 0.05 * SPEED
+    assert inside.sum() > 10 and not estimated.observable[inside].any()
+    assert estimated.flow[inside].sum() == pytest.approx(Q[inside].sum(), rel=0.02)
     steady = (SHORT.time_s > 2.2) & (SHORT.time_s < 3.0)
     np.testing.assert_allclose(estimated.flow[steady], Q[steady], rtol=0.02)
 

@@ -59,33 +59,18 @@ class Sections(NamedTuple):
     length: float
 
 
-class Pause(NamedTuple):
-    """A stretch in which the gantry stood: begin and end in s; the
-    volume laid there in mm^3 and its standard deviation."""
-
-    begin_s: float
-    end_s: float
-    volume: float
-    deviation: float
-
-
 class Flow(NamedTuple):
     """Q (T,) in mm^3/s at the gantry's samples and its standard
     deviation, given the smoothness that the data chose.
 
     observable (T,) is False where the gantry stood or the camera never saw what was laid: there only
-    the volume of the whole pause is measured, and Q is its likeliest spread over time. `strength` is
-    the weight of smoothness, `noise` the scatter of A(s) about the fit in
-    multiples of what the frames' scatter lets expect (more where the bead itself is rough), `outliers`
+    the volume of the whole pause is measured, and Q is its likeliest spread over time. `outliers` are
     the places that were given less than half their weight.
     """
 
     flow: np.ndarray
     deviation: np.ndarray
     observable: np.ndarray
-    pauses: tuple[Pause, ...]
-    strength: float
-    noise: float
     outliers: int
 
 
@@ -220,10 +205,7 @@ def estimate(
         )
     K, A = K[reached], sections.area[reached]
     bead = A > 0
-    fit, deviation, spread, strength, noise, outliers = _robust_fit(
-        K, A, sections.deviation[reached], bead, shapes.T
-    )
-    Q = fit.z + shapes.T @ fit.a
+    Q, deviation, outliers = _robust_fit(K, A, sections.deviation[reached], bead, shapes.T)
     share = (
         2 * width_deviation_mm / np.sqrt(np.median(A[bead]) / area(1.0, contact_angle_deg))
         if bead.any()
@@ -233,30 +215,17 @@ def estimate(
     speed = np.abs(np.gradient(position, dt))
     moving = speed > SLOW * speed.max()
     lit = np.asarray(K.sum(axis=0)).ravel() * sections.length > 0.4 * dt
-    pauses = tuple(_pause(a, b, time_s, Q, fit.factor, spread) for a, b in _runs(~moving))
-    return Flow(Q, deviation, moving & lit, pauses, strength, noise, outliers)
-
-
-class _RobustFit(NamedTuple):
-    """The solution, the deviation (T,) of its flow, the part (T, k) of the latter that the amplitudes
-    spread, the strength of the prior, the noise of A(s), and how many places are outliers."""
-
-    fit: "_Fit"
-    deviation: np.ndarray
-    spread: np.ndarray
-    strength: float
-    noise: float
-    outliers: int
+    return Flow(Q, deviation, moving & lit, outliers)
 
 
 def _robust_fit(
     K: scipy.sparse.csr_matrix, A: np.ndarray, expected: np.ndarray, bead: np.ndarray, shapes: np.ndarray
-) -> _RobustFit:
-    """Least squares with Huber's weights, reweighted ROUNDS times; each time the likeliest strength."""
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """The flow Q (T,), its deviation (T,), and how many places are outliers: least squares with Huber's
+    weights, reweighted ROUNDS times; each time the likeliest strength."""
     steps = K.shape[1]
-    noise = _roughness(A, expected, bead)
     P, robust = _penalty(steps), np.ones(len(A))
-    deviation = np.where(bead, noise * expected, expected)
+    deviation = np.where(bead, _roughness(A, expected, bead) * expected, expected)
     for _ in range(ROUNDS):
         weight = np.sqrt(robust) / deviation
         H = scipy.sparse.diags(weight) @ K
@@ -274,7 +243,7 @@ def _robust_fit(
     U = shapes - scipy.linalg.cho_solve_banded((fit.factor, True), C)
     spread = U @ np.linalg.inv(np.linalg.cholesky(fit.S)).T
     deviation = np.sqrt(_inverse_diagonal(_sum(M, P, np.exp(best.x))) + np.sum(spread**2, axis=1))
-    return _RobustFit(fit, deviation, spread, float(np.exp(best.x)), noise, int(np.sum(robust < 0.5)))
+    return Q, deviation, int(np.sum(robust < 0.5))
 
 
 def _roughness(A: np.ndarray, expected: np.ndarray, bead: np.ndarray) -> float:
@@ -399,18 +368,3 @@ def _inverse_diagonal(band: np.ndarray) -> np.ndarray:
         G = S + S @ E.T @ G @ E @ S
         out.append(np.diag(G))
     return np.concatenate(out[::-1])[:steps]
-
-
-def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
-    """(first, one past the last) of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-
-
-def _pause(a: int, b: int, time_s, Q, factor, spread) -> Pause:
-    """Volume w'Q of the samples a to b - 1, each dt long, and its standard deviation: both parts of the
-    covariance, of z and of the amplitudes."""
-    w = np.zeros(len(Q))
-    w[a:b] = time_s[1] - time_s[0]
-    variance = w @ scipy.linalg.cho_solve_banded((factor, True), w) + np.sum((w @ spread) ** 2)
-    return Pause(float(time_s[a]), float(time_s[b - 1]), float(w @ Q), float(np.sqrt(variance)))

@@ -49,7 +49,7 @@ def identify(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s:
         min over (K, tau, delay, yield) of sum (max(x - yield, 0) - y)^2
 
     u (T,) in mm and measured flow y (T,) in mm^3/s of each trial; NaN in y is a sample that was not
-    observable. Raises ValueError where a command holds NaN or never moves.
+    observable. Raises ValueError where the command never moves, or hardly any flow was observable.
     """
     u, y = [np.asarray(a, float) for a in u], [np.asarray(b, float) for b in y]
     _check(u, y)
@@ -208,20 +208,11 @@ def deviations(
 
 
 def _check(u: list[np.ndarray], y: list[np.ndarray]) -> None:
-    if not u or len(u) != len(y) or any(a.shape != b.shape or a.ndim != 1 for a, b in zip(u, y, strict=True)):
-        raise ValueError(
-            "identify: expected one command and one flow of equal length a trial but found shapes "
-            f"{[a.shape for a in u]} and {[b.shape for b in y]}"
-        )
-    for j, (a, b) in enumerate(zip(u, y, strict=True)):
-        if not np.isfinite(a).all():
-            raise ValueError(
-                f"identify: expected a command without gaps but trial {j} holds NaN; record the trial again"
-            )
-        if np.isfinite(b).sum() < 50:
+    for j, flow_ in enumerate(y):
+        if np.isfinite(flow_).sum() < 50:
             raise ValueError(
                 f"identify: expected at least 50 observable samples of flow but trial {j} has "
-                f"{np.isfinite(b).sum()}; check the frames of that trial"
+                f"{np.isfinite(flow_).sum()}; check the frames of that trial"
             )
     if all(np.ptp(a) == 0 for a in u):
         raise ValueError(
