@@ -169,15 +169,16 @@ def gauged(camera: SimulatedCamera, rng: np.random.Generator, each: int = 5):
 
 def errors(estimated: Flow, Q: np.ndarray) -> dict[str, float]:
     e, slope = 100 * (estimated.flow - Q) / NOMINAL_FLOW, np.gradient(Q, TS)
-    pause = estimated.pauses[0]
-    laid = Q[(R.time_s >= pause.begin_s) & (R.time_s <= pause.end_s)].sum() * TS
+    speed = np.abs(np.gradient(R.position, TS))
+    inside = speed <= 0.05 * speed.max()
+    off = (estimated.flow - Q)[inside].sum() * TS
     steady = (R.time_s > R.start_s + 2) & (R.time_s < R.pause_s[0] - 0.5)
     return {
         "rms_percent": float(np.sqrt(np.mean(e**2))),
         "corner_percent": float(np.sqrt(np.mean(e[CORNER] ** 2))),
         "mean_steady_percent": float(abs(e[steady].mean())),
         "lag_ms": float(abs(1e3 * slope @ (estimated.flow - Q) / (slope @ slope))),
-        "pause_volume_percent_of_0.6_s": float(100 * abs(pause.volume - laid) / (0.6 * NOMINAL_FLOW)),
+        "pause_volume_percent_of_0.6_s": float(100 * abs(off) / (0.6 * NOMINAL_FLOW)),
         "errors_over_deviation": float(
             np.sqrt(
                 np.mean(

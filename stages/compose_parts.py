@@ -62,7 +62,7 @@ def main() -> None:
         )  # fmt: skip
         rng = np.random.default_rng(settings.seed)
         scored = [
-            (part, evaluation.judge(learned, part.composed, part.conformance.lines, judging, rng))
+            (part, evaluation.evaluate(learned, part.composed, part.conformance.lines, judging, rng))
             for part in tqdm(parts, desc="compose_parts: parts", mininterval=2)
         ]
         rows = part_report.rows(scored)
@@ -89,7 +89,7 @@ def compose_part(
     """A part program, composed: X, Y and Z `scale` times as large, feeds `speed` times as fast; with the
     diameter of what E pushes, what drives the extrusion, and the declared bead instead of E, if a person
     requests these. Raises ValueError naming the file, and the line if there is one."""
-    from pipeline.deposition.parts import part
+    from pipeline.deposition.parts import extrusion, part
     from pipeline.recordings.part_files import read_part_program
 
     learned_s = learned.library.sample_time_s
@@ -103,8 +103,8 @@ def compose_part(
         program = part.parse(data, scale=scale, speed=speed, extruder=extruder)
         del data
         declared_mm = printer.filament_mm
-        extruded = part.volumes(
-            program, bead_area_mm2=printer.bead_area_mm2, filament_mm=filament_mm, scale=scale,
+        extruded = extrusion.wanted(
+            program, bead_area_mm2=printer.bead_area_mm2, asked_mm=filament_mm, scale=scale,
             declared_mm={one.tool: declared_mm for one in printer.materials if declared_mm is not None},
             declared_bead=declared_bead,
         )  # fmt: skip
@@ -119,7 +119,7 @@ def compose_part(
 def report_with_measured(part: ComposedPart, folder: Path) -> dict[str, Any]:
     """The conformance report of a part, with measured_percent beside the forecast of each material whose
     print was measured."""
-    from pipeline.deposition.parts import part_report, verification
+    from pipeline.deposition.parts import forecast, part_report
     from pipeline.recordings import part_files
 
     report = part_report.report(part)
@@ -128,7 +128,7 @@ def report_with_measured(part: ComposedPart, folder: Path) -> dict[str, Any]:
         if path:
             y, _ = part_files.read_measured(path, len(stream.r), part.composed.sample_time_s)
             with artifacts.about(path):
-                percent = verification.measured_percent(y, stream.on_off, stream.r)
+                percent = forecast.measured_percent(y, stream.on_off, stream.r)
             report["forecast"][stream.material]["measured_percent"] = percent
     return report
 

@@ -17,7 +17,7 @@ from pipeline.store import artifacts, params
 if TYPE_CHECKING:
     import numpy as np
 
-    from pipeline.deposition.camera import latency, readings, trial_flow
+    from pipeline.deposition.camera import readings, trial_flow
     from pipeline.deposition.extruder import Extruder, Routine
     from pipeline.deposition.learning.ilc import Trial
     from pipeline.recordings.trial_files import TrialRecording
@@ -127,7 +127,7 @@ def learn_in_pictures(
     """The model inverse on the reference routine of a simulated machine, the flow measured from pictures.
     Every trial is one recording in `folder`, written and read back; the first and the last are kept. `rngs`
     draw what the camera sees, and what does not repeat."""
-    from pipeline.deposition.camera import rendering, simulated_trial, trial_flow
+    from pipeline.deposition.camera import rendering, trial_flow
     from pipeline.deposition.learning import training
     from pipeline.recordings.trial_files import TrialConditions, TrialSignals, open_trial, write_trial
 
@@ -140,7 +140,7 @@ def learn_in_pictures(
         number, law = len(measured), "pixels" if measured else "on_off"
         path = folder / f"{name}_{number:02d}.mcap"
         known = trial_conditions(printer, camera, material, routine, number, law, calibration[:2])
-        pictures, applied, truth = simulated_trial.simulate_trial(
+        pictures, applied, truth = rendering.simulate_trial(
             plant, film, routine, u, rngs[1], noise=settings.shares._asdict(), drive=laws.drive,
             sample_time_s=laws.sample_time_s, **camera.film(printer),
         )  # fmt: skip
@@ -254,18 +254,18 @@ def read(recording: TrialRecording, camera: Camera, memo: Path | None = None) ->
 
 
 def measure_trial(
-    recording: TrialRecording, values: readings.Readings, earlier: Sequence[latency.Latency],
+    recording: TrialRecording, values: readings.Readings, earlier: Sequence[readings.Latency],
     routine: Routine, printer: Printer, camera: Camera,
 ) -> trial_flow.MeasuredTrial:  # fmt: skip
     """The trial of a recording on the clock of its routine, from the readings of its frames; the camera's
     latency from section `camera`, or from this recording and `earlier` ones. Raises ValueError, naming the
     file, if it says nothing of its conditions or shows no bead."""
     from pipeline.deposition import drive
-    from pipeline.deposition.camera import flow, latency, trial_flow
+    from pipeline.deposition.camera import flow, readings, trial_flow
     from pipeline.recordings import trial_files
 
     known, mounting = trial_files.check_conditions(recording), camera.mounting
-    scale, late = known.scale, latency.of_camera(camera.latency_s, [*earlier, values.latency])
+    scale, late = known.scale, readings.latency_of_camera(camera.latency_s, [*earlier, values.latency])
     with artifacts.about(recording.path):
         measured = trial_flow.measure_trial(
             values, recording.signals, routine, mounting, scale=scale,

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.commands import compose
-from pipeline.deposition.parts import forecast, part_report, verification
-from pipeline.deposition.parts.composition import LearnedLibrary, LearnedMaterial, Stream
+from pipeline.deposition.parts import forecast, part_report
+from pipeline.deposition.parts.composition import LearnedLibrary
 from pipeline.deposition.parts.part import ComposedPart
 from pipeline.deposition.settings import ComposeParts, Printer
 from pipeline.recordings.part_files import COLUMNS, COMMAND, print_name, print_path, read_measured
@@ -22,10 +22,10 @@ def write(
     command, tasks and report, in `folder`; in words what was written and what each is forecast to come to."""
     sentences, composed = [], part.composed
     for stream in composed.streams:
-        material, Ts = _material(learned, stream), composed.sample_time_s
+        material, Ts = stream.learned, composed.sample_time_s
         flows = forecast.flows(material.chain, material.missed, stream.u, stream.r, sample_time_s=Ts)
-        hardest = verification.windows(flows, stream.r, composed.lines, stream.tool, sample_time_s=Ts)
-        text, duration_s = verification.program(
+        hardest = forecast.windows(flows, stream.r, composed.lines, stream.tool, sample_time_s=Ts)
+        text, duration_s = forecast.verification_program(
             part.name, hardest, composed.lines, stream.tool, bead_area_mm2=printer.bead_area_mm2
         )
         path = folder / f"{part.name}_verify_{stream.material}.gcode"
@@ -46,14 +46,6 @@ def write(
     return "\n".join(sentences)
 
 
-def _material(learned: LearnedLibrary, stream: Stream) -> LearnedMaterial:
-    return next(
-        one
-        for one in learned.materials
-        if (one.material, one.nozzle_mm) == (stream.material, stream.nozzle_mm)
-    )
-
-
 # ---- learning on
 
 
@@ -68,8 +60,8 @@ def next_commands(
         path = print_path(folder, part.name, stream.material)
         if path:
             y, u = read_measured(path, len(stream.r), part.composed.sample_time_s)
-            commands[stream.material] = verification.next_command(
-                _material(learned, stream).chain.extruder,
+            commands[stream.material] = forecast.next_command(
+                stream.learned.chain.extruder,
                 stream.u if u is None else u,
                 y,
                 stream.r,

@@ -10,8 +10,6 @@ signals; a model-based one inverts the identified chain of the extruder; on-off 
 are the baselines. A command that was learned on the very part is the reference: no other composer knows the
 part beforehand."""
 
-import importlib
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 
@@ -23,9 +21,6 @@ class DepositionController(NamedTuple):
     kind: Literal["model-based", "data-driven", "baseline", "reference"]
     explanation: str
     flow: str = ""  # meaning of its column in signals.parquet; a law has none
-    # "file.function" of pipeline/deposition/parts: library, share of a part, drive -> command (T,) in mm,
-    # without learning on the part; on-off control and full-part ILC are made by `evaluation`
-    command: str = ""
 
 
 # in the order of every page
@@ -47,23 +42,23 @@ COMPOSERS = (
     ),
     DepositionController(
         "pressure_advance", "Pressure advance", "baseline", "as in Klipper, tuned on the chain",
-        "the same of pressure advance", "composition.by_advance",
+        "the same of pressure advance",
     ),
     DepositionController(
         "pressure_advance_lead", "Pressure advance, lead", "baseline", "the same, sent ahead",
-        "the same of pressure advance sent ahead", "composition.by_advance_with_lead",
+        "the same of pressure advance sent ahead",
     ),
     DepositionController(
         "priority", "Library, priority", "data-driven", "the paper’s rule",
-        "the same of the library by the priority rule", "composition.by_priority",
+        "the same of the library by the priority rule",
     ),
     DepositionController(
         "superposition", "Library, superposition", "data-driven", "overlaps are added",
-        "the same of the library by superposition", "composition.by_superposition",
+        "the same of the library by superposition",
     ),
     DepositionController(
         "basis", "Basis functions", "model-based", "identified chain, inverted",
-        "the same of the basis functions", "composition.by_basis_functions",
+        "the same of the basis functions",
     ),
     DepositionController(
         "ilc", "Learned whole", "reference", "trials of this very part",
@@ -71,9 +66,3 @@ COMPOSERS = (
     ),
 )  # fmt: skip
 CONTROLLERS = {controller.name: controller for controller in (*LAWS, *COMPOSERS)}
-
-
-def command(name: str) -> Callable:
-    """The function that makes the command of a composer."""
-    file, _, function = CONTROLLERS[name].command.partition(".")
-    return getattr(importlib.import_module(f"pipeline.deposition.parts.{file}"), function)

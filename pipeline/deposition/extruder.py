@@ -189,26 +189,38 @@ def lagged(u: np.ndarray, delay_s: float, lag_hz: float, sample_time_s: float) -
     return scipy.signal.lfilter(numerator, denominator, late)
 
 
-def backlash(x: np.ndarray, play: float) -> np.ndarray:
-    """Play of full width `play` on x (T,): the output stays until x leaves it by half the play. y(-1) = 0 and
+def backlash(x: np.ndarray, play: np.ndarray | float) -> np.ndarray:
+    """Play of full width `play` (...,) along the last axis of x (..., T): the output stays until x leaves it
+    by half the play. y(-1) = 0 and
 
-    y(t) = min(max(y(t-1), x(t) - play/2), x(t) + play/2)
+        y(t) = min(max(y(t-1), x(t) - play/2), x(t) + play/2)
+
+    Each step clips y to [x - play/2, x + play/2], and clips compose to clips: blocks of
+    the time axis are walked side by side, then joined.
     """
-    half, y, out = play / 2, 0.0, []
-    for value in x.tolist():
-        if y < value - half:
-            y = value - half
-        elif y > value + half:
-            y = value + half
-        out.append(y)
-    return np.array(out)
-
-
-def _played(x: np.ndarray, play: float) -> np.ndarray:
-    """`backlash` on x (..., T), none where the play is 0."""
-    if play <= 0:
+    if not np.any(play):
         return x
-    return np.apply_along_axis(backlash, -1, x, play) if x.ndim > 1 else backlash(x, play)
+    rows, length = math.prod(x.shape[:-1]), x.shape[-1]
+    block = max(1, math.isqrt(length // 4) if rows < 64 else length)
+    blocks = -(-length // block)
+    padded = np.pad(x.reshape(rows, length), ((0, 0), (0, blocks * block - length)), mode="edge")
+    half = np.repeat(np.broadcast_to(play, x.shape[:-1]).ravel() / 2, blocks)
+    steps = np.ascontiguousarray(padded.reshape(rows * blocks, block).T)
+    del padded
+    low, high = np.full(rows * blocks, -np.inf), np.full(rows * blocks, np.inf)
+    if blocks > 1:
+        for step in steps:
+            a, b = step - half, step + half  # np.clip takes twice as long
+            low, high = np.minimum(np.maximum(low, a), b), np.minimum(np.maximum(high, a), b)
+    start, y = np.zeros((rows, blocks)), np.zeros(rows)
+    for k, (a, b) in enumerate(zip(low.reshape(rows, blocks).T, high.reshape(rows, blocks).T, strict=True)):
+        start[:, k] = y
+        y = np.minimum(np.maximum(y, a), b)
+    y, out = start.ravel(), np.empty_like(steps)
+    for step, row in zip(steps, out, strict=True):
+        y = np.minimum(np.maximum(y, step - half), step + half, out=row)
+    del steps, step
+    return out.T.reshape(rows, blocks * block)[:, :length].reshape(x.shape)
 
 
 def _modes(extruder: Extruder) -> list[tuple[float, float]]:
@@ -227,8 +239,8 @@ def pressed(
     in series with the extruder's own play. Each block takes the one before it as held at its mean over the
     sample.
     """
-    v = _played(obeyed(u, drive, sample_time_s=sample_time_s), drive.backlash_mm)
-    v = _played(lagged(v, extruder.delay_s, extruder.lag_hz, sample_time_s), extruder.play)
+    v = backlash(obeyed(u, drive, sample_time_s=sample_time_s), drive.backlash_mm)
+    v = backlash(lagged(v, extruder.delay_s, extruder.lag_hz, sample_time_s), extruder.play)
     x = np.zeros(v.shape)
     for share, tau in _modes(extruder):
         a = math.exp(-sample_time_s / tau)

@@ -3,7 +3,7 @@ on little is lost to it."""
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.linalg
@@ -12,20 +12,15 @@ import scipy.signal
 from pipeline.deposition.drive import Drive
 from pipeline.deposition.extruder import Extruder, ramp_of_gantry
 
-# sum_k taps[k](t) z(t-k) from rest: each tap one number, or (N,) where it changes with time
-Taps = Sequence[float | np.ndarray]
 # a drive follows where it adds at most this share of on-off control's error to that of the unlimited command
 LOSS = 0.02
-# of Newton's method at one barrier: 12 were too few for a limit of twice the steady command, and left 25 %
-# more error than there need be
-MOST_STEPS = 50
 # a longer signal is solved in pieces, each as far as MARGIN beyond its end, where what follows no longer
 # counts; where the limits hold the next piece otherwise by more than JOINED, in the unit of x or as a share
 # of the most, the margin doubles, up to a PIECE
-LONG, PIECE, MARGIN, JOINED = 8192, 8192, 512, 0.02
+PIECE, MARGIN, JOINED = 8192, 512, 0.02
 # of the interior-point method on a piece: mean product of slack and multiplier at its begin and end, the
 # share of it that a step aims at, and of the way to the nearest bound that it goes
-FIRST_GAP, LAST_GAP, AIM, MOST_OF_WAY = 30.0, 1e-6, 0.2, 0.99
+FIRST_GAP, LAST_GAP, AIM, MOST_OF_WAY, MOST_STEPS = 30.0, 1e-6, 0.2, 0.99, 100
 
 
 def nearest(
@@ -36,6 +31,8 @@ def nearest(
     bound: float,
     step: float = math.inf,
     rest: np.ndarray | None = None,
+    piece: int = PIECE,
+    margin: int = MARGIN,
 ) -> np.ndarray:
     """x (N,) from rest that is nearest to `target` (N,) among all with |v(t)| <= bound and |v(t) - v(t-1)| <=
     step, v(t) = x(t) - pole x(t-1): all that a first-order extruder can press.
@@ -43,14 +40,31 @@ def nearest(
     Where `free` (N,) is True only what lies above the target costs (no-flow: below the yield all is well),
     and below it x settles at `rest` (N,), the target where none is given. x, bound and step in mm^3/s: K (1 -
     pole) times the amplitude, and times the speed and the sample time.
+
+    A long signal is solved piece by piece, each from where the one before ends, so that x keeps the limits
+    across the joins, and with so much of what follows that the piece does not change with more.
     """
     if not (math.isfinite(bound) or math.isfinite(step)):
         return np.array(target, float)
-    if len(target) > LONG:
-        return in_pieces(target, free, pole=pole, bound=bound, step=step, rest=rest)
-    return nearest_response(
-        target, free, output=(1.0,), command=(1.0, -pole), bound=bound, step=step, rest=rest
-    )
+    N, c = len(target), min(bound, step / (1 - pole))
+    below = target if rest is None else rest
+    x, begin, before, ahead, least = np.empty(N), 0, 0, None, margin
+    while True:
+        upto = min(begin + piece + margin, N)
+        first, second = (x[begin - k] / c if begin else 0.0 for k in (1, 2))
+        z, hold = _piece(
+            target[begin:upto] / c, free[begin:upto], below[begin:upto] / c, pole=pole,
+            bound=bound / c, step=step / c, x=first, v=first - pole * second,
+        )  # fmt: skip
+        if ahead is not None and margin < piece and not _same(hold, ahead):
+            begin, margin, ahead = before, 2 * margin, None
+            continue
+        margin = margin if ahead is None else max(least, margin // 2)
+        if upto == N:
+            x[begin:] = c * z
+            return x
+        x[begin : begin + piece], ahead = c * z[:piece], hold[:, piece:]
+        before, begin = begin, begin + piece
 
 
 @functools.cache
@@ -118,13 +132,6 @@ def flow(extruder: Extruder, r: np.ndarray, drive: Drive, sample_time_s: float) 
     """The flow (T,) in mm^3/s nearest to r (T,) that the drive lets the extruder's gain, time constant and
     yield press out; its delay and lag, which a command can be sent ahead of, its play and creep are left
     out (a lag overshoots its input by 5 %, so that a percent more may be in reach)."""
-    return _pressed(nearest, extruder, r, drive, sample_time_s)
-
-
-def _pressed(
-    nearest: Callable[..., np.ndarray], extruder: Extruder, r: np.ndarray, drive: Drive, sample_time_s: float
-) -> np.ndarray:
-    """`flow` by `nearest` or `in_pieces`."""
     a, yield_ = math.exp(-sample_time_s / extruder.time_constant_s), extruder.yield_
     scale = extruder.gain * (1 - a)
     x = nearest(
@@ -142,7 +149,7 @@ def lost(extruder: Extruder, r: np.ndarray, drive: Drive, sample_time_s: float) 
     control r / K without limits."""
     a = math.exp(-sample_time_s / extruder.time_constant_s)
     on_off = np.linalg.norm(scipy.signal.lfilter([0.0, 1 - a], [1.0, -a], r) - r)
-    least = np.linalg.norm(_pressed(in_pieces, extruder, r, drive, sample_time_s) - r)
+    least = np.linalg.norm(flow(extruder, r, drive, sample_time_s) - r)
     return float(least / max(on_off, 1e-300))
 
 
@@ -157,94 +164,6 @@ def _line(
     )
     r = steady_flow * (up - down)
     return np.where(r > 1e-9 * steady_flow, r, 0.0)
-
-
-def nearest_response(
-    target: np.ndarray,
-    free: np.ndarray,
-    *,
-    output: Taps,
-    command: Taps,
-    bound: float,
-    step: float = math.inf,
-    weight: np.ndarray | float = 1.0,
-    rest: np.ndarray | None = None,
-) -> np.ndarray:
-    """z (N,) from rest whose output y = B z is nearest to `target` (N,) among all whose command v = A z keeps
-    |v(t)| <= bound and |v(t) - v(t-1)| <= step; A and B are the taps `command` and `output`.
-
-    At least one limit is finite. y = A^-1 B v is any linear extruder of finite order, without the inverse: A
-    and B are banded, and so is the Hessian of Newton's method on a log barrier (Boyd and Vandenberghe 2004,
-    ch. 11): an iteration is O(N). Where `free` (N,) is True only what lies above the target costs, and below
-    it a trace of weight draws y to `rest`, or to the target; `weight` (N,) of the squares.
-    """
-    limits = [(command, bound), (_changes(command), step)]
-    limits = [(taps, most) for taps, most in limits if math.isfinite(most)]
-    N = len(target)
-    # the unit of z: of the size that the nearer limit leaves it
-    still = abs(float(np.mean(sum(command))))
-    c = min(bound / float(np.mean(command[0])), step / max(still, 1e-300))
-    within = [(taps, most / c) for taps, most in limits]
-    bands = max(len(output), *(len(taps) for taps, _ in within))
-    s, z, barrier = target / c, np.zeros(N), 1.0
-    below = s if rest is None else rest / c
-    while barrier > 1e-7:
-        for _ in range(MOST_STEPS):
-            # a trace of weight below the target keeps z determined there
-            y = _of(z, output)
-            counts = ~free | (y > s)
-            w = weight * np.where(counts, 1.0, 1e-3)
-            gradient, band = _back(w * (y - np.where(counts, s, below)), output), np.zeros((bands, N))
-            _add_squares(band, np.broadcast_to(w, N), output)
-            for taps, most in within:
-                v = _of(z, taps) / most
-                slack = 1 - v * v
-                gradient += _back(2 * barrier * v / slack / most, taps)
-                _add_squares(band, 2 * barrier * (1 + v * v) / slack**2 / most**2, taps)
-            dz = -_solved(band, gradient)
-            # every bound holds: at most 0.95 of the way to the nearest
-            reach = max(_reach(_of(z, taps) / most, _of(dz, taps) / most) for taps, most in within)
-            length = min(1.0, 0.95 / max(reach, 1e-300))
-            z = z + length * dz
-            if length == 1.0 and gradient @ -dz < 1e-3 * N * barrier:
-                break
-        barrier *= 0.1
-    return c * z
-
-
-def in_pieces(
-    target: np.ndarray,
-    free: np.ndarray,
-    *,
-    pole: float,
-    bound: float,
-    step: float = math.inf,
-    rest: np.ndarray | None = None,
-    piece: int = PIECE,
-    margin: int = MARGIN,
-) -> np.ndarray:
-    """`nearest` quicker, as good within 1e-5 of the cost: piece by piece, each from where the one before
-    ends, so that x keeps the limits across the joins, and with so much of what follows that the piece does
-    not change with more. At least one limit is finite."""
-    N, c = len(target), min(bound, step / (1 - pole))
-    below = target if rest is None else rest
-    x, begin, before, ahead, least = np.empty(N), 0, 0, None, margin
-    while True:
-        upto = min(begin + piece + margin, N)
-        first, second = (x[begin - k] / c if begin else 0.0 for k in (1, 2))
-        z, hold = _piece(
-            target[begin:upto] / c, free[begin:upto], below[begin:upto] / c, pole=pole,
-            bound=bound / c, step=step / c, x=first, v=first - pole * second,
-        )  # fmt: skip
-        if ahead is not None and margin < piece and not _same(hold, ahead):
-            begin, margin, ahead = before, 2 * margin, None
-            continue
-        margin = margin if ahead is None else max(least, margin // 2)
-        if upto == N:
-            x[begin:] = c * z
-            return x
-        x[begin : begin + piece], ahead = c * z[:piece], hold[:, piece:]
-        before, begin = begin, begin + piece
 
 
 def _same(hold: np.ndarray, ahead: np.ndarray) -> bool:
@@ -281,7 +200,7 @@ def _piece(
     slack = np.concatenate([1 - share, 1 + share])
     force, gap, aim = FIRST_GAP / slack, FIRST_GAP, AIM
     gone, nowhere = np.empty_like(slack), not free.any()
-    for _ in range(2 * MOST_STEPS):
+    for _ in range(MOST_STEPS):
         low = free & (z <= s)
         w = 1.0 if nowhere else np.where(low, 1e-3, 1.0)
         gradient = z - s if nowhere else w * (z - np.where(low, below, s))
@@ -348,46 +267,6 @@ def _solved(band: np.ndarray, gradient: np.ndarray) -> np.ndarray:
         except np.linalg.LinAlgError:
             continue
     raise ValueError(
-        "reachable: the taps of output and command leave the response undetermined; "
-        "expected poles inside the unit circle"
+        "reachable: the limits of the drive leave the nearest flow undetermined; "
+        "expected a time constant, an amplitude and a speed above 0"
     )
-
-
-def _changes(taps: Taps) -> Taps:
-    """The taps of v(t) - v(t-1), v those of `taps`."""
-    late = [np.append(0.0, tap[:-1]) if isinstance(tap, np.ndarray) else tap for tap in taps]
-    return [taps[0], *(tap - before for tap, before in zip(taps[1:], late, strict=False)), -late[-1]]
-
-
-def _of(z: np.ndarray, taps: Taps) -> np.ndarray:
-    """sum_k taps[k] z(t-k) (N,), from rest."""
-    v = taps[0] * z
-    for k, tap in enumerate(taps[1:], 1):
-        v[k:] += _from(tap, k) * z[:-k]
-    return v
-
-
-def _from(tap: float | np.ndarray, k: int) -> float | np.ndarray:
-    return tap[k:] if isinstance(tap, np.ndarray) else tap
-
-
-def _back(y: np.ndarray, taps: Taps) -> np.ndarray:
-    """The transpose of `_of` on y (N,)."""
-    z = taps[0] * y
-    for k, tap in enumerate(taps[1:], 1):
-        z[:-k] += _from(tap, k) * y[k:]
-    return z
-
-
-def _add_squares(band: np.ndarray, h: np.ndarray, taps: Taps) -> None:
-    """Adds D' diag(h) D to the lower bands (B, N), D the matrix of `_of`; h (N,)."""
-    N = len(h)
-    for i, first in enumerate(taps):
-        for k in range(i + 1):
-            # row t of D holds taps[i] in column t - i and taps[k] in column t - k
-            band[i - k, : N - i] += _from(first, i) * _from(taps[k], i) * h[i:]
-
-
-def _reach(v: np.ndarray, dv: np.ndarray) -> float:
-    """How far a step dv (N,) goes towards the nearer of the bounds +-1 of v (N,), as a share of the way."""
-    return float(np.max(np.maximum(dv / (1 - v), -dv / (1 + v))))

@@ -253,7 +253,7 @@ class Camera(Section):
         )  # fmt: skip
 
     def film(self, printer: Printer) -> dict[str, Any]:
-        """How a simulated trial is filmed: keywords of `simulated_trial.simulate_trial`."""
+        """How a simulated trial is filmed: keywords of `rendering.simulate_trial`."""
         from pipeline.deposition.camera.flow import View
 
         return {

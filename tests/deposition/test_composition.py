@@ -327,19 +327,19 @@ def test_a_program_that_would_jump_from_steady_state_to_no_flow_is_refused_with_
 def test_on_a_machine_whose_flow_nobody_knows_a_composer_scores_the_upper_end_of_its_forecast():
     made = of_part("dashes")
     plain = evaluation.Judging({"A": NOMINAL}, {}, LAWS, training.Noise(0, 0, 0), 1, AREA, 0.4)
-    scores = evaluation.evaluate(learned(PLANT), made, plain, np.random.default_rng(0))
+    checks = conform(
+        made, learned(PLANT), bead_area_mm2=AREA, ramp_s=RAMP, drive=UNLIMITED, shortest_s=0.4,
+        largest_error_percent=20.0,
+    )  # fmt: skip
+    scores = evaluation.evaluate(learned(PLANT), made, checks.lines, plain, np.random.default_rng(0))
     told = {prediction.composer: prediction for prediction in made.predictions}
     assert {score.composer for score in scores} == {"on_off", *told}
     for score in scores[1:]:
         assert score.rms_percent_of_on_off == told[score.composer].high > score.predicted_percent
     # and the line furthest off is that of the interval, not that of the chain that made the command
-    checks = conform(
-        made, learned(PLANT), bead_area_mm2=AREA, ramp_s=RAMP, drive=UNLIMITED, shortest_s=0.4,
-        largest_error_percent=20.0,
-    )  # fmt: skip
     ends = np.abs([checks.lines.low_percent, checks.lines.high_percent]).max()
     assert np.all(checks.lines.low_percent <= checks.lines.high_percent)
-    chosen = next(score for score in evaluation.upper_ends(made, checks.lines, scores, plain) if score.chosen)
+    chosen = next(score for score in scores if score.chosen)
     assert chosen.worst_line_volume_percent == ends > checks.worst_line_volume_percent
 
 

@@ -7,15 +7,7 @@ import pytest
 from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
 from pipeline.deposition.extruder import Extruder, flow
 from pipeline.deposition.parts import basis
-from pipeline.deposition.parts.conformance import (
-    conform,
-    line_volumes,
-    ramp_that_would_do,
-    saturation,
-    volume_between,
-)
-from pipeline.deposition.reachable import LOSS, lost
-from pipeline.deposition.toolpath.gcode_words import LineRefusal
+from pipeline.deposition.parts.conformance import conform, line_volumes, saturation, volume_between
 from tests.deposition.test_composition import composed, of_part
 from tests.deposition.trained import AREA, NOMINAL, PLANT, RAMP, TS, learned, protocol
 
@@ -103,33 +95,10 @@ def test_the_peak_is_about_1_plus_tau_over_ramp():
         assert forecast.peak_over_steady == pytest.approx(0.5 + 3.0 / ramp_s, rel=0.05)
 
 
-def test_the_ramp_that_would_do_does_and_a_shorter_one_does_not():
-    chain, on = learned(PLANT).materials[0].chain.extruder, protocol(ramp_s=1e-9).r
-    limit = 8 * on.max() / chain.gain
-    ramp_s = ramp_that_would_do(chain, on, ramp_s=RAMP, drive=Drive(limit, np.inf, 0.0), sample_time_s=TS)
-    plain = Extruder(chain.gain, chain.time_constant_s, yield_=chain.yield_)
-    losses = [
-        lost(plain, protocol(gantry_ramp_s=x, pause_s=0.6 + x).r, Drive(limit, np.inf, 0.0), TS)
-        for x in (ramp_s, 0.8 * ramp_s)
-    ]
-    # the routine starts and stops twice, at a pause, where the line does once
-    assert losses[0] <= 1.3 * LOSS < losses[1]
-    assert (
-        ramp_that_would_do(chain, on, ramp_s=RAMP, drive=Drive(1e3, np.inf, 0.0), sample_time_s=TS) == 0.0
-    )  # none is needed
-    assert (
-        ramp_that_would_do(
-            chain, on, ramp_s=RAMP, drive=Drive(0.5 * on.max() / chain.gain, np.inf, 0.0), sample_time_s=TS
-        )
-        == np.inf
-    )  # not even the steady flow
-
-
 def test_refusals_carry_their_lines_and_the_library_s_guesses_only_where_it_is_used():
     made = composed("G21\nG90\nM83\nT0\nG0 X10 F480\nG1 X20 E1\nG4 P200\nG1 X30 E1\nG0 X0\nG4 P3000")
-    reader = [LineRefusal(3, "cannot be read")]
-    assert conform(made, learned(PLANT), **REPORT, refusals=reader).refused == [(3, "cannot be read", 1)]
+    assert conform(made, learned(PLANT), **REPORT).refused == []
     forced = made._replace(streams=tuple(s._replace(composer="priority") for s in made.streams))
-    refused = conform(forced, learned(PLANT), **REPORT, refusals=reader).refused
-    assert [r.line for r in refused] == [3, 6]
-    assert refused[1].why.startswith("the library lacks Corner at 8 mm/s with a pause of 0.2")
+    refused = conform(forced, learned(PLANT), **REPORT).refused
+    assert [r.line for r in refused] == [6]
+    assert refused[0].why.startswith("the library lacks Corner at 8 mm/s with a pause of 0.2")

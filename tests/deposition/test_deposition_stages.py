@@ -16,7 +16,7 @@ import yaml
 
 from pipeline import cli
 from pipeline.commands import compose
-from pipeline.deposition.camera import rendering, simulated_trial
+from pipeline.deposition.camera import rendering
 from pipeline.deposition.drive import Drive, demand, follows
 from pipeline.deposition.extruder import draw, flow
 from pipeline.deposition.learning import training
@@ -163,7 +163,7 @@ def machine(asked: int, index: int = 0, **changes) -> Path:
     scale = (abs(camera.mm_per_px), 0.0)
     known = trial_conditions(printer, camera, material, routine, asked, "model_inverse", scale)
     path = Path(f"datasets/raw/deposition/print_{index}_{asked}{'_'.join(changes)}.mcap")
-    pictures, applied, truth = simulated_trial.simulate_trial(
+    pictures, applied, truth = rendering.simulate_trial(
         plant, film, routine, command, np.random.default_rng(100 + asked),
         noise={"white": 0.03, "drift": 0.01, "gain": 0.01}, drive=printer.limits,
         sample_time_s=printer.sample_time_s, **camera.film(printer),

@@ -11,8 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.commands import compose
-from pipeline.deposition.parts import extrusion, leads, part_motion, part_report
+from pipeline.deposition.parts import extrusion, leads, part_report
 from pipeline.deposition.parts.forecast import ForecastJudgement
+from pipeline.deposition.parts.part import slowed_to
 from pipeline.deposition.settings import ComposeParts, Printer
 from pipeline.deposition.toolpath import gcode, motion
 from pipeline.deposition.toolpath.gcode import Kind
@@ -273,7 +274,7 @@ def test_a_lengthened_ramp_is_several_legs_of_rising_feed(tmp_path, machine):
     them, it is where it is planned at that time."""
     done = part(tmp_path, machine, line(machine[0].bead_area_mm2, length=60))
     moves, planned, n = done.program.moves, done.planned, len(done.composed.streams[0].u)
-    assert part_motion.slowed_to(planned, moves) is not None
+    assert slowed_to(planned, moves) is not None
     found = leads.legs(
         moves,
         planned,

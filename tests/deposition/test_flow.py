@@ -49,7 +49,7 @@ def exact_sections(time_s, Q, position) -> Sections:
         )
         / LENGTH
     )
-    return Sections((faces[:-1] + faces[1:]) / 2, A, np.full(len(A), 1e-4), np.full(len(A), 17), LENGTH, 0)
+    return Sections((faces[:-1] + faces[1:]) / 2, A, np.full(len(A), 1e-4), np.full(len(A), 17), LENGTH)
 
 
 def inverted(r, places, shapes=None):
@@ -112,17 +112,14 @@ def test_without_noise_the_flow_comes_back_everywhere_it_is_observable(name):
     assert 100 * abs((estimated.flow - Q).mean()) / NOMINAL_FLOW < 0.1  # volume is not lost
 
 
-def test_the_volume_of_a_pause_is_known_within_its_deviation_though_its_flow_is_not():
+def test_the_volume_of_a_pause_is_known_though_its_flow_is_not():
     Q = on_off(SHORT)
     estimated = inverted(SHORT, exact_sections(SHORT.time_s, Q, SHORT.position))
-    assert len(estimated.pauses) == 1
-    pause = estimated.pauses[0]
-    inside = (SHORT.time_s >= pause.begin_s) & (SHORT.time_s <= pause.end_s)
-    assert not estimated.observable[inside].any()
-    assert pause.volume == pytest.approx(Q[inside].sum() * 0.02, rel=0.02)
-    assert np.isnan(estimated.per_travel[inside]).all()
+    inside = np.abs(np.gradient(SHORT.position, 0.02)) <= 0.05 * SPEED
+    assert inside.sum() > 10 and not estimated.observable[inside].any()
+    assert estimated.flow[inside].sum() == pytest.approx(Q[inside].sum(), rel=0.02)
     steady = (SHORT.time_s > 2.2) & (SHORT.time_s < 3.0)
-    np.testing.assert_allclose(estimated.per_travel[steady], Q[steady] / SPEED, rtol=0.02)
+    np.testing.assert_allclose(estimated.flow[steady], Q[steady], rtol=0.02)
 
 
 def test_the_deviation_is_larger_where_the_gantry_stands():
@@ -185,7 +182,6 @@ def test_readings_of_one_place_are_averaged_and_specks_dropped():
     widths[4, 30] = 1.5
     places = sections(position, columns, widths, view=VIEW, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0)
     np.testing.assert_allclose(places.area, AREA, rtol=1e-9)
-    assert places.dropped == 1
     assert places.frames.max() == 10
     assert np.all(np.diff(places.s) == pytest.approx(LENGTH, abs=1e-9))
 
@@ -254,7 +250,7 @@ def test_a_gantry_that_comes_back_is_refused():
 def test_what_no_frame_saw_is_not_observable_and_the_rest_does_not_suffer():
     exact = exact_sections(SHORT.time_s, SHORT.r, SHORT.position)
     dark = (exact.s > 18.0) & (exact.s < 21.0)
-    lit = Sections(*(part[~dark] for part in exact[:4]), LENGTH, 0)
+    lit = Sections(*(part[~dark] for part in exact[:4]), LENGTH)
     estimated = inverted(SHORT, lit)
     blind = (SHORT.position > 18.3) & (SHORT.position < 20.7)
     assert not estimated.observable[blind].any()
@@ -296,66 +292,15 @@ def test_a_line_printed_the_other_way_is_read_by_a_mirrored_view():
 # ---- refusals
 
 
-@pytest.mark.parametrize(
-    ("time_s", "position", "shapes", "message"),
-    [
-        (
-            np.arange(5) * 0.02,
-            np.arange(5.0),
-            np.zeros((0, 5)),
-            r"with T at least 10, but found \(5,\), \(5,\) and \(0, 5\)",
-        ),
-        (
-            np.arange(20) * 0.02,
-            np.arange(20.0),
-            np.zeros(20),
-            r"shapes \(k, T\) .* but found \(20,\), \(20,\) and \(20,\)",
-        ),
-        (
-            np.arange(20) ** 2 * 0.02,
-            np.arange(20.0),
-            np.zeros((0, 20)),
-            r"evenly spaced samples but found steps of 0.02 to 0.74 s",
-        ),
-        (
-            np.arange(20) * 0.02,
-            np.full(20, np.nan),
-            np.zeros((0, 20)),
-            r"finite positions and shapes but found gaps",
-        ),
-        (
+def test_a_record_in_which_the_nozzle_reaches_no_place_is_refused():
+    places = Sections(np.arange(10) * LENGTH, np.full(10, AREA), np.full(10, 1e-3), np.full(10, 17), LENGTH)
+    with pytest.raises(ValueError, match=r"the nozzle reached no place of A\(s\) in this record"):
+        estimate(
             np.arange(20) * 0.02,
             1e3 + np.arange(20.0),
-            np.zeros((0, 20)),
-            r"the nozzle reached no place of A\(s\) in this record",
-        ),
-    ],
-)
-def test_a_record_that_cannot_be_inverted_is_refused(time_s, position, shapes, message):
-    places = Sections(
-        np.arange(10) * LENGTH, np.full(10, AREA), np.full(10, 1e-3), np.full(10, 17), LENGTH, 0
-    )
-    with pytest.raises(ValueError, match=message):
-        estimate(
-            time_s,
-            position,
             places,
             nozzle_radius_mm=RADIUS,
-            shapes=shapes,
+            shapes=np.zeros((0, 20)),
             contact_angle_deg=90.0,
             width_deviation_mm=0.0,
-        )
-
-
-def test_widths_of_another_shape_are_refused():
-    with pytest.raises(
-        ValueError, match=r"expected widths of 3 frames x 2 columns but found \(2, 2\); give one row a frame"
-    ):
-        sections(
-            np.zeros(3),
-            np.zeros(2),
-            np.zeros((2, 2)),
-            view=VIEW,
-            nozzle_radius_mm=RADIUS,
-            contact_angle_deg=90.0,
         )

@@ -7,7 +7,7 @@ import pytest
 from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, frequency_response, pressed, routine
 from pipeline.deposition.learning import ilc, training
-from pipeline.deposition.learning.unmodelled import SMOOTHED_HZ
+from pipeline.deposition.learning.trial_model import SMOOTHED_HZ
 from pipeline.papers.deposition import causal_q
 from tests.foreign import deposition as foreign_deposition
 from tests.foreign import displacing

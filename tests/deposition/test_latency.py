@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.deposition.camera import latency
-from pipeline.deposition.camera.latency import Latency
+from pipeline.deposition.camera import readings
+from pipeline.deposition.camera.readings import Latency
 from pipeline.deposition.extruder import Extruder, flow, routine
 from tests.foreign.camera import GROUNDS, Eye, trial
 
@@ -31,7 +31,7 @@ def told(eye: Eye, delay_s: float = 0.1, seed: int = 3) -> Latency:
     )  # fmt: skip
     size = ((eye.width - FIRST) // STEP_PX, 12)
     signals = [cv2.resize(frame[:, FIRST:], size, interpolation=cv2.INTER_AREA) for _, frame in frames]
-    return latency.estimate(
+    return readings.estimate_latency(
         np.array([time for time, _ in frames]), np.array(signals),
         (ROUTINE.time_s, ROUTINE.position), step_mm=-STEP_PX * eye.mm_per_px,
     )  # fmt: skip
@@ -54,7 +54,7 @@ def test_pictures_of_noise_tell_no_latency():
     for seed in range(4):
         noise = np.random.default_rng(seed).normal(100, 3, (150, 12, 40))
         gantry = (ROUTINE.time_s, ROUTINE.position)
-        assert latency.estimate(time, noise, gantry, step_mm=-0.08) == latency.UNTOLD
+        assert readings.estimate_latency(time, noise, gantry, step_mm=-0.08) == readings.UNTOLD
 
 
 def test_at_an_even_speed_no_latency_is_told():
@@ -64,14 +64,14 @@ def test_at_an_even_speed_no_latency_is_told():
     signals = np.array(
         [[np.interp(8 * t + 0.08 * np.arange(40), np.arange(4000) * 0.02, ground)] for t in frames]
     )
-    assert latency.estimate(frames, signals, (time, 8 * time), step_mm=0.08) == latency.UNTOLD
+    assert readings.estimate_latency(frames, signals, (time, 8 * time), step_mm=0.08) == readings.UNTOLD
 
 
 def test_several_recordings_count_by_their_certainty_and_scatter():
     # by hand: weights 1 and 1/4 of 0.02 and 0.03 give 0.022; they part by less than they say
-    one = latency.pooled([Latency(0.02, 0.01), Latency(0.03, 0.02), latency.UNTOLD])
+    one = readings.pool_latencies([Latency(0.02, 0.01), Latency(0.03, 0.02), readings.UNTOLD])
     assert one.latency_s == pytest.approx(0.022)
     assert one.deviation_s == pytest.approx(1 / math.sqrt(1 / 0.01**2 + 1 / 0.02**2))
     # two that contradict each other are as uncertain as they part
-    assert latency.pooled([Latency(0.0, 0.001), Latency(0.1, 0.001)]).deviation_s > 0.04
-    assert latency.pooled([]) == latency.UNTOLD
+    assert readings.pool_latencies([Latency(0.0, 0.001), Latency(0.1, 0.001)]).deviation_s > 0.04
+    assert readings.pool_latencies([]) == readings.UNTOLD

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.deposition.parts import part_motion
+from pipeline.deposition.parts import part
 from pipeline.deposition.settings import ComposeParts, PlungerDrive, Printer
 from pipeline.deposition.toolpath import gcode
 from pipeline.store import params
@@ -32,11 +32,11 @@ def machine(printer):
 
 
 def planned(name, printer=PRINTER):
-    return part_motion.plan_part(moves(name), *machine(printer), printer.longest_ramp_s)
+    return part.plan_part(moves(name), *machine(printer), printer.longest_ramp_s)
 
 
 def sufficient_ramp(name, printer=PRINTER):
-    return part_motion.sufficient_ramp(moves(name), *machine(printer))
+    return part.sufficient_ramp(moves(name), *machine(printer))
 
 
 def moves(name):
@@ -55,14 +55,14 @@ def test_ramps_lengthen_until_the_drive_follows_the_part_and_short_lines_need_lo
         assert sufficient_ramp(name) == pytest.approx(ramp_s, rel=0.02)  # bisected to 1 %
     # travel stays as quick as the gantry goes
     assert long.acceleration.max() == PRINTER.acceleration_mm_per_s2
-    assert part_motion.slowed_to(long, moves("fig9")) == pytest.approx(8.0 / ramps[0])
+    assert part.slowed_to(long, moves("fig9")) == pytest.approx(8.0 / ramps[0])
 
 
 @pytest.mark.parametrize("changes", [{"drive": None}, {"longest_ramp_s": None}])
 def test_without_a_drive_or_where_ramps_are_not_to_lengthen_the_gantry_is_as_quick_as_it_goes(changes):
     plan = planned("dashes", PRINTER.model_copy(update=changes))
     assert np.all(plan.acceleration == PRINTER.acceleration_mm_per_s2)
-    assert part_motion.slowed_to(plan, moves("dashes")) is None
+    assert part.slowed_to(plan, moves("dashes")) is None
     assert all(
         np.array_equal(a.r, b.r)
         for a, b in zip(

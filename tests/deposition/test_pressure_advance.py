@@ -5,12 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from pipeline.deposition import controllers
 from pipeline.deposition.drive import UNLIMITED, Drive, follows
 from pipeline.deposition.extruder import Extruder, ramp
 from pipeline.deposition.parts import pressure_advance
 from pipeline.deposition.parts.chain import forecast
-from pipeline.deposition.parts.composition import ToolShare, learn
+from pipeline.deposition.parts.composition import COMPOSERS, ToolShare, learn
 from pipeline.deposition.parts.pressure_advance import PressureAdvance, TunedAdvance
 from tests.deposition.trained import NOMINAL, PLANT, TS, learned, protocol
 from tests.foreign import parts as foreign_parts
@@ -80,9 +79,9 @@ def test_the_command_of_a_part_is_what_the_drive_can_follow():
     drive, material = Drive(5.0, 8.0, 0.0), learned(PLANT).materials[0]
     share = ToolShare(0, material, protocol().r, None, None)
     for name, advance in material.advances.items():
-        u = controllers.command(name)(learned(PLANT).library, share, drive)
+        u = COMPOSERS[name](learned(PLANT).library, share, drive)
         assert follows(u, drive, sample_time_s=TS)
-        free = controllers.command(name)(learned(PLANT).library, share, UNLIMITED)
+        free = COMPOSERS[name](learned(PLANT).library, share, UNLIMITED)
         np.testing.assert_array_equal(free, command(protocol().r, *advance.tuned))
         assert not follows(free, drive, sample_time_s=TS)
 

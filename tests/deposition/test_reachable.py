@@ -6,14 +6,8 @@ import scipy.optimize
 
 from pipeline.deposition.drive import UNLIMITED, Drive
 from pipeline.deposition.extruder import Extruder, routine
-from pipeline.deposition.reachable import (
-    LOSS,
-    in_pieces,
-    lost,
-    nearest,
-    nearest_response,
-    ramp_that_loses_little,
-)
+from pipeline.deposition.reachable import LOSS, lost, nearest, ramp_that_loses_little
+from tests.foreign.drive import nearest_response
 
 
 def pulse(N):
@@ -154,7 +148,7 @@ def test_in_pieces_a_long_signal_comes_as_near_as_solved_at_once():
     whole = nearest_response(
         target, free, output=(1.0,), command=(1.0, -pole), bound=bound, step=step, rest=low
     )
-    quick = in_pieces(target, free, pole=pole, bound=bound, step=step, rest=low, piece=2000)
+    quick = nearest(target, free, pole=pole, bound=bound, step=step, rest=low, piece=2000)
 
     def cost(x):
         return np.sum(np.where(free, np.maximum(x - target, 0.0), x - target) ** 2)
@@ -173,14 +167,14 @@ def test_a_margin_too_short_for_what_follows_is_doubled():
     target = np.where(np.arange(N) >= 1060, 1.5, 0.5)
     none = np.zeros(N, bool)
     whole = nearest(target, none, pole=pole, bound=bound)
-    quick = in_pieces(target, none, pole=pole, bound=bound, piece=1000, margin=20)
+    quick = nearest(target, none, pole=pole, bound=bound, piece=1000, margin=20)
     np.testing.assert_allclose(quick, whole, atol=0.03 * bound)
 
 
 @pytest.mark.parametrize(("bound", "step"), [(0.05, np.inf), (np.inf, 0.002)])
 def test_in_pieces_one_limit_is_enough(bound, step):
     target, none = 3 * pulse(9000), np.zeros(9000, bool)
-    quick = in_pieces(target, none, pole=0.99, bound=bound, step=step)
+    quick = nearest(target, none, pole=0.99, bound=bound, step=step)
     whole = nearest_response(target, none, output=(1.0,), command=(1.0, -0.99), bound=bound, step=step)
     np.testing.assert_allclose(quick, whole, atol=5e-3 * 0.05)
     np.testing.assert_array_equal(nearest(target, none, pole=0.99, bound=bound, step=step), quick)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.deposition.camera import bead, excerpts, latency, line, readings, trial_flow
+from pipeline.deposition.camera import bead, excerpts, line, readings, trial_flow
 from pipeline.deposition.extruder import Extruder, flow, routine
 from pipeline.deposition.settings import Camera, Printer, trial_conditions
 from pipeline.recordings import trial_files
@@ -164,7 +164,7 @@ def test_a_turned_and_late_camera_measures_the_flow_whether_its_rotation_is_give
 
 
 def test_a_latency_that_is_not_told_is_said_to_be_unknown(turned, monkeypatch):
-    monkeypatch.setattr(latency, "estimate", lambda *_, **__: latency.UNTOLD)
+    monkeypatch.setattr(readings, "estimate_latency", lambda *_, **__: readings.UNTOLD)
     measured = flow_of(turned, settings(tip_px=tip(140.0), rotation_deg=140.0, columns=[76, 200]))
     assert trial_flow.latency_figures([measured]) == {"latency_s": None, "latency_deviation_s": None}
 

@@ -6,8 +6,7 @@ import pytest
 
 from pipeline.deposition.extruder import Extruder, flow, frequency_response, routine
 from pipeline.deposition.learning import ilc
-from pipeline.deposition.learning.trial_model import TrialModel
-from pipeline.deposition.learning.unmodelled import unmodelled
+from pipeline.deposition.learning.trial_model import TrialModel, unmodelled
 
 TS = 0.02
 R = routine(

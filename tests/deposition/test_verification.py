@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.deposition.drive import UNLIMITED, Drive, follows
 from pipeline.deposition.extruder import flow
-from pipeline.deposition.parts import basis, forecast, verification
+from pipeline.deposition.parts import basis, forecast
 from pipeline.deposition.parts.composition import learn
 from pipeline.deposition.parts.forecast import NAMES
 from pipeline.deposition.toolpath import gcode
@@ -29,7 +29,7 @@ LONG = "G21\nG90\nM83\nT0\nG0 X0 Y0 F480\n" + "".join(
 def hardest(made):
     stream, material = made.streams[0], learned(PLANT).materials[0]
     flows = forecast.flows(material.chain, material.missed, stream.u, stream.r, sample_time_s=TS)
-    return verification.windows(flows, stream.r, made.lines, stream.tool, sample_time_s=TS)
+    return forecast.windows(flows, stream.r, made.lines, stream.tool, sample_time_s=TS)
 
 
 def lines_of(text):
@@ -41,18 +41,18 @@ def test_the_print_is_shorter_than_a_long_part_and_holds_its_hardest_events():
     made = composed(LONG)
     windows = hardest(made)
     assert {window.event for window in windows} <= set(NAMES) and 1 <= len(windows) <= 2
-    text, duration_s = verification.program("long", windows, made.lines, 0, bead_area_mm2=AREA)
+    text, duration_s = forecast.verification_program("long", windows, made.lines, 0, bead_area_mm2=AREA)
     assert duration_s < 0.2 * len(made.streams[0].r) * TS
     # the ends of a long line remain, at the speed of the part
     lines = lines_of(text)
     np.testing.assert_allclose(lines.speed, 8.0)
-    np.testing.assert_allclose(lines.length, 2 * verification.PLATEAU_S * 8.0)
+    np.testing.assert_allclose(lines.length, 2 * forecast.PLATEAU_S * 8.0)
 
 
 def test_runs_and_gaps_of_the_print_are_those_of_the_part():
     made = of_part("dashes")
     windows = hardest(made)
-    lines = lines_of(verification.program("dashes", windows, made.lines, 0, bead_area_mm2=AREA)[0])
+    lines = lines_of(forecast.verification_program("dashes", windows, made.lines, 0, bead_area_mm2=AREA)[0])
     mine = np.concatenate([window.lines for window in windows])
     np.testing.assert_allclose(lines.length, made.lines.length[mine], atol=1e-3)
     gaps = lines.begin_s[1:] - lines.end_s[:-1]
@@ -68,7 +68,7 @@ def test_the_window_is_where_what_may_come_out_differs_most():
     third = np.flatnonzero(made.lines.tool == 0)[2]
     at = round(made.lines.begin_s[third] / TS)
     flows[:, at : at + 20] += np.linspace(-1, 1, 8)[:, None]
-    windows = verification.windows(flows, stream.r, made.lines, 0, sample_time_s=TS)
+    windows = forecast.windows(flows, stream.r, made.lines, 0, sample_time_s=TS)
     sure = max(windows, key=lambda window: window.deviation)
     assert sure.event == "start" and third in sure.lines
 
@@ -76,7 +76,7 @@ def test_the_window_is_where_what_may_come_out_differs_most():
 def test_a_tool_that_prints_nothing_is_refused():
     made = of_part("dashes")
     with pytest.raises(ValueError, match="verification: expected lines of T7 but it prints none"):
-        verification.windows(np.zeros((2, 5)), np.zeros(5), made.lines, 7, sample_time_s=TS)
+        forecast.windows(np.zeros((2, 5)), np.zeros(5), made.lines, 7, sample_time_s=TS)
 
 
 def test_a_part_is_learned_on_from_its_composed_start():
@@ -91,9 +91,7 @@ def test_a_part_is_learned_on_from_its_composed_start():
         y = plant(u, trial)
         errors.append(float(np.linalg.norm(y - r)))
         measured = seen(y, rng, steady_flow=float(r.max()))
-        u = verification.next_command(
-            material.chain.extruder, u, measured, r, drive=UNLIMITED, sample_time_s=TS
-        )
+        u = forecast.next_command(material.chain.extruder, u, measured, r, drive=UNLIMITED, sample_time_s=TS)
     assert errors[2] < 0.6 * errors[0] and errors[3] < errors[0]
 
 
@@ -101,10 +99,10 @@ def test_the_next_command_obeys_the_drive_and_learns_nothing_where_nothing_was_s
     r = of_part("dashes").streams[0].r
     u, blind = r / NOMINAL.gain, np.full(len(r), np.nan)
     extruder = learned(PLANT).materials[0].chain.extruder
-    again = verification.next_command(extruder, u, blind, r, drive=UNLIMITED, sample_time_s=TS)
+    again = forecast.next_command(extruder, u, blind, r, drive=UNLIMITED, sample_time_s=TS)
     np.testing.assert_allclose(again, u, atol=1e-9)
     drive = Drive(4.0, 50.0, 0.0)
-    bound = verification.next_command(extruder, u, 0 * r, r, drive=drive, sample_time_s=TS)
+    bound = forecast.next_command(extruder, u, 0 * r, r, drive=drive, sample_time_s=TS)
     assert follows(bound, drive, sample_time_s=TS)
 
 
@@ -113,11 +111,11 @@ def test_what_was_measured_is_in_percent_of_on_off_and_of_what_was_seen():
     first = flow(PLANT, stream.r / NOMINAL.gain, sample_time_s=TS)
     y = flow(PLANT, stream.u, sample_time_s=TS)
     expected = percent_of_on_off(PLANT, stream.u, stream.r)
-    assert verification.measured_percent(y, first, stream.r) == pytest.approx(expected)
+    assert forecast.measured_percent(y, first, stream.r) == pytest.approx(expected)
     holed = np.where(np.arange(len(y)) < len(y) // 2, np.nan, y)
-    assert np.isfinite(verification.measured_percent(holed, first, stream.r))
+    assert np.isfinite(forecast.measured_percent(holed, first, stream.r))
     with pytest.raises(ValueError, match="every sample is missing; record it again"):
-        verification.measured_percent(np.full(len(y), np.nan), first, stream.r)
+        forecast.measured_percent(np.full(len(y), np.nan), first, stream.r)
 
 
 # ---- files

@@ -50,24 +50,13 @@ class View(NamedTuple):
 class Sections(NamedTuple):
     """Cross-section along the stage: centres s (n,) in mm of places 8 px long, area (n,) in
     mm^2 and its standard deviation as the frames scatter, and the number of frames (n,) that
-    saw each; `dropped` of all readings were outliers."""
+    saw each."""
 
     s: np.ndarray
     area: np.ndarray
     deviation: np.ndarray
     frames: np.ndarray
     length: float
-    dropped: int
-
-
-class Pause(NamedTuple):
-    """A stretch in which the gantry stood: begin and end in s; the
-    volume laid there in mm^3 and its standard deviation."""
-
-    begin_s: float
-    end_s: float
-    volume: float
-    deviation: float
 
 
 class Flow(NamedTuple):
@@ -75,21 +64,13 @@ class Flow(NamedTuple):
     deviation, given the smoothness that the data chose.
 
     observable (T,) is False where the gantry stood or the camera never saw what was laid: there only
-    the volume of the whole pause is measured, and Q is its likeliest spread over time. per_travel (T,)
-    is Q / v in mm^3/mm, NaN where v is below 5 % of its maximum. `amplitudes` (k,) belong to the
-    shapes, `strength` is the weight of smoothness, `noise` the scatter of A(s) about the fit in
-    multiples of what the frames' scatter lets expect (more where the bead itself is rough), `outliers`
+    the volume of the whole pause is measured, and Q is its likeliest spread over time. `outliers` are
     the places that were given less than half their weight.
     """
 
     flow: np.ndarray
     deviation: np.ndarray
     observable: np.ndarray
-    per_travel: np.ndarray
-    pauses: tuple[Pause, ...]
-    amplitudes: np.ndarray
-    strength: float
-    noise: float
     outliers: int
 
 
@@ -120,16 +101,6 @@ def sections(
     are left out; so are those beyond five robust deviations from the median of their place. Raises ValueError
     where nothing is left, or where the gantry does not move away from what the camera sees.
     """
-    position, columns, widths = (
-        np.asarray(position, float),
-        np.asarray(columns, float),
-        np.asarray(widths, float),
-    )
-    if widths.shape != (len(position), len(columns)):
-        raise ValueError(
-            f"sections: expected widths of {len(position)} frames x {len(columns)} columns but found "
-            f"{widths.shape}; give one row a frame"
-        )
     s, w = _readings(position, columns, widths, view, nozzle_radius_mm)
     px = abs(view.mm_per_px)
     length = BLOCK * px
@@ -143,7 +114,7 @@ def sections(
     # a place averages over its length: where A bends within it, the mean is not the value in the middle
     bend = np.convolve(np.pad(A, 1, "edge"), [1.0, -2.0, 1.0], "valid") / 12
     deviation = np.sqrt(slope**2 * scatter**2 / count + blind**2 / 12 + bend**2)
-    return Sections(where, A, deviation, count.astype(int), length, int(np.sum(~keep)))
+    return Sections(where, A, deviation, count.astype(int), length)
 
 
 def column_trend(position: np.ndarray, columns: np.ndarray, widths: np.ndarray, view: View) -> float:
@@ -221,15 +192,9 @@ def estimate(
     the command; none, as zeros (0, T)). The strength maximises the likelihood of A with all Q integrated out
     (generalised maximum likelihood, Wahba 1985). W carries the deviations of A, scaled to its scatter about
     the fit, and Huber's weights. `width_deviation_mm` is what a calibration leaves: it moves all widths
-    alike, so that Q is uncertain by Q 2 dw / w on top. Raises ValueError where the record is too short,
-    unevenly sampled, or where no place is reached by the nozzle.
+    alike, so that Q is uncertain by Q 2 dw / w on top. Raises ValueError where no place is reached by the
+    nozzle.
     """
-    time_s, position, shapes = (
-        np.asarray(time_s, float),
-        np.asarray(position, float),
-        np.asarray(shapes, float),
-    )
-    _check(time_s, position, shapes)
     dt = float(np.mean(np.diff(time_s)))
     K = _laid(position, dt, sections, nozzle_radius_mm)
     reached = np.asarray(K.sum(axis=1)).ravel() > 0
@@ -240,10 +205,7 @@ def estimate(
         )
     K, A = K[reached], sections.area[reached]
     bead = A > 0
-    fit, deviation, spread, strength, noise, outliers = _robust_fit(
-        K, A, sections.deviation[reached], bead, shapes.T
-    )
-    Q = fit.z + shapes.T @ fit.a
+    Q, deviation, outliers = _robust_fit(K, A, sections.deviation[reached], bead, shapes.T)
     share = (
         2 * width_deviation_mm / np.sqrt(np.median(A[bead]) / area(1.0, contact_angle_deg))
         if bead.any()
@@ -253,38 +215,27 @@ def estimate(
     speed = np.abs(np.gradient(position, dt))
     moving = speed > SLOW * speed.max()
     lit = np.asarray(K.sum(axis=0)).ravel() * sections.length > 0.4 * dt
-    per_travel = np.where(moving, Q / np.where(moving, speed, 1.0), np.nan)
-    pauses = tuple(_pause(a, b, time_s, Q, fit.factor, spread) for a, b in _runs(~moving))
-    return Flow(Q, deviation, moving & lit, per_travel, pauses, fit.a, strength, noise, outliers)
-
-
-class _RobustFit(NamedTuple):
-    """The solution, the deviation (T,) of its flow, the part (T, k) of the latter that the amplitudes
-    spread, the strength of the prior, the noise of A(s), and how many places are outliers."""
-
-    fit: "_Fit"
-    deviation: np.ndarray
-    spread: np.ndarray
-    strength: float
-    noise: float
-    outliers: int
+    return Flow(Q, deviation, moving & lit, outliers)
 
 
 def _robust_fit(
     K: scipy.sparse.csr_matrix, A: np.ndarray, expected: np.ndarray, bead: np.ndarray, shapes: np.ndarray
-) -> _RobustFit:
-    """Least squares with Huber's weights, reweighted ROUNDS times; each time the likeliest strength."""
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """The flow Q (T,), its deviation (T,), and how many places are outliers: least squares with Huber's
+    weights, reweighted ROUNDS times; each time the likeliest strength."""
     steps = K.shape[1]
-    noise = _roughness(A, expected, bead)
     P, robust = _penalty(steps), np.ones(len(A))
-    deviation = np.where(bead, noise * expected, expected)
+    deviation = np.where(bead, _roughness(A, expected, bead) * expected, expected)
     for _ in range(ROUNDS):
         weight = np.sqrt(robust) / deviation
         H = scipy.sparse.diags(weight) @ K
         M, C = _banded((H.T @ H).tocoo(), steps), H.T @ (H @ shapes)
         data = (M, P, C, shapes, H.T @ (weight * A), float(np.sum((weight * A) ** 2)))
         best = scipy.optimize.minimize_scalar(
-            _unlikely, args=(data,), bounds=STRENGTHS, method="bounded", options={"xatol": 0.1}
+            lambda log_strength, data=data: _solve(log_strength, data).unlikely,
+            bounds=STRENGTHS,
+            method="bounded",
+            options={"xatol": 0.1},
         )
         fit = _solve(best.x, data)
         Q = fit.z + shapes @ fit.a
@@ -292,7 +243,7 @@ def _robust_fit(
     U = shapes - scipy.linalg.cho_solve_banded((fit.factor, True), C)
     spread = U @ np.linalg.inv(np.linalg.cholesky(fit.S)).T
     deviation = np.sqrt(_inverse_diagonal(_sum(M, P, np.exp(best.x))) + np.sum(spread**2, axis=1))
-    return _RobustFit(fit, deviation, spread, float(np.exp(best.x)), noise, int(np.sum(robust < 0.5)))
+    return Q, deviation, int(np.sum(robust < 0.5))
 
 
 def _roughness(A: np.ndarray, expected: np.ndarray, bead: np.ndarray) -> float:
@@ -310,31 +261,6 @@ def _roughness(A: np.ndarray, expected: np.ndarray, bead: np.ndarray) -> float:
         return 1.0
     spread = np.sqrt(variance[:-2] + 4 * variance[1:-1] + variance[2:])
     return max(1.4826 * float(np.median(np.abs(np.diff(mean, 2) / spread)[inside])), 1.0)
-
-
-def _check(time_s: np.ndarray, position: np.ndarray, shapes: np.ndarray) -> None:
-    if (
-        len(time_s) < 10
-        or position.shape != time_s.shape
-        or shapes.ndim != 2
-        or shapes.shape[1] != len(time_s)
-    ):
-        raise ValueError(
-            "estimate: expected time and position (T,) and shapes (k, T) with T at least 10, "
-            f"but found {time_s.shape}, {position.shape} and {shapes.shape}; "
-            "resample them on one clock"
-        )
-    gaps = np.diff(time_s)
-    if gaps.min() <= 0 or np.ptp(gaps) > 0.01 * gaps.mean():
-        raise ValueError(
-            f"estimate: expected evenly spaced samples but found steps of {gaps.min():.4g} to "
-            f"{gaps.max():.4g} s; resample the gantry's record"
-        )
-    if not np.isfinite(position).all() or not np.isfinite(shapes).all():
-        raise ValueError(
-            "estimate: expected finite positions and shapes but found gaps; cut the record there, "
-            "or fill the gantry's position first"
-        )
 
 
 def _laid(position: np.ndarray, dt: float, sections: Sections, radius: float) -> scipy.sparse.csr_matrix:
@@ -416,10 +342,6 @@ def _solve(log_strength: float, data: _Data) -> _Fit:
     return _Fit(factor, S, z, a, float(unlikely))
 
 
-def _unlikely(log_strength: float, data: _Data) -> float:
-    return _solve(log_strength, data).unlikely
-
-
 def _inverse_diagonal(band: np.ndarray) -> np.ndarray:
     """Diagonal of the inverse of a symmetric banded matrix: blocks as wide as the band make it block
     tridiagonal; Schur complements down, inverses up (Takahashi 1973)."""
@@ -446,18 +368,3 @@ def _inverse_diagonal(band: np.ndarray) -> np.ndarray:
         G = S + S @ E.T @ G @ E @ S
         out.append(np.diag(G))
     return np.concatenate(out[::-1])[:steps]
-
-
-def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
-    """(first, one past the last) of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-
-
-def _pause(a: int, b: int, time_s, Q, factor, spread) -> Pause:
-    """Volume w'Q of the samples a to b - 1, each dt long, and its standard deviation: both parts of the
-    covariance, of z and of the amplitudes."""
-    w = np.zeros(len(Q))
-    w[a:b] = time_s[1] - time_s[0]
-    variance = w @ scipy.linalg.cho_solve_banded((factor, True), w) + np.sum((w @ spread) ** 2)
-    return Pause(float(time_s[a]), float(time_s[b - 1]), float(w @ Q), float(np.sqrt(variance)))

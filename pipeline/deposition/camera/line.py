@@ -15,7 +15,6 @@ import numpy as np
 import scipy.ndimage
 
 from pipeline.deposition.camera.bead import gray
-from pipeline.deposition.camera.latency import Gantry
 
 # longest side in px at which a line is sought, and the step of its direction in degrees
 COARSE_PX, STEP_DEG = 200, 5.0
@@ -39,6 +38,9 @@ LEVEL_DEG = 4.0
 BETWEEN = 0.15
 # of the gap to another line so much is left beside the bead
 GAP = 0.7
+
+# the gantry as recorded: time_s (T,), and its place (T,) in mm along the line
+Gantry = tuple[np.ndarray, np.ndarray]
 
 
 class ImageLine(NamedTuple):

@@ -9,9 +9,8 @@ import numpy as np
 import scipy.signal
 
 from pipeline.deposition.camera import flow
-from pipeline.deposition.camera.latency import Latency
 from pipeline.deposition.camera.line import Mounting
-from pipeline.deposition.camera.readings import Readings
+from pipeline.deposition.camera.readings import Latency, Readings
 from pipeline.deposition.extruder import Routine
 from pipeline.deposition.learning.ilc import Trial
 
@@ -229,21 +228,15 @@ def flow_errors(measured: Sequence[MeasuredTrial], routine: Routine) -> dict[str
 
 def filmed_rows(measured: Mapping[tuple[str, int], Sequence[MeasuredTrial]]) -> dict[str, list]:
     """Columns of filmed.parquet: one row a measured trial, by (material, number of the routine)."""
-    rows = [
-        {
-            "material": material,
-            "routine": index,
-            "trial": number,
-            "frames": one.frames,
-            "rejected": sum(one.rejected.values()),
-            "reasons": ", ".join(f"{reason} {count}" for reason, count in sorted(one.rejected.items())),
-            "deviation_mm3_per_s": float(np.median(one.flow.deviation)),
-            "observable": float(np.mean(one.flow.observable)),
-            "outliers": one.flow.outliers,
-        }
-        for (material, index), trials in measured.items()
-        for number, one in enumerate(trials)
-    ]
     names = ("material", "routine", "trial", "frames", "rejected", "reasons")
     names += ("deviation_mm3_per_s", "observable", "outliers")
-    return {name: [row[name] for row in rows] for name in names}
+    rows = [
+        (
+            material, index, number, one.frames, sum(one.rejected.values()),
+            ", ".join(f"{reason} {count}" for reason, count in sorted(one.rejected.items())),
+            float(np.median(one.flow.deviation)), float(np.mean(one.flow.observable)), one.flow.outliers,
+        )
+        for (material, index), trials in measured.items()
+        for number, one in enumerate(trials)
+    ]  # fmt: skip
+    return {name: [row[k] for row in rows] for k, name in enumerate(names)}

@@ -17,8 +17,7 @@ from pipeline.deposition import reachable
 from pipeline.deposition.drive import Drive, at_limit, demand, follows, obeyed
 from pipeline.deposition.extruder import Extruder, flow, frequency_response
 from pipeline.deposition.learning.trial_filter import Repeating, repeating
-from pipeline.deposition.learning.trial_model import TrialModel, identify_with_lag, lag_delay_s
-from pipeline.deposition.learning.unmodelled import SMOOTHED_HZ
+from pipeline.deposition.learning.trial_model import SMOOTHED_HZ, TrialModel, identify_with_lag, lag_delay_s
 
 # of the steady gain squared: only keeps the inverse finite where half
 # a sample of delay makes a zero, far above any Q

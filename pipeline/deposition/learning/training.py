@@ -10,8 +10,7 @@ from pipeline.deposition.drive import Drive, obeyed
 from pipeline.deposition.extruder import Extruder, Routine, disturb, draw, flow, frequency_response, to_json
 from pipeline.deposition.learning import ilc
 from pipeline.deposition.learning.ilc import Law, Trial
-from pipeline.deposition.learning.trial_model import deviations
-from pipeline.deposition.learning.unmodelled import unmodelled
+from pipeline.deposition.learning.trial_model import deviations, unmodelled
 
 # the frequencies of the convergence test reach to half the sampling rate
 FREQUENCIES = 2000
@@ -48,11 +47,6 @@ class TrialSequence(NamedTuple):
     trials: list[Trial]
     rows: list[ilc.TrialRow]
     model: ilc.TrialModel | None
-
-
-def on_off(r: np.ndarray, model: Extruder) -> np.ndarray:
-    """u_0 = r / K (T,) in mm: what a machine does that knows only the gain of its nominal model."""
-    return r / model.gain
 
 
 def hoelzle_2009(routine: Routine, nominal: Extruder, settings: LawSettings) -> Law:
@@ -102,7 +96,7 @@ def run_trials(
     on_step: Callable[[Trial], None],
 ) -> TrialSequence:
     """`trials` updates from on-off control, with roll-back (`ilc.learn`)."""
-    u0 = on_off(routine.r, nominal)
+    u0 = routine.r / nominal.gain
     done = ilc.learn(law, measure, u0, routine.r, trials=trials, rise=settings.rise, on_step=on_step)
     rows = ilc.table(
         done,
@@ -200,10 +194,12 @@ def convergence_of_model_inverse(
 
     That is the largest |Q (1 - L P (1 + Delta'))| of all |Delta'(f)| <= |Delta(f)|, and Delta is what the
     model leaves of the trials that identified it and of the next one, which it has not seen
-    (`unmodelled.unmodelled`).
+    (`trial_model.unmodelled`).
     """
     e, law, Ts = sequence.model.extruder, settings.model_inverse, settings.sample_time_s
-    first = _first_trials(sequence, law.identify_trials + 1, settings)
+    # of the first trials of the machine as it is now the model was identified
+    keep = ilc.state_of(sequence.trials, sequence.routine.r, rise=settings.rise).keep
+    first = [sequence.trials[j] for j in keep[: law.identify_trials + 1]]
     u, y = [t.u for t in first], [t.y for t in first]
     n = law.identify_trials
     spread = deviations(
@@ -224,12 +220,6 @@ def convergence_of_model_inverse(
     return float(gammas[0]), gammas[1:]
 
 
-def _first_trials(sequence: TrialSequence, count: int, settings: LawSettings) -> list[Trial]:
-    """The first trials of the machine as it is now: of them the model was identified."""
-    state = ilc.state_of(sequence.trials, sequence.routine.r, rise=settings.rise)
-    return [sequence.trials[j] for j in state.keep[:count]]
-
-
 def actuator_headroom(
     routine: Routine, nominal: Extruder, *, worst_ratio: float, settings: LawSettings
 ) -> ilc.ActuatorHeadroom:
@@ -238,7 +228,7 @@ def actuator_headroom(
     control; the sentence names the ramp that would do."""
     headroom = ilc.actuator_headroom(
         routine.r,
-        on_off(routine.r, nominal),
+        routine.r / nominal.gain,
         nominal,
         order=settings.model_inverse.order,
         cutoff_hz=settings.model_inverse.cutoff_hz,
@@ -317,7 +307,7 @@ def resume(
     """What was learned in the trials so far, the next command u (T,) in mm, and its figures: trial 0 is
     on-off control. Raises ValueError if they show another gain than the nominal one by more than
     WRONG_GAIN."""
-    u0 = on_off(routine.r, nominal)
+    u0 = routine.r / nominal.gain
     if not trials:
         first = obeyed(u0, settings.drive, sample_time_s=settings.sample_time_s)
         return None, first, {"best_trial": 0, "rolled_back": False, "restarts": []}
@@ -368,55 +358,31 @@ def join(parts: Iterable[tuple[dict, dict, dict, dict]]) -> tuple[dict, dict, di
 
 def trial_rows(sequences: dict[tuple[str, int], list[TrialSequence]]) -> dict[str, np.ndarray]:
     """One row a trial of every sequence, by (material, number of the routine)."""
-    columns: dict[str, list] = {
-        name: []
-        for name in ("material", "law", "routine", "speed_mm_per_s", "pause_s", *ilc.TrialRow._fields)
-    }
-    for (material, index), of_routine in sequences.items():
-        for sequence in of_routine:
-            routine, law = sequence.routine, sequence.law
-            speed = float(routine.speed.max())
-            pause = round(routine.pause_s[1] - routine.pause_s[0], 9)
-            for row in sequence.rows:
-                for name, value in zip(columns, (material, law, index, speed, pause, *row), strict=True):
-                    columns[name].append(value)
+    names = ("material", "law", "routine", "speed_mm_per_s", "pause_s", *ilc.TrialRow._fields)
+    rows = [
+        (material, one.law, index, one.routine.plan["speed_mm_per_s"], one.routine.plan["pause_s"], *row)
+        for (material, index), of_routine in sequences.items()
+        for one in of_routine
+        for row in one.rows
+    ]
     return {
-        name: np.array(values, object if name in ("material", "law") else None)
-        for name, values in columns.items()
+        name: np.array([row[k] for row in rows], object if k < 2 else None) for k, name in enumerate(names)
     }
 
 
 def sample_rows(sequences: dict[tuple[str, int], list[TrialSequence]]) -> dict[str, np.ndarray]:
     """Every sample of every trial of every sequence: what a library is cut from."""
-    parts: dict[str, list[np.ndarray]] = {
-        name: []
-        for name in (
-            "material",
-            "law",
-            "routine",
-            "trial",
-            "time_s",
-            "wanted_mm3_per_s",
-            "command_mm",
-            "measured_mm3_per_s",
-            "true_mm3_per_s",
+    names = ("material", "law", "routine", "trial", "time_s", "wanted_mm3_per_s")
+    names += ("command_mm", "measured_mm3_per_s", "true_mm3_per_s")
+    parts = [
+        (
+            np.full(len(u), material, object), np.full(len(u), one.law, object), np.full(len(u), index),
+            np.full(len(u), j), one.routine.time_s, one.routine.r, u, y,
+            np.full(len(u), np.nan) if truth is None else truth,
         )
-    }
-    for (material, index), of_routine in sequences.items():
-        for sequence in of_routine:
-            for j, (u, y, truth) in enumerate(sequence.trials):
-                n, r = len(u), sequence.routine
-                names = [np.full(n, text, object) for text in (material, sequence.law)]
-                values = (
-                    *names,
-                    np.full(n, index),
-                    np.full(n, j),
-                    r.time_s,
-                    r.r,
-                    u,
-                    y,
-                    np.full(n, np.nan) if truth is None else truth,
-                )
-                for name, value in zip(parts, values, strict=True):
-                    parts[name].append(value)
-    return {name: np.concatenate(values) if values else np.array([]) for name, values in parts.items()}
+        for (material, index), of_routine in sequences.items()
+        for one in of_routine
+        for j, (u, y, truth) in enumerate(one.trials)
+    ]  # fmt: skip
+    columns = zip(*parts, strict=True) if parts else [[np.array([])]] * len(names)
+    return {name: np.concatenate(values) for name, values in zip(names, columns, strict=True)}

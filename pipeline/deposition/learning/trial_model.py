@@ -1,10 +1,12 @@
 """What one measured trial tells of the extruder: gain, time constant, total delay and yield by least squares,
-each with its uncertainty; a second-order lag beside the delay; up and down apart."""
+each with its uncertainty; a second-order lag beside the delay; up and down apart; and what the model does not
+know of the machine, as a multiplicative uncertainty of its frequency response."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.ndimage
 import scipy.optimize
 
 from pipeline.deposition.extruder import DAMPING, Extruder, flow, pressed
@@ -20,6 +22,13 @@ USUAL_LAG_HZ, LAG_SPREAD, LAG_HZ = 3.0, 0.4, (0.3, 20.0)
 # an extruder of another kind still reaches 60 %; noise alone gives 0
 LEAST_FIT_PERCENT = 20.0
 
+# spectra are smoothed over this width: a trial of starts and stops has zeros at single frequencies
+SMOOTHED_HZ = 0.5
+# the highest frequencies, this share of them, hold white noise alone
+NOISE_SHARE = 0.5
+# a frequency is excited where the simulated flow has this many times the power of the noise
+EXCITED = 4.0
+
 
 class TrialModel(NamedTuple):
     """y = max(K / (tau s + 1) e^(-delay s) u - yield, 0), the delay holding all that is late (transport and
@@ -34,24 +43,14 @@ class TrialModel(NamedTuple):
     fit_percent: float
 
 
-def identify(
-    u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float, yield_: float | None = None
-) -> TrialModel:
-    """The model that simulates the trials best from rest:
+def identify(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float) -> TrialModel:
+    """The model that simulates the trials best from rest, however well it fits:
 
         min over (K, tau, delay, yield) of sum (max(x - yield, 0) - y)^2
 
     u (T,) in mm and measured flow y (T,) in mm^3/s of each trial; NaN in y is a sample that was not
-    observable. `yield_` in mm^3/s where it is known and not sought. Raises ValueError where a command holds
-    NaN or never moves, or the flow never leaves its noise.
+    observable. Raises ValueError where the command never moves, or hardly any flow was observable.
     """
-    return _fitting(_first_order(u, y, sample_time_s=sample_time_s, yield_=yield_))
-
-
-def _first_order(
-    u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float, yield_: float | None
-) -> TrialModel:
-    """The model of `identify`, however well it fits."""
     u, y = [np.asarray(a, float) for a in u], [np.asarray(b, float) for b in y]
     _check(u, y)
     observable = [np.isfinite(b) for b in y]
@@ -72,20 +71,14 @@ def _first_order(
     span = float(np.quantile(measured, 0.95))
 
     def four(theta):
-        return (
-            float(np.exp(theta[0])),
-            float(np.exp(theta[1])),
-            float(theta[2]),
-            float(theta[3] * span) if yield_ is None else yield_,
-        )
+        return float(np.exp(theta[0])), float(np.exp(theta[1])), float(theta[2]), float(theta[3] * span)
 
-    n = 4 if yield_ is None else 3
-    low = [np.log(gain) - 3, np.log(tau) - 3, 0.0, 0.0][:n]
-    high = [np.log(gain) + 3, np.log(tau) + 3, LONGEST_DELAY_S, 1.0][:n]
-    start = [np.log(gain), np.log(tau), max(delay, sample_time_s), 0.02][:n]
+    low = [np.log(gain) - 3, np.log(tau) - 3, 0.0, 0.0]
+    high = [np.log(gain) + 3, np.log(tau) + 3, LONGEST_DELAY_S, 1.0]
+    start = [np.log(gain), np.log(tau), max(delay, sample_time_s), 0.02]
     fit = scipy.optimize.least_squares(
         lambda theta: predicted(*four(theta)) - measured, start, bounds=(low, high),
-        x_scale=[0.1, 0.1, 0.02, 0.02][:n], diff_step=1e-4, xtol=1e-7, ftol=1e-9
+        x_scale=[0.1, 0.1, 0.02, 0.02], diff_step=1e-4, xtol=1e-7, ftol=1e-9
     )  # fmt: skip
     K, tau, delay, fitted_yield = four(fit.x)
     extruder = Extruder(K, tau, delay, yield_=fitted_yield)
@@ -99,15 +92,6 @@ def _model(extruder: Extruder, left: np.ndarray, measured: np.ndarray) -> TrialM
     return TrialModel(extruder, float(np.sqrt(np.mean(left**2))), fit_percent)
 
 
-def _fitting(model: TrialModel) -> TrialModel:
-    if model.fit_percent < LEAST_FIT_PERCENT:
-        raise ValueError(
-            "identify: expected a flow that follows the command but the best model fits "
-            f"{model.fit_percent:.0f} %; check that command and frames are of the same trial and clock"
-        )
-    return model
-
-
 def identify_with_lag(
     u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float
 ) -> TrialModel:
@@ -117,7 +101,7 @@ def identify_with_lag(
     LAG_SPREAD)^2: a prior, for a first trial leaves a valley between delay and lag. Without a lag the inverse
     is wrong by half a turn on a machine of third order.
     """
-    first = _first_order(u, y, sample_time_s=sample_time_s, yield_=None)
+    first = identify(u, y, sample_time_s=sample_time_s)
     u, y = [np.asarray(a, float) for a in u], [np.asarray(b, float) for b in y]
     observable = [np.isfinite(b) for b in y]
     measured = np.concatenate([b[mask] for b, mask in zip(y, observable, strict=True)])
@@ -143,7 +127,13 @@ def identify_with_lag(
         errors, start, bounds=(low, high), x_scale=[0.1, 0.1, 0.02, 0.1, 0.02],
         diff_step=1e-4, xtol=1e-7, ftol=1e-9
     )  # fmt: skip
-    return _fitting(_model(extruder(fit.x), fit.fun[:-1], measured))
+    model = _model(extruder(fit.x), fit.fun[:-1], measured)
+    if model.fit_percent < LEAST_FIT_PERCENT:
+        raise ValueError(
+            "identify: expected a flow that follows the command but the best model fits "
+            f"{model.fit_percent:.0f} %; check that command and frames are of the same trial and clock"
+        )
+    return model
 
 
 def lag_delay_s(lag_hz: float) -> float:
@@ -218,23 +208,49 @@ def deviations(
 
 
 def _check(u: list[np.ndarray], y: list[np.ndarray]) -> None:
-    if not u or len(u) != len(y) or any(a.shape != b.shape or a.ndim != 1 for a, b in zip(u, y, strict=True)):
-        raise ValueError(
-            "identify: expected one command and one flow of equal length a trial but found shapes "
-            f"{[a.shape for a in u]} and {[b.shape for b in y]}"
-        )
-    for j, (a, b) in enumerate(zip(u, y, strict=True)):
-        if not np.isfinite(a).all():
-            raise ValueError(
-                f"identify: expected a command without gaps but trial {j} holds NaN; record the trial again"
-            )
-        if np.isfinite(b).sum() < 50:
+    for j, flow_ in enumerate(y):
+        if np.isfinite(flow_).sum() < 50:
             raise ValueError(
                 f"identify: expected at least 50 observable samples of flow but trial {j} has "
-                f"{np.isfinite(b).sum()}; check the frames of that trial"
+                f"{np.isfinite(flow_).sum()}; check the frames of that trial"
             )
     if all(np.ptp(a) == 0 for a in u):
         raise ValueError(
             "identify: the command never moves, so neither gain nor delay is identified; "
             "record a trial with a start and a stop"
         )
+
+
+def unmodelled(
+    model: TrialModel,
+    u: Sequence[np.ndarray],
+    y: Sequence[np.ndarray],
+    frequency_hz: np.ndarray,
+    *,
+    sample_time_s: float,
+) -> np.ndarray:
+    """|Delta(f)| (F,) of P = P_model (1 + Delta), from the trials that identified the model; 0 at frequencies
+    that they do not excite.
+
+        |Delta|^2 = (S_residual - S_noise) / S_flow
+
+    The residual y - y_model is that of the whole model with its dead band, each spectrum summed over the
+    trials and smoothed over SMOOTHED_HZ; S_noise is the level of the residual at the highest frequencies.
+    What does not repeat and is slow counts as Delta: one trial does not tell it from the machine. u (T,) in
+    mm and y (T,) in mm^3/s of each trial, NaN where not observable; frequency_hz (F,)."""
+    n = max(len(a) for a in u)
+    f = np.fft.rfftfreq(n, sample_time_s)
+    residual, simulated = np.zeros(len(f)), np.zeros(len(f))
+    for a, b in zip(u, y, strict=True):
+        x = flow(model.extruder, np.asarray(a, float), sample_time_s=sample_time_s)
+        left = np.where(np.isfinite(b), b - x, 0.0)
+        residual += np.abs(np.fft.rfft(left, n)) ** 2
+        simulated += np.abs(np.fft.rfft(x, n)) ** 2
+    noise = float(np.mean(residual[f >= (1 - NOISE_SHARE) * f[-1]]))
+    width = max(round(SMOOTHED_HZ / f[1]), 1)
+    residual, simulated = (
+        scipy.ndimage.uniform_filter1d(power, width, mode="nearest") for power in (residual, simulated)
+    )
+    power = np.maximum(residual - noise, 0.0) / np.maximum(simulated, np.finfo(float).tiny)
+    delta = np.where(simulated >= EXCITED * noise, np.sqrt(power), 0.0)
+    return np.interp(frequency_hz, f, delta)

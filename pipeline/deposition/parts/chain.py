@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 
-from pipeline.deposition.extruder import DAMPING, Extruder, lagged
+from pipeline.deposition.extruder import DAMPING, Extruder, backlash, lagged
 from pipeline.deposition.parts.library import TooFewTrials, Training
 
 
@@ -109,37 +109,6 @@ def records(trainings: Sequence[Training], *, early: int = 3) -> Records:
     longest = max(len(row[0]) for row in rows)
     padded = [np.stack([np.pad(row[k], (0, longest - len(row[k]))) for row in rows]) for k in range(3)]
     return Records(*padded, np.array([row[3] for row in rows]))
-
-
-def backlash(x: np.ndarray, play: np.ndarray) -> np.ndarray:
-    """Play of full width `play` (...,) along the last axis of x (..., T), from y(-1) = 0:
-
-        y(t) = min(max(y(t-1), x(t) - play/2), x(t) + play/2)
-
-    Each step clips y to [x - play/2, x + play/2], and clips compose to clips: blocks of
-    the time axis are walked side by side, then joined.
-    """
-    rows, length = math.prod(x.shape[:-1]), x.shape[-1]
-    block = max(1, math.isqrt(length // 4) if rows < 64 else length)
-    blocks = -(-length // block)
-    padded = np.pad(x.reshape(rows, length), ((0, 0), (0, blocks * block - length)), mode="edge")
-    half = np.repeat(np.broadcast_to(play, x.shape[:-1]).ravel() / 2, blocks)
-    steps = np.ascontiguousarray(padded.reshape(rows * blocks, block).T)
-    del padded
-    low, high = np.full(rows * blocks, -np.inf), np.full(rows * blocks, np.inf)
-    if blocks > 1:
-        for step in steps:
-            a, b = step - half, step + half  # np.clip takes twice as long
-            low, high = np.minimum(np.maximum(low, a), b), np.minimum(np.maximum(high, a), b)
-    start, y = np.zeros((rows, blocks)), np.zeros(rows)
-    for k, (a, b) in enumerate(zip(low.reshape(rows, blocks).T, high.reshape(rows, blocks).T, strict=True)):
-        start[:, k] = y
-        y = np.minimum(np.maximum(y, a), b)
-    y, out = start.ravel(), np.empty_like(steps)
-    for step, row in zip(steps, out, strict=True):
-        y = np.minimum(np.maximum(y, step - half), step + half, out=row)
-    del steps, step
-    return out.T.reshape(rows, blocks * block)[:, :length].reshape(x.shape)
 
 
 def first_order(x: np.ndarray, time_constant_s: float, sample_time_s: float) -> np.ndarray:

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.deposition import controllers
 from pipeline.deposition.drive import CommandKind, Drive, at_limit, follows, obeyed
 from pipeline.deposition.parts import basis, forecast, pressure_advance
 from pipeline.deposition.parts.chain import Chain, averaged, identify, simulate
@@ -33,8 +32,6 @@ from pipeline.deposition.toolpath.gcode import Kind, Moves, PartProgram
 from pipeline.deposition.toolpath.motion import Motion, rate, sampled
 from pipeline.deposition.toolpath.tasks import PrintedLines, Tasks, halting, printed_lines, refuse, sequence
 
-# composers that know nothing of the part beforehand
-COMPOSERS = tuple(row.name for row in controllers.COMPOSERS if row.command)
 # rest before the first line and after the last: longer than any lead
 MARGIN_S = 2.0
 # a long job is judged by its first minutes of each material
@@ -96,13 +93,13 @@ class ComposerForecast(NamedTuple):
 
 class Stream(NamedTuple):
     """One tool's share of a part, all (T,): wanted flow r (mm^3/s), the same before its steps were shaped,
-    command u (mm), predicted flow y and that of on-off control; the composer that u is from, whether its
-    forecast may be believed, and the share of
-    the time that u is at a limit of the drive."""
+    command u (mm), predicted flow y and that of on-off control; the composer that u is from, what it knows of
+    the material, the share of the time that u is at a limit of the drive, and whether its forecast may be
+    believed."""
 
     tool: int
     material: str
-    nozzle_mm: float
+    learned: LearnedMaterial
     composer: str
     r: np.ndarray
     unshaped: np.ndarray
@@ -276,35 +273,18 @@ def by_basis_functions(library: Library, share: ToolShare, drive: Drive) -> np.n
     return basis.compose(extruder, share.r, sample_time_s=library.sample_time_s, drive=drive)
 
 
-def by_advance(library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
-    """u (T,) in mm of pressure advance for one tool's share of a part, as the drive follows it."""
-    return _by_advance("pressure_advance", library, share, drive)
-
-
-def by_advance_with_lead(library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
-    """The same, sent ahead by the lead."""
-    return _by_advance("pressure_advance_lead", library, share, drive)
-
-
-def _by_advance(name: str, library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
+def by_advance(name: str, library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
+    """u (T,) in mm of pressure advance, by the numbers tuned for the composer `name`, as the drive follows
+    it."""
     numbers = share.material.advances[name].tuned
     u = pressure_advance.command(numbers, share.r, sample_time_s=library.sample_time_s)
     return obeyed(u, drive, sample_time_s=library.sample_time_s)
 
 
-def by_priority(library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
-    """u (T,) in mm of the library by the priority rule, as the drive can follow it."""
-    return _by_library(priority, library, share, drive)
-
-
-def by_superposition(library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
-    """u (T,) in mm of the library by superposition, as the drive can follow it."""
-    return _by_library(superposition, library, share, drive)
-
-
-def _by_library(
+def by_library(
     rule: Callable[..., np.ndarray], library: Library, share: ToolShare, drive: Drive
 ) -> np.ndarray:
+    """u (T,) in mm of the library by a rule, as the drive can follow it."""
     material, Ts = share.material, library.sample_time_s
     u = rule(
         library, material.material, material.nozzle_mm, share.tasks, share.lines, share.tool,
@@ -322,17 +302,23 @@ def _sent_ahead(share: ToolShare, Ts: float) -> np.ndarray:
     return np.interp(t + extruder.delay_s + basis.mean_lag_s(extruder), t, share.r, right=0.0)
 
 
+# composers that know nothing of the part beforehand, in the order of every page:
+# library, share of a part, drive -> command (T,) in mm
+COMPOSERS: dict[str, Callable[[Library, ToolShare, Drive], np.ndarray]] = {
+    "pressure_advance": functools.partial(by_advance, "pressure_advance"),
+    "pressure_advance_lead": functools.partial(by_advance, "pressure_advance_lead"),
+    "priority": functools.partial(by_library, priority),
+    "superposition": functools.partial(by_library, superposition),
+    "basis": by_basis_functions,
+}
+
+
 def commands(
     learned: LearnedLibrary, composed: Composed, stream: Stream, *, drive: Drive
 ) -> dict[str, np.ndarray]:
     """The command (T,) of every composer for one stream of a part, to set beside the chosen one."""
-    material = next(
-        one
-        for one in learned.materials
-        if (one.material, one.nozzle_mm) == (stream.material, stream.nozzle_mm)
-    )
-    share = ToolShare(stream.tool, material, stream.r, composed.tasks, composed.lines)
-    return {name: controllers.command(name)(learned.library, share, drive) for name in COMPOSERS}
+    share = ToolShare(stream.tool, stream.learned, stream.r, composed.tasks, composed.lines)
+    return {name: compose(learned.library, share, drive) for name, compose in COMPOSERS.items()}
 
 
 def _judge(library: Library, share: ToolShare, drive: Drive) -> dict[str, tuple[float, float, float]]:
@@ -347,9 +333,9 @@ def _judge(library: Library, share: ToolShare, drive: Drive) -> dict[str, tuple[
     on_off = flows(_on_off(excerpt, drive, Ts))
     return {
         name: forecast.error_percent(
-            flows(controllers.command(name)(library, excerpt, drive)), on_off, excerpt.r, material.missed
+            flows(compose(library, excerpt, drive)), on_off, excerpt.r, material.missed
         )
-        for name in COMPOSERS
+        for name, compose in COMPOSERS.items()
     }
 
 
@@ -466,7 +452,7 @@ def _stream(
     """The share by one composer: its command, and the flows that the chain predicts for it and for on-off. If
     volume is conserved, what is pushed is the share's volume over what came out of the learned trials."""
     material, drive, Ts = share.material, settings.drive, library.sample_time_s
-    u = controllers.command(composer)(library, share, drive)
+    u = COMPOSERS[composer](library, share, drive)
     if settings.command != "pressure":
         u = obeyed(u * (share.r.sum() / (material.volume_per_mm * u.sum())), drive, sample_time_s=Ts)
     y, on_off = (
@@ -476,7 +462,7 @@ def _stream(
     return Stream(
         share.tool,
         material.material,
-        material.nozzle_mm,
+        material,
         composer,
         share.r,
         unshaped,

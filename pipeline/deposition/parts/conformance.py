@@ -2,7 +2,6 @@
 drive's limit costs, and what was refused, by line number."""
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,21 +13,12 @@ from pipeline.deposition.extruder import Extruder
 from pipeline.deposition.parts import basis, forecast
 from pipeline.deposition.parts.chain import IdentifiedExtruder
 from pipeline.deposition.parts.chain import forecast as predicted_flow
-from pipeline.deposition.parts.composition import (
-    EXCERPT_S,
-    MARGIN_S,
-    Composed,
-    LearnedLibrary,
-    LearnedMaterial,
-    Stream,
-)
+from pipeline.deposition.parts.composition import EXCERPT_S, MARGIN_S, Composed, LearnedLibrary
 from pipeline.deposition.parts.library import STOP, Library
 from pipeline.deposition.toolpath.gcode_words import LineRefusal
 
 # flow this long before a line begins and after it ends is its own, unless a neighbour is nearer
 REACH_S = 1.0
-# ramps longer than this are no ramps of a printed line
-LONGEST_RAMP_S = 10.0
 
 
 class LineVolumes(NamedTuple):
@@ -72,15 +62,15 @@ class Saturation(NamedTuple):
 
 class Conformance(NamedTuple):
     """The report on a part: its lines, the worst error in % among the `judged` lines of at least shortest_s,
-    for each tool the saturation with the ramp as it is and the ramp of the gantry in s with which the drive
-    would follow a line (inf where none does), and what was refused."""
+    for each tool the saturation with the ramp as it is, and what was refused; if the drive does not follow,
+    the ramp of the gantry in s with which it would (inf where none does)."""
 
     lines: LineVolumes
     worst_line_volume_percent: float
     judged: int
     saturation: dict[int, Saturation]
-    ramp_that_would_do_s: dict[int, float]
     refused: list[LineRefusal]
+    ramp_that_would_do_s: float | None = None
 
 
 def conform(
@@ -92,26 +82,25 @@ def conform(
     drive: Drive,
     shortest_s: float,
     largest_error_percent: float,
-    refusals: Sequence[LineRefusal] = (),
+    least_mm3: float = 0.0,
 ) -> Conformance:
-    """Whether the part will print: line volumes, saturation, refusals of the program's reader, and tasks
-    whose signal the library only guesses (predicted error above largest_error_percent, or
-    unknown), where the library's signals are used."""
+    """Whether the part will print: line volumes, saturation, and tasks whose signal the library only guesses
+    (predicted error above largest_error_percent, or unknown), where the library's signals are used. Lines of
+    less than least_mm3 get no percent: for a dot it means nothing."""
     lines = line_volumes(composed, learned.library, bead_area_mm2=bead_area_mm2)
-    lines = _intervals(lines, composed, learned)
-    judged = lines.duration_s >= shortest_s - 1e-9
+    error = np.where(lines.planned_mm3 >= least_mm3, lines.error_percent, np.nan)
+    lines = _intervals(lines, composed)._replace(error_percent=error)
+    judged = (lines.duration_s >= shortest_s - 1e-9) & np.isfinite(error)
     Ts = composed.sample_time_s
-    saturations, ramps = {}, {}
+    saturations = {}
     for stream in composed.streams:
-        material = _material(learned, stream)
         first = int(np.argmax(stream.unshaped > 0))
         some = stream.unshaped[max(0, first - round(MARGIN_S / Ts)) : first + round(EXCERPT_S / Ts)]
-        settings = {"ramp_s": ramp_s, "drive": drive, "sample_time_s": Ts}
         saturations[stream.tool] = saturation(
-            material.chain.extruder, some, on_off_gain=material.on_off_gain, **settings
-        )
-        ramps[stream.tool] = ramp_that_would_do(material.chain.extruder, some, **settings)
-    refused = [*refusals]
+            stream.learned.chain.extruder, some, on_off_gain=stream.learned.on_off_gain, ramp_s=ramp_s,
+            drive=drive, sample_time_s=Ts,
+        )  # fmt: skip
+    refused = []
     by_library = np.isin(
         composed.tasks.tool,
         [stream.tool for stream in composed.streams if CONTROLLERS[stream.composer].kind == "data-driven"],
@@ -126,16 +115,16 @@ def conform(
                 f"{composed.error_percent[k]:.0f} %",
             )
         )
-    worst = float(np.abs(lines.error_percent[judged]).max()) if judged.any() else math.nan
-    return Conformance(lines, worst, int(judged.sum()), saturations, ramps, sorted(refused))
+    worst = float(np.abs(error[judged]).max()) if judged.any() else math.nan
+    return Conformance(lines, worst, int(judged.sum()), saturations, sorted(refused))
 
 
-def _intervals(lines: LineVolumes, composed: Composed, learned: LearnedLibrary) -> LineVolumes:
+def _intervals(lines: LineVolumes, composed: Composed) -> LineVolumes:
     """The lines with the 90 % interval of each one's volume, of what the streams' forecasts may come to."""
     low, high = lines.low_percent.copy(), lines.high_percent.copy()
     for stream in composed.streams:
-        material = _material(learned, stream)
-        mine, start, stop = _reaches(composed, stream.tool)
+        material = stream.learned
+        mine, start, stop = reaches(composed, stream.tool)
         planned = lines.planned_mm3[mine]
         made = forecast.each_flow(
             material.chain, material.missed, stream.u, stream.r, sample_time_s=composed.sample_time_s
@@ -149,16 +138,7 @@ def _intervals(lines: LineVolumes, composed: Composed, learned: LearnedLibrary) 
     return lines._replace(low_percent=low, high_percent=high)
 
 
-def _material(learned: LearnedLibrary, stream: Stream) -> LearnedMaterial:
-    """What was learned of the stream's material with its nozzle."""
-    return next(
-        material
-        for material in learned.materials
-        if (material.material, material.nozzle_mm) == (stream.material, stream.nozzle_mm)
-    )
-
-
-def _reaches(composed: Composed, tool: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def reaches(composed: Composed, tool: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The lines of a tool, and from when to when in s the flow is theirs: to the middles of the gaps to
     their neighbours, at most REACH_S from their ends."""
     mine = np.flatnonzero(composed.lines.tool == tool)
@@ -177,7 +157,7 @@ def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) 
     run_s = np.bincount(lines.run, weights=np.where(lines.last, lines.end_s, 0.0)) - begin
     predicted, on_off = np.zeros(len(lines.line)), np.zeros(len(lines.line))
     for stream in composed.streams:
-        mine, start, stop = _reaches(composed, stream.tool)
+        mine, start, stop = reaches(composed, stream.tool)
         predicted[mine] = volume_between(stream.y, start, stop, sample_time_s=Ts)
         on_off[mine] = volume_between(stream.on_off, start, stop, sample_time_s=Ts)
     planned = bead_area_mm2 * lines.length
@@ -230,7 +210,17 @@ def saturation(
         float(np.linalg.norm(predicted_flow(extruder, command, sample_time_s=sample_time_s) - r))
         for command in (first, u, free)
     )
-    least = float(np.linalg.norm(reachable.flow(_plain(extruder), r, drive, sample_time_s) - r))
+    least = float(
+        np.linalg.norm(
+            reachable.flow(
+                Extruder(extruder.gain, extruder.time_constant_s, yield_=extruder.yield_),
+                r,
+                drive,
+                sample_time_s,
+            )
+            - r
+        )
+    )
     share = np.mean(at_limit(u, drive, sample_time_s=sample_time_s)[r > 0])
     on_off = max(on_off, 1e-300)
     return Saturation(
@@ -245,29 +235,3 @@ def saturation(
         100 * least / on_off,
         limited - unlimited <= reachable.LOSS * on_off,
     )
-
-
-def ramp_that_would_do(
-    extruder: Extruder | IdentifiedExtruder,
-    unshaped: np.ndarray,
-    *,
-    ramp_s: float,
-    drive: Drive,
-    sample_time_s: float,
-) -> float:
-    """The shortest time in s in which the gantry comes to the highest speed of the wanted flow (T,), its
-    steps shaped by two boxes of ramp_s, such that the drive follows a line
-    (`reachable.ramp_that_loses_little`); inf where none up to LONGEST_RAMP_S does."""
-    return reachable.ramp_that_loses_little(
-        _plain(extruder),
-        drive,
-        steady_flow=float(unshaped.max()),
-        ramp_s=ramp_s,
-        longest_s=LONGEST_RAMP_S,
-        sample_time_s=sample_time_s,
-    )
-
-
-def _plain(extruder: Extruder | IdentifiedExtruder) -> Extruder:
-    """Its gain, time constant and yield: what a drive's limits stand against."""
-    return Extruder(extruder.gain, extruder.time_constant_s, yield_=extruder.yield_)

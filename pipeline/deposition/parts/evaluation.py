@@ -1,7 +1,6 @@
 """Every composer on one part, beside on-off control and full-part ILC; judged by the true flow of the
 machine, on a real one by the forecast."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ from pipeline.deposition.learning import ilc, training
 from pipeline.deposition.learning.training import LawSettings, Noise
 from pipeline.deposition.parts.chain import forecast
 from pipeline.deposition.parts.composition import Composed, LearnedLibrary, Stream, commands
-from pipeline.deposition.parts.conformance import LineVolumes, line_volumes
+from pipeline.deposition.parts.conformance import LineVolumes, reaches, volume_between
 
 ON_OFF, FULL_PART_ILC = "on_off", "ilc"
 
@@ -46,17 +45,23 @@ class Judging(NamedTuple):
 
 
 def evaluate(
-    learned: LearnedLibrary, composed: Composed, judging: Judging, rng: np.random.Generator
+    learned: LearnedLibrary,
+    composed: Composed,
+    lines: LineVolumes,
+    judging: Judging,
+    rng: np.random.Generator,
 ) -> list[ComposerScore]:
     """Scores of all composers on all streams.
 
     On a real machine nobody knows the true flow: a composer scores the upper end of its forecast, its flow is
-    the chain's, and full-part ILC is left out.
+    the chain's, and full-part ILC is left out. The worst line of the chosen composer is the farther end of
+    its interval in `lines`, for the flow of the chain that made the command is no measure of it.
     """
     scores, Ts, drive = [], judging.laws.sample_time_s, judging.laws.drive
+    ends = np.maximum(np.abs(lines.low_percent), np.abs(lines.high_percent))
     for i, stream in enumerate(composed.streams):
         nominal, plant = judging.nominals[stream.material], judging.plants.get(stream.material)
-        chain = next(one.chain.extruder for one in learned.materials if one.material == stream.material)
+        long_enough = (lines.tool == stream.tool) & (lines.duration_s >= judging.shortest_s - 1e-9)
         by_composer = {ON_OFF: obeyed(stream.r / nominal.gain, drive, sample_time_s=Ts)} | commands(
             learned, composed, stream, drive=drive
         )
@@ -68,44 +73,17 @@ def evaluate(
             y = (
                 flow(plant, u, sample_time_s=Ts, drive=drive)
                 if plant
-                else forecast(chain, u, sample_time_s=Ts)
+                else forecast(stream.learned.chain.extruder, u, sample_time_s=Ts)
             )
             error = float(np.linalg.norm(y - stream.r))
             yardstick = error if name == ON_OFF else yardstick
-            worst = _worst_line(learned, composed, i, y, judging)
+            off = ends if name == stream.composer and not plant else _off(composed, stream.tool, y, judging)
+            worst = float(off[long_enough].max()) if long_enough.any() else np.nan
             told = predicted.get(name)
             percent = told.high if told and not plant else 100 * error / max(yardstick, 1e-12)
             middle = told.median if told else np.nan
             scores.append(ComposerScore(i, name, name == stream.composer, percent, middle, worst, y))
     return scores
-
-
-def judge(
-    learned: LearnedLibrary,
-    composed: Composed,
-    lines: LineVolumes,
-    judging: Judging,
-    rng: np.random.Generator,
-) -> list[ComposerScore]:
-    """Scores of all composers; on a machine whose true flow nobody knows the worst line of the chosen
-    composer is the farther end of its interval, for the flow of the chain that made the command is no measure
-    of it."""
-    scores = evaluate(learned, composed, judging, rng)
-    return upper_ends(composed, lines, scores, judging)
-
-
-def upper_ends(
-    composed: Composed, lines: LineVolumes, scores: Sequence[ComposerScore], judging: Judging
-) -> list[ComposerScore]:
-    """The scores, with the farther ends of the lines' intervals where the true flow is unknown."""
-    streams, long_enough = composed.streams, lines.duration_s >= judging.shortest_s - 1e-9
-    ends, out = np.maximum(np.abs(lines.low_percent), np.abs(lines.high_percent)), []
-    for score in scores:
-        own = long_enough & (lines.tool == streams[score.stream].tool)
-        real = score.chosen and streams[score.stream].material not in judging.plants
-        worst = float(ends[own].max()) if real and own.any() else score.worst_line_volume_percent
-        out.append(score._replace(worst_line_volume_percent=worst))
-    return out
 
 
 def _full_part_ilc(
@@ -117,20 +95,16 @@ def _full_part_ilc(
     part = Routine(t, stream.r, np.zeros(len(t)), np.zeros(len(t)), stream.r > 0, 0.0, (0.0, 0.0), 0.0)
     measure = training.simulated(plant, rng, judging.noise, steady_flow=float(stream.r.max()), settings=laws)
     law = training.model_inverse(part, laws)
-    u0 = training.on_off(stream.r, nominal)
+    u0 = stream.r / nominal.gain
     trials = ilc.learn(law, measure, u0, stream.r, trials=judging.updates, rise=laws.rise)
     return ilc.next_step(trials, stream.r, law, rise=laws.rise).u
 
 
-def _worst_line(
-    learned: LearnedLibrary, composed: Composed, i: int, y: np.ndarray, judging: Judging
-) -> float:
-    """Largest error in % of the volume of a line of stream i under the flow y."""
-    with_flow = composed._replace(
-        streams=(*composed.streams[:i], composed.streams[i]._replace(y=y), *composed.streams[i + 1 :])
-    )
-    volumes = line_volumes(with_flow, learned.library, bead_area_mm2=judging.bead_area_mm2)
-    long_enough = (volumes.tool == composed.streams[i].tool) & (
-        volumes.duration_s >= judging.shortest_s - 1e-9
-    )
-    return float(np.abs(volumes.error_percent[long_enough]).max()) if long_enough.any() else float("nan")
+def _off(composed: Composed, tool: int, y: np.ndarray, judging: Judging) -> np.ndarray:
+    """By how much in % the volume of each line (L,) is off under the flow y (T,) of its tool; NaN for the
+    lines of others."""
+    mine, start, stop = reaches(composed, tool)
+    planned, off = judging.bead_area_mm2 * composed.lines.length, np.full(len(composed.lines.line), np.nan)
+    made = volume_between(y, start, stop, sample_time_s=composed.sample_time_s)
+    off[mine] = np.abs(100 * (made / planned[mine] - 1))
+    return off

@@ -51,10 +51,12 @@ def wanted(
     asked_mm: float | None = None,
     declared_mm: Mapping[int, float] | None = None,
     scale: float = 1.0,
+    declared_bead: bool = False,
 ) -> Extruded:
-    """The volume of every printed move. A tool's diameter is what was asked for, else what the program says
-    (a slicer's comment, M200), else what the machine declares; without one its lines are declared beads. A
-    part made `scale` times as large asks for scale^3 of E's volume."""
+    """The volume of every printed move; with declared_bead the declared bead's for all. A tool's diameter is
+    what was asked for, else what the program says (a slicer's comment, M200), else what the machine declares;
+    without one its lines are declared beads. A part made `scale` times as large asks for scale^3 of E's
+    volume."""
     moves, said = program.moves, program.diameter_mm
     printed = (moves.kind == Kind.EXTRUDE) & (moves.length > 0)
     diameter, source, area = {}, {}, {}
@@ -64,7 +66,9 @@ def wanted(
             ((declared_mm or {}).get(tool), "as declared"),
         )  # fmt: skip
         d, where = next(((d, where) for d, where in choices if d), (None, ""))
-        if not _lettered(program):
+        if declared_bead:
+            source[tool] = "the declared bead was asked for"
+        elif not _lettered(program):
             source[tool] = f"{program.extruder or 'nothing'} drives the extrusion, which tells no volume"
         elif np.all(program.volumetric[printed & (moves.tool == tool)]):
             source[tool], area[tool] = "E counts mm^3 (M200)", 1.0
@@ -74,7 +78,7 @@ def wanted(
             diameter[tool], source[tool] = d, f"diameter {d:g} mm, {where}"
             area[tool] = math.pi * d**2 / 4
     e = volumes(program, diameter) * scale**3
-    by_e = printed & np.isfinite(e)
+    by_e = printed & np.isfinite(e) & (not declared_bead)
     volume = np.where(by_e, e, np.where(printed, bead_area_mm2 * moves.length, np.nan))
     return Extruded(volume, by_e, source, area)
 

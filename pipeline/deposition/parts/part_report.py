@@ -8,13 +8,13 @@ import numpy as np
 
 from pipeline.deposition import drive
 from pipeline.deposition.controllers import COMPOSERS
-from pipeline.deposition.parts import extrusion, part_motion
+from pipeline.deposition.parts import extrusion
 from pipeline.deposition.parts.composition import Composed, Stream
 from pipeline.deposition.parts.conformance import Conformance
 from pipeline.deposition.parts.evaluation import FULL_PART_ILC, ComposerScore
 from pipeline.deposition.parts.extrusion import Extruded
-from pipeline.deposition.parts.part import ComposedPart
-from pipeline.deposition.parts.stored import finite_or_none
+from pipeline.deposition.parts.part import ComposedPart, slowed_to
+from pipeline.deposition.parts.stored import finite, finite_or_none
 from pipeline.deposition.toolpath import motion
 from pipeline.deposition.toolpath.gcode import PartProgram
 from pipeline.deposition.toolpath.gcode_words import LineRefusal, Refusals
@@ -35,7 +35,7 @@ def summary_lines(part: ComposedPart) -> str:
         f"{duration:.1f} s; "
         f"the gantry sets out {composed.lead_in_s:.2f} s after the signal"
     )
-    slow = part_motion.slowed_to(part.planned, part.program.moves)
+    slow = slowed_to(part.planned, part.program.moves)
     if slow is not None:
         text.append(
             f"for the drive, printed lines begin and end at rest and change speed at {slow:.3g} mm/s^2: "
@@ -45,10 +45,10 @@ def summary_lines(part: ComposedPart) -> str:
         text.append(forecast_sentence(composed, stream))
         sat = checks.saturation[stream.tool]
         if not sat.enough:
-            ramp = checks.ramp_that_would_do_s[stream.tool]
+            ramp = checks.ramp_that_would_do_s
             do = (
                 f"ramps of {ramp:.2f} s would do"
-                if math.isfinite(ramp)
+                if ramp is not None and math.isfinite(ramp)
                 else "no ramp would do: print slower, or take a drive of more than printer.drive declares"
             )
             text.append(
@@ -199,7 +199,7 @@ def report(part: ComposedPart) -> dict[str, Any]:
         "printed_lines": len(lines.line),
         "runs": int(composed.lines.run[-1]) + 1,
         "duration_s": len(composed.streams[0].r) * composed.sample_time_s,
-        "printing_acceleration_mm_per_s2": part_motion.slowed_to(part.planned, part.program.moves),
+        "printing_acceleration_mm_per_s2": slowed_to(part.planned, part.program.moves),
         "worst_line_volume_percent": finite_or_none(checks.worst_line_volume_percent),
         "judged_lines": checks.judged,
         "shorter_than_lead": int(np.sum(lines.shorter_than_lead)),
@@ -212,11 +212,12 @@ def report(part: ComposedPart) -> dict[str, Any]:
         },
         "forecast": {stream.material: forecast_of(composed, stream) for stream in composed.streams},
         "saturation": {
-            name: {key: finite_or_none(value) for key, value in one._asdict().items()}
-            for name, one in _by_material(part, checks.saturation)
+            stream.material: finite(checks.saturation[stream.tool]._asdict()) for stream in composed.streams
         },
         "ramp_that_would_do_s": {
-            name: finite_or_none(value) for name, value in _by_material(part, checks.ramp_that_would_do_s)
+            stream.material: finite_or_none(checks.ramp_that_would_do_s)
+            for stream in composed.streams
+            if checks.ramp_that_would_do_s is not None
         },
         "refused": [one._asdict() for one in grouped(checks, part.program.refusals)],
         "unknown_words": sum(one.count for one in part.program.told if not one.what),
@@ -235,10 +236,6 @@ def program_report(program: PartProgram, extruded: Extruded, *, bead_area_mm2: f
         "words": [one._asdict() for one in program.told],
         "refused": [one._asdict() for one in program.refusals],
     }
-
-
-def _by_material(part: ComposedPart, of_tool: dict[int, Any]) -> list[tuple[str, Any]]:
-    return [(stream.material, of_tool[stream.tool]) for stream in part.composed.streams]
 
 
 def figures(judged: Sequence[tuple[ComposedPart, Sequence[ComposerScore]]]) -> dict[str, Any]:

@@ -35,13 +35,11 @@ class Motion(NamedTuple):
 
 class MotionSignal(NamedTuple):
     """The plan at t = 0, Ts, 2 Ts, ... to its end: position (T, 3) in mm, speed (T,) in mm/s (0 where E moves
-    alone), the move (T,) and the share (T,) of its way that is done; e_rate (T,) in mm/s, the mean from each
-    instant to the next, so that its sum times Ts is all of E."""
+    alone), the move (T,) and the share (T,) of its way that is done."""
 
     time_s: np.ndarray
     position: np.ndarray
     speed: np.ndarray
-    e_rate: np.ndarray
     move: np.ndarray
     share: np.ndarray
 
@@ -182,10 +180,8 @@ def sampled(motion: Motion, moves: Moves, *, sample_time_s: float, rates_only: b
         places, speeds, share[some] = _at(motion, moves, move[some], time_s)
         if not rates_only:
             position[some], speed[some] = places, speeds
-    if rates_only:
-        return MotionSignal(np.zeros(0), position, speed, np.zeros(0), move, share)
-    signal = MotionSignal(np.arange(count) * sample_time_s, position, speed, np.zeros(0), move, share)
-    return signal._replace(e_rate=rate(signal, moves.e, sample_time_s=sample_time_s))
+    time_s = np.arange(kept) * sample_time_s
+    return MotionSignal(time_s, position, speed, move, share)
 
 
 def _at(
