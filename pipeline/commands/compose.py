@@ -1,7 +1,7 @@
 """`beadline compose PART`: a part program into plunger commands as CSV, Parquet, MCAP and G-code with leads;
 tasks and lines as Parquet; whether it will print as JSON."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +99,7 @@ def _write_commands(part: ComposedPart, folder: Path, formats: Collection[str]) 
         write_frames(files[-1], tables, dict.fromkeys(tables, TYPES["/plunger"]), time_s, None)
     if "gcode" in formats:
         files.append(folder / f"{part.name}.leads.gcode")
-        artifacts.write_text(files[-1], with_leads(part))
+        artifacts.write_lines(files[-1], with_leads(part))
     return files
 
 
@@ -111,10 +111,10 @@ def _sources(composed: Composed) -> list[Source]:
     return [COMMAND._replace(source=f"/plunger/T{stream.tool}:{field}") for stream in composed.streams]
 
 
-def with_leads(part: ComposedPart) -> str:
-    """The part as G-code whose E is what is pushed, and at its end the volume of the part over area and
-    identified flow ratio (`leads.text`). A pressure has no flow ratio: E counts the program's own filament,
-    and is the plunger's place if its diameter is not known."""
+def with_leads(part: ComposedPart) -> Iterator[str]:
+    """The part's lines of G-code whose E is what is pushed, and at its end the volume of the part over area
+    and identified flow ratio (`leads.lines`). A pressure has no flow ratio: E counts the program's own
+    filament, and is the plunger's place if its diameter is not known."""
     program, composed, area = part.program, part.composed, part.extruded.area_mm2
     commands = {stream.tool: stream.u for stream in composed.streams}
     speeds = composed.command != "pressure" or all(tool in area for tool in commands)
@@ -122,7 +122,7 @@ def with_leads(part: ComposedPart) -> str:
         commands = {
             one.tool: one.u * (one.r.sum() / (area[one.tool] * one.u.sum())) for one in composed.streams
         }
-    return leads.text(
+    return leads.lines(
         program.moves, part.planned, commands, speeds=speeds,
         letter=program.extruder if len(program.extruder) == 1 and program.extruder.isalpha() else "E",
         lead_in_s=composed.lead_in_s, sample_time_s=composed.sample_time_s,

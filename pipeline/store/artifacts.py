@@ -272,6 +272,12 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
+def write_lines(path: str | Path, lines: Iterable[str]) -> None:
+    """The same, line by line as they come."""
+    with beside(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
+        stream.writelines(f"{line}\n" for line in lines)
+
+
 def write_bytes(path: str | Path, content: bytes) -> None:
     with beside(path) as temporary:
         temporary.write_bytes(content)

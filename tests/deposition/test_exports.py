@@ -199,7 +199,7 @@ def test_commands_are_the_same_in_every_format(tmp_path, machine):
 
 def test_gcode_with_leads_moves_gantry_and_plunger_as_the_signal_does(tmp_path, machine):
     done = part(tmp_path, machine, TWO)
-    text = compose.with_leads(done)
+    text = "\n".join(compose.with_leads(done))
     program, Ts = gcode.parse(text), done.composed.sample_time_s
     m = program.moves
     assert program.refusals == [] and program.extruder == "E"
@@ -229,7 +229,7 @@ def test_gcode_with_leads_moves_gantry_and_plunger_as_the_signal_does(tmp_path, 
 
 def test_leads_prime_ahead_of_a_line_and_let_back_ahead_of_its_end(tmp_path, machine):
     done = part(tmp_path, machine, line(machine[0].bead_area_mm2, length=60))
-    m = gcode.parse(compose.with_leads(done)).moves
+    m = gcode.parse("\n".join(compose.with_leads(done))).moves
     first = int(np.argmax((m.start[:, 0] < 5.001) & (m.end[:, 0] > 5.001)))
     speed = m.e / np.where(m.length > 0, m.length, np.maximum(np.abs(m.e), 1e-9)) * m.feed
     peak = speed[: first + 1].max()
@@ -243,7 +243,7 @@ def test_leads_prime_ahead_of_a_line_and_let_back_ahead_of_its_end(tmp_path, mac
 def test_e_ends_at_the_volume_of_the_part_over_the_area_of_its_filament(tmp_path, machine, ends):
     bead = ends * machine[0].bead_area_mm2
     done = part(tmp_path, machine, line(bead, length=60))
-    net = gcode.parse(compose.with_leads(done)).moves.e.sum()
+    net = gcode.parse("\n".join(compose.with_leads(done))).moves.e.sum()
     assert net * AREA_175 == pytest.approx(60 * bead, rel=0.01)
 
 
@@ -251,7 +251,7 @@ def test_e_of_two_filaments_goes_on_from_tool_to_tool(tmp_path, machine):
     done = part(
         tmp_path, machine, "; filament_diameter = 1.75,1.75\n" + TWO.replace("E25", "E3").replace("E15", "E2")
     )
-    m = gcode.parse(compose.with_leads(done)).moves
+    m = gcode.parse("\n".join(compose.with_leads(done))).moves
     for tool, volume in ((0, 7 * AREA_175), (1, 3 * AREA_175)):
         assert m.e[m.tool == tool].sum() * AREA_175 == pytest.approx(volume, rel=0.01)
 

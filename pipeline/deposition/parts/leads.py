@@ -2,8 +2,8 @@
 primed ahead of each line and let back ahead of its end, by a machine that plays no signal."""
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ LEAD_SHARE = 0.005
 WAY_MM = 0.05
 # a place that goes on is followed as near as by what LEAD_SHARE of the largest speed makes of this time
 PLACE_S = 0.1
+ROWS = 1 << 15
 
 
 class Legs(NamedTuple):
@@ -99,8 +100,8 @@ def bends(u: np.ndarray, tolerance: float) -> np.ndarray:
     `tolerance` of u (T,): each line as long as the cone of slopes from its start allows."""
     kept, start, last, low, high = [0], 0, 0, -np.inf, np.inf
     flat = np.flatnonzero(np.append(True, np.abs(np.diff(u)) > 0))  # runs of equal values have two ends
-    inner = np.union1d(flat, [*np.maximum(flat - 1, 0), len(u) - 1])
-    for k, value in zip(inner.tolist(), u[inner].tolist(), strict=True):
+    inner = np.union1d(flat, np.append(np.maximum(flat - 1, 0), len(u) - 1))
+    for k, value in zip(_each(inner), _each(u[inner]), strict=True):
         if k == 0:
             continue
         slope = (value - u[start]) / (k - start)
@@ -113,7 +114,7 @@ def bends(u: np.ndarray, tolerance: float) -> np.ndarray:
     return np.unique(np.append(kept, len(u) - 1))
 
 
-def text(
+def lines(
     moves: Moves,
     motion: Motion,
     commands: Mapping[int, np.ndarray],
@@ -122,10 +123,10 @@ def text(
     lead_in_s: float,
     sample_time_s: float,
     speeds: bool = False,
-) -> str:
-    """The part as G-code whose E, or another letter, is the plunger's place, or what was pushed if the
-    commands are speeds, so that it primes ahead of each line and lets back ahead of its end; what no program
-    can hold stands in its head. Parameters as of `legs`."""
+) -> Iterator[str]:
+    """The part, line by line, as G-code whose E, or another letter, is the plunger's place, or what was
+    pushed if the commands are speeds, so that it primes ahead of each line and lets back ahead of its end;
+    what no program can hold stands in its head. Parameters as of `legs`."""
     largest = max(float(np.abs(u).max()) for u in commands.values())
     found = legs(
         moves, motion, commands, lead_in_s=lead_in_s, sample_time_s=sample_time_s,
@@ -140,19 +141,20 @@ def text(
         head.append(
             f"; Left out: {found.lost_mm:.3g} {unit} of a tool's command while another tool was in use."
         )
-    return "\n".join([*head, *program(found, letter=letter, goes_on=speeds), ""])
+    yield from head
+    yield from program(found, letter=letter, goes_on=speeds)
 
 
-def program(found: Legs, *, letter: str = "E", goes_on: bool = False) -> list[str]:
+def program(found: Legs, *, letter: str = "E", goes_on: bool = False) -> Iterator[str]:
     """The legs as lines of G-code in mm, absolute: G1 with the plunger's place behind `letter`, the feed that
     makes the leg last as long as planned; G4 where nothing moves. If it goes on, a tool begins where the one
     before it ended."""
-    lines, held, wait, tool = ["G21", "G90", "M82"], [0.0] * 4, 0.0, None
-    columns = zip(*(np.asarray(column).tolist() for column in found[:5]), strict=True)
-    for each, position, u, seconds, change in columns:
+    held, wait, tool = [0.0] * 4, 0.0, None
+    yield from ("G21", "G90", "M82")
+    for each, position, u, seconds, change in zip(*map(_each, found[:5]), strict=True):
         if each != tool:
             held[3] = held[3] if goes_on else 0.0
-            lines += [*_waited(wait), f"T{each}", f"G92 {letter}{held[3]:.9g}"]
+            yield from (*_waited(wait), f"T{each}", f"G92 {letter}{held[3]:.9g}")
             tool, wait = each, 0.0
         if change:
             continue
@@ -164,9 +166,15 @@ def program(found: Legs, *, letter: str = "E", goes_on: bool = False) -> list[st
         # with X, Y or Z the feed is that of the path, else that of the plunger
         way = math.hypot(*step[:3]) or abs(step[3])
         words = [f"{c}{x:.9g}" for c, x, d in zip(("X", "Y", "Z", letter), to, step, strict=True) if d]
-        lines += [*_waited(wait), f"G1 {' '.join(words)} F{60 * way / seconds:.6g}"]
+        yield from (*_waited(wait), f"G1 {' '.join(words)} F{60 * way / seconds:.6g}")
         held, wait = to, 0.0
-    return [*lines, *_waited(wait)]
+    yield from _waited(wait)
+
+
+def _each(column: np.ndarray) -> Iterator[Any]:
+    """Its rows as Python's numbers, made a part at a time: they take eight times the memory."""
+    for at in range(0, len(column), ROWS):
+        yield from column[at : at + ROWS].tolist()
 
 
 def _waited(seconds: float) -> list[str]:
