@@ -31,6 +31,8 @@ SPEED = Source("speed_mm_per_s", "/gantry:speed_mm_per_s", "mm/s")
 COMMAND = Source("command_mm", "/plunger:displacement_mm", "mm")
 FLOW = Source("flow_mm3_per_s", "/true_flow:flow_mm3_per_s", "mm^3/s")
 SOURCES = (POSITION, SPEED, COMMAND, FLOW)
+# of recordings, in which no trial is read
+OTHER_FORMATS = {".avi", ".bag", ".csv", ".db3", ".mkv", ".mov", ".mp4", ".parquet"}
 TYPES = {
     "/gantry": "beadline_msgs/msg/Gantry",
     "/plunger": "beadline_msgs/msg/Plunger",
@@ -207,7 +209,14 @@ def sources(mapping: Mapping[str, Mapped]) -> tuple[Source, ...]:
 
 
 def trial_paths(folder: Path) -> list[Path]:
-    """The recordings of trials below a folder, without those that a person excluded."""
+    """The recordings of trials below a folder, without those that a person excluded. Raises ValueError,
+    naming the file, for a recording in another format."""
+    other = next((p for p in sorted(folder.rglob("[!.]*")) if p.suffix.lower() in OTHER_FORMATS), None)
+    if other:
+        raise ValueError(
+            f"{other}: expected a trial as MCAP with its frames and signals, found {other.suffix}; record the "
+            "trial as .mcap, and move this file out of the folder"
+        )
     return readable(sorted(folder.rglob("[!.]*.mcap")), folder)
 
 

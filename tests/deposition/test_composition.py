@@ -341,6 +341,11 @@ def test_on_a_machine_whose_flow_nobody_knows_a_composer_scores_the_upper_end_of
     assert np.all(checks.lines.low_percent <= checks.lines.high_percent)
     chosen = next(score for score in scores if score.chosen)
     assert chosen.worst_line_volume_percent == ends > checks.worst_line_volume_percent
+    # a forecast that may not be believed tells no volume either
+    doubtful = [one._replace(judged=one.judged._replace(judged=False)) for one in made.streams]
+    made = made._replace(streams=tuple(doubtful))
+    scores = evaluation.evaluate(learned(PLANT), made, checks.lines, plain, np.random.default_rng(0))
+    assert np.isnan([score.worst_line_volume_percent for score in scores]).all()
 
 
 def test_the_composer_with_the_least_upper_end_is_chosen():

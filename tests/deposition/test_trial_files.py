@@ -401,6 +401,17 @@ def test_a_recording_without_images_or_command_is_refused_with_what_it_has(tmp_p
     )
 
 
+def test_a_recording_in_another_format_is_not_passed_over(tmp_path):
+    (tmp_path / "trial_0.mcap").write_bytes(b"")
+    (tmp_path / "notes.txt").write_text("of the evening")
+    assert trial_files.trial_paths(tmp_path) == [tmp_path / "trial_0.mcap"]
+    (tmp_path / "trial_1.CSV").write_text("time_s,command_mm")
+    with pytest.raises(
+        ValueError, match=r"trial_1\.CSV: expected a trial as MCAP .* found \.CSV; record the"
+    ):
+        trial_files.trial_paths(tmp_path)
+
+
 def test_of_two_cameras_one_must_be_named(tmp_path):
     path = tmp_path / "trial.mcap"
     made = Written()

@@ -55,7 +55,8 @@ def evaluate(
 
     On a real machine nobody knows the true flow: a composer scores the upper end of its forecast, its flow is
     the chain's, and full-part ILC is left out. The worst line of the chosen composer is the farther end of
-    its interval in `lines`, for the flow of the chain that made the command is no measure of it.
+    its interval in `lines`, for the flow of the chain that made the command is no measure of it; there is
+    none if the forecast may not be believed.
     """
     scores, Ts, drive = [], judging.laws.sample_time_s, judging.laws.drive
     ends = np.maximum(np.abs(lines.low_percent), np.abs(lines.high_percent))
@@ -78,7 +79,8 @@ def evaluate(
             error = float(np.linalg.norm(y - stream.r))
             yardstick = error if name == ON_OFF else yardstick
             off = ends if name == stream.composer and not plant else _off(composed, stream.tool, y, judging)
-            worst = float(off[long_enough].max()) if long_enough.any() else np.nan
+            known = long_enough.any() and (plant or stream.judged.judged)
+            worst = float(off[long_enough].max()) if known else np.nan
             told = predicted.get(name)
             percent = told.high if told and not plant else 100 * error / max(yardstick, 1e-12)
             middle = told.median if told else np.nan
