@@ -214,8 +214,8 @@ def trial_paths(folder: Path) -> list[Path]:
     other = next((p for p in sorted(folder.rglob("[!.]*")) if p.suffix.lower() in OTHER_FORMATS), None)
     if other:
         raise ValueError(
-            f"{other}: expected a trial as MCAP with its frames and signals, found {other.suffix}; record the "
-            "trial as .mcap, and move this file out of the folder"
+            f"{other}: expected a trial as MCAP with its frames and signals, found {other.suffix}; record "
+            "the trial as .mcap, and move this file out of the folder"
         )
     return readable(sorted(folder.rglob("[!.]*.mcap")), folder)
 
