@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.setpoint.frames import nozzle_scene
+from pipeline.setpoint.frames import familiar, nozzle_scene
 from pipeline.setpoint.frames.rendered import LabelledFrames
 from pipeline.setpoint.tables import FRAME_PARTS, WINDOW_PARTS
 from pipeline.setpoint.vision import parts
@@ -23,7 +23,7 @@ def prints(first: int, count: int, frames: int = WINDOW) -> LabelledFrames:
     segment = 3 * number + np.digitize(flow, [90, 110])
     return LabelledFrames(
         np.zeros((n, 16, 48), np.uint8), nozzle_scene.label(flow), flow, np.full(n, 210.0), number, segment,
-        np.ones(n, bool), np.full(n, "", object), np.full(n, 20.0),
+        np.ones(n, bool), np.full(n, "", object), np.full(n, 20.0), np.full((n, len(familiar.NAMES)), np.nan),
     )  # fmt: skip
 
 

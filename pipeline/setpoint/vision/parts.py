@@ -82,7 +82,7 @@ def _enough(frames: LabelledFrames, window: int) -> bool:
 
 def _windows(frames: LabelledFrames, window: int) -> np.ndarray:
     """First frame (w,) of each window in which one is valid."""
-    rows = calibration.windows(frames.segment, frames.label, length=window).rows
+    rows = calibration.windows(frames.segment, length=window)
     return rows[frames.valid[rows].any(axis=1)][:, 0]
 
 
@@ -92,11 +92,9 @@ def _of_class(frames: LabelledFrames) -> int:
     return min(len(np.unique(valid.print_number[valid.label == c])) for c in range(len(CLASS_NAMES)))
 
 
-def check_parts(
-    by_part: Mapping[str, LabelledFrames], *, recorded: bool, window: int, coverage: float, confidence: float
-) -> None:
-    """Raises ValueError if a class is learned in too few stretches for the yardstick's folds, a part has no
-    window, or too few segments have one for the conformal sets (calibration.conformal_level)."""
+def check_parts(by_part: Mapping[str, LabelledFrames], *, recorded: bool, window: int) -> None:
+    """Raises ValueError if a class is learned in too few stretches for the yardstick's folds, or a part has
+    no window."""
     of = "prints" if recorded else "segments"
     learned = Labelled(*by_part["learned"].labelled())
     for c, name in enumerate(CLASS_NAMES):
@@ -110,23 +108,11 @@ def check_parts(
             )
     for part in ("judged", "calibration"):
         data = all_frames(by_part[part], recorded=recorded)
-        rows = calibration.windows(data.segment, data.label, length=window).rows
-        if not len(rows):
+        if not len(calibration.windows(data.segment, length=window)):
             raise ValueError(
-                f"expected {window} frames in a row at one class in the frames for {part}, "
-                f"found none in {len(data.label)}; "
-                "record longer stretches, "
-                "or lower train_classifier.window"
+                f"expected {window} frames in a row in the frames for {part}, found none in "
+                f"{len(data.label)}; record longer stretches, or lower train_classifier.window"
             )
-    calibrated = len(np.unique(data.segment[rows[:, 0]]))
-    needed = int(np.ceil(np.log(1 - confidence) / np.log(coverage)))
-    if calibrated < needed:
-        raise ValueError(
-            f"expected windows of at least log(1 - confidence) / log(coverage) = {needed} "
-            f"{of} to calibrate with, "
-            f"found {calibrated}; add {of}, raise "
-            f"train_classifier.{of}.calibration, or lower train_classifier.coverage or confidence"
-        )
 
 
 def all_frames(frames: LabelledFrames, *, recorded: bool) -> Labelled:
