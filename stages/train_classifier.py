@@ -29,7 +29,6 @@ CHECKPOINTS = Path("datasets/memo/train_classifier")
 # the code that decides where a training ends, beside its data and settings
 VISION = Path(__file__).parents[1] / "pipeline/setpoint/vision"
 CODE = (VISION / "classifier.py", VISION / "vision_transformer.py")
-TRANSFORMER, CNN = "vision transformer", "convolutional network"
 # figures of control that git keeps and that runs are compared by
 METRICS = (
     "*_accuracy",
@@ -45,13 +44,13 @@ METRICS = (
 
 class Learned(NamedTuple):
     """The CalibratedClassifier, not proven yet; its Assessment; WindowPredictions by part of WINDOW_PARTS, of
-    segments or prints that it had not learned from; the state of each network that was trained, by name; and
-    more figures."""
+    segments or prints that it had not learned from; the TrainState of the network, None if none was trained;
+    and more figures."""
 
     model: Any
     judged: Any
     windows: dict[str, Any]
-    trained: dict[str, Any]
+    trained: Any
     figures: dict[str, Any]
 
 
@@ -86,7 +85,7 @@ def main() -> None:
         store_classifier(out, learned.figures["size"], model)
         artifacts.write_table(out / "classified.parquet", CLASSIFIED, assessment.classified(judged))
         artifacts.write_table(out / "reliability.parquet", RELIABILITY, assessment.reliability(judged))
-        columns = assessment.curves(learned.trained)
+        columns = assessment.curve(learned.trained)
         artifacts.write_table(out / "course.parquet", CLASSIFIER_CURVE, columns)
         losses = ("training_loss", "held_out_loss", "held_out_accuracy")
         artifacts.write_learning_curve(out / "live", columns, of="learner", step="epoch", figures=losses)
@@ -114,7 +113,7 @@ def learn_rendered(settings: TrainClassifier) -> tuple[Learned, Iterator[tuple[A
     rendered = restore_frames(RENDERED, (*FRAME_PARTS, *WINDOW_PARTS))
     rendered = {part: standing_out(frames, settings.least_score) for part, frames in rendered.items()}
     by_part, windows = ({part: rendered[part] for part in parts} for parts in (FRAME_PARTS, WINDOW_PARTS))
-    learned = learn_networks(settings, by_part, windows, counted(by_part))
+    learned = learn_network(settings, by_part, windows, counted(by_part))
     rng = np.random.default_rng([settings.seed, 9])
     return learned, gallery.render_examples(learned.model, rng, least_score=settings.least_score)
 
@@ -144,7 +143,7 @@ def learn_recordings(
         shown = usable
     else:
         by_part, windows, apart = split_parts(RAW, labelled, settings, WINDOW_PARTS)
-        learned = learn_networks(settings, by_part, windows, read | {"windows_apart": apart})
+        learned = learn_network(settings, by_part, windows, read | {"windows_apart": apart})
         prob, distance = gallery.classified_frames(learned.model, frames)
         shown = np.isin(frames.print_number, by_part["judged"].print_number) | (frames.print_number < 0)
     return learned, show_recorded(settings, learned.model, frames, (prob, distance), shown, material), frames
@@ -208,29 +207,27 @@ def learn_heads(
         "data": read | {"windows_apart": True},
     }
     judged = Assessment(fitted, own.frames, own.windows, {})
-    return Learned(own.model, judged, windows, {}, figures), prob, distance
+    return Learned(own.model, judged, windows, None, figures), prob, distance
 
 
-def learn_networks(
+def learn_network(
     settings: TrainClassifier, by_part: Mapping[str, Any], windows: Mapping[str, Any], read: dict[str, Any]
 ) -> Learned:
-    """The vision transformer of settings.size, beside the small CNN, from LabelledFrames by part of
-    FRAME_PARTS; what it shows of those by part of WINDOW_PARTS; `read` is what was read, counted."""
+    """The vision transformer of settings.size from LabelledFrames by part of FRAME_PARTS; what it shows of
+    those by part of WINDOW_PARTS; `read` is what was read, counted."""
     from pipeline.setpoint.vision import assessment
     from pipeline.setpoint.vision.vision_transformer import parameters
 
     trained = train(settings, by_part)
-    network, cnn = trained[TRANSFORMER].best, trained[CNN].best
-    model, judged, foreign = assess(settings, by_part, network, cnn)
+    model, judged, foreign = assess(settings, by_part, trained.best)
     predictions = each(windows, partial(assessment.predict_windows, model, window=settings.window))
     figures = {
         "learned": "the network",
         "size": settings.size,
         "augmentation": settings.augmentation,
-        "parameters": parameters(network),
-        "cnn_parameters": parameters(cnn),
-        "epochs": {name: int(state.epoch) for name, state in trained.items()},
-        "best_epoch": {name: int(state.best_epoch) for name, state in trained.items()},
+        "parameters": parameters(trained.best),
+        "epochs": {"vision transformer": int(trained.epoch)},
+        "best_epoch": {"vision transformer": int(trained.best_epoch)},
         "out_of_distribution": foreign,
         "data": read,
     }
@@ -240,57 +237,40 @@ def learn_networks(
 # ---- training
 
 
-def train(
-    settings: TrainClassifier, by_part: Mapping[str, Any], checkpoints: Path = CHECKPOINTS
-) -> dict[str, Any]:
-    """The TrainState of the vision transformer of settings.size, and of the small CNN, which learns from
-    fewer frames. A training that was killed goes on from its last epoch.
+def train(settings: TrainClassifier, by_part: Mapping[str, Any], checkpoints: Path = CHECKPOINTS) -> Any:
+    """The TrainState of the vision transformer of settings.size. A training that was killed goes on from its
+    last epoch.
 
     Raises ValueError, nothing trained, if the other parts do not suffice for what is fitted and judged
     afterwards.
     """
-    from concurrent.futures import ThreadPoolExecutor
-
     import jax
     import joblib
     import numpy as np
 
     from pipeline.setpoint.vision import classifier
-    from pipeline.setpoint.vision.assessment import fewer
     from pipeline.setpoint.vision.classifier import Labelled, TrainingSettings
     from pipeline.setpoint.vision.files import SIZES, train_from_checkpoint
     from pipeline.setpoint.vision.parts import check_parts
-    from pipeline.setpoint.vision.vision_transformer import convolutional, vision_transformer
+    from pipeline.setpoint.vision.vision_transformer import vision_transformer
 
     check_parts(by_part, recorded=settings.source == "recordings", window=settings.window)
     learned, held_out = (Labelled(*by_part[part].labelled()) for part in ("learned", "held_out"))
-    augment = {"along_bead": classifier.along_bead, "adr": classifier.adr}[settings.augmentation]
-    rngs = [np.random.default_rng([settings.seed, stream]) for stream in (10, 11)]
-    transformer, cnn = vision_transformer(SIZES[settings.size], rngs[0]), convolutional(rngs[1])
-    untrained = {
-        TRANSFORMER: (transformer, getattr(settings, settings.size), learned),
-        CNN: (cnn, settings.cnn, fewer(learned)),
-    }
-    code = [artifacts.sha256(path) for path in CODE]
-    trainings: dict[str, Callable[[], Any]] = {}
-    for i, (name, (network, recipe, data)) in enumerate(untrained.items()):
-        inputs = settings.size, settings.augmentation, settings.seed, recipe.model_dump()
-        what = (name, *inputs, [a.tobytes() for some in (data, held_out) for a in some], code)
-        training = partial(
-            classifier.train,
-            learned=data,
-            held_out=held_out,
-            settings=TrainingSettings(**recipe.model_dump(exclude={"epochs"})),
-            key=jax.random.fold_in(jax.random.key(settings.seed), i),
-            augment=augment,
-        )
-        state = classifier.untrained(network, epochs=recipe.epochs)
-        checkpoint = checkpoints / f"{joblib.hash(what)}.safetensors"
-        trainings[name] = partial(train_from_checkpoint, training, state, name, checkpoint)
-    # at the same time: neither keeps both cores busy, and neither knows of the other
-    with ThreadPoolExecutor(len(trainings)) as pool:
-        running = {name: pool.submit(training) for name, training in trainings.items()}
-    return {name: training.result() for name, training in running.items()}
+    recipe = getattr(settings, settings.size)
+    inputs = settings.size, settings.augmentation, settings.seed, recipe.model_dump()
+    data = [array.tobytes() for some in (learned, held_out) for array in some]
+    checkpoint = joblib.hash((*inputs, data, [artifacts.sha256(path) for path in CODE]))
+    training = partial(
+        classifier.train,
+        learned=learned,
+        held_out=held_out,
+        settings=TrainingSettings(**recipe.model_dump(exclude={"epochs"})),
+        key=jax.random.fold_in(jax.random.key(settings.seed), 0),
+        augment={"along_bead": classifier.along_bead, "adr": classifier.adr}[settings.augmentation],
+    )
+    network = vision_transformer(SIZES[settings.size], np.random.default_rng([settings.seed, 10]))
+    state = classifier.untrained(network, epochs=recipe.epochs)
+    return train_from_checkpoint(training, state, checkpoints / f"{checkpoint}.safetensors")
 
 
 # ---- what it is worth
@@ -306,7 +286,7 @@ def each(parts: Mapping[str, Any], work: Callable[[Any], Any]) -> dict[str, Any]
 
 
 def assess(
-    settings: TrainClassifier, by_part: Mapping[str, Any], network: Any, cnn: Any
+    settings: TrainClassifier, by_part: Mapping[str, Any], network: Any
 ) -> tuple[Any, Any, dict[str, Any]]:
     """The CalibratedClassifier, its Assessment on the part that it is judged on, and how foreign pictures are
     detected."""
@@ -329,9 +309,7 @@ def assess(
         Labelled(*by_part["learned"].labelled()),
         calibrated_classifier.CalibratedClassifier(network, fitted),
     )
-    judged = assessment.assess(
-        fitted, outputs["judged"], cnn, learned, data["judged"], window=settings.window
-    )
+    judged = assessment.assess(fitted, outputs["judged"], learned, data["judged"], window=settings.window)
     foreign = calibrated_classifier.foreign_detection(model, outputs["judged"], data["judged"])
     return model, judged, foreign
 

@@ -28,7 +28,7 @@ from pipeline.setpoint.published import (
 from pipeline.setpoint.simulation.simulator import GOOD_BORDERS, STAND, TEMPERATURE_LIMITS, Observation
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, read_frames
 from pipeline.setpoint.vision.proof import may_judge, verdict
-from pipeline.setpoint.vision.vision_transformer import VisionTransformer, named_arrays
+from pipeline.setpoint.vision.vision_transformer import named_arrays
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT
 from pipeline.store import artifacts
 
@@ -72,14 +72,8 @@ def write(folder: str | Path, made: Weights) -> None:
 
 
 def classifier_arrays(model: CalibratedClassifier) -> dict[str, np.ndarray]:
-    """Weights, form and calibration. Raises ValueError for a network that the reader does not know."""
-    body = model.network.body
-    if not isinstance(body, VisionTransformer):
-        raise ValueError(
-            f"the exported reader knows a vision transformer but the classifier is a {type(body).__name__}; "
-            "train one with train_classifier.size small or paper"
-        )
-    fitted = model.calibration
+    """Weights, form and calibration."""
+    body, fitted = model.network.body, model.calibration
     return named_arrays(model.network) | {
         "patch": np.array(body.patch),
         "heads": np.array(body.blocks[0].heads),

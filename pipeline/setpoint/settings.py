@@ -99,7 +99,6 @@ class TrainClassifier(Section):
     topics: RecordedTopics
     small: Recipe
     paper: Recipe
-    cnn: Recipe
     least_right: float = Field(gt=1 / 3, lt=1)
     false_alarms: float = Field(gt=0, lt=0.5)
 

@@ -52,7 +52,7 @@ CLASSIFIER_CURVE = Schema(
     "course",
     1,
     (
-        Column("learner", TEXT, NONE, "vision transformer or convolutional network"),
+        Column("learner", TEXT, NONE, "vision transformer"),
         Column("epoch", INDEX, NONE, "epochs done", low=0),
         Column("training_loss", FLOAT, NONE, "mean cross entropy of the epoch's batches"),
         Column("held_out_loss", FLOAT, NONE, "the same on segments that are only watched", nullable=True),

@@ -21,7 +21,7 @@ SMALL = {
     "execution.jobs": 1,
     "train_classifier.window": SHOTS,
     "train_classifier.false_alarms": 0.1,
-    **{f"train_classifier.{net}.{key}": value for net in ("small", "cnn") for key, value in RECIPE.items()},
+    **{f"train_classifier.small.{key}": value for key, value in RECIPE.items()},
     "train_agent.runs": 1,
     "train_agent.li_2025.updates": [20, 20, 20, 20],
     "train_agent.belief_dqn.updates": 20,

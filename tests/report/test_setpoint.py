@@ -338,7 +338,7 @@ def test_the_page_says_whether_the_classifier_may_judge(project):
 def test_heads_of_few_own_pictures_have_no_learning_curve_and_no_yardsticks(project):
     empty = {column.name: [] for column in tables.CLASSIFIER_CURVE.columns}
     artifacts.write_table("datasets/train_classifier/course.parquet", tables.CLASSIFIER_CURVE, empty)
-    change("train_classifier", svc_image_accuracy=None, cnn_image_accuracy=None, width_image_accuracy=None)
+    change("train_classifier", svc_image_accuracy=None, width_image_accuracy=None)
     text = page()
     assert "few own pictures train no network: only its last layer was fitted" in text
     assert "Vision transformer" in text and "Support vector machine" not in text

@@ -19,7 +19,6 @@ from pipeline.setpoint.vision.calibration import (
     auroc,
     by_flow,
     calibrate,
-    energy,
     fit_familiar,
     fit_temperature,
     foreign_above,
@@ -217,9 +216,6 @@ def test_the_threshold_is_exceeded_by_no_more_than_its_share():
 
 def test_the_share_of_pairs_in_order_by_hand():
     assert auroc(np.array([1.0, 2.0]), np.array([2.0, 3.0])) == pytest.approx((1 + 0.5 + 1 + 1) / 4)
-    assert (
-        auroc(energy(np.array([[9.0, 0, 0]])), energy(np.array([[1.0, 0, 0]]))) == 1.0
-    )  # large logits are familiar
 
 
 def test_blur_and_a_turned_key_area_look_unlike_beads_and_light_does_not_matter():

@@ -76,10 +76,8 @@ def test_whatever_arrives_the_shares_are_a_distribution_and_an_action_rests_on_e
     )
     tip = data.draw(arrays.arrays(bool, E))
     got = judge_window(P, valid, score, tip, **RULES)
-    for p in (got.p, got.shares):
-        np.testing.assert_allclose(p.sum(axis=1), 1.0, atol=1e-12)  # rounding of three shares
-        assert (p >= 0).all()
-    assert got.scaled.max(axis=1) == pytest.approx(1.0)
+    np.testing.assert_allclose(got.p.sum(axis=1), 1.0, atol=1e-12)  # rounding of three shares
+    assert (got.p >= 0).all()
     may = (np.isfinite(P).all(axis=2) & valid & (score <= 5.0)).sum(axis=1) >= 8
     assert not ((got.reason == ACTS) & (~may | tip)).any()
 
@@ -90,8 +88,6 @@ def test_twenty_frames_by_hand():
     got = judge_window(P, np.ones((1, 20), bool), np.ones((1, 20)), np.array([False]), **RULES)
     np.testing.assert_array_equal(got.p[0], UNDER)
     assert (got.flow_seen[0], got.spread[0]) == (80.0, 0.07)
-    np.testing.assert_allclose(got.shares[0], [0.75, 0.25, 0.0])
-    np.testing.assert_allclose(got.scaled[0], [1.0, 1 / 3, 0.0])  # (4)
     assert (got.label[0], got.used[0], got.reason[0]) == (0, 20, ACTS)
 
 

@@ -64,8 +64,7 @@ SMALL = {
     "render_frames.camera_segments": 240,
     "train_classifier.window": SHOTS,
     "train_classifier.false_alarms": 0.1,
-    **{f"train_classifier.{network}.{key}": value for network in ("small", "cnn") for key,
-    value in RECIPE.items()},
+    **{f"train_classifier.small.{key}": value for key, value in RECIPE.items()},
     "train_agent.runs": 1,
     "train_agent.li_2025.updates": [20, 20, 20, 20],
     "train_agent.belief_dqn.updates": 20,
@@ -183,12 +182,7 @@ def check_classifier(source: str, *, trained: bool = True) -> dict:
     assert all(("group" in row) == (source == "recordings") for row in frames)
     expected |= {camera_files.CAMERA_FILE}
     courses = {f"{figure}.tsv" for figure in ("training_loss", "held_out_loss", "held_out_accuracy")}
-    expected |= {
-        f"live/plots/metrics/{learner}/{name}"
-        for learner in ("vision_transformer", "convolutional_network")
-        for name in courses
-        if trained
-    }
+    expected |= {f"live/plots/metrics/vision_transformer/{name}" for name in courses if trained}
     assert {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()} == expected
     figures = artifacts.read_figures("train_classifier")
     shares = ("image_accuracy", "window_accuracy", "ece_image", "ece_window")
@@ -201,7 +195,7 @@ def check_classifier(source: str, *, trained: bool = True) -> dict:
     for low, high in figures["intervals_percent"].values():
         assert 0 <= low <= high <= 100
     if trained:
-        assert figures["epochs"] == {"vision transformer": 2, "convolutional network": 2}
+        assert figures["epochs"] == {"vision transformer": 2}
     proof = restore_classifier(*(f"{out}/{name}" for name in MODEL)).calibration.proof
     assert figures["proof"] == proof._asdict() | {
         "may_judge": may_judge(proof), "verdict": verdict(proof)
@@ -215,7 +209,7 @@ def test_on_rendered_frames_every_artifact_is_written_with_its_schema(simulated,
     assert figures["data"]["frames"] == 15 * (3 * 1 + 1 * 2 + 2 * SHOTS + 2 * SHOTS)
     assert figures["data"]["valid"] + sum(figures["data"]["rejected"].values()) == figures["data"]["frames"]
     course = artifacts.read_table("datasets/train_classifier/course.parquet", CLASSIFIER_CURVE)
-    assert course["epoch"].tolist() == [1, 2] * 2
+    assert course["epoch"].tolist() == [1, 2]
 
 
 def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(
@@ -236,17 +230,15 @@ def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(
     with pytest.raises(KeyboardInterrupt):
         train_classifier.train(p, found)
     once = train_classifier.train(p, found)
-    assert sorted(epochs) == [1, 1, 2, 2], (
-        "each epoch of both networks, which learn at once, was learned once"
-    )
+    assert epochs == [1, 2], "each epoch was learned once"
     # a damaged checkpoint is begun anew
     for path in Path("datasets/memo/train_classifier").glob("*.safetensors"):
         path.write_bytes(path.read_bytes()[:1000])
     twice = train_classifier.train(p, found)
-    assert sorted(epochs) == [1, 1, 1, 1, 2, 2, 2, 2]
+    assert epochs == [1, 2, 1, 2]
     whole, _ = read_weights(simulated / "datasets/train_classifier/weights.safetensors", CLASSIFIER_SCHEMA)
-    for curves in (once, twice):
-        arrays = named_arrays(curves[train_classifier.TRANSFORMER].best)
+    for state in (once, twice):
+        arrays = named_arrays(state.best)
         assert arrays.keys() == whole.keys()
         for name, values in whole.items():
             np.testing.assert_array_equal(arrays[name], values, err_msg=name)
@@ -488,8 +480,10 @@ def test_few_pictures_move_the_heads_of_the_shipped_network_and_prove_or_hold(us
     assert moved == {"head.classes.W", "head.classes.b", "flow_head.flow.W", "flow_head.flow.b"}
     assert figures["data"]["windows_apart"] is True
     proof = figures["proof"]
-    assert (proof["windows"], proof["prints"], proof["known_from"]) == (3 * PRINTS, PRINTS, 3 * PRINTS)
-    assert not proof["may_judge"] and "36 windows do not tell it from other cameras" in proof["verdict"]
+    assert (proof["windows"], proof["prints"]) == (3 * PRINTS, PRINTS)
+    # in some windows no frame was measured
+    assert 0 < proof["known_from"] < 3 * PRINTS and not proof["may_judge"]
+    assert f"but {proof['known_from']} windows do not tell it from other cameras" in proof["verdict"]
     first = artifacts.sha256("datasets/train_classifier")
     stage("train_classifier")
     assert artifacts.sha256("datasets/train_classifier") == first

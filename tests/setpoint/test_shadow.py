@@ -43,7 +43,7 @@ TIP, FRAMES = (120.0, 90.0), 8
 MEASURES = len(familiar.NAMES)
 # to which every picture is familiar
 ANY_CAMERA = familiar.KnownCamera(
-    np.zeros(MEASURES), np.ones(MEASURES), np.eye(MEASURES), np.full(100, np.inf)
+    np.zeros(MEASURES), np.ones(MEASURES), np.eye(MEASURES), np.full(100, 1e300)
 )
 PROVEN = CameraProof(0.9, 0.8, 0.6, 400, 40, 400, False)
 

@@ -20,7 +20,7 @@ from pipeline.verdict.verdict import Figure, Missing
 CLASSES = ("under", "good", "over")
 # characters of a frame's place in its recording that are shown, its end
 LONGEST = 60
-NAMES = {"svc": "support vector machine", "cnn": "convolutional network", "width": "width rule"}
+NAMES = {"svc": "support vector machine", "width": "width rule"}
 DIAGRAMS = (
     ("image", "raw", "One image, as trained", "softmax of the network", "ece_image_raw"),
     ("image", "calibrated", "One image, calibrated", "logits over one temperature", "ece_image"),
@@ -354,8 +354,6 @@ class Foreign(NamedTuple):
 
     kind: str
     auroc: str
-    energy: str
-    max_p: str
     detected: str
     alarms: str
 
@@ -397,9 +395,9 @@ def _foreign(detection: Any) -> list[Foreign]:
     rows = []
     for kind, figures in detection.items():
         if isinstance(figures, dict) and "auroc" in figures:
-            areas = (_area(figures.get(name)) for name in ("auroc", "energy_auroc", "max_p_auroc"))
             alarms = figures.get("false_alarms", detection.get("false_alarms"))
-            rows.append(Foreign(str(kind), *areas, _share(figures.get("found")), _share(alarms)))
+            area, found = _area(figures["auroc"]), _share(figures.get("found"))
+            rows.append(Foreign(str(kind), area, found, _share(alarms)))
     return rows
 
 

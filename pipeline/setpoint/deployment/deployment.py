@@ -21,7 +21,6 @@ from pipeline.setpoint.simulation.actuation import (
     still,
 )
 from pipeline.setpoint.simulation.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS
-from pipeline.setpoint.vision.calibration import hard_shares
 from pipeline.setpoint.vision.proof import CameraProof, may_judge
 from pipeline.setpoint.vision.window_flow import WindowFlow
 
@@ -31,16 +30,13 @@ CLASSES = ("under", "good", "over")
 class JudgedWindow(NamedTuple):
     """What E windows of frames say. `reason` indexes REASONS: 0 acts, all else holds.
 
-    p (E, 3) soft shares, counts of which the paper makes its shares: shares (E, 3) and scaled (E, 3) of (4),
-    label (E,) the class of p, score (E,) the median out-of-distribution score, valid (E,) and used (E,) the
-    frames that were valid and the frames that count, reason (E,), flow_seen (E,) in percent of nominal and
-    spread (E,), the deviation of its logarithm. Where no frame counts, p and shares are 1/3 each and score,
-    flow and spread NaN.
+    p (E, 3) shares of the classes, label (E,) the class of p, score (E,) the median out-of-distribution
+    score, valid (E,) and used (E,) the frames that were valid and the frames that count, reason (E,),
+    flow_seen (E,) in percent of nominal and spread (E,), the deviation of its logarithm. Where no frame
+    counts, p is 1/3 each and score, flow and spread NaN.
     """
 
     p: np.ndarray
-    shares: np.ndarray
-    scaled: np.ndarray
     label: np.ndarray
     score: np.ndarray
     valid: np.ndarray
@@ -74,7 +70,6 @@ def judge_window(
     `foreign_above`. Of the m that count
 
         flow_seen, spread, p = flows(frames that count (E, W))      window_flow.window_flow
-        w_c = #{i: argmax p_i = c},  p = w / m,  p-hat = p / max p  Li and Pattinson 2025, eq. 1-4
 
     Held: fewer than `least_frames` count (by what cost the most of them), or the tip has moved. How sure the
     flow is, is for the controller to weigh.
@@ -100,22 +95,11 @@ def judge_window(
     sound = valid & (P >= 0).all(axis=2) & (np.abs(P.sum(axis=2) - 1) < 1e-3)
     familiar = sound & (scores <= foreign_above)
     m = familiar.sum(axis=1)
-    logs = np.log(np.clip(P, 1e-6, 1.0))
-    shares = hard_shares(logs, familiar)
     flow_seen, spread, p = flows(familiar)
     few = np.where(sound.sum(axis=1) >= least_frames, FOREIGN, FEW)
     reason = np.where(tip_moved, TIP, np.where(m < least_frames, few, ACTS))
     return JudgedWindow(
-        p,
-        shares,
-        shares / shares.max(axis=1, keepdims=True),
-        p.argmax(axis=1),
-        _median(scores, sound),
-        valid.sum(axis=1),
-        m,
-        reason,
-        flow_seen,
-        spread,
+        p, p.argmax(axis=1), _median(scores, sound), valid.sum(axis=1), m, reason, flow_seen, spread
     )
 
 

@@ -7,15 +7,14 @@ import numpy as np
 
 from pipeline.setpoint.frames.rendered import LabelledFrames, flow_edges
 from pipeline.setpoint.simulation.recorded import WindowTable
-from pipeline.setpoint.vision import calibrated_classifier, calibration, classifier
+from pipeline.setpoint.vision import calibrated_classifier, calibration
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, WindowPredictions
 from pipeline.setpoint.vision.calibration import ClassifierCalibration, ClassifierOutputs, WindowTruth
 from pipeline.setpoint.vision.classifier import Labelled, TrainState
 from pipeline.setpoint.vision.parts import all_frames
 from pipeline.setpoint.vision.proof import may_judge, verdict
-from pipeline.setpoint.vision.vision_transformer import Classifier
 
-# yardsticks, the small CNN among them, learn from one frame in so many: they take ten times as long a frame
+# yardsticks learn from one frame in so many: they take ten times as long a frame
 EVERY = 3
 
 
@@ -37,7 +36,6 @@ def fewer(learned: Labelled) -> Labelled:
 def assess(
     fitted: ClassifierCalibration,
     outputs: ClassifierOutputs,
-    cnn: Classifier,
     learned: Labelled,
     data: Labelled,
     *,
@@ -45,8 +43,7 @@ def assess(
 ) -> Assessment:
     """The classifier's `outputs` on the frames `data`, beside yardsticks that learn from `learned`."""
     windows = calibrated_classifier.window_predictions(fitted, outputs, length=window)
-    others = {"cnn": classifier.predict(cnn, data.key_area, data.temperature_degC).logits.argmax(axis=1)}
-    others |= calibrated_classifier.yardstick_classes(fewer(learned), data)
+    others = calibrated_classifier.yardstick_classes(fewer(learned), data)
     return Assessment(fitted, outputs, windows, others)
 
 
@@ -155,12 +152,9 @@ def predict_windows(model: CalibratedClassifier, frames: LabelledFrames, *, wind
     return calibrated_classifier.window_predictions(model.calibration, outputs, length=window)
 
 
-def curves(trained: Mapping[str, TrainState]) -> dict[str, list]:
-    """Columns of schema CLASSIFIER_CURVE: a row for each epoch of each network."""
-    rows = [
-        (name, epoch + 1, *(float(v) for v in state.history[epoch]))
-        for name, state in trained.items()
-        for epoch in range(int(state.epoch))
-    ]
+def curve(state: TrainState | None) -> dict[str, list]:
+    """Columns of schema CLASSIFIER_CURVE: a row for each epoch of the network, if it was trained."""
+    history = [] if state is None else np.asarray(state.history, float)[: int(state.epoch)].tolist()
+    rows = [("vision transformer", epoch + 1, *row) for epoch, row in enumerate(history)]
     names = ("learner", "epoch", "training_loss", "held_out_loss", "held_out_accuracy")
     return {name: [row[i] for row in rows] for i, name in enumerate(names)}

@@ -154,23 +154,19 @@ def foreign_images(key_area: np.ndarray) -> dict[str, np.ndarray]:
 def foreign_detection(
     model: CalibratedClassifier, frames: ClassifierOutputs, data: Labelled
 ) -> dict[str, Any]:
-    """By kind of foreign picture the AUROC of the distance, beside those of the energy and of 1 - max p, and
-    the share found; and the share of familiar ones called foreign."""
+    """By kind of foreign picture the AUROC of the distance and the share found; and the share of familiar
+    ones called foreign."""
     v, fitted = frames.valid, model.calibration
     familiar = calibration.mahalanobis(fitted.familiar, frames.features[v])
-    plain = -scipy.special.softmax(frames.logits[v], axis=1).max(axis=1)
     figures: dict[str, Any] = {"false_alarms": float(np.mean(familiar > fitted.foreign_above))}
     for name, images in foreign_images(data.key_area[v]).items():
         shown = predict(model.network, images, data.temperature_degC[v])
         scores = calibration.mahalanobis(
             fitted.familiar, np.hstack([shown.features, calibration.appearance(images)])
         )
-        energies = calibration.energy(frames.logits[v]), calibration.energy(shown.logits)
         figures[name] = {
             "auroc": calibration.auroc(familiar, scores),
             "found": float(np.mean(scores > fitted.foreign_above)),
-            "energy_auroc": calibration.auroc(*energies),
-            "max_p_auroc": calibration.auroc(plain, -scipy.special.softmax(shown.logits, axis=1).max(axis=1)),
         }
     return figures
 

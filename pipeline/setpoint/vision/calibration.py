@@ -260,11 +260,6 @@ def mahalanobis(familiar: Familiar, features: np.ndarray) -> np.ndarray:
     )
 
 
-def energy(logits: np.ndarray) -> np.ndarray:
-    """-log sum_c exp logit_c (n,), higher for the foreign (Liu, Wang, Owens and Li 2020); the yardstick."""
-    return -scipy.special.logsumexp(np.asarray(logits, float), axis=1)
-
-
 def foreign_above(scores: np.ndarray, *, false_alarms: float) -> float:
     """The score that a share `false_alarms` of familiar images exceeds at most."""
     scores = np.sort(np.asarray(scores, float))

@@ -104,14 +104,12 @@ def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedCl
     )
 
 
-def train_from_checkpoint(train: Callable, state: TrainState, name: str, checkpoint: Path) -> TrainState:
+def train_from_checkpoint(train: Callable, state: TrainState, checkpoint: Path) -> TrainState:
     """train(state, on_step=...) from the checkpoint, if there is one; it is written after each epoch."""
     with contextlib.suppress(ValueError):  # there is none yet, or it is damaged: from the beginning
         state = from_named_arrays(state, read_weights(checkpoint, CLASSIFIER_SCHEMA)[0])
-    words = f"train_classifier: {name}"
-    with tqdm(
-        total=len(state.history), initial=int(state.epoch), desc=words, unit="epoch", mininterval=2
-    ) as bar:
+    done, words = int(state.epoch), "train_classifier"
+    with tqdm(total=len(state.history), initial=done, desc=words, unit="epoch", mininterval=2) as bar:
 
         def on_step(state: TrainState) -> None:
             epoch = int(state.epoch)
