@@ -125,16 +125,15 @@ def learn_recordings(
     that judges them, was learned from, and its NozzleFrames: heads for the shipped network, from
     own_pictures.TRAINED_FROM stretches of constant settings on a network.
 
-    No print is in two parts of FRAME_PARTS, none in two of WINDOW_PARTS. For a network, the windows of learn,
-    choose and judge are of prints of their own, taken from those to learn from, if these are enough; else of
-    the prints for calibration, held_out and judged.
+    No print is in two parts.
     """
     import numpy as np
 
     from pipeline.recordings import nozzle_frames
-    from pipeline.setpoint.recordings import read_frames, split_parts
+    from pipeline.setpoint.recordings import read_frames
     from pipeline.setpoint.vision import gallery
     from pipeline.setpoint.vision.own_pictures import TRAINED_FROM
+    from pipeline.setpoint.vision.parts import deal_prints
 
     frames, labelled, usable = read_frames(RAW, settings, execution, material)
     read = nozzle_frames.figures(frames)
@@ -142,8 +141,11 @@ def learn_recordings(
         learned, prob, distance = learn_heads(settings, labelled, usable, read)
         shown = usable
     else:
-        by_part, windows, apart = split_parts(RAW, labelled, settings, WINDOW_PARTS)
-        learned = learn_network(settings, by_part, windows, read | {"windows_apart": apart})
+        shares = settings.prints.model_dump() | dict.fromkeys(WINDOW_PARTS, 1)
+        with artifacts.about(RAW):
+            by_part = deal_prints(labelled, shares, np.random.default_rng(settings.seed))
+        windows = {part: by_part.pop(part) for part in WINDOW_PARTS}
+        learned = learn_network(settings, by_part, windows, read)
         prob, distance = gallery.classified_frames(learned.model, frames)
         shown = np.isin(frames.print_number, by_part["judged"].print_number) | (frames.print_number < 0)
     return learned, show_recorded(settings, learned.model, frames, (prob, distance), shown, material), frames
@@ -204,7 +206,7 @@ def learn_heads(
         "learned": "heads for the shipped network",
         "size": size,
         "parameters": parameters(network),
-        "data": read | {"windows_apart": True},
+        "data": read,
     }
     judged = Assessment(fitted, own.frames, own.windows, {})
     return Learned(own.model, judged, windows, None, figures), prob, distance
@@ -220,7 +222,9 @@ def learn_network(
 
     trained = train(settings, by_part)
     model, judged, foreign = assess(settings, by_part, trained.best)
-    predictions = each(windows, partial(assessment.predict_windows, model, window=settings.window))
+    recorded = settings.source == "recordings"
+    predict = partial(assessment.predict_windows, model, window=settings.window, recorded=recorded)
+    predictions = each(windows, predict)
     figures = {
         "learned": "the network",
         "size": settings.size,

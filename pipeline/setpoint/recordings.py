@@ -2,7 +2,7 @@
 `train_classifier`, and the front end, which takes from a memo what it made of the same frames by the same
 code."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -79,21 +79,6 @@ def read_frames(
     truth = frames.label, frames.flow, frames.temperature, frames.print_number, frames.segment
     seen = frames.valid, np.array(frames.reasons, object), frames.score, frames.surroundings
     return frames, LabelledFrames(frames.images, *truth, *seen).take(usable), usable
-
-
-def split_parts(
-    folder: Path, labelled: LabelledFrames, settings: TrainClassifier, window_parts: Sequence[str]
-) -> tuple[dict[str, LabelledFrames], dict[str, LabelledFrames], bool]:
-    """The frames by part of `settings.prints`; those whose windows stand for the camera, by part of
-    `window_parts`; and whether no print is in both."""
-    # here, as who only reads needs no learner
-    from pipeline.setpoint.vision.parts import deal_prints, split_windows
-
-    with artifacts.about(folder):
-        shares = {part: float(n) for part, n in settings.prints.model_dump().items()}
-        dealt = deal_prints(labelled, shares, np.random.default_rng(settings.seed))
-        rng = np.random.default_rng([settings.seed, 1])
-        return split_windows(dealt, window_parts, window=settings.window, rng=rng)
 
 
 class FrontEnd(NamedTuple):

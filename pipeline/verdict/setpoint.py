@@ -427,7 +427,7 @@ def _round(value: float) -> int:
 
 
 # yardsticks of the classifier
-BRIEF = {"svc": "SVC", "width": "width"}
+BRIEF = {"svc": "SVC", "cnn": "CNN", "width": "width"}
 
 
 # ---- the verdict

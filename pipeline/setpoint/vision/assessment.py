@@ -145,9 +145,11 @@ def window_tables(windows: Mapping[str, WindowPredictions]) -> dict[str, WindowT
     }
 
 
-def predict_windows(model: CalibratedClassifier, frames: LabelledFrames, *, window: int) -> WindowPredictions:
-    """What the model says of windows of the frames at one flow."""
-    data = all_frames(frames, recorded=False)
+def predict_windows(
+    model: CalibratedClassifier, frames: LabelledFrames, *, window: int, recorded: bool
+) -> WindowPredictions:
+    """What the model says of windows of the frames of rendered segments, or of recorded prints."""
+    data = all_frames(frames, recorded=recorded)
     outputs = calibrated_classifier.outputs(model.network, data, frames.valid, frames.surroundings)
     return calibrated_classifier.window_predictions(model.calibration, outputs, length=window)
 
