@@ -246,12 +246,14 @@ def _watch(arguments: argparse.Namespace, ready: "Ready") -> None:
     from pipeline.commands import shadow as watching
     from pipeline.commands.shadow import deploy
     from pipeline.recordings.watch_sources import display_name, source
+    from pipeline.setpoint.vision.proof import verdict
 
     asked = deploy.asked(
         arguments.flow, arguments.temperature, arguments.tip, once=arguments.once, settings=ready
     )
     frames = source(arguments.source, ready.topics, rate_hz=deploy.bounded("--rate", arguments.rate))
     place = display_name(arguments.source)
+    print(f"{place}: {verdict(ready.deployed.proof)}", flush=True)
     print(f"{place}: open {arguments.out / 'index.html'}; Ctrl-C ends the watch", flush=True)
     with watching.until_told() as stopped:
         watched = watching.watch(frames, ready.deployed, asked, arguments.out, place=place, stopped=stopped)

@@ -233,7 +233,6 @@ def simulate_pixels(
 def pixel_loop(model: Any, settings: EvaluateSetpoint, view: TrainClassifier, camera: Any) -> Any:
     """The loop as deployed (pixels.PixelLoop). Windows that are not of the known camera are held."""
     from pipeline.setpoint.deployment import deployment, pixels
-    from pipeline.setpoint.frames import familiar
     from pipeline.setpoint.simulation import actuation
     from pipeline.setpoint.vision.calibrated_classifier import read_frames
     from pipeline.setpoint.vision.window_flow import window_flow
@@ -246,14 +245,14 @@ def pixel_loop(model: Any, settings: EvaluateSetpoint, view: TrainClassifier, ca
         frame_rate_hz=q.frame_rate_hz,
         waits=actuation.Waits(q.wait_s, q.wait_s, q.idle_wait_s),
         limits=deployment.deployed_limits(q.per_action, q.per_minute),
-        judge=deployment.window_judge(
-            fitted, least_frames=q.least_frames, foreign_above=fitted.foreign_above
+        judge=partial(
+            deployment.judge_window, least_frames=q.least_frames, foreign_above=fitted.foreign_above
         ),
         least_score=view.least_score,
         tip_tolerance_px=q.tip_tolerance_px,
         segment_mean_s=q.segment_mean_s,
         window_flow=partial(window_flow, fitted=fitted.flow),
-        foreign=camera and partial(familiar.foreign, camera, false_alarms=familiar.FALSE_ALARMS),
+        foreign=deployment.camera_guard(camera, fitted.proof),
     )
 
 

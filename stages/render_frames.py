@@ -15,6 +15,8 @@ from pipeline.store.params import Execution, Section
 
 # segments that a worker renders in one go: three at each temperature
 AT_ONCE = 15
+# parts whose windows are read with what lies around their beads
+MEASURED = ("calibration", "judged")
 # the place of the known camera's segments among the seeds of this stage
 CAMERA_STREAM = 20
 
@@ -103,7 +105,8 @@ def segment_calls(settings: RenderFrames) -> Iterator[tuple[str, tuple[Callable,
         flow = draw(np.random.default_rng((settings.seed, k)), AT_ONCE * counts[part])
         for i in range(counts[part]):
             some = flow[AT_ONCE * i : AT_ONCE * (i + 1)]
-            yield part, delayed(filmed)((settings.seed, k, i), some, frames[part])
+            seed = (settings.seed, k, i)
+            yield part, delayed(filmed)(seed, some, frames[part], measured=part in MEASURED)
 
 
 def sweep_calls(settings: RenderFrames) -> Iterator[tuple[str, tuple[Callable, tuple, dict]]]:

@@ -1,12 +1,13 @@
-"""Nozzle frames -> classifier of the flow: reads datasets/render_frames, or datasets/raw/setpoint; writes
-datasets/train_classifier: weights.safetensors and calibration.parquet of the vision transformer,
-classified.parquet and reliability.parquet of the frames it is judged on, course.parquet, windows.parquet for
-the simulator, frames for the page, and known_camera.parquet, by which frames of other cameras are foreign."""
+"""Nozzle frames -> classifier of the flow: reads datasets/render_frames, or datasets/raw/setpoint and the
+shipped network's weights; writes datasets/train_classifier: weights.safetensors and calibration.parquet of
+the vision transformer, classified.parquet and reliability.parquet of the frames it is judged on,
+course.parquet, windows.parquet for the simulator, frames for the page, and known_camera.parquet, by which
+frames of other cameras are foreign."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import stages
 from pipeline.setpoint.settings import SetpointMaterial, TrainClassifier
@@ -22,11 +23,12 @@ from pipeline.store import artifacts, params
 from pipeline.store.params import Execution
 
 RENDERED, RAW = Path("datasets/render_frames"), Path("datasets/raw/setpoint")
+# the network whose features few own pictures are read by
+SHIPPED = "datasets/kept/train_classifier/weights.safetensors"
 CHECKPOINTS = Path("datasets/memo/train_classifier")
 # the code that decides where a training ends, beside its data and settings
 VISION = Path(__file__).parents[1] / "pipeline/setpoint/vision"
 CODE = (VISION / "classifier.py", VISION / "vision_transformer.py")
-TRANSFORMER, CNN = "vision transformer", "convolutional network"
 # figures of control that git keeps and that runs are compared by
 METRICS = (
     "*_accuracy",
@@ -34,11 +36,22 @@ METRICS = (
     "images",
     "windows",
     "ece_*",
-    "conformal.coverage",
-    "conformal.held",
+    "proof.*",
     "out_of_distribution.false_alarms",
     "out_of_distribution.*.found",
 )
+
+
+class Learned(NamedTuple):
+    """The CalibratedClassifier, not proven yet; its Assessment; WindowPredictions by part of WINDOW_PARTS, of
+    segments or prints that it had not learned from; the TrainState of the network, None if none was trained;
+    and more figures."""
+
+    model: Any
+    judged: Any
+    windows: dict[str, Any]
+    trained: Any
+    figures: dict[str, Any]
 
 
 def main() -> None:
@@ -52,118 +65,216 @@ def main() -> None:
         from pipeline.setpoint.vision import assessment
         from pipeline.setpoint.vision.files import store_classifier
 
-        by_part, windows, read, recordings = load_parts(settings, execution, material)
-        curves = train(settings, by_part)
-        model, judged = assess(settings, by_part, curves[TRANSFORMER].best, curves[CNN].best)
-        predict = partial(assessment.predict_windows, model, window=settings.window)
-        recorded = assessment.window_tables(each(windows, predict))
-        store_classifier(out, settings.size, model)
-        classified = assessment.classified(judged, by_part["judged"].flow)
-        artifacts.write_table(out / "classified.parquet", CLASSIFIED, classified)
-        reliability = assessment.reliability(judged, window=settings.window)
-        artifacts.write_table(out / "reliability.parquet", RELIABILITY, reliability)
-        columns = assessment.curves(curves)
+        rendered = settings.source == "simulated"
+        if rendered:
+            learned, pictures = learn_rendered(settings)
+            camera = camera_files.restore_camera(RENDERED / camera_files.CAMERA_FILE)
+            known_from = 0 if camera is None else 2 * len(camera.scores)
+        else:
+            learned, pictures, recordings = learn_recordings(settings, execution, material)
+            looks = recordings.surroundings, recordings.segment
+            camera, known_from = fit_recorded_camera(*looks, length=settings.window)
+        fitted = assessment.proven(
+            learned.model.calibration,
+            learned.judged.windows,
+            least=settings.least_right,
+            known_from=known_from,
+            rendered=rendered,
+        )
+        judged, model = learned.judged._replace(fitted=fitted), learned.model._replace(calibration=fitted)
+        store_classifier(out, learned.figures["size"], model)
+        artifacts.write_table(out / "classified.parquet", CLASSIFIED, assessment.classified(judged))
+        artifacts.write_table(out / "reliability.parquet", RELIABILITY, assessment.reliability(judged))
+        columns = assessment.curve(learned.trained)
         artifacts.write_table(out / "course.parquet", CLASSIFIER_CURVE, columns)
         losses = ("training_loss", "held_out_loss", "held_out_accuracy")
         artifacts.write_learning_curve(out / "live", columns, of="learner", step="epoch", figures=losses)
-        artifacts.write_table(out / "windows.parquet", WINDOWS, window_rows(recorded))
-        write_frames(out / "frames", settings, model, recordings, by_part["judged"].print_number, material)
-        if recordings is None:
-            camera = camera_files.restore_camera(RENDERED / camera_files.CAMERA_FILE)
-        else:
-            camera = fit_recorded_camera(recordings.surroundings, recordings.segment, length=settings.window)
+        windows = window_rows(assessment.window_tables(learned.windows))
+        artifacts.write_table(out / "windows.parquet", WINDOWS, windows)
+        write_frames(out / "frames", pictures)
         camera_files.store_camera(out / camera_files.CAMERA_FILE, camera)
-        artifacts.write_metrics("train_classifier", figures(settings, model, judged, curves, read), METRICS)
+        more = learned.figures | {"source": settings.source}
+        artifacts.write_metrics("train_classifier", assessment.figures(judged) | more, METRICS)
 
 
-# ---- frames
+# ---- what is learned from
 
 
-def load_parts(
-    settings: TrainClassifier, execution: Execution, material: Any
-) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any], Any]:
-    """LabelledFrames by part of FRAME_PARTS; those whose windows stand for the camera, by part of
-    WINDOW_PARTS; what was read, counted (`windows_apart`: whether no print of a folder is in both); and the
-    NozzleFrames of a folder of recordings, or None.
+def learn_rendered(settings: TrainClassifier) -> tuple[Learned, Iterator[tuple[Any, dict[str, Any]]]]:
+    """What is learned from rendered frames, and pictures of some of them for the page. No segment is in two
+    parts."""
+    import numpy as np
 
-    No segment is in two parts of FRAME_PARTS, none in two of WINDOW_PARTS, and no rendered one in both. In a
-    folder the windows of learn, choose and judge are of prints of their own, taken from those to learn from,
-    if these are enough; else they are not apart: of the prints for calibration, held_out and judged.
-    """
-    if settings.source == "recordings":
-        from pipeline.setpoint.recordings import read_parts
-
-        return read_parts(RAW, settings, WINDOW_PARTS, execution, material)
     from pipeline.setpoint.frames.files import restore_frames
     from pipeline.setpoint.frames.rendered import standing_out
+    from pipeline.setpoint.vision import gallery
     from pipeline.setpoint.vision.parts import counted
 
     rendered = restore_frames(RENDERED, (*FRAME_PARTS, *WINDOW_PARTS))
     rendered = {part: standing_out(frames, settings.least_score) for part, frames in rendered.items()}
-    by_part = {part: rendered[part] for part in FRAME_PARTS}
-    return by_part, {part: rendered[part] for part in WINDOW_PARTS}, counted(by_part), None
+    by_part, windows = ({part: rendered[part] for part in parts} for parts in (FRAME_PARTS, WINDOW_PARTS))
+    learned = learn_network(settings, by_part, windows, counted(by_part))
+    rng = np.random.default_rng([settings.seed, 9])
+    return learned, gallery.render_examples(learned.model, rng, least_score=settings.least_score)
+
+
+def learn_recordings(
+    settings: TrainClassifier, execution: Execution, material: Any
+) -> tuple[Learned, Iterator[tuple[Any, dict[str, Any]]], Any]:
+    """What is learned from a folder of recordings, pictures of some frames of prints that nothing, or nothing
+    that judges them, was learned from, and its NozzleFrames: heads for the shipped network, from
+    own_pictures.TRAINED_FROM stretches of constant settings on a network.
+
+    No print is in two parts.
+    """
+    import numpy as np
+
+    from pipeline.recordings import nozzle_frames
+    from pipeline.setpoint.recordings import read_frames
+    from pipeline.setpoint.vision import gallery
+    from pipeline.setpoint.vision.own_pictures import TRAINED_FROM
+    from pipeline.setpoint.vision.parts import deal_prints
+
+    frames, labelled, usable = read_frames(RAW, settings, execution, material)
+    read = nozzle_frames.figures(frames)
+    if len(np.unique(labelled.segment)) < TRAINED_FROM:
+        learned, prob, distance = learn_heads(settings, labelled, usable, read)
+        shown = usable
+    else:
+        shares = settings.prints.model_dump() | dict.fromkeys(WINDOW_PARTS, 1)
+        with artifacts.about(RAW):
+            by_part = deal_prints(labelled, shares, np.random.default_rng(settings.seed))
+        windows = {part: by_part.pop(part) for part in WINDOW_PARTS}
+        learned = learn_network(settings, by_part, windows, read)
+        prob, distance = gallery.classified_frames(learned.model, frames)
+        shown = np.isin(frames.print_number, by_part["judged"].print_number) | (frames.print_number < 0)
+    return learned, show_recorded(settings, learned.model, frames, (prob, distance), shown, material), frames
+
+
+def show_recorded(
+    settings: TrainClassifier, model: Any, frames: Any, said: tuple[Any, Any], shown: Any, material: Any
+) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """Picture and row of some of the frames `shown` (n,), of which was said: probabilities (n, 3), distance
+    (n,)."""
+    import numpy as np
+
+    from pipeline.recordings import nozzle_frames
+    from pipeline.setpoint.recordings import read_options
+    from pipeline.setpoint.vision import gallery
+
+    groups = gallery.group_frames(*said, model.calibration.foreign_above, frames)
+    groups = groups._replace(group=np.where(shown, groups.group, ""))
+    chosen = gallery.choose_frames(groups, frames)
+    topics = read_options(settings).topics
+    pictures = nozzle_frames.pictures([frames.picture[i] for i in chosen], topics)
+    for i, picture in zip(chosen, pictures, strict=True):
+        row = gallery.describe_recorded(model, groups, frames, i, shown, material)
+        yield gallery.draw_recorded(picture, frames, i), row
+
+
+def learn_heads(
+    settings: TrainClassifier, labelled: Any, usable: Any, read: dict[str, Any]
+) -> tuple[Learned, Any, Any]:
+    """Heads for the shipped network from the frames `labelled`, those `usable` (n,) of a folder; and for all
+    n frames what was said of them without learning from their print: probabilities (n, 3), distance (n,)."""
+    import numpy as np
+
+    from pipeline.setpoint.vision import calibration, own_pictures
+    from pipeline.setpoint.vision.assessment import Assessment
+    from pipeline.setpoint.vision.files import restore_network
+    from pipeline.setpoint.vision.parts import deal_prints
+    from pipeline.setpoint.vision.vision_transformer import parameters
+
+    network, size = restore_network(SHIPPED)
+    with artifacts.about(RAW):
+        own = own_pictures.learn(
+            network, labelled, window=settings.window, false_alarms=settings.false_alarms
+        )
+        shares = dict.fromkeys(WINDOW_PARTS, 1.0)
+        dealt = deal_prints(labelled, shares, np.random.default_rng([settings.seed, 1]))
+    windows = {
+        part: own.windows.take(np.isin(own.windows.truth.segment, frames.print_number))
+        for part, frames in dealt.items()
+    }
+    fitted = own.model.calibration
+    prob, distance = np.full((len(usable), 3), np.nan), np.full(len(usable), np.nan)
+    rows = np.flatnonzero(usable)[labelled.valid]
+    logits = own.frames.logits[labelled.valid]
+    prob[rows] = np.exp(calibration.log_probabilities(logits, fitted.temperature))
+    distance[rows] = own.distance[labelled.valid]
+    figures = {
+        "learned": "heads for the shipped network",
+        "size": size,
+        "parameters": parameters(network),
+        "data": read,
+    }
+    judged = Assessment(fitted, own.frames, own.windows, {})
+    return Learned(own.model, judged, windows, None, figures), prob, distance
+
+
+def learn_network(
+    settings: TrainClassifier, by_part: Mapping[str, Any], windows: Mapping[str, Any], read: dict[str, Any]
+) -> Learned:
+    """The vision transformer of settings.size from LabelledFrames by part of FRAME_PARTS; what it shows of
+    those by part of WINDOW_PARTS; `read` is what was read, counted."""
+    from pipeline.setpoint.vision import assessment
+    from pipeline.setpoint.vision.vision_transformer import parameters
+
+    trained = train(settings, by_part)
+    model, judged, foreign = assess(settings, by_part, trained.best)
+    recorded = settings.source == "recordings"
+    predict = partial(assessment.predict_windows, model, window=settings.window, recorded=recorded)
+    predictions = each(windows, predict)
+    figures = {
+        "learned": "the network",
+        "size": settings.size,
+        "augmentation": settings.augmentation,
+        "parameters": parameters(trained.best),
+        "epochs": {"vision transformer": int(trained.epoch)},
+        "best_epoch": {"vision transformer": int(trained.best_epoch)},
+        "out_of_distribution": foreign,
+        "data": read,
+    }
+    return Learned(model, judged, predictions, trained, figures)
 
 
 # ---- training
 
 
-def train(
-    settings: TrainClassifier, by_part: Mapping[str, Any], checkpoints: Path = CHECKPOINTS
-) -> dict[str, Any]:
-    """The TrainState of the vision transformer of settings.size, and of the small CNN, which learns from
-    fewer frames. A training that was killed goes on from its last epoch.
+def train(settings: TrainClassifier, by_part: Mapping[str, Any], checkpoints: Path = CHECKPOINTS) -> Any:
+    """The TrainState of the vision transformer of settings.size. A training that was killed goes on from its
+    last epoch.
 
     Raises ValueError, nothing trained, if the other parts do not suffice for what is fitted and judged
     afterwards.
     """
-    from concurrent.futures import ThreadPoolExecutor
-
     import jax
     import joblib
     import numpy as np
 
     from pipeline.setpoint.vision import classifier
-    from pipeline.setpoint.vision.assessment import fewer
     from pipeline.setpoint.vision.classifier import Labelled, TrainingSettings
     from pipeline.setpoint.vision.files import SIZES, train_from_checkpoint
     from pipeline.setpoint.vision.parts import check_parts
-    from pipeline.setpoint.vision.vision_transformer import convolutional, vision_transformer
+    from pipeline.setpoint.vision.vision_transformer import vision_transformer
 
-    check_parts(
-        by_part,
-        recorded=settings.source == "recordings",
-        window=settings.window,
-        coverage=settings.coverage,
-        confidence=settings.confidence,
-    )
+    check_parts(by_part, recorded=settings.source == "recordings", window=settings.window)
     learned, held_out = (Labelled(*by_part[part].labelled()) for part in ("learned", "held_out"))
-    augment = {"along_bead": classifier.along_bead, "adr": classifier.adr}[settings.augmentation]
-    rngs = [np.random.default_rng([settings.seed, stream]) for stream in (10, 11)]
-    transformer, cnn = vision_transformer(SIZES[settings.size], rngs[0]), convolutional(rngs[1])
-    untrained = {
-        TRANSFORMER: (transformer, getattr(settings, settings.size), learned),
-        CNN: (cnn, settings.cnn, fewer(learned)),
-    }
-    code = [artifacts.sha256(path) for path in CODE]
-    trainings: dict[str, Callable[[], Any]] = {}
-    for i, (name, (network, recipe, data)) in enumerate(untrained.items()):
-        inputs = settings.size, settings.augmentation, settings.seed, recipe.model_dump()
-        what = (name, *inputs, [a.tobytes() for some in (data, held_out) for a in some], code)
-        training = partial(
-            classifier.train,
-            learned=data,
-            held_out=held_out,
-            settings=TrainingSettings(**recipe.model_dump(exclude={"epochs"})),
-            key=jax.random.fold_in(jax.random.key(settings.seed), i),
-            augment=augment,
-        )
-        state = classifier.untrained(network, epochs=recipe.epochs)
-        checkpoint = checkpoints / f"{joblib.hash(what)}.safetensors"
-        trainings[name] = partial(train_from_checkpoint, training, state, name, checkpoint)
-    # at the same time: neither keeps both cores busy, and neither knows of the other
-    with ThreadPoolExecutor(len(trainings)) as pool:
-        running = {name: pool.submit(training) for name, training in trainings.items()}
-    return {name: training.result() for name, training in running.items()}
+    recipe = getattr(settings, settings.size)
+    inputs = settings.size, settings.augmentation, settings.seed, recipe.model_dump()
+    data = [array.tobytes() for some in (learned, held_out) for array in some]
+    checkpoint = joblib.hash((*inputs, data, [artifacts.sha256(path) for path in CODE]))
+    training = partial(
+        classifier.train,
+        learned=learned,
+        held_out=held_out,
+        settings=TrainingSettings(**recipe.model_dump(exclude={"epochs"})),
+        key=jax.random.fold_in(jax.random.key(settings.seed), 0),
+        augment={"along_bead": classifier.along_bead, "adr": classifier.adr}[settings.augmentation],
+    )
+    network = vision_transformer(SIZES[settings.size], np.random.default_rng([settings.seed, 10]))
+    state = classifier.untrained(network, epochs=recipe.epochs)
+    return train_from_checkpoint(training, state, checkpoints / f"{checkpoint}.safetensors")
 
 
 # ---- what it is worth
@@ -178,8 +289,11 @@ def each(parts: Mapping[str, Any], work: Callable[[Any], Any]) -> dict[str, Any]
         return dict(zip(parts, pool.map(work, parts.values()), strict=True))
 
 
-def assess(settings: TrainClassifier, by_part: Mapping[str, Any], network: Any, cnn: Any) -> tuple[Any, Any]:
-    """The CalibratedClassifier, and its Assessment on the part that it is judged on."""
+def assess(
+    settings: TrainClassifier, by_part: Mapping[str, Any], network: Any
+) -> tuple[Any, Any, dict[str, Any]]:
+    """The CalibratedClassifier, its Assessment on the part that it is judged on, and how foreign pictures are
+    detected."""
     from pipeline.setpoint.vision import assessment, calibrated_classifier, calibration
     from pipeline.setpoint.vision.classifier import Labelled
     from pipeline.setpoint.vision.parts import all_frames
@@ -189,72 +303,25 @@ def assess(settings: TrainClassifier, by_part: Mapping[str, Any], network: Any, 
         part: all_frames(frames, recorded=settings.source == "recordings") for part, frames in parts.items()
     }
     outputs = each(
-        {part: (data[part], frames.valid) for part, frames in parts.items()},
+        {part: (data[part], frames.valid, frames.surroundings) for part, frames in parts.items()},
         lambda part: calibrated_classifier.outputs(network, *part),
     )
     fitted = calibration.calibrate(
-        outputs["learned"],
-        outputs["calibration"],
-        length=settings.window,
-        promise=calibration.Promise(settings.coverage, settings.confidence, settings.coverage_by_flow),
-        false_alarms=settings.false_alarms,
+        outputs["learned"], outputs["calibration"], length=settings.window, false_alarms=settings.false_alarms
     )
-    learned = Labelled(*by_part["learned"].labelled())
-    judged = assessment.assess(
-        fitted, outputs["judged"], cnn, learned, data["judged"], window=settings.window
+    learned, model = (
+        Labelled(*by_part["learned"].labelled()),
+        calibrated_classifier.CalibratedClassifier(network, fitted),
     )
-    return calibrated_classifier.CalibratedClassifier(network, fitted), judged
+    judged = assessment.assess(fitted, outputs["judged"], learned, data["judged"], window=settings.window)
+    foreign = calibrated_classifier.foreign_detection(model, outputs["judged"], data["judged"])
+    return model, judged, foreign
 
 
-def figures(
-    settings: TrainClassifier, model: Any, judged: Any, curves: Mapping[str, Any], read: dict[str, Any]
-) -> dict[str, Any]:
-    from pipeline.setpoint.vision import assessment
-    from pipeline.setpoint.vision.vision_transformer import parameters
-
-    return assessment.figures(model.network, judged, window=settings.window, coverage=settings.coverage) | {
-        "size": settings.size,
-        "augmentation": settings.augmentation,
-        "source": settings.source,
-        "parameters": parameters(model.network),
-        "cnn_parameters": parameters(curves[CNN].best),
-        "epochs": {name: int(state.epoch) for name, state in curves.items()},
-        "best_epoch": {name: int(state.best_epoch) for name, state in curves.items()},
-        "data": read,
-    }
-
-
-def write_frames(
-    folder: Path, settings: TrainClassifier, model: Any, recordings: Any, prints: Any, material: Any
-) -> None:
-    """frames.json with a row for each frame of the page, and its JPEG: real ones of the prints with these
-    numbers, from which nothing was learned; rendered ones if there are no recordings."""
-    import numpy as np
-
-    from pipeline.recordings import nozzle_frames
-    from pipeline.setpoint.recordings import read_options
-    from pipeline.setpoint.vision import gallery
-
-    if recordings is None:
-        rng = np.random.default_rng([settings.seed, 9])
-        examples = gallery.render_examples(model, rng, least_score=settings.least_score)
-    else:
-        judged = np.isin(recordings.print_number, prints) | (recordings.print_number < 0)
-        groups = gallery.group_frames(model, recordings)
-        groups = groups._replace(group=np.where(judged, groups.group, ""))
-        chosen = gallery.choose_frames(groups, recordings)
-        pictures = nozzle_frames.pictures(
-            [recordings.picture[i] for i in chosen], read_options(settings, material).topics
-        )
-        examples = (
-            (
-                gallery.draw_recorded(picture, recordings, i),
-                gallery.describe_recorded(model, groups, recordings, i, judged, material),
-            )
-            for i, picture in zip(chosen, pictures, strict=True)
-        )
+def write_frames(folder: Path, pictures: Iterable[tuple[Any, dict[str, Any]]]) -> None:
+    """frames.json with a row for each frame of the page, and its JPEG."""
     rows = []
-    for picture, row in examples:
+    for picture, row in pictures:
         name = f"frame_{len(rows):02d}.jpg"
         artifacts.write_jpeg(folder / name, picture)
         rows.append({"file": name} | row)

@@ -72,13 +72,17 @@ def outputs(w, key_area, temperature_degC):
     return dense(w, "head.classes", features), log_flow, np.exp(-2 + 2.5 * np.tanh(z))
 
 
-def window(w, log_flow, deviation):
+def window(w, log_flow, deviation, looks=None):
     """Flow in percent, its relative deviation, and the probabilities of under, good, over of one window of
-    valid frames (m,)."""
-    weight = np.asarray(deviation, float) ** -2.0
-    shown, m = (weight * log_flow).sum() / weight.sum(), len(weight)
+    valid frames (m,). looks (measures,) is what lies around the bead, as pipeline/setpoint/frames/familiar.py
+    measures it; without it the deviation is larger."""
+    weight, moved, unknown = np.asarray(deviation, float) ** -2.0, 0.0, w["looks_explained"]
+    if looks is not None and np.isfinite(looks).all():
+        z = (np.asarray(looks, float) - w["looks_mean"]) / w["looks_deviation"]
+        moved, unknown = np.clip(z, -3.0, 3.0) @ w["looks_weight"], 0.0
+    shown, m = (weight * log_flow).sum() / weight.sum() - moved, len(weight)
     seen = np.interp(shown, w["flow_shown"], w["flow_knots"])
     scale = np.interp(seen, w["flow_knots"], w["flow_scale"])
-    spread = scale * np.sqrt((1 + (m - 1) * w["flow_correlation"]) / weight.sum())
+    spread = np.hypot(scale * np.sqrt((1 + (m - 1) * w["flow_correlation"]) / weight.sum()), unknown)
     below, above = (0.5 * math.erfc((b - seen) / spread / -math.sqrt(2)) for b in np.log([0.9, 1.1]))
     return 100 * np.exp(seen), spread, np.array([below, above - below, 1 - above])

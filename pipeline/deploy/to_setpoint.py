@@ -27,7 +27,8 @@ from pipeline.setpoint.published import (
 )
 from pipeline.setpoint.simulation.simulator import GOOD_BORDERS, STAND, TEMPERATURE_LIMITS, Observation
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, read_frames
-from pipeline.setpoint.vision.vision_transformer import VisionTransformer, named_arrays
+from pipeline.setpoint.vision.proof import may_judge, verdict
+from pipeline.setpoint.vision.vision_transformer import named_arrays
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT
 from pipeline.store import artifacts
 
@@ -71,14 +72,8 @@ def write(folder: str | Path, made: Weights) -> None:
 
 
 def classifier_arrays(model: CalibratedClassifier) -> dict[str, np.ndarray]:
-    """Weights, form and calibration. Raises ValueError for a network that the reader does not know."""
-    body = model.network.body
-    if not isinstance(body, VisionTransformer):
-        raise ValueError(
-            f"the exported reader knows a vision transformer but the classifier is a {type(body).__name__}; "
-            "train one with train_classifier.size small or paper"
-        )
-    fitted = model.calibration
+    """Weights, form and calibration."""
+    body, fitted = model.network.body, model.calibration
     return named_arrays(model.network) | {
         "patch": np.array(body.patch),
         "heads": np.array(body.blocks[0].heads),
@@ -88,6 +83,7 @@ def classifier_arrays(model: CalibratedClassifier) -> dict[str, np.ndarray]:
         "flow_shown": np.asarray(fitted.flow.shown, float),
         "flow_scale": np.asarray(fitted.flow.scale, float),
         "flow_correlation": np.array(fitted.flow.correlation),
+        **{f"looks_{name}": np.asarray(value, float) for name, value in fitted.flow.looks._asdict().items()},
         "foreign_above": np.array(fitted.foreign_above),
         "means": np.asarray(fitted.familiar.means, float),
         "whitening": np.asarray(fitted.familiar.whitening, float),
@@ -165,10 +161,12 @@ def decider(name: str, parameters: Any, belief: Belief, network: BeliefNetwork) 
 def write_checked(
     folder: Path, name: str, model: CalibratedClassifier, decides: Decider | None, seed: int
 ) -> dict[str, Any]:
-    """Writes the files. Returns why there is no certificate, and how far the readers are from the
-    networks."""
-    if decides is None:
-        why = f"{name} has no filter whose tables could be exported."
+    """Writes the files, none if the classifier cannot judge its camera. Returns why there is no certificate,
+    and how far the readers are from the networks."""
+    why = "" if decides else f"{name} has no filter whose tables could be exported."
+    if not may_judge(model.calibration.proof):
+        why = f"The classifier {verdict(model.calibration.proof)}."
+    if why or decides is None:
         return {"controller": name, "measured": False, "why": why, "largest_difference": {}}
     write(folder, weights(model, decides))
     difference = {"log_flow": of_reader(folder, model, np.random.default_rng(seed))}

@@ -2,7 +2,7 @@
 `train_classifier`, and the front end, which takes from a memo what it made of the same frames by the same
 code."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -69,33 +69,16 @@ def read_options(
     )
 
 
-def read_parts(
-    folder: Path,
-    settings: TrainClassifier,
-    window_parts: Sequence[str],
-    execution: Execution,
-    material: PrintedMaterial = PLA,
-) -> tuple[dict[str, LabelledFrames], dict[str, LabelledFrames], dict[str, Any], NozzleFrames]:
-    """The frames of a user's folder by part of `settings.prints`; those whose windows stand for the camera,
-    by part of `window_parts`; what was read, counted; and all of it. Frames without a known class or
-    temperature are in no part."""
-    # here, as who only reads needs no learner
-    from pipeline.setpoint.vision.parts import deal_prints, split_windows
-
+def read_frames(
+    folder: Path, settings: TrainClassifier, execution: Execution, material: PrintedMaterial = PLA
+) -> tuple[NozzleFrames, LabelledFrames, np.ndarray]:
+    """All frames of a user's folder (n); those with a known class and temperature; which these are (n,)."""
     frames = nozzle_frames.read_folder(folder, read_options(settings, material), execution)
     nozzle_frames.check(folder, frames)
     usable = (frames.label >= 0) & np.isfinite(frames.temperature)
     truth = frames.label, frames.flow, frames.temperature, frames.print_number, frames.segment
-    reasons = np.array(frames.reasons, object)
-    labelled = LabelledFrames(frames.images, *truth, frames.valid, reasons, frames.score).take(usable)
-    with artifacts.about(folder):
-        shares = {part: float(n) for part, n in settings.prints.model_dump().items()}
-        dealt = deal_prints(labelled, shares, np.random.default_rng(settings.seed))
-        rng = np.random.default_rng([settings.seed, 1])
-        by_part, windows, apart = split_windows(dealt, window_parts, window=settings.window, rng=rng)
-    prints = {part: len(np.unique(of.print_number)) for part, of in windows.items()}
-    read = nozzle_frames.figures(frames) | {"windows_apart": apart, "window_prints": prints}
-    return by_part, windows, read, frames
+    seen = frames.valid, np.array(frames.reasons, object), frames.score, frames.surroundings
+    return frames, LabelledFrames(frames.images, *truth, *seen).take(usable), usable
 
 
 class FrontEnd(NamedTuple):

@@ -99,10 +99,7 @@ class TrainClassifier(Section):
     topics: RecordedTopics
     small: Recipe
     paper: Recipe
-    cnn: Recipe
-    coverage: float = Field(gt=0.5, lt=1)
-    confidence: float = Field(gt=0.5, lt=1)
-    coverage_by_flow: float = Field(gt=0.5, lt=1)
+    least_right: float = Field(gt=1 / 3, lt=1)
     false_alarms: float = Field(gt=0, lt=0.5)
 
 

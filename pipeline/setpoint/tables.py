@@ -16,7 +16,7 @@ WINDOW_PARTS = ("learn", "choose", "judge")
 
 CLASSIFIED = Schema(
     "classified",
-    1,
+    2,
     (
         Column(
             "segment",
@@ -30,11 +30,6 @@ CLASSIFIED = Schema(
         Column("label", INDEX, NONE, f"true class: {_CLASS}", 0, 2),
         *_SHARES,
         Column("named", INDEX, NONE, f"class named by the vision transformer: {_CLASS}", 0, 2),
-        Column("named_cnn", INDEX, NONE, "the same by the small convolutional network", 0, 2),
-        Column(
-            "named_svc", INDEX, NONE, "the same by the support vector machine on the bead's profile", 0, 2
-        ),
-        Column("named_width", INDEX, NONE, "the same by Otsu's width and two thresholds", 0, 2),
         Column("distance", FLOAT, NONE, "Mahalanobis distance of the features from what was learned", low=0),
     ),
 )
@@ -44,9 +39,7 @@ RELIABILITY = Schema(
     1,
     (
         Column("of", TEXT, NONE, "image, or window of frames of one segment"),
-        Column(
-            "method", TEXT, NONE, "raw or calibrated (image); hard_counts, mean, log_sum or flow (window)"
-        ),
+        Column("method", TEXT, NONE, "raw or calibrated (image); hard_counts or flow (window)"),
         Column("low", FLOAT, NONE, "confidence from", 0, 1),
         Column("high", FLOAT, NONE, "confidence to", 0, 1),
         Column("count", COUNT, NONE, "images or windows in this bin", low=0),
@@ -59,7 +52,7 @@ CLASSIFIER_CURVE = Schema(
     "course",
     1,
     (
-        Column("learner", TEXT, NONE, "vision transformer or convolutional network"),
+        Column("learner", TEXT, NONE, "vision transformer"),
         Column("epoch", INDEX, NONE, "epochs done", low=0),
         Column("training_loss", FLOAT, NONE, "mean cross entropy of the epoch's batches"),
         Column("held_out_loss", FLOAT, NONE, "the same on segments that are only watched", nullable=True),

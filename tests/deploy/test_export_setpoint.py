@@ -11,15 +11,18 @@ import pytest
 from pipeline.commands import export
 from pipeline.deploy import agent_reader, flow_filter, flow_reader, to_setpoint
 from pipeline.setpoint.agents import agent, bayes, belief_agent
+from pipeline.setpoint.frames.familiar import NAMES
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
 from pipeline.setpoint.simulation.simulator import TEMPERATURE_LIMITS, Observation
 from pipeline.setpoint.vision import classifier, window_flow
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
 from pipeline.setpoint.vision.calibration import ClassifierCalibration, Familiar
-from pipeline.setpoint.vision.vision_transformer import SMALL, convolutional, vision_transformer
+from pipeline.setpoint.vision.proof import CameraProof
+from pipeline.setpoint.vision.vision_transformer import SMALL, vision_transformer
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.store import artifacts
 
+PROVEN = CameraProof(0.9, 0.8, 0.6, 400, 40, 400, False)
 WINDOWS, FRAMES = 1000, 2
 FEATURES = 114  # of the last layer
 # float32 through two layers: the sums are taken in another order
@@ -36,10 +39,12 @@ CLASS_FILTER = {
 @pytest.fixture(scope="module")
 def model() -> CalibratedClassifier:
     knots = np.log(np.array(KNOTS_PERCENT) / 100)
-    flow = FlowCalibration(0.8 * knots + 0.02, np.linspace(0.8, 1.4, len(knots)), 0.3)
+    measures = np.linspace(1.0, 2.0, len(NAMES))
+    looks = window_flow.LookCorrection(measures, measures / 10, 0.02 * np.sin(10 * measures), 0.05)
+    flow = FlowCalibration(0.8 * knots + 0.02, np.linspace(0.8, 1.4, len(knots)), 0.3, looks)
     familiar = Familiar(np.zeros((3, FEATURES)), np.eye(FEATURES))
     network = vision_transformer(SMALL, np.random.default_rng(1))
-    return CalibratedClassifier(network, ClassifierCalibration(1.3, 0.2, 0.1, familiar, 9.0, flow))
+    return CalibratedClassifier(network, ClassifierCalibration(1.3, familiar, 9.0, flow, PROVEN))
 
 
 def written(model: CalibratedClassifier, folder: Path) -> tuple[dict, dict]:
@@ -48,6 +53,17 @@ def written(model: CalibratedClassifier, folder: Path) -> tuple[dict, dict]:
     files = ("classifier.safetensors", "filter.safetensors")
     first, second = (flow_reader.read_safetensors(folder / name) for name in files)
     return first, second
+
+
+def test_of_a_camera_that_cannot_be_judged_nothing_is_exported_and_it_is_said_why(model, tmp_path):
+    decides = bayes.class_filter(**CLASS_FILTER)
+    fitted = model.calibration._replace(proof=PROVEN._replace(low=0.5))
+    said = to_setpoint.write_checked(tmp_path, "Bayes", model._replace(calibration=fitted), decides, 1)
+    assert not said["measured"] and said["why"].startswith(
+        "The classifier cannot judge this camera: right in 90 %"
+    )
+    assert not list(tmp_path.iterdir())
+    assert to_setpoint.write_checked(tmp_path, "Bayes", model, decides, 1)["measured"]
 
 
 def test_a_thousand_windows_read_as_by_the_network(model, tmp_path):
@@ -62,9 +78,13 @@ def test_a_thousand_windows_read_as_by_the_network(model, tmp_path):
         assert np.abs(one - other).max() < SINGLE
     frames = (theirs.log_flow.astype(float), theirs.deviation.astype(float))
     log_flow, deviation = (part.reshape(WINDOWS, FRAMES) for part in frames)
-    seen = window_flow.window_flow(log_flow, deviation, np.ones_like(log_flow, bool), model.calibration.flow)
+    looks = rng.normal(1.5, 0.5, (WINDOWS, len(NAMES)))
+    looks[::3] = np.nan
+    valid = np.ones_like(log_flow, bool)
+    seen = window_flow.window_flow(log_flow, deviation, valid, looks, model.calibration.flow)
     for i in range(WINDOWS):
-        flow, spread, prob = flow_reader.window(weights, log_flow[i], deviation[i])
+        known = None if i % 6 == 0 else looks[i]
+        flow, spread, prob = flow_reader.window(weights, log_flow[i], deviation[i], known)
         # doubles: the same formulas, with erfc in place of ndtr
         assert np.allclose((flow, spread), (seen.flow_seen[i], seen.spread[i]), rtol=1e-12)
         assert np.allclose(prob, seen.prob[i], atol=1e-12)
@@ -108,12 +128,6 @@ def test_the_readers_need_numpy_and_the_language_only():
         assert set(re.findall(r"^(?:import|from) (\w+)", text, re.M)) <= {"json", "math", "numpy"}
 
 
-def test_a_network_that_the_reader_does_not_know_is_refused(model):
-    other = model._replace(network=convolutional(np.random.default_rng(1)))
-    with pytest.raises(ValueError, match="knows a vision transformer but the classifier is a Convolutional"):
-        to_setpoint.classifier_arrays(other)
-
-
 # ---- our agent
 
 
@@ -155,7 +169,8 @@ def test_from_key_areas_on_our_agent_decides_as_exported(model, our_agent, tmp_p
     # an untrained network calls every window alike: what it says is spread over all flows
     spread = 15.0
     frames[0] = spread * (frames[0] - theirs.log_flow.mean())
-    shown = window_flow.window_flow(*frames, np.ones((n, FRAMES), bool), model.calibration.flow)
+    valid, unknown = np.ones((n, FRAMES), bool), np.full((n, len(NAMES)), np.nan)
+    shown = window_flow.window_flow(*frames, valid, unknown, model.calibration.flow)
     _, log_flow, deviation = flow_reader.outputs(w, areas, temperature)
     log_flow = spread * (log_flow - theirs.log_flow.mean())
     log_flow, deviation = log_flow.reshape(n, FRAMES), deviation.reshape(n, FRAMES)

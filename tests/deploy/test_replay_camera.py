@@ -25,7 +25,7 @@ from pipeline.setpoint.vision.calibration import ClassifierCalibration, Familiar
 from pipeline.setpoint.vision.vision_transformer import SMALL, vision_transformer
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.store import artifacts
-from tests.setpoint.test_shadow import FRAMES, deployed
+from tests.setpoint.test_shadow import FRAMES, PROVEN, deployed
 
 NARROW, WINDOWS = 55.0, 3
 
@@ -35,7 +35,7 @@ def trained() -> deploy.TrainedClassifier:
     knots = np.log(np.array(KNOTS_PERCENT) / 100)
     flow = FlowCalibration(knots, np.ones(len(knots)), 0.5)
     network = vision_transformer(SMALL, np.random.default_rng(1))
-    fitted = ClassifierCalibration(1.3, 0.5, 0.15, Familiar(np.zeros((3, 2)), np.eye(2)), 9.0, flow)
+    fitted = ClassifierCalibration(1.3, Familiar(np.zeros((3, 2)), np.eye(2)), 9.0, flow, PROVEN)
     return deploy.TrainedClassifier(CalibratedClassifier(network, fitted), "", None)  # ty: ignore[invalid-argument-type]
 
 

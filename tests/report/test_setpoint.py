@@ -11,6 +11,7 @@ import yaml
 from pipeline.report.setpoint import agent as setpoint_agent
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
+from pipeline.setpoint import tables
 from pipeline.setpoint.agents.criteria import harm_bar
 from pipeline.setpoint.simulation.simulator import reward
 from pipeline.setpoint.tables import PATHS
@@ -326,7 +327,24 @@ def test_windows_of_all_flows_are_held_against_no_bar(project):
     assert len(re.findall(r'class="num bad">50.0', PAGE.read_text())) == 1
 
 
-def test_right_and_covered_are_told_by_flow_the_worst_bin_first(project):
+def test_the_page_says_whether_the_classifier_may_judge(project):
+    said = "right in 88 % of 300 windows of 300 rendered segments never learned from: may judge"
+    assert f"The classifier: {said}." in page()
+    said = "cannot judge this camera: right in 61 % of 48 windows of 4 prints never learned from"
+    change("train_classifier", proof={"verdict": said})
+    assert f"The classifier: {said}." in page()
+
+
+def test_heads_of_few_own_pictures_have_no_learning_curve_and_no_yardsticks(project):
+    empty = {column.name: [] for column in tables.CLASSIFIER_CURVE.columns}
+    artifacts.write_table("datasets/train_classifier/course.parquet", tables.CLASSIFIER_CURVE, empty)
+    change("train_classifier", svc_image_accuracy=None, width_image_accuracy=None)
+    text = page()
+    assert "few own pictures train no network: only its last layer was fitted" in text
+    assert "Vision transformer" in text and "Support vector machine" not in text
+
+
+def test_right_is_told_by_flow_the_worst_bin_first(project):
     text = page()
     assert (
         "Worst bin: 105–110 % of flow, 40 % right (36–43), 200 windows; the ideal reader reaches 62 % there. "

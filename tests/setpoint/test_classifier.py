@@ -30,7 +30,6 @@ from pipeline.setpoint.vision.vision_transformer import (
     Block,
     Classifier,
     Size,
-    convolutional,
     from_named_arrays,
     inverse_root,
     named_arrays,
@@ -98,9 +97,8 @@ def test_the_papers_network_has_the_papers_parameters():
     assert parameters(network.flow_head) == 2 * (128 + 16) + 2  # ours, beside them
 
 
-def test_the_small_transformer_has_some_76_thousand_parameters_and_the_cnn_some_50():
+def test_the_small_transformer_has_some_76_thousand_parameters():
     assert parameters(drawn(SMALL)) == pytest.approx(75_800, rel=0.1)
-    assert parameters(convolutional(np.random.default_rng(0))) == pytest.approx(50_000, rel=0.02)
 
 
 def test_a_block_is_attention_then_feed_forward_as_loops_write_them():
@@ -142,8 +140,8 @@ def test_patches_are_read_where_their_positions_are():
     assert np.abs(network(moved) - network(x)).max() > 1e-4
 
 
-@pytest.mark.parametrize("network", [drawn(TINY), convolutional(np.random.default_rng(0))])
-def test_neither_lighting_nor_the_other_images_of_a_batch_change_the_logits(network):
+def test_neither_lighting_nor_the_other_images_of_a_batch_change_the_logits():
+    network = drawn(TINY)
     x = np.random.default_rng(0).integers(40, 200, (5, 16, 48))
     u = np.array([190.0, 200, 210, 220, 230])
     look = jax.jit(lambda x, u: network(x.astype(jnp.float32), u))
@@ -196,12 +194,8 @@ def test_weights_of_another_architecture_are_refused_by_the_first_array_that_dif
         ValueError, match=r"body.blocks.1.attended.W is expected of shape \(8, 8\) but found absent"
     ):
         from_named_arrays(drawn(TINY._replace(layers=2)), arrays)
-    with pytest.raises(ValueError, match=r"body.class_token is expected absent but found of shape \(8,\)"):
-        from_named_arrays(
-            convolutional(np.random.default_rng(0)),
-            {k: v for k, v in arrays.items() if "blocks" not in k}
-            | named_arrays(convolutional(np.random.default_rng(0))),
-        )
+    with pytest.raises(ValueError, match=r"body.more is expected absent but found of shape \(8,\)"):
+        from_named_arrays(drawn(TINY), arrays | {"body.more": np.zeros(8)})
 
 
 def test_patches_that_do_not_tile_are_refused():
@@ -440,9 +434,9 @@ def test_an_inverse_root_is_rounded_as_every_cpu_rounds_it():
     np.testing.assert_allclose(jax.jit(jax.grad(inverse_root))(4.0), -0.0625, rtol=1e-7)
 
 
-@pytest.mark.parametrize("network", [drawn(SMALL), convolutional(np.random.default_rng(0))])
-def test_no_program_of_a_classifier_asks_a_cpu_for_its_own_guess_of_a_root(network):
+def test_no_program_of_a_classifier_asks_a_cpu_for_its_own_guess_of_a_root():
     """Intel's and AMD's instruction of that kind answer with other digits, and the weights with them."""
+    network = drawn(SMALL)
     data = stripes(12, 4, seed=0)
     rows = [jnp.asarray(a) for a in data[:4]]
     state = untrained(network, epochs=1)

@@ -12,13 +12,13 @@ from hypothesis.extra import numpy as arrays
 from pipeline.setpoint.deployment.deployment import camera_seen, judge_window, why
 from pipeline.setpoint.simulation.actuation import (
     ACTS,
-    AMBIGUOUS,
     FEW,
     FOREIGN,
     REASONS,
     STILL,
     TABLE,
     TIP,
+    UNPROVEN,
     SetpointLimits,
     Waits,
     at_rest,
@@ -29,12 +29,22 @@ from pipeline.setpoint.simulation.actuation import (
     wait_after,
 )
 from pipeline.setpoint.simulation.simulator import Action, SetpointController
+from pipeline.setpoint.vision.window_flow import WindowFlow
 
-RULES = {"least_frames": 8, "correlation": 0.45, "foreign_above": 5.0, "conformal_level": 0.2}
 LIMITS = SetpointLimits(
     np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([60.0, 30.0])
 )
 UNDER = np.array([0.9, 0.08, 0.02])
+
+
+def under(counts: np.ndarray) -> WindowFlow:
+    """80 % of flow in windows in which a frame counts."""
+    some = counts.any(axis=1)
+    prob = np.where(some[:, None], UNDER, 1 / 3)
+    return WindowFlow(np.where(some, 80.0, np.nan), np.where(some, 0.07, np.nan), prob)
+
+
+RULES = {"flows": under, "least_frames": 8, "foreign_above": 5.0}
 
 
 def one(p=UNDER, frames=20, valid=20, foreign=0, moved=False, **rules):
@@ -66,31 +76,18 @@ def test_whatever_arrives_the_shares_are_a_distribution_and_an_action_rests_on_e
     )
     tip = data.draw(arrays.arrays(bool, E))
     got = judge_window(P, valid, score, tip, **RULES)
-    for p in (got.p, got.shares):
-        np.testing.assert_allclose(p.sum(axis=1), 1.0, atol=1e-12)  # rounding of three shares
-        assert (p >= 0).all()
-    assert got.scaled.max(axis=1) == pytest.approx(1.0)
+    np.testing.assert_allclose(got.p.sum(axis=1), 1.0, atol=1e-12)  # rounding of three shares
+    assert (got.p >= 0).all()
     may = (np.isfinite(P).all(axis=2) & valid & (score <= 5.0)).sum(axis=1) >= 8
     assert not ((got.reason == ACTS) & (~may | tip)).any()
-
-
-def test_a_window_of_one_frame_many_times_over_says_less_than_as_many_independent_ones():
-    p = one(correlation=1.0).p[0]
-    np.testing.assert_allclose(p, UNDER, atol=1e-12)  # twenty copies of one frame are one frame; rounding
-    assert one(correlation=0.0).p[0, 0] > 0.9999
-    assert 0.9 < one(correlation=0.45).p[0, 0] < 0.9999
 
 
 def test_twenty_frames_by_hand():
     P = np.tile(UNDER, (1, 20, 1))
     P[0, 15:] = [0.1, 0.8, 0.1]
-    got = judge_window(
-        P, np.ones((1, 20), bool), np.ones((1, 20)), np.array([False]), **{**RULES, "correlation": 1 / 19}
-    )
-    logs = (15 * np.log(UNDER) + 5 * np.log([0.1, 0.8, 0.1])) / 2  # 1 + 19/19
-    np.testing.assert_allclose(got.p[0], np.exp(logs) / np.exp(logs).sum(), rtol=1e-12)
-    np.testing.assert_allclose(got.shares[0], [0.75, 0.25, 0.0])
-    np.testing.assert_allclose(got.scaled[0], [1.0, 1 / 3, 0.0])  # (4)
+    got = judge_window(P, np.ones((1, 20), bool), np.ones((1, 20)), np.array([False]), **RULES)
+    np.testing.assert_array_equal(got.p[0], UNDER)
+    assert (got.flow_seen[0], got.spread[0]) == (80.0, 0.07)
     assert (got.label[0], got.used[0], got.reason[0]) == (0, 20, ACTS)
 
 
@@ -106,22 +103,8 @@ def test_twenty_frames_by_hand():
         ({"foreign": 12}, ACTS),
         ({"foreign": 13}, FOREIGN),
         ({"moved": True}, TIP),
-        ({"p": np.array([0.5, 0.49, 0.01])}, AMBIGUOUS),
-        ({"p": np.full(3, 1 / 3), "conformal_level": 0.5}, AMBIGUOUS),
     ],
-    ids=[
-        "sound",
-        "just enough",
-        "one too few",
-        "empty",
-        "NaN",
-        "no distribution",
-        "some odd",
-        "odd",
-        "tip",
-        "two classes",
-        "no class",
-    ],
+    ids=["sound", "just enough", "one too few", "empty", "NaN", "no distribution", "some odd", "odd", "tip"],
 )
 def test_a_window_is_held_for_its_own_reason(window, reason):
     assert one(**window).reason[0] == reason, REASONS[reason]
@@ -232,8 +215,8 @@ def test_the_wait_is_the_longest_that_any_move_asks_for():
 
 def test_the_strip_says_what_was_seen_and_why_it_was_held():
     assert (
-        why(12.5, one(correlation=1.0), 0, np.array([10.0, 0.0]))
-        == "  12.5 s: 20 frames valid, 20 count, under 0.90; flow +10 %"
+        why(12.5, one(), 0, np.array([10.0, 0.0]))
+        == "  12.5 s: 20 frames valid, 20 count, flow 80 %, under 0.90; flow +10 %"
     )
     assert why(0.0, one(), 0, np.zeros(2)).endswith("no change")
     assert why(3.0, one(valid=3), 0, np.zeros(2)).endswith("score 1; held: too few valid frames")
@@ -250,8 +233,6 @@ def test_a_window_that_shows_a_flow_is_not_held_for_two_classes():
     got = one(p=np.array([0.5, 0.49, 0.01]), flows=flows)
     assert (got.reason[0], got.label[0]) == (ACTS, 1)
     assert (got.flow_seen[0], got.spread[0]) == (91.0, 0.07)
-    assert one(p=np.array([0.5, 0.49, 0.01])).reason[0] == AMBIGUOUS
-    assert np.isnan(one().flow_seen[0])
     assert one(valid=3, flows=lambda counts: flows(counts)).reason[0] == FEW
     assert "flow 91 %" in why(0.0, got, 0, np.zeros(2))
 
@@ -266,7 +247,7 @@ def test_a_camera_that_repeats_its_reading_to_the_last_bit_stands_still():
 
 
 @pytest.mark.parametrize(
-    ("reason", "remembers"), [(ACTS, True), (AMBIGUOUS, True), (FEW, False), (STILL, False)]
+    ("reason", "remembers"), [(ACTS, True), (UNPROVEN, False), (FEW, False), (STILL, False)]
 )
 def test_a_controller_remembers_what_is_evidence_and_is_asked_whether_the_camera_is_strange(
     reason, remembers
@@ -293,7 +274,7 @@ def test_a_window_of_no_known_camera_is_held_and_keeps_a_reason_that_it_has():
     looks = np.array([[0.0], [9.0], [9.0], [9.0], [np.nan]])
     seen = camera_seen(window, last, looks, lambda looks: looks[:, 0] > 5)
     assert seen.reason.tolist() == [ACTS, FOREIGN, STILL, TIP, ACTS]
-    assert camera_seen(window, last, looks, None).reason.tolist() == [ACTS, ACTS, STILL, TIP, ACTS]
+    assert camera_seen(window, last, looks, None).reason.tolist() == [UNPROVEN] * 5
 
 
 def test_jax_and_numpy_take_the_same_limits():

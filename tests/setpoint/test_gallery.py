@@ -37,7 +37,9 @@ def model(monkeypatch):
 def page_rows(model, frames, prints, folder):
     """The rows of frames.json, and the pictures beside it."""
     settings = params.load(TrainClassifier, "train_classifier", ROOT / params.FILE)
-    train_classifier.write_frames(folder, settings, model, frames, prints, PLA)
+    shown, said = np.isin(frames.print_number, prints), gallery.classified_frames(model, frames)
+    pictures = train_classifier.show_recorded(settings, model, frames, said, shown, PLA)
+    train_classifier.write_frames(folder, pictures)
     return artifacts.read_json(folder / "frames.json")
 
 
@@ -52,7 +54,7 @@ def test_each_frame_is_in_one_group_and_shares_are_of_the_judged_prints(tmp_path
     frames = made(tmp_path)
     judged = page_rows(model, frames, np.array([1]), tmp_path)
     assert {row["source"].split(": ")[1].split("/")[0][-6:] for row in judged} == {"print1"}
-    shown = gallery.group_frames(model, frames)
+    shown = gallery.group_frames(*gallery.classified_frames(model, frames), 20.0, frames)
     mine = frames.print_number == 1
     shares = {row["group"]: row["share"] for row in judged}
     assert shares == {g: (shown.group[mine] == g).mean() for g in shares}
@@ -113,13 +115,14 @@ def test_a_folder_s_camera_is_known_from_its_windows_and_another_s_frames_are_fo
     many = 240
     measured = rng.normal(3.0, 0.1, (5 * many, len(familiar.NAMES))).astype(np.float32)
     segment = np.repeat(np.arange(4), 5 * many // 4)
-    camera = familiar.fit_recorded_camera(
-        measured, segment, length=5
-    )  # 4 stretches are too few: windows then
+    # 4 stretches are too few: windows then
+    camera, known_from = familiar.fit_recorded_camera(measured, segment, length=5)
+    assert known_from == many
     assert len(camera.scores) == many // 2
     windows, _ = familiar.window_medians(measured, segment, length=5)
     assert familiar.foreign(camera, windows, false_alarms=0.01).mean() <= 0.02
     assert familiar.foreign(camera, windows + 1.0, false_alarms=0.01).all()
+    assert familiar.fit_recorded_camera(measured[:995], segment[:995], length=5) == (None, 199)
 
 
 def test_a_camera_comes_back_from_its_file_and_one_of_other_measures_is_refused(tmp_path):

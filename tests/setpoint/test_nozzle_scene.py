@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.setpoint.frames import nozzle_scene
+from pipeline.setpoint.frames import nozzle_scene, rendered
 from pipeline.setpoint.frames.key_area import find
 from pipeline.setpoint.vision import yardsticks
 
@@ -157,35 +157,37 @@ def test_few_flows_are_as_many_as_asked_for_and_fifteen_hold_every_class(n):
         assert n < 15 or set(nozzle_scene.label(flow).tolist()) == {0, 1, 2}
 
 
-def test_filmed_segments_keep_their_flow_and_temperature():
-    flow, temperature = np.array([60.0, 140.0]), np.array([190.0, 230.0])
-    made = nozzle_scene.filmed(np.random.default_rng(14), flow, temperature, frames=3, least_score=LEAST)
-    np.testing.assert_array_equal(made.flow, np.repeat(flow, 3))
-    np.testing.assert_array_equal(made.temperature, np.repeat(temperature, 3))
-    np.testing.assert_array_equal(made.segment, np.repeat([0, 1], 3))
-    assert (made.score[made.valid] >= LEAST).all()
+def data_set(seed, *, segments, frames, measured=False):
+    """So many segments of each class at each temperature, flows uniform within their class."""
+    rng = np.random.default_rng(seed)
+    flow = [nozzle_scene.draw_class_flow(rng, k // 5 % 3, 1)[0] for k in range(15 * segments)]
+    made = rendered.filmed(seed, np.array(flow), frames, measured=measured)
+    return rendered.standing_out(made, LEAST)
 
 
-def test_a_data_set_holds_the_fifteen_combinations_in_equal_parts():
-    made = nozzle_scene.data_set(np.random.default_rng(13), segments=2, frames=3, least_score=LEAST)
-    assert made.images.shape == (90, 16, 48)
-    assert made.images.dtype == np.uint8
+@pytest.mark.parametrize("measured", [False, True])
+def test_filmed_segments_keep_their_flow_and_temperature(measured):
+    made = data_set((13,), segments=2, frames=6, measured=measured)
+    assert made.images.shape == (180, 16, 48) and made.images.dtype == np.uint8
     pairs, counts = np.unique(np.column_stack([made.label, made.temperature]), axis=0, return_counts=True)
-    assert len(pairs) == 15
-    assert set(counts) == {6}
+    assert len(pairs) == 15 and set(counts) == {12}
     assert np.unique(made.segment).tolist() == list(range(30))
     for k in range(30):
         assert len(set(made.flow[made.segment == k])) == len(set(made.temperature[made.segment == k])) == 1
     np.testing.assert_array_equal(made.valid, [not r for r in made.reasons])
-    assert not made.images[~made.valid].any()
+    assert (made.score[made.valid] >= LEAST).all() and not made.images[~made.valid].any()
     np.testing.assert_array_equal(made.label, nozzle_scene.label(made.flow))
+    # of every five frames of a segment the first with a line is measured, where measures are asked for
+    seen = np.isfinite(made.surroundings).all(axis=1).reshape(30, 6)
+    first = np.zeros((30, 6), bool)
+    for k, valid in enumerate(made.valid.reshape(30, 6)):
+        first[k, np.flatnonzero(valid[:5])[:1]] = True
+        first[k, 5] = valid[5]
+    np.testing.assert_array_equal(seen, first & measured)
 
 
 def image_accuracy(seed, *, train, test):
-    rng = np.random.default_rng(seed)
-    seen, held_out = (
-        nozzle_scene.data_set(rng, segments=s, frames=5, least_score=LEAST) for s in (train, test)
-    )
+    seen, held_out = (data_set((seed, k), segments=s, frames=5) for k, s in enumerate((train, test)))
     v, w = seen.valid, held_out.valid
     fitted = yardsticks.fit_profile_machine(
         seen.images[v], seen.temperature[v], seen.label[v], seen.segment[v]

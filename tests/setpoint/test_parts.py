@@ -1,18 +1,14 @@
-"""Of a user's folder: which prints the classifier learns from, and whose windows stand for the camera."""
+"""Which prints of a folder a network learns from, and which stand for the camera."""
 
 import numpy as np
 import pytest
 
-from pipeline.setpoint.frames import nozzle_scene
+from pipeline.setpoint.frames import familiar, nozzle_scene
 from pipeline.setpoint.frames.rendered import LabelledFrames
-from pipeline.setpoint.tables import FRAME_PARTS, WINDOW_PARTS
+from pipeline.setpoint.tables import WINDOW_PARTS
 from pipeline.setpoint.vision import parts
 
 WINDOW = 4
-
-
-def split_windows(given: dict[str, LabelledFrames]):
-    return parts.split_windows(given, WINDOW_PARTS, window=WINDOW, rng=np.random.default_rng([0, 1]))
 
 
 def prints(first: int, count: int, frames: int = WINDOW) -> LabelledFrames:
@@ -23,54 +19,27 @@ def prints(first: int, count: int, frames: int = WINDOW) -> LabelledFrames:
     segment = 3 * number + np.digitize(flow, [90, 110])
     return LabelledFrames(
         np.zeros((n, 16, 48), np.uint8), nozzle_scene.label(flow), flow, np.full(n, 210.0), number, segment,
-        np.ones(n, bool), np.full(n, "", object), np.full(n, 20.0),
+        np.ones(n, bool), np.full(n, "", object), np.full(n, 20.0), np.full((n, len(familiar.NAMES)), np.nan),
     )  # fmt: skip
 
 
-def folder(learned: int, frames: int = WINDOW) -> dict[str, LabelledFrames]:
-    counts = dict(zip(FRAME_PARTS, (learned, 4, 8, 8), strict=True))
-    begins = np.cumsum([0, *counts.values()])
-    return {
-        part: prints(int(at), count, frames)
-        for at, (part, count) in zip(begins, counts.items(), strict=False)
-    }
+def test_no_print_is_in_two_parts_and_each_part_has_its_share_of_them():
+    shares = {"learned": 6, "held_out": 1, "calibration": 2, "judged": 2} | dict.fromkeys(WINDOW_PARTS, 1)
+    dealt = parts.deal_prints(prints(0, 70), shares, np.random.default_rng(0))
+    numbers = {part: set(frames.print_number.tolist()) for part, frames in dealt.items()}
+    assert sum(map(len, numbers.values())) == len(set.union(*numbers.values())) == 70
+    assert [len(numbers[part]) for part in shares] == pytest.approx([5 * n for n in shares.values()], abs=1)
+    for frames in dealt.values():
+        assert set(frames.label) == {0, 1, 2}
+    with pytest.raises(ValueError, match="5 segments do not let each of 7 parts hold every class"):
+        parts.deal_prints(prints(0, 5), shares, np.random.default_rng(0))
 
 
-def numbers(frames: LabelledFrames) -> set[int]:
-    return set(frames.print_number.tolist())
-
-
-def test_where_prints_suffice_windows_are_of_none_that_the_classifier_has():
-    given = folder(60)
-    by_part, windows, apart = split_windows(given)
-    assert apart and tuple(by_part) == FRAME_PARTS and tuple(windows) == WINDOW_PARTS
-    several = [numbers(frames) for frames in (*by_part.values(), *windows.values())]
-    assert sum(map(len, several)) == len(set.union(*several)) == 80
-    # two thirds stay, the others are shared alike
-    assert [len(one) for one in (several[0], *several[4:])] == pytest.approx([40, 7, 7, 7], abs=1)
-    for part in ("held_out", "calibration", "judged"):
-        assert by_part[part] is given[part]
-    for frames in windows.values():
-        assert set(frames.label) == {0, 1, 2} and len(frames.label) == 3 * WINDOW * len(numbers(frames))
-
-
-@pytest.mark.parametrize("given", [folder(20), folder(2), folder(60, frames=WINDOW - 1)])
-def test_where_they_do_not_the_classifier_keeps_all_and_it_is_said(given):
-    given |= {part: prints(100 + 20 * k, 4) for k, part in enumerate(FRAME_PARTS[1:])}
-    by_part, windows, apart = split_windows(given)
-    assert not apart and by_part is given
-    assert [windows[part] is given[of] for part, of in zip(
-        WINDOW_PARTS, ("calibration", "held_out", "judged"), strict=True)] == [True] * 3  # fmt: skip
-
-
-@pytest.mark.parametrize("part", FRAME_PARTS[1:])
+@pytest.mark.parametrize("part", ["judged", "calibration"])
 def test_a_part_without_a_window_is_refused_in_one_sentence(part):
-    given = folder(4)
+    given = {"learned": prints(0, 4), "judged": prints(10, 4), "calibration": prints(20, 4)}
+    parts.check_parts(given, recorded=True, window=3 * WINDOW)
     given[part] = prints(200, 4, frames=WINDOW - 1)
-    with pytest.raises(
-        ValueError, match=f"expected 4 frames in a row at one class .* for {part}, found none"
-    ):
-        split_windows(given)
-    given[part] = prints(200, 4)._replace(valid=np.zeros(12 * WINDOW, bool))
-    with pytest.raises(ValueError, match=f"for {part}, found none in 48; record longer stretches"):
-        split_windows(given)
+    said = f"expected 12 frames in a row in the frames for {part}, found none in 36; record longer stretches"
+    with pytest.raises(ValueError, match=said):
+        parts.check_parts(given, recorded=True, window=3 * WINDOW)

@@ -15,6 +15,7 @@ from pipeline.setpoint.frames import familiar
 from pipeline.setpoint.simulation import actuation
 from pipeline.setpoint.simulation.actuation import ACTS, SetpointLimits, Waits
 from pipeline.setpoint.simulation.simulator import Action, SetpointController
+from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration, window_flow
 from pipeline.store import params
 from stages.render_frames import RenderFrames, render_camera
 from tests.setpoint.step_response import settling_s, step_response
@@ -23,9 +24,8 @@ MACHINE = MachineDynamics(heater_s=15.0, heater_delay_s=2.0, melt_s=1.2, softeni
 LIMITS = SetpointLimits(
     np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([120.0, 40.0])
 )
-JUDGE = functools.partial(
-    deployment.judge_window, least_frames=4, correlation=0.45, foreign_above=5.0, conformal_level=0.15
-)
+JUDGE = functools.partial(deployment.judge_window, least_frames=4, foreign_above=5.0)
+KNOTS = np.log(np.array(KNOTS_PERCENT) / 100)
 TICK = 0.05
 
 
@@ -92,11 +92,13 @@ def test_a_hotter_melt_lets_go_of_what_it_holds_and_then_flows_as_it_is_fed():
 
 
 def _classify(images, temperature):
-    """Class probabilities from a width in percent that stands in a key area's first
-    two bytes; a key area without a width is foreign."""
+    """Class probabilities and flow from a width in percent that stands in a key area's first two bytes; a key
+    area without a width is foreign."""
     width = images[:, 0, 0] + 256.0 * images[:, 0, 1]
     under, over = norm.cdf((90 - width) / 8), norm.sf((110 - width) / 8)
-    return np.stack([under, np.clip(1 - under - over, 0, 1), over], axis=1), np.where(width > 0, 0.0, 9.0)
+    prob = np.stack([under, np.clip(1 - under - over, 0, 1), over], axis=1)
+    log_flow = np.log(np.maximum(width, 1.0) / 100)
+    return prob, np.where(width > 0, 0.0, 9.0), log_flow, np.full(len(width), 0.1)
 
 
 LOOP = PixelLoop(
@@ -110,6 +112,8 @@ LOOP = PixelLoop(
     least_score=10.0,
     tip_tolerance_px=4.0,
     segment_mean_s=20.0,
+    window_flow=functools.partial(window_flow, fitted=FlowCalibration(KNOTS, np.ones(len(KNOTS)), 0.3)),
+    foreign=lambda looks: np.zeros(len(looks), bool),
 )
 
 
@@ -218,7 +222,13 @@ def test_time_counts_waits_and_windows(numbers):
 
 def _over(images, temperature):
     """A classifier that sees too much everywhere."""
-    return np.tile([0.01, 0.01, 0.98], (len(images), 1)), np.zeros(len(images))
+    log_flow = np.log(1.8) + 1e-4 * images.mean(axis=(1, 2))
+    return (
+        np.tile([0.01, 0.01, 0.98], (len(images), 1)),
+        np.zeros(len(images)),
+        log_flow,
+        np.full(len(images), 0.1),
+    )
 
 
 # six starts in one segment each: the template is cut and found again under the same light
@@ -276,7 +286,7 @@ def camera():
 
 def test_pictures_of_another_kind_are_held_and_those_of_the_known_camera_are_not(camera):
     """Two windows as they are rendered, then two through a lens so far out of focus as none of the segments;
-    where no camera is known, those are acted on."""
+    where nothing is foreign, those are acted on, and where the camera cannot be judged, none."""
     foreign = functools.partial(familiar.foreign, camera, false_alarms=familiar.FALSE_ALARMS)
     loop = CALM_LIGHT._replace(foreign=foreign)
     blurred = calm(6)._replace(blur_px=np.full(6, 6.0), burst_at=np.full(6, 2), burst_for=np.full(6, 2))
@@ -287,6 +297,10 @@ def test_pictures_of_another_kind_are_held_and_those_of_the_known_camera_are_not
     assert held[:, :2].mean() <= 0.1
     assert seen[:, 2:].any() and held[:, 2:][seen[:, 2:]].all()
     assert (got.sent[held] == 0).all()
+    unproven = run(FILTERED, None, SIX, CALM_LIGHT._replace(foreign=None), calm(6), decisions=2,
+                   rng=np.random.default_rng(3))  # fmt: skip
+    assert (unproven.windows.reason == actuation.UNPROVEN).all()
+    assert (unproven.sent == 0).all()
 
 
 def test_a_picture_without_any_detail_is_held():

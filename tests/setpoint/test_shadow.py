@@ -28,9 +28,11 @@ from pipeline.recordings import watch_sources
 from pipeline.recordings.watch_sources import CameraFrame, Folder, RecordingSource
 from pipeline.setpoint.agents import bayes
 from pipeline.setpoint.deployment import deployment
+from pipeline.setpoint.frames import familiar
 from pipeline.setpoint.material import PLA, PrintedMaterial
 from pipeline.setpoint.simulation import actuation
 from pipeline.setpoint.vision.calibrated_classifier import FrameReadings
+from pipeline.setpoint.vision.proof import CameraProof
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration, window_flow
 from pipeline.store import artifacts
 from tests.nozzle_folders import ANY
@@ -38,6 +40,12 @@ from tests.nozzle_folders import ANY
 ROOT = Path(__file__).resolve().parents[2]
 GIF = Path("/work/shared/data/fast_caxton_frames/nozzle_video.gif")
 TIP, FRAMES = (120.0, 90.0), 8
+MEASURES = len(familiar.NAMES)
+# to which every picture is familiar
+ANY_CAMERA = familiar.KnownCamera(
+    np.zeros(MEASURES), np.ones(MEASURES), np.eye(MEASURES), np.full(100, 1e300)
+)
+PROVEN = CameraProof(0.9, 0.8, 0.6, 400, 40, 400, False)
 
 
 def picture(seed: int, half_width: float = 9.0) -> np.ndarray:
@@ -66,15 +74,14 @@ def deployed(**changes) -> DeployedLoop:
     )
 
     def judge(*window, flows):
-        return deployment.judge_window(
-            *window, flows=flows, least_frames=4, correlation=0.5, foreign_above=9.0, conformal_level=0.15
-        )
+        return deployment.judge_window(*window, flows=flows, least_frames=4, foreign_above=9.0)
 
     knots = np.log(np.array(KNOTS_PERCENT) / 100)
     made = DeployedLoop(
         read=by_width,
         window_flow=partial(window_flow, fitted=FlowCalibration(knots, np.ones(len(knots)), 0.5)),
-        known=None,
+        known=ANY_CAMERA,
+        proof=PROVEN,
         name="Bayes",
         controller=bayes.bayes(1),
         parameters=parameters,

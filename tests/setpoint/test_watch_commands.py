@@ -25,14 +25,14 @@ from pipeline.setpoint.tables import WINDOW_PARTS, WINDOWS
 from pipeline.setpoint.vision import calibration
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
 from pipeline.setpoint.vision.calibration import ClassifierCalibration, Familiar
-from pipeline.setpoint.vision.files import store_classifier
+from pipeline.setpoint.vision.files import restore_classifier, store_classifier
 from pipeline.setpoint.vision.vision_transformer import SMALL, vision_transformer
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.store import artifacts, params
 from stages import train_agent
 from stages.train_agent import TrainAgent
 from tests.setpoint.synthetic import synthetic_flow_table
-from tests.setpoint.test_shadow import TIP, picture
+from tests.setpoint.test_shadow import ANY_CAMERA, PROVEN, TIP, picture
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -80,12 +80,12 @@ def make() -> None:
     features = network.head.classes.W.shape[0] + bands
     knots = np.log(np.array(KNOTS_PERCENT) / 100)
     known = ClassifierCalibration(
-        1.0, 0.1, 0.2, Familiar(np.zeros((3, features)), np.eye(features)), 1e9,
-        FlowCalibration(knots, np.ones(len(knots)), 0.5),
+        1.0, Familiar(np.zeros((3, features)), np.eye(features)), 1e9,
+        FlowCalibration(knots, np.ones(len(knots)), 0.5), PROVEN,
     )  # fmt: skip
     view = params.load(TrainClassifier, "train_classifier")
     store_classifier(folder, view.size, CalibratedClassifier(network, known))
-    store_camera(folder / CAMERA_FILE, None)
+    store_camera(folder / CAMERA_FILE, ANY_CAMERA)
     tables = {
         part: synthetic_flow_table(np.random.default_rng(1), segments=80, windows=3) for part in WINDOW_PARTS
     }
@@ -117,6 +117,32 @@ def test_the_default_watches_a_folder(command, trained):
     assert "in: 45 frames, 2 decisions" in said and "nothing was sent" in said
     assert len(decisions()) == 2 and decisions()[0]["flow_seen_percent"] > 0
     assert "Bayes, robust" in Path("shadow/index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("proof", "camera_known", "why"),
+    [
+        (PROVEN._replace(low=0.5), True, "50 % at least by its 90 % bound, 60 % required"),
+        (PROVEN._replace(known_from=72), False, "but 72 windows do not tell it from other cameras, 200 do"),
+    ],
+    ids=["not right enough", "too few windows to know the camera"],
+)
+def test_a_camera_that_cannot_be_judged_is_held_and_the_first_line_says_why(
+    command, trained, proof, camera_known, why
+):
+    folder = Path("datasets/train_classifier")
+    model = restore_classifier(f"{folder}/weights.safetensors", f"{folder}/calibration.parquet")
+    store_classifier(folder, "small", model._replace(calibration=model.calibration._replace(proof=proof)))
+    store_camera(folder / CAMERA_FILE, ANY_CAMERA if camera_known else None)
+    camera(45)
+    status, said, wrong = command("shadow", "in", "--once", "--tip", f"{TIP[0]:g},{TIP[1]:g}")
+    assert (status, wrong) == (0, "")
+    first = said.splitlines()[0]
+    assert first.startswith("in: cannot judge this camera: right in 90 % of 400 windows of 40 prints")
+    assert why in first and first.endswith("everything is held")
+    assert "2 decisions: 0 would have changed a setpoint, 2 held" in said
+    assert {row["reason"] for row in decisions()} == {"cannot judge this camera"}
+    assert "cannot judge this camera: right in 90 %" in Path("shadow/index.html").read_text()
 
 
 def test_the_material_of_the_settings_is_what_is_watched(command, trained):

@@ -229,8 +229,12 @@ def _seen(window: Sequence[CameraFrame], flow: float, protocol: Protocol, eye: E
         )
     )
     readings = eye.read(areas.images, temperature)
-    shown = eye.window_flow(readings.log_flow[None], readings.deviation[None], valid[None])
-    looks = familiar.median(areas.surroundings.astype(float))
+    # no looks: what they say is of the camera that the classifier learned from
+    looks, unknown = (
+        familiar.median(areas.surroundings.astype(float)),
+        np.full((1, len(familiar.NAMES)), np.nan),
+    )
+    shown = eye.window_flow(readings.log_flow[None], readings.deviation[None], valid[None], unknown)
     flow = float(eye.material.published_flow(np.array(flow)))
     return _Window(flow, float(shown.flow_seen[0]), len(window), readings.distance[valid], looks)
 

@@ -12,10 +12,10 @@ import numpy as np
 from pipeline.recordings.watch_sources import CameraFrame
 from pipeline.setpoint.agents import bayes
 from pipeline.setpoint.deployment import deployment
-from pipeline.setpoint.deployment.deployment import JudgedWindow, camera_seen
+from pipeline.setpoint.deployment.deployment import JudgedWindow, camera_guard, camera_seen
 from pipeline.setpoint.deployment.pixels import ADVANTAGE, LIKENESS, LOOKS, REACH_PX, TEMPLATE_PX
 from pipeline.setpoint.frames import familiar, key_area
-from pipeline.setpoint.frames.familiar import FALSE_ALARMS, KnownCamera
+from pipeline.setpoint.frames.familiar import KnownCamera
 from pipeline.setpoint.frames.front_end import FrameKeyAreas, find_key_areas
 from pipeline.setpoint.material import PLA, PrintedMaterial
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
@@ -24,6 +24,7 @@ from pipeline.setpoint.simulation import actuation
 from pipeline.setpoint.simulation.actuation import ACTS, FOREIGN, SetpointLimits, is_evidence
 from pipeline.setpoint.simulation.simulator import Observation, SetpointController
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, FrameReadings, read_frames
+from pipeline.setpoint.vision.proof import CameraProof
 from pipeline.store.printable import printable
 
 # frames of a window that the page shows
@@ -52,16 +53,18 @@ class DeployedLoop(NamedTuple):
     """What decides.
 
     read(images (n, 16, 48), temperature (n,)) -> what n key areas show; window_flow(log_flow, deviation,
-    valid), each (E, W) -> flow_seen in percent, spread and class probabilities of windows, those of this
-    camera where levels were recorded; how the known camera looks, None where nobody said; the default
-    controller with its name and parameters, frames of a window, the front end's least score, how a window is
-    judged, the limits, how long after a move of the setpoint frames are of no use, how far the nozzle may be
-    from where its tip was. All of it is of the published material; `material` is the one that is printed.
+    valid, looks), each (E, W), looks (E, measures) -> flow_seen in percent, spread and class probabilities of
+    windows, those of this camera where levels were recorded; how the known camera looks, and what is proven
+    of it (`proof`): where it cannot be judged all is held; the default controller with its name and
+    parameters, frames of a window, the front end's least score, how a window is judged, the limits, how long
+    after a move of the setpoint frames are of no use, how far the nozzle may be from where its tip was. All
+    of it is of the published material; `material` is the one that is printed.
     """
 
     read: Callable[[np.ndarray, np.ndarray], FrameReadings]
     window_flow: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
     known: KnownCamera | None
+    proof: CameraProof
     name: str
     controller: SetpointController
     parameters: Any
@@ -92,11 +95,12 @@ class ShadowDecision(NamedTuple):
 
 
 class Looks(NamedTuple):
-    """What is known of this printer's camera: what makes a window's flow, as Deployed has it; how it looks,
-    and the distance that is foreign there."""
+    """What is known of this printer's camera: what makes a window's flow, as DeployedLoop has it; how it
+    looks, what is proven of it, and the distance that is foreign there."""
 
     window_flow: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
     known: KnownCamera | None
+    proof: CameraProof
     foreign_above: float
 
 
@@ -110,12 +114,10 @@ def deployed(
 ) -> DeployedLoop:
     """The loop as it is deployed through pixels, without a machine."""
     q = settings.pixels
-    judge = deployment.window_judge(
-        model.calibration, least_frames=q.least_frames, foreign_above=looks.foreign_above
-    )
+    judge = partial(deployment.judge_window, least_frames=q.least_frames, foreign_above=looks.foreign_above)
     limits = deployment.deployed_limits(q.per_action, q.per_minute)
     read = partial(read_frames, model)
-    eye = read, looks.window_flow, looks.known
+    eye = read, looks.window_flow, looks.known, looks.proof
     return DeployedLoop(
         *eye, *spec, view.window, view.least_score, judge, limits, q.wait_s, q.tip_tolerance_px, material
     )
@@ -169,17 +171,21 @@ class Mind:
         """What the frames say together."""
         of = self.deployed
         valid = np.array([not reason for reason in areas.reasons])
-        readings = of.read(areas.images, temperature)
+        readings, looks = (
+            of.read(areas.images, temperature),
+            familiar.median(areas.surroundings.astype(float)),
+        )
         judged = of.judge(
             readings.prob[None],
             valid[None],
             readings.distance[None],
             np.array([tip_moved]),
-            flows=lambda counts: of.window_flow(readings.log_flow[None], readings.deviation[None], counts),
+            flows=lambda counts: of.window_flow(
+                readings.log_flow[None], readings.deviation[None], counts, looks[None]
+            ),
         )
-        looks, was = familiar.median(areas.surroundings.astype(float)), judged.reason[0]
-        foreign = of.known and partial(familiar.foreign, of.known, false_alarms=FALSE_ALARMS)
-        judged = camera_seen(judged, np.array([self.last_seen]), looks[None], foreign)
+        was, guard = judged.reason[0], camera_guard(of.known, of.proof)
+        judged = camera_seen(judged, np.array([self.last_seen]), looks[None], guard)
         self.last_seen = judged.flow_seen[0]
         if of.known is not None and judged.reason[0] == FOREIGN != was:
             notes.append(f"the pictures are none of the known camera: {familiar.unlike(of.known, looks)}")

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.commands.levels_files import LEVELS_FILE, restore_levels
+from pipeline.commands.levels_files import LEVELS_FILE, RecordedLevels, restore_levels
 from pipeline.commands.shadow.decide import DeployedLoop, Looks, WatchOptions, deployed
 from pipeline.recordings.nozzle_frames import Topics
 from pipeline.setpoint import levels
@@ -66,11 +66,14 @@ def ready(levels_file: str | None) -> Ready:
     agents = restore_agents("datasets/train_agent/weights.safetensors")
     learn = windows["learn"]
     flow = partial(window_flow, fitted=model.calibration.flow)
-    looks = Looks(flow, restore_camera(CAMERA), model.calibration.foreign_above)
+    proof = model.calibration.proof
+    looks = Looks(flow, restore_camera(CAMERA), proof, model.calibration.foreign_above)
     if levels_file is not None and (levels_file or artifacts.exists(LEVELS_FILE)):
         recorded = restore_levels(levels_file or LEVELS_FILE, digest)
         learn = levels.table(recorded.levels, recorded.windows, learn.flow_edges)
-        looks = Looks(partial(of_camera, flow, recorded.levels), recorded.camera, recorded.foreign_above)
+        corrected = partial(of_camera, flow, recorded.levels)
+        proof = proof._replace(known_from=known_from(recorded))
+        looks = Looks(corrected, recorded.camera, proof, recorded.foreign_above)
     rows = [row for row in CONTROLLERS if row.name == name]
     built = build_controllers(settings.baselines, agents, learn, rows)
     if name not in built:
@@ -84,15 +87,23 @@ def ready(levels_file: str | None) -> Ready:
     return Ready(deployed(model, spec, looks, settings, view, material), options.topics, options.tip_px)
 
 
+def known_from(recorded: RecordedLevels) -> int:
+    """Windows by which a camera with levels is told from others."""
+    return len(recorded.windows.seen) if recorded.camera is None else 2 * len(recorded.camera.scores)
+
+
 def of_camera(
     flow: Callable[..., WindowFlow],
     of: levels.Levels,
     log_flow: np.ndarray,
     deviation: np.ndarray,
     valid: np.ndarray,
+    looks: np.ndarray,
 ) -> WindowFlow:
-    """What `flow` gives of windows (E, W), corrected by the levels of this camera."""
-    seen = levels.corrected(of, flow(log_flow, deviation, valid).flow_seen)
+    """What `flow` gives of windows (E, W), corrected by the levels of this camera. What looks say is of the
+    camera that the classifier learned from, and left out here."""
+    unknown = np.full_like(looks, np.nan)
+    seen = levels.corrected(of, flow(log_flow, deviation, valid, unknown).flow_seen)
     some = np.isfinite(seen)
     prob = np.full((len(seen), 3), 1 / 3)
     prob[some] = levels.probabilities(of, seen[some])

@@ -16,6 +16,7 @@ from pipeline.setpoint.deployment import deployment
 from pipeline.setpoint.material import GOOD, PrintedMaterial
 from pipeline.setpoint.simulation import actuation
 from pipeline.setpoint.simulation.actuation import ACTS
+from pipeline.setpoint.vision.proof import verdict
 from pipeline.store.printable import counted, printable, printable_page
 
 COLOURS = ("#3b76c4", "#2f9e5a", "#d0662a")
@@ -41,6 +42,7 @@ def render(
     values = {
         "place": _text(place),
         "controller": _text(of.name),
+        "proof": _text(verdict(of.proof)),
         "refresh": "" if state == ENDED else '<meta http-equiv="refresh" content="2">',
         "warnings": "".join(f"<p class=warning>{_text(text)}</p>" for text in warnings),
         "would": "<p class=big>No window yet.</p>" if last is None else _would(last),

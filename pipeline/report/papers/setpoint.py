@@ -197,7 +197,7 @@ def _vision(sources: Sources) -> list[PaperFigure]:
     """Figure 5 (b, c) of the classifier of the last run."""
     course, classified = sources.tables["course"], sources.tables["classified"]
     out = []
-    if not isinstance(course, Missing):
+    if not isinstance(course, Missing) and len(course["epoch"]):
         mine = course["learner"] == "vision transformer"
         epochs, loss = course["epoch"][mine].tolist(), course["training_loss"][mine].tolist()
         right = course["held_out_accuracy"][mine]

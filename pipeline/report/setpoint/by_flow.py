@@ -1,4 +1,4 @@
-"""How often the classifier is right and covered, by flow: one chart, one table, the worst bin first."""
+"""How often the classifier is right, by flow: one chart, one table, the worst bin first."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -9,12 +9,12 @@ from markupsafe import Markup
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.digits import THIN, band, number, percent, quantity
+from pipeline.verdict.digits import THIN, band, number, quantity
 from pipeline.verdict.evidence import lookup
 from pipeline.verdict.setpoint import CLASS_BORDERS, share_in
 from pipeline.verdict.verdict import Figure, Missing
 
-TITLE = "Right and covered, by flow"
+TITLE = "Named rightly, by flow"
 # An ideal reader of the width that a rendered bead was drawn with: per cent of 960 new segments of 20 frames,
 # flow uniform over 70-150 %, by the lower edge of each bin of 5 %. Each segment carries a width bias of 5 %,
 # one draw, and each frame one of 8 % more, which no picture undoes.
@@ -29,32 +29,29 @@ IDEAL_BY_BIN = dict(
 
 
 class Bin(NamedTuple):
-    """A bin of true flow in percent: how often its windows are right and covered, what the ideal reader
-    reaches there (NaN where nobody knows), and whether a border of the classes is one of its ends."""
+    """A bin of true flow in percent: how often its windows are right, what the ideal reader reaches there
+    (NaN where nobody knows), and whether a border of the classes is one of its ends."""
 
     low: float
     high: float
     windows: int
     right: Figure
-    covered: Figure | Missing
     ideal: float
     beside: bool
 
 
 def bins(metrics: Mapping | Missing) -> list[Bin] | Missing:
     """Of train_classifier.json, the bin that is right least often first."""
-    found, covered = (lookup(metrics, key) for key in ("by_flow", "coverage_by_flow"))
+    found = lookup(metrics, "by_flow")
     if isinstance(found, Missing):
         return found
     rendered = lookup(metrics, "source") == "simulated"
-    sets = {} if isinstance(covered, Missing) else {row["flow_low"]: row for row in covered}
     rows = [
         Bin(
             row["flow_low"],
             row["flow_high"],
             row["windows"],
             figure,
-            share_in(sets.get(row["flow_low"])) or Missing("not measured", "no sets were judged"),
             IDEAL_BY_BIN.get(row["flow_low"], float("nan")) if rendered else float("nan"),
             any(border in CLASS_BORDERS for border in (row["flow_low"], row["flow_high"])),
         )
@@ -83,20 +80,14 @@ def by_flow(sources: Sources) -> dict[str, Any]:
             "right": quantity(row.right.value, "%", 0),
             "band": band(row.right.low, row.right.high, 0),
             "ideal": number(row.ideal, 0) if row.ideal == row.ideal else "not known",
-            "covered": row.covered.state
-            if isinstance(row.covered, Missing)
-            else quantity(row.covered.value, "%", 0),
-            "covered_band": ""
-            if isinstance(row.covered, Missing)
-            else band(row.covered.low, row.covered.high, 0),
             "windows": f"{row.windows:,}",
         }
         for row in found
     ]
     caption = (
         f"Bars: windows named rightly, by bins of 5{THIN}% of true flow; strokes: their 95{THIN}% intervals, "
-        "by segment. Pale: a bin beside a border of the classes. Blue line: windows whose set of classes "
-        "holds the true one. Segments that nothing was learned, calibrated or chosen on."
+        "by segment. Pale: a bin beside a border of the classes. Segments that nothing was learned, "
+        "calibrated or chosen on."
     )
     if ideal:
         caption += (
@@ -106,7 +97,7 @@ def by_flow(sources: Sources) -> dict[str, Any]:
     picture = Picture(
         "by-flow",
         TITLE,
-        finding(found, lookup(metrics, "right_70_150"), lookup(metrics, "conformal.held")),
+        finding(found, lookup(metrics, "right_70_150")),
         [PictureColumn("Windows named rightly", "in per cent, by true flow", "", [_chart(found)])],
         caption,
         page.origin(sources.source("train_classifier")),
@@ -114,9 +105,8 @@ def by_flow(sources: Sources) -> dict[str, Any]:
     return {"picture": picture, "rows": rows, "ideal": ideal}
 
 
-def finding(rows: Sequence[Bin], every: Any, held: Any) -> str:
-    """The worst bin, the worst away from the borders, all as if as frequent, the worst coverage, and its
-    price: the share of windows whose set is no single class."""
+def finding(rows: Sequence[Bin], every: Any) -> str:
+    """The worst bin, the worst away from the borders, and all as if as frequent."""
     text = _worst("Worst bin: ", rows[0])
     away = [row for row in rows if not row.beside]
     if rows[0].beside and away:
@@ -127,17 +117,7 @@ def finding(rows: Sequence[Bin], every: Any, held: Any) -> str:
             f"({band(share.low, share.high, 1)})"
         )
         text += f"; the ideal reader {quantity(IDEAL, '%', 1)}." if rows[0].ideal == rows[0].ideal else "."
-    covered = [(row.covered, row) for row in rows if isinstance(row.covered, Figure)]
-    if not covered:
-        return f"{text} Coverage by flow was not measured."
-    least, where = min(covered, key=lambda pair: (pair[0].value, pair[0].low))
-    text += (
-        f" Covered least at {place(where)}: {quantity(least.value, '%', 0)}"
-        f"{_interval(least)} of {where.windows:,} windows."
-    )
-    if isinstance(held, Missing):
-        return text
-    return f"{text} The price: in {percent(100 * held, 2)} of all windows no single class is left."
+    return text
 
 
 def _worst(head: str, row: Bin) -> str:
@@ -156,7 +136,7 @@ def _interval(figure: Figure) -> str:
 
 
 def _chart(rows: Sequence[Bin]) -> Markup:
-    """Bars with intervals, coverage and the ideal reader as steps."""
+    """Bars with intervals, and the ideal reader as steps."""
     rows = sorted(rows)
     x = charts.Axis(rows[0].low, rows[-1].high, tuple((v, f"{v:g}") for v in _ticks(rows)))
     y = charts.Axis(0, 104, tuple((float(v), str(v)) for v in (0, 25, 50, 75, 100)))
@@ -179,10 +159,6 @@ def _chart(rows: Sequence[Bin]) -> Markup:
     ideal = np.repeat([row.ideal for row in rows], 2)
     if np.isfinite(ideal).any():
         layers.append(charts.line(frame, edges, ideal, "ref"))
-    covered = [row.covered.value if isinstance(row.covered, Figure) else np.nan for row in rows]
-    layers.append(charts.line(frame, edges, np.repeat(covered, 2), "line dd"))
-    if isinstance(rows[-1].covered, Figure):
-        layers.append(charts.label(frame, rows[-1].high, covered[-1], "covered", anchor="end", dy=-5))
     least = min(rows, key=lambda row: row.right.value)
     alt = (
         f"Windows are named rightly least often between {least.low:g} and {least.high:g} % of flow, "

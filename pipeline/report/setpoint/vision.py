@@ -20,7 +20,7 @@ from pipeline.verdict.verdict import Figure, Missing
 CLASSES = ("under", "good", "over")
 # characters of a frame's place in its recording that are shown, its end
 LONGEST = 60
-NAMES = {"svc": "support vector machine", "cnn": "convolutional network", "width": "width rule"}
+NAMES = {"svc": "support vector machine", "width": "width rule"}
 DIAGRAMS = (
     ("image", "raw", "One image, as trained", "softmax of the network", "ece_image_raw"),
     ("image", "calibrated", "One image, calibrated", "logits over one temperature", "ece_image"),
@@ -278,6 +278,9 @@ def learning_curves(sources: Sources) -> Picture:
     title = "The classifier in training"
     if isinstance(table, Missing):
         return placeholder("course", title, table)
+    if not len(table["epoch"]):
+        gap = Missing("not applicable", "few own pictures train no network: only its last layer was fitted")
+        return placeholder("course", title, gap)
     svc, limit = accuracy(metrics, "svc_image"), 100 * sources.declared.rules.image_accuracy
     columns, sentences = [], []
     for name, rows in pd.DataFrame(table).groupby("learner", sort=False):
@@ -351,8 +354,6 @@ class Foreign(NamedTuple):
 
     kind: str
     auroc: str
-    energy: str
-    max_p: str
     detected: str
     alarms: str
 
@@ -367,6 +368,8 @@ def yardsticks(sources: Sources) -> dict[str, Any]:
         ("", "Vision transformer"),
         *((key, text[:1].upper() + text[1:]) for key, text in NAMES.items()),
     ):
+        if isinstance(accuracy(metrics, f"{name}_image".strip("_")), Missing):
+            continue  # of few own pictures no other way is learned
         cells = []
         # of windows of all flows none is asked: the rule asks for 70 to 150 %
         for of, limit in (("image", sources.declared.rules.image_accuracy), ("window", 0.0)):
@@ -379,21 +382,10 @@ def yardsticks(sources: Sources) -> dict[str, Any]:
                 }
             )
         rows.append({"name": head, "mark": "baseline" if name else "data_driven", "cells": cells})
-    sets = lookup(metrics, "conformal")
+    said = lookup(metrics, "proof.verdict")
+    proof = said.sentence() if isinstance(said, Missing) else f"The classifier: {said}."
     foreign = lookup(metrics, "out_of_distribution")
-    return {"missing": None, "rows": rows, "conformal": _conformal(sets), "foreign": _foreign(foreign)}
-
-
-def _conformal(sets: Any) -> str:
-    if isinstance(sets, Missing):
-        return f"Sets of classes: {sets.sentence()}"
-    asked = f" ({percent(100 * sets['asked'], 3)} asked for)" if sets.get("asked") is not None else ""
-    return (
-        f"Sets of classes hold the true one in {percent(100 * sets['coverage'], 3)} of "
-        f"{sets['windows']:,} windows{asked}; "
-        f"in {percent(100 * sets['held'], 2)} the set is no single class. "
-        "The controller weighs the flow that such a window shows, and may still move."
-    )
+    return {"missing": None, "rows": rows, "proof": proof, "foreign": _foreign(foreign)}
 
 
 def _foreign(detection: Any) -> list[Foreign]:
@@ -403,9 +395,9 @@ def _foreign(detection: Any) -> list[Foreign]:
     rows = []
     for kind, figures in detection.items():
         if isinstance(figures, dict) and "auroc" in figures:
-            areas = (_area(figures.get(name)) for name in ("auroc", "energy_auroc", "max_p_auroc"))
             alarms = figures.get("false_alarms", detection.get("false_alarms"))
-            rows.append(Foreign(str(kind), *areas, _share(figures.get("found")), _share(alarms)))
+            area, found = _area(figures["auroc"]), _share(figures.get("found"))
+            rows.append(Foreign(str(kind), area, found, _share(alarms)))
     return rows
 
 

@@ -7,19 +7,22 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.setpoint.frames import familiar
+from pipeline.setpoint.frames.familiar import FALSE_ALARMS, KnownCamera
 from pipeline.setpoint.simulation.actuation import (
     ACTS,
-    AMBIGUOUS,
     FEW,
     FOREIGN,
     REASONS,
     TIP,
+    UNPROVEN,
     SetpointLimits,
     is_evidence,
     still,
 )
 from pipeline.setpoint.simulation.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS
-from pipeline.setpoint.vision.calibration import ClassifierCalibration, hard_shares, window_probabilities
+from pipeline.setpoint.vision.proof import CameraProof, may_judge
+from pipeline.setpoint.vision.window_flow import WindowFlow
 
 CLASSES = ("under", "good", "over")
 
@@ -27,18 +30,14 @@ CLASSES = ("under", "good", "over")
 class JudgedWindow(NamedTuple):
     """What E windows of frames say. `reason` indexes REASONS: 0 acts, all else holds.
 
-    p (E, 3) soft shares, counts of which the paper makes its shares: shares (E, 3) and scaled (E, 3) of (4),
-    label (E,) the class of p, members (E, 3) the conformal set, score (E,) the median out-of-distribution
-    score, valid (E,) and used (E,) the frames that were valid and the frames that count, reason (E,). Where
-    no frame counts, p and shares are 1/3 each and the score is NaN. flow_seen (E,) in percent of nominal and
-    spread (E,), the deviation of its logarithm, NaN where the classifier names classes only.
+    p (E, 3) shares of the classes, label (E,) the class of p, score (E,) the median out-of-distribution
+    score, valid (E,) and used (E,) the frames that were valid and the frames that count, reason (E,),
+    flow_seen (E,) in percent of nominal and spread (E,), the deviation of its logarithm. Where no frame
+    counts, p is 1/3 each and score, flow and spread NaN.
     """
 
     p: np.ndarray
-    shares: np.ndarray
-    scaled: np.ndarray
     label: np.ndarray
-    members: np.ndarray
     score: np.ndarray
     valid: np.ndarray
     used: np.ndarray
@@ -54,30 +53,15 @@ def deployed_limits(per_action: Sequence[float], per_minute: Sequence[float]) ->
     return SetpointLimits(*ends, np.array(per_action), np.array(per_minute))
 
 
-def window_judge(
-    fitted: ClassifierCalibration, *, least_frames: int, foreign_above: float
-) -> Callable[..., "JudgedWindow"]:
-    """`judge_window` by a classifier's calibration."""
-    return partial(
-        judge_window,
-        least_frames=least_frames,
-        correlation=fitted.correlation,
-        foreign_above=foreign_above,
-        conformal_level=fitted.level,
-    )
-
-
 def judge_window(
     probabilities: np.ndarray,
     valid: np.ndarray,
     scores: np.ndarray,
     tip_moved: np.ndarray,
     *,
-    flows: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]] | None = None,
+    flows: Callable[[np.ndarray], WindowFlow],
     least_frames: int,
-    correlation: float,
     foreign_above: float,
-    conformal_level: float,
 ) -> JudgedWindow:
     """E windows of W frames each: class probabilities (E, W, 3), valid (E, W), out-of-distribution scores (E,
     W), tip moved (E,) -> what they say together.
@@ -85,16 +69,10 @@ def judge_window(
     A frame counts when its key area is valid, its probabilities are a distribution and its score is at most
     `foreign_above`. Of the m that count
 
-        p = softmax( sum_i log p_i / (1 + (m - 1) correlation) )    design effect of one segment: Kish 1965
-        w_c = #{i: argmax p_i = c},  p = w / m,  p-hat = p / max p  Li and Pattinson 2025, eq. 1-4
-        members = {c: p_c >= conformal_level}                       split conformal: Sadinle et al. 2019
+        flow_seen, spread, p = flows(frames that count (E, W))      window_flow.window_flow
 
-    Held: fewer than `least_frames` count (by what cost the most of them), the tip has
-    moved, or the set is no single class.
-
-    flows(frames that count (E, W)) -> flow_seen (E,), spread (E,), class probabilities (E, 3) is of a
-    classifier that shows flows (`calibration.window_flow`). Its windows have those probabilities, and are not
-    held for two classes: how sure the flow is, is for the controller to weigh.
+    Held: fewer than `least_frames` count (by what cost the most of them), or the tip has moved. How sure the
+    flow is, is for the controller to weigh.
     """
     P, valid, scores = np.asarray(probabilities, float), np.asarray(valid, bool), np.asarray(scores, float)
     if (
@@ -117,27 +95,11 @@ def judge_window(
     sound = valid & (P >= 0).all(axis=2) & (np.abs(P.sum(axis=2) - 1) < 1e-3)
     familiar = sound & (scores <= foreign_above)
     m = familiar.sum(axis=1)
-    logs = np.log(np.clip(P, 1e-6, 1.0))
-    p, shares = window_probabilities(logs, familiar, correlation), hard_shares(logs, familiar)
-    flow_seen, spread = np.full((2, len(P)), np.nan)
-    if flows is not None:
-        flow_seen, spread, p = flows(familiar)
-    members = p >= conformal_level
+    flow_seen, spread, p = flows(familiar)
     few = np.where(sound.sum(axis=1) >= least_frames, FOREIGN, FEW)
-    reason = np.where((members.sum(axis=1) != 1) & np.isnan(flow_seen), AMBIGUOUS, ACTS)
-    reason = np.where(tip_moved, TIP, np.where(m < least_frames, few, reason))
+    reason = np.where(tip_moved, TIP, np.where(m < least_frames, few, ACTS))
     return JudgedWindow(
-        p,
-        shares,
-        shares / shares.max(axis=1, keepdims=True),
-        p.argmax(axis=1),
-        members,
-        _median(scores, sound),
-        valid.sum(axis=1),
-        m,
-        reason,
-        flow_seen,
-        spread,
+        p, p.argmax(axis=1), _median(scores, sound), valid.sum(axis=1), m, reason, flow_seen, spread
     )
 
 
@@ -150,6 +112,13 @@ def _median(scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return ordered[np.arange(len(n)), np.where(n > 0, n // 2, -1)]
 
 
+def camera_guard(camera: KnownCamera | None, proof: CameraProof) -> Callable[[np.ndarray], np.ndarray] | None:
+    """foreign(looks) for `camera_seen`; None where the camera cannot be judged: everything is held."""
+    if camera is None or not may_judge(proof):
+        return None
+    return partial(familiar.foreign, camera, false_alarms=FALSE_ALARMS)
+
+
 def camera_seen(
     window: JudgedWindow,
     last_seen: np.ndarray,
@@ -160,10 +129,12 @@ def camera_seen(
 
     last_seen (E,) is the flow that the window before showed, NaN where there was none; looks (E, measures)
     how the windows look (`familiar`), NaN where no frame was measured; foreign(looks) -> (E,) bool, None
-    where no camera is known.
+    where the camera cannot be judged (`proof`): all windows are held.
     """
     reason = np.where(window.reason == ACTS, still(window.flow_seen, last_seen), window.reason)
-    if foreign is not None:
+    if foreign is None:
+        reason = np.full_like(reason, UNPROVEN)
+    else:
         reason = np.where(is_evidence(reason) & foreign(looks), FOREIGN, reason)
     return window._replace(reason=reason)
 
@@ -181,7 +152,7 @@ def why(time_s: float, window: JudgedWindow, i: int, change: np.ndarray) -> str:
             )
             or "no change"
         )
-        seen = "" if np.isnan(window.flow_seen[i]) else f", flow {window.flow_seen[i]:.0f} %"
-        return f"{frames}{seen}, {CLASSES[window.label[i]]} {window.p[i, window.label[i]]:.2f}; {moves}"
+        named = f"{CLASSES[window.label[i]]} {window.p[i, window.label[i]]:.2f}"
+        return f"{frames}, flow {window.flow_seen[i]:.0f} %, {named}; {moves}"
     shares = " ".join(f"{name} {p:.2f}" for name, p in zip(CLASSES, window.p[i], strict=True))
     return f"{frames}, {shares}, score {window.score[i]:.3g}; held: {REASONS[window.reason[i]]}"

@@ -2,7 +2,6 @@
 -> window -> hold or controller -> setpoints."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -154,13 +153,13 @@ class PixelLoop(NamedTuple):
     """What is closed into a loop, and how it is deployed.
 
     The machine; the classifier classify(images (n, 16, 48), temperature (n,)) -> class probabilities (n, 3),
-    out-of-distribution scores (n,) and, where it shows flows, log(flow / 100 %) (n,) and its deviation (n,);
+    out-of-distribution scores (n,), log(flow / 100 %) (n,) and its deviation (n,);
     frames a window at frame_rate_hz, waits, limits, and the rule of the window, judge(P, valid, scores,
     tip_moved, flows=) -> Window; the least ridge score of a key area, how far the nozzle may be from where
     its tip was calibrated, and how long a segment's conditions last on average. window_flow(log_flow,
-    deviation, valid), each (E, W), -> flow_seen, spread and class probabilities of windows; None of a
-    classifier that names classes only. foreign(looks (E, measures)) -> (E,) whether windows are of no camera
-    that is known (`familiar.foreign`); None where none is known.
+    deviation, valid, looks), each (E, W), looks (E, measures), -> flow_seen, spread and class probabilities
+    of windows. foreign(looks) -> (E,) whether windows are of no camera that is known; None where the camera
+    cannot be judged, and all is held (`deployment.camera_guard`).
     """
 
     machine: MachineDynamics
@@ -173,8 +172,8 @@ class PixelLoop(NamedTuple):
     least_score: float
     tip_tolerance_px: float
     segment_mean_s: float
-    window_flow: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]] | None = None
-    foreign: Callable[[np.ndarray], np.ndarray] | None = None
+    window_flow: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
+    foreign: Callable[[np.ndarray], np.ndarray] | None
 
 
 def _answer(
@@ -302,9 +301,8 @@ def _judged(loop: PixelLoop, areas: "_WindowAreas", temperature: np.ndarray) -> 
     E = len(temperature)
     P, scores, *flows = loop.classify(areas.images.reshape(-1, *key_area.SHAPE), temperature.ravel())
     shown = P.reshape(E, -1, 3), areas.valid, scores.reshape(E, -1), areas.tip_moved
-    if loop.window_flow is None:
-        return loop.judge(*shown)
-    return loop.judge(*shown, flows=partial(loop.window_flow, *(a.reshape(E, -1) for a in flows)))
+    log_flow, deviation = (a.reshape(E, -1) for a in flows)
+    return loop.judge(*shown, flows=lambda counts: loop.window_flow(log_flow, deviation, counts, areas.looks))
 
 
 def _episodes(
@@ -406,8 +404,7 @@ def _window_areas(
         nozzle = key_area.drift(some, cameras.templates[i], tip, reach_px=REACH_PX)
         images.append(areas.images)
         valid.append(areas.valid)
-        if loop.foreign is not None:
-            looks[i] = familiar.of_window(frames, np.array(tip), areas)
+        looks[i] = familiar.of_window(frames, np.array(tip), areas)
         moved.append(
             np.hypot(*nozzle.offset_px) > loop.tip_tolerance_px
             and nozzle.correlation >= LIKENESS

@@ -22,8 +22,9 @@ LEVELS = (1, 5, 25, 50, 75, 95, 99)  # percentiles of gray levels of the crop
 OCTAVES = 5
 # the strip beside the bead, in px across the line; the bead and its edges lie within REACH
 NEAR, REACH, START = 14, 28, 12
-# a frame's measures vary with its bead; a window's are the medians of a few
-FRAMES = 4
+# a frame's measures vary with its bead; a window's are the medians of a few: of so many that are spread over
+# it, or of the first accepted of every so many
+FRAMES, MEASURED = 4, 5
 # of windows of the known camera, the share that may be called foreign; pictures of other machines lie so far
 # off that it may be small
 FALSE_ALARMS = 0.01
@@ -174,6 +175,26 @@ def of_window(
     )
 
 
+def of_frames(
+    frames: np.ndarray, tip: tuple[float, float], areas: KeyAreas, *, least_score: float
+) -> np.ndarray:
+    """(n, measures) float32 of the first of every MEASURED frames (n, height, width) that has a line of
+    least_score gray levels; NaN of the others."""
+    looks = np.full((len(frames), len(NAMES)), np.nan, np.float32)
+    clear = np.flatnonzero(areas.valid & (areas.score >= least_score))
+    for i in clear[np.unique(clear // MEASURED, return_index=True)[1]]:
+        gray = key_area.crop(frames[i], (float(tip[0]), float(tip[1]))).gray
+        looks[i] = surroundings(gray, areas.angle_deg[i], areas.miss_px[i])
+    return looks
+
+
+def medians(measures: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """(w, measures) of windows with the frames `rows` (w, length) of `measures` (n, measures); NaN where none
+    of a window's was measured."""
+    looks = [median(measures[some].astype(float)) for some in rows]
+    return np.array(looks).reshape(len(rows), measures.shape[1])
+
+
 def median(rows: np.ndarray) -> np.ndarray:
     """(measures,) of a window's frames (n, measures), those without measures (NaN) left out."""
     rows = rows[np.isfinite(rows).all(axis=1)]
@@ -190,6 +211,11 @@ class KnownCamera(NamedTuple):
     scores: np.ndarray
 
 
+def needed_windows(false_alarms: float) -> int:
+    """Windows by which a camera is known: half of them give p-values down to false_alarms."""
+    return 2 * int(np.ceil(1 / false_alarms - 1e-9))
+
+
 def fit_camera(windows: np.ndarray, segment: np.ndarray, *, false_alarms: float) -> KnownCamera:
     """The camera of windows (n, f) of segments (n,): every other segment gives mean and covariance (shrunk:
     Ledoit and Wolf 2004), the others the scores, one each, the largest of its windows'.
@@ -199,7 +225,7 @@ def fit_camera(windows: np.ndarray, segment: np.ndarray, *, false_alarms: float)
     windows, segment = np.asarray(windows, float), np.asarray(segment)
     sound = np.isfinite(windows).all(axis=1)
     windows, segment = windows[sound], segment[sound]
-    names, needed = np.unique(segment), 2 * int(np.ceil(1 / false_alarms - 1e-9))
+    names, needed = np.unique(segment), needed_windows(false_alarms)
     if len(names) < needed:
         raise ValueError(
             f"a camera is known from at least {needed} segments with a fresh line where {false_alarms:.0%} "
@@ -247,17 +273,19 @@ def unlike(camera: KnownCamera, window: np.ndarray) -> str:
     return f"{NAMES[k]}: {abs(z[k]):.0f} deviations {'above' if z[k] > 0 else 'below'} the known camera's"
 
 
-def fit_recorded_camera(surroundings: np.ndarray, segment: np.ndarray, *, length: int) -> KnownCamera | None:
+def fit_recorded_camera(
+    surroundings: np.ndarray, segment: np.ndarray, *, length: int
+) -> tuple[KnownCamera | None, int]:
     """The camera of frames with `surroundings` (n, measures), by windows of `length` of them in a row in one
-    stretch `segment` (n,) of constant settings. What errs together is such a stretch; if these are too few, a
-    window; None if those are too few as well."""
+    stretch `segment` (n,) of constant settings; and the number of windows. What errs together is such a
+    stretch; if these are too few, a window; no camera if those are too few as well."""
     windows, stretch = window_medians(surroundings, segment, length=length)
     for together in (stretch, np.arange(len(windows))):
         try:
-            return fit_camera(windows, together, false_alarms=FALSE_ALARMS)
+            return fit_camera(windows, together, false_alarms=FALSE_ALARMS), len(windows)
         except ValueError:
             continue
-    return None
+    return None, len(windows)
 
 
 def window_medians(

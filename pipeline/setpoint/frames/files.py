@@ -11,7 +11,7 @@ from pipeline.setpoint.frames.rendered import LabelledFrames
 from pipeline.store import artifacts
 
 CAMERA_FILE, CAMERA_SCHEMA = "known_camera.parquet", ("known_camera", 1)
-FRAMES_SCHEMA = "frames 1"
+FRAMES_SCHEMA = "frames 2"
 
 
 def store_camera(path: Path, camera: KnownCamera | None) -> None:

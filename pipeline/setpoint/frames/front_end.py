@@ -9,8 +9,6 @@ import numpy as np
 
 from pipeline.setpoint.frames import familiar, key_area, travel
 
-# of so many frames the first accepted one is measured as the known camera's are: four of a window
-MEASURED = 5
 # frames among which the ground's motion is sought at a time
 IN_A_ROW = 20
 # cameras of 10 and 12 bits may leave the upper ones of 16 empty; a picture as dark as that
@@ -29,8 +27,8 @@ REMEDIES = {
 class FrameKeyAreas(NamedTuple):
     """What the front end made of n frames: images (n, 16, 48) uint8, zeros where rejected; angle_deg,
     miss_px, score, padded_share (n,), NaN where nothing was looked at; tip (n, 2) in px; surroundings (n,
-    measures) float32 of the first accepted of every MEASURED frames, NaN of the others; n reasons, empty
-    where there is a key area; n digests of what the frame held."""
+    measures) float32 of the first accepted of every familiar.MEASURED frames, NaN of the others; n reasons,
+    empty where there is a key area; n digests of what the frame held."""
 
     images: np.ndarray
     angle_deg: np.ndarray
@@ -57,9 +55,9 @@ def find_key_areas(
         areas += _found([one for one, _ in some], [float(d) for _, d in some], least_score)
         for i in range(first, len(areas)):
             cropped, area = some[i - first][0], areas[i]
-            if i // MEASURED > measured and not area.reason and not isinstance(cropped, str):
+            if i // familiar.MEASURED > measured and not area.reason and not isinstance(cropped, str):
                 surroundings[i] = familiar.surroundings(cropped.gray, area.angle_deg, area.miss_px)
-                measured = i // MEASURED
+                measured = i // familiar.MEASURED
     images = np.array([area.image for area in areas], np.uint8).reshape(-1, *key_area.SHAPE)
     figures = (
         np.array([getattr(area, name) for area in areas], float)

@@ -85,21 +85,6 @@ class RenderedFrames(NamedTuple):
     tip: tuple[float, float]
 
 
-class DataSet(NamedTuple):
-    """Key areas of many segments: images (n, 16, 48) uint8, label (n,) 0 1 2,
-    flow (n,) in percent, temperature (n,) in degC, segment (n,) 0 1 2 ..., valid
-    (n,) bool (images are zeros elsewhere), score (n,) of the line's ridge in gray levels, n reasons."""
-
-    images: np.ndarray
-    label: np.ndarray
-    flow: np.ndarray
-    temperature: np.ndarray
-    segment: np.ndarray
-    valid: np.ndarray
-    score: np.ndarray
-    reasons: tuple[str, ...]
-
-
 def label(flow: np.ndarray) -> np.ndarray:
     """Class of a flow in percent: 0 below 90, 1 from 90 to 110, 2 above; a flow that is not known (NaN) has
     none, and is for the caller to leave out."""
@@ -212,37 +197,6 @@ def draw_class_flow(rng: np.random.Generator, kind: int, n: int) -> np.ndarray:
     dealt out, with a leap at each border."""
     ends = (FLOWS[0], *BORDERS, FLOWS[1])
     return rng.uniform(ends[kind], ends[kind + 1], n)
-
-
-def filmed(
-    rng: np.random.Generator, flow: np.ndarray, temperature: np.ndarray, *, frames: int, least_score: float
-) -> DataSet:
-    """Key areas of n segments, each at its flow (n,) in percent and temperature (n,) in degC with `frames`
-    images.
-
-    Images of one segment share its conditions: a classifier learns
-    more from many short segments than from few long ones.
-    """
-    rows: list[tuple] = []
-    for q, degrees in zip(flow, temperature, strict=True):
-        made = render(draw_segment(rng), np.full(frames, q), np.full(frames, degrees), rng)
-        rows.append((made, key_areas(made, least_score=least_score)))
-    flow = np.repeat(np.asarray(flow, float), frames)
-    areas = [k for _, k in rows]
-    return DataSet(
-        np.concatenate([k.images for k in areas]), label(flow), flow, np.repeat(temperature, frames),
-        np.repeat(np.arange(len(rows)), frames), np.concatenate([k.valid for k in areas]),
-        np.concatenate([k.score for k in areas]), sum((k.reasons for k in areas), ()),
-    )  # fmt: skip
-
-
-def data_set(rng: np.random.Generator, *, segments: int, frames: int, least_score: float) -> DataSet:
-    """Key areas of `segments` segments for each of the paper's 15 combinations of class and temperature,
-    `frames` images each; flow and temperature stay within a segment."""
-    combination = np.arange(15 * segments)
-    flow = np.array([draw_class_flow(rng, kind, 1)[0] for kind in combination % 3])
-    temperature = np.array(TEMPERATURES)[combination // 3 % 5]
-    return filmed(rng, flow, temperature, frames=frames, least_score=least_score)
 
 
 def _slope(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:

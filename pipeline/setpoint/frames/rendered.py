@@ -23,7 +23,7 @@ LEAST_SCORE, CAMERA_SCORE = 0.0, 10.0
 class LabelledFrames(NamedTuple):
     """n frames: key areas (n, 16, 48) uint8, class and true flow in percent (n,), temperature (n,) in °C,
     print and segment (n,), valid (n,) and the reason why not; score (n,) in gray levels of the line's
-    ridge."""
+    ridge; surroundings (n, measures) of familiar.NAMES, NaN of frames that are not measured."""
 
     images: np.ndarray
     label: np.ndarray
@@ -34,6 +34,7 @@ class LabelledFrames(NamedTuple):
     valid: np.ndarray
     reasons: np.ndarray
     score: np.ndarray
+    surroundings: np.ndarray
 
     def take(self, rows: np.ndarray) -> "LabelledFrames":
         return LabelledFrames(*(a[rows] for a in self))
@@ -44,14 +45,15 @@ class LabelledFrames(NamedTuple):
         return some.images, some.temperature, some.label, some.flow, some.segment
 
 
-def filmed(seed: Sequence[int], flow: np.ndarray, frames: int) -> LabelledFrames:
-    """A segment at each flow (n,) in percent, with the temperatures in turn."""
-    temperature = np.resize(nozzle_scene.TEMPERATURES, len(flow))
+def filmed(seed: Sequence[int], flow: np.ndarray, frames: int, *, measured: bool) -> LabelledFrames:
+    """A segment at each flow (n,) in percent, with the temperatures in turn; `measured`: with the measures of
+    its surroundings."""
     rng = np.random.default_rng(seed)
-    scene = nozzle_scene.filmed(rng, flow, temperature, frames=frames, least_score=LEAST_SCORE)
-    reasons = np.array(scene.reasons, object)
-    truth = scene.label, scene.flow, scene.temperature, scene.segment, scene.segment
-    return LabelledFrames(scene.images, *truth, scene.valid, reasons, scene.score)
+    pieces = []
+    for percent, degrees in zip(flow, np.resize(nozzle_scene.TEMPERATURES, len(flow)), strict=True):
+        scene = nozzle_scene.render(nozzle_scene.draw_segment(rng), np.full(frames, percent), degrees, rng)
+        pieces.append(_labelled(scene, measured=measured))
+    return joined(pieces)
 
 
 def swept(seed: Sequence[int], windows: float, frames: int) -> LabelledFrames:
@@ -67,11 +69,17 @@ def swept(seed: Sequence[int], windows: float, frames: int) -> LabelledFrames:
         count = int((windows if FINE[0] <= low < FINE[1] else min(windows, 1.0)) + rng.random())
         flows.append(rng.uniform(low, high, count))
     flow = np.repeat(np.concatenate(flows), frames)
-    scene = nozzle_scene.render(segment, flow, degrees, rng)
+    return _labelled(nozzle_scene.render(segment, flow, degrees, rng), measured=True)
+
+
+def _labelled(scene: nozzle_scene.RenderedFrames, *, measured: bool) -> LabelledFrames:
+    """The frames of one segment."""
     areas = nozzle_scene.key_areas(scene, least_score=LEAST_SCORE)
-    number, reasons = np.zeros(len(flow), int), np.array(areas.reasons, object)
-    truth = nozzle_scene.label(flow), flow, scene.temperature, number, number
-    return LabelledFrames(areas.images, *truth, areas.valid, reasons, areas.score)
+    number, reasons = np.zeros(len(scene.flow), int), np.array(areas.reasons, object)
+    truth = nozzle_scene.label(scene.flow), scene.flow, scene.temperature, number, number
+    least = CAMERA_SCORE if measured else np.inf
+    looks = familiar.of_frames(scene.frames, scene.tip, areas, least_score=least)
+    return LabelledFrames(areas.images, *truth, areas.valid, reasons, areas.score, looks)
 
 
 def joined(several: Sequence[LabelledFrames]) -> LabelledFrames:

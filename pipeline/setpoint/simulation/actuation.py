@@ -15,12 +15,12 @@ REASONS = (
     "too few valid frames",
     "out of distribution",
     "tip moved",
-    "the classes cannot be told apart",
+    "cannot judge this camera",
     "the action is not a number",
     "the camera is not the one of the table: record levels",
     "the picture stands still",
 )
-ACTS, FEW, FOREIGN, TIP, AMBIGUOUS, NO_NUMBER, TABLE, STILL = range(8)
+ACTS, FEW, FOREIGN, TIP, UNPROVEN, NO_NUMBER, TABLE, STILL = range(8)
 REMEMBERED = 64  # actions that the travel of 60 s is summed over: a window takes about a second
 
 
@@ -28,9 +28,9 @@ REMEMBERED = 64  # actions that the travel of 60 s is summed over: a window take
 
 
 def is_evidence(reason):
-    """Whether the controller is shown a window: those acted on, those that cannot tell the classes apart, and
-    those of a camera that is not the table's, so that it may be found to be after all."""
-    return (reason == ACTS) | (reason == AMBIGUOUS) | (reason == TABLE)
+    """Whether the controller is shown a window: those acted on, and those of a camera that is not the
+    table's, so that it may be found to be after all."""
+    return (reason == ACTS) | (reason == TABLE)
 
 
 def still(flow_seen, last_seen):

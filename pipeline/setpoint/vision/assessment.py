@@ -7,30 +7,24 @@ import numpy as np
 
 from pipeline.setpoint.frames.rendered import LabelledFrames, flow_edges
 from pipeline.setpoint.simulation.recorded import WindowTable
-from pipeline.setpoint.vision import calibrated_classifier, calibration, classifier
-from pipeline.setpoint.vision.calibrated_classifier import (
-    CalibratedClassifier,
-    WindowPredictions,
-    YardstickClasses,
-)
+from pipeline.setpoint.vision import calibrated_classifier, calibration
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, WindowPredictions
 from pipeline.setpoint.vision.calibration import ClassifierCalibration, ClassifierOutputs, WindowTruth
 from pipeline.setpoint.vision.classifier import Labelled, TrainState
 from pipeline.setpoint.vision.parts import all_frames
-from pipeline.setpoint.vision.vision_transformer import Classifier
+from pipeline.setpoint.vision.proof import may_judge, verdict
 
-# yardsticks, the small CNN among them, learn from one frame in so many: they take ten times as long a frame
+# yardsticks learn from one frame in so many: they take ten times as long a frame
 EVERY = 3
 
 
 class Assessment(NamedTuple):
-    """The classifier on the frames that it is judged on."""
+    """The classifier on the frames that it is judged on, none of which it had learned from."""
 
     fitted: ClassifierCalibration
-    data: Labelled  # the frames, rejected ones too
-    frames: ClassifierOutputs  # of the classifier on them
+    frames: ClassifierOutputs  # of the classifier on them, rejected ones too
     windows: WindowPredictions
-    cnn: np.ndarray  # (n,) classes named by the small CNN
-    yardsticks: YardstickClasses
+    yardsticks: dict[str, np.ndarray]  # (n,) classes named by simpler ways, by name; none of few own pictures
 
 
 def fewer(learned: Labelled) -> Labelled:
@@ -42,7 +36,6 @@ def fewer(learned: Labelled) -> Labelled:
 def assess(
     fitted: ClassifierCalibration,
     outputs: ClassifierOutputs,
-    cnn: Classifier,
     learned: Labelled,
     data: Labelled,
     *,
@@ -50,64 +43,63 @@ def assess(
 ) -> Assessment:
     """The classifier's `outputs` on the frames `data`, beside yardsticks that learn from `learned`."""
     windows = calibrated_classifier.window_predictions(fitted, outputs, length=window)
-    return Assessment(
-        fitted,
-        data,
-        outputs,
-        windows,
-        classifier.predict(cnn, data.key_area, data.temperature_degC).logits.argmax(axis=1),
-        calibrated_classifier.yardstick_classes(fewer(learned), data, windows, outputs.valid),
-    )
+    others = calibrated_classifier.yardstick_classes(fewer(learned), data)
+    return Assessment(fitted, outputs, windows, others)
 
 
-def figures(network: Classifier, of: Assessment, *, window: int, coverage: float) -> dict[str, Any]:
-    """Accuracies with their 95 % intervals by segment, also by flow; calibration, sets, and how foreign
-    pictures are detected."""
-    frames, valid, fitted = of.frames, of.frames.valid, of.fitted
-    named = {
-        "image": frames.logits.argmax(axis=1),
-        "svc_image": of.yardsticks.svc,
-        "cnn_image": of.cnn,
-        "width_image": of.yardsticks.width,
-    }
-    prob, truth = judged_windows(of)
+def figures(of: Assessment) -> dict[str, Any]:
+    """Accuracies with their 95 % intervals by segment, also by flow; calibration; whether it may judge."""
+    frames, valid, proof = of.frames, of.frames.valid, of.fitted.proof
+    named = {"image": frames.logits.argmax(axis=1)}
+    named |= {f"{name}_image": classes for name, classes in of.yardsticks.items()}
+    prob, truth = judged_windows(of.windows)
     right = prob.argmax(axis=1) == truth.label
     shares = {
         name: calibration.share_by_segment((classes == frames.label)[valid], frames.segment[valid])
         for name, classes in named.items()
     } | {"window": calibration.share_by_segment(right, truth.segment)}
-    errors = calibrated_classifier.reliabilities(fitted, frames, length=window)
-    sets = calibration.sets(prob, truth.label, fitted.level)
-    covered = calibration.holds_true_class(prob, truth.label, fitted.level)
+    if "svc" in of.yardsticks:
+        rows, votes = of.windows.rows, np.eye(3)[of.yardsticks["svc"]]
+        counted = calibration.hard_shares(votes[rows], valid[rows])[of.windows.any_valid].argmax(axis=1)
+        shares["svc_window"] = calibration.share_by_segment(counted == truth.label, truth.segment)
+    errors = calibrated_classifier.reliabilities(of.fitted, frames, of.windows)
     return {
         **{f"{name}_accuracy": share.percent / 100 for name, share in shares.items()},
-        "svc_window_accuracy": of.yardsticks.svc_window_accuracy,
         "intervals_percent": {name: [share.low, share.high] for name, share in shares.items()},
         "right_70_150": _finite(calibration.uniform_share(right, truth)),
         "by_flow": [_finite(row) for row in calibration.by_flow(right, truth)],
-        "coverage_by_flow": [_finite(row) for row in calibration.by_flow(covered, truth)],
         "images": int(valid.sum()), "windows": len(right),
         "judged_segments": len(np.unique(frames.segment)),
         "ece_image": errors["image", "calibrated"].error, "ece_image_raw": errors["image", "raw"].error,
         "ece_image_floor": errors["image", "calibrated"].floor,
         "ece_window": errors["window", "flow"].error,
-        "ece_window_log_sum": errors["window", "log_sum"].error,
         "ece_window_counts": errors["window", "hard_counts"].error,
-        "ece_window_mean": errors["window", "mean"].error,
         "ece_window_floor": errors["window", "flow"].floor,
-        "temperature": fitted.temperature, "window_correlation": fitted.correlation,
-        "flow_correlation": fitted.flow.correlation, "conformal_level": fitted.level,
-        "conformal": {"asked": coverage, "coverage": sets.coverage, "held": sets.held, "windows": len(right)},
-        "out_of_distribution": calibrated_classifier.foreign_detection(
-            CalibratedClassifier(network, fitted), frames, of.data
-        ),
+        "temperature": of.fitted.temperature, "flow_correlation": of.fitted.flow.correlation,
+        "proof": proof._asdict() | {"may_judge": may_judge(proof), "verdict": verdict(proof)},
     }  # fmt: skip
 
 
-def judged_windows(of: Assessment) -> tuple[np.ndarray, WindowTruth]:
-    """Probabilities (w, 3) and truth of the judged windows that have a valid frame."""
-    some = of.windows.any_valid
-    return of.windows.seen.prob[some], WindowTruth(*(column[some] for column in of.windows.truth))
+def judged_windows(windows: WindowPredictions) -> tuple[np.ndarray, WindowTruth]:
+    """Probabilities (w, 3) and truth of the windows that have a valid frame."""
+    some = windows.any_valid
+    return windows.seen.prob[some], WindowTruth(*(column[some] for column in windows.truth))
+
+
+def proven(
+    fitted: ClassifierCalibration,
+    windows: WindowPredictions,
+    *,
+    least: float,
+    known_from: int,
+    rendered: bool,
+) -> ClassifierCalibration:
+    """The calibration with what windows of segments or prints that nothing was learned from prove of it."""
+    prob, truth = judged_windows(windows)
+    proof = calibration.prove(
+        prob.argmax(axis=1), truth, least=least, known_from=known_from, rendered=rendered
+    )
+    return fitted._replace(proof=proof)
 
 
 def _finite(row: NamedTuple) -> dict[str, float | None]:
@@ -115,28 +107,27 @@ def _finite(row: NamedTuple) -> dict[str, float | None]:
     return {name: value if np.isfinite(value) else None for name, value in row._asdict().items()}
 
 
-def classified(of: Assessment, flow: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of schema CLASSIFIED: the valid frames of the judged part, flow (n,) the true one."""
+def classified(of: Assessment) -> dict[str, np.ndarray]:
+    """Columns of schema CLASSIFIED: the valid frames of the judged part."""
     frames, fitted = of.frames, of.fitted
     prob = np.clip(np.exp(calibration.log_probabilities(frames.logits, fitted.temperature)), 0, 1)
     columns = {
-        "segment": frames.segment, "flow_percent": flow, "temperature_degC": of.data.temperature_degC,
+        "segment": frames.segment, "flow_percent": frames.flow_percent,
+        "temperature_degC": frames.temperature_degC,
         "label": frames.label,
         "p_under": prob[:, 0], "p_good": prob[:, 1], "p_over": prob[:, 2],
         "named": frames.logits.argmax(axis=1),
-        "named_cnn": of.cnn,
-        "named_svc": of.yardsticks.svc, "named_width": of.yardsticks.width,
         "distance": calibration.mahalanobis(fitted.familiar, frames.features),
     }  # fmt: skip
     return {name: values[frames.valid] for name, values in columns.items()}
 
 
-def reliability(of: Assessment, *, window: int) -> dict[str, list]:
+def reliability(of: Assessment) -> dict[str, list]:
     """Columns of schema RELIABILITY."""
     columns: dict[str, list] = {
         name: [] for name in ("of", "method", "low", "high", "count", "confidence", "accuracy")
     }
-    bins = calibrated_classifier.reliabilities(of.fitted, of.frames, length=window)
+    bins = calibrated_classifier.reliabilities(of.fitted, of.frames, of.windows)
     for (unit, method), one in bins.items():
         n, high = len(one.count), np.append(one.edges[1:], 1.0)
         rows = ([unit] * n, [method] * n, one.edges, high, one.count, one.confidence, one.accuracy)
@@ -154,18 +145,18 @@ def window_tables(windows: Mapping[str, WindowPredictions]) -> dict[str, WindowT
     }
 
 
-def predict_windows(model: CalibratedClassifier, frames: LabelledFrames, *, window: int) -> WindowPredictions:
-    """What the model says of windows of the frames at one flow."""
-    outputs = calibrated_classifier.outputs(model.network, all_frames(frames, recorded=False), frames.valid)
+def predict_windows(
+    model: CalibratedClassifier, frames: LabelledFrames, *, window: int, recorded: bool
+) -> WindowPredictions:
+    """What the model says of windows of the frames of rendered segments, or of recorded prints."""
+    data = all_frames(frames, recorded=recorded)
+    outputs = calibrated_classifier.outputs(model.network, data, frames.valid, frames.surroundings)
     return calibrated_classifier.window_predictions(model.calibration, outputs, length=window)
 
 
-def curves(trained: Mapping[str, TrainState]) -> dict[str, list]:
-    """Columns of schema CLASSIFIER_CURVE: a row for each epoch of each network."""
-    rows = [
-        (name, epoch + 1, *(float(v) for v in state.history[epoch]))
-        for name, state in trained.items()
-        for epoch in range(int(state.epoch))
-    ]
+def curve(state: TrainState | None) -> dict[str, list]:
+    """Columns of schema CLASSIFIER_CURVE: a row for each epoch of the network, if it was trained."""
+    history = [] if state is None else np.asarray(state.history, float)[: int(state.epoch)].tolist()
+    rows = [("vision transformer", epoch + 1, *row) for epoch, row in enumerate(history)]
     names = ("learner", "epoch", "training_loss", "held_out_loss", "held_out_accuracy")
-    return dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
+    return {name: [row[i] for row in rows] for i, name in enumerate(names)}

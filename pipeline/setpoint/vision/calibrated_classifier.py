@@ -1,22 +1,24 @@
 """A classifier with its calibration: class probabilities of key areas and of windows, and how far a key area
 is from what was learned."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import scipy.special
 
+from pipeline.setpoint.frames.familiar import medians
 from pipeline.setpoint.vision import calibration
 from pipeline.setpoint.vision.calibration import (
     ClassifierCalibration,
     ClassifierOutputs,
     Reliability,
-    WindowFlow,
     WindowTruth,
 )
 from pipeline.setpoint.vision.classifier import Labelled, predict
 from pipeline.setpoint.vision.vision_transformer import Classifier
+from pipeline.setpoint.vision.window_flow import WindowFlow, window_flow
 
 BINS = 10  # of reliability diagrams
 
@@ -60,61 +62,69 @@ def classify(
     return read_frames(model, images, temperature_degC)[:2]
 
 
-def outputs(network: Classifier, data: Labelled, valid: np.ndarray) -> ClassifierOutputs:
-    """The network's outputs on n frames, valid (n,) or not."""
+def outputs(network: Classifier, data: Labelled, valid: np.ndarray, looks: np.ndarray) -> ClassifierOutputs:
+    """The network's outputs on n frames, valid (n,) or not, with looks (n, measures)."""
     prediction = predict(network, data.key_area, data.temperature_degC)
-    return calibration.classifier_outputs(prediction, data, valid)
+    return calibration.classifier_outputs(prediction, data, valid, looks)
 
 
 class WindowPredictions(NamedTuple):
-    """Of w windows: the flow seen and the probabilities of the classes that follow from it; those by summed
-    logarithms (w, 3), by hard counts and by the mean; the truth, rows (w, length) of the frames, whether any
-    is valid (w,)."""
+    """Of w windows: the flow seen and the probabilities of the classes that follow from it; the shares of
+    classes counted (w, 3); the truth at their middle frames, rows (w, length) of the frames, whether any is
+    valid (w,)."""
 
     seen: WindowFlow
-    log_sum: np.ndarray
     hard: np.ndarray
-    mean: np.ndarray
     truth: WindowTruth
     rows: np.ndarray
     any_valid: np.ndarray
+
+    def take(self, some: np.ndarray) -> "WindowPredictions":
+        seen, truth = WindowFlow(*(a[some] for a in self.seen)), WindowTruth(*(a[some] for a in self.truth))
+        return WindowPredictions(seen, self.hard[some], truth, self.rows[some], self.any_valid[some])
+
+
+def joined_windows(several: Sequence[WindowPredictions]) -> WindowPredictions:
+    """One behind the other."""
+    seen, hard, truth, rows, any_valid = zip(*several, strict=True)
+    return WindowPredictions(
+        WindowFlow(*map(np.concatenate, zip(*seen, strict=True))),
+        np.concatenate(hard),
+        WindowTruth(*map(np.concatenate, zip(*truth, strict=True))),
+        np.concatenate(rows),
+        np.concatenate(any_valid),
+    )
 
 
 def window_predictions(
     fitted: ClassifierCalibration, frames: ClassifierOutputs, *, length: int
 ) -> WindowPredictions:
-    """Predictions of the windows of `length` frames of one segment and class; 1/3 each for those without a
-    valid frame."""
-    rows = calibration.windows(frames.segment, frames.label, length=length).rows
+    """Predictions of the windows of `length` frames of one segment; 1/3 each for those without a valid
+    frame."""
+    rows = calibration.windows(frames.segment, length=length)
     log_p, valid = calibration.log_probabilities(frames.logits, fitted.temperature)[rows], frames.valid[rows]
-    total = np.where(valid[:, :, None], np.exp(log_p), 0).sum(axis=1)
-    m = valid.sum(axis=1)[:, None]
-    first = rows[:, 0]
+    looks, middle = medians(frames.looks, rows), rows[:, length // 2]
     truth = frames.label, frames.flow_percent, frames.temperature_degC, frames.segment
     return WindowPredictions(
-        seen=calibration.window_flow(frames.log_flow[rows], frames.deviation[rows], valid, fitted.flow),
-        log_sum=calibration.window_probabilities(log_p, valid, fitted.correlation),
+        seen=window_flow(frames.log_flow[rows], frames.deviation[rows], valid, looks, fitted.flow),
         hard=calibration.hard_shares(log_p, valid),
-        mean=np.where(m > 0, total / np.maximum(m, 1), 1 / 3),
-        truth=WindowTruth(*(column[first] for column in truth)),
+        truth=WindowTruth(*(column[middle] for column in truth)),
         rows=rows,
         any_valid=valid.any(axis=1),
     )
 
 
 def reliabilities(
-    fitted: ClassifierCalibration, frames: ClassifierOutputs, *, length: int
+    fitted: ClassifierCalibration, frames: ClassifierOutputs, windows: WindowPredictions
 ) -> dict[tuple[str, str], Reliability]:
-    """By (image or window, method): before and after calibration; of windows the paper's hard counts, the
-    mean, summed logarithms, and what follows from the flow seen."""
-    v, windows = frames.valid, window_predictions(fitted, frames, length=length)
+    """By (image or window, method): before and after calibration; of windows the paper's hard counts, and
+    what follows from the flow seen."""
+    v, some = frames.valid, windows.any_valid
     images = {
         "raw": scipy.special.softmax(frames.logits[v], axis=1),
         "calibrated": np.exp(calibration.log_probabilities(frames.logits[v], fitted.temperature)),
     }
-    methods = {"hard_counts": windows.hard, "mean": windows.mean, "log_sum": windows.log_sum}
-    methods["flow"] = windows.seen.prob
-    some = windows.any_valid
+    methods = {"hard_counts": windows.hard, "flow": windows.seen.prob}
     return {
         ("image", name): calibration.reliability(prob, frames.label[v], bins=BINS)
         for name, prob in images.items()
@@ -144,41 +154,26 @@ def foreign_images(key_area: np.ndarray) -> dict[str, np.ndarray]:
 def foreign_detection(
     model: CalibratedClassifier, frames: ClassifierOutputs, data: Labelled
 ) -> dict[str, Any]:
-    """By kind of foreign picture the AUROC of the distance, beside those of the energy and of 1 - max p, and
-    the share found; and the share of familiar ones called foreign."""
+    """By kind of foreign picture the AUROC of the distance and the share found; and the share of familiar
+    ones called foreign."""
     v, fitted = frames.valid, model.calibration
     familiar = calibration.mahalanobis(fitted.familiar, frames.features[v])
-    plain = -scipy.special.softmax(frames.logits[v], axis=1).max(axis=1)
     figures: dict[str, Any] = {"false_alarms": float(np.mean(familiar > fitted.foreign_above))}
     for name, images in foreign_images(data.key_area[v]).items():
         shown = predict(model.network, images, data.temperature_degC[v])
         scores = calibration.mahalanobis(
             fitted.familiar, np.hstack([shown.features, calibration.appearance(images)])
         )
-        energies = calibration.energy(frames.logits[v]), calibration.energy(shown.logits)
         figures[name] = {
             "auroc": calibration.auroc(familiar, scores),
             "found": float(np.mean(scores > fitted.foreign_above)),
-            "energy_auroc": calibration.auroc(*energies),
-            "max_p_auroc": calibration.auroc(plain, -scipy.special.softmax(shown.logits, axis=1).max(axis=1)),
         }
     return figures
 
 
-class YardstickClasses(NamedTuple):
-    """The yardsticks' classes of n frames (n,): support vector machine on the profile, width; and the share
-    of windows that the machine's counts name rightly."""
-
-    svc: np.ndarray
-    width: np.ndarray
-    svc_window_accuracy: float
-
-
-def yardstick_classes(
-    learned: Labelled, data: Labelled, windows: WindowPredictions, valid: np.ndarray
-) -> YardstickClasses:
-    """Both yardsticks, fitted on the valid frames that the network
-    learned, on the frames `data` and their windows."""
+def yardstick_classes(learned: Labelled, data: Labelled) -> dict[str, np.ndarray]:
+    """The classes (n,) of the frames `data` by a support vector machine on the profile and by the width, both
+    fitted on valid frames that the network learned."""
     from pipeline.setpoint.vision import yardsticks  # here, as who only classifies needs none
 
     machine = yardsticks.fit_profile_machine(
@@ -186,10 +181,4 @@ def yardstick_classes(
     )
     rule = yardsticks.fit_width_rule(learned.key_area, learned.label)
     prob = yardsticks.profile_probabilities(machine, data.key_area, data.temperature_degC)
-    log_p = np.log(prob + 1e-12)[windows.rows]
-    counts = calibration.hard_shares(log_p, valid[windows.rows]).argmax(axis=1)
-    return YardstickClasses(
-        prob.argmax(axis=1),
-        yardsticks.width_class(rule, data.key_area),
-        float(np.mean((counts == windows.truth.label)[windows.any_valid])),
-    )
+    return {"svc": prob.argmax(axis=1), "width": yardsticks.width_class(rule, data.key_area)}

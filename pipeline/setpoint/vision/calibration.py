@@ -1,5 +1,5 @@
-"""What a classifier's probabilities are worth: temperature for one image, a fitted log-sum for a window,
-conformal sets by segment, distance from what was learned.
+"""What a classifier's probabilities are worth: temperature for one image, the flow of a window, distance from
+what was learned, and whether it is proven on prints that nothing was learned from.
 
 All of it is fitted on segments that the classifier never saw, and judged on yet others.
 """
@@ -14,9 +14,11 @@ import scipy.optimize
 import scipy.special
 import scipy.stats
 
+from pipeline.setpoint.frames.familiar import medians
 from pipeline.setpoint.simulation.recorded import WindowTable
 from pipeline.setpoint.vision.classifier import ClassifierPrediction, Labelled
-from pipeline.setpoint.vision.window_flow import FlowCalibration, WindowFlow, fit_flow, window_flow
+from pipeline.setpoint.vision.proof import CONFIDENCE, UNPROVEN, CameraProof
+from pipeline.setpoint.vision.window_flow import FlowCalibration, WindowFlow, fit_flow
 from pipeline.statistics import Share
 
 CLASSES = 3
@@ -44,51 +46,17 @@ def fit_temperature(logits: np.ndarray, label: np.ndarray) -> float:
 # ---- a window of images
 
 
-class WindowRows(NamedTuple):
-    """Rows (w, length) of the frames of each window, and how many frames fill no window."""
-
-    rows: np.ndarray
-    left_over: int
-
-
-def windows(segment: np.ndarray, label: np.ndarray, *, length: int) -> WindowRows:
-    """Every `length` frames of one segment and one class in the order in which they come,
-    none used twice; a change of class starts anew."""
-    segment, label = np.asarray(segment), np.asarray(label)
+def windows(segment: np.ndarray, *, length: int) -> np.ndarray:
+    """Rows (w, length): every `length` frames of one segment or print in the order in which they come, none
+    used twice. A window may straddle a change of flow: its truth is that of its middle frame."""
+    segment = np.asarray(segment)
     order = np.argsort(segment, kind="stable")
-    change = (
-        (np.diff(segment[order]) != 0) | (np.diff(label[order]) != 0) if len(order) else np.zeros(0, bool)
-    )
     rows = [
         run[i : i + length]
-        for run in np.split(order, np.flatnonzero(change) + 1)
+        for run in np.split(order, np.flatnonzero(np.diff(segment[order])) + 1)
         for i in range(0, len(run) - length + 1, length)
     ]
-    return WindowRows(np.array(rows, int).reshape(-1, length), len(order) - length * len(rows))
-
-
-def window_probabilities(log_p: np.ndarray, valid: np.ndarray, correlation: float) -> np.ndarray:
-    """p (w, 3) = softmax( sum_i log p_i / (1 + (m - 1) correlation) ) over the m valid of a window's frames;
-    log_p (w, length, 3), valid (w, length).
-
-    Frames of one segment repeat each other: the divisor is Kish's design effect (1965), 1 for independent
-    frames and m where each says the same. No valid frame: 1/3 each.
-    """
-    m = valid.sum(axis=1)
-    total = np.where(valid[:, :, None], log_p, 0.0).sum(axis=1)
-    return scipy.special.softmax(total / (1 + np.maximum(m - 1, 0) * correlation)[:, None], axis=1)
-
-
-def fit_correlation(log_p: np.ndarray, valid: np.ndarray, label: np.ndarray) -> float:
-    """The correlation in 0 .. 3 that makes the labels (w,) of the windows most likely
-    (above 1: images are surer than they should be)."""
-    label = np.asarray(label)
-
-    def loss(correlation):
-        p = window_probabilities(log_p, valid, correlation)
-        return -np.log(np.maximum(p[np.arange(len(label)), label], 1e-300)).mean()
-
-    return float(scipy.optimize.minimize_scalar(loss, bounds=(0.0, 3.0), method="bounded").x)
+    return np.array(rows, int).reshape(-1, length)
 
 
 def hard_shares(log_p: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -161,9 +129,11 @@ def reliability(p: np.ndarray, label: np.ndarray, *, bins: int) -> Reliability:
     return Reliability(*means, count, edges[:-1], float(error), float(floor))
 
 
-def share_by_segment(happened: np.ndarray, segment: np.ndarray) -> Share:
-    """The share of True among n images or windows, in percent, with its 95 % interval: what is of one segment
-    (n,) errs together, so the segments are what was drawn.
+def share_by_segment(
+    happened: np.ndarray, segment: np.ndarray, *, weight: np.ndarray | None = None, confidence: float = 0.95
+) -> Share:
+    """The share of True among n images or windows, in percent, with its interval: what is of one segment (n,)
+    errs together, so the segments are what was drawn. Each counts by its weight (n,), of mean 1.
 
     Wilson's interval of n_eff = p (1 - p) / V images, with V the variance of a ratio of sums over segments
     and a factor for Student's t of few of them (Korn and Graubard 1998); n_eff is at most n, and the number
@@ -173,13 +143,14 @@ def share_by_segment(happened: np.ndarray, segment: np.ndarray) -> Share:
     if n == 0:
         return Share(np.nan, np.nan, np.nan)
     _, place = np.unique(segment, return_inverse=True)
-    clusters = int(place.max()) + 1
-    p, z = float(happened.mean()), float(scipy.special.ndtri(0.975))
-    residual = np.bincount(place, happened - p)
+    clusters, inside = int(place.max()) + 1, (1 + confidence) / 2
+    weight = np.ones(n) if weight is None else weight
+    p, z = float((weight * happened).sum() / n), float(scipy.special.ndtri(inside))
+    residual = np.bincount(place, weight * (happened - p))
     variance = (residual**2).sum() / n**2 * clusters / max(clusters - 1, 1)
     effective = float(clusters)
     if variance > 0 and clusters > 1:
-        student = float(scipy.special.stdtrit(clusters - 1, 0.975))
+        student = float(scipy.special.stdtrit(clusters - 1, inside))
         effective = min(p * (1 - p) / variance, n) * (z / student) ** 2
     centre = (p + z**2 / (2 * effective)) / (1 + z**2 / effective)
     half = z * np.sqrt(p * (1 - p) / effective + z**2 / (4 * effective**2)) / (1 + z**2 / effective)
@@ -232,98 +203,6 @@ def uniform_share(happened: np.ndarray, truth: WindowTruth) -> Share:
     mean = float(np.mean([row.percent for row in rows]))
     half = z * np.sqrt(np.sum([((row.high - row.low) / (2 * z)) ** 2 for row in rows])) / len(rows)
     return Share(mean, float(max(mean - half, 0.0)), float(min(mean + half, 100.0)))
-
-
-# ---- sets that hold the true class
-
-
-def conformal_level(
-    p: np.ndarray, label: np.ndarray, segment: np.ndarray, *, coverage: float, confidence: float
-) -> float:
-    """The level of the sets {c: p_c >= level}: they hold the true class of a new segment's window with
-    probability `coverage` (Sadinle, Lei and Wasserman 2019).
-
-    Calibrated by segment: each counts once, however many windows (w,) it has, for its windows err together.
-    The coverage that n segments promise varies with their draw; with the k-th smallest p_label of n, the
-    share missed is Beta(k, n + 1 - k) (Vovk 2012), and k is the largest for which it is at most 1 - coverage
-    with probability `confidence`. Raises ValueError where even k = 1 does not promise that.
-    """
-    _, place, windows_of = np.unique(segment, return_inverse=True, return_counts=True)
-    n = len(windows_of)
-    k = 0
-    while k < n and scipy.stats.beta.cdf(1 - coverage, k + 1, n - k) >= confidence:
-        k += 1
-    if k == 0:
-        needed = int(np.ceil(np.log(1 - confidence) / np.log(coverage)))
-        raise ValueError(
-            f"sets that cover {coverage:.0%} with confidence {confidence:.0%} need at least {needed} "
-            f"calibration segments but found {n}; film more, or ask for less"
-        )
-    true = p[np.arange(len(label)), label]
-    order = np.argsort(true, kind="stable")
-    below = np.cumsum(1 / windows_of[place[order]])  # segments at or below each window
-    return float(true[order][np.searchsorted(below, k - 1e-9)])
-
-
-class Promise(NamedTuple):
-    """What the conformal sets promise: `coverage` of all windows with this confidence, and `by_flow` of those
-    at any one flow."""
-
-    coverage: float
-    confidence: float
-    by_flow: float
-
-
-# bins of flow in percent, where controllers work, in each of which sets must cover
-COVERED_PERCENT = (70.0, 80.0, 90.0, 100.0, 110.0, 120.0, 150.0)
-
-
-def conditional_level(p: np.ndarray, truth: WindowTruth, promise: Promise) -> float:
-    """One level whose sets cover at every flow and temperature: the lowest of 1 - by_flow, the conformal
-    level of all windows (w,), and those of the windows in each bin of COVERED_PERCENT and at each
-    temperature.
-
-    Sets that cover on average do so where nothing is in doubt, and miss beside the borders. Under the normal
-    law a flow at the border of its class has p < a with probability a, so that 1 - by_flow is enough where
-    that law holds. The groups hold it against what was measured (label-conditional prediction, Vovk 2012),
-    each at even odds; one with too few segments for that is left to the others.
-    """
-    every = conformal_level(
-        p, truth.label, truth.segment, coverage=promise.coverage, confidence=promise.confidence
-    )
-    levels = [every, 1 - promise.by_flow]
-    near = (truth.flow_percent >= COVERED_PERCENT[0]) & (truth.flow_percent < COVERED_PERCENT[-1])
-    flow_bin = np.searchsorted(COVERED_PERCENT, truth.flow_percent, side="right")
-    groups = [near & (flow_bin == k) for k in range(1, len(COVERED_PERCENT))]
-    groups += [near & (truth.temperature_degC == degrees) for degrees in np.unique(truth.temperature_degC)]
-    needed = np.log(0.5) / np.log(promise.by_flow)
-    for group in groups:
-        segment = truth.segment[group]
-        if len(np.unique(segment)) >= needed:
-            levels.append(
-                conformal_level(
-                    p[group], truth.label[group], segment, coverage=promise.by_flow, confidence=0.5
-                )
-            )
-    return min(levels)
-
-
-def holds_true_class(p: np.ndarray, label: np.ndarray, level: float) -> np.ndarray:
-    """(w,) whether the set {c: p_c >= level} holds the true class (w,)."""
-    return p[np.arange(len(label)), label] >= level
-
-
-class Sets(NamedTuple):
-    """Share of sets {c: p_c >= level} that hold the true class, and share that does not
-    name one class alone."""
-
-    coverage: float
-    held: float
-
-
-def sets(p: np.ndarray, label: np.ndarray, level: float) -> Sets:
-    members = p >= level
-    return Sets(float(members[np.arange(len(label)), label].mean()), float((members.sum(axis=1) != 1).mean()))
 
 
 # ---- distance from what was learned
@@ -381,11 +260,6 @@ def mahalanobis(familiar: Familiar, features: np.ndarray) -> np.ndarray:
     )
 
 
-def energy(logits: np.ndarray) -> np.ndarray:
-    """-log sum_c exp logit_c (n,), higher for the foreign (Liu, Wang, Owens and Li 2020); the yardstick."""
-    return -scipy.special.logsumexp(np.asarray(logits, float), axis=1)
-
-
 def foreign_above(scores: np.ndarray, *, false_alarms: float) -> float:
     """The score that a share `false_alarms` of familiar images exceeds at most."""
     scores = np.sort(np.asarray(scores, float))
@@ -404,7 +278,7 @@ def auroc(familiar: np.ndarray, foreign: np.ndarray) -> float:
 class ClassifierOutputs(NamedTuple):
     """A network's outputs on n frames: logits (n, 3), features with appearance (n, f), log(flow / 100 %) (n,)
     with its deviation (n,); and the frames' label, flow in percent, temperature in °C, segment and valid
-    (n,)."""
+    (n,), and their looks (n, measures), NaN of frames that are not measured."""
 
     logits: np.ndarray
     features: np.ndarray
@@ -415,10 +289,14 @@ class ClassifierOutputs(NamedTuple):
     temperature_degC: np.ndarray
     segment: np.ndarray
     valid: np.ndarray
+    looks: np.ndarray
+
+    def take(self, rows: np.ndarray) -> "ClassifierOutputs":
+        return ClassifierOutputs(*(a[rows] for a in self))
 
 
 def classifier_outputs(
-    prediction: ClassifierPrediction, data: Labelled, valid: np.ndarray
+    prediction: ClassifierPrediction, data: Labelled, valid: np.ndarray, looks: np.ndarray
 ) -> ClassifierOutputs:
     """The head's features with the appearance of the key areas beside them;
     frames that the front end rejected are not valid."""
@@ -432,55 +310,51 @@ def classifier_outputs(
         np.asarray(data.temperature_degC, float),
         data.segment,
         np.asarray(valid, bool),
+        looks,
     )
 
 
 class ClassifierCalibration(NamedTuple):
-    """What turns outputs into decisions: temperature of images, correlation of the classes of a window's
-    frames (for summed logarithms), level of a window's conformal set, the distance that is foreign, and what
-    turns the flows of frames into that of a window."""
+    """What turns outputs into decisions: temperature of images, the distance that is foreign, what turns the
+    flows of frames into that of a window, and whether it may judge at all."""
 
     temperature: float
-    correlation: float
-    level: float
     familiar: Familiar
     foreign_above: float
     flow: FlowCalibration
+    proof: CameraProof
 
 
 def calibrate(
-    learned: ClassifierOutputs,
-    unseen: ClassifierOutputs,
-    *,
-    length: int,
-    promise: Promise,
-    false_alarms: float,
+    learned: ClassifierOutputs, unseen: ClassifierOutputs, *, length: int, false_alarms: float
 ) -> ClassifierCalibration:
     """Everything fitted on segments `unseen` in training, but for the familiar features, which are those
-    `learned`; windows have `length` frames."""
+    `learned`; windows have `length` frames. Nothing is proven yet."""
     v = unseen.valid
     T = fit_temperature(unseen.logits[v], unseen.label[v])
-    rows = _rows(unseen, length)
-    first = rows[:, 0]
-    correlation = fit_correlation(log_probabilities(unseen.logits, T)[rows], v[rows], unseen.label[first])
-    of_frames = unseen.log_flow[rows], unseen.deviation[rows], v[rows]
-    flow = fit_flow(*of_frames, unseen.flow_percent[first])
-    truth = WindowTruth(
-        unseen.label[first], unseen.flow_percent[first], unseen.temperature_degC[first], unseen.segment[first]
-    )
-    level = conditional_level(window_flow(*of_frames, flow).prob, truth, promise)
-    familiar = fit_familiar(learned.features[learned.valid], learned.label[learned.valid])
-    distance = mahalanobis(familiar, unseen.features[v])
-    return ClassifierCalibration(
-        T, correlation, level, familiar, foreign_above(distance, false_alarms=false_alarms), flow
-    )
-
-
-def _rows(frames: ClassifierOutputs, length: int) -> np.ndarray:
-    rows = windows(frames.segment, frames.label, length=length).rows
+    rows = windows(unseen.segment, length=length)
     if not len(rows):
         raise ValueError(
-            f"expected a segment with {length} frames in a row of one class but found none among "
-            f"{len(frames.label)} frames; film longer ones, or take shorter windows"
+            f"expected a segment with {length} frames in a row but found none among {len(v)} frames; "
+            "film longer ones, or take shorter windows"
         )
-    return rows
+    looks = medians(unseen.looks, rows)
+    middle = unseen.flow_percent[rows[:, length // 2]]
+    flow = fit_flow(unseen.log_flow[rows], unseen.deviation[rows], v[rows], looks, middle)
+    familiar = fit_familiar(learned.features[learned.valid], learned.label[learned.valid])
+    distance = mahalanobis(familiar, unseen.features[v])
+    above = foreign_above(distance, false_alarms=false_alarms)
+    return ClassifierCalibration(T, familiar, above, flow, UNPROVEN)
+
+
+def prove(
+    named: np.ndarray, truth: WindowTruth, *, least: float, known_from: int, rendered: bool
+) -> CameraProof:
+    """What the classes named (w,) of windows of segments or prints that nothing was learned from prove."""
+    n, of_class = len(named), np.bincount(truth.label, minlength=CLASSES)
+    weight = n / CLASSES / of_class[truth.label]
+    share = share_by_segment(
+        named == truth.label, truth.segment, weight=weight, confidence=2 * CONFIDENCE - 1
+    )
+    prints = len(np.unique(truth.segment))
+    return CameraProof(share.percent / 100, share.low / 100, least, n, prints, known_from, rendered)

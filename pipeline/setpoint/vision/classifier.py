@@ -347,7 +347,7 @@ def _steps(augment, carry, drawn, rows, rates):
 
 
 def _steps_on_cpu(augment, carry, drawn, rows, rates):
-    """The same, one call a step: inside a scan XLA's CPU convolutions are 12 times slower."""
+    """The same, one call a step: a scan would be another program, with other last digits."""
     losses = []
     for one in zip(*drawn, strict=True):
         carry, loss = _step(augment, carry, one, rows, rates)

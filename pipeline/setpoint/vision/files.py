@@ -7,23 +7,26 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from pipeline.setpoint.frames.familiar import NAMES
 from pipeline.setpoint.vision import calibration
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
 from pipeline.setpoint.vision.calibration import ClassifierCalibration
 from pipeline.setpoint.vision.classifier import TrainState
+from pipeline.setpoint.vision.proof import CameraProof
 from pipeline.setpoint.vision.vision_transformer import (
     PAPER,
     SMALL,
+    Classifier,
     from_named_arrays,
     named_arrays,
     vision_transformer,
 )
-from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
+from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration, LookCorrection
 from pipeline.store import artifacts
 from pipeline.store.artifacts import read_weights, write_weights
 
 SIZES = {"small": SMALL, "paper": PAPER}
-CLASSIFIER_SCHEMA, CALIBRATION = "classifier 2", ("classifier_calibration", 2)
+CLASSIFIER_SCHEMA, CALIBRATION = "classifier 2", ("classifier_calibration", 3)
 
 
 def store_classifier(folder: Path, size: str, model: CalibratedClassifier) -> None:
@@ -34,12 +37,6 @@ def store_classifier(folder: Path, size: str, model: CalibratedClassifier) -> No
     fitted = model.calibration
     numbers = {
         "temperature": (np.array(fitted.temperature), "1", "logits of single images are divided by it"),
-        "correlation": (
-            np.array(fitted.correlation),
-            "1",
-            "of a window's frames; summed logarithms are divided by 1 + (m - 1) times it",
-        ),
-        "level": (np.array(fitted.level), "1", "classes of at least this share are in the conformal set"),
         "foreign_above": (
             np.array(fitted.foreign_above),
             "1",
@@ -54,12 +51,20 @@ def store_classifier(folder: Path, size: str, model: CalibratedClassifier) -> No
         ),
         "flow_scale": (fitted.flow.scale, "1", "deviations of frames are multiplied by it there"),
         "flow_correlation": (np.array(fitted.flow.correlation), "1", "of the errors of a window's frames"),
+        **{
+            f"looks_{name}": (np.asarray(value), "1", f"window_flow.LookCorrection.{name}")
+            for name, value in fitted.flow.looks._asdict().items()
+        },
+        **{
+            f"proof_{name}": (np.array(float(value)), "1", f"proof.CameraProof.{name}")
+            for name, value in fitted.proof._asdict().items()
+        },
     }
     artifacts.write_arrays(folder / "calibration.parquet", *CALIBRATION, numbers)
 
 
-def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedClassifier:
-    """What `store_classifier` wrote."""
+def restore_network(weights_path: str) -> tuple[Classifier, str]:
+    """The network that `store_classifier` wrote, and its size."""
     arrays, about = read_weights(weights_path, CLASSIFIER_SCHEMA)
     if about.get("size") not in SIZES:
         raise ValueError(
@@ -70,30 +75,41 @@ def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedCl
         network = from_named_arrays(
             vision_transformer(SIZES[about["size"]], np.random.default_rng(0)), arrays
         )
-    knots = (len(KNOTS_PERCENT),)
-    fitted = artifacts.read_arrays(
-        calibration_path, *CALIBRATION, shapes={"flow_shown": knots, "flow_scale": knots}
+    return network, about["size"]
+
+
+def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedClassifier:
+    """What `store_classifier` wrote."""
+    network, _ = restore_network(weights_path)
+    knots, measures = (len(KNOTS_PERCENT),), (len(NAMES),)
+    shapes = {"flow_shown": knots, "flow_scale": knots}
+    shapes |= {f"looks_{name}": measures for name in ("mean", "deviation", "weight")}
+    fitted = artifacts.read_arrays(calibration_path, *CALIBRATION, shapes=shapes)
+    looks = LookCorrection(
+        *(fitted[f"looks_{name}"] for name in ("mean", "deviation", "weight")),
+        float(fitted["looks_explained"]),
     )
-    numbers = (float(fitted[name]) for name in ("temperature", "correlation", "level"))
+    right, low, least, *counts, rendered = (float(fitted[f"proof_{name}"]) for name in CameraProof._fields)
+    proof = CameraProof(right, low, least, *map(int, counts), bool(rendered))
+    correlation = float(fitted["flow_correlation"])
     return CalibratedClassifier(
         network,
         ClassifierCalibration(
-            *numbers,
+            float(fitted["temperature"]),
             calibration.Familiar(fitted["means"], fitted["whitening"]),
             float(fitted["foreign_above"]),
-            FlowCalibration(fitted["flow_shown"], fitted["flow_scale"], float(fitted["flow_correlation"])),
+            FlowCalibration(fitted["flow_shown"], fitted["flow_scale"], correlation, looks),
+            proof,
         ),
     )
 
 
-def train_from_checkpoint(train: Callable, state: TrainState, name: str, checkpoint: Path) -> TrainState:
+def train_from_checkpoint(train: Callable, state: TrainState, checkpoint: Path) -> TrainState:
     """train(state, on_step=...) from the checkpoint, if there is one; it is written after each epoch."""
     with contextlib.suppress(ValueError):  # there is none yet, or it is damaged: from the beginning
         state = from_named_arrays(state, read_weights(checkpoint, CLASSIFIER_SCHEMA)[0])
-    words = f"train_classifier: {name}"
-    with tqdm(
-        total=len(state.history), initial=int(state.epoch), desc=words, unit="epoch", mininterval=2
-    ) as bar:
+    done, words = int(state.epoch), "train_classifier"
+    with tqdm(total=len(state.history), initial=done, desc=words, unit="epoch", mininterval=2) as bar:
 
         def on_step(state: TrainState) -> None:
             epoch = int(state.epoch)

@@ -33,18 +33,23 @@ class Groups(NamedTuple):
     distance: np.ndarray
 
 
-def group_frames(model: CalibratedClassifier, frames: Any) -> Groups:
-    """Each frame in one group: rejected by the front end, foreign to the classifier, named wrongly, or
-    accepted."""
+def classified_frames(model: CalibratedClassifier, frames: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Probabilities (n, 3) and distance (n,) of n frames, NaN of those that are not valid."""
     prob, distance = np.full((len(frames.valid), 3), np.nan), np.full(len(frames.valid), np.nan)
     some = np.flatnonzero(frames.valid)
     if len(some):
         prob[some], distance[some] = calibrated_classifier.classify(
             model, frames.images[some], frames.temperature[some]
         )[:2]
+    return prob, distance
+
+
+def group_frames(prob: np.ndarray, distance: np.ndarray, foreign_above: float, frames: Any) -> Groups:
+    """Each frame in one group: rejected by the front end, foreign to the classifier, named wrongly, or
+    accepted."""
     named = np.where(frames.valid, np.nan_to_num(prob).argmax(axis=1), -1)
     group = np.where(named == frames.label, ACCEPTED, WRONG)
-    group = np.where(distance > model.calibration.foreign_above, FOREIGN, group)
+    group = np.where(distance > foreign_above, FOREIGN, group)
     return Groups(np.where(frames.valid, group, REJECTED), prob, distance)
 
 

@@ -2,7 +2,7 @@
 camera: parts share no segment, or no print."""
 
 import collections
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,6 @@ from pipeline.setpoint.frames.rendered import LabelledFrames
 from pipeline.setpoint.vision import calibration
 from pipeline.setpoint.vision.classifier import CLASS_NAMES, Labelled, split_by_segment
 
-# of a folder's prints to learn from: those that stay so, and those of each part of windows
-STAYING, EACH = 6.0, 1.0
-# with fewer prints in each part of windows an interval by print says nothing; what is learned from has each
-# class in so many
-LEAST_PRINTS, LEAST_OF_CLASS = 5, 3
 # of the yardstick that is fitted beside the networks, yardsticks.fit_profile_machine
 FOLDS = 3
 
@@ -45,58 +40,13 @@ def deal_prints(
     }
 
 
-def split_windows(
-    by_part: dict[str, LabelledFrames], parts: Sequence[str], *, window: int, rng: np.random.Generator
-) -> tuple[dict[str, LabelledFrames], dict[str, LabelledFrames], bool]:
-    """The frames to learn from, watch, calibrate and judge on; those of each of the `parts` of windows; and
-    whether no print is in both. Raises ValueError if they are not apart and a part has no window."""
-    learned = by_part["learned"]
-    shares = {"learned": STAYING} | dict.fromkeys(parts, EACH)
-    try:
-        windows = deal_prints(learned, shares, rng)
-        stays = windows.pop("learned")
-        if _of_class(stays) >= LEAST_OF_CLASS and all(_enough(of, window) for of in windows.values()):
-            return by_part | {"learned": stays}, windows, True
-    except ValueError:
-        pass  # the prints do not let each part hold every class
-    for part in ("judged", "calibration", "held_out"):
-        if not len(_windows(by_part[part], window)):
-            raise ValueError(
-                f"expected {window} frames in a row at one class in the frames for {part}, found "
-                f"none in {len(by_part[part].label)}; record longer stretches, or lower "
-                "train_classifier.window"
-            )
-    taken = (by_part[part] for part in ("calibration", "held_out", "judged"))
-    return by_part, dict(zip(parts, taken, strict=True)), False
-
-
 def _by_print(frames: LabelledFrames) -> Labelled:
     return Labelled(frames.images, frames.temperature, frames.label, frames.flow, frames.print_number)
 
 
-def _enough(frames: LabelledFrames, window: int) -> bool:
-    """Whether there are prints enough, and windows of each class."""
-    labels = frames.label[_windows(frames, window)]
-    return len(np.unique(frames.print_number)) >= LEAST_PRINTS and len(np.unique(labels)) == len(CLASS_NAMES)
-
-
-def _windows(frames: LabelledFrames, window: int) -> np.ndarray:
-    """First frame (w,) of each window in which one is valid."""
-    rows = calibration.windows(frames.segment, frames.label, length=window).rows
-    return rows[frames.valid[rows].any(axis=1)][:, 0]
-
-
-def _of_class(frames: LabelledFrames) -> int:
-    """Prints with a valid frame of the class that the fewest have."""
-    valid = frames.take(frames.valid)
-    return min(len(np.unique(valid.print_number[valid.label == c])) for c in range(len(CLASS_NAMES)))
-
-
-def check_parts(
-    by_part: Mapping[str, LabelledFrames], *, recorded: bool, window: int, coverage: float, confidence: float
-) -> None:
-    """Raises ValueError if a class is learned in too few stretches for the yardstick's folds, a part has no
-    window, or too few segments have one for the conformal sets (calibration.conformal_level)."""
+def check_parts(by_part: Mapping[str, LabelledFrames], *, recorded: bool, window: int) -> None:
+    """Raises ValueError if a class is learned in too few stretches for the yardstick's folds, or a part has
+    no window."""
     of = "prints" if recorded else "segments"
     learned = Labelled(*by_part["learned"].labelled())
     for c, name in enumerate(CLASS_NAMES):
@@ -110,23 +60,11 @@ def check_parts(
             )
     for part in ("judged", "calibration"):
         data = all_frames(by_part[part], recorded=recorded)
-        rows = calibration.windows(data.segment, data.label, length=window).rows
-        if not len(rows):
+        if not len(calibration.windows(data.segment, length=window)):
             raise ValueError(
-                f"expected {window} frames in a row at one class in the frames for {part}, "
-                f"found none in {len(data.label)}; "
-                "record longer stretches, "
-                "or lower train_classifier.window"
+                f"expected {window} frames in a row in the frames for {part}, found none in "
+                f"{len(data.label)}; record longer stretches, or lower train_classifier.window"
             )
-    calibrated = len(np.unique(data.segment[rows[:, 0]]))
-    needed = int(np.ceil(np.log(1 - confidence) / np.log(coverage)))
-    if calibrated < needed:
-        raise ValueError(
-            f"expected windows of at least log(1 - confidence) / log(coverage) = {needed} "
-            f"{of} to calibrate with, "
-            f"found {calibrated}; add {of}, raise "
-            f"train_classifier.{of}.calibration, or lower train_classifier.coverage or confidence"
-        )
 
 
 def all_frames(frames: LabelledFrames, *, recorded: bool) -> Labelled:

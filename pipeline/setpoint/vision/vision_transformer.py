@@ -1,5 +1,5 @@
 """The networks that look at key areas: the paper's vision transformer and head (Li and Pattinson 2025, figure
-5a), a small one, and a small CNN as yardstick.
+5a), and a small one.
 
 Written on whole batches: every layer is one matrix product over (images x
 tokens). Weights are float32 and leave as named arrays.
@@ -154,34 +154,6 @@ class VisionTransformer(eqx.Module):
         return self.norm(self.blocks[-1](tokens, 1)[:, 0])
 
 
-class ConvolutionalNetwork(eqx.Module):
-    """Three 3 x 3 convolutions with pooling, then the mean over the
-    area: 50 k parameters with the head; the yardstick."""
-
-    kernels: list[Float[Array, "3 3 inputs outputs"]]
-    biases: list[Float[Array, " outputs"]]
-
-    def __init__(self, rng: np.random.Generator):
-        pairs = ((1, 24), (24, 48), (48, 84))
-        self.kernels = [
-            _float32(rng.standard_normal((3, 3, a, b)) * np.sqrt(2 / (9 * a))) for a, b in pairs
-        ]  # He et al. 2015
-        self.biases = [_float32(np.zeros(b)) for _, b in pairs]
-
-    def __call__(self, x: Float[Array, "n 16 48"]) -> Float[Array, "n width"]:
-        x = x[..., None]
-        for i, (kernel, bias) in enumerate(zip(self.kernels, self.biases, strict=True)):
-            x = jax.nn.relu(
-                jax.lax.conv_general_dilated(
-                    x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
-                )
-                + bias
-            )
-            if i < len(self.kernels) - 1:
-                x = x.reshape(len(x), x.shape[1] // 2, 2, x.shape[2] // 2, 2, x.shape[3]).max(axis=(2, 4))
-        return x.mean(axis=(1, 2))
-
-
 class ClassifierHead(eqx.Module):
     """relu of the image's and of the temperature's layer, concatenated, then one layer to the
     classes: 33,363 parameters at the paper's size."""
@@ -217,7 +189,7 @@ class Classifier(eqx.Module):
     """Key area and nozzle temperature -> logits of the three flow classes, and beside them log flow with its
     log deviation, from the same features."""
 
-    body: VisionTransformer | ConvolutionalNetwork
+    body: VisionTransformer
     head: ClassifierHead
     flow_head: FlowHead
 
@@ -250,11 +222,6 @@ def vision_transformer(size: Size, rng: np.random.Generator) -> Classifier:
         ClassifierHead(size.width, size.image_features, size.temperature_features, rng),
         FlowHead(size.image_features + size.temperature_features, rng),
     )
-
-
-def convolutional(rng: np.random.Generator) -> Classifier:
-    """The small CNN with random weights."""
-    return Classifier(ConvolutionalNetwork(rng), ClassifierHead(84, 32, 16, rng), FlowHead(48, rng))
 
 
 def parameters(tree) -> int:

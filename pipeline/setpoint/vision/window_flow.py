@@ -1,7 +1,8 @@
 """The flow that a window of frames shows, with its spread, and the classes that follow from it.
 
 Each frame says a log flow with a deviation of its own. What they say is fitted to true flows on segments that
-the network never saw.
+the network never saw. Noise, ground and focus move what a whole segment shows: what the looks of a window
+(frames/familiar.py) say of that is taken off first.
 """
 
 from typing import NamedTuple
@@ -9,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.special
 
+from pipeline.setpoint.frames import familiar
 from pipeline.setpoint.frames.nozzle_scene import BORDERS
 
 CLASSES = 3
@@ -34,10 +36,29 @@ KNOTS_PERCENT = (
 STRAIGHT, LEAST_SLOPE = 3.0, 0.1
 
 
+# flows in percent from whose windows it is learned how looks move what is shown, the penalty of its ridge,
+# and the deviations beyond which a look says no more
+LOOKED_PERCENT, LOOK_PENALTY, FURTHEST_LOOK = (50.0, 200.0), 3.0, 3.0
+
+
+class LookCorrection(NamedTuple):
+    """By how much of log flow the looks of a window move what its frames show: c = weight' z with z the looks
+    less `mean` in units of `deviation`, (measures,) each; `explained` is the deviation of c, in the log flow
+    that is seen."""
+
+    mean: np.ndarray
+    deviation: np.ndarray
+    weight: np.ndarray
+    explained: float
+
+
+NO_CORRECTION = LookCorrection(*(np.full(len(familiar.NAMES), x) for x in (0.0, 1.0, 0.0)), 0.0)
+
+
 class FlowCalibration(NamedTuple):
     """What turns the log flows of frames into that of a window: `shown` (k,) is what frames show on average
     at the flows KNOTS_PERCENT, rising; `scale` (k,) multiplies their deviation there; `correlation` is that
-    of the errors of one segment's frames.
+    of the errors of one segment's frames; `looks` what is taken off for what lies around the bead.
 
     A network that is sure of little says a flow nearer to those that it learned than the true one: the map
     undoes that, so that a window at any flow shows that flow on average.
@@ -46,6 +67,7 @@ class FlowCalibration(NamedTuple):
     shown: np.ndarray
     scale: np.ndarray
     correlation: float
+    looks: LookCorrection = NO_CORRECTION
 
 
 class WindowFlow(NamedTuple):
@@ -58,21 +80,45 @@ class WindowFlow(NamedTuple):
 
 
 def window_flow(
-    log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, fitted: FlowCalibration
+    log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, looks: np.ndarray, fitted: FlowCalibration
 ) -> WindowFlow:
-    """The flow of w windows from log(flow / 100 %) of their frames with its deviation, and valid (w, length).
+    """The flow of w windows from log(flow / 100 %) of their frames with its deviation, valid (w, length), and
+    looks (w, measures).
 
-    What is shown is the mean of the m valid frames weighted by v_i = deviation_i^-2, and flow_seen the flow
-    at which frames show that on average. Frames of one segment repeat each other: spread^2 =
-    scale^2 (1 + (m - 1) correlation) / sum_i v_i (design effect; Kish 1965).
+    What is shown is the mean of the m valid frames weighted by v_i = deviation_i^-2, less what the looks
+    explain, and flow_seen the flow at which frames show that on average. Frames of one segment repeat each
+    other: spread^2 = scale^2 (1 + (m - 1) correlation) / sum_i v_i (design effect; Kish 1965), and more
+    without looks (NaN).
     """
     shown, unscaled = _shown(log_flow, deviation, valid, fitted.correlation)
-    seen = np.interp(shown, fitted.shown, _knots())
+    moved = correction(fitted.looks, looks)
+    seen = np.interp(shown - np.nan_to_num(moved), fitted.shown, _knots())
     some = np.isfinite(seen)
     spread = unscaled * np.interp(seen, _knots(), fitted.scale)
+    spread = np.hypot(spread, np.where(np.isnan(moved), fitted.looks.explained, 0.0))
     prob = np.full((len(seen), CLASSES), 1 / CLASSES)
     prob[some] = class_probabilities(seen[some], spread[some])
     return WindowFlow(100 * np.exp(seen), spread, prob)
+
+
+def correction(of: LookCorrection, looks: np.ndarray) -> np.ndarray:
+    """(w,) of log flow that is to be taken off for looks (w, measures); NaN for those that are not known."""
+    z = (looks - of.mean) / of.deviation
+    return np.clip(z, -FURTHEST_LOOK, FURTHEST_LOOK) @ of.weight
+
+
+def fit_correction(looks: np.ndarray, residual: np.ndarray) -> LookCorrection:
+    """Ridge of what windows show too much of log flow, residual (w,), on their looks (w, measures); none of
+    fewer windows than three for each measure, by which it would learn noise."""
+    some = np.isfinite(looks).all(axis=1) & np.isfinite(residual)
+    looks, residual = looks[some], residual[some]
+    if len(looks) < 3 * looks.shape[1]:
+        return NO_CORRECTION
+    mean, deviation = looks.mean(axis=0), looks.std(axis=0) + 1e-6
+    Z = np.clip((looks - mean) / deviation, -FURTHEST_LOOK, FURTHEST_LOOK)
+    gram = Z.T @ Z + LOOK_PENALTY * np.eye(Z.shape[1])
+    weight = np.linalg.solve(gram, Z.T @ (residual - residual.mean()))
+    return LookCorrection(mean, deviation, weight, 0.0)
 
 
 def _shown(
@@ -103,28 +149,26 @@ def _straight() -> np.ndarray:
 
 
 def fit_flow(
-    log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, flow: np.ndarray
+    log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, looks: np.ndarray, flow: np.ndarray
 ) -> FlowCalibration:
-    """Map, scale and correlation from windows (w, length) at flows (w,) in percent, all of segments that were
-    not learned from.
+    """Map, scale, correlation and what is taken off for looks (w, measures), from windows (w, length) at
+    flows (w,) in percent, all of segments that were not learned from.
 
-    The map is least squares with its changes of slope weighed as STRAIGHT windows; the correlation that of
-    the standardised residuals of two frames of a window (analysis of variance); the scale what makes the
-    windows' squared errors as large as they are, smoothed in the same way.
+    The map is least squares with its changes of slope weighed as STRAIGHT windows, before and after the looks
+    have explained what they can of its residuals; the correlation that of the standardised residuals of two
+    frames of a window (analysis of variance); the scale what makes the windows' squared errors as large as
+    they are, smoothed in the same way.
     """
     some = valid.any(axis=1)
-    log_flow, deviation, valid, truth = (a[some] for a in (log_flow, deviation, valid, np.log(flow / 100)))
-    hats, straight = _hats(truth), STRAIGHT * _straight().T @ _straight()
-    slopes = np.eye(len(KNOTS_PERCENT))[[0, -1]] * 1e-6  # keeps ends that nobody saw finite
+    log_flow, deviation, valid, looks = (a[some] for a in (log_flow, deviation, valid, looks))
+    truth, flow = np.log(flow[some] / 100), flow[some]
+    hats, straight, knots = _hats(truth), STRAIGHT * _straight().T @ _straight(), _knots()
     shown, _ = _shown(log_flow, deviation, valid, 0.0)
-    knots = _knots()
-    fitted = np.linalg.solve(
-        hats.T @ hats + straight + slopes.T @ slopes, hats.T @ shown + slopes.T @ slopes @ knots
-    )
-    steps = np.maximum(np.diff(fitted), LEAST_SLOPE * np.diff(knots))
-    middle = KNOTS_PERCENT.index(100.0)
-    rising = np.concatenate([[0.0], np.cumsum(steps)])
-    fitted = rising + fitted[middle] - rising[middle]
+    near = (flow >= LOOKED_PERCENT[0]) & (flow <= LOOKED_PERCENT[1])
+    of_looks = fit_correction(looks[near], (shown - hats @ _fit_map(hats, shown))[near])
+    moved = np.nan_to_num(correction(of_looks, looks))
+    log_flow = log_flow - moved[:, None]
+    fitted = _fit_map(hats, shown - moved)
     correlation = _correlation((log_flow - (hats @ fitted)[:, None]) / deviation, valid)
     shown, unscaled = _shown(log_flow, deviation, valid, correlation)
     seen = np.interp(shown, fitted, knots)
@@ -132,7 +176,23 @@ def fit_flow(
     hats = _hats(seen)
     level = squared.mean()
     scale2 = np.linalg.solve(hats.T @ hats + straight + 1e-6 * np.eye(len(knots)), hats.T @ squared)
-    return FlowCalibration(fitted, np.sqrt(np.clip(scale2, 0.25 * level, 16 * level)), correlation)
+    scale = np.sqrt(np.clip(scale2, 0.25 * level, 16 * level))
+    explained = float((np.interp(shown + moved, fitted, knots) - seen)[near].std()) if near.any() else 0.0
+    return FlowCalibration(fitted, scale, correlation, of_looks._replace(explained=explained))
+
+
+def _fit_map(hats: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    """(k,) what frames show at the knots, rising, from windows with the weights hats (w, k) that show
+    `shown` (w,) on average."""
+    straight, knots = STRAIGHT * _straight().T @ _straight(), _knots()
+    slopes = np.eye(len(KNOTS_PERCENT))[[0, -1]] * 1e-6  # keeps ends that nobody saw finite
+    fitted = np.linalg.solve(
+        hats.T @ hats + straight + slopes.T @ slopes, hats.T @ shown + slopes.T @ slopes @ knots
+    )
+    steps = np.maximum(np.diff(fitted), LEAST_SLOPE * np.diff(knots))
+    middle = KNOTS_PERCENT.index(100.0)
+    rising = np.concatenate([[0.0], np.cumsum(steps)])
+    return rising + fitted[middle] - rising[middle]
 
 
 def _correlation(residual: np.ndarray, valid: np.ndarray) -> float:

@@ -1,0 +1,144 @@
+"""A classifier of few own pictures: the features of the shipped network stay as they are, and heads are
+fitted to them by ridge regression (Hoerl and Kennard 1970)
+
+    W = (Z'Z + penalty I)^-1 Z' (y - mean y)    Z: features less their mean, in deviations
+
+of the three classes as 0 and 1, and of log(flow / 100 %). Every print is read by heads, and its windows by a
+calibration, that learned nothing from it.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from pipeline.setpoint.frames.rendered import LabelledFrames
+from pipeline.setpoint.vision import calibrated_classifier, calibration
+from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, WindowPredictions
+from pipeline.setpoint.vision.calibration import ClassifierOutputs
+from pipeline.setpoint.vision.classifier import CLASS_NAMES
+from pipeline.setpoint.vision.parts import all_frames
+from pipeline.setpoint.vision.vision_transformer import LOG_DEVIATION, Classifier
+
+# from so many stretches of constant settings on the network itself is trained
+TRAINED_FROM = 2000
+PENALTY = 10.0
+# prints are left out one at a time, many of them in so many groups; each class is in so many prints at least,
+# as two are left out at a time
+MOST_GROUPS, LEAST_PRINTS = 12, 3
+
+
+class Heads(NamedTuple):
+    """Scores of the classes and log flow = features W + b, W (f, 4), b (4,); deviation of log flow."""
+
+    W: np.ndarray
+    b: np.ndarray
+    deviation: float
+
+
+class OwnClassifier(NamedTuple):
+    """The classifier that learned from all prints; what heads that had not learned from a print say of its
+    frames and windows; and how far its frames are from those of the other prints (n,)."""
+
+    model: CalibratedClassifier
+    frames: ClassifierOutputs
+    windows: WindowPredictions
+    distance: np.ndarray
+
+
+def learn(network: Classifier, frames: LabelledFrames, *, window: int, false_alarms: float) -> OwnClassifier:
+    """The shipped network with heads for the frames of a folder. Raises ValueError if a class is in too few
+    prints, or no print fills a window."""
+    check(frames)
+    data = all_frames(frames, recorded=True)
+    outputs = calibrated_classifier.outputs(network, data, frames.valid, frames.surroundings)
+    group = np.unique(frames.print_number, return_inverse=True)[1] % MOST_GROUPS
+    unlearned = read_apart(outputs, group)
+    fitted = calibration.calibrate(unlearned, unlearned, length=window, false_alarms=false_alarms)
+    distance = _distances(outputs, group)
+    above = calibration.foreign_above(distance[frames.valid], false_alarms=false_alarms)
+    pieces = []
+    for one in np.unique(group):
+        mine, others = np.flatnonzero(group == one), np.flatnonzero(group != one)
+        inner = read_apart(outputs.take(others), group[others])
+        of_others = calibration.calibrate(inner, inner, length=window, false_alarms=false_alarms)
+        seen = calibrated_classifier.window_predictions(of_others, unlearned.take(mine), length=window)
+        pieces.append(seen._replace(rows=mine[seen.rows]))
+    heads = fit_heads(outputs.take(outputs.valid))
+    model = CalibratedClassifier(with_heads(network, heads), fitted._replace(foreign_above=above))
+    return OwnClassifier(model, unlearned, calibrated_classifier.joined_windows(pieces), distance)
+
+
+def check(frames: LabelledFrames) -> None:
+    """Raises ValueError if a class has valid frames in fewer than LEAST_PRINTS prints."""
+    for c, name in enumerate(CLASS_NAMES):
+        prints = len(np.unique(frames.print_number[frames.valid & (frames.label == c)]))
+        if prints < LEAST_PRINTS:
+            raise ValueError(
+                f"expected class {c}, {name}, in at least {LEAST_PRINTS} prints, found it in {prints}; "
+                "record more prints with flows of every class"
+            )
+
+
+def fit_heads(learned: ClassifierOutputs) -> Heads:
+    """Heads by the features of valid frames."""
+    X = _features(learned)
+    Y = np.column_stack([np.eye(calibration.CLASSES)[learned.label], np.log(learned.flow_percent / 100)])
+    mean, deviation = X.mean(axis=0), X.std(axis=0) + 1e-6
+    Z = (X - mean) / deviation
+    W = np.linalg.solve(Z.T @ Z + PENALTY * np.eye(Z.shape[1]), Z.T @ (Y - Y.mean(axis=0)))
+    residual = Y[:, -1] - Y[:, -1].mean() - Z @ W[:, -1]
+    W /= deviation[:, None]
+    return Heads(W, Y.mean(axis=0) - mean @ W, max(float(residual.std()), 0.02))
+
+
+def _features(outputs: ClassifierOutputs) -> np.ndarray:
+    """The features that the network's last layers see, without the appearance beside them."""
+    return outputs.features[:, : -calibration.appearance(np.zeros((1, 16, 48))).shape[1]]
+
+
+def read(heads: Heads, outputs: ClassifierOutputs) -> ClassifierOutputs:
+    """What heads say of frames."""
+    said = _features(outputs) @ heads.W + heads.b
+    deviation = np.full(len(said), heads.deviation)
+    return outputs._replace(logits=said[:, :-1], log_flow=said[:, -1], deviation=deviation)
+
+
+def read_apart(outputs: ClassifierOutputs, group: np.ndarray) -> ClassifierOutputs:
+    """What heads say of the frames (n,) of each group that learned from all others."""
+    rows, pieces = [], []
+    for one in np.unique(group):
+        mine = group == one
+        heads = fit_heads(outputs.take(outputs.valid & ~mine))
+        rows.append(np.flatnonzero(mine))
+        pieces.append(read(heads, outputs.take(mine)))
+    order = np.argsort(np.concatenate(rows))
+    return ClassifierOutputs(*(np.concatenate(column)[order] for column in zip(*pieces, strict=True)))
+
+
+def _distances(outputs: ClassifierOutputs, group: np.ndarray) -> np.ndarray:
+    """(n,) how far each frame is from those of the other groups."""
+    distance = np.zeros(len(group))
+    for one in np.unique(group):
+        others = outputs.take(outputs.valid & (group != one))
+        familiar = calibration.fit_familiar(others.features, others.label)
+        distance[group == one] = calibration.mahalanobis(familiar, outputs.features[group == one])
+    return distance
+
+
+def with_heads(network: Classifier, heads: Heads) -> Classifier:
+    """The network with these heads in the place of its own."""
+    middle, reach = LOG_DEVIATION
+    z = np.arctanh((np.log(heads.deviation) - middle) / reach)
+    flow_W = np.column_stack([heads.W[:, -1], np.zeros(len(heads.W))])
+    classes, flow = network.head.classes, network.flow_head.flow
+    new = heads.W[:, :-1], heads.b[:-1], flow_W, np.array([heads.b[-1], z])
+    return eqx.tree_at(
+        lambda net: (net.head.classes.W, net.head.classes.b, net.flow_head.flow.W, net.flow_head.flow.b),
+        network,
+        tuple(
+            jnp.asarray(value, old.dtype)
+            for value, old in zip(new, (classes.W, classes.b, flow.W, flow.b), strict=True)
+        ),
+    )

@@ -1,0 +1,50 @@
+"""Whether a camera may be judged by: windows of prints that nothing was learned from must be named rightly,
+and the camera be told from others. One value, which the loop, the exports, `shadow` and the page obey."""
+
+from typing import NamedTuple
+
+from pipeline.setpoint.frames.familiar import FALSE_ALARMS, needed_windows
+
+# one-sided, of the share of windows that are named rightly
+CONFIDENCE = 0.9
+
+
+class CameraProof(NamedTuple):
+    """Of `windows` windows of `prints` prints (rendered segments if `rendered`) that nothing was learned from
+    a share `right` is named rightly, each class counted alike, and at least `low` with CONFIDENCE; `least` is
+    required. A window is named rightly if its class is the true one at its middle. `known_from`: windows by
+    which the camera is told from others."""
+
+    right: float
+    low: float
+    least: float
+    windows: int
+    prints: int
+    known_from: int
+    rendered: bool
+
+
+UNPROVEN = CameraProof(0.0, 0.0, 1.0, 0, 0, 0, False)
+
+
+def may_judge(proof: CameraProof) -> bool:
+    return proof.low >= proof.least and proof.known_from >= needed_windows(FALSE_ALARMS)
+
+
+def verdict(proof: CameraProof) -> str:
+    """One sentence on accuracy and verdict."""
+    of = "rendered segments" if proof.rendered else "prints"
+    right = (
+        f"right in {100 * proof.right:.0f} % of {proof.windows:,} windows of {proof.prints:,} {of} "
+        "never learned from"
+    )
+    if may_judge(proof):
+        return f"{right}: may judge"
+    if proof.low < proof.least:
+        why = (
+            f"{right}, {100 * proof.low:.0f} % at least by its 90 % bound, {100 * proof.least:.0f} % required"
+        )
+    else:
+        needed = needed_windows(FALSE_ALARMS)
+        why = f"{right}, but {proof.known_from} windows do not tell it from other cameras, {needed} do"
+    return f"cannot judge this camera: {why}; everything is held"
