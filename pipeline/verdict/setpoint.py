@@ -423,7 +423,7 @@ def undecided(question: Question, figure: Figure, words: Mapping[str, Any]) -> s
     if state(question, figure) != UNDECIDED:
         return ""
     if "n_eff" in words:
-        more = math.ceil(words["segments"] * (words["needed"] / max(words["n_eff"], 1.0) - 1))
+        more = math.ceil(words["segments"] * (words["needed"] / max(words["n_eff"], 1.0) - 1) - 1e-6)
         return (
             f" Undecided: these runs are worth {number(words['n_eff'], 0)} that share nothing, of "
             f"{number(words['needed'], 0)}; about {more:,} more segments would decide."
