@@ -12,10 +12,8 @@ import numpy as np
 
 from pipeline.setpoint.agents import flow_filter, score, trials
 from pipeline.setpoint.agents.baselines import SequentialTest, sequential_test
-from pipeline.setpoint.settings import EvaluateSetpoint
 from pipeline.setpoint.simulation.recorded import UNSEEN, WindowTable
 from pipeline.setpoint.simulation.simulator import paper_windows, rollout
-from pipeline.store import params
 
 matplotlib.use("Agg")
 from matplotlib import pyplot  # noqa: E402  a figure without a screen
@@ -25,9 +23,12 @@ starts = trials.starts(4, accuracy=0.7)  # 21 wrong starts, four times each
 key = jax.random.key(1)
 
 # %% Three controllers. Each is a pair of pure functions: start() -> memory, act(parameters, memory, ...).
-declared = params.load(EvaluateSetpoint, "evaluate_setpoint").baselines.flow_filter.model_dump()
+costs = {"move_cost": 0.0, "move_fixed_cost": 0.0, "outside_cost": 0.0, "border_std": 1.0}
+declared = {"gains": [1.0], "biases": 1, "accuracy": 0.7, "ends": 0.2, "known_start_share": 0.0} | costs
 nothing = WindowTable(*4 * (np.empty(0),), np.empty(0), UNSEEN)  # this camera shows classes, no flows
-no_jumps, jumps = (flow_filter.fit(nothing, **declared | {"hazard": hazard}) for hazard in (0.0, 0.01))
+no_jumps, jumps = (
+    flow_filter.fit(nothing, known_start_std=0.05, hazard=hazard, **declared) for hazard in (0.0, 0.02)
+)
 law = flow_filter.flow_filter(len(jumps.gains), len(jumps.bias))
 controllers = {  # parameters are arrays, so that one compiled program serves all values
     "sequential test": (sequential_test(), SequentialTest(accuracy=0.746, threshold=2.86, cap=5.28)),
