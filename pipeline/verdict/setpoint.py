@@ -58,8 +58,8 @@ NO_CLOG = Missing("not applicable", "nothing happens in this case")
 class Cell(NamedTuple):
     """One controller in one case: shares of runs in percent with their 95 % intervals, or why one is missing.
     Then steps until inside for good; overshoot and flow error in percent; beyond, of good starts those that
-    leave them by each of BEYOND points; back, within +-15 % after a clog, and decisions until inside again.
-    redraws of the segments, by which the intervals are clustered."""
+    leave them by each of BEYOND points; back, within +-15 % after a clog, and decisions until 95 % of the
+    runs are inside again. n_eff: as many runs that share nothing as a share is worth, by its name."""
 
     runs: int
     counts: bool
