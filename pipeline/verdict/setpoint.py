@@ -423,10 +423,11 @@ def undecided(question: Question, figure: Figure, words: Mapping[str, Any]) -> s
     if state(question, figure) != UNDECIDED:
         return ""
     if "n_eff" in words:
-        more = math.ceil(words["segments"] * (words["needed"] / max(words["n_eff"], 1.0) - 1) - 1e-6)
+        more = words["segments"] * (words["needed"] / max(words["n_eff"], 1.0) - 1) - 1e-6
+        told = f"about {math.ceil(more):,} more segments" if math.isfinite(more) else "more segments"
         return (
             f" Undecided: these runs are worth {number(words['n_eff'], 0)} that share nothing, of "
-            f"{number(words['needed'], 0)}; about {more:,} more segments would decide."
+            f"{number(words['needed'], 0)}; {told} would decide."
         )
     off = abs(figure.value - question.limit)
     times = ((figure.high - figure.low) / 2 / off) ** 2 if off else math.inf
@@ -500,7 +501,7 @@ def verdict(evidence: Evidence) -> Verdict:
         state=ended,
         decision=words.of(ended),
         lead=f"First {'failed' if failed else 'undecided'} rule: {first.name[:1].lower()}{first.name[1:]}.",
-        reason=_closest(name, first),
+        reason=f"{_closest(name, first)} {pair_sentence(evidence.tables['choice']).text}",
         remedy=_conditions(asked, claim == CLAIM),
         rule=first.name,
     )
@@ -562,9 +563,11 @@ def named(board: Board, name: str) -> str:
 
 
 class PairSentence(NamedTuple):
-    """Model-based against data-driven: the answer in words, and who is better; None if not told apart."""
+    """Model-based against data-driven: the answer in words, the same in short, and who is better; None if not
+    told apart."""
 
     text: str
+    short: str
     winner: str | None
 
 
@@ -574,7 +577,7 @@ def pair_sentence(choice: Any) -> PairSentence:
     head, pair = "Model-based against data-driven:", lookup(choice, "pair")
     gap = lookup(pair, "difference")
     if isinstance(gap, Missing):
-        return PairSentence(f"{head} not measured.", None)
+        return PairSentence(f"{head} not measured.", "", None)
     a, b, winner = str(pair["a"]), str(pair["b"]), pair.get("winner")
     same = f"on the same {pair['segments']:,} segments, {count(pair['cases'], 'case')}"
     if winner not in (a, b):
@@ -584,14 +587,15 @@ def pair_sentence(choice: Any) -> PairSentence:
         )
         ends = band(pair["low"], pair["high"], 1)
         text = f"undecided between {_the(a)} and {_the(b)} {same} (90{THIN}% interval {ends} points); {more}"
-        return PairSentence(f"{head} {text}.", None)
+        return PairSentence(f"{head} {text}.", f"{head} undecided; {more}.", None)
     other, sign = (b, 1) if winner == a else (a, -1)
     ends = band(*sorted(sign * pair[end] for end in ("low", "high")), 1)
     text = (
         f"{_the(winner)} brings {number(abs(gap), 1)} points more of its runs to the target and keeps them "
         f"there than {_the(other)} {same} (90{THIN}% interval {ends} points)"
     )
-    return PairSentence(f"{head} {text}.", winner)
+    short = f"{head} {winner}, by {number(abs(gap), 1)} points ({ends})."
+    return PairSentence(f"{head} {text}.", short, winner)
 
 
 def _the(name: str) -> str:

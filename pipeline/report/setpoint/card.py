@@ -70,7 +70,7 @@ def card(sources: Sources, verdict: Verdict) -> Card:
         ],
         basis=f"Worst case of each; small: 95{THIN}% interval, by segment. Harm: good prints that leave "
         f"±{BEYOND[-1]}{THIN}%.",
-        beside=f"{pair_sentence(sources.tables['choice']).text} {_beside(scores, names)}".strip(),
+        beside=pair_sentence(sources.tables["choice"]).short,
         sources=sources.source("scoreboard"),
     )
 
@@ -132,18 +132,6 @@ def _harm_cells(harms: Sequence[Harm | Missing], limit: float | None) -> list[Ca
         own = "" if harm.limit == limit else f"; ≤ {harm.limit:g}{THIN}%"
         cells.append(cell._replace(band=cell.band + own))
     return cells
-
-
-def _beside(scores: Board, names: Sequence[str]) -> str:
-    """Where the default and the agent fare worst."""
-    _, mine = worst(scores, names[0], "lasting")
-    figure, place = worst(scores, names[1], "lasting") if len(names) > 1 else (Missing("", ""), None)
-    if mine is None:
-        return ""
-    text = f"Worst case of {names[0]}: {within(mine)}."
-    if place is None or place == mine:
-        return text
-    return f"{text} Of {names[1]}: {within(place)}, {share_text(figure)} settle and stay."
 
 
 def _step(sources: Sources, verdict: Verdict) -> CardStep:

@@ -26,7 +26,6 @@ from pipeline.verdict.setpoint import (
     board,
     case_text,
     lasting,
-    pair_sentence,
     role,
     share_text,
     summary,
@@ -91,7 +90,6 @@ def render(sources: Sources) -> str:
         second=judged_scores is not None
         and bool(judged_scores.default)
         and judged_scores.kinds[judged_scores.default] != DATA_DRIVEN,
-        pair=pair_sentence(sources.tables["choice"]),
         summary=summary(sources.evidence, judged_scores) if judged_scores and judged_scores.default else "",
         no_board=scores if isinstance(scores, Missing) else None,
         heads=heads(judged_scores),
