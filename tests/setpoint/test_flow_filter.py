@@ -221,6 +221,12 @@ def test_noise_and_misreadings_are_those_of_the_camera_s_own_windows_and_segment
     np.testing.assert_allclose(of.weight, weight / weight.sum(), rtol=1e-5)
 
 
+def test_windows_that_agree_by_chance_leave_some_noise():
+    table = camera()
+    same = table._replace(flow_seen=2.0 * table.flow)
+    assert np.asarray(fitted(same).noise).min() == pytest.approx(flow_filter.LEAST_NOISE)
+
+
 def test_a_table_of_classes_only_is_no_obstacle():
     of = fitted(synthetic_table(np.random.default_rng(100), segments=3, windows=2))
     assert np.isfinite(np.asarray(of.noise)).all() and np.isfinite(np.asarray(of.bias)).all()

@@ -41,6 +41,7 @@ TAIL, FARTHEST = 4.0, 4.0  # Student's degrees of freedom; deviations up to whic
 CLOGS, SURELY = (0.4, 1.05), 0.9  # factors on the flow at a jump, in this share of the jumps; else anywhere
 NOISE_WIDTH = 0.12  # of log flow, one deviation: over which a window's noise is smooth
 UNKNOWN_NOISE, UNKNOWN_BIAS = 0.05, 0.07  # of a table that shows classes only
+LEAST_NOISE = 0.01  # few windows may agree by chance
 # corrections that begin with each of the five moves, in percent: a far flow takes many moves, and the fixed
 # cost is of the correction, not of each
 LARGEST = max(FLOW_MOVES)
@@ -157,7 +158,7 @@ def fit(
         shown = log_grid + np.interp(log_grid, log_flow[order], mean[order])
         at = np.clip(log_grid, log_flow.min(), log_flow.max())
         near = np.exp(-0.5 * ((at[:, None] - log_flow) / NOISE_WIDTH) ** 2)
-        noise = np.sqrt(near @ (errors.within - mean) ** 2 / near.sum(axis=1))
+        noise = np.sqrt(near @ (errors.within - mean) ** 2 / near.sum(axis=1)).clip(LEAST_NOISE)
     z = np.linspace(-FARTHEST, FARTHEST, biases)
     weight = (1.0 + z**2 / TAIL) ** (-(TAIL + 1.0) / 2.0)
     as_told = np.exp(-0.5 * (log_grid / known_start_std) ** 2) / GRID
