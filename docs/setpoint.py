@@ -1,7 +1,7 @@
 """The setpoint loop in arrays: a camera names each bead, a controller moves flow and temperature.
 
 `./run python docs/setpoint.py` draws setpoint.svg into the folder where it is started.
-The setpoint stages do the same with images, trained networks and twelve cases.
+The setpoint stages do the same with images, trained networks and eight cases.
 """
 
 # %% The simulator of Li 2025 names a bead under, good or over. It is right 70 % of the time.
@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 
-from pipeline.setpoint.agents import bayes, score, trials
-from pipeline.setpoint.agents.baselines import Proportional, proportional
+from pipeline.setpoint.agents import flow_filter, score, trials
+from pipeline.setpoint.agents.baselines import SequentialTest, sequential_test
+from pipeline.setpoint.simulation.recorded import UNSEEN, WindowTable
 from pipeline.setpoint.simulation.simulator import paper_windows, rollout
 
 matplotlib.use("Agg")
@@ -22,12 +23,17 @@ starts = trials.starts(4, accuracy=0.7)  # 21 wrong starts, four times each
 key = jax.random.key(1)
 
 # %% Three controllers. Each is a pair of pure functions: start() -> memory, act(parameters, memory, ...).
-no_jumps = bayes.class_filter(accuracy=0.7, hazard=0.0, move_cost=0.0, outside_cost=0.0)
-jumps = bayes.class_filter(accuracy=0.7, hazard=0.02, move_cost=0.0, outside_cost=0.0)
+costs = {"move_cost": 0.0, "move_fixed_cost": 0.0, "outside_cost": 0.0, "border_std": 1.0}
+declared = {"gains": [1.0], "biases": 1, "accuracy": 0.7, "ends": 0.2, "known_start_share": 0.0} | costs
+nothing = WindowTable(*4 * (np.empty(0),), np.empty(0), UNSEEN)  # this camera shows classes, no flows
+no_jumps, jumps = (
+    flow_filter.fit(nothing, known_start_std=0.05, hazard=hazard, **declared) for hazard in (0.0, 0.02)
+)
+law = flow_filter.flow_filter(len(jumps.gains), len(jumps.bias))
 controllers = {  # parameters are arrays, so that one compiled program serves all values
-    "filtered proportional": (proportional(), Proportional(gain=11.4, time_constant=11.2)),
-    "Bayes filter": (bayes.bayes(1), no_jumps),
-    "Bayes filter, expects jumps": (bayes.bayes(1), jumps),
+    "sequential test": (sequential_test(), SequentialTest(accuracy=0.746, threshold=2.86, cap=5.28)),
+    "Bayes filter": (law, no_jumps),
+    "Bayes filter, expects jumps": (law, jumps),
 }
 controllers = {name: (law, jax.tree.map(jnp.float32, values)) for name, (law, values) in controllers.items()}
 
@@ -56,7 +62,7 @@ for name in ("Bayes filter", "Bayes filter, expects jumps"):
 
 # %% The figure: the flow of every run, and the band that it should stay in.
 figure, axes = pyplot.subplots(2, 2, figsize=(10, 6), sharex=True, sharey=True)
-panels = {name: runs[name] for name in ("filtered proportional", "Bayes filter")}
+panels = {name: runs[name] for name in ("sequential test", "Bayes filter")}
 panels |= {f"{name}; a clog": run for name, run in clogged.items()}
 for axis, (name, run) in zip(axes.flat, panels.items(), strict=True):
     axis.plot(np.asarray(run.flow).T, color="tab:blue", alpha=0.15, linewidth=0.8)

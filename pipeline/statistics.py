@@ -81,6 +81,15 @@ class Share(NamedTuple):
     high: float
 
 
+class PooledShare(NamedTuple):
+    """A share of runs in percent with its 95 % interval; n runs that share nothing tell it as well."""
+
+    percent: float
+    low: float
+    high: float
+    n: float
+
+
 def wilson(happened: np.ndarray) -> Share:
     """The share of True (n,) in percent with its 95 % interval, for n that share nothing (Wilson 1927)."""
     return wilson_interval(float(np.mean(happened)), len(happened))
@@ -100,65 +109,40 @@ def wilson_interval(p: float, n: float) -> Share:
 
 
 class Mean(NamedTuple):
-    """A mean with the ends of its 95 % interval."""
+    """A mean with the ends of its interval."""
 
     value: float
     low: float
     high: float
 
 
-def shared_variance(figures: Sequence[np.ndarray]) -> float:
-    """The share of a run's variance that all runs on one redraw have in common (intraclass correlation),
-    pooled over figures (B, n) that are alike: B redraws of what runs share, n runs on each.
+def effective(happened: np.ndarray) -> float:
+    """As how many runs that share nothing do n runs on each of P pools tell a share? happened (P, n).
 
-    sum (var_b(mean_b) - s^2 / n) / sum (var_b(mean_b) + (1 - 1 / n) s^2), not below 0, with s^2 the variance
-    within a redraw (components of variance: Searle 1971). One figure alone tells it badly: what n runs differ
-    by exceeds what they share. Raises ValueError for fewer than two redraws.
+    n P / max(1, var(p_k) / (p (1 - p) / n)): what the pools' shares p_k differ by, against what runs that
+    share nothing differ by (design effect: Kish 1965). One pool says nothing of others: 1.
     """
-    between = total = 0.0
-    for figure in figures:
-        values = np.asarray(figure, float)
-        if values.ndim != 2 or values.shape[0] < 2:
-            raise ValueError(
-                f"shared_variance: expected values (B, n) of at least 2 redraws, found shape {values.shape}; "
-                "redraw more often"
-            )
-        n = values.shape[1]
-        within = float(values.var(axis=1, ddof=1).mean()) if n > 1 else 0.0
-        common = float(values.mean(axis=1).var(ddof=1)) - within / n
-        between, total = between + common, total + common + within
-    return min(max(between / total, 0.0), 1.0) if total > 0 else 0.0
+    happened = np.asarray(happened, float)
+    pools, n = happened.shape
+    p = float(happened.mean())
+    if pools < 2:
+        return 1.0
+    if p in (0.0, 1.0):
+        return float(happened.size)
+    between = float(happened.mean(axis=1).var(ddof=1))
+    return happened.size / max(1.0, between * n / (p * (1.0 - p)))
 
 
-def effective_runs(redraws: int, runs: int, shared: float) -> float:
-    """As how many runs that share nothing do `runs`, on so many redraws of segments, tell a mean?
-
-    1 / (shared + (1 - shared) / runs): further runs say nothing more of the segments (Kish 1965), times
-    (z / t)^2 for Student's t of redraws - 1 (Korn and Graubard 1998).
-    """
-    student = float(scipy.special.ndtri(0.975) / scipy.special.stdtrit(redraws - 1, 0.975))
-    return student**2 / (shared + (1.0 - shared) / runs)
+def pooled_share(happened: np.ndarray) -> PooledShare:
+    """The share of True (P, n) in percent, worth `effective` runs, with its 95 % interval: Wilson's, widened
+    by Student's t of P - 1 (Korn and Graubard 1998)."""
+    pools, n = len(happened), effective(happened)
+    student = scipy.special.stdtrit(max(pools - 1, 1), 0.975) / scipy.special.ndtri(0.975)
+    return PooledShare(*wilson_interval(float(np.mean(happened)), n / student**2), n)
 
 
-def redrawn_mean(values: np.ndarray, shared: float) -> Mean:
-    """The mean of values (B, n) of n runs on each of B redraws with its 95 % interval, for the `shared`
-    variance of `shared_variance`."""
-    values = np.asarray(values, float)
-    mean, n = float(values.mean()), effective_runs(len(values), values.size, shared)
-    half = float(scipy.special.ndtri(0.975) * values.std() / np.sqrt(n))
-    return Mean(mean, mean - half, mean + half)
-
-
-def redrawn_share(happened: np.ndarray, shared: float) -> Share:
-    """The share of True in happened (B, n) in percent with the 95 % interval of what the same work gives on
-    other segments: Wilson's, of an effective number of runs.
-
-    The mean of B redraws and a repetition on one set of segments differ by shared (1 + 1 / B) of a run's
-    variance for the segments and by (1 - shared) / (B n) for the runs of either; z / t as in
-    `effective_runs`. `shared` is of all figures alike; where this one shows more, its own counts.
-    """
-    happened = np.asarray(happened, bool)
-    B, own = len(happened), max(shared, shared_variance([happened]))
-    student = float(scipy.special.ndtri(0.975) / scipy.special.stdtrit(B - 1, 0.975))
-    variance = own * (1.0 + 1.0 / B) + 2.0 * (1.0 - own) / happened.size
-    return wilson_interval(float(happened.mean()), student**2 / variance)
+def mean_of_pools(values: np.ndarray, *, level: float) -> Mean:
+    """The mean of values (P,) of pools that share nothing, with the ends of its interval (Student's t)."""
+    mean, pools = float(np.mean(values)), len(values)
+    half = scipy.special.stdtrit(pools - 1, (1 + level) / 2) * np.std(values, ddof=1) / np.sqrt(pools)
+    return Mean(mean, mean - float(half), mean + float(half))

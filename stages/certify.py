@@ -257,7 +257,7 @@ def certify_setpoint(folder: Path, seed: int) -> dict[str, Any]:
     """The files of the default controller, which have no certificate, and how far they are from the
     networks."""
     from pipeline.deploy import to_setpoint
-    from pipeline.setpoint.agents.files import restore_agents
+    from pipeline.setpoint.agents.files import restore_published
     from pipeline.setpoint.controllers import build_controllers
     from pipeline.setpoint.settings import EvaluateSetpoint
     from pipeline.setpoint.simulation.recorded import window_tables
@@ -269,12 +269,11 @@ def certify_setpoint(folder: Path, seed: int) -> dict[str, Any]:
     )
     columns = artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS)
     learned = window_tables(columns, WINDOW_PARTS)["learn"]
-    agents = restore_agents("datasets/train_agent/weights.safetensors")
+    agent = restore_published("datasets/train_agent/weights.safetensors")
     baselines = params.load(EvaluateSetpoint, "evaluate_setpoint").baselines
     default = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
-    built = build_controllers(baselines, agents, learned).get(default)
-    decides = to_setpoint.decider(default, built and built.parameters, agents.belief, agents.belief_dqn)
-    return to_setpoint.write_checked(folder, default, model, decides, seed)
+    built = build_controllers(baselines, agent, learned).get(default)
+    return to_setpoint.write_checked(folder, default, model, built and built.parameters, seed)
 
 
 if __name__ == "__main__":

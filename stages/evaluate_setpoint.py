@@ -1,25 +1,24 @@
 """Agents and classifier -> who sets flow and temperature: reads datasets/train_classifier
 and datasets/train_agent; writes datasets/evaluate_setpoint: scoreboard.parquet,
 paths.parquet of one run from each start, in the case that decides too, decisions.parquet of
-two episodes through pixels, and choice.json, the default with its worst case."""
+two episodes through pixels, and choice.json: the default with its worst case, and the best model-based
+controller against the best data-driven one."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import stages
-from pipeline.setpoint.controllers import THROUGH_PIXELS, BuiltController, build_controllers
+from pipeline.setpoint.controllers import BuiltController, build_controllers, of_kind
 from pipeline.setpoint.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.setpoint.tables import DECISIONS, PATHS, SCOREBOARD, WINDOW_PARTS, WINDOWS
 from pipeline.store import artifacts, params
 
 if TYPE_CHECKING:
-    from pipeline.setpoint.evaluation.contest import Contest
-    from pipeline.setpoint.evaluation.judging import Case, DefaultChoice
+    from pipeline.setpoint.evaluation.judging import DefaultChoice
     from pipeline.setpoint.evaluation.pixel_rollouts import PixelRollouts
-    from pipeline.setpoint.simulation.recorded import WindowTable
 
 WEIGHTS = "datasets/train_classifier/weights.safetensors"
 CALIBRATION = "datasets/train_classifier/calibration.parquet"
@@ -28,7 +27,7 @@ AGENTS = "datasets/train_agent/weights.safetensors"
 METRICS = (
     "default",
     "worst",
-    "margin*",
+    "pair.*",
     "cases.*.settled",
     "cases.*.stay",
     "cases.*.recovered",
@@ -42,9 +41,8 @@ def main() -> None:
     with artifacts.stage("evaluate_setpoint") as out:
         settings = params.load(EvaluateSetpoint, "evaluate_setpoint")
         view = params.load(TrainClassifier, "train_classifier")
-        from pipeline.setpoint.agents.files import restore_agents
+        from pipeline.setpoint.agents.files import restore_published
         from pipeline.setpoint.evaluation import judging, scoreboard
-        from pipeline.setpoint.evaluation.contest import with_figures
         from pipeline.setpoint.frames.files import restore_camera
         from pipeline.setpoint.simulation.recorded import window_tables
         from pipeline.setpoint.vision.files import restore_classifier
@@ -52,26 +50,29 @@ def main() -> None:
         model = restore_classifier(WEIGHTS, CALIBRATION)
         table = artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS)
         windows = window_tables(table, WINDOW_PARTS)
-        controllers = build_controllers(settings.baselines, restore_agents(AGENTS), windows["learn"])
-        room = judging.room([windows["choose"], windows["judge"]])  # one program for both
-        choice = choose_default(controllers, windows["choose"], settings, room=room)
+        controllers = build_controllers(settings.baselines, restore_published(AGENTS), windows["learn"])
+        segments = judging.pools([windows["choose"], windows["judge"]], settings.pool)
+        choice = choose_default(controllers, segments[0], settings)
         camera = restore_camera("datasets/train_classifier/known_camera.parquet")
         with ThreadPoolExecutor(1) as beside:
             running = beside.submit(
                 simulate_pixels, controllers, choice.name, settings, pixel_loop(model, settings, view, camera)
             )
-            contest = simulate_contest(controllers, windows["judge"], settings, choice.name, room=room)
-        rollouts, choice = running.result(), with_figures(choice, contest)
-        groups = {name: controller.group for name, controller in controllers.items()}
-        board = scoreboard.scoreboard(groups, contest, rollouts)
-        artifacts.write_table(out / "scoreboard.parquet", SCOREBOARD, board)
-        paths = scoreboard.paths(groups, contest, choice, rollouts)
-        artifacts.write_table(out / "paths.parquet", PATHS, paths)
+            judged, paths = simulate(controllers, segments[1], settings, stream=1)
+        count = len(segments[1])
+        contest = scoreboard.Contest(scoreboard.scores(judged, count), paths)
+        worst, case = judging.worst_case(judged[choice.name])
+        rollouts, choice = running.result(), choice._replace(worst=worst, case=case)
+        pair = judging.compare(judged, count, segments=len({*windows["judge"].segment.tolist()}))
+        artifacts.write_table(
+            out / "scoreboard.parquet", SCOREBOARD, scoreboard.scoreboard(contest, rollouts)
+        )
+        artifacts.write_table(out / "paths.parquet", PATHS, scoreboard.paths(contest, choice, rollouts))
         none = {column.name: [] for column in DECISIONS.columns}
         decisions = none | scoreboard.decisions(choice.name, rollouts)
         artifacts.write_table(out / "decisions.parquet", DECISIONS, decisions)
-        artifacts.write_json(out / "choice.json", scoreboard.choice_record(choice))
-        figures = scoreboard.metrics(groups, contest, choice, rollouts)
+        artifacts.write_json(out / "choice.json", choice._asdict() | {"pair": pair})
+        figures = scoreboard.metrics(contest, choice, pair, rollouts)
         artifacts.write_metrics("evaluate_setpoint", figures, METRICS)
 
 
@@ -79,115 +80,51 @@ def main() -> None:
 
 
 def choose_default(
-    controllers: Mapping[str, BuiltController],
-    windows: "WindowTable",
-    settings: EvaluateSetpoint,
-    *,
-    room: int = 0,
+    controllers: Mapping[str, BuiltController], segments: Sequence[Any], settings: EvaluateSetpoint
 ) -> "DefaultChoice":
-    """The default, by the segments to choose on (sequential halving): in each of settings.rounds every
-    controller that may still become the default runs on settings.redraws further redraws of them."""
-    import jax
-    import numpy as np
+    """The default, by the pools of segments to choose on, of which none is judged."""
+    from pipeline.setpoint.evaluation import judging
 
-    from pipeline.setpoint.evaluation import contest, judging
-
-    redraws, harmed = settings.redraws, settings.most_harmed
-    limits = contest.harm_limits(perfect=harmed.perfect_percent, in_band=harmed.in_band_percent)
-    every = judging.all_cases(settings.runs, segment_mean_decisions=settings.segment_mean_decisions)
-    cases = {name: case for name, case in every.items() if not case.good or name in limits}
-    rng = np.random.default_rng([settings.seed, 0])
-    redrawn = judging.redrawn(windows, settings.rounds * redraws, rng, room=room)
-    outcomes: dict[str, Any] = {name: {} for name in controllers}
-    judged, survivors = {}, list(controllers)
-    for number in range(settings.rounds):
-        key = jax.random.fold_in(jax.random.key(settings.seed), number)
-        segments = contest.one_round(redrawn, number, redraws)
-        with progress(f"choose, round {number + 1}", len(survivors) * len(cases)) as bar:
-            simulate = partial(simulate_controller, controllers, cases, redraws, bar.update, segments, key)
-            batch = each_controller(controllers, survivors, simulate)
-        for name, (latest, _) in batch.items():
-            outcomes[name] = contest.append(outcomes[name], latest)
-            judged[name] = contest.judge(outcomes[name], cases, (number + 1) * redraws)
-        if number + 1 < settings.rounds:
-            survivors = contest.eliminate(survivors, judged, limits)
-    return judging.choose(judged, simplest_first=list(controllers), bars=limits)
+    harmed = settings.most_harmed
+    outcomes, _ = simulate(controllers, segments, settings, stream=0)
+    limits = {"perfect": harmed.perfect_percent, "in_band": harmed.in_band_percent}
+    bars = judging.harm_limits([*outcomes[next(iter(outcomes))]], **limits)
+    return judging.choose(outcomes, len(segments), simplest_first=list(controllers), bars=bars)
 
 
-def simulate_contest(
+def simulate(
     controllers: Mapping[str, BuiltController],
-    windows: "WindowTable",
+    segments: Sequence[Any],
     settings: EvaluateSetpoint,
-    default: str,
     *,
-    room: int = 0,
-) -> "Contest":
-    """Figures on segments that nothing was trained, tuned or chosen on: the default on all redraws of them,
-    the others on those of one round."""
+    stream: int,
+) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
+    """What becomes of every controller's runs on these pools, by name and case (Outcomes), and of the cases
+    that count its first run from each start. Controllers run on every core at once; what comes out does not
+    depend on the cores."""
     import jax
-    import numpy as np
 
-    from pipeline.setpoint.evaluation import contest, judging
+    from pipeline.setpoint.evaluation import judging, scoreboard
 
     cases = judging.all_cases(settings.runs, segment_mean_decisions=settings.segment_mean_decisions)
-    redraws = settings.redraws
-    rng = np.random.default_rng([settings.seed, 1])
-    redrawn = judging.redrawn(windows, settings.rounds * redraws, rng, room=room)
-    segments = [contest.one_round(redrawn, number, redraws) for number in range(settings.rounds)]
-    rounds = {name: settings.rounds if name == default else 1 for name in controllers}
-    with progress("judge", sum(rounds.values()) * len(cases)) as bar:
+    key = jax.random.fold_in(jax.random.key(settings.seed), stream)
 
-        def simulate(name: str) -> tuple[Any, Any, Any]:
-            outcomes, paths = {}, {}
-            for number in range(rounds[name]):
-                key = jax.random.fold_in(jax.random.key(settings.seed), settings.rounds + number)
-                latest, first = simulate_controller(
-                    controllers, cases, redraws, bar.update, segments[number], key, name
-                )
-                outcomes, paths = contest.append(outcomes, latest), paths or first
-            n = rounds[name] * redraws
-            return contest.summaries(outcomes, n), contest.judge(outcomes, cases, n), paths
+    def one(name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+        outcomes, paths = {}, {}
+        for i, (case, asked) in enumerate(cases.items()):
+            built, own = controllers[name], jax.random.fold_in(key, i)
+            runs = judging.simulate(built.controller, built.parameters, asked, segments, own)
+            outcomes[case] = judging.become(runs)
+            if judging.counts(case):
+                paths[case] = scoreboard.first_of_each(runs)
+            bar.update()
+        return outcomes, paths
 
-        simulated = each_controller(controllers, list(controllers), simulate)
-    return contest.Contest(
-        {name: scores for name, (scores, _, _) in simulated.items()},
-        {name: judged for name, (_, judged, _) in simulated.items()},
-        {name: count * redraws for name, count in rounds.items()},
-        {name: paths for name, (_, _, paths) in simulated.items()},
-    )
-
-
-def simulate_controller(
-    controllers: Mapping[str, BuiltController],
-    cases: "Mapping[str, Case]",
-    redraws: int,
-    on_case: Callable[[], object],
-    segments: Any,
-    key: Any,
-    name: str,
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """contest.simulate of the controller with this name on the redrawn segments of one round."""
-    from pipeline.setpoint.evaluation import contest
-
-    built = controllers[name]
-    return contest.simulate(built.controller, built.parameters, cases, segments, redraws, key, on_case)
-
-
-T = TypeVar("T")
-
-
-def each_controller(
-    controllers: Mapping[str, BuiltController], names: Sequence[str], work: Callable[[str], T]
-) -> dict[str, T]:
-    """work(name) of these controllers, on every core at once. Those that share what is compiled follow each
-    other; the elaborate ones begin. What comes out does not depend on the cores."""
-    alike: dict[Any, list[str]] = {}
-    for name in names:
-        alike.setdefault(controllers[name].controller, []).append(name)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        groups = pool.map(lambda group: {name: work(name) for name in group}, [*alike.values()][::-1])
-        results = {name: result for group in groups for name, result in group.items()}
-    return {name: results[name] for name in names}
+    words = ("choose", "judge")[stream]
+    with progress(words, len(controllers) * len(cases)) as bar, ThreadPoolExecutor(os.cpu_count()) as pool:
+        # the elaborate ones begin
+        found = dict(zip([*controllers][::-1], pool.map(one, [*controllers][::-1]), strict=True))
+    return {name: found[name][0] for name in controllers}, {name: found[name][1] for name in controllers}
 
 
 def progress(words: str, total: int) -> Any:
@@ -202,8 +139,8 @@ def progress(words: str, total: int) -> Any:
 def simulate_pixels(
     controllers: Mapping[str, BuiltController], default: str, settings: EvaluateSetpoint, loop: Any
 ) -> "PixelRollouts":
-    """The default, and the belief DQN or the robust filter beside it, from some starts; and two episodes in
-    which something befalls the default. Nothing if no start is set."""
+    """The default, and the first model-based controller or data-driven one beside it, from some starts; and
+    two episodes in which something befalls the default. Nothing if no start is set."""
     import numpy as np
 
     from pipeline.setpoint.deployment import pixels
@@ -212,7 +149,7 @@ def simulate_pixels(
     own = settings.pixels
     if not own.starts:
         return pixel_rollouts.PixelRollouts({}, None, ())
-    names = [*dict.fromkeys((default, *THROUGH_PIXELS))][:2]
+    names = [*dict.fromkeys((default, of_kind("model-based"), of_kind("data-driven")))][:2]
     starts = pixel_rollouts.spread_starts(own.starts, own.runs)
     hard_starts, disturbances, words = pixel_rollouts.disturbed_episodes(own.decisions)
 

@@ -1,25 +1,21 @@
-"""Recorded windows -> agents: reads datasets/train_classifier/windows.parquet; writes datasets/train_agent:
-weights.safetensors of the agent of Li and Pattinson (2025) after each phase and of the belief DQN with its
-filter, and agents.parquet, the learning curves."""
+"""The agent of Li and Pattinson (2025), trained in its own simulator: writes datasets/train_agent:
+weights.safetensors of its network after each phase, and agents.parquet, the learning curves."""
 
 import contextlib
 import itertools
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
 import stages
-from pipeline.setpoint.settings import RobustFilter
-from pipeline.setpoint.tables import AGENT_CURVE, WINDOW_PARTS, WINDOWS
+from pipeline.setpoint.tables import AGENT_CURVE
 from pipeline.store import artifacts, params
 from pipeline.store.params import Section
 
 if TYPE_CHECKING:
-    from pipeline.setpoint.agents import agent, belief_agent
-    from pipeline.setpoint.agents.files import Agents
-    from pipeline.setpoint.simulation.recorded import WindowTable
+    from pipeline.setpoint.agents import agent
 
 MEMO = Path("datasets/memo/train_agent")
 # points of a learning curve that a page has room for, of each phase
@@ -56,44 +52,12 @@ class Li2025(Learning):
     accuracy: float = Field(gt=0.34, le=1)
 
 
-class Costs(Section):
-    """Of a step, belief_agent.Costs."""
-
-    scale: float = Field(gt=0, le=1000)
-    outside: float = Field(ge=0, le=1000)
-    move: float = Field(ge=0, le=10)
-
-
-class Disturbances(Section):
-    """What training episodes meet, belief_agent.Disturbances."""
-
-    recorded_share: float = Field(ge=0, le=1)
-    longest_segment: float = Field(ge=1, le=10_000)
-    accuracy: float = Field(gt=0.34, le=1)
-    gain: float = Field(gt=0, le=1)
-    clog: float = Field(gt=0, le=1)
-    clog_share: float = Field(ge=0, le=1)
-    drift: float = Field(ge=0, le=0.1)
-
-
-class BeliefDqn(Learning):
-    """Belief DQN: the filter whose belief the network reads, what a step costs, what episodes meet,
-    and rounds of updates, the best of which is kept."""
-
-    filter: RobustFilter
-    costs: Costs
-    disturbances: Disturbances
-    updates: int = Field(ge=1, le=10_000_000)
-    rounds: int = Field(ge=1, le=1000)
-
-
 class TrainAgent(Section):
     """Section `train_agent`."""
 
     seed: int = Field(ge=0, le=2**31)
     runs: int = Field(ge=1, le=10_000)
     li_2025: Li2025
-    belief_dqn: BeliefDqn
 
 
 # figures of control that git keeps and that runs are compared by
@@ -103,56 +67,26 @@ METRICS = ("*.settled*", "*.stay", "*.overshoot_p95", "*.median_steps", "*.runs"
 def main() -> None:
     with artifacts.stage("train_agent") as out:
         settings = params.load(TrainAgent, "train_agent")
-        from pipeline.setpoint.agents.files import store_agents
-        from pipeline.setpoint.simulation.recorded import window_tables
+        from tqdm import tqdm
 
-        table = artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS)
-        trained = train_agents(settings, window_tables(table, WINDOW_PARTS)["learn"], memo=MEMO)
-        store_agents(out / "weights.safetensors", trained.agents)
-        artifacts.write_table(out / "agents.parquet", AGENT_CURVE, trained.curve)
-        artifacts.write_learning_curve(
-            out / "live", trained.curve, of="agent", step="update", figures=("reward",)
-        )
-        artifacts.write_metrics("train_agent", metrics(settings, trained), METRICS)
+        from pipeline.setpoint.agents.files import store_published
 
-
-class TrainedAgents(NamedTuple):
-    agents: "Agents"
-    best_round: int  # of the belief DQN, the round that was kept
-    validation: tuple[float, ...]  # what each round was worth
-    curve: dict[str, list]  # columns of schema AGENT_CURVE: both learning curves
+        with tqdm(total=len(settings.li_2025.updates), desc="train_agent: phases", mininterval=2) as bar:
+            published = published_agent(settings, MEMO, lambda *_: bar.update())
+        curve = learning_curve(settings.li_2025, published)
+        store_published(out / "weights.safetensors", published.networks)
+        artifacts.write_table(out / "agents.parquet", AGENT_CURVE, curve)
+        artifacts.write_learning_curve(out / "live", curve, of="agent", step="update", figures=("reward",))
+        artifacts.write_metrics("train_agent", metrics(settings, published.networks), METRICS)
 
 
-def train_agents(settings: TrainAgent, windows: "WindowTable", *, memo: Path | None = None) -> TrainedAgents:
-    """Both agents, trained from keys of one seed, the belief DQN on the windows to learn from; a memo keeps
-    the published one, so that other windows do not train it again."""
-    import jax
-    import numpy as np
-    from tqdm import tqdm
-
-    from pipeline.setpoint.agents import belief_agent
-    from pipeline.setpoint.agents.files import Agents
-
-    key, updates, rounds = jax.random.key(settings.seed), settings.li_2025.updates, settings.belief_dqn.rounds
-    curve: list[tuple[str, int, int, float]] = []
-    with tqdm(total=len(updates) + rounds, desc="train_agent: phases", mininterval=2) as bar:
-        published = published_agent(settings, memo, lambda *_: bar.update())
-        for i, rewards in enumerate(published.rewards):
-            curve += curve_points("li_2025", i + 1, sum(updates[:i]), rewards)
-        belief = filter_belief(settings.belief_dqn, windows)
-        trained = belief_agent.train(
-            jax.random.fold_in(key, 1),
-            belief,
-            windows,
-            belief_training(settings.belief_dqn),
-            on_step=lambda *_: bar.update(),
-        )
-    for i, rewards in enumerate(np.split(np.asarray(trained.rewards), rounds)):
-        curve += curve_points("belief_dqn", i + 1, i * settings.belief_dqn.updates, rewards)
+def learning_curve(settings: Li2025, published: "agent.PublishedAgent") -> dict[str, list]:
+    """Columns of schema AGENT_CURVE: the mean reward of a step, phase after phase."""
+    points: list[tuple[str, int, int, float]] = []
+    for i, rewards in enumerate(published.rewards):
+        points += curve_points("li_2025", i + 1, sum(settings.updates[:i]), rewards)
     names = ("agent", "phase", "update", "reward")
-    columns = dict(zip(names, map(list, zip(*curve, strict=True)), strict=True))
-    agents = Agents(published.networks, belief, trained.network)
-    return TrainedAgents(agents, trained.best_round, trained.validation, columns)
+    return dict(zip(names, map(list, zip(*points, strict=True)), strict=True))
 
 
 def published_agent(
@@ -181,20 +115,6 @@ def published_agent(
     return published
 
 
-def filter_belief(settings: BeliefDqn, windows: "WindowTable") -> Any:
-    """The Belief: the filter on recorded windows, which tells when the camera is not theirs, and the value of
-    each move were the flow observed."""
-    import jax.numpy as jnp
-
-    from pipeline.setpoint.agents import bayes, belief_agent
-
-    model = bayes.CameraErrorModel(**settings.filter.model_dump())
-    costs = belief_agent.StepCosts(**settings.costs.model_dump())
-    values = belief_agent.observed_values(costs, settings.gamma)
-    robust = bayes.watching_filter(windows, model)
-    return belief_agent.Belief(robust, jnp.asarray(values, jnp.float32), settings.gamma)
-
-
 # ---- settings as the methods take them
 
 
@@ -210,21 +130,6 @@ def published_training(settings: Li2025) -> "agent.PublishedTraining":
     numbers = settings.model_dump(include={*agent.PublishedTraining._fields})
     numbers["updates"] = tuple(settings.updates)
     return agent.PublishedTraining(dqn=dqn_settings(settings), **numbers)
-
-
-def belief_training(settings: BeliefDqn) -> "belief_agent.BeliefTraining":
-    from pipeline.setpoint.agents import belief_agent
-
-    return belief_agent.BeliefTraining(
-        costs=belief_agent.StepCosts(**settings.costs.model_dump()),
-        disturbances=belief_agent.EpisodeDisturbances(**settings.disturbances.model_dump()),
-        dqn=dqn_settings(settings),
-        learning_rate=settings.learning_rate,
-        updates=settings.updates,
-        rounds=settings.rounds,
-        explore=settings.explore,
-        least=settings.least,
-    )
 
 
 # ---- figures
@@ -243,25 +148,17 @@ def curve_points(name: str, phase: int, before: int, rewards: Any) -> list[tuple
     ]
 
 
-def metrics(settings: TrainAgent, trained: TrainedAgents) -> dict[str, Any]:
+def metrics(settings: TrainAgent, networks: Any) -> dict[str, Any]:
     """The agent of Li and Pattinson (2025) after three phases and after the last one, if the class is always
-    right and if it is not, on the paper's simulator, and what the paper claims of it; the belief DQN at the
-    same accuracies."""
+    right and if it is not, on the paper's simulator, and what the paper claims of it."""
     import jax
 
     from pipeline.setpoint.agents import claims
 
-    agents, own = trained.agents, settings.li_2025
-    key = jax.random.key(settings.seed + 1)
-    return claims.simulated_figures(agents, key, settings.runs, own.history, own.flow_actions) | {
-        "parameters": {
-            "li_2025": claims.parameters(agents.li_2025[0]),
-            "belief_dqn": claims.parameters(agents.belief_dqn),
-        },
-        "kept_round": trained.best_round,
-        "validation": list(trained.validation),
-        "rounds": settings.belief_dqn.rounds,
-        "claims": paper_claims(settings, agents.li_2025),
+    own, key = settings.li_2025, jax.random.key(settings.seed + 1)
+    return claims.simulated_figures(networks, key, settings.runs, own.history, own.flow_actions) | {
+        "parameters": {"li_2025": claims.parameters(networks[0])},
+        "claims": paper_claims(settings, networks),
         "guesses": guesses(own),
     }
 

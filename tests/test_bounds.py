@@ -71,4 +71,4 @@ def test_the_owner_of_a_machine_has_few_numbers_to_set():
         return sum(map(leaves, entries.values())) if isinstance(entries, dict) and entries else 1
 
     owner, expert = map(leaves, params.files(ROOT / "params.yaml").values())
-    assert owner <= 63 and expert > 5 * owner
+    assert owner <= 63 and expert > 4 * owner

@@ -15,7 +15,7 @@ import yaml
 
 from pipeline import quick
 from pipeline.report.shared.headline import Loop, decision
-from pipeline.setpoint.agents.files import restore_agents
+from pipeline.setpoint.agents.files import restore_published
 from pipeline.setpoint.frames.files import CAMERA_FILE, restore_camera
 from pipeline.setpoint.simulation.recorded import window_tables
 from pipeline.setpoint.tables import WINDOW_PARTS, WINDOWS
@@ -292,7 +292,7 @@ def test_what_is_kept_is_whole_and_read_by_the_code_of_today():
     assert {"learn", "choose", "judge"} <= set(
         window_tables(artifacts.read_table(model / "windows.parquet", WINDOWS), WINDOW_PARTS)
     )
-    assert len(restore_agents(str(kept / "train_agent/weights.safetensors")).li_2025) == 4
+    assert len(restore_published(kept / "train_agent/weights.safetensors").networks) == 4
 
 
 def test_a_kept_file_that_differs_is_refused_by_name(checkout, beadline):

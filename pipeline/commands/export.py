@@ -86,19 +86,19 @@ def export(folder: Path, to: str, out: Path | None, section: str) -> str:
 
 def shows_frames(folder: Path) -> bool:
     """Whether a controller's folder is that of the setpoint loop, whose recordings are frames."""
-    return (folder / to_setpoint.CLASSIFIER).exists() and not (folder / machine.CONTROLLER).exists()
+    return (folder / next(iter(to_setpoint.FILES))).exists() and not (folder / machine.CONTROLLER).exists()
 
 
 def _export_readers(folder: Path, to: str, target: Path) -> str:
-    """Writes classifier, filter and, where it decides, our agent, with their readers in Python."""
+    """Writes classifier and filter with their readers in Python."""
     if to != "python":
         raise ValueError(
-            f"{folder}: classifier, filter and agent of the setpoint loop run in Python alone, found --to "
+            f"{folder}: classifier and filter of the setpoint loop run in Python alone, found --to "
             f"{to}; write --to python"
         )
-    names = [name for name in to_setpoint.FILES if name != to_setpoint.AGENT or (folder / name).exists()]
-    made = {name: artifacts.read_weights(folder / name, to_setpoint.FILES[name][0])[0] for name in names}
+    files = to_setpoint.FILES
+    made = {name: artifacts.read_weights(folder / name, schema)[0] for name, (schema, _) in files.items()}
     with artifacts.together(target) as place:
         to_setpoint.write(place, made)
     written = ", ".join(str(path) for path in sorted(target.iterdir()) if path.is_file())
-    return f"{', '.join(name.partition('.')[0] for name in names)}. {UNCERTIFIED}\nwritten: {written}"
+    return f"{', '.join(name.partition('.')[0] for name in files)}. {UNCERTIFIED}\nwritten: {written}"

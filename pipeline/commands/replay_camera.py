@@ -8,9 +8,7 @@ import numpy as np
 
 from pipeline.commands.shadow import deploy
 from pipeline.deploy import to_setpoint
-from pipeline.deploy.to_setpoint import BELIEF
-from pipeline.setpoint.agents.bayes import Filter
-from pipeline.setpoint.agents.files import restore_agents
+from pipeline.setpoint.agents.flow_filter import FlowFilter
 from pipeline.store import artifacts
 
 
@@ -18,24 +16,15 @@ def ready(folder: Path) -> deploy.Ready:
     """The loop that evaluate_setpoint judged, without the levels of a camera, which were not exported. Raises
     ValueError where the folder's numbers are others, and where a stage has not run."""
     judged = deploy.ready(None)
-    for name, arrays in to_setpoint.weights(deploy.trained().model, _decider(judged)).items():
-        _check(folder / name, to_setpoint.FILES[name][0], arrays)
-    return judged
-
-
-def _decider(judged: deploy.Ready) -> to_setpoint.Decider:
-    """The filter of the default, or our agent with that by which it sees."""
-    name, parameters = judged.deployed.name, judged.deployed.parameters
-    if name == BELIEF:
-        return to_setpoint.BeliefAgent(
-            restore_agents("datasets/train_agent/weights.safetensors").belief, parameters
-        )
-    if not isinstance(parameters, Filter):
+    name, decides = judged.deployed.name, judged.deployed.parameters
+    if not isinstance(decides, FlowFilter):
         raise ValueError(
             f"datasets/evaluate_setpoint/choice.json: expected a controller with a filter, found {name!r}, "
             "so what was exported is not what it judged; export again with ./run dvc repro export_controllers"
         )
-    return parameters
+    for file, arrays in to_setpoint.weights(deploy.trained().model, decides).items():
+        _check(folder / file, to_setpoint.FILES[file][0], arrays)
+    return judged
 
 
 def _check(path: Path, schema: str, judged: Mapping[str, np.ndarray]) -> None:

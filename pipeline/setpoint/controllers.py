@@ -9,65 +9,49 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 if TYPE_CHECKING:
-    from pipeline.setpoint.agents.files import Agents
+    from pipeline.setpoint.agents.agent import PublishedAgent
     from pipeline.setpoint.settings import Baselines
     from pipeline.setpoint.simulation.recorded import WindowTable
     from pipeline.setpoint.simulation.simulator import SetpointController
 
-Kind = Literal["model-based", "data-driven", "baseline", "reference"]
+Kind = Literal["model-based", "data-driven", "baseline"]
 
 
 class ControllerRow(NamedTuple):
     name: str  # as it stands in artifacts and on pages
     kind: Kind
-    group: Literal["agent", "baseline", "paper"]  # column `kind` of scoreboard.parquet, as first written
     build: str  # "file.function" of pipeline/setpoint/agents: settings, agents, windows -> what is built
     settings: str = ""  # the section of evaluate_setpoint.baselines that it is built with
 
 
 class BuiltController(NamedTuple):
-    group: str  # of its row
     controller: "SetpointController"
     parameters: Any  # a pytree of numbers or arrays
 
 
 NO_CONTROL = "do nothing"
-BELIEF_DQN = "our agent"
 CONTROLLERS = (
-    ControllerRow(NO_CONTROL, "baseline", "baseline", "baselines.build_no_control"),
-    ControllerRow("proportional", "baseline", "baseline", "baselines.build_proportional", "proportional"),
-    ControllerRow(
-        "filtered proportional",
-        "baseline",
-        "baseline",
-        "baselines.build_proportional",
-        "filtered_proportional",
-    ),
-    ControllerRow(
-        "sequential test", "baseline", "baseline", "baselines.build_sequential_test", "sequential_test"
-    ),
-    ControllerRow("Bayes, exact model", "reference", "baseline", "bayes.build_class_filter", "bayes_exact"),
-    ControllerRow("Bayes with leak", "model-based", "baseline", "bayes.build_class_filter", "bayes_leak"),
-    ControllerRow("Bayes, robust", "model-based", "baseline", "bayes.build_robust_filter", "bayes_robust"),
-    ControllerRow("paper's agent, 3 phases", "data-driven", "paper", "agent.build_after_phase_3"),
-    ControllerRow("paper's agent, 4 phases", "data-driven", "paper", "agent.build_after_phase_4"),
-    ControllerRow(BELIEF_DQN, "data-driven", "agent", "belief_agent.build"),
+    ControllerRow(NO_CONTROL, "baseline", "baselines.build_no_control"),
+    ControllerRow("sequential test", "baseline", "baselines.build_sequential_test", "sequential_test"),
+    ControllerRow("Bayes filter", "model-based", "flow_filter.build", "flow_filter"),
+    ControllerRow("paper's agent", "data-driven", "agent.build"),
 )
 KINDS: dict[str, Kind] = {row.name: row.kind for row in CONTROLLERS}
 
-# the first of them that is not the default runs beside it through pixels
-THROUGH_PIXELS = (BELIEF_DQN, "Bayes, robust")
+
+def of_kind(kind: Kind) -> str:
+    """The first controller of a kind: the pair that answers "model-based or data-driven?" is one of each."""
+    return next(row.name for row in CONTROLLERS if row.kind == kind)
 
 
 def build_controllers(
     settings: "Baselines | None",
-    agents: "Agents | None",
+    agents: "PublishedAgent | None",
     windows: "WindowTable | None",
     rows: Sequence[ControllerRow] = CONTROLLERS,
 ) -> dict[str, BuiltController]:
-    """The controllers of these rows by name, in the table's order, without those that cannot be built, such
-    as a phase that was not trained. Numbers of a baseline are float32, so that all of one controller are one
-    program."""
+    """The controllers of these rows by name, in the table's order. Numbers are float32, so that all
+    controllers of one kind are one program."""
     import importlib
 
     import jax
@@ -78,11 +62,7 @@ def build_controllers(
         file, function = row.build.split(".")
         build = getattr(importlib.import_module(f"pipeline.setpoint.agents.{file}"), function)
         section = getattr(settings, row.settings).model_dump() if row.settings else {}
-        made = build(section, agents, windows)
-        if made is None:
-            continue
-        controller, parameters = made
-        if row.group == "baseline":
-            parameters = jax.tree.map(lambda number: jnp.asarray(number, dtype=jnp.float32), parameters)
-        built[row.name] = BuiltController(row.group, controller, parameters)
+        controller, parameters = build(section, agents, windows)
+        parameters = jax.tree.map(lambda number: jnp.asarray(number, dtype=jnp.float32), parameters)
+        built[row.name] = BuiltController(controller, parameters)
     return built

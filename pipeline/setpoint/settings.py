@@ -103,33 +103,20 @@ class TrainClassifier(Section):
     false_alarms: float = Field(gt=0, lt=0.5)
 
 
-class RobustFilter(Section):
-    """The section of bayes.CameraErrorModel."""
+class FlowFilterSettings(Section):
+    """What agents/flow_filter.py declares: probabilities a decision, costs in percent of flow error."""
 
-    accuracies: list[Annotated[float, Field(gt=0.34, lt=1)]] = Field(min_length=1, max_length=20)
     gains: list[Annotated[float, Field(gt=0, le=10)]] = Field(min_length=1, max_length=20)
-    width_bias_levels: int = Field(ge=1, le=51)
-    width_bias_std: float = Field(gt=0, le=1)
-    floor: float = Field(gt=0, lt=1)
-    smoothing: float = Field(gt=0, le=100)
-    segment_mean_decisions: float = Field(ge=1, le=10_000)
-    mode_switch_probability: float = Field(gt=0, lt=1)
-    window_repeat_probability: float = Field(ge=0, lt=1)
+    biases: int = Field(ge=1, le=51)
+    accuracy: float = Field(gt=0.34, lt=1)
+    ends: float = Field(gt=0, le=1)
     hazard: float = Field(ge=0, lt=1)
     move_cost: float = Field(ge=0, le=10)
-    outside_cost: float = Field(ge=0, le=1000)
     move_fixed_cost: float = Field(ge=0, le=100)
+    outside_cost: float = Field(ge=0, le=1000)
+    border_std: float = Field(gt=0, le=100)
     known_start_share: float = Field(ge=0, lt=1)
     known_start_std: float = Field(gt=0, le=1)
-    border_std: float = Field(ge=0, le=100)
-
-    def hypotheses(self) -> int:
-        return len(self.gains) * (len(self.accuracies) + self.width_bias_levels)
-
-
-class ProportionalSettings(Section):
-    gain: float = Field(gt=0, le=1000)
-    time_constant: float = Field(ge=1, le=1000)
 
 
 class SequentialTestSettings(Section):
@@ -138,25 +125,12 @@ class SequentialTestSettings(Section):
     cap: float = Field(gt=0, le=100)
 
 
-class ClassFilter(Section):
-    accuracy: float = Field(gt=0.34, lt=1)
-    hazard: float = Field(ge=0, lt=1)
-    move_cost: float = Field(ge=0, le=10)
-    outside_cost: float = Field(ge=0, le=1000)
-    move_fixed_cost: float = Field(ge=0, le=100)
-    known_start_share: float = Field(ge=0, lt=1)
-    known_start_std: float = Field(gt=0, le=1)
-
-
 class Baselines(Section):
-    """Settings of the controllers without learning, tuned on windows and seeds that nothing is judged on."""
+    """Settings of the controllers without learning, declared or tuned on segments that nothing is judged
+    on."""
 
-    proportional: ProportionalSettings
-    filtered_proportional: ProportionalSettings
     sequential_test: SequentialTestSettings
-    bayes_exact: ClassFilter
-    bayes_leak: ClassFilter
-    bayes_robust: RobustFilter
+    flow_filter: FlowFilterSettings
 
 
 class Pixels(Section):
@@ -188,13 +162,12 @@ class MostHarmed(Section):
 
 
 class EvaluateSetpoint(Section):
-    """Section `evaluate_setpoint`. Segments are redrawn `redraws` times a round, in each of which whoever may
-    still become the default runs `runs` times from each of 21 starts, in every case."""
+    """Section `evaluate_setpoint`: `runs` from each of 21 starts in every case, on each pool of `pool`
+    recorded segments that share none."""
 
     seed: int = Field(ge=0, le=2**31)
     runs: int = Field(ge=1, le=10_000)
-    redraws: int = Field(ge=2, le=1000)
-    rounds: int = Field(ge=1, le=100)
+    pool: int = Field(ge=1, le=10_000)
     most_harmed: MostHarmed
     segment_mean_decisions: float = Field(ge=1, le=10_000)
     baselines: Baselines

@@ -87,7 +87,7 @@ AGENT_CURVE = Schema(
     "agents",
     2,
     (
-        Column("agent", TEXT, NONE, "li_2025: as published; belief_dqn: on the belief of a filter"),
+        Column("agent", TEXT, NONE, "li_2025: as published"),
         Column("phase", INDEX, NONE, "phase of training, from 1", low=1),
         Column("update", COUNT, NONE, "updates done in all phases so far", low=0),
         Column("reward", FLOAT, NONE, "mean reward of a step in the reward of that phase"),
@@ -96,19 +96,20 @@ AGENT_CURVE = Schema(
 
 
 def _share(name: str, meaning: str) -> tuple[Column, ...]:
-    """A share of runs with its interval: three columns."""
+    """A share of runs with its interval and what it rests on: four columns."""
     return (
         Column(f"{name}_percent", FLOAT, "percent", meaning, 0, 100, nullable=True),
         Column(
             f"{name}_low_percent", FLOAT, "percent", "lower end of its 95 % interval", 0, 100, nullable=True
         ),
         Column(f"{name}_high_percent", FLOAT, "percent", "upper end", 0, 100, nullable=True),
+        Column(f"{name}_n_eff", FLOAT, NONE, "as many runs that share nothing", 0, nullable=True),
     )
 
 
 _WHO = (
     Column("controller", TEXT, NONE, "who sets flow and temperature"),
-    Column("kind", TEXT, NONE, "agent, baseline or paper"),
+    Column("kind", TEXT, NONE, "model-based, data-driven or baseline"),
     Column(
         "simulator",
         TEXT,
@@ -166,17 +167,9 @@ _ERRORS = (
 
 SCOREBOARD = Schema(
     "scoreboard",
-    2,
+    3,
     (
         *_WHO,
-        Column(
-            "redraws",
-            COUNT,
-            NONE,
-            "redraws of the recorded segments that the runs are on, in equal blocks, by which intervals are "
-            "clustered; 1: the runs share nothing, and intervals are Wilson's",
-            low=1,
-        ),
         *_SETTLED,
         *_share(
             "back", "within +-15 % from some step up to 90 until step 120; missing where nothing happens"
@@ -192,11 +185,10 @@ SCOREBOARD = Schema(
         ),
         *_MEDIAN,
         Column(
-            "recovery_steps",
+            "recovery_p95_steps",
             FLOAT,
             NONE,
-            "decisions from step 60 until inside for good, median of recovered runs; missing where nothing "
-            "happens at step 60",
+            "decisions from step 60 until 95 % of the runs are inside for good; missing if fewer ever are",
             nullable=True,
         ),
         *_ERRORS,

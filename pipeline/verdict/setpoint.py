@@ -3,13 +3,12 @@
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from pipeline.setpoint.agents.criteria import BEYOND, harm_bar
-from pipeline.setpoint.controllers import KINDS
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.verdict.digits import THIN, band, count, number, quantity
 from pipeline.verdict.evidence import Evidence, lookup
@@ -33,7 +32,7 @@ from pipeline.verdict.verdict import (
 )
 
 LOOP = "setpoint"
-AGENT, PAPER, BASELINE = "agent", "paper", "baseline"
+MODEL_BASED, DATA_DRIVEN, BASELINE = "model-based", "data-driven", "baseline"
 SIMULATORS = {
     "paper": "The paper’s simulator",
     "recorded": "Recorded windows",
@@ -49,18 +48,14 @@ CLAIM_RECORDED = (
     "it is known "
     "on these printers only."
 )
-NOT_APART = (
-    " Controllers learn, are chosen and judged on windows of prints that the classifier was calibrated, "
-    "chosen and judged on: the folder has too few prints to keep them apart."
-)
 NO_CLOG = Missing("not applicable", "nothing happens in this case")
 
 
 class Cell(NamedTuple):
     """One controller in one case: shares of runs in percent with their 95 % intervals, or why one is missing.
     Then steps until inside for good; overshoot and flow error in percent; beyond, of good starts those that
-    leave them by each of BEYOND points; back, within +-15 % after a clog, and decisions until inside again.
-    redraws of the segments, by which the intervals are clustered."""
+    leave them by each of BEYOND points; back, within +-15 % after a clog, and decisions until 95 % of the
+    runs are inside again. n_eff: as many runs that share nothing as a share is worth, by its name."""
 
     runs: int
     counts: bool
@@ -74,8 +69,8 @@ class Cell(NamedTuple):
     worst_start: tuple[float, float, float]
     beyond: tuple[Figure | Missing, ...] = ()
     back: Figure | Missing = NO_CLOG
-    recovery_steps: float = math.nan
-    redraws: int = 1
+    recovery_p95: float = math.nan
+    n_eff: Mapping[str, float] = {}
 
 
 # borders of the classes in percent of nominal flow
@@ -98,31 +93,25 @@ class Board(NamedTuple):
         """The cases that count for the choice."""
         return [(case, cell) for case in self.cases if (cell := self.cells.get((name, case))) and cell.counts]
 
-    def best(self, *kinds: str) -> str:
-        """Of these kinds, the one with the best worst case; "" where there is none."""
-        return next((name for name in self.names if self.kinds[name] in kinds), "")
-
     def baseline(self) -> str:
-        """The baseline that is shown: the default where it is one, else the best."""
-        mine = self.default and self.kinds[self.default] == BASELINE
-        return self.default if mine else self.best(BASELINE)
+        """The controller of the second column: the default unless it learned from data, else the model-based
+        one; "" where it was not judged."""
+        if self.default and self.kinds[self.default] != DATA_DRIVEN:
+            return self.default
+        return self._judged(MODEL_BASED)
 
     def learned(self) -> str:
-        """The agent that competes: the default where it is one, else ours, else the paper's."""
-        return (
-            self.default
-            if self.default and self.kinds[self.default] != BASELINE
-            else self.best(AGENT) or self.best(PAPER)
-        )
+        """The data-driven one that competes: the default where it is one."""
+        mine = self.default and self.kinds[self.default] == DATA_DRIVEN
+        return self.default if mine else self._judged(DATA_DRIVEN)
+
+    def _judged(self, kind: Literal["model-based", "data-driven"]) -> str:
+        return next((name for name in self.names if self.kinds[name] == kind), "")
 
 
 def role(board: Board, name: str) -> str:
-    """The mark of a controller by its kind: circle what learned (hollow: not the one that competes), square
-    the first that is model-based (hollow: the others), ring the baselines."""
-    if board.kinds[name] != BASELINE:
-        return "data_driven" if name == board.learned() else "kernel"
-    models = [other for other in board.names if KINDS.get(other) in ("model-based", "reference")]
-    return "baseline" if name not in models else "model_based" if name == models[0] else "exact_model"
+    """The mark of a controller by its kind: circle data-driven, square model-based, ring the baselines."""
+    return {DATA_DRIVEN: "data_driven", MODEL_BASED: "model_based"}.get(board.kinds[name], "baseline")
 
 
 def case_text(case: Case, *, whole: bool = False) -> str:
@@ -176,8 +165,8 @@ def _cell(row: Any) -> Cell:
             for points in BEYOND
         ),
         _figure(row.back_percent, row.back_low_percent, row.back_high_percent),
-        row.recovery_steps,
-        row.redraws,
+        row.recovery_p95_steps,
+        {name: getattr(row, f"{name}_n_eff") for name in ("settled", "stay", f"beyond_{BEYOND[-1]}")},
     )
 
 
@@ -294,13 +283,39 @@ def _share(what: str) -> Callable[[Evidence, Board | None, str], Reading]:
         figure, case = worst(board, name, what)
         if isinstance(figure, Missing) or case is None:
             return figure, {"text": share_text(figure)}
-        return figure, {
-            "text": share_text(figure),
-            "within": within(case),
-            "clustered": board.cells[name, case].redraws > 1,
-        }
+        limit = float(getattr(evidence.rules, f"{what}_percent"))
+        held, words = threshold(figure, board.cells[name, case].n_eff[what], limit, at_least=True)
+        return held, words | {"segments": _segments(evidence), "within": within(case)}
 
     return read
+
+
+# a rule of L percent that may be lost passes up to 3 of 3.9 L: of so many runs that share nothing 19 of 20
+# controllers that lose L / 3 pass, and 19 of 20 that lose 2 L fail
+EXPECTED, ALLOWED, LEAST_RUNS = 3.9, 3.0, 130.0
+
+
+def threshold(figure: Figure, n_eff: float, limit: float, *, at_least: bool) -> tuple[Figure, dict[str, Any]]:
+    """The figure as a rule reads it, one threshold on the estimate, and words: decided where it is worth
+    enough runs, else open to both sides. 97 % is passed at 97.7 %, by 130 runs."""
+    lost = 100 - limit if at_least else limit
+    allowed = ALLOWED / EXPECTED * lost
+    needed = max(LEAST_RUNS, 100 * EXPECTED / lost) if lost else math.inf
+    words = {
+        "text": share_text(figure),
+        "limit": 100 - allowed if at_least else allowed,
+        "limit_words": f"{limit:g}{THIN}%",
+        "allowed": f"{'≥' if at_least else '≤'} {limit:g}{THIN}%",
+        "n_eff": n_eff,
+        "needed": needed,
+    }
+    return count_of(figure.value) if n_eff >= needed else Figure(figure.value, 0.0, 100.0), words
+
+
+def _segments(evidence: Evidence) -> float:
+    """How many recorded segments the controllers were judged on."""
+    found = lookup(evidence.tables["choice"], "pair.segments")
+    return math.nan if isinstance(found, Missing) else float(found)
 
 
 def _harm(evidence: Evidence, board: Board | None, name: str) -> Reading:
@@ -318,19 +333,19 @@ def _harm(evidence: Evidence, board: Board | None, name: str) -> Reading:
         return Missing(OPEN, ""), absent | {"reason": harm.sentence()}
     idle = harm_of(board, DOES_NOTHING, limits)
     ends = sorted(set(limits.values()))
-    return harm.figure, {
-        "limit": harm.limit,
-        "text": share_text(harm.figure),
+    n_eff = board.cells[name, harm.case].n_eff[f"beyond_{BEYOND[-1]}"]
+    held, words = threshold(harm.figure, n_eff, harm.limit, at_least=False)
+    return held, words | {
+        "segments": _segments(evidence),
         "allowed": f"≤ {' or '.join(f'{end:g}' for end in ends)}{THIN}%",
         "case_text": case_text(harm.case, whole=True),
         "idle": "" if isinstance(idle, Missing) else f" With doing nothing {share_text(idle.figure)} do.",
-        "clustered": True,
     }
 
 
 def _seen(figure: Figure | Missing, text: str = "") -> Reading:
     """The reading of a share of frames or windows."""
-    return figure, {"text": text or share_text(figure), "clustered": True}
+    return figure, {"text": text or share_text(figure)}
 
 
 def share_in(row: Mapping[str, Any] | None) -> Figure | None:
@@ -399,31 +414,25 @@ SEEING = {
 
 
 def undecided(question: Question, figure: Figure, words: Mapping[str, Any]) -> str:
-    """What would tell, where the interval straddles the limit: of runs that share nothing
-    z^2 p (1 - p) / (p - limit)^2 at 95 %; of clustered ones the segments by which the interval shrinks."""
+    """What would tell: of a share of runs how many more segments; of a share of frames or windows, whose
+    interval straddles the limit, how many times as many."""
     if state(question, figure) != UNDECIDED:
         return ""
-    p, off = figure.value / 100, abs(figure.value - question.limit) / 100
-    if words.get("clustered"):
-        times = ((figure.high - figure.low) / 200 / off) ** 2 if off else math.inf
-        more = (
-            f"about {number(max(math.ceil(times - 1e-6), 2), 0)} times as many segments would decide"
-            if times < 1000
-            else "no number of segments would decide"
+    if "n_eff" in words:
+        more = words["segments"] * (words["needed"] / max(words["n_eff"], 1.0) - 1) - 1e-6
+        told = f"about {math.ceil(more):,} more segments" if math.isfinite(more) else "more segments"
+        return (
+            f" Undecided: these runs are worth {number(words['n_eff'], 0)} that share nothing, of "
+            f"{number(words['needed'], 0)}; {told} would decide."
         )
-        return f" Its interval, {band(figure.low, figure.high, 1)}, straddles that; {more}."
-    needed = 1.96**2 * p * (1 - p) / off**2 if off else math.inf
+    off = abs(figure.value - question.limit)
+    times = ((figure.high - figure.low) / 2 / off) ** 2 if off else math.inf
     more = (
-        f"about {_round(needed):,} runs in all would decide"
-        if needed < 1e7
-        else "no number of runs would decide"
+        f"about {number(max(math.ceil(times - 1e-6), 2), 0)} times as many segments would decide"
+        if times < 1000
+        else "no number of segments would decide"
     )
     return f" Its interval, {band(figure.low, figure.high, 1)}, straddles that; {more}."
-
-
-def _round(value: float) -> int:
-    power = 10 ** max(math.floor(math.log10(max(value, 1))) - 1, 0)
-    return math.ceil(value / power) * power
 
 
 # yardsticks of the classifier
@@ -438,8 +447,6 @@ def verdict(evidence: Evidence) -> Verdict:
     anything is claimed."""
     scores, recorded = board(evidence), evidence.recorded("train_classifier")
     claim, words = CLAIM_RECORDED if recorded else CLAIM, words_for(recorded=recorded, quick=evidence.quick)
-    if recorded and lookup(evidence.figures["train_classifier"], "data.windows_apart") is False:
-        claim += NOT_APART
     if isinstance(scores, Missing) or not scores.default:
         gap = scores if isinstance(scores, Missing) else evidence.tables["choice"]
         return Verdict(
@@ -488,7 +495,7 @@ def verdict(evidence: Evidence) -> Verdict:
         state=ended,
         decision=words.of(ended),
         lead=f"First {'failed' if failed else 'undecided'} rule: {first.name[:1].lower()}{first.name[1:]}.",
-        reason=_closest(name, first),
+        reason=f"{_closest(name, first)} {pair_sentence(evidence.tables['choice']).text}",
         remedy=_conditions(asked, claim == CLAIM),
         rule=first.name,
     )
@@ -511,7 +518,7 @@ def _certified(evidence: Evidence, board: Board) -> Board:
 
 def _asked(lines: Sequence[Pair], board: Board) -> list[Rule]:
     """The rules of the default: those of the classifier, and those of its column."""
-    column = int(board.kinds[board.default] == BASELINE)
+    column = int(board.kinds[board.default] != DATA_DRIVEN)
     return [line[0 if of_classifier(line[0]) else column] for line in lines]
 
 
@@ -545,56 +552,56 @@ def _closest(name: str, rule: Rule) -> str:
 
 
 def named(board: Board, name: str) -> str:
-    """ "the agent “ours”", "the baseline “Bayes, robust”"."""
-    kind = {AGENT: "the agent", PAPER: "the paper’s agent"}.get(board.kinds[name], "the baseline")
-    return (
-        kind
-        if name.lower() in ("agent", "our agent", "ours", "the paper's agent", "paper", "the paper’s agent")
-        else f"{kind} “{name}”"
+    """ "the model-based “Bayes filter”", "the baseline “do nothing”"."""
+    return f"the {board.kinds[name]}{'' if board.kinds[name] == BASELINE else ' controller'} “{name}”"
+
+
+class PairSentence(NamedTuple):
+    """Model-based against data-driven: the answer in words, the same in short, and who is better; None if not
+    told apart."""
+
+    text: str
+    short: str
+    winner: str | None
+
+
+def pair_sentence(choice: Any) -> PairSentence:
+    """ "the Bayes filter keeps 41 points more of its runs than the paper's agent", on the same windows and
+    segments; or that more segments are needed to tell."""
+    head, pair = "Model-based against data-driven:", lookup(choice, "pair")
+    gap = lookup(pair, "difference")
+    if isinstance(gap, Missing):
+        return PairSentence(f"{head} not measured.", "", None)
+    a, b, winner = str(pair["a"]), str(pair["b"]), pair.get("winner")
+    same = f"on the same {pair['segments']:,} segments, {count(pair['cases'], 'case')}"
+    if winner not in (a, b):
+        needed = pair.get("needed")
+        more = (
+            "no number of segments would tell" if needed is None else f"{needed:,} more segments would tell"
+        )
+        ends = band(pair["low"], pair["high"], 1)
+        text = f"undecided between {_the(a)} and {_the(b)} {same} (90{THIN}% interval {ends} points); {more}"
+        return PairSentence(f"{head} {text}.", f"{head} undecided; {more}.", None)
+    other, sign = (b, 1) if winner == a else (a, -1)
+    ends = band(*sorted(sign * pair[end] for end in ("low", "high")), 1)
+    text = (
+        f"{_the(winner)} brings {number(abs(gap), 1)} points more of its runs to the target and keeps them "
+        f"there than {_the(other)} {same} (90{THIN}% interval {ends} points)"
     )
+    short = f"{head} {winner}, by {number(abs(gap), 1)} points ({ends})."
+    return PairSentence(f"{head} {text}.", short, winner)
 
 
-def _noise(choice: Any, mine: Figure, other: Figure) -> str:
-    """The interval of the margin where the choice gives one, and whether it is within noise."""
-    ends = [lookup(choice, f"margin_{end}") for end in ("low", "high")]
-    if any(isinstance(end, Missing) for end in ends):
-        return ", which is within the noise of these runs" if other.high >= mine.low else ""
-    low, high = (float(end) for end in ends)
-    within_noise = " and within noise" if low <= 0 <= high else ""
-    return f" (95{THIN}% interval {band(low, high, 1)} points{within_noise})"
+def _the(name: str) -> str:
+    return name if name.startswith("the ") else f"the {name}"
 
 
 def summary(evidence: Evidence, board: Board) -> str:
-    """The default's worst case, by how much it beats the next of those that may run, and,
-    where the agent is neither, how far it came."""
+    """The default's worst case, and who is better: model-based or data-driven."""
     mine, place = worst(board, board.default, "lasting")
     if place is None or isinstance(mine, Missing):
         return ""
-    runs = board.cells[board.default, place].runs
-    text = f"In its worst case ({within(place)}) {share_text(mine)} of {runs:,} runs settle and stay"
-    judged = [name for name in board.names if name != board.default and worst(board, name, "lasting")[1]]
-    others = [name for name in judged if name not in board.refused]
-    if not others:
-        return f"{text}. {'Nothing else may run' if judged else 'Nothing else was judged'}."
-    figure, where = worst(board, others[0], "lasting")
-    if where is None or isinstance(figure, Missing):
-        return text
-    margin = lookup(evidence.tables["choice"], "margin")
-    points = mine.value - figure.value if isinstance(margin, Missing) else float(margin)
-    noise = _noise(evidence.tables["choice"], mine, figure)
-    rival = f"the next, {named(board, others[0])}, in its own ({within(where)}: {share_text(figure)})"
-    text += (
-        f", {number(abs(points), 1)} points {'more' if points > 0 else 'fewer'} than of {rival}{noise}."
-        if abs(points) >= 0.05
-        else f", as many as of {rival}."
-    )
-    learned = board.learned()
-    if not learned or learned in (board.default, others[0]):
-        return text
-    figure, where = worst(board, learned, "lasting")
-    if where is None:
-        return text
-    name = named(board, learned)
-    if learned in board.refused:
-        return f"{text} {name[:1].upper()}{name[1:]} may not run, for its harm."
-    return f"{text} {name[:1].upper()}{name[1:]} did not earn it: {share_text(figure)} ({within(where)})."
+    cell = board.cells[board.default, place]
+    worth = f", worth {number(cell.n_eff['stay'], 0)} that share nothing," if "stay" in cell.n_eff else ""
+    runs = f"{share_text(mine)} of {cell.runs:,} runs{worth} settle and stay"
+    return f"In its worst case ({within(place)}) {runs}. {pair_sentence(evidence.tables['choice']).text}"

@@ -6,8 +6,6 @@ import json
 import sys
 
 import cv2
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -17,8 +15,7 @@ from pipeline.commands import replay_camera
 from pipeline.commands.shadow import deploy
 from pipeline.deploy import to_setpoint
 from pipeline.recordings.nozzle_frames import Topics
-from pipeline.setpoint.agents import bayes, belief_agent
-from pipeline.setpoint.agents.files import Agents
+from pipeline.setpoint.agents import baselines
 from pipeline.setpoint.frames import nozzle_scene
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier
 from pipeline.setpoint.vision.calibration import ClassifierCalibration, Familiar
@@ -84,11 +81,11 @@ def test_a_folder_of_frames_is_decided_window_by_window(folder, tmp_path, monkey
 
 
 @pytest.mark.parametrize(
-    ("file", "array"), [("classifier.safetensors", "flow_scale"), ("filter.safetensors", "transition")]
+    ("file", "array"), [("classifier.safetensors", "flow_scale"), ("filter.safetensors", "jump")]
 )
 def test_numbers_that_were_not_judged_are_refused_by_name(folder, file, array):
     replay_camera.ready(folder)
-    schema = {"classifier.safetensors": "flow classifier 1", "filter.safetensors": "flow filter 1"}[file]
+    schema = {"classifier.safetensors": "flow classifier 1", "filter.safetensors": "flow filter 2"}[file]
     arrays, about = artifacts.read_weights(folder / file, schema)
     changed = arrays[array].copy()
     changed.flat[0] = np.nextafter(changed.flat[0], 2)
@@ -100,16 +97,10 @@ def test_numbers_that_were_not_judged_are_refused_by_name(folder, file, array):
         replay_camera.ready(folder)
 
 
-def test_our_agent_is_replayed_with_the_network_that_was_judged(folder, monkeypatch):
-    belief = belief_agent.Belief(deployed().parameters, jnp.zeros((5, len(bayes.GRID))), 0.8)
-    ours, other = (belief_agent.BeliefNetwork(1, jax.random.key(seed)) for seed in (0, 1))
-    judged = deploy.Ready(deployed(name="our agent", parameters=ours), None, None)  # ty: ignore[invalid-argument-type]
+def test_a_default_without_a_filter_is_not_replayed(folder, monkeypatch):
+    judged = deploy.Ready(
+        deployed(name="do nothing", controller=baselines.nothing(), parameters=()), None, None
+    )
     monkeypatch.setattr(deploy, "ready", lambda levels: judged)
-    monkeypatch.setattr(replay_camera, "restore_agents", lambda path: Agents((), belief, ours))
-    with pytest.raises(ValueError, match="agent.safetensors is missing"):
-        replay_camera.ready(folder)
-    to_setpoint.write(folder, to_setpoint.weights(trained().model, to_setpoint.BeliefAgent(belief, ours)))
-    assert replay_camera.ready(folder) == judged
-    to_setpoint.write(folder, to_setpoint.weights(trained().model, to_setpoint.BeliefAgent(belief, other)))
-    with pytest.raises(ValueError, match="agent.safetensors: expected the numbers .* found others in flow.h"):
+    with pytest.raises(ValueError, match="expected a controller with a filter, found 'do nothing'"):
         replay_camera.ready(folder)

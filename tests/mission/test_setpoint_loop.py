@@ -24,16 +24,11 @@ SMALL = {
     **{f"train_classifier.small.{key}": value for key, value in RECIPE.items()},
     "train_agent.runs": 1,
     "train_agent.li_2025.updates": [20, 20, 20, 20],
-    "train_agent.belief_dqn.updates": 20,
-    "train_agent.belief_dqn.rounds": 1,
     **{
-        f"train_agent.{who}.{key}": value
-        for who in ("li_2025", "belief_dqn")
+        f"train_agent.li_2025.{key}": value
         for key, value in {"environments": 4, "batch": 16, "capacity": 1000}.items()
     },
     "evaluate_setpoint.runs": 1,
-    "evaluate_setpoint.redraws": 2,
-    "evaluate_setpoint.rounds": 1,
     "evaluate_setpoint.pixels.starts": 1,
     "evaluate_setpoint.pixels.decisions": 20,
     "evaluate_setpoint.pixels.least_frames": 2,
@@ -99,7 +94,7 @@ def decided_by_kept_agents(project: Project) -> Project:
     shutil.copytree(ROOT / KEPT / "train_agent", project.folder / "datasets/train_agent")
     choice = project.folder / "datasets/evaluate_setpoint/choice.json"
     choice.parent.mkdir()
-    choice.write_text(json.dumps({"name": "Bayes, robust"}))
+    choice.write_text(json.dumps({"name": "Bayes filter"}))
     return project
 
 

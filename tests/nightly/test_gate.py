@@ -219,7 +219,7 @@ def deposition(rules: ReportRules):
 
 def setpoint(rules: ReportRules):
     def lost(percent, runs=made_setpoint.RUNS):
-        return lambda _: made_setpoint.scoreboard({"our agent": (percent, 0.0)}, runs)
+        return lambda _: made_setpoint.scoreboard({made_setpoint.DEFAULT: (percent, 0.0)}, runs)
 
     def image(percent, low, high):
         def change(stages):

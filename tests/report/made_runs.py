@@ -74,7 +74,7 @@ def metrics(settling=26.0, stay=71.0, flow=2.5, winner="pi_simc"):
         "reports/metrics/report.json": report,
         "reports/metrics/compose_parts.json": {"square": {"A": {"basis": composer, "chosen": "basis"}}},
         "reports/metrics/train_ilc.json": {"A": {"model_inverse": {"last_ratio": 0.02}}},
-        "reports/metrics/evaluate_setpoint.json": {"default": "Bayes, robust", "cases": cases, "harm": harm},
+        "reports/metrics/evaluate_setpoint.json": {"default": "Bayes filter", "cases": cases, "harm": harm},
         "reports/metrics/train_classifier.json": {
             "right_70_150": {"percent": 82.5, "low": 78.0, "high": 87.0}
         },

@@ -81,7 +81,7 @@ def test_deposition_shows_the_worst_stream_of_each_composer_and_the_range(report
 
 def test_setpoint_shows_the_worst_case_of_each_controller_with_its_interval(reports, cards):
     board = pd.read_parquet(reports.parent / "datasets/evaluate_setpoint/scoreboard.parquet")
-    counting = board[board.counts & (board.controller == "our agent")]
+    counting = board[board.counts & (board.controller == "Bayes filter")]
     worst = counting.loc[counting.settled_percent.idxmin()]
     ends = [worst.settled_percent, worst.settled_low_percent, worst.settled_high_percent]
     shown = numbers(row(cards["setpoint"], "Settles", "Stays"))

@@ -107,7 +107,7 @@ def test_curves_of_both_runs_are_drawn_and_an_accepted_run_without_curves_says_s
 
 def test_a_long_curve_keeps_its_first_and_its_last_sample():
     table = {
-        "agent": made.np.array(["belief_dqn"] * 1000),
+        "agent": made.np.array(["li_2025"] * 1000),
         "update": made.np.arange(1000),
         "reward": made.np.append(made.np.nan, made.np.arange(999) / 7),
     }

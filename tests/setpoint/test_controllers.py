@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pipeline.setpoint.agents import baselines, trials
-from pipeline.setpoint.agents.agent import QNetwork
-from pipeline.setpoint.agents.files import Agents
-from pipeline.setpoint.controllers import CONTROLLERS, KINDS, THROUGH_PIXELS, ControllerRow, build_controllers
+from pipeline.setpoint.agents.agent import PublishedAgent, QNetwork
+from pipeline.setpoint.controllers import CONTROLLERS, KINDS, ControllerRow, build_controllers, of_kind
 from pipeline.setpoint.settings import Baselines, EvaluateSetpoint
 from pipeline.setpoint.simulation.simulator import paper_windows
 from pipeline.store import params
@@ -22,48 +21,38 @@ def settings(root) -> Baselines:
 
 def test_a_new_controller_is_one_row_of_the_table_and_is_judged_like_the_others(root):
     """The twin of one in the table gets its score."""
-    row = ControllerRow("twin", "baseline", "baseline", "baselines.build_proportional", "proportional")
-    built = build_controllers(settings(root), None, None, (*CONTROLLERS[1:3], row))
-    assert list(built) == ["proportional", "filtered proportional", "twin"]
+    row = ControllerRow("twin", "baseline", "baselines.build_sequential_test", "sequential_test")
+    built = build_controllers(settings(root), None, None, (*CONTROLLERS[:2], row))
+    assert list(built) == ["do nothing", "sequential test", "twin"]
     windows, conditions, key = paper_windows(), trials.starts(1, accuracy=0.7), jax.random.key(1)
     scores = {
         name: trials.evaluate(one.controller, one.parameters, windows, conditions, key)
         for name, one in built.items()
     }
     # as text, since a figure that there is none of is not equal to itself
-    assert repr(scores["twin"]) == repr(scores["proportional"]) != repr(scores["filtered proportional"])
+    assert repr(scores["twin"]) == repr(scores["sequential test"]) != repr(scores["do nothing"])
 
 
-def test_numbers_of_a_baseline_are_float32_so_that_all_of_one_kind_share_what_is_compiled(monkeypatch):
-    whole = ControllerRow("whole", "baseline", "baseline", "baselines.build_no_control")
-    agent = ControllerRow("agent", "data-driven", "agent", "belief_agent.build")
-    network = object()
+def test_numbers_are_float32_so_that_all_of_one_kind_share_what_is_compiled(monkeypatch):
+    whole = ControllerRow("whole", "baseline", "baselines.build_no_control")
     monkeypatch.setattr(baselines, "build_no_control", lambda *_: (None, (3, 2.5)))
-    monkeypatch.setattr("pipeline.setpoint.agents.belief_agent.build", lambda *_: (None, network))
-    built = build_controllers(None, None, None, (whole, agent))
+    built = build_controllers(None, None, None, (whole,))
     assert [number.dtype for number in built["whole"].parameters] == [jnp.float32, jnp.float32]
     np.testing.assert_array_equal(np.array(built["whole"].parameters), [3, 2.5])
-    assert built["agent"].parameters is network
 
 
-NETWORKS = tuple(QNetwork(jax.random.key(k), 12) for k in range(3))
+def test_the_paper_s_agent_is_that_of_its_last_phase_and_sees_as_many_classes_as_it_was_trained_with():
+    networks = tuple(QNetwork(jax.random.key(k), 12) for k in range(3))
+    rows = tuple(row for row in CONTROLLERS if row.kind == "data-driven")
+    (built,) = build_controllers(None, PublishedAgent(networks, ()), None, rows).values()
+    np.testing.assert_array_equal(built.parameters.heads.weight, networks[2].heads.weight)
+    assert jax.tree.leaves(built.controller.start())[0].shape == (12,)
 
 
-def test_a_phase_that_was_not_trained_is_no_controller():
-    published = tuple(row for row in CONTROLLERS if row.group == "paper")
-    agents = Agents(li_2025=NETWORKS, belief=None, belief_dqn=None)
-    built = build_controllers(None, agents, None, published)
-    assert [(name, one.parameters) for name, one in built.items()] == [
-        ("paper's agent, 3 phases", NETWORKS[2])
-    ]
-    # it sees as many former classes as it was trained with
-    assert jax.tree.leaves(built["paper's agent, 3 phases"].controller.start())[0].shape == (12,)
-
-
-def test_the_names_of_the_table_are_distinct_and_those_shown_through_pixels_are_among_them():
+def test_the_names_of_the_table_are_distinct_and_the_pair_is_one_of_each_kind():
     assert len(KINDS) == len(CONTROLLERS)
-    assert set(THROUGH_PIXELS) <= set(KINDS)
-    assert set(KINDS.values()) == {"model-based", "data-driven", "baseline", "reference"}
+    assert set(KINDS.values()) == {"model-based", "data-driven", "baseline"}
+    assert [KINDS[of_kind(kind)] for kind in ("model-based", "data-driven")] == ["model-based", "data-driven"]
 
 
 def test_names_and_kinds_are_read_without_numerics(root):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.setpoint.agents.files import AGENTS_SCHEMA, Agents, restore_agents, store_agents
+from pipeline.setpoint.agents.files import restore_published, store_published
 from pipeline.setpoint.frames import files as camera_files
 from pipeline.setpoint.frames import nozzle_scene
 from pipeline.setpoint.frames.files import restore_frames
@@ -41,8 +41,7 @@ from pipeline.setpoint.vision.vision_transformer import named_arrays, vision_tra
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.store import artifacts, params
 from pipeline.store.artifacts import read_weights, write_weights
-from stages import train_agent, train_classifier
-from stages.train_agent import TrainAgent
+from stages import train_classifier
 from tests.nozzle_folders import SHOTS, folder, rows, table
 from tests.setpoint.synthetic import synthetic_table
 
@@ -65,10 +64,8 @@ SMALL = {
     **{f"train_classifier.small.{key}": value for key, value in RECIPE.items()},
     "train_agent.runs": 1,
     "train_agent.li_2025.updates": [20, 20, 20, 20],
-    "train_agent.belief_dqn.updates": 20,
-    "train_agent.belief_dqn.rounds": 2,
-    **{f"train_agent.{who}.{key}": value for who in ("li_2025", "belief_dqn") for key,
-    value in {"environments": 4, "batch": 16, "capacity": 1000}.items()},
+    **{f"train_agent.li_2025.{key}": value for key, value in
+    {"environments": 4, "batch": 16, "capacity": 1000}.items()},
     "evaluate_setpoint.runs": 1,
     "evaluate_setpoint.pixels.starts": 1,
     "evaluate_setpoint.pixels.decisions": 20,
@@ -345,29 +342,21 @@ def test_bins_of_the_flow_by_hand():
     np.testing.assert_array_equal(flow_edges([np.array([15.0]), np.array([320.0])]), [15.0, 320.0])
 
 
-def test_agents_survive_being_stored(project, tmp_path):
+@pytest.mark.parametrize("rewards", [(), tuple(np.arange(4.0) + k for k in range(4))])
+def test_the_networks_of_every_phase_survive_being_stored(tmp_path, rewards):
     import jax
 
     from pipeline.setpoint.agents.agent import QNetwork
-    from pipeline.setpoint.agents.belief_agent import BeliefNetwork
 
-    settings = params.load(TrainAgent, "train_agent").belief_dqn
-    belief = train_agent.filter_belief(
-        settings, synthetic_table(np.random.default_rng(0), segments=3, windows=2)
-    )
-    keys = jax.random.split(jax.random.key(3), 5)
-    networks = tuple(QNetwork(key) for key in keys[:4])
-    on_belief = BeliefNetwork(belief.filter.evidence.shape[0], keys[4])
-    store_agents(tmp_path / "a.safetensors", Agents(networks, belief, on_belief))
-    arrays, _ = read_weights(tmp_path / "a.safetensors", AGENTS_SCHEMA)
-    assert "belief.filter.repeats" in arrays  # names in the file stay as an older version wrote them
-    agents = restore_agents(str(tmp_path / "a.safetensors"))
-    restored = (*agents.li_2025, agents.belief, agents.belief_dqn)
-    for stored, again in zip((*networks, belief, on_belief), restored, strict=True):
-        leaves = [jax.tree.leaves(one) for one in (stored, again)]
+    networks = tuple(QNetwork(key) for key in jax.random.split(jax.random.key(3), 4))
+    store_published(tmp_path / "a.safetensors", networks, rewards)
+    again = restore_published(tmp_path / "a.safetensors")
+    np.testing.assert_array_equal(again.rewards, rewards)
+    for stored, restored in zip(networks, again.networks, strict=True):
+        leaves = [jax.tree.leaves(one) for one in (stored, restored)]
         assert len(leaves[0]) == len(leaves[1]) > 0
         for a, b in zip(*leaves, strict=True):
-            np.testing.assert_array_equal(np.asarray(a, np.float32), np.asarray(b))
+            np.testing.assert_array_equal(a, b)
 
 
 # ---- weights and tables that are not what they should be
@@ -400,7 +389,7 @@ def test_damaged_or_foreign_weights_are_refused_by_name(stored, capsys):
 def test_damaged_windows_are_refused_by_name(stored, capsys):
     path = Path("datasets/train_classifier/windows.parquet")
     path.write_bytes(path.read_bytes()[:500])
-    assert f"{path} is not a whole Parquet file" in refusal("train_agent", capsys)
+    assert f"{path} is not a whole Parquet file" in refusal("evaluate_setpoint", capsys)
     path.unlink()
     assert f"{path} is missing; make it again with ./run dvc repro train_classifier" in refusal(
         "train_agent", capsys
@@ -544,7 +533,7 @@ def test_windows_longer_than_a_print_are_refused(users, capsys):
 
 def check_agents() -> None:
     course = artifacts.read_table("datasets/train_agent/agents.parquet", AGENT_CURVE)
-    assert {"li_2025", "belief_dqn"} == set(course["agent"])
+    assert {"li_2025"} == set(course["agent"])
     figures = artifacts.read_figures("train_agent")
     assert 0 <= figures["phase3"]["settled"] <= 100
 

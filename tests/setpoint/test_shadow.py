@@ -26,7 +26,7 @@ from pipeline.commands.shadow.decide import DeployedLoop, WatchOptions
 from pipeline.commands.shadow.windows import FrameWindows
 from pipeline.recordings import watch_sources
 from pipeline.recordings.watch_sources import CameraFrame, Folder, RecordingSource
-from pipeline.setpoint.agents import bayes
+from pipeline.setpoint.agents import flow_filter
 from pipeline.setpoint.deployment import deployment
 from pipeline.setpoint.frames import familiar
 from pipeline.setpoint.material import PLA, PrintedMaterial
@@ -36,6 +36,7 @@ from pipeline.setpoint.vision.proof import CameraProof
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration, window_flow
 from pipeline.store import artifacts
 from tests.nozzle_folders import ANY
+from tests.setpoint.test_flow_filter import fitted
 
 ROOT = Path(__file__).resolve().parents[2]
 GIF = Path("/work/shared/data/fast_caxton_frames/nozzle_video.gif")
@@ -68,7 +69,8 @@ def by_width(images: np.ndarray, temperature: np.ndarray) -> FrameReadings:
 
 
 def deployed(**changes) -> DeployedLoop:
-    parameters = bayes.class_filter(accuracy=0.8, hazard=0.02, move_cost=0.2, outside_cost=2.0)
+    costs = {"move_cost": 0.2, "move_fixed_cost": 0.0, "outside_cost": 2.0, "border_std": 1.0}
+    parameters = fitted(accuracy=0.8, hazard=0.02, known_start_share=0.0, **costs)
     limits = actuation.SetpointLimits(
         np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([40.0, 40.0])
     )
@@ -83,7 +85,7 @@ def deployed(**changes) -> DeployedLoop:
         known=ANY_CAMERA,
         proof=PROVEN,
         name="Bayes",
-        controller=bayes.bayes(1),
+        controller=flow_filter.flow_filter(2, 9),
         parameters=parameters,
         window=FRAMES,
         least_score=10.0,
@@ -178,7 +180,7 @@ def test_the_controller_is_told_what_the_print_did_and_never_more(tmp_path):
     """Where the recording's setpoint moves, the window of both is dropped, frames pass while the melt
     follows, and the controller hears of the move; what it would have moved itself it never hears of."""
     heard = []
-    inner = bayes.bayes(1)
+    inner = flow_filter.flow_filter(2, 9)
 
     def act(parameters, memory, observation, key):
         import jax

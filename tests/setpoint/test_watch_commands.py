@@ -15,8 +15,7 @@ from mcap.reader import make_reader
 from pipeline import cli
 from pipeline.commands.levels_files import LEVELS_FILE, RecordedLevels, store_levels
 from pipeline.setpoint.agents.agent import QNetwork
-from pipeline.setpoint.agents.belief_agent import BeliefNetwork
-from pipeline.setpoint.agents.files import Agents, store_agents
+from pipeline.setpoint.agents.files import store_published
 from pipeline.setpoint.frames.files import CAMERA_FILE, store_camera
 from pipeline.setpoint.levels import Levels, LevelWindows
 from pipeline.setpoint.settings import TrainClassifier
@@ -29,8 +28,6 @@ from pipeline.setpoint.vision.files import restore_classifier, store_classifier
 from pipeline.setpoint.vision.vision_transformer import SMALL, vision_transformer
 from pipeline.setpoint.vision.window_flow import KNOTS_PERCENT, FlowCalibration
 from pipeline.store import artifacts, params
-from stages import train_agent
-from stages.train_agent import TrainAgent
 from tests.setpoint.synthetic import synthetic_flow_table
 from tests.setpoint.test_shadow import ANY_CAMERA, PROVEN, TIP, picture
 
@@ -90,12 +87,9 @@ def make() -> None:
         part: synthetic_flow_table(np.random.default_rng(1), segments=80, windows=3) for part in WINDOW_PARTS
     }
     artifacts.write_table(folder / "windows.parquet", WINDOWS, window_rows(tables))
-    belief = train_agent.filter_belief(params.load(TrainAgent, "train_agent").belief_dqn, tables["learn"])
-    keys = jax.random.split(jax.random.key(3), 5)
-    networks = tuple(QNetwork(key) for key in keys[:4])
-    on_belief = BeliefNetwork(belief.filter.evidence.shape[0], keys[4])
-    store_agents(Path("datasets/train_agent/weights.safetensors"), Agents(networks, belief, on_belief))
-    artifacts.write_json("datasets/evaluate_setpoint/choice.json", {"name": "Bayes, robust"})
+    networks = tuple(QNetwork(key) for key in jax.random.split(jax.random.key(3), 4))
+    store_published(Path("datasets/train_agent/weights.safetensors"), networks)
+    artifacts.write_json("datasets/evaluate_setpoint/choice.json", {"name": "Bayes filter"})
 
 
 def camera(count: int) -> None:
@@ -116,7 +110,7 @@ def test_the_default_watches_a_folder(command, trained):
     assert (status, wrong) == (0, "")
     assert "in: 45 frames, 2 decisions" in said and "nothing was sent" in said
     assert len(decisions()) == 2 and decisions()[0]["flow_seen_percent"] > 0
-    assert "Bayes, robust" in Path("shadow/index.html").read_text()
+    assert "Bayes filter" in Path("shadow/index.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pipeline.recordings.watch_sources import CameraFrame
-from pipeline.setpoint.agents import bayes
+from pipeline.setpoint.agents import flow_filter
 from pipeline.setpoint.deployment import deployment
 from pipeline.setpoint.deployment.deployment import JudgedWindow, camera_guard, camera_seen
 from pipeline.setpoint.deployment.pixels import ADVANTAGE, LIKENESS, LOOKS, REACH_PX, TEMPLATE_PX
@@ -79,8 +79,8 @@ class DeployedLoop(NamedTuple):
 
 class ShadowDecision(NamedTuple):
     """One window: what was seen, what it would do, and what the page shows of it; setpoint, would and flow
-    seen are of the material that is printed. belief (N,) over bayes.GRID, flows of the published one, or None
-    where the controller has none; pictures are of some of its frames."""
+    seen are of the material that is printed. belief (N,) over flow_filter.GRID, flows of the published one,
+    or None where the controller has none; pictures are of some of its frames."""
 
     number: int
     time_s: float
@@ -308,17 +308,16 @@ def _tip(shown: CameraFrame, asked: WatchOptions) -> tuple[float, float]:
 
 
 def believed(memory: Any) -> np.ndarray | None:
-    """The belief (N,) over the flows bayes.GRID of a controller that has one."""
-    belief = getattr(memory, "belief", None)
-    if belief is None or np.shape(belief)[-1:] != bayes.GRID.shape:
+    """The belief (N,) over the flows flow_filter.GRID of a controller that has one."""
+    if isinstance(memory, tuple) or np.shape(memory)[-1:] != flow_filter.GRID.shape or not np.any(memory):
         return None
-    total = np.asarray(belief, float).reshape(-1, len(bayes.GRID)).sum(axis=0)
+    total = np.asarray(memory, float).reshape(-1, len(flow_filter.GRID)).sum(axis=0)
     return total / total.sum()
 
 
 def belief_range(belief: np.ndarray, material: PrintedMaterial) -> tuple[float, float, float]:
     """The flows in percent, of a material, below which 5, 50 and 95 % of the belief lie."""
-    low, median, high = np.interp([0.05, 0.5, 0.95], np.cumsum(belief), material.own_flow(bayes.GRID))
+    low, median, high = np.interp([0.05, 0.5, 0.95], np.cumsum(belief), material.own_flow(flow_filter.GRID))
     return float(low), float(median), float(high)
 
 

@@ -10,7 +10,7 @@ from pipeline.commands.levels_files import LEVELS_FILE, RecordedLevels, restore_
 from pipeline.commands.shadow.decide import DeployedLoop, Looks, WatchOptions, deployed
 from pipeline.recordings.nozzle_frames import Topics
 from pipeline.setpoint import levels
-from pipeline.setpoint.agents.files import restore_agents
+from pipeline.setpoint.agents.files import restore_published
 from pipeline.setpoint.controllers import CONTROLLERS, build_controllers
 from pipeline.setpoint.frames.files import restore_camera
 from pipeline.setpoint.recordings import read_options
@@ -63,7 +63,7 @@ def ready(levels_file: str | None) -> Ready:
     name = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
     table = artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS)
     windows = window_tables(table, WINDOW_PARTS)
-    agents = restore_agents("datasets/train_agent/weights.safetensors")
+    agents = restore_published("datasets/train_agent/weights.safetensors")
     learn = windows["learn"]
     flow = partial(window_flow, fitted=model.calibration.flow)
     proof = model.calibration.proof

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from pipeline.commands.shadow.decide import DeployedLoop, DrawnFrame, ShadowDecision
-from pipeline.setpoint.agents import bayes
+from pipeline.setpoint.agents import flow_filter
 from pipeline.setpoint.deployment import deployment
 from pipeline.setpoint.material import GOOD, PrintedMaterial
 from pipeline.setpoint.simulation import actuation
@@ -91,7 +91,7 @@ def _shares(last: ShadowDecision) -> str:
 def _belief(belief: np.ndarray, material: PrintedMaterial) -> str:
     """The belief over the flow of a material as a drawing, on a logarithmic axis, with the good range
     shaded."""
-    grid, (thin, thick) = material.own_flow(bayes.GRID), material.good_flow_percent
+    grid, (thin, thick) = material.own_flow(flow_filter.GRID), material.good_flow_percent
     low, high = np.log(grid[[0, -1]])
 
     def place(flow: float) -> float:

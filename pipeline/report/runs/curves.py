@@ -75,9 +75,8 @@ def _classifier(table: Table) -> Iterator[tuple[str, Curve]]:
 
 
 def _agent(table: Table) -> Iterator[tuple[str, Curve]]:
-    rows = table["agent"] == "belief_dqn"
-    reward = table["reward"][rows]
-    yield "Setpoint: agent, reward of a step", _curve("Update", "Mean reward", table["update"][rows], reward)
+    reward = table["reward"]
+    yield "Setpoint: agent, reward of a step", _curve("Update", "Mean reward", table["update"], reward)
 
 
 def _curve(across: str, up: str, x: np.ndarray, y: np.ndarray) -> Curve:

@@ -1,8 +1,7 @@
 """How controllers of setpoints fare, drawn: ways from the 21 starts over the reward, their flow step by step,
-training of the agents, settled runs against the classifier's accuracy."""
+and training of the paper's agent."""
 
 import math
-import re
 from typing import Any
 
 import numpy as np
@@ -16,32 +15,21 @@ from pipeline.setpoint.agents.criteria import FLOW_BAND, SETTLED_BY, TEMPERATURE
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, PHASES, ROTATION
 from pipeline.verdict.digits import THIN, number, percent, quantity
 from pipeline.verdict.evidence import Table, lookup
-from pipeline.verdict.setpoint import AGENT, BASELINE, PAPER, Board, Case, case_text, role
-from pipeline.verdict.verdict import Figure, Missing
+from pipeline.verdict.setpoint import Board, Case, case_text, role
+from pipeline.verdict.verdict import Missing
 
 # rewards whose lines are drawn, of the last phase
 LEVELS = (0.5, 0.0, -0.5, -0.8)
 FLOW, TEMPERATURE = charts.linear(0, 320, ticks=6), charts.linear(180, 240, ticks=6)
 # starts that a panel has room for
 MOST = 42
-CASES = (("recorded", "recorded, fresh"), ("paper", "accuracy 0.7"))
+CASES = (("recorded", "recorded, sticky"), ("paper", "accuracy 0.7"))
 # key of train_agent.json -> who, after what
 TAUGHT = {
     "phase3": ("The paper’s agent", "phases 1 to 3, judged with classes that are always right"),
     "phase3_at_0.7": ("The paper’s agent", f"phases 1 to 3, judged with 70{THIN}% right"),
     "phase4": ("The paper’s agent", f"all four phases, judged with 70{THIN}% right"),
     "phase4_at_1": ("The paper’s agent", "all four phases, judged with classes that are always right"),
-    "belief_dqn": ("Our agent", "as deployed, judged with classes that are always right"),
-    "belief_dqn_at_0.7": ("Our agent", f"as deployed, judged with 70{THIN}% right"),
-}
-
-
-# the line of a controller, by its mark
-LINES = {
-    "data_driven": "line dd",
-    "kernel": "line dd dash",
-    "model_based": "line",
-    "exact_model": "line dash",
 }
 
 
@@ -49,22 +37,14 @@ LINES = {
 
 
 def shown(board: Board, table: Table, case: Case) -> list[str]:
-    """The default first, then the paper's agent, then the best of the
-    other side, as far as their ways were kept."""
+    """The default first, then the model-based and the data-driven controller, as far as their ways were
+    kept."""
     in_paths = {
         str(name)
         for name in table["controller"][(table["simulator"] == case[0]) & (table["case"] == case[1])]
     }
-    other = (
-        board.best(BASELINE)
-        if board.default and board.kinds[board.default] != BASELINE
-        else board.best(AGENT)
-    )
-    return [
-        name
-        for name in dict.fromkeys((board.default or board.names[0], board.best(PAPER), other))
-        if name in in_paths
-    ]
+    names = (board.default or board.names[0], board.baseline(), board.learned())
+    return [name for name in dict.fromkeys(names) if name in in_paths]
 
 
 def ways(sources: Sources, board: Board | Missing) -> list[Picture]:
@@ -103,7 +83,7 @@ def _ways(sources: Sources, board: Board, table: Table, case: Case, i: int) -> P
         panels = [_surface(name, flow, temperature, ends, css, first), _steps(name, flow, inside, css, first)]
         columns.append(
             PictureColumn(
-                name, "runs by default" if name == board.default else _kind(board, name), mark, panels
+                name, "runs by default" if name == board.default else board.kinds[name], mark, panels
             )
         )
     where = case_text(case, whole=True)
@@ -121,10 +101,6 @@ def _ways(sources: Sources, board: Board, table: Table, case: Case, i: int) -> P
             sources.source("paths"), simulator=case[0], case=case[1], controller=shown(board, table, case)
         ),
     )
-
-
-def _kind(board: Board, name: str) -> str:
-    return {AGENT: "our agent", PAPER: "as published"}.get(board.kinds[name], "best baseline")
 
 
 def _by_start(table: Table, mine: np.ndarray, column: str) -> list[np.ndarray]:
@@ -235,47 +211,25 @@ def _steps(name: str, flow: list[np.ndarray], inside: list[np.ndarray], css: str
 
 
 def training(sources: Sources) -> Picture:
-    """Mean reward while the agents learn, phase after phase (figure 6 of the paper)."""
-    table, title = sources.tables["agents"], "The agents in training, phase after phase"
+    """Mean reward while the paper's agent learns, phase after phase (figure 6 of the paper)."""
+    table, title = sources.tables["agents"], "The paper’s agent in training, phase after phase"
     if isinstance(table, Missing):
         return placeholder("agents", title, table)
-    columns, sentences = [], []
-    for agent, mine in pd.DataFrame(table).groupby("agent", sort=False):
-        ends = mine.groupby("phase").reward.last().tolist()
-        values = (
-            ", ".join(number(end, 2) for end in ends)
-            if len(ends) <= 6
-            else f"{number(ends[0], 2)}, the last of {len(ends)} at {number(ends[-1], 2)}"
-        )
-        word = "phase" if agent == "li_2025" else "round"
-        sentences.append(
-            f"{_agent(agent)} ends its {f'{word}s' if len(ends) <= 6 else f'first {word}'} at a "
-            f"mean reward of {values}"
-        )
-        columns.append(
-            PictureColumn(
-                _agent(agent),
-                "as published" if agent == "li_2025" else "ours",
-                "kernel" if agent == "li_2025" else "data_driven",
-                [_course(mine, agent, word, values)],
-            )
-        )
+    course = pd.DataFrame(table)
+    values = ", ".join(number(end, 2) for end in course.groupby("phase").reward.last().tolist())
     return Picture(
         "agents",
         title,
-        f"{'. '.join(sentences)}.",
-        columns,
-        "Mean reward of a step, in the reward of its phase, against thousands of updates. As published: "
+        f"Its phases end at a mean reward of {values}.",
+        [PictureColumn("The paper’s agent", "as published", "data_driven", [_course(course, values)])],
+        "Mean reward of a step, in the reward of its phase, against thousands of updates: "
         f"{', then '.join(f'a, b = {a:g}, {b:g}' for a, b in PHASES)}, "
-        "then the last with classes that are wrong at times. "
-        "Ours learns in rounds, of which the one is kept that costs least on episodes it did not learn from; "
-        "its reward is what a step costs, with a minus. Rewards of two phases, "
-        "or of two agents, do not compare.",
+        "then the last with classes that are wrong at times. Rewards of two phases do not compare.",
         page.origin(sources.source("agents")),
     )
 
 
-def _course(mine: pd.DataFrame, agent: str, word: str, reward_text: str) -> Markup:
+def _course(mine: pd.DataFrame, reward_text: str) -> Markup:
     updates, reward = mine["update"] / 1000, mine.reward
     span = max(float(reward.max() - reward.min()), 0.2)
     y = charts.linear(float(reward.min()) - 0.25 * span, float(reward.max()) + 0.1 * span, ticks=4)
@@ -291,136 +245,15 @@ def _course(mine: pd.DataFrame, agent: str, word: str, reward_text: str) -> Mark
                     x, frame.above, frame.height - frame.below
                 )
             )
-        layers.append(
-            charts.label(
-                frame, begin, y.low, f"{word} {k}" if len(phases) <= 6 or not i else str(k), dx=3, dy=-4
-            )
-        )
+        layers.append(charts.label(frame, begin, y.low, f"phase {k}", dx=3, dy=-4))
         layers.append(charts.line(frame, updates.to_numpy()[here], reward.to_numpy()[here]))
     alt = (
-        f"{_agent(agent)}: mean reward at the end of each {word} {reward_text}, "
+        f"The paper’s agent: mean reward at the end of each phase {reward_text}, "
         f"after {number(float(mine['update'].max()), 0)} updates in all"
     )
     return charts.panel(
         frame, layers, alt=alt, css="dd wide", title="mean reward", units=("thousand updates", "")
     )
-
-
-def _agent(name: str) -> str:
-    return {"li_2025": "The paper’s agent", "belief_dqn": "Our agent"}.get(name, name)
-
-
-def by_accuracy(sources: Sources, board: Board | Missing) -> Picture:
-    """Settled runs against the share of windows that are named rightly,
-    on the paper's simulator (figure 7, as figures)."""
-    title = "How much misnaming each bears"
-    if isinstance(board, Missing):
-        return placeholder("by-accuracy", title, board)
-    cases = sorted(
-        (float(match[1]), case)
-        for case in board.cases
-        if (match := re.fullmatch(r"accuracy (\d\.?\d*)", case[1]))
-    )
-    if len(cases) < 2:
-        return placeholder(
-            "by-accuracy", title, Missing("not measured", "fewer than two accuracies were judged")
-        )
-    asked = sources.declared.rules
-    panels = [
-        _accuracy_panel(board, cases, what, head, limit)
-        for what, head, limit in (
-            ("settled", "Settle", asked.settled_percent),
-            ("stay", "Settle and stay", asked.stay_percent),
-            ("median", "Decisions until inside", None),
-        )
-    ]
-    return Picture(
-        "by-accuracy",
-        title,
-        f"With {100 * cases[0][0]:g}{THIN}% of the windows named rightly. "
-        f"{'; '.join(sentence for _, sentence in panels)}.",
-        [column for column, _ in panels],
-        "Share of runs on the paper’s simulator against the share of windows that are named rightly. Blue: "
-        "our agent; blue, dashed: the paper’s; ink or grey: the best baseline. Grey area: what is asked for.",
-        page.origin(sources.source("scoreboard")),
-    )
-
-
-def _accuracy_panel(
-    board: Board, cases: list[tuple[float, Case]], what: str, head: str, limit: float | None
-) -> tuple[PictureColumn, str]:
-    """The panel of one figure, which has a limit where it is a share of runs, and its values at the lowest
-    accuracy in words."""
-    names = [
-        name for name in dict.fromkeys((board.learned(), board.best(PAPER), board.best(BASELINE))) if name
-    ]
-    curves = {name: curve for name in names if (curve := _curve(board, name, cases, what))}
-    frame = charts.Frame(_accuracies(cases), _figure_axis(curves, limit), 368, 190, 30)
-    layers = []
-    if limit:
-        layers = [
-            charts.tint(frame, limit, 100),
-            charts.level(frame, limit, "lim", f"limit {limit:g}", above=False),
-        ]
-    for name, curve in curves.items():
-        px, py = map(np.array, zip(*curve, strict=True))
-        mark = role(board, name)
-        layers += [
-            charts.line(frame, px, py, LINES.get(mark, "line bl")),
-            charts.dots(frame, px, py, f"dot whole {page.MARKS[mark]}", 2.4),
-        ]
-    first = [(curve[0][1], name) for name, curve in curves.items()]
-    last = [(curve[-1][1], name) for name, curve in curves.items()]
-    layers += _names(frame, first) if limit else _names(frame, last, right=True)
-    values = ", ".join(
-        f"{name} {number(value, 1) + THIN + '%' if limit else number(value, 0)}" for value, name in first
-    )
-    panel = charts.panel(
-        frame,
-        layers,
-        alt=f"At {100 * cases[0][0]:g} % right, {head.lower()}: {values}",
-        css="mb",
-        title="%" if limit else "decisions",
-        units=("% right", "%" if limit else ""),
-    )
-    small = "of runs, in per cent" if limit else "median of the runs that settle"
-    return PictureColumn(head, small, "", [panel]), f"{head}: {values}"
-
-
-def _accuracies(cases: list[tuple[float, Case]]) -> charts.Axis:
-    ticks = tuple((100 * a, f"{100 * a:g}") for a, _ in cases)
-    return charts.Axis(100 * cases[0][0], 100 * cases[-1][0], ticks)
-
-
-def _figure_axis(curves: dict[str, list[tuple[float, float]]], limit: float | None) -> charts.Axis:
-    if limit:
-        return charts.Axis(0, 104, ((0.0, "0"), (50.0, "50"), (100.0, "100")))
-    top = max((max(value for _, value in curve) for curve in curves.values()), default=1.0)
-    return charts.linear(0, 1.1 * top, ticks=4)
-
-
-def _curve(board: Board, name: str, cases: list[tuple[float, Case]], what: str) -> list[tuple[float, float]]:
-    """(accuracy in percent, figure), where it is known."""
-    cells = [(100 * a, cell) for a, case in cases if (cell := board.cells.get((name, case)))]
-    if what == "median":
-        return [(a, cell.median) for a, cell in cells if not math.isnan(cell.median)]
-    return [(a, share.value) for a, cell in cells if isinstance(share := getattr(cell, what), Figure)]
-
-
-def _names(frame: charts.Frame, ends: list[tuple[float, str]], *, right: bool = False) -> list[Markup]:
-    """Names below the ends of lines, from the top down, 11 px apart at least."""
-    made, last = [], -100.0
-    for value, name in sorted(ends, reverse=True):
-        y = max(float(frame.py(value)) + 12, last + 11)
-        y = min(y, frame.height - frame.below - 3)
-        x, anchor = (frame.width - frame.right - 6, "end") if right else (frame.left + 6, "start")
-        made.append(
-            Markup('<text x="{}" y="{:.1f}" text-anchor="{}">{} {}</text>').format(
-                x, y, anchor, name, number(value, 0 if right else 1)
-            )
-        )
-        last = y
-    return made
 
 
 def phases(sources: Sources) -> dict[str, Any]:
@@ -438,7 +271,7 @@ def phases(sources: Sources) -> dict[str, Any]:
             {
                 "name": head,
                 "small": small,
-                "mark": "data_driven" if name.startswith("belief_dqn") else "kernel",
+                "mark": "data_driven",
                 "settled": percent(float(figures["settled"]), 3),
                 "stay": "not measured" if isinstance(stay, Missing) else percent(float(stay), 3),
                 "steps": "none settled" if isinstance(steps, Missing) else number(float(steps), 0),
@@ -446,25 +279,7 @@ def phases(sources: Sources) -> dict[str, Any]:
             }
         )
     gap = None if rows else Missing("not measured", "train_agent.json holds no run")
-    return {"missing": gap, "rows": rows, "best_round": _best_round(metrics)}
-
-
-def _best_round(metrics: dict[str, Any]) -> str:
-    """What the rounds of our agent came to, on episodes that it did not learn from."""
-    judged, best_round, rounds = (metrics.get(key) for key in ("validation", "kept_round", "rounds"))
-    if not judged or best_round is None or not 0 <= best_round < len(judged):
-        return ""
-    before, after = number(float(judged[0]), 3), number(float(judged[best_round]), 3)
-    if best_round == 0:
-        return (
-            f"No round of ours was better than what it began with: {before} a step on episodes it "
-            "did not learn "
-            "from, and that is kept."
-        )
-    return (
-        f"Of ours round {best_round} of {rounds} is kept: {after} a step on episodes it did not learn from, "
-        f"{before} before any training."
-    )
+    return {"missing": gap, "rows": rows}
 
 
 # ---- what the paper claims of its agent, and what it does not print

@@ -20,12 +20,11 @@ from pipeline.report.shared.card import (
 )
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import BEYOND, FLOW_BAND
-from pipeline.setpoint.controllers import KINDS
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.verdict.digits import THIN, band, count
 from pipeline.verdict.evidence import lookup
 from pipeline.verdict.setpoint import (
-    BASELINE,
+    DATA_DRIVEN,
     Board,
     Case,
     Harm,
@@ -34,6 +33,7 @@ from pipeline.verdict.setpoint import (
     case_text,
     harm_of,
     lasting,
+    pair_sentence,
     role,
     share_text,
     within,
@@ -58,7 +58,6 @@ def card(sources: Sources, verdict: Verdict) -> Card:
     limits = bars(sources.evidence, scores)
     harms = [harm_of(scores, name, limits) for name in names]
     limit = next((harm.limit for harm in harms if isinstance(harm, Harm)), None)
-    clustered = any(cell.redraws > 1 for cell in scores.cells.values())
     return of_verdict(
         verdict,
         MOVES,
@@ -69,18 +68,17 @@ def card(sources: Sources, verdict: Verdict) -> Card:
             _shares("Stays", scores, names, "stay", asked.stay_percent),
             CardRow("Harm", "" if limit is None else f"≤ {limit:g}{THIN}%", _harm_cells(harms, limit)),
         ],
-        basis=f"Worst case of each; small: 95{THIN}% interval{', by segment' if clustered else ''}. Harm: "
-        f"good prints that leave ±{BEYOND[-1]}{THIN}%.",
-        beside=_beside(scores, names),
+        basis=f"Worst case of each; small: 95{THIN}% interval, by segment. Harm: good prints that leave "
+        f"±{BEYOND[-1]}{THIN}%.",
+        beside=pair_sentence(sources.tables["choice"]).short,
         sources=sources.source("scoreboard"),
     )
 
 
 def shown(sources: Sources, scores: Board) -> list[str]:
-    """The default, then the agent (the best rule where the agent is the default), then what was accepted,
-    else doing nothing."""
+    """The default, then the other one of the pair, then what was accepted, else doing nothing."""
     mine = scores.default
-    other = scores.learned() if scores.kinds[mine] == BASELINE else scores.best(BASELINE)
+    other = scores.baseline() if scores.kinds[mine] == DATA_DRIVEN else scores.learned()
     third = [accepted(sources), DOES_NOTHING, *scores.names]
     names = [mine, *([other] if other else [])]
     return [*names, *[name for name in third if name in scores.kinds and name not in names][:1]]
@@ -100,7 +98,7 @@ def _notes(sources: Sources, scores: Board, names: Sequence[str]) -> list[tuple[
         (
             name,
             "as before" if name == before else "closest" if i == 0
-            else KINDS.get(name, "baseline"),
+            else scores.kinds[name],
         )
         for i, name in enumerate(names)
     ]  # fmt: skip
@@ -134,18 +132,6 @@ def _harm_cells(harms: Sequence[Harm | Missing], limit: float | None) -> list[Ca
         own = "" if harm.limit == limit else f"; ≤ {harm.limit:g}{THIN}%"
         cells.append(cell._replace(band=cell.band + own))
     return cells
-
-
-def _beside(scores: Board, names: Sequence[str]) -> str:
-    """Where the default and the agent fare worst."""
-    _, mine = worst(scores, names[0], "lasting")
-    figure, place = worst(scores, names[1], "lasting") if len(names) > 1 else (Missing("", ""), None)
-    if mine is None:
-        return ""
-    text = f"Worst case of {names[0]}: {within(mine)}."
-    if place is None or place == mine:
-        return text
-    return f"{text} Of {names[1]}: {within(place)}, {share_text(figure)} settle and stay."
 
 
 def _step(sources: Sources, verdict: Verdict) -> CardStep:

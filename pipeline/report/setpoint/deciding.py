@@ -128,7 +128,7 @@ def picture(sources: Sources, board: Board | Missing) -> Picture:
             PictureColumn("Flow", "per cent, against decisions", "", [flow]),
             PictureColumn("Runs inside", "per cent of them, against decisions", "", [share]),
         ],
-        f"One run from each of {starts}, on one redraw of the segments. {reading(found.runs)} Dashed: "
+        f"One run from each of {starts}, on the first pool of segments. {reading(found.runs)} Dashed: "
         f"{BEST_FLOW - FLOW_BAND:g}–{BEST_FLOW + FLOW_BAND:g}{THIN}%. Inside: there, and "
         f"{BEST_TEMPERATURE:g}{THIN}±{THIN}{TEMPERATURE_BAND:g}{THIN}°C. What lies beyond the axis is not "
         "drawn.",

@@ -9,7 +9,7 @@ from markupsafe import Markup
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.agents.criteria import BEYOND
+from pipeline.setpoint.agents.criteria import BEYOND, CLOG_STEP, SETTLED_BY, STEPS
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.verdict.digits import THIN, band, number
 from pipeline.verdict.setpoint import Board, Case, Harm, bars, case_text, harm_of, role, share_text
@@ -32,7 +32,8 @@ def harms(sources: Sources, board: Board | Missing) -> dict[str, Any]:
     if not known:
         gap = Missing("not measured", "no run from a good start", "Run ./run dvc repro evaluate_setpoint")
         return {"picture": placeholder("harm", TITLE, gap), "rows": (), "clustered": ""}
-    rows = [_row(board, name, harm) for name, harm in known.items()]
+    seconds = decision_seconds(sources)
+    rows = [_row(board, name, harm, seconds) for name, harm in known.items()]
     clog = case_text(CLOG, whole=True)
     caption = (
         f"Across: runs from good starts that leave ±{BEYOND[-1]}{THIN}% of flow within 200 decisions, in "
@@ -57,14 +58,12 @@ def harms(sources: Sources, board: Board | Missing) -> dict[str, Any]:
 
 def clustered(board: Board) -> str:
     """How the intervals of the scoreboard were made."""
-    redraws = sorted({cell.redraws for cell in board.cells.values() if cell.redraws > 1})
-    if not redraws:
+    if not any(n_eff > 0 for cell in board.cells.values() for n_eff in cell.n_eff.values()):
         return f"Intervals are Wilson’s, 95{THIN}%."
-    many = f"{redraws[0]:,}" if len(redraws) == 1 else f"{redraws[0]:,} to {redraws[-1]:,}"
     return (
-        f"Intervals, 95{THIN}%, are clustered by segment on recorded windows and from good starts: runs are "
-        f"on {many} redraws of the segments. On the paper’s simulator runs share nothing, and intervals are "
-        "Wilson’s."
+        f"Intervals, 95{THIN}%, are Wilson’s of n_eff runs: as many runs that share nothing as these are "
+        "worth. The recorded segments are parted into pools that share none. How much the shares of the "
+        "pools differ says what the segments weigh."
     )
 
 
@@ -78,21 +77,42 @@ def _recovered(board: Board, name: str, what: str = "recovered", case: Case = CL
     return Missing("not measured", "this case was not run") if cell is None else getattr(cell, what)
 
 
-def _row(board: Board, name: str, harm: Harm) -> dict[str, Any]:
+def decision_seconds(sources: Sources) -> float:
+    """How long a decision takes as deployed: the wait, and the window of frames."""
+    everything = sources.declared.everything
+    pixels = everything["evaluate_setpoint"]["pixels"]
+    return pixels["wait_s"] + everything["train_classifier"]["window"] / pixels["frame_rate_hz"]
+
+
+def minutes_back(board: Board, name: str, case: Case, decision_s: float) -> str:
+    """ "95 % back after 7 min", beside the deadline."""
+    cell = board.cells.get((name, case))
+    if cell is None:
+        return ""
+    deadline = (SETTLED_BY - CLOG_STEP) * decision_s / 60
+    late = f"not within {number((STEPS - CLOG_STEP) * decision_s / 60, 0)}"
+    after = (
+        late if math.isnan(cell.recovery_p95) else f"after {number(cell.recovery_p95 * decision_s / 60, 1)}"
+    )
+    return f"95{THIN}% back {after} min (deadline {number(deadline, 1)} min)"
+
+
+def _row(board: Board, name: str, harm: Harm, decision_s: float) -> dict[str, Any]:
     share, back = _recovered(board, name), _recovered(board, name, "back", HALF_CLOG)
-    cell = board.cells.get((name, CLOG))
-    steps = math.nan if cell is None else cell.recovery_steps
+    n_eff = board.cells[name, harm.case].n_eff.get(f"beyond_{BEYOND[-1]}", math.nan)
+    worth = "" if math.isnan(n_eff) else f", n_eff {number(n_eff, 0)}"
     return {
         "name": name,
         "mark": role(board, name),
         "default": name == board.default,
         "harm": share_text(harm.figure),
-        "harm_band": band(harm.figure.low, harm.figure.high, 1),
+        "harm_band": f"{band(harm.figure.low, harm.figure.high, 1)}{worth}",
         "bad": harm.state == "failed",
         "where": f"{start_text(harm.case)}, ≤\u00a0{harm.limit:g}{THIN}%",
         "recovered": share_text(share),
         "recovered_band": band(share.low, share.high, 1) if isinstance(share, Figure) else "",
-        "steps": "" if math.isnan(steps) else f"in {number(steps, 0)} decisions",
+        "minutes": minutes_back(board, name, CLOG, decision_s),
+        "half_minutes": minutes_back(board, name, HALF_CLOG, decision_s),
         "back": share_text(back),
         "back_band": band(back.low, back.high, 1) if isinstance(back, Figure) else "",
         "why": "may not run" if name in board.refused else "",

@@ -1,7 +1,6 @@
 """The page of the setpoint loop: who sets flow and temperature by default, what each controller makes of each
 case, and what the camera's classifier is worth."""
 
-import re
 from typing import Any, NamedTuple
 
 from pipeline.report.deposition.page import flat
@@ -15,11 +14,11 @@ from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import BEYOND
-from pipeline.setpoint.controllers import KINDS
-from pipeline.verdict.digits import THIN, band, count, number, percent, quantity
+from pipeline.verdict.digits import THIN, band, number, percent, quantity
 from pipeline.verdict.evidence import lookup
 from pipeline.verdict.setpoint import (
-    BASELINE,
+    DATA_DRIVEN,
+    MODEL_BASED,
     SIMULATORS,
     Board,
     Case,
@@ -46,7 +45,6 @@ WORDS = (
     "as_published",
     "bayes",
     "sequential",
-    "proportional",
     "recorded_windows",
     "sticky",
     "segment",
@@ -65,7 +63,8 @@ WORDS = (
 )
 SECTIONS = ("setpoint_material", "train_classifier", "train_agent", "evaluate_setpoint")
 MOST = 12
-LANES = {"data_driven": "dd", "kernel": "dd", "model_based": "mb", "exact_model": "mb", "baseline": "acc"}
+GOOD = 1  # of the classes under, good, over
+LANES = {"data_driven": "dd", "model_based": "mb", "baseline": "acc"}
 
 
 def render(sources: Sources) -> str:
@@ -83,12 +82,14 @@ def render(sources: Sources) -> str:
         if judged_scores is None
         else (
             HEADS[0],
-            {"model-based": "Model\u2011based"}.get(KINDS.get(judged_scores.baseline(), ""), HEADS[1]),
+            {MODEL_BASED: "Model\u2011based"}.get(
+                judged_scores.kinds.get(judged_scores.baseline(), ""), HEADS[1]
+            ),
             role(judged_scores, judged_scores.baseline()) if judged_scores.baseline() else HEADS[2],
         ),
         second=judged_scores is not None
         and bool(judged_scores.default)
-        and judged_scores.kinds[judged_scores.default] == BASELINE,
+        and judged_scores.kinds[judged_scores.default] != DATA_DRIVEN,
         summary=summary(sources.evidence, judged_scores) if judged_scores and judged_scores.default else "",
         no_board=scores if isinstance(scores, Missing) else None,
         heads=heads(judged_scores),
@@ -102,11 +103,11 @@ def render(sources: Sources) -> str:
         ways=setpoint_agent.ways(sources, scores),
         strips=setpoint_why.strips(sources),
         training=setpoint_agent.training(sources),
-        by_accuracy=setpoint_agent.by_accuracy(sources, scores),
         phases=setpoint_agent.phases(sources),
         claims=[] if isinstance(claimed, Missing) else claimed,
         claims_missing=claimed if isinstance(claimed, Missing) else None,
         guesses=setpoint_agent.guesses(sources),
+        good_named=good_named(sources),
         by_flow=setpoint_by_flow.by_flow(sources),
         yardsticks=setpoint_vision.yardsticks(sources),
         reliability=setpoint_vision.reliability(sources),
@@ -123,18 +124,24 @@ def render(sources: Sources) -> str:
     )
 
 
+def good_named(sources: Sources) -> str:
+    """How many frames of good prints the classifier names good."""
+    table = sources.tables["classified"]
+    if isinstance(table, Missing):
+        return ""
+    right = table["named"][table["label"] == GOOD] == GOOD
+    if not len(right):
+        return ""
+    return f"Of {len(right):,} frames of good prints {percent(100 * float(right.mean()), 2)} are named good."
+
+
 def choice_sentence(sources: Sources) -> str:
-    """Why the default is the default, as the stage that chose it says; who may not run is told as a number,
-    and by name in the table of harm."""
-    said = lookup(sources.tables["choice"], "sentence")
+    """Why the default is the default, as the stage that chose it says, and who may not run."""
+    said, refused = (lookup(sources.tables["choice"], key) for key in ("sentence", "refused"))
     if isinstance(said, Missing):
         return ""
-    text, refused = re.subn(r" Not asked: .*?\.(?= Not asked:| On segments|$)", "", str(said))
-    if refused:
-        others, spoil = count(refused, "other").capitalize(), "it spoils" if refused == 1 else "they spoil"
-        more = f" {others} may not run: {spoil} more good prints than allowed."
-        text = text.replace(" On segments", f"{more} On segments", 1)
-    return text.replace("+-", "±")
+    barred = [] if isinstance(refused, Missing) else [f"{name} {why}." for name, why in refused.items()]
+    return " ".join([str(said), *(["May not run:"] if barred else []), *barred]).replace("+-", "±")
 
 
 def heads(scores: Board | None) -> list[dict[str, Any]]:
@@ -302,7 +309,7 @@ def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> BoardCe
         if isinstance(share, Figure):
             failed = state(Question(0, "", "", "%", limits[what], True, ""), share) == FAILED
             text = f"{word}{quantity(share.value, '%', 1)}"
-            lines.append({"text": text, "band": band(share.low, share.high, 1), "bad": failed})
+            lines.append({"text": text, "band": _worth(cell, what, share), "bad": failed})
     for points, share in zip(BEYOND, cell.beyond, strict=False):
         if isinstance(share, Figure):
             text = f"beyond {points}: {quantity(share.value, '%', 1)}"
@@ -319,6 +326,13 @@ def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> BoardCe
     return BoardCell(lines, steps, more.strip(", "), tip, bold)
 
 
+def _worth(cell: Cell, what: str, share: Figure) -> str:
+    """The interval of a share, and as many runs that share nothing as it is worth."""
+    n_eff = cell.n_eff.get(what, float("nan"))
+    worth = "" if n_eff != n_eff else f", n_eff {number(n_eff, 0)}"
+    return f"{band(share.low, share.high, 1)}{worth}"
+
+
 def worsts(scores: Board) -> list[dict[str, Any]]:
     """Everybody's worst case, the best first, with the start from which fewest settle there."""
     rows = []
@@ -331,16 +345,16 @@ def worsts(scores: Board) -> list[dict[str, Any]]:
             share.value for _, other in scores.counting(name) if isinstance(share := lasting(other), Figure)
         ]
         flow, degrees, settled = cell.worst_start
-        kinds = {BASELINE: "no learning", "agent": "ours, learned"}
         rows.append(
             {
                 "name": name,
                 "mark": role(scores, name),
                 "default": name == scores.default,
-                "kind": kinds.get(scores.kinds[name], "as published"),
+                "kind": scores.kinds[name],
                 "case": case_text(case, whole=True),
                 "value": share_text(figure),
                 "band": band(figure.low, figure.high, 1),
+                "n_eff": number(cell.n_eff["stay"], 0) if cell.n_eff.get("stay", 0) > 0 else "",
                 "mean": percent(sum(shares) / len(shares), 3),
                 "start": f"{flow:g}{THIN}%, {degrees:g}{THIN}°C: {number(settled, 0)}{THIN}% settle",
             }

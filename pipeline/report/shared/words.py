@@ -28,7 +28,6 @@ INDEX = (
     "basis",
     "recorded_windows",
     "sticky",
-    "weak_actuator",
     "settles",
     "stays",
 )
@@ -107,8 +106,8 @@ FIXED = {
         "Data\u2011driven, model\u2011based",
         "Temperature: Algorithm 2’s learned kernel; subspace + LQG, designed from the identified model. "
         "Deposition: basis functions of a chain identified "
-        + "from trials; the paper’s law and its library; on\u2011off control. Setpoint: our agent; a "
-        "Bayes filter, whose model is given; the best proportional rule.",
+        + "from trials; the paper’s law and its library; on\u2011off control. Setpoint: the paper’s "
+        "agent; a Bayes filter.",
     ),
     "settling": (
         "Settling",
@@ -325,20 +324,10 @@ FIXED = {
         "Sequential test",
         "Adds up the evidence of windows until it suffices for a move, then begins anew.",
     ),
-    "proportional": (
-        "Proportional",
-        "Moves the flow by the difference between the shares of over and under, "
-        "as seen or smoothed over a few windows.",
-    ),
     "recorded_windows": (
         "Recorded windows",
         "Windows that the trained classifier really named, drawn again by the flow of the moment: "
         "its errors sit at the class borders and persist.",
-    ),
-    "weak_actuator": (
-        "Gain 0.6",
-        "The extruder moves only 0.6 of what it is told, as a worn or slipping drive does; "
-        "the controller is not told.",
     ),
     "segment": (
         "Segment",

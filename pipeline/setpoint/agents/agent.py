@@ -1,11 +1,9 @@
 """Deep Q-learning of setpoints as published (Li and Pattinson 2025, eqs. 10-13, tables 1 and 2): network,
 replay, one phase as one program, and the four phases.
 
-An `ObservationEncoder` makes the network's input, so that the paper's 35 numbers and the belief
-(belief_agent.py) train by the same lines. Two heads, one for the flow and one for the temperature, each with
-one maximum and a one-step target of its own; step 100 ends an episode without ending the task, so its target
-still looks ahead.
-"""
+An `ObservationEncoder` makes the network's input of the paper's 35 numbers. Two heads, one for the flow and
+one for the temperature, each with one maximum and a one-step target of its own; step 100 ends an episode
+without ending the task, so its target still looks ahead."""
 
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -186,12 +184,6 @@ class DqnProblem(NamedTuple):
 def dqn_target(network, target_network, after: jax.Array) -> jax.Array:
     """max_a Q(s', a; target network) of each head (11)."""
     return target_network(after).max(axis=1)
-
-
-def double_dqn_target(network, target_network, after: jax.Array) -> jax.Array:
-    """Q(s', argmax_a Q(s', a); target network): the network chooses, the target network values
-    (van Hasselt, Guez and Silver 2016)."""
-    return jnp.take_along_axis(target_network(after), network(after).argmax(axis=1)[:, None], axis=1)[:, 0]
 
 
 def _fresh(problem: DqnProblem, network, keys):
@@ -437,21 +429,9 @@ def _published(history: int) -> SetpointController:
     return greedy(paper_encoder(history))
 
 
-def _build_after_phase(number: int, agents: Any) -> tuple[SetpointController, QNetwork] | None:
-    """The agent of Li and Pattinson (2025) after so many of its phases; None if it was not trained so far."""
-    if number > len(agents.li_2025):
-        return None
-    network = agents.li_2025[number - 1]
+def build(
+    settings: Mapping[str, Any], agents: PublishedAgent, windows: Any
+) -> tuple[SetpointController, QNetwork]:
+    """The agent of Li and Pattinson (2025) after the last of its phases that was trained."""
+    network = agents.networks[-1]
     return _published(history_of(network)), network
-
-
-def build_after_phase_3(
-    settings: Mapping[str, Any], agents: Any, windows: Any
-) -> tuple[SetpointController, QNetwork] | None:
-    return _build_after_phase(3, agents)
-
-
-def build_after_phase_4(
-    settings: Mapping[str, Any], agents: Any, windows: Any
-) -> tuple[SetpointController, QNetwork] | None:
-    return _build_after_phase(4, agents)

@@ -1,9 +1,9 @@
-"""Controllers without learning, behind the interface of the agent: nothing, proportional, filtered
-proportional, and a sequential test (CUSUM) of the window's class.
+"""Controllers without learning, behind the interface of the agent: nothing, and a sequential test (CUSUM) of
+the window's class.
 
 The class depends on the flow alone, so nothing that the camera sees bears on the temperature: every
 controller here moves the target to 210 °C in the largest steps that lambda's clock allows, which the lag (6)
-then follows. The Bayes filters are in bayes.py.
+then follows. The Bayes filter is in flow_filter.py.
 """
 
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pipeline.setpoint.published import BEST_TEMPERATURE, FLOW_MOVES, TEMPERATURE_MOVES
+from pipeline.setpoint.published import BEST_TEMPERATURE, TEMPERATURE_MOVES
 from pipeline.setpoint.simulation.simulator import (
     CLASSES,
     GOOD,
@@ -47,30 +47,6 @@ def nothing() -> SetpointController:
         return memory, Action(jnp.int32(STAND), temperature_move(observation))
 
     return SetpointController(lambda: (), act)
-
-
-class Proportional(NamedTuple):
-    """gain: percent of flow by unit of p_0 - p_2; time_constant of the
-    filter in decisions, 1 is no memory."""
-
-    gain: float
-    time_constant: float
-
-
-@cache  # one pair of functions, so that what was compiled for it is found again
-def proportional() -> SetpointController:
-    """a_q nearest to gain y, y += (p_0 - p_2 - y) / time_constant: Proportional parameters. After a move the
-    filter forgets: what it saw was another flow."""
-
-    def act(
-        parameters: Proportional, y: jax.Array, observation: Observation, key: jax.Array
-    ) -> tuple[jax.Array, Action]:
-        y = y + (observation.shares[UNDER] - observation.shares[OVER] - y) / parameters.time_constant
-        move = nearest(FLOW_MOVES, parameters.gain * y)
-        remembered = jnp.where(move == STAND, y, y * (1.0 - 1.0 / parameters.time_constant))
-        return remembered, Action(move, temperature_move(observation))
-
-    return SetpointController(lambda: jnp.zeros(()), act)
 
 
 class SequentialTest(NamedTuple):
@@ -117,12 +93,6 @@ def build_no_control(
     settings: Mapping[str, float], agents: Any, windows: Any
 ) -> tuple[SetpointController, tuple]:
     return nothing(), ()
-
-
-def build_proportional(
-    settings: Mapping[str, float], agents: Any, windows: Any
-) -> tuple[SetpointController, Proportional]:
-    return proportional(), Proportional(**settings)
 
 
 def build_sequential_test(

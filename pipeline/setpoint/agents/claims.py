@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint.agents import agent, belief_agent, trials
+from pipeline.setpoint.agents import agent, trials
 from pipeline.setpoint.agents.score import RunScore
 from pipeline.setpoint.simulation.simulator import nominal, paper_windows, rollout
 
@@ -16,23 +16,19 @@ CLAIM_RUNS, RESTING = 100, 20
 
 
 def simulated_figures(
-    agents: Any, key: jax.Array, runs: int, history: int, flow_actions: int
+    networks: Sequence[agent.QNetwork], key: jax.Array, runs: int, history: int, flow_actions: int
 ) -> dict[str, dict[str, Any]]:
-    """Figures of the networks after three phases and after the last, and of the belief DQN, from the 21
-    starts, `runs` times each, with the class always right and right with probability 0.7."""
+    """Figures of the networks after three phases and after the last, from the 21 starts, `runs` times each,
+    with the class always right and right with probability 0.7."""
     right, noisy = (trials.starts(runs, accuracy=accuracy) for accuracy in (1.0, 0.7))
     published = agent.greedy(agent.paper_encoder(history))
-    on_belief = agent.greedy(belief_agent.belief_encoder(agents.belief))
-    cases = {"phase3": (agents.li_2025[2], right)}
-    if len(agents.li_2025) > 3:
-        cases |= {"phase4": (agents.li_2025[3], noisy), "phase4_at_1": (agents.li_2025[3], right)}
-    cases |= {"phase3_at_0.7": (agents.li_2025[2], noisy)}
+    cases = {"phase3": (networks[2], right)}
+    if len(networks) > 3:
+        cases |= {"phase4": (networks[3], noisy), "phase4_at_1": (networks[3], right)}
+    cases |= {"phase3_at_0.7": (networks[2], noisy)}
     simulated = {
         name: (published, network, starts._replace(flow_actions=flow_actions * jnp.ones_like(starts.flow)))
         for name, (network, starts) in cases.items()
-    } | {
-        "belief_dqn": (on_belief, agents.belief_dqn, right),
-        "belief_dqn_at_0.7": (on_belief, agents.belief_dqn, noisy),
     }
     return {
         name: _figures(trials.evaluate(controller, network, paper_windows(), conditions, key))

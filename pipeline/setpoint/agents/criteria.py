@@ -14,9 +14,6 @@ BACK_BAND = 15.0  # within which a half clogged nozzle shall be brought back
 
 
 def harm_bar(case: str, *, perfect: float, in_band: float) -> float | None:
-    """Percent of runs from good starts that may leave +-25 % in this case: with the camera right, stuck or
-    blind. None where nobody is barred: of a camera of another make, or with moved borders, no rule can know
-    better, and harm is only told."""
-    if case == "perfect":
-        return perfect
-    return in_band if case == "in band" or case.startswith(("in band, stuck", "in band, blind")) else None
+    """Percent of runs from good starts that may leave +-25 % in this case; None if nobody is barred: of a
+    camera of another scale no rule can know better, and harm is only told."""
+    return {"perfect": perfect, "in band": in_band}.get(case)

@@ -17,7 +17,7 @@ from pipeline.setpoint.agents.criteria import (
     TEMPERATURE_BAND,
 )
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
-from pipeline.statistics import Share, redrawn_share, wilson
+from pipeline.statistics import PooledShare, pooled_share, wilson
 
 # float32 sums of moves end a hair outside a border that they are on
 ROUNDING = 1e-3
@@ -27,11 +27,11 @@ class Outcomes(NamedTuple):
     """n runs, each (n,) unless said. flow and temperature at the start; entered: the step from which the run
     is inside 90-110 % and 210 +- 5 °C until 100, 101 where it is outside then.
 
-    settled: entered by 90; stay: settled, and never out from 100 to 200; recovered: inside from some step
-    <= 90 until 120, and recovery the step since CLOG_STEP; back: within +-15 % likewise; beyond (n, 3):
-    farther than BEYOND from 100 % at some step; overshoot: points of flow past 100 % on the far side of the
-    start, before step 60; flow_error: mean |q - 100 %| over steps 100 to 200.
-    """
+    settled: entered by 90; stay: settled, and never out from 100 to 200; recovered: inside from some step <=
+    90 until 120; recovery: decisions from CLOG_STEP until inside for good until 200, infinite if never; back:
+    within +-15 % likewise; beyond (n, 3): farther than BEYOND from 100 % at some step; overshoot: points of
+    flow past 100 % on the far side of the start, before step 60; flow_error: mean |q - 100 %| over steps 100
+    to 200."""
 
     flow: np.ndarray
     temperature: np.ndarray
@@ -51,21 +51,21 @@ class RunScore(NamedTuple):
 
     median_steps and p90_steps of the settled runs until they are inside for good (NaN where none settled);
     overshoot_p95, the 95th percentile; flow_error, the mean; worst_start names the start with the fewest
-    settled, with its percent; recovery_steps, the median of the recovered (NaN where there is none).
+    settled, with its percent; recovery_p95, the 95th percentile of all runs (NaN if fewer are ever back).
     """
 
     runs: int
-    settled: Share
-    stay: Share
-    recovered: Share
+    settled: PooledShare
+    stay: PooledShare
+    recovered: PooledShare
     median_steps: float
     p90_steps: float
     overshoot_p95: float
     flow_error: float
     worst_start: tuple[float, float, float]
-    back: Share
-    recovery_steps: float
-    beyond: tuple[Share, ...]
+    back: PooledShare
+    recovery_p95: float
+    beyond: tuple[PooledShare, ...]
 
 
 def judge(flow: np.ndarray, temperature: np.ndarray) -> RunScore:
@@ -88,7 +88,7 @@ def outcomes(flow: np.ndarray, temperature: np.ndarray) -> Outcomes:
     off = np.abs(flow - BEST_FLOW)
     warm = np.abs(temperature - BEST_TEMPERATURE) <= TEMPERATURE_BAND + ROUNDING
     inside = (off <= FLOW_BAND + ROUNDING) & warm
-    entered, recovery = _inside_since(inside, DWELL_UNTIL), _inside_since(inside, RECOVERED_UNTIL)
+    entered, home = _inside_since(inside, DWELL_UNTIL), _inside_since(inside, STEPS)
     settled = entered <= SETTLED_BY
     past = np.sign(BEST_FLOW - flow[:, :1]) * (flow[:, :CLOG_STEP] - BEST_FLOW)
     farthest = off[:, : STEPS + 1].max(axis=1)
@@ -98,8 +98,8 @@ def outcomes(flow: np.ndarray, temperature: np.ndarray) -> Outcomes:
         entered=entered,
         settled=settled,
         stay=settled & inside[:, DWELL_UNTIL : STEPS + 1].all(axis=1),
-        recovered=recovery <= SETTLED_BY,
-        recovery=recovery - CLOG_STEP,
+        recovered=_inside_since(inside, RECOVERED_UNTIL) <= SETTLED_BY,
+        recovery=np.where(home <= STEPS, np.maximum(home - CLOG_STEP, 0.0), np.inf),
         back=_inside_since((off <= BACK_BAND + ROUNDING) & warm, RECOVERED_UNTIL) <= SETTLED_BY,
         beyond=farthest[:, None] > np.array(BEYOND) + ROUNDING,
         overshoot=past.max(axis=1).clip(0),
@@ -107,15 +107,18 @@ def outcomes(flow: np.ndarray, temperature: np.ndarray) -> Outcomes:
     )
 
 
-def summary(of: Outcomes, *, redraws: int = 1, shared: float = 0.0) -> RunScore:
-    """The score of runs that are `redraws` equal blocks, one after the other, each on a redraw of segments
-    of its own, where a block's runs have the share `shared` of their variance in common
-    (`statistics.shared_variance`). With one redraw the runs share nothing, and the intervals are Wilson's."""
+def summary(of: Outcomes, *, pools: int | None = None) -> RunScore:
+    """The score of runs on so many pools of segments, pool by pool as many: intervals and what they are worth
+    by how the pools differ (`statistics.effective`). Without pools the runs share nothing, and the intervals
+    are Wilson's."""
 
-    def share(happened: np.ndarray) -> Share:
-        return wilson(happened) if redraws == 1 else redrawn_share(happened.reshape(redraws, -1), shared)
+    def share(happened: np.ndarray) -> PooledShare:
+        if pools is None:
+            return PooledShare(*wilson(happened), len(happened))
+        return pooled_share(happened.reshape(pools, -1))
 
     median, p90 = np.percentile(of.entered[of.settled], [50, 90]) if of.settled.any() else (np.nan, np.nan)
+    late = float(np.percentile(of.recovery, 95, method="higher"))
     return RunScore(
         runs=len(of.flow),
         settled=share(of.settled),
@@ -127,7 +130,7 @@ def summary(of: Outcomes, *, redraws: int = 1, shared: float = 0.0) -> RunScore:
         flow_error=float(of.flow_error.mean()),
         worst_start=_worst_start(of.flow, of.temperature, of.settled),
         back=share(of.back),
-        recovery_steps=float(np.median(of.recovery[of.recovered])) if of.recovered.any() else float("nan"),
+        recovery_p95=late if np.isfinite(late) else float("nan"),
         beyond=tuple(share(column) for column in of.beyond.T),
     )
 

@@ -1,23 +1,31 @@
-"""The contest as tables and figures: columns of schemas SCOREBOARD, PATHS and DECISIONS. `groups` has the
-group of each controller by name, which stands in column `kind`."""
+"""What was judged as tables and figures: columns of schemas SCOREBOARD, PATHS and DECISIONS."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.setpoint.agents.criteria import BEYOND, NO_CONTROL, STEPS
-from pipeline.setpoint.agents.score import RunScore
+from pipeline.setpoint.agents.criteria import BEYOND, STEPS
+from pipeline.setpoint.agents.score import RunScore, summary
+from pipeline.setpoint.agents.trials import START_FLOWS, START_TEMPERATURES, STARTS
+from pipeline.setpoint.controllers import KINDS
 from pipeline.setpoint.deployment import deployment, pixels
 from pipeline.setpoint.evaluation import judging
-from pipeline.setpoint.evaluation.contest import Contest
-from pipeline.setpoint.evaluation.judging import DefaultChoice
+from pipeline.setpoint.evaluation.judging import DefaultChoice, Runs
 from pipeline.setpoint.evaluation.pixel_rollouts import DWELL, PixelRollouts
 from pipeline.setpoint.simulation import actuation
-from pipeline.statistics import Share, wilson
+from pipeline.statistics import PooledShare, wilson
 
 # the cases of which runs of every controller are kept beside the deciding one, and so many decisions of them
-PATHS_OF, PATH_STEPS = ("accuracy 0.7", "recorded, fresh"), 100
+PATHS_OF, PATH_STEPS = ("accuracy 0.7", "recorded, sticky"), 100
+
+
+class Contest(NamedTuple):
+    """Every controller on the segments that are read once, by name: its scores by case, and of the cases that
+    count the first run from each start."""
+
+    scores: dict[str, dict[str, RunScore]]
+    paths: dict[str, dict[str, Runs]]
 
 
 def simulator(case: str) -> str:
@@ -27,21 +35,36 @@ def simulator(case: str) -> str:
     return "recorded" if case.startswith("recorded") else "paper"
 
 
-def scoreboard(groups: Mapping[str, str], contest: Contest, rollouts: PixelRollouts) -> dict[str, list]:
+def scores(judged: Mapping[str, judging.Judged], pools: int) -> dict[str, dict[str, RunScore]]:
+    """By name and case; on the paper's simulator runs share nothing."""
+    return {
+        name: {
+            case: summary(outcomes, pools=None if simulator(case) == "paper" else pools)
+            for case, outcomes in by_case.items()
+        }
+        for name, by_case in judged.items()
+    }
+
+
+def first_of_each(of: Runs) -> Runs:
+    """The first run (21, STEPS + 1) from each of the `starts`, on the first pool."""
+    shape = len(START_FLOWS), -1, len(START_TEMPERATURES), STEPS + 1
+    return Runs(*(a[0].reshape(shape)[:, 0].reshape(STARTS, STEPS + 1).copy() for a in of))
+
+
+def scoreboard(contest: Contest, rollouts: PixelRollouts) -> dict[str, list]:
     """Columns of schema SCOREBOARD."""
     rows = [
-        _score_row(name, groups[name], case, score, contest.redraws[name])
+        _score_row(name, case, score)
         for name, by_case in contest.scores.items()
         for case, score in by_case.items()
     ]
-    return _columns(
-        rows + [_pixel_row(name, groups[name], "calm", episodes) for name, episodes in rollouts.calm.items()]
-    )
+    return _columns(rows + [_pixel_row(name, "calm", episodes) for name, episodes in rollouts.calm.items()])
 
 
-def _score_row(name: str, kind: str, case: str, score: RunScore, redraws: int) -> dict[str, Any]:
+def _score_row(name: str, case: str, score: RunScore) -> dict[str, Any]:
     clogged = case.endswith("clog")
-    shares: dict[str, Share | None] = {
+    shares: dict[str, PooledShare | None] = {
         "settled": score.settled,
         "stay": score.stay,
         "recovered": score.recovered if clogged else None,
@@ -51,16 +74,15 @@ def _score_row(name: str, kind: str, case: str, score: RunScore, redraws: int) -
     shares |= {f"beyond_{points}": share for points, share in zip(BEYOND, harmed, strict=True)}
     return {
         "controller": name,
-        "kind": kind,
+        "kind": KINDS[name],
         "simulator": simulator(case),
         "case": case,
         "counts": judging.counts(case),
         "runs": score.runs,
-        "redraws": 1 if simulator(case) == "paper" else redraws,
         **{column: value for key, share in shares.items() for column, value in _ends(key, share).items()},
         "median_steps": score.median_steps,
         "p90_steps": score.p90_steps,
-        "recovery_steps": score.recovery_steps if clogged else np.nan,
+        "recovery_p95_steps": score.recovery_p95 if clogged else np.nan,
         "overshoot_p95_percent": score.overshoot_p95,
         "flow_error_percent": score.flow_error,
         "worst_start_flow_percent": score.worst_start[0],
@@ -69,40 +91,25 @@ def _score_row(name: str, kind: str, case: str, score: RunScore, redraws: int) -
     }
 
 
-def _ends(key: str, share: Share | None) -> dict[str, float]:
-    """The three columns of a share, missing where it is none."""
-    values = (np.nan,) * 3 if share is None else share
-    return dict(zip((f"{key}_percent", f"{key}_low_percent", f"{key}_high_percent"), values, strict=True))
+def _ends(key: str, share: PooledShare | None) -> dict[str, float]:
+    """The four columns of a share, missing where it is none."""
+    values = (np.nan,) * 4 if share is None else share
+    names = (f"{key}_percent", f"{key}_low_percent", f"{key}_high_percent", f"{key}_n_eff")
+    return dict(zip(names, values, strict=True))
 
 
 def _columns(rows: list[dict[str, Any]]) -> dict[str, list]:
     return {name: [row[name] for row in rows] for name in rows[0]}
 
 
-def compared(groups: Mapping[str, str], contest: Contest, choice: DefaultChoice) -> list[str]:
-    """Who is set beside the default in its worst case, in the contestants' order: doing nothing, the
-    strongest simple rule and the strongest agent of ours. The strongest keeps most in its own worst case;
-    who may not run gives way to who may."""
-    names = {choice.name, NO_CONTROL}
-    for kind in ("baseline", "agent"):
-        others = [name for name in contest.judged if groups[name] == kind and name not in names]
-        others.sort(key=lambda name: (name in choice.refused, -judging.worst_case(contest.judged[name])[0]))
-        names |= {*others[:1]}
-    return [name for name in contest.judged if name in names]
-
-
-def paths(
-    groups: Mapping[str, str], contest: Contest, choice: DefaultChoice, rollouts: PixelRollouts
-) -> dict[str, Any]:
-    """Columns of schema PATHS: one run from each of the 21 starts, of those judged. Of every controller
-    PATH_STEPS decisions of the cases PATHS_OF; of those that are compared STEPS of the choice's case, which
-    decides. And the runs through pixels."""
+def paths(contest: Contest, choice: DefaultChoice, rollouts: PixelRollouts) -> dict[str, Any]:
+    """Columns of schema PATHS: one run from each of the 21 starts, of those judged: PATH_STEPS decisions of
+    the cases PATHS_OF, STEPS of the choice's case, which decides. And the runs through pixels."""
     pieces = []
     for case in dict.fromkeys((*PATHS_OF, choice.case)):
-        names = contest.paths if case in PATHS_OF else compared(groups, contest, choice)
         last = STEPS if case == choice.case else PATH_STEPS
-        for name in names:
-            flow, temperature = (np.asarray(a[:, : last + 1], float) for a in contest.paths[name][case])
+        for name, kept in contest.paths.items():
+            flow, temperature = (np.asarray(a[:, : last + 1], float) for a in kept[case])
             pieces.append(((name, simulator(case), case), flow, temperature))
     for name, episodes in rollouts.calm.items():
         pieces.append(((name, "pixels", "calm"), episodes.flow, episodes.temperature))
@@ -119,11 +126,11 @@ def paths(
     }
 
 
-def _pixel_row(name: str, kind: str, case: str, episodes: pixels.Episodes) -> dict[str, Any]:
+def _pixel_row(name: str, case: str, episodes: pixels.Episodes) -> dict[str, Any]:
     """A row of schema SCOREBOARD: settled is inside to the end from at least DWELL decisions before it."""
     since, runs, last = pixels.settled_since(episodes), len(episodes.flow), episodes.flow.shape[1] - 1
     settled = since <= last - DWELL
-    share = wilson(settled)
+    share = PooledShare(*wilson(settled), len(settled))
     past = np.sign(100.0 - episodes.flow[:, :1]) * (episodes.flow - 100.0)
     starts = episodes.setpoint[:, 0]
     worst = starts[int(since.argmax())]
@@ -132,17 +139,16 @@ def _pixel_row(name: str, kind: str, case: str, episodes: pixels.Episodes) -> di
         nothing |= _ends(key, None)
     return {
         "controller": name,
-        "kind": kind,
+        "kind": KINDS[name],
         "simulator": "pixels",
         "case": case,
         "counts": False,
         "runs": runs,
-        "redraws": 1,
         **_ends("settled", share),
         **nothing,
         "median_steps": float(np.median(since[settled])) if settled.any() else np.nan,
         "p90_steps": float(np.percentile(since[settled], 90)) if settled.any() else np.nan,
-        "recovery_steps": np.nan,
+        "recovery_p95_steps": np.nan,
         "overshoot_p95_percent": float(np.percentile(past.max(axis=1).clip(0), 95)),
         "flow_error_percent": float(np.abs(episodes.flow[:, -DWELL:] - 100.0).mean()),
         "worst_start_flow_percent": float(worst[0]),
@@ -185,7 +191,7 @@ def decisions(name: str, rollouts: PixelRollouts) -> dict[str, list]:
 
 
 def metrics(
-    groups: Mapping[str, str], contest: Contest, choice: DefaultChoice, rollouts: PixelRollouts
+    contest: Contest, choice: DefaultChoice, pair: Mapping[str, Any], rollouts: PixelRollouts
 ) -> dict[str, Any]:
     """By controller, simulator and case; then the default, its cases and what it does to good prints."""
     figures: dict[str, Any] = {
@@ -198,7 +204,7 @@ def metrics(
         for name, by_case in contest.scores.items()
     }
     for name, episodes in rollouts.calm.items():
-        row = _pixel_row(name, groups[name], "calm", episodes)
+        row = _pixel_row(name, "calm", episodes)
         figures[name]["pixels"] = {
             "calm": {
                 "settled": row["settled_percent"],
@@ -212,9 +218,7 @@ def metrics(
         "default": choice.name,
         "worst": choice.worst,
         "case": choice.case,
-        "margin": _plain(choice.margin),
-        "margin_low": _plain(choice.margin_low),
-        "margin_high": _plain(choice.margin_high),
+        "pair": dict(pair),
         "sentence": choice.sentence,
         "cases": {case: _shares(case, score) for case, score in default.items() if judging.counts(case)},
         "harm": {case: _harm(score) for case, score in default.items() if not judging.counts(case)},
@@ -229,11 +233,12 @@ def _shares(case: str, score: RunScore) -> dict[str, float | int | None]:
         "stay": score.stay.percent,
         "low": score.stay.low,
         "high": score.stay.high,
+        "n_eff": score.stay.n,
     }
     if case.endswith("clog"):
         figures |= {
             "recovered": score.recovered.percent,
-            "recovery_steps": _plain(score.recovery_steps),
+            "recovery_p95_steps": _plain(score.recovery_p95),
             "back_within_15": score.back.percent,
         }
     return figures
@@ -260,13 +265,6 @@ def _figures(case: str, score: RunScore) -> dict[str, float | None]:
         "overshoot_p95": score.overshoot_p95,
         "clog_recovered": score.recovered.percent if case.endswith("clog") else None,
         "flow_error": score.flow_error,
-    }
-
-
-def choice_record(choice: DefaultChoice) -> dict[str, Any]:
-    """What choice.json holds: null where there is no figure, as of a margin where nothing else may run."""
-    return {
-        name: _plain(value) if isinstance(value, float) else value for name, value in choice._asdict().items()
     }
 
 
