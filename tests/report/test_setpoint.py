@@ -94,12 +94,6 @@ def test_what_may_be_claimed_stands_in_the_verdict_and_on_page_one(project):
     sections = params.read("params.yaml")
     sections["train_classifier"]["source"] = "recordings"
     Path("params.yaml").write_text(yaml.safe_dump(sections))
-    shared = "the folder has too few prints to keep them apart"
-    for apart in (True, False):
-        figures = artifacts.read_figures("train_classifier")
-        figures["data"]["windows_apart"] = apart
-        artifacts.write_metrics("train_classifier", figures)
-        assert (shared in page()) is not apart
     assert claim not in page() and "recordings of datasets/raw/setpoint, split by print" in Page(PAGE).text
 
 

@@ -392,7 +392,7 @@ def test_damaged_windows_are_refused_by_name(stored, capsys):
     assert f"{path} is not a whole Parquet file" in refusal("evaluate_setpoint", capsys)
     path.unlink()
     assert f"{path} is missing; make it again with ./run dvc repro train_classifier" in refusal(
-        "train_agent", capsys
+        "evaluate_setpoint", capsys
     )
 
 
