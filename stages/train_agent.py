@@ -46,7 +46,8 @@ class Learning(Section):
 
 class Li2025(Learning):
     """The agent of Li and Pattinson (2025): updates of its phases, exploration again from the second on,
-    accuracy of the last; classes of its history, eta, and flow actions to one of temperature, lambda."""
+    accuracy of the last and the share of the learning rate left at its end; classes of its history, eta, and
+    flow actions to one of temperature, lambda."""
 
     history: int = Field(ge=1, le=1000)
     flow_actions: int = Field(ge=1, le=50)
@@ -54,6 +55,7 @@ class Li2025(Learning):
     updates: list[Annotated[int, Field(ge=1, le=10_000_000)]] = Field(min_length=3, max_length=4)
     explore_again: float = Field(ge=0, le=1)
     accuracy: float = Field(gt=0.34, le=1)
+    rate_at_end: float = Field(gt=0, le=1)
 
 
 class Costs(Section):

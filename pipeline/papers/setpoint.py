@@ -9,11 +9,14 @@ delta, alpha nor sigma of its simulator: ours are in pipeline/setpoint/published
 
 import itertools
 import math
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
+import joblib
 import numpy as np
 
 from pipeline.papers import files
@@ -28,13 +31,17 @@ from pipeline.setpoint.simulation.simulator import (
     rollout,
 )
 from pipeline.setpoint.vision.vision_transformer import PAPER, parameters, vision_transformer
-from pipeline.store import params
+from pipeline.store import artifacts, params
 from stages import train_agent
-from stages.train_agent import TrainAgent
+from stages.train_agent import Li2025, TrainAgent
 
 COMMAND = "./run dvc repro datasets/papers/dvc.yaml:setpoint"
 MEMO = Path("datasets/memo/train_agent")
-RUNS, STEPS, SHOWN, RESTING, TRAINING_SEEDS = 100, 200, 100, 20, 5
+RUNS, STEPS, SHOWN, RESTING, TRAINING_SEEDS = 100, 200, 100, 20, 3
+# what the paper does not print of phase 4, searched: exploration as it begins, episodes at once, and the share
+# of the learning rate that is left at its end
+SEARCH = {"explore_again": (0.1, 0.3), "environments": (8, 32), "rate_at_end": (1.0, 0.05)}
+SEARCHED = "published phase 4 1"
 # start of the single runs: flow in percent, temperature in °C
 SINGLE = {
     "figure_3": (191.0, 213.3),
@@ -204,19 +211,87 @@ def rewards_of(agents: PhaseNetworks, episode: int) -> dict[str, Any]:
     return {"by_phase": phases, "updates": [len(part) for part in agents.rewards], **ends, **shape}
 
 
-def seeds(settings: TrainAgent, count: int = TRAINING_SEEDS) -> dict[str, Any]:
-    """Settled in percent at accuracy 0.7 after phase 4, by training seed 0, 1, ...; each judged from 21
-    starts, 100 runs a start."""
-    controller = agent.greedy(agent.paper_encoder(settings.li_2025.history))
-    conditions, settled = trials.starts(RUNS, accuracy=RHO), []
+class SearchedRun(NamedTuple):
+    """Phase 4 by one setting from one seed: its best checkpoint, as validation chose it, the updates before
+    it, and the shares in percent of fresh runs at accuracy RHO that settle, and that settle and stay, of it
+    and of the phase's end."""
+
+    network: agent.QNetwork
+    updates: int
+    settled: float
+    stay: float
+    settled_at_end: float
+    stay_at_end: float
+
+
+def searched_run(
+    own: Li2025, seed: int, third: Callable[[], tuple[agent.DqnState, jax.Array]]
+) -> SearchedRun:
+    """Phase 4 by these settings after the third phase of the seed; what the same code trained is in the memo."""
+    code = [artifacts.sha256(train_agent.LOOP / name) for name in train_agent.PUBLISHED_CODE]
+    entry = MEMO / f"phase_4_{joblib.hash((own.model_dump(), seed, code, jax.__version__))}.safetensors"
+    if entry.is_file():
+        arrays, told = artifacts.read_weights(entry, SEARCHED)
+        network = agent.with_weights(agent.untrained(agent.QNetwork, own.history), arrays)
+        return SearchedRun(
+            cast(agent.QNetwork, network), int(told["updates"]),
+            *(float(told[name]) for name in SearchedRun._fields[2:]),
+        )  # fmt: skip
+    (train_state, key), training = third(), train_agent.published_training(own)
+    result = agent.published_phase(train_state, key, training, len(PHASES))
+    best = agent.best_checkpoint(result, key, training)
+    controller = agent.greedy(agent.paper_encoder(own.history))
+    told = [
+        trials.evaluate(
+            controller,
+            network,
+            paper_windows(),
+            trials.starts(RUNS, accuracy=RHO),
+            jax.random.key(1000 + seed),
+        )
+        for network in (best.network, result.train_state.network)
+    ]
+    shares = [share.percent for one in told for share in (one.settled, one.stay)]
+    run = SearchedRun(best.network, best.after * own.updates[-1] // agent.CHECKPOINTS, *shares)
     MEMO.mkdir(parents=True, exist_ok=True)
-    for seed in range(count):
-        own = settings.model_copy(update={"seed": seed})
-        network = train_agent.published_agent(own, MEMO, lambda *_: None).networks[-1]
-        key = jax.random.key(1000 + seed)
-        score = trials.evaluate(controller, network, paper_windows(), conditions, key)
-        settled.append(round(score.settled.percent, 2))
-    return {"settled": settled, "least": min(settled), "most": max(settled), "seeds": len(settled)}
+    numbers = {name: repr(value) for name, value in run._asdict().items() if name != "network"}
+    artifacts.write_weights(entry, SEARCHED, agent.weights(run.network), numbers)
+    print(seed, own.explore_again, own.environments, own.rate_at_end, numbers, flush=True)
+    return run
+
+
+def search(settings: Li2025, first_seed: int) -> tuple[dict[str, Any], agent.QNetwork]:
+    """Phase 4 by every setting from every seed: figures, and the best network of the best setting, which is
+    the one whose seeds stay most on average."""
+
+    def third(seed: int) -> tuple[agent.DqnState, jax.Array]:
+        training = train_agent.published_training(settings)
+        train_state, key = agent.begin_published(jax.random.fold_in(jax.random.key(seed), 0), training)
+        for i in range(len(PHASES)):
+            train_state = agent.published_phase(train_state, key, training, i).train_state
+        return train_state, key
+
+    grid = [dict(zip(SEARCH, values, strict=True)) for values in itertools.product(*SEARCH.values())]
+    runs: list[list[SearchedRun]] = [[] for _ in grid]
+    for seed in range(first_seed, first_seed + TRAINING_SEEDS):
+        once = cache(lambda seed=seed: third(seed))
+        for changes, found in zip(grid, runs, strict=True):
+            found.append(searched_run(settings.model_copy(update=changes), seed, once))
+    best = max(range(len(grid)), key=lambda k: np.mean([run.stay for run in runs[k]]))
+    rows = [
+        changes | {name: [getattr(run, name) for run in found] for name in SearchedRun._fields[1:]}
+        for changes, found in zip(grid, runs, strict=True)
+    ]
+    network = max(runs[best], key=lambda run: run.stay).network
+    settled, stay = rows[best]["settled"], rows[best]["stay"]
+    ends = [at_end for row in rows for at_end in row["stay_at_end"]]
+    figures = {
+        "settings": len(grid), "seeds": TRAINING_SEEDS, "updates": settings.updates[-1], "rows": rows,
+        "best": grid[best], "settled": settled, "stay": stay, "settled_least": min(settled),
+        "settled_most": max(settled), "stay_least": min(stay), "stay_most": max(stay),
+        "stay_at_end_least": min(ends), "stay_at_end_most": max(ends),
+    }  # fmt: skip
+    return figures, network
 
 
 def table_2(settings: TrainAgent) -> dict[str, float]:

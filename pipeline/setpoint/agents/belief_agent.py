@@ -339,7 +339,7 @@ def train(
     problem = DqnProblem(encoder, env, optimiser, double_dqn_target, dqn)
     networks, validation, all_rewards = [network], [judge(network)], []
     for i in range(rounds):
-        train_state, mean_rewards = phase(
+        train_state, mean_rewards, _ = phase(
             train_state,
             jax.random.fold_in(key, i),
             problem,
