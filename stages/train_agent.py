@@ -22,34 +22,33 @@ MEMO = Path("datasets/memo/train_agent")
 POINTS = 50
 # the code that decides what the agent of Li and Pattinson (2025) comes to, which sees no recorded window
 LOOP = Path(__file__).parents[1] / "pipeline/setpoint"
-PUBLISHED_CODE = ("agents/agent.py", "simulation/simulator.py", "simulation/actuation.py", "published.py")
+PUBLISHED_CODE = (
+    "agents/agent.py", "agents/criteria.py", "agents/score.py", "agents/trials.py", "simulation/simulator.py",
+    "simulation/actuation.py", "published.py",
+)  # fmt: skip
 
 
-class Learning(Section):
-    """Deep Q-learning: environments stepped together, batch, transitions remembered, steps of an episode,
-    Adam's rate, discount, the target network's step, and how much is explored."""
+class Li2025(Section):
+    """The agent of Li and Pattinson (2025): environments stepped together, batch, transitions remembered,
+    steps of an episode, Adam's rate and the share of it left at the end of the last phase, discount, the
+    target network's step; of each phase its updates, and how much is explored as it begins and in the end;
+    accuracy of the last phase; classes of its history, eta, and flow actions to one of temperature, lambda.
+    """
 
     environments: int = Field(ge=1, le=100_000)
     batch: int = Field(ge=1, le=100_000)
     capacity: int = Field(ge=1000, le=10_000_000)
     episode: int = Field(ge=10, le=10_000)
     learning_rate: float = Field(gt=0, le=1)
+    rate_at_end: float = Field(gt=0, le=1)
     gamma: float = Field(ge=0, lt=1)
     tau: float = Field(gt=0, le=1)
-    explore: float = Field(ge=0, le=1)
+    updates: list[Annotated[int, Field(ge=1, le=10_000_000)]] = Field(min_length=3, max_length=4)
+    explore: list[Annotated[float, Field(ge=0, le=1)]] = Field(min_length=4, max_length=4)
     least: float = Field(ge=0, le=1)
-
-
-class Li2025(Learning):
-    """The agent of Li and Pattinson (2025): updates of its phases, exploration again from the second on,
-    accuracy of the last; classes of its history, eta, and flow actions to one of temperature, lambda."""
-
+    accuracy: float = Field(gt=0.34, le=1)
     history: int = Field(ge=1, le=1000)
     flow_actions: int = Field(ge=1, le=50)
-
-    updates: list[Annotated[int, Field(ge=1, le=10_000_000)]] = Field(min_length=3, max_length=4)
-    explore_again: float = Field(ge=0, le=1)
-    accuracy: float = Field(gt=0.34, le=1)
 
 
 class TrainAgent(Section):
@@ -118,7 +117,7 @@ def published_agent(
 # ---- settings as the methods take them
 
 
-def dqn_settings(settings: Learning) -> "agent.DqnSettings":
+def dqn_settings(settings: Li2025) -> "agent.DqnSettings":
     from pipeline.setpoint.agents import agent
 
     return agent.DqnSettings(**settings.model_dump(include={*agent.DqnSettings._fields}))
@@ -128,7 +127,7 @@ def published_training(settings: Li2025) -> "agent.PublishedTraining":
     from pipeline.setpoint.agents import agent
 
     numbers = settings.model_dump(include={*agent.PublishedTraining._fields})
-    numbers["updates"] = tuple(settings.updates)
+    numbers |= {"updates": tuple(settings.updates), "explore": tuple(settings.explore)}
     return agent.PublishedTraining(dqn=dqn_settings(settings), **numbers)
 
 
@@ -197,7 +196,7 @@ def guesses(settings: Li2025) -> dict[str, Any]:
         "updates_by_phase": settings.updates,
         "environments": settings.environments,
         "replay_capacity": settings.capacity,
-        "explore_by_phase": [settings.explore, *[settings.explore_again] * (len(settings.updates) - 1)],
+        "explore_by_phase": settings.explore[: len(settings.updates)],
         "explore_least": settings.least,
     }
 

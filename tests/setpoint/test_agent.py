@@ -33,7 +33,7 @@ from pipeline.setpoint.simulation.simulator import STAND, Observation, begin, no
 
 SMALL = DqnSettings(gamma=0.99, tau=0.005, batch=64, capacity=512, environments=8, episode=100)
 PUBLISHED = PublishedTraining(
-    dqn=SMALL, learning_rate=1e-4, updates=(20, 20), accuracy=0.7, explore=1.0, explore_again=0.3, least=0.05
+    dqn=SMALL, learning_rate=1e-4, updates=(20, 20), accuracy=0.7, explore=(1.0, 0.3, 0.3, 0.3), least=0.05
 )
 
 

@@ -12,6 +12,8 @@ from pipeline.setpoint.simulation.recorded import WindowTable, recorded_windows
 from pipeline.setpoint.simulation.simulator import (
     CHANCES,
     FLOW_MOVES,
+    GOOD,
+    OVER,
     TEMPERATURE_MOVES,
     Action,
     Observation,
@@ -339,10 +341,13 @@ def up_by(index, at):
     return moves
 
 
-def test_a_melt_lets_the_flow_follow_by_what_has_left_it():
-    """A move of 10 at the first decision, a wait of 3 s, half a window of 1 s: exp(-3.5 / melt_s) is left."""
-    run = played(up_by(4, 0), machine(100.0, 210.0, wait_s=3.0, melt_s=5.0))
-    np.testing.assert_allclose(run.flow[0, 1:5], 110 - 10 * np.exp(-3.5 / 5.0) ** np.arange(1, 5), rtol=1e-5)
+@pytest.mark.parametrize("wait_s, named", [(3.0, GOOD), (6.0, OVER)])
+def test_a_picture_that_comes_early_shows_the_line_of_before_the_move(wait_s, named):
+    """A move from 105 to 115 %: after 3.5 s half of what a picture shows was laid since, 110 %; after 6.5 s
+    all but a tenth."""
+    run = played(up_by(4, 0), machine(105.0, 210.0, wait_s=wait_s, view_s=7.0))
+    np.testing.assert_allclose(run.flow[0, 1:5], 115.0)
+    assert run.named[0, 1] == named and run.named[0, 2] == OVER
 
 
 def test_a_gain_that_drifts_moves_by_what_it_is_then_and_keeps_to_its_limits():

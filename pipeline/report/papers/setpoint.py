@@ -21,8 +21,11 @@ def pictures(results: Mapping[str, Any], sources: Sources) -> list[PaperFigure]:
     agents, settings = results["agents"], results["settings"]
     right = f"class right in {number(settings['right_percent'], 0)} %"
     six, three = (number(wait, 0) for wait in sorted(settings["waits_s"], reverse=True))
-    melt = number(settings["melt_s"], 0)
-    waits = f"Solid: {six} s. Dashed: {three} s. Simulated, with a melt that follows in {melt} s."
+    view = number(settings["view_s"], 0)
+    waits = (
+        f"Solid: {six} s. Dashed: {three} s. Simulated: {view} s after a move the picture shows only what "
+        "was laid since."
+    )
     example = agents["phase_3"]["figure_3_100"]["run"]
     return [
         PaperFigure("Figure 3 (b)", f"A run from {_start(settings, 'figure_3')}", _setpoints(example)),
@@ -165,7 +168,7 @@ def _ellipses(results: Mapping[str, Any]) -> Markup:
 
 
 def _waits(of: Mapping[str, Any]) -> Markup:
-    six, three = of["wait_6_melt_4"], of["wait_3_melt_4"]
+    six, three = of["wait_6_view_6"], of["wait_3_view_6"]
     steps = range(len(six["flow"]))
     return plot(
         [PaperCurve(steps, three["flow"], "line dash"), PaperCurve(steps, six["flow"], "line")],

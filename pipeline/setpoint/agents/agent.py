@@ -16,6 +16,7 @@ import numpy as np
 import optax
 from jax.tree_util import Partial
 
+from pipeline.setpoint.agents import trials
 from pipeline.setpoint.published import BEST_TEMPERATURE, LAMBDA, PHASES
 from pipeline.setpoint.simulation.simulator import (
     CHANCES,
@@ -44,6 +45,8 @@ ACTIONS = 5  # of each head
 # rows that one product sums: the linear algebra under XLA cuts longer sums by the size of the CPU's first
 # cache (288 numbers in 32 kB)
 SHORT = 256
+VALIDATION_RUNS = 20  # from each of the 21 starts, to choose a checkpoint by
+CHECKPOINTS = 16  # of a phase: the network after each of so many equal parts
 TEMPERATURE_SCALE = 30.0  # °C, half the range of the targets: degrees as they come drown the camera's numbers
 
 
@@ -255,6 +258,15 @@ def _mean_gradient(loss: Callable, network, *batch: jax.Array):
     return jax.tree.map(lambda *g: sum(g) / parts, *(jax.grad(loss)(network, *rows) for rows in slices))
 
 
+class PhaseResult(NamedTuple):
+    """The train state after a phase, the mean reward of each step (updates,), and the network after each
+    CHECKPOINTS-th of the phase, leaves (CHECKPOINTS, ...)."""
+
+    train_state: DqnState
+    rewards: jax.Array
+    checkpoints: Any
+
+
 def phase(
     train_state: DqnState,
     key: jax.Array,
@@ -263,18 +275,17 @@ def phase(
     updates: int,
     longest: int,
     epsilon: tuple[float, float],
-) -> tuple[DqnState, jax.Array]:
-    """A whole phase as one program -> the train state after it and the mean reward of each step (updates,);
-    epsilon falls in a line over the first third.
+) -> PhaseResult:
+    """A whole phase as one program; epsilon falls in a line over the first third.
 
     A step of all episodes, one batch from an empty replay buffer, one update, `updates` times. Episodes start
     at different steps, so that they do not end together. Phases with the same `longest`, the updates of the
     longest of them, are one program compiled once.
     """
-    train_state, rewards = _phase(
+    train_state, rewards, checkpoints = _phase(
         train_state, key, problem, jnp.asarray(updates), jnp.asarray(epsilon), longest=longest
     )
-    return train_state, rewards[:updates]
+    return PhaseResult(train_state, rewards[:updates], checkpoints)
 
 
 @eqx.filter_jit
@@ -301,18 +312,25 @@ def _phase(train_state: DqnState, key, problem: DqnProblem, updates, epsilon, *,
         train_state = _updated(train_state, _unpacked(replay_buffer[chosen]), problem)
         return train_state, episodes, replay_buffer, rewards.at[i].set(new.reward.mean())
 
+    def part(carry, k):
+        carry = jax.lax.fori_loop(k * updates // CHECKPOINTS, (k + 1) * updates // CHECKPOINTS, one, carry)
+        return carry, carry[0].network
+
     replay_buffer = jnp.zeros((capacity, 2 * x.shape[1] + 5))
-    train_state, _, _, rewards = jax.lax.fori_loop(
-        0, updates, one, (train_state, (conditions, state, memory, x), replay_buffer, jnp.zeros(longest))
+    (train_state, _, _, rewards), checkpoints = jax.lax.scan(
+        part,
+        (train_state, (conditions, state, memory, x), replay_buffer, jnp.zeros(longest)),
+        jnp.arange(CHECKPOINTS),
     )
-    return train_state, rewards
+    return train_state, rewards, checkpoints
 
 
 # ---- the paper's four phases
 
 
 class PublishedAgent(NamedTuple):
-    """Networks after phases 1 to 4, and the mean reward of each step of each phase."""
+    """Networks after phases 1 to 4, of the fourth the best checkpoint, and the mean reward of each step of
+    each phase."""
 
     networks: tuple[QNetwork, ...]
     rewards: tuple[jax.Array, ...]
@@ -336,51 +354,103 @@ def anywhere(accuracy, key: jax.Array, *, flow_actions=LAMBDA) -> EpisodeConditi
 class PublishedTraining(NamedTuple):
     """`updates` of each phase, as many phases as there are numbers; accuracy of the windows in the last one.
 
-    Epsilon falls to `least`: from `explore` in phase 1, from `explore_again` in the later ones. history is
-    eta of (8), flow_actions is lambda, table 2.
+    Epsilon falls from `explore` of each phase to `least`. history is eta of (8), flow_actions is lambda,
+    table 2. The learning rate of phase 4 falls in a line to the share `rate_at_end`, 1 if it does not fall.
     """
 
     dqn: DqnSettings
     learning_rate: float
     updates: tuple[int, ...]
     accuracy: float
-    explore: float
-    explore_again: float
+    explore: tuple[float, ...]
     least: float
+    rate_at_end: float = 1.0
     history: int = HISTORY
     flow_actions: int = LAMBDA
 
 
 def train_published(key: jax.Array, settings: PublishedTraining, *, on_step=None) -> PublishedAgent:
     """The four phases: reward shapes (40, 20), (40, 10), (20, 10) on windows that are always right, then the
-    last shape with `accuracy`; Adam at one rate throughout.
+    last shape with `accuracy`; Adam. Of the fourth phase the best checkpoint is kept.
 
     on_step(phase, network, rewards) is called after each phase.
     """
-    k_network, key = jax.random.split(key)
-    network, optimiser = QNetwork(k_network, settings.history), optax.adam(settings.learning_rate)
-    encoder, windows = paper_encoder(settings.history), paper_windows()
-    clock = jnp.float32(settings.flow_actions)
-    train_state = DqnState(network, network, optimiser.init(eqx.filter(network, eqx.is_array)))
+    train_state, key = begin_published(key, settings)
     networks, all_rewards = [], []
-    for i, count in enumerate(settings.updates):
-        a, b = PHASES[min(i, len(PHASES) - 1)]
-        right = 1.0 if i < len(PHASES) else settings.accuracy
-        start = Partial(anywhere, jnp.asarray(right), flow_actions=clock)
-        env = EnvSpec(windows, start, Partial(ellipse, jnp.asarray(a), jnp.asarray(b)))
-        train_state, rewards = phase(
-            train_state,
-            jax.random.fold_in(key, i),
-            DqnProblem(encoder, env, optimiser, dqn_target, settings.dqn),
-            updates=count,
-            longest=max(settings.updates),
-            epsilon=(settings.explore if i == 0 else settings.explore_again, settings.least),
-        )
-        networks.append(train_state.network)
-        all_rewards.append(rewards)
+    for i in range(len(settings.updates)):
+        result = published_phase(train_state, key, settings, i)
+        train_state = result.train_state
+        network = train_state.network if i < len(PHASES) else best_checkpoint(result, key, settings).network
+        networks.append(network)
+        all_rewards.append(result.rewards)
         if on_step is not None:
-            on_step(i + 1, train_state.network, rewards)
+            on_step(i + 1, network, result.rewards)
     return PublishedAgent(tuple(networks), tuple(all_rewards))
+
+
+def begin_published(key: jax.Array, settings: PublishedTraining) -> tuple[DqnState, jax.Array]:
+    """The train state before phase 1, and the key of all phases."""
+    k_network, key = jax.random.split(key)
+    network = QNetwork(k_network, settings.history)
+    moments = _adam(settings.learning_rate).init(eqx.filter(network, eqx.is_array))
+    return DqnState(network, network, moments), key
+
+
+@cache  # one for phases alike, so that what was compiled for them is found again
+def _adam(
+    rate: float, at_end: float = 1.0, updates: int = 1, before: int = 0
+) -> optax.GradientTransformation:
+    """Adam at a rate that falls in a line to the share at_end within so many updates after those before."""
+    return optax.adam(optax.linear_schedule(rate, rate * at_end, updates, before))
+
+
+def published_phase(
+    train_state: DqnState, key: jax.Array, settings: PublishedTraining, i: int
+) -> PhaseResult:
+    """Phase i + 1 from what the one before left."""
+    a, b = PHASES[min(i, len(PHASES) - 1)]
+    last = i == len(PHASES)
+    right, before = settings.accuracy if last else 1.0, sum(settings.updates[:i])
+    start = Partial(anywhere, jnp.asarray(right), flow_actions=jnp.float32(settings.flow_actions))
+    env = EnvSpec(paper_windows(), start, Partial(ellipse, jnp.asarray(a), jnp.asarray(b)))
+    falls = (settings.rate_at_end, settings.updates[i], before) if last else ()
+    return phase(
+        train_state,
+        jax.random.fold_in(key, i),
+        DqnProblem(
+            paper_encoder(settings.history),
+            env,
+            _adam(settings.learning_rate, *falls),
+            dqn_target,
+            settings.dqn,
+        ),
+        updates=settings.updates[i],
+        longest=max(settings.updates),
+        epsilon=(settings.explore[i], settings.least),
+    )
+
+
+class Checkpoint(NamedTuple):
+    """A network in the middle of a phase, after so many of its CHECKPOINTS, and the shares in percent of
+    validation runs from the 21 starts that settle, and that settle and stay."""
+
+    network: QNetwork
+    after: int
+    settled: float
+    stay: float
+
+
+def best_checkpoint(result: PhaseResult, key: jax.Array, settings: PublishedTraining) -> Checkpoint:
+    """Of a phase's checkpoints the one of which most validation runs stay; of equal ones the last."""
+    conditions = trials.starts(VALIDATION_RUNS, accuracy=settings.accuracy)
+    conditions = conditions._replace(flow_actions=settings.flow_actions * jnp.ones_like(conditions.flow))
+    controller, key = greedy(paper_encoder(settings.history)), jax.random.fold_in(key, 100)
+    found = []
+    for k in range(CHECKPOINTS):
+        network = jax.tree.map(lambda leaf, k=k: leaf[k], result.checkpoints)
+        told = trials.evaluate(controller, network, paper_windows(), conditions, key)
+        found.append(Checkpoint(network, k + 1, told.settled.percent, told.stay.percent))
+    return max(found, key=lambda one: (one.stay, one.settled, one.after))
 
 
 # ---- weights by name

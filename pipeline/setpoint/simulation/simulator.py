@@ -9,7 +9,7 @@ One decision is one window of frames. At step t the controller sees an
     u_hat <- u_hat + (u_bar - u_hat) / delta
 
 What may be sent, how long to wait and when to hold is `actuation`'s, as in the loop through pixels. The
-commanded flow acts at once, or as fast as the melt lets it, and the class depends on the true flow q alone.
+commanded flow acts at once, and the class depends alone on the true flow q of what the picture shows.
 What a window shows for a flow comes from a `Windows`: `paper_windows()` here, or windows recorded from a
 trained classifier (`recorded.recorded_windows`). Flow is in percent of nominal, temperature in °C.
 """
@@ -103,7 +103,8 @@ class EpisodeConditions(NamedTuple):
     factor on the flow from clog_step on, 1 is none; drift: relative change of the flow at each step;
     jump_rate: probability a step that the flow is multiplied by exp(jump_size N(0, 1)).
 
-    As deployed: wait_s after every action; melt_s: time constant with which the flow follows, 0 is at once;
+    As deployed: wait_s after every action; view_s: time after a move until all that a picture shows was laid
+    since, 0 is at once;
     gain_drift: relative change of the gain at each step, within GAIN_LIMITS; clog_rate: probability a step
     that a clog comes, and goes again with CLOG_GOES; seen: factor on the flow that the camera reads, against
     its record; the camera repeats its window for stuck_for decisions from stuck_from on, and shows nothing
@@ -121,7 +122,7 @@ class EpisodeConditions(NamedTuple):
     jump_rate: jax.Array
     jump_size: jax.Array
     wait_s: jax.Array
-    melt_s: jax.Array
+    view_s: jax.Array
     gain_drift: jax.Array
     clog_rate: jax.Array
     seen: jax.Array
@@ -263,7 +264,7 @@ def _begun(
         step=none,
         acted=none,
     )
-    state = _watched(windows, conditions, state, u[:3])
+    state = _watched(windows, conditions, state, flow, u[:3])
     return state, _observation(state)
 
 
@@ -280,8 +281,9 @@ def stepped(
     t = state.step + 1
     blockage, clogged = _blocked(conditions, state, t, u)
     reached = blockage * sent.value[0]
-    # the window's middle is what it shows of a melt on its way
-    late = jnp.exp(-(wait_s + WINDOW_S / 2) / jnp.maximum(conditions.melt_s, 1e-3))
+    # of what the window's middle shows, the share that was laid before the move
+    before = jnp.clip(1.0 - (wait_s + WINDOW_S / 2) / jnp.maximum(conditions.view_s, 1e-3), 0.0, 1.0)
+    seen = reached + (state.flow - reached) * before
     saw = actuation.is_evidence(state.reason)
     state = state._replace(
         sent=sent,
@@ -292,7 +294,7 @@ def stepped(
         ),
         blockage=blockage,
         clogged=clogged,
-        flow=reached + (state.flow - reached) * late,
+        flow=reached,
         flow_move=executed + jnp.where(saw, 0.0, state.flow_move),
         temperature=state.temperature + (sent.value[1] - state.temperature) / DELTA,  # (6)
         segment=jnp.where(u[5] * conditions.persistence < 1.0, u[6], state.segment),
@@ -300,7 +302,7 @@ def stepped(
         step=t,
         acted=state.acted + (state.reason == ACTS),
     )
-    state = _watched(windows, conditions, state, u[:3])
+    state = _watched(windows, conditions, state, seen, u[:3])
     return state, _observation(state)
 
 
@@ -346,10 +348,10 @@ def _blocked(
 
 
 def _watched(
-    windows: WindowSource, conditions: EpisodeConditions, state: MachineState, u: jax.Array
+    windows: WindowSource, conditions: EpisodeConditions, state: MachineState, flow: jax.Array, u: jax.Array
 ) -> MachineState:
-    """The state with the window that the camera shows now, and whether that holds."""
-    fresh = windows.draw(windows.table, conditions, conditions.seen * state.flow, state.segment, u)
+    """The state with the window that the camera shows of this flow, and whether that holds."""
+    fresh = windows.draw(windows.table, conditions, conditions.seen * flow, state.segment, u)
     stuck = _lasts(state.step, conditions.stuck_from, conditions.stuck_for)
     shown = jax.tree.map(lambda new, old: jnp.where(stuck, old, new), fresh, state.shown)
     blind = _lasts(state.step, conditions.blind_from, conditions.blind_for)
