@@ -45,7 +45,7 @@ LOOPS = {
         "**[Setpoint](docs/explanation/setpoint.md)**: flow and nozzle temperature",
         "images of a nozzle camera",
         "setpoint decisions, shown live and not sent",
-        "simple rules, Bayes filters, DQN agents",
+        "sequential test, Bayes filter, DQN agent",
     ),
 }
 
