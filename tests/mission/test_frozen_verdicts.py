@@ -29,6 +29,8 @@ DRAWS = 100
 NOT_MADE = Missing("not measured", "nothing ran")
 # of a table's columns: shares of runs, which stay between 0 and 100
 PERCENT = "percent"
+# of a study that could pass: the frames that its classifier names rightly
+SEES_WELL = {"image_accuracy": 0.85}
 
 
 class Tables(dict):
@@ -62,6 +64,8 @@ def draw(inputs: Mapping[str, Any], seed: int) -> dict[str, Any]:
         hard = float(rng.choice((0.0, 0.0, 0.0, 2.0, 4.0)))
         metrics["evaluate_temperature"] = scale(metrics["evaluate_temperature"], rng, 0.0, 0.0, by=hard)
     favourable = bool(rng.uniform() < 0.4)
+    if favourable and "train_classifier" in metrics:
+        metrics["train_classifier"] |= SEES_WELL
     tables = lose(improve(inputs["tables"]) if favourable else inputs["tables"])
     tables = {
         name: scale_table(table, rng, deviation) if name in inputs["columns"] else table

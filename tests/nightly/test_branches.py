@@ -795,10 +795,7 @@ def depending_on(place: str) -> set[str]:
             "certify verdict export_controllers report",
         ),
         ("deposition", "train_ilc segment_library compose_parts verdict export_controllers report"),
-        (
-            "setpoint",
-            "train_classifier train_agent evaluate_setpoint certify verdict export_controllers report",
-        ),
+        ("setpoint", "train_classifier evaluate_setpoint certify verdict export_controllers report"),
     ],
 )
 def test_a_new_recording_reruns_the_stages_of_its_own_loop_and_the_pages(loop, stages):
