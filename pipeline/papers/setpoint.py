@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -233,11 +233,10 @@ def rewards_of(agents: PhaseNetworks, episode: int) -> dict[str, Any]:
 
 
 class SearchedRun(NamedTuple):
-    """Phase 4 by one setting from one seed: its best checkpoint, as validation chose it, the updates before
-    it, and the shares in percent of fresh runs at accuracy RHO that settle, and that settle and stay, of it
-    and of the phase's end."""
+    """Phase 4 by one setting from one seed: the updates before its best checkpoint, as validation chose it,
+    and the shares in percent of fresh runs at accuracy RHO that settle, and that settle and stay, of it and
+    of the phase's end."""
 
-    network: agent.QNetwork
     updates: int
     settled: float
     stay: float
@@ -253,12 +252,8 @@ def searched_run(
     code = [artifacts.sha256(train_agent.LOOP / name) for name in train_agent.PUBLISHED_CODE]
     entry = MEMO / f"phase_4_{joblib.hash((own.model_dump(), seed, code, jax.__version__))}.safetensors"
     if entry.is_file():
-        arrays, told = artifacts.read_weights(entry, SEARCHED)
-        network = agent.with_weights(agent.untrained(agent.QNetwork, own.history), arrays)
-        return SearchedRun(
-            cast(agent.QNetwork, network), int(told["updates"]),
-            *(float(told[name]) for name in SearchedRun._fields[2:]),
-        )  # fmt: skip
+        _, told = artifacts.read_weights(entry, SEARCHED)
+        return SearchedRun(int(told["updates"]), *(float(told[name]) for name in SearchedRun._fields[1:]))
     (train_state, key), training = third(), train_agent.published_training(own)
     result = agent.published_phase(train_state, key, training, len(PHASES))
     best = agent.best_checkpoint(result, key, training)
@@ -274,17 +269,17 @@ def searched_run(
         for network in (best.network, result.train_state.network)
     ]
     shares = [share.percent for one in told for share in (one.settled, one.stay)]
-    run = SearchedRun(best.network, best.after * own.updates[-1] // agent.CHECKPOINTS, *shares)
+    run = SearchedRun(best.after * own.updates[-1] // agent.CHECKPOINTS, *shares)
     MEMO.mkdir(parents=True, exist_ok=True)
-    numbers = {name: repr(value) for name, value in run._asdict().items() if name != "network"}
-    artifacts.write_weights(entry, SEARCHED, agent.weights(run.network), numbers)
+    numbers = {name: repr(value) for name, value in run._asdict().items()}
+    artifacts.write_weights(entry, SEARCHED, agent.weights(best.network), numbers)
     print(seed, own.explore[-1], own.environments, own.rate_at_end, numbers, flush=True)
     return run
 
 
-def search(settings: Li2025, first_seed: int) -> tuple[dict[str, Any], agent.QNetwork]:
-    """Phase 4 by every setting from every seed: figures, and the best network of the best setting, which is
-    the one whose seeds stay most on average."""
+def search(settings: Li2025, first_seed: int) -> dict[str, Any]:
+    """Phase 4 by every setting from every seed, and the best setting: the one whose seeds stay most on
+    average."""
 
     def third(seed: int) -> tuple[agent.DqnState, jax.Array]:
         training = train_agent.published_training(settings)
@@ -301,19 +296,17 @@ def search(settings: Li2025, first_seed: int) -> tuple[dict[str, Any], agent.QNe
             found.append(searched_run(settings.model_copy(update=changes), seed, once))
     best = max(range(len(grid)), key=lambda k: np.mean([run.stay for run in runs[k]]))
     rows: list[dict[str, Any]] = [
-        changes | {name: [getattr(run, name) for run in found] for name in SearchedRun._fields[1:]}
+        changes | {name: [getattr(run, name) for run in found] for name in SearchedRun._fields}
         for changes, found in zip(grid, runs, strict=True)
     ]
-    network = max(runs[best], key=lambda run: run.stay).network
     settled, stay = rows[best]["settled"], rows[best]["stay"]
     ends = [at_end for row in rows for at_end in row["stay_at_end"]]
-    figures = {
+    return {
         "settings": len(grid), "seeds": TRAINING_SEEDS, "updates": settings.updates[-1], "rows": rows,
         "best": grid[best], "settled": settled, "stay": stay, "settled_least": min(settled),
         "settled_most": max(settled), "stay_least": min(stay), "stay_most": max(stay),
         "stay_at_end_least": min(ends), "stay_at_end_most": max(ends),
     }  # fmt: skip
-    return figures, network
 
 
 def table_2(settings: TrainAgent) -> dict[str, float]:
@@ -382,11 +375,10 @@ def main() -> None:
             name, {place: round(of["settled"], 1) for place, of in row.items() if "settled" in of}, flush=True
         )
     starts_of = result["agents"]["phase_4"]
-    found, _ = search(settings.li_2025, settings.seed)
     result |= {
         "reward": reward_figures(),
         "learning": rewards_of(agents, settings.li_2025.episode),
-        "search": found,
+        "search": search(settings.li_2025, settings.seed),
         "waiting_helps": waiting_helps(starts_of["waits"]),
         "measured": starts_of[f"starts_{100 * measured():.0f}"],
         "parameters": sizes(agents),

@@ -1,5 +1,8 @@
 """The paper's network and learning rule, and its phases as one program."""
 
+from types import SimpleNamespace
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,11 +10,14 @@ import optax
 import pytest
 from jax.tree_util import Partial
 
+from pipeline.setpoint.agents import trials
 from pipeline.setpoint.agents.agent import (
+    CHECKPOINTS,
     DqnProblem,
     DqnSettings,
     DqnState,
     EnvSpec,
+    PhaseResult,
     PublishedTraining,
     QNetwork,
     ReplayRows,
@@ -20,6 +26,7 @@ from pipeline.setpoint.agents.agent import (
     _unpacked,
     _updated,
     anywhere,
+    best_checkpoint,
     dqn_target,
     ellipse,
     paper_encoder,
@@ -134,6 +141,25 @@ def test_transitions_survive_the_replay_buffer():
     for before, after in zip(rows, _unpacked(_packed(rows)), strict=True):
         assert before.dtype == after.dtype
         np.testing.assert_array_equal(before, after)
+
+
+def test_the_checkpoint_is_kept_whose_runs_stay_most_and_of_equal_ones_the_last(monkeypatch):
+    stays = np.zeros(CHECKPOINTS)
+    stays[[3, 9]] = 80.0
+    network = QNetwork(jax.random.key(0))
+    checkpoints = jax.tree.map(lambda leaf: jnp.stack([leaf] * CHECKPOINTS), network)
+    checkpoints = eqx.tree_at(
+        lambda of: of.heads.bias, checkpoints, jnp.arange(CHECKPOINTS)[:, None] * jnp.ones(10)
+    )
+
+    def evaluate(controller, network, windows, conditions, key):
+        stay = float(stays[int(network.heads.bias[0])])
+        return SimpleNamespace(settled=SimpleNamespace(percent=90.0), stay=SimpleNamespace(percent=stay))
+
+    monkeypatch.setattr(trials, "evaluate", evaluate)
+    result = PhaseResult(None, jnp.zeros(1), checkpoints)
+    best = best_checkpoint(result, jax.random.key(1), PUBLISHED)
+    assert (best.after, best.stay, float(best.network.heads.bias[0])) == (10, 80.0, 9.0)
 
 
 @pytest.mark.slow
