@@ -296,8 +296,9 @@ MAY_BE_LOST, LEAST_RUNS = 5.7, 190.0
 
 
 def threshold(figure: Figure, n_eff: float, limit: float, *, at_least: bool) -> tuple[Figure, dict[str, Any]]:
-    """The figure as a rule reads it, one threshold on the estimate, the limit itself, and words: decided if it
-    is worth enough runs, else open to both sides. 97 % takes 190 runs, harm of at most 1 % 570."""
+    """The figure as a rule reads it, and words: one threshold on the estimate, which is the limit itself.
+    Decided if it is worth enough runs, else open to both sides: 97 % takes 190 runs, harm of at most 1 % 570.
+    """
     lost = 100 - limit if at_least else limit
     needed = max(LEAST_RUNS, 100 * MAY_BE_LOST / lost) if lost else math.inf
     words = {"text": share_text(figure), "limit": limit, "n_eff": n_eff, "needed": needed}

@@ -36,7 +36,8 @@ from pipeline.setpoint.simulation.simulator import (
 SPACING = 2.5  # percent: half the smallest move
 GRID = np.arange(FLOW_LIMITS[0], FLOW_LIMITS[1] + SPACING / 2, SPACING)  # (N,)
 ANYWHERE = 1 / GRID / np.sum(1 / GRID)  # errors of extrusion are ratios: 50 % is as likely as 200 %
-OUTLIERS, FAR_OFF = 0.01, 5.0  # share of the windows that may show any flow of the grid; deviations of one
+OUTLIERS = 0.01  # share of the windows that may show any flow of the grid
+FAR_OFF = 5.0  # deviations from its segment's median by which a window of the table is one of these
 TAIL, FARTHEST = 4.0, 4.0  # Student's degrees of freedom; deviations up to which a segment misreads
 CLOGS, SURELY = (0.4, 1.05), 0.9  # factors on the flow at a jump, in this share of the jumps; else anywhere
 NOISE_WIDTH = 0.12  # of log flow, one deviation: over which a window's noise is smooth
@@ -145,8 +146,9 @@ def fit(
     table: WindowTable, *, biases: int, known_start_share: float, known_start_std: float, **declared: Any
 ) -> FlowFilter:
     """The filter of a camera: shown, noise and bias by the errors of the table's windows and segments
-    (maximum likelihood of a one-way layout, outliers left out); the rest as declared. At the start the machine prints as
-    commanded with known_start_share, log flow ~ N(log 100 %, known_start_std^2); else anything."""
+    (maximum likelihood of a one-way layout, outliers left out); the rest as declared. At the start the
+    machine prints as commanded with known_start_share, log flow ~ N(log 100 %, known_start_std^2); else
+    anything."""
     log_grid = np.log(GRID / BEST_FLOW)
     shown, noise, bias_std = log_grid, np.full(len(GRID), UNKNOWN_NOISE), UNKNOWN_BIAS
     if with_flows(table):

@@ -14,7 +14,7 @@ import scipy.optimize
 import scipy.special
 import scipy.stats
 
-from pipeline.setpoint.frames.familiar import medians
+from pipeline.setpoint.frames.familiar import medians, windows
 from pipeline.setpoint.simulation.recorded import WindowTable
 from pipeline.setpoint.vision.classifier import ClassifierPrediction, Labelled
 from pipeline.setpoint.vision.proof import CONFIDENCE, UNPROVEN, CameraProof
@@ -44,19 +44,6 @@ def fit_temperature(logits: np.ndarray, label: np.ndarray) -> float:
 
 
 # ---- a window of images
-
-
-def windows(segment: np.ndarray, *, length: int) -> np.ndarray:
-    """Rows (w, length): every `length` frames of one segment or print in the order in which they come, none
-    used twice. A window may straddle a change of flow: its truth is that of its middle frame."""
-    segment = np.asarray(segment)
-    order = np.argsort(segment, kind="stable")
-    rows = [
-        run[i : i + length]
-        for run in np.split(order, np.flatnonzero(np.diff(segment[order])) + 1)
-        for i in range(0, len(run) - length + 1, length)
-    ]
-    return np.array(rows, int).reshape(-1, length)
 
 
 def hard_shares(log_p: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -4,7 +4,8 @@ fitted to them by ridge regression (Hoerl and Kennard 1970)
     W = (Z'Z + penalty I)^-1 Z' (y - mean y)    Z: features less their mean, in deviations
 
 of the three classes as 0 and 1, and of log(flow / 100 %). Every print is read by heads, and its windows by a
-calibration, that learned nothing from it.
+calibration, that learned nothing from it. By their errors the spread is stretched: few prints teach a
+calibration what their own windows err by, not what those of the next print do.
 """
 
 from typing import NamedTuple
@@ -20,6 +21,7 @@ from pipeline.setpoint.vision.calibration import ClassifierOutputs
 from pipeline.setpoint.vision.classifier import CLASS_NAMES
 from pipeline.setpoint.vision.parts import all_frames
 from pipeline.setpoint.vision.vision_transformer import LOG_DEVIATION, Classifier
+from pipeline.setpoint.vision.window_flow import FlowCalibration, WindowFlow, class_probabilities
 
 # from so many stretches of constant settings on the network itself is trained
 TRAINED_FROM = 2000
@@ -65,9 +67,33 @@ def learn(network: Classifier, frames: LabelledFrames, *, window: int, false_ala
         of_others = calibration.calibrate(inner, inner, length=window, false_alarms=false_alarms)
         seen = calibrated_classifier.window_predictions(of_others, unlearned.take(mine), length=window)
         pieces.append(seen._replace(rows=mine[seen.rows]))
+    windows = calibrated_classifier.joined_windows(pieces)
+    stretch = spread_stretch(windows)
     heads = fit_heads(outputs.take(outputs.valid))
-    model = CalibratedClassifier(with_heads(network, heads), fitted._replace(foreign_above=above))
-    return OwnClassifier(model, unlearned, calibrated_classifier.joined_windows(pieces), distance)
+    fitted = fitted._replace(foreign_above=above, flow=stretched(fitted.flow, stretch))
+    model = CalibratedClassifier(with_heads(network, heads), fitted)
+    return OwnClassifier(model, unlearned, windows._replace(seen=widen(windows.seen, stretch)), distance)
+
+
+def spread_stretch(windows: WindowPredictions) -> float:
+    """The root mean square of error over spread, of log flow, of windows that nothing was learned from."""
+    some = windows.any_valid
+    error = np.log(windows.seen.flow_seen[some] / windows.truth.flow_percent[some])
+    return float(np.sqrt(np.mean((error / windows.seen.spread[some]) ** 2)))
+
+
+def stretched(flow: FlowCalibration, by: float) -> FlowCalibration:
+    """The calibration with a spread `by` times as large."""
+    return flow._replace(
+        scale=by * flow.scale, looks=flow.looks._replace(explained=by * flow.looks.explained)
+    )
+
+
+def widen(seen: WindowFlow, by: float) -> WindowFlow:
+    """The same flows with a spread `by` times as large, and the probabilities of the classes that follow."""
+    some, prob = np.isfinite(seen.flow_seen), seen.prob.copy()
+    prob[some] = class_probabilities(np.log(seen.flow_seen[some] / 100), by * seen.spread[some])
+    return WindowFlow(seen.flow_seen, by * seen.spread, prob)
 
 
 def check(frames: LabelledFrames) -> None:
