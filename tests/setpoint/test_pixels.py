@@ -122,7 +122,7 @@ def numbers(monkeypatch):
     """A scene and front end of one number: the bead's width in percent, 5 %
     off for a segment, 8 % an image; blurred, it is 0."""
 
-    def areas(cameras, flow, temperature, loop, disturbances, decision, draw):
+    def areas(cameras, flow, temperature, loop, disturbances, decision):
         images = np.zeros((*flow.shape, 16, 48), np.uint8)
         for i, rng in enumerate(cameras.rngs):
             burst = 0 <= decision - disturbances.burst_at[i] < disturbances.burst_for[i]
@@ -132,7 +132,7 @@ def numbers(monkeypatch):
             images[i, :, 0, 0], images[i, :, 0, 1] = width % 256, width // 256
         valid = np.stack([rng.random(loop.frames) > 0.06 for rng in cameras.rngs])
         looks = np.full((len(valid), len(familiar.NAMES)), np.nan)
-        return pixels._WindowAreas(images, valid, np.zeros(len(valid), bool), looks, {})
+        return pixels._WindowAreas(images, valid, np.zeros(len(valid), bool), looks)
 
     monkeypatch.setattr(pixels, "_next_segment", lambda segment, rng: 0.05 * rng.normal())
     monkeypatch.setattr(pixels, "_window_areas", areas)
