@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.setpoint.vision.calibrated_classifier import WindowPredictions
 from pipeline.setpoint.vision.calibration import WindowTruth
-from pipeline.setpoint.vision.own_pictures import spread_stretch, stretched, widen
+from pipeline.setpoint.vision.own_pictures import spread_growth, stretch, widen
 from pipeline.setpoint.vision.window_flow import (
     KNOTS_PERCENT,
     NO_CORRECTION,
@@ -29,14 +29,14 @@ def predictions(rng: np.random.Generator, *, error: float, spread: float, n: int
 def test_a_print_that_is_read_quite_wrongly_widens_the_others_little():
     windows = predictions(np.random.default_rng(3), error=0.12, spread=0.12)
     wrong = windows.seen.flow_seen * np.where(np.arange(400) < 32, 3.0, 1.0)
-    assert spread_stretch(windows._replace(seen=windows.seen._replace(flow_seen=wrong))) < 1.3
+    assert spread_growth(windows._replace(seen=windows.seen._replace(flow_seen=wrong))) < 1.3
 
 
 def test_after_the_stretch_error_over_spread_is_one():
     windows = predictions(np.random.default_rng(0), error=0.24, spread=0.12)
-    stretch = spread_stretch(windows)
-    assert np.isclose(stretch, 2.0, rtol=0.1)
-    assert np.isclose(spread_stretch(windows._replace(seen=widen(windows.seen, stretch))), 1.0)
+    growth = spread_growth(windows)
+    assert np.isclose(growth, 2.0, rtol=0.1)
+    assert np.isclose(spread_growth(windows._replace(seen=widen(windows.seen, growth))), 1.0)
 
 
 def test_a_wider_spread_leaves_the_flow_and_makes_the_classes_less_sure():
@@ -54,6 +54,6 @@ def test_a_stretched_calibration_states_the_same_flows_with_so_much_more_spread(
     rng, valid = np.random.default_rng(2), np.ones((5, 4), bool)
     frames = 0.2 * rng.standard_normal((5, 4)), np.full((5, 4), 0.1), valid
     looks = np.where(np.arange(5)[:, None] < 3, 0.0, np.full((5, len(NO_CORRECTION.mean)), np.nan))
-    before, after = (window_flow(*frames, looks, of) for of in (plain, stretched(plain, 1.7)))
+    before, after = (window_flow(*frames, looks, of) for of in (plain, stretch(plain, 1.7)))
     np.testing.assert_array_equal(after.flow_seen, before.flow_seen)
     np.testing.assert_allclose(after.spread, 1.7 * before.spread)

@@ -92,14 +92,13 @@ def _melt_s(machine: MachineDynamics, temperature: np.ndarray) -> np.ndarray:
 class PixelDisturbances(NamedTuple):
     """Of E episodes, counted in decisions: the feed is multiplied by clog (E,) from clog_at (E,) on; the
     camera moves by shift_px (E, 2) at shift_at (E,); for burst_for (E,) decisions from burst_at (E,) the
-    picture is blurred by blur_px (E,) and outshone by glare (E,) gray levels beside the nozzle."""
+    picture is blurred by blur_px (E,)."""
 
     clog: np.ndarray
     clog_at: np.ndarray
     shift_px: np.ndarray
     shift_at: np.ndarray
     blur_px: np.ndarray
-    glare: np.ndarray
     burst_at: np.ndarray
     burst_for: np.ndarray
 
@@ -107,19 +106,15 @@ class PixelDisturbances(NamedTuple):
 def calm(episodes: int) -> PixelDisturbances:
     """Nothing befalls E episodes; `_replace` what is to."""
     zero, never = np.zeros(episodes), np.full(episodes, np.iinfo(int).max)
-    return PixelDisturbances(zero + 1, never, np.zeros((episodes, 2)), never, zero, zero, never, zero)
+    return PixelDisturbances(zero + 1, never, np.zeros((episodes, 2)), never, zero, never, zero)
 
 
-def _filmed(frames: np.ndarray, d: PixelDisturbances, i: int, decision: int, tip: np.ndarray) -> np.ndarray:
+def _filmed(frames: np.ndarray, d: PixelDisturbances, i: int, decision: int) -> np.ndarray:
     """The frames (n, h, w) of episode i as a disturbed camera gives them."""
     burst = 0 <= decision - d.burst_at[i] < d.burst_for[i]
     h, w = frames.shape[1:]
     if burst and d.blur_px[i] > 0:
         frames = np.stack([cv2.GaussianBlur(f, (0, 0), d.blur_px[i]) for f in frames])
-    if burst and d.glare[i] > 0:
-        y, x = np.mgrid[:h, :w]
-        spot = d.glare[i] * np.exp(-((x - tip[0] - 30) ** 2 + (y - tip[1] - 15) ** 2) / (2 * 40.0**2))
-        frames = np.clip(frames + spot, 0, 255).astype(np.uint8)
     if decision >= d.shift_at[i]:
         by = np.float32([[1, 0, d.shift_px[i, 0]], [0, 1, d.shift_px[i, 1]]])
         frames = np.stack([cv2.warpAffine(f, by, (w, h), borderMode=cv2.BORDER_REPLICATE) for f in frames])
@@ -363,7 +358,7 @@ def _window_areas(
     images, valid, moved, looks = [], [], [], []
     for i, segment in enumerate(cameras.segments):
         scene = nozzle_scene.render(segment, flow[i], temperature[i], cameras.rngs[i])
-        frames, tip = _filmed(scene.frames, disturbances, i, decision, segment.tip), segment.tip
+        frames, tip = _filmed(scene.frames, disturbances, i, decision), segment.tip
         areas = key_area.find_all(
             frames, tip, least_score=loop.least_score, directions_deg=segment.direction_deg
         )

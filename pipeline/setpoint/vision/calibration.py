@@ -16,7 +16,6 @@ import scipy.stats
 
 from pipeline.setpoint.frames.familiar import medians, windows
 from pipeline.setpoint.simulation.recorded import WindowTable
-from pipeline.setpoint.vision.classifier import ClassifierPrediction, Labelled
 from pipeline.setpoint.vision.proof import CONFIDENCE, UNPROVEN, CameraProof
 from pipeline.setpoint.vision.window_flow import FlowCalibration, WindowFlow, fit_flow
 from pipeline.statistics import Share
@@ -280,25 +279,6 @@ class ClassifierOutputs(NamedTuple):
 
     def take(self, rows: np.ndarray) -> "ClassifierOutputs":
         return ClassifierOutputs(*(a[rows] for a in self))
-
-
-def classifier_outputs(
-    prediction: ClassifierPrediction, data: Labelled, valid: np.ndarray, looks: np.ndarray
-) -> ClassifierOutputs:
-    """The head's features with the appearance of the key areas beside them;
-    frames that the front end rejected are not valid."""
-    return ClassifierOutputs(
-        prediction.logits,
-        np.hstack([prediction.features, appearance(data.key_area)]),
-        np.asarray(prediction.log_flow, float),
-        np.asarray(prediction.deviation, float),
-        data.label,
-        np.asarray(data.flow_percent, float),
-        np.asarray(data.temperature_degC, float),
-        data.segment,
-        np.asarray(valid, bool),
-        looks,
-    )
 
 
 class ClassifierCalibration(NamedTuple):

@@ -71,14 +71,14 @@ def learn(network: Classifier, frames: LabelledFrames, *, window: int, false_ala
         seen = calibrated_classifier.window_predictions(of_others, unlearned.take(mine), length=window)
         pieces.append(seen._replace(rows=mine[seen.rows]))
     windows = calibrated_classifier.joined_windows(pieces)
-    stretch = spread_stretch(windows)
+    growth = spread_growth(windows)
     heads = fit_heads(outputs.take(outputs.valid))
-    fitted = fitted._replace(foreign_above=above, flow=stretched(fitted.flow, stretch))
+    fitted = fitted._replace(foreign_above=above, flow=stretch(fitted.flow, growth))
     model = CalibratedClassifier(with_heads(network, heads), fitted)
-    return OwnClassifier(model, unlearned, windows._replace(seen=widen(windows.seen, stretch)), distance)
+    return OwnClassifier(model, unlearned, windows._replace(seen=widen(windows.seen, growth)), distance)
 
 
-def spread_stretch(windows: WindowPredictions) -> float:
+def spread_growth(windows: WindowPredictions) -> float:
     """By how much the spread must grow so that the share COVERED of windows that nothing was learned from err
     by as little as Gaussian ones would: one print that is read quite wrongly shall not widen all others."""
     some = windows.any_valid
@@ -87,7 +87,7 @@ def spread_stretch(windows: WindowPredictions) -> float:
     return float(within / scipy.special.ndtri((1 + COVERED) / 2))
 
 
-def stretched(flow: FlowCalibration, by: float) -> FlowCalibration:
+def stretch(flow: FlowCalibration, by: float) -> FlowCalibration:
     """The calibration with a spread `by` times as large."""
     return flow._replace(
         scale=by * flow.scale, looks=flow.looks._replace(explained=by * flow.looks.explained)
