@@ -257,6 +257,8 @@ def _watch(arguments: argparse.Namespace, ready: "Ready") -> None:
     print(f"{place}: open {arguments.out / 'index.html'}; Ctrl-C ends the watch", flush=True)
     with watching.until_told() as stopped:
         watched = watching.watch(frames, ready.deployed, asked, arguments.out, place=place, stopped=stopped)
+    if watched.unreadable:
+        raise ValueError(f"{place}: none of {watched.frames} frames can be read: {watched.unreadable}")
     print(watching.summary_lines(watched, place))
 
 

@@ -32,11 +32,11 @@ def machine(printer):
 
 
 def planned(name, printer=PRINTER):
-    return part.plan_part(moves(name), *machine(printer), printer.longest_ramp_s)
+    return part.plan_part(moves(name), *machine(printer), printer.longest_ramp_s)[0]
 
 
 def sufficient_ramp(name, printer=PRINTER):
-    return part.sufficient_ramp(moves(name), *machine(printer))
+    return part.plan_part(moves(name), *machine(printer), part.LONGEST_RAMP_S)[1]
 
 
 def moves(name):

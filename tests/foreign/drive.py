@@ -10,8 +10,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.linalg
 import scipy.signal
+import scipy.sparse
+import scipy.sparse.linalg
 
 from pipeline.deposition.drive import Drive, obeyed
 from pipeline.deposition.learning.ilc import rms
@@ -65,7 +66,7 @@ def _step(e: ForeignExtruder, u: np.ndarray, r: np.ndarray, drive: Drive, Ts: fl
         step=drive.speed_mm_per_s * Ts,
         weight=np.where(r > 0, slope**2, 1.0),
     )
-    return obeyed(_of(z, command), drive, sample_time_s=Ts)
+    return obeyed(_matrix(command, len(z)) @ z, drive, sample_time_s=Ts)
 
 
 def _pressure(e: ForeignExtruder, u: np.ndarray, Ts: float) -> tuple[list, list, np.ndarray]:
@@ -105,36 +106,33 @@ def nearest_response(
     |v(t)| <= bound and |v(t) - v(t-1)| <= step; A and B are the taps `command` and `output`.
 
     At least one limit is finite. y = A^-1 B v is any linear extruder of finite order, without the inverse: A
-    and B are banded, and so is the Hessian of Newton's method on a log barrier (Boyd and Vandenberghe 2004,
-    ch. 11): an iteration is O(N). Where `free` (N,) is True only what lies above the target costs, and below
-    it a trace of weight draws y to `rest`, or to the target; `weight` (N,) of the squares.
+    and B are sparse, and so is the Hessian of Newton's method on a log barrier (Boyd and Vandenberghe 2004,
+    ch. 11), which SciPy factorises. Where `free` (N,) is True only what lies above the target costs, and
+    below it a trace of weight draws y to `rest`, or to the target; `weight` (N,) of the squares.
     """
-    limits = [(command, bound), (_changes(command), step)]
-    limits = [(taps, most) for taps, most in limits if math.isfinite(most)]
     N = len(target)
+    A, B = _matrix(command, N), _matrix(output, N)
     # the unit of z: of the size that the nearer limit leaves it
     still = abs(float(np.mean(sum(command))))
     c = min(bound / float(np.mean(command[0])), step / max(still, 1e-300))
-    within = [(taps, most / c) for taps, most in limits]
-    bands = max(len(output), *(len(taps) for taps, _ in within))
+    limits = [(A, bound), (_matrix((1.0, -1.0), N) @ A, step)]
+    # |M z| <= 1, one below the other
+    M = scipy.sparse.vstack([matrix * (c / most) for matrix, most in limits if math.isfinite(most)]).tocsr()
     s, z, barrier = target / c, np.zeros(N), 1.0
     below = s if rest is None else rest / c
     while barrier > 1e-7:
         for _ in range(MOST_STEPS):
             # a trace of weight below the target keeps z determined there
-            y = _of(z, output)
+            y, v = B @ z, M @ z
             counts = ~free | (y > s)
-            w = weight * np.where(counts, 1.0, 1e-3)
-            gradient, band = _back(w * (y - np.where(counts, s, below)), output), np.zeros((bands, N))
-            _add_squares(band, np.broadcast_to(w, N), output)
-            for taps, most in within:
-                v = _of(z, taps) / most
-                slack = 1 - v * v
-                gradient += _back(2 * barrier * v / slack / most, taps)
-                _add_squares(band, 2 * barrier * (1 + v * v) / slack**2 / most**2, taps)
-            dz = -_solved(band, gradient)
+            w, slack = weight * np.where(counts, 1.0, 1e-3), 1 - v * v
+            gradient = B.T @ (w * (y - np.where(counts, s, below))) + M.T @ (2 * barrier * v / slack)
+            curvature = scipy.sparse.diags(2 * barrier * (1 + v * v) / slack**2)
+            H = B.T @ scipy.sparse.diags(np.broadcast_to(w, N)) @ B + M.T @ curvature @ M
+            dz = -scipy.sparse.linalg.spsolve(H.tocsc(), gradient)
             # every bound holds: at most 0.95 of the way to the nearest
-            reach = max(_reach(_of(z, taps) / most, _of(dz, taps) / most) for taps, most in within)
+            dv = M @ dz
+            reach = float(np.max(np.maximum(dv / (1 - v), -dv / (1 + v))))
             length = min(1.0, 0.95 / max(reach, 1e-300))
             z = z + length * dz
             if length == 1.0 and gradient @ -dz < 1e-3 * N * barrier:
@@ -143,56 +141,7 @@ def nearest_response(
     return c * z
 
 
-def _changes(taps: Taps) -> Taps:
-    """The taps of v(t) - v(t-1), v those of `taps`."""
-    late = [np.append(0.0, tap[:-1]) if isinstance(tap, np.ndarray) else tap for tap in taps]
-    return [taps[0], *(tap - before for tap, before in zip(taps[1:], late, strict=False)), -late[-1]]
-
-
-def _of(z: np.ndarray, taps: Taps) -> np.ndarray:
-    """sum_k taps[k] z(t-k) (N,), from rest."""
-    v = taps[0] * z
-    for k, tap in enumerate(taps[1:], 1):
-        v[k:] += _from(tap, k) * z[:-k]
-    return v
-
-
-def _from(tap: float | np.ndarray, k: int) -> float | np.ndarray:
-    return tap[k:] if isinstance(tap, np.ndarray) else tap
-
-
-def _back(y: np.ndarray, taps: Taps) -> np.ndarray:
-    """The transpose of `_of` on y (N,)."""
-    z = taps[0] * y
-    for k, tap in enumerate(taps[1:], 1):
-        z[:-k] += _from(tap, k) * y[k:]
-    return z
-
-
-def _add_squares(band: np.ndarray, h: np.ndarray, taps: Taps) -> None:
-    """Adds D' diag(h) D to the lower bands (B, N), D the matrix of `_of`; h (N,)."""
-    N = len(h)
-    for i, first in enumerate(taps):
-        for k in range(i + 1):
-            # row t of D holds taps[i] in column t - i and taps[k] in column t - k
-            band[i - k, : N - i] += _from(first, i) * _from(taps[k], i) * h[i:]
-
-
-def _reach(v: np.ndarray, dv: np.ndarray) -> float:
-    """How far a step dv (N,) goes towards the nearer of the bounds +-1 of v (N,), as a share of the way."""
-    return float(np.max(np.maximum(dv / (1 - v), -dv / (1 + v))))
-
-
-def _solved(band: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """Newton's step (N,) of the lower bands (B, N); a larger diagonal where rounding makes them indefinite
-    (poles near 1 in a row): a shorter step of the same descent."""
-    for share in (0.0, 1e-13, 1e-11, 1e-9):
-        try:
-            whole = np.vstack([band[:1] * (1 + share), band[1:]])
-            return scipy.linalg.solveh_banded(whole, gradient, lower=True, check_finite=False)
-        except np.linalg.LinAlgError:
-            continue
-    raise ValueError(
-        "reachable: the taps of output and command leave the response undetermined; "
-        "expected poles inside the unit circle"
-    )
+def _matrix(taps: Taps, N: int) -> scipy.sparse.csr_matrix:
+    """(N, N) with which z (N,) becomes sum_k taps[k](t) z(t-k), from rest."""
+    bands = [np.broadcast_to(np.asarray(tap, float), N)[k:] for k, tap in enumerate(taps)]
+    return scipy.sparse.diags(bands, [-k for k in range(len(taps))], format="csr")

@@ -137,10 +137,10 @@ def test_the_first_failed_rule_is_said_in_words(project, metric, value, rule, se
 def test_too_few_runs_leave_a_rule_undecided_and_say_how_many_more_segments_would_tell(project):
     made_setpoint.scoreboard(lost(Bayes_filter=(0.5, 0.3)), runs=100)
     text = page()
-    # of 97 % 130 runs are needed; 600 segments were judged: 600 (130 / 100 - 1) = 180
+    # of 97 % 190 runs are needed; 600 segments were judged: 600 (190 / 100 - 1) = 540
     assert (
         "98.6 % of its runs settle; 97 % are asked for. Undecided: these runs are worth 100 that share "
-        "nothing, of 130; about 180 more segments would decide." in text
+        "nothing, of 190; about 540 more segments would decide." in text
     )
     assert setpoint_verdict.undecided(
         Question(0, "", "", "%", 97.0, True, ""), Figure(97.0, 96.0, 98.0), {}
@@ -148,12 +148,12 @@ def test_too_few_runs_leave_a_rule_undecided_and_say_how_many_more_segments_woul
 
 
 def test_a_rule_is_one_threshold_on_the_estimate():
-    """97 % is passed at 97.7 %; at most 1 % of harm at 0.77 %, which takes 390 runs."""
+    """It is the limit itself: 97 % is passed at 97 %. At most 1 % of harm takes 570 runs."""
     for value, n_eff, limit, at_least, expected in (
-        (97.7, 130, 97.0, True, "passed"), (97.6, 130, 97.0, True, "failed"),
-        (99.9, 129, 97.0, True, "undecided"), (10.0, 129, 97.0, True, "undecided"),
-        (0.7, 390, 1.0, False, "passed"), (0.8, 390, 1.0, False, "failed"),
-        (0.0, 389, 1.0, False, "undecided"),
+        (97.0, 190, 97.0, True, "passed"), (96.9, 190, 97.0, True, "failed"),
+        (99.9, 189, 97.0, True, "undecided"), (10.0, 189, 97.0, True, "undecided"),
+        (1.0, 570, 1.0, False, "passed"), (1.1, 570, 1.0, False, "failed"),
+        (0.0, 569, 1.0, False, "undecided"),
     ):  # fmt: skip
         held, words = setpoint_verdict.threshold(Figure(value, 0.0, 100.0), n_eff, limit, at_least=at_least)
         question = Question(0, "", "", "%", words["limit"], at_least, "")
@@ -260,7 +260,7 @@ def test_a_default_that_spoils_good_prints_fails_by_the_case_most_beyond_its_bar
     # by hand: beyond 25 in (30 + 4 hard) / 2 / 8 %: 1.9 of at most 1 from 100 %, 2.1 of 2 in band
     made_setpoint.scoreboard(lost(Bayes_filter=(30.0, 4.0)))
     rules, text = harm_rules(project)
-    assert rules == [("failed", "0.9\u202f%"), ("failed", "1.9\u202f%")]
+    assert rules == [("passed", "0.9\u202f%"), ("failed", "1.9\u202f%")]
     assert (
         "First failed rule: does no harm. Judged is the model-based controller “Bayes filter”: from good "
         "starts, perfect, 1.9 % of its runs leave ±25 %; at most 1 % may. With doing nothing 0.0 % do."

@@ -1,11 +1,18 @@
 """Whether pictures are of a camera that is known: rendered windows of new segments are, those of other
 machines are not."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
+from pipeline.setpoint.deployment.deployment import camera_guard
 from pipeline.setpoint.frames import familiar, key_area, nozzle_scene
+from pipeline.setpoint.frames.files import CAMERA_FILE, restore_camera
+from pipeline.setpoint.vision.calibrated_classifier import read_frames
+from pipeline.setpoint.vision.files import restore_classifier
+from pipeline.setpoint.vision.window_flow import window_flow
 from tests.foreign import pictures as foreign_pictures
 
 ALARMS = 0.02
@@ -109,3 +116,37 @@ def test_what_is_unlike_is_named(camera):
     window[familiar.NAMES.index("noise")] += 9.0
     assert familiar.unlike(camera, window).startswith("noise: ")
     assert "above the known camera's" in familiar.unlike(camera, window)
+
+
+KEPT = Path(__file__).parents[2] / "datasets/kept/train_classifier"
+
+
+def read_windows(noise: float, segments: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    """Of a camera with `noise` times the noise, and the classifier that git keeps: whether the guard lets a
+    window of each segment pass (n,), and its error of log flow (n,)."""
+    model = restore_classifier(*(str(KEPT / name) for name in ("weights.safetensors", "calibration.parquet")))
+    foreign = camera_guard(restore_camera(KEPT / CAMERA_FILE), model.calibration.proof)
+    passes, errors = [], []
+    for i in range(segments):
+        rng = np.random.default_rng([31, i])
+        segment = nozzle_scene.draw_segment(rng)
+        flow, degrees = np.exp(rng.uniform(*np.log((70.0, 150.0)))), rng.choice(nozzle_scene.TEMPERATURES)
+        noisy = segment._replace(noise=noise * segment.noise)
+        scene = nozzle_scene.render(noisy, np.full(20, flow), degrees, rng)
+        areas = nozzle_scene.key_areas(scene, least_score=10.0)
+        looks = familiar.of_window(scene.frames, np.array(scene.tip), areas)[None]
+        said = read_frames(model, areas.images, np.full(20, degrees))
+        frames = said.log_flow[None], said.deviation[None], areas.valid[None]
+        seen = window_flow(*frames, looks, model.calibration.flow).flow_seen
+        passes.append(not foreign(looks)[0])
+        errors.append(float(np.log(seen[0] / flow)))
+    return np.array(passes), np.array(errors)
+
+
+def test_a_camera_with_another_noise_is_held_or_read_as_well_as_the_known_one():
+    passes, errors = read_windows(1.0)
+    assert passes.mean() >= 0.97
+    known = np.percentile(np.abs(errors[passes]), 80)
+    passes, errors = read_windows(3.0)
+    assert 0.1 < passes.mean() < 0.7
+    assert np.percentile(np.abs(errors[passes]), 80) <= 1.3 * known

@@ -151,14 +151,14 @@ def ruled(happened: np.ndarray, limit: float) -> str:
 
 
 def test_a_rule_passes_a_controller_of_99_percent_and_fails_one_of_94_in_19_of_20_repetitions():
-    """By 130 runs that share nothing, the fewest that decide."""
+    """By 190 runs that share nothing, the fewest that decide."""
     rng, n = np.random.default_rng(2), int(LEAST_RUNS)
     states = {
         share: [ruled(rng.random((10, n // 10)) < share, 97.0) for _ in range(400)] for share in (0.99, 0.94)
     }
     decided = {share: [one for one in told if one != UNDECIDED] for share, told in states.items()}
     assert np.mean([one == PASSED for one in decided[0.99]]) >= 0.95
-    assert np.mean([one == FAILED for one in decided[0.94]]) >= 0.94
+    assert np.mean([one == FAILED for one in decided[0.94]]) >= 0.95
     assert min(map(len, decided.values())) > 50
 
 

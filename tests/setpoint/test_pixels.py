@@ -122,7 +122,7 @@ def numbers(monkeypatch):
     """A scene and front end of one number: the bead's width in percent, 5 %
     off for a segment, 8 % an image; blurred, it is 0."""
 
-    def areas(cameras, flow, temperature, loop, disturbances, decision, draw):
+    def areas(cameras, flow, temperature, loop, disturbances, decision):
         images = np.zeros((*flow.shape, 16, 48), np.uint8)
         for i, rng in enumerate(cameras.rngs):
             burst = 0 <= decision - disturbances.burst_at[i] < disturbances.burst_for[i]
@@ -132,7 +132,7 @@ def numbers(monkeypatch):
             images[i, :, 0, 0], images[i, :, 0, 1] = width % 256, width // 256
         valid = np.stack([rng.random(loop.frames) > 0.06 for rng in cameras.rngs])
         looks = np.full((len(valid), len(familiar.NAMES)), np.nan)
-        return pixels._WindowAreas(images, valid, np.zeros(len(valid), bool), looks, {})
+        return pixels._WindowAreas(images, valid, np.zeros(len(valid), bool), looks)
 
     monkeypatch.setattr(pixels, "_next_segment", lambda segment, rng: 0.05 * rng.normal())
     monkeypatch.setattr(pixels, "_window_areas", areas)
@@ -238,26 +238,13 @@ CALM_LIGHT = LOOP._replace(
 SIX = np.tile([[200.0, 210.0]], (6, 1))
 
 
-def test_frames_are_rendered_seen_and_acted_on_and_pictures_are_kept():
-    got = run(
-        FILTERED,
-        None,
-        SIX,
-        CALM_LIGHT,
-        calm(6),
-        decisions=3,
-        rng=np.random.default_rng(0),
-        draw=frozenset({(0, 1), (5, 2)}),
-    )
+def test_frames_are_rendered_seen_and_acted_on():
+    got = run(FILTERED, None, SIX, CALM_LIGHT, calm(6), decisions=3, rng=np.random.default_rng(0))
     assert (got.sent[:, :, 0] <= 0).all()
     assert (
         got.windows.reason == ACTS
     ).mean() >= 0.8  # 6 % of frames show no line: 4 % of windows keep less than two of four
     assert (got.setpoint + got.sent)[:, -1, 0].mean() <= 185.0  # -5, -10, -10 % where none is held
-    assert sorted(got.pictures) == [(0, 1), (5, 2)]
-    assert all(
-        picture.shape == (350, 350, 3) and picture.dtype == np.uint8 for picture in got.pictures.values()
-    )
 
 
 def test_a_camera_that_moved_is_held_for_that_and_one_that_shook_a_little_is_not():

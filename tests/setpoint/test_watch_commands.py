@@ -103,6 +103,17 @@ def decisions() -> list[dict]:
         return [json.loads(message.data) for _, _, message in make_reader(stream).iter_messages()]
 
 
+@pytest.mark.parametrize("count", [3, 45])
+def test_pictures_none_of_which_can_be_read_end_the_watch_with_one_sentence(command, trained, count):
+    Path("in").mkdir()
+    for k in range(count):
+        Path(f"in/f{k}.png").write_bytes(b"\x89PNG and no more")
+    status, _, wrong = command("shadow", "in", "--once")
+    assert status == 1 and wrong.count("\n") == 1
+    assert wrong.startswith(f"beadline: in: none of {count} frames can be read: f")
+    assert "a picture of 16 bytes without its end" in wrong
+
+
 def test_the_default_watches_a_folder(command, trained):
     camera(45)
     tip = f"{TIP[0]:g},{TIP[1]:g}"

@@ -29,7 +29,7 @@ PAGE_S, LISTED = 2.0, 30
 
 class Watched(NamedTuple):
     """What a watch saw: frames, decisions, how many of them would have changed a setpoint and how many were
-    held, and the files; where there was no window, why."""
+    held, and the files; where there was no window, why; if no frame could be read, why the last could not."""
 
     frames: int
     decisions: int
@@ -38,6 +38,7 @@ class Watched(NamedTuple):
     page: Path
     log: Path
     why: str = ""
+    unreadable: str = ""
 
 
 def watch(
@@ -59,7 +60,7 @@ def watch(
         FrameWindows(deployed.window, deployed.settle_s),
         Mind(deployed),
     )
-    page, frames, first = out / "index.html", 0, log.path
+    page, frames, readable, first = out / "index.html", 0, 0, log.path
     changes, held, broken = 0, 0, ""
     decisions: list[ShadowDecision] = []
 
@@ -73,7 +74,10 @@ def watch(
         came = False
         for shown in source.frames():
             came, frames, came_at = True, frames + 1, time.monotonic()
-            broken = f"; {shown.name}: {shown.frame}" if isinstance(shown.frame, str) else broken
+            if isinstance(shown.frame, str):
+                broken = f"; {shown.name}: {shown.frame}"
+            else:
+                readable += 1
             full = windows.add(shown)
             if full is not None:
                 notes, remarks = windows.taken_notes() + _damage(source)[remarks:], len(_damage(source))
@@ -103,7 +107,8 @@ def watch(
         raise OSError(log.trouble)
     why = f"expected {counted(deployed.window, 'frame')} in a row at one flow{broken}"
     why = why if frames else source.waits_for or f"it lacks {source.lacks}"
-    return Watched(frames, mind.number, changes, held, page, first, why)
+    unreadable = "" if readable else broken.removeprefix("; ")
+    return Watched(frames, mind.number, changes, held, page, first, why, unreadable)
 
 
 def summary_lines(watched: Watched, place: str) -> str:

@@ -70,7 +70,8 @@ def compose(
     """A part program, composed; `materials` are the tools' names. Raises ValueError naming the line if there
     is one."""
     area, moves = settings.bead_area_mm2, program.moves
-    planned = plan_part(moves, gantry, settings, learned, materials, longest_ramp_s)
+    planned, _ = plan_part(moves, gantry, settings, learned, materials, longest_ramp_s)
+    check_duration(moves, planned)
     # a printed line is as long as the declared bead would be of the volume that E asks for
     beads = extrusion.as_lengths(program, extruded, bead_area_mm2=area)
     composed = composition.compose(learned, beads, planned, settings, materials=materials)
@@ -82,29 +83,9 @@ def compose(
     # the lines' own lengths, not those of their beads
     report = report._replace(lines=report.lines._replace(length_mm=moves.length[composed.lines.move]))
     if not all(one.enough for one in report.saturation.values()):
-        ramp_s = sufficient_ramp(moves, gantry, settings, learned, materials)
+        _, ramp_s = plan_part(moves, gantry, settings, learned, materials, LONGEST_RAMP_S)
         report = report._replace(ramp_that_would_do_s=ramp_s)
     return ComposedPart(name, program, planned, composed, report, extruded, area)
-
-
-def plan_part(
-    moves: Moves,
-    gantry: Mapping[str, float],
-    settings: PartSettings,
-    learned: LearnedLibrary,
-    materials: dict[int, str],
-    longest_ramp_s: float | None,
-) -> Motion:
-    """The gantry's plan of a part: its printed moves as quick as the machine goes, or slower until the drive
-    follows the flow of each material as identified, with ramps of at most longest_ramp_s. `gantry` are
-    keywords of `motion.plan`, `materials` the tools' names. Raises ValueError for a plan longer than any
-    print."""
-    if longest_ramp_s is None:
-        plan = motion.plan(moves, **gantry)
-    else:
-        plan = _followed(moves, gantry, settings, learned, materials, longest_ramp_s)[0]
-    check_duration(moves, plan)
-    return plan
 
 
 def check_duration(moves: Moves, planned: Motion) -> None:
@@ -127,34 +108,27 @@ def slowed_to(plan: Motion, moves: Moves) -> float | None:
     return float(plan.acceleration[slowed].max()) if slowed.any() else None
 
 
-def sufficient_ramp(
+def plan_part(
     moves: Moves,
     gantry: Mapping[str, float],
     settings: PartSettings,
     learned: LearnedLibrary,
     materials: dict[int, str],
-) -> float:
-    """The time in s, to a fifth, in which the gantry comes to the part's highest printing speed such that the
-    drive follows its flow; inf if none up to LONGEST_RAMP_S does."""
-    return _followed(moves, gantry, settings, learned, materials, LONGEST_RAMP_S)[1]
-
-
-def _followed(
-    moves: Moves,
-    gantry: Mapping[str, float],
-    settings: PartSettings,
-    learned: LearnedLibrary,
-    materials: dict[int, str],
-    longest_s: float,
+    longest_s: float | None,
 ) -> tuple[Motion, float]:
-    """The plan with the shortest ramps up to longest_s that the drive follows, and these in s: inf, beside
-    the plan with the longest, if it follows none."""
-    extruders = _extruders(moves, settings.nozzle_mm, learned, materials)
-    speed, Ts = _printing_speed(moves, gantry), learned.library.sample_time_s
+    """The gantry's plan of a part: its printed moves as quick as the machine goes, or slower until the drive
+    follows the flow of each material as identified, with ramps of at most longest_s. And the time in s, to a
+    fifth, of the shortest ramps that the drive follows: inf if none up to longest_s does. `gantry` are
+    keywords of `motion.plan`, `materials` the tools' names. Raises ValueError for a plan longer than any
+    print."""
     quick = motion.plan(moves, **gantry)
     check_duration(moves, quick)
-    if settings.drive == UNLIMITED or not extruders:
+    if longest_s is None or settings.drive == UNLIMITED:
         return quick, 0.0
+    extruders = _extruders(moves, settings.nozzle_mm, learned, materials)
+    if not extruders:
+        return quick, 0.0
+    speed, Ts = _printing_speed(moves, gantry), learned.library.sample_time_s
     begins = [quick.begin_s[np.argmax(_prints(moves) & (moves.tool == tool))] for tool in extruders]
     excerpt = Moves(*(column[: np.searchsorted(quick.begin_s, max(begins) + JUDGED_S)] for column in moves))
     ramp_s = reachable.ramp_of_all(

@@ -26,6 +26,7 @@ from pipeline.verdict.setpoint import (
     board,
     case_text,
     lasting,
+    of_classifier,
     role,
     share_text,
     summary,
@@ -87,6 +88,7 @@ def render(sources: Sources) -> str:
             ),
             role(judged_scores, judged_scores.baseline()) if judged_scores.baseline() else HEADS[2],
         ),
+        seeing=[line[0].name for line in judged.rules if of_classifier(line[0])],
         second=judged_scores is not None
         and bool(judged_scores.default)
         and judged_scores.kinds[judged_scores.default] != DATA_DRIVEN,

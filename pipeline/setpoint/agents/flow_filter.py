@@ -37,6 +37,7 @@ SPACING = 2.5  # percent: half the smallest move
 GRID = np.arange(FLOW_LIMITS[0], FLOW_LIMITS[1] + SPACING / 2, SPACING)  # (N,)
 ANYWHERE = 1 / GRID / np.sum(1 / GRID)  # errors of extrusion are ratios: 50 % is as likely as 200 %
 OUTLIERS = 0.01  # share of the windows that may show any flow of the grid
+FAR_OFF = 5.0  # deviations from its segment's median by which a window of the table is one of these
 TAIL, FARTHEST = 4.0, 4.0  # Student's degrees of freedom; deviations up to which a segment misreads
 CLOGS, SURELY = (0.4, 1.05), 0.9  # factors on the flow at a jump, in this share of the jumps; else anywhere
 NOISE_WIDTH = 0.12  # of log flow, one deviation: over which a window's noise is smooth
@@ -145,11 +146,13 @@ def fit(
     table: WindowTable, *, biases: int, known_start_share: float, known_start_std: float, **declared: Any
 ) -> FlowFilter:
     """The filter of a camera: shown, noise and bias by the errors of the table's windows and segments
-    (maximum likelihood of a one-way layout); the rest as declared. At the start the machine prints as
-    commanded with known_start_share, log flow ~ N(log 100 %, known_start_std^2); else anything."""
+    (maximum likelihood of a one-way layout, outliers left out); the rest as declared. At the start the
+    machine prints as commanded with known_start_share, log flow ~ N(log 100 %, known_start_std^2); else
+    anything."""
     log_grid = np.log(GRID / BEST_FLOW)
     shown, noise, bias_std = log_grid, np.full(len(GRID), UNKNOWN_NOISE), UNKNOWN_BIAS
     if with_flows(table):
+        table = without_outliers(table)
         log_flow, error = np.log(table.flow / BEST_FLOW), np.log(table.flow_seen / table.flow)
         errors, order = segment_errors(table, width_bias_std=UNKNOWN_BIAS), np.argsort(log_flow)
         mean = smooth_mean(log_flow, error)
@@ -166,6 +169,18 @@ def fit(
     learned = shown, noise, bias_std * z, weight / weight.sum(), declared.pop("gains"), jumps(), prior
     numbers = dict(zip(FlowFilter._fields, learned, strict=False)) | declared
     return FlowFilter(**{name: jnp.asarray(number, jnp.float32) for name, number in numbers.items()})
+
+
+def without_outliers(table: WindowTable) -> WindowTable:
+    """Flow, flow seen and segment of the windows that lie within FAR_OFF robust deviations of their segment's
+    median: one window in fifty that shows anything would make the noise four times as large."""
+    error = np.log(table.flow_seen / table.flow)
+    error = error - smooth_mean(np.log(table.flow), error)
+    _, place = np.unique(table.segment, return_inverse=True)
+    about = error - np.array([np.median(error[place == k]) for k in range(place.max() + 1)])[place]
+    sound = np.abs(about) <= FAR_OFF * max(np.median(np.abs(about)) / 0.6745, LEAST_NOISE)
+    columns = {name: getattr(table, name)[sound] for name in ("flow", "flow_seen", "segment")}
+    return table._replace(**columns)
 
 
 def jumps() -> np.ndarray:

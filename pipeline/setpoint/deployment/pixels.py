@@ -92,14 +92,13 @@ def _melt_s(machine: MachineDynamics, temperature: np.ndarray) -> np.ndarray:
 class PixelDisturbances(NamedTuple):
     """Of E episodes, counted in decisions: the feed is multiplied by clog (E,) from clog_at (E,) on; the
     camera moves by shift_px (E, 2) at shift_at (E,); for burst_for (E,) decisions from burst_at (E,) the
-    picture is blurred by blur_px (E,) and outshone by glare (E,) gray levels beside the nozzle."""
+    picture is blurred by blur_px (E,)."""
 
     clog: np.ndarray
     clog_at: np.ndarray
     shift_px: np.ndarray
     shift_at: np.ndarray
     blur_px: np.ndarray
-    glare: np.ndarray
     burst_at: np.ndarray
     burst_for: np.ndarray
 
@@ -107,19 +106,15 @@ class PixelDisturbances(NamedTuple):
 def calm(episodes: int) -> PixelDisturbances:
     """Nothing befalls E episodes; `_replace` what is to."""
     zero, never = np.zeros(episodes), np.full(episodes, np.iinfo(int).max)
-    return PixelDisturbances(zero + 1, never, np.zeros((episodes, 2)), never, zero, zero, never, zero)
+    return PixelDisturbances(zero + 1, never, np.zeros((episodes, 2)), never, zero, never, zero)
 
 
-def _filmed(frames: np.ndarray, d: PixelDisturbances, i: int, decision: int, tip: np.ndarray) -> np.ndarray:
+def _filmed(frames: np.ndarray, d: PixelDisturbances, i: int, decision: int) -> np.ndarray:
     """The frames (n, h, w) of episode i as a disturbed camera gives them."""
     burst = 0 <= decision - d.burst_at[i] < d.burst_for[i]
     h, w = frames.shape[1:]
     if burst and d.blur_px[i] > 0:
         frames = np.stack([cv2.GaussianBlur(f, (0, 0), d.blur_px[i]) for f in frames])
-    if burst and d.glare[i] > 0:
-        y, x = np.mgrid[:h, :w]
-        spot = d.glare[i] * np.exp(-((x - tip[0] - 30) ** 2 + (y - tip[1] - 15) ** 2) / (2 * 40.0**2))
-        frames = np.clip(frames + spot, 0, 255).astype(np.uint8)
     if decision >= d.shift_at[i]:
         by = np.float32([[1, 0, d.shift_px[i, 0]], [0, 1, d.shift_px[i, 1]]])
         frames = np.stack([cv2.warpAffine(f, by, (w, h), borderMode=cv2.BORDER_REPLICATE) for f in frames])
@@ -135,7 +130,7 @@ class Episodes(NamedTuple):
 
     Per decision (E, D): time_s at the window's end, setpoint and sent (E, D, 2) flow and target before, and
     the change that was sent, windows (each field (E, D, ...)), segment number; clipped (E, 4) as in
-    actuation.Setpoints; pictures (350, 350, 3) uint8 by (episode, decision), the key area drawn in.
+    actuation.Setpoints.
     """
 
     flow: np.ndarray
@@ -146,7 +141,6 @@ class Episodes(NamedTuple):
     windows: JudgedWindow
     segment: np.ndarray
     clipped: np.ndarray
-    pictures: dict[tuple[int, int], np.ndarray]
 
 
 class PixelLoop(NamedTuple):
@@ -216,18 +210,6 @@ class _Cameras(NamedTuple):
     numbers: np.ndarray
 
 
-class _Step(NamedTuple):
-    """A decision of E episodes, as `Episodes` has it."""
-
-    flow: np.ndarray
-    temperature: np.ndarray
-    time_s: np.ndarray
-    setpoint: np.ndarray
-    sent: np.ndarray
-    window: JudgedWindow
-    segment: np.ndarray
-
-
 def run(
     controller: SetpointController,
     parameters: Any,
@@ -237,10 +219,8 @@ def run(
     *,
     decisions: int,
     rng: np.random.Generator,
-    draw: frozenset[tuple[int, int]] = frozenset(),
 ) -> Episodes:
-    """Episodes from the setpoints start (E, 2), at rest there; the first frame of each
-    (episode, decision) in `draw` is kept as a picture.
+    """Episodes from the setpoints start (E, 2), at rest there.
 
     A window whose classes cannot be told apart is no reason to act, but it is evidence: the controller is
     shown it and remembers, and its answer is not sent. Of windows held for another reason it hears nothing.
@@ -260,8 +240,7 @@ def run(
     memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (E, *jnp.shape(leaf))), controller.start())
     time_s, change = np.zeros(E), np.zeros((E, 2))
     acted, since, seen = np.zeros(E, int), np.zeros(E), np.full(E, np.nan)
-    steps: list[_Step] = []
-    pictures: dict[tuple[int, int], np.ndarray] = {}
+    steps: list[tuple] = []
     for decision in range(decisions + 1):
         clog = np.where(decision >= disturbances.clog_at, disturbances.clog, 1.0)
         ticks = np.rint(actuation.wait_after(change, loop.waits) / tick_s).astype(int) * (decision > 0)
@@ -270,10 +249,9 @@ def run(
         if decision == decisions:
             break
         _renew_segments(cameras, time_s, loop.segment_mean_s)
-        areas = _window_areas(cameras, flow, temperature, loop, disturbances, decision, draw)
+        areas = _window_areas(cameras, flow, temperature, loop, disturbances, decision)
         window = deployment.camera_seen(_judged(loop, areas, temperature), seen, areas.looks, loop.foreign)
         seen = window.flow_seen
-        pictures |= areas.pictures
         step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, decision)
         shown = Observation(
             window.p,
@@ -289,11 +267,20 @@ def run(
         before, setpoints = setpoints, actuation.moved(setpoints, wanted, time_s, loop.limits)
         change = setpoints.value - before.value
         means = flow.mean(axis=1), temperature.mean(axis=1)
-        steps.append(_Step(*means, time_s, before.value, change, window, cameras.numbers.copy()))
+        steps.append((*means, time_s, before.value, change, window, cameras.numbers.copy()))
         since = np.where(actuation.is_evidence(reason), 0.0, since) + change[:, 0]
         acted = acted + (reason == ACTS)
-    last = flow.mean(axis=1), temperature.mean(axis=1)
-    return _episodes(steps, *last, setpoints.clipped, pictures)
+    flows, temperatures, times, values, changes, windows, segments = zip(*steps, strict=True)
+    return Episodes(
+        flow=np.stack([*flows, flow.mean(axis=1)], axis=1),
+        temperature=np.stack([*temperatures, temperature.mean(axis=1)], axis=1),
+        time_s=np.stack(times, axis=1),
+        setpoint=np.stack(values, axis=1),
+        sent=np.stack(changes, axis=1),
+        windows=JudgedWindow(*(np.stack(field, axis=1) for field in zip(*windows, strict=True))),
+        segment=np.stack(segments, axis=1),
+        clipped=setpoints.clipped,
+    )
 
 
 def _judged(loop: PixelLoop, areas: "_WindowAreas", temperature: np.ndarray) -> JudgedWindow:
@@ -303,25 +290,6 @@ def _judged(loop: PixelLoop, areas: "_WindowAreas", temperature: np.ndarray) -> 
     shown = P.reshape(E, -1, 3), areas.valid, scores.reshape(E, -1), areas.tip_moved
     log_flow, deviation = (a.reshape(E, -1) for a in flows)
     return loop.judge(*shown, flows=lambda counts: loop.window_flow(log_flow, deviation, counts, areas.looks))
-
-
-def _episodes(
-    steps: list[_Step], flow: np.ndarray, temperature: np.ndarray, clipped: np.ndarray, pictures: dict
-) -> Episodes:
-    """The decisions of E episodes behind one another; flow and temperature (E,) are of the window after the
-    last."""
-    flows, temperatures, times, values, changes, windows, segments = zip(*steps, strict=True)
-    return Episodes(
-        flow=np.stack([*flows, flow], axis=1),
-        temperature=np.stack([*temperatures, temperature], axis=1),
-        time_s=np.stack(times, axis=1),
-        setpoint=np.stack(values, axis=1),
-        sent=np.stack(changes, axis=1),
-        windows=JudgedWindow(*(np.stack(field, axis=1) for field in zip(*windows, strict=True))),
-        segment=np.stack(segments, axis=1),
-        clipped=clipped,
-        pictures=pictures,
-    )
 
 
 def _filmed_window(
@@ -370,14 +338,12 @@ def _next_segment(segment, rng: np.random.Generator):
 
 class _WindowAreas(NamedTuple):
     """Key areas (E, W, 16, 48) uint8, whether they are valid (E, W), whether the nozzle is elsewhere than
-    where it was calibrated (E,), how the windows look (E, measures), NaN where nobody asks, and the pictures
-    asked for."""
+    where it was calibrated (E,), and how the windows look (E, measures)."""
 
     images: np.ndarray
     valid: np.ndarray
     tip_moved: np.ndarray
     looks: np.ndarray
-    pictures: dict[tuple[int, int], np.ndarray]
 
 
 def _window_areas(
@@ -387,14 +353,12 @@ def _window_areas(
     loop: PixelLoop,
     disturbances: PixelDisturbances,
     decision: int,
-    draw: frozenset,
 ) -> _WindowAreas:
     """What the cameras show of flow and temperature (E, W)."""
-    images, valid, moved, pictures = [], [], [], {}
-    looks = np.full((len(cameras.segments), len(familiar.NAMES)), np.nan)
+    images, valid, moved, looks = [], [], [], []
     for i, segment in enumerate(cameras.segments):
         scene = nozzle_scene.render(segment, flow[i], temperature[i], cameras.rngs[i])
-        frames, tip = _filmed(scene.frames, disturbances, i, decision, segment.tip), segment.tip
+        frames, tip = _filmed(scene.frames, disturbances, i, decision), segment.tip
         areas = key_area.find_all(
             frames, tip, least_score=loop.least_score, directions_deg=segment.direction_deg
         )
@@ -404,18 +368,13 @@ def _window_areas(
         nozzle = key_area.drift(some, cameras.templates[i], tip, reach_px=REACH_PX)
         images.append(areas.images)
         valid.append(areas.valid)
-        looks[i] = familiar.of_window(frames, np.array(tip), areas)
+        looks.append(familiar.of_window(frames, np.array(tip), areas))
         moved.append(
             np.hypot(*nozzle.offset_px) > loop.tip_tolerance_px
             and nozzle.correlation >= LIKENESS
             and nozzle.advantage >= ADVANTAGE
         )
-        if (i, decision) in draw:
-            one = key_area.find(
-                frames[0], tip, least_score=loop.least_score, direction_deg=segment.direction_deg
-            )
-            pictures[i, decision] = key_area.drawn(frames[0], tip, one)
-    return _WindowAreas(np.stack(images), np.stack(valid), np.array(moved), looks, pictures)
+    return _WindowAreas(np.stack(images), np.stack(valid), np.array(moved), np.stack(looks))
 
 
 def settled_since(episodes: Episodes) -> np.ndarray:

@@ -188,6 +188,19 @@ def of_frames(
     return looks
 
 
+def windows(segment: np.ndarray, *, length: int) -> np.ndarray:
+    """Rows (w, length): every `length` frames of one segment or print in the order in which they come, none
+    used twice. A window may straddle a change of flow: its truth is that of its middle frame."""
+    segment = np.asarray(segment)
+    order = np.argsort(segment, kind="stable")
+    rows = [
+        run[i : i + length]
+        for run in np.split(order, np.flatnonzero(np.diff(segment[order])) + 1)
+        for i in range(0, len(run) - length + 1, length)
+    ]
+    return np.array(rows, int).reshape(-1, length)
+
+
 def medians(measures: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """(w, measures) of windows with the frames `rows` (w, length) of `measures` (n, measures); NaN where none
     of a window's was measured."""
@@ -292,12 +305,8 @@ def window_medians(
     surroundings: np.ndarray, segment: np.ndarray, *, length: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """(measures of the windows (w, f), stretch of each (w,)), of those with a measured frame."""
-    rows, stretch = [], []
-    for number in np.unique(segment):
-        measures = surroundings[segment == number]
-        for start in range(0, len(measures) - length + 1, length):
-            rows.append(median(measures[start : start + length].astype(float)))
-            stretch.append(number)
-    windows = np.array(rows, float).reshape(-1, surroundings.shape[1])
-    sound = np.isfinite(windows).all(axis=1)
-    return windows[sound], np.array(stretch, int)[sound]
+    segment = np.asarray(segment)
+    rows = windows(segment, length=length)
+    looks = medians(surroundings, rows)
+    sound = np.isfinite(looks).all(axis=1)
+    return looks[sound], segment[rows[sound, 0]]

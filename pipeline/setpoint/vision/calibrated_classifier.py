@@ -63,9 +63,21 @@ def classify(
 
 
 def outputs(network: Classifier, data: Labelled, valid: np.ndarray, looks: np.ndarray) -> ClassifierOutputs:
-    """The network's outputs on n frames, valid (n,) or not, with looks (n, measures)."""
+    """The network's outputs on n frames, valid (n,) or not, with looks (n, measures): the head's features
+    with the appearance of the key areas beside them."""
     prediction = predict(network, data.key_area, data.temperature_degC)
-    return calibration.classifier_outputs(prediction, data, valid, looks)
+    return ClassifierOutputs(
+        prediction.logits,
+        np.hstack([prediction.features, calibration.appearance(data.key_area)]),
+        np.asarray(prediction.log_flow, float),
+        np.asarray(prediction.deviation, float),
+        data.label,
+        np.asarray(data.flow_percent, float),
+        np.asarray(data.temperature_degC, float),
+        data.segment,
+        np.asarray(valid, bool),
+        looks,
+    )
 
 
 class WindowPredictions(NamedTuple):

@@ -14,9 +14,8 @@ import scipy.optimize
 import scipy.special
 import scipy.stats
 
-from pipeline.setpoint.frames.familiar import medians
+from pipeline.setpoint.frames.familiar import medians, windows
 from pipeline.setpoint.simulation.recorded import WindowTable
-from pipeline.setpoint.vision.classifier import ClassifierPrediction, Labelled
 from pipeline.setpoint.vision.proof import CONFIDENCE, UNPROVEN, CameraProof
 from pipeline.setpoint.vision.window_flow import FlowCalibration, WindowFlow, fit_flow
 from pipeline.statistics import Share
@@ -44,19 +43,6 @@ def fit_temperature(logits: np.ndarray, label: np.ndarray) -> float:
 
 
 # ---- a window of images
-
-
-def windows(segment: np.ndarray, *, length: int) -> np.ndarray:
-    """Rows (w, length): every `length` frames of one segment or print in the order in which they come, none
-    used twice. A window may straddle a change of flow: its truth is that of its middle frame."""
-    segment = np.asarray(segment)
-    order = np.argsort(segment, kind="stable")
-    rows = [
-        run[i : i + length]
-        for run in np.split(order, np.flatnonzero(np.diff(segment[order])) + 1)
-        for i in range(0, len(run) - length + 1, length)
-    ]
-    return np.array(rows, int).reshape(-1, length)
 
 
 def hard_shares(log_p: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -293,25 +279,6 @@ class ClassifierOutputs(NamedTuple):
 
     def take(self, rows: np.ndarray) -> "ClassifierOutputs":
         return ClassifierOutputs(*(a[rows] for a in self))
-
-
-def classifier_outputs(
-    prediction: ClassifierPrediction, data: Labelled, valid: np.ndarray, looks: np.ndarray
-) -> ClassifierOutputs:
-    """The head's features with the appearance of the key areas beside them;
-    frames that the front end rejected are not valid."""
-    return ClassifierOutputs(
-        prediction.logits,
-        np.hstack([prediction.features, appearance(data.key_area)]),
-        np.asarray(prediction.log_flow, float),
-        np.asarray(prediction.deviation, float),
-        data.label,
-        np.asarray(data.flow_percent, float),
-        np.asarray(data.temperature_degC, float),
-        data.segment,
-        np.asarray(valid, bool),
-        looks,
-    )
 
 
 class ClassifierCalibration(NamedTuple):

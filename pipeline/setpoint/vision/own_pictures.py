@@ -4,7 +4,8 @@ fitted to them by ridge regression (Hoerl and Kennard 1970)
     W = (Z'Z + penalty I)^-1 Z' (y - mean y)    Z: features less their mean, in deviations
 
 of the three classes as 0 and 1, and of log(flow / 100 %). Every print is read by heads, and its windows by a
-calibration, that learned nothing from it.
+calibration, that learned nothing from it. By their errors the spread is stretched: few prints teach a
+calibration what their own windows err by, not what those of the next print do.
 """
 
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 
 from pipeline.setpoint.frames.rendered import LabelledFrames
 from pipeline.setpoint.vision import calibrated_classifier, calibration
@@ -20,6 +22,7 @@ from pipeline.setpoint.vision.calibration import ClassifierOutputs
 from pipeline.setpoint.vision.classifier import CLASS_NAMES
 from pipeline.setpoint.vision.parts import all_frames
 from pipeline.setpoint.vision.vision_transformer import LOG_DEVIATION, Classifier
+from pipeline.setpoint.vision.window_flow import FlowCalibration, WindowFlow, class_probabilities
 
 # from so many stretches of constant settings on the network itself is trained
 TRAINED_FROM = 2000
@@ -27,6 +30,8 @@ PENALTY = 10.0
 # prints are left out one at a time, many of them in so many groups; each class is in so many prints at least,
 # as two are left out at a time
 MOST_GROUPS, LEAST_PRINTS = 12, 3
+# share of the windows by whose errors the spread is stretched
+COVERED = 0.8
 
 
 class Heads(NamedTuple):
@@ -65,9 +70,35 @@ def learn(network: Classifier, frames: LabelledFrames, *, window: int, false_ala
         of_others = calibration.calibrate(inner, inner, length=window, false_alarms=false_alarms)
         seen = calibrated_classifier.window_predictions(of_others, unlearned.take(mine), length=window)
         pieces.append(seen._replace(rows=mine[seen.rows]))
+    windows = calibrated_classifier.joined_windows(pieces)
+    growth = spread_growth(windows)
     heads = fit_heads(outputs.take(outputs.valid))
-    model = CalibratedClassifier(with_heads(network, heads), fitted._replace(foreign_above=above))
-    return OwnClassifier(model, unlearned, calibrated_classifier.joined_windows(pieces), distance)
+    fitted = fitted._replace(foreign_above=above, flow=stretch(fitted.flow, growth))
+    model = CalibratedClassifier(with_heads(network, heads), fitted)
+    return OwnClassifier(model, unlearned, windows._replace(seen=widen(windows.seen, growth)), distance)
+
+
+def spread_growth(windows: WindowPredictions) -> float:
+    """By how much the spread must grow so that the share COVERED of windows that nothing was learned from err
+    by as little as Gaussian ones would: one print that is read quite wrongly shall not widen all others."""
+    some = windows.any_valid
+    error = np.log(windows.seen.flow_seen[some] / windows.truth.flow_percent[some])
+    within = np.quantile(np.abs(error) / windows.seen.spread[some], COVERED)
+    return float(within / scipy.special.ndtri((1 + COVERED) / 2))
+
+
+def stretch(flow: FlowCalibration, by: float) -> FlowCalibration:
+    """The calibration with a spread `by` times as large."""
+    return flow._replace(
+        scale=by * flow.scale, looks=flow.looks._replace(explained=by * flow.looks.explained)
+    )
+
+
+def widen(seen: WindowFlow, by: float) -> WindowFlow:
+    """The same flows with a spread `by` times as large, and the probabilities of the classes that follow."""
+    some, prob = np.isfinite(seen.flow_seen), seen.prob.copy()
+    prob[some] = class_probabilities(np.log(seen.flow_seen[some] / 100), by * seen.spread[some])
+    return WindowFlow(seen.flow_seen, by * seen.spread, prob)
 
 
 def check(frames: LabelledFrames) -> None:
