@@ -39,14 +39,13 @@ SECTIONS = (
     "segment_library",
     "setpoint_material",
     "tracking",
-    "train_agent",
     "render_frames",
     "train_classifier",
     "train_ilc",
     "tune_weights",
 )
 # the second pipeline has a file of its own, which no owner of a machine needs to know
-PAPERS, PAPERS_SECTIONS = "datasets/papers/params.yaml", ("reproduce_study",)
+PAPERS, PAPERS_SECTIONS = "datasets/papers/params.yaml", ("reproduce_study", "train_agent")
 # old dotted key or section -> new one, for one version
 RENAMED: dict[str, str] = {"export_controllers": "certify"}
 

@@ -92,7 +92,7 @@ class EpisodeConditions(NamedTuple):
     flow (percent) and temperature (°C) at the start; accuracy rho of the paper's windows; persistence:
     decisions that a recorded segment lasts on average, 1 is fresh; clog: factor on the flow from clog_step
     on, 1 is none; wait_s after every action; view_s: time after a move until all that a picture shows was
-    laid since, 0 is at once; flow_actions: lambda, of flow to one of temperature.
+    laid since, 0 is at once.
     """
 
     flow: jax.Array
@@ -103,7 +103,6 @@ class EpisodeConditions(NamedTuple):
     clog_step: jax.Array
     wait_s: jax.Array
     view_s: jax.Array
-    flow_actions: jax.Array
 
 
 class MachineState(NamedTuple):
@@ -165,7 +164,6 @@ def nominal(flow, temperature, *, accuracy: float) -> EpisodeConditions:
             "temperature": jnp.asarray(temperature, float) * one,
             "accuracy": accuracy * one,
             "wait_s": 6.0 * one,
-            "flow_actions": LAMBDA * one,
         }
     )
 
@@ -229,7 +227,7 @@ def stepped(
 
     u (CHANCES,) are the chances, uniform in [0, 1), which the caller draws for many at once.
     """
-    heeded = state.step % conditions.flow_actions == 0
+    heeded = state.step % LAMBDA == 0
     target_move = jnp.where(heeded, jnp.asarray(TEMPERATURE_MOVES)[action.temperature], 0.0)
     asked = jnp.stack([jnp.asarray(FLOW_MOVES)[action.flow], target_move])
     sent = actuation.moved(state.sent, asked, state.time_s, LIMITS)
